@@ -1,79 +1,143 @@
-"""What each idea of the default fit brings: on and off at equal time, or at equal steps.
+"""What single settings of a fit are worth: each changed alone, beside the default, in equal CPU time.
 
-    python -m benchmarks.ideas [--json FILE] [--clip bunny|bikes ...] [--minutes M | --steps N] [--seeds N]
-                               [--idea NAME ...]
+    python -m benchmarks.ideas --cpu-seconds S [--clips FOLDER] [--samples bunny|bikes|carphone ...] [--only NAME ...]
+                               [--size HxW] [--frames N] [--seeds N] [--json FILE]
 
-Every idea is switched off alone, everything else as in `FitConfig()`; fits of one clip and seed run one after another,
-the default among them, so that a slow minute of the machine hits neighbours alike. With `--steps` the machine's pace
-does not matter, which is fair to ideas that do not change what a step costs. PSNR is the mean over all frames of 8-bit
-pictures. *Bunny* is at 160x320 with 40,000 Gaussians, *bikes* at its own 272x640 with the default's number.
+Each row is a fit with one setting changed and everything else as in `FitConfig()`: an idea of the default that is
+switched off, or a value that a search by hand would try. Fits take one thread and S seconds of the CPU time of their
+process, so that other work on the machine takes nothing from them. PSNR is the mean over all frames of 8-bit images,
+and that of the worst frame. `VARIANTS` lists the rows; rows that change the number of Gaussians are relative to the
+number that the default chose.
+
+A clip of fewer frames or pixels with a budget in proportion has the same CPU time for each pixel, and so gets about as
+many Gaussians for each pixel and visits to each frame: a search in ten minutes of 90 frames of 480x854 on two cores is
+represented by 80 seconds with --frames 24 --size 240x427.
+
+With --json each fit that is done is kept there, and the same command continues after it.
 """
 
+import argparse
 import dataclasses
-import itertools
-import statistics
+from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from benchmarks import _common
+from benchmarks._clips import SAMPLE_SIZES
 from benchmarks._common import console
-from foldgauss.io import read_video
-from foldgauss.io.datasets import sample_clip
+from benchmarks._runs import Run, Runs
+from benchmarks.presets import minutes as positive
+from benchmarks.tune import Candidate, fit_candidate, processes, sources_of
 from foldgauss.render import RenderOptions
-from foldgauss.video import FitConfig, evaluate, fit
+from foldgauss.video import FitConfig, LearningRates
 
-#: What switches an idea off.
-IDEAS = {
-    "starts along the flow, shots apart": {"follow_motion": False},
-    "rates in units of own time": {"scale_rates_by_duration": False},
-    "rates in units of own size": {"scale_rates_by_size": False},
-    "squared error at the end": {"l2_fraction": 0.0},
-    "frame times learned": {"learn_frame_times": False},
-    "low pass 0.1 px^2 instead of 0.3": {"options": RenderOptions()},
+DEFAULT = "default"
+
+
+def scaled_rates(factor: float) -> LearningRates:
+    rates = dataclasses.asdict(LearningRates())
+    return LearningRates(**{name: factor * value for name, value in rates.items()})
+
+
+#: The fields of `FitConfig` that each row changes; `gaussians` is a factor on the number that the default chose.
+VARIANTS: dict[str, dict[str, Any]] = {
+    "starts at rest": {"follow_motion": False},
+    "rates not by duration": {"scale_rates_by_duration": False},
+    "rates not by size": {"scale_rates_by_size": False},
+    "frame times fixed": {"learn_frame_times": False},
+    "low pass 0.3 px^2": {"options": RenderOptions()},
+    "Gaussians x0.5": {"gaussians": 0.5},
+    "Gaussians x0.7": {"gaussians": 0.7},
+    "Gaussians x1.5": {"gaussians": 1.5},
+    "rates x0.7": {"rates": scaled_rates(0.7)},
+    "rates x1.4": {"rates": scaled_rates(1.4)},
+    "final rate 0.1": {"final_rate": 0.1},
+    "final rate 0.4": {"final_rate": 0.4},
+    "cooldown 0.5": {"cooldown_fraction": 0.5},
+    "degree 1": {"degree": 1},
+    "degree 2": {"degree": 2},
+    "no squared error": {"l2_fraction": 0.0},
+    "squared error 0.6": {"l2_fraction": 0.6},
+    "D-SSIM 0": {"ssim_fraction": 0.0},
+    "D-SSIM 0.1": {"ssim_fraction": 0.1},
+    "views by error 0": {"error_fraction": 0.0},
+    "views by error 0.6": {"error_fraction": 0.6},
+    "relocated 0": {"relocated_fraction": 0.0},
+    "relocated 0.1": {"relocated_fraction": 0.1},
+    "2 frames a step": {"batch_size": 2},
 }
-CLIPS = {"bunny": ((160, 320), 40_000), "bikes": (None, None)}
+
+
+def config_of(name: str, cpu_seconds: float, seed: int, chosen: int | None) -> FitConfig:
+    """The settings of a row; `chosen`: the number of Gaussians of the default's fit."""
+    changes = dict(VARIANTS.get(name, {}))
+    factor = changes.pop("gaussians", None)
+    num = None if factor is None else round(factor * chosen)
+    return FitConfig(minutes=cpu_seconds / 60, num_gaussians=num, seed=seed, **changes)
+
+
+def measure(options: argparse.Namespace, runs: Runs) -> dict[str, dict[str, list[Run]]]:
+    """The runs of every seed by clip and row, the default first."""
+    found: dict[str, dict[str, list[Run]]] = {}
+    with processes(1):
+        for source in sources_of(options):
+            rows = found[source.name] = {name: [] for name in (DEFAULT, *options.only)}
+            for seed in range(options.seeds):
+                for name in rows:
+                    chosen = rows[DEFAULT][seed]["gaussians"] if name != DEFAULT else None
+                    candidate = Candidate(source, config_of(name, options.cpu_seconds, seed, chosen))
+                    label = f"{source.name}, seed {seed}, {name}"
+                    rows[name].append(runs.get(label, lambda candidate=candidate: fit_candidate(candidate)))
+    return found
+
+
+def means(runs: list[Run]) -> tuple[float, float]:
+    """Mean PSNR and that of the worst frame, over the seeds; NaN where a fit diverged."""
+    return tuple(float(np.mean([run.get(name, np.nan) for run in runs])) for name in ("psnr", "worst_psnr"))
+
+
+def show(clip: str, rows: dict[str, list[Run]], options: argparse.Namespace) -> dict[str, float]:
+    """Print a clip's table, best first; returns its figures."""
+    default, worst = means(rows[DEFAULT])
+    title = f"{clip}: {options.cpu_seconds:g} s of one core, {options.seeds} seed(s)"
+    table = _common.table(title, "changed", "PSNR, dB", "gain", "worst frame", "gain", "Gaussians", "steps")
+    for name, runs in sorted(rows.items(), key=lambda row: -np.nan_to_num(means(row[1])[0])):
+        psnr, lowest = means(runs)
+        gains = f"{psnr - default:+.2f}", f"{lowest - worst:+.2f}"
+        counts = (f"{np.mean([run.get(key, np.nan) for run in runs]):,.0f}" for key in ("gaussians", "steps"))
+        table.add_row(name, f"{psnr:.2f}", gains[0], f"{lowest:.2f}", gains[1], *counts)
+    console.print(table)
+    figures = {f"{clip}_{name}_gain": means(runs)[0] - default for name, runs in rows.items() if name != DEFAULT}
+    return {f"{clip}_{DEFAULT}_psnr": default} | figures
 
 
 def main(arguments: list[str] | None = None) -> None:
-    parser = _common.parser(__doc__)
-    parser.add_argument("--clip", choices=tuple(CLIPS), action="append", help="[both]")
-    length = parser.add_mutually_exclusive_group()
-    length.add_argument("--minutes", type=float, default=0.5, help="of each fit [0.5]")
-    length.add_argument("--steps", type=_common.whole, help="of each fit, instead of minutes")
-    parser.add_argument("--seeds", type=_common.whole, default=3, help="[3]")
-    parser.add_argument("--idea", choices=tuple(IDEAS), action="append", help="only this one [all]")
+    parser = _parser()
     options = _common.parse(parser, arguments)
-    ideas = options.idea or list(IDEAS)
-    budget = {"minutes": options.minutes} if options.steps is None else {"steps": options.steps}
+    setting = {name: getattr(options, name) for name in ("cpu_seconds", "size", "frames")}
+    try:
+        runs = Runs(options.json, setting)
+    except ValueError as error:
+        parser.error(str(error))
     figures = {}
-    for name in options.clip or list(CLIPS):
-        size, num = CLIPS[name]
-        clip = read_video(sample_clip(name), size=size)
-        base = FitConfig(num_gaussians=num, **budget)
-        psnr: dict[str, list[float]] = {"default": [], **{idea: [] for idea in ideas}}
-        for seed, what in itertools.product(range(options.seeds), psnr):
-            config = dataclasses.replace(base, seed=seed, **IDEAS.get(what, {}))
-            result = fit(clip.frames, config, fps=clip.fps)
-            psnr[what].append(evaluate(result.model, clip.frames).mean_psnr)
-            text = f"{name}, seed {seed}, {what}: {psnr[what][-1]:.2f} dB, {result.history[-1].step:,} steps"
-            console.print(text, style="dim", soft_wrap=True)
-        figures |= show(name, psnr, options)
-    _common.finish(options.json, figures, _common.describe_machine(), **budget, seeds=options.seeds)
+    for clip, rows in measure(options, runs).items():
+        figures |= show(clip, rows, options)
+    _common.finish(None, figures, _common.describe_machine())
+    runs.write(figures=figures)
 
 
-def show(clip: str, psnr: dict[str, list[float]], options) -> dict[str, float]:
-    """Print a clip's table; returns its figures: what each idea brings, in dB, mean and range over the seeds."""
-    length = f"{options.minutes:g} minutes" if options.steps is None else f"{options.steps:,} steps"
-    title = f"{clip}: dB with the idea less dB without, {length}, {options.seeds} seeds"
-    table = _common.table(title, "idea", "mean", "lowest", "highest")
-    default = psnr.pop("default")
-    figures = {f"{clip}_default_psnr": statistics.fmean(default)}
-    for idea, without in psnr.items():
-        gains = [one - other for one, other in zip(default, without, strict=True)]
-        table.add_row(idea, *(f"{value:+.2f}" for value in (statistics.fmean(gains), min(gains), max(gains))))
-        figures[f"{clip}_{idea}"] = statistics.fmean(gains)
-    table.add_section()
-    table.add_row("the default, dB", f"{statistics.fmean(default):.2f}", f"{min(default):.2f}", f"{max(default):.2f}")
-    console.print(table)
-    return figures
+def _parser() -> argparse.ArgumentParser:
+    parser = _common.parser(__doc__)
+    parser.add_argument("--cpu-seconds", type=positive, required=True, metavar="S", help="CPU time of each fit")
+    parser.add_argument("--clips", type=Path, metavar="FOLDER", help="whose subfolders of images are the clips")
+    parser.add_argument("--samples", nargs="+", choices=tuple(SAMPLE_SIZES), help="sample clips [none]")
+    names = tuple(VARIANTS)
+    parser.add_argument("--only", nargs="+", choices=names, default=names, metavar="NAME", help=f"[{', '.join(names)}]")
+    parser.add_argument("--size", type=_common.size, metavar="HxW", help="of all clips [each its own]")
+    parser.add_argument("--frames", type=_common.whole, metavar="N", help="only the first N of each clip [all]")
+    parser.add_argument("--seeds", type=_common.whole, default=1, help="[1]")
+    return parser
 
 
 if __name__ == "__main__":
