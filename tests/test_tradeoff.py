@@ -132,7 +132,7 @@ def test_each_variant_changes_one_setting_and_has_a_command():
     assert left == []
     assert len({point.name for point in made}) == len(made) == 1 + sum(map(len, AXES.values()))
     commands = kept.Commands(Path("my clip.mp4"), "320x640", "0:132", Path("out"))
-    lines = [commands.format_point(point, 132, (320, 640)) for point in made]
+    lines = [commands.format_point(point) for point in made]
     assert len(set(lines)) == len(lines)
     for point, line in zip(made, lines, strict=True):
         changed = kept.changed_settings(point, BASE)

@@ -1,14 +1,12 @@
 """The starts of a fit: along edges, in order of time."""
 
-import math
-
 import numpy as np
 import pytest
 from clips import moving_blobs
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video import Economy
-from foldgauss.video.fitting.config import FitConfig, most_alive
+from foldgauss.video.fitting.config import ALIVE_POWER, FitConfig, default_num_gaussians
 from foldgauss.video.fitting.initialize import ELONGATION, count_alive, initialize, sample_orientations
 
 
@@ -57,24 +55,27 @@ def test_gaussians_are_in_order_of_time():
     assert (np.diff(home) >= 0).all()
 
 
-def test_fewer_start_where_more_would_be_alive_at_once():
-    """The limit holds for the mean over frames; without it, or above what is alive, the number is what is asked for."""
-    frames = moving_blobs()
-    envelope = TimeLikelihood(power=np.float32(1))
-    for most in (40.0, 150.0):
-        splats = initialize(frames, 5000, degree=1, envelope=envelope, seed=0, most_alive=most)
-        times, spread = np.linspace(0, 1, len(frames)), np.exp(splats.log_time_scale)
-        alive = count_alive(1 / (1 + np.exp(-splats.time_loc_logit)), spread, times)
-        assert alive.mean() == pytest.approx(most, rel=0.15)
-    assert initialize(frames, 300, degree=1, envelope=envelope, seed=0, most_alive=1e4).num_gaussians == 300
-    assert initialize(frames, 300, degree=1, envelope=envelope, seed=0, most_alive=1e-9).num_gaussians == 1
+def test_number_follows_from_the_lifetime():
+    """A function of the mean lifetime in frames is given that of the starts."""
+    frames, lifetimes = moving_blobs(), []
+
+    def choose(lifetime):
+        lifetimes.append(lifetime)
+        return 2000
+
+    splats = initialize(frames, choose, degree=1, envelope=TimeLikelihood(power=np.float32(1)), seed=0)
+    times, spread = np.linspace(0, 1, len(frames)), np.exp(splats.log_time_scale)
+    alive = count_alive(1 / (1 + np.exp(-splats.time_loc_logit)), spread, times)
+    assert splats.num_gaussians == 2000
+    assert lifetimes == [pytest.approx(alive.sum() / 2000, rel=0.15)]
 
 
-def test_minutes_limit_how_many_are_alive():
-    """Only where they choose the number: more time, more alive; half the threads are worth half the minutes."""
+def test_longer_lifetimes_mean_fewer_gaussians():
+    """By the square root; and where they live throughout, a limit of those alive holds, which grows with the time."""
     size = 132, 160, 320
-    least, most = (most_alive(FitConfig(minutes=m), *size, threads=2) for m in (1.0, 10.0))
-    assert 0 < least < most < math.inf
-    assert most_alive(FitConfig(minutes=10.0), *size, threads=1) == most_alive(FitConfig(minutes=5.0), *size, threads=2)
-    for config in (FitConfig(), FitConfig(minutes=1.0, num_gaussians=9), FitConfig(minutes=1.0, economy=Economy())):
-        assert most_alive(config, *size) == math.inf
+    number = [default_num_gaussians(FitConfig(minutes=1.0), *size, lifetime=life, threads=2) for life in (8.0, 32.0)]
+    assert number[0] == pytest.approx(2 * number[1], rel=1e-4)
+    alive = [default_num_gaussians(FitConfig(minutes=m), *size, lifetime=132.0, threads=2) for m in (4.0, 16.0)]
+    assert alive[1] == pytest.approx(4**ALIVE_POWER * alive[0], rel=1e-4)
+    given = FitConfig(minutes=1.0, economy=Economy())
+    assert default_num_gaussians(given, *size, lifetime=8.0) == default_num_gaussians(given, *size, lifetime=100.0)

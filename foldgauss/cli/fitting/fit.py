@@ -23,7 +23,7 @@ from foldgauss.cli.fitting.options import (
     fit_options,
 )
 from foldgauss.cli.fitting.progress import Display, Observer, display_progress, print_json, save_previews
-from foldgauss.cli.fitting.segments import describe_budgets, fit_in_segments
+from foldgauss.cli.fitting.segments import describe_budgets, fit_in_segments, plan_gaussians
 from foldgauss.cli.fitting.workers import WorkerOptions
 from foldgauss.cli.shared.arguments import Frames, NewClip, Overwrite, Size, parse_frames, parse_size
 from foldgauss.cli.shared.outputs import name_after, refuse_existing, refuse_input
@@ -38,7 +38,7 @@ from foldgauss.jobs.job import FitJob
 from foldgauss.jobs.runner import FitRun, clip_warnings, missed_psnr, run_fit
 from foldgauss.jobs.runner import Stopped as FitStopped
 from foldgauss.jobs.segments import read_segment_seconds
-from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, most_alive, planned_steps
+from foldgauss.video.fitting.config import FitConfig, planned_steps
 from foldgauss.video.fitting.divergence import FitDiverged
 from foldgauss.video.fitting.loop import FitInfo
 from foldgauss.video.fitting.state import FitState, running_psnr
@@ -257,7 +257,7 @@ def _print_plan(clip: Clip, config: FitConfig, display: Display) -> None:
     height, width = clip.size
     for text in clip_warnings(clip):
         warn(f"{clip.source}: {text}")
-    num = chosen_num_gaussians(config, clip.num_frames, height, width)
+    num, at_most = plan_gaussians(config, clip.num_frames, height, width)
     steps = planned_steps(config, clip.num_frames)
     if steps is not None and steps * config.batch_size < clip.num_frames:
         warn(
@@ -274,7 +274,6 @@ def _print_plan(clip: Clip, config: FitConfig, display: Display) -> None:
         psnr = config.economy.psnr
         plan += ", pruned by description length" if psnr is None else f", the smallest at {psnr:g} dB"
     growing = "" if config.growth is None else " at the start"
-    at_most = "up to " if num > most_alive(config, clip.num_frames, height, width) else ""
     computed = f"{num_threads()} threads" if engine == "cpu" else f"engine {engine} on {describe_device()}"
     out.print(
         f"{clip.source}: {format_count(clip.num_frames, 'frame')} of {height}x{width}"

@@ -15,7 +15,7 @@ from foldgauss.cli.shared.tables import format_count, print_figures
 from foldgauss.jobs import FitJob, JoinedFit, LongFit, Outcome, plan_long_fit, segments_folder
 from foldgauss.jobs.job import read_record
 from foldgauss.jobs.segments import SEGMENT_SECONDS, read_segment_seconds
-from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, most_alive, planned_steps
+from foldgauss.video.fitting.config import SHORTEST_LIFETIME, FitConfig, chosen_num_gaussians, planned_steps
 
 
 def fit_in_segments(
@@ -72,6 +72,15 @@ def fit_in_segments(
 def print_failures(failed: list[Outcome]) -> None:
     for outcome in failed:
         err.print(f"failed: {outcome.job.name}: {outcome.failure}", style="red", soft_wrap=True)
+
+
+def plan_gaussians(config: FitConfig, num_frames: int, *size: int, threads: int | None = None) -> tuple[int, str]:
+    """The number of Gaussians at the start; and "up to " where it is a bound, as the motion of the clip decides."""
+    least, most = (
+        chosen_num_gaussians(config, num_frames, *size, lifetime=lifetime, threads=threads)
+        for lifetime in (max(num_frames, SHORTEST_LIFETIME), SHORTEST_LIFETIME)
+    )
+    return most, "up to " if least < most else ""
 
 
 def describe_budgets(config: FitConfig, steps: int | None) -> str:
@@ -143,8 +152,7 @@ def _print_plan(fit: LongFit, config: FitConfig, display: Display, video: Path, 
     lengths = [stop - first for first, stop in fit.spans]
     size = index.size if fit.jobs[0].size is None else fit.jobs[0].size
     longest = fit.jobs[lengths.index(max(lengths))].config  # with its part of the file's size
-    num = chosen_num_gaussians(longest, max(lengths), *size, threads=options.threads)
-    at_most = "up to " if num > most_alive(longest, max(lengths), *size, threads=options.threads) else ""
+    num, at_most = plan_gaussians(longest, max(lengths), *size, threads=options.threads)
     if display == "json":
         about = {"clip": str(video), "num_frames": index.num_frames, "height": size[0], "width": size[1]}
         emit_json("start", about | {"spans": [list(span) for span in fit.spans], "num_gaussians": num})

@@ -276,7 +276,7 @@ class _Run:
             "floats": shown.num_parameters,
             "gaussians": shown.num_gaussians,
             "frames_per_second": round(rate, 2),
-            "command": self.commands.format_point(point, self.clip.num_frames, self.clip.size),
+            "command": self.commands.format_point(point),
         }
 
     def _measure_variant(

@@ -23,7 +23,7 @@ from foldgauss.cli.shared.tables import write_json
 from foldgauss.io._atomic import atomic_path
 from foldgauss.io.figures import write_tradeoff
 from foldgauss.render import RenderOptions
-from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, rename_options, rename_settings
+from foldgauss.video.fitting.config import FitConfig, rename_options, rename_settings
 from foldgauss.video.tradeoff import FLOAT16, FLOAT32, MAX_LOSS_DB, PASSES, Point, Skipped, knee, pareto_front
 
 RECORD, ROWS, PLOT, BASE = "tradeoff.json", "tradeoff.csv", "tradeoff.png", "base.safetensors"
@@ -158,7 +158,7 @@ class Commands:
     frames: str | None
     folder: Path
 
-    def format_point(self, point: Point, num_frames: int, size: tuple[int, int]) -> str:
+    def format_point(self, point: Point) -> str:
         """The command that fits the model of `point`, or converts or evaluates that of the base."""
         name, base = point.name.replace(", ", "-").replace(" ", "-").replace("/", "_"), self.folder / BASE
         if point.played is not None:
@@ -173,8 +173,7 @@ class Commands:
         words = ["fit", str(self.video), "--out", f"{name}.safetensors"]
         words += [] if self.size is None else ["--size", self.size]
         words += [] if self.frames is None else ["--frames", self.frames]
-        chosen = dataclasses.replace(point.config, num_gaussians=None)
-        default = FitConfig(num_gaussians=chosen_num_gaussians(chosen, num_frames, *size))
+        default = FitConfig()
         words += _changed(point.config, default, FIT_OPTIONS)
         words += _changed(point.config.options, default.options, RENDER_OPTIONS)
         return shlex.join(["foldgauss", *words])

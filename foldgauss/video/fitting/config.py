@@ -404,8 +404,13 @@ HEADER_BYTES = 4096
 DEFAULT_STEPS, DEFAULT_VISITS = 3000, 20
 #: Time of a core for each pixel of a step, in microseconds, by which steps and minutes are compared.
 PIXEL_TIME = 0.4
-#: Gaussians per pixel of a clip where a core has one microsecond for each; it grows by this power of the time.
-DENSITY, DENSITY_POWER = 0.0028, 0.85
+#: Gaussians per pixel of a clip where a core has one microsecond for each, and where they live for one frame; it grows
+#: by these powers of the time and of the lifetime. Gaussians that live long are seldom needed anew.
+DENSITY, DENSITY_POWER, LIFETIME_POWER = 0.017, 0.85, -0.5
+#: A model with parameters of so many bytes is at most as large as the frames as bytes.
+PARAMETER_BYTES = 2
+#: Mean lifetimes in frames: of slow clips (*Bunny* 68, carphone 35), and the shortest, in flicker. DAVIS: 5 to 19.
+TYPICAL_LIFETIME, SHORTEST_LIFETIME = 35.0, 2.0
 #: Gaussians alive in a frame, at most: for a frame of one pixel and one microsecond; it grows by these powers of the
 #: time, likewise, and of the pixels. Where they live long, more of them leave time for too few steps.
 ALIVE, ALIVE_POWER, ALIVE_PIXEL_POWER = 5.3, 0.55, 0.75
@@ -418,54 +423,55 @@ SMALLEST_TIMES = 5
 
 
 def default_num_gaussians(
-    config: FitConfig, num_frames: int, height: int, width: int, threads: int | None = None
+    config: FitConfig,
+    num_frames: int,
+    height: int,
+    width: int,
+    *,
+    lifetime: float = TYPICAL_LIFETIME,
+    threads: int | None = None,
 ) -> int:
     """The number of Gaussians that is best for the budget, see docs/fit.md for the measurements.
 
-    It is `DENSITY` x^`DENSITY_POWER` for each pixel of all frames, where a core has x microseconds for each: `minutes`
-    times the number of `threads` (default: those of this process), or the time that `steps` take. The model file is
-    never larger than the frames as bytes. `most_alive` may lower it.
+    `lifetime` is the mean number of frames in which a Gaussian is alive, which depends on the motion in the clip. The
+    number is the smallest of three, where a core has x microseconds for each pixel of all frames, p pixels each:
+    `DENSITY` x^`DENSITY_POWER` lifetime^`LIFETIME_POWER` for each pixel of all frames; the number of which `ALIVE`
+    x^`ALIVE_POWER` p^`ALIVE_PIXEL_POWER` are alive in a frame; and the number whose parameters, with `PARAMETER_BYTES`
+    each, take as many bytes as the frames. x is the time that `steps` take, or `minutes` times the number of `threads`
+    (default: those of this process).
     """
-    pixels = num_frames * height * width
+    area = height * width
+    pixels = num_frames * area
     if config.economy is not None:
         fraction = SMALLEST_FRACTION if _is_smallest(config) else 1.0
-        return max(round(fraction * ECONOMICAL * math.sqrt(height * width) * max(1.0, num_frames / 250)), 1)
+        return max(round(fraction * ECONOMICAL * math.sqrt(area) * max(1.0, num_frames / 250)), 1)
     steps, budgets = planned_steps(config, num_frames), []  # in microseconds for each pixel of all frames
     if steps is not None:
         budgets.append(PIXEL_TIME * steps * config.batch_size / num_frames)
     if config.minutes is not None:
-        budgets.append(_time_per_pixel(config, pixels, threads))
-    density = min(DENSITY * min(budgets) ** DENSITY_POWER, 3 / bytes_per_gaussian(config.degree))
-    return max(round(density * pixels), 1)
+        budgets.append(60e6 * config.minutes * (threads or num_threads()) / pixels)
+    time = min(budgets)
+    by_time = DENSITY * time**DENSITY_POWER * lifetime**LIFETIME_POWER * pixels
+    by_life = ALIVE * time**ALIVE_POWER * area**ALIVE_PIXEL_POWER * num_frames / lifetime
+    by_size = 3 * pixels / (PARAMETER_BYTES * parameters_per_gaussian(config.degree))
+    return max(round(min(by_time, by_life, by_size)), 1)
 
 
-def most_alive(config: FitConfig, num_frames: int, height: int, width: int, threads: int | None = None) -> float:
-    """The largest mean number of Gaussians alive in a frame at the start, where `minutes` choose their number.
-
-    It is `ALIVE` x^`ALIVE_POWER` p^`ALIVE_PIXEL_POWER`, x as in `default_num_gaussians`, for frames of p pixels; else
-    infinite. How many are alive depends on the motion in the clip: `initialize` lowers the number by it.
-    """
-    if config.minutes is None or config.num_gaussians is not None or config.economy is not None:
-        return math.inf
-    time = _time_per_pixel(config, num_frames * height * width, threads)
-    return ALIVE * time**ALIVE_POWER * (height * width) ** ALIVE_PIXEL_POWER
-
-
-def _time_per_pixel(config: FitConfig, pixels: int, threads: int | None) -> float:
-    """Microseconds of a core that `minutes` have for each pixel of all frames."""
-    return 60e6 * config.minutes * (threads or num_threads()) / pixels
+def parameters_per_gaussian(degree: int) -> int:
+    return 11 + 2 * degree
 
 
 def bytes_per_gaussian(degree: int) -> int:
     """Of a model file."""
-    return 4 * (11 + 2 * degree)
+    return 4 * parameters_per_gaussian(degree)
 
 
-def chosen_num_gaussians(
-    config: FitConfig, num_frames: int, height: int, width: int, threads: int | None = None
-) -> int:
-    """Number of Gaussians at the start, at most `most_gaussians`. Raises ValueError as that does."""
-    num = config.num_gaussians or default_num_gaussians(config, num_frames, height, width, threads)
+def chosen_num_gaussians(config: FitConfig, num_frames: int, height: int, width: int, **known: float | None) -> int:
+    """Number of Gaussians at the start, at most `most_gaussians`. Raises ValueError as that does.
+
+    `known`: `lifetime` and `threads`, see `default_num_gaussians`.
+    """
+    num = config.num_gaussians or default_num_gaussians(config, num_frames, height, width, **known)
     return min(num, most_gaussians(config, num_frames))
 
 

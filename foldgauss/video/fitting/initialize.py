@@ -1,7 +1,6 @@
 """The initial Gaussians of a fit: drawn from the detail and the colors of the clip; or uniformly, as published."""
 
 import dataclasses
-import math
 from collections.abc import Callable
 
 import cv2
@@ -56,7 +55,7 @@ UNIFORM_BOX = 1.1
 
 def initialize(
     frames: np.ndarray,
-    num_gaussians: int,
+    num_gaussians: int | Callable[[float], int],
     *,
     degree: int,
     envelope: TimeLikelihood,
@@ -65,15 +64,14 @@ def initialize(
     motion: Motion | None = None,
     opacity: float = START_OPACITY,
     with_static: bool = False,
-    most_alive: float = math.inf,
 ) -> FoldedSplats:
     """Initial splats for `frames`, uint8 (num_frames, height, width, 3), at `times` (default: evenly spaced).
 
     Positions are drawn by image gradient within each frame, m_t is that frame's time, sizes follow from the local
     density of starts, colors from the pixel. With `motion`, folds follow the optical flow, and sigma_t is drawn as a
     fraction of the length of the track; without, folds are at rest and sigma_t is log-uniform. With `with_static`,
-    starts whose pixel never changes are static Gaussians, behind the others. There are fewer than `num_gaussians` where
-    more than `most_alive` would be alive in a frame on average.
+    starts whose pixel never changes are static Gaussians, behind the others. `num_gaussians` may be a function of their
+    mean lifetime in frames.
     """
     rng = np.random.default_rng([seed, 0])
     num_frames = len(frames)
@@ -86,8 +84,8 @@ def initialize(
     _, spread = make(pilot, draw_positions(pilot, density_of, rng)[0])
     chance = EVEN_FRAMES * _even_chance(pilot, spread, times) + (1 - EVEN_FRAMES) / num_frames
     first, last = find_lifetimes(times[pilot], spread, times)
-    lifetime = np.average(last - first, weights=chance[pilot])  # in frames
-    num_gaussians = max(round(min(num_gaussians, most_alive * num_frames / lifetime)), 1)
+    if callable(num_gaussians):
+        num_gaussians = num_gaussians(float(np.average(last - first, weights=chance[pilot])))
     if num_gaussians < FEW_STARTS * num_frames:  # random frames would leave out whole intervals
         home = _draw(chance, (np.arange(num_gaussians) + rng.random()) / num_gaussians)
     else:

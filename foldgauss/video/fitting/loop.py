@@ -4,6 +4,7 @@ Each step yields (state, info). Frames are arrays; files and progress bars belon
 """
 
 import dataclasses
+import functools
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -22,7 +23,7 @@ from foldgauss.video.fitting.budget import (
     next_level,
     starts_level,
 )
-from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, most_alive, planned_steps
+from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, planned_steps
 from foldgauss.video.fitting.divergence import Guard
 from foldgauss.video.fitting.initialize import START_OPACITY, SUMMED_OPACITY, initialize, initialize_uniform
 from foldgauss.video.fitting.pruning.relocation import is_relocation_due, relocates
@@ -274,14 +275,14 @@ def _check_config(model: VideoModel, config: FitConfig) -> None:
 
 def _initialize(frames: np.ndarray, config: FitConfig, logits: np.ndarray, motion: Motion | None) -> FoldedSplats:
     """The splats at the start."""
-    num, shape = chosen_num_gaussians(config, *frames.shape[:3]), {"degree": config.degree, "seed": config.seed}
+    shape = {"degree": config.degree, "seed": config.seed}
+    choose_num = functools.partial(chosen_num_gaussians, config, *frames.shape[:3])
     if config.initialization == "uniform":
-        return initialize_uniform(num, frames.shape[1:3], envelope=envelope_of(config), **shape)
+        return initialize_uniform(choose_num(), frames.shape[1:3], envelope=envelope_of(config), **shape)
     times = np.asarray(FrameTimes(logits).times())
     opacity = SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY
     clip = {"times": times, "motion": motion, "opacity": opacity, "with_static": config.economy is not None}
-    clip["most_alive"] = most_alive(config, *frames.shape[:3])
-    return initialize(frames, num, envelope=envelope_of(config), **clip, **shape)
+    return initialize(frames, lambda life: choose_num(lifetime=life), envelope=envelope_of(config), **clip, **shape)
 
 
 # ------------------------------------------------------------------------------------------------ checks
