@@ -108,7 +108,7 @@ def tradeoff_command(
     """Measure what speed and size cost, one setting at a time.
 
     Writes a table (tradeoff.csv, tradeoff.json) and a plot (tradeoff.png); prints the knee of each Pareto front and the
-    command that reproduces each point on it. The same command continues a stopped run. See docs/tradeoff.md.
+    command that reproduces each point on it. The same command continues a stopped run. See docs/results.md.
     """
     try:
         check_one_of("clock", clock, tuple(CLOCKS))
