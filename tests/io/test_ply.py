@@ -514,7 +514,7 @@ DAMAGED = {
     "unknown type": (_header("element vertex 1", "property half x"), "line 4"),
     "a negative count": (_header("element vertex -1"), "line 3"),
     "no number": (_header("element vertex many"), "line 3"),
-    "a count that lies": (_header("element vertex 999999999999", "property float x"), "breaks off"),
+    "a count that lies": (_header("element vertex 999999999999", "property float x"), "truncated"),
     "a count that lies in text": (_header("element vertex 99999999999", "property int x", layout="ascii"), "breaks"),
     "more digits": (_header("element vertex " + "9" * 5000, "property float x"), "line 3"),
     "twice": (_header("element vertex 1", "property float x", "property float x"), "'x' twice"),
@@ -525,7 +525,7 @@ DAMAGED = {
     "a mesh": (_header("element vertex 1", "property float x") + bytes(4), "m_0"),
     "no vertices": (_header("element face 1", "property float x") + bytes(4), "no element 'vertex'"),
     "lists that lie": (_header("element face 1", "property list int int x", "element vertex 1", "property int x")
-                       + struct.pack("<i", 2**31 - 1), "breaks off"),
+                       + struct.pack("<i", 2**31 - 1), "truncated"),
     "lists of negative length": (_header("element face 1", "property list int int x", "element vertex 1",
                                          "property int x") + struct.pack("<i", -1), "-1"),
     "words": (_header("element vertex 1", "property float x", layout="ascii") + b"north", "'north' in x of vertex 0"),
