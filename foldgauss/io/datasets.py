@@ -97,7 +97,7 @@ def ball(
     Raises ValueError unless `num_frames` and both sides are positive integers, `fps` is positive and `noise` is not
     negative.
 
-    Example: `sample = ball(16); by_mask(model, sample.masks)`.
+    Example: `sample = ball(16); by_mask(model, sample.masks == 1)`.
     """
     x, y = _pixel_indices(num_frames, size, fps)
     if not is_within(noise, "[0, inf)"):

@@ -515,7 +515,7 @@ DAMAGED = {
     "a negative count": (_header("element vertex -1"), "line 3"),
     "no number": (_header("element vertex many"), "line 3"),
     "a count that lies": (_header("element vertex 999999999999", "property float x"), "truncated"),
-    "a count that lies in text": (_header("element vertex 99999999999", "property int x", layout="ascii"), "breaks"),
+    "a count that lies in text": (_header("element vertex 99999999999", "property int x", layout="ascii"), "truncated"),
     "more digits": (_header("element vertex " + "9" * 5000, "property float x"), "line 3"),
     "twice": (_header("element vertex 1", "property float x", "property float x"), "'x' twice"),
     "two elements": (_header("element vertex 1", "property float x", "element vertex 1"), "'vertex' twice"),
