@@ -66,7 +66,7 @@ def compress_command(
     """Write a model as a compact file, a fraction of its size.
 
     It can be rendered, evaluated, edited and exported like any model. It loses at most --max-loss-db of PSNR. See
-    docs/format.md.
+    docs/compress.md.
     """
     suffix = f".float16{MODEL_SUFFIX}" if float16 else COMPACT_SUFFIX
     target = Path(f"{model_path.resolve().stem}{suffix}") if out_path is None else out_path
