@@ -16,7 +16,6 @@ NEEDS = {
     "docs/distribution.md": ("numpyro", "matplotlib", "blackjax"),
     "docs/estimator.md": ("sklearn",),
     "docs/fit.md": ("matplotlib",),
-    "docs/mixture.md": ("numpyro",),
     "docs/results.md": ("matplotlib",),
     "docs/tutorial-points.md": ("sklearn",),
     "docs/uncertainty.md": ("emcee",),
