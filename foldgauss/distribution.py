@@ -398,7 +398,12 @@ class FoldedGaussian(BatchModule):
         if self._time_index not in indices:
             return time_mixture(self, rest, indices, values, keeps_time=True)
         if not rest:
-            raise invalid("indices", expected="a coordinate left over", got="all", cure="That is log_prob.")
+            raise invalid(
+                "indices",
+                expected="at least one coordinate that is not given",
+                got="all",
+                cure="For the density use log_prob.",
+            )
         where = indices.index(self._time_index)
         given = tuple(i for i in indices if i != self._time_index)
         ordered = self.marginal((*given, *rest, self._time_index))

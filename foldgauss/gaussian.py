@@ -257,7 +257,12 @@ class Gaussian(BatchModule):
         indices = normalize_indices(indices, self.event_shape[0])
         rest = tuple(i for i in range(self.event_shape[0]) if i not in indices)
         if not rest:
-            raise invalid("indices", expected="a coordinate left over", got="all", cure="That is log_prob.")
+            raise invalid(
+                "indices",
+                expected="at least one coordinate that is not given",
+                got="all",
+                cure="For the density use log_prob.",
+            )
         values = as_value(values, self.loc.dtype)
         check_event("values", values, (len(indices),))
         return condition_on_first(self.marginal((*indices, *rest)), values)

@@ -361,14 +361,12 @@ GIVEN = {
     "docs/compress.md": ("holiday.mp4", "holiday.safetensors"),
     "docs/editing.md": ("holiday.safetensors", "edits.toml", "point_cloud.ply"),
     "docs/fit.md": ("holiday.mp4", "DAVIS", "folder/of/images"),
-    "docs/economy.md": ("clip.mp4",),
     "docs/format.md": ("holiday.mp4", "holiday.safetensors"),
     "docs/player.md": ("holiday.mp4", "holiday.safetensors"),
     "docs/quickstart.md": ("holiday.mp4",),
-    "docs/results.md": ("bunny.mp4", "bunny.safetensors"),
+    "docs/results.md": ("bunny.mp4", "bunny.safetensors", "holiday.mp4"),
     "docs/scale.md": ("film.mp4", "holidays"),
     "docs/slow-motion.md": ("holiday.mp4",),
-    "docs/tradeoff.md": ("holiday.mp4",),
     "docs/uncertainty.md": ("clip.mp4", "model.safetensors"),
 }
 

@@ -253,7 +253,7 @@ def test_many_clips_given_again_do_what_is_left(clips, tmp_path, capsys, monkeyp
     assert run("fit-many", own, "--out", out, *QUICK, "--quiet") == 1
     stamps = {path.name: path.stat().st_mtime_ns for path in out.glob("*.safetensors")}
     assert run("fit-many", own, "--out", out, *QUICK[:-1], "2") == 2  # not in place of others
-    assert "of other settings" in capsys.readouterr().err
+    assert "with other settings" in capsys.readouterr().err
     shutil.copyfile(own / "clip0.mp4", own / "broken.mp4")  # mended
     assert run("fit-many", own, "--out", out, *QUICK) == 0
     assert "4 clips, 3 of them done already" in capsys.readouterr().out
@@ -285,7 +285,7 @@ def test_many_clips_begun_anew_and_stopped_go_on(clips, tmp_path, capsys, monkey
     stopped(monkeypatch, "clip1.mp4", "fit-many", clips, "--out", out, *other, "--overwrite")
     assert "Give the command again without --overwrite to continue." in capsys.readouterr().err
     assert run("fit-many", clips, "--out", out, *QUICK) == 2  # what is kept is of other settings
-    assert "exists, of other settings" in capsys.readouterr().err
+    assert "exists, with other settings" in capsys.readouterr().err
     kept = out / "records" / "clip1.safetensors.checkpoint"
     before, stamp = kept.read_bytes(), (out / "clip0.safetensors").stat().st_mtime_ns
     assert run("fit-many", clips, "--out", out, *other[:-1], "3") == 2
@@ -303,7 +303,7 @@ def test_a_checkpoint_of_other_settings_is_not_thrown_away(clips, tmp_path, caps
     before = kept.read_bytes()
     capsys.readouterr()
     assert run("fit-many", clips, "--out", out, *QUICK[:-1], "2") == 2
-    assert f"{kept} exists, of other settings" in " ".join(capsys.readouterr().err.split())
+    assert f"{kept} exists, with other settings" in " ".join(capsys.readouterr().err.split())
     assert kept.read_bytes() == before
 
 

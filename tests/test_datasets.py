@@ -45,6 +45,51 @@ def test_clips_are_cut_as_the_paper_cuts_them():
     assert (clip.num_frames, clip.size) == (3, (72, 88))
 
 
+def test_waves_move_by_two_pixels_a_frame():
+    clip = datasets.waves(3, size=(20, 30), fps=10)
+    assert (clip.frames.shape, clip.frames.dtype, clip.fps) == ((3, 20, 30, 3), np.uint8, 10)
+    np.testing.assert_array_equal(clip.frames[1, :, :-2], clip.frames[0, :, 2:])
+    assert np.ptp(clip.frames) > 100
+    np.testing.assert_array_equal(clip.frames, datasets.waves(3, size=(20, 30)).frames)
+
+
+def test_masks_are_those_of_the_ball():
+    sample = datasets.ball(5)
+    assert sample.masks.shape == (5, 48, 80)
+    assert sample.num_objects == 1
+    centers = [np.nonzero(mask)[1].mean() for mask in sample.masks]
+    np.testing.assert_allclose(np.diff(centers), 0.65 * 80 / 4, atol=0.5)
+    inside, outside = sample.clip.frames[sample.masks == 1], sample.clip.frames[sample.masks == 0]
+    assert (inside[:, 0] == 230).all()
+    assert (outside[:, 0] < 130).all()
+
+
+def test_noise_of_the_ball_has_its_deviation_and_seed():
+    plain, noisy = datasets.ball(4).clip.frames, datasets.ball(4, noise=5.0).clip.frames
+    # 46,080 values: the standard error of the deviation is 0.016, and rounding adds 1/12 to the variance.
+    assert abs(np.std(noisy.astype(float) - plain) - 5.0) < 0.15
+    np.testing.assert_array_equal(noisy, datasets.ball(4, noise=5.0).clip.frames)
+    assert (noisy != datasets.ball(4, noise=5.0, seed=1).clip.frames).any()
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ({"num_frames": 0}, "num_frames"),
+        ({"num_frames": 2.5}, "num_frames"),
+        ({"size": (48,)}, "size"),
+        ({"size": (0, 80)}, "size"),
+        ({"fps": 0}, "fps"),
+    ],
+)
+def test_arguments_of_synthetic_clips_are_checked(options, name):
+    for make in (datasets.waves, datasets.ball):
+        with pytest.raises(ValueError, match=f"^{name}: expected"):
+            make(**options)
+    with pytest.raises(ValueError, match=r"^noise: expected"):
+        datasets.ball(noise=-1)
+
+
 HEIGHT, WIDTH = 40, 60
 #: DAVIS' own first colours: an OpenCV reader sees 128s where the labels are 1 and 2.
 PALETTE = [0, 0, 0, 128, 0, 0, 0, 128, 0, 128, 128, 0]

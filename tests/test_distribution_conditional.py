@@ -613,7 +613,7 @@ def test_bad_requests_are_refused():
     dist = _dist()
     with pytest.raises(ValueError, match=r"^indices: expected time last, got "):
         dist.marginal([2, 0])
-    with pytest.raises(ValueError, match=r"^indices: expected a coordinate left over, got all"):
+    with pytest.raises(ValueError, match=r"^indices: expected at least one coordinate that is not given, got all"):
         dist.condition([0, 1, 2], [0.0, 0.0, 0.0])
     with pytest.raises(ValueError, match=r"^values: expected shape "):
         dist.condition([0], [0.0, 1.0])

@@ -7,21 +7,21 @@ from PIL import Image
 
 from foldgauss.io import load_video_model
 from foldgauss.io.edit_script import parse_edit_script
-from foldgauss.video import EditedVideo
+from foldgauss.video import EditedVideo, evaluate
 
 #: Extras that a page needs; all are part of the extra `test`.
 NEEDS = {
     "README.md": ("emcee", "matplotlib"),
     "docs/commands.md": ("matplotlib",),
-    "docs/distribution.md": ("numpyro", "matplotlib"),
+    "docs/distribution.md": ("numpyro", "matplotlib", "blackjax"),
     "docs/estimator.md": ("sklearn",),
     "docs/fit.md": ("matplotlib",),
-    "docs/mixture.md": ("numpyro",),
-    "docs/tradeoff.md": ("matplotlib",),
+    "docs/results.md": ("matplotlib",),
+    "docs/tutorial-points.md": ("sklearn",),
     "docs/uncertainty.md": ("emcee",),
 }
 #: Pages that take a few seconds and run by default; all others, new ones included, are marked slow.
-QUICK = {"CONTRIBUTING.md", "docs/economy.md", "docs/own-loss.md"}
+QUICK = {"CONTRIBUTING.md", "docs/density.md", "docs/tutorial-video.md"}
 
 
 def _has_programs(page: str) -> bool:
@@ -72,12 +72,6 @@ def _commands(names, folder):
     assert made <= {path.name for path in folder.iterdir()}
 
 
-def _compress(names, folder):
-    assert names["made"].loss_db <= 0.3
-    sizes = {path.name: path.stat().st_size for path in folder.iterdir()}
-    assert sizes["holiday.fgz"] < sizes["rounded.fgz"] < sizes["half.safetensors"] < sizes["holiday.safetensors"]
-
-
 def _concepts(names, folder):
     np.testing.assert_allclose(names["at"].mean, [0.1 + 3 * 0.0625 - 9 * 0.25**3], rtol=1e-5)
 
@@ -85,11 +79,6 @@ def _concepts(names, folder):
 def _distribution(names, folder):
     assert names["select_degree"](names["x"], 4, "bic").degree == 2
     assert names["kl_divergence"](names["dist"], names["dist"]) == 0
-
-
-def _economy(names, folder):
-    assert names["degrees"][1] == names["degrees"][1:].max()
-    assert names["throughout"] > 0
 
 
 def _editing(names, folder):
@@ -115,16 +104,6 @@ def _estimator(names, folder):
     np.testing.assert_array_equal(np.concatenate(names["labels"]), names["mixture"].predict(names["x"]))
     assert names["regressor"].score(names["times"], names["heights"]) > 0.85
     assert ((names["low"] < names["heights"]) & (names["heights"] < names["high"])).mean() > 0.85
-
-
-def _extending(names, folder):
-    assert np.isfinite(names["jump"].log_prob(names["x"])).all()
-    assert names["wide"] > 2 * names["narrow"]
-    np.testing.assert_allclose(names["mine"], names["expected"], atol=1e-5)
-    before = names["model"].render(0.8)
-    for video in ("swirled", "later"):
-        assert np.abs(names[video].render(0.8) - before).max() > 0.02
-    np.testing.assert_allclose(names["later"].render(0.0), names["model"].render(0.0), atol=1e-5)
 
 
 def _fit(names, folder):
@@ -158,19 +137,10 @@ def _mixture(names, folder):
     np.testing.assert_allclose(mass, names["mixture"].marginal([-1]).pdf(np.float32([0.5])), rtol=1e-2)
 
 
-def _own_fold(names, folder):
-    assert names["away"] < 0.15  # of a circle 0.6 wide
-    assert names["frame"].shape == (48, 80, 3)
-    assert np.abs(names["slope"].fold.sine).max() > 0
-
-
-def _own_loss(names, folder):
-    assert names["left_psnr"](names["better"]) > names["left_psnr"](names["model"]) + 1
-
-
 def _quickstart(names, folder):
-    assert {"look.png", "slow.mp4", "grey.mp4", "short.safetensors"} <= {path.name for path in folder.iterdir()}
-    assert len(names["corner"]) > 0
+    made = {"foldgauss-demo", "holiday.safetensors", "look.png", "slow.mp4", "short.safetensors"}
+    assert made <= {path.name for path in folder.iterdir()}
+    assert names["picture"].shape == (*guides.SIZE, 3)
 
 
 def _rendering(names, folder):
@@ -194,19 +164,6 @@ def _rendering(names, folder):
         assert np.abs(names[other] - image).max() > 0.05
 
 
-def _results(names, folder):
-    assert names["control"].num_parameters <= names["model"].num_parameters
-    assert names["gain"] > 0
-
-
-def _segments(names, folder):
-    assert names["spans"] == [(0, 12), (9, 20)]
-    assert names["score"] > 20
-    assert names["part"].num_frames == 11
-    made = {"slow.mp4", "scores.json", "waves-ply", "second.safetensors", "second.fgz", "waves.interpolation.png"}
-    assert made <= {path.name for path in folder.iterdir()}
-
-
 def _slow_motion(names, folder):
     assert len(names["slow"]) == 4 * (guides.NUM_FRAMES - 1) + 1
     assert len(names["large"]) == 2 * guides.NUM_FRAMES - 1
@@ -218,13 +175,6 @@ def _player(names, folder):
     assert (folder / "waves.html").read_text(encoding="utf-8").count('id="frame-') == len(names["clip"])
 
 
-def _tradeoff(names, folder):
-    assert names["chosen"] == [0, 1, 2, 3]
-    assert names["bend"] == 1
-    assert (folder / "trade" / "tradeoff.png").exists()
-    assert (folder / "few" / "tradeoff.csv").exists()
-
-
 def _uncertainty(names, folder):
     assert (folder / "chains.h5").exists()
     assert names["posterior"].converged
@@ -233,13 +183,69 @@ def _uncertainty(names, folder):
     assert names["row"].name == "even"
 
 
+def _compress(names, folder):
+    assert names["made"].loss_db <= 0.3
+    sizes = {path.name: path.stat().st_size for path in folder.iterdir()}
+    assert sizes["holiday.fgz"] < sizes["rounded.fgz"] < sizes["half.safetensors"] < sizes["holiday.safetensors"]
+    assert names["degrees"][1:].sum() < names["economical"].num_gaussians == names["degrees"].sum()
+    assert names["static"] > 0
+
+
+def _extending(names, folder):
+    assert names["away"] < 0.15  # of a circle 0.6 wide
+    assert np.isfinite(names["jump"].log_prob(names["x"])).all()
+    assert names["wide"] > 2 * names["narrow"]
+    assert names["frame"].shape == (48, 80, 3)
+    assert np.abs(names["slope"].fold.sine).max() > 0
+    assert names["left_psnr"](names["better"]) > names["left_psnr"](names["model"]) + 1
+    np.testing.assert_allclose(names["mine"], names["expected"], atol=1e-5)
+    before = names["model"].render(0.8)
+    for video in ("swirled", "later"):
+        assert np.abs(names[video].render(0.8) - before).max() > 0.02
+    np.testing.assert_allclose(names["later"].render(0.0), names["model"].render(0.0), atol=1e-5)
+
+
+def _results(names, folder):
+    assert names["control"].num_parameters <= names["model"].num_parameters
+    assert names["gain"] > 0
+    assert names["chosen"] == [0, 1, 2, 3]
+    assert names["bend"] == 1
+    assert (folder / "trade" / "tradeoff.png").exists()
+    assert (folder / "few" / "tradeoff.csv").exists()
+
+
+def _scale(names, folder):
+    assert names["joined"].mean_psnr > 15
+    assert names["spans"] == [(0, 12), (9, 20)]
+    assert names["score"] > 20
+    assert names["part"].num_frames == 11
+    made = {"slow.mp4", "scores.json", "waves-ply", "second.safetensors", "second.fgz", "long.safetensors"}
+    assert made <= {path.name for path in folder.iterdir()}
+    assert all(len(part) > 0 for part in names["left"].selection.parts)
+    assert np.abs(names["darker"].render(0.5) - names["picture"]).max() > 0.1
+
+
+def _tutorial_points(names, folder):
+    assert names["best"] == 2
+    assert names["mixture"].score(names["points"]) > 0.5
+    assert names["curve"].shape == (50, 1)
+
+
+def _tutorial_video(names, folder):
+    assert evaluate(names["model"], names["frames"]).mean_psnr > 25
+    ball, model = names["ball"], names["model"]
+    assert 5 < len(ball) < model.num_gaussians / 2
+    assert names["gone"].num_gaussians == model.num_gaussians - len(ball)
+    assert {"copies.safetensors", "copies.mp4", "ball.html"} <= {path.name for path in folder.iterdir()}
+    assert load_video_model(folder / "copies.safetensors").num_gaussians > model.num_gaussians
+
+
 CHECKS = {
     "README.md": _readme,
     "docs/commands.md": _commands,
     "docs/compress.md": _compress,
     "docs/concepts.md": _concepts,
     "docs/distribution.md": _distribution,
-    "docs/economy.md": _economy,
     "docs/editing.md": _editing,
     "docs/estimator.md": _estimator,
     "docs/extending.md": _extending,
@@ -247,14 +253,14 @@ CHECKS = {
     "docs/format.md": _format,
     "docs/formats.md": _formats,
     "docs/mixture.md": _mixture,
-    "docs/own-fold.md": _own_fold,
-    "docs/own-loss.md": _own_loss,
+    "docs/player.md": _player,
     "docs/quickstart.md": _quickstart,
     "docs/rendering.md": _rendering,
     "docs/results.md": _results,
-    "docs/segments.md": _segments,
+    "docs/scale.md": _scale,
     "docs/slow-motion.md": _slow_motion,
-    "docs/tradeoff.md": _tradeoff,
+    "docs/tutorial-points.md": _tutorial_points,
+    "docs/tutorial-video.md": _tutorial_video,
     "docs/uncertainty.md": _uncertainty,
 }
 

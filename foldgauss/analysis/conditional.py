@@ -245,7 +245,12 @@ class TimeMixture(eqx.Module):
             return self.parent.condition(given, both)
         kept = tuple(i for i in range(offset + self._space_dim) if i not in given)
         if not kept:
-            raise invalid("indices", expected="a coordinate left over", got="all", cure="That is log_prob.")
+            raise invalid(
+                "indices",
+                expected="at least one coordinate that is not given",
+                got="all",
+                cure="For the density use log_prob.",
+            )
         return time_mixture(self.parent, kept, given, both, keeps_time=False)
 
     @property

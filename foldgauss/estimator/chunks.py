@@ -271,7 +271,7 @@ def _check_iterable(name: str, chunks) -> None:
     if not isinstance(chunks, Iterable):
         raise invalid(name, expected="chunks of rows", got=type(chunks).__name__, cure=_SOURCES)
     if iter(chunks) is chunks:
-        got = f"{type(chunks).__name__}, which can be read but once"
+        got = f"{type(chunks).__name__}, which can be read only once"
         raise invalid(name, expected="chunks that can be read again in each pass", got=got, cure=_SOURCES)
 
 

@@ -1,4 +1,4 @@
-"""Sample clips: three that a package contains, DAVIS sequences, and folders of frames."""
+"""Sample clips: two synthetic ones, three that a package contains, DAVIS sequences, and folders of frames."""
 
 import difflib
 import os
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from foldgauss._runtime.checks import check_one_of, invalid
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.media.image_files import image_paths, image_size
 from foldgauss.io.media.masks import read_labels
@@ -69,6 +69,63 @@ def bikes(*, frames: Range | None = None, size: Size | None = None) -> Clip:
 def carphone(*, frames: Range | None = None, size: Size | None = None) -> Clip:
     """*carphone*, decoded: 120 frames of 144x176. See `bunny`."""
     return read_video(sample_clip("carphone"), frames=frames, size=size)
+
+
+def waves(num_frames: int = 6, *, size: Size = (48, 80), fps: float = 24.0) -> Clip:
+    """A synthetic clip without noise: a grey pattern of waves that moves to the left by 2 pixels a frame.
+
+    `size` is (height, width) in pixels. The clip needs no extra and takes no time to make; examples and tests use it.
+
+    Raises ValueError unless `num_frames` and both sides are positive integers and `fps` is positive.
+
+    Example: `fit(waves(20).frames)`.
+    """
+    x, y = _pixel_indices(num_frames, size, fps)
+    k = np.arange(num_frames)[:, None, None]
+    grey = 128 + 100 * np.sin(0.15 * x + 0.3 * k) * np.cos(0.1 * y)
+    return _synthetic("waves", np.repeat(grey[..., None], 3, axis=-1), fps)
+
+
+def ball(
+    num_frames: int = 8, *, size: Size = (48, 80), fps: float = 24.0, noise: float = 0.0, seed: int = 0
+) -> "MaskedClip":
+    """A synthetic clip with masks: an orange ball crosses a textured ground from left to right at constant speed.
+
+    The masks are 1 on the ball and 0 elsewhere. `noise` is the standard deviation of independent normal noise on every
+    value, in grey levels (0 to 255), drawn with `seed`. The clip needs no extra; examples and tests use it.
+
+    Raises ValueError unless `num_frames` and both sides are positive integers, `fps` is positive and `noise` is not
+    negative.
+
+    Example: `sample = ball(16); by_mask(model, sample.masks == 1)`.
+    """
+    x, y = _pixel_indices(num_frames, size, fps)
+    if not is_within(noise, "[0, inf)"):
+        raise invalid("noise", expected="a standard deviation in grey levels, 0 or more", got=repr(noise))
+    height, width = size
+    center = width * np.linspace(0.15, 0.8, num_frames)[:, None, None]
+    inside = np.hypot(x + 0.5 - center, y + 0.5 - height / 2) < height / 5
+    ground = np.stack([0.3 + 0.2 * np.sin(0.15 * x), 0.5 + 0.2 * np.cos(0.1 * y), 0.3 + 0 * x], axis=-1)
+    values = 255 * np.where(inside[..., None], [0.9, 0.3, 0.1], ground)
+    noisy = values + np.random.default_rng(seed).normal(0, noise, values.shape)
+    return MaskedClip(_synthetic("ball", noisy, fps), inside.astype(np.uint8))
+
+
+def _pixel_indices(num_frames: int, size: Size, fps: float) -> tuple[np.ndarray, np.ndarray]:
+    """x and y of each pixel, (height, width) each, after checks of the arguments of a synthetic clip."""
+    if not is_integer(num_frames, 1):
+        raise invalid("num_frames", expected="a positive integer", got=repr(num_frames))
+    if len(size) != 2 or not all(is_integer(side, 1) for side in size):
+        raise invalid("size", expected="(height, width), positive integers", got=repr(size))
+    if not is_within(fps, "(0, inf)"):
+        raise invalid("fps", expected="a positive number of frames per second", got=repr(fps))
+    y, x = np.mgrid[: size[0], : size[1]]
+    return x, y
+
+
+def _synthetic(name: str, values: np.ndarray, fps: float) -> Clip:
+    frames = np.ascontiguousarray(np.clip(values, 0, 255).round().astype(np.uint8))
+    return Clip(frames, float(fps), name, num_declared=len(frames))
 
 
 def frames(

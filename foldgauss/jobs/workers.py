@@ -379,7 +379,7 @@ _NONE_HERE = (
     "they die while they start, for the reason above; a program of your own must start them under "
     '`if __name__ == "__main__":`'
 )
-_LOST = "The scheduler is gone. Finished jobs are kept: start one, and run the command again."
+_LOST = "The scheduler does not answer any more. Finished jobs are kept: start one, and run the command again."
 
 
 def _stamp(job: FitJob) -> tuple[int, int] | None:

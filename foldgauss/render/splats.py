@@ -162,7 +162,7 @@ class RenderOptions:
 
     @classmethod
     def fast(cls) -> "RenderOptions":
-        """Cutoff 1/64 and stop 1e-3, for previews; docs/performance.md reports speed and error on a fitted model.
+        """Cutoff 1/64 and stop 1e-3, for previews; docs/results.md reports speed and error on a fitted model.
 
         An earlier stop or a smaller support radius would cost more quality than they save time.
         """

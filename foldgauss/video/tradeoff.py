@@ -72,7 +72,7 @@ def _cutoffs() -> tuple[Variant, ...]:
     return (*played, *fitted)
 
 
-#: The axes in the order of their runs; docs/tradeoff.md describes their benefits and costs.
+#: The axes in the order of their runs; docs/results.md lists them.
 AXES: Mapping[str, tuple[Variant, ...]] = MappingProxyType(
     {
         "time": (

@@ -33,7 +33,7 @@ def _run(arguments: list[str] | None) -> None:
         if _names_option(text) and option.partition(":")[0] in arguments:
             text = option
         if not isinstance(error, ValueError | OSError | MemoryError | Stopped | KeyboardInterrupt):
-            text = f"{type(error).__name__}: {text[:300]} (--debug shows where)"
+            text = f"{type(error).__name__}: {text[:300]} (--debug shows the traceback)"
         err.print(f"error: {text}", style="red", soft_wrap=True)
         sys.exit(_exit_code(error))
 

@@ -29,7 +29,9 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
         "segment": Command("editing.edit", "Extract one segment of a model in segments as a model of its own."),
         "edit": Command("editing.edit", "Edit objects or single frames of a model by a script."),
         "compress": Command("editing.compress", "Write a model as a compact file, a fraction of its size."),
-        "tradeoff": Command("measuring.tradeoff", "Measure what speed and size cost, one setting at a time."),
+        "tradeoff": Command(
+            "measuring.tradeoff", "Measure time, size and speed against quality, one setting at a time."
+        ),
         "export": Command("editing.export", "Write a model for other programs, or as a web page."),
         "import": Command("editing.export", "Read a model of another program, see docs/formats.md."),
         "doctor": Command("measuring.doctor", "Check the installation: versions, devices, and a small fit."),

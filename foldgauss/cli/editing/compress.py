@@ -66,7 +66,7 @@ def compress_command(
     """Write a model as a compact file, a fraction of its size.
 
     It can be rendered, evaluated, edited and exported like any model. It loses at most --max-loss-db of PSNR. See
-    docs/format.md.
+    docs/compress.md.
     """
     suffix = f".float16{MODEL_SUFFIX}" if float16 else COMPACT_SUFFIX
     target = Path(f"{model_path.resolve().stem}{suffix}") if out_path is None else out_path
@@ -150,7 +150,7 @@ def _write_compressed(
         made = compress(model, given, max_loss_db=max_loss_db, psnr=known_psnr, passes=passes, on_step=show)
     if passes and made.loss_db < -MAX_GAIN_DB:
         warn(
-            f"the compact file is {-made.loss_db:.1f} dB nearer to the clip than the model. Either its fit had not "
+            f"the compact file is {-made.loss_db:.1f} dB closer to the clip than the model. Either its fit had not "
             "converged, or it was edited, and the passes have undone the edits. --passes 0 only rounds."
         )
     save_compressed(target, made, about, known=clip is not None or known_psnr is not None)

@@ -149,8 +149,8 @@ def _prepare_outputs(jobs: list[FitJob], overwrite: bool) -> None:
             mine = before is None and job.checkpoint.exists()
             if os.path.exists(path) and not mine:
                 raise WrongUse(
-                    f"--out: {path} exists, of other settings or another clip. Remove it, choose another folder, or "
-                    "add --overwrite, which starts over."
+                    f"--out: {path} exists, with other settings or of another clip. Remove it, choose another folder, "
+                    "or add --overwrite, which starts over."
                 )
     for job in waiting:
         if overwrite:

@@ -118,7 +118,7 @@ class _FitColumn(ProgressColumn):
     def render(self, task) -> str:
         info: FitInfo | None = task.fields.get("info")
         if info is None:
-            return "following the motion, compiling" if not task.finished else ""
+            return "estimating the motion, compiling" if not task.finished else ""
         return _describe(info)
 
 

@@ -99,16 +99,16 @@ def tradeoff_command(
     clock: Annotated[
         str,
         typer.Option(
-            help="Clock of the fitting time: wall; or cpu, the sum over all cores, if other programs use them.",
+            help="Clock of the fitting time: wall; or cpu, the sum over all cores, for machines with other load.",
             autocompletion=complete_choice(CLOCKS),
         ),
     ] = "wall",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Discard earlier results.")] = False,
 ) -> None:
-    """Measure what speed and size cost, one setting at a time.
+    """Measure time, size and speed against quality, one setting at a time.
 
     Writes a table (tradeoff.csv, tradeoff.json) and a plot (tradeoff.png); prints the knee of each Pareto front and the
-    command that reproduces each point on it. The same command continues a stopped run. See docs/tradeoff.md.
+    command that reproduces each point on it. The same command continues a stopped run. See docs/results.md.
     """
     try:
         check_one_of("clock", clock, tuple(CLOCKS))
@@ -176,7 +176,7 @@ class _Run:
     def _print_plan(self, num_points: int, steps: int, expected: float) -> None:
         out.print(
             f"{self.clip.source}: {self.clip.num_frames} frames of {self.clip.size[0]}x{self.clip.size[1]}; "
-            f"{num_points} points about a base of {steps:,} steps, about {expected:.1f} minutes",
+            f"{num_points} points around a base of {steps:,} steps, about {expected:.1f} minutes",
             soft_wrap=True,
         )
 
@@ -188,8 +188,8 @@ class _Run:
             )
         if expected > 1.02 * minutes:
             err.print(
-                f"warning: --minutes: {minutes:g} are too few for {num_points} points about a base of {steps:,} steps, "
-                f"the fewest allowed: this takes about {expected:.1f}. Choose fewer --axes or --frames, or a "
+                f"warning: --minutes: {minutes:g} are too few for {num_points} points around a base of {steps:,} "
+                f"steps, the fewest allowed: this takes about {expected:.1f}. Choose fewer --axes or --frames, or a "
                 "smaller --size.",
                 soft_wrap=True,
             )

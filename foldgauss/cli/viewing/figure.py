@@ -72,7 +72,7 @@ def reconstruction(
     out_path: Out = None,
     at: Annotated[
         str | None,
-        typer.Option(metavar="K,K,..", help=f"Frames of the model, from 0 [default: {DEFAULT_FRAMES}, evenly spread]."),
+        typer.Option(metavar="K,K,..", help=f"Frames of the model, from 0 [default: {DEFAULT_FRAMES}, evenly spaced]."),
     ] = None,
     width: Width = None,
     frames: Annotated[

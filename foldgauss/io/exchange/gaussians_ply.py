@@ -212,7 +212,7 @@ def read_3dgs_ply(path: str | os.PathLike, *, axes: str = "y-down") -> Gaussians
     lengths = np.linalg.norm(turn, axis=1)
     if (lengths < _SMALLEST).any():
         got = f"0 in vertex {np.argmax(lengths < _SMALLEST)}"
-        raise format_error(ply.path, expected="quaternions of some length", got=got, cure="Drop that row.")
+        raise format_error(ply.path, expected="quaternions of nonzero length", got=got, cure="Drop that row.")
     rotation = (
         scipy.spatial.transform.Rotation.from_quat(turn[:, [1, 2, 3, 0]]).as_matrix()
         if len(turn)

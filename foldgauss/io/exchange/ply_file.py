@@ -44,7 +44,7 @@ def facts_error(path: object, error: Exception) -> FormatError:
     if ": expected " in text:
         return FormatError(f"{path}: {text}")
     got = f"others ({type(error).__name__}: {text})"
-    return format_error(path, expected="facts as foldgauss notes them", got=got, cure="Remove them.")
+    return format_error(path, expected="metadata as foldgauss writes them", got=got, cure="Remove them.")
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class Ply:
         if len(wrong):
             row, place = wrong[0]
             got = f"{columns[row, place]} in {names[place]} of {element} {row}"
-            raise format_error(self.path, expected="numbers that float32 holds", got=got, cure="Drop that row.")
+            raise format_error(self.path, expected="numbers that float32 can represent", got=got, cure="Drop that row.")
         return columns
 
 
@@ -245,7 +245,7 @@ class _BinaryBody:
         left = len(self.data) - self.at
         if num_bytes > left:
             expected = f"{element.count} rows of element {element.name!r}, {num_bytes} bytes or more"
-            raise format_error(self.path, expected=expected, got=f"{left} bytes", cure="The file breaks off.")
+            raise format_error(self.path, expected=expected, got=f"{left} bytes", cure="The file is truncated.")
 
 
 class _TextBody:
@@ -296,7 +296,7 @@ class _TextBody:
         left = len(self.words) - self.at
         if num > left:
             expected = f"{element.count} rows of element {element.name!r}, {num} numbers or more"
-            raise format_error(self.path, expected=expected, got=str(left), cure="The file breaks off.")
+            raise format_error(self.path, expected=expected, got=str(left), cure="The file is truncated.")
 
 
 def _is_number(word: bytes) -> bool:
@@ -352,5 +352,5 @@ def to_float32(ply: Ply, name: str, leaf: np.ndarray) -> np.ndarray:
     with np.errstate(over="ignore"):
         leaf = np.ascontiguousarray(leaf, np.float32)
     if not np.isfinite(leaf).all():
-        raise format_error(ply.path, expected=f"a {name} that float32 holds in model space", got="a larger one")
+        raise format_error(ply.path, expected=f"a {name} that float32 can represent in model space", got="a larger one")
     return leaf

@@ -253,7 +253,7 @@ def _check_notes(folder: Path, notes: dict, num_frames: int) -> dict:
             raise invalid("fps", expected="a positive rate", got=fps)
         if times.shape != (num_frames,) or not ((times >= 0) & (times <= 1)).all():
             expected = f"{num_frames} numbers in [0, 1], one for each .obj"
-            cure = "A frame was added or removed: mend the list too, or remove the file and give size."
+            cure = "A frame was added or removed: correct the list too, or remove the file and give size."
             raise invalid("times", expected=expected, got=f"shape {times.shape}", cure=cure)
     except (TypeError, ValueError, OverflowError) as error:
         raise facts_error(folder / NOTES, error) from error
@@ -286,7 +286,9 @@ def _check_area(path: Path, edges: Float[np.ndarray, "num 2 3"]) -> None:
         valid = area > _COLLINEAR * np.linalg.norm(first, axis=-1) * np.linalg.norm(second, axis=-1)
     if not valid.all():
         cure = "Move a vertex off the line through the other two."
-        raise format_error(path, expected="faces of some area", got=f"none in face {np.argmin(valid) + 1}", cure=cure)
+        raise format_error(
+            path, expected="faces of nonzero area", got=f"none in face {np.argmin(valid) + 1}", cure=cure
+        )
 
 
 def read_obj(path: str | os.PathLike) -> Float[np.ndarray, "faces 3 3"]:
@@ -356,7 +358,7 @@ def _parse_face(path: Path, number: int, words: list[str], num_vertices: int) ->
     except ValueError:
         indices = []
     if len(indices) != 3 or 0 in indices:
-        cure = "Triangles alone stand for Gaussians: turn off what makes polygons."
+        cure = "Only triangles represent Gaussians: disable the merging of triangles into polygons."
         raise format_error(where, expected="a face of 3 vertices", got=repr(" ".join(words)[:60]), cure=cure)
     return [index - 1 if index > 0 else num_vertices + index for index in indices]
 

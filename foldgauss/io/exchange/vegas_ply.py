@@ -230,13 +230,15 @@ def _read_note(ply: Ply) -> dict:
     except (ValueError, RecursionError):
         note = None
     if not isinstance(note, dict) or not isinstance(note.get("options", {}), dict):
-        raise format_error(ply.path, expected="facts in the comment 'foldgauss'", got=texts[0][:60], cure="Remove it.")
+        raise format_error(
+            ply.path, expected="metadata in the comment 'foldgauss'", got=texts[0][:60], cure="Remove it."
+        )
     return note
 
 
 def _check_writable_as_vegas(model: VideoModel) -> None:
     if not isinstance(model, VideoModel):
-        cure = "An edited video goes out frame by frame, as ply3dgs or obj."
+        cure = "Export the frames of an edited video as ply3dgs or obj."
         if isinstance(model, SegmentedVideo):
             cure = "export(model, 'ply', FOLDER) writes one for each segment."
         raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
@@ -247,7 +249,12 @@ def _check_writable_as_vegas(model: VideoModel) -> None:
     }
     if model.num_frames < 2:
         cure = "Write the picture as a still scene, ply3dgs."
-        raise invalid("model", expected="at least 2 frames, whose distances a VeGaS file holds", got="1", cure=cure)
+        raise invalid(
+            "model",
+            expected="at least 2 frames, as a VeGaS file stores the intervals between frames",
+            got="1",
+            cure=cure,
+        )
     for name, (found, known, cure) in facts.items():
         if not (found == known).all():
             got, expected = ", ".join(map(str, found[:3])), f"{known}, the only one in a VeGaS file"

@@ -173,7 +173,7 @@ def video_error(parameter: str, *, expected: str, got: str, cure: str = "") -> V
 def no_frames_error(start: int, stop: int | None, num_decoded: int, num_total: int, path: Path) -> VideoError:
     """The error for a range in which no frame decodes."""
     got = f"{format_range(start, stop)}, while {num_decoded} of {num_total} frames decode in {str(path)!r}"
-    return video_error("frames", expected="a range with frames that decode", got=got, cure="Ask for earlier frames.")
+    return video_error("frames", expected="a range with frames that decode", got=got, cure="Choose earlier frames.")
 
 
 def format_range(start: int, stop: int | None) -> str:

@@ -211,7 +211,7 @@ def _check_described(kind: _Kind, model: Any, header: str) -> None:
     if have != want:
         raise model_file_error(
             "header",
-            expected=f"every static fact of the model of kind {kind.name!r}",
+            expected=f"every static field of the model of kind {kind.name!r}",
             got="a skeleton of another structure",
             cure="Let to_header and from_header carry each static field.",
         )

@@ -269,7 +269,7 @@ class FitConfig:
     error_fraction: float = field(
         default=0.3,
         metadata=setting(
-            "Fraction of the views that are drawn in proportion to the frames' squared errors",
+            "Fraction of the views that are chosen in proportion to the squared errors of the frames",
             "In between, all frames are visited in turn. Improves the worst frames. Ignored with `economy.psnr`.",
             bounds="[0, 1)",
             option="--error-fraction",
@@ -279,7 +279,7 @@ class FitConfig:
     relocated_fraction: float = field(
         default=0.05,
         metadata=setting(
-            "Fraction of the Gaussians that is moved, three times, from where they matter least to the largest errors",
+            "Fraction of the Gaussians moved, three times, from the smallest contributions to the largest errors",
             "Ignored with `growth` or `economy`, which add Gaussians themselves, and without `sparse_updates`.",
             bounds="[0, 0.5]",
             option="--relocated-fraction",

@@ -43,7 +43,7 @@ class Economy:
     most_dropped: float = field(
         default=0.3, metadata=setting("Largest fraction of the Gaussians that a round prunes", bounds="(0, 1]")
     )
-    grows: bool = field(default=True, metadata=setting("Gaussians are also born"))
+    grows: bool = field(default=True, metadata=setting("Gaussians are also added where errors are largest"))
 
     def __post_init__(self) -> None:
         check_settings(self, "economy.")
