@@ -26,7 +26,7 @@ FRAMES, SIZE = (34, 58), (360, 640)
 FIRST = 4
 #: Times of the slow panels for each frame, and milliseconds that each is shown.
 SLOWDOWN, MILLISECONDS = 4, 40
-QUALITY = 58
+QUALITY = 45
 
 # fmt: off
 #: Rough outlines of the rabbit by frame, (x, y) in pixels: body with arms, and both ears.
@@ -104,7 +104,7 @@ class Copy(NamedTuple):
 
 
 FEET = (250, 303)
-COPIES = (Copy((438, 264), 0.62, 2), Copy((560, 240), 0.42, 4))
+COPIES = (Copy((438, 264), 0.62, 2), Copy((566, 312), 0.45, 4))
 
 
 def outline(outlines: dict[int, list[tuple[int, int]]], frame: int) -> np.ndarray:
@@ -180,7 +180,8 @@ def pictures(frames: np.ndarray, model: VideoModel, edited: EditedVideo) -> list
 def _labeled(picture: np.ndarray, text: str) -> np.ndarray:
     image = Image.fromarray(picture)
     font = ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans-Bold.ttf", 18)
-    ImageDraw.Draw(image).text((8, 5), text, "white", font, stroke_width=2, stroke_fill="black")
+    place = 8, picture.shape[0] - 28
+    ImageDraw.Draw(image).text(place, text, "white", font, stroke_width=2, stroke_fill="black")
     return np.asarray(image)
 
 
@@ -214,8 +215,9 @@ def main(arguments: list[str] | None = None) -> None:
             append_images=others,
             duration=MILLISECONDS,
             loop=0,
+            kmax=1,
             quality=QUALITY,
-            method=6,
+            method=4,
         )
     if options.still is not None:
         images[len(images) // 2].save(options.still)

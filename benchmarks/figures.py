@@ -5,8 +5,8 @@
 *density*, *shapes* and *marginals* are drawn from distributions of two coordinates. *pipeline* and *cameras* show 25
 frames of *bikes* at 160x384, the rider of `benchmarks.editing`, fitted with 20,000 Gaussians in 3,000 steps, half of
 which learn what lies between frames; `--models` keeps that model, and takes the one that is there. *distribution* and
-*uncertainty* are the examples of README; the latter fits these frames at 68x160 in 1,000 steps and samples the frame
-times of another cut of them. Others: `benchmarks.animation`, `benchmarks.record_figures`.
+*uncertainty* are the examples of README; the latter fits 46 frames of *Bunny* at 80x160 and samples their times.
+Others: `benchmarks.animation`, `benchmarks.record_figures`.
 """
 
 from pathlib import Path
@@ -27,7 +27,7 @@ from benchmarks.editing import Scene, fitted, rider
 from foldgauss import Constant, FoldedGaussian, PolynomialFold, TimeLikelihood, ZeroFold
 from foldgauss.analysis.plot import plot_density
 from foldgauss.io._atomic import atomic_path
-from foldgauss.io.datasets import bikes
+from foldgauss.io.datasets import bunny
 from foldgauss.render import Camera, Gaussians3D, project, render
 from foldgauss.uncertainty import frame_time_posterior, increment_intervals, irregularities
 from foldgauss.video import FitConfig, VideoModel, fit
@@ -42,8 +42,8 @@ CONFIG = FitConfig(num_gaussians=20_000, steps=3_000, interpolation_fraction=0.5
 #: Inches of README's examples: text is readable on a screen of 360 pixels.
 EXAMPLE_SIZE = 5.0, 3.2
 HALO = {"path_effects": [patheffects.withStroke(linewidth=3, foreground="white")]}
-#: Frames of the example of uncertainty.
-REPEATED, MISSING = 8, 16
+#: Frames of *Bunny* in the example of uncertainty: 57 and 82 repeat the ones before.
+REPEATING = 40, 86
 #: One in so many Gaussians has its outline drawn.
 EVERY = 4
 
@@ -227,7 +227,7 @@ def distribution() -> plt.Figure:
         scale_tril=0.1 * jnp.eye(2),
         time_loc=0.5,
         time_scale=0.2,
-        fold=PolynomialFold(jnp.array([[1.0, 0.0], [0.0, 3.0]])),
+        fold=PolynomialFold(jnp.array([[3.0, 0.0], [0.0, 4.0]])),
     )
     x = np.asarray(bend.sample(jax.random.key(0), (1000,)))
     fig, ax = plt.subplots(figsize=EXAMPLE_SIZE)
@@ -236,31 +236,31 @@ def distribution() -> plt.Figure:
         given = bend.condition_time(t)
         width = 4 * float(given.scale_tril[0, 0])  # the covariance is a multiple of the identity
         ax.add_patch(Ellipse(np.asarray(given.loc), width, width, fill=False, ec="black", lw=1.2))
-        ax.annotate(f"t = {t:g}", np.asarray(given.loc), ha="center", va="center", fontsize=11, **HALO)
-    fig.colorbar(points, label="time t").solids.set_alpha(1)
+        ax.annotate(f"t = {t:g}", np.asarray(given.loc) - [0, 0.3], ha="center", va="center", fontsize=11, **HALO)
+    fig.colorbar(points, label="time t", orientation="horizontal", aspect=40).solids.set_alpha(1)
     ax.set(xlabel="x", ylabel="y", aspect="equal")
     return fig
 
 
 def uncertainty() -> plt.Figure:
-    """README's example: the steps between frames of a cut in which one frame is repeated and one is missing."""
-    clip = bikes(frames=(30, 55), size=(68, 160))
-    model = fit(clip.frames, FitConfig(num_gaussians=4_000, steps=1_000), fps=clip.fps).model
-    order = [*range(REPEATED + 1), *range(REPEATED, MISSING), *range(MISSING + 1, len(clip.frames))]
-    posterior = frame_time_posterior(model, clip.frames[order], progress=False)
+    """README's example: the steps between frames of *Bunny*, two of which are repeated in the file itself."""
+    first, stop = REPEATING
+    clip = bunny(frames=REPEATING, size=(80, 160))
+    model = fit(clip.frames, FitConfig(num_gaussians=6_000, steps=1_500), fps=clip.fps).model
+    posterior = frame_time_posterior(model, clip.frames, progress=False)
     found = increment_intervals(posterior, 0.9)
     fig, ax = plt.subplots(figsize=EXAMPLE_SIZE)
     ax.axhline(1, color=GREY, lw=0.8)
-    number = np.arange(len(found.mean))
-    ax.vlines(number, found.low, found.high, color=BLUE, lw=5, alpha=0.4)
+    number = np.arange(first, stop - 1)
+    ax.vlines(number, found.low, found.high, color=BLUE, lw=4, alpha=0.4)
     ax.plot(number, found.mean, "o", color=BLUE, ms=4)
     for one in irregularities(posterior):
-        first = one.frames[0]
-        ax.plot(first, found.mean[first], "o", color=RED, ms=7)
-        text = f"{one.kind}, probability {one.probability:.2f}"
-        ax.annotate(text, (first, found.mean[first]), (-8, 0), textcoords="offset points", ha="right", va="center",
+        at = one.frames[0]
+        ax.plot(first + at, found.mean[at], "o", color=RED, ms=7)
+        text = f"{one.kind},\nprobability {one.probability:.2f}"
+        ax.annotate(text, (first + at, found.mean[at]), (-8, 0), textcoords="offset points", ha="right", va="center",
                     color=RED, fontsize=11)  # fmt: skip
-    ax.set(xlabel="frame", ylabel="step to the next frame", ylim=(-0.15, 2.4))
+    ax.set(xlabel="frame", ylabel="step to the next frame", ylim=(-0.2, 1.6))
     return fig
 
 

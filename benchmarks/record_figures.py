@@ -16,6 +16,7 @@ from typing import Any
 
 import matplotlib
 from matplotlib import pyplot as plt
+from matplotlib.lines import Line2D
 
 from benchmarks import _common
 from benchmarks.ablation import PAPER_STARTS
@@ -52,6 +53,7 @@ CODERS = {
 CLIPS = {"bunny": BLUE, "bikes": ORANGE, "carphone": GREEN}
 #: Presets in the figure of the trade-off, which are drawn apart from the budgets.
 PRESETS = {"draft": "^", "standard": "s"}
+SETTINGS = {"--minutes": "o", "--preset draft": "^", "no option": "s"}
 
 Runs = dict[str, dict[str, Any]]
 
@@ -131,15 +133,20 @@ def tradeoff_clips(records: Path) -> plt.Figure:
                 by_bytes.plot(*_curve([own[f"{name}, compact"]], "bytes", 1e-6), marker, color=color)
     by_time.set(xlabel="time to fit, CPU seconds (one core)", ylabel="PSNR (dB)", xscale="log")
     by_bytes.set(xlabel="size, megabytes", ylabel="PSNR (dB)", xscale="log")
-    for axes, ticks in ((by_time, (5, 10, 20, 40, 80)), (by_bytes, (0.1, 0.2, 0.5, 1, 2, 5))):
-        axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    for axes, ticks in ((by_time, (5, 10, 20, 40, 80, 160)), (by_bytes, (0.05, 0.1, 0.2, 0.5, 1, 2, 5))):
+        low, high = axes.get_xlim()
+        shown = [tick for tick in ticks if low <= tick <= high]
+        axes.set_xticks(shown, [f"{tick:g}" for tick in shown])
         axes.minorticks_off()
-    for marker, label in (("o", "--minutes"), *((marker, f"--preset {name}") for name, marker in PRESETS.items())):
-        by_time.plot([], [], marker, color=GREY, label=label)
-    by_time.legend(ncols=2, fontsize=9.5, loc="lower right")
-    by_bytes.plot([], [], "o-", color=GREY, label="compact file (.fgz)")
-    by_bytes.plot([], [], "o--", color=GREY, mfc="white", label="model file")
-    by_bytes.legend(fontsize=9.5, loc="lower right")
+    grey = {"color": GREY, "ls": ""}
+    handles = [Line2D([], [], color=color, lw=3, label=clip) for clip, color in CLIPS.items()]
+    handles += [
+        Line2D([], [], marker=marker, label=name, **grey)
+        for name, marker in (("--minutes", "o"), ("--preset draft", "^"), ("no option", "s"))
+    ]
+    handles += [Line2D([], [], marker="o", mfc="white", label="model file", **grey)]
+    handles += [Line2D([], [], marker="o", label="compact file", **grey)]
+    fig.legend(handles=handles, loc="outside upper center", ncols=3, fontsize=9.5, columnspacing=1)
     return fig
 
 

@@ -28,13 +28,12 @@ from foldgauss.video.fitting.state import to_model
 NUM_FRAMES = 48
 SIZES = {"bunny": (160, 320), "bikes": (136, 320), "carphone": (144, 176)}
 BUDGETS = (10.0, 20.0, 40.0, 80.0)
-PRESETS = ("draft", "standard")
 
 
 def configurations(budgets: list[float]) -> dict[str, FitConfig]:
     """Settings by name: each budget in CPU seconds, and each preset without one."""
     by_budget = {f"{seconds:g} s": FitConfig(minutes=seconds / 60) for seconds in budgets}
-    return by_budget | {name: FitConfig.preset(name) for name in PRESETS}
+    return {"draft": FitConfig.preset("draft"), **by_budget, "standard": FitConfig()}
 
 
 def fit_clip(source: ClipSource, config: FitConfig, path: Path) -> Run:
