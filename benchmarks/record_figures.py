@@ -39,7 +39,7 @@ STYLE = {
 }
 #: Sizes of *Bunny* and the runs of `defaults.json` at each.
 BUNNY = {
-    "160x320": (GREEN, ("bunny-160-30s", "bunny-160-1", "bunny-160")),
+    "160x320": (GREEN, ("bunny-160-1", "bunny-160")),
     "640x1280": (BLUE, ("bunny-640-5", "bunny-640", "bunny-640-60")),
 }
 #: Coders of `codecs.json` in the figure of bytes: marker, colour, label.
