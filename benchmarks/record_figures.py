@@ -51,9 +51,10 @@ CODERS = {
     "JPEG": ("s", ORANGE, "JPEG images"),
 }
 CLIPS = {"bunny": BLUE, "bikes": ORANGE, "carphone": GREEN}
-#: Presets in the figure of the trade-off, which are drawn apart from the budgets.
-PRESETS = {"draft": "^", "standard": "s"}
-SETTINGS = {"--minutes": "o", "--preset draft": "^", "no option": "s"}
+#: Presets in the figure of the trade-off, which are drawn apart from the budgets: marker and label.
+PRESETS = {"draft": ("^", "--preset draft"), "standard": ("s", "no option")}
+#: Runs of compact files are named as the fit, with this.
+COMPACT = ", compact"
 
 Runs = dict[str, dict[str, Any]]
 
@@ -119,40 +120,34 @@ def tradeoff_clips(records: Path) -> plt.Figure:
     fig, (by_time, by_bytes) = plt.subplots(2, figsize=(WIDTH, 6.4))
     for clip, color in CLIPS.items():
         own = {name.removeprefix(f"{clip}, "): run for name, run in runs.items() if name.startswith(f"{clip}, ")}
-        fits = {name: run for name, run in own.items() if not name.endswith(", compact")}
-        budgets = [run for name, run in fits.items() if name not in PRESETS]
-        compact = [own[f"{name}, compact"] for name in fits if name not in PRESETS and f"{name}, compact" in own]
-        by_time.plot(*_curve(budgets, "cpu_seconds"), "o-", color=color, label=clip)
-        by_bytes.plot(*_curve(budgets, "bytes", 1e-6), "o--", color=color, mfc="white")
-        by_bytes.plot(*_curve(compact, "bytes", 1e-6), "o-", color=color)
-        for name, marker in PRESETS.items():
-            if name in fits:
-                by_time.plot(*_curve([fits[name]], "cpu_seconds"), marker, color=color)
-                by_bytes.plot(*_curve([fits[name]], "bytes", 1e-6), marker, color=color, mfc="white")
-            if f"{name}, compact" in own:
-                by_bytes.plot(*_curve([own[f"{name}, compact"]], "bytes", 1e-6), marker, color=color)
+        fits = {name: run for name, run in own.items() if not name.endswith(COMPACT)}
+        compact = {name.removesuffix(COMPACT): run for name, run in own.items() if name.endswith(COMPACT)}
+        _draw(by_time, fits, "cpu_seconds", 1.0, color=color)
+        _draw(by_bytes, fits, "bytes", 1e-6, color=color, mfc="white", ls="--")
+        _draw(by_bytes, compact, "bytes", 1e-6, color=color)
     by_time.set(xlabel="time to fit, CPU seconds (one core)", ylabel="PSNR (dB)", xscale="log")
     by_bytes.set(xlabel="size, megabytes", ylabel="PSNR (dB)", xscale="log")
-    for axes, ticks in ((by_time, (5, 10, 20, 40, 80, 160)), (by_bytes, (0.05, 0.1, 0.2, 0.5, 1, 2, 5))):
+    for axes, ticks in ((by_time, (5, 10, 20, 40, 80, 160)), (by_bytes, (0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10))):
         low, high = axes.get_xlim()
         shown = [tick for tick in ticks if low <= tick <= high]
         axes.set_xticks(shown, [f"{tick:g}" for tick in shown])
         axes.minorticks_off()
-    grey = {"color": GREY, "ls": ""}
     handles = [Line2D([], [], color=color, lw=3, label=clip) for clip, color in CLIPS.items()]
-    handles += [
-        Line2D([], [], marker=marker, label=name, **grey)
-        for name, marker in (("--minutes", "o"), ("--preset draft", "^"), ("no option", "s"))
-    ]
-    handles += [Line2D([], [], marker="o", mfc="white", label="model file", **grey)]
-    handles += [Line2D([], [], marker="o", label="compact file", **grey)]
+    markers = {"--minutes": "o"} | {label: marker for name, (marker, label) in PRESETS.items() if name in fits}
+    styles = {label: {"marker": marker} for label, marker in markers.items()}
+    styles |= {"model file": {"marker": "o", "mfc": "white"}, "compact file": {"marker": "o"}}
+    handles += [Line2D([], [], color=GREY, ls="", label=label, **style) for label, style in styles.items()]
     fig.legend(handles=handles, loc="outside upper center", ncols=3, fontsize=9.5, columnspacing=1)
     return fig
 
 
-def _curve(runs: list[dict[str, Any]], name: str, factor: float = 1.0) -> tuple[list[float], list[float]]:
-    points = sorted((factor * run[name], run["psnr"]) for run in runs)
-    return [x for x, _ in points], [y for _, y in points]
+def _draw(axes: plt.Axes, runs: Runs, cost: str, factor: float, **style: Any) -> None:
+    """A curve of the budgets, and a point for each preset."""
+    points = sorted((factor * run[cost], run["psnr"]) for name, run in runs.items() if name not in PRESETS)
+    axes.plot([x for x, _ in points], [y for _, y in points], marker="o", **style)
+    for name, (marker, _) in PRESETS.items():
+        if name in runs:
+            axes.plot(factor * runs[name][cost], runs[name]["psnr"], marker, **style | {"ls": ""})
 
 
 def _read(folder: Path, name: str) -> dict[str, Any]:
