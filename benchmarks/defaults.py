@@ -5,9 +5,9 @@
 Each fit is given nothing but what a user would give: a clip, its size, the minutes, and in two of them the largest
 number of Gaussians or the PSNR of the smallest model. All else is the default.
 
-- `bunny-160`: *Bunny* at 160x320, 2 minutes;
-- `bunny-640`, `bunny-640-60`, `bunny-640-620k`: at 640x1280, 15 minutes, 60 minutes, and 15 minutes with at most
-  620,000 Gaussians;
+- `bunny-160`, `bunny-160-1`: *Bunny* at 160x320, 2 minutes and 1 minute;
+- `bunny-640`, `bunny-640-5`, `bunny-640-60`, `bunny-640-620k`: at 640x1280, 15, 5 and 60 minutes, and 15 minutes with
+  at most 620,000 Gaussians;
 - `bikes`, `carphone`: at their own sizes, 5 and 2 minutes;
 - `smallest`: *Bunny* at 160x320, the smallest model at 33 dB;
 - `clips/NAME`: every subfolder of `--clips`, a folder of images each, 10 minutes; and their mean.
@@ -47,7 +47,9 @@ class Case(NamedTuple):
 SMALL = (160, 320)
 CASES = {
     "bunny-160": Case("bunny", SMALL, {"minutes": 2}),
+    "bunny-160-1": Case("bunny", SMALL, {"minutes": 1}),
     "bunny-640": Case("bunny", None, {"minutes": 15}),
+    "bunny-640-5": Case("bunny", None, {"minutes": 5}),
     "bunny-640-60": Case("bunny", None, {"minutes": 60}),
     "bunny-640-620k": Case("bunny", None, {"minutes": 15, "max_gaussians": 620_000}),
     "bikes": Case("bikes", None, {"minutes": 5}),
@@ -81,7 +83,9 @@ class AtMost(NamedTuple):
 #: The figures asked of each fit, by name of the fit; `FOLDER` stands for each clip of the folder.
 ASKED: dict[str, dict[str, AtLeast | AtMost]] = {
     "bunny-160": {"psnr": AtLeast(42)},
+    "bunny-160-1": {"psnr": AtLeast(41)},
     "bunny-640": {"psnr": AtLeast(41)},
+    "bunny-640-5": {"psnr": AtLeast(39)},
     "bunny-640-60": {"psnr": AtLeast(42.5)},
     "bunny-640-620k": {"psnr": AtLeast(40)},
     "bikes": {"psnr": AtLeast(38.5), "worst_psnr": AtLeast(33)},

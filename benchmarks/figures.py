@@ -1,20 +1,25 @@
-"""The pictures of README and of docs/concepts.md.
+"""The pictures of docs/concepts.md, and those beside the examples in README.
 
     python -m benchmarks.figures [--out FOLDER] [--only NAME ...] [--models FOLDER]
 
-*density*, *shapes* and *marginals* are drawn from distributions of two coordinates. *sheet*, *pipeline* and *cameras*
-show 25 frames of *bikes* at 160x384, the rider of `benchmarks.editing`, fitted with 20,000 Gaussians in 3,000 steps,
-half of which learn what lies between frames; `--models` keeps that model, and takes the one that is there.
+*density*, *shapes* and *marginals* are drawn from distributions of two coordinates. *pipeline* and *cameras* show 25
+frames of *bikes* at 160x384, the rider of `benchmarks.editing`, fitted with 20,000 Gaussians in 3,000 steps, half of
+which learn what lies between frames; `--models` keeps that model, and takes the one that is there. *distribution* and
+*uncertainty* are the examples of README; the latter fits 46 frames of *Bunny* at 80x160 and samples their times.
+Others: `benchmarks.animation`, `benchmarks.record_figures`.
 """
 
 from pathlib import Path
 
 import cv2
+import jax
 import jax.numpy as jnp
 import matplotlib
 import numpy as np
+from matplotlib import patheffects
 from matplotlib import pyplot as plt
 from matplotlib.collections import EllipseCollection
+from matplotlib.patches import Ellipse
 from matplotlib.transforms import Affine2D
 
 from benchmarks import _common
@@ -22,16 +27,23 @@ from benchmarks.editing import Scene, fitted, rider
 from foldgauss import Constant, FoldedGaussian, PolynomialFold, TimeLikelihood, ZeroFold
 from foldgauss.analysis.plot import plot_density
 from foldgauss.io._atomic import atomic_path
+from foldgauss.io.datasets import bunny
 from foldgauss.render import Camera, Gaussians3D, project, render
-from foldgauss.video import FitConfig, VideoModel, by_mask
+from foldgauss.uncertainty import frame_time_posterior, increment_intervals, irregularities
+from foldgauss.video import FitConfig, VideoModel, fit
 
 BLUE, RED, GREY = "#2b5c8a", "#c2452d", "#5a5f66"
 DPI = 140
 #: The clip is dark: it is shown so many times as bright.
 BRIGHTNESS = 1.6
-#: Frames that the sheet shows, one a column.
-SHOWN = (2, 5, 8)
+#: The frame that is shown.
+SHOWN = 5
 CONFIG = FitConfig(num_gaussians=20_000, steps=3_000, interpolation_fraction=0.5)
+#: Inches of README's examples: text is readable on a screen of 360 pixels.
+EXAMPLE_SIZE = 5.0, 3.2
+HALO = {"path_effects": [patheffects.withStroke(linewidth=3, foreground="white")]}
+#: Frames of *Bunny* in the example of uncertainty: 57 and 82 repeat the ones before.
+REPEATING = 40, 86
 #: One in so many Gaussians has its outline drawn.
 EVERY = 4
 
@@ -117,32 +129,9 @@ def shapes() -> plt.Figure:
     return fig
 
 
-def sheet(scene: Scene, model: VideoModel) -> np.ndarray:
-    """Rows: the frames, the model's, those half way to the next ones, and with the rider three times."""
-    times = np.asarray(model.frame_times.times())
-    shown = np.array(SHOWN)
-    between = (times[shown] + times[shown + 1]) / 2
-    it = by_mask(model, scene.masks)
-    edited = scene.edits["multiply"](model, it)
-    rows = {
-        "the clip": scene.frames[shown],
-        "the model": np.stack(list(model.frames(times[shown]))),
-        "half a frame later": np.stack(list(model.frames(between))),
-        "edited": np.stack(list(edited.frames(times[shown]))),
-    }
-    lines = []
-    for name, pictures in rows.items():
-        bright = (BRIGHTNESS * pictures.astype(np.float64)).round().clip(0, 255).astype(np.uint8)
-        line = np.concatenate([np.pad(one, ((2, 2), (2, 2), (0, 0)), constant_values=255) for one in bright], axis=1)
-        for color, thickness in (((0, 0, 0), 4), ((255, 255, 255), 1)):
-            cv2.putText(line, name, (10, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.6, color, thickness, cv2.LINE_AA)
-        lines.append(line)
-    return np.concatenate(lines)
-
-
 def pipeline(scene: Scene, model: VideoModel) -> plt.Figure:
     """From frames to pictures: optical flow, Gaussians, a picture between two frames."""
-    k = SHOWN[1]
+    k = SHOWN
     t = float(np.asarray(model.frame_times.times())[k])
     fig, axes = plt.subplots(2, 2, figsize=(9.6, 4.7))
     panels = {
@@ -192,7 +181,7 @@ def _outlines(ax: plt.Axes, model: VideoModel, t: float) -> None:
 def cameras(scene: Scene, model: VideoModel) -> plt.Figure:
     """Flat Gaussians between two cameras, and what each sees, and a third from the side."""
     height, width = model.size
-    aspect, k = height / width, SHOWN[1]
+    aspect, k = height / width, SHOWN
     t = float(np.asarray(model.frame_times.times())[k])
     flat = Gaussians3D.from_flat(model.splats.at(jnp.asarray(t, jnp.float32)))
     front = Camera.front(aspect=aspect)
@@ -231,45 +220,83 @@ def _stage(ax: plt.Axes, picture: np.ndarray, front: Camera, aspect: float) -> N
     ax.axis("off")
 
 
+def distribution() -> plt.Figure:
+    """README's example: samples colored by time, and the Gaussians at five times."""
+    bend = FoldedGaussian(
+        loc=jnp.zeros(2),
+        scale_tril=0.1 * jnp.eye(2),
+        time_loc=0.5,
+        time_scale=0.2,
+        fold=PolynomialFold(jnp.array([[3.0, 0.0], [0.0, 4.0]])),
+    )
+    x = np.asarray(bend.sample(jax.random.key(0), (1000,)))
+    fig, ax = plt.subplots(figsize=EXAMPLE_SIZE)
+    points = ax.scatter(*x.T[:2], c=x[:, 2], s=9, alpha=0.7, cmap="viridis", vmin=0, vmax=1, linewidths=0)
+    for t in (0.1, 0.3, 0.5, 0.7, 0.9):
+        given = bend.condition_time(t)
+        width = 4 * float(given.scale_tril[0, 0])  # the covariance is a multiple of the identity
+        ax.add_patch(Ellipse(np.asarray(given.loc), width, width, fill=False, ec="black", lw=1.2))
+        ax.annotate(f"t = {t:g}", np.asarray(given.loc) - [0, 0.3], ha="center", va="center", fontsize=11, **HALO)
+    fig.colorbar(points, label="time t", orientation="horizontal", aspect=40).solids.set_alpha(1)
+    ax.set(xlabel="x", ylabel="y", aspect="equal")
+    return fig
+
+
+def uncertainty() -> plt.Figure:
+    """README's example: the steps between frames of *Bunny*, two of which are repeated in the file itself."""
+    first, stop = REPEATING
+    clip = bunny(frames=REPEATING, size=(80, 160))
+    model = fit(clip.frames, FitConfig(num_gaussians=6_000, steps=1_500), fps=clip.fps).model
+    posterior = frame_time_posterior(model, clip.frames, progress=False)
+    found = increment_intervals(posterior, 0.9)
+    fig, ax = plt.subplots(figsize=EXAMPLE_SIZE)
+    ax.axhline(1, color=GREY, lw=0.8)
+    number = np.arange(first, stop - 1)
+    ax.vlines(number, found.low, found.high, color=BLUE, lw=4, alpha=0.4)
+    ax.plot(number, found.mean, "o", color=BLUE, ms=4)
+    for one in irregularities(posterior):
+        at = one.frames[0]
+        ax.plot(first + at, found.mean[at], "o", color=RED, ms=7)
+        text = f"{one.kind},\nprobability {one.probability:.2f}"
+        ax.annotate(text, (first + at, found.mean[at]), (-8, 0), textcoords="offset points", ha="right", va="center",
+                    color=RED, fontsize=11)  # fmt: skip
+    ax.set(xlabel="frame", ylabel="step to the next frame", ylim=(-0.2, 1.6))
+    return fig
+
+
 DRAWN = {"density": density, "marginals": marginals, "shapes": shapes}
-FROM_CLIP = {"sheet": sheet, "pipeline": pipeline, "cameras": cameras}
-#: Files carry what they are of.
-PREFIX = dict.fromkeys((*DRAWN, *FROM_CLIP), "concept-") | {"sheet": ""}
+EXAMPLES = {"distribution": distribution, "uncertainty": uncertainty}
+FROM_CLIP = {"pipeline": pipeline, "cameras": cameras}
+#: The names of files begin with what they are of.
+PREFIX = dict.fromkeys((*DRAWN, *FROM_CLIP), "concept-") | dict.fromkeys(EXAMPLES, "example-")
 
 
-def write(path: Path, made: plt.Figure | np.ndarray) -> None:
+def write(path: Path, figure: plt.Figure) -> None:
     with atomic_path(path) as temporary:
-        if isinstance(made, np.ndarray):
-            picture = cv2.cvtColor(made, cv2.COLOR_RGB2BGR)
-            temporary.write_bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes())
-        else:
-            made.tight_layout()
-            made.savefig(temporary, dpi=DPI, format="png", facecolor="white")
-            plt.close(made)
+        figure.tight_layout()
+        figure.savefig(temporary, dpi=DPI, format="png", facecolor="white")
+        plt.close(figure)
 
 
 def main(arguments: list[str] | None = None) -> None:
+    every = (*DRAWN, *EXAMPLES, *FROM_CLIP)
     parser = _common.parser(__doc__)
     parser.add_argument("--out", type=Path, default=Path("docs"), metavar="FOLDER", help="[docs]")
-    parser.add_argument("--only", choices=(*DRAWN, *FROM_CLIP), action="append", metavar="NAME", help="[all]")
+    parser.add_argument("--only", choices=every, action="append", metavar="NAME", help="[all]")
     parser.add_argument("--models", type=Path, metavar="FOLDER", help="keep the model there, or take it from there")
     options = _common.parse(parser, arguments)
     matplotlib.use("Agg")
-    wanted = options.only or (*DRAWN, *FROM_CLIP)
+    wanted = options.only or every
     options.out.mkdir(parents=True, exist_ok=True)
-    for name in wanted:
-        if name in DRAWN:
-            write(options.out / f"{PREFIX[name]}{name}.png", DRAWN[name]())
+    made = {name: (DRAWN | EXAMPLES)[name]() for name in wanted if name not in FROM_CLIP}
     if set(wanted) & FROM_CLIP.keys():
         if options.models is not None:
             options.models.mkdir(parents=True, exist_ok=True)
         scene = rider()
         model = fitted(scene._replace(name="figures"), CONFIG, options.models)
-        for name in wanted:
-            if name in FROM_CLIP:
-                made = FROM_CLIP[name](scene, model)
-                suffix = "jpg" if isinstance(made, np.ndarray) else "png"
-                write(options.out / f"{PREFIX[name]}{name}.{suffix}", made)
+        made |= {name: FROM_CLIP[name](scene, model) for name in wanted if name in FROM_CLIP}
+    for name, figure in made.items():
+        write(options.out / f"{PREFIX[name]}{name}.png", figure)
 
 
 if __name__ == "__main__":

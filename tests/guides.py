@@ -20,6 +20,7 @@ Commands run in this process, where kernels are compiled once, with the argument
 - Workers are tested elsewhere: with `--workers` and `--scheduler` this process does the work; the options of `dask` are
   looked up.
 - `foldgauss view` makes its page and its server, opens no browser, and ends as by Ctrl-C.
+- `git clone ADDRESS FOLDER` and `cd FOLDER` are not run: FOLDER must be the project's name.
 - `pip`, `pytest`, `ruff` and so on are not run: what they name (extras, files, markers, tools) is looked up. `python
   -m benchmarks...` has its arguments parsed by the benchmark's own parser and goes no
   further.
@@ -56,6 +57,9 @@ PAGES = sorted(str(path.relative_to(ROOT)) for path in (*ROOT.glob("*.md"), *(RO
 RUN, READ = ("python", "sh"), ("toml", "text", "math")
 #: First words of commands, to find them in indented blocks.
 _COMMAND = re.compile(r"\s*(?:\$ )?(?:foldgauss|pip|python|pytest|mkdocs|ruff|git|bash|lint-imports)\b")
+
+#: Its name, and that of the folder that it is cloned to.
+PROJECT = "foldgauss"
 
 #: Steps of a fit without a number of steps.
 STEPS = 100
@@ -193,6 +197,14 @@ def _ended(server) -> None:
     raise KeyboardInterrupt
 
 
+def _git(words: list[str], where: str) -> None:
+    assert words == ["clone", "ADDRESS", PROJECT], where
+
+
+def _cd(words: list[str], where: str) -> None:
+    assert words == [PROJECT], where
+
+
 def _pip(words: list[str], where: str) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     asked = [word for word in words[1:] if not word.startswith("-")]
@@ -204,7 +216,7 @@ def _pip(words: list[str], where: str) -> None:
     assert asked, where
     for requirement in asked:
         name, extras = re.fullmatch(r"([\w.-]+?)(?:\[([\w,]+)\])?", requirement).groups()
-        assert name in (".", project["name"]), f"{where}: {requirement}"
+        assert name in (".", PROJECT), f"{where}: {requirement}"
         for extra in (extras or "").split(","):
             assert not extra or extra in project["optional-dependencies"], f"{where}: no extra {extra!r}"
 
@@ -261,6 +273,8 @@ def _bash(words: list[str], where: str) -> None:
 
 _TOOLS = {
     "foldgauss": _foldgauss,
+    "git": _git,
+    "cd": _cd,
     "pip": _pip,
     "pytest": _pytest,
     "benchmarks": _benchmark,
@@ -362,6 +376,7 @@ GIVEN = {
     "docs/editing.md": ("holiday.safetensors", "edits.toml", "point_cloud.ply"),
     "docs/fit.md": ("holiday.mp4", "DAVIS", "folder/of/images"),
     "docs/format.md": ("holiday.mp4", "holiday.safetensors"),
+    "docs/index.md": ("holiday.mp4",),
     "docs/player.md": ("holiday.mp4", "holiday.safetensors"),
     "docs/quickstart.md": ("holiday.mp4",),
     "docs/results.md": ("bunny.mp4", "bunny.safetensors", "holiday.mp4"),
