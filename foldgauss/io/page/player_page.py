@@ -45,7 +45,8 @@ QUALITY = 80
 LARGE, LARGEST_IN_NOTEBOOK = 50e6, 20e6
 _SOURCES = Path(__file__).parent / "player"
 _DECODER = Path(__file__).parent / "compact.js"
-_IMPORT = re.compile(r'^import (?:\{[^}]*\}|(?P<text>\w+)) from "\./(?P<name>[\w.-]+)";\n', re.MULTILINE)
+_IMPORT = re.compile(r'^import (?:(?P<names>\{[^}]*\})|(?P<text>\w+)) from "\./(?P<name>[\w.-]+)";\n', re.MULTILINE)
+_EXPORT = re.compile(r"^export (?:async )?(?:const|class|function) (\w+)", re.MULTILINE)
 #: Binary logarithm of equal steps, where steps in proportion are beyond the format.
 _EVEN = -18.0
 _PER_E = 1.4427  # log2 e: slopes are those of natural logarithms
@@ -263,7 +264,10 @@ def _digest(text: str) -> str:
 
 
 def bundle_script(entry: str) -> str:
-    """A module and all that it imports, each once, as one script without imports; texts become strings."""
+    """A module and all that it imports, each once, as one script without imports; texts become strings.
+
+    Each module is a function of its own, so that names need not be unique, whose result are its exports.
+    """
     done: dict[str, str] = {}
 
     def add(name: str) -> None:
@@ -274,17 +278,22 @@ def bundle_script(entry: str) -> str:
         for found in _IMPORT.finditer(source):
             if not found["text"]:
                 add(found["name"])
-        source = _IMPORT.sub(_as_constant, source)
+        exports = ", ".join(_EXPORT.findall(source))
+        source = re.sub(r"^export ", "", _IMPORT.sub(_as_constant, source), flags=re.MULTILINE)
         del done[name]
-        done[name] = re.sub(r"^export ", "", source, flags=re.MULTILINE)
+        done[name] = f"const {_module_variable(name)} = (() => {{\n{source}return {{ {exports} }};\n}})();\n"
 
     add(entry)
     return '"use strict";\n' + "\n".join(done.values())
 
 
 def _as_constant(found: re.Match) -> str:
-    """An import of a text, as of a shader, as a constant; others are in the bundle and go."""
+    """An import as constants: of a text, as of a shader, that text; of a module its exports."""
     if not found["text"]:
-        return ""
+        return f"const {found['names']} = {_module_variable(found['name'])};\n"
     text = json.dumps((_SOURCES / found["name"]).read_text(encoding="utf-8")).replace("</", "<\\/")
     return f"const {found['text']} = {text};\n"
+
+
+def _module_variable(name: str) -> str:
+    return "module_" + re.sub(r"\W", "_", name)
