@@ -5,6 +5,7 @@ Its sources are the files in `player/`; `compact.js` decodes the models there. S
 """
 
 import base64
+import dataclasses
 import hashlib
 import html
 import json
@@ -89,12 +90,38 @@ def warn_of_size(page: str, has_original: bool) -> None:
         warnings.warn(f"page: {len(page) / 1e6:.0f} MB, which browsers are slow to open. {cure}", stacklevel=3)
 
 
-def html_page(model: Model, *, original: Frames | None = None, quality: int = QUALITY, title: str | None = None) -> str:
+@dataclasses.dataclass(frozen=True)
+class SaveTarget:
+    """Where a page that a local server serves saves its edit: `PUT /script` with the token in a header.
+
+    `name` is the script's file name, for display; `script` the edit that the page begins with, if there is one.
+    """
+
+    name: str
+    token: str
+    script: bytes | None = None
+
+    def blocks(self) -> Iterator[str]:
+        about = json.dumps({"token": self.token, "script": self.name}).replace("<", "\\u003c")
+        yield f'<script type="application/json" id="server">{about}</script>'
+        if self.script is not None:
+            yield _block("script", self.script)
+
+
+def html_page(
+    model: Model,
+    *,
+    original: Frames | None = None,
+    quality: int = QUALITY,
+    title: str | None = None,
+    save_to: SaveTarget | None = None,
+) -> str:
     """The page as text.
 
     `model`: a model; or the path of a file with one, of which a compact one goes in as it is. Any other is quantized
     finely, and so is each segment of a video in segments: see docs/player.md for the accuracy.
     `original`: the clip's frames, of the model's number and size, shown beside it; as WebP of `quality`, 1 to 100.
+    `save_to`: of a page that a local server serves; it may then make requests to that server, and to nothing else.
 
     Raises ValueError for edits that no folded model holds, several envelopes or a degree above 15, in a segment, too,
     and for frames that do not fit; errors of reading as `load_video_model`.
@@ -105,7 +132,12 @@ def html_page(model: Model, *, original: Frames | None = None, quality: int = QU
         raise invalid("quality", expected="a whole number from 1 to 100", got=quality)
     plain, name = _load(model)
     pictures = [] if original is None else _encode_original(original, plain, quality)
-    return _assemble(_encode_model(model, plain), pictures, name if title is None else title)
+    return _assemble(_encode_model(model, plain), pictures, name if title is None else title, save_to)
+
+
+def empty_page() -> str:
+    """The page without a model: it opens model files from the computer that it is shown on."""
+    return _assemble([], [], "foldgauss player")
 
 
 def make_notebook_iframe(model: VideoModel | EditedVideo | SegmentedVideo) -> str | None:
@@ -226,11 +258,12 @@ def _encode_webp(frame: UInt8[np.ndarray, "height width channels"], quality: int
 # ------------------------------------------------------------------------------------------------ the page
 
 
-def _assemble(models: Iterable[str], pictures: Iterable[bytes], title: str) -> str:
+def _assemble(models: Iterable[str], pictures: Iterable[bytes], title: str, save_to: SaveTarget | None = None) -> str:
     script, style = bundle_script("main.js"), (_SOURCES / "player.css").read_text(encoding="utf-8")
     blocks = [*models, *(_block(f"frame-{k}", picture) for k, picture in enumerate(pictures))]
+    blocks += [] if save_to is None else save_to.blocks()
     parts = {
-        "policy": _policy(script, style),
+        "policy": _policy(script, style, connects=save_to is not None),
         "title": html.escape(title.encode("utf-8", "replace").decode()),  # names of files need not be UTF-8
         "style": style,
         "data": "\n".join(blocks),
@@ -245,8 +278,8 @@ def _block(name: str, data: bytes) -> str:
     return f'<script type="application/octet-stream" id="{name}">{base64.b64encode(data).decode()}</script>'
 
 
-def _policy(script: str, style: str) -> str:
-    """The content security policy: the page's own script, style, images and worker, and nothing else."""
+def _policy(script: str, style: str, *, connects: bool) -> str:
+    """The content security policy: the page's own script, style, images and worker, and its server if it has one."""
     allowed = {
         "default-src": "'none'",
         "script-src": _digest(script),
@@ -256,6 +289,8 @@ def _policy(script: str, style: str) -> str:
         "base-uri": "'none'",
         "form-action": "'none'",
     }
+    if connects:
+        allowed["connect-src"] = "'self'"
     return "; ".join(f"{name} {value}" for name, value in allowed.items())
 
 

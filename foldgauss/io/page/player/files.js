@@ -69,7 +69,15 @@ export class Files {
     element("download-model").disabled = segments.spans.length > 1;
     const found = this.storage.attach(`${fingerprint}-${segments.total}-${segments.spans.length}`, history);
     if (found) toast("The edit is as you left it.");
-    else if (this.isOfPage && element("script")) this.readScript(new TextDecoder().decode(bytesOf(element("script").textContent)), server?.script);
+    else if (this.isOfPage && element("script")) this.readFromDisk();
+  }
+
+  /** Take up the script beside the model; one that the page cannot do must not be replaced. */
+  readFromDisk() {
+    const { script } = this.server;
+    if (this.readScript(new TextDecoder().decode(bytesOf(element("script").textContent)), script)) return;
+    element("save-disk").disabled = true;
+    put("save-about", `${script} has edits that the page cannot do, and is left alone. Rename it to save another.`);
   }
 
   /** Open a file: a script for this model, or a model. */
@@ -105,14 +113,20 @@ export class Files {
     };
   }
 
+  /** Apply a script; whether that was possible. */
   readScript(text, name) {
     const { player } = this;
-    if (!player.segments) return toast("Open the model first, then its script.", LONG);
+    if (!player.segments) {
+      toast("Open the model first, then its script.", LONG);
+      return false;
+    }
     try {
       player.editing.load(readScript(text, player.segments.counts));
       toast(`${name} is applied. Undo takes it back.`);
+      return true;
     } catch (error) {
       toast(`${name}: ${error.message}`, LONG);
+      return false;
     }
   }
 
@@ -123,7 +137,7 @@ export class Files {
 
   /** To the disk if there is a way, else as a download. */
   save() {
-    if (this.server && this.isOfPage) return this.saveToDisk();
+    if (this.server && this.isOfPage && !element("save-disk").disabled) return this.saveToDisk();
     return this.downloadScript();
   }
 
