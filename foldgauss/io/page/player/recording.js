@@ -4,6 +4,7 @@ import { download } from "./files.js";
 
 const FORMATS = [["video/webm;codecs=vp9", "webm"], ["video/webm", "webm"], ["video/mp4", "mp4"]];
 const BITS_PER_PIXEL = 0.2, LEAST_BITS = 2e6, MOST_BITS = 6e7;
+const LONGEST_START = 3000, LEAST_PAUSE = 4; // milliseconds, in which the encoder takes the frame
 
 const pause = (milliseconds) => new Promise((next) => setTimeout(next, milliseconds));
 
@@ -63,6 +64,14 @@ export class Recording {
     return { first: Math.min(first, stop), last: Math.max(first, stop), speed: Math.min(Math.max(Number(element("record-speed").value) || 1, 1 / 64), 16) };
   }
 
+  /** Start a recorder; its encoder takes a while, in which frames would be lost. */
+  async start(recorder, track) {
+    let started = false;
+    recorder.onstart = () => (started = true);
+    recorder.start();
+    for (const begun = performance.now(); !started && performance.now() - begun < LONGEST_START; await pause(10)) track.requestFrame();
+  }
+
   async run() {
     const { player } = this, canvas = this.canvas(), [width, height] = [canvas.width, canvas.height], context = canvas.getContext("2d");
     const { first, last, speed } = this.range, rate = player.timeline.fps * speed, before = player.position, parts = [];
@@ -72,7 +81,7 @@ export class Recording {
     const recorder = new MediaRecorder(stream, { mimeType: this.type, videoBitsPerSecond: Math.min(Math.max(BITS_PER_PIXEL * pixels, LEAST_BITS), MOST_BITS) });
     recorder.ondataavailable = (event) => parts.push(event.data);
     const ended = new Promise((done) => (recorder.onstop = done)), at = async (position) => {
-      player.seekPosition(position);
+      player.goTo(position); // the screen need not show it
       await player.segments.ready();
       this.draw(context, width, height);
       track.requestFrame();
@@ -80,14 +89,16 @@ export class Recording {
     [this.running, this.stopped] = [true, false];
     try {
       await at(first);
-      recorder.start();
+      await this.start(recorder, track);
       const begun = performance.now();
       for (let seconds = 0; seconds < length && !this.stopped; seconds = (performance.now() - begun) / 1000) {
         const now = performance.now();
         await at(Math.min(first + Math.floor(seconds * rate + 1e-6) + (rate < 24 ? (seconds * rate) % 1 : 0), last)); // slow motion has times between frames
         put("record", `Recording ${Math.round((100 * seconds) / length)} % — stop`);
-        await pause(Math.max(tick - (performance.now() - now), 0));
+        await pause(Math.max(tick - (performance.now() - now), LEAST_PAUSE));
       }
+      if (!this.stopped) await at(last); // where the computer is slow, frames are left out, but never this one
+      for (let k = 0; k < 3; k++, await pause(tick)) track.requestFrame();
       recorder.stop();
       await ended;
       download(new Blob(parts, { type: this.type }), `${this.files.title}.${this.suffix}`);
