@@ -124,12 +124,13 @@ export class Panel {
   }
 
   update() {
-    const { player, tools } = this, { lead, editing, segments } = player, count = editing.count(lead.number, lead.base);
+    const { player, tools } = this, { lead, editing, segments } = player;
     element("panel").hidden = !player.highlighting;
     press("edit", player.highlighting);
     element("stage").classList.toggle("selecting", player.highlighting && tools.isSelecting);
-    this.following.update(count);
     if (!player.highlighting) return;
+    const count = editing.count(lead.number, lead.base);
+    this.following.update(count);
     put("picked", count ? `${count.toLocaleString("en")} ${segments.spans.length > 1 ? "in this segment" : "selected"}` : "Nothing selected");
     pressOne("tools", "tool", tools.name);
     pressOne("how", "how", tools.how);

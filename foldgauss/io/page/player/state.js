@@ -6,7 +6,13 @@ export function begin(model) {
   return { model, selected: new Uint8Array(model.num), origin: Uint32Array.from({ length: model.num }, (_, i) => i) };
 }
 
-export const countOf = ({ selected }) => selected.reduce((sum, own) => sum + own, 0);
+const counts = new WeakMap(); // by selection, which is never changed in place
+
+/** How many Gaussians are selected. */
+export function countOf({ selected }) {
+  if (!counts.has(selected)) counts.set(selected, selected.reduce((sum, own) => sum + own, 0));
+  return counts.get(selected);
+}
 
 /** The selected Gaussians' indices. */
 export function indicesOf({ selected }) {
