@@ -143,7 +143,7 @@ def test_requests_that_are_not_the_pages_save_nothing(tmp_path, monkeypatch):
             (404, good | {"path": "/script?name=../secret.toml"}),
             (404, good | {"path": "/%2e%2e/secret.toml"}),
             (413, good | {"body": "#" * 1001}),
-            (413, good | {"Content_Length": "99999999999999999999"}),
+            (413, good | {"Content_Length": "9" * 5000}),
             (411, good | {"Content_Length": "-1"}),
             (411, good | {"Content_Length": "1e3"}),
             (400, good | {"body": "not TOML"}),

@@ -74,8 +74,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         length = self.headers.get("Content-Length", "")
         if not (length.isascii() and length.isdigit()):
             return self._answer(411, "Expected a length.")
-        if int(length) > MAX_BYTES:
-            return self._answer(413, f"Expected a script of at most {MAX_BYTES:,} bytes, got {int(length):,}.")
+        if len(length) > len(str(MAX_BYTES)) or int(length) > MAX_BYTES:
+            return self._answer(413, f"Expected a script of at most {MAX_BYTES:,} bytes, got more.")
         body = self.rfile.read(int(length))
         with self.server.saving:
             self._save(body, int(length))

@@ -17,6 +17,7 @@ export function writeScript(steps, counts, title) {
       const begins = name === undefined;
       if (begins) selections.push(selectionTables((name = `s${selections.length + 1}`), select, counts));
       edits.push(editTable(step, begins ? name : undefined));
+      if (step.do === "vanish" || step.factor === 0) select = undefined; // what was selected is gone: later edits change nothing
     }
   }
   if (select && name === undefined && Object.keys(select).length) selections.push(selectionTables(CURRENT, select, counts));

@@ -1,7 +1,11 @@
 // The edit of each model that was opened, kept in the browser until it is discarded: under the model's fingerprint.
 import { recall, remember } from "./elements.js";
+import { problemOf } from "./operations.js";
 
 const PREFIX = "foldgauss-edit-", PAUSE = 400; // milliseconds after a change
+
+/** Whether a value is a step of a history, as far as can be told without the model. */
+const isStep = (step) => Array.isArray(step?.script) ? step.script.every(isStep) : step?.select ? typeof step.select === "object" : step?.do !== undefined && problemOf(step) === "";
 
 export class Storage {
   /** `onFull` is called when the browser does not keep an edit. */
@@ -16,13 +20,14 @@ export class Storage {
     this.flush();
     this.history = history;
     this.key = PREFIX + fingerprint;
+    this.told = false;
     let kept = null;
     try {
       kept = JSON.parse(recall(this.key));
     } catch {
       // not ours
     }
-    if (!Array.isArray(kept?.steps) || !(kept.done >= 0 && kept.done <= kept.steps.length)) return false;
+    if (!Array.isArray(kept?.steps) || !kept.steps.every(isStep) || !(kept.done >= 0 && kept.done <= kept.steps.length)) return false;
     history.restore(kept);
     return history.canUndo;
   }
@@ -36,7 +41,8 @@ export class Storage {
     if (this.pending === undefined) return;
     this.pending = undefined;
     const { steps, done } = this.history;
-    this.kept = steps.length ? remember(this.key, JSON.stringify({ steps, done })) : remember(this.key, null);
-    if (!this.kept) this.onFull();
+    const kept = steps.length ? remember(this.key, JSON.stringify({ steps, done })) : remember(this.key, null);
+    if (!kept && !this.told) this.onFull();
+    this.told = !kept; // once, until it works again
   }
 }
