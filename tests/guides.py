@@ -169,7 +169,7 @@ def _foldgauss(words: list[str], where: str) -> None:
         words = [*words, *ONE_AXIS]
     with warnings.catch_warnings(), pytest.MonkeyPatch.context() as patch:
         patch.setattr(viewing.webbrowser, "open", lambda url: True)
-        patch.setattr(viewing._Server, "serve_forever", _ended)
+        patch.setattr(viewing.PageServer, "serve_forever", _ended)
         # What a reader would see as a line; the suite makes errors of warnings, and few steps give some.
         warnings.simplefilter("default")
         code = run(*words)

@@ -379,6 +379,7 @@ def test_commands_are_listed_as_one_comes_to_need_them(capsys):
         "fit",
         "fit-many",
         "view",
+        "player",
         "render",
         "stabilize",
         "evaluate",

@@ -1,22 +1,26 @@
 """`view` and `export --format html`: a page on this machine alone, or in a file."""
 
+import base64
 import http.client
+import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
 import threading
 import time
 import webbrowser
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 from commands import run
 from tiny_clips import NUM_FRAMES, write_both
 
-from foldgauss.cli.viewing import view as viewing
-from foldgauss.io import load_video_model, save_video_model
+from foldgauss.cli.viewing import page_server
+from foldgauss.io import html_page, load_video_model, save_video_model
 from foldgauss.video import edit
 
 
@@ -38,7 +42,7 @@ def served(work, monkeypatch, capsys):
             servers.append((server.server_address[0], server.page.decode()))
             raise KeyboardInterrupt
 
-        monkeypatch.setattr(viewing._Server, "serve_forever", serve)
+        monkeypatch.setattr(page_server.PageServer, "serve_forever", serve)
         monkeypatch.setattr(webbrowser, "open", opened.append)
         code = run("view", *arguments)
         return code, servers, capsys.readouterr(), opened
@@ -61,34 +65,135 @@ def test_view_serves_a_page_and_opens_it(served, work):
     assert f'id="frame-{NUM_FRAMES - 1}"' in servers[0][1]
 
 
-def test_the_server_answers_this_machine_about_its_page_only():
-    with viewing._Server(b"the page", 0) as server:
+@contextmanager
+def serving(**how):
+    """A server in a thread, and a function that sends it a request and gives status, body and headers of its answer."""
+    with page_server.PageServer(b"the page", 0, **how) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
+
+        def ask(method="GET", path="/", body=None, **headers):
+            connection = http.client.HTTPConnection("127.0.0.1", server.server_address[1], timeout=10)
+            named = {name.replace("_", "-"): value for name, value in headers.items() if value is not None}
+            connection.request(method, path, body, {"Host": f"127.0.0.1:{server.server_address[1]}"} | named)
+            answer = connection.getresponse()
+            found = answer.status, answer.read(), answer.headers
+            connection.close()
+            return found
+
         try:
-            port = server.server_address[1]
-
-            def ask(method="GET", path="/", host=f"127.0.0.1:{port}"):
-                connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
-                connection.request(method, path, headers={"Host": host})
-                answer = connection.getresponse()
-                found = answer.status, answer.read(), answer.getheader("Cache-Control")
-                connection.close()
-                return found
-
-            assert ask() == (200, b"the page", "no-store")
-            assert ask(host=f"localhost:{port}", path="/?again")[0] == 200
-            assert ask("HEAD")[:2] == (200, b"")
-            assert ask(host="evil.example")[0] == 403
-            assert ask(path="/etc/passwd")[0] == 404
-            assert ask("POST")[0] == 501
+            yield server, ask
         finally:
             server.shutdown()
             thread.join()
 
 
+def test_the_server_answers_this_machine_about_its_page_only():
+    with serving() as (server, ask):
+        port = server.server_address[1]
+        assert ask()[:2] == (200, b"the page")
+        assert ask()[2]["Cache-Control"] == "no-store"
+        assert ask(Host=f"localhost:{port}", path="/?again")[0] == 200
+        assert ask("HEAD")[:2] == (200, b"")
+        assert ask(Host="evil.example")[0] == 403
+        assert ask(path="/etc/passwd")[0] == 404
+        assert ask("POST")[0] == 501
+        assert ask("OPTIONS", "/script")[0] == 501  # no other origin may send the token's header
+        assert ask("PUT", "/script", "x", X_Foldgauss_Token="")[0] == 404  # it saves nothing
+
+
+SCRIPT = '[selections.it]\nindices = "0-3"\n\n[[edits]]\nselect = "it"\ndo = "vanish"\n'
+
+
+def test_the_server_saves_the_script_of_its_page(tmp_path):
+    script, token = tmp_path / "clip.edit.toml", page_server.make_token()
+    with serving(script=script, token=token) as (_, ask):
+        for text in (SCRIPT, SCRIPT.replace("0-3", "5")):
+            assert ask("PUT", "/script", text, X_Foldgauss_Token=token)[:2] == (200, b"clip.edit.toml")
+            assert script.read_text() == text
+        script.write_text("# by hand")
+        status, told, _ = ask("PUT", "/script", SCRIPT, X_Foldgauss_Token=token)
+        assert (status, script.read_text()) == (409, "# by hand")
+        assert b"changed by another program" in told
+    assert [path.name for path in tmp_path.iterdir()] == ["clip.edit.toml"]
+
+
+def test_requests_that_are_not_the_pages_save_nothing(tmp_path, monkeypatch):
+    folder = tmp_path / "models"
+    folder.mkdir()
+    script, token = folder / "clip.edit.toml", page_server.make_token()
+    monkeypatch.setattr(page_server, "MAX_BYTES", 1000)
+    with serving(script=script, token=token) as (server, ask):
+        port, good = server.server_address[1], {"X_Foldgauss_Token": token}
+        for status, request in (
+            (403, {}),
+            (403, {"X_Foldgauss_Token": ""}),
+            (403, {"X_Foldgauss_Token": token[:-1]}),
+            (403, {"X_Foldgauss_Token": "\xe9" * 43}),
+            (403, {"X_Foldgauss_Token": page_server.make_token()}),
+            (403, good | {"Host": "evil.example"}),
+            (403, good | {"Host": f"evil.example:{port}"}),
+            (403, good | {"Host": f"127.0.0.1:{port + 1}"}),
+            (403, good | {"Origin": "http://evil.example"}),
+            (403, good | {"Origin": "null"}),
+            (403, good | {"Origin": f"http://127.0.0.1:{port + 1}"}),
+            (404, good | {"path": "/"}),
+            (404, good | {"path": "/../secret.toml"}),
+            (404, good | {"path": "/script/../../secret.toml"}),
+            (404, good | {"path": "/script?name=../secret.toml"}),
+            (404, good | {"path": "/%2e%2e/secret.toml"}),
+            (413, good | {"body": "#" * 1001}),
+            (413, good | {"Content_Length": "9" * 5000}),
+            (411, good | {"Content_Length": "-1"}),
+            (411, good | {"Content_Length": "1e3"}),
+            (400, good | {"body": "not TOML"}),
+            (400, good | {"body": b"\xff\xfe"}),
+            (400, good | {"body": "[[edits]]\ndo = 'sing'"}),
+        ):
+            told = ask("PUT", **{"path": "/script", "body": SCRIPT} | request)
+            assert told[0] == status, (request, told)
+            assert token.encode() not in told[1]
+        assert ask("PUT", "/script", SCRIPT, Origin=f"http://localhost:{port}", **good)[0] == 200  # the page's own
+    assert sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")) == [
+        "models",
+        "models/clip.edit.toml",
+    ]
+    assert page_server.make_token() != token
+    assert len(token) >= 43
+
+
+def test_view_saves_beside_the_model(served, work, tmp_path):
+    model = shutil.copy(work / "model.safetensors", tmp_path / "my clip.safetensors")
+    _, ((_, page),), _, _ = served(model, "--no-browser")
+    (about,) = re.findall(r'id="server">(.*?)</script>', page)
+    assert json.loads(about)["script"] == "my clip.edit.toml"
+    assert len(json.loads(about)["token"]) >= 43
+    assert "connect-src 'self'" in page
+    assert 'id="script"' not in page
+    (tmp_path / "my clip.edit.toml").write_text(SCRIPT)
+    _, ((_, again),), _, _ = served(model, "--no-browser")
+    assert f'id="script">{base64.b64encode(SCRIPT.encode()).decode()}<' in again
+    assert "connect-src" not in html_page(model)
+
+
+def test_player_writes_a_page_without_a_model(tmp_path, capsys):
+    out = tmp_path / "site" / "player"
+    assert run("player", "--out", out) == 0
+    assert [path.name for path in out.iterdir()] == ["index.html"]
+    page = (out / "index.html").read_text(encoding="utf-8")
+    assert "default-src 'none'" in page
+    assert 'id="model"' not in page
+    assert "connect-src" not in page
+    assert run("player", "--out", out) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert run("player", "--out", out, "--overwrite") == 0
+    capsys.readouterr()
+    assert run("player", "--out", out / "index.html") == 2
+    assert "--out: expected a folder" in capsys.readouterr().err
+
+
 def test_a_port_that_is_taken_is_told(served, work):
-    with viewing._Server(b"", 0) as other:
+    with page_server.PageServer(b"", 0) as other:
         port = other.server_address[1]
         code, servers, told, _ = served(work / "model.safetensors", "--port", port, "--no-browser")
     assert (code, servers) == (2, [])

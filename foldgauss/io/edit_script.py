@@ -3,7 +3,9 @@
 The schema, in which every table is optional; paths are relative to the script, angles are in degrees, and all other
 values are in the units of `Edit`:
 
-- `[selections.NAME]`: `mask` (an image, folder or video, with `label`, `level`) or `file` (of `save_selection`), or
+- `[selections.NAME]`: `indices` (numbers and ranges of Gaussians, "3,17,40-52", with `num_gaussians`, which is
+  checked, and, of a video in segments, the number of a `segment`), `mask` (an image, folder or video, with `label`,
+  `level`) or `file` (of `save_selection`), or
   `box`, `polygon`, `color`, `click`, `times`, with `frame`, `frames`, `tolerance`, `alive`, `threshold`, `follow`, as
   `foldgauss.video.select` takes them; or `any`, `all`, `without`: lists of earlier names, for the union, the
   intersection and the difference. All are evaluated on the video before the first edit.
@@ -27,10 +29,12 @@ from functools import reduce
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from foldgauss._runtime.checks import invalid
 from foldgauss.io._toml_lines import key_lines
 from foldgauss.io.media.masks import read_masks
-from foldgauss.io.models.selections import load_selection
+from foldgauss.io.models.selections import load_selection, parse_indices
 from foldgauss.io.models.video_model import load_video_model
 from foldgauss.render import Camera
 from foldgauss.video.editing.chain import Edit, edit
@@ -46,8 +50,8 @@ Video = VideoModel | EditedVideo | SegmentedVideo
 Selected = Selection | SegmentedSelection
 Chain = Edit | SegmentedEdit
 
-#: Size of the largest script that is read: tens of thousands of edits.
-MAX_BYTES = 4_000_000
+#: Size of the largest script that is read: some hundred selections of scattered Gaussians by their indices.
+MAX_BYTES = 32_000_000
 #: Largest number of parts of a dotted key; the parser makes a table for each.
 MAX_PARTS = 16
 _DEEP_KEY = re.compile(rf"(?:[\w\"'-]+[ \t]*\.[ \t]*){{{MAX_PARTS}}}")
@@ -120,6 +124,7 @@ _Keys = Mapping[str, _Kind]
 _WHEN: _Keys = {"frame": _WHOLE, "frames": _FRAMES, "times": _PAIR, "ease": _ONE_OR_TWO, "curve": _TEXT}
 _COMBINATION: _Keys = dict.fromkeys(("any", "all", "without"), _NAMES)
 _MASK_FILE: _Keys = {"label": _WHOLE, "level": _NUMBER}
+_INDICES: _Keys = {"indices": _TEXT, "num_gaussians": _WHOLE, "segment": _WHOLE}
 _CRITERIA: _Keys = {
     "mask": _PATH,
     "file": _PATH,
@@ -236,6 +241,8 @@ class EditScript:
     def _select(self, video: Video, table: dict[str, Any], named: dict[str, Selected]) -> Selected:
         if table.keys() & _COMBINATION.keys():
             return _combine(table, named)
+        if "indices" in table:
+            return _select_indices(video, **table)
         criteria = _convert_spans(table)
         if "file" in criteria:
             if not isinstance(video, VideoModel):
@@ -440,6 +447,8 @@ def _check_selections(source: str, text: str, selections: Any) -> None:
         if table.keys() & _COMBINATION.keys():
             _check_keys(context, table, _COMBINATION)
             _check_combined(context, table, known)
+        elif "indices" in table:
+            _check_keys(context, table, _INDICES)
         else:
             _check_keys(context, table, {**_CRITERIA, **(_MASK_FILE if "mask" in table else {})})
             if "mask" in table and "file" in table:
@@ -474,6 +483,28 @@ def _check_layer(context: _TableContext, table: dict[str, Any], selections: dict
     _check_keys(context, table, _LAYER, {"model": _PATH})
     if table.get("where", "behind") not in ("front", "behind"):
         raise context.error("where", "'front' or 'behind'", repr(table["where"]))
+
+
+def _select_indices(
+    video: Video, indices: str, num_gaussians: int | None = None, segment: int | None = None
+) -> Selected:
+    """Gaussians by their indices in the video's order, of layers the front one's first; or in that of a segment."""
+    if isinstance(video, SegmentedVideo):
+        counts = [one.num_gaussians for one in video.segments]
+        if segment is None or segment >= len(counts):
+            expected = f"the number of one of {len(counts)} segments"
+            raise invalid("segment", expected=expected, got="none" if segment is None else segment)
+    elif segment is not None:
+        raise invalid("segment", expected="none, since the video has no segments", got=segment)
+    else:
+        counts, segment = [video.num_gaussians], 0
+    if num_gaussians not in (None, counts[segment]):
+        cure = "Give the model that the selection was made in, unchanged."
+        expected = f"{counts[segment]}, as many as there are"
+        raise invalid("num_gaussians", expected=expected, got=num_gaussians, cure=cure)
+    parts = [Selection(np.zeros(num, bool)) for num in counts]
+    parts[segment] = parse_indices(indices, counts[segment])
+    return SegmentedSelection(tuple(parts)) if isinstance(video, SegmentedVideo) else parts[0]
 
 
 def _combine(table: dict[str, Any], named: dict[str, Selected]) -> Selected:

@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from soft_models import NUM, OBJECT, SIZE, soft_model
+from soft_models import NUM, NUM_FRAMES, OBJECT, SIZE, soft_model
 
 from foldgauss.io import save_selection, save_video_model
 from foldgauss.io._toml_lines import key_lines
 from foldgauss.io.edit_script import ACTIONS, EditScriptError, parse_edit_script, read_edit_script
+from foldgauss.io.models.selections import format_indices, parse_indices
 from foldgauss.render import Camera
 from foldgauss.video import EditedVideo, SegmentedVideo, Selection, VideoModel, edit, layers, select
 
@@ -47,6 +48,60 @@ def error(text, model=MODEL, folder=".") -> str:
 
 
 # ------------------------------------------------------------------------------------------------------ what it does
+
+
+@pytest.mark.parametrize("indices", ["3,17,20-25", " 3 , 17,20 - 25".replace(" - ", "-"), "20-25,3,17,17"])
+def test_indices_select_these_gaussians(indices):
+    text = f'[selections.it]\nindices = "{indices}"\nnum_gaussians = {NUM}\n[[edits]]\nselect = "it"\ndo = "vanish"'
+    these = np.isin(np.arange(NUM), [3, 17, *range(20, 26)])
+    assert same(made(text), edit(MODEL).select(these).vanish().video())
+    several = layers(MODEL, MODEL)
+    behind = text.replace("17,", "17,63,").replace(f"= {NUM}", f"= {2 * NUM}")
+    both = np.concatenate([these, np.arange(NUM) == 63 - NUM])
+    assert same(made(behind, several), edit(several).select(both).vanish().video())
+
+
+@given(mask=st.lists(st.booleans(), min_size=1, max_size=40).filter(any))
+def test_indices_round_trip_as_text(mask):
+    text = format_indices(Selection(np.array(mask)))
+    assert np.array_equal(parse_indices(text, len(mask)).mask, mask)
+    assert len(re.findall(r"\d+", text)) <= sum(mask)
+
+
+def test_indices_of_segments_are_those_of_one_of_them():
+    video = SegmentedVideo.from_models([(0, MODEL), (NUM_FRAMES, soft_model(seed=1))])
+    text = '[selections.a]\nindices = "0-4"\nsegment = 0\n[selections.b]\nindices = "7"\nsegment = 1\n'
+    text += '[selections.it]\nany = ["a", "b"]\n[[edits]]\nselect = "it"\ndo = "vanish"'
+    found = made(text, video)
+    for segment, gone in zip(found.segments, (range(5), [7]), strict=True):
+        number = found.segments.index(segment)
+        expected = edit(video.segments[number].model).select(np.isin(np.arange(NUM), gone)).vanish().video()
+        assert same(segment.model, expected)
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ('indices = "3,x"', """indices: expected numbers and ranges, as "3,17,40-52", got 'x'"""),
+        ('indices = "5-3"', "indices: expected numbers and ranges"),
+        (f'indices = "0-{NUM}"', f"indices: expected Gaussians from 0 to {NUM - 1}, got {NUM}. Is it another model's"),
+        (
+            'indices = "3"\nnum_gaussians = 41',
+            "num_gaussians: expected 40, as many as there are, got 41. Give the model",
+        ),
+        ('indices = "3"\nsegment = 0', "segment: expected none, since the video has no segments, got 0"),
+        ('indices = "3"\nbox = [0, 0, 1, 1]', "box: expected one of indices, num_gaussians, segment"),
+        ("indices = [3]", "indices: expected a text in quotes"),
+    ],
+)
+def test_wrong_indices_are_refused(keys, message):
+    assert message in error(f"[selections.it]\n{keys}")
+
+
+def test_indices_of_segments_need_the_segments_number():
+    assert "segment: expected the number of one of 1 segments, got none" in error(
+        '[selections.it]\nindices = "3"\n[[edits]]\nselect = "it"\ndo = "vanish"', IN_ONE
+    )
 
 
 @pytest.mark.parametrize(

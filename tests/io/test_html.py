@@ -27,8 +27,10 @@ from foldgauss.video.compression.quantize import dequantize
 from foldgauss.video.models.frame_times import make_time_logits
 from foldgauss.video.models.renderer import VideoRenderer
 
+#: Indices of the selected Gaussians, as an expression in the page.
+PICKED = "Array.from(foldgauss.player.state.selected.keys()).filter((i) => foldgauss.player.state.selected[i])"
 #: What the brush is made of.
-MODULES = ("gaussians", "selection", "timeline")
+MODULES = ("gaussians", "timeline")
 
 
 class _Elements(HTMLParser):
@@ -331,8 +333,10 @@ def test_keys_do_what_the_help_says(opened):
         ("[", "speed", 0.5),
         ("[", "speed", 0.25),
         (">", "speed", 0.5),
-        ("b", "brushing", True),
-        ("Escape", "brushing", False),
+        ("b", "editing", True),
+        ("Escape", "editing", False),
+        ("p", "tool", "polygon"),
+        ("e", "editing", False),
         ("3", "mode", "slider"),
         ("5", "mode", "difference"),
         ("1", "mode", "model"),
@@ -376,7 +380,7 @@ def test_what_is_brushed_can_vanish_and_come_back(opened):
     page.page.mouse.down()
     page.page.mouse.move(at[0] + 40, at[1] + 20, steps=4)
     page.page.mouse.up()
-    picked = page.page.evaluate("foldgauss.player.selection.indices()")
+    picked = page.page.evaluate(PICKED)
     assert page.stats["picked"] == len(picked) >= 4
     assert OBJECT[picked].mean() > 0.7
     assert np.abs(page.picture().astype(float) - before).mean() > 0.2  # tinted
@@ -386,15 +390,10 @@ def test_what_is_brushed_can_vanish_and_come_back(opened):
     left[picked] = False
     wanted = VideoRenderer(edit(model).select(~left).vanish().video()).frame(0.5)
     assert np.abs(gone.astype(float) - wanted).mean() < 0.5
-    page.page.click("#vanish")
-    page.page.locator("#scale").fill("0.5")
-    page.page.keyboard.press("b")  # no tint
-    small = page.picture()
-    assert np.abs(small.astype(float) - before).mean() > 0.2
-    assert np.abs(small.astype(float) - gone).mean() > 0.2
-    page.page.keyboard.press("b")
     page.page.keyboard.press("z")
-    page.page.keyboard.press("b")
+    assert page.stats["picked"] == len(picked)
+    page.page.keyboard.press("z")
+    page.page.keyboard.press("e")
     assert page.stats["picked"] == 0
     np.testing.assert_array_equal(page.picture(), before)
 
@@ -414,12 +413,13 @@ def test_what_is_brushed_is_followed_through_the_clip(opened):
     )
     page = opened(VideoModel(splats, FrameTimes.uniform(9), SIZE, 25.0, RenderOptions()))
     page.page.evaluate("foldgauss.seek(0)")
-    page.page.evaluate("foldgauss.player.selection.begin(), foldgauss.player.selection.paint(0, -0.1, 0, 0.03, false)")
-    assert page.page.evaluate("foldgauss.player.selection.indices()") == [0]
     page.page.keyboard.press("b")
+    found = "foldgauss.controls.tools.picker.inCircle(foldgauss.player.state, 0, -0.1, 0, 0.03)"
+    page.page.evaluate(f"foldgauss.controls.tools.select({found}, 'new')")
+    assert page.page.evaluate(PICKED) == [0]
     page.page.click("#follow")
     page.page.locator("#toast").wait_for()
-    assert page.page.evaluate("foldgauss.player.selection.indices()") == [0, 1]
+    assert page.page.evaluate(PICKED) == [0, 1]
 
 
 def test_the_original_is_shown_beside_it(opened):
@@ -730,17 +730,17 @@ def test_the_brush_acts_on_the_segment_seen(opened):
     before = page.picture()
     page.page.evaluate(
         """() => {
-          const { selection } = foldgauss.player, paint = selection.paint;
-          selection.paint = function (time, ...more) {
+          const { picker } = foldgauss.controls.tools, inCircle = picker.inCircle;
+          picker.inCircle = function (state, time, ...more) {
             window.paintedAt = time;
-            paint.call(this, time, ...more);
+            return inCircle.call(this, state, time, ...more);
           };
         }"""
     )
     page.page.mouse.move(*middle)
     page.page.mouse.down()
     page.page.mouse.move(middle[0] + 40, middle[1], steps=3)
-    own = page.page.evaluate("foldgauss.player.selection.indices()")
+    own = page.page.evaluate(PICKED)
     assert own
     assert page.page.evaluate("paintedAt") == pytest.approx(1 / 6)  # the segment's own time
     assert page.page.locator("#picked").inner_text() == f"{len(own)} in this segment"
@@ -749,7 +749,7 @@ def test_the_brush_acts_on_the_segment_seen(opened):
     assert page.stats["picked"] == 0
     page.page.mouse.move(middle[0] + 60, middle[1] + 30, steps=3)
     page.page.mouse.up()
-    other = page.page.evaluate("foldgauss.player.selection.indices()")
+    other = page.page.evaluate(PICKED)
     assert other
     page.page.click("#vanish")
 
@@ -763,18 +763,13 @@ def test_the_brush_acts_on_the_segment_seen(opened):
     assert np.abs(page.picture(13 / 18).astype(float) - without(3, other).frame(float(times[1]))).mean() < 0.5
     page.page.evaluate("foldgauss.seek(18 / 18)")
     page.until("foldgauss.stats.missing === undefined")
-    assert np.abs(page.picture(1 / 18).astype(float) - without(0, own).frame(1 / 6)).mean() < 0.5  # it was kept
-    page.page.keyboard.press("z")
+    assert np.abs(page.picture(1 / 18).astype(float) - without(0, own).frame(1 / 6)).mean() < 0.5  # in all segments
+    for _ in range(3):  # the edit and both strokes, whichever segment is seen
+        page.page.keyboard.press("z")
     np.testing.assert_array_equal(page.picture(), before)
-    page.page.evaluate("foldgauss.seek(13 / 18)")
-    assert page.stats["picked"] == len(other)  # undone was the stroke in the segment seen
-    page.page.evaluate("foldgauss.seek(1 / 18)")
-    page.page.mouse.move(*middle)
-    page.page.mouse.down()
-    page.page.mouse.move(middle[0] + 40, middle[1], steps=3)
-    page.page.mouse.up()
-    assert page.stats["picked"]
-    page.page.click("#clear")
+    page.page.keyboard.press("Shift+Z")
+    assert page.page.evaluate(PICKED) == own
+    page.page.click("#select-none")
     page.page.evaluate("foldgauss.seek(13 / 18)")
     assert page.stats["picked"] == 0  # nowhere
 
@@ -791,12 +786,12 @@ def test_the_brush_conditions_as_the_distribution_does(tmp_path, how):
     (tmp_path / "run.js").write_text(
         """
         import { readFileSync } from "node:fs";
-        import { prepare } from "./gaussians.js";
-        import { Selection, condition } from "./selection.js";
+        import { decode } from "./compact.js";
+        import { alive, condition, prepare } from "./gaussians.js";
         const file = readFileSync("m.fgz");
-        const model = prepare(file.buffer.slice(file.byteOffset, file.byteOffset + file.length), () => {});
-        const alive = Array.from(new Selection(model).alive(0.3));
-        console.log(JSON.stringify(alive.map((i) => condition(model, i, 0.3, 0))));
+        const model = prepare(decode(file.buffer.slice(file.byteOffset, file.byteOffset + file.length)));
+        const found = Array.from(alive(model, 0.3, new Uint32Array(model.num)));
+        console.log(JSON.stringify(found.map((i) => condition(model, i, 0.3, 0))));
         """
     )
     ran = subprocess.run(["node", "run.js"], cwd=tmp_path, check=True, timeout=60, capture_output=True, text=True)

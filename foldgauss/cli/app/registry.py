@@ -17,7 +17,10 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
     {
         "fit": Command("fitting.fit", "Fit a model to a clip; the first of its budgets ends the fit."),
         "fit-many": Command("fitting.fit_many", "Fit a model to each clip of a folder, and list those that fail."),
-        "view": Command("viewing.view", "Play a model in the browser, until Ctrl-C."),
+        "view": Command("viewing.view", "Play and edit a model in the browser, until Ctrl-C."),
+        "player": Command(
+            "viewing.player", "Write the player without a model, as a static site: one page that opens model files."
+        ),
         "render": Command("viewing.render", "Render a model as a video, also between its frames."),
         "stabilize": Command("viewing.stabilize", "Render a model as a steadier camera would show it."),
         "evaluate": Command("viewing.evaluate", "Compare a model with its clip: PSNR and SSIM of every frame."),

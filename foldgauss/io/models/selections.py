@@ -1,8 +1,9 @@
-"""Selection files: a mask of Gaussians, with a digest of the model that it belongs to."""
+"""Selections outside of programs: files with a digest of the model that they belong to, and indices as text."""
 
 import dataclasses
 import hashlib
 import os
+import re
 from pathlib import Path
 
 import jax
@@ -70,6 +71,36 @@ def load_selection(path: str | os.PathLike, model: VideoModel) -> Selection:
     if record.digest != compute_digest(model):
         raise invalid("path", expected="a selection of this model", got=f"another's in {str(path)!r}", cure=cure)
     return Selection(np.asarray(record.mask))
+
+
+_INDEX_RANGE = re.compile(r"\s*([0-9]{1,9})(?:-([0-9]{1,9}))?\s*")
+
+
+def format_indices(selection: Selection) -> str:
+    """The indices as a text of numbers and ranges whose ends are included: "3,17,40-52". See `parse_indices`."""
+    edges = np.flatnonzero(np.diff(np.r_[False, selection.mask, False].astype(np.int8)))
+    ends = zip(edges[::2], edges[1::2] - 1, strict=True)
+    return ",".join(f"{first}" if first == last else f"{first}-{last}" for first, last in ends)
+
+
+def parse_indices(text: str, num_gaussians: int) -> Selection:
+    """The selection, of `num_gaussians`, that a text of numbers and ranges describes, as "3,17,40-52".
+
+    **Raises:** ValueError for another text, and for indices that the model does not have.
+
+    **Example:** `parse_indices("0-2,7", model.num_gaussians)`.
+    """
+    mask = np.zeros(num_gaussians, bool)
+    for part in text.split(","):
+        found = _INDEX_RANGE.fullmatch(part)
+        first, last = (int(found[1]), int(found[2] or found[1])) if found else (0, -1)
+        if last < first:
+            raise invalid("indices", expected='numbers and ranges, as "3,17,40-52"', got=repr(part[:40]))
+        if last >= num_gaussians:
+            cure = "Is it another model's script?"
+            raise invalid("indices", expected=f"Gaussians from 0 to {num_gaussians - 1:,}", got=f"{last:,}", cure=cure)
+        mask[first : last + 1] = True
+    return Selection(mask)
 
 
 def compute_digest(model: VideoModel) -> str:

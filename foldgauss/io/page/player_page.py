@@ -5,6 +5,7 @@ Its sources are the files in `player/`; `compact.js` decodes the models there. S
 """
 
 import base64
+import dataclasses
 import hashlib
 import html
 import json
@@ -45,7 +46,8 @@ QUALITY = 80
 LARGE, LARGEST_IN_NOTEBOOK = 50e6, 20e6
 _SOURCES = Path(__file__).parent / "player"
 _DECODER = Path(__file__).parent / "compact.js"
-_IMPORT = re.compile(r'^import (?:\{[^}]*\}|(?P<text>\w+)) from "\./(?P<name>[\w.-]+)";\n', re.MULTILINE)
+_IMPORT = re.compile(r'^import (?:(?P<names>\{[^}]*\})|(?P<text>\w+)) from "\./(?P<name>[\w.-]+)";\n', re.MULTILINE)
+_EXPORT = re.compile(r"^export (?:async )?(?:const|class|function) (\w+)", re.MULTILINE)
 #: Binary logarithm of equal steps, where steps in proportion are beyond the format.
 _EVEN = -18.0
 _PER_E = 1.4427  # log2 e: slopes are those of natural logarithms
@@ -88,12 +90,38 @@ def warn_of_size(page: str, has_original: bool) -> None:
         warnings.warn(f"page: {len(page) / 1e6:.0f} MB, which browsers are slow to open. {cure}", stacklevel=3)
 
 
-def html_page(model: Model, *, original: Frames | None = None, quality: int = QUALITY, title: str | None = None) -> str:
+@dataclasses.dataclass(frozen=True)
+class SaveTarget:
+    """Where a page that a local server serves saves its edit: `PUT /script` with the token in a header.
+
+    `name` is the script's file name, for display; `script` the edit that the page begins with, if there is one.
+    """
+
+    name: str
+    token: str
+    script: bytes | None = None
+
+    def blocks(self) -> Iterator[str]:
+        about = json.dumps({"token": self.token, "script": self.name}).replace("<", "\\u003c")
+        yield f'<script type="application/json" id="server">{about}</script>'
+        if self.script is not None:
+            yield _block("script", self.script)
+
+
+def html_page(
+    model: Model,
+    *,
+    original: Frames | None = None,
+    quality: int = QUALITY,
+    title: str | None = None,
+    save_to: SaveTarget | None = None,
+) -> str:
     """The page as text.
 
     `model`: a model; or the path of a file with one, of which a compact one goes in as it is. Any other is quantized
     finely, and so is each segment of a video in segments: see docs/player.md for the accuracy.
     `original`: the clip's frames, of the model's number and size, shown beside it; as WebP of `quality`, 1 to 100.
+    `save_to`: of a page that a local server serves; it may then make requests to that server, and to nothing else.
 
     Raises ValueError for edits that no folded model holds, several envelopes or a degree above 15, in a segment, too,
     and for frames that do not fit; errors of reading as `load_video_model`.
@@ -104,7 +132,12 @@ def html_page(model: Model, *, original: Frames | None = None, quality: int = QU
         raise invalid("quality", expected="a whole number from 1 to 100", got=quality)
     plain, name = _load(model)
     pictures = [] if original is None else _encode_original(original, plain, quality)
-    return _assemble(_encode_model(model, plain), pictures, name if title is None else title)
+    return _assemble(_encode_model(model, plain), pictures, name if title is None else title, save_to)
+
+
+def empty_page() -> str:
+    """The page without a model: it opens model files from the computer that it is shown on."""
+    return _assemble([], [], "foldgauss player")
 
 
 def make_notebook_iframe(model: VideoModel | EditedVideo | SegmentedVideo) -> str | None:
@@ -225,11 +258,12 @@ def _encode_webp(frame: UInt8[np.ndarray, "height width channels"], quality: int
 # ------------------------------------------------------------------------------------------------ the page
 
 
-def _assemble(models: Iterable[str], pictures: Iterable[bytes], title: str) -> str:
+def _assemble(models: Iterable[str], pictures: Iterable[bytes], title: str, save_to: SaveTarget | None = None) -> str:
     script, style = bundle_script("main.js"), (_SOURCES / "player.css").read_text(encoding="utf-8")
     blocks = [*models, *(_block(f"frame-{k}", picture) for k, picture in enumerate(pictures))]
+    blocks += [] if save_to is None else save_to.blocks()
     parts = {
-        "policy": _policy(script, style),
+        "policy": _policy(script, style, connects=save_to is not None),
         "title": html.escape(title.encode("utf-8", "replace").decode()),  # names of files need not be UTF-8
         "style": style,
         "data": "\n".join(blocks),
@@ -244,8 +278,8 @@ def _block(name: str, data: bytes) -> str:
     return f'<script type="application/octet-stream" id="{name}">{base64.b64encode(data).decode()}</script>'
 
 
-def _policy(script: str, style: str) -> str:
-    """The content security policy: the page's own script, style, images and worker, and nothing else."""
+def _policy(script: str, style: str, *, connects: bool) -> str:
+    """The content security policy: the page's own script, style, images and worker, and its server if it has one."""
     allowed = {
         "default-src": "'none'",
         "script-src": _digest(script),
@@ -255,6 +289,8 @@ def _policy(script: str, style: str) -> str:
         "base-uri": "'none'",
         "form-action": "'none'",
     }
+    if connects:
+        allowed["connect-src"] = "'self'"
     return "; ".join(f"{name} {value}" for name, value in allowed.items())
 
 
@@ -263,7 +299,10 @@ def _digest(text: str) -> str:
 
 
 def bundle_script(entry: str) -> str:
-    """A module and all that it imports, each once, as one script without imports; texts become strings."""
+    """A module and all that it imports, each once, as one script without imports; texts become strings.
+
+    Each module is a function of its own, so that names need not be unique, whose result are its exports.
+    """
     done: dict[str, str] = {}
 
     def add(name: str) -> None:
@@ -274,17 +313,22 @@ def bundle_script(entry: str) -> str:
         for found in _IMPORT.finditer(source):
             if not found["text"]:
                 add(found["name"])
-        source = _IMPORT.sub(_as_constant, source)
+        exports = ", ".join(_EXPORT.findall(source))
+        source = re.sub(r"^export ", "", _IMPORT.sub(_as_constant, source), flags=re.MULTILINE)
         del done[name]
-        done[name] = re.sub(r"^export ", "", source, flags=re.MULTILINE)
+        done[name] = f"const {_module_variable(name)} = (() => {{\n{source}return {{ {exports} }};\n}})();\n"
 
     add(entry)
     return '"use strict";\n' + "\n".join(done.values())
 
 
 def _as_constant(found: re.Match) -> str:
-    """An import of a text, as of a shader, as a constant; others are in the bundle and go."""
+    """An import as constants: of a text, as of a shader, that text; of a module its exports."""
     if not found["text"]:
-        return ""
+        return f"const {found['names']} = {_module_variable(found['name'])};\n"
     text = json.dumps((_SOURCES / found["name"]).read_text(encoding="utf-8")).replace("</", "<\\/")
     return f"const {found['text']} = {text};\n"
+
+
+def _module_variable(name: str) -> str:
+    return "module_" + re.sub(r"\W", "_", name)

@@ -1,42 +1,54 @@
-// A decoded model prepare for rendering: activated parameters in texels of four, and the time windows of Gaussians.
-import { decode } from "./compact.js";
+// A model's Gaussians: their parameters, and what the shader reads of them, texels of four floats and windows of time.
 import { frameTimes } from "./timeline.js";
 
 export const TEXTURE_WIDTH = 2048;
-const SH_C0 = 0.28209479177387814;
+export const SH_C0 = 0.28209479177387814;
 const TAU_MAX = Math.sqrt(-2 * Math.log(0.01)); // beyond, a Gaussian is not rendered
+/** log sigma_t of Gaussians without a time of their own, as STATIC_LOG_TIME_SCALE in foldgauss.video.models.splats. */
+export const STATIC = Math.fround(Math.log(1024));
 
-const sigmoid = (x) => 1 / (1 + Math.exp(-x));
+export const sigmoid = (x) => 1 / (1 + Math.exp(-x));
+
+/** Numbers per Gaussian of each leaf; `coefficients` has two per power. */
+export const WIDTHS = {
+  loc: () => 2, log_scale: () => 2, angle_logit: () => 1, time_loc: () => 1, log_time_scale: () => 1,
+  coefficients: (degree) => 2 * degree, opacity_logit: () => 1, color_dc: () => 3,
+};
 
 /**
- * Prepare a compact file's model. Texels of a Gaussian:
- * 0: m_s, m_t, sigma_t; 1: two standard deviations, cosine and sine of the first one's angle;
+ * Prepare a model for rendering and editing from a file's header and leaves, named and laid out as in FoldedSplats.
+ *
+ * Its `leaves` hold m_t itself, `time_loc` in double precision, since an edit may move it out of the clip. Texels of a
+ * Gaussian: 0: m_s, m_t, sigma_t; 1: two standard deviations, cosine and sine of the first one's angle;
  * 2: red, green, blue, opacity; 3 and on: the path's coefficients, two powers each.
  */
-export function prepare(buffer, onProgress) {
-  const { header, leaves } = decode(buffer, onProgress);
-  const num = header.num_gaussians, degree = header.degree, texels = 3 + Math.ceil(degree / 2), width = 4 * texels;
-  const rows = Math.ceil((num * texels) / TEXTURE_WIDTH);
-  const values = new Float32Array(4 * TEXTURE_WIDTH * rows);
-  for (let i = 0; i < num; i++) {
-    const at = i * width, angle = 2 * Math.PI * sigmoid(leaves.angle_logit[i]);
-    const color = [0, 1, 2].map((c) => Math.max(0.5 + SH_C0 * leaves.color_dc[3 * i + c], 0));
-    values.set(
-      [
-        leaves.loc[2 * i], leaves.loc[2 * i + 1], sigmoid(leaves.time_loc_logit[i]), Math.exp(leaves.log_time_scale[i]),
-        Math.exp(leaves.log_scale[2 * i]), Math.exp(leaves.log_scale[2 * i + 1]), Math.cos(angle), Math.sin(angle),
-        ...color, sigmoid(leaves.opacity_logit[i]),
-      ],
-      at,
-    );
-    for (let k = 0; k < 2 * degree; k++) values[at + 12 + k] = leaves.coefficients[2 * degree * i + k];
-  }
-  const times = frameTimes(leaves.frame_times);
-  return { header, num, degree, texels, rows, values, times, windows: windows(header, num, width, values) };
+export function prepare({ header, leaves: { time_loc_logit: logits, frame_times: intervals, ...rest } }) {
+  const num = header.num_gaussians, { degree } = header, texels = 3 + Math.ceil(degree / 2);
+  const rows = Math.ceil((num * texels) / TEXTURE_WIDTH), leaves = { ...rest, time_loc: Float64Array.from(logits, sigmoid) };
+  const values = new Float32Array(4 * TEXTURE_WIDTH * rows), times = frameTimes(intervals);
+  for (let i = 0; i < num; i++) fillTexels(values, i, leaves, texels, degree);
+  const windows = makeWindows(header, num, 4 * texels, values);
+  return { header, num, degree, texels, rows, values, times, windows, leaves, intervals, fingerprint: fingerprint(values, num) };
+}
+
+/** Write the texels of Gaussian `i`. */
+export function fillTexels(values, i, leaves, texels, degree) {
+  const at = 4 * texels * i, angle = 2 * Math.PI * sigmoid(leaves.angle_logit[i]);
+  values[at] = leaves.loc[2 * i];
+  values[at + 1] = leaves.loc[2 * i + 1];
+  values[at + 2] = leaves.time_loc[i];
+  values[at + 3] = Math.exp(leaves.log_time_scale[i]);
+  values[at + 4] = Math.exp(leaves.log_scale[2 * i]);
+  values[at + 5] = Math.exp(leaves.log_scale[2 * i + 1]);
+  values[at + 6] = Math.cos(angle);
+  values[at + 7] = Math.sin(angle);
+  for (let c = 0; c < 3; c++) values[at + 8 + c] = Math.max(0.5 + SH_C0 * leaves.color_dc[3 * i + c], 0);
+  values[at + 11] = sigmoid(leaves.opacity_logit[i]);
+  for (let k = 0; k < 2 * degree; k++) values[at + 12 + k] = leaves.coefficients[2 * degree * i + k];
 }
 
 /** Time windows in which Gaussians are rendered: near m_t, and above the file's scale cutoff. */
-function windows(header, num, width, values) {
+function makeWindows(header, num, width, values) {
   const { power, floor, scale_cutoff: thinnest } = header, spans = new Float32Array(2 * num);
   for (let i = 0; i < num; i++) {
     const own = values[i * width + 2], duration = values[i * width + 3];
@@ -52,3 +64,48 @@ function windows(header, num, width, values) {
   }
   return spans;
 }
+
+/** A short name of a model by its values, for what the browser keeps: FNV-1a over their bits. */
+function fingerprint(values, num) {
+  const words = new Uint32Array(values.buffer);
+  let sum = 0x811c9dc5, other = num;
+  for (let k = 0; k < words.length; k++) {
+    sum = Math.imul(sum ^ words[k], 0x01000193);
+    other = (Math.imul(other, 31) + sum) | 0; // 32 bits more
+  }
+  return [sum, other].map((own) => (own >>> 0).toString(16).padStart(8, "0")).join("");
+}
+
+/** A Gaussian conditioned on a time: centre, variances along its axes with the low-pass filter's added, axes. Model units. */
+export function condition(model, i, time, lowPass) {
+  const { values, texels, degree, header } = model, at = 4 * texels * i;
+  const u = values[at + 2] - time, tau = u / values[at + 3];
+  const a = header.floor + (1 - header.floor) * Math.exp(-0.5 * header.power * tau * tau);
+  let x = 0, y = 0;
+  for (let k = 2 * degree - 2; k >= 0; k -= 2) {
+    x = u * (x + values[at + 12 + k]);
+    y = u * (y + values[at + 13 + k]);
+  }
+  return {
+    i, a, x: values[at] + x, y: values[at + 1] + y,
+    first: values[at + 4] ** 2 * a + lowPass, second: values[at + 5] ** 2 * a + lowPass,
+    cos: values[at + 6], sin: values[at + 7], opacity: values[at + 11],
+  };
+}
+
+/** Its alpha at a point. */
+export function alphaAt(one, x, y) {
+  const dx = x - one.x, dy = y - one.y, along = one.cos * dx + one.sin * dy, across = one.cos * dy - one.sin * dx;
+  return one.opacity * Math.exp(-0.5 * ((along * along) / one.first + (across * across) / one.second));
+}
+
+/** The indices of the Gaussians alive at a time, in order, written to `room`, of which the part used is returned. */
+export function alive(model, time, room) {
+  const { num, windows } = model, t = Math.fround(time);
+  let count = 0;
+  for (let i = 0; i < num; i++) if (windows[2 * i] < t && t < windows[2 * i + 1]) room[count++] = i;
+  return room.subarray(0, count);
+}
+
+/** The fit's low-pass filter as a variance in model units. */
+export const lowPassOf = ({ options, size }) => options.low_pass / Math.max(...size) ** 2;

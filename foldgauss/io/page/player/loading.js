@@ -1,59 +1,62 @@
 // Decoding in a worker that runs the page's own script, or on the page where no worker is allowed.
+import { readModel } from "./formats.js";
 import { prepare } from "./gaussians.js";
 
-/** The bytes of a data block of the page, or null if it is missing. */
-export function blockOf(name) {
-  const block = document.getElementById(name);
-  return block && bytesOf(block.textContent);
-}
-
-function bytesOf(text) {
+export function bytesOf(text) {
   const binary = atob(text), bytes = new Uint8Array(binary.length);
   for (let k = 0; k < binary.length; k++) bytes[k] = binary.charCodeAt(k);
   return bytes;
 }
 
-/** The worker: receives a file's text, answers with the fraction decoded, then with the model or an error. */
+/** A model to decode: `data` is a file's bytes, or the text of a block of the page, in base64; `given`: see `readModel`. */
+const decodeSource = ({ data, given }, onProgress) =>
+  prepare(readModel(typeof data === "string" ? bytesOf(data).buffer : data, given, onProgress));
+
+/** The worker: receives a source, answers with the fraction decoded, then with the model or an error. */
 export function serve(scope) {
   scope.onmessage = ({ data }) => {
     try {
-      const model = prepare(bytesOf(data).buffer, (fraction) => scope.postMessage({ fraction }));
-      scope.postMessage({ model }, [model.values.buffer, model.windows.buffer]);
+      const model = decodeSource(data, (fraction) => scope.postMessage({ fraction }));
+      const arrays = [model.values, model.windows, ...Object.values(model.leaves)];
+      scope.postMessage({ model }, [...new Set(arrays.map((own) => own.buffer))]);
     } catch (error) {
-      scope.postMessage({ error: error.message });
+      scope.postMessage({ error: error.message, missing: error.missing });
     }
   };
 }
 
-/** The spans of the segments; null for a page with one model. */
+/** The spans of the page's segments; null for a page with one model. */
 export function spansOfPage() {
   return JSON.parse(document.getElementById("segments")?.textContent ?? "null");
 }
+
+/** The page's models, in order of time. */
+export const sourcesOfPage = () => [...document.querySelectorAll('script[id^="model"]')].map((block) => ({ data: block.textContent }));
 
 function startWorker() {
   const script = new Blob([document.getElementById("player").textContent], { type: "text/javascript" });
   return new Worker(URL.createObjectURL(script));
 }
 
-/** Decodes the page's models, one at a time. */
+/** Decodes models, one at a time. */
 export class Decoder {
-  constructor() {
-    this.blocks = [...document.querySelectorAll('script[id^="model"]')]; // in order of time
+  constructor(sources) {
+    this.sources = sources;
   }
 
-  /** Size of all models in the page. */
+  /** Size of all models. */
   get numBytes() {
-    return this.blocks.reduce((sum, { textContent }) => sum + (textContent.length * 3) / 4, 0);
+    return this.sources.reduce((sum, { data }) => sum + (typeof data === "string" ? (data.length * 3) / 4 : data.byteLength), 0);
   }
 
   /** Decode a model; `onProgress` is called with the fraction decoded. */
   decode(number, onProgress) {
-    const text = this.blocks[number].textContent;
+    const source = this.sources[number];
     return new Promise((resolve, reject) => {
       const here = () => {
         this.stop();
         try {
-          resolve(prepare(bytesOf(text).buffer, onProgress));
+          resolve(decodeSource(source, onProgress));
         } catch (error) {
           reject(error);
         }
@@ -67,9 +70,9 @@ export class Decoder {
       this.worker.onerror = here;
       this.worker.onmessage = ({ data }) => {
         if ("fraction" in data) return onProgress(data.fraction);
-        return data.error ? reject(new Error(data.error)) : resolve(data.model);
+        return data.error ? reject(Object.assign(new Error(data.error), { missing: data.missing })) : resolve(data.model);
       };
-      this.worker.postMessage(text);
+      this.worker.postMessage(source);
     });
   }
 

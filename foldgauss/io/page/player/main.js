@@ -1,18 +1,15 @@
-// Entry point: in a worker, decode; in the page, decode in a worker, then play.
-import { element } from "./elements.js";
+// Entry point: in a worker, decode; in the page, decode in a worker, then play. A page without a model waits for one.
 import { Controls } from "./controls.js";
-import { Decoder, serve, spansOfPage } from "./loading.js";
+import { element, notify } from "./elements.js";
+import { Files } from "./files.js";
+import { Decoder, serve, sourcesOfPage, spansOfPage } from "./loading.js";
+import { Originals } from "./originals.js";
 import { Player } from "./player.js";
 import { Renderer } from "./renderer.js";
 import { Segments } from "./segments.js";
+import { bindShell } from "./shell.js";
 
-/** Show a notice in place of the image, with a progress bar for a `fraction` in [0, 1]. */
-function notify(text, fraction) {
-  element("notice").hidden = text === "";
-  element("notice-text").textContent = text;
-  element("notice-bar").hidden = fraction === undefined;
-  element("notice-bar").value = fraction ?? 0;
-}
+const WELCOME = "Open a model, or drop one here: .safetensors or .fgz of foldgauss, or a .ply of VeGaS. It stays on this computer.";
 
 /** Restore the player after the graphics card has lost its context. */
 function restoreOnLoss(canvas, player) {
@@ -28,18 +25,20 @@ function restoreOnLoss(canvas, player) {
 }
 
 /** Interface for tests and scripts; see docs/player.md. */
-function hooks(player) {
+function hooks(player, controls) {
   return {
     seek: (time) => player.seek(time),
     pixels: (width, height) => player.pixels(width, height),
     get stats() {
-      const { alive, rate, position, time, playing, speed, loop, mode, edit, view, brushing } = player;
-      const picked = player.selection.count, zoom = view.zoom, [height, width] = player.model.header.size;
-      const { segments } = player, { total } = segments, numFrames = player.timeline.last + 1;
+      const { alive, rate, position, time, playing, speed, loop, mode, view, segments, editing, lead } = player;
+      const { history } = editing, [height, width] = player.base.header.size, { total } = segments, { tools } = controls;
       const decoded = [...segments.held.keys()].sort((a, b) => a - b), textures = player.renderer.held.size;
-      const parts = { segment: player.lead.number, segments: segments.spans.length, decoded, textures, missing: segments.missing };
-      const about = { total, numFrames, width, height, loadSeconds: player.loadSeconds, ...parts };
-      return { alive, rate, position, time, playing, speed, loop, mode, edit: { ...edit }, picked, zoom, brushing, ...about };
+      return {
+        alive, total, rate, position, time, playing, speed, loop, mode, zoom: view.zoom, width, height, textures, decoded,
+        numFrames: player.timeline.last + 1, segment: lead.number, segments: segments.spans.length, missing: segments.missing,
+        editing: player.highlighting, tool: tools.name, how: tools.how, picked: editing.count(lead.number, lead.base),
+        steps: history.current, undoable: history.done, redoable: history.steps.length - history.done, loadSeconds: player.loadSeconds,
+      };
     },
   };
 }
@@ -47,35 +46,50 @@ function hooks(player) {
 let failed = false; // the error message stays, though a worker may still be decoding
 
 async function start() {
-  const canvas = element("canvas");
-  notify("Decoding", 0);
-  const decoder = new Decoder();
-  const loading = decoder.decode(0, (fraction) => failed || notify("Decoding", fraction));
+  bindShell();
+  const canvas = element("canvas"), sources = sourcesOfPage(), decoder = new Decoder(sources);
+  if (sources.length) notify("Decoding", 0);
+  const loading = sources.length && decoder.decode(0, (fraction) => failed || notify("Decoding", fraction));
   const renderer = new Renderer(canvas); // compiles its programs meanwhile
-  const segments = new Segments(await loading, spansOfPage(), decoder);
   let controls;
-  const player = new Player(canvas, renderer, segments, () => controls?.update());
-  controls = new Controls(player);
+  const player = new Player(canvas, renderer, () => controls?.update());
   restoreOnLoss(canvas, player);
-  segments.onError = (error) => {
-    player.pause();
-    notify(error.message);
+
+  const show = (segments, title, originals) => {
+    player.open(segments, originals);
+    segments.onError = (error) => {
+      player.pause();
+      notify(error.message);
+    };
+    document.title = element("title").textContent = title;
+    controls ??= new Controls(player, files);
+    notify("");
+    controls.describe();
+    files.attach(title);
+    player.loadSeconds = performance.now() / 1000;
+    if (!matchMedia("(prefers-reduced-motion: reduce)").matches && player.timeline.last > 0) player.play();
+    else player.changed();
+    setTimeout(() => !player.playing && player.pause(), 150); // the first image has the model's own size, to appear early
+    requestAnimationFrame(() => requestAnimationFrame(() => segments.begin()));
+    Object.assign(window.foldgauss, { player, controls, files });
+    Object.defineProperties(window.foldgauss, Object.getOwnPropertyDescriptors(hooks(player, controls)));
   };
-  notify("");
-  player.loadSeconds = performance.now() / 1000;
-  if (!matchMedia("(prefers-reduced-motion: reduce)").matches && player.timeline.last > 0) player.play();
-  else player.changed();
-  setTimeout(() => !player.playing && player.pause(), 150); // the first image has the model's own size, to appear early
-  requestAnimationFrame(() => requestAnimationFrame(() => segments.begin()));
-  window.foldgauss.player = player;
-  Object.defineProperties(window.foldgauss, Object.getOwnPropertyDescriptors(hooks(player)));
+  const welcome = () => {
+    notify(WELCOME);
+    element("notice-open").hidden = false;
+  };
+  const files = new Files(player, show, (text, fraction) => (text || player.segments ? notify(text, fraction) : welcome()));
+  if (!sources.length) return welcome();
+  files.isOfPage = true;
+  const frames = [...document.querySelectorAll('script[id^="frame-"]')];
+  show(new Segments(await loading, spansOfPage(), decoder), element("title").textContent, new Originals(frames, () => {}));
 }
 
 if (typeof document === "undefined") serve(self);
 else {
-  const ready = start();
-  window.foldgauss = { ready };
-  ready.catch((error) => {
+  window.foldgauss = {};
+  window.foldgauss.ready = start();
+  window.foldgauss.ready.catch((error) => {
     failed = true;
     notify(error.message);
   });

@@ -1,12 +1,13 @@
 // The original's frames, in the page's data blocks, decoded on demand.
-import { blockOf } from "./loading.js";
+import { bytesOf } from "./loading.js";
 
 const KEPT = 24, AHEAD = 4;
 
 export class Originals {
-  /** `onReady` is called when a missing frame has been decoded. */
-  constructor(onReady) {
-    this.num = document.querySelectorAll('script[id^="frame-"]').length;
+  /** Of blocks with the frames as WebP, in base64; `onReady` is called when a missing frame has been decoded. */
+  constructor(blocks, onReady) {
+    this.blocks = blocks;
+    this.num = blocks.length;
     this.images = new Map(); // least recently used first
     this.coming = new Set();
     this.onReady = onReady;
@@ -27,7 +28,7 @@ export class Originals {
   async fetch(k) {
     if (this.images.has(k) || this.coming.has(k)) return;
     this.coming.add(k);
-    const data = new Blob([blockOf(`frame-${k}`)], { type: "image/webp" });
+    const data = new Blob([bytesOf(this.blocks[k].textContent)], { type: "image/webp" });
     const image = await createImageBitmap(data, { colorSpaceConversion: "none", premultiplyAlpha: "none" });
     this.coming.delete(k);
     this.images.set(k, image);

@@ -1,35 +1,42 @@
-// The player: position in time, display mode and edits, and when to render.
+// The player: position in time, display mode, the edited Gaussians of that time, and when to render.
+import { Editing } from "./editing.js";
+import { alive } from "./gaussians.js";
 import { Originals } from "./originals.js";
-import { WHAT } from "./renderer.js";
+import { SELECTED, WHAT } from "./renderer.js";
 import { View, common } from "./view.js";
 
 export const SPEEDS = [1 / 16, 1 / 8, 1 / 4, 1 / 2, 1, 2];
-const TINT = [1, 0.58, 0.2];
+const HIGHLIGHT = 0.65;
 const MOST_PIXELS = 6e6;
 const SLOW = 1 / 27, FAST = 1 / 50; // seconds per image: render fewer pixels, more pixels
 
-/** Edits of the selected Gaussians. `front` null: in front if there are copies. */
-const UNCHANGED = { vanish: false, front: null, scale: 1, copies: 1, offset: 0.2 };
-
 export class Player {
-  constructor(canvas, renderer, segments, onChange) {
-    this.canvas = canvas;
+  constructor(canvas, renderer, onChange) {
+    Object.assign(this, { canvas, renderer, onChange });
+    Object.assign(this, { playing: false, speed: 1, loop: true, quality: 0.1, alive: 0, renderTimes: [], waiting: false });
+    Object.assign(this, { mode: "model", split: 0.5, background: [0, 0, 0], highlighting: false, before: 0, pace: 0 });
+    this.room = new Uint32Array(0);
+  }
+
+  /** Show a model: the segments of a page or a file, with the original's frames or null. */
+  open(segments, originals = null) {
+    this.renderer.check(segments.held.get(0).base);
+    this.pause();
     this.segments = segments;
-    this.onChange = onChange;
     this.timeline = segments.timeline;
-    this.renderer = renderer;
+    this.originals = originals ?? new Originals([], () => {});
+    this.originals.onReady = () => this.invalidate();
+    this.mode = "model";
+    this.editing = new Editing();
+    this.editing.onChange = () => this.changed();
+    this.seen = this.lead = null;
     this.goTo(0);
-    this.view = new View(this.model.header.size);
-    renderer.check(this.model);
-    segments.check = (model) => renderer.check(model);
+    this.view = new View(this.base.header.size, this.view?.area);
+    segments.check = (model) => this.renderer.check(model);
     segments.onReady = () => {
       this.goTo(this.position);
       this.changed();
     };
-    this.originals = new Originals(() => this.invalidate());
-    Object.assign(this, { playing: false, speed: 1, loop: true });
-    Object.assign(this, { mode: "model", split: 0.5, background: [0, 0, 0], brushing: false, edit: { ...UNCHANGED } });
-    Object.assign(this, { quality: 0.1, alive: 0, renderTimes: [], waiting: false, before: 0, pace: 0 });
   }
 
   // ---------------------------------------------------------------------------------------------- time
@@ -41,6 +48,7 @@ export class Player {
     this.segments.goTo(position);
     this.seen = this.segments.parts() ?? this.seen;
     this.lead = this.seen.reduce((one, other) => (other.weight > one.weight ? other : one));
+    this.editing.forget(this.segments.held);
   }
 
   /** Go to a position in frames; fractions are times between frames. */
@@ -55,13 +63,17 @@ export class Player {
     return this.segments.ready();
   }
 
-  /** The model of the segment with the largest weight, and its selection. */
-  get model() {
-    return this.lead.model;
+  /** The model, as in the file, of the segment with the largest weight; its edited state; the time in it. */
+  get base() {
+    return this.lead.base;
   }
 
-  get selection() {
-    return this.lead.selection;
+  get state() {
+    return this.editing.stateOf(this.lead.number, this.lead.base);
+  }
+
+  get ownTime() {
+    return this.lead.time;
   }
 
   step(frames) {
@@ -79,7 +91,7 @@ export class Player {
   pause() {
     this.playing = false;
     this.quality = 1;
-    this.changed();
+    if (this.segments) this.changed();
   }
 
   toggle() {
@@ -127,11 +139,15 @@ export class Player {
       this.waiting = false;
       if (this.playing) this.advance(now);
       this.draw();
-      if (this.playing && this.segments.next) this.renderer.take(this.segments.next); // upload it before it is needed
+      if (this.playing && this.segments.next !== undefined) this.renderer.take(this.stateOf(this.segments.next).model); // before it is needed
       this.renderTimes = [...this.renderTimes.filter((own) => now - own < 1000), now];
       this.onChange();
       if (this.playing) this.invalidate();
     });
+  }
+
+  stateOf(number) {
+    return this.editing.stateOf(number, this.segments.held.get(number).base);
   }
 
   resize(width, height) {
@@ -178,21 +194,28 @@ export class Player {
     this.drawTo({
       width: size[0], height: size[1], unit: k * Math.max(frame.width, frame.height), origin: middle.map((own) => k * own),
       // The low-pass filter of the fit, in the model's pixels, whatever their size here.
-      lowPass: this.model.header.options.low_pass * Math.max(k * frame.scale, 1) ** 2,
+      lowPass: this.base.header.options.low_pass * Math.max(k * frame.scale, 1) ** 2,
     });
     return [0, 0, (visible.width * k) / size[0], (visible.height * k) / size[1]];
   }
 
   drawTo(target) {
-    const { scale, offset } = this.edit, highlight = this.brushing ? 0.65 : 0;
+    const highlight = this.highlighting ? HIGHLIGHT : 0;
     this.alive = 0;
-    const parts = this.seen.map(({ model, selection, time, weight }) => {
-      const { list, alive } = selection.instances(time, { ...this.edit, front: this.inFront });
-      const edit = { scale, pivot: selection.middle(time), shift: [offset, 0], highlight, tint: TINT };
-      this.alive += alive;
-      return { model, instances: list, time, weight, edit };
+    const parts = this.seen.map(({ number, base, time, weight }) => {
+      const state = this.editing.stateOf(number, base), instances = this.instances(state, time, highlight > 0);
+      this.alive += instances.length;
+      return { model: state.model, instances, time, weight, highlight };
     });
     this.renderer.draw(parts, target);
+  }
+
+  /** The Gaussians alive at a time, front to back, those selected marked on demand. */
+  instances({ model, selected }, time, marked) {
+    if (this.room.length < model.num) this.room = new Uint32Array(model.num);
+    const list = alive(model, time, this.room).slice(); // several models are drawn one after another
+    if (marked) for (let k = 0; k < list.length; k++) if (selected[list[k]]) list[k] += SELECTED;
+    return list;
   }
 
   /** Show one pane. */
@@ -217,9 +240,9 @@ export class Player {
   /** The image at this time as the engines of foldgauss render it, width x height: red, green, blue, 255. */
   pixels(width, height) {
     if (this.segments.missing !== undefined) throw new Error("This time is still being decoded: await seek(t) first.");
-    const [rows, columns] = this.model.header.size, aspect = rows / columns;
+    const [rows, columns] = this.base.header.size, aspect = rows / columns;
     const unit = Math.max(height / Math.min(1, aspect), width / Math.min(1, 1 / aspect));
-    const lowPass = this.model.header.options.low_pass;
+    const lowPass = this.base.header.options.low_pass;
     this.drawTo({ width, height, unit, origin: [width / 2, height / 2], lowPass });
     return this.renderer.read(this.background);
   }
@@ -227,46 +250,5 @@ export class Player {
   /** Images rendered in the last second. */
   get rate() {
     return this.renderTimes.length;
-  }
-
-  // ------------------------------------------------------------------------------------------ the brush
-
-  beginStroke() {
-    this.stroke = this.selection;
-    this.stroke.begin();
-  }
-
-  endStroke() {
-    if (this.stroke?.strokes.at(-1)?.length === 0) this.stroke.strokes.pop();
-    this.stroke = null;
-  }
-
-  /** Select under the brush, at a point of the screen with a radius, in device pixels. */
-  paint(x, y, radius, erase) {
-    if (this.segments.missing !== undefined) return; // the image shown is of another time
-    if (this.stroke !== this.selection) { // a new segment begins a new stroke
-      this.endStroke();
-      this.beginStroke();
-    }
-    const pane = this.view.paneAt(x, y, this.numPanes), [atX, atY, unit] = this.view.toModel(x, y, pane);
-    this.selection.paint(this.lead.time, atX, atY, radius / unit, erase, this.edit.vanish);
-    this.changed();
-  }
-
-  get inFront() {
-    return this.edit.front ?? this.edit.copies > 1;
-  }
-
-  resetEdit() {
-    this.segments.clear();
-    this.edit = { ...UNCHANGED };
-    this.changed();
-  }
-
-  /** Follow the selection through its segment; returns the number of Gaussians added. */
-  async follow(onProgress) {
-    const { selection, time, timeline } = this.lead, before = selection.count;
-    await selection.follow(time, timeline.times, onProgress);
-    return selection.count - before;
   }
 }

@@ -7,6 +7,9 @@ import showFragment from "./show.frag.glsl";
 import mixFragment from "./mix.frag.glsl";
 
 export const WHAT = { model: 0, original: 1, difference: 2 };
+/** Colour of selected Gaussians, and the bit of an instance that marks them. */
+const TINT = [1, 0.58, 0.2];
+export const SELECTED = 2 ** 31;
 const NO_BOUND = 1e30;
 const ALL_OF_IT = [0, 0, 1, 1], UPRIGHT = [0, 1, 1, -1]; // a whole target, whose rows go up
 /** Models on the graphics card at once: those of a fade, and the next one. */
@@ -97,7 +100,7 @@ export class Renderer {
     gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
     gl.vertexAttribDivisor(0, 1);
     gl.disable(gl.DITHER);
-    this.held = new Map(); // textures by model, least recently used first
+    this.held = new Map(); // textures by the values in them, least recently used first
   }
 
   /** Throw an Error for display if a model is too large. */
@@ -107,19 +110,19 @@ export class Renderer {
       throw new Error(`This graphics card cannot hold ${model.num.toLocaleString("en")} Gaussians.`);
   }
 
-  /** The texture of a model's Gaussians, uploaded if necessary. */
-  take(model) {
-    const { gl, held } = this, found = held.get(model);
-    held.delete(model);
+  /** The texture of a model's Gaussians, uploaded if necessary. Those of the same values are the same. */
+  take({ values, rows }) {
+    const { gl, held } = this, found = held.get(values);
+    held.delete(values);
     if (!found)
       for (const [old, own] of held) {
         if (held.size < HELD) break;
         held.delete(old);
         gl.deleteTexture(own);
       }
-    const made = found ?? texture(gl, gl.NEAREST), size = [TEXTURE_WIDTH, model.rows];
-    if (!found) gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, ...size, 0, gl.RGBA, gl.FLOAT, model.values);
-    held.set(model, made);
+    const made = found ?? texture(gl, gl.NEAREST), size = [TEXTURE_WIDTH, rows];
+    if (!found) gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, ...size, 0, gl.RGBA, gl.FLOAT, values);
+    held.set(values, made);
     return made;
   }
 
@@ -158,7 +161,7 @@ export class Renderer {
    * Render the listed Gaussians of a model, front to back, at a time, into width x height pixels. Of the target: `unit`,
    * pixels per unit of model space; `origin`, the frame's centre; `lowPass` in px^2.
    */
-  drawOne({ model, instances, time, edit }, { width, height, unit, origin, lowPass }) {
+  drawOne({ model, instances, time, highlight }, { width, height, unit, origin, lowPass }) {
     const { gl, splat: { made, at } } = this, { header } = model, { options } = header;
     const gaussians = this.take(model);
     this.rendered.bind(width, height);
@@ -185,11 +188,8 @@ export class Renderer {
     gl.uniform1f(at.cutoff, options.alpha_cutoff);
     gl.uniform1f(at.ceiling, options.alpha_ceiling);
     gl.uniform1f(at.support, options.support_radius === null ? NO_BOUND : options.support_radius ** 2);
-    gl.uniform2fv(at.pivot, edit.pivot);
-    gl.uniform2fv(at.shift, edit.shift);
-    gl.uniform1f(at.selectedScale, edit.scale);
-    gl.uniform1f(at.highlight, edit.highlight);
-    gl.uniform3fv(at.tint, edit.tint);
+    gl.uniform1f(at.highlight, highlight);
+    gl.uniform3fv(at.tint, TINT);
     gl.enable(gl.BLEND);
     // Front to back: colours are weighted by the transmittance, which each Gaussian reduces, except in sums.
     if (header.compositing === "sum") gl.blendFuncSeparate(gl.ONE, gl.ONE, gl.ZERO, gl.ONE);

@@ -1,8 +1,7 @@
 // The clip's segments: their weights at each position, and their models, decoded on demand. A single model is one segment.
-import { Selection } from "./selection.js";
 import { Timeline } from "./timeline.js";
 
-/** Most Gaussians held decoded, some hundred bytes each, besides the visible segments and their neighbours. */
+/** Most Gaussians held decoded, some two hundred bytes each, besides the visible segments and their neighbours. */
 const MOST_HELD = 2e6;
 const CLOSE = 1e-6; // frames: a position closer to a frame is that frame
 
@@ -54,7 +53,7 @@ export class Segments {
   }
 
   hold(number, model) {
-    const own = { model, timeline: new Timeline(model.times, model.header.fps), selection: new Selection(model) };
+    const own = { base: model, timeline: new Timeline(model.times, model.header.fps) };
     this.held.set(number, own);
     return own;
   }
@@ -71,8 +70,7 @@ export class Segments {
     this.position = position;
     this.seen = weights(this.spans, position).map(([number]) => number);
     const wanted = this.order(this.seen);
-    for (const [number, { selection }] of this.held) // selections are kept
-      if (!wanted.includes(number) && !selection.count && !selection.strokes.length) this.held.delete(number);
+    for (const number of this.held.keys()) if (!wanted.includes(number)) this.held.delete(number);
     this.wanted = wanted;
     this.work();
   }
@@ -93,7 +91,7 @@ export class Segments {
     return this.seen.find((number) => !this.held.has(number));
   }
 
-  /** The visible models with their weights and times; null while one of them is being decoded. */
+  /** The visible models, as in the file, with their weights and times; null while one of them is being decoded. */
   parts() {
     if (this.missing !== undefined) return null;
     return weights(this.spans, this.position).map(([number, weight]) => {
@@ -102,9 +100,15 @@ export class Segments {
     });
   }
 
-  /** The model of the next segment, if decoded. */
+  /** The number of the next segment, if it is decoded. */
   get next() {
-    return this.held.get((this.seen.at(-1) + 1) % this.spans.length)?.model;
+    const number = (this.seen.at(-1) + 1) % this.spans.length;
+    return this.held.has(number) ? number : undefined;
+  }
+
+  /** The number of Gaussians of each segment. */
+  get counts() {
+    return this.spans.map((span) => span.num_gaussians);
   }
 
   /** Fulfilled when the visible segments are decoded. */
@@ -143,10 +147,5 @@ export class Segments {
     this.decoder.stop();
     for (const { reject } of this.waiting.splice(0)) reject(error);
     this.onError(error);
-  }
-
-  /** Clear all selections. */
-  clear() {
-    for (const { selection } of this.held.values()) selection.clear();
   }
 }

@@ -10,10 +10,9 @@ uniform float time, envelopePower, envelopeFloor;
 uniform float unit; // pixels of the target per unit of model space
 uniform vec2 origin, target; // the frame's centre and the target's size, pixels
 uniform float lowPass, cutoff, support; // px^2; alpha; squared deviations
-uniform vec2 pivot, shift; // of selected Gaussians: centre of scaling, and offset between copies, model units
-uniform float selectedScale, highlight;
+uniform float highlight; // of selected Gaussians: how much of their colour is the tint's
 
-in uint instance; // index; from bit 28 the number of the copy; highest bit: selected
+in uint instance; // index; highest bit: selected
 
 flat out vec2 centre;
 flat out vec4 axes; // rows that map an offset in pixels to standard deviations
@@ -36,22 +35,16 @@ vec2 path(int index, float u) {
 }
 
 void main() {
-  int index = int(instance & 0x0fffffffu);
-  float copy = float((instance >> 28) & 7u);
-  bool selected = (instance >> 31) == 1u;
+  int index = int(instance & 0x7fffffffu);
   vec4 place = texel(index, 0), shape = texel(index, 1);
   paint = texel(index, 2);
-  tinted = selected ? highlight : 0.0;
+  tinted = (instance >> 31) == 1u ? highlight : 0.0;
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0); // outside: not rendered
   if (!(paint.a >= cutoff)) return;
 
   float u = place.z - time, tau = u / place.w;
   float shrink = sqrt(envelopeFloor + (1.0 - envelopeFloor) * exp(-0.5 * envelopePower * tau * tau));
   vec2 mean = place.xy + path(index, u), deviations = shape.xy * shrink;
-  if (selected) {
-    mean = pivot + (mean - pivot) * selectedScale + copy * shift;
-    deviations *= selectedScale;
-  }
   vec2 variances = deviations * deviations * (unit * unit) + lowPass;
   if (!(min(variances.x, variances.y) > 1e-12)) return;
 

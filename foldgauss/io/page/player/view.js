@@ -4,9 +4,9 @@ const MOST = 64;
 const GAP = 8;
 
 export class View {
-  constructor([height, width]) {
+  constructor([height, width], area = [1, 1]) {
     [this.height, this.width] = [height, width];
-    this.area = [1, 1];
+    this.area = area;
     this.reset();
   }
 
@@ -66,6 +66,12 @@ export class View {
   toModel(x, y, pane) {
     const frame = this.frameIn(pane), unit = Math.max(frame.width, frame.height);
     return [(x - frame.x - frame.width / 2) / unit, (y - frame.y - frame.height / 2) / unit, unit];
+  }
+
+  /** A point of model space on the screen. */
+  toScreen(x, y, pane) {
+    const frame = this.frameIn(pane), unit = Math.max(frame.width, frame.height);
+    return [frame.x + frame.width / 2 + x * unit, frame.y + frame.height / 2 + y * unit, unit];
   }
 }
 

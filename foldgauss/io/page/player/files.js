@@ -1,0 +1,173 @@
+// Opening models and scripts, and saving the edit: downloads, and the disk if the page comes from `foldgauss view`.
+import { element, on, put, toast } from "./elements.js";
+import { Decoder, bytesOf } from "./loading.js";
+import { writeSafetensors } from "./safetensors.js";
+import { readScript, writeScript } from "./script.js";
+import { Segments } from "./segments.js";
+import { openDialog } from "./shell.js";
+import { Storage } from "./storage.js";
+
+const LONG = 8000; // milliseconds that a problem is shown
+
+/** Offer a file for download. */
+export function download(content, name) {
+  const link = document.createElement("a"), url = URL.createObjectURL(content);
+  [link.href, link.download] = [url, name];
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(url), 60_000);
+}
+
+export class Files {
+  /** `show(segments, title)` opens a model that was decoded; `onProgress(text, fraction)` tells how far that is. */
+  constructor(player, show, onProgress) {
+    Object.assign(this, { player, show, onProgress });
+    this.server = JSON.parse(element("server")?.textContent ?? "null");
+    this.storage = new Storage(() => toast("The browser does not keep this edit: it is too large, or storage is not allowed here. Download the script.", LONG));
+    on("files-open", "click", () => openDialog("files"));
+    for (const name of ["open-file", "notice-open"]) on(name, "click", () => this.choose());
+    on("chooser", "change", () => this.open(element("chooser").files[0]));
+    on("download-script", "click", () => this.downloadScript());
+    on("download-model", "click", () => this.downloadModel());
+    on("save-disk", "click", () => this.saveToDisk());
+    on("start-afresh", "click", () => this.discard());
+    this.bindDrop();
+  }
+
+  bindDrop() {
+    const drop = element("drop"), hasFiles = (event) => event.dataTransfer?.types.includes("Files");
+    document.addEventListener("dragover", (event) => {
+      if (!hasFiles(event)) return;
+      event.preventDefault();
+      drop.hidden = false;
+    });
+    document.addEventListener("dragleave", (event) => event.relatedTarget ?? (drop.hidden = true));
+    document.addEventListener("drop", (event) => {
+      if (!hasFiles(event)) return;
+      event.preventDefault();
+      drop.hidden = true;
+      this.open(event.dataTransfer.files[0]);
+    });
+  }
+
+  choose() {
+    element("chooser").value = "";
+    element("chooser").click();
+  }
+
+  /** Describe a model that was opened, and take up its edit where it was left. */
+  attach(title) {
+    this.title = title;
+    const { player, server } = this, { editing, segments } = player, { fingerprint } = player.base;
+    const { history } = editing, changed = history.onChange;
+    history.onChange = () => {
+      this.storage.changed();
+      changed();
+    };
+    for (const one of document.querySelectorAll(".with-edit")) one.hidden = false;
+    element("save-disk").hidden = element("save-about").hidden = !server || !this.isOfPage;
+    if (server) put("save-about", `As ${server.script}`);
+    element("download-model").disabled = segments.spans.length > 1;
+    const found = this.storage.attach(`${fingerprint}-${segments.total}-${segments.spans.length}`, history);
+    if (found) toast("The edit is as you left it.");
+    else if (this.isOfPage && element("script")) this.readFromDisk();
+  }
+
+  /** Take up the script beside the model; one that the page cannot do must not be replaced. */
+  readFromDisk() {
+    const { script } = this.server;
+    if (this.readScript(new TextDecoder().decode(bytesOf(element("script").textContent)), script)) return;
+    element("save-disk").disabled = true;
+    put("save-about", `${script} has edits that the page cannot do, and is left alone. Rename it to save another.`);
+  }
+
+  /** Open a file: a script for this model, or a model. */
+  async open(file) {
+    if (!file) return;
+    element("files").close();
+    if (/\.toml$/i.test(file.name)) return this.readScript(await file.text(), file.name);
+    await this.openModel(await file.arrayBuffer(), file.name);
+  }
+
+  async openModel(data, name, given) {
+    const decoder = new Decoder([{ data, given }]);
+    try {
+      this.onProgress(`Opening ${name}`, 0);
+      const model = await decoder.decode(0, (fraction) => this.onProgress(`Opening ${name}`, fraction));
+      this.isOfPage = false;
+      this.show(new Segments(model, null, decoder), name.replace(/\.\w+$/, ""));
+    } catch (error) {
+      if (error.missing) return this.askFacts(data, name);
+      this.onProgress("");
+      toast(`${name}: ${error.message}`, LONG);
+    }
+  }
+
+  /** Ask for the size and the rate that a file lacks. */
+  askFacts(data, name) {
+    this.onProgress("");
+    openDialog("facts-needed");
+    element("facts-needed").onclose = () => {
+      if (element("facts-needed").returnValue !== "open") return;
+      const [width, height, fps] = ["width", "height", "fps"].map((own) => Number(element(`needed-${own}`).value));
+      this.openModel(data, name, { size: [height, width], fps });
+    };
+  }
+
+  /** Apply a script; whether that was possible. */
+  readScript(text, name) {
+    const { player } = this;
+    if (!player.segments) {
+      toast("Open the model first, then its script.", LONG);
+      return false;
+    }
+    try {
+      player.editing.load(readScript(text, player.segments.counts));
+      toast(`${name} is applied. Undo takes it back.`);
+      return true;
+    } catch (error) {
+      toast(`${name}: ${error.message}`, LONG);
+      return false;
+    }
+  }
+
+  get script() {
+    const { editing, segments } = this.player;
+    return writeScript(editing.history.current, segments.counts, this.title);
+  }
+
+  /** To the disk if there is a way, else as a download. */
+  save() {
+    if (this.server && this.isOfPage && !element("save-disk").disabled) return this.saveToDisk();
+    return this.downloadScript();
+  }
+
+  downloadScript() {
+    download(new Blob([this.script], { type: "application/toml" }), `${this.title}.edit.toml`);
+  }
+
+  downloadModel() {
+    const { player: { state }, title } = this;
+    try {
+      download(writeSafetensors(state.model, { clip: title, edited: "foldgauss player" }), `${title}.edited.safetensors`);
+    } catch (error) {
+      toast(error.message, LONG);
+    }
+  }
+
+  async saveToDisk() {
+    const { token, script } = this.server;
+    try {
+      const answer = await fetch("/script", { method: "PUT", headers: { "X-Foldgauss-Token": token }, body: this.script });
+      if (!answer.ok) throw new Error((await answer.text()).trim() || `the server answers ${answer.status}`);
+      toast(`Saved as ${script}`);
+    } catch (error) {
+      toast(`Not saved: ${error.message}. If foldgauss view has ended, download the script.`, LONG);
+    }
+  }
+
+  discard() {
+    this.player.editing.load([]);
+    element("files").close();
+    toast("The edit is discarded. Undo brings it back.");
+  }
+}

@@ -1,0 +1,35 @@
+// Files that the player opens, told apart by their first bytes: compact models, model files and PLY files of VeGaS.
+import { decode } from "./compact.js";
+import { readVegas } from "./vegas.js";
+import { readSafetensors } from "./safetensors.js";
+
+const COMPACT = [0x8b, 0x46, 0x47, 0x5a];
+
+/** Formats that people try, by their first bytes, and what to do with them. */
+const OTHERS = [
+  [/^\x89PNG|^\xff\xd8\xff|^GIF8|^RIFF....WEBP/s, "a picture", "Fit a model to it first: foldgauss fit."],
+  [/^....ftyp|^\x1aE\xdf\xa3|^RIFF....AVI/s, "a video", "Fit a model to it first: foldgauss fit CLIP."],
+  [/^PK\x03\x04/, "a zip archive, as of SuperSplat's .sog", "Unpack it, and open the model in it."],
+  [/^\s*<!doctype html/i, "a page of the player", "Open it in a tab of its own."],
+];
+
+/** A file's {header, leaves}, as of `decode`. `given`: {size, fps} where the file holds none. Throws an Error for display. */
+export function readModel(buffer, given = {}, onProgress = () => {}) {
+  const bytes = new Uint8Array(buffer), start = String.fromCharCode(...bytes.subarray(0, 32));
+  if (!bytes.length) throw new Error("The file is empty.");
+  if (COMPACT.every((own, k) => bytes[k] === own)) return checked(decode(buffer, onProgress));
+  if (/^ply\r?\n/.test(start)) return checked(readVegas(buffer, given));
+  if (start[8] === "{") return checked(readSafetensors(buffer));
+  const known = OTHERS.find(([pattern]) => pattern.test(start));
+  const got = known ? known[1] : "something else";
+  throw new Error(`This is ${got}. Expected a model: .safetensors or .fgz of foldgauss, or a .ply of VeGaS. ${known ? known[2] : "Is it the right file?"}`);
+}
+
+/** Refuse values that cannot be rendered. */
+function checked({ header, leaves }) {
+  if (!(header.num_gaussians > 0)) throw new Error("The model has no Gaussians.");
+  for (const [name, leaf] of Object.entries(leaves))
+    for (let k = 0; k < leaf.length; k++)
+      if (!Number.isFinite(leaf[k])) throw new Error(`The file is damaged: ${name} has a value that is not finite. Copy or fit it again.`);
+  return { header, leaves };
+}

@@ -1,0 +1,169 @@
+// The editor's panel: tools, and edits of the selection by buttons, sliders and numbers.
+import { element, fill, on, press, pressOne, put } from "./elements.js";
+import { isAlike } from "./editing.js";
+
+const BUTTONS = {
+  "select-all": "selectAll", "select-none": "selectNone", invert: "invert", grow: "grow", shrink: "shrink",
+};
+const round = (own, digits = 6) => Number(own.toFixed(digits));
+const value = (name) => Number(element(name).value);
+
+/** Inputs of an edit: their values from its keys, and its keys from their values; `model`: side, last frame, time. */
+const FORMS = {
+  move: {
+    inputs: ["move-x", "move-y"], empty: [0, 0],
+    show: ({ offset }, { side }) => offset.map((own) => round(own * side, 2)),
+    step: ([x, y], { side }) => ({ do: "move", offset: [round(x / side), round(y / side)] }),
+  },
+  scale: {
+    inputs: ["scale"], empty: [100], show: ({ factor }) => [round(100 * [factor].flat()[0], 2)],
+    step: ([percent], { center, last }) => percent > 0 && { do: "scale", factor: round(percent / 100), about: last?.about ?? center },
+  },
+  rotate: {
+    inputs: ["rotate"], empty: [0], show: ({ degrees }) => [degrees],
+    step: ([degrees], { center, last }) => ({ do: "rotate", degrees, about: last?.about ?? center }),
+  },
+  hue: {
+    inputs: ["hue"], empty: [0], slides: true, show: ({ hue }) => [Math.round(360 * hue)],
+    step: ([degrees]) => degrees >= 0 && degrees <= 360 && { do: "recolor", hue: round(degrees / 360) },
+  },
+  gain: { inputs: ["gain"], empty: [1], slides: true, show: ({ gain }) => [[gain].flat()[0]], step: ([gain]) => gain >= 0 && { do: "recolor", gain } },
+  opacity: { inputs: ["opacity"], empty: [1], slides: true, show: ({ factor }) => [factor], step: ([factor]) => factor > 0 && { do: "opacity", factor } },
+  shift: {
+    inputs: ["shift"], empty: [0], timed: true, show: ({ shift }, { frames }) => [round(shift * frames, 3)],
+    step: ([later], { frames }) => ({ do: "retime", shift: round(later / frames) }),
+  },
+  stretch: {
+    inputs: ["stretch"], empty: [1], timed: true, show: ({ stretch }) => [round(1 / stretch, 3)],
+    step: ([speed], { time, last }) => Math.abs(speed) >= 0.01 && { do: "retime", stretch: round(1 / speed), about: last?.about ?? round(time) },
+  },
+  multiply: {
+    inputs: ["copies", "delay", "apart-x", "apart-y"], empty: null,
+    show: ({ offsets, delays = [0] }, { side, frames }) => [offsets.length, round([delays].flat()[0] * frames, 3), ...offsets[0].map((own) => round(own * side, 2))],
+    step: ([copies, delay, x, y], { side, frames }) => {
+      const each = Array.from({ length: Math.min(Math.max(Math.round(copies), 1), 100) }, (_, k) => k + 1);
+      return { do: "multiply", offsets: each.map((k) => [round((k * x) / side), round((k * y) / side)]), delays: each.map((k) => round((k * delay) / frames)) };
+    },
+  },
+};
+
+export class Panel {
+  constructor(player, tools, following) {
+    Object.assign(this, { player, tools, following });
+    on("edit", "click", () => this.toggle());
+    on("panel-close", "click", () => this.toggle(false));
+    on("undo", "click", () => this.undo());
+    on("redo", "click", () => this.redo());
+    for (const button of element("tools").children) button.addEventListener("click", () => tools.choose(button.dataset.tool));
+    for (const button of element("how").children) button.addEventListener("click", () => this.chooseHow(button.dataset.how));
+    for (const [name, method] of Object.entries(BUTTONS)) on(name, "click", () => tools[method]());
+    for (const [name, form] of Object.entries(FORMS))
+      for (const input of form.inputs) for (const own of form.slides ? [input, `${input}-value`] : [input]) on(own, "input", () => this.changed(name, own));
+    on("duplicate", "click", () => this.duplicate());
+    on("freeze", "click", () => this.act({ do: "freeze", at: round(player.position, 3) }));
+    on("to-front", "click", () => this.act({ do: "to_front" }));
+    on("to-back", "click", () => this.act({ do: "to_back" }));
+    on("vanish", "click", () => this.remove());
+  }
+
+  toggle(open = !this.player.highlighting) {
+    this.tools.cancel();
+    this.player.highlighting = open;
+    element("cursor").hidden = true;
+    this.player.changed();
+  }
+
+  chooseHow(how) {
+    this.tools.how = how;
+    this.player.onChange();
+  }
+
+  undo() {
+    this.tools.cancel();
+    this.player.editing.history.undo();
+  }
+
+  redo() {
+    this.tools.cancel();
+    this.player.editing.history.redo();
+  }
+
+  get hasSelection() {
+    const { editing, lead } = this.player, { selection } = editing;
+    return editing.count(lead.number, lead.base) > 0 || Object.keys(selection).some((number) => Number(number) !== lead.number);
+  }
+
+  act(step) {
+    if (this.hasSelection) this.player.editing.edit(step);
+  }
+
+  remove() {
+    this.act({ do: "vanish" });
+  }
+
+  duplicate() {
+    this.act(FORMS.multiply.step(FORMS.multiply.inputs.map(value), this.facts()));
+  }
+
+  /** What the forms need to know of the model. */
+  facts() {
+    const { player } = this, { base } = player, { last } = player.editing.history;
+    const center = this.tools.picker.placeOf(player.state, player.ownTime)?.center ?? [0, 0];
+    return { side: Math.max(...base.header.size), frames: Math.max(player.timeline.last, 1), time: player.time, center: center.map((own) => round(own)), last };
+  }
+
+  /** An input of a form was changed: change the last edit if it is of that kind, else add one. */
+  changed(name, input) {
+    const form = FORMS[name], values = form.inputs.map((own) => value(own === input || !form.slides ? own : input));
+    if (!values.every(Number.isFinite) || element(input).value === "") return;
+    const facts = this.facts(), { editing } = this.player, step = form.step(values, { ...facts, last: null });
+    if (!step) return;
+    const amends = isAlike(editing.history.last, step);
+    if (amends) editing.edit(form.step(values, facts), true);
+    else if (name !== "multiply") this.act(step);
+  }
+
+  update() {
+    const { player, tools } = this, { lead, editing, segments } = player;
+    element("panel").hidden = !player.highlighting;
+    press("edit", player.highlighting);
+    element("stage").classList.toggle("selecting", player.highlighting && tools.isSelecting);
+    if (!player.highlighting) return;
+    const count = editing.count(lead.number, lead.base);
+    this.following.update(count);
+    put("picked", count ? `${count.toLocaleString("en")} ${segments.spans.length > 1 ? "in this segment" : "selected"}` : "Nothing selected");
+    pressOne("tools", "tool", tools.name);
+    pressOne("how", "how", tools.how);
+    element("undo").disabled = !editing.history.canUndo;
+    element("redo").disabled = !editing.history.canRedo;
+    const { hasSelection } = this;
+    for (const name of ["select-none", "grow", "shrink"]) element(name).disabled = !count;
+    element("edits").disabled = !hasSelection;
+    for (const name of ["shift", "stretch", "freeze", "delay"]) element(name).disabled = segments.spans.length > 1;
+    for (const name of ["radius", "tolerance"]) this.showSlide(name, tools[name]);
+    element("radius").parentElement.hidden = tools.name !== "brush";
+    element("tolerance").parentElement.hidden = tools.name !== "eyedropper";
+    element("how").hidden = !tools.isSelecting;
+    this.showForms();
+  }
+
+  showSlide(name, own) {
+    fill(element(name), own);
+    if (document.activeElement !== element(`${name}-value`)) element(`${name}-value`).value = own;
+  }
+
+  /** Show the last edit in its form; all others are empty. */
+  showForms() {
+    const facts = { side: Math.max(...this.player.base.header.size), frames: Math.max(this.player.timeline.last, 1) }, { last } = this.player.editing.history;
+    for (const form of Object.values(FORMS)) {
+      const like = form.step(form.empty ?? [1, 0, 0, 0], { ...facts, time: 0, center: [0, 0], last: null });
+      const shown = isAlike(last, like) ? form.show(last, facts) : form.empty;
+      if (shown) form.inputs.forEach((name, k) => this.showInput(form, name, shown[k]));
+    }
+  }
+
+  showInput(form, name, own) {
+    if (form.slides) return this.showSlide(name, own);
+    if (document.activeElement !== element(name) || Number(element(name).value) !== own) element(name).value = own;
+  }
+}

@@ -1,0 +1,113 @@
+// Model files of foldgauss, safetensors with a header of their own: see foldgauss.io.models.model_file and docs/format.md.
+import { STATIC } from "./gaussians.js";
+
+const FORMAT = "foldgauss-model", VERSION = "1";
+const ARRAYS = { F32: Float32Array, U8: Uint8Array, U16: Uint16Array, U32: Uint32Array, F16: Uint16Array };
+/** Kinds of Gaussians: the bits of leaves that are left out, the degree, and the values of those; see sparse_storage.py. */
+const STATIC_BIT = 128, OPAQUE_BIT = 64, DEGREE_MASK = 63;
+const ABSENT = {
+  time_loc_logit: [STATIC_BIT, 0], log_time_scale: [STATIC_BIT, STATIC], opacity_logit: [OPAQUE_BIT, 8],
+};
+const DAMAGED = "The file is damaged or cut short. Copy it again.";
+
+/** {header, leaves} of a video model. Throws an Error for display. */
+export function readSafetensors(buffer) {
+  const { about, tensor } = readTensors(buffer);
+  if (about.kind === "segmented") throw new Error("This is a model in segments, which the page cannot open as a file. Write its page with foldgauss export --format html, or extract one segment with foldgauss segment.");
+  if (about.kind === "edited") throw new Error("This is an edited video whose edits no folded model holds. Render it with foldgauss render, or open the model and the edit script.");
+  if (about.kind !== "video") throw new Error(`This is a ${JSON.stringify(about.kind)}, not a model. Open the file that foldgauss fit wrote.`);
+  const header = JSON.parse(about.header), { num_gaussians: num, degree } = header;
+  const dense = (name) => tensor(`splats.${name}`), envelope = (name) => oneOf(tensor(`splats.envelope.${name}`), name);
+  let leaves = {};
+  for (const name of ["loc", "log_scale", "angle_logit", "time_loc_logit", "log_time_scale", "coefficients", "opacity_logit", "color_dc"]) leaves[name] = dense(name);
+  const { powers, colors, shapes } = header.stored ?? {};
+  if (powers !== undefined) leaves = { ...leaves, ...unpackKinds(leaves, dense("kinds"), num, degree) };
+  if (colors !== undefined) leaves.color_dc = rows(leaves.color_dc, dense("color_index"), 3);
+  if (shapes !== undefined) leaves.log_scale = rows(leaves.log_scale, dense("shape_index"), 2);
+  leaves.frame_times = tensor("frame_times.logits");
+  const widths = { loc: 2, log_scale: 2, coefficients: 2 * degree, color_dc: 3 };
+  for (const [name, leaf] of Object.entries(leaves))
+    if (leaf.length !== (name === "frame_times" ? header.num_frames - 1 : num * (widths[name] ?? 1))) throw new Error(DAMAGED);
+  return { header: { compositing: "over", scale_cutoff: 0, ...header, power: envelope("power"), floor: envelope("floor") }, leaves };
+}
+
+/** The file's own header, and a function that gives a tensor's values by name. */
+function readTensors(buffer) {
+  let entries, start;
+  try {
+    start = 8 + Number(new DataView(buffer).getBigUint64(0, true));
+    entries = JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(new Uint8Array(buffer, 8, start - 8)));
+  } catch {
+    throw new Error(DAMAGED);
+  }
+  const about = entries.__metadata__ ?? {};
+  if (about.format !== FORMAT) throw new Error("This is a safetensors file of another program. Open the file that foldgauss fit wrote.");
+  if (about.version !== VERSION) throw new Error(`This model file has version ${about.version}; the page reads version ${VERSION}. Write the page with the newer foldgauss.`);
+  const tensor = (name) => {
+    const { dtype, data_offsets: [from, to] = [] } = entries[name] ?? {}, kind = ARRAYS[dtype];
+    if (!kind || !(from >= 0 && to >= from && start + to <= buffer.byteLength)) throw new Error(DAMAGED);
+    const own = new kind(buffer.slice(start + from, start + to));
+    return dtype === "F16" ? Float32Array.from(own, fromHalf) : own;
+  };
+  return { about, tensor };
+}
+
+function fromHalf(bits) {
+  const sign = bits & 0x8000 ? -1 : 1, exponent = (bits >> 10) & 31, fraction = bits & 1023;
+  if (exponent === 31) return fraction ? NaN : sign * Infinity;
+  return sign * (exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : (2 ** -14 * fraction) / 1024);
+}
+
+/** The value of an envelope's parameter, which the player has for all Gaussians together. */
+function oneOf(values, name) {
+  if (values.some((own) => own !== values[0])) throw new Error(`The model has several envelopes (${name}), which the page cannot play. Render it with foldgauss render.`);
+  return values[0];
+}
+
+/** Leaves of which Gaussians of some kinds have none, at full length. */
+function unpackKinds(leaves, kinds, num, degree) {
+  const full = { coefficients: new Float32Array(2 * degree * num) };
+  for (const [name, [bit, value]] of Object.entries(ABSENT)) {
+    let next = 0;
+    full[name] = Float32Array.from(kinds, (kind) => (kind & bit ? value : leaves[name][next++] ?? NaN));
+  }
+  let next = 0;
+  for (let i = 0; i < num; i++) for (let k = 0; k < 2 * Math.min(kinds[i] & DEGREE_MASK, degree); k++) full.coefficients[2 * degree * i + k] = leaves.coefficients[next++] ?? NaN;
+  return full;
+}
+
+/** The rows that indices name. */
+function rows(table, index, width) {
+  const found = new Float32Array(width * index.length);
+  for (let i = 0; i < index.length; i++) for (let c = 0; c < width; c++) found[width * i + c] = table[width * index[i] + c] ?? NaN;
+  return found;
+}
+
+/** A model as a file that foldgauss opens: float32, all leaves dense. Throws an Error for display where none can hold it. */
+export function writeSafetensors({ header, num, degree, leaves, intervals }, metadata) {
+  const outside = leaves.time_loc.reduce((sum, own) => sum + (own > 0 && own < 1 ? 0 : 1), 0);
+  if (outside) throw new Error(`${outside.toLocaleString("en")} Gaussians were moved in time beyond the clip, where no model file holds them. Download the script, and apply it with foldgauss edit.`);
+  const logits = Float32Array.from(leaves.time_loc, (own) => Math.log(own) - Math.log1p(-own));
+  const tensors = {
+    "frame_times.logits": [intervals, [intervals.length]], "splats.angle_logit": [leaves.angle_logit, [num]],
+    "splats.coefficients": [leaves.coefficients, [num, degree, 2]], "splats.color_dc": [leaves.color_dc, [num, 3]],
+    "splats.envelope.floor": [Float32Array.of(header.floor), []], "splats.envelope.power": [Float32Array.of(header.power), []],
+    "splats.loc": [leaves.loc, [num, 2]], "splats.log_scale": [leaves.log_scale, [num, 2]],
+    "splats.log_time_scale": [leaves.log_time_scale, [num]], "splats.opacity_logit": [leaves.opacity_logit, [num]],
+    "splats.time_loc_logit": [logits, [num]],
+  };
+  const own = {
+    num_gaussians: num, degree, envelope: "TimeLikelihood", num_frames: intervals.length + 1, size: header.size, fps: header.fps,
+    options: header.options, compositing: header.compositing, scale_cutoff: header.scale_cutoff,
+  };
+  const about = { format: FORMAT, version: VERSION, kind: "video", header: JSON.stringify(own), metadata: JSON.stringify(metadata) };
+  const entries = { __metadata__: about };
+  let end = 0;
+  for (const [name, [values, shape]] of Object.entries(tensors)) entries[name] = { dtype: "F32", shape, data_offsets: [end, (end += values.byteLength)] };
+  const text = new TextEncoder().encode(JSON.stringify(entries));
+  const padded = new Uint8Array(8 * Math.ceil(text.length / 8)).fill(32);
+  padded.set(text);
+  const length = new DataView(new ArrayBuffer(8));
+  length.setBigUint64(0, BigInt(padded.length), true);
+  return new Blob([length.buffer, padded, ...Object.values(tensors).map(([values]) => values)], { type: "application/octet-stream" });
+}

@@ -1,0 +1,48 @@
+// The edit of each model that was opened, kept in the browser until it is discarded: under the model's fingerprint.
+import { recall, remember } from "./elements.js";
+import { problemOf } from "./operations.js";
+
+const PREFIX = "foldgauss-edit-", PAUSE = 400; // milliseconds after a change
+
+/** Whether a value is a step of a history, as far as can be told without the model. */
+const isStep = (step) => Array.isArray(step?.script) ? step.script.every(isStep) : step?.select ? typeof step.select === "object" : step?.do !== undefined && problemOf(step) === "";
+
+export class Storage {
+  /** `onFull` is called when the browser does not keep an edit. */
+  constructor(onFull) {
+    this.onFull = onFull;
+    addEventListener("pagehide", () => this.flush());
+    document.addEventListener("visibilitychange", () => document.hidden && this.flush());
+  }
+
+  /** Restore the history of a model, if there is one; from now on keep it. */
+  attach(fingerprint, history) {
+    this.flush();
+    this.history = history;
+    this.key = PREFIX + fingerprint;
+    this.told = false;
+    let kept = null;
+    try {
+      kept = JSON.parse(recall(this.key));
+    } catch {
+      // not ours
+    }
+    if (!Array.isArray(kept?.steps) || !kept.steps.every(isStep) || !(kept.done >= 0 && kept.done <= kept.steps.length)) return false;
+    history.restore(kept);
+    return history.canUndo;
+  }
+
+  changed() {
+    this.pending ??= setTimeout(() => this.flush(), PAUSE);
+  }
+
+  flush() {
+    clearTimeout(this.pending);
+    if (this.pending === undefined) return;
+    this.pending = undefined;
+    const { steps, done } = this.history;
+    const kept = steps.length ? remember(this.key, JSON.stringify({ steps, done })) : remember(this.key, null);
+    if (!kept && !this.told) this.onFull();
+    this.told = !kept; // once, until it works again
+  }
+}

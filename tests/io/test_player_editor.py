@@ -1,0 +1,244 @@
+"""The player's edits: their pictures, scripts and models are those of `foldgauss edit`, and nothing done is lost."""
+
+import json
+
+import numpy as np
+import pytest
+from browser import chromium
+from editor_page import (
+    EDITS,
+    IT,
+    PICKED,
+    TIMES,
+    assert_shows,
+    download,
+    drop,
+    pages_of,
+    read_script,
+    save_soft_model,
+    script_of,
+    select,
+)
+from soft_models import NUM, OBJECT, SIZE, soft_model
+
+from foldgauss.io import load_video_model, save_compact
+from foldgauss.io.edit_script import parse_edit_script
+from foldgauss.io.page.player_page import quantize_finely
+from foldgauss.render import RenderOptions
+from foldgauss.video import SegmentedVideo, VideoModel
+from foldgauss.video.models.renderer import VideoRenderer
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def compact(tmp_path_factory):
+    return save_soft_model(tmp_path_factory.mktemp("compact"))
+
+
+@pytest.fixture
+def edited(browser, tmp_path):
+    with pages_of(browser, tmp_path) as open_page:
+        yield open_page
+
+
+@pytest.mark.parametrize("name", EDITS)
+def test_an_edit_shows_what_foldgauss_edit_gives(edited, compact, name):
+    page, model = edited(compact), load_video_model(compact)
+    before = page.picture(0.9)
+    read_script(page, IT + EDITS[name])
+    assert_shows(page, parse_edit_script(IT + EDITS[name]).apply(model))
+    assert np.abs(page.picture(0.9).astype(float) - before).mean() > 0.3 or name in ("front", "back")
+    own = script_of(page)  # what the page writes means the same
+    assert_shows(page, parse_edit_script(own).apply(model), (0.5,))
+    page.page.keyboard.press("z")
+    np.testing.assert_array_equal(page.picture(0.9), before)
+
+
+@pytest.mark.parametrize("how", [{"power": 1.0, "floor": 0.1}, {"compositing": "sum"}, {"degree": 0}])
+def test_edits_are_those_of_any_model(edited, tmp_path, how):
+    path = save_compact(tmp_path / "m.fgz", quantize_finely(soft_model(options=RenderOptions(), **how)))
+    page = edited(path)
+    text = IT + EDITS["freeze"] + "\n[[edits]]\n" + EDITS["scale by axes"] + "\n[[edits]]\n" + EDITS["copies"]
+    read_script(page, text)
+    assert_shows(page, parse_edit_script(text).apply(load_video_model(path)))
+
+
+def test_the_edited_model_is_that_of_foldgauss_edit(edited, compact, tmp_path):
+    page, model = edited(compact), load_video_model(compact)
+    assert download(page, "#download-model", tmp_path / "plain.safetensors") == "clip.edited.safetensors"
+    plain = load_video_model(tmp_path / "plain.safetensors")
+    for name in ("loc", "log_scale", "angle_logit", "coefficients", "opacity_logit", "color_dc", "log_time_scale"):
+        np.testing.assert_array_equal(getattr(plain.splats, name), getattr(model.splats, name), name)
+    np.testing.assert_allclose(plain.splats.time_loc_logit, model.splats.time_loc_logit, rtol=1e-6, atol=1e-6)
+    assert (plain.size, plain.fps, plain.options, plain.num_frames) == (model.size, model.fps, model.options, 7)
+    text = "".join(IT + "".join(f"{EDITS[name]}\n[[edits]]\n" for name in ("transform", "gain", "copies", "fainter")))
+    text += EDITS["front"]
+    read_script(page, text)
+    download(page, "#download-model", tmp_path / "edited.safetensors")
+    edited, wanted = load_video_model(tmp_path / "edited.safetensors"), parse_edit_script(text).apply(model)
+    assert isinstance(wanted, VideoModel)
+    for name in ("loc", "log_scale", "coefficients", "opacity_logit", "color_dc", "log_time_scale", "time_loc_logit"):
+        np.testing.assert_allclose(getattr(edited.splats, name), getattr(wanted.splats, name), rtol=2e-6, atol=2e-6)
+    for t in TIMES:
+        assert np.abs(VideoRenderer(edited).image(t) - VideoRenderer(wanted).image(t)).max() < 1e-4
+    assert_shows(page, edited)
+
+
+def test_a_model_that_no_file_holds_is_told(edited, compact):
+    page = edited(compact)
+    read_script(page, IT + 'do = "retime"\nshift = 0.9\n')
+    page.page.click("#files-open")
+    page.page.click("#download-model")
+    assert "beyond the clip" in page.page.locator("#toast").inner_text()
+
+
+def test_undo_and_redo_go_through_all_steps(edited, compact):
+    page = edited(compact)
+    page.page.keyboard.press("e")
+    pictures = [page.picture(0.4)]
+    for action in (
+        lambda: select(page, range(12)),
+        lambda: page.page.locator("#move-x").fill("12"),
+        lambda: page.page.locator("#gain").fill("2"),
+        lambda: select(page, range(5), "subtract"),
+        lambda: page.page.click("#duplicate"),
+        lambda: page.page.click("#to-front"),
+        lambda: page.page.evaluate("foldgauss.controls.panel.act({ do: 'freeze', at: 6 })"),
+        lambda: read_script(page, IT + EDITS["vanish"]),
+        lambda: page.page.evaluate("foldgauss.files.discard()"),
+    ):
+        action()
+        pictures.append(page.picture(0.4))
+        assert page.stats["undoable"] == len(pictures) - 1
+        assert np.abs(pictures[-1].astype(float) - pictures[-2]).mean() > 0.005
+    page.page.locator("#stage").click()
+    page.page.evaluate("document.activeElement.blur()")
+    np.testing.assert_array_equal(pictures[-1], pictures[0])
+    steps = page.stats["undoable"]
+    for k in range(len(pictures) - 2, -1, -1):
+        page.page.keyboard.press("Control+z")
+        np.testing.assert_array_equal(page.picture(0.4), pictures[k], str(k))
+    assert page.page.locator("#undo").is_disabled()
+    for k in range(1, len(pictures)):
+        page.page.keyboard.press("Control+Shift+z")
+        np.testing.assert_array_equal(page.picture(0.4), pictures[k], str(k))
+    assert (page.stats["undoable"], page.stats["redoable"]) == (steps, 0)
+
+
+def test_the_edit_is_there_again_when_the_page_is(edited, compact):
+    page = edited(compact)
+    read_script(page, IT + EDITS["move"])
+    page.page.keyboard.press("e")
+    select(page, [20, 21])
+    before, text = page.picture(0.4), script_of(page)
+    assert "20-21" in text
+    page.page.reload()
+    page.ready()
+    page.page.keyboard.press("e")
+    np.testing.assert_array_equal(page.picture(0.4), before)
+    assert script_of(page) == text
+    page.page.keyboard.press("z")
+    page.page.keyboard.press("z")
+    assert page.stats["steps"] == []
+    page.page.keyboard.press("Shift+z")
+    assert len(page.stats["steps"]) == 2
+    page.page.evaluate("foldgauss.files.discard()")
+    page.page.reload()
+    page.ready()
+    assert page.stats["steps"] == []
+
+
+def test_a_script_comes_back_by_drop_and_by_the_button(edited, compact, tmp_path):
+    page = edited(compact)
+    read_script(page, IT + EDITS["several"])
+    select(page, [3, 4])
+    wanted, text, picked = page.picture(0.3), script_of(page), page.page.evaluate(PICKED)
+    assert {3, 4} <= set(picked)
+    path = tmp_path / "it.toml"
+    assert download(page, "#download-script", path) == "clip.edit.toml"
+    assert path.read_text() == text
+    for way in ("drop", "button"):
+        page.page.evaluate("foldgauss.files.discard()")
+        assert np.abs(page.picture(0.3).astype(float) - wanted).mean() > 0.3
+        if way == "drop":
+            drop(page, path)
+        else:
+            page.page.locator("#chooser").set_input_files(path)
+        page.until("foldgauss.stats.steps.length > 0")
+        np.testing.assert_array_equal(page.picture(0.3), wanted)
+        assert script_of(page) == text
+        assert page.page.evaluate(PICKED) == picked
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[selections.a]\nbox = [0, 0, 1, 1]\n", "line 1, [selections.a]: box: expected indices, or any, all"),
+        (IT + 'do = "move"\noffset = [0.1, 0]\nframes = [2, 4]\n', "frames: expected an edit at all times"),
+        (IT + 'do = "scale"\nfactor = 2\n', "about a fixed point: give about"),
+        (IT + 'do = "sing"\n', "do: expected one of move"),
+        (IT + 'do = "move"\noffset = "far"\n', 'line 5, [[edits]] number 1: offset: expected two numbers, got "far"'),
+        (IT.replace(f"= {NUM}", "= 41") + EDITS["vanish"], "num_gaussians: expected 40, those of this model, got 41"),
+        (IT.replace("0-11", "0-99") + EDITS["vanish"], "indices: expected Gaussians from 0 to 39, got 99"),
+        (IT.replace('"it"', '"them"') + EDITS["vanish"], "select: expected the name of a selection"),
+        ("[[layers]]\nmodel = 'm'\n", "[layers]: expected selections and edits"),
+        ("[camera", "line 1: expected ]"),
+        ("a = b", 'line 1: expected a key or a value, got "b"'),
+        ("a = 1\na = 2", "line 2: expected each key once"),
+        ("[[edits]]\n__proto__ = 1\ndo = 'vanish'", "__proto__: expected one of no keys"),
+    ],
+)
+def test_scripts_that_the_page_cannot_do_are_told(edited, compact, text, message):
+    page = edited(compact)
+    read_script(page, text, "own.toml")
+    told = page.page.locator("#toast").inner_text()
+    assert told.startswith("own.toml: ")
+    assert message in told
+    assert page.stats["undoable"] == 0
+
+
+def test_selections_of_scripts_are_combined(edited, compact):
+    text = '[selections.a]\nindices = "0-9"\n[selections."b c"]\nindices = "5-14" # and\n'
+    text += '[selections.d]\nany = ["a", "b c"]\nwithout = [\n  "e",\n]\n'.replace('"e"', '"b c"')
+    text += '[selections.current]\nany = ["d"]\nall = ["a"]\n'
+    page = read_script(edited(compact), text)
+    assert page.page.evaluate(PICKED) == list(range(5))
+
+
+def test_segments_are_edited_by_one_script(edited):
+    parts = [(6 * k, soft_model(seed=k, options=RenderOptions(), num_frames=7)) for k in range(2)]
+    video = SegmentedVideo.from_models(parts)
+    page = edited(video)
+    page.until("foldgauss.stats.decoded.length === 2")
+    page.page.evaluate("foldgauss.seek(0.2)")
+    select(page, range(12))
+    page.page.evaluate("foldgauss.seek(0.9)")
+    select(page, range(12, 20))
+    page.page.keyboard.press("e")
+    page.page.locator("#move-x").fill("10")
+    assert page.page.locator("#freeze").is_disabled()
+    page.page.keyboard.press("Escape")
+    text = script_of(page)
+    edited = VideoRenderer(parse_edit_script(text).apply(video))
+    plain = VideoRenderer(video)
+    for t in (0.2, 0.9):
+        far = np.abs(page.picture(t).astype(float) - edited.frame(t)).mean()
+        assert far < 0.5 < np.abs(page.picture(t).astype(float) - plain.frame(t)).mean()
+
+
+def test_json_of_steps_is_all_that_the_browser_keeps(edited, compact):
+    page = edited(compact)
+    read_script(page, IT + EDITS["hue"])
+    page.page.evaluate("foldgauss.files.storage.flush()")
+    kept = page.page.evaluate("Object.entries(localStorage)")
+    ((name, text),) = kept
+    assert name.startswith("foldgauss-edit-")
+    assert json.loads(text) == {"steps": [{"script": page.stats["steps"]}], "done": 1}
+    assert page.stats["steps"][1] == {"do": "recolor", "hue": 0.6}
+    assert OBJECT.sum() == 12
+    assert SIZE == (40, 64)

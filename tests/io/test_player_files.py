@@ -1,0 +1,266 @@
+"""Files of the player: opening any model, saving to the disk, recording; and small screens."""
+
+import dataclasses
+import re
+import threading
+from contextlib import contextmanager
+
+import cv2
+import numpy as np
+import pytest
+from browser import Opened, chromium
+from editor_page import (
+    EDITS,
+    IT,
+    assert_shows,
+    download,
+    drop,
+    pages_of,
+    read_script,
+    save_soft_model,
+    script_of,
+    select,
+)
+from soft_models import NUM, SIZE, soft_model
+
+from foldgauss.cli.viewing.page_server import PageServer, make_token
+from foldgauss.io import export, html_page, import_model, load_video_model, read_video, save_video_model, write_html
+from foldgauss.io.edit_script import parse_edit_script, read_edit_script
+from foldgauss.io.page.player_page import SaveTarget, empty_page
+from foldgauss.render import RenderOptions
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def compact(tmp_path_factory):
+    return save_soft_model(tmp_path_factory.mktemp("compact"))
+
+
+@pytest.fixture
+def edited(browser, tmp_path):
+    with pages_of(browser, tmp_path) as open_page:
+        yield open_page
+
+
+@pytest.fixture
+def bare(browser, tmp_path):
+    """The page without a model."""
+    path = tmp_path / "index.html"
+    path.write_text(empty_page(), encoding="utf-8")
+    page = Opened(browser, path, viewport={"width": 900, "height": 640})
+    page.page.locator("#notice-open").wait_for()
+    yield page
+    page.close()
+    assert not page.said
+    assert all(url.startswith(("file:", "blob:", "data:")) for url in page.asked)
+
+
+def thinned():
+    """A model whose file leaves out parameters: static and opaque Gaussians, shared colours, several degrees."""
+    model = soft_model(options=RenderOptions())
+    leaves = {
+        name: np.array(getattr(model.splats, name)) for name in ("time_loc_logit", "log_time_scale", "opacity_logit")
+    }
+    leaves["time_loc_logit"][::2], leaves["log_time_scale"][::2] = 0, np.log(np.float32(1024))
+    leaves["opacity_logit"][::3] = 8
+    color, coefficients = np.array(model.splats.color_dc), np.array(model.splats.coefficients)
+    color[:] = color[np.arange(NUM) % 4]
+    coefficients[::2] = 0
+    splats = dataclasses.replace(model.splats, **leaves, color_dc=color, coefficients=coefficients)
+    return dataclasses.replace(model, splats=splats)
+
+
+def test_the_empty_page_opens_any_model(bare, compact, tmp_path):
+    model = soft_model(options=RenderOptions(), seed=3)
+    save_video_model(tmp_path / "plain.safetensors", model)
+    save_video_model(tmp_path / "thin.safetensors", thinned())
+    export(model, "ply", tmp_path / "vegas.ply")
+    for path in (tmp_path / "plain.safetensors", compact, tmp_path / "thin.safetensors", tmp_path / "vegas.ply"):
+        bare.page.evaluate("window.foldgauss.seek = null")
+        drop(bare, path)
+        bare.until(f"foldgauss.seek && document.title === '{path.stem}'")
+        wanted = import_model(path) if path.suffix == ".ply" else load_video_model(path)
+        assert_shows(bare, wanted)
+        assert bare.stats["total"] == NUM
+    read_script(bare, IT + EDITS["rotate"])
+    assert_shows(bare, parse_edit_script(IT + EDITS["rotate"]).apply(wanted))
+
+
+def test_a_vegas_file_without_a_size_is_asked_for_it(bare, tmp_path):
+    model = soft_model(options=RenderOptions())
+    path = export(model, "ply", tmp_path / "theirs.ply")
+    path.write_bytes(re.sub(rb"comment foldgauss [^\n]*\n", b"", path.read_bytes()))
+    drop(bare, path)
+    bare.page.locator("#facts-needed").wait_for()
+    for name, value in (("width", SIZE[1]), ("height", SIZE[0]), ("fps", 12)):
+        bare.page.locator(f"#needed-{name}").fill(str(value))
+    bare.page.click("#facts-needed [value=open]")
+    bare.until("foldgauss.seek")
+    assert_shows(bare, import_model(path, size=SIZE, fps=12))
+    assert bare.page.locator("#whole").inner_text() == "/ 0:00.50"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.png", b"\x89PNG\r\n\x1a\n" + bytes(30), "This is a picture. Expected a model"),
+        ("a.mp4", bytes(4) + b"ftypisom" + bytes(30), "This is a video. Expected a model: .safetensors"),
+        ("a.bin", b"hello, world", "This is something else. Expected a model"),
+        ("a.fgz", b"", "The file is empty"),
+        ("a.safetensors", (2).to_bytes(8, "little") + b"{}", "a safetensors file of another program"),
+        ("b.safetensors", (200).to_bytes(8, "little") + b"{}", "damaged or cut short"),
+        (
+            "a.ply",
+            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
+            "is no video of VeGaS",
+        ),
+        (
+            "b.ply",
+            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float f_dc_0\nend_header\n1\n",
+            "a still 3DGS scene",
+        ),
+        (
+            "c.ply",
+            b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty float x\nend_header\n1",
+            "cut short",
+        ),
+        ("a.toml", b"", "Open the model first"),
+    ],
+)
+def test_files_that_cannot_be_opened_are_told(bare, tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    drop(bare, tmp_path / name)
+    bare.page.locator("#toast").wait_for()
+    assert message in bare.page.locator("#toast").inner_text()
+    assert bare.page.locator("#notice-open").is_visible()
+
+
+def test_damaged_models_are_told(bare, compact, tmp_path):
+    good = save_video_model(tmp_path / "m.safetensors", soft_model()).read_bytes()
+    for name, content in (
+        ("cut.safetensors", good[:-100]),
+        ("nan.safetensors", good[:-8] + np.float32([np.nan, 1]).tobytes()),
+        ("cut.fgz", compact.read_bytes()[:-50]),
+    ):
+        (tmp_path / name).write_bytes(content)
+        bare.page.evaluate("document.getElementById('toast').hidden = true")
+        drop(bare, tmp_path / name)
+        bare.page.locator("#toast").wait_for()
+        assert "damaged" in bare.page.locator("#toast").inner_text()
+
+
+def test_view_saves_to_disk_and_takes_it_up_again(browser, compact, tmp_path):
+    script, token = tmp_path / "clip.edit.toml", make_token()
+
+    def served():
+        saved = script.read_bytes() if script.exists() else None
+        page = html_page(compact, save_to=SaveTarget(script.name, token, saved))
+        return PageServer(page.encode(), 0, script=script, token=token)
+
+    @contextmanager
+    def shown():
+        with served() as server:
+            thread = threading.Thread(target=server.serve_forever)
+            thread.start()
+            page = Opened(browser, server.url, viewport={"width": 900, "height": 640}).ready()
+            try:
+                yield page
+            finally:
+                page.close()
+                server.shutdown()
+                thread.join()
+        assert not page.said
+        assert all(url.startswith((server.url, "blob:", "data:")) for url in page.asked)
+
+    with shown() as page:
+        read_script(page, IT + EDITS["move"])
+        page.page.keyboard.press("Control+s")
+        page.page.get_by_text("Saved as clip.edit.toml").wait_for()
+        assert script.read_text() == script_of(page)
+        wanted = page.picture(0.4)
+    with shown() as page:  # at another port, whose browser storage is another
+        np.testing.assert_array_equal(page.picture(0.4), wanted)
+        assert_shows(page, read_edit_script(script).apply(load_video_model(compact)))
+    script.write_text("[selections.it]\nbox = [0, 0, 9, 9]\nframe = 0\n")
+    with shown() as page:
+        assert "box: expected indices" in page.page.locator("#toast").inner_text()
+        page.page.keyboard.press("s")
+        assert page.page.locator("#save-disk").is_disabled()
+        assert "left alone" in page.page.locator("#save-about").inner_text()
+
+
+def test_a_picture_is_what_is_shown(edited, compact, tmp_path):
+    page = edited(compact)
+    page.page.evaluate("foldgauss.seek(0.5)")
+    page.page.keyboard.press("e")
+    select(page, range(12))
+    page.page.keyboard.press("s")
+    page.page.locator("#record-height").fill("80")
+    assert download(page, "#picture", tmp_path / "frame.png") == "clip-3.png"
+    saved = cv2.imread(str(tmp_path / "frame.png"))[..., ::-1]
+    page.page.keyboard.press("e")
+    np.testing.assert_array_equal(saved, page.picture(size=(80, 128)))  # without the marks of the selection
+
+
+def test_a_video_is_recorded(edited, compact, tmp_path):
+    page = edited(compact)
+    page.page.keyboard.press("s")
+    for name, value in (("height", 80), ("speed", 0.25), ("first", 1), ("last", 5)):
+        page.page.locator(f"#record-{name}").fill(str(value))
+    with page.page.expect_download() as waited:
+        page.page.click("#record")
+    waited.value.save_as(tmp_path / "clip.webm")
+    assert waited.value.suggested_filename == "clip.webm"
+    page.page.evaluate("document.getElementById('files').close()")
+    clip = read_video(tmp_path / "clip.webm").frames
+    assert clip.shape[1:3] == (80, 128)
+    wanted = [page.picture(t, (80, 128)).astype(float) for t in (1 / 6, 5 / 6)]
+    far = np.array([[np.abs(frame - one).mean() for frame in clip] for one in wanted])
+    assert (far.min(axis=1) < 6).all()  # what the encoder's rate allows
+    assert far[0].argmin() < far[1].argmin()
+    assert np.abs(wanted[0] - wanted[1]).mean() > 6
+    assert page.stats["position"] == 5  # where the pictures were just taken
+
+
+def test_small_screens_and_both_themes_show_all(browser, compact, tmp_path):
+    path = write_html(tmp_path / "page.html", compact)
+    for width, height, scheme in ((1280, 800, "dark"), (360, 640, "light"), (740, 360, "dark")):
+        page = Opened(browser, path, viewport={"width": width, "height": height}, color_scheme=scheme, has_touch=True)
+        page.ready().page.keyboard.press("e")
+        select(page, range(12))
+        for name in ("panel", "files"):
+            if name == "files":
+                page.page.keyboard.press("s")
+            assert page.page.evaluate("document.documentElement.scrollWidth") <= width
+            outside = page.page.evaluate(
+                """(name) => [...document.getElementById(name).querySelectorAll("button, input:not([type=file])")]
+                .filter((own) => own.offsetParent).map((own) => [own.id, own.getBoundingClientRect()])
+                .filter(([, box]) => box.left < 0 || box.right > innerWidth || box.width < 30 || box.height < 30)
+                .map(([id, box]) => `${id} ${box.left} ${box.width} ${box.height}`)""",
+                name,
+            )
+            assert outside == []
+        low = page.page.evaluate(
+            """() => {
+              const parse = (text) => text.match(/[\\d.]+/g).map(Number), linear = (c) => (c / 255) ** 2.2;
+              const light = ([r, g, b]) => 0.2126 * linear(r) + 0.7152 * linear(g) + 0.0722 * linear(b);
+              const back = (own) => {
+                const [r, g, b, a = 1] = parse(getComputedStyle(own).backgroundColor);
+                return a > 0.99 || !own.parentElement ? [r, g, b] : back(own.parentElement);
+              };
+              return [...document.querySelectorAll("h1, h2, h3, p, label, button:enabled, output, span")]
+                .filter((own) => own.offsetParent && own.textContent.trim() && !own.closest(":disabled"))
+                .map((own) => {
+                  const ink = light(parse(getComputedStyle(own).color)), paper = light(back(own));
+                  const name = own.id || own.textContent.trim().slice(0, 20);
+                  return [name, (Math.max(ink, paper) + 0.05) / (Math.min(ink, paper) + 0.05)];
+                }).filter(([, ratio]) => ratio < 4.5);
+            }"""
+        )
+        assert low == []
+        page.close()

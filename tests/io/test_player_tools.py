@@ -1,0 +1,230 @@
+"""The player's tools: selections, handles and numbers by mouse, keys and fingers."""
+
+import numpy as np
+import pytest
+from browser import chromium
+from editor_page import assert_shows, drag, in_box, pages_of, picked, save_soft_model, screen_at, script_of, select
+from soft_models import NUM, SIZE
+
+from foldgauss.io import load_video_model
+from foldgauss.io.edit_script import parse_edit_script
+from foldgauss.video.selection.tracking import to_lab
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def compact(tmp_path_factory):
+    return save_soft_model(tmp_path_factory.mktemp("compact"))
+
+
+@pytest.fixture
+def edited(browser, tmp_path):
+    with pages_of(browser, tmp_path) as open_page:
+        yield open_page
+
+
+def test_outlines_select_and_combine_by_keys(edited, compact):
+    page, model = edited(compact), load_video_model(compact)
+    page.page.evaluate("foldgauss.seek(0.5)")
+    all_of_it, left = in_box(model, -0.3, -0.25, 0.15, 0.3), in_box(model, -0.3, -0.25, -0.1, 0.3)
+    page.page.keyboard.press("r")
+    drag(page, [(-0.3, -0.25), (0.15, 0.3)])
+    found = picked(page)
+    assert len(found) > 5
+    assert found <= all_of_it  # without those that nobody sees
+    drag(page, [(-0.3, -0.25), (-0.1, 0.3)], modifiers=["Alt"])
+    assert picked(page) == found - left
+    drag(page, [(-0.3, -0.25), (0.15, 0.3)], modifiers=["Shift"])
+    assert picked(page) == found
+    drag(page, [(-0.3, -0.25), (-0.1, 0.3)], modifiers=["Shift", "Alt"])
+    assert picked(page) == found & left
+    page.page.keyboard.press("a")
+    drag(page, [(-0.3, -0.25), (0.15, -0.25), (0.15, 0.3), (-0.3, 0.3)])
+    assert picked(page) == found
+    page.page.keyboard.press("p")
+    page.page.click("[data-how=subtract]")
+    for corner in [(-0.3, -0.25), (-0.1, -0.25), (-0.1, 0.3), (-0.3, 0.3), (-0.3, -0.25)]:
+        page.page.mouse.click(*screen_at(page, *corner))
+    assert picked(page) == found - left
+    page.page.keyboard.press("Control+i")
+    assert picked(page) == set(range(NUM)) - (found - left)
+    page.page.keyboard.press("Control+a")
+    assert len(picked(page)) == NUM
+    page.page.keyboard.press("Control+Shift+a")
+    assert not picked(page)
+
+
+def test_an_outline_is_drawn_while_it_grows(edited, compact):
+    page = edited(compact)
+    page.page.keyboard.press("p")
+    for corner in [(-0.2, -0.1), (0.1, -0.1), (0.1, 0.1)]:
+        page.page.mouse.click(*screen_at(page, *corner))
+    outline = page.page.locator("#outline path").last
+    assert outline.get_attribute("d").count("L") >= 2
+    page.page.keyboard.press("Backspace")
+    page.page.keyboard.press("Escape")
+    assert outline.get_attribute("d") == ""
+    assert page.stats["editing"]
+
+
+def test_a_color_selects_what_looks_like_it(edited, compact):
+    page, model = edited(compact), load_video_model(compact)
+    page.page.keyboard.press("i")
+    page.page.locator("#tolerance-value").fill("12")
+    page.page.evaluate("foldgauss.controls.tools.picker.colorAt = () => [0.2, 0.5, 0.3]")
+    page.page.mouse.click(*screen_at(page, 0, 0))
+    color = np.clip(0.5 + 0.28209479 * np.asarray(model.splats.color_dc), 0, 1)
+    assert picked(page) == set(
+        np.flatnonzero(np.linalg.norm(to_lab(color) - to_lab(np.array([0.2, 0.5, 0.3])), axis=-1) <= 12)
+    )
+
+
+def test_the_eyedropper_sees_the_color_that_is_shown(edited, compact):
+    page = edited(compact)
+    shown = page.picture(0.5)
+    for x, y in ((-0.15, 0.0), (0.1, 0.1), (0.3, -0.1)):
+        column, row = int((x + 0.5) * SIZE[1]), int((y + 0.5 * SIZE[0] / SIZE[1]) * SIZE[1])
+        x, y = (column + 0.5) / SIZE[1] - 0.5, (row + 0.5 - SIZE[0] / 2) / SIZE[1]
+        color = page.page.evaluate(
+            "(at) => foldgauss.controls.tools.picker.colorAt(foldgauss.player.state, foldgauss.player.ownTime, ...at)",
+            [x, y],
+        )
+        np.testing.assert_allclose(np.array(color) * 255, shown[row, column], atol=4)
+
+
+def test_a_selection_grows_and_shrinks(edited, compact):
+    page = edited(compact)
+    page.page.evaluate("foldgauss.seek(0.5)")
+    page.page.keyboard.press("e")
+    page.page.evaluate("Object.defineProperty(foldgauss.controls.tools, 'distance', { value: 0.12 })")
+    select(page, [0])
+    sizes = [1]
+    for _ in range(3):
+        page.page.click("#grow")
+        sizes.append(page.stats["picked"])
+    assert sizes == sorted(sizes)
+    assert sizes[-1] > sizes[1] > 1
+    grown = picked(page)
+    page.page.click("#shrink")
+    assert picked(page) < grown
+
+
+def test_handles_and_numbers_are_one_edit(edited, compact):
+    page, model = edited(compact), load_video_model(compact)
+    page.page.evaluate("foldgauss.seek(0.5)")
+    page.page.keyboard.press("e")
+    select(page, range(12))
+    page.page.keyboard.press("v")
+    page.settle()
+    frame = page.page.locator("#handle-move").bounding_box()
+    middle = frame["x"] + frame["width"] / 2, frame["y"] + frame["height"] / 2
+    unit = page.page.evaluate(
+        "(() => { const { view } = foldgauss.player; return view.toScreen(0, 0, view.panes(1)[0])[2] })()"
+    )
+    page.page.mouse.move(*middle)
+    page.page.mouse.down()
+    page.page.mouse.move(middle[0] + 0.1 * unit, middle[1] - 0.05 * unit, steps=5)
+    page.page.mouse.up()
+    (_, move) = page.stats["steps"]
+    np.testing.assert_allclose(move["offset"], [0.1, -0.05], atol=1e-3)
+    assert float(page.page.locator("#move-x").input_value()) == pytest.approx(6.4, abs=0.1)
+    page.page.locator("#move-x").fill("3.2")
+    assert page.stats["steps"][1]["offset"][0] == pytest.approx(0.05)
+    assert len(page.stats["steps"]) == 2
+    page.page.evaluate("document.activeElement.blur()")
+    page.page.keyboard.press("Alt+Shift+ArrowRight")
+    assert page.stats["steps"][1]["offset"][0] == pytest.approx(0.05 + 10 / 64)
+    for handle, key in (("#handle-scale", "factor"), ("#handle-rotate", "degrees")):
+        page.settle()
+        box = page.page.locator(handle).bounding_box()
+        at = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        page.page.mouse.move(*at)
+        page.page.mouse.down()
+        page.page.mouse.move(at[0] + 60, at[1] + 40, steps=4)
+        page.page.mouse.up()
+        assert key in page.stats["steps"][-1]
+        assert len(page.stats["steps"][-1]["about"]) == 2
+    assert page.stats["steps"][2]["factor"] > 1.1
+    assert 5 < page.stats["steps"][3]["degrees"] < 90
+    page.page.keyboard.press("Escape")
+    assert_shows(page, parse_edit_script(script_of(page)).apply(model), (0.5, 0.8))
+
+
+def test_fields_make_the_edits_that_they_name(edited, compact):
+    page = edited(compact)
+    page.page.evaluate("foldgauss.seek(0.5)")
+    page.page.keyboard.press("e")
+    select(page, range(12))
+    for name, value, step in (
+        ("scale", "150", {"do": "scale", "factor": 1.5}),
+        ("rotate", "30", {"do": "rotate", "degrees": 30}),
+        ("hue-value", "120", {"do": "recolor", "hue": 0.333333}),
+        ("gain", "1.5", {"do": "recolor", "gain": 1.5}),
+        ("opacity-value", "0.5", {"do": "opacity", "factor": 0.5}),
+        ("shift", "3", {"do": "retime", "shift": 0.5}),
+        ("stretch", "2", {"do": "retime", "stretch": 0.5, "about": 0.5}),
+    ):
+        page.page.locator(f"#{name}").fill(value)
+        last = page.stats["steps"][-1]
+        assert {key: own for key, own in last.items() if key in step} == step
+        assert page.page.locator(f"#{name}").input_value() == value
+    page.page.locator("#copies").fill("2")
+    page.page.locator("#delay").fill("1.5")
+    page.page.click("#duplicate")
+    expected = {"do": "multiply", "offsets": [[0.3125, 0], [0.625, 0]], "delays": [0.25, 0.5]}
+    assert page.stats["steps"][-1] == expected
+    page.page.locator("#copies").fill("1")
+    assert page.stats["steps"][-1]["offsets"] == [[0.3125, 0]]
+    page.page.click("#to-back")
+    page.page.click("#freeze")
+    page.page.click("#vanish")
+    assert [step.get("do") for step in page.stats["steps"][-3:]] == ["to_back", "freeze", "vanish"]
+    assert page.page.locator("#to-back").is_disabled()  # nothing is selected any more
+
+
+def test_the_keyboard_alone_selects_and_edits(edited, compact):
+    page = edited(compact)
+    page.page.keyboard.press("r")
+    page.page.locator("#canvas").focus()
+    press = page.page.keyboard.press
+    for _ in range(20):
+        press("ArrowLeft")
+    press("Enter")
+    for _ in range(30):
+        press("ArrowRight")
+        press("ArrowDown")
+    press("Enter")
+    assert page.stats["picked"] > 2
+    press("d")
+    press("Delete")
+    assert [step.get("do") for step in page.stats["steps"]] == [None, "multiply", "vanish"]
+
+
+def test_fingers_brush_and_pinch(edited, compact):
+    page = edited(compact, has_touch=True)
+    page.page.keyboard.press("b")
+    box = page.page.locator("#canvas").bounding_box()
+    touch = page.context.new_cdp_session(page.page)
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+
+    def send(kind, *points):
+        touch.send(
+            "Input.dispatchTouchEvent",
+            {"type": kind, "touchPoints": [{"x": x, "y": y, "id": k} for k, (x, y) in enumerate(points)]},
+        )
+
+    send("touchStart", middle)
+    send("touchMove", (middle[0] - 80, middle[1] + 10))
+    send("touchEnd")
+    count = page.stats["picked"]
+    assert count > 0
+    send("touchStart", middle, (middle[0] + 50, middle[1]))
+    send("touchMove", (middle[0] - 50, middle[1]), (middle[0] + 100, middle[1]))
+    send("touchEnd")
+    assert page.stats["zoom"] > 2
+    assert page.stats["picked"] == count  # a pinch is no stroke
