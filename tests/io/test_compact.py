@@ -273,6 +273,27 @@ def test_invisible_gaussians_are_dropped():
     assert compress(hidden, max_loss_db=0.1).num_dropped >= 5
 
 
+def test_dropping_uses_the_loss_that_it_may_cost():
+    search = sys.modules["foldgauss.video.compression.search"]
+    model = crowd(soft_model(options=RenderOptions()))
+    loss, plan = search._Loss(model, clip_of(model), None), search._Plan(model)
+    kept = [search._drop(model, plan, loss, -8.0, most) for most in (0.1, 1.0, 5.0)]
+    lost = [loss(one, loss.all_frames) for one in kept]
+    assert lost[0] <= 0.1
+    assert 0.1 < lost[1] <= 1.0 < lost[2] <= 5.0
+    assert model.num_gaussians > kept[0].num_gaussians > kept[1].num_gaussians > kept[2].num_gaussians
+
+
+def test_order_found_before_fine_tuning_shortens_the_column_of_cells():
+    """Nine in ten steps go on in a sweep; in the model's own order half of them go back."""
+    model = crowd(soft_model(degree=3, options=RenderOptions()))
+    back = [
+        (np.diff(one.columns["cell"]) < 0).mean() for one in (fine(model), compress(model, clip_of(model)).quantized)
+    ]
+    assert back[0] > 0.4
+    assert back[1] < 0.15
+
+
 def test_loss_out_of_reach(monkeypatch):
     """Where even the finest steps lose more."""
     module = sys.modules["foldgauss.video.compression.search"]  # its name in the package is the function's

@@ -63,16 +63,22 @@ _FINEST, _COARSEST, _CLOSE = -8.0, 9.0, 0.05
 _WORTH = 40.0
 #: How much coarser, in powers of two, the first try with fine-tuning is; and the loss per power of two, dB.
 _COARSER, _SLOPE = 1.7, 0.7
-#: Tries with fine-tuning, each of passes / 2 + passes / 4 passes; and the fraction of the allowed loss that ends them.
+#: Loss in dB by dropping Gaussians, before the others are fine-tuned, for each pass and for an allowed loss of 1 dB;
+#: it grows with the square root of the allowed loss. And the most.
+_DROPPED, _MAX_DROPPED = 0.5, 12.0
+#: Tries with fine-tuning, each of passes / 4 + passes / 8 passes; and the fraction of the allowed loss that ends them.
 _TRIES, _ENOUGH = 6, 0.9
 #: Most powers of two by which a try may extrapolate.
 _MAX_EXTRAPOLATION = 2.0
-#: Fraction of the allowed loss that dropping Gaussians may cost after fine-tuning the others; if it costs more, the
-#: next try drops as many as for steps finer by this many powers of two.
-_DROPPING, _FEWER = 0.4, 0.7
+#: Fraction of the allowed loss that dropping Gaussians may cost after fine-tuning the others; if it costs more, half of
+#: the loss before is tried, up to this many times in all.
+_DROPPING, _DROPS = 0.4, 3
 #: Fraction of the allowed squared error that reordering may add if all pairs whose order is given up are swapped; and
 #: fraction of the allowed loss that it may cost.
 _ORDERING = 0.3
+#: Squared error that reordering may add before fine-tuning, which compensates for most of it, as a fraction of the
+#: model's own.
+_FIRST_ORDERING = 0.05
 #: Least number of Gaussians from which steps are regressed on features.
 _FEW = 100
 _MIN_SENSITIVITY = 1e-4  # below, a Gaussian is not visible
@@ -102,7 +108,7 @@ def compress(
     *,
     max_loss_db: float = 0.2,
     psnr: float | None = None,
-    passes: int = 8,
+    passes: int = 24,
     on_step: Callable[[str, float], None] = lambda what, loss_db: None,
 ) -> Compressed:
     """Quantize `model` as coarsely as `max_loss_db` allows, in dB of the mean PSNR of all frames.
@@ -113,9 +119,9 @@ def compress(
     parameters (`FoldedSplats.degrees`, `static`, `opaque`) stay absent, and shared colours stay shared.
 
     With the clip, fine-tuning compensates for losses and allows coarser steps: all leaves for `passes` passes once
-    Gaussians have been dropped, paths and colours for half as many once geometry is rounded, colours for a quarter once
-    paths are. With 0 passes every parameter is the model's own, rounded. `on_step(what, loss_db)` is called now and
-    then, with NaN before anything has been measured.
+    Gaussians have been dropped, paths and colours for a quarter of them once geometry is rounded, colours for an eighth
+    once paths are. More passes make smaller files. With 0 passes every parameter is the model's own, rounded.
+    `on_step(what, loss_db)` is called now and then, with NaN before anything has been measured.
 
     Raises ValueError for anything but a `VideoModel` (bake edits first), for NaN or infinities, several envelopes, a
     degree above 15, frames that do not fit, and a loss out of reach.
@@ -152,7 +158,6 @@ class _Try:
 
 def _search_rounded(plan: "_Plan", loss: "_Loss", max_loss: float, on_step: Callable) -> _Try:
     """The coarsest steps that lose at most `max_loss`, without fine-tuning."""
-    sampled = np.unique(np.linspace(0, loss.num_frames - 1, TRIED_FRAMES).round().astype(int))
 
     def attempt(factor: float, which: Int[np.ndarray, " some"]) -> _Try:
         quantized = plan.quantize(factor, plan.keep(factor))
@@ -164,7 +169,7 @@ def _search_rounded(plan: "_Plan", loss: "_Loss", max_loss: float, on_step: Call
     fine, coarse = _FINEST, _COARSEST
     while coarse - fine > _CLOSE:
         middle = (fine + coarse) / 2
-        fine, coarse = (middle, coarse) if attempt(middle, sampled).loss_db <= max_loss else (fine, middle)
+        fine, coarse = (middle, coarse) if attempt(middle, loss.sampled_frames).loss_db <= max_loss else (fine, middle)
     for _ in range(8):
         found = attempt(fine, loss.all_frames)
         if found.loss_db <= max_loss:
@@ -184,24 +189,26 @@ def _search_finetuned(
     on_step: Callable,
 ) -> _Try | None:
     """The coarsest steps found that lose at most `max_loss` after fine-tuning; None unless above the factor `least`."""
-    factor = least + _COARSER
 
     def finetune(model: VideoModel, fraction: float, what: str, **how: object) -> VideoModel:
         return finetune_model(
             model, loss.target, math.ceil(fraction * passes), on_pass=lambda: on_step(what, math.nan), **how
         )
 
-    while True:
-        kept = _take(model, complete.keep(factor))
+    dropped = min(_DROPPED * passes * math.sqrt(max_loss), _MAX_DROPPED)
+    for _ in range(_DROPS):
+        kept = _Sorting(_drop(model, complete, loss, least, dropped))(_FIRST_ORDERING * loss.error)
         kept = finetune(kept, 1, "fine-tuning after dropping Gaussians", seed=0, shared=index_colors(kept))
-        if loss(kept, loss.all_frames) <= _DROPPING * max_loss or factor - _FEWER <= least:
+        measured = loss(kept, loss.all_frames)
+        on_step("dropped", measured)
+        if measured <= _DROPPING * max_loss:
             break
-        factor -= _FEWER  # too many to compensate for
-    plan = _Plan(_reorder(kept, loss, max_loss))
+        dropped /= 2  # too many to compensate for
+    plan, factor = _Plan(_reorder(kept, loss, max_loss)), least + _COARSER
     best, tried = None, {}
     for _ in range(_TRIES):
         quantized, exact = plan.quantize(factor), plan.exact
-        for what, free, fraction in (("paths and colours", PATH_AND_COLOR, 0.5), ("colours", COLOR, 0.25)):
+        for what, free, fraction in (("paths and colours", PATH_AND_COLOR, 0.25), ("colours", COLOR, 0.125)):
             with_path = free is PATH_AND_COLOR
             start = _undo_rounding(quantized, exact, path=with_path)
             tuned = finetune(start, fraction, f"fine-tuning {what}", free=free, seed=1, shared=exact.shade)
@@ -245,19 +252,38 @@ def _next_factor(tried: dict[float, float], max_loss: float, least: float) -> fl
     return factor if least < factor <= _COARSEST + 2 else None
 
 
+def _drop(model: VideoModel, plan: "_Plan", loss: "_Loss", least: float, most: float) -> VideoModel:
+    """The model without as many of the Gaussians that matter least as costs at most `most` dB."""
+    fine, coarse = least, least + 2 * _MAX_DROPPED
+    while coarse - fine > 2 * _CLOSE:
+        middle = (fine + coarse) / 2
+        lost = loss(_take(model, plan.keep(middle)), loss.sampled_frames)
+        fine, coarse = (middle, coarse) if lost <= most else (fine, middle)
+    return _take(model, plan.keep(fine))
+
+
 def _reorder(model: VideoModel, loss: "_Loss", max_loss: float) -> VideoModel:
     """The model with its Gaussians in an order that needs fewer bits, if that costs little of the allowed loss."""
-    samples = 3 * model.num_frames * math.prod(model.size)
-    budget = _ORDERING * samples * (10 ** ((max_loss - loss.psnr) / 10) - 10 ** (-loss.psnr / 10))
-    cells = find_cells(compute_columns(model))
-    if model.compositing == "sum":  # any order gives the same image
-        return _take(model, np.argsort(cells, kind="stable"))
-    before, overlaps = loss(model, loss.all_frames), find_overlaps(Contributions(model))
+    budget = _ORDERING * loss.error * (10 ** (max_loss / 10) - 1)
+    before, sort = loss(model, loss.all_frames), _Sorting(model)
     for fraction in (1.0, 0.1, 0.0):
-        reordered = _take(model, sort_by_cell(cells, overlaps, fraction * budget))
+        reordered = sort(fraction * budget)
         if loss(reordered, loss.all_frames) <= before + _ORDERING * max_loss:
             return reordered
     return model
+
+
+class _Sorting:
+    """Sorts a model's Gaussians by cell; see `sort_by_cell` for the budget."""
+
+    def __init__(self, model: VideoModel):
+        self._model, self._cells = model, find_cells(compute_columns(model))
+        self._overlaps = None if model.compositing == "sum" else find_overlaps(Contributions(model))
+
+    def __call__(self, budget: float) -> VideoModel:
+        if self._overlaps is None:  # any order gives the same image
+            return _take(self._model, np.argsort(self._cells, kind="stable"))
+        return _take(self._model, sort_by_cell(self._cells, self._overlaps, budget))
 
 
 def _take(model: VideoModel, which: Bool[np.ndarray, " num"] | Int[np.ndarray, " some"]) -> VideoModel:
@@ -298,6 +324,7 @@ class _Loss:
     def __init__(self, model: VideoModel, frames: np.ndarray | None, reference: float | None):
         self._compositing, self._frames, self.num_frames = model.compositing, frames, model.num_frames
         self.all_frames = np.arange(model.num_frames)
+        self.sampled_frames = np.unique(np.linspace(0, model.num_frames - 1, TRIED_FRAMES).round().astype(int))
         images = list(VideoRenderer(model).frames())
         if frames is None:
             self.measured_by, self._targets = "model", images
@@ -309,6 +336,11 @@ class _Loss:
         self._before = np.array([psnr_of(*pair) for pair in zip(self._targets, images, strict=True)])
         self._before = np.minimum(self._before, EXACT_PSNR)
         self.psnr = float(self._before.mean())
+
+    @property
+    def error(self) -> float:
+        """The model's squared error at `psnr`, colours in [0, 1], summed over frames, pixels and channels."""
+        return self._targets[0].size * self.num_frames * 10 ** (-self.psnr / 10)
 
     def __call__(self, model: VideoModel, which: Int[np.ndarray, " some"]) -> float:
         """Mean over the frames `which`."""

@@ -406,7 +406,7 @@ DEFAULT_STEPS, DEFAULT_VISITS = 3000, 20
 PIXEL_TIME = 0.4
 #: Gaussians per pixel of a clip where a core has one microsecond for each, and where they live for one frame; it grows
 #: by these powers of the time and of the lifetime. Gaussians that live long are seldom needed anew.
-DENSITY, DENSITY_POWER, LIFETIME_POWER = 0.017, 0.85, -0.5
+DENSITY, DENSITY_POWER, LIFETIME_POWER = 0.0205, 0.85, -0.6
 #: A model with parameters of so many bytes is at most as large as the frames as bytes.
 PARAMETER_BYTES = 2
 #: Mean lifetimes in frames: of slow clips (*Bunny* 68, carphone 35), and the shortest, in flicker. DAVIS: 5 to 19.
