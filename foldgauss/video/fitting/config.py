@@ -104,7 +104,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 
 #: The default of `FitConfig.interpolation_fraction`.
-INTERPOLATION_FRACTION = 0.15
+INTERPOLATION_FRACTION = 0.1
 #: Groups of settings, which are the panels of `foldgauss fit --help`.
 MODEL, BUDGET, OPTIMIZATION = "model", "budget", "optimization"
 
