@@ -1,8 +1,8 @@
 """Frames never seen: fit every second frame, draw those in between, and compare with what is usual.
 
     python -m benchmarks.interpolation [--json FILE] [--clip bunny|bikes|carphone|PATH ...] [--size HxW]
-                                       [--frames A:B] [--gaussians N] [--steps N | --minutes M] [--seed S]
-                                       [--set NAME=VALUE ...] [--sheet FILE]
+                                       [--frames A:B] [--gaussians N] [--steps N | --minutes M [--cpu-time]]
+                                       [--seed S] [--set NAME=VALUE ...] [--sheet FILE] [--cost]
 
 Without options: *bunny* and *bikes* at 160x320, 5 minutes each, with as many Gaussians as the fit chooses. Frames 0, 2,
 4, ... are fitted, and frames 1, 3, 5, ... drawn half way between the learned times of their neighbours. Beside them, of
@@ -12,11 +12,15 @@ the same neighbours:
 - both again, of the model's own pictures of the neighbours: then all start from the same quality.
 
 PSNR and SSIM of 8-bit pictures, means over the frames; "without cuts" leaves out frames between two shots, which
-nothing can know. `--sheet` draws the held-out frames on which ours and the best rival differ most.
+nothing can know. `--sheet` draws the held-out frames on which ours and the best rival differ most. `--cost` instead
+fits all frames, with interpolated frames and without, and compares the PSNR at the frames. With `--cpu-time` minutes
+are those of the processor, on one thread, so that fits beside other work are comparable.
 """
 
 import argparse
+import dataclasses
 import itertools
+import time
 from pathlib import Path
 
 import cv2
@@ -24,14 +28,16 @@ import numpy as np
 
 from benchmarks import _common, fit_clip
 from benchmarks._common import console
+from foldgauss._runtime.threads import set_num_threads
 from foldgauss.io import Clip, read_video, write_image
 from foldgauss.io.datasets import sample_clip
 from foldgauss.io.media.contact_sheet import make_comparison_sheet
 from foldgauss.video import interpolated_times
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.loop import fit
+from foldgauss.video.fitting.loop import fit_steps, to_model
 from foldgauss.video.models.frame_times import is_cut
 from foldgauss.video.models.metrics import psnr, ssim
+from foldgauss.video.models.video_model import VideoModel
 
 CLIPS, SIZE, MINUTES = ("bunny", "bikes"), (160, 320), 5.0
 SHOWN = 4
@@ -55,10 +61,32 @@ def warped_half_way(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return mean_of_two(*moved)
 
 
-def measure(clip: Clip, config: FitConfig, name: str, sheet: Path | None) -> dict[str, float]:
+def fit_model(frames: np.ndarray, config: FitConfig, fps: float, cpu_time: bool) -> VideoModel:
+    """The fitted model; its minutes are those of the processor with `cpu_time`."""
+    for last, _ in fit_steps(frames, config, clock=time.process_time if cpu_time else time.perf_counter):
+        state = last
+    return to_model(state, config, frames.shape[1:3], fps)
+
+
+def measure_cost(clip: Clip, config: FitConfig, name: str, cpu_time: bool) -> dict[str, float]:
+    """PSNR at the frames of a fit to all of them, with `config` and without interpolated frames."""
+    figures = {}
+    for way, chosen in {"frames": config, "plain": dataclasses.replace(config, interpolation_fraction=0.0)}.items():
+        model = fit_model(clip.frames, chosen, clip.fps, cpu_time)
+        scores = [psnr(target, made) for target, made in zip(clip.frames, model.frames(), strict=True)]
+        figures[f"{way}_{name}"] = float(np.mean(scores))
+    figures[f"cost_{name}"] = figures[f"plain_{name}"] - figures[f"frames_{name}"]
+    table = _common.table(f"{name}: all {len(clip.frames)} frames fitted", "PSNR at the frames, dB", "")
+    table.add_row("with interpolated frames", f"{figures[f'frames_{name}']:.2f}")
+    table.add_row("without", f"{figures[f'plain_{name}']:.2f}")
+    console.print(table)
+    return figures
+
+
+def measure(clip: Clip, config: FitConfig, name: str, sheet: Path | None, cpu_time: bool) -> dict[str, float]:
     """Figures of one clip, which are also shown."""
     seen, held_out = clip.frames[::2], clip.frames[1:-1:2] if len(clip.frames) % 2 else clip.frames[1::2][:-1]
-    model = fit(np.ascontiguousarray(seen), config, fps=clip.fps / 2).model
+    model = fit_model(np.ascontiguousarray(seen), config, clip.fps / 2, cpu_time)
     times = np.asarray(model.frame_times.times())
     own = list(model.frames())
     between = list(model.frames(interpolated_times(times, 2)[1::2]))
@@ -121,11 +149,16 @@ def main(arguments: list[str] | None = None) -> None:
     options = _common.parse(_parser(), arguments)
     budget = {"steps": options.steps} if options.steps is not None else {"minutes": options.minutes or MINUTES}
     config = FitConfig(num_gaussians=options.gaussians, seed=options.seed, **budget | dict(options.set or ()))
+    if options.cpu_time:
+        set_num_threads(1)
     figures = {}
     for name in options.clip or CLIPS:
         path = sample_clip(name) if name in fit_clip.SAMPLES else Path(name)
         clip = read_video(path, frames=options.frames, size=options.size)
-        figures |= measure(clip, config, Path(name).stem, options.sheet)
+        if options.cost:
+            figures |= measure_cost(clip, config, Path(name).stem, options.cpu_time)
+        else:
+            figures |= measure(clip, config, Path(name).stem, options.sheet, options.cpu_time)
     setting = {"size": options.size, "gaussians": options.gaussians, "seed": options.seed} | budget
     _common.finish(
         options.json, figures, _common.describe_machine(), setting=setting | {"set": dict(options.set or ())}
@@ -141,6 +174,8 @@ def _parser() -> argparse.ArgumentParser:
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--steps", type=_common.whole, help="how long, in steps")
     length.add_argument("--minutes", type=float, help=f"how long, in minutes [{MINUTES:g}]")
+    parser.add_argument("--cpu-time", action="store_true", help="minutes of the processor, on one thread")
+    parser.add_argument("--cost", action="store_true", help="fit all frames, with interpolated frames and without")
     parser.add_argument("--seed", type=int, default=0, help="[0]")
     parser.add_argument("--set", action="append", type=fit_clip._setting, metavar="NAME=VALUE", help="of FitConfig")
     parser.add_argument("--sheet", type=Path, metavar="FILE", help="pictures of held-out frames go here (PNG)")

@@ -69,7 +69,10 @@ EARLIER = FitConfig(
     final_rate=0.07,
     quarter_fraction=0.2,
     half_fraction=0.4,
+    interpolation_fraction=0.0,
 )
+#: Settings that v0.1 did not have.
+LATER = ("scale_rates_by_size", "cooldown_fraction", "error_fraction", "relocated_fraction", "interpolation_end")
 
 
 def test_settings_in_records_of_an_earlier_version_are_read():
@@ -77,7 +80,7 @@ def test_settings_in_records_of_an_earlier_version_are_read():
     changes = {"economy": Economy(), "scale_rates_by_duration": False, "interpolation_fraction": 0.25}
     for name, config in {"default": EARLIER, "economy": dataclasses.replace(EARLIER, **changes)}.items():
         expected = json.loads(json.dumps(dataclasses.asdict(config)))
-        for later in ("scale_rates_by_size", "cooldown_fraction", "error_fraction", "relocated_fraction"):
+        for later in LATER:
             del expected[later]
         assert rename_settings(recorded[name]) == expected
     assert rename_settings(["own_time"]) == ["own_time"]

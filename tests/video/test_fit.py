@@ -14,7 +14,7 @@ from foldgauss._runtime import threads as _threads
 from foldgauss.render import RenderOptions
 from foldgauss.video import Economy, FitConfig, LearningRates, evaluate, fit, fit_steps, interpolated_times, psnr
 from foldgauss.video.fitting import loop as fit_module
-from foldgauss.video.fitting.config import chosen_num_gaussians, planned_steps
+from foldgauss.video.fitting.config import chosen_interpolation, chosen_num_gaussians, planned_steps
 from foldgauss.video.fitting.loop import check_frames, start, start_from, to_model
 from foldgauss.video.fitting.schedule import steps_per_pass
 from foldgauss.video.fitting.steppers import cpu_stepper
@@ -143,12 +143,56 @@ def test_interpolated_frames_are_learned():
     scores = {}
     for share in (0.0, 0.6):
         config = FitConfig(num_gaussians=600, steps=300, follow_motion=False, interpolation_fraction=share)
+        config = dataclasses.replace(config, interpolation_end=1.0)
         result = fit(seen, config)
         times = interpolated_times(np.asarray(result.model.frame_times.times()), 2)[1::2]
         drawn = list(result.model.frames(times))
         scores[share] = np.mean([psnr(target, made) for target, made in zip(never, drawn, strict=True)])
     assert scores[0.6] > scores[0.0] + 0.5
     assert abs(result.history[-1].psnr - evaluate(result.model, seen).mean_psnr) < 2
+
+
+def test_interpolation_ends():
+    """After its last step, a fit goes on from where it is as one without interpolation would."""
+    frames, models = moving_blobs(), []
+    config = dataclasses.replace(CONFIG, interpolation_fraction=0.9, interpolation_end=0.5)
+    for state, info in fit_steps(frames, config):
+        if info.step == 30:
+            break
+    for fraction in (0.9, 0.0):
+        again = dataclasses.replace(config, interpolation_fraction=fraction)
+        for last, _ in fit_steps(frames, again, jax.tree.map(np.array, state)):
+            pass
+        models.append(leaves_of(to_model(last, config, frames.shape[1:3], 25.0)))
+    for one, other in zip(*models, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_interpolation_is_the_default():
+    frames, config = moving_blobs(), dataclasses.replace(CONFIG, num_gaussians=50, steps=200)
+    models = [fit(frames, config).model, fit(frames, dataclasses.replace(config, interpolation_fraction=0.0)).model]
+    assert not np.array_equal(*(model.splats.loc for model in models))
+
+
+@pytest.mark.parametrize(
+    ("changes", "alpha"),
+    [({"follow_motion": False}, False), ({"economy": Economy()}, False), ({}, True)],
+    ids=["no motion", "economy", "alpha"],
+)
+def test_interpolation_is_off_by_default_where_it_is_not_supported(changes, alpha):
+    assert chosen_interpolation(FitConfig(**changes), alpha=alpha) == 0
+    assert chosen_interpolation(FitConfig(interpolation_fraction=0.1, **changes), alpha=alpha) == 0.1
+
+
+def test_still_clip_is_not_interpolated():
+    """Between equal frames there is nothing to learn: a fit has the bits of one without interpolation."""
+    frames = np.repeat(moving_blobs()[:1], 4, axis=0)
+    models = [
+        fit(frames, dataclasses.replace(CONFIG, steps=20, interpolation_fraction=fraction)).model
+        for fraction in (0.5, 0.0)
+    ]
+    for one, other in zip(*map(leaves_of, models), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_interpolation_refuses_alpha():

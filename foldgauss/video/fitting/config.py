@@ -95,6 +95,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "decayed": "loc",
         "error_fraction": 0.0,
         "relocated_fraction": 0.0,
+        "interpolation_fraction": 0.0,
         "two_cameras": True,
         "growth": Growth(),
         "options": RenderOptions.standard(),
@@ -102,6 +103,8 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 
+#: The default of `FitConfig.interpolation_fraction`.
+INTERPOLATION_FRACTION = 0.1
 #: Groups of settings, which are the panels of `foldgauss fit --help`.
 MODEL, BUDGET, OPTIMIZATION = "model", "budget", "optimization"
 
@@ -256,13 +259,24 @@ class FitConfig:
             "Fraction of the steps, at the end, whose loss is the squared error, which PSNR measures", bounds="[0, 1]"
         ),
     )
-    interpolation_fraction: float = field(
-        default=0.0,
+    interpolation_fraction: float | None = field(
+        default=None,
         metadata=setting(
-            "Fraction of the steps that fit frames interpolated by optical flow, for slow motion, as 0.5",
-            "Improves the times between frames and lowers the quality at the frames.",
+            "Fraction of the first steps that fit frames interpolated by optical flow, for slow motion",
+            "Improves the times between frames. First steps are those before `interpolation_end`.",
             bounds="[0, 1)",
+            unset=f"{INTERPOLATION_FRACTION:g}; 0 with an economy or alpha, or without follow_motion",
             option="--interpolation-fraction",
+            group=OPTIMIZATION,
+        ),
+    )
+    interpolation_end: float = field(
+        default=0.5,
+        metadata=setting(
+            "Fraction of the steps after which no interpolated frames are fitted any more",
+            "With more, times between frames improve further, at the cost of the frames: the last steps recover them.",
+            bounds="[0, 1]",
+            option="--interpolation-end",
             group=OPTIMIZATION,
         ),
     )
@@ -494,6 +508,18 @@ def planned_steps(config: FitConfig, num_frames: int) -> int | None:
         return config.steps
     steps = max(DEFAULT_STEPS, -(-DEFAULT_VISITS * num_frames // config.batch_size))
     return config.steps or (SMALLEST_TIMES * steps if _is_smallest(config) else steps)
+
+
+def chosen_interpolation(config: FitConfig, *, alpha: bool) -> float:
+    """The fraction of the first steps that fit interpolated frames; `alpha`: whether the frames have it.
+
+    By default none do where optical flow is not used or does not tell what is there (behind alpha), and with an
+    economy, which weighs bits against the errors of frames.
+    """
+    if config.interpolation_fraction is not None:
+        return config.interpolation_fraction
+    supported = config.follow_motion and config.economy is None and not alpha
+    return INTERPOLATION_FRACTION if supported else 0.0
 
 
 def _is_smallest(config: FitConfig) -> bool:

@@ -321,7 +321,7 @@ def _check_alpha(frames: np.ndarray, config: FitConfig) -> None:
     if config.compositing == "sum":
         cure = "Sums are never opaque: drop the alpha, or give 'over'."
         raise invalid("compositing", expected="'over' for frames with alpha", got="'sum'", cure=cure)
-    if config.interpolation_fraction > 0:
+    if config.interpolation_fraction:
         cure = "Leave it out: optical flow does not determine what is behind."
         got = config.interpolation_fraction
         raise invalid("interpolation_fraction", expected="0 for frames with alpha", got=got, cure=cure)

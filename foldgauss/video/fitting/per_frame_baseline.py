@@ -126,7 +126,7 @@ def _check_config(config: FitConfig) -> None:
             raise invalid(
                 f"config.{name}", expected="None", got=value, cure="num_parameters sets the number of Gaussians."
             )
-    if config.interpolation_fraction > 0:
+    if config.interpolation_fraction:
         cure = "Frames that share nothing cannot be interpolated."
         raise invalid("config.interpolation_fraction", expected="0", got=config.interpolation_fraction, cure=cure)
     if config.initialization != "clip":

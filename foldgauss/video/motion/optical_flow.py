@@ -26,6 +26,8 @@ MISS, MISS_FRACTION = 0.5, 0.2
 #: The longer side, in pixels, of the images that flow is computed on, and of the flow maps: motion is smoother than
 #: images.
 FLOW_SIDE, KEPT_SIDE = 640, 320
+#: What moves by fewer pixels between two frames stands still.
+STILL = 0.1
 #: Fixed-point iterations of the flow at a time between two frames.
 FLOW_ITERATIONS = 2
 #: The maps of long clips are smaller, so that they take no more bytes than this, or than this fraction of the frames.
@@ -101,6 +103,10 @@ class Motion:
     def find_cuts(self) -> list[int]:
         """The frames, in order, that begin a new shot."""
         return [k + 1 for k, known in enumerate(self.measure_tracked()) if known < CUT_FRACTION]
+
+    def find_still(self) -> list[int]:
+        """The intervals, k for that between frames k and k + 1, in which nothing moves by `STILL` pixels."""
+        return [k for k, flow in enumerate(self.there) if np.abs(flow).max() < STILL]
 
     def measure_tracked(self) -> list[float]:
         """The fraction of points on a grid that can be tracked from each frame to the next."""

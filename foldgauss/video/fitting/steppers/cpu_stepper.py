@@ -22,6 +22,7 @@ from foldgauss.video.fitting.schedule import (
     to_planes,
 )
 from foldgauss.video.fitting.state import FitState, frame_times, update_rows
+from foldgauss.video.fitting.steppers.interpolated_frames import make_interpolated
 from foldgauss.video.fitting.steppers.loss import ImageLoss, image_loss, squared_loss
 from foldgauss.video.fitting.steppers.protocol import StepResult
 from foldgauss.video.models.background import random_background
@@ -52,8 +53,7 @@ class CpuStepper:
         own = config.degree, config.power, config.floor
         self.shapes = [ConditioningSpec(*own, level.size, aspect=height / width) for level in self.levels[:-1]]
         self.shapes.append(ConditioningSpec(*own, (height, width)))
-        interpolates = config.interpolation_fraction > 0
-        self.interpolation = _InterpolatedFrames(frames, config, find_motion()) if interpolates else None
+        self.interpolation = make_interpolated(frames, config, find_motion)
         if config.economy is not None:
             coarse = 1 - self.levels[-1].fraction
             self.pruner = Pruner(frames, config, self.shapes[-1], coarse, find_motion)
@@ -75,7 +75,9 @@ class CpuStepper:
         seen = None if state.statistics is None else []
         for view in choose_views(config, num_frames, state.step, state.frame_errors):
             k, mirrored = int(view) % num_frames, int(view) >= num_frames
-            fraction = None if self.interpolation is None else self.interpolation.choose(state.step, k)
+            fraction = None
+            if self.interpolation is not None:
+                fraction = self.interpolation.choose(state.step, progress, k)
             t = times[k] if fraction is None else (1 - fraction) * times[k] + fraction * times[k + 1]
             loss, done, d_time = self._differentiate(
                 state, k, t, self.shapes[level], squared=squared, mirrored=mirrored, seen=seen, fraction=fraction
@@ -141,7 +143,7 @@ class CpuStepper:
         if fraction is None:
             target = to_planes(shrink_frame(self.frames[k], shape.size), self.background)
         else:
-            target = self.interpolation.interpolate(k, fraction, shape.size)
+            target = np.ascontiguousarray(np.moveaxis(self.interpolation.interpolate(k, fraction, shape.size), -1, 0))
         rows = state.rows
         done = condition(rows, self.window, t, shape)
         mean, factor = done.mean, done.factor
@@ -181,25 +183,6 @@ class CpuStepper:
             compositing=self.config.compositing,
             options=self.config.options,
         )
-
-
-class _InterpolatedFrames:
-    """Training images between frames: which steps have one, and what the optical flow predicts there."""
-
-    def __init__(self, frames: np.ndarray, config: FitConfig, motion: Motion):
-        self.frames, self.config, self.motion = np.ascontiguousarray(frames[..., :3]), config, motion
-        self.last_of_shots = {*(k - 1 for k in motion.find_cuts()), len(frames) - 1}
-
-    def choose(self, step: int, k: int) -> float | None:
-        """At which fraction of the way from frame k to the next the time of a step lies; None for the frame itself."""
-        rng = np.random.default_rng([self.config.seed, 2, step, k])
-        chosen, fraction = rng.random() < self.config.interpolation_fraction, rng.uniform(0.1, 0.9)
-        return fraction if chosen and step and k not in self.last_of_shots else None
-
-    def interpolate(self, k: int, fraction: float, size: tuple[int, int]) -> np.ndarray:
-        """Planes (3, height, width)."""
-        image = self.motion.interpolate(self.frames, k, fraction, size)
-        return np.ascontiguousarray(np.moveaxis(image, -1, 0) * np.float32(1 / 255))
 
 
 def mirror(mean: np.ndarray, factor: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:

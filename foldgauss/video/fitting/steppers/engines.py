@@ -52,8 +52,6 @@ def _find_unsupported(frames: np.ndarray, config: FitConfig, state: FitState | N
     """A setting that the JAX engines do not support, in words; empty where there is none."""
     if config.economy is not None:
         return "an economy"
-    if config.interpolation_fraction > 0:
-        return f"interpolation_fraction {config.interpolation_fraction:g}"
     if frames.shape[3] == 4:
         return "frames that have alpha"
     if state is not None and (len(state.colors.index) or len(state.shapes.index)):

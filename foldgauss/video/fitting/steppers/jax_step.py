@@ -37,6 +37,14 @@ class Control(NamedTuple):
     squared: Bool[Array, ""]  # which loss
     rates: Float[Array, " width"]
     time_rate: Float[Array, ""]
+    between: "Between | None" = None  # where the fit interpolates frames
+
+
+class Between(NamedTuple):
+    """The views of a step whose targets are interpolated, see `interpolated_frames`."""
+
+    fractions: Float[Array, " batch"]  # of the way from frame k to the next; negative: the view is the frame itself
+    targets: Float[Array, "batch height width 3"]  # values in [0, 1]
 
 
 class Report(NamedTuple):
@@ -70,6 +78,7 @@ class Program:
     rate_units: RateUnits
     learns_times: bool
     grows: bool
+    interpolates: bool
     num_devices: int
 
     @property
@@ -116,7 +125,10 @@ def _specs(program: Program) -> tuple[DeviceArrays, jax.ShapeDtypeStruct, Contro
     sizes, kinds = Sizes(program.capacity, program.width, program.num_frames, program.grows), FitState.array_fields()
     arrays = DeviceArrays(*(kinds[name].spec(sizes) for name in DeviceArrays._fields))
     views, num = spec(program.batch_size, dtype=np.int32), spec(dtype=np.int32)
-    control = Control(views, num, spec(dtype=np.bool_), spec(program.width), spec())
+    between = None
+    if program.interpolates:
+        between = Between(spec(program.batch_size), spec(program.batch_size, *program.size, 3))
+    control = Control(views, num, spec(dtype=np.bool_), spec(program.width), spec(), between)
     return arrays, spec(program.num_frames, *program.size, 3, dtype=np.uint8), control
 
 
@@ -182,7 +194,8 @@ def _distribute(program: Program):
             largest(own.screen),
         )
 
-    own = Control(views=views, num=whole, squared=whole, rates=whole, time_rate=whole)
+    between = Between(views, views) if program.interpolates else None
+    own = Control(views=views, num=whole, squared=whole, rates=whole, time_rate=whole, between=between)
     # The replication check does not support the loops inside.
     return jax.shard_map(on_each, mesh=mesh, in_specs=(whole, whole, whole, own), out_specs=whole, check_vma=False)
 
@@ -190,14 +203,19 @@ def _distribute(program: Program):
 def _differentiate(program: Program, rows, times, frames, control: Control) -> Gradients:
     """Render the views and differentiate their losses by rows and times; sums over this device's part of the batch."""
     k, mirrored = control.views % program.num_frames, control.views >= program.num_frames
-    alive = _map_views(len(k), lambda t: find_alive(program, rows, control.num, t), times[k])
-    target = frames[k].astype(jnp.float32) * np.float32(1 / 255)
+    t, target, whole = times[k], frames[k].astype(jnp.float32) * np.float32(1 / 255), jnp.ones(len(k), bool)
+    if control.between is not None:
+        fractions, targets = control.between
+        whole = fractions < 0
+        t = jnp.where(whole, t, (1 - fractions) * t + fractions * times[jnp.minimum(k + 1, program.num_frames - 1)])
+        target = jnp.where(whole[:, None, None, None], target, targets)
+    alive = _map_views(len(k), lambda t: find_alive(program, rows, control.num, t), t)
     target = jnp.where(mirrored[:, None, None, None], target[:, :, ::-1], target)
 
     def condition(rows, t):
         return _map_views(len(k), functools.partial(_splats, program, rows), t, alive, mirrored)
 
-    splats, to_rows = jax.vjp(condition, rows, times[k])
+    splats, to_rows = jax.vjp(condition, rows, t)
     images, to_splats = jax.vjp(functools.partial(_map_views, len(k), functools.partial(_render, program)), splats)
 
     def mean_loss(images):
@@ -210,8 +228,8 @@ def _differentiate(program: Program, rows, times, frames, control: Control) -> G
     return Gradients(
         loss,
         by_rows,
-        jnp.zeros_like(times).at[k].add(by_t),  # a batch may hold a frame twice
-        jnp.full_like(times, -1.0).at[k].set(errors),
+        jnp.zeros_like(times).at[k].add(jnp.where(whole, by_t, 0)),  # a batch may hold a frame twice
+        jnp.full_like(times, -1.0).at[k].max(jnp.where(whole, errors, -1)),
         jnp.any(alive, axis=0),
         _screen_gradient(program, splats, by_splats, alive) if program.grows else jnp.zeros_like(rows[:, 0]),
     )

@@ -22,7 +22,9 @@ from foldgauss.video.fitting.schedule import (
     steps_per_pass,
 )
 from foldgauss.video.fitting.state import DeviceArrays, FitState, Sizes, frame_times
+from foldgauss.video.fitting.steppers.interpolated_frames import make_interpolated
 from foldgauss.video.fitting.steppers.jax_step import (
+    Between,
     Control,
     Program,
     Report,
@@ -90,6 +92,8 @@ class JaxStepper:
         self.size = tuple(size)
         self.levels, self.rates = plan_levels(config, self.size), RateSchedule(config)
         self.steps_per_pass = steps_per_pass(config, self.num_frames)
+        self.interpolation = make_interpolated(frames, config, self.find_motion)
+        self._no_targets: dict[tuple[int, int], jax.Array] = {}  # by size
         self.capacity = 0
         self.adopt(state)
         place = replicated(self.programs[-1])
@@ -127,17 +131,35 @@ class JaxStepper:
             self.adopt(state)
         held, config = state.held, self.config
         rates, time_rate = self.rates.at(progress, state.backoffs)
+        views = choose_views(config, self.num_frames, state.step, state.frame_errors)
         control = Control(
-            views=choose_views(config, self.num_frames, state.step, state.frame_errors).astype(np.int32),
+            views=views.astype(np.int32),
             num=np.int32(held.num),
             squared=np.bool_(progress >= 1 - config.l2_fraction),
             rates=rates,
             time_rate=time_rate,
+            between=self._interpolate(views, state.step, progress, self.levels[level].size),
         )
         arrays, report = compile_step(self.programs[level])(held.arrays, self.images[level], control)
         report = jax.device_get(report)
         state.hold(HeldArrays(arrays, held.num, held.growing, report))
         return StepResult(float(report.loss), int(report.num_alive), state.is_finite("rows"))
+
+    def _interpolate(self, views: np.ndarray, step: int, progress: float, size: tuple[int, int]) -> Between | None:
+        """The interpolated targets of a step, of `size`; None if the fit has none at all."""
+        if self.interpolation is None:
+            return None
+        fractions = np.full(len(views), -1.0, np.float32)
+        targets = np.zeros((len(views), *size, 3), np.float32)
+        for n, k in enumerate(views % self.num_frames):
+            fraction = self.interpolation.choose(step, progress, int(k))
+            if fraction is not None:
+                fractions[n], targets[n] = fraction, self.interpolation.interpolate(int(k), fraction, size)
+        if (fractions < 0).all():  # the device has zeros already
+            if size not in self._no_targets:
+                self._no_targets[size] = jax.device_put(targets, replicated(self.programs[-1]))
+            targets = self._no_targets[size]
+        return Between(fractions, targets)
 
     def grow(self, state: FitState) -> None:
         """Densification on the host, where any is due."""
@@ -203,6 +225,7 @@ class JaxStepper:
             rate_units=config.rate_units,
             learns_times=config.learn_frame_times and self.num_frames > 2,
             grows=config.growth is not None,
+            interpolates=self.interpolation is not None,
             num_devices=max(divisors),
         )
 
