@@ -50,6 +50,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "Gaussians x0.5": {"gaussians": 0.5},
     "Gaussians x0.7": {"gaussians": 0.7},
     "Gaussians x1.5": {"gaussians": 1.5},
+    "Gaussians x2": {"gaussians": 2.0},
+    "Gaussians x3": {"gaussians": 3.0},
     "rates x0.7": {"rates": scaled_rates(0.7)},
     "rates x1.4": {"rates": scaled_rates(1.4)},
     "final rate 0.1": {"final_rate": 0.1},
