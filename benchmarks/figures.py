@@ -38,7 +38,7 @@ DPI = 140
 BRIGHTNESS = 1.6
 #: The frame that is shown.
 SHOWN = 5
-CONFIG = FitConfig(num_gaussians=20_000, steps=3_000, interpolation_fraction=0.5)
+CONFIG = FitConfig(num_gaussians=20_000, steps=3_000, interpolation_fraction=0.5, interpolation_end=1.0)
 #: Inches of README's examples: text is readable on a screen of 360 pixels.
 EXAMPLE_SIZE = 5.0, 3.2
 HALO = {"path_effects": [patheffects.withStroke(linewidth=3, foreground="white")]}

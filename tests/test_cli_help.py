@@ -110,7 +110,7 @@ def completions(words: str, folder: Path, monkeypatch, capsys) -> list[str]:
         ("fit --preset ", ["standard", "draft", "paper"]),
         ("fit --preset dr", ["draft"]),
         ("fit --compositing ", ["over", "sum"]),
-        ("fit --interp", ["--interpolation-fraction"]),
+        ("fit --interp", ["--interpolation-fraction", "--interpolation-end"]),
         ("export m.safetensors --format ply", ["ply", "ply3dgs"]),
         ("render m.safetensors --format ", ["png", "webp"]),
         ("uncertainty m c --noise s", ["score"]),

@@ -138,7 +138,7 @@ def test_log_json_is_json_line_by_line(clip, tmp_path, monkeypatch, capfd):
     told = capfd.readouterr()
     assert told.err == ""
     start, *progress, done = map(json.loads, told.out.splitlines())
-    assert (start["event"], start["num_frames"], start["num_gaussians"]) == ("start", 6, 300)
+    assert (start["event"], start["num_frames"], start["most_gaussians"]) == ("start", 6, 300)
     assert {line["event"] for line in progress} == {"progress"}
     assert [line["step"] for line in progress] == list(range(1, 21))
     assert progress[-1]["progress"] == 1

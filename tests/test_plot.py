@@ -10,6 +10,7 @@ import pytest
 from foldgauss.analysis.plot import _mass_levels, plot_density, plot_history
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.fold import PolynomialFold
+from foldgauss.mixture import FoldedMixture
 
 pyplot = pytest.importorskip("matplotlib.pyplot", reason="matplotlib is an optional extra")
 
@@ -112,3 +113,18 @@ def test_missing_matplotlib_names_the_extra(monkeypatch, draw):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(ImportError, match=r"pip install 'foldgauss\[plot\]'"):
         draw()
+
+
+def test_a_mixture_is_drawn_with_the_means_of_its_conditionals(ax):
+    """The dots lie at E[s | t], between the two components."""
+    parts = FoldedGaussian(
+        loc=jnp.array([[0.0], [1.0]]),
+        scale_tril=jnp.full((2, 1, 1), 0.1),
+        time_loc=jnp.array([0.3, 0.6]),
+        time_scale=jnp.array([0.1, 0.2]),
+        fold=PolynomialFold(jnp.array([[[1.0]], [[-1.0]]])),
+    )
+    mixture = FoldedMixture(parts, logits=jnp.zeros(2))
+    axes = plot_density(mixture, ax, slices=[0.4])
+    (dot,) = [line for line in axes.lines if line.get_marker() == "o"]
+    np.testing.assert_allclose(dot.get_ydata(), mixture.condition_time(0.4).mean, rtol=1e-5)

@@ -1,6 +1,7 @@
 """Figures of a Folded-Gaussian, of a fit's history and of speed against accuracy; matplotlib is imported on use."""
 
 import itertools
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
@@ -35,10 +36,10 @@ def plot_density(
     t_limits: tuple[float, float] | None = None,
     s_limits: tuple[float, float] | None = None,
 ) -> "Axes":
-    """The density of a Folded-Gaussian of d = 2, with conditional distributions s | t in red: the paper's figure.
+    """The density of a Folded-Gaussian or a mixture of d = 2, with conditional distributions s | t in red.
 
     Contour lines enclose 30, 60 and 90% of the probability shown. The red curve at each of `slices` is `N(s | t)`,
-    rotated and scaled to the same height, with a dot at its center `loc + f(time_loc - t)`.
+    rotated and scaled to the same height, with a dot at its mean, `loc + f(time_loc - t)` for a Folded-Gaussian.
 
     **Shapes:** `dist` has `event_shape == (2,)` and no batch; `slices` is their number, or the times themselves.
 
@@ -46,13 +47,13 @@ def plot_density(
 
     **Example:** `plot_density(dist, ax).set_title("f(u) = u^2")`
 
-    **Source:** fig:2D_dist. **Raises:** ImportError that names the extra if matplotlib is missing; ValueError if
+    **Source:** VeGaS, fig:2D_dist. **Raises:** ImportError that names the extra if matplotlib is missing; ValueError if
     `dist` is not a single distribution in the plane.
     """
     _check_plane(dist)
     pyplot = import_pyplot("plot_density")
     ax = pyplot.subplots()[1] if ax is None else ax
-    loc, scale = float(dist.time_loc), float(dist.time_scale)
+    loc, scale = _time_moments(dist)
     t_limits = (loc - _REACH * scale, loc + _REACH * scale) if t_limits is None else t_limits
     s_limits = _space_limits(dist, t_limits) if s_limits is None else s_limits
     times = loc + scale * np.linspace(-1.5, 1.5, slices) if isinstance(slices, int) else np.asarray(slices, float)
@@ -227,7 +228,7 @@ def _running_median(values: np.ndarray) -> np.ndarray:
 def _draw_density(dist, ax, t_limits, s_limits) -> None:
     t, s = (np.linspace(*limits, _GRID) for limits in (t_limits, s_limits))
     points = np.stack(np.broadcast_arrays(s[:, None], t[None, :]), axis=-1)
-    density = np.exp(np.asarray(_LOG_PROB(dist, jnp.asarray(points, dist.loc.dtype)), float))
+    density = np.exp(np.asarray(_LOG_PROB(dist, jnp.asarray(points, dist.mean.dtype)), float))
     # The square root keeps the tails visible beside the peak.
     shade = np.sqrt(density / density.max())
     ax.pcolormesh(t, s, shade, cmap=_DENSITY, vmin=0, vmax=1.6, shading="gouraud", rasterized=True)
@@ -245,9 +246,11 @@ def _mass_levels(density: np.ndarray) -> np.ndarray:
 
 def _draw_slices(dist, ax, times, s_limits, width: float) -> None:
     for t in times:
-        center, scale = _conditional(dist, np.array([t]))
-        s = np.linspace(center[0] - 3.5 * scale[0], center[0] + 3.5 * scale[0], 201)
-        bell = t + width * np.exp(-0.5 * ((s - center[0]) / scale[0]) ** 2)
+        gaussian = dist.condition_time(jnp.asarray(t, dist.mean.dtype))
+        center, spread = _conditional(dist, np.array([t]))
+        s = np.linspace(center[0] - 3.5 * spread[0], center[0] + 3.5 * spread[0], 201)
+        height = np.exp(np.asarray(gaussian.log_prob(jnp.asarray(s[:, None], dist.mean.dtype)), float))
+        bell = t + width * height / height.max()
         ax.fill_betweenx(s, t, bell, color=_RED, alpha=0.25, linewidth=0, zorder=3)
         ax.plot(bell, s, color=_RED, linewidth=1.4, zorder=4)
         ax.plot([t, t], s_limits, color=_RED, linewidth=0.7, alpha=0.55, zorder=2)
@@ -261,14 +264,19 @@ def _bell_width(times, t_limits) -> float:
 
 
 def _conditional(dist, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Center and standard deviation of s | t."""
-    gaussian = dist.condition_time(jnp.asarray(t, dist.loc.dtype))
-    return np.asarray(gaussian.loc, float)[..., 0], np.asarray(gaussian.scale_tril, float)[..., 0, 0]
+    """Mean and standard deviation of s | t."""
+    gaussian = dist.condition_time(jnp.asarray(t, dist.mean.dtype))
+    return np.asarray(gaussian.mean, float)[..., 0], np.sqrt(np.asarray(gaussian.variance, float)[..., 0])
+
+
+def _time_moments(dist) -> tuple[float, float]:
+    """Mean and standard deviation of t."""
+    return float(dist.mean[-1]), math.sqrt(float(dist.variance[-1]))
 
 
 def _space_limits(dist, t_limits) -> tuple[float, float]:
     """The range of s of about 99% of the probability."""
-    loc, scale = float(dist.time_loc), float(dist.time_scale)
+    loc, scale = _time_moments(dist)
     t = np.linspace(max(t_limits[0], loc - 2.2 * scale), min(t_limits[1], loc + 2.2 * scale), 101)
     center, spread = _conditional(dist, t)
     low, high = (center - 3.2 * spread).min(), (center + 3.2 * spread).max()

@@ -30,7 +30,10 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
             ),
             Example("A small file", "foldgauss fit holiday.mp4 --economy --max-size-mb 2"),
             Example("Frames as images; resume a stopped fit", "foldgauss fit frames/ --resume"),
-            Example("For slow motion", "foldgauss fit holiday.mp4 --interpolation-fraction 0.3"),
+            Example(
+                "For slow motion above all",
+                "foldgauss fit holiday.mp4 --interpolation-fraction 0.3 --interpolation-end 1",
+            ),
             Example(
                 "A long clip, in segments of 10 seconds, with four processes", "foldgauss fit film.mp4 --workers 4"
             ),
@@ -70,6 +73,7 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
                 "foldgauss stabilize holiday.safetensors --fixed --border fill",
             ),
         ),
+        "player": (Example("The page without a model, to be hosted", "foldgauss player --out site"),),
         "view": (
             Example("Play it in the browser", "foldgauss view holiday.safetensors"),
             Example("Next to the clip", "foldgauss view holiday.safetensors --original holiday.mp4"),

@@ -266,7 +266,7 @@ def _print_plan(clip: Clip, config: FitConfig, display: Display) -> None:
         )
     if display == "json":
         about = {"clip": clip.source, "num_frames": clip.num_frames, "height": height, "width": width}
-        print_json("start", about | {"num_gaussians": num, "degree": config.degree, "threads": num_threads()})
+        print_json("start", about | {"most_gaussians": num, "degree": config.degree, "threads": num_threads()})
     if display in ("json", "quiet"):
         return
     plan = describe_budgets(config, steps)

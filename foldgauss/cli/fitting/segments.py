@@ -76,10 +76,10 @@ def print_failures(failed: list[Outcome]) -> None:
 
 def plan_gaussians(config: FitConfig, num_frames: int, *size: int, threads: int | None = None) -> tuple[int, str]:
     """The number of Gaussians at the start; and "up to " where it is a bound, as the motion of the clip decides."""
-    least, most = (
-        chosen_num_gaussians(config, num_frames, *size, lifetime=lifetime, threads=threads)
-        for lifetime in (max(num_frames, SHORTEST_LIFETIME), SHORTEST_LIFETIME)
-    )
+    choose = partial(chosen_num_gaussians, config, num_frames, *size, threads=threads)
+    if config.initialization == "uniform":
+        return choose(), ""
+    least, most = choose(lifetime=num_frames), choose(lifetime=min(num_frames, SHORTEST_LIFETIME))
     return most, "up to " if least < most else ""
 
 
@@ -155,7 +155,7 @@ def _print_plan(fit: LongFit, config: FitConfig, display: Display, video: Path, 
     num, at_most = plan_gaussians(longest, max(lengths), *size, threads=options.threads)
     if display == "json":
         about = {"clip": str(video), "num_frames": index.num_frames, "height": size[0], "width": size[1]}
-        emit_json("start", about | {"spans": [list(span) for span in fit.spans], "num_gaussians": num})
+        emit_json("start", about | {"spans": [list(span) for span in fit.spans], "most_gaussians": num})
     if display in ("json", "quiet"):
         return
     done = sum(read_record(job) is not None for job in fit.jobs)

@@ -41,7 +41,8 @@ from foldgauss.io.models.video_model import load_video_model, save_video_model
 from foldgauss.io.provenance import fingerprint
 from foldgauss.jobs.runner import clip_warnings, fit_metadata, mean_scores
 from foldgauss.video.compression.search import compress
-from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, planned_steps
+from foldgauss.video.fitting.config import TYPICAL_LIFETIME, FitConfig, chosen_num_gaussians, planned_steps
+from foldgauss.video.fitting.initialize import measure_lifetime
 from foldgauss.video.fitting.loop import FitInfo, fit_steps
 from foldgauss.video.fitting.state import FitState, to_model
 from foldgauss.video.models.metrics import Evaluation, evaluate
@@ -155,9 +156,9 @@ class _Run:
 
     def plan_base(self, wanted: FitConfig, axes: tuple[str, ...], minutes: float, steps: int | None) -> FitConfig:
         """Choose the number of steps that the minutes allow; measures the throughput unless it is recorded."""
-        num = chosen_num_gaussians(wanted, self.clip.num_frames, *self.clip.size)
         full = planned_steps(wanted, self.clip.num_frames)
         if not self.record.plan:
+            num = self._choose_number(wanted)
             with err.status("Measuring the throughput"):
                 throughput = self._measure_throughput(dataclasses.replace(wanted, num_gaussians=num, steps=PILOT_STEPS))
             base = dataclasses.replace(wanted, num_gaussians=num, steps=full)
@@ -166,12 +167,24 @@ class _Run:
             least = max(LEAST_STEPS, self.clip.num_frames)  # so that the base sees every frame
             chosen = min(max(allowed, least), full) if steps is None else steps
             expected = MARGIN * estimate_seconds(points, chosen, throughput, self.clip.num_frames) / 60
-            self.record.plan |= {"steps": chosen, "expected_minutes": round(expected, 2), "pace": throughput._asdict()}
+            self.record.plan |= {"num_gaussians": num, "steps": chosen}
+            self.record.plan |= {"expected_minutes": round(expected, 2), "pace": throughput._asdict()}
             self._print_plan(len(points), chosen, expected)
             if steps is None:
                 self._warn_of_minutes(len(points), chosen, full, expected, minutes)
         self.record.save()
+        num = self.record.plan.get("num_gaussians")
+        if num is None:  # in records of versions that did not keep it
+            num = chosen_num_gaussians(wanted, self.clip.num_frames, *self.clip.size)
         return dataclasses.replace(wanted, num_gaussians=num, steps=self.record.plan["steps"])
+
+    def _choose_number(self, wanted: FitConfig) -> int:
+        """The number of Gaussians that a fit with `wanted` begins with."""
+        lifetime = TYPICAL_LIFETIME
+        if wanted.num_gaussians is None and wanted.follow_motion:
+            frames = np.ascontiguousarray(self.clip.frames[..., :3])
+            lifetime = measure_lifetime(frames, self._find_motion(), wanted.degree)
+        return chosen_num_gaussians(wanted, self.clip.num_frames, *self.clip.size, lifetime=lifetime)
 
     def _print_plan(self, num_points: int, steps: int, expected: float) -> None:
         out.print(

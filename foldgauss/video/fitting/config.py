@@ -427,7 +427,7 @@ PARAMETER_BYTES = 2
 TYPICAL_LIFETIME, SHORTEST_LIFETIME = 35.0, 2.0
 #: Gaussians alive in a frame, at most: for a frame of one pixel and one microsecond; it grows by these powers of the
 #: time, likewise, and of the pixels. Where they live long, more of them leave time for too few steps.
-ALIVE, ALIVE_POWER, ALIVE_PIXEL_POWER = 5.3, 0.55, 0.75
+ALIVE, ALIVE_POWER, ALIVE_PIXEL_POWER = 0.378, 0.55, 0.95
 #: The default number of Gaussians for the economy, which adds those that pay: so many for the square root of a frame's
 #: pixels; and this fraction of it for the smallest model at a PSNR. (Bunny 80x160 at 33 dB, which takes 3,100: 31.9
 #: thousand parameters from 20,000 Gaussians, 30.9 from 14,000, 36.2 from 40,000.)

@@ -7,6 +7,7 @@ import cv2
 import jax
 import numpy as np
 import scipy
+from jaxtyping import UInt8
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.fitting.growth import PUBLISHED_UNIT
@@ -80,12 +81,9 @@ def initialize(
     make = lambda home, position: make_splats(  # noqa: E731
         frames, home, position, times, degree, envelope, motion, rng, opacity
     )
-    pilot = np.repeat(np.arange(num_frames), max(min(PILOT, MAX_PILOTS // num_frames), 1))
-    _, spread = make(pilot, draw_positions(pilot, density_of, rng)[0])
-    chance = EVEN_FRAMES * _even_chance(pilot, spread, times) + (1 - EVEN_FRAMES) / num_frames
-    first, last = find_lifetimes(times[pilot], spread, times)
+    chance, lifetime = _try_starts(times, make, density_of, rng)
     if callable(num_gaussians):
-        num_gaussians = num_gaussians(float(np.average(last - first, weights=chance[pilot])))
+        num_gaussians = num_gaussians(lifetime)
     if num_gaussians < FEW_STARTS * num_frames:  # random frames would leave out whole intervals
         home = _draw(chance, (np.arange(num_gaussians) + rng.random()) / num_gaussians)
     else:
@@ -104,6 +102,32 @@ def initialize(
     shape = {"log_scale": np.float32(log_scale), "angle_logit": np.float32(_logit(angle / (2 * np.pi)))}
     splats = dataclasses.replace(splats, **shape)
     return jax.tree.map(lambda leaf: leaf[order] if leaf.ndim else leaf, splats)
+
+
+def measure_lifetime(frames: UInt8[np.ndarray, "num_frames height width 3"], motion: Motion, degree: int) -> float:
+    """The mean number of frames in which the Gaussians of `initialize` are alive, if the frames are evenly spaced."""
+    rng, times = np.random.default_rng(0), np.linspace(0, 1, len(frames))
+    envelope = TimeLikelihood(power=np.float32(1))
+
+    def make(home: np.ndarray, position: np.ndarray) -> tuple[FoldedSplats, np.ndarray]:
+        return make_splats(frames, home, position, times, degree, envelope, motion, rng, START_OPACITY)
+
+    return _try_starts(times, make, lambda k: measure_detail(frames[k]), rng)[1]
+
+
+def _try_starts(
+    times: np.ndarray,
+    make: Callable[[np.ndarray, np.ndarray], tuple[FoldedSplats, np.ndarray]],
+    density_of: Callable[[int], np.ndarray],
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, float]:
+    """The chance of a start in each frame, and the mean lifetime of starts in frames, from some trial starts."""
+    num_frames = len(times)
+    pilot = np.repeat(np.arange(num_frames), max(min(PILOT, MAX_PILOTS // num_frames), 1))
+    _, spread = make(pilot, draw_positions(pilot, density_of, rng)[0])
+    chance = EVEN_FRAMES * _even_chance(pilot, spread, times) + (1 - EVEN_FRAMES) / num_frames
+    first, last = find_lifetimes(times[pilot], spread, times)
+    return chance, float(np.average(last - first, weights=chance[pilot]))
 
 
 def initialize_uniform(
