@@ -149,7 +149,7 @@ class TestDefaults:
     def test_unknown_names_are_refused(self, capsys):
         with pytest.raises(SystemExit):
             defaults.main(["--only", "bunny"])
-        assert "--only: expected some of bunny-160, bunny-640," in capsys.readouterr().err
+        assert "--only: expected some of bunny-160, bunny-160-1, bunny-640," in capsys.readouterr().err
 
     def test_clips_of_a_folder(self, folder, monkeypatch, capsys):
         monkeypatch.setattr(defaults, "FOLDER_CHANGES", {"steps": 10, "num_gaussians": 60})

@@ -29,4 +29,5 @@ def invert_precisions(precisions, kind: str, num: int, dim: int) -> np.ndarray:
 
 def factor_precisions(covariances: Float[np.ndarray, "k d d"]) -> Float[np.ndarray, "k d d"]:
     """Upper-triangular U with U U^T the inverses of the covariances. Raises LinAlgError for singular ones."""
-    return np.linalg.inv(np.linalg.cholesky(covariances)).swapaxes(-1, -2)
+    inverse = np.linalg.inv(np.linalg.cholesky(covariances))  # lower triangular up to rounding, by some LAPACK
+    return np.tril(inverse).swapaxes(-1, -2)

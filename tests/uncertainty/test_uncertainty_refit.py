@@ -11,7 +11,7 @@ from foldgauss.uncertainty.likelihood.refit import Refit, merge_logits, resample
 from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.video import FitConfig, FrameTimes, LearningRates, fit
 
-CONFIG = FitConfig(num_gaussians=150, steps=200, degree=2)
+CONFIG = FitConfig(num_gaussians=150, steps=200, degree=2, interpolation_fraction=0.0)
 #: Learning rates with which only the frame times are fitted.
 HELD = LearningRates(0, 0, 0, 0, 0, 0, 0, 0, frame_times=4e-3)
 
@@ -188,7 +188,7 @@ def test_every_method_works(model, frames, how):
 
 def test_default_steps_are_the_end_of_the_schedule(model, frames):
     config, steps = dataclasses.replace(CONFIG, steps=100, minutes=5.0, target_psnr=10.0), []
-    original = FitConfig(num_gaussians=150, steps=30, degree=2)
+    original = dataclasses.replace(CONFIG, steps=30)
     for each in (config, original):
         how = {"replicates": 1, "method": "order", "steps": None if each is config else 30}
         steps.append(next(iter_refits(model, frames, each, **how)).times)
