@@ -191,9 +191,11 @@ def test_a_page_plays_all_segments(here, work, tmp_path, capsys, monkeypatch):
     noted = read_video(work / "clip").frames[2 + 2]  # the model's frame 2 is the folder's fourth
     assert psnr(shown, noted) > 25
     served = []
-    monkeypatch.setattr(viewing._Server, "serve_forever", lambda server: served.append(server.page.decode()))
+    monkeypatch.setattr(viewing.PageServer, "serve_forever", lambda server: served.append(server.page.decode()))
     assert run("view", here, "--no-browser", "--original", work / "clip") == 0
-    assert served == [page.replace(">long<", ">clip<")]  # named after its clip
+    (seen,) = served
+    assert (seen.count('id="model-'), seen.count('id="frame-')) == (3, NUM_FRAMES)
+    assert ">clip<" in seen  # named after its clip
 
 
 NIGHT = '[[edits]]\ndo = "recolor"\ngain = 0.5\nframes = "4:14"\nease = 3\n'

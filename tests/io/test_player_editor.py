@@ -46,7 +46,14 @@ def edited(browser, tmp_path):
         yield open_page
 
 
-@pytest.mark.parametrize("name", EDITS)
+#: Of each kind of edit one: of places, shapes, colors, times, copies and order.
+QUICK = ("move", "transform", "gain", "freeze", "copies", "front")
+assert set(QUICK) <= EDITS.keys()
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in EDITS]
+)
 def test_an_edit_shows_what_foldgauss_edit_gives(edited, compact, name):
     page, model = edited(compact), load_video_model(compact)
     before = page.picture(0.9)
