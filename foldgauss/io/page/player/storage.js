@@ -15,7 +15,10 @@ export class Storage {
     document.addEventListener("visibilitychange", () => document.hidden && this.flush());
   }
 
-  /** Restore the history of a model, if there is one; from now on keep it. */
+  /**
+   * Restore the history of a model, if there is one; from now on keep it, with the `version` of the script on the disk
+   * that it began with or was saved as. Whether something can be undone, and whether it `isCurrent`: of that version.
+   */
   attach(fingerprint, history) {
     this.flush();
     this.history = history;
@@ -27,9 +30,9 @@ export class Storage {
     } catch {
       // not ours
     }
-    if (!Array.isArray(kept?.steps) || !kept.steps.every(isStep) || !(kept.done >= 0 && kept.done <= kept.steps.length)) return false;
+    if (!Array.isArray(kept?.steps) || !kept.steps.every(isStep) || !(kept.done >= 0 && kept.done <= kept.steps.length)) return {};
     history.restore(kept);
-    return history.canUndo;
+    return { canUndo: history.canUndo, isCurrent: kept.version === this.version };
   }
 
   changed() {
@@ -40,8 +43,8 @@ export class Storage {
     clearTimeout(this.pending);
     if (this.pending === undefined) return;
     this.pending = undefined;
-    const { steps, done } = this.history;
-    const kept = steps.length ? remember(this.key, JSON.stringify({ steps, done })) : remember(this.key, null);
+    const { version, history: { steps, done } } = this;
+    const kept = steps.length ? remember(this.key, JSON.stringify({ steps, done, version })) : remember(this.key, null);
     if (!kept && !this.told) this.onFull();
     this.told = !kept; // once, until it works again
   }
