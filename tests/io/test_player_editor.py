@@ -202,6 +202,62 @@ def test_scripts_that_the_page_cannot_do_are_told(edited, compact, text, message
     assert page.stats["undoable"] == 0
 
 
+BLACK = """() => {
+  const { base } = foldgauss.player;
+  base.leaves.color_dc.fill(-5);
+}"""
+
+
+def test_a_script_that_fails_when_applied_changes_nothing(edited, compact):
+    page = edited(compact)
+    page.page.evaluate(BLACK)
+    read_script(page, IT + EDITS["hue"])
+    before = page.picture(0.5)
+    read_script(page, IT + EDITS["color"], "own.toml")
+    assert "own.toml: color: expected an object that is not black" in page.page.locator("#toast").inner_text()
+    many = "\n[[edits]]\n".join(
+        f'do = "multiply"\noffsets = {[[0.1, 0.0]] * num}\noriginals = true\n' for num in (100, 999)
+    )
+    read_script(page, IT + many)
+    assert (
+        "expected at most 1,000,000 Gaussians with the copies, got 1,212,028"
+        in page.page.locator("#toast").inner_text()
+    )
+    assert page.stats["undoable"] == 1
+    np.testing.assert_array_equal(page.settle().picture(0.5), before)
+
+
+def test_too_many_copies_by_the_panel_are_told(edited, compact):
+    page = edited(compact)
+    read_script(page, IT + f'do = "multiply"\noffsets = {[[0.1, 0.0]] * 100}\noriginals = true\n')
+    page.page.keyboard.press("e")
+    step = {"do": "multiply", "offsets": [[0.1, 0.0]] * 999}
+    page.page.evaluate("(step) => foldgauss.controls.panel.act(step)", step)
+    assert "got 1,212,028. Select fewer, or make fewer" in page.page.locator("#toast").inner_text()
+    assert page.settle().stats["undoable"] == 1
+    page.page.evaluate("foldgauss.controls.panel.duplicate()")
+    assert page.settle().stats["undoable"] == 2
+
+
+def test_what_the_browser_kept_is_discarded_if_it_cannot_be_applied(edited, compact):
+    page = edited(compact)
+    read_script(page, IT + EDITS["hue"])
+    page.page.evaluate("foldgauss.files.storage.flush()")
+    page.page.evaluate(
+        """(offsets) => {
+          const [name] = Object.keys(localStorage), kept = JSON.parse(localStorage[name]);
+          const copies = { do: "multiply", offsets, originals: true };
+          kept.steps.push(copies, copies); // undone: they fail when they are done again
+          localStorage[name] = JSON.stringify(kept);
+        }""",
+        [[0.1, 0.0]] * 999,
+    )
+    page.page.reload()
+    assert page.ready().stats["steps"] == []
+    assert "The edit that the browser kept is discarded: offsets: exp" in page.page.locator("#toast").inner_text()
+    assert page.page.evaluate("Object.keys(localStorage)") == []
+
+
 def test_selections_of_scripts_are_combined(edited, compact):
     text = '[selections.a]\nindices = "0-9"\n[selections."b c"]\nindices = "5-14" # and\n'
     text += '[selections.d]\nany = ["a", "b c"]\nwithout = [\n  "e",\n]\n'.replace('"e"', '"b c"')

@@ -23,7 +23,7 @@ export class Files {
   constructor(player, show, onProgress) {
     Object.assign(this, { player, show, onProgress });
     this.server = JSON.parse(element("server")?.textContent ?? "null");
-    this.storage = new Storage(() => toast("The browser does not keep this edit: it is too large, or storage is not allowed here. Download the script.", LONG));
+    this.storage = new Storage((error) => toast(`The edit that the browser kept is discarded: ${error.message}`, LONG), () => toast("The browser does not keep this edit: it is too large, or storage is not allowed here. Download the script.", LONG));
     on("files-open", "click", () => openDialog("files"));
     for (const name of ["open-file", "notice-open"]) on(name, "click", () => this.choose());
     on("chooser", "change", () => this.open(element("chooser").files[0]));
@@ -69,7 +69,7 @@ export class Files {
     if (server) put("save-about", `As ${server.script}`);
     element("download-model").disabled = segments.spans.length > 1;
     this.storage.version = server && this.isOfPage ? element("script")?.dataset.version ?? NO_SCRIPT : undefined;
-    const { canUndo, isCurrent } = this.storage.attach(`${fingerprint}-${segments.total}-${segments.spans.length}`, history);
+    const { canUndo, isCurrent } = this.storage.attach(`${fingerprint}-${segments.total}-${segments.spans.length}`, history, (steps) => editing.check(steps, segments.held));
     if (canUndo) toast("The edit is as you left it.");
     if (this.isOfPage && element("script")) this.readFromDisk(canUndo && isCurrent);
   }
@@ -83,8 +83,8 @@ export class Files {
     try {
       const text = new TextDecoder("utf-8", { fatal: true }).decode(bytesOf(element("script").textContent));
       const steps = readScript(text, this.player.segments.counts);
-      if (isKnown) return;
-      this.player.editing.load(steps);
+      if (isKnown) return this.player.editing.check([{ script: steps }], this.player.segments.held);
+      this.player.editing.load(steps, this.player.segments.held);
       toast(`${script} is applied. Undo takes it back.`);
     } catch (error) {
       toast(`${script}: ${error.message}`, LONG);
@@ -134,7 +134,7 @@ export class Files {
       return false;
     }
     try {
-      player.editing.load(readScript(text, player.segments.counts));
+      player.editing.load(readScript(text, player.segments.counts), player.segments.held);
       toast(`${name} is applied. Undo takes it back.`);
       return true;
     } catch (error) {
@@ -188,7 +188,7 @@ export class Files {
   }
 
   discard() {
-    this.player.editing.load([]);
+    this.player.editing.load([], []);
     element("files").close();
     toast("The edit is discarded. Undo brings it back.");
   }
