@@ -258,6 +258,27 @@ def test_what_the_browser_kept_is_discarded_if_it_cannot_be_applied(edited, comp
     assert page.page.evaluate("Object.keys(localStorage)") == []
 
 
+def test_an_edit_that_the_browser_cannot_keep_leaves_no_older_one(edited, compact):
+    page = edited(compact)
+    read_script(page, IT + EDITS["hue"])
+    page.page.evaluate("foldgauss.files.storage.flush()")
+    assert len(page.page.evaluate("Object.keys(localStorage)")) == 1
+    page.page.evaluate(
+        """() => {
+          for (let more = 2 ** 22; more >= 1; more >>= 1)
+            try {
+              localStorage.filler = (localStorage.filler ?? "") + " ".repeat(more);
+            } catch {
+              // full
+            }
+        }"""
+    )
+    read_script(page, IT + EDITS["several"])
+    page.page.evaluate("foldgauss.files.storage.flush()")
+    assert "does not keep this edit, nor its earlier state" in page.page.locator("#toast").inner_text()
+    assert page.page.evaluate("Object.keys(localStorage)") == ["filler"]
+
+
 def test_selections_of_scripts_are_combined(edited, compact):
     text = '[selections.a]\nindices = "0-9"\n[selections."b c"]\nindices = "5-14" # and\n'
     text += '[selections.d]\nany = ["a", "b c"]\nwithout = [\n  "e",\n]\n'.replace('"e"', '"b c"')

@@ -23,7 +23,7 @@ export class Files {
   constructor(player, show, onProgress) {
     Object.assign(this, { player, show, onProgress });
     this.server = JSON.parse(element("server")?.textContent ?? "null");
-    this.storage = new Storage((error) => toast(`The edit that the browser kept is discarded: ${error.message}`, LONG), () => toast("The browser does not keep this edit: it is too large, or storage is not allowed here. Download the script.", LONG));
+    this.storage = new Storage((error) => toast(`The edit that the browser kept is discarded: ${error.message}`, LONG), () => toast("The browser does not keep this edit, nor its earlier state: it is too large, or storage is not allowed here. Download the script.", LONG));
     on("files-open", "click", () => openDialog("files"));
     for (const name of ["open-file", "notice-open"]) on(name, "click", () => this.choose());
     on("chooser", "change", () => this.open(element("chooser").files[0]));
