@@ -186,6 +186,7 @@ def test_a_script_comes_back_by_drop_and_by_the_button(edited, compact, tmp_path
         (IT.replace(f"= {NUM}", "= 41") + EDITS["vanish"], "num_gaussians: expected 40, those of this model, got 41"),
         (IT.replace("0-11", "0-99") + EDITS["vanish"], "indices: expected Gaussians from 0 to 39, got 99"),
         (IT.replace('"it"', '"them"') + EDITS["vanish"], "select: expected the name of a selection"),
+        (IT.replace("0-11", "") + EDITS["vanish"], "indices: expected a text of numbers and ranges"),
         ("[[layers]]\nmodel = 'm'\n", "[layers]: expected selections and edits"),
         ("[camera", "line 1: expected ]"),
         ("a = b", 'line 1: expected a key or a value, got "b"'),
@@ -277,6 +278,14 @@ def test_an_edit_that_the_browser_cannot_keep_leaves_no_older_one(edited, compac
     page.page.evaluate("foldgauss.files.storage.flush()")
     assert "does not keep this edit, nor its earlier state" in page.page.locator("#toast").inner_text()
     assert page.page.evaluate("Object.keys(localStorage)") == ["filler"]
+
+
+def test_scripts_are_toml_whatever_the_title(edited, compact):
+    page = edited(compact)
+    read_script(page, IT + EDITS["hue"])
+    page.page.evaluate("foldgauss.files.title = 'a\\x7f\\x00\\x85\\n\\u2028\"\\ud800' + '\u00e9'")
+    assert len(parse_edit_script(script_of(page)).tables["edits"]) == 1
+    assert "\u00e9" in script_of(page)
 
 
 def test_selections_of_scripts_are_combined(edited, compact):
