@@ -21,6 +21,7 @@ from tiny_clips import NUM_FRAMES, write_both
 
 from foldgauss.cli.viewing import page_server
 from foldgauss.io import html_page, load_video_model, save_video_model
+from foldgauss.io.page.player_page import script_version, with_script
 from foldgauss.video import edit
 
 
@@ -39,7 +40,7 @@ def served(work, monkeypatch, capsys):
         servers, opened = [], []
 
         def serve(server):
-            servers.append((server.server_address[0], server.page.decode()))
+            servers.append((server.server_address[0], with_script(server.page, server.read_script()).decode()))
             raise KeyboardInterrupt
 
         monkeypatch.setattr(page_server.PageServer, "serve_forever", serve)
@@ -108,13 +109,19 @@ SCRIPT = '[selections.it]\nindices = "0-3"\n\n[[edits]]\nselect = "it"\ndo = "va
 def test_the_server_saves_the_script_of_its_page(tmp_path):
     script, token = tmp_path / "clip.edit.toml", page_server.make_token()
     with serving(script=script, token=token) as (_, ask):
+        version = '"none"'
         for text in (SCRIPT, SCRIPT.replace("0-3", "5")):
-            assert ask("PUT", "/script", text, X_Foldgauss_Token=token)[:2] == (200, b"clip.edit.toml")
-            assert script.read_text() == text
+            status, told, headers = ask("PUT", "/script", text, X_Foldgauss_Token=token, If_Match=version)
+            assert (status, told, script.read_text()) == (200, b"clip.edit.toml", text)
+            assert headers["ETag"] == f'"{script_version(text.encode())}"'
+            before, version = version, headers["ETag"]
+        for stale in (before, '"none"', "*", None):  # another tab's
+            status, told, _ = ask("PUT", "/script", SCRIPT, X_Foldgauss_Token=token, If_Match=stale)
+            assert (status, script.read_text()) == (428 if stale is None else 412, text)
         script.write_text("# by hand")
-        status, told, _ = ask("PUT", "/script", SCRIPT, X_Foldgauss_Token=token)
-        assert (status, script.read_text()) == (409, "# by hand")
-        assert b"changed by another program" in told
+        status, told, _ = ask("PUT", "/script", SCRIPT, X_Foldgauss_Token=token, If_Match=version)
+        assert (status, script.read_text()) == (412, "# by hand")
+        assert b"changed by another tab or program" in told
     assert [path.name for path in tmp_path.iterdir()] == ["clip.edit.toml"]
 
 
@@ -124,7 +131,7 @@ def test_requests_that_are_not_the_pages_save_nothing(tmp_path, monkeypatch):
     script, token = folder / "clip.edit.toml", page_server.make_token()
     monkeypatch.setattr(page_server, "MAX_BYTES", 1000)
     with serving(script=script, token=token) as (server, ask):
-        port, good = server.server_address[1], {"X_Foldgauss_Token": token}
+        port, good = server.server_address[1], {"X_Foldgauss_Token": token, "If_Match": '"none"'}
         for status, request in (
             (403, {}),
             (403, {"X_Foldgauss_Token": ""}),
@@ -172,7 +179,8 @@ def test_view_saves_beside_the_model(served, work, tmp_path):
     assert 'id="script"' not in page
     (tmp_path / "my clip.edit.toml").write_text(SCRIPT)
     _, ((_, again),), _, _ = served(model, "--no-browser")
-    assert f'id="script">{base64.b64encode(SCRIPT.encode()).decode()}<' in again
+    version = script_version(SCRIPT.encode())
+    assert f'id="script" data-version="{version}">{base64.b64encode(SCRIPT.encode()).decode()}<' in again
     assert "connect-src" not in html_page(model)
 
 

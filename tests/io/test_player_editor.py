@@ -193,6 +193,7 @@ def test_a_script_comes_back_by_drop_and_by_the_button(edited, compact, tmp_path
         (IT.replace(f"= {NUM}", "= 41") + EDITS["vanish"], "num_gaussians: expected 40, those of this model, got 41"),
         (IT.replace("0-11", "0-99") + EDITS["vanish"], "indices: expected Gaussians from 0 to 39, got 99"),
         (IT.replace('"it"', '"them"') + EDITS["vanish"], "select: expected the name of a selection"),
+        (IT.replace("0-11", "") + EDITS["vanish"], "indices: expected a text of numbers and ranges"),
         ("[[layers]]\nmodel = 'm'\n", "[layers]: expected selections and edits"),
         ("[camera", "line 1: expected ]"),
         ("a = b", 'line 1: expected a key or a value, got "b"'),
@@ -207,6 +208,91 @@ def test_scripts_that_the_page_cannot_do_are_told(edited, compact, text, message
     assert told.startswith("own.toml: ")
     assert message in told
     assert page.stats["undoable"] == 0
+
+
+BLACK = """() => {
+  const { base } = foldgauss.player;
+  base.leaves.color_dc.fill(-5);
+}"""
+
+
+def test_a_script_that_fails_when_applied_changes_nothing(edited, compact):
+    page = edited(compact)
+    page.page.evaluate(BLACK)
+    read_script(page, IT + EDITS["hue"])
+    before = page.picture(0.5)
+    read_script(page, IT + EDITS["color"], "own.toml")
+    assert "own.toml: color: expected an object that is not black" in page.page.locator("#toast").inner_text()
+    many = "\n[[edits]]\n".join(
+        f'do = "multiply"\noffsets = {[[0.1, 0.0]] * num}\noriginals = true\n' for num in (100, 999)
+    )
+    read_script(page, IT + many)
+    assert (
+        "expected at most 1,000,000 Gaussians with the copies, got 1,212,028"
+        in page.page.locator("#toast").inner_text()
+    )
+    assert page.stats["undoable"] == 1
+    np.testing.assert_array_equal(page.settle().picture(0.5), before)
+
+
+def test_too_many_copies_by_the_panel_are_told(edited, compact):
+    page = edited(compact)
+    read_script(page, IT + f'do = "multiply"\noffsets = {[[0.1, 0.0]] * 100}\noriginals = true\n')
+    page.page.keyboard.press("e")
+    step = {"do": "multiply", "offsets": [[0.1, 0.0]] * 999}
+    page.page.evaluate("(step) => foldgauss.controls.panel.act(step)", step)
+    assert "got 1,212,028. Select fewer, or make fewer" in page.page.locator("#toast").inner_text()
+    assert page.settle().stats["undoable"] == 1
+    page.page.evaluate("foldgauss.controls.panel.duplicate()")
+    assert page.settle().stats["undoable"] == 2
+
+
+def test_what_the_browser_kept_is_discarded_if_it_cannot_be_applied(edited, compact):
+    page = edited(compact)
+    read_script(page, IT + EDITS["hue"])
+    page.page.evaluate("foldgauss.files.storage.flush()")
+    page.page.evaluate(
+        """(offsets) => {
+          const [name] = Object.keys(localStorage), kept = JSON.parse(localStorage[name]);
+          const copies = { do: "multiply", offsets, originals: true };
+          kept.steps.push(copies, copies); // undone: they fail when they are done again
+          localStorage[name] = JSON.stringify(kept);
+        }""",
+        [[0.1, 0.0]] * 999,
+    )
+    page.page.reload()
+    assert page.ready().stats["steps"] == []
+    assert "The edit that the browser kept is discarded: offsets: exp" in page.page.locator("#toast").inner_text()
+    assert page.page.evaluate("Object.keys(localStorage)") == []
+
+
+def test_an_edit_that_the_browser_cannot_keep_leaves_no_older_one(edited, compact):
+    page = edited(compact)
+    read_script(page, IT + EDITS["hue"])
+    page.page.evaluate("foldgauss.files.storage.flush()")
+    assert len(page.page.evaluate("Object.keys(localStorage)")) == 1
+    page.page.evaluate(
+        """() => {
+          for (let more = 2 ** 22; more >= 1; more >>= 1)
+            try {
+              localStorage.filler = (localStorage.filler ?? "") + " ".repeat(more);
+            } catch {
+              // full
+            }
+        }"""
+    )
+    read_script(page, IT + EDITS["several"])
+    page.page.evaluate("foldgauss.files.storage.flush()")
+    assert "does not keep this edit, nor its earlier state" in page.page.locator("#toast").inner_text()
+    assert page.page.evaluate("Object.keys(localStorage)") == ["filler"]
+
+
+def test_scripts_are_toml_whatever_the_title(edited, compact):
+    page = edited(compact)
+    read_script(page, IT + EDITS["hue"])
+    page.page.evaluate("foldgauss.files.title = 'a\\x7f\\x00\\x85\\n\\u2028\"\\ud800' + '\u00e9'")
+    assert len(parse_edit_script(script_of(page)).tables["edits"]) == 1
+    assert "\u00e9" in script_of(page)
 
 
 def test_selections_of_scripts_are_combined(edited, compact):

@@ -158,8 +158,7 @@ def test_view_saves_to_disk_and_takes_it_up_again(browser, compact, tmp_path):
     script, token = tmp_path / "clip.edit.toml", make_token()
 
     def served():
-        saved = script.read_bytes() if script.exists() else None
-        page = html_page(compact, save_to=SaveTarget(script.name, token, saved))
+        page = html_page(compact, save_to=SaveTarget(script.name, token))
         return PageServer(page.encode(), 0, script=script, token=token)
 
     @contextmanager
@@ -192,6 +191,48 @@ def test_view_saves_to_disk_and_takes_it_up_again(browser, compact, tmp_path):
         page.page.keyboard.press("s")
         assert page.page.locator("#save-disk").is_disabled()
         assert "left alone" in page.page.locator("#save-about").inner_text()
+
+
+def test_view_keeps_what_others_wrote_to_the_script(browser, compact, tmp_path):
+    script, token = tmp_path / "clip.edit.toml", make_token()
+    page = html_page(compact, save_to=SaveTarget(script.name, token))
+    with PageServer(page.encode(), 0, script=script, token=token) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        first = Opened(browser, server.url).ready()
+        try:
+            read_script(first, IT + EDITS["move"])
+            second = first.context.new_page()
+            second.goto(server.url)
+            second.evaluate("foldgauss.ready")
+            first.page.evaluate("foldgauss.files.save()")
+            saved = script.read_text()
+            second.evaluate("foldgauss.files.save()")  # it began without a script
+            second.get_by_text("changed by another tab or program").wait_for()
+            assert script.read_text() == saved
+            second.close()
+            wait = "Promise.all([foldgauss.files.save(), foldgauss.files.save()])"
+            first.page.evaluate(wait)  # again, by the version that it saved
+            assert "Saved as" in first.page.locator("#toast").inner_text()
+            first.page.reload()
+            assert [step["do"] for step in first.ready().stats["steps"] if "do" in step] == ["move"]
+            script.write_text(IT + EDITS["hue"])  # by hand: it comes before what the browser kept
+            first.page.reload()
+            assert first.ready().stats["steps"][1] == {"do": "recolor", "hue": 0.6}
+            first.page.evaluate("foldgauss.player.editing.history.undo()")
+            assert first.stats["steps"][1]["do"] == "move"
+            for bad in (b"[camera]\nazimuth = 3\n", b"# \xff\n"):
+                script.write_bytes(bad)
+                for _ in range(2):  # what the browser then keeps is no reason to replace it
+                    first.page.reload()
+                    first.ready().page.evaluate("foldgauss.files.storage.changed()")
+                    assert first.page.locator("#save-disk").is_disabled()
+                assert script.read_bytes() == bad
+        finally:
+            first.close()
+            server.shutdown()
+            thread.join()
+    assert [one for one in first.said if "412" not in one] == []
 
 
 def test_a_picture_is_what_is_shown(edited, compact, tmp_path):

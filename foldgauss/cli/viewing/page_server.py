@@ -8,6 +8,7 @@ from pathlib import Path
 
 from foldgauss.io._atomic import OutputError, atomic_path
 from foldgauss.io.edit_script import MAX_BYTES, EditScriptError, parse_edit_script
+from foldgauss.io.page.player_page import script_version, with_script
 
 HOST = "127.0.0.1"
 TOKEN_HEADER = "X-Foldgauss-Token"
@@ -28,6 +29,9 @@ def script_path(model_path: Path) -> Path:
 class PageServer(http.server.ThreadingHTTPServer):
     """Serves `page` to browsers of this machine; with the token they may write `script`, and nothing else.
 
+    The page comes with the script as it is at that time. To replace it a tab names, in If-Match, the version that it
+    began with or last saved: what another tab or program wrote since then is kept.
+
     A page of another origin could send requests here from the same browser. It cannot read the token, which is in the
     page alone, nor send the token's header without a preflight request, which is not answered; and requests that name
     another host (DNS rebinding) or another origin are refused.
@@ -37,7 +41,6 @@ class PageServer(http.server.ThreadingHTTPServer):
 
     def __init__(self, page: bytes, port: int, *, script: Path | None = None, token: str | None = None):
         self.page, self.script, self.token = page, script, token
-        self.known = self.read_script()  # what the page began with or saved: anything else is not replaced
         self.saving = threading.Lock()
         super().__init__((HOST, port), _Handler)
         number = self.server_address[1]
@@ -76,28 +79,30 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             return self._answer(411, "Expected a length.")
         if len(length) > len(str(MAX_BYTES)) or int(length) > MAX_BYTES:
             return self._answer(413, f"Expected a script of at most {MAX_BYTES:,} bytes, got more.")
+        version = self.headers.get("If-Match", "").strip('"')
+        if not version:
+            return self._answer(428, "Expected the version of the script to replace, If-Match. Reload the page.")
         body = self.rfile.read(int(length))
         with self.server.saving:
-            self._save(body, int(length))
+            self._save(body, int(length), version)
 
-    def _save(self, body: bytes, length: int) -> None:
+    def _save(self, body: bytes, length: int, version: str) -> None:
         script = self.server.script
-        if self.server.read_script() != self.server.known:
-            text = f"{script.name} was changed by another program. Start foldgauss view again, or move the file away."
-            return self._answer(409, text)
         try:
+            if script_version(self.server.read_script()) != version:
+                text = f"{script.name} was changed by another tab or program. Download the script, or reload the page."
+                return self._answer(412, text)
             if len(body) < length:
                 raise EditScriptError("script: expected a whole script, got a part.")
             text = body.decode()
             parse_edit_script(text, folder=script.parent)
             with atomic_path(script) as temporary:
                 temporary.write_bytes(body)
-            self.server.known = body
         except (EditScriptError, UnicodeDecodeError) as error:
             return self._answer(400, str(error))
-        except OutputError as error:
+        except (OutputError, OSError) as error:
             return self._answer(500, str(error))
-        self._answer(200, script.name)
+        self._answer(200, script.name, version=script_version(body))
 
     def _is_foreign(self) -> bool:
         origin = self.headers.get("Origin")
@@ -111,14 +116,22 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         elif self.path.partition("?")[0] != "/":
             self.send_error(404)
         else:
-            self._answer(200, self.server.page, "text/html", send=send)
+            try:
+                page = with_script(self.server.page, self.server.read_script())
+            except OSError as error:
+                return self._answer(500, f"{self.server.script.name}: expected a script, got {error}.", send=send)
+            self._answer(200, page, "text/html", send=send)
 
-    def _answer(self, code: int, body: str | bytes, kind: str = "text/plain", *, send: bool = True) -> None:
+    def _answer(
+        self, code: int, body: str | bytes, kind: str = "text/plain", *, version: str = "", send: bool = True
+    ) -> None:
         data = body.encode() if isinstance(body, str) else body
         self.send_response(code)
         self.send_header("Content-Type", f"{kind}; charset=utf-8")
         self.send_header("Content-Length", str(len(data)))
         self.send_header("Cache-Control", "no-store")
+        if version:
+            self.send_header("ETag", f'"{version}"')
         self.send_header("X-Content-Type-Options", "nosniff")
         self.send_header("Cross-Origin-Resource-Policy", "same-origin")
         self.send_header("X-Frame-Options", "DENY")

@@ -30,9 +30,8 @@ def view_command(
     if original is not None:
         frames = read_fitted_clip(load_video_model(model_path), model_path, original, None)
     script, token = script_path(model_path), make_token()
-    saved = script.read_bytes() if script.is_file() else None
     with err.status("Writing the page"):
-        target = SaveTarget(script.name, token, saved)
+        target = SaveTarget(script.name, token)
         page = html_page(model_path, original=frames, quality=original_quality, save_to=target)
     warn_of_size(page, original is not None)
     try:

@@ -48,6 +48,8 @@ _SOURCES = Path(__file__).parent / "player"
 _DECODER = Path(__file__).parent / "compact.js"
 _IMPORT = re.compile(r'^import (?:(?P<names>\{[^}]*\})|(?P<text>\w+)) from "\./(?P<name>[\w.-]+)";\n', re.MULTILINE)
 _EXPORT = re.compile(r"^export (?:async )?(?:const|class|function) (\w+)", re.MULTILINE)
+#: Where a server puts the edit script into the page.
+_SCRIPT_PLACE = "<!--edit script-->"
 #: Binary logarithm of equal steps, where steps in proportion are beyond the format.
 _EVEN = -18.0
 _PER_E = 1.4427  # log2 e: slopes are those of natural logarithms
@@ -94,18 +96,27 @@ def warn_of_size(page: str, has_original: bool) -> None:
 class SaveTarget:
     """Where a page that a local server serves saves its edit: `PUT /script` with the token in a header.
 
-    `name` is the script's file name, for display; `script` the edit that the page begins with, if there is one.
+    `name` is the script's file name, for display. The server puts the script itself in by `with_script`.
     """
 
     name: str
     token: str
-    script: bytes | None = None
 
     def blocks(self) -> Iterator[str]:
         about = json.dumps({"token": self.token, "script": self.name}).replace("<", "\\u003c")
         yield f'<script type="application/json" id="server">{about}</script>'
-        if self.script is not None:
-            yield _block("script", self.script)
+        yield _SCRIPT_PLACE
+
+
+def with_script(page: bytes, script: bytes | None) -> bytes:
+    """A page with a `SaveTarget`, with the edit script that it begins with, if there is one, and its version."""
+    block = "" if script is None else _block("script", script, f' data-version="{script_version(script)}"')
+    return page.replace(_SCRIPT_PLACE.encode(), block.encode(), 1)
+
+
+def script_version(script: bytes | None) -> str:
+    """What tells versions of an edit script apart: its SHA-256, or "none" where there is no script."""
+    return "none" if script is None else hashlib.sha256(script).hexdigest()
 
 
 def html_page(
@@ -273,9 +284,9 @@ def _assemble(models: Iterable[str], pictures: Iterable[bytes], title: str, save
     return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], page)
 
 
-def _block(name: str, data: bytes) -> str:
+def _block(name: str, data: bytes, attributes: str = "") -> str:
     """Bytes as a script element of a type that browsers do not execute."""
-    return f'<script type="application/octet-stream" id="{name}">{base64.b64encode(data).decode()}</script>'
+    return f'<script type="application/octet-stream" id="{name}"{attributes}>{base64.b64encode(data).decode()}</script>'
 
 
 def _policy(script: str, style: str, *, connects: bool) -> str:

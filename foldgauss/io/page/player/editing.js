@@ -1,5 +1,5 @@
 // The Gaussians of each segment as edited: states that follow from the history.
-import { History } from "./history.js";
+import { History, inEffect } from "./history.js";
 import { fromRanges, toRanges } from "./indices.js";
 import { applyStep } from "./operations.js";
 import { begin, countOf, originalsOf, withOriginals } from "./state.js";
@@ -104,15 +104,27 @@ export class Editing {
 
   // ----------------------------------------------------------------------------------------------- edits
 
-  /** Add an edit of the selection, or change the one that was just added, if it is of the same kind. */
+  /**
+   * Add an edit of the selection, or change the one that was just added, if it is of the same kind. Throws an Error for
+   * display where that is not possible; nothing is changed then.
+   */
   edit(step, amend = false) {
+    if (step.do === "multiply") for (const [number, { base }] of this.chains) this.apply(this.stateOf(number, base), step, number, base);
     if (amend && isAlike(this.history.last, step)) this.history.amend(step);
     else this.history.push(step);
   }
 
-  /** Replace the edit by the steps of a script; it can be undone. */
-  load(steps) {
+  /** Replace the edit by the steps of a script; it can be undone. `held` and errors: as of `check`. */
+  load(steps, held) {
+    this.check([{ script: steps }], held);
     this.history.push({ script: steps });
+  }
+
+  /** Throw an Error for display where the steps of a history cannot be applied to the segments {number: {base}} of `held`. */
+  check(steps, held) {
+    const ends = steps.map((_, k) => k + 1).filter((k) => k === steps.length || steps[k].script); // of all that undo leads to
+    for (const [number, { base }] of held)
+      for (const end of ends) inEffect(steps.slice(0, end)).reduce((state, step) => this.apply(state, step, number, base), begin(base));
   }
 
   /** How many of a segment's current Gaussians are selected. */

@@ -45,13 +45,14 @@ export function recall(name) {
   }
 }
 
-/** Keep a text, or forget it if it is null; whether that was possible. */
+/** Keep a text, or forget it if it is null; whether that was possible. If not, no earlier text is kept either. */
 export function remember(name, value) {
   try {
     if (value === null) localStorage.removeItem(name);
     else localStorage.setItem(name, value);
     return true;
   } catch {
+    if (value !== null) remember(name, null);
     return false; // not allowed, or full
   }
 }

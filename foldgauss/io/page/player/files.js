@@ -8,6 +8,7 @@ import { openDialog } from "./shell.js";
 import { Storage } from "./storage.js";
 
 const LONG = 8000; // milliseconds that a problem is shown
+const NO_SCRIPT = "none"; // the version where there is no script on the disk
 
 /** Offer a file for download. */
 export function download(content, name) {
@@ -22,7 +23,7 @@ export class Files {
   constructor(player, show, onProgress) {
     Object.assign(this, { player, show, onProgress });
     this.server = JSON.parse(element("server")?.textContent ?? "null");
-    this.storage = new Storage(() => toast("The browser does not keep this edit: it is too large, or storage is not allowed here. Download the script.", LONG));
+    this.storage = new Storage((error) => toast(`The edit that the browser kept is discarded: ${error.message}`, LONG), () => toast("The browser does not keep this edit, nor its earlier state: it is too large, or storage is not allowed here. Download the script.", LONG));
     on("files-open", "click", () => openDialog("files"));
     for (const name of ["open-file", "notice-open"]) on(name, "click", () => this.choose());
     on("chooser", "change", () => this.open(element("chooser").files[0]));
@@ -67,17 +68,29 @@ export class Files {
     element("save-disk").hidden = element("save-about").hidden = !server || !this.isOfPage;
     if (server) put("save-about", `As ${server.script}`);
     element("download-model").disabled = segments.spans.length > 1;
-    const found = this.storage.attach(`${fingerprint}-${segments.total}-${segments.spans.length}`, history);
-    if (found) toast("The edit is as you left it.");
-    else if (this.isOfPage && element("script")) this.readFromDisk();
+    this.storage.version = server && this.isOfPage ? element("script")?.dataset.version ?? NO_SCRIPT : undefined;
+    const { canUndo, isCurrent } = this.storage.attach(`${fingerprint}-${segments.total}-${segments.spans.length}`, history, (steps) => editing.check(steps, segments.held));
+    if (canUndo) toast("The edit is as you left it.");
+    if (this.isOfPage && element("script")) this.readFromDisk(canUndo && isCurrent);
   }
 
-  /** Take up the script beside the model; one that the page cannot do must not be replaced. */
-  readFromDisk() {
+  /**
+   * Take up the script beside the model, unless the edit that the browser kept began with it (`isKnown`); one that the
+   * page cannot do must not be replaced.
+   */
+  readFromDisk(isKnown) {
     const { script } = this.server;
-    if (this.readScript(new TextDecoder().decode(bytesOf(element("script").textContent)), script)) return;
-    element("save-disk").disabled = true;
-    put("save-about", `${script} has edits that the page cannot do, and is left alone. Rename it to save another.`);
+    try {
+      const text = new TextDecoder("utf-8", { fatal: true }).decode(bytesOf(element("script").textContent));
+      const steps = readScript(text, this.player.segments.counts);
+      if (isKnown) return this.player.editing.check([{ script: steps }], this.player.segments.held);
+      this.player.editing.load(steps, this.player.segments.held);
+      toast(`${script} is applied. Undo takes it back.`);
+    } catch (error) {
+      toast(`${script}: ${error.message}`, LONG);
+      element("save-disk").disabled = true;
+      put("save-about", `${script} has edits that the page cannot do, and is left alone. Rename it to save another.`);
+    }
   }
 
   /** Open a file: a script for this model, or a model. */
@@ -121,7 +134,7 @@ export class Files {
       return false;
     }
     try {
-      player.editing.load(readScript(text, player.segments.counts));
+      player.editing.load(readScript(text, player.segments.counts), player.segments.held);
       toast(`${name} is applied. Undo takes it back.`);
       return true;
     } catch (error) {
@@ -154,11 +167,20 @@ export class Files {
     }
   }
 
-  async saveToDisk() {
+  /** Save after any saving under way, whose version this one replaces. */
+  saveToDisk() {
+    return (this.saving = Promise.resolve(this.saving).then(() => this.replaceScript()));
+  }
+
+  async replaceScript() {
     const { token, script } = this.server;
     try {
-      const answer = await fetch("/script", { method: "PUT", headers: { "X-Foldgauss-Token": token }, body: this.script });
+      const headers = { "X-Foldgauss-Token": token, "If-Match": `"${this.storage.version}"` };
+      const answer = await fetch("/script", { method: "PUT", headers, body: this.script });
+      if (answer.status === 412) return toast(`Not saved: ${await answer.text()}`, LONG);
       if (!answer.ok) throw new Error((await answer.text()).trim() || `the server answers ${answer.status}`);
+      this.storage.version = answer.headers.get("ETag").replaceAll('"', "");
+      this.storage.changed();
       toast(`Saved as ${script}`);
     } catch (error) {
       toast(`Not saved: ${error.message}. If foldgauss view has ended, download the script.`, LONG);
@@ -166,7 +188,7 @@ export class Files {
   }
 
   discard() {
-    this.player.editing.load([]);
+    this.player.editing.load([], []);
     element("files").close();
     toast("The edit is discarded. Undo brings it back.");
   }

@@ -16,8 +16,7 @@ export class History {
 
   /** The steps in effect, without those that a script replaced. */
   get current() {
-    const steps = this.steps.slice(0, this.done), from = steps.findLastIndex((step) => step.script);
-    return from < 0 ? steps : [...steps[from].script, ...steps.slice(from + 1)];
+    return inEffect(this.steps.slice(0, this.done));
   }
 
   get last() {
@@ -64,4 +63,10 @@ export class History {
     [this.steps, this.done] = [steps, done];
     this.onChange();
   }
+}
+
+/** Steps without those that a script among them replaced. */
+export function inEffect(steps) {
+  const from = steps.findLastIndex((step) => step.script);
+  return from < 0 ? steps : [...steps[from].script, ...steps.slice(from + 1)];
 }

@@ -4,6 +4,7 @@ import { countOf, gathered, indicesOf } from "./state.js";
 
 const IDENTITY = [[1, 0], [0, 1]];
 const MOST_COPIES = 1000;
+const MOST_GAUSSIANS = 1_000_000; // after multiply: a few hundred bytes each, in each state that is kept
 
 const isNumber = (own) => typeof own === "number" && Number.isFinite(own) && Math.abs(own) <= 1e9;
 const isList = (length, of = isNumber) => (own) => Array.isArray(own) && own.length === length && own.every(of);
@@ -47,6 +48,8 @@ function ordered(state, selectedFirst) {
 
 /** Copies, each just behind what it is a copy of; they are the selection then, with the originals if asked for. */
 function multiplied(state, { offsets, delays = 0, scale = 1, degrees = 0, about, originals = false }) {
+  const total = state.model.num + countOf(state) * offsets.length;
+  if (total > MOST_GAUSSIANS) throw new Error(`offsets: expected at most ${MOST_GAUSSIANS.toLocaleString("en")} Gaussians with the copies, got ${total.toLocaleString("en")}. Select fewer, or make fewer copies.`);
   const source = [], copy = [];
   for (let i = 0; i < state.model.num; i++)
     for (let k = 0; k <= (state.selected[i] ? offsets.length : 0); k++) {

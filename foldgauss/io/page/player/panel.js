@@ -1,5 +1,5 @@
 // The editor's panel: tools, and edits of the selection by buttons, sliders and numbers.
-import { element, fill, on, press, pressOne, put } from "./elements.js";
+import { element, fill, on, press, pressOne, put, toast } from "./elements.js";
 import { isAlike } from "./editing.js";
 
 const BUTTONS = {
@@ -94,7 +94,11 @@ export class Panel {
   }
 
   act(step) {
-    if (this.hasSelection) this.player.editing.edit(step);
+    try {
+      if (this.hasSelection) this.player.editing.edit(step);
+    } catch (error) {
+      toast(error.message, 8000);
+    }
   }
 
   remove() {

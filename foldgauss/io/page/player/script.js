@@ -21,7 +21,8 @@ export function writeScript(steps, counts, title) {
     }
   }
   if (select && name === undefined && Object.keys(select).length) selections.push(selectionTables(CURRENT, select, counts));
-  const about = `# An edit of ${JSON.stringify(title)} by the foldgauss player. To apply it:\n# foldgauss edit MODEL THIS_FILE --out edited.safetensors\n`;
+  const printable = title.replace(/\p{Cc}/gu, " "); // comments of TOML hold no control characters
+  const about = `# An edit of ${JSON.stringify(printable)} by the foldgauss player. To apply it:\n# foldgauss edit MODEL THIS_FILE --out edited.safetensors\n`;
   return [about, ...selections, ...edits].join("\n");
 }
 
@@ -95,7 +96,7 @@ function fail(message) {
 function resolveIndices({ indices, num_gaussians: num, segment = 0, ...rest }, counts) {
   const [other] = Object.keys(rest);
   if (other) fail(`${other}: expected indices alone, with num_gaussians and segment. ${RENDER}`);
-  if (typeof indices !== "string") fail('indices: expected a text of numbers and ranges, as "3,17,40-52".');
+  if (typeof indices !== "string" || indices === "") fail('indices: expected a text of numbers and ranges, as "3,17,40-52".');
   if (!Number.isInteger(segment) || !(segment >= 0 && segment < counts.length)) fail(`segment: expected a number below ${counts.length}, got ${segment}.`);
   if (num !== undefined && num !== counts[segment]) fail(`num_gaussians: expected ${counts[segment]}, those of this model, got ${num}. Open the model that the script was made for.`);
   return counts.map((own, number) => (number === segment ? fromRanges(indices, own) : new Uint8Array(own)));

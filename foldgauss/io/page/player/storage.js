@@ -8,15 +8,18 @@ const PREFIX = "foldgauss-edit-", PAUSE = 400; // milliseconds after a change
 const isStep = (step) => Array.isArray(step?.script) ? step.script.every(isStep) : step?.select ? typeof step.select === "object" : step?.do !== undefined && problemOf(step) === "";
 
 export class Storage {
-  /** `onFull` is called when the browser does not keep an edit. */
-  constructor(onFull) {
-    this.onFull = onFull;
+  /** `onInvalid(error)` is called for an edit that cannot be applied, `onFull` when the browser does not keep an edit. */
+  constructor(onInvalid, onFull) {
+    Object.assign(this, { onInvalid, onFull });
     addEventListener("pagehide", () => this.flush());
     document.addEventListener("visibilitychange", () => document.hidden && this.flush());
   }
 
-  /** Restore the history of a model, if there is one; from now on keep it. */
-  attach(fingerprint, history) {
+  /**
+   * Restore the history of a model, if there is one; from now on keep it, with the `version` of the script on the disk
+   * that it began with or was saved as. What `check(steps)` throws for is forgotten. Whether something can be undone, and whether it `isCurrent`: of that version.
+   */
+  attach(fingerprint, history, check) {
     this.flush();
     this.history = history;
     this.key = PREFIX + fingerprint;
@@ -27,9 +30,16 @@ export class Storage {
     } catch {
       // not ours
     }
-    if (!Array.isArray(kept?.steps) || !kept.steps.every(isStep) || !(kept.done >= 0 && kept.done <= kept.steps.length)) return false;
+    if (!Array.isArray(kept?.steps) || !kept.steps.every(isStep) || !(kept.done >= 0 && kept.done <= kept.steps.length)) return {};
+    try {
+      check(kept.steps);
+    } catch (error) {
+      remember(this.key, null);
+      this.onInvalid(error);
+      return {};
+    }
     history.restore(kept);
-    return history.canUndo;
+    return { canUndo: history.canUndo, isCurrent: kept.version === this.version };
   }
 
   changed() {
@@ -40,8 +50,8 @@ export class Storage {
     clearTimeout(this.pending);
     if (this.pending === undefined) return;
     this.pending = undefined;
-    const { steps, done } = this.history;
-    const kept = steps.length ? remember(this.key, JSON.stringify({ steps, done })) : remember(this.key, null);
+    const { version, history: { steps, done } } = this;
+    const kept = steps.length ? remember(this.key, JSON.stringify({ steps, done, version })) : remember(this.key, null);
     if (!kept && !this.told) this.onFull();
     this.told = !kept; // once, until it works again
   }
