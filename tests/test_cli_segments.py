@@ -182,7 +182,7 @@ def test_one_segment_is_taken_out(here, work, tmp_path, capsys):
 def test_a_page_plays_all_segments(here, work, tmp_path, capsys, monkeypatch):
     out = tmp_path / "long.html"
     assert run("export", here, "--format", "html", "--original", work / "clip") == 0
-    assert f"long.html: a page of 0.2 MB, {3 * NUM} Gaussians" in told(capsys)
+    assert f"long.html: a page of 0.3 MB, {3 * NUM} Gaussians" in told(capsys)
     page = out.read_text(encoding="utf-8")
     assert page.count('id="model-') == 3
     assert page.count('id="frame-') == NUM_FRAMES
