@@ -156,6 +156,9 @@ def test_requests_that_are_not_the_pages_save_nothing(tmp_path, monkeypatch):
             (400, good | {"body": "not TOML"}),
             (400, good | {"body": b"\xff\xfe"}),
             (400, good | {"body": "[[edits]]\ndo = 'sing'"}),
+            (400, good | {"body": SCRIPT.replace("0-3", "9" * 900)}),
+            (400, good | {"body": SCRIPT.replace("0-3", "3-0")}),
+            (400, good | {"body": SCRIPT.replace("0-3", "0-3,all")}),
         ):
             told = ask("PUT", **{"path": "/script", "body": SCRIPT} | request)
             assert told[0] == status, (request, told)

@@ -24,6 +24,7 @@ import operator
 import os
 import re
 import tomllib
+from collections import deque
 from collections.abc import Callable, Mapping
 from functools import reduce
 from pathlib import Path
@@ -34,7 +35,7 @@ import numpy as np
 from foldgauss._runtime.checks import invalid
 from foldgauss.io._toml_lines import key_lines
 from foldgauss.io.media.masks import read_masks
-from foldgauss.io.models.selections import load_selection, parse_indices
+from foldgauss.io.models.selections import load_selection, parse_indices, parse_ranges
 from foldgauss.io.models.video_model import load_video_model
 from foldgauss.render import Camera
 from foldgauss.video.editing.chain import Edit, edit
@@ -54,7 +55,7 @@ Chain = Edit | SegmentedEdit
 MAX_BYTES = 32_000_000
 #: Largest number of parts of a dotted key; the parser makes a table for each.
 MAX_PARTS = 16
-_DEEP_KEY = re.compile(rf"(?:[\w\"'-]+[ \t]*\.[ \t]*){{{MAX_PARTS}}}")
+_DEEP_KEY = re.compile(rf"(?<![\w\"'-])(?:[\w\"'-]+[ \t]*\.[ \t]*){{{MAX_PARTS}}}")
 #: Largest absolute value of a number; no position, time or angle is larger, and squares could overflow.
 LARGEST = 1e9
 
@@ -449,6 +450,8 @@ def _check_selections(source: str, text: str, selections: Any) -> None:
             _check_combined(context, table, known)
         elif "indices" in table:
             _check_keys(context, table, _INDICES)
+            with context:
+                deque(parse_ranges(table["indices"]), maxlen=0)
         else:
             _check_keys(context, table, {**_CRITERIA, **(_MASK_FILE if "mask" in table else {})})
             if "mask" in table and "file" in table:

@@ -98,6 +98,12 @@ def test_wrong_indices_are_refused(keys, message):
     assert message in error(f"[selections.it]\n{keys}")
 
 
+@pytest.mark.parametrize("indices", ["9" * 1_000_000, "1,", "4-2", "-1", "0x3"])
+def test_indices_are_checked_before_there_is_a_video(indices):
+    with pytest.raises(EditScriptError, match=r"line 2, \[selections\.it\]: indices: expected numbers and ranges"):
+        parse_edit_script(f'[selections.it]\nindices = "{indices}"\n')
+
+
 def test_indices_of_segments_need_the_segments_number():
     assert "segment: expected the number of one of 1 segments, got none" in error(
         '[selections.it]\nindices = "3"\n[[edits]]\nselect = "it"\ndo = "vanish"', IN_ONE

@@ -83,23 +83,23 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         if not version:
             return self._answer(428, "Expected the version of the script to replace, If-Match. Reload the page.")
         body = self.rfile.read(int(length))
+        try:
+            if len(body) < int(length):
+                raise EditScriptError("script: expected a whole script, got a part.")
+            parse_edit_script(body.decode(), folder=self.server.script.parent)
+        except (EditScriptError, UnicodeDecodeError) as error:
+            return self._answer(400, str(error))
         with self.server.saving:
-            self._save(body, int(length), version)
+            self._save(body, version)
 
-    def _save(self, body: bytes, length: int, version: str) -> None:
+    def _save(self, body: bytes, version: str) -> None:
         script = self.server.script
         try:
             if script_version(self.server.read_script()) != version:
                 text = f"{script.name} was changed by another tab or program. Download the script, or reload the page."
                 return self._answer(412, text)
-            if len(body) < length:
-                raise EditScriptError("script: expected a whole script, got a part.")
-            text = body.decode()
-            parse_edit_script(text, folder=script.parent)
             with atomic_path(script) as temporary:
                 temporary.write_bytes(body)
-        except (EditScriptError, UnicodeDecodeError) as error:
-            return self._answer(400, str(error))
         except (OutputError, OSError) as error:
             return self._answer(500, str(error))
         self._answer(200, script.name, version=script_version(body))

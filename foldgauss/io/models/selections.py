@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -91,16 +92,22 @@ def parse_indices(text: str, num_gaussians: int) -> Selection:
     **Example:** `parse_indices("0-2,7", model.num_gaussians)`.
     """
     mask = np.zeros(num_gaussians, bool)
-    for part in text.split(","):
-        found = _INDEX_RANGE.fullmatch(part)
-        first, last = (int(found[1]), int(found[2] or found[1])) if found else (0, -1)
-        if last < first:
-            raise invalid("indices", expected='numbers and ranges, as "3,17,40-52"', got=repr(part[:40]))
+    for first, last in parse_ranges(text):
         if last >= num_gaussians:
             cure = "Is it another model's script?"
             raise invalid("indices", expected=f"Gaussians from 0 to {num_gaussians - 1:,}", got=f"{last:,}", cure=cure)
         mask[first : last + 1] = True
     return Selection(mask)
+
+
+def parse_ranges(text: str) -> Iterator[tuple[int, int]]:
+    """The first and the last index of each range in a text of `parse_indices`; ValueError for another text."""
+    for part in text.split(","):
+        found = _INDEX_RANGE.fullmatch(part)
+        first, last = (int(found[1]), int(found[2] or found[1])) if found else (0, -1)
+        if last < first:
+            raise invalid("indices", expected='numbers and ranges, as "3,17,40-52"', got=repr(part[:40]))
+        yield first, last
 
 
 def compute_digest(model: VideoModel) -> str:
