@@ -99,12 +99,12 @@ export function alphaAt(one, x, y) {
   return one.opacity * Math.exp(-0.5 * ((along * along) / one.first + (across * across) / one.second));
 }
 
-/** The indices of the Gaussians alive at a time, in order, written to `room`, of which the part used is returned. */
-export function alive(model, time, room) {
+/** The indices of the Gaussians alive at a time, in order, written to `buffer`; returns the part that is used. */
+export function alive(model, time, buffer) {
   const { num, windows } = model, t = Math.fround(time);
   let count = 0;
-  for (let i = 0; i < num; i++) if (windows[2 * i] < t && t < windows[2 * i + 1]) room[count++] = i;
-  return room.subarray(0, count);
+  for (let i = 0; i < num; i++) if (windows[2 * i] < t && t < windows[2 * i + 1]) buffer[count++] = i;
+  return buffer.subarray(0, count);
 }
 
 /** The fit's low-pass filter as a variance in model units. */

@@ -6,14 +6,14 @@ import { deltaE, toLab } from "./lab.js";
 /** Conditions the Gaussians of a model on times, in memory that is used again. */
 export class Picker {
   constructor() {
-    this.room = new Uint32Array(0);
+    this.buffer = new Uint32Array(0);
   }
 
   /** The Gaussians alive at a time, conditioned, front to back. */
   at({ model }, time, wanted = () => true) {
-    if (this.room.length < model.num) this.room = new Uint32Array(model.num);
+    if (this.buffer.length < model.num) this.buffer = new Uint32Array(model.num);
     const lowPass = lowPassOf(model.header), found = [];
-    for (const i of alive(model, time, this.room)) {
+    for (const i of alive(model, time, this.buffer)) {
       const one = condition(model, i, time, lowPass);
       if (wanted(one)) found.push(one);
     }

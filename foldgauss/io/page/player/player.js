@@ -15,7 +15,7 @@ export class Player {
     Object.assign(this, { canvas, renderer, onChange });
     Object.assign(this, { playing: false, speed: 1, loop: true, quality: 0.1, alive: 0, renderTimes: [], waiting: false });
     Object.assign(this, { mode: "model", split: 0.5, background: [0, 0, 0], highlighting: false, before: 0, pace: 0 });
-    this.room = new Uint32Array(0);
+    this.buffer = new Uint32Array(0);
   }
 
   /** Show a model: the segments of a page or a file, with the original's frames or null. */
@@ -212,8 +212,8 @@ export class Player {
 
   /** The Gaussians alive at a time, front to back, those selected marked on demand. */
   instances({ model, selected }, time, marked) {
-    if (this.room.length < model.num) this.room = new Uint32Array(model.num);
-    const list = alive(model, time, this.room).slice(); // several models are drawn one after another
+    if (this.buffer.length < model.num) this.buffer = new Uint32Array(model.num);
+    const list = alive(model, time, this.buffer).slice(); // several models are drawn one after another
     if (marked) for (let k = 0; k < list.length; k++) if (selected[list[k]]) list[k] += SELECTED;
     return list;
   }

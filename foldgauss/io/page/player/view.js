@@ -36,7 +36,7 @@ export class View {
   /** Rectangle of the frame, which may extend beyond the pane. */
   frameIn(pane) {
     const scale = this.fit(pane) * this.zoom, width = scale * this.width, height = scale * this.height;
-    const held = (pan, size, room) => Math.min(Math.max(pan, -Math.max(size - room, 0) / 2), Math.max(size - room, 0) / 2);
+    const held = (pan, size, available) => Math.min(Math.max(pan, -Math.max(size - available, 0) / 2), Math.max(size - available, 0) / 2);
     const pan = [held(this.pan[0], width, pane.width), held(this.pan[1], height, pane.height)];
     const x = pane.x + (pane.width - width) / 2 + pan[0], y = pane.y + (pane.height - height) / 2 + pan[1];
     return { x, y, width, height, scale, pan };
