@@ -80,8 +80,11 @@ class AtMost(NamedTuple):
         return f"<= {self.limit:,g}" if self.limit < 10_000 else f"<= {self.limit:,.0f}"
 
 
-#: The figures asked of each fit, by name of the fit; `FOLDER` stands for each clip of the folder. Of others none are.
+#: The figures asked of each fit, by name of the fit; `FOLDER` stands for each clip of the folder.
+#: Those of 1 and 5 minutes are no goals: a regression would fall below the 40.5 and 39.1 dB that were measured.
 ASKED: dict[str, dict[str, AtLeast | AtMost]] = {
+    "bunny-160-1": {"psnr": AtLeast(40)},
+    "bunny-640-5": {"psnr": AtLeast(38.5)},
     "bunny-160": {"psnr": AtLeast(42)},
     "bunny-640": {"psnr": AtLeast(41)},
     "bunny-640-60": {"psnr": AtLeast(42.5)},
@@ -153,7 +156,7 @@ def measure(fits: dict[str, Fit], runs: Runs, *, half: bool) -> dict[str, Run]:
 
 def judgements(name: str, row: Run) -> Iterator[tuple[str, bool]]:
     """What is asked of a row in words, and whether it is met."""
-    asked = ASKED.get(FOLDER if name.startswith(FOLDER) else name, {})
+    asked = ASKED[FOLDER if name.startswith(FOLDER) else name]
     for figure, limit in asked.items():
         yield f"{SHOWN[figure]} {limit}", limit.met(row[figure])
     if "loss" in row:
