@@ -6,7 +6,13 @@ from clips import moving_blobs
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video import Economy
-from foldgauss.video.fitting.config import ALIVE_POWER, LIFETIME_POWER, FitConfig, default_num_gaussians
+from foldgauss.video.fitting.config import (
+    ALIVE_POWER,
+    LIFETIME_POWER,
+    MOST_PER_PIXEL,
+    FitConfig,
+    default_num_gaussians,
+)
 from foldgauss.video.fitting.initialize import ELONGATION, count_alive, initialize, sample_orientations
 
 
@@ -71,11 +77,12 @@ def test_number_follows_from_the_lifetime():
 
 
 def test_longer_lifetimes_mean_fewer_gaussians():
-    """By a power of it; and where they live throughout, a limit of those alive holds, which grows with the time."""
+    """By a power of it; where they live throughout, by a limit of those alive, which grows with the time up to an end."""
     size = 132, 160, 320
     number = [default_num_gaussians(FitConfig(minutes=1.0), *size, lifetime=life, threads=2) for life in (8.0, 32.0)]
     assert number[0] == pytest.approx(4**-LIFETIME_POWER * number[1], rel=1e-4)
-    alive = [default_num_gaussians(FitConfig(minutes=m), *size, lifetime=132.0, threads=2) for m in (4.0, 16.0)]
+    alive = [default_num_gaussians(FitConfig(minutes=m), *size, lifetime=132.0, threads=2) for m in (0.25, 1.0, 99.0)]
     assert alive[1] == pytest.approx(4**ALIVE_POWER * alive[0], rel=1e-4)
+    assert alive[2] == pytest.approx(MOST_PER_PIXEL * 160 * 320, rel=1e-4)
     given = FitConfig(minutes=1.0, economy=Economy())
     assert default_num_gaussians(given, *size, lifetime=8.0) == default_num_gaussians(given, *size, lifetime=100.0)

@@ -98,11 +98,11 @@ def test_minutes_are_planned_by_the_speed_of_all_levels():
     assert state.seconds == pytest.approx(100, rel=0.01)
 
 
-@pytest.mark.parametrize(("early", "late"), [(3.0, 1.0), (1.0, 3.0)])
-def test_minutes_are_used_up_whatever_the_machine_does(early, late):
+@pytest.mark.parametrize(("early", "late", "until"), [(3.0, 1.0, 30), (1.0, 3.0, 30), (4.0, 1.0, 65)])
+def test_minutes_are_used_up_whatever_the_machine_does(early, late, until):
     """The machine is busy at first, or later: the plan is corrected, and progress never falls, jumps or stops short."""
     config = dataclasses.replace(HALF, steps=None, minutes=100 / 60)
-    pace = lambda state, level: 0.05 * (early if state.seconds < 30 else late)  # noqa: E731
+    pace = lambda state, level: 0.05 * (early if state.seconds < until else late)  # noqa: E731
     state, course = run_by_clock(config, [Level(1.0, (48, 64))], pace)
     assert state.seconds == pytest.approx(100, rel=0.02)
     progress = np.array([done for _, done in course])

@@ -19,7 +19,8 @@ BIRTH_SLOWDOWN = 1.15
 STEPS_PER_ROUND = 2.0
 #: The speed is measured after so many steps, in which kernels are compiled or loaded, over at least so many.
 WARM_UP, MIN_STEPS = 5, 10
-#: The fractions of the time at which the number of steps is planned, by the speed since the one before.
+#: The fractions of the time or of the plan, whichever is first, at which the number of steps is planned, by the speed
+#: since the one before.
 PLANNED_AT = (0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 0.9, 0.97)
 #: Steps of the whole fit are slower than the first ones by this: Gaussians grow longer in time.
 SLOWDOWN = 1.05
@@ -74,7 +75,10 @@ class StepPlanner:
         if not state.plan:
             enough = self.seconds >= PLANNED_AT[0] * budget
             return enough or (self.config.steps is not None and state.step >= self.config.steps * PLANNED_AT[0])
-        return any(state.seconds - self.seconds < part * budget <= state.seconds for part in PLANNED_AT)
+        # By the plan, too: where the machine has become faster, it would end before its time.
+        before = max((state.seconds - self.seconds) / budget, state.planned_progress)
+        now = max(state.seconds / budget, measure_progress(state, self.config))
+        return any(before < part <= now for part in PLANNED_AT)
 
 
 class TimeLeft:

@@ -428,6 +428,8 @@ TYPICAL_LIFETIME, SHORTEST_LIFETIME = 35.0, 2.0
 #: Gaussians alive in a frame, at most: for a frame of one pixel and one microsecond; it grows by these powers of the
 #: time, likewise, and of the pixels. Where they live long, more of them leave time for too few steps.
 ALIVE, ALIVE_POWER, ALIVE_PIXEL_POWER = 0.378, 0.55, 0.95
+#: More Gaussians than this in each pixel gain nothing, however much time there is.
+MOST_PER_PIXEL = 1.6
 #: The default number of Gaussians for the economy, which adds those that pay: so many for the square root of a frame's
 #: pixels; and this fraction of it for the smallest model at a PSNR. (Bunny 80x160 at 33 dB, which takes 3,100: 31.9
 #: thousand parameters from 20,000 Gaussians, 30.9 from 14,000, 36.2 from 40,000.)
@@ -450,9 +452,9 @@ def default_num_gaussians(
     `lifetime` is the mean number of frames in which a Gaussian is alive, which depends on the motion in the clip. The
     number is the smallest of three, where a core has x microseconds for each pixel of all frames, p pixels each:
     `DENSITY` x^`DENSITY_POWER` lifetime^`LIFETIME_POWER` for each pixel of all frames; the number of which `ALIVE`
-    x^`ALIVE_POWER` p^`ALIVE_PIXEL_POWER` are alive in a frame; and the number whose parameters, with `PARAMETER_BYTES`
-    each, take as many bytes as the frames. x is the time that `steps` take, or `minutes` times the number of `threads`
-    (default: those of this process).
+    x^`ALIVE_POWER` p^`ALIVE_PIXEL_POWER`, at most `MOST_PER_PIXEL` p, are alive in a frame; and the number whose
+    parameters, with `PARAMETER_BYTES` each, take as many bytes as the frames. x is the time that `steps` take, or
+    `minutes` times the number of `threads` (default: those of this process).
     """
     area = height * width
     pixels = num_frames * area
@@ -466,7 +468,8 @@ def default_num_gaussians(
         budgets.append(60e6 * config.minutes * (threads or num_threads()) / pixels)
     time = min(budgets)
     by_time = DENSITY * time**DENSITY_POWER * lifetime**LIFETIME_POWER * pixels
-    by_life = ALIVE * time**ALIVE_POWER * area**ALIVE_PIXEL_POWER * num_frames / lifetime
+    alive = min(ALIVE * time**ALIVE_POWER * area**ALIVE_PIXEL_POWER, MOST_PER_PIXEL * area)
+    by_life = alive * num_frames / lifetime
     by_size = 3 * pixels / (PARAMETER_BYTES * parameters_per_gaussian(config.degree))
     return max(round(min(by_time, by_life, by_size)), 1)
 

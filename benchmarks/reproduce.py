@@ -1,0 +1,165 @@
+"""The paper's recipe to its end: preset `paper` with all its steps, and with one thing changed.
+
+    python -m benchmarks.reproduce --folder FOLDER [--size HxW] [--frames A:B] [--steps N] [--only NAME ...]
+                                   [--seed S] [--json FILE]
+
+*Bunny*, by default all 132 frames of 640x1280, in the published 30,000 steps of 3 frames: hours on a desktop machine. A
+smaller `--size` has Gaussians at the start in proportion to its pixels, and takes 20 to 40 minutes a fit at 160x320 on
+two cores. `VARIANTS` lists the fits: "as published", the power of the paper's text instead of its code's, other batches
+and degrees, and what the paper does not state or we chose. PSNR and SSIM are of 8-bit images, the mean over all frames,
+beside the published 38.53 dB and 0.62 million Gaussians (table:bs-pol, batch 3, degree 7).
+
+FOLDER keeps a checkpoint of the fit under way and, for each fit, the curve NAME.csv of PSNR (of the frames seen last)
+and number of Gaussians against steps. The same command continues a fit after its checkpoint; with --json also after the
+fits that are done. `cpu_hours` are of the process, over all its runs.
+"""
+
+import csv
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any
+
+from benchmarks import _common, fit_clip
+from benchmarks._common import console
+from benchmarks._runs import Run, Runs, scaled, scores
+from foldgauss.io import Clip
+from foldgauss.io._atomic import atomic_path
+from foldgauss.io.datasets import bunny
+from foldgauss.io.provenance import fingerprint
+from foldgauss.jobs.runner import Checkpoint, run_steps
+from foldgauss.video import FitConfig, Growth, fit_steps
+from foldgauss.video.fitting.config import PRESETS
+from foldgauss.video.fitting.growth import PUBLISHED_STEPS
+from foldgauss.video.fitting.state import FitState, to_model
+
+FULL = (640, 1280)
+PUBLISHED_PSNR, PUBLISHED_GAUSSIANS = 38.53, 620_000
+#: Steps between two points of a curve, and seconds between two checkpoints.
+EVERY, CHECKPOINT_SECONDS = 100, 120.0
+
+#: What each fit changes in the preset, or in its `Growth`; the largest questions first.
+VARIANTS: dict[str, dict[str, Any]] = {
+    "as published": {},
+    "power of the text": {"power": 1.0},
+    "batch 1": {"batch_size": 1},
+    "degree 1": {"degree": 1},
+    "degree 3": {"degree": 3},
+    "one camera": {"two_cameras": False},
+    "start from the clip": {"initialization": "clip"},
+    "100,000 at the start": {"num_gaussians": 100_000},
+    "time gradient not used": {"growth": {"time_gradient": 1e9}},
+    "time gradient x0.25": {"growth": {"time_gradient": 5e-5}},
+    "half of the gradients": {"growth": {"screen_gradient": 1e-4, "time_gradient": 1e-4}},
+    "opacity 0.005 pruned": {"growth": {"prune_opacity": 0.005}},
+    "wide Gaussians kept": {"growth": {"prune_radius": 1e9, "prune_scale": 1e9}},
+    "no resets": {"growth": {"reset_every": 10**9}},
+    "rates x2": {"rates": 2.0},
+    "positions learn to the end": {"final_rate": 1.0},
+}
+
+
+def config_of(name: str, size: tuple[int, int], steps: int, seed: int) -> FitConfig:
+    """The settings of a fit. Numbers of Gaussians are those of `FULL`, and scaled to `size`."""
+    changes = {"num_gaussians": PRESETS["paper"]["num_gaussians"], **VARIANTS[name]}
+    changes["num_gaussians"] = scaled(changes["num_gaussians"], size)
+    if "growth" in changes:
+        changes["growth"] = dataclasses.replace(Growth(), **changes["growth"])
+    if "rates" in changes:
+        published = dataclasses.asdict(PRESETS["paper"]["rates"])
+        rates = {field: changes["rates"] * value for field, value in published.items()}
+        changes["rates"] = dataclasses.replace(PRESETS["paper"]["rates"], **rates)
+    return FitConfig.preset("paper", **changes, steps=steps, seed=seed)
+
+
+class Curve:
+    """Steps, PSNR, number of Gaussians and CPU seconds of a fit, in a CSV file; a resumed fit continues it."""
+
+    COLUMNS = ("step", "psnr", "gaussians", "cpu_seconds")
+
+    def __init__(self, path: Path, state: FitState | None):
+        self.path = path
+        self.points: list[tuple[float, ...]] = []
+        if state is not None and path.exists():
+            with path.open(newline="") as file:
+                rows = [tuple(float(row[name]) for name in self.COLUMNS) for row in csv.DictReader(file)]
+            self.points = [row for row in rows if row[0] <= state.step]
+        self.before = self.points[-1][-1] if self.points else 0.0
+        self.begun = time.process_time()
+
+    def cpu_seconds(self) -> float:
+        return self.before + time.process_time() - self.begun
+
+    def add(self, step: int, psnr: float, gaussians: int) -> None:
+        self.points.append((step, round(psnr, 3), gaussians, round(self.cpu_seconds(), 1)))
+        with atomic_path(self.path) as temporary, temporary.open("w", newline="") as file:
+            csv.writer(file).writerows([self.COLUMNS, *self.points])
+
+
+def run_to_end(clip: Clip, name: str, config: FitConfig, folder: Path) -> Run:
+    """A fit, continued after its checkpoint where there is one of the same settings and frames."""
+    stem = name.replace(" ", "-").replace(",", "").replace(".", "_")
+    checkpoint = Checkpoint(folder / f"{stem}.checkpoint", config, fingerprint(clip))
+    state = checkpoint.load(required=False)
+    curve = Curve(folder / f"{stem}.csv", state)
+    where = "" if state is None else f" continues after step {state.step:,}"
+    console.print(f"{name}{where}", style="dim", soft_wrap=True)
+
+    def observe(state: FitState, info) -> None:
+        if info.step % EVERY == 0 or info.progress >= 1:
+            curve.add(info.step, info.psnr, info.num_gaussians)
+
+    state, info = run_steps(fit_steps(clip.frames, config, state), observe, checkpoint, CHECKPOINT_SECONDS)
+    model = to_model(state, config, clip.size, clip.fps)
+    run = scores(model, clip.frames) | {"gaussians": model.num_gaussians, "steps": info.step}
+    checkpoint.remove()
+    return run | {"seconds": info.seconds, "cpu_hours": curve.cpu_seconds() / 3600}
+
+
+def show(runs: dict[str, Run], title: str) -> None:
+    table = _common.table(title, "fit", "PSNR, dB", "", "worst frame", "SSIM", "Gaussians", "steps", "CPU hours")
+    first = runs[next(iter(VARIANTS))]["psnr"] if next(iter(VARIANTS)) in runs else None
+    for name, run in runs.items():
+        gain = "" if first is None else f"{run['psnr'] - first:+.2f}"
+        figures = f"{run['psnr']:.2f}", gain, f"{run['worst_psnr']:.2f}", f"{run['ssim']:.4f}"
+        table.add_row(name, *figures, f"{run['gaussians']:,}", f"{run['steps']:,}", f"{run['cpu_hours']:.2f}")
+    table.add_section()
+    full = "x".join(map(str, FULL))
+    table.add_row(f"the paper, {full}", f"{PUBLISHED_PSNR}", "", "", "", f"{PUBLISHED_GAUSSIANS:,}", "30,000", "")
+    console.print(table)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = _parser()
+    options = _common.parse(parser, arguments)
+    clip = bunny(size=options.size, frames=options.frames)
+    setting = {"size": clip.size, "frames": clip.num_frames, "steps": options.steps, "seed": options.seed}
+    try:
+        options.folder.mkdir(parents=True, exist_ok=True)
+        runs = Runs(options.json, setting)
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
+    done = {}
+    for name in options.only:
+        config = config_of(name, clip.size, options.steps, options.seed)
+        done[name] = runs.get(name, lambda name=name, config=config: run_to_end(clip, name, config, options.folder))
+    show(done, f"Bunny, {clip.num_frames} frames of {clip.size[0]}x{clip.size[1]}, {options.steps:,} steps")
+    figures = {f"psnr, {name}": run["psnr"] for name, run in done.items()}
+    _common.finish(None, figures, _common.describe_machine())
+    runs.write(figures=figures)
+
+
+def _parser():
+    parser = _common.parser(__doc__)
+    parser.add_argument("--folder", type=Path, required=True, help="of checkpoints and curves")
+    parser.add_argument("--size", type=_common.size, metavar="HxW", default=FULL, help="[640x1280]")
+    parser.add_argument("--frames", type=fit_clip._frames, metavar="A:B", help="frames A <= i < B [all]")
+    parser.add_argument("--steps", type=_common.whole, default=PUBLISHED_STEPS, help=f"[{PUBLISHED_STEPS:,}]")
+    names = tuple(VARIANTS)
+    parser.add_argument("--only", nargs="+", choices=names, default=names, metavar="NAME", help=f"[{', '.join(names)}]")
+    parser.add_argument("--seed", type=int, default=0, help="[0]")
+    return parser
+
+
+if __name__ == "__main__":
+    main()
