@@ -77,7 +77,7 @@ def test_number_follows_from_the_lifetime():
 
 
 def test_longer_lifetimes_mean_fewer_gaussians():
-    """By a power of it; where they live throughout, by a limit of those alive, which grows with the time up to an end."""
+    """By a power of it; where they live throughout, by a limit of those alive, which grows with the time to an end."""
     size = 132, 160, 320
     number = [default_num_gaussians(FitConfig(minutes=1.0), *size, lifetime=life, threads=2) for life in (8.0, 32.0)]
     assert number[0] == pytest.approx(4**-LIFETIME_POWER * number[1], rel=1e-4)
