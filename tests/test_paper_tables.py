@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks import ablation, davis, folding_gain, frame_times, presets
+from benchmarks import ablation, davis, folding_gain, frame_times, presets, reproduce
 from benchmarks._runs import Runs, kept_setting, scaled, scores, seconds_per_step
 from foldgauss.io import Clip, write_video
 from foldgauss.video import FitConfig, psnr, ssim
@@ -438,3 +438,42 @@ class TestFrameTimes:
         assert figures["step_where_doubled"] < figures["step_elsewhere"] < figures["step_where_dropped"]
         assert figures["rmse"] < 0.85 * figures["rmse_even"]
         assert figures["gain"] > 0.5
+
+
+class TestReproduce:
+    """`benchmarks.reproduce`: fits of hours, which continue where they were interrupted."""
+
+    def test_each_fit_differs_from_the_preset_in_one_thing(self):
+        made = {name: reproduce.config_of(name, (640, 1280), 30_000, 0) for name in reproduce.VARIANTS}
+        first, *others = made.values()
+        assert first == FitConfig.preset("paper", seed=0)
+        for config in others:
+            changed = [field for field in vars(first) if getattr(first, field) != getattr(config, field)]
+            assert len(changed) == 1
+
+    def test_an_interrupted_fit_continues(self, tmp_path, monkeypatch):
+        """Stopped between checkpoints, it goes on from the last one: model and curve are those of a whole run."""
+        monkeypatch.setattr(reproduce, "EVERY", 2)
+        monkeypatch.setattr(reproduce, "CHECKPOINT_SECONDS", 0.0)
+        clip = Clip(blob(), 12.0, "blob", len(blob()))
+        config = dataclasses.replace(reproduce.config_of("as published", SIZE, 6, 0), num_gaussians=50)
+        whole = reproduce.run_to_end(clip, "whole", config, tmp_path)
+        steps = reproduce.fit_steps
+
+        def interrupted(*arguments):
+            for state, info in steps(*arguments):
+                if info.step == 4:
+                    raise KeyboardInterrupt
+                yield state, info
+
+        monkeypatch.setattr(reproduce, "fit_steps", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            reproduce.run_to_end(clip, "parts", config, tmp_path)
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["parts.checkpoint", "parts.csv", "whole.csv"]
+        monkeypatch.setattr(reproduce, "fit_steps", steps)
+        again = reproduce.run_to_end(clip, "parts", config, tmp_path)
+        assert (again["psnr"], again["gaussians"], again["steps"]) == (whole["psnr"], whole["gaussians"], 6)
+        rows = [line.split(",")[:3] for line in (tmp_path / "parts.csv").read_text().splitlines()]
+        assert [row[0] for row in rows] == ["step", "2", "4", "6"]
+        assert rows == [line.split(",")[:3] for line in (tmp_path / "whole.csv").read_text().splitlines()]
+        assert not (tmp_path / "parts.checkpoint").exists()
