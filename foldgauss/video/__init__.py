@@ -28,7 +28,9 @@ from foldgauss.video.models.frame_times import (
 from foldgauss.video.models.metrics import Evaluation, evaluate, psnr, ssim
 from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.motion.background_plate import fill_background
 from foldgauss.video.motion.camera_path import CameraPath, estimate_camera_path
+from foldgauss.video.motion.moving_object import find_moving_object
 from foldgauss.video.motion.stabilization import StabilizedVideo, stabilize
 from foldgauss.video.segmented.layering import layers
 from foldgauss.video.segmented.segmented_edit import SegmentedEdit
@@ -89,6 +91,8 @@ __all__ = [
     "edit",
     "estimate_camera_path",
     "evaluate",
+    "fill_background",
+    "find_moving_object",
     "fit",
     "fit_steps",
     "independent_frames",

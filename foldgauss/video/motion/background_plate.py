@@ -1,0 +1,259 @@
+"""The background of a clip: homographies between its frames, and images of it in which nothing is in front."""
+
+import dataclasses
+import itertools
+
+import cv2
+import numba as nb
+import numpy as np
+from jaxtyping import Bool, Float, Float16, Float32, Int, UInt8
+
+from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.kernels import kernel
+from foldgauss._runtime.threads import run_tasks
+from foldgauss.video.motion.optical_flow import both_flows, pixel_grid, warp_image
+
+#: The longer side, in pixels, of the images that flow is computed on, and the distance of the points in them.
+SIDE, SPACING = 480, 6
+#: A point is used where forward and backward flow agree within this many pixels, and this fraction of the distance.
+MISS, MISS_FRACTION = 0.3, 0.05
+#: MAGSAC: the largest scale of noise in pixels, and iterations at most.
+NOISE, ITERATIONS = 1.0, 2000
+#: Another shot begins where less than this fraction of the points follows one homography (as for the camera's path);
+#: frames are aligned with one that is further away, so that errors do not add up, while it is more than the second.
+LEAST_INLIERS, KEY_INLIERS = 0.08, 0.35
+#: A plate is the median of at most so many frames, of those at most so far away.
+PLATE_FRAMES, PLATE_REACH = 14, 40
+#: Holes of a plate are filled from frames in which at least this fraction of a pixel is uncovered.
+UNCOVERED = 250 / 255
+#: What an object covers is replaced with this margin, and a soft edge of this width; fractions of the longer side.
+MARGIN, SOFT_EDGE = 0.012, 0.004
+
+Frames = UInt8[np.ndarray, "frames height width 3"]
+Masks = Bool[np.ndarray, "frames height width"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Alignment:
+    """How the background of each frame moves to the others, on images whose longer side is at most `SIDE`.
+
+    `images` are the frames of that size, in gray; `there` and `back` the flow between neighbors, both ways;
+    `matrices` (frames, 3, 3) homographies from the first frame of a shot to each frame of it, in pixels of the images,
+    whose centers are whole numbers. A shot begins at each of `starts`.
+
+    Source: Kroeger et al. 2016 (DIS flow); Barath et al. 2019 (MAGSAC).
+    """
+
+    images: UInt8[np.ndarray, "frames rows columns"]
+    there: Float16[np.ndarray, "intervals rows columns 2"]
+    back: Float16[np.ndarray, "intervals rows columns 2"]
+    matrices: Float[np.ndarray, "frames 3 3"]
+    starts: tuple[int, ...]
+
+    @classmethod
+    def from_frames(cls, frames: Frames) -> "Alignment":
+        images = np.stack([cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in reduce_frames(frames)])
+        flows = np.empty((2, len(images) - 1, *images.shape[1:], 2), np.float16)
+
+        def match(k: int) -> None:
+            flows[0, k], flows[1, k] = both_flows(images[k], images[k + 1])
+
+        run_tasks(match, range(len(images) - 1))
+        matrices, starts = _chain(images, *flows)
+        return cls(images, *flows, matrices, starts)
+
+    @property
+    def shots(self) -> list[tuple[int, int]]:
+        """The first frame of each shot and the one after its last."""
+        return list(itertools.pairwise([*self.starts, len(self.images)]))
+
+    def between(self, frame: int, other: int) -> Float[np.ndarray, "3 3"]:
+        """The map of points of the background in one frame to another of the same shot."""
+        return self.matrices[other] @ np.linalg.inv(self.matrices[frame])
+
+    def flow(self, frame: int, other: int) -> tuple[Float32[np.ndarray, "rows columns 2"], ...]:
+        """The flow from a frame to one of its neighbors, and the flow back."""
+        pair = (self.there, self.back) if other > frame else (self.back, self.there)
+        return tuple(one[min(frame, other)].astype(np.float32) for one in pair)
+
+    def plate_frames(self, frame: int, shot: tuple[int, int]) -> Int[np.ndarray, " num"]:
+        """The frames that show the background of one."""
+        first, last = max(shot[0], frame - PLATE_REACH), min(shot[1] - 1, frame + PLATE_REACH)
+        return np.unique(np.linspace(first, last, min(PLATE_FRAMES, last - first + 1)).round().astype(int))
+
+
+def reduce_frames(frames: Frames) -> UInt8[np.ndarray, "frames rows columns 3"]:
+    """The frames with a longer side of at most `SIDE` pixels."""
+    height, width = frames.shape[1:3]
+    scale = min(1.0, SIDE / max(height, width))
+    size = max(16, round(width * scale)), max(16, round(height * scale))
+    return np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames])
+
+
+def check_frames(frames: np.ndarray) -> None:
+    """Raise ValueError unless these are three color frames at least."""
+    shape, dtype = np.shape(frames), getattr(frames, "dtype", None)
+    if len(shape) != 4 or shape[0] < 3 or shape[-1] != 3 or 0 in shape or dtype != np.uint8:
+        got = f"{dtype} {shape}"
+        raise invalid("frames", expected="uint8 (num_frames, height, width, 3) of 3 frames at least", got=got)
+
+
+def fill_background(frames: Frames, masks: Masks, *, alignment: Alignment | None = None) -> Frames:
+    """The frames without what the masks cover: other frames, moved as the background, show what is behind it.
+
+    A pixel is the median of the frames that show it, up to `PLATE_REACH` frames away within its shot. One that no
+    frame shows is interpolated from its surroundings. Pixels away from the masks stay as they are. `alignment` is
+    that of the frames (default: estimated here).
+
+    Raises ValueError for frames of another type, and masks of another size.
+    Example: `fill_background(frames, find_moving_object(frames, shadow=True))`.
+    """
+    check_frames(frames)
+    masks = np.asarray(masks)
+    if masks.shape != frames.shape[:3] or masks.dtype != bool:
+        expected = f"bool {frames.shape[:3]}"
+        raise invalid("masks", expected=expected, got=f"{masks.dtype} {masks.shape}")
+    alignment = Alignment.from_frames(frames) if alignment is None else alignment
+    side = max(frames.shape[1:3])
+    margin, edge = 2 * round(MARGIN * side) + 1, max(SOFT_EDGE * side, 0.5)
+    covered = np.stack([dilate(mask, margin) for mask in masks])
+    filled = frames.copy()
+
+    def fill(item: tuple[int, tuple[int, int]]) -> None:
+        k, shot = item
+        if not covered[k].any():
+            return
+        window = bounding_box(covered[k])
+        plate, count = render_plate(frames, covered, alignment, k, shot, box=window)
+        unknown = np.uint8(count == 0)
+        plate = cv2.inpaint(plate, unknown, 3, cv2.INPAINT_TELEA) if unknown.any() else plate
+        # From 0 at the border of what is replaced, where the blurred mask is a half, to 1.
+        weight = np.clip(2 * cv2.GaussianBlur(covered[k][window].astype(np.float32), (0, 0), edge) - 1, 0, 1)[..., None]
+        filled[k][window] = (weight * plate + (1 - weight) * frames[k][window]).round()
+
+    run_tasks(fill, [(k, shot) for shot in alignment.shots for k in range(*shot)])
+    return filled
+
+
+def render_plate(
+    frames: Frames,
+    covered: Masks,
+    alignment: Alignment,
+    k: int,
+    shot: tuple[int, int],
+    box: tuple[slice, slice] | None = None,
+) -> tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"]]:
+    """The background of frame k, black where it is unknown, and how many frames show each of its pixels.
+
+    `box`: only this part. Frames and masks may be larger than the alignment's images.
+    """
+    height, width = frames.shape[1:3]
+    rows, columns = (slice(0, height), slice(0, width)) if box is None else box
+    size = columns.stop - columns.start, rows.stop - rows.start
+    to_box = np.array([[1, 0, columns.start], [0, 1, rows.start], [0, 0, 1]], float)
+    to_image = _scale_pixels((height, width), alignment.images.shape[1:])
+    others = alignment.plate_frames(k, shot)
+    stack, known = np.empty((len(others), size[1], size[0], 3), np.uint8), np.empty((len(others), *size[::-1]), bool)
+    for n, j in enumerate(others):
+        to_other = np.linalg.inv(to_image) @ alignment.between(k, j) @ to_image @ to_box
+        stack[n] = warp_by(frames[j], to_other, size)
+        known[n] = warp_by(255 * np.uint8(~covered[j]), to_other, size, cv2.BORDER_CONSTANT) >= 255 * UNCOVERED
+    plate, count = np.empty(stack.shape[1:], np.uint8), np.empty(known.shape[1:], np.uint8)
+    _median(stack, known, np.empty(len(others), np.uint8), plate, count)
+    return plate, count
+
+
+def warp_by(image, matrix: Float[np.ndarray, "3 3"], size: tuple[int, int], border: int = cv2.BORDER_REPLICATE):
+    """The image whose point p shows the point `matrix` p of the given one; `size` is (width, height)."""
+    return cv2.warpPerspective(image, matrix, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=border)
+
+
+def dilate(mask: Bool[np.ndarray, "height width"], diameter: int) -> Bool[np.ndarray, "height width"]:
+    """The mask, grown by half of the diameter on all sides."""
+    return cv2.dilate(mask.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (diameter, diameter))) > 0
+
+
+def bounding_box(mask: Bool[np.ndarray, "height width"]) -> tuple[slice, slice]:
+    """The rows and the columns in which a mask is."""
+    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    return slice(y, y + height), slice(x, x + width)
+
+
+def _chain(images, there, back) -> tuple[Float[np.ndarray, "frames 3 3"], tuple[int, ...]]:
+    """Homographies from the first frame of each shot to its frames, and the starts of shots.
+
+    A frame is aligned with the last key frame, not with its neighbor only, so that errors add up at key frames alone.
+    """
+    matrices, starts = np.tile(np.eye(3), (len(images), 1, 1)), [0]
+    key, from_key = 0, np.eye(3)
+    for k in range(1, len(images)):
+        step = find_homography(there[k - 1].astype(np.float32), back[k - 1].astype(np.float32))
+        if step is None:
+            key, from_key = k, np.eye(3)
+            starts.append(k)
+            continue
+        rest = _align(images[key], images[k], step[0] @ from_key)
+        if rest is None or rest[1] < KEY_INLIERS:
+            key, from_key = k - 1, np.eye(3)
+            rest = _align(images[key], images[k], step[0])
+        from_key = step[0] @ from_key if rest is None else rest[0]
+        from_key = from_key / from_key[2, 2]
+        matrices[k] = from_key @ matrices[key]
+        matrices[k] /= matrices[k, 2, 2]
+    return matrices, tuple(starts)
+
+
+def _align(one, other, start: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarray, "3 3"], float] | None:
+    """The homography between two images, and the fraction of points that follow it, from one that is about right."""
+    size = one.shape[::-1]
+    inside = cv2.erode(warp_by(np.ones_like(other), start, size, cv2.BORDER_CONSTANT), np.ones((7, 7))) > 0
+    found = find_homography(*both_flows(one, warp_by(other, start, size)), inside)
+    return None if found is None else (start @ found[0], found[1])
+
+
+def find_homography(there, back, inside=None) -> tuple[Float[np.ndarray, "3 3"], float] | None:
+    """The homography that most points follow, and their fraction of all; None if less than `LEAST_INLIERS` do."""
+    rows, columns = there.shape[:2]
+    part = slice(SPACING // 2, None, SPACING)
+    points, flow = pixel_grid(rows, columns)[part, part].reshape(-1, 2), there[part, part].reshape(-1, 2)
+    target = points + flow
+    returned = warp_image(back, target[None], cv2.INTER_LINEAR)[0]
+    known = ((target >= 0) & (target <= np.float32([columns - 1, rows - 1]))).all(1)
+    known &= np.hypot(*(flow + returned).T) < MISS + MISS_FRACTION * np.hypot(*flow.T)
+    if inside is not None:
+        known &= inside[part, part].ravel()
+    if known.sum() < max(8, LEAST_INLIERS * len(points)):
+        return None
+    cv2.setRNGSeed(0)
+    matrix, used = cv2.findHomography(
+        points[known], target[known], cv2.USAC_MAGSAC, NOISE, maxIters=ITERATIONS, confidence=0.9999
+    )
+    fraction = 0.0 if matrix is None else float(used.sum() / len(points))
+    return None if fraction < LEAST_INLIERS or np.linalg.det(matrix) <= 0 else (matrix, fraction)
+
+
+def _scale_pixels(size: tuple[int, int], to: tuple[int, int]) -> Float[np.ndarray, "3 3"]:
+    """The map of pixels of images of one size to those of another, with centers at whole numbers."""
+    x, y = to[1] / size[1], to[0] / size[0]
+    return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1]])
+
+
+@kernel
+def _median(stack, known, sorted_, plate, count):
+    """The lower median of the known values of each pixel, by insertion; 0 where none is known."""
+    num, rows, columns, channels = stack.shape
+    for y in range(rows):
+        for x in range(columns):
+            for c in range(channels):
+                found = 0
+                for n in range(num):
+                    if not known[n, y, x]:
+                        continue
+                    value, at = stack[n, y, x, c], found
+                    while at > 0 and sorted_[at - 1] > value:
+                        sorted_[at] = sorted_[at - 1]
+                        at -= 1
+                    sorted_[at] = value
+                    found += 1
+                plate[y, x, c] = sorted_[(found - 1) // 2] if found > 0 else nb.uint8(0)
+            count[y, x] = found

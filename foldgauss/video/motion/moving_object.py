@@ -1,0 +1,312 @@
+"""The moving object of a clip, as a mask of each frame, found by its motion against the background.
+
+Two cues are combined: flow that is left after the frames are aligned, and the difference from a plate of the background
+that the other frames show. GrabCut places the borders, the pieces are followed through the shot, and the masks vote
+along the flow.
+"""
+
+import math
+
+import cv2
+import numpy as np
+import scipy
+from jaxtyping import Bool, Float32, Int32, UInt8
+
+from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.threads import run_tasks
+from foldgauss.video.motion.background_plate import (
+    Alignment,
+    Frames,
+    Masks,
+    check_frames,
+    dilate,
+    reduce_frames,
+    render_plate,
+    warp_by,
+)
+from foldgauss.video.motion.optical_flow import both_flows, pixel_grid
+
+#: Motion is measured over so many frames: slow objects need more, fast ones are not found again after many.
+GAPS = (1, 2, 4)
+#: What moves by less than this many pixels, or this multiple of the image's median, is hardly evidence; likewise for
+#: differences from the plate, in levels of 255.
+LEAST_MOTION, LEAST_DIFFERENCE, TIMES_MEDIAN = 0.7, 12.0, 4.0
+#: Evidence of what moves as the background, only faster: it may stand still and be nearer than the background.
+PARALLAX = 0.2
+#: Evidence is motion to this power times difference to the rest. (car-shadow: 0.4 to 0.7 are alike.)
+MOTION_POWER = 0.6
+#: Evidence that may be of an object, that probably is, and that certainly is; relative to the frame's largest, its
+#: percentile `TOP`, which counts as `FAINTEST` at least. An object has `LEAST_EVIDENCE` on average, not relative.
+MAYBE, PROBABLY, CERTAINLY, TOP, FAINTEST, LEAST_EVIDENCE = 0.3, 0.5, 0.8, 99.8, 0.35, 0.4
+#: Votes are passed on to the next frame at this rate: of motion, and of masks. Flow must agree with the flow back
+#: within about so many pixels.
+MOTION_VOTE, MASK_VOTE, VOTE_MISS = 0.6, 0.8, 1.5
+#: A shadow darkens all channels alike, to this difference of logarithms. It may be slight where borders are sought;
+#: it is cut off below an object where it is strong.
+HUE, SLIGHT, STRONG, DARKEST = 0.12, -0.1, -0.6, -2.2
+#: The smallest piece, a fraction of the image. A piece follows if this fraction of it, or so much of what is expected,
+#: is where it is expected; the frame has lost the object below a tenth of its usual area.
+SMALLEST, INSIDE, REFOUND, LOST, MERGED = 3e-4, 0.5, 0.4, 0.1, 2.0
+#: A lost object is sought this many pixels further in each frame, at most this fraction of the longer side away.
+SEARCH, FARTHEST = 6, 0.125
+#: Objects are followed from every so many frames.
+SEED_SPACING = 5
+
+
+def find_moving_object(frames: Frames, *, shadow: bool = False, alignment: Alignment | None = None) -> Masks:
+    """Where the largest object is that moves on its own, in each frame: bool (num_frames, height, width).
+
+    `frames` are uint8 (num_frames, height, width, 3), in which the background fills most of the image and moves as a
+    plane does, about: a camera that turns, zooms, or passes a distant scene. Each shot has an object of its own. Masks
+    are empty where it is hidden. `shadow`: with the shadow that it casts. `alignment` is that of the frames (default:
+    estimated here).
+
+    It costs about half a second of processor time for each frame, of any size.
+
+    Raises ValueError for frames of another type, and if nothing moves on its own.
+    Example: `by_mask(model, find_moving_object(clip.frames))`.
+    Source: Papazoglou and Ferrari 2013 (motion against the camera, then appearance); Rother et al. 2004 (GrabCut).
+    """
+    check_frames(frames)
+    alignment = Alignment.from_frames(frames) if alignment is None else alignment
+    small = reduce_frames(frames)
+    height, width = frames.shape[1:3]
+    masks = np.zeros((len(frames), height, width), bool)
+    for shot in alignment.shots:
+        for k, mask in zip(range(*shot), _find_in_shot(small, alignment, shot, shadow), strict=False):
+            masks[k] = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
+    if not masks.any():
+        cure = "Select it by a mask, a box or a click."
+        raise invalid("frames", expected="an object that moves against the background", got="none", cure=cure)
+    return masks
+
+
+def _find_in_shot(frames: Frames, alignment: Alignment, shot: tuple[int, int], shadow: bool) -> Masks | list:
+    """The masks of one shot at the size of the alignment's images; none if nothing moves."""
+    first, stop = shot
+    num = stop - first
+    if num < 3:
+        return []
+    moved = np.stack(_map(lambda k: _measure_motion(alignment, first + k, shot), num))
+    moved = _vote(moved, alignment, first, MOTION_VOTE)
+    covered = np.zeros(frames.shape[:3], bool)
+    covered[first:stop] = [dilate(one > MAYBE, 9) for one in moved]
+    slight, strong = (np.empty(moved.shape, bool) for _ in range(2))
+
+    def compare(k: int) -> Float32[np.ndarray, "rows columns"]:
+        plate, count = render_plate(frames, covered, alignment, first + k, shot)
+        slight[k], strong[k] = (_find_shadow(frames[first + k], plate, level) for level in (SLIGHT, STRONG))
+        different = np.where(count < 2, moved[k], _measure_difference(frames[first + k], plate, count >= 2))
+        return moved[k] ** MOTION_POWER * different ** (1 - MOTION_POWER)
+
+    evidence = np.stack(_map(compare, num))
+    relative = [np.minimum(1, one / np.clip(np.percentile(one, TOP), FAINTEST, 1)) for one in evidence]
+    pieces = _map(lambda k: _cut_out(frames[first + k], relative[k], slight[k]), num)
+    masks = _track_best(pieces, relative, alignment, first)
+    if masks is None or max(one[mask].mean() for one, mask in zip(evidence, masks, strict=True) if mask.any()) < (
+        LEAST_EVIDENCE
+    ):
+        return []
+    if not shadow:
+        masks = np.stack([_clean(_cut_shadow(mask, dark)) for mask, dark in zip(masks, strong, strict=True)])
+    votes = _vote(masks.astype(np.float32), alignment, first, MASK_VOTE)
+    return np.stack([_clean(one > 0.5) for one in votes])
+
+
+def _map(function, num: int) -> list:
+    """`function(k)` for all k < num, by several threads."""
+    results = [None] * num
+
+    def run(k: int) -> None:
+        results[k] = function(k)
+
+    run_tasks(run, range(num))
+    return results
+
+
+# ------------------------------------------------------------------------------------------------------- evidence
+
+
+def _measure_motion(alignment: Alignment, k: int, shot: tuple[int, int]) -> Float32[np.ndarray, "rows columns"]:
+    """How certain it is that each pixel moves against the background, in [0, 1]."""
+    image = alignment.images[k]
+    size, ones = image.shape[::-1], np.ones_like(image)
+    found, nearer = [], []
+    for gap in GAPS:
+        lengths = []
+        for j in (k - gap, k + gap):
+            if not shot[0] <= j < shot[1]:
+                continue
+            matrix = alignment.between(k, j)
+            inside = cv2.erode(warp_by(ones, matrix, size, cv2.BORDER_CONSTANT), np.ones((5, 5))) > 0
+            flow = both_flows(image, warp_by(alignment.images[j], matrix, size))[0]
+            length = np.hypot(flow[..., 0], flow[..., 1])
+            lengths.append(np.where(inside, length, np.inf))
+            if gap == 1:
+                nearer.append(_measure_parallax(flow, length, matrix))
+        if lengths:
+            # What is visible in one of the two frames only has no flow to the other.
+            least = np.minimum.reduce(lengths)
+            known = np.isfinite(least)
+            found.append(_compare_to_median(np.where(known, least, np.nan), LEAST_MOTION))
+    with np.errstate(invalid="ignore"):
+        known = ~np.isnan(found)
+        mean = np.where(known, found, 0).sum(0) / np.maximum(known.sum(0), 1)
+    return np.float32(mean * (1 - (1 - PARALLAX) * np.mean(nearer, axis=0)))
+
+
+def _measure_parallax(flow, length, matrix) -> Float32[np.ndarray, "rows columns"]:
+    """How far a pixel moves as the background does, only faster, in [0, 1]."""
+    grid = pixel_grid(*length.shape)
+    camera = cv2.perspectiveTransform(grid.reshape(-1, 1, 2), matrix).reshape(grid.shape) - grid
+    speed = np.hypot(camera[..., 0], camera[..., 1])
+    cosine = (flow * camera).sum(-1) / (speed * length + 1e-6)
+    return np.clip(2 * cosine - 1, 0, 1) * speed / (speed + 1)
+
+
+def _measure_difference(
+    image: UInt8[np.ndarray, "rows columns 3"], plate, known: Bool[np.ndarray, "rows columns"]
+) -> Float32[np.ndarray, "rows columns"]:
+    """How certain it is that a pixel is not of the plate, in [0, 1]; its neighbors there count as its own."""
+    near = np.ones((3, 3))
+    over, under = cv2.subtract(image, cv2.dilate(plate, near)), cv2.subtract(cv2.erode(plate, near), image)
+    difference = np.where(known, np.maximum(over, under).max(-1), np.nan)
+    return np.nan_to_num(_compare_to_median(difference, LEAST_DIFFERENCE))
+
+
+def _compare_to_median(values, least: float) -> Float32[np.ndarray, "rows columns"]:
+    """From 0 to 1, a half where a value is `TIMES_MEDIAN` of the median and `least`, whichever is larger."""
+    known = values[~np.isnan(values)]
+    unit = max(least, TIMES_MEDIAN * float(np.median(known))) if len(known) else least
+    return np.float32(values**2 / (values**2 + unit**2))
+
+
+def _find_shadow(image, plate, level: float) -> Bool[np.ndarray, "rows columns"]:
+    """Where the image is a darker version of the plate."""
+    here, there = (cv2.GaussianBlur(np.float32(one), (0, 0), 1) + 4 for one in (image, plate))
+    ratio = np.log(here / there)
+    mean = ratio.mean(-1)
+    return (np.abs(ratio - mean[..., None]).max(-1) < HUE) & (mean < level) & (mean > DARKEST)
+
+
+# -------------------------------------------------------------------------------------------------- masks of a frame
+
+
+def _cut_out(image, evidence, shadow: Bool[np.ndarray, "rows columns"]) -> Int32[np.ndarray, "rows columns"]:
+    """Labels of the pieces that GrabCut finds, from 1; 0 elsewhere."""
+    near = np.ones((3, 3))
+    labels = np.full(evidence.shape, cv2.GC_BGD, np.uint8)
+    labels[dilate(evidence > MAYBE, 7)] = cv2.GC_PR_BGD
+    labels[evidence > PROBABLY] = cv2.GC_PR_FGD
+    labels[cv2.erode(np.uint8(evidence > CERTAINLY), near) > 0] = cv2.GC_FGD
+    labels[shadow & (labels != cv2.GC_BGD)] = cv2.GC_PR_BGD
+    inside = np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD))
+    if inside.any() and not inside.all():
+        cv2.setRNGSeed(0)  # its color models begin with k-means
+        models = np.zeros((1, 65)), np.zeros((1, 65))
+        cv2.grabCut(np.ascontiguousarray(image), labels, None, *models, 2, cv2.GC_INIT_WITH_MASK)
+        inside = np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD))
+    num, pieces, table, _ = cv2.connectedComponentsWithStats(np.uint8(_clean(inside)))
+    large = table[:, cv2.CC_STAT_AREA] >= SMALLEST * pieces.size
+    large[0] = False
+    return np.where(large, np.arange(num), 0)[pieces]
+
+
+def _clean(mask: Bool[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "rows columns"]:
+    """Without specks, gaps and holes."""
+    small, large = (cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)) for size in (3, 7))
+    opened = cv2.morphologyEx(np.uint8(mask), cv2.MORPH_OPEN, small)
+    return scipy.ndimage.binary_fill_holes(cv2.morphologyEx(opened, cv2.MORPH_CLOSE, large) > 0)
+
+
+def _cut_shadow(mask, dark: Bool[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "rows columns"]:
+    """The mask without shadow that has nothing else of the object below it."""
+    solid = cv2.morphologyEx(np.uint8(mask & ~dark), cv2.MORPH_OPEN, np.ones((3, 3)))
+    above_solid = np.maximum.accumulate(solid[::-1])[::-1] > 0
+    return mask & (above_solid | ~dark)
+
+
+# ------------------------------------------------------------------------------------------------------ through time
+
+
+def _vote(values: Float32[np.ndarray, "frames rows columns"], alignment: Alignment, first: int, rate: float):
+    """The mean of each pixel's values along the flow, both ways, those nearer in time with more weight."""
+    total, weights = values.copy(), np.ones_like(values)
+    for step in (1, -1):
+        order = range(len(values))[::step]
+        carried, weight = values[order[0]], np.ones_like(values[0])
+        for k in order[1:]:
+            ahead, back = alignment.flow(first + k, first + k - step)
+            certain = rate * _agreement(ahead, back)
+            carried, weight = (_pull(one, ahead) * certain for one in (carried, weight))
+            total[k] += carried
+            weights[k] += weight
+            carried, weight = carried + values[k], weight + 1
+    return total / weights
+
+
+def _agreement(there, back) -> Float32[np.ndarray, "rows columns"]:
+    """1 where the flow back leads home again, to 0 where it misses by more than `VOTE_MISS` pixels, or out of sight."""
+    rows, columns = there.shape[:2]
+    target = pixel_grid(rows, columns) + there
+    miss = there + cv2.remap(back, target, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    inside = ((target >= 0) & (target <= np.float32([columns - 1, rows - 1]))).all(-1)
+    return inside * np.exp(-(miss**2).sum(-1) / VOTE_MISS**2)
+
+
+def _pull(image: Float32[np.ndarray, "rows columns"], flow) -> Float32[np.ndarray, "rows columns"]:
+    """The image of the frame that the flow leads to, seen from here; 0 outside."""
+    return cv2.remap(image, pixel_grid(*image.shape) + flow, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+
+
+def _track_best(pieces, evidence, alignment: Alignment, first: int) -> Masks | None:
+    """The object whose track has most evidence; tracks begin at the best piece of every `SEED_SPACING`-th frame."""
+    best, best_score = None, 0.0
+    for k in range(min(2, len(pieces) - 1), len(pieces), SEED_SPACING):
+        scores = np.bincount(pieces[k].ravel(), evidence[k].ravel())
+        scores[0] = 0
+        seed = pieces[k] == scores.argmax()
+        if not scores.any() or (best is not None and (best[k] & seed).sum() > INSIDE * seed.sum()):
+            continue
+        masks = _track(pieces, seed, k, alignment, first)
+        score = sum(float(one[mask].sum()) for one, mask in zip(evidence, masks, strict=True))
+        if score > best_score:
+            best, best_score = masks, score
+    return best
+
+
+def _track(pieces: list, seed: Bool[np.ndarray, "rows columns"], start: int, alignment: Alignment, first: int) -> Masks:
+    """The pieces of the object `seed` of frame `start` in all frames; while it is lost, it goes on at its speed."""
+    masks = np.zeros((len(pieces), *seed.shape), bool)
+    masks[start] = seed
+    farthest = FARTHEST * max(seed.shape)
+    for step in (1, -1):
+        last, missed, area, speed = seed, 0, float(seed.sum()), np.zeros(2)
+        for k in range(start + step, len(pieces) if step > 0 else -1, step):
+            there, back = alignment.flow(first + k - step, first + k)
+            if missed == 0:
+                speed = 0.8 * speed + 0.2 * np.median(there[last], axis=0)
+                expected = _pull(last.astype(np.float32), back) > 0.5
+            else:
+                expected = scipy.ndimage.shift(last, speed[::-1], order=0)
+            reach = min(3 + SEARCH * missed, 2 * math.ceil(farthest / 2) + 1)
+            found = _choose_pieces(pieces[k], expected, reach)
+            if found.sum() > MERGED * area:  # with another object
+                found &= dilate(expected, 15)
+            if found.sum() > LOST * area:
+                masks[k], last, missed, area = found, found, 0, 0.8 * area + 0.2 * float(found.sum())
+            elif expected.any():
+                last, missed = expected, missed + 1
+            else:
+                break
+    return masks
+
+
+def _choose_pieces(labels, expected: Bool[np.ndarray, "rows columns"], reach: int) -> Bool[np.ndarray, "rows columns"]:
+    """The pieces that are mostly where an object is expected, or cover much of it."""
+    num = labels.max() + 1
+    area = np.bincount(labels.ravel(), minlength=num)
+    hit = np.bincount(labels[dilate(expected, reach)], minlength=num)
+    chosen = (hit > INSIDE * area) | (hit > REFOUND * max(expected.sum(), 1))
+    chosen[0] = False
+    return chosen[labels]
