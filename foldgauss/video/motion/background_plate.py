@@ -18,7 +18,7 @@ SIDE, SPACING = 480, 6
 #: A point is used where forward and backward flow agree within this many pixels, and this fraction of the distance.
 MISS, MISS_FRACTION = 0.3, 0.05
 #: MAGSAC: the largest scale of noise in pixels, and iterations at most.
-NOISE, ITERATIONS = 1.0, 2000
+NOISE, ITERATIONS = 0.5, 2000
 #: Another shot begins where less than this fraction of the points follows one homography (as for the camera's path);
 #: frames are aligned with one that is further away, so that errors do not add up, while it is more than the second.
 LEAST_INLIERS, KEY_INLIERS = 0.08, 0.35
@@ -35,7 +35,7 @@ Masks = Bool[np.ndarray, "frames height width"]
 
 @dataclasses.dataclass(frozen=True)
 class Alignment:
-    """How the background of each frame moves to the others, on images whose longer side is at most `SIDE`.
+    """How the background of each frame moves to the others, on images whose longer side is `SIDE`.
 
     `images` are the frames of that size, in gray; `there` and `back` the flow between neighbors, both ways;
     `matrices` (frames, 3, 3) homographies from the first frame of a shot to each frame of it, in pixels of the images,
@@ -52,7 +52,7 @@ class Alignment:
 
     @classmethod
     def from_frames(cls, frames: Frames) -> "Alignment":
-        images = np.stack([cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in reduce_frames(frames)])
+        images = np.stack([cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in resize_frames(frames)])
         flows = np.empty((2, len(images) - 1, *images.shape[1:], 2), np.float16)
 
         def match(k: int) -> None:
@@ -82,12 +82,13 @@ class Alignment:
         return np.unique(np.linspace(first, last, min(PLATE_FRAMES, last - first + 1)).round().astype(int))
 
 
-def reduce_frames(frames: Frames) -> UInt8[np.ndarray, "frames rows columns 3"]:
-    """The frames with a longer side of at most `SIDE` pixels."""
+def resize_frames(frames: Frames) -> UInt8[np.ndarray, "frames rows columns 3"]:
+    """The frames with a longer side of `SIDE` pixels: small ones are enlarged, so that all lengths are of one unit."""
     height, width = frames.shape[1:3]
-    scale = min(1.0, SIDE / max(height, width))
+    scale = SIDE / max(height, width)
     size = max(16, round(width * scale)), max(16, round(height * scale))
-    return np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames])
+    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    return np.stack([cv2.resize(frame, size, interpolation=how) for frame in frames])
 
 
 def check_frames(frames: np.ndarray) -> None:

@@ -5,8 +5,6 @@ that the other frames show. GrabCut places the borders, the pieces are followed 
 along the flow.
 """
 
-import math
-
 import cv2
 import numpy as np
 import scipy
@@ -20,8 +18,8 @@ from foldgauss.video.motion.background_plate import (
     Masks,
     check_frames,
     dilate,
-    reduce_frames,
     render_plate,
+    resize_frames,
     warp_by,
 )
 from foldgauss.video.motion.optical_flow import both_flows, pixel_grid
@@ -69,7 +67,7 @@ def find_moving_object(frames: Frames, *, shadow: bool = False, alignment: Align
     """
     check_frames(frames)
     alignment = Alignment.from_frames(frames) if alignment is None else alignment
-    small = reduce_frames(frames)
+    small = resize_frames(frames)
     height, width = frames.shape[1:3]
     masks = np.zeros((len(frames), height, width), bool)
     for shot in alignment.shots:
@@ -289,9 +287,8 @@ def _track(pieces: list, seed: Bool[np.ndarray, "rows columns"], start: int, ali
                 expected = _pull(last.astype(np.float32), back) > 0.5
             else:
                 expected = scipy.ndimage.shift(last, speed[::-1], order=0)
-            reach = min(3 + SEARCH * missed, 2 * math.ceil(farthest / 2) + 1)
-            found = _choose_pieces(pieces[k], expected, reach)
-            if found.sum() > MERGED * area:  # with another object
+            found = _choose_pieces(pieces[k], expected, min(1 + SEARCH * missed, farthest))
+            if missed == 0 and found.sum() > MERGED * area:  # with another object
                 found &= dilate(expected, 15)
             if found.sum() > LOST * area:
                 masks[k], last, missed, area = found, found, 0, 0.8 * area + 0.2 * float(found.sum())
@@ -302,11 +299,16 @@ def _track(pieces: list, seed: Bool[np.ndarray, "rows columns"], start: int, ali
     return masks
 
 
-def _choose_pieces(labels, expected: Bool[np.ndarray, "rows columns"], reach: int) -> Bool[np.ndarray, "rows columns"]:
-    """The pieces that are mostly where an object is expected, or cover much of it."""
+def _choose_pieces(
+    labels, expected: Bool[np.ndarray, "rows columns"], reach: float
+) -> Bool[np.ndarray, "rows columns"]:
+    """The pieces that are mostly within `reach` pixels of where an object is expected, or cover much of it."""
+    if not expected.any():
+        return expected
+    near = cv2.distanceTransform(np.uint8(~expected), cv2.DIST_L2, 3) <= reach
     num = labels.max() + 1
     area = np.bincount(labels.ravel(), minlength=num)
-    hit = np.bincount(labels[dilate(expected, reach)], minlength=num)
-    chosen = (hit > INSIDE * area) | (hit > REFOUND * max(expected.sum(), 1))
+    hit = np.bincount(labels[near], minlength=num)
+    chosen = (hit > INSIDE * area) | (hit > REFOUND * expected.sum())
     chosen[0] = False
     return chosen[labels]
