@@ -6,7 +6,7 @@ values are in the units of `Edit`:
 - `[selections.NAME]`: `indices` (numbers and ranges of Gaussians, "3,17,40-52", with `num_gaussians`, which is
   checked, and, of a video in segments, the number of a `segment`), `mask` (an image, folder or video, with `label`,
   `level`) or `file` (of `save_selection`), or
-  `box`, `polygon`, `color`, `click`, `times`, with `frame`, `frames`, `tolerance`, `alive`, `threshold`, `follow`, as
+  `box`, `polygon`, `color`, `click`, `moving`, `times`, with `frame`, `frames`, `tolerance`, `alive`, `threshold`, `follow`, as
   `foldgauss.video.select` takes them; or `any`, `all`, `without`: lists of earlier names, for the union, the
   intersection and the difference. All are evaluated on the video before the first edit.
 - `[[edits]]`, applied in order: `do` is one of `ACTIONS`, `select` a name (default: the current selection, at first
@@ -133,6 +133,7 @@ _CRITERIA: _Keys = {
     "polygon": _Kind("pairs of numbers, as [[10, 10], [60, 12], [30, 50]]", _rows_check(2)),
     "color": _THREE,
     "click": _PAIR,
+    "moving": _Kind("true", lambda value: value is True),
     "times": _PAIR,
     "frame": _WHOLE,
     "frames": _FRAMES,

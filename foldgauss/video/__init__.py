@@ -30,7 +30,7 @@ from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.motion.background_plate import fill_background
 from foldgauss.video.motion.camera_path import CameraPath, estimate_camera_path
-from foldgauss.video.motion.moving_object import find_moving_object
+from foldgauss.video.motion.moving_object import NothingMoves, find_moving_object
 from foldgauss.video.motion.stabilization import StabilizedVideo, stabilize
 from foldgauss.video.segmented.layering import layers
 from foldgauss.video.segmented.segmented_edit import SegmentedEdit
@@ -42,6 +42,7 @@ from foldgauss.video.selection.selectors import (
     by_click,
     by_color,
     by_mask,
+    by_motion,
     by_polygon,
     by_time,
     contribution,
@@ -70,6 +71,7 @@ __all__ = [
     "IndependentFrames",
     "Layer",
     "LearningRates",
+    "NothingMoves",
     "Segment",
     "SegmentedEdit",
     "SegmentedSelection",
@@ -83,6 +85,7 @@ __all__ = [
     "by_click",
     "by_color",
     "by_mask",
+    "by_motion",
     "by_polygon",
     "by_time",
     "compress",

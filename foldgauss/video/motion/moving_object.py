@@ -51,6 +51,10 @@ SEARCH, FARTHEST = 6, 0.125
 SEED_SPACING = 5
 
 
+class NothingMoves(ValueError):
+    """No object moves on its own, or none that can be told from the background."""
+
+
 def find_moving_object(frames: Frames, *, shadow: bool = False, alignment: Alignment | None = None) -> Masks:
     """Where the largest object is that moves on its own, in each frame: bool (num_frames, height, width).
 
@@ -61,7 +65,7 @@ def find_moving_object(frames: Frames, *, shadow: bool = False, alignment: Align
 
     It costs about half a second of processor time for each frame, of any size.
 
-    Raises ValueError for frames of another type, and if nothing moves on its own.
+    Raises ValueError for frames of another type, and `NothingMoves`, which is one, if nothing moves on its own.
     Example: `by_mask(model, find_moving_object(clip.frames))`.
     Source: Papazoglou and Ferrari 2013 (motion against the camera, then appearance); Rother et al. 2004 (GrabCut).
     """
@@ -74,9 +78,13 @@ def find_moving_object(frames: Frames, *, shadow: bool = False, alignment: Align
         for k, mask in zip(range(*shot), _find_in_shot(small, alignment, shot, shadow), strict=False):
             masks[k] = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
     if not masks.any():
-        cure = "Select it by a mask, a box or a click."
-        raise invalid("frames", expected="an object that moves against the background", got="none", cure=cure)
+        raise nothing_moves("an object that moves against the background", "none")
     return masks
+
+
+def nothing_moves(expected: str, got: object) -> NothingMoves:
+    """The error, to be raised."""
+    return NothingMoves(str(invalid("moving", expected=expected, got=got, cure="Select by a mask, a box or a click.")))
 
 
 def _find_in_shot(frames: Frames, alignment: Alignment, shot: tuple[int, int], shadow: bool) -> Masks | list:

@@ -12,6 +12,7 @@ from foldgauss._runtime.checks import invalid
 from foldgauss.video.editing.chain import Edit
 from foldgauss.video.editing.clip_window import ClipWindow
 from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.motion.moving_object import NothingMoves
 from foldgauss.video.segmented.segmented_selection import SegmentedSelection
 from foldgauss.video.segmented.segmented_video import Segment
 from foldgauss.video.selection.contributions import Contributions, render_matte
@@ -23,12 +24,16 @@ from foldgauss.video.selection.selectors import (
     by_click,
     by_color,
     by_mask,
+    by_motion,
     by_polygon,
     by_time,
 )
 
 #: A pixel of a shared frame shows an object if at least this fraction of its color is the object's contribution.
 _MIN_CONTRIBUTION = 0.5
+
+#: Selectors that are evaluated on each segment on its own.
+_OF_EACH = (by_color, by_motion, by_time)
 
 #: A selector such as `by_mask`, and its arguments.
 Criterion = tuple[Callable[..., Selection], dict[str, Any]]
@@ -52,8 +57,8 @@ class CriteriaEvaluator:
     def evaluate(self, criteria: list[Criterion]) -> SegmentedSelection:
         """The intersection of all criteria: regions first, so that the others are evaluated on fewer segments."""
         found: SegmentedSelection | None = None
-        for function, arguments in sorted(criteria, key=lambda criterion: criterion[0] in (by_color, by_time)):
-            if function in (by_color, by_time):
+        for function, arguments in sorted(criteria, key=lambda criterion: criterion[0] in _OF_EACH):
+            if function in _OF_EACH:
                 selection = self._evaluate_each(function, arguments, found)
             else:
                 selection = _RegionCriterion(self, function, arguments).evaluate()
@@ -72,9 +77,12 @@ class CriteriaEvaluator:
     def _evaluate_each(
         self, function: Callable[..., Selection], arguments: dict[str, Any], within: SegmentedSelection | None
     ) -> SegmentedSelection:
-        """By color or by time, on each segment that is not yet known to be without selected Gaussians."""
-        positions = None if function is by_color else self._positions(**arguments)
-        parts = []
+        """By color, motion or time, on each segment that is not yet known to be without selected Gaussians.
+
+        Raises `NothingMoves` if nothing moves in any of them.
+        """
+        positions = self._positions(**arguments) if function is by_time else None
+        parts, still = [], []
         for number, segment in enumerate(self.segments):
             if within is not None and not len(within.parts[number]):
                 parts.append(within.parts[number])
@@ -83,7 +91,13 @@ class CriteriaEvaluator:
             else:
                 one = self.replay(number)
                 own = arguments if positions is None else _own_arguments(positions, segment, one._window, arguments)
-                parts.append(self.evaluate_segment(one, lambda model, _, own=own: function(model, **own)))
+                try:
+                    parts.append(self.evaluate_segment(one, lambda model, _, own=own: function(model, **own)))
+                except NothingMoves as error:
+                    still.append(error)
+                    parts.append(self.select_none(number))
+        if still and len(still) == len(parts):
+            raise still[0]
         return SegmentedSelection(tuple(parts))
 
     def _positions(self, times: Any = None, frame: Any = None, frames: Any = None, alive: bool = False) -> Any:

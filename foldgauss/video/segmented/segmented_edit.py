@@ -67,7 +67,7 @@ class SegmentedEdit:
     - Regions (`mask=`, `box=`, `polygon=`, `click=`) are evaluated on the segments that have the frames named, and
       propagated from segment to segment: where the selection contributes at least half of a pixel of a shared frame,
       that pixel is in the neighbour's mask. There is no propagation across a cut, where no frame is shared, nor with
-      `follow=False`. `color=` and times are evaluated on every segment.
+      `follow=False`. `color=`, `moving=` and times are evaluated on every segment.
     - Clocks (`retime`, `freeze`, `delays=`) work within one segment only: a clock that would show frames of another
       segment raises ValueError.
 

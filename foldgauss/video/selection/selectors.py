@@ -11,6 +11,8 @@ from jaxtyping import ArrayLike, Bool, Float, Float32, Int, Int8
 from foldgauss._runtime.checks import invalid, is_integer
 from foldgauss.video.models.splats import SH_C0
 from foldgauss.video.models.video_model import VideoModel, check_model, check_time
+from foldgauss.video.motion.background_plate import SIDE
+from foldgauss.video.motion.moving_object import find_moving_object, nothing_moves
 from foldgauss.video.selection.contributions import (
     Contributions,
     average_seen_colors,
@@ -147,6 +149,7 @@ def select(
     polygon: Float[ArrayLike, "corners 2"] | None = None,
     color: tuple[float, float, float] | None = None,
     click: tuple[float, float] | None = None,
+    moving: bool = False,
     times: tuple[float, float] | None = None,
     frame: int | None = None,
     frames: tuple[int, int] | None = None,
@@ -156,12 +159,13 @@ def select(
     follow: bool = True,
 ) -> Selection:
     """The Gaussians that meet every criterion given: those of `by_mask`, `by_box`, `by_polygon`, `by_color`,
-    `by_click` and `by_time`, intersected.
+    `by_click`, `by_motion` and `by_time`, intersected.
 
     - `frame`, or `frames` = (first, stop), half-open: the frames of mask, box, polygon and click, *not* a limit in
       time. Without any of these, they are a criterion of their own: `by_time`. `times` always is one.
     - `tolerance`: of `color` and `click`, in Delta E; None: their defaults.
-    - `alive`: of `by_time`. `threshold`, `follow`: of mask, box and polygon.
+    - `moving`: `by_motion`, from all frames. `alive`: of `by_time`.
+    - `threshold`: of mask, box, polygon and `moving`. `follow`: of mask, box and polygon.
 
     **Units:** pixels of the model's own size, x right, y down; times in [0, 1]; colours in [0, 1].
 
@@ -169,7 +173,8 @@ def select(
 
     **Raises:** ValueError without any criterion, for options of a criterion not given, and as the functions.
     """
-    given = {"mask": mask, "box": box, "polygon": polygon, "color": color, "click": click, "times": times}
+    given = {"mask": mask, "box": box, "polygon": polygon, "color": color, "click": click}
+    given |= {"moving": moving, "times": times}
     where = {"frame": frame, "frames": frames, "tolerance": tolerance}
     criteria = list_criteria(**given, **where, alive=alive, threshold=threshold, follow=follow)
     return functools.reduce(Selection.__and__, [function(model, **options) for function, options in criteria])
@@ -182,6 +187,7 @@ def list_criteria(
     polygon: Float[ArrayLike, "corners 2"] | None = None,
     color: tuple[float, float, float] | None = None,
     click: tuple[float, float] | None = None,
+    moving: bool = False,
     times: tuple[float, float] | None = None,
     frame: int | None = None,
     frames: tuple[int, int] | None = None,
@@ -202,9 +208,13 @@ def list_criteria(
             found.append((function, {name: value, **where, "threshold": threshold, "follow": follow}))
     regional = bool(found)
     placed = regional or click is not None
+    if not isinstance(moving, bool | np.bool_):
+        raise invalid("moving", expected="True or False", got=repr(moving))
+    if moving:
+        found.append((by_motion, {"threshold": threshold}))
     timed = times is not None or not (placed or (frame is None and frames is None))
     for name, misplaced, wanted in (
-        ("threshold", threshold != THRESHOLD and not regional, "a mask, box or polygon with it"),
+        ("threshold", threshold != THRESHOLD and not (regional or moving), "a mask, box, polygon or moving with it"),
         ("follow", not follow and not regional, "a mask, box or polygon with it"),
         ("alive", alive and not timed, "times or frames with it"),
         ("frames", click is not None and frames is not None, "frame, the one that was clicked in"),
@@ -310,6 +320,23 @@ def by_polygon(
     **Example:** `by_polygon(model, [(10, 10), (60, 12), (30, 50)], frame=0)`. **Raises:** ValueError as `by_box`.
     """
     return _select_region(model, region_from_polygon(model, polygon, frame, frames), threshold, follow)
+
+
+def by_motion(model: VideoModel, *, threshold: float = THRESHOLD) -> Selection:
+    """The Gaussians of the moving object: those whose rendered contribution lies inside the masks that
+    `find_moving_object` finds in the model's own images, to at least `threshold`.
+
+    It is the largest object that moves against the background, in each shot. It takes about a second per frame.
+
+    **Example:** `edit(model).select(moving=True).vanish()`. **Raises:** ValueError if nothing moves, and as `by_mask`.
+    """
+    check_model(model)
+    if model.num_frames < 3:
+        raise nothing_moves("a video of 3 frames at least", model.num_frames)
+    scale = min(1.0, SIDE / max(model.size))
+    size = tuple(max(1, round(side * scale)) for side in model.size)
+    masks = find_moving_object(np.stack(list(model.frames(size=size))))
+    return by_mask(model, masks, threshold=threshold)
 
 
 def by_color(
