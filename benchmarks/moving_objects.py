@@ -2,8 +2,8 @@
 
     python -m benchmarks.moving_objects --clips FOLDER --masks FOLDER [--only NAME ...] [--sheets FOLDER] [--json FILE]
 
-Each subfolder of --clips holds the frames of a clip, and the subfolder of --masks of the same name its masks, as those of
-DAVIS; clips without masks are left out. Intersection over union is of each frame, and its mean is over all of them.
+Each subfolder of --clips holds the frames of a clip, and the subfolder of --masks of the same name its masks, as
+those of DAVIS; clips without masks are left out. Intersection over union is of each frame, its mean over all of them.
 """
 
 import argparse

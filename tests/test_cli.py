@@ -382,6 +382,7 @@ def test_commands_are_listed_as_one_comes_to_need_them(capsys):
         "player",
         "render",
         "stabilize",
+        "plate",
         "evaluate",
         "info",
         "figure",

@@ -78,6 +78,12 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
             Example("Play it in the browser", "foldgauss view holiday.safetensors"),
             Example("Next to the clip", "foldgauss view holiday.safetensors --original holiday.mp4"),
         ),
+        "plate": (
+            Example("Without the moving object, into holiday.plate.mp4", "foldgauss plate holiday.safetensors"),
+            Example(
+                "And its masks, for edit scripts", "foldgauss plate holiday.safetensors --out empty.mp4 --masks masks"
+            ),
+        ),
         "evaluate": (
             Example("PSNR and SSIM of every frame", "foldgauss evaluate holiday.safetensors holiday.mp4"),
             Example("As JSON", "foldgauss evaluate holiday.safetensors holiday.mp4 --json holiday.json"),

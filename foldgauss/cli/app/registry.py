@@ -23,6 +23,9 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
         ),
         "render": Command("viewing.render", "Render a model as a video, also between its frames."),
         "stabilize": Command("viewing.stabilize", "Render a model as a steadier camera would show it."),
+        "plate": Command(
+            "viewing.plate", "Render a model without its moving object, with what other frames show behind it."
+        ),
         "evaluate": Command("viewing.evaluate", "Compare a model with its clip: PSNR and SSIM of every frame."),
         "info": Command("viewing.info", "Show what a model file contains."),
         "figure": Command("viewing.figure", "Make a labeled figure of images from a model: PNG."),

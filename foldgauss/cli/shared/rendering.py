@@ -124,18 +124,37 @@ def render_to_file(
         write_image(path, next(model.frames(times, size, background=background)))
         out.print(f"{path}: the image at time {times[0]:g}", soft_wrap=True)
         return
+    images = model.frames(times, size, background=background)
+    write_images(path, images, len(times), fps, image_format=image_format, overwrite=overwrite, options=options)
+
+
+def write_images(
+    path: Path,
+    images: Iterable[np.ndarray],
+    num: int,
+    fps: float,
+    *,
+    image_format: str = "png",
+    overwrite: bool = False,
+    options: VideoOptions = VideoOptions(),  # noqa: B008
+) -> None:
+    """Write `num` images as a video or to a folder."""
     most = MAX_GIF_FPS if path.suffix.lower() == ".gif" else MAX_FPS
     if path.suffix and not path.is_dir() and fps > most:
         expected, cure = f"at most {most:g} frames per second", "Give a lower rate, or write to a folder."
         raise wrong_use("--fps", expected=expected, got=f"{fps:g}", cure=cure)
-    with progress_bar("Rendering", len(times)) as advance:
-        images = advance_over(model.frames(times, size, background=background), advance)
+    with progress_bar("Rendering", num) as advance:
         try:
             write_video(
-                path, images, min(fps, MAX_FPS), overwrite=overwrite, image_format=image_format, **options._asdict()
+                path,
+                advance_over(images, advance),
+                min(fps, MAX_FPS),
+                overwrite=overwrite,
+                image_format=image_format,
+                **options._asdict(),
             )
         except ValueError as error:
             if not str(error).startswith(VideoOptions._fields):
                 raise
             raise WrongUse(name_option(str(error))) from error
-    out.print(f"{path}: {format_count(len(times), 'frame')} at {fps:g} frames per second", soft_wrap=True)
+    out.print(f"{path}: {format_count(num, 'frame')} at {fps:g} frames per second", soft_wrap=True)

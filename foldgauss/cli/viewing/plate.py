@@ -1,0 +1,70 @@
+"""The command `plate`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from foldgauss.cli.app.application import app, out, wrong_use
+from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, parse_size
+from foldgauss.cli.shared.outputs import check_image_path, name_after, refuse_existing, refuse_huge, refuse_input
+from foldgauss.cli.shared.rendering import CodecName, Crf, PixelFormat, VideoOptions, progress_bar, write_images
+from foldgauss.io._atomic import check_writable
+from foldgauss.io.media.video_writing import VIDEO_SUFFIXES
+from foldgauss.io.models.video_model import load_video_model
+from foldgauss.video.motion.background_plate import Alignment, fill_background
+from foldgauss.video.motion.moving_object import find_moving_object
+
+
+@app.command("plate")
+def plate_command(
+    model_path: ModelFile,
+    out_path: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            help="FILE.mp4, .webm, .mov, .mkv, .gif or .webp; a folder for images "
+            "[default: the model's name in this folder, .plate.mp4].",
+        ),
+    ] = None,
+    masks_path: Annotated[
+        Path | None,
+        typer.Option(
+            "--masks", metavar="FOLDER", help="Also write the masks of the object here, for edit scripts: PNGs."
+        ),
+    ] = None,
+    size: Size = None,
+    codec: CodecName = None,
+    crf: Crf = None,
+    pixel_format: PixelFormat = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Render a model without its moving object, with what other frames show behind it."""
+    image_size = parse_size(size)
+    if out_path is None:
+        out_path = name_after(model_path, f".plate{VIDEO_SUFFIXES[0]}")
+    check_image_path(out_path)
+    if masks_path is not None and masks_path.suffix:
+        raise wrong_use("--masks", expected="a folder, without extension", got=masks_path)
+    for option, path in (("--out", out_path), ("--masks", masks_path)):
+        if path is not None and not path.is_dir():
+            refuse_input(path, "model", model_path, option)
+            refuse_existing(path, overwrite, option)
+            check_writable(path)
+    model = load_video_model(model_path)
+    image_size = image_size or model.size
+    refuse_huge(image_size)
+    frames = np.empty((model.num_frames, *image_size, 3), np.uint8)
+    with progress_bar("Rendering", model.num_frames) as advance:
+        for k, frame in enumerate(model.frames(size=image_size)):
+            frames[k] = frame
+            advance()
+    out.print("Searching for what moves against the background ...")
+    alignment = Alignment.from_frames(frames)
+    masks = find_moving_object(frames, shadow=True, alignment=alignment)
+    plate, options = fill_background(frames, masks, alignment=alignment), VideoOptions(codec, crf, pixel_format)
+    write_images(out_path, plate, len(plate), model.fps, overwrite=overwrite, options=options)
+    if masks_path is not None:
+        images = (np.repeat(np.uint8(255 * mask)[..., None], 3, -1) for mask in masks)
+        write_images(masks_path, images, len(masks), model.fps, overwrite=overwrite)

@@ -1,0 +1,91 @@
+"""`foldgauss plate`, and edit scripts that select by motion."""
+
+import numpy as np
+import pytest
+from commands import run
+from soft_models import soft_model
+
+from foldgauss.cli.viewing import plate
+from foldgauss.io import load_video_model, read_masks, read_video, save_video_model
+from foldgauss.io.edit_script import EditScriptError, parse_edit_script
+from foldgauss.video import NothingMoves, by_mask, edit
+from foldgauss.video.motion.moving_object import nothing_moves
+from foldgauss.video.selection import selectors
+
+MODEL = soft_model()
+MASKS = np.zeros((MODEL.num_frames, *MODEL.size), bool)
+MASKS[:, 10:30, 12:32] = True
+SCRIPT = '[selections.it]\nmoving = true\n[[edits]]\nselect = "it"\ndo = "vanish"\n'
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    path = tmp_path_factory.mktemp("plate") / "m.safetensors"
+    save_video_model(path, MODEL)
+    return path
+
+
+@pytest.fixture
+def searched(monkeypatch):
+    """The object is found at `MASKS`; the search itself has tests of its own."""
+    monkeypatch.setattr(selectors, "find_moving_object", lambda frames: MASKS)
+    monkeypatch.setattr(plate, "find_moving_object", lambda frames, **options: MASKS)
+
+
+@pytest.mark.usefixtures("searched")
+def test_scripts_select_what_moves(model, tmp_path, capsys):
+    wanted = edit(MODEL).select(by_mask(MODEL, MASKS)).vanish().video()
+    assert parse_edit_script(SCRIPT).apply(MODEL).num_gaussians == wanted.num_gaussians < MODEL.num_gaussians
+    (tmp_path / "edits.toml").write_text(SCRIPT)
+    assert run("edit", model, tmp_path / "edits.toml", "--out", tmp_path / "gone.safetensors") == 0
+    assert f"{wanted.num_gaussians} Gaussians" in capsys.readouterr().out
+    assert load_video_model(tmp_path / "gone.safetensors").num_gaussians == wanted.num_gaussians
+
+
+def test_scripts_say_where_nothing_moves(model, tmp_path, monkeypatch, capsys):
+    def search(frames, **options):
+        raise nothing_moves("an object that moves against the background", "none")
+
+    monkeypatch.setattr(selectors, "find_moving_object", search)
+    monkeypatch.setattr(plate, "find_moving_object", search)
+    with pytest.raises(EditScriptError, match=r"line 2, \[selections.it\]: moving: expected an object that moves"):
+        parse_edit_script(SCRIPT).apply(MODEL)
+    with pytest.raises(EditScriptError, match="moving: expected true, got False"):
+        parse_edit_script(SCRIPT.replace("true", "false"))
+    with pytest.raises(NothingMoves):
+        edit(MODEL).select(moving=True)
+    assert run("plate", model, "--out", tmp_path / "images") == 1
+    assert "moving: expected an object that moves against the background, got none." in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.usefixtures("searched")
+def test_the_plate_and_its_masks_are_written(model, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert run("plate", model, "--masks", "masks", "--out", "images") == 0
+    assert "7 frames at 25 frames per second" in capsys.readouterr().out
+    np.testing.assert_array_equal(read_masks("masks"), MASKS)
+    filled, frames = read_video("images").frames, np.stack(list(MODEL.frames()))
+    np.testing.assert_array_equal(filled[:, :5], frames[:, :5])
+    assert (filled[MASKS] != frames[MASKS]).any()
+    assert run("plate", model) == 0
+    assert read_video("m.plate.mp4").frames.shape == frames.shape
+    assert run("plate", model) == 2
+    assert "exists. Choose another path, or add --overwrite." in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--out", "x.png"], "--out: expected"),
+        (["--size", "0x3"], "--size: expected HxW"),
+        (["--masks", "x.png"], "--masks: expected a folder, without extension, got x.png"),
+        (["--codec", "divx"], "--codec: expected"),
+    ],
+)
+@pytest.mark.usefixtures("searched")
+def test_mistakes_are_told_and_nothing_is_written(model, tmp_path, monkeypatch, capsys, options, message):
+    monkeypatch.chdir(tmp_path)
+    assert run("plate", model, *options) == 2
+    assert message in " ".join(capsys.readouterr().err.split())
+    assert not list(tmp_path.iterdir())
