@@ -96,7 +96,7 @@ def _find_in_shot(frames: Frames, alignment: Alignment, shot: tuple[int, int], s
     moved = np.stack(_map(lambda k: _measure_motion(alignment, first + k, shot), num))
     moved = _vote(moved, alignment, first, MOTION_VOTE)
     covered = np.zeros(frames.shape[:3], bool)
-    covered[first:stop] = [dilate(one > CERTAINLY, 9) for one in moved]
+    covered[first:stop] = [dilate(one > PROBABLY, 9) for one in moved]
     slight, strong = (np.empty(moved.shape, bool) for _ in range(2))
 
     def compare(k: int) -> Float32[np.ndarray, "rows columns"]:
