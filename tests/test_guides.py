@@ -206,10 +206,6 @@ def _extending(names, folder):
 
 
 def _results(names, folder):
-    assert names["control"].num_parameters <= names["model"].num_parameters
-    assert names["gain"] > 0
-    assert names["chosen"] == [0, 1, 2, 3]
-    assert names["bend"] == 1
     assert (folder / "trade" / "tradeoff.png").exists()
     assert (folder / "few" / "tradeoff.csv").exists()
 
