@@ -373,7 +373,7 @@ GIVEN = {
     "README.md": ("holiday.mp4", "masks", "film.mp4", "holidays"),
     "docs/commands.md": ("holiday.mp4", "edits.toml", "film.mp4", "holidays"),
     "docs/compress.md": ("holiday.mp4", "holiday.safetensors"),
-    "docs/editing.md": ("holiday.safetensors", "edits.toml", "point_cloud.ply"),
+    "docs/editing.md": ("holiday.safetensors", "edits.toml"),
     "docs/fit.md": ("holiday.mp4", "DAVIS", "folder/of/images"),
     "docs/format.md": ("holiday.mp4", "holiday.safetensors"),
     "docs/index.md": ("holiday.mp4",),

@@ -215,7 +215,7 @@ def _scale(names, folder):
     assert names["spans"] == [(0, 12), (9, 20)]
     assert names["score"] > 20
     assert names["part"].num_frames == 11
-    made = {"slow.mp4", "scores.json", "waves-ply", "second.safetensors", "second.fgz", "long.safetensors"}
+    made = {"slow.mp4", ""waves-ply", "second.safetensors", "second.fgz", "long.safetensors"}
     assert made <= {path.name for path in folder.iterdir()}
     assert all(len(part) > 0 for part in names["left"].selection.parts)
     assert np.abs(names["darker"].render(0.5) - names["picture"]).max() > 0.1
