@@ -371,11 +371,12 @@ THINGS = {
 #: What each page takes for granted.
 GIVEN = {
     "README.md": ("holiday.mp4", "masks", "film.mp4", "holidays"),
-    "docs/commands.md": ("holiday.mp4", "edits.toml", "film.mp4", "holidays"),
+    "docs/commands.md": ("holiday.mp4",),
     "docs/compress.md": ("holiday.mp4", "holiday.safetensors"),
     "docs/editing.md": ("holiday.safetensors", "edits.toml"),
     "docs/fit.md": ("holiday.mp4", "DAVIS", "folder/of/images"),
     "docs/format.md": ("holiday.mp4", "holiday.safetensors"),
+    "docs/formats.md": ("holiday.safetensors", "point_cloud.ply"),
     "docs/index.md": ("holiday.mp4",),
     "docs/player.md": ("holiday.mp4", "holiday.safetensors"),
     "docs/quickstart.md": ("holiday.mp4",),
