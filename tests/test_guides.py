@@ -215,7 +215,7 @@ def _scale(names, folder):
     assert names["joined"].mean_psnr > 15
     assert names["spans"] == [(0, 12), (9, 20)]
     assert names["part"].num_frames == 11
-    made = {"slow.mp4", ""waves-ply", "second.safetensors", "second.fgz", "long.safetensors"}
+    made = {"slow.mp4", "waves-ply", "second.safetensors", "second.fgz", "long.safetensors"}
     assert made <= {path.name for path in folder.iterdir()}
     assert all(len(part) > 0 for part in names["left"].selection.parts)
     assert np.abs(names["darker"].render(0.5) - names["video"].render(0.5)).max() > 0.1
