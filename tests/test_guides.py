@@ -193,7 +193,6 @@ def _compress(names, folder):
 
 
 def _extending(names, folder):
-    assert np.isfinite(names["loss"])
     assert np.abs(names["gradient"].fold.parameters.layers[0].weight).max() > 0
     assert np.isfinite(names["jump"].log_prob(names["x"])).all()
     assert names["wide"] > 2 * names["narrow"]
