@@ -14,7 +14,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from browser import Opened, chromium
+from browser import Opened
 from soft_models import NUM, OBJECT, SIZE, soft_model
 
 from foldgauss.envelope import TimeLikelihood
@@ -238,31 +238,8 @@ def test_notebooks_show_the_player(monkeypatch):
 # ------------------------------------------------------------------------------------------------- in a browser
 
 
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as found:
-        yield found
-
-
-#: By default pages are small, which are quickly drawn; a large one is for what is done on the picture by hand.
-SMALL, LARGE = ({"viewport": {"width": width, "height": height}} for width, height in ((400, 400), (900, 640)))
-
-
-@pytest.fixture
-def opened(browser, tmp_path):
-    """Opens pages, and holds at the end that they said nothing and asked for nothing."""
-    pages = []
-
-    def open_page(model, *, original=None, **options):
-        path = write_html(tmp_path / f"{len(pages)}.html", model, original=original)
-        pages.append(Opened(browser, path, **SMALL | options))
-        return pages[-1].ready()
-
-    yield open_page
-    for one in pages:
-        one.close()
-        assert not one.said
-        assert all(url.startswith(("file:", "blob:", "data:")) for url in one.asked)
+#: Large, for what is done on the picture by hand.
+LARGE = {"viewport": {"width": 900, "height": 640}}
 
 
 @pytest.fixture(scope="module")
@@ -358,11 +335,8 @@ def test_it_plays_and_stops_at_the_end(opened):
     page = opened(soft_model(), reduced_motion="no-preference")
     assert page.stats["playing"]
     page.page.keyboard.press("l")
-    while page.stats["playing"]:
-        page.page.wait_for_timeout(50)
-    assert page.stats["position"] == 6
-    still = opened(soft_model(), reduced_motion="reduce")
-    assert not still.stats["playing"]
+    assert page.until("!foldgauss.stats.playing").stats["position"] == 6
+    assert not opened(soft_model(), reduced_motion="reduce").stats["playing"]
 
 
 def test_what_is_brushed_can_vanish_and_come_back(opened):
@@ -455,9 +429,9 @@ def test_the_original_is_shown_beside_it(opened):
 
 
 def test_a_phone_has_room_for_all_of_it(opened):
+    model, clip = soft_model(), waves(7, *SIZE)
     for width, height in ((360, 640), (390, 844), (740, 360)):
-        phone = {"viewport": {"width": width, "height": height}, "device_scale_factor": 2, "has_touch": True}
-        page = opened(soft_model(), original=waves(7, *SIZE), **phone).settle().page
+        page = opened(model, original=clip, viewport={"width": width, "height": height}).page
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         small = page.evaluate(
             """[...document.querySelectorAll("button, select")].filter((own) => own.offsetParent)
@@ -485,7 +459,7 @@ def test_nothing_is_drawn_where_nothing_changes(opened):
     count = """foldgauss.player.renderer.count = 0; foldgauss.player.draw = new Proxy(foldgauss.player.draw, {
         apply: (draw, own, values) => (own.renderer.count++, Reflect.apply(draw, own, values)) })"""
     page.page.evaluate(f"() => {{ {count} }}")
-    page.page.wait_for_timeout(300)
+    page.page.wait_for_timeout(100)
     assert page.page.evaluate("foldgauss.player.renderer.count") == 0
     page.page.keyboard.press(".")
     page.settle()
