@@ -239,7 +239,7 @@ def test_notebooks_show_the_player(monkeypatch):
 
 
 #: Large, for what is done on the picture by hand.
-LARGE = {"viewport": {"width": 900, "height": 640}}
+LARGE = {"viewport": {"width": 480, "height": 760}}
 
 
 @pytest.fixture(scope="module")
@@ -417,7 +417,7 @@ def test_the_original_is_shown_beside_it(opened):
                 break
         assert page.stats["mode"] == mode
     assert shares["model"] < 0.02
-    assert shares["original"] > 0.6
+    assert shares["original"] > 0.5
     assert 0.3 < shares["slider"] / shares["original"] < 0.6
     assert shares["side"] > 0.1
     page.page.keyboard.press("3")
@@ -454,7 +454,7 @@ def test_buttons_have_names_and_themes_change(opened):
 
 
 def test_nothing_is_drawn_where_nothing_changes(opened):
-    page = opened(soft_model()).settle()
+    page = opened(soft_model(), fresh=True)
     page.until("foldgauss.player.quality === 1").settle()  # the first picture has been sharpened
     count = """foldgauss.player.renderer.count = 0; foldgauss.player.draw = new Proxy(foldgauss.player.draw, {
         apply: (draw, own, values) => (own.renderer.count++, Reflect.apply(draw, own, values)) })"""
@@ -467,7 +467,7 @@ def test_nothing_is_drawn_where_nothing_changes(opened):
 
 
 def test_a_lost_context_comes_back(opened):
-    page = opened(soft_model())
+    page = opened(soft_model(), fresh=True)
     before = page.picture(0.4)
     page.page.evaluate("void (lost = foldgauss.player.renderer.gl.getExtension('WEBGL_lose_context')).loseContext()")
     page.page.get_by_text("graphics context was lost").wait_for()
@@ -515,7 +515,7 @@ def segmented(**how):
 
 def test_a_page_of_segments_has_a_model_of_each(tmp_path):
     video = segmented()
-    page = html_page(video, title="long")
+    page = html_page(video, title="a long clip")
     spans = json.loads(_Elements(page).text("script", id="segments"))
     assert [(span["first"], span["num_frames"]) for span in spans] == list(zip(FIRSTS, LENGTHS, strict=True))
     assert [span["num_gaussians"] for span in spans] == [NUM] * 5
@@ -524,8 +524,8 @@ def test_a_page_of_segments_has_a_model_of_each(tmp_path):
         again = VideoRenderer(load_video_model(tmp_path / "out.fgz")).frame(0.4)
         assert np.abs(again - VideoRenderer(segment.model).frame(0.4).astype(float)).mean() < 0.5
     path = save_video_model(tmp_path / "long.safetensors", video, metadata={"clip": "a long clip"})
-    assert html_page(path, title="long") == page
-    assert "<title>a long clip</title>" in html_page(path)
+    assert html_page(path) == page
+    assert "<title>a long clip</title>" in page
     plain = html_page(soft_model())
     assert 'id="segments"' not in plain
     assert data_of(plain)
@@ -616,7 +616,7 @@ def test_controls_work_on_the_whole_clip(opened):
 
 
 def test_play_goes_over_the_seams(opened):
-    page = opened(segmented())
+    page = opened(segmented(), fresh=True)
     page.page.evaluate(
         """() => {
           const { player } = foldgauss, draw = player.draw;
@@ -694,7 +694,7 @@ def test_a_segment_that_cannot_be_decoded_is_told(browser, tmp_path):
 
 def test_the_brush_acts_on_the_segment_seen(opened):
     video = segmented()
-    page = opened(video, **LARGE)
+    page = opened(video, fresh=True, **LARGE)
     page.until("foldgauss.stats.decoded.length === 5")
     page.page.evaluate("foldgauss.player.segments.most = 0")
     page.page.keyboard.press("b")

@@ -97,7 +97,7 @@ def test_a_selection_grows_and_shrinks(opened, compact):
 
 
 def test_handles_and_numbers_are_one_edit(opened, compact):
-    page, model = opened(compact, viewport={"width": 900, "height": 640}), load_video_model(compact)
+    page, model = opened(compact, viewport={"width": 480, "height": 760}), load_video_model(compact)
     page.page.evaluate("foldgauss.seek(0.5)")
     page.page.keyboard.press("e")
     select(page, range(12))
@@ -127,7 +127,7 @@ def test_handles_and_numbers_are_one_edit(opened, compact):
         at = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
         page.page.mouse.move(*at)
         page.page.mouse.down()
-        page.page.mouse.move(at[0] + 60, at[1] + 40, steps=4)
+        page.page.mouse.move(at[0] + 0.07 * unit, at[1] + 0.05 * unit, steps=4)
         page.page.mouse.up()
         assert key in page.stats["steps"][-1]
         assert len(page.stats["steps"][-1]["about"]) == 2
