@@ -13,8 +13,8 @@ from foldgauss.render import RenderOptions
 from foldgauss.video.models.renderer import VideoRenderer
 
 TIMES = (0.0, 0.21, 0.5, 1.0)
-#: Half floats, in which pictures are added up, leave up to a level and a half; see docs/player.md.
-LEVELS, WORST = 0.4, 2
+#: Of 255: the order of rounding differs, so that a value near a half may go either way; see docs/player.md.
+LEVELS, WORST = 0.05, 1
 PICKED = "Array.from(foldgauss.player.state.selected.keys()).filter((i) => foldgauss.player.state.selected[i])"
 
 

@@ -1,6 +1,7 @@
 """The player's edits: their pictures, scripts and models are those of `foldgauss edit`, and nothing done is lost."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -80,7 +81,46 @@ def test_a_model_that_no_file_holds_is_told(opened, compact):
     read_script(page, IT + 'do = "retime"\nshift = 0.9\n')
     page.page.click("#files-open")
     page.page.click("#download-model")
-    assert "beyond the clip" in page.page.locator("#toast").inner_text()
+    told = page.page.locator("#toast").inner_text()
+    assert re.search(r"^\d+ Gaussians were moved in time beyond the clip, by up to [\d.]+ frames", told)
+    assert "Make Later, Speed or Delay that much less" in told
+    assert "foldgauss edit MODEL SCRIPT --out edited.mp4" in told
+
+
+def test_what_no_image_has_is_left_out_of_the_model(opened, compact, tmp_path):
+    page = opened(compact)
+    read_script(page, IT + 'do = "retime"\nshift = 9\n')
+    download(page, "#download-model", tmp_path / "edited.safetensors")
+    model = load_video_model(tmp_path / "edited.safetensors")
+    assert model.num_gaussians == NUM - OBJECT.sum()
+    assert_shows(page, model)
+
+
+def test_messages_stand_above_the_dialog(opened, compact):
+    page = opened(compact)
+    for name in ("files", "help"):
+        page.page.click(f"#{name}-open")
+        read_script(page, "no script")  # its message comes above the dialog that is open
+        box = page.page.locator("#toast").bounding_box()
+        middle = [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2]
+        assert page.page.evaluate("(at) => document.elementFromPoint(...at).id", middle) == "toast"
+        page.page.keyboard.press("Escape")
+        page.settle()
+        assert page.page.locator("#toast").is_visible()  # it stays when the dialog is closed
+
+
+def test_a_change_of_color_is_shown_without_the_tint(opened, compact):
+    page = opened(compact)
+    plain = page.picture(0.4)
+    page.page.keyboard.press("e")
+    select(page, range(12))
+    tinted = page.picture()
+    assert np.abs(tinted.astype(float) - plain).mean() > 0.5
+    for name, value in (("gain", "1.01"), ("opacity", "0.99")):
+        page.page.locator(f"#{name}").fill(value)
+        assert np.abs(page.picture().astype(float) - plain).max() <= 4
+    page.page.locator("#move-x").fill("0.01")
+    assert np.abs(page.picture().astype(float) - tinted).max() <= 6
 
 
 def test_undo_and_redo_go_through_all_steps(opened, compact):
@@ -223,6 +263,31 @@ def test_too_many_copies_by_the_panel_are_told(opened, compact):
     assert page.settle().stats["undoable"] == 1
     page.page.evaluate("foldgauss.controls.panel.duplicate()")
     assert page.settle().stats["undoable"] == 2
+
+
+_COPIES = f'do = "multiply"\noffsets = {[[0.1, 0.0]] * 250}\noriginals = true\n'
+
+
+def test_too_many_copies_in_a_segment_that_is_not_decoded_are_told(opened):
+    parts = [(6 * k, soft_model(seed=k, options=RenderOptions(), num_frames=7)) for k in range(4)]
+    page = opened(SegmentedVideo.from_models(parts), fresh=True)
+    page.until("foldgauss.stats.decoded.length === 4")
+    page.page.evaluate("foldgauss.player.segments.most = 0")
+    page.page.evaluate("foldgauss.seek(0)")
+    page.until("!foldgauss.stats.decoded.includes(3)")
+    page.page.evaluate("foldgauss.player.editing.history.push({ select: { 0: '0', 3: '0-39' } })")
+    step = {"do": "multiply", "offsets": [[0.1, 0.0]] * 250, "originals": True}
+    page.page.evaluate("(step) => foldgauss.controls.panel.act(step)", step)
+    page.page.evaluate("(step) => foldgauss.controls.panel.act(step)", step)
+    told = "expected at most 1,000,000 Gaussians with the copies, got 2,520,040"
+    assert told in page.page.locator("#toast").inner_text()
+    assert page.stats["undoable"] == 2
+    script = "".join(
+        f"[selections.s]\nindices = \"0-39\"\nsegment = 3\n[[edits]]\nselect = 's'\n{_COPIES}[[edits]]\n{_COPIES}"
+    )
+    read_script(page, script)
+    assert told in page.page.locator("#toast").inner_text()
+    assert page.stats["undoable"] == 2
 
 
 def test_what_the_browser_kept_is_discarded_if_it_cannot_be_applied(opened, compact):

@@ -169,6 +169,47 @@ def test_fields_make_the_edits_that_they_name(opened, compact):
     assert page.page.locator("#to-back").is_disabled()  # nothing is selected any more
 
 
+def test_keys_work_while_a_number_has_the_focus(opened, compact):
+    page = opened(compact)
+    page.page.keyboard.press("e")
+    select(page, range(12))
+    field, press = page.page.locator("#gain-value"), page.page.keyboard.press
+    field.fill("")
+    field.press_sequentially("1.5e0")
+    press("ArrowLeft")
+    press("Backspace")
+    press("Delete")
+    assert (field.input_value(), page.stats["steps"][-1]) == ("1.5", {"do": "recolor", "gain": 1.5})
+    press("Control+z")
+    assert (field.input_value(), page.stats["undoable"]) == ("1", 1)
+    press("Control+Shift+z")
+    assert (field.input_value(), page.stats["undoable"]) == ("1.5", 2)
+    press("Control+y")
+    press("r")
+    assert page.stats["tool"] == "rectangle"
+    assert page.page.evaluate("document.activeElement.id") == "gain-value"
+    press("Control+a")
+    press("2")
+    assert (field.input_value(), page.stats["mode"], page.stats["picked"]) == ("2", "model", 12)
+    press("Control+i")
+    assert page.stats["picked"] == NUM - 12
+    press("Space")
+    assert page.stats["playing"]
+
+
+def test_the_count_tells_copies_apart(opened, compact):
+    page = opened(compact)
+    page.page.keyboard.press("e")
+    shown = page.page.locator("#picked")
+    select(page, range(12))
+    assert shown.inner_text() == "12 selected"
+    page.page.locator("#copies").fill("2")
+    page.page.click("#duplicate")
+    assert shown.inner_text() == "24, copies of 12"
+    select(page, range(36))  # each with its copies behind it
+    assert shown.inner_text() == "36, copies of 12"
+
+
 def test_the_keyboard_alone_selects_and_edits(opened, compact):
     page = opened(compact)
     page.page.keyboard.press("r")
