@@ -46,6 +46,7 @@ def thinned():
 def test_the_empty_page_opens_any_model(opened, compact, tmp_path):
     bare = opened(None, fresh=True)
     assert bare.page.locator("#notice-open").is_visible()
+    assert not bare.page.locator("#transport").is_visible()  # there is nothing to play
     model = soft_model(options=RenderOptions(), seed=3)
     save_video_model(tmp_path / "plain.safetensors", model)
     save_video_model(tmp_path / "thin.safetensors", thinned())
