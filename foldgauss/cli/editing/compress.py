@@ -53,7 +53,7 @@ def compress_command(
     ] = None,
     passes: Annotated[
         int, typer.Option(help="Passes over VIDEO that reduce the loss by rounding; 0: only round.", min=0)
-    ] = 24,
+    ] = 48,
     frames: Annotated[
         str | None, typer.Option(metavar="A:B", help="Frames of VIDEO [default: those that it was fitted to].")
     ] = None,

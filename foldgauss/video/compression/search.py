@@ -72,7 +72,7 @@ _TRIES, _ENOUGH = 6, 0.9
 _MAX_EXTRAPOLATION = 2.0
 #: Fraction of the allowed loss that dropping Gaussians may cost after fine-tuning the others; if it costs more, half of
 #: the loss before is tried, up to this many times in all.
-_DROPPING, _DROPS = 0.4, 3
+_DROPPING, _STAGES, _STAGES_OF_PASSES, _FIRST_DROPPED = 0.4, 6, 3, 3.0
 #: Fraction of the allowed squared error that reordering may add if all pairs whose order is given up are swapped; and
 #: fraction of the allowed loss that it may cost.
 _ORDERING = 0.3
@@ -108,7 +108,7 @@ def compress(
     *,
     max_loss_db: float = 0.2,
     psnr: float | None = None,
-    passes: int = 24,
+    passes: int = 48,
     on_step: Callable[[str, float], None] = lambda what, loss_db: None,
 ) -> Compressed:
     """Quantize `model` as coarsely as `max_loss_db` allows, in dB of the mean PSNR of all frames.
@@ -195,15 +195,17 @@ def _search_finetuned(
             model, loss.target, math.ceil(fraction * passes), on_pass=lambda: on_step(what, math.nan), **how
         )
 
-    dropped = min(_DROPPED * passes * math.sqrt(max_loss), _MAX_DROPPED)
-    for _ in range(_DROPS):
-        kept = _Sorting(_drop(model, complete, loss, least, dropped))(_FIRST_ORDERING * loss.error)
-        kept = finetune(kept, 1, "fine-tuning after dropping Gaussians", seed=0, shared=index_colors(kept))
-        measured = loss(kept, loss.all_frames)
+    kept, plan, so_far, dropped = model, complete, 0.0, _FIRST_DROPPED
+    for stage in range(_STAGES):
+        trial = _Sorting(_drop(kept, plan, loss, least, max(so_far, 0.0) + dropped))(_FIRST_ORDERING * loss.error)
+        what = "fine-tuning after dropping Gaussians"
+        trial = finetune(trial, 1 / _STAGES_OF_PASSES, what, seed=stage, shared=index_colors(trial))
+        measured = loss(trial, loss.all_frames)
         on_step("dropped", measured)
         if measured <= _DROPPING * max_loss:
-            break
-        dropped /= 2  # too many to compensate for
+            kept, plan, so_far = trial, _Plan(trial), measured
+        else:
+            dropped /= 2  # too many to compensate for
     plan, factor = _Plan(_reorder(kept, loss, max_loss)), least + _COARSER
     best, tried = None, {}
     for _ in range(_TRIES):
