@@ -154,8 +154,8 @@ def _write_compressed(
         made = compress(model, given, max_loss_db=max_loss_db, psnr=known_psnr, passes=passes, on_step=show)
     if passes and gain > MAX_GAIN_DB:
         warn(
-            f"fine-tuning came {gain:.1f} dB closer to the clip than the model. Either its fit had not converged, or it "
-            "was edited, and the passes have undone the edits. --passes 0 only rounds."
+            f"fine-tuning came {gain:.1f} dB closer to the clip than the model. Either its fit had not converged, or "
+            "it was edited, and the passes have undone the edits. --passes 0 only rounds."
         )
     save_compressed(target, made, about, known=clip is not None or known_psnr is not None)
     if clip is None:

@@ -63,16 +63,15 @@ _FINEST, _COARSEST, _CLOSE = -8.0, 9.0, 0.05
 _WORTH = 40.0
 #: How much coarser, in powers of two, the first try with fine-tuning is; and the loss per power of two, dB.
 _COARSER, _SLOPE = 1.7, 0.7
-#: Loss in dB by dropping Gaussians, before the others are fine-tuned, for each pass and for an allowed loss of 1 dB;
-#: it grows with the square root of the allowed loss. And the most.
-_DROPPED, _MAX_DROPPED = 0.5, 12.0
+#: Gaussians are dropped in stages, each of passes / 2 passes: first as many as lose so many dB before the others are
+#: fine-tuned, and half as many after each stage that lost more than this fraction of the allowed loss.
+_STAGES, _STAGES_OF_PASSES, _FIRST_DROPPED, _DROPPING = 5, 2, 4.0, 0.4
+#: How much coarser, in powers of two, the steps may be at which a Gaussian that is dropped is not worth its bits.
+_MAX_COARSER = 24.0
 #: Tries with fine-tuning, each of passes / 4 + passes / 8 passes; and the fraction of the allowed loss that ends them.
 _TRIES, _ENOUGH = 6, 0.9
 #: Most powers of two by which a try may extrapolate.
 _MAX_EXTRAPOLATION = 2.0
-#: Fraction of the allowed loss that dropping Gaussians may cost after fine-tuning the others; if it costs more, half of
-#: the loss before is tried, up to this many times in all.
-_DROPPING, _STAGES, _STAGES_OF_PASSES, _FIRST_DROPPED = 0.4, 6, 3, 3.0
 #: Fraction of the allowed squared error that reordering may add if all pairs whose order is given up are swapped; and
 #: fraction of the allowed loss that it may cost.
 _ORDERING = 0.3
@@ -118,8 +117,8 @@ def compress(
     Frames beyond `EXACT_PSNR`, 58.9 dB, count as that. Gaussians are reordered where that is hardly visible; absent
     parameters (`FoldedSplats.degrees`, `static`, `opaque`) stay absent, and shared colours stay shared.
 
-    With the clip, fine-tuning compensates for losses and allows coarser steps: all leaves for `passes` passes once
-    Gaussians have been dropped, paths and colours for a quarter of them once geometry is rounded, colours for an eighth
+    With the clip, fine-tuning compensates for losses and allows coarser steps: all leaves for half of the `passes` each
+    time Gaussians have been dropped, paths and colours for a quarter once geometry is rounded, colours for an eighth
     once paths are. More passes make smaller files. With 0 passes every parameter is the model's own, rounded.
     `on_step(what, loss_db)` is called now and then, with NaN before anything has been measured.
 
@@ -256,7 +255,7 @@ def _next_factor(tried: dict[float, float], max_loss: float, least: float) -> fl
 
 def _drop(model: VideoModel, plan: "_Plan", loss: "_Loss", least: float, most: float) -> VideoModel:
     """The model without as many of the Gaussians that matter least as costs at most `most` dB."""
-    fine, coarse = least, least + 2 * _MAX_DROPPED
+    fine, coarse = least, least + _MAX_COARSER
     while coarse - fine > 2 * _CLOSE:
         middle = (fine + coarse) / 2
         lost = loss(_take(model, plan.keep(middle)), loss.sampled_frames)
