@@ -455,7 +455,9 @@ def test_buttons_have_names_and_themes_change(opened):
 
 def test_nothing_is_drawn_where_nothing_changes(opened):
     page = opened(soft_model(), fresh=True)
-    page.until("foldgauss.player.quality === 1").settle()  # the first picture has been sharpened
+    # The first picture has been sharpened, at the size that the page has come to.
+    page.until("foldgauss.player.quality === 1").settle().until("!foldgauss.player.waiting")
+    page.page.wait_for_timeout(300)
     count = """foldgauss.player.renderer.count = 0; foldgauss.player.draw = new Proxy(foldgauss.player.draw, {
         apply: (draw, own, values) => (own.renderer.count++, Reflect.apply(draw, own, values)) })"""
     page.page.evaluate(f"() => {{ {count} }}")
