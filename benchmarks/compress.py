@@ -87,7 +87,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--size", type=_common.size, default=SIZE, metavar="HxW", help="[160x320]")
     parser.add_argument("--frames", type=_common.whole, default=48, metavar="N", help="the first N frames [48]")
     parser.add_argument("--loss", type=float, default=0.2, help="dB [0.2]")
-    parser.add_argument("--passes", type=_common.whole, default=24, help="[24]")
+    parser.add_argument("--passes", type=_common.whole, default=48, help="[48]")
     options = _common.parse(parser, arguments)
     if options.model is not None and options.clip is None:
         parser.error("--model needs --clip")

@@ -82,8 +82,9 @@ class Curve:
         self.points: list[tuple[float, ...]] = []
         if state is not None and path.exists():
             with path.open(newline="") as file:
-                rows = [tuple(float(row[name]) for name in self.COLUMNS) for row in csv.DictReader(file)]
-            self.points = [row for row in rows if row[0] <= state.step]
+                rows = [[row[name] for name in self.COLUMNS] for row in csv.DictReader(file)]
+            points = [(int(step), float(psnr), int(num), float(cpu)) for step, psnr, num, cpu in rows]
+            self.points = [point for point in points if point[0] <= state.step]
         self.before = self.points[-1][-1] if self.points else 0.0
         self.begun = time.process_time()
 

@@ -11,6 +11,8 @@ import threading
 _CACHE = "JAX_COMPILATION_CACHE_DIR"
 _own_cache = None if _CACHE in os.environ else os.environ.setdefault(_CACHE, tempfile.mkdtemp(prefix="foldgauss-jax-"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+# Most of the time goes into XLA's compilation, which takes a quarter less like this. `.ci/slow` runs with optimization.
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 
 import jax  # noqa: E402
 import pytest  # noqa: E402

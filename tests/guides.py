@@ -359,8 +359,8 @@ def _ply(folder: Path) -> None:
 
 #: By name as pages write it.
 THINGS = {
-    **{name: _video(name) for name in ("holiday.mp4", "clip.mp4", "bunny.mp4", "film.mp4")},
-    **{f"{name}.safetensors": _model(f"{name}.safetensors") for name in ("holiday", "model", "bunny")},
+    **{name: _video(name) for name in ("holiday.mp4", "clip.mp4", "film.mp4")},
+    **{f"{name}.safetensors": _model(f"{name}.safetensors") for name in ("holiday", "model")},
     "folder/of/images": _images("folder/of/images"),
     "masks": _masks,
     "point_cloud.ply": _ply,
@@ -371,15 +371,16 @@ THINGS = {
 #: What each page takes for granted.
 GIVEN = {
     "README.md": ("holiday.mp4", "masks", "film.mp4", "holidays"),
-    "docs/commands.md": ("holiday.mp4", "edits.toml", "film.mp4", "holidays"),
+    "docs/commands.md": ("holiday.mp4",),
     "docs/compress.md": ("holiday.mp4", "holiday.safetensors"),
-    "docs/editing.md": ("holiday.safetensors", "edits.toml", "point_cloud.ply"),
+    "docs/editing.md": ("holiday.safetensors", "edits.toml"),
     "docs/fit.md": ("holiday.mp4", "DAVIS", "folder/of/images"),
     "docs/format.md": ("holiday.mp4", "holiday.safetensors"),
+    "docs/formats.md": ("holiday.safetensors", "point_cloud.ply"),
     "docs/index.md": ("holiday.mp4",),
     "docs/player.md": ("holiday.mp4", "holiday.safetensors"),
     "docs/quickstart.md": ("holiday.mp4",),
-    "docs/results.md": ("bunny.mp4", "bunny.safetensors", "holiday.mp4"),
+    "docs/results.md": ("holiday.mp4",),
     "docs/scale.md": ("film.mp4", "holidays"),
     "docs/slow-motion.md": ("holiday.mp4",),
     "docs/uncertainty.md": ("clip.mp4", "model.safetensors"),

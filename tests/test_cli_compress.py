@@ -110,7 +110,7 @@ def test_an_edit_that_is_fitted_away_is_told(work, tmp_path, capsys):
     bright = eqx.tree_at(lambda m: m.splats.color_dc, model, np.asarray(model.splats.color_dc) + 1)
     path = save_video_model(tmp_path / "bright.safetensors", bright)
     assert run("compress", path, work / "clip", "--passes", 2, "--out", tmp_path / "bright.fgz") == 0
-    assert re.search(r"warning: the compact file is \d+\.\d dB closer to the clip", capsys.readouterr().err)
+    assert re.search(r"warning: fine-tuning came \d+\.\d dB closer to the clip", capsys.readouterr().err)
     assert run("compress", path, work / "clip", "--passes", 0, "--out", tmp_path / "rounded.fgz") == 0
     assert "nearer" not in capsys.readouterr().err
 

@@ -40,7 +40,7 @@ def test_splits_keep_groups_whole():
 @pytest.mark.parametrize(
     "name",
     [
-        name if name in ("KernelDensity", "foldgauss, defaults") else pytest.param(name, marks=pytest.mark.slow)
+        name if name == "KernelDensity" else pytest.param(name, marks=pytest.mark.slow)
         for name in _density_methods.METHODS
     ],
 )

@@ -16,6 +16,7 @@ NEEDS = {
     "docs/distribution.md": ("numpyro", "matplotlib", "blackjax"),
     "docs/estimator.md": ("sklearn",),
     "docs/fit.md": ("matplotlib",),
+    "docs/mixture.md": ("numpyro", "sklearn"),
     "docs/results.md": ("matplotlib",),
     "docs/tutorial-points.md": ("sklearn",),
     "docs/uncertainty.md": ("emcee",),
@@ -68,7 +69,7 @@ def _readme(names, folder):
 
 
 def _commands(names, folder):
-    made = {"slow.mp4", "middle.png", "figures.json", "trip.fgz", "edited.mp4", "trip.ply", "between.png", "frames.png"}
+    made = {"middle.png", "figures.json", "trip.html", "between.png", "frames.png"}
     assert made <= {path.name for path in folder.iterdir()}
 
 
@@ -114,10 +115,7 @@ def _fit(names, folder):
 
 
 def _format(names, folder):
-    assert names["made"].loss_db == pytest.approx(names["lost"], abs=1e-6)
-    assert names["lost"] <= 0.2
-    made = {"waves.fgz", "holiday.fgz"}
-    assert {path.name for path in folder.iterdir()} == made | {"holiday.mp4", "holiday.safetensors"}
+    assert {path.name for path in folder.iterdir()} == {"holiday.fgz", "holiday.mp4", "holiday.safetensors"}
 
 
 def _formats(names, folder):
@@ -126,6 +124,7 @@ def _formats(names, folder):
     assert len(names["gaussians"].mean) > 10
     assert names["vertices"].shape[1:] == (3, 3)
     made = {"edited.webm", "frames", "loop.gif", "mesh", "middle.ply", "pictures", "video.ply", "waves.safetensors"}
+    made |= {"scenes", "theirs.safetensors", "holiday.safetensors", "point_cloud.ply"}
     assert {path.name for path in folder.iterdir()} == made
 
 
@@ -135,6 +134,8 @@ def _mixture(names, folder):
     np.testing.assert_allclose(names["same"].weights, names["mixture"].weights, rtol=1e-5)
     mass = names["image"].sum() / names["pixels_per_unit"]((90, 160)) ** 2
     np.testing.assert_allclose(mass, names["mixture"].marginal([-1]).pdf(np.float32([0.5])), rtol=1e-2)
+    assert (names["choice"].estimator.n_components, names["choice"].estimator.degree) == (2, 2)
+    np.testing.assert_allclose(names["mcmc"].get_samples()["weights"].mean(0), [0.3, 0.7], atol=0.06)
 
 
 def _quickstart(names, folder):
@@ -192,13 +193,12 @@ def _compress(names, folder):
 
 
 def _extending(names, folder):
-    assert names["away"] < 0.15  # of a circle 0.6 wide
+    assert np.abs(names["gradient"].fold.parameters.layers[0].weight).max() > 0
     assert np.isfinite(names["jump"].log_prob(names["x"])).all()
     assert names["wide"] > 2 * names["narrow"]
     assert names["frame"].shape == (48, 80, 3)
     assert np.abs(names["slope"].fold.sine).max() > 0
-    assert names["left_psnr"](names["better"]) > names["left_psnr"](names["model"]) + 1
-    np.testing.assert_allclose(names["mine"], names["expected"], atol=1e-5)
+    assert names["left_error"](names["better"]) < 0.8 * names["left_error"](names["model"])
     before = names["model"].render(0.8)
     for video in ("swirled", "later"):
         assert np.abs(names[video].render(0.8) - before).max() > 0.02
@@ -206,10 +206,6 @@ def _extending(names, folder):
 
 
 def _results(names, folder):
-    assert names["control"].num_parameters <= names["model"].num_parameters
-    assert names["gain"] > 0
-    assert names["chosen"] == [0, 1, 2, 3]
-    assert names["bend"] == 1
     assert (folder / "trade" / "tradeoff.png").exists()
     assert (folder / "few" / "tradeoff.csv").exists()
 
@@ -217,12 +213,11 @@ def _results(names, folder):
 def _scale(names, folder):
     assert names["joined"].mean_psnr > 15
     assert names["spans"] == [(0, 12), (9, 20)]
-    assert names["score"] > 20
     assert names["part"].num_frames == 11
-    made = {"slow.mp4", "scores.json", "waves-ply", "second.safetensors", "second.fgz", "long.safetensors"}
+    made = {"slow.mp4", "waves-ply", "second.safetensors", "second.fgz", "long.safetensors"}
     assert made <= {path.name for path in folder.iterdir()}
     assert all(len(part) > 0 for part in names["left"].selection.parts)
-    assert np.abs(names["darker"].render(0.5) - names["picture"]).max() > 0.1
+    assert np.abs(names["darker"].render(0.5) - names["video"].render(0.5)).max() > 0.1
 
 
 def _tutorial_points(names, folder):

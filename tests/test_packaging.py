@@ -127,3 +127,11 @@ def test_modules_are_attributes_and_others_are_not():
     for name in ("vidoe", "_nothing"):
         with pytest.raises(AttributeError, match=f"'foldgauss' has no attribute '{name}'"):
             getattr(foldgauss, name)
+
+
+def test_a_missing_scikit_learn_is_reported_with_its_remedy(monkeypatch):
+    for name in [name for name in sys.modules if name.startswith(("sklearn", "foldgauss.estimator.folded_"))]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "sklearn", None)
+    with pytest.raises(ImportError, match=r"needs scikit-learn: pip install 'foldgauss\[sklearn\]'"):
+        foldgauss.estimator.__getattr__("FoldedMixtureRegressor")

@@ -14,7 +14,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from browser import Opened, chromium
+from browser import Opened
 from soft_models import NUM, OBJECT, SIZE, soft_model
 
 from foldgauss.envelope import TimeLikelihood
@@ -238,31 +238,8 @@ def test_notebooks_show_the_player(monkeypatch):
 # ------------------------------------------------------------------------------------------------- in a browser
 
 
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as found:
-        yield found
-
-
-#: By default pages are small, which are quickly drawn; a large one is for what is done on the picture by hand.
-SMALL, LARGE = ({"viewport": {"width": width, "height": height}} for width, height in ((400, 400), (900, 640)))
-
-
-@pytest.fixture
-def opened(browser, tmp_path):
-    """Opens pages, and holds at the end that they said nothing and asked for nothing."""
-    pages = []
-
-    def open_page(model, *, original=None, **options):
-        path = write_html(tmp_path / f"{len(pages)}.html", model, original=original)
-        pages.append(Opened(browser, path, **SMALL | options))
-        return pages[-1].ready()
-
-    yield open_page
-    for one in pages:
-        one.close()
-        assert not one.said
-        assert all(url.startswith(("file:", "blob:", "data:")) for url in one.asked)
+#: Large, for what is done on the picture by hand.
+LARGE = {"viewport": {"width": 480, "height": 760}}
 
 
 @pytest.fixture(scope="module")
@@ -358,11 +335,8 @@ def test_it_plays_and_stops_at_the_end(opened):
     page = opened(soft_model(), reduced_motion="no-preference")
     assert page.stats["playing"]
     page.page.keyboard.press("l")
-    while page.stats["playing"]:
-        page.page.wait_for_timeout(50)
-    assert page.stats["position"] == 6
-    still = opened(soft_model(), reduced_motion="reduce")
-    assert not still.stats["playing"]
+    assert page.until("!foldgauss.stats.playing").stats["position"] == 6
+    assert not opened(soft_model(), reduced_motion="reduce").stats["playing"]
 
 
 def test_what_is_brushed_can_vanish_and_come_back(opened):
@@ -443,7 +417,7 @@ def test_the_original_is_shown_beside_it(opened):
                 break
         assert page.stats["mode"] == mode
     assert shares["model"] < 0.02
-    assert shares["original"] > 0.6
+    assert shares["original"] > 0.5
     assert 0.3 < shares["slider"] / shares["original"] < 0.6
     assert shares["side"] > 0.1
     page.page.keyboard.press("3")
@@ -455,9 +429,9 @@ def test_the_original_is_shown_beside_it(opened):
 
 
 def test_a_phone_has_room_for_all_of_it(opened):
+    model, clip = soft_model(), waves(7, *SIZE)
     for width, height in ((360, 640), (390, 844), (740, 360)):
-        phone = {"viewport": {"width": width, "height": height}, "device_scale_factor": 2, "has_touch": True}
-        page = opened(soft_model(), original=waves(7, *SIZE), **phone).settle().page
+        page = opened(model, original=clip, viewport={"width": width, "height": height}).page
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         small = page.evaluate(
             """[...document.querySelectorAll("button, select")].filter((own) => own.offsetParent)
@@ -480,12 +454,14 @@ def test_buttons_have_names_and_themes_change(opened):
 
 
 def test_nothing_is_drawn_where_nothing_changes(opened):
-    page = opened(soft_model()).settle()
-    page.until("foldgauss.player.quality === 1").settle()  # the first picture has been sharpened
+    page = opened(soft_model(), fresh=True)
+    # The first picture has been sharpened, at the size that the page has come to.
+    page.until("foldgauss.player.quality === 1").settle().until("!foldgauss.player.waiting")
+    page.page.wait_for_timeout(300)
     count = """foldgauss.player.renderer.count = 0; foldgauss.player.draw = new Proxy(foldgauss.player.draw, {
         apply: (draw, own, values) => (own.renderer.count++, Reflect.apply(draw, own, values)) })"""
     page.page.evaluate(f"() => {{ {count} }}")
-    page.page.wait_for_timeout(300)
+    page.page.wait_for_timeout(100)
     assert page.page.evaluate("foldgauss.player.renderer.count") == 0
     page.page.keyboard.press(".")
     page.settle()
@@ -493,7 +469,7 @@ def test_nothing_is_drawn_where_nothing_changes(opened):
 
 
 def test_a_lost_context_comes_back(opened):
-    page = opened(soft_model())
+    page = opened(soft_model(), fresh=True)
     before = page.picture(0.4)
     page.page.evaluate("void (lost = foldgauss.player.renderer.gl.getExtension('WEBGL_lose_context')).loseContext()")
     page.page.get_by_text("graphics context was lost").wait_for()
@@ -541,7 +517,7 @@ def segmented(**how):
 
 def test_a_page_of_segments_has_a_model_of_each(tmp_path):
     video = segmented()
-    page = html_page(video, title="long")
+    page = html_page(video, title="a long clip")
     spans = json.loads(_Elements(page).text("script", id="segments"))
     assert [(span["first"], span["num_frames"]) for span in spans] == list(zip(FIRSTS, LENGTHS, strict=True))
     assert [span["num_gaussians"] for span in spans] == [NUM] * 5
@@ -550,8 +526,8 @@ def test_a_page_of_segments_has_a_model_of_each(tmp_path):
         again = VideoRenderer(load_video_model(tmp_path / "out.fgz")).frame(0.4)
         assert np.abs(again - VideoRenderer(segment.model).frame(0.4).astype(float)).mean() < 0.5
     path = save_video_model(tmp_path / "long.safetensors", video, metadata={"clip": "a long clip"})
-    assert html_page(path, title="long") == page
-    assert "<title>a long clip</title>" in html_page(path)
+    assert html_page(path) == page
+    assert "<title>a long clip</title>" in page
     plain = html_page(soft_model())
     assert 'id="segments"' not in plain
     assert data_of(plain)
@@ -642,7 +618,7 @@ def test_controls_work_on_the_whole_clip(opened):
 
 
 def test_play_goes_over_the_seams(opened):
-    page = opened(segmented())
+    page = opened(segmented(), fresh=True)
     page.page.evaluate(
         """() => {
           const { player } = foldgauss, draw = player.draw;
@@ -720,7 +696,7 @@ def test_a_segment_that_cannot_be_decoded_is_told(browser, tmp_path):
 
 def test_the_brush_acts_on_the_segment_seen(opened):
     video = segmented()
-    page = opened(video, **LARGE)
+    page = opened(video, fresh=True, **LARGE)
     page.until("foldgauss.stats.decoded.length === 5")
     page.page.evaluate("foldgauss.player.segments.most = 0")
     page.page.keyboard.press("b")

@@ -8,56 +8,24 @@ from contextlib import contextmanager
 import cv2
 import numpy as np
 import pytest
-from browser import Opened, chromium
+from browser import Opened
 from editor_page import (
     EDITS,
     IT,
     assert_shows,
     download,
     drop,
-    pages_of,
     read_script,
-    save_soft_model,
     script_of,
     select,
 )
 from soft_models import NUM, SIZE, soft_model
 
 from foldgauss.cli.viewing.page_server import PageServer, make_token
-from foldgauss.io import export, html_page, import_model, load_video_model, read_video, save_video_model, write_html
+from foldgauss.io import export, html_page, import_model, load_video_model, read_video, save_video_model
 from foldgauss.io.edit_script import parse_edit_script, read_edit_script
-from foldgauss.io.page.player_page import SaveTarget, empty_page
+from foldgauss.io.page.player_page import SaveTarget
 from foldgauss.render import RenderOptions
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as found:
-        yield found
-
-
-@pytest.fixture(scope="module")
-def compact(tmp_path_factory):
-    return save_soft_model(tmp_path_factory.mktemp("compact"))
-
-
-@pytest.fixture
-def edited(browser, tmp_path):
-    with pages_of(browser, tmp_path) as open_page:
-        yield open_page
-
-
-@pytest.fixture
-def bare(browser, tmp_path):
-    """The page without a model."""
-    path = tmp_path / "index.html"
-    path.write_text(empty_page(), encoding="utf-8")
-    page = Opened(browser, path, viewport={"width": 900, "height": 640})
-    page.page.locator("#notice-open").wait_for()
-    yield page
-    page.close()
-    assert not page.said
-    assert all(url.startswith(("file:", "blob:", "data:")) for url in page.asked)
 
 
 def thinned():
@@ -75,7 +43,10 @@ def thinned():
     return dataclasses.replace(model, splats=splats)
 
 
-def test_the_empty_page_opens_any_model(bare, compact, tmp_path):
+def test_the_empty_page_opens_any_model(opened, compact, tmp_path):
+    bare = opened(None, fresh=True)
+    assert bare.page.locator("#notice-open").is_visible()
+    assert not bare.page.locator("#transport").is_visible()  # there is nothing to play
     model = soft_model(options=RenderOptions(), seed=3)
     save_video_model(tmp_path / "plain.safetensors", model)
     save_video_model(tmp_path / "thin.safetensors", thinned())
@@ -91,7 +62,8 @@ def test_the_empty_page_opens_any_model(bare, compact, tmp_path):
     assert_shows(bare, parse_edit_script(IT + EDITS["rotate"]).apply(wanted))
 
 
-def test_a_vegas_file_without_a_size_is_asked_for_it(bare, tmp_path):
+def test_a_vegas_file_without_a_size_is_asked_for_it(opened, tmp_path):
+    bare = opened(None, fresh=True)
     model = soft_model(options=RenderOptions())
     path = export(model, "ply", tmp_path / "theirs.ply")
     path.write_bytes(re.sub(rb"comment foldgauss [^\n]*\n", b"", path.read_bytes()))
@@ -132,7 +104,8 @@ def test_a_vegas_file_without_a_size_is_asked_for_it(bare, tmp_path):
         ("a.toml", b"", "Open the model first"),
     ],
 )
-def test_files_that_cannot_be_opened_are_told(bare, tmp_path, name, content, message):
+def test_files_that_cannot_be_opened_are_told(opened, tmp_path, name, content, message):
+    bare = opened(None)
     (tmp_path / name).write_bytes(content)
     drop(bare, tmp_path / name)
     bare.page.locator("#toast").wait_for()
@@ -140,7 +113,8 @@ def test_files_that_cannot_be_opened_are_told(bare, tmp_path, name, content, mes
     assert bare.page.locator("#notice-open").is_visible()
 
 
-def test_damaged_models_are_told(bare, compact, tmp_path):
+def test_damaged_models_are_told(opened, compact, tmp_path):
+    bare = opened(None)
     good = save_video_model(tmp_path / "m.safetensors", soft_model()).read_bytes()
     for name, content in (
         ("cut.safetensors", good[:-100]),
@@ -154,89 +128,86 @@ def test_damaged_models_are_told(bare, compact, tmp_path):
         assert "damaged" in bare.page.locator("#toast").inner_text()
 
 
-def test_view_saves_to_disk_and_takes_it_up_again(browser, compact, tmp_path):
-    script, token = tmp_path / "clip.edit.toml", make_token()
+@contextmanager
+def serving(page, script, token):
+    """The server of `foldgauss view`, in a thread."""
+    with PageServer(page.encode(), 0, script=script, token=token) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield server.url
+        finally:
+            server.shutdown()
+            thread.join()
 
-    def served():
-        page = html_page(compact, save_to=SaveTarget(script.name, token))
-        return PageServer(page.encode(), 0, script=script, token=token)
+
+def test_view_saves_to_disk_and_takes_it_up_again(browser, compact, tmp_path):
+    script, token, page = tmp_path / "holiday.edit.toml", make_token(), Opened(browser)
 
     @contextmanager
     def shown():
-        with served() as server:
-            thread = threading.Thread(target=server.serve_forever)
-            thread.start()
-            page = Opened(browser, server.url, viewport={"width": 900, "height": 640}).ready()
-            try:
-                yield page
-            finally:
-                page.close()
-                server.shutdown()
-                thread.join()
-        assert not page.said
-        assert all(url.startswith((server.url, "blob:", "data:")) for url in page.asked)
+        with serving(html_page(compact, save_to=SaveTarget(script.name, token)), script, token) as url:
+            yield page.go(url).ready()
+            page.check(url)
 
-    with shown() as page:
+    with shown():
         read_script(page, IT + EDITS["move"])
         page.page.keyboard.press("Control+s")
-        page.page.get_by_text("Saved as clip.edit.toml").wait_for()
+        page.page.get_by_text("Saved as holiday.edit.toml").wait_for()
         assert script.read_text() == script_of(page)
         wanted = page.picture(0.4)
-    with shown() as page:  # at another port, whose browser storage is another
+        # Files are named after the model's, not by the clip's title.
+        assert download(page, "#download-script", tmp_path / "own.toml") == "holiday.edit.toml"
+        assert download(page, "#download-model", tmp_path / "own") == "holiday.edited.safetensors"
+    with shown():  # at another port, whose browser storage is another
         np.testing.assert_array_equal(page.picture(0.4), wanted)
         assert_shows(page, read_edit_script(script).apply(load_video_model(compact)))
     script.write_text("[selections.it]\nbox = [0, 0, 9, 9]\nframe = 0\n")
-    with shown() as page:
+    with shown():
         assert "box: expected indices" in page.page.locator("#toast").inner_text()
         page.page.keyboard.press("s")
         assert page.page.locator("#save-disk").is_disabled()
         assert "left alone" in page.page.locator("#save-about").inner_text()
+    page.close()
 
 
 def test_view_keeps_what_others_wrote_to_the_script(browser, compact, tmp_path):
     script, token = tmp_path / "clip.edit.toml", make_token()
-    page = html_page(compact, save_to=SaveTarget(script.name, token))
-    with PageServer(page.encode(), 0, script=script, token=token) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        first = Opened(browser, server.url).ready()
-        try:
-            read_script(first, IT + EDITS["move"])
-            second = first.context.new_page()
-            second.goto(server.url)
-            second.evaluate("foldgauss.ready")
-            first.page.evaluate("foldgauss.files.save()")
-            saved = script.read_text()
-            second.evaluate("foldgauss.files.save()")  # it began without a script
-            second.get_by_text("changed by another tab or program").wait_for()
-            assert script.read_text() == saved
-            second.close()
-            wait = "Promise.all([foldgauss.files.save(), foldgauss.files.save()])"
-            first.page.evaluate(wait)  # again, by the version that it saved
-            assert "Saved as" in first.page.locator("#toast").inner_text()
-            first.page.reload()
-            assert [step["do"] for step in first.ready().stats["steps"] if "do" in step] == ["move"]
-            script.write_text(IT + EDITS["hue"])  # by hand: it comes before what the browser kept
-            first.page.reload()
-            assert first.ready().stats["steps"][1] == {"do": "recolor", "hue": 0.6}
-            first.page.evaluate("foldgauss.player.editing.history.undo()")
-            assert first.stats["steps"][1]["do"] == "move"
-            for bad in (b"[camera]\nazimuth = 3\n", b"# \xff\n"):
-                script.write_bytes(bad)
-                for _ in range(2):  # what the browser then keeps is no reason to replace it
-                    first.page.reload()
-                    first.ready().page.evaluate("foldgauss.files.storage.changed()")
-                    assert first.page.locator("#save-disk").is_disabled()
-                assert script.read_bytes() == bad
-        finally:
-            first.close()
-            server.shutdown()
-            thread.join()
+    with serving(html_page(compact, save_to=SaveTarget(script.name, token)), script, token) as url:
+        first = Opened(browser, url).ready()
+        read_script(first, IT + EDITS["move"])
+        second = first.context.new_page()
+        second.goto(url)
+        second.evaluate("foldgauss.ready")
+        first.page.evaluate("foldgauss.files.save()")
+        saved = script.read_text()
+        second.evaluate("foldgauss.files.save()")  # it began without a script
+        second.get_by_text("changed by another tab or program").wait_for()
+        assert script.read_text() == saved
+        second.close()
+        wait = "Promise.all([foldgauss.files.save(), foldgauss.files.save()])"
+        first.page.evaluate(wait)  # again, by the version that it saved
+        assert "Saved as" in first.page.locator("#toast").inner_text()
+        first.page.reload()
+        assert [step["do"] for step in first.ready().stats["steps"] if "do" in step] == ["move"]
+        script.write_text(IT + EDITS["hue"])  # by hand: it comes before what the browser kept
+        first.page.reload()
+        assert first.ready().stats["steps"][1] == {"do": "recolor", "hue": 0.6}
+        first.page.evaluate("foldgauss.player.editing.history.undo()")
+        assert first.stats["steps"][1]["do"] == "move"
+        for bad in (b"[camera]\nazimuth = 3\n", b"# \xff\n"):
+            script.write_bytes(bad)
+            for _ in range(2):  # what the browser then keeps is no reason to replace it
+                first.page.reload()
+                first.ready().page.evaluate("foldgauss.files.storage.changed()")
+                assert first.page.locator("#save-disk").is_disabled()
+            assert script.read_bytes() == bad
+        first.close()
     assert [one for one in first.said if "412" not in one] == []
 
 
-def test_a_picture_is_what_is_shown(edited, compact, tmp_path):
-    page = edited(compact)
+def test_a_picture_is_what_is_shown(opened, compact, tmp_path):
+    page = opened(compact)
     page.page.evaluate("foldgauss.seek(0.5)")
     page.page.keyboard.press("e")
     select(page, range(12))
@@ -248,8 +219,8 @@ def test_a_picture_is_what_is_shown(edited, compact, tmp_path):
     np.testing.assert_array_equal(saved, page.picture(size=(80, 128)))  # without the marks of the selection
 
 
-def test_a_video_is_recorded(edited, compact, tmp_path):
-    page = edited(compact)
+def test_a_video_is_recorded(opened, compact, tmp_path):
+    page = opened(compact)
     page.page.keyboard.press("s")
     for name, value in (("height", 80), ("speed", 0.25), ("first", 1), ("last", 5)):
         page.page.locator(f"#record-{name}").fill(str(value))
@@ -268,11 +239,10 @@ def test_a_video_is_recorded(edited, compact, tmp_path):
     assert page.stats["position"] == 5  # where the pictures were just taken
 
 
-def test_small_screens_and_both_themes_show_all(browser, compact, tmp_path):
-    path = write_html(tmp_path / "page.html", compact)
+def test_small_screens_and_both_themes_show_all(opened, compact):
     for width, height, scheme in ((1280, 800, "dark"), (360, 640, "light"), (740, 360, "dark")):
-        page = Opened(browser, path, viewport={"width": width, "height": height}, color_scheme=scheme, has_touch=True)
-        page.ready().page.keyboard.press("e")
+        page = opened(compact, viewport={"width": width, "height": height}, color_scheme=scheme)
+        page.page.keyboard.press("e")
         select(page, range(12))
         for name in ("panel", "files"):
             if name == "files":
@@ -304,4 +274,3 @@ def test_small_screens_and_both_themes_show_all(browser, compact, tmp_path):
             }"""
         )
         assert low == []
-        page.close()

@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from browser import chromium
-from editor_page import assert_shows, drag, in_box, pages_of, picked, save_soft_model, screen_at, script_of, select
+from editor_page import assert_shows, drag, in_box, picked, screen_at, script_of, select
 from soft_models import NUM, SIZE
 
 from foldgauss.io import load_video_model
@@ -11,25 +10,8 @@ from foldgauss.io.edit_script import parse_edit_script
 from foldgauss.video.selection.tracking import to_lab
 
 
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as found:
-        yield found
-
-
-@pytest.fixture(scope="module")
-def compact(tmp_path_factory):
-    return save_soft_model(tmp_path_factory.mktemp("compact"))
-
-
-@pytest.fixture
-def edited(browser, tmp_path):
-    with pages_of(browser, tmp_path) as open_page:
-        yield open_page
-
-
-def test_outlines_select_and_combine_by_keys(edited, compact):
-    page, model = edited(compact), load_video_model(compact)
+def test_outlines_select_and_combine_by_keys(opened, compact):
+    page, model = opened(compact), load_video_model(compact)
     page.page.evaluate("foldgauss.seek(0.5)")
     all_of_it, left = in_box(model, -0.3, -0.25, 0.15, 0.3), in_box(model, -0.3, -0.25, -0.1, 0.3)
     page.page.keyboard.press("r")
@@ -59,8 +41,8 @@ def test_outlines_select_and_combine_by_keys(edited, compact):
     assert not picked(page)
 
 
-def test_an_outline_is_drawn_while_it_grows(edited, compact):
-    page = edited(compact)
+def test_an_outline_is_drawn_while_it_grows(opened, compact):
+    page = opened(compact)
     page.page.keyboard.press("p")
     for corner in [(-0.2, -0.1), (0.1, -0.1), (0.1, 0.1)]:
         page.page.mouse.click(*screen_at(page, *corner))
@@ -72,8 +54,8 @@ def test_an_outline_is_drawn_while_it_grows(edited, compact):
     assert page.stats["editing"]
 
 
-def test_a_color_selects_what_looks_like_it(edited, compact):
-    page, model = edited(compact), load_video_model(compact)
+def test_a_color_selects_what_looks_like_it(opened, compact):
+    page, model = opened(compact, fresh=True), load_video_model(compact)
     page.page.keyboard.press("i")
     page.page.locator("#tolerance-value").fill("12")
     page.page.evaluate("foldgauss.controls.tools.picker.colorAt = () => [0.2, 0.5, 0.3]")
@@ -84,8 +66,8 @@ def test_a_color_selects_what_looks_like_it(edited, compact):
     )
 
 
-def test_the_eyedropper_sees_the_color_that_is_shown(edited, compact):
-    page = edited(compact)
+def test_the_eyedropper_sees_the_color_that_is_shown(opened, compact):
+    page = opened(compact)
     shown = page.picture(0.5)
     for x, y in ((-0.15, 0.0), (0.1, 0.1), (0.3, -0.1)):
         column, row = int((x + 0.5) * SIZE[1]), int((y + 0.5 * SIZE[0] / SIZE[1]) * SIZE[1])
@@ -97,8 +79,8 @@ def test_the_eyedropper_sees_the_color_that_is_shown(edited, compact):
         np.testing.assert_allclose(np.array(color) * 255, shown[row, column], atol=4)
 
 
-def test_a_selection_grows_and_shrinks(edited, compact):
-    page = edited(compact)
+def test_a_selection_grows_and_shrinks(opened, compact):
+    page = opened(compact, fresh=True)
     page.page.evaluate("foldgauss.seek(0.5)")
     page.page.keyboard.press("e")
     page.page.evaluate("Object.defineProperty(foldgauss.controls.tools, 'distance', { value: 0.12 })")
@@ -114,8 +96,8 @@ def test_a_selection_grows_and_shrinks(edited, compact):
     assert picked(page) < grown
 
 
-def test_handles_and_numbers_are_one_edit(edited, compact):
-    page, model = edited(compact), load_video_model(compact)
+def test_handles_and_numbers_are_one_edit(opened, compact):
+    page, model = opened(compact, viewport={"width": 480, "height": 760}), load_video_model(compact)
     page.page.evaluate("foldgauss.seek(0.5)")
     page.page.keyboard.press("e")
     select(page, range(12))
@@ -145,7 +127,7 @@ def test_handles_and_numbers_are_one_edit(edited, compact):
         at = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
         page.page.mouse.move(*at)
         page.page.mouse.down()
-        page.page.mouse.move(at[0] + 60, at[1] + 40, steps=4)
+        page.page.mouse.move(at[0] + 0.07 * unit, at[1] + 0.05 * unit, steps=4)
         page.page.mouse.up()
         assert key in page.stats["steps"][-1]
         assert len(page.stats["steps"][-1]["about"]) == 2
@@ -155,8 +137,8 @@ def test_handles_and_numbers_are_one_edit(edited, compact):
     assert_shows(page, parse_edit_script(script_of(page)).apply(model), (0.5, 0.8))
 
 
-def test_fields_make_the_edits_that_they_name(edited, compact):
-    page = edited(compact)
+def test_fields_make_the_edits_that_they_name(opened, compact):
+    page = opened(compact)
     page.page.evaluate("foldgauss.seek(0.5)")
     page.page.keyboard.press("e")
     select(page, range(12))
@@ -187,8 +169,49 @@ def test_fields_make_the_edits_that_they_name(edited, compact):
     assert page.page.locator("#to-back").is_disabled()  # nothing is selected any more
 
 
-def test_the_keyboard_alone_selects_and_edits(edited, compact):
-    page = edited(compact)
+def test_keys_work_while_a_number_has_the_focus(opened, compact):
+    page = opened(compact)
+    page.page.keyboard.press("e")
+    select(page, range(12))
+    field, press = page.page.locator("#gain-value"), page.page.keyboard.press
+    field.fill("")
+    field.press_sequentially("1.5e0")
+    press("ArrowLeft")
+    press("Backspace")
+    press("Delete")
+    assert (field.input_value(), page.stats["steps"][-1]) == ("1.5", {"do": "recolor", "gain": 1.5})
+    press("Control+z")
+    assert (field.input_value(), page.stats["undoable"]) == ("1", 1)
+    press("Control+Shift+z")
+    assert (field.input_value(), page.stats["undoable"]) == ("1.5", 2)
+    press("Control+y")
+    press("r")
+    assert page.stats["tool"] == "rectangle"
+    assert page.page.evaluate("document.activeElement.id") == "gain-value"
+    press("Control+a")
+    press("2")
+    assert (field.input_value(), page.stats["mode"], page.stats["picked"]) == ("2", "model", 12)
+    press("Control+i")
+    assert page.stats["picked"] == NUM - 12
+    press("Space")
+    assert page.stats["playing"]
+
+
+def test_the_count_tells_copies_apart(opened, compact):
+    page = opened(compact)
+    page.page.keyboard.press("e")
+    shown = page.page.locator("#picked")
+    select(page, range(12))
+    assert shown.inner_text() == "12 selected"
+    page.page.locator("#copies").fill("2")
+    page.page.click("#duplicate")
+    assert shown.inner_text() == "24, copies of 12"
+    select(page, range(36))  # each with its copies behind it
+    assert shown.inner_text() == "36, copies of 12"
+
+
+def test_the_keyboard_alone_selects_and_edits(opened, compact):
+    page = opened(compact)
     page.page.keyboard.press("r")
     page.page.locator("#canvas").focus()
     press = page.page.keyboard.press
@@ -205,8 +228,8 @@ def test_the_keyboard_alone_selects_and_edits(edited, compact):
     assert [step.get("do") for step in page.stats["steps"]] == [None, "multiply", "vanish"]
 
 
-def test_fingers_brush_and_pinch(edited, compact):
-    page = edited(compact, has_touch=True)
+def test_fingers_brush_and_pinch(opened, compact):
+    page = opened(compact)
     page.page.keyboard.press("b")
     box = page.page.locator("#canvas").bounding_box()
     touch = page.context.new_cdp_session(page.page)

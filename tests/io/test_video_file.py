@@ -119,9 +119,20 @@ def test_frame_range_is_half_open(clip_file, frames, first, count):
         ((1, 5000), (5000, 16), (0, 1, 2499, 2500)),
     ],
 )
-def testaspect_window(have, want, window):
+def test_aspect_window(have, want, window):
     rows, columns = resizing.aspect_window(have, want)
     assert (rows.start, rows.stop, columns.start, columns.stop) == window
+
+
+def test_a_size_that_crops_much_is_reported(clip_file):
+    """The clip is of 48x64, or another 3:4."""
+    height, width = read_video(clip_file).size
+    assert read_video(clip_file, size=(height // 2, width // 2)).notes == ()
+    (note,) = read_video(clip_file, size=(width // 2, height // 4)).notes
+    assert note.endswith("keeps all of them.")
+    whole = tuple(int(side) for side in note.split()[-5].split("x"))
+    assert read_video(clip_file, size=whole).notes == ()
+    assert abs(whole[0] / whole[1] - height / width) < 0.05
 
 
 def test_enlarging_is_cubic_and_centred(clip_file):

@@ -313,10 +313,11 @@ def test_a_fit_by_minutes_resumes_exactly():
 
 
 def test_more_time_means_more_gaussians():
-    """Up to parameters of 16 bits as large as the frames; a fraction of the pixels suffices for a fraction of them."""
+    """Up to a number for each pixel, and parameters of 16 bits as large as the frames; fewer pixels take fewer."""
     number = [chosen_num_gaussians(FitConfig(minutes=m), 80, 480, 854) for m in (0.1, 1.0, 10.0, 100.0, 1000.0)]
     assert number[0] < number[1] < number[2] <= number[3] == number[4]
-    assert number[-1] * 2 * (11 + 2 * 3) == pytest.approx(80 * 480 * 854 * 3, rel=1e-4)
+    large = FitConfig(minutes=1000.0, degree=15)
+    assert chosen_num_gaussians(large, 80, 480, 854) * 2 * (11 + 2 * 15) == pytest.approx(80 * 480 * 854 * 3, rel=1e-4)
     by_steps = [chosen_num_gaussians(FitConfig(steps=n), 80, 480, 854) for n in (10, 1000, 10_000)]
     assert by_steps[0] < by_steps[1] < by_steps[2]
     both = chosen_num_gaussians(FitConfig(minutes=1000.0, steps=1000), 80, 480, 854)

@@ -33,7 +33,7 @@ from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.tradeoff import to_half_precision
 
 Score = Callable[[VideoModel], Evaluation]
-#: A compact file that is better than its model by more dB than this causes a warning.
+#: Fine-tuning that is better than the model by more dB than this causes a warning.
 MAX_GAIN_DB = 0.5
 
 
@@ -53,7 +53,7 @@ def compress_command(
     ] = None,
     passes: Annotated[
         int, typer.Option(help="Passes over VIDEO that reduce the loss by rounding; 0: only round.", min=0)
-    ] = 24,
+    ] = 48,
     frames: Annotated[
         str | None, typer.Option(metavar="A:B", help="Frames of VIDEO [default: those that it was fitted to].")
     ] = None,
@@ -142,16 +142,20 @@ def _write_compressed(
     with Progress(*columns, console=err, disable=not err.is_terminal, transient=True) as bar:
         task = bar.add_task("Compressing", total=None)  # the number of trials is unknown
 
+        gain = 0.0
+
         def show(what: str, loss: float) -> None:
+            nonlocal gain
+            gain = gain if math.isnan(loss) else max(gain, -loss)
             text = f"Compressing: {what}" + ("" if math.isnan(loss) else f", {loss:.3f} dB lost")
             bar.update(task, description=text)
 
         given = None if clip is None else clip.frames
         made = compress(model, given, max_loss_db=max_loss_db, psnr=known_psnr, passes=passes, on_step=show)
-    if passes and made.loss_db < -MAX_GAIN_DB:
+    if passes and gain > MAX_GAIN_DB:
         warn(
-            f"the compact file is {-made.loss_db:.1f} dB closer to the clip than the model. Either its fit had not "
-            "converged, or it was edited, and the passes have undone the edits. --passes 0 only rounds."
+            f"fine-tuning came {gain:.1f} dB closer to the clip than the model. Either its fit had not converged, or "
+            "it was edited, and the passes have undone the edits. --passes 0 only rounds."
         )
     save_compressed(target, made, about, known=clip is not None or known_psnr is not None)
     if clip is None:

@@ -12,6 +12,7 @@ from foldgauss.cli.fitting.progress import Display
 from foldgauss.cli.fitting.workers import WorkerOptions
 from foldgauss.cli.shared.rendering import progress_bar
 from foldgauss.cli.shared.tables import format_count, print_figures
+from foldgauss.io.media.resizing import describe_crop
 from foldgauss.jobs import FitJob, JoinedFit, LongFit, Outcome, plan_long_fit, segments_folder
 from foldgauss.jobs.job import read_record
 from foldgauss.jobs.segments import SEGMENT_SECONDS, read_segment_seconds
@@ -147,10 +148,10 @@ def _print_plan(fit: LongFit, config: FitConfig, display: Display, video: Path, 
     index = fit.index
     if index.num_declared > index.num_frames:
         warn(f"only {index.num_frames} of {index.num_declared} frames of {video} decode; those are used.")
-    for note in index.notes:
-        warn(f"{video}: {note}")
     lengths = [stop - first for first, stop in fit.spans]
     size = index.size if fit.jobs[0].size is None else fit.jobs[0].size
+    for note in (*index.notes, *describe_crop([index.size], size)):
+        warn(f"{video}: {note}")
     longest = fit.jobs[lengths.index(max(lengths))].config  # with its part of the file's size
     num, at_most = plan_gaussians(longest, max(lengths), *size, threads=options.threads)
     if display == "json":

@@ -20,7 +20,7 @@ from foldgauss.io.media.decoder import DecodedFrame, VideoDecoder
 from foldgauss.io.media.frame_index import FrameIndex, digest_frame
 from foldgauss.io.media.frame_rate import FrameRate, describe_rate
 from foldgauss.io.media.image_files import read_images
-from foldgauss.io.media.resizing import convert_channels, make_resizer
+from foldgauss.io.media.resizing import convert_channels, describe_crop, make_resizer
 from foldgauss.io.media.video_decoding import describe_span
 from foldgauss.io.media.video_reading import choose_reader
 
@@ -62,9 +62,10 @@ def read_indexed(index: FrameIndex, first: int, stop: int | None, *, size: tuple
         num_declared, rate, notes = describe_span(index.report, stamps, places, high - low, index.start + first, end)
     elif stop is None:
         num_declared = index.num_declared - first
+    crop = () if size is None else describe_crop([index.size], size)
     if index.fixed_fps is not None:
-        return Clip(frames, index.fixed_fps, index.source, num_declared, None, notes)
-    return Clip(frames, float(rate.fps), index.source, num_declared, rate.times, notes + describe_rate(rate))
+        return Clip(frames, index.fixed_fps, index.source, num_declared, None, notes + crop)
+    return Clip(frames, float(rate.fps), index.source, num_declared, rate.times, notes + describe_rate(rate) + crop)
 
 
 def _check_span(index: FrameIndex, first: int, stop: int | None) -> tuple[int, int | None]:

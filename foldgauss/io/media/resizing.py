@@ -9,6 +9,8 @@ import numpy as np
 from foldgauss.io.media.clip import format_size, video_error
 
 BLOCK_BYTES = 64 << 20
+#: Fraction of a frame, above which a crop to another aspect is reported: 16:9 to 2:1, a ninth, is not.
+CROP_REPORTED = 0.15
 
 
 def memory_limit() -> int:
@@ -57,6 +59,18 @@ def aspect_window(have: tuple[int, int], want: tuple[int, int]) -> tuple[slice, 
     else:
         window = max(1, round(width * want[0] / want[1])), width
     return center_window(have, window)
+
+
+def describe_crop(sizes: Iterable[tuple[int, int]], want: tuple[int, int]) -> tuple[str, ...]:
+    """A note if the aspect of `want` keeps little of frames of these `sizes`; otherwise nothing."""
+    for height, width in sizes:
+        rows, columns = aspect_window((height, width), want)
+        lost = 1 - (rows.stop - rows.start) * (columns.stop - columns.start) / (height * width)
+        if lost > CROP_REPORTED:
+            scale = (want[0] * want[1] / (height * width)) ** 0.5
+            whole = f"{max(1, round(scale * height))}x{max(1, round(scale * width))}"
+            return (f"{want[0]}x{want[1]} crops {lost:.0%} of frames of {height}x{width}; {whole} keeps all of them.",)
+    return ()
 
 
 def center_window(have: tuple[int, int], window: tuple[int, int]) -> tuple[slice, slice]:

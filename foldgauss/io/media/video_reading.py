@@ -19,7 +19,7 @@ from foldgauss.io.media.clip import (
 from foldgauss.io.media.format_detection import may_be_animation
 from foldgauss.io.media.frame_rate import describe_rate
 from foldgauss.io.media.image_files import is_image_file, read_animation, read_folder, read_image_file
-from foldgauss.io.media.resizing import make_resizer, stack_frames, unify_channels
+from foldgauss.io.media.resizing import describe_crop, make_resizer, stack_frames, unify_channels
 from foldgauss.io.media.video_decoding import read_video_file
 
 
@@ -39,7 +39,7 @@ def read_video(
     to enlarge: (160, 320) of a 1280x720 clip is rows 40 to 680. `fps` overrides the rate of the container (25 for
     images). `center_crop = (height, width)` first crops that window around the center (an odd remainder is cut below
     and to the right). Frames are decoded one by one: memory is that of the output plus two source frames, and a clip
-    that would take over a third of the machine's memory is refused.
+    that would take over a third of the machine's memory is refused. `Clip.notes` reports a `size` that crops much.
 
     Images of 16 bits are scaled to 8, and so are videos of 10 or more; gray ones get three equal channels. Colors of
     videos are converted by the matrix and the range that the file declares (BT.601 and limited where it does not), with
@@ -55,7 +55,13 @@ def read_video(
     """
     path = check_readable(path)
     start, stop = check_range(frames)
-    prepare = make_resizer(check_frame_size(size), check_frame_size(center_crop, "center_crop"))
+    resize = make_resizer(check_frame_size(size), check_frame_size(center_crop, "center_crop"))
+    sizes = set()
+
+    def prepare(image):
+        sizes.add(image.shape[:2])
+        return resize(image)
+
     if fps is not None:
         check_fps(fps)
     with translate_os_errors(path):
@@ -66,6 +72,8 @@ def read_video(
     clip_fps, times = (rate.fps, rate.times) if fps is None else (fps, None)
     if fps is None:
         notes += describe_rate(rate)
+    if size is not None and center_crop is None:
+        notes += describe_crop(sizes, size)
     kept = unify_channels(kept)
     return Clip(stack_frames(kept), float(clip_fps), str(path), num_declared, times, notes)
 

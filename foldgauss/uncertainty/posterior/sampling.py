@@ -254,7 +254,8 @@ class _Run:
         )
         missing = self._missing_for_convergence(found, kept / tau)
         done = f"onverged after {steps * self.thin_by:,} steps"
-        message = f"Not c{done}: {'; '.join(missing)}. Give more steps." if missing else f"C{done}."
+        cure = "Give more steps" + (", or use the exact posterior." if "exact" in str(missing) else ".")
+        message = f"Not c{done}: {'; '.join(missing)}. {cure}" if missing else f"C{done}."
         identified = int(found.identified()[self.free].sum())
         if identified < len(self.free):
             message += f" {identified} of {len(self.free)} frame times are identified."

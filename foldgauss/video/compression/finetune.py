@@ -17,7 +17,7 @@ from foldgauss.video.models.sparse_storage import find_kinds
 from foldgauss.video.models.video_model import VideoModel
 
 #: Learning rates decay exponentially between these fractions of a fit's first ones: the model is near its optimum.
-FIRST_RATE, LAST_RATE = 0.3, 0.05
+FIRST_RATE, LAST_RATE = 0.4, 0.12
 PATH_AND_COLOR, COLOR = ("loc", "coefficients", "color_dc"), ("color_dc",)
 
 #: The planes (3, height, width) that frame k should match in a step, and the background colour (3,).

@@ -63,16 +63,15 @@ _FINEST, _COARSEST, _CLOSE = -8.0, 9.0, 0.05
 _WORTH = 40.0
 #: How much coarser, in powers of two, the first try with fine-tuning is; and the loss per power of two, dB.
 _COARSER, _SLOPE = 1.7, 0.7
-#: Loss in dB by dropping Gaussians, before the others are fine-tuned, for each pass and for an allowed loss of 1 dB;
-#: it grows with the square root of the allowed loss. And the most.
-_DROPPED, _MAX_DROPPED = 0.5, 12.0
+#: Gaussians are dropped in stages, each of passes / 2 passes: first as many as lose so many dB before the others are
+#: fine-tuned, and half as many after each stage that lost more than this fraction of the allowed loss.
+_STAGES, _STAGES_OF_PASSES, _FIRST_DROPPED, _DROPPING = 5, 2, 4.0, 0.4
+#: How much coarser, in powers of two, the steps may be at which a Gaussian that is dropped is not worth its bits.
+_MAX_COARSER = 24.0
 #: Tries with fine-tuning, each of passes / 4 + passes / 8 passes; and the fraction of the allowed loss that ends them.
 _TRIES, _ENOUGH = 6, 0.9
 #: Most powers of two by which a try may extrapolate.
 _MAX_EXTRAPOLATION = 2.0
-#: Fraction of the allowed loss that dropping Gaussians may cost after fine-tuning the others; if it costs more, half of
-#: the loss before is tried, up to this many times in all.
-_DROPPING, _DROPS = 0.4, 3
 #: Fraction of the allowed squared error that reordering may add if all pairs whose order is given up are swapped; and
 #: fraction of the allowed loss that it may cost.
 _ORDERING = 0.3
@@ -108,7 +107,7 @@ def compress(
     *,
     max_loss_db: float = 0.2,
     psnr: float | None = None,
-    passes: int = 24,
+    passes: int = 48,
     on_step: Callable[[str, float], None] = lambda what, loss_db: None,
 ) -> Compressed:
     """Quantize `model` as coarsely as `max_loss_db` allows, in dB of the mean PSNR of all frames.
@@ -118,8 +117,8 @@ def compress(
     Frames beyond `EXACT_PSNR`, 58.9 dB, count as that. Gaussians are reordered where that is hardly visible; absent
     parameters (`FoldedSplats.degrees`, `static`, `opaque`) stay absent, and shared colours stay shared.
 
-    With the clip, fine-tuning compensates for losses and allows coarser steps: all leaves for `passes` passes once
-    Gaussians have been dropped, paths and colours for a quarter of them once geometry is rounded, colours for an eighth
+    With the clip, fine-tuning compensates for losses and allows coarser steps: all leaves for half of the `passes` each
+    time Gaussians have been dropped, paths and colours for a quarter once geometry is rounded, colours for an eighth
     once paths are. More passes make smaller files. With 0 passes every parameter is the model's own, rounded.
     `on_step(what, loss_db)` is called now and then, with NaN before anything has been measured.
 
@@ -195,15 +194,17 @@ def _search_finetuned(
             model, loss.target, math.ceil(fraction * passes), on_pass=lambda: on_step(what, math.nan), **how
         )
 
-    dropped = min(_DROPPED * passes * math.sqrt(max_loss), _MAX_DROPPED)
-    for _ in range(_DROPS):
-        kept = _Sorting(_drop(model, complete, loss, least, dropped))(_FIRST_ORDERING * loss.error)
-        kept = finetune(kept, 1, "fine-tuning after dropping Gaussians", seed=0, shared=index_colors(kept))
-        measured = loss(kept, loss.all_frames)
+    kept, plan, so_far, dropped = model, complete, 0.0, _FIRST_DROPPED
+    for stage in range(_STAGES):
+        trial = _Sorting(_drop(kept, plan, loss, least, max(so_far, 0.0) + dropped))(_FIRST_ORDERING * loss.error)
+        what = "fine-tuning after dropping Gaussians"
+        trial = finetune(trial, 1 / _STAGES_OF_PASSES, what, seed=stage, shared=index_colors(trial))
+        measured = loss(trial, loss.all_frames)
         on_step("dropped", measured)
         if measured <= _DROPPING * max_loss:
-            break
-        dropped /= 2  # too many to compensate for
+            kept, plan, so_far = trial, _Plan(trial), measured
+        else:
+            dropped /= 2  # too many to compensate for
     plan, factor = _Plan(_reorder(kept, loss, max_loss)), least + _COARSER
     best, tried = None, {}
     for _ in range(_TRIES):
@@ -254,7 +255,7 @@ def _next_factor(tried: dict[float, float], max_loss: float, least: float) -> fl
 
 def _drop(model: VideoModel, plan: "_Plan", loss: "_Loss", least: float, most: float) -> VideoModel:
     """The model without as many of the Gaussians that matter least as costs at most `most` dB."""
-    fine, coarse = least, least + 2 * _MAX_DROPPED
+    fine, coarse = least, least + _MAX_COARSER
     while coarse - fine > 2 * _CLOSE:
         middle = (fine + coarse) / 2
         lost = loss(_take(model, plan.keep(middle)), loss.sampled_frames)

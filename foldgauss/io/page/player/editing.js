@@ -2,7 +2,8 @@
 import { History, inEffect } from "./history.js";
 import { fromRanges, toRanges } from "./indices.js";
 import { applyStep } from "./operations.js";
-import { begin, countOf, originalsOf, withOriginals } from "./state.js";
+import { checkSize } from "./sizes.js";
+import { begin, countOf, fileCountOf, originalsOf, withOriginals } from "./state.js";
 
 /** States kept from the last steps, so that undoing and sliders begin there. */
 const KEPT = 8;
@@ -16,7 +17,9 @@ const COMBINE = {
 };
 
 export class Editing {
-  constructor() {
+  /** `counts`: the number of Gaussians of each segment. */
+  constructor(counts) {
+    this.counts = counts;
     this.history = new History();
     this.history.onChange = () => this.onChange();
     this.chains = new Map(); // by segment: the model of the file, and [{step, state}] after each step
@@ -24,11 +27,11 @@ export class Editing {
     this.onChange = () => {};
   }
 
-  /** The state of a segment whose model, as in the file, is `base`. */
-  stateOf(number, base) {
+  /** The state of a segment whose model, as in the file, is `base`, after steps. */
+  stateOf(number, base, steps = this.history.current) {
     let chain = this.chains.get(number);
     if (chain?.base !== base) this.chains.set(number, (chain = { base, begun: begin(base), links: [] }));
-    const steps = this.history.current, { links } = chain;
+    const { links } = chain;
     let common = 0;
     while (common < links.length && common < steps.length && links[common].step === steps[common]) common++;
     links.length = common;
@@ -109,9 +112,18 @@ export class Editing {
    * display where that is not possible; nothing is changed then.
    */
   edit(step, amend = false) {
-    if (step.do === "multiply") for (const [number, { base }] of this.chains) this.apply(this.stateOf(number, base), step, number, base);
-    if (amend && isAlike(this.history.last, step)) this.history.amend(step);
-    else this.history.push(step);
+    const { history } = this, amends = amend && isAlike(history.last, step), before = history.current.slice(0, amends ? -1 : undefined);
+    if (step.do === "multiply") this.checkMultiply(before, step);
+    if (amends) history.amend(step);
+    else history.push(step);
+  }
+
+  checkMultiply(before, step) {
+    this.counts.forEach((num, number) => {
+      const { base } = this.chains.get(number) ?? {};
+      if (base) this.apply(this.stateOf(number, base, before), step, number, base);
+      else checkSize([...before, step], number, num);
+    });
   }
 
   /** Replace the edit by the steps of a script; it can be undone. `held` and errors: as of `check`. */
@@ -120,16 +132,25 @@ export class Editing {
     this.history.push({ script: steps });
   }
 
-  /** Throw an Error for display where the steps of a history cannot be applied to the segments {number: {base}} of `held`. */
+  /** Throw an Error for display where the steps of a history cannot be applied; `held`: {number: {base}}, segments decoded. */
   check(steps, held) {
     const ends = steps.map((_, k) => k + 1).filter((k) => k === steps.length || steps[k].script); // of all that undo leads to
-    for (const [number, { base }] of held)
-      for (const end of ends) inEffect(steps.slice(0, end)).reduce((state, step) => this.apply(state, step, number, base), begin(base));
+    for (const own of ends.map((end) => inEffect(steps.slice(0, end))))
+      this.counts.forEach((num, number) => {
+        const { base } = held.get(number) ?? {};
+        if (base) own.reduce((state, step) => this.apply(state, step, number, base), begin(base));
+        else checkSize(own, number, num);
+      });
   }
 
   /** How many of a segment's current Gaussians are selected. */
   count(number, base) {
     return countOf(this.stateOf(number, base));
+  }
+
+  /** How many of a segment's Gaussians in the file they stem from. */
+  fileCount(number, base) {
+    return fileCountOf(this.stateOf(number, base), base.num);
   }
 }
 

@@ -20,7 +20,14 @@ export function fill(slider, value) {
 
 let hiding;
 
+/** Put the message into the open dialog, which covers the rest of the page, or back. */
+export function placeToast() {
+  const parent = [...document.querySelectorAll("dialog[open]")].at(-1) ?? document.body;
+  if (element("toast").parentElement !== parent) parent.append(element("toast"));
+}
+
 export function toast(text, milliseconds = 2600) {
+  placeToast();
   put("toast", text);
   element("toast").hidden = false;
   clearTimeout(hiding);

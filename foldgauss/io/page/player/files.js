@@ -5,6 +5,7 @@ import { writeSafetensors } from "./safetensors.js";
 import { readScript, writeScript } from "./script.js";
 import { Segments } from "./segments.js";
 import { openDialog } from "./shell.js";
+import { withoutUnseen } from "./state.js";
 import { Storage } from "./storage.js";
 
 const LONG = 8000; // milliseconds that a problem is shown
@@ -143,6 +144,11 @@ export class Files {
     }
   }
 
+  /** What the names of downloads begin with: beside `foldgauss view` that of the model's file, else the title. */
+  get stem() {
+    return this.server && this.isOfPage ? this.server.script.replace(/\.edit\.toml$/, "") : this.title;
+  }
+
   get script() {
     const { editing, segments } = this.player;
     return writeScript(editing.history.current, segments.counts, this.title);
@@ -155,13 +161,13 @@ export class Files {
   }
 
   downloadScript() {
-    download(new Blob([this.script], { type: "application/toml" }), `${this.title}.edit.toml`);
+    download(new Blob([this.script], { type: "application/toml" }), `${this.stem}.edit.toml`);
   }
 
   downloadModel() {
-    const { player: { state }, title } = this;
+    const { player: { state }, title, stem } = this;
     try {
-      download(writeSafetensors(state.model, { clip: title, edited: "foldgauss player" }), `${title}.edited.safetensors`);
+      download(writeSafetensors(withoutUnseen(state).model, { clip: title, edited: "foldgauss player" }), `${stem}.edited.safetensors`);
     } catch (error) {
       toast(error.message, LONG);
     }
@@ -188,7 +194,7 @@ export class Files {
   }
 
   discard() {
-    this.player.editing.load([], []);
+    this.player.editing.load([], this.player.segments.held);
     element("files").close();
     toast("The edit is discarded. Undo brings it back.");
   }

@@ -41,13 +41,17 @@ function nameOf(event) {
   return `${event.ctrlKey || event.metaKey ? "ctrl+" : ""}${event.altKey ? "alt+" : ""}${shift ? "shift+" : ""}${key}`;
 }
 
+/** Keys that a number field takes itself: digits, signs, e, what moves in it and deletes, and Ctrl with a, c, v, x. */
+const OF_NUMBERS = /^(ctrl\+[acvx]|(shift\+)?([\de+\-.,=]|arrow\w+|home|end|delete|backspace))$/;
+
 export function bindKeys(parts) {
   const keys = makeKeys(parts);
   document.addEventListener("keydown", (event) => {
-    if (document.querySelector("dialog[open]")) return;
-    const { target } = event, name = nameOf(event), does = keys[name] ?? (event.ctrlKey || event.altKey ? undefined : keys[name.replace("shift+", "")]);
+    const name = nameOf(event);
+    if (document.querySelector("dialog[open]") && !/^ctrl\+[os]$/.test(name)) return;
+    const { target } = event, does = keys[name] ?? (event.ctrlKey || event.altKey ? undefined : keys[name.replace("shift+", "")]);
     if (!does) return;
-    const typing = target.matches?.("input[type=number]") && !/^ctrl\+(shift\+)?[soz]$|escape/.test(name);
+    const typing = target.matches?.("input[type=number]") && OF_NUMBERS.test(name);
     const sliding = target.matches?.("input[type=range]:not(#scrub), select") && /^(shift\+)?(arrow|home|end)/.test(name);
     if (typing || sliding || (target.matches?.("button, select") && (event.key === " " || event.key === "Enter"))) return;
     event.preventDefault();

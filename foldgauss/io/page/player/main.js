@@ -63,6 +63,7 @@ async function start() {
     };
     document.title = element("title").textContent = title;
     controls ??= new Controls(player, files);
+    element("transport").hidden = false;
     notify("");
     controls.describe();
     files.attach(title);
@@ -75,6 +76,7 @@ async function start() {
     Object.defineProperties(window.foldgauss, Object.getOwnPropertyDescriptors(hooks(player, controls)));
   };
   const welcome = () => {
+    element("transport").hidden = true;
     notify(WELCOME);
     element("notice-open").hidden = false;
   };

@@ -46,10 +46,14 @@ function ordered(state, selectedFirst) {
   return gathered(state, source, Uint8Array.from(source, (i) => state.selected[i]));
 }
 
+/** Refuse more Gaussians than can be held. */
+export function checkTotal(total) {
+  if (total > MOST_GAUSSIANS) throw new Error(`offsets: expected at most ${MOST_GAUSSIANS.toLocaleString("en")} Gaussians with the copies, got ${total.toLocaleString("en")}. Select fewer, or make fewer copies.`);
+}
+
 /** Copies, each just behind what it is a copy of; they are the selection then, with the originals if asked for. */
 function multiplied(state, { offsets, delays = 0, scale = 1, degrees = 0, about, originals = false }) {
-  const total = state.model.num + countOf(state) * offsets.length;
-  if (total > MOST_GAUSSIANS) throw new Error(`offsets: expected at most ${MOST_GAUSSIANS.toLocaleString("en")} Gaussians with the copies, got ${total.toLocaleString("en")}. Select fewer, or make fewer copies.`);
+  checkTotal(state.model.num + countOf(state) * offsets.length);
   const source = [], copy = [];
   for (let i = 0; i < state.model.num; i++)
     for (let k = 0; k <= (state.selected[i] ? offsets.length : 0); k++) {

@@ -135,7 +135,7 @@ export class Panel {
     if (!player.highlighting) return;
     const count = editing.count(lead.number, lead.base);
     this.following.update(count);
-    put("picked", count ? `${count.toLocaleString("en")} ${segments.spans.length > 1 ? "in this segment" : "selected"}` : "Nothing selected");
+    put("picked", this.describe(count, editing.fileCount(lead.number, lead.base)));
     pressOne("tools", "tool", tools.name);
     pressOne("how", "how", tools.how);
     element("undo").disabled = !editing.history.canUndo;
@@ -151,9 +151,23 @@ export class Panel {
     this.showForms();
   }
 
+  /** How many are selected, and of how many of the file's they are copies. */
+  describe(count, inFile) {
+    const [all, own] = [count, inFile].map((number) => number.toLocaleString("en"));
+    if (!count) return "Nothing selected";
+    if (count > inFile) return `${all}, copies of ${own}`;
+    return `${all} ${this.player.segments.spans.length > 1 ? "in this segment" : "selected"}`;
+  }
+
   showSlide(name, own) {
     fill(element(name), own);
-    if (document.activeElement !== element(`${name}-value`)) element(`${name}-value`).value = own;
+    this.showNumber(`${name}-value`, own);
+  }
+
+  /** Show a number, unless it is the one being typed. */
+  showNumber(name, own) {
+    const input = element(name), isTyped = document.activeElement === input && (input.value === "" || Number(input.value) === own);
+    if (!isTyped) input.value = own;
   }
 
   /** Show the last edit in its form; all others are empty. */
@@ -167,7 +181,7 @@ export class Panel {
   }
 
   showInput(form, name, own) {
-    if (form.slides) return this.showSlide(name, own);
-    if (document.activeElement !== element(name) || Number(element(name).value) !== own) element(name).value = own;
+    if (form.slides) this.showSlide(name, own);
+    else this.showNumber(name, own);
   }
 }

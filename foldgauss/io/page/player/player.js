@@ -7,6 +7,7 @@ import { View, common } from "./view.js";
 
 export const SPEEDS = [1 / 16, 1 / 8, 1 / 4, 1 / 2, 1, 2];
 const HIGHLIGHT = 0.65;
+const COLORING = ["recolor", "opacity"];
 const MOST_PIXELS = 6e6;
 const SLOW = 1 / 27, FAST = 1 / 50; // seconds per image: render fewer pixels, more pixels
 
@@ -27,7 +28,7 @@ export class Player {
     this.originals = originals ?? new Originals([], () => {});
     this.originals.onReady = () => this.invalidate();
     this.mode = "model";
-    this.editing = new Editing();
+    this.editing = new Editing(segments.counts);
     this.editing.onChange = () => this.changed();
     this.seen = this.lead = null;
     this.goTo(0);
@@ -194,13 +195,19 @@ export class Player {
     this.drawTo({
       width: size[0], height: size[1], unit: k * Math.max(frame.width, frame.height), origin: middle.map((own) => k * own),
       // The low-pass filter of the fit, in the model's pixels, whatever their size here.
-      lowPass: this.base.header.options.low_pass * Math.max(k * frame.scale, 1) ** 2,
+      lowPass: this.base.header.options.low_pass * Math.max(k * frame.scale, 1) ** 2, isExact: !this.playing,
     });
     return [0, 0, (visible.width * k) / size[0], (visible.height * k) / size[1]];
   }
 
+  /** Whether the selection is tinted: not after an edit of its colour, which the tint would hide, until the next step. */
+  get isTinted() {
+    const { draft, history } = this.editing;
+    return this.highlighting && (draft !== null || !COLORING.includes(history.last?.do));
+  }
+
   drawTo(target) {
-    const highlight = this.highlighting ? HIGHLIGHT : 0;
+    const highlight = this.isTinted ? HIGHLIGHT : 0;
     this.alive = 0;
     const parts = this.seen.map(({ number, base, time, weight }) => {
       const state = this.editing.stateOf(number, base), instances = this.instances(state, time, highlight > 0);
@@ -243,7 +250,7 @@ export class Player {
     const [rows, columns] = this.base.header.size, aspect = rows / columns;
     const unit = Math.max(height / Math.min(1, aspect), width / Math.min(1, 1 / aspect));
     const lowPass = this.base.header.options.low_pass;
-    this.drawTo({ width, height, unit, origin: [width / 2, height / 2], lowPass });
+    this.drawTo({ width, height, unit, origin: [width / 2, height / 2], lowPass, isExact: true });
     return this.renderer.read(this.background);
   }
 

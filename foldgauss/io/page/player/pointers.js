@@ -9,6 +9,10 @@ export class Pointers {
     Object.assign(this, { player, screen, tools, pointers: new Map(), cursor: null });
     const canvas = element("canvas");
     canvas.addEventListener("pointerdown", (event) => this.down(event));
+    canvas.addEventListener("mousedown", (event) => { // keys are the page's then, not those of a field, nor of the canvas
+      event.preventDefault();
+      document.activeElement.blur();
+    });
     canvas.addEventListener("pointermove", (event) => this.moved(event));
     for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, (event) => this.up(event));
     canvas.addEventListener("pointerleave", () => (element("cursor").hidden = true));

@@ -55,7 +55,7 @@ export class Recording {
     this.draw(canvas.getContext("2d"), width, height);
     player.invalidate();
     const frame = Number(player.position.toFixed(2));
-    canvas.toBlob((picture) => download(picture, `${files.title}-${frame}.png`), "image/png");
+    canvas.toBlob((picture) => download(picture, `${files.stem}-${frame}.png`), "image/png");
   }
 
   /** Frames from one to another at a speed. */
@@ -101,7 +101,7 @@ export class Recording {
       for (let k = 0; k < 3; k++, await pause(tick)) track.requestFrame();
       recorder.stop();
       await ended;
-      download(new Blob(parts, { type: this.type }), `${this.files.title}.${this.suffix}`);
+      download(new Blob(parts, { type: this.type }), `${this.files.stem}.${this.suffix}`);
       if (this.stopped) toast("Recorded up to here.");
     } catch (error) {
       toast(`Not recorded: ${error.message}`, 8000);

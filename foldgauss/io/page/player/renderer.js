@@ -1,4 +1,4 @@
-// WebGL2: renders the Gaussians of one time into a half-float texture, and shows it on the screen.
+// WebGL2: renders the Gaussians of one time into a texture of floats, and shows it on the screen.
 import { TEXTURE_WIDTH } from "./gaussians.js";
 import splatVertex from "./splat.vert.glsl";
 import splatFragment from "./splat.frag.glsl";
@@ -46,25 +46,24 @@ function texture(gl, filter) {
   return made;
 }
 
-/** A texture to render into, resized on demand. */
+/** A texture to render into, of a size and a format set on demand. */
 class Target {
-  constructor(gl, format) {
+  constructor(gl) {
     this.gl = gl;
-    this.format = format;
     this.texture = texture(gl, gl.LINEAR);
     this.buffer = gl.createFramebuffer();
     this.width = this.height = 0;
   }
 
-  bind(width, height) {
+  bind(width, height, format) {
     const { gl } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.buffer);
     gl.viewport(0, 0, width, height);
-    if (width === this.width && height === this.height) return;
-    [this.width, this.height] = [width, height];
+    if (width === this.width && height === this.height && format === this.format) return;
+    Object.assign(this, { width, height, format });
     gl.bindTexture(gl.TEXTURE_2D, this.texture);
-    const kind = this.format === gl.RGBA16F ? gl.HALF_FLOAT : gl.UNSIGNED_BYTE;
-    gl.texImage2D(gl.TEXTURE_2D, 0, this.format, width, height, 0, gl.RGBA, kind, null);
+    const kind = { [gl.RGBA32F]: gl.FLOAT, [gl.RGBA16F]: gl.HALF_FLOAT, [gl.RGBA8]: gl.UNSIGNED_BYTE }[format];
+    gl.texImage2D(gl.TEXTURE_2D, 0, format, width, height, 0, gl.RGBA, kind, null);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.texture, 0);
   }
 }
@@ -81,14 +80,17 @@ export class Renderer {
   /** Create all resources on the graphics card, also after its context was lost. */
   restore() {
     const { gl } = this;
-    const half = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
+    const floats = gl.getExtension("EXT_color_buffer_float"), half = floats || gl.getExtension("EXT_color_buffer_half_float");
+    const single = floats && gl.getExtension("EXT_float_blend") && gl.getExtension("OES_texture_float_linear");
+    this.fast = half ? gl.RGBA16F : gl.RGBA8; // while it plays: half floats are off by up to two levels of 255
+    this.exact = single ? gl.RGBA32F : this.fast;
     this.splat = program(gl, splatVertex, splatFragment);
     this.show = program(gl, showVertex, showFragment);
     this.blend = program(gl, showVertex, mixFragment);
-    this.rendered = new Target(gl, half ? gl.RGBA16F : gl.RGBA8);
-    this.mixed = new Target(gl, half ? gl.RGBA16F : gl.RGBA8);
+    this.rendered = new Target(gl);
+    this.mixed = new Target(gl);
     this.result = this.rendered; // the target that is shown
-    this.bytes = new Target(gl, gl.RGBA8);
+    this.bytes = new Target(gl);
     this.original = texture(gl, gl.LINEAR);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, 1, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, null);
     this.originalShown = null;
@@ -140,7 +142,7 @@ export class Renderer {
   /** Add the rendered part to the sum. */
   mix(weight, begin) {
     const { gl, rendered, blend: { made, at } } = this;
-    this.mixed.bind(rendered.width, rendered.height);
+    this.mixed.bind(rendered.width, rendered.height, rendered.format);
     gl.clearColor(0, 0, 0, 0);
     if (begin) gl.clear(gl.COLOR_BUFFER_BIT);
     gl.useProgram(made);
@@ -159,12 +161,12 @@ export class Renderer {
 
   /**
    * Render the listed Gaussians of a model, front to back, at a time, into width x height pixels. Of the target: `unit`,
-   * pixels per unit of model space; `origin`, the frame's centre; `lowPass` in px^2.
+   * pixels per unit of model space; `origin`, the frame's centre; `lowPass` in px^2; `isExact`: in single precision.
    */
-  drawOne({ model, instances, time, highlight }, { width, height, unit, origin, lowPass }) {
+  drawOne({ model, instances, time, highlight }, { width, height, unit, origin, lowPass, isExact }) {
     const { gl, splat: { made, at } } = this, { header } = model, { options } = header;
     const gaussians = this.take(model);
-    this.rendered.bind(width, height);
+    this.rendered.bind(width, height, isExact ? this.exact : this.fast);
     gl.disable(gl.SCISSOR_TEST);
     gl.clearColor(0, 0, 0, 1); // alpha holds the transmittance
     gl.clear(gl.COLOR_BUFFER_BIT);
@@ -240,7 +242,7 @@ export class Renderer {
   /** The rendered image as bytes: red, green, blue, 255, the top row first. */
   read(background) {
     const { gl, result: { width, height } } = this, bytes = new Uint8Array(4 * width * height);
-    this.bytes.bind(width, height);
+    this.bytes.bind(width, height, gl.RGBA8);
     this.put(WHAT.model, UPRIGHT, ALL_OF_IT, ALL_OF_IT, background);
     gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
     return bytes;

@@ -85,8 +85,11 @@ function rows(table, index, width) {
 
 /** A model as a file that foldgauss opens: float32, all leaves dense. Throws an Error for display where none can hold it. */
 export function writeSafetensors({ header, num, degree, leaves, intervals }, metadata) {
-  const outside = leaves.time_loc.reduce((sum, own) => sum + (own > 0 && own < 1 ? 0 : 1), 0);
-  if (outside) throw new Error(`${outside.toLocaleString("en")} Gaussians were moved in time beyond the clip, where no model file holds them. Download the script, and apply it with foldgauss edit.`);
+  const outside = leaves.time_loc.filter((own) => !(own > 0 && own < 1));
+  if (outside.length) {
+    const frames = intervals.length * outside.reduce((most, own) => Math.max(most, own - 1, -own), 0);
+    throw new Error(`${outside.length.toLocaleString("en")} Gaussians were moved in time beyond the clip, by up to ${frames.toFixed(1)} frames, where no model file holds them. Make Later, Speed or Delay that much less; or download the edit script, and render it: foldgauss edit MODEL SCRIPT --out edited.mp4.`);
+  }
   const logits = Float32Array.from(leaves.time_loc, (own) => Math.log(own) - Math.log1p(-own));
   const tensors = {
     "frame_times.logits": [intervals, [intervals.length]], "splats.angle_logit": [leaves.angle_logit, [num]],

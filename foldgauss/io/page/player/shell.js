@@ -1,5 +1,5 @@
 // What the page does without a model: light and dark, full screen, and the help.
-import { element, on, recall, remember, toast } from "./elements.js";
+import { element, on, placeToast, recall, remember, toast } from "./elements.js";
 
 const THEME = "foldgauss-theme";
 
@@ -18,6 +18,7 @@ export function toggleFull() {
 /** Show a dialog; its title has the focus, not a button, whose focus ring would distract. */
 export function openDialog(name) {
   element(name).showModal();
+  placeToast();
   element(element(name).getAttribute("aria-labelledby")).focus();
 }
 
@@ -35,4 +36,5 @@ export function bindShell() {
     on(`${name}-close`, "click", () => element(name).close());
     on(name, "click", (event) => event.target === element(name) && element(name).close());
   }
+  for (const dialog of document.querySelectorAll("dialog")) dialog.addEventListener("close", placeToast);
 }

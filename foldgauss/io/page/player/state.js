@@ -6,12 +6,19 @@ export function begin(model) {
   return { model, selected: new Uint8Array(model.num), origin: Uint32Array.from({ length: model.num }, (_, i) => i) };
 }
 
-const counts = new WeakMap(); // by selection, which is never changed in place
+const sum = (mask) => mask.reduce((total, own) => total + own, 0);
+const counts = new WeakMap(), fileCounts = new WeakMap(); // by selection, which is never changed in place
 
 /** How many Gaussians are selected. */
 export function countOf({ selected }) {
-  if (!counts.has(selected)) counts.set(selected, selected.reduce((sum, own) => sum + own, 0));
+  if (!counts.has(selected)) counts.set(selected, sum(selected));
   return counts.get(selected);
+}
+
+/** How many of the file's `num` Gaussians are selected: copies of one count once. */
+export function fileCountOf(state, num) {
+  if (!fileCounts.has(state.selected)) fileCounts.set(state.selected, sum(originalsOf(state, num)));
+  return fileCounts.get(state.selected);
 }
 
 /** The selected Gaussians' indices. */
@@ -44,6 +51,13 @@ export function withChanged(state, names, change) {
     fillTexels(values, i, leaves, model.texels, model.degree);
   }
   return { ...state, model: { ...model, leaves, values } };
+}
+
+/** The state without the Gaussians that were moved in time so far beyond the clip that no image of it has them. */
+export function withoutUnseen(state) {
+  const { num, leaves: { time_loc: times }, windows } = state.model, kept = [];
+  for (let i = 0; i < num; i++) if ((times[i] > 0 && times[i] < 1) || (windows[2 * i] < 1 && windows[2 * i + 1] > 0)) kept.push(i);
+  return kept.length === num ? state : gathered(state, kept, Uint8Array.from(kept, (i) => state.selected[i]));
 }
 
 /** The state of the Gaussians at the indices `source`, which may repeat or leave some out, with this selection. */

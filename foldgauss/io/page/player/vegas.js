@@ -14,7 +14,7 @@ const NOTE = "comment foldgauss ";
 /** {header, leaves}. `given`: {size, fps}, which files of the published code lack: an Error says so by `missing`. */
 export function readVegas(buffer, given) {
   const { elements, note } = readPly(buffer), { vertex, time } = elements;
-  if (!vertex?.m_0 && vertex?.f_dc_0) throw new Error("This is a still 3DGS scene, in space. The player shows videos in a plane: open it in SuperSplat, or give foldgauss a video.");
+  if (!vertex?.m_0 && vertex?.f_dc_0) throw new Error("This is a still 3DGS scene, in space. The player shows videos in a plane: open it in SuperSplat. Of a frame that foldgauss exported, open the model itself.");
   if (!vertex?.m_0 || !vertex.sigma_0 || !vertex.rot_0 || !time) throw new Error("This PLY file is no video of VeGaS, which has m_0, sigma_0, rot_0 and an element time. Is it the right file?");
   const size = note.size ?? given.size, fps = note.fps ?? given.fps;
   if (!size || !fps) throw Object.assign(new Error("A VeGaS file holds neither the size nor the rate of its video."), { missing: true });

@@ -29,6 +29,9 @@ from foldgauss.video.motion.optical_flow import Motion
 MAX_BORN = 4
 #: How often a fit is trimmed at its end, and the fraction of its parameters that is worth another time.
 MAX_TRIMS, MIN_TRIM = 8, 0.002
+#: A round is tried again with these fractions of what it would prune, where the mean PSNR falls by more than so many dB
+#: below the target: the remaining Gaussians do not grow over a large region that nothing covers.
+LESS, MAX_SHORTFALL = (0.5, 0.25, 0.1), 6.0
 #: Colors and shapes are shared, and opacities left out, only so many rounds before the last, in plans that have them:
 #: these correct for it.
 LATE_ROUNDS = 1
@@ -63,6 +66,10 @@ class Pruner:
         room = allowed_error(economy, scores, psnr, progress)
         late = steps[max(len(steps) // 2, len(steps) - 1 - LATE_ROUNDS)]
         pruned = self._prune_rows(state, scores, room, allow_opaque=state.step >= late)
+        for fraction in LESS:
+            if not self._falls_far_below(state, pruned):
+                break
+            pruned = self._prune_rows(state, scores, room, allow_opaque=state.step >= late, fraction=fraction)
         survived = state.newborn[pruned.stay].sum() / max(state.newborn.sum(), 1) if state.step > steps[0] else 1.0
         _keep(state, pruned, config.degree)
         if state.step == late and not growing and state.statistics is None:  # newborn Gaussians share nothing
@@ -105,17 +112,33 @@ class Pruner:
                 return True
         return False
 
+    def _falls_far_below(self, state: FitState, pruned: PrunedRows) -> bool:
+        """Whether the images after pruning are far below the target PSNR; never without one."""
+        if self._config.economy.psnr is None:
+            return False
+        trial = dataclasses.replace(state)
+        _keep(trial, pruned, self._config.degree)
+        return mean_psnr(trial, self._config, self._frames) < self._config.economy.psnr - MAX_SHORTFALL
+
     def _prune_rows(
-        self, state: FitState, scores: PruningScores, room: float | None, *, allow_opaque: bool = True
+        self,
+        state: FitState,
+        scores: PruningScores,
+        room: float | None,
+        *,
+        allow_opaque: bool = True,
+        fraction: float = 1.0,
     ) -> PrunedRows:
+        """What a round keeps; with a `fraction` of the error that it may add and of the Gaussians that it may drop."""
+        economy = self._config.economy
         return prune_rows(
             state.rows,
             state.kinds,
             scores,
-            self._config.economy,
+            dataclasses.replace(economy, most_dropped=fraction * economy.most_dropped),
             degree=self._config.degree,
             pixels=pixels_per_unit(self._spec.size),
-            room=room,
+            room=None if room is None else fraction * room,
             progress=min(state.step / state.plan, 1.0),
             shares_sizes=len(state.shapes.index) > 0,
             # Resets of opacity make none; and what is opaque early hides for good what others could become.
