@@ -138,7 +138,7 @@ def searched(moving, monkeypatch):
 def test_the_gaussians_of_the_object_are_found(moving):
     _, label, found = moving
     assert found.mask[label == DISC].mean() > 0.95  # the largest, in front
-    assert found.mask[label == BACKGROUND].mean() < 0.1
+    assert found.mask[label == BACKGROUND].mean() < 0.2
 
 
 def test_select_combines_motion_with_other_criteria(moving, searched):

@@ -13,15 +13,20 @@ from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.video.motion.optical_flow import both_flows, pixel_grid, warp_image
 
-#: The longer side, in pixels, of the images that flow is computed on, and the distance of the points in them.
-SIDE, SPACING = 480, 6
+#: The longer side, in pixels, of the images that flow is computed on, unless small frames would be enlarged by more
+#: than the second; and the distance of the points in them.
+SIDE, LARGEST_SCALE, SPACING = 480, 2.0, 6
 #: A point is used where forward and backward flow agree within this many pixels, and this fraction of the distance.
-MISS, MISS_FRACTION = 0.3, 0.05
+#: Another shot begins where less than the last fraction of the points does. (Between frames of two clips it was 0.05
+#: at most, within shots 0.84 at least.)
+MISS, MISS_FRACTION, LEAST_KNOWN = 1.0, 0.1, 0.3
 #: MAGSAC: the largest scale of noise in pixels, and iterations at most.
 NOISE, ITERATIONS = 0.5, 2000
-#: Another shot begins where less than this fraction of the points follows one homography (as for the camera's path);
-#: frames are aligned with one that is further away, so that errors do not add up, while it is more than the second.
-LEAST_INLIERS, KEY_INLIERS = 0.08, 0.35
+#: Frames are aligned with one that is further away, so that errors do not add up, while this fraction of the points
+#: follows one homography.
+KEY_INLIERS = 0.35
+#: A homography has 8 parameters, of which a point gives two.
+LEAST_POINTS = 8
 #: A plate is the median of at most so many frames, of those at most so far away.
 PLATE_FRAMES, PLATE_REACH = 14, 40
 #: Holes of a plate are filled from frames in which at least this fraction of a pixel is uncovered.
@@ -35,7 +40,7 @@ Masks = Bool[np.ndarray, "frames height width"]
 
 @dataclasses.dataclass(frozen=True)
 class Alignment:
-    """How the background of each frame moves to the others, on images whose longer side is `SIDE`.
+    """How the background of each frame moves to the others, on images of about `SIDE` pixels.
 
     `images` are the frames of that size, in gray; `there` and `back` the flow between neighbors, both ways;
     `matrices` (frames, 3, 3) homographies from the first frame of a shot to each frame of it, in pixels of the images,
@@ -83,9 +88,9 @@ class Alignment:
 
 
 def resize_frames(frames: Frames) -> UInt8[np.ndarray, "frames rows columns 3"]:
-    """The frames with a longer side of `SIDE` pixels: small ones are enlarged, so that all lengths are of one unit."""
+    """The frames with a longer side of `SIDE` pixels, or `LARGEST_SCALE` times as large."""
     height, width = frames.shape[1:3]
-    scale = SIDE / max(height, width)
+    scale = min(LARGEST_SCALE, SIDE / max(height, width))
     size = max(16, round(width * scale)), max(16, round(height * scale))
     how = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
     return np.stack([cv2.resize(frame, size, interpolation=how) for frame in frames])
@@ -213,24 +218,27 @@ def _align(one, other, start: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarra
 
 
 def find_homography(there, back, inside=None) -> tuple[Float[np.ndarray, "3 3"], float] | None:
-    """The homography that most points follow, and their fraction of all; None if less than `LEAST_INLIERS` do."""
+    """The homography that most points follow, and their fraction; None if the flow is that of two different scenes."""
     rows, columns = there.shape[:2]
     part = slice(SPACING // 2, None, SPACING)
     points, flow = pixel_grid(rows, columns)[part, part].reshape(-1, 2), there[part, part].reshape(-1, 2)
+    if inside is not None:
+        points, flow = points[inside[part, part].ravel()], flow[inside[part, part].ravel()]
+    if len(points) < LEAST_POINTS:
+        return None
     target = points + flow
     returned = warp_image(back, target[None], cv2.INTER_LINEAR)[0]
     known = ((target >= 0) & (target <= np.float32([columns - 1, rows - 1]))).all(1)
     known &= np.hypot(*(flow + returned).T) < MISS + MISS_FRACTION * np.hypot(*flow.T)
-    if inside is not None:
-        known &= inside[part, part].ravel()
-    if known.sum() < max(8, LEAST_INLIERS * len(points)):
+    if known.sum() < max(LEAST_POINTS, LEAST_KNOWN * len(points)):
         return None
     cv2.setRNGSeed(0)
     matrix, used = cv2.findHomography(
         points[known], target[known], cv2.USAC_MAGSAC, NOISE, maxIters=ITERATIONS, confidence=0.9999
     )
-    fraction = 0.0 if matrix is None else float(used.sum() / len(points))
-    return None if fraction < LEAST_INLIERS or np.linalg.det(matrix) <= 0 else (matrix, fraction)
+    if matrix is None or np.linalg.det(matrix) <= 0:
+        return np.eye(3), 0.0
+    return matrix, float(used.sum() / len(points))
 
 
 def _scale_pixels(size: tuple[int, int], to: tuple[int, int]) -> Float[np.ndarray, "3 3"]:
