@@ -25,6 +25,17 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 
+@pytest.fixture(scope="module")
+def optimized():
+    """Compiled as for users from here to the end of the module, for what depends on the last bits."""
+    jax.clear_caches()
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+    jax.clear_caches()
+
+
 def pytest_unconfigure():
     if _own_cache is not None:
         shutil.rmtree(_own_cache, ignore_errors=True)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from threadpoolctl import threadpool_info
 
 from foldgauss.video import Economy, FitConfig, Growth, compress, evaluate, fit
 
@@ -62,12 +63,12 @@ def machine() -> dict[str, str]:
 def record() -> dict:
     frames = clip()
     models = {name: fit(frames, config).model for name, config in CONFIGS.items()}
-    # What is compressed depends on the kernels of BLAS for the processor, too.
-    compact = compress(models["plain"], frames, max_loss_db=0.5).model
+    models["compact"] = compress(models["plain"], frames, max_loss_db=0.5).model
     return {
         "machine": machine(),
+        "blas": sorted(one["architecture"] for one in threadpool_info() if one["user_api"] == "blas"),
         "digests": {name: digest(model) for name, model in models.items()},
-        "psnr": {n: round(evaluate(m, frames).mean_psnr, 3) for n, m in (models | {"compact": compact}).items()},
+        "psnr": {name: round(evaluate(model, frames).mean_psnr, 3) for name, model in models.items()},
     }
 
 

@@ -112,7 +112,7 @@ def test_an_edit_that_is_fitted_away_is_told(work, tmp_path, capsys):
     assert run("compress", path, work / "clip", "--passes", 2, "--out", tmp_path / "bright.fgz") == 0
     assert re.search(r"warning: fine-tuning came \d+\.\d dB closer to the clip", capsys.readouterr().err)
     assert run("compress", path, work / "clip", "--passes", 0, "--out", tmp_path / "rounded.fgz") == 0
-    assert "nearer" not in capsys.readouterr().err
+    assert "closer" not in capsys.readouterr().err
 
 
 def test_without_the_clip(work, tmp_path, capsys):

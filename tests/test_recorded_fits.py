@@ -5,7 +5,6 @@ import hashlib
 import json
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 import recorded_fits
@@ -22,20 +21,18 @@ ELSEWHERE_DB = 0.5
 
 
 @pytest.fixture(scope="module")
-def now():
-    """Compiled as for users: the suite turns most of XLA's optimizations off."""
-    jax.clear_caches()
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", False)
-    yield recorded_fits.record()
-    jax.config.update("jax_disable_most_optimizations", before)
-    jax.clear_caches()
+def now(optimized):
+    return recorded_fits.record()
 
 
-@pytest.mark.parametrize("name", RECORDED["psnr"])
+@pytest.mark.parametrize("name", RECORDED["digests"])
 def test_fit_has_the_recorded_bits(now, name):
-    """Equal to the bit on the recorded kind of machine with the recorded versions; elsewhere, as good."""
-    if now["machine"] == RECORDED["machine"] and name in now["digests"]:
+    """Equal to the bit on the recorded kind of machine with the recorded versions; elsewhere, as good.
+
+    What is compressed depends on the kernels that BLAS chooses for the processor, too.
+    """
+    same_machine = now["machine"] == RECORDED["machine"]
+    if same_machine and (name != "compact" or now["blas"] == RECORDED["blas"]):
         assert now["digests"][name] == RECORDED["digests"][name]
     else:
         assert abs(now["psnr"][name] - RECORDED["psnr"][name]) < ELSEWHERE_DB

@@ -124,13 +124,15 @@ def test_step_matches_the_cpu(progress):
     assert np.abs(there.rows - warm_state(CONFIG).rows).max() > 1e-3  # it did step
 
 
-def test_step_with_interpolated_frames_matches_the_cpu():
-    """A batch of frames and of images between frames."""
+@pytest.mark.parametrize("progress", [0.1, pytest.param(0.8, marks=pytest.mark.slow)], ids=["mixed", "frames alone"])
+def test_step_with_interpolated_frames_matches_the_cpu(progress):
+    """A batch of frames and of images between frames, and later one of frames alone."""
     config = dataclasses.replace(CONFIG, batch_size=4, interpolation_fraction=0.5)
     chosen = CpuStepper(FRAMES, config, start(FRAMES, config)).interpolation.choose
     views = choose_views(config, len(FRAMES), 20, warm_state(config).frame_errors)
     assert 0 < sum(chosen(20, 0.1, int(k)) is not None for k in views) < 4
-    compare_steps(config, 0.1)
+    _, there = compare_steps(config, progress)
+    assert np.abs(there.rows - warm_state(config).rows).max() > 1e-3  # it did step
 
 
 @pytest.mark.slow

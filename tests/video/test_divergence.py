@@ -20,7 +20,7 @@ RATES = LearningRates()
 
 
 @pytest.fixture(scope="module")
-def usual() -> float:
+def usual(optimized) -> float:
     """dB of the fit that nothing happens to."""
     return evaluate(fit(CLIP, CONFIG).model, CLIP).mean_psnr
 
@@ -92,7 +92,7 @@ def test_exploding_folds_are_named(usual):
 
     with pytest.warns(DivergenceWarning, match="dB worse than they were; coefficients moved most"):
         got = _fit_with(explode, dataclasses.replace(CONFIG, quarter_fraction=0, half_fraction=0))
-    assert got > usual - 4
+    assert got > usual - 3
 
 
 def test_exhausted_backoffs_raise():

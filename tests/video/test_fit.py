@@ -14,7 +14,13 @@ from foldgauss._runtime import threads as _threads
 from foldgauss.render import RenderOptions
 from foldgauss.video import Economy, FitConfig, LearningRates, evaluate, fit, fit_steps, interpolated_times, psnr
 from foldgauss.video.fitting import loop as fit_module
-from foldgauss.video.fitting.config import chosen_interpolation, chosen_num_gaussians, planned_steps
+from foldgauss.video.fitting.config import (
+    MOST_PER_PIXEL,
+    TYPICAL_LIFETIME,
+    chosen_interpolation,
+    chosen_num_gaussians,
+    planned_steps,
+)
 from foldgauss.video.fitting.loop import check_frames, start, start_from, to_model
 from foldgauss.video.fitting.schedule import steps_per_pass
 from foldgauss.video.fitting.steppers import cpu_stepper
@@ -316,6 +322,8 @@ def test_more_time_means_more_gaussians():
     """Up to a number for each pixel, and parameters of 16 bits as large as the frames; fewer pixels take fewer."""
     number = [chosen_num_gaussians(FitConfig(minutes=m), 80, 480, 854) for m in (0.1, 1.0, 10.0, 100.0, 1000.0)]
     assert number[0] < number[1] < number[2] <= number[3] == number[4]
+    # Of so many alive in each pixel, each for as long as is assumed where no clip is known.
+    assert number[-1] == pytest.approx(MOST_PER_PIXEL * 80 * 480 * 854 / TYPICAL_LIFETIME, rel=1e-4)
     large = FitConfig(minutes=1000.0, degree=15)
     assert chosen_num_gaussians(large, 80, 480, 854) * 2 * (11 + 2 * 15) == pytest.approx(80 * 480 * 854 * 3, rel=1e-4)
     by_steps = [chosen_num_gaussians(FitConfig(steps=n), 80, 480, 854) for n in (10, 1000, 10_000)]

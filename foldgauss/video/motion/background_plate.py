@@ -13,9 +13,8 @@ from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.video.motion.optical_flow import both_flows, pixel_grid, warp_image
 
-#: The longer side, in pixels, of the images that flow is computed on, unless small frames would be enlarged by more
-#: than the second; and the distance of the points in them.
-SIDE, LARGEST_SCALE, SPACING = 480, 2.0, 6
+#: The longer side, in pixels, of the images that flow is computed on, and the distance of the points in them.
+SIDE, SPACING = 480, 6
 #: A point is used where forward and backward flow agree within this many pixels, and this fraction of the distance.
 #: Another shot begins where less than the last fraction of the points does. (Between frames of two clips it was 0.05
 #: at most, within shots 0.84 at least.)
@@ -40,7 +39,7 @@ Masks = Bool[np.ndarray, "frames height width"]
 
 @dataclasses.dataclass(frozen=True)
 class Alignment:
-    """How the background of each frame moves to the others, on images of about `SIDE` pixels.
+    """How the background of each frame moves to the others, on images whose longer side is `SIDE`.
 
     `images` are the frames of that size, in gray; `there` and `back` the flow between neighbors, both ways;
     `matrices` (frames, 3, 3) homographies from the first frame of a shot to each frame of it, in pixels of the images,
@@ -88,9 +87,9 @@ class Alignment:
 
 
 def resize_frames(frames: Frames) -> UInt8[np.ndarray, "frames rows columns 3"]:
-    """The frames with a longer side of `SIDE` pixels, or `LARGEST_SCALE` times as large."""
+    """The frames with a longer side of `SIDE` pixels: small ones are enlarged, so that all lengths are of one unit."""
     height, width = frames.shape[1:3]
-    scale = min(LARGEST_SCALE, SIDE / max(height, width))
+    scale = SIDE / max(height, width)
     size = max(16, round(width * scale)), max(16, round(height * scale))
     how = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
     return np.stack([cv2.resize(frame, size, interpolation=how) for frame in frames])

@@ -59,8 +59,8 @@ def find_moving_object(frames: Frames, *, shadow: bool = False, alignment: Align
     """Where the largest object is that moves on its own, in each frame: bool (num_frames, height, width).
 
     `frames` are uint8 (num_frames, height, width, 3), in which the background fills most of the image and moves as a
-    plane does, about: a camera that turns, zooms, or passes a distant scene. Each shot has an object of its own. Masks
-    are empty where it is hidden. `shadow`: with the shadow that it casts. `alignment` is that of the frames (default:
+    plane does, about: a camera that turns, zooms, or passes a distant scene. Each shot has an object of its own, and
+    objects that touch count as one. Masks are empty where it is hidden. `shadow`: with the shadow that it casts. `alignment` is that of the frames (default:
     estimated here).
 
     It costs about half a second of processor time for each frame, of any size.
@@ -96,7 +96,7 @@ def _find_in_shot(frames: Frames, alignment: Alignment, shot: tuple[int, int], s
     moved = np.stack(_map(lambda k: _measure_motion(alignment, first + k, shot), num))
     moved = _vote(moved, alignment, first, MOTION_VOTE)
     covered = np.zeros(frames.shape[:3], bool)
-    covered[first:stop] = [dilate(one > PROBABLY, 9) for one in moved]
+    covered[first:stop] = [dilate(one > CERTAINLY, 9) for one in moved]
     slight, strong = (np.empty(moved.shape, bool) for _ in range(2))
 
     def compare(k: int) -> Float32[np.ndarray, "rows columns"]:
