@@ -16,6 +16,7 @@ from foldgauss.video.fitting.adam import sparse_adam
 from foldgauss.video.fitting.codebook import Codebook, average_clusters, find_clusters
 from foldgauss.video.fitting.growth import Growth
 from foldgauss.video.fitting.loop import fit_steps, start, to_model
+from foldgauss.video.fitting.pruning import pruner
 from foldgauss.video.fitting.pruning.description_length import MAX_OPAQUE_FRACTION, prune_rows, weigh_frames
 from foldgauss.video.fitting.pruning.pruner import _long_axis_first
 from foldgauss.video.fitting.pruning.scores import PruningScores, measure_scores
@@ -575,6 +576,25 @@ def test_smallest_model_reaches_its_psnr():
     assert smallest.history[-1].stopped_by == "smallest_at_psnr"
     assert 34 <= evaluate(smallest.model, frames).mean_psnr < 35.5
     assert smallest.model.num_parameters < 0.35 * plain.num_parameters
+
+
+def test_a_round_that_falls_far_below_is_tried_again_with_less(monkeypatch):
+    """Costs are predicted; where full rounds would leave one Gaussian, smaller ones still reach the target."""
+    tried = []
+
+    def misjudged(rows, kinds, scores, economy, **options):
+        found = prune_rows(rows, kinds, scores, economy, **options)
+        tried.append(economy.most_dropped)
+        if economy.most_dropped < Economy().most_dropped:
+            return found
+        return found._replace(stay=found.stay[:1], rows=found.rows[:1], kinds=found.kinds[:1])
+
+    monkeypatch.setattr(pruner, "prune_rows", misjudged)
+    frames = disc(lambda s: (15 + 50 * s, 24), num_frames=8)
+    result = fit(frames, FitConfig(num_gaussians=150, steps=300, economy=Economy(psnr=28)))
+    assert tried[:2] == [Economy().most_dropped, 0.5 * Economy().most_dropped]
+    assert 2 < result.model.num_gaussians < 150
+    assert evaluate(result.model, frames).mean_psnr >= 28
 
 
 def test_psnr_of_alpha_is_over_black():

@@ -45,6 +45,12 @@ SoundFile = Annotated[
 ]
 
 
+def video_option(suffix: str) -> Any:
+    """The option `--out` of a command that writes a video, by default the model's name with this suffix."""
+    kinds = "FILE.mp4, .webm, .mov, .mkv, .gif or .webp; a folder for images"
+    return typer.Option("--out", help=f"{kinds} [default: the model's name in this folder, {suffix}].")
+
+
 class VideoOptions(NamedTuple):
     """Options of `write_video` for video files."""
 

@@ -9,7 +9,15 @@ import typer
 from foldgauss.cli.app.application import app, out, wrong_use
 from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, parse_size
 from foldgauss.cli.shared.outputs import check_image_path, name_after, refuse_existing, refuse_huge, refuse_input
-from foldgauss.cli.shared.rendering import CodecName, Crf, PixelFormat, VideoOptions, progress_bar, write_images
+from foldgauss.cli.shared.rendering import (
+    CodecName,
+    Crf,
+    PixelFormat,
+    VideoOptions,
+    progress_bar,
+    video_option,
+    write_images,
+)
 from foldgauss.io._atomic import check_writable
 from foldgauss.io.media.video_writing import VIDEO_SUFFIXES
 from foldgauss.io.models.video_model import load_video_model
@@ -20,14 +28,7 @@ from foldgauss.video.motion.moving_object import find_moving_object
 @app.command("plate")
 def plate_command(
     model_path: ModelFile,
-    out_path: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            help="FILE.mp4, .webm, .mov, .mkv, .gif or .webp; a folder for images "
-            "[default: the model's name in this folder, .plate.mp4].",
-        ),
-    ] = None,
+    out_path: Annotated[Path | None, video_option(".plate.mp4")] = None,
     masks_path: Annotated[
         Path | None,
         typer.Option(

@@ -19,6 +19,7 @@ from foldgauss.cli.shared.rendering import (
     choose_sound,
     progress_bar,
     render_to_file,
+    video_option,
 )
 from foldgauss.cli.shared.timeline import Fps, Speed, Timeline, Upsample
 from foldgauss.io._atomic import check_writable
@@ -31,14 +32,7 @@ from foldgauss.video.motion.stabilization import BORDERS, MAX_ZOOM, SMOOTHING, s
 @app.command("stabilize")
 def stabilize_command(
     model_path: ModelFile,
-    out_path: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            help="FILE.mp4, .webm, .mov, .mkv, .gif or .webp; a folder for images "
-            "[default: the model's name in this folder, .stable.mp4].",
-        ),
-    ] = None,
+    out_path: Annotated[Path | None, video_option(".stable.mp4")] = None,
     smoothing: Annotated[
         float, typer.Option(metavar="SECONDS", help="Standard deviation of the filter that smooths the camera's path.")
     ] = SMOOTHING,

@@ -123,24 +123,24 @@ def prune_rows(
     *,
     degree: int,
     pixels: float,
-    room: float | None = None,
+    max_added_error: float | None = None,
     progress: float = 1.0,
     shares_sizes: bool = False,
     allow_opaque: bool = True,
 ) -> PrunedRows:
     """Drop the Gaussians and parameters of packed rows that do not pay, at a fraction `progress` of the plan.
 
-    At the price of `compute_price`; or where `room` is given, at the one that adds so much squared error. `pixels` is
-    the number of pixels along one unit of model space. With `shares_sizes`, where Gaussians share shapes, sizes do not
-    change; without `allow_opaque`, all keep their opacities. At least one Gaussian stays.
+    At the price of `compute_price`; or where `max_added_error` is given, at the one that adds so much squared error.
+    `pixels` is the number of pixels along one unit of model space. With `shares_sizes`, where Gaussians share shapes,
+    sizes do not change; without `allow_opaque`, all keep their opacities. At least one Gaussian stays.
     """
     table = _CostTable(rows, kinds, scores, degree, pixels, shares_sizes, allow_opaque)
-    if room is None:
+    if max_added_error is None:
         return table.prune(compute_price(scores, economy.bits, progress), economy.most_dropped)
     low, high = 0.0, max(scores.squared_error, 1e-9)
     for _ in range(40):
         middle = (low + high) / 2 if low > 0 else high / 2
-        low, high = (middle, high) if table.added(middle, economy.most_dropped) <= room else (low, middle)
+        low, high = (middle, high) if table.added(middle, economy.most_dropped) <= max_added_error else (low, middle)
         if low > 0 and high < 1.01 * low:
             break
     return table.prune(low, economy.most_dropped)

@@ -63,13 +63,15 @@ class Pruner:
         growing = state.step in steps[: len(steps) // 2]
         scores, progress = self._measure(state), state.step / state.plan
         psnr = self._psnr(state, scores)
-        room = allowed_error(economy, scores, psnr, progress)
+        max_added_error = allowed_error(economy, scores, psnr, progress)
         late = steps[max(len(steps) // 2, len(steps) - 1 - LATE_ROUNDS)]
-        pruned = self._prune_rows(state, scores, room, allow_opaque=state.step >= late)
+        pruned = self._prune_rows(state, scores, max_added_error, allow_opaque=state.step >= late)
         for fraction in LESS:
             if not self._falls_far_below(state, pruned):
                 break
-            pruned = self._prune_rows(state, scores, room, allow_opaque=state.step >= late, fraction=fraction)
+            pruned = self._prune_rows(
+                state, scores, max_added_error, allow_opaque=state.step >= late, fraction=fraction
+            )
         survived = state.newborn[pruned.stay].sum() / max(state.newborn.sum(), 1) if state.step > steps[0] else 1.0
         _keep(state, pruned, config.degree)
         if state.step == late and not growing and state.statistics is None:  # newborn Gaussians share nothing
@@ -101,10 +103,10 @@ class Pruner:
     def _trim_once(self, state: FitState) -> bool:
         config, scores = self._config, self._measure(state)
         wanted, size = config.economy.psnr, count_parameters(state.kinds)
-        room = scores.squared_error * (10 ** (max(self._psnr(state, scores) - wanted, 0.0) / 10) - 1)
+        max_added_error = scores.squared_error * (10 ** (max(self._psnr(state, scores) - wanted, 0.0) / 10) - 1)
         for fraction in (1.5, 1.0, 0.8, 0.6, 0.4, 0.2):
             trial = dataclasses.replace(state)
-            _keep(trial, self._prune_rows(trial, scores, fraction * room), config.degree)
+            _keep(trial, self._prune_rows(trial, scores, fraction * max_added_error), config.degree)
             fewer = count_parameters(trial.kinds) < (1 - MIN_TRIM) * size
             if fewer and mean_psnr(trial, config, self._frames) >= wanted:
                 for field in dataclasses.fields(state):
@@ -124,7 +126,7 @@ class Pruner:
         self,
         state: FitState,
         scores: PruningScores,
-        room: float | None,
+        max_added_error: float | None,
         *,
         allow_opaque: bool = True,
         fraction: float = 1.0,
@@ -138,7 +140,7 @@ class Pruner:
             dataclasses.replace(economy, most_dropped=fraction * economy.most_dropped),
             degree=self._config.degree,
             pixels=pixels_per_unit(self._spec.size),
-            room=None if room is None else fraction * room,
+            max_added_error=None if max_added_error is None else fraction * max_added_error,
             progress=min(state.step / state.plan, 1.0),
             shares_sizes=len(state.shapes.index) > 0,
             # Resets of opacity make none; and what is opaque early hides for good what others could become.
