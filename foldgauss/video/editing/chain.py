@@ -212,7 +212,9 @@ class Edit:
         interpolates the rotation and the symmetric part of A, see `Affine`.
         """
         rows = check_matrix("matrix", matrix, 2)
-        if not abs(np.linalg.det(rows)) > 1e-12 * np.abs(rows).max() ** 2:
+        # By its formula: LAPACK's elimination divides by zero where a pivot is subnormal.
+        determinant = rows[0, 0] * rows[1, 1] - rows[0, 1] * rows[1, 0]
+        if not abs(determinant) > 1e-12 * np.abs(rows).max() ** 2:
             raise invalid("matrix", expected="an invertible matrix", got=rows.tolist(), cure="See vanish().")
         offset = self._point("offset", offset)
         return self._map(*polar_decompose(rows), offset, self._fixed_point(about), when)

@@ -132,7 +132,8 @@ class Affine(AbstractOverlay):
             check_numbers("about", self.about, 2)
         if len(self.stretch) != 2 or self.stretch[0][1] != self.stretch[1][0]:
             raise invalid("stretch", expected="a symmetric 2x2 matrix", got=self.stretch)
-        if np.linalg.det(self.stretch) == 0:
+        (first, shear), (_, second) = self.stretch
+        if first * second - shear**2 == 0:
             raise invalid("stretch", expected="an invertible matrix", got=self.stretch, cure="See vanish().")
 
     @property
