@@ -18,7 +18,7 @@ from foldgauss.video import (
     psnr,
     select,
 )
-from foldgauss.video.motion.background_plate import Alignment
+from foldgauss.video.motion.background_plate import Alignment, _median
 from foldgauss.video.motion.moving_object import nothing_moves
 from foldgauss.video.selection import selectors
 
@@ -79,6 +79,18 @@ def test_the_background_is_filled_in_from_other_frames():
     # Without other frames to fill it from, the hole is filled from its surroundings.
     everywhere = np.broadcast_to(truth.any(0), truth.shape)
     assert 30 > psnr(fill_background(frames[:3], everywhere[:3]), empty[:3]) > psnr(frames[:3], empty[:3])
+
+
+def test_the_kernel_takes_the_lower_median_of_what_is_known():
+    rng = np.random.default_rng(0)
+    stack, known = rng.integers(0, 256, (7, 5, 6, 3), np.uint8), rng.random((7, 5, 6)) < 0.4
+    plate, count = np.full((5, 6, 3), 9, np.uint8), np.empty((5, 6), np.uint8)
+    _median(stack, known, np.empty(7, np.uint8), plate, count)
+    np.testing.assert_array_equal(count, known.sum(0))
+    assert count.min() == 0
+    for place in np.ndindex(count.shape):
+        values = np.sort(stack[:, *place][known[:, *place]], axis=0)
+        np.testing.assert_array_equal(plate[place], values[(len(values) - 1) // 2] if len(values) else 0)
 
 
 @pytest.mark.parametrize("pan", [0.0, 3.0])
