@@ -63,7 +63,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 def config_of(name: str, size: tuple[int, int], steps: int, seed: int) -> FitConfig:
     """The settings of a fit, in pixels the same at every size.
 
-    Numbers are stated for `FULL` and in proportion to the pixels. Lengths in model space, whose unit is the longer side,
+    Numbers are stated for `FULL` and in proportion to the pixels. Lengths in model space, in units of the longer side,
     grow as that side gets fewer pixels; so do gradients of the mean over all pixels by a position in half widths.
     """
     zoom = max(FULL) / max(size)
