@@ -458,7 +458,6 @@ class TestReproduce:
         # the mean, and is twice as wide in half widths.
         for length in "clone_below", "prune_scale", "screen_gradient", "time_gradient":
             assert getattr(half.growth, length) == 2 * getattr(full.growth, length)
-        assert half.growth.prune_radius == full.growth.prune_radius  # in pixels
         assert (half.rates.loc, half.rates.coefficients) == (2 * full.rates.loc, 2 * full.rates.coefficients)
         assert half.rates.log_scale == full.rates.log_scale
 
