@@ -8,7 +8,7 @@ smaller `--size` has Gaussians at the start in proportion to its pixels, and len
 of gradients that are the same in pixels (`config_of`). `VARIANTS` lists the fits: "as published", the power of the
 paper's text instead of its code's, other batches and degrees, and what the paper does not state or we chose. PSNR and
 SSIM are of 8-bit images, the mean over all frames, beside the published ones: 39.02 dB with 500,000 Gaussians at the
-start, 38.53 dB with 100,000 (table:init-gauss). The batches and degrees of table:bs-pol start with 100,000: its 38.53 dB
+start, 38.53 dB with 100,000 (table:init-gauss). Batches and degrees (table:bs-pol) start with 100,000: their 38.53 dB
 for batch 3 and degree 7 is the first row of the other table.
 
 FOLDER keeps a checkpoint of the fit under way and, for each fit, the curve NAME.csv of PSNR (of the frames seen last)
