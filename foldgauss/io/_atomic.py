@@ -5,7 +5,7 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -132,15 +132,19 @@ def atomic_path(path: str | os.PathLike, *, suffix: str | None = None) -> Iterat
 
 
 @contextmanager
-def atomic_folder(folder: str | os.PathLike, *, check: Callable[[], object] = lambda: None) -> Iterator[Path]:
+def atomic_folder(
+    folder: str | os.PathLike, overwrite: bool = False, *, pattern: str, what: str = "frames"
+) -> Iterator[Path]:
     """Provide a temporary folder beside `folder`, and rename it to `folder` when the block ends without an error.
 
-    An existing folder is moved aside first and deleted last, so at any moment one of the two is whole. `check` is
-    called just before and raises where the folder must not be replaced, since the block may have taken hours.
+    An existing folder is moved aside first and deleted last, so at any moment one of the two is whole. It is refused,
+    before the block and again after it, since that may have taken hours, unless it is empty, or contains only `what`
+    and `overwrite` is given. `pattern` matches the names of `what`; other files are never deleted.
 
-    Raises `OutputError` if the parent folder is missing or not writable.
+    Raises `OutputError` if the folder is refused, or its parent is missing or not writable.
     """
-    folder = Path(folder).resolve()
+    given, folder = Path(folder), Path(folder).resolve()
+    _check_replaceable(given, overwrite, pattern, what)
     _check_target(folder)
     temporary, aside = temporary_name(folder, ""), temporary_name(folder, "")
     try:
@@ -151,7 +155,7 @@ def atomic_folder(folder: str | os.PathLike, *, check: Callable[[], object] = la
         with _name_output(folder, temporary):
             yield temporary
         try:
-            check()
+            _check_replaceable(given, overwrite, pattern, what)
             if folder.exists():
                 os.replace(folder, aside)
             os.replace(temporary, folder)
@@ -164,11 +168,8 @@ def atomic_folder(folder: str | os.PathLike, *, check: Callable[[], object] = la
         shutil.rmtree(aside, ignore_errors=True)
 
 
-def check_replaceable(folder: Path, overwrite: bool, *, pattern: str, what: str = "frames") -> None:
-    """Raise `OutputError` unless `folder` is missing, empty, or contains only `what` and `overwrite` is given.
-
-    `pattern` matches the names of `what`; other files are never deleted.
-    """
+def _check_replaceable(folder: Path, overwrite: bool, pattern: str, what: str) -> None:
+    """Raise `OutputError` unless `atomic_folder` may replace `folder`."""
     if not os.path.exists(folder):
         return
     if not folder.is_dir():

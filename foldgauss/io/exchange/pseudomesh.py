@@ -9,7 +9,6 @@ import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -17,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from foldgauss._runtime.checks import check_one_of, invalid
-from foldgauss.io._atomic import atomic_folder, check_replaceable
+from foldgauss.io._atomic import atomic_folder
 from foldgauss.io.exchange.gaussians_ply import check_times, frame_gaussians, read_3dgs_ply, write_gaussians_ply
 from foldgauss.io.exchange.ply_file import facts_error, format_error
 from foldgauss.io.media.frame_rate import DEFAULT_FPS
@@ -139,9 +138,7 @@ def write_pseudomesh(
     **Source:** VeGaS eq:traingle_face; Waczyńska et al. 2024, GaMeS (pseudomesh).
     """
     folder, times = Path(folder), check_times(model, times)
-    check = partial(check_replaceable, folder, overwrite, pattern=_FILES, what="frames of a pseudomesh")
-    check()
-    with atomic_folder(folder, check=check) as temporary:
+    with atomic_folder(folder, overwrite, pattern=_FILES, what="frames of a pseudomesh") as temporary:
         renderer = VideoRenderer(model)
         for number, t in enumerate(times):
             gaussians = frame_gaussians(renderer, t, depth_step=0.0)
