@@ -191,7 +191,7 @@ def _code(values, present, contexts, origin, step, scale, near, fill, state, dat
             magnitude, exponent = abs(value), 0
             while _code_adaptive(data, interval, decodes, state, 2 + exponent, magnitude >> (exponent + 1) > 0):
                 exponent += 1
-                if exponent >= LARGEST_BITS:
+                if decodes and exponent >= LARGEST_BITS:
                     return False
             coded, leading = 1, 1
             for b in range(exponent - 1, -1, -1):
