@@ -108,7 +108,7 @@ def read_ply(path: str | os.PathLike, wanted: Iterable[str]) -> Ply:
     a file that is not PLY, breaks off, declares more rows than it holds, or has lists in a wanted element.
     """
     path = Path(path)
-    data = _read_bytes(path)
+    data = read_bytes(path)
     header, start = _split_header(path, data)
     order, elements, comments = _parse_header(path, header)
     wanted = set(wanted)
@@ -129,7 +129,8 @@ def read_ply(path: str | os.PathLike, wanted: Iterable[str]) -> Ply:
     return Ply(path, found, comments)
 
 
-def _read_bytes(path: Path) -> bytes:
+def read_bytes(path: Path) -> bytes:
+    """The content of a file. Raises `FileNotFoundError`, and `FormatError` where it cannot be read."""
     try:
         return path.read_bytes()
     except FileNotFoundError:
