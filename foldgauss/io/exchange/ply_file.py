@@ -7,6 +7,7 @@ Source of the layout: G. Turk, "The PLY Polygon File Format" (1994).
 """
 
 import os
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,7 @@ _SIZES = {
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 #: Bytes; a header names each frame of a VeGaS video in about 30, so this allows some 100,000 frames.
 MAX_HEADER = 4 << 20
+_END_OF_HEADER = re.compile(rb"^[ \t]*end_header[ \t\r]*\n", re.MULTILINE)
 #: Characters of the longest accepted number.
 LONGEST_WORD = 64
 
@@ -147,18 +149,11 @@ def _split_header(path: Path, data: bytes) -> tuple[list[str], int]:
     if data[:4] not in (b"ply\n", b"ply\r"):
         got = "an empty file" if not data else f"one that starts with {data[:8]!r}"
         raise format_error(path, expected="a PLY file, which starts with 'ply'", got=got, cure="Check the path.")
-    head = data[:MAX_HEADER]
-    lines, start = [], 0
-    while True:
-        end = head.find(b"\n", start)
-        if end < 0:
-            got = f"none in {len(head)} bytes"
-            raise format_error(path, expected="a line 'end_header'", got=got, cure="Copy the file again.")
-        line = head[start:end].rstrip(b"\r").decode("ascii", errors="replace")
-        start = end + 1
-        if line.strip() == "end_header":
-            return lines[1:], start
-        lines.append(line)
+    found = _END_OF_HEADER.search(data[:MAX_HEADER])
+    if found is None:
+        got = f"none in {min(len(data), MAX_HEADER)} bytes"
+        raise format_error(path, expected="a line 'end_header'", got=got, cure="Copy the file again.")
+    return data[: found.start()].decode("ascii", errors="replace").split("\n")[1:-1], found.end()
 
 
 def _parse_header(path: Path, lines: list[str]) -> tuple[str, list[_Element], tuple[str, ...]]:
@@ -182,7 +177,7 @@ def _parse_header(path: Path, lines: list[str]) -> tuple[str, list[_Element], tu
             elements[-1][2].append(_parse_property(where, rest))
         else:
             expected = "format ascii|binary_little_endian|binary_big_endian 1.0, element NAME COUNT, property TYPE NAME"
-            raise format_error(where, expected=expected, got=repr(line[:80]), cure="The header is damaged.")
+            raise format_error(where, expected=expected, got=repr(line.rstrip()[:80]), cure="The header is damaged.")
     if order is None:
         raise format_error(path, expected="a line 'format ...' in the header", got="none", cure="Copy it again.")
     for name, _, properties in elements:
