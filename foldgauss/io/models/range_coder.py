@@ -60,7 +60,7 @@ class Column:
 
     `present`: which rows have an integer; others are 0. `contexts`: below 256. An integer q encodes the value
     `origin + q step`. A row's value is predicted by the mean over the rows `near` (-1: none) of value / `scale`, times
-    its own scale. Absent rows count as `fill`.
+    its own scale. Absent rows count as 0.
     """
 
     present: Bool[np.ndarray, " num"]
@@ -69,7 +69,6 @@ class Column:
     step: Float[np.ndarray, " num"]
     scale: Float[np.ndarray, " num"]
     near: Int32[np.ndarray, "num neighbours"]
-    fill: float = 0.0
 
     @classmethod
     def without_contexts(cls, num: int) -> "Column":
@@ -80,7 +79,7 @@ class Column:
     def as_arrays(self) -> tuple:
         floats = (np.ascontiguousarray(one, np.float64) for one in (self.origin, self.step, self.scale))
         near = np.ascontiguousarray(self.near, np.int32)
-        return self.present, np.ascontiguousarray(self.contexts, np.uint8), *floats, near, float(self.fill)
+        return self.present, np.ascontiguousarray(self.contexts, np.uint8), *floats, near
 
 
 # ------------------------------------------------------------------------------------------ adaptive model
@@ -172,12 +171,12 @@ def _code_adaptive(data, interval, decodes, state, node, bit):
 
 
 @exact_kernel
-def _code(values, present, contexts, origin, step, scale, near, fill, state, data, interval, decodes, room):
+def _code(values, present, contexts, origin, step, scale, near, state, data, interval, decodes, room):
     """Encode the values into `data`, or decode them from it; False where `room` bytes are too few, or were not encoded.
 
     Both directions take the same steps: the bits that are given to `_code_adaptive` only matter to the encoder.
     """
-    seen, own = np.full(len(values), fill), state[0]
+    seen, own = np.zeros(len(values)), state[0]
     for k in range(len(values)):
         if not present[k]:
             continue
