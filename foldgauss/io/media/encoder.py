@@ -140,13 +140,14 @@ def encode_video(
     pixel_format = av.VideoFormat(encoding.pixel_format, 64, 64)
     matrix = None if pixel_format.is_rgb else Colorspace.ITU709
     steps = 64 // pixel_format.chroma_height(), 64 // pixel_format.chroma_width()
-    container = av.open(str(path), "w", options={"movflags": "+faststart"} if path.suffix in (".mp4", ".mov") else {})
+    suffix = path.suffix.lower()
+    container = av.open(str(path), "w", options={"movflags": "+faststart"} if suffix in (".mp4", ".mov") else {})
     with container:
         stream = container.add_stream(encoding.codec.encoder, rate=rate, options=options)
         stream.pix_fmt = encoding.pixel_format
         packets, waiting = iter(()), None
         if sound is not None:
-            codec = "libopus" if path.suffix == ".webm" else "aac"
+            codec = "libopus" if suffix == ".webm" else "aac"
             packets = _encode_sound(container.add_stream(codec, rate=SAMPLE_RATE, layout="stereo"), sound)
         for number, frame in enumerate(frames):
             image = _pad(frame, steps)

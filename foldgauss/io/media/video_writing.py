@@ -85,7 +85,7 @@ def write_video(
     encoding = choose_encoding(suffix, codec, crf, pixel_format, first.shape)
     if sound is not None:
         check_sound(sound)
-    with atomic_path(path, suffix=suffix) as temporary:
+    with atomic_path(path) as temporary:
         try:
             encode_video(temporary, chain([first], frames), float(fps), encoding, sound)
         except OSError as error:
