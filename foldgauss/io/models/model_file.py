@@ -342,12 +342,10 @@ def _check_container(path: Path) -> None:
         first = file.read(_PREFIX + 1)
     if size == 0:
         raise _unreadable_error(path, "an empty file")
-    for magic, name in _MAGIC.items():
-        if first.startswith(magic):
-            raise _unreadable_error(path, name)
     length = int.from_bytes(first[:_PREFIX], "little")
     if size < _PREFIX + 2 or not first[_PREFIX:].startswith(b"{"):
-        raise _unreadable_error(path, "a file of another kind, or one cut off within its first bytes")
+        names = (name for magic, name in _MAGIC.items() if first.startswith(magic))
+        raise _unreadable_error(path, next(names, "a file of another kind, or one cut off within its first bytes"))
     if length > size - _PREFIX:
         raise _unreadable_error(
             path, f"a file of {size} bytes whose header claims {length}, so it is cut off or damaged"
