@@ -109,6 +109,7 @@ export class Files {
       const model = await decoder.decode(0, (fraction) => this.onProgress(`Opening ${name}`, fraction));
       this.isOfPage = false;
       this.show(new Segments(model, null, decoder), name.replace(/\.\w+$/, ""));
+      if (model.header.about) toast(model.header.about, LONG);
     } catch (error) {
       if (error.missing) return this.askFacts(data, name);
       this.onProgress("");

@@ -159,7 +159,7 @@ export class Panel {
     const { hasSelection } = this;
     for (const name of ["select-none", "grow", "shrink"]) element(name).disabled = !count;
     element("edits").disabled = !hasSelection;
-    for (const name of ["shift", "stretch", "freeze", "delay"]) element(name).disabled = segments.spans.length > 1;
+    for (const name of ["shift", "stretch", "freeze", "delay"]) element(name).disabled = segments.spans.length > 1 || player.timeline.last === 0; // a still image has no time
     for (const name of ["radius", "tolerance"]) this.showSlide(name, tools[name]);
     element("radius").parentElement.hidden = tools.name !== "brush";
     element("tolerance").parentElement.hidden = tools.name !== "eyedropper";
