@@ -36,7 +36,7 @@ from foldgauss.io import (
 )
 from foldgauss.io.edit_script import parse_edit_script, read_edit_script
 from foldgauss.io.page.player_page import SaveTarget
-from foldgauss.render import Camera, Gaussians3D, RenderOptions, cpu, project
+from foldgauss.render import Camera, Gaussians3D, RenderOptions, project, render
 from foldgauss.video.models.renderer import VideoRenderer
 
 
@@ -126,12 +126,12 @@ def test_a_3dgs_scene_is_seen_along_z(opened, tmp_path):
     size = bare.stats["height"], bare.stats["width"]
     assert size == (round(1280 * box[1] / side), round(1280 * box[0] / side))
     at = [*bulk.mean(axis=0)[:2], bulk[0, 2]]
-    placed = dataclasses.replace(scene, mean=(scene.mean - jnp.float32(at)) / side, factor=scene.factor / side)
+    placed = dataclasses.replace(scene, mean=jnp.float32((mean - at) / side), factor=scene.factor / side)
     splats = project(placed, Camera.front(size[0] / size[1]), size)
     assert not splats.opacity.all()
-    wanted = 255 * np.clip(cpu.render(splats, size, RenderOptions()), 0, 1)
+    wanted = 255 * np.clip(render(splats, size, options=RenderOptions()), 0, 1)
     far = np.abs(bare.picture() - wanted)
-    assert wanted.mean() > 50
+    assert wanted.mean() > 30
     assert (far.mean() < 0.4) & (far.max() <= 1)  # rounding to whole levels alone is 0.25
 
 
