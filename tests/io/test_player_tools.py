@@ -2,11 +2,15 @@
 
 import numpy as np
 import pytest
+from browser import Opened
 from editor_page import EDITS, IT, assert_shows, drag, in_box, picked, read_script, screen_at, script_of, select
-from soft_models import NUM, SIZE
+from soft_models import NUM, NUM_FRAMES, SIZE, soft_model
 
-from foldgauss.io import load_video_model
+from foldgauss.io import html_page, load_video_model
 from foldgauss.io.edit_script import parse_edit_script
+from foldgauss.render import RenderOptions
+from foldgauss.video import NothingMoves, SegmentedVideo, by_mask
+from foldgauss.video.selection import selectors
 from foldgauss.video.selection.tracking import to_lab
 
 
@@ -77,6 +81,36 @@ def test_the_eyedropper_sees_the_color_that_is_shown(opened, compact):
             [x, y],
         )
         np.testing.assert_allclose(np.array(color) * 255, shown[row, column], atol=4)
+
+
+def test_a_button_selects_what_moves(browser, compact, tmp_path, monkeypatch):
+    masks = np.zeros((NUM_FRAMES, *SIZE), bool)
+    masks[:, :, : SIZE[1] // 2] = True
+    monkeypatch.setattr(selectors, "find_moving_object", lambda frames: masks)
+    path, other = tmp_path / "clip.html", soft_model(options=RenderOptions(), seed=3)
+    video = SegmentedVideo.from_models([(0, load_video_model(compact)), (NUM_FRAMES, other)])
+    for model, parts in ((compact, [load_video_model(compact)]), (video, [load_video_model(compact), other])):
+        path.write_text(html_page(model, moving=True))
+        page = Opened(browser, path).ready()
+        page.page.keyboard.press("e")
+        page.page.click("#select-moving")
+        expected = [set(np.flatnonzero(by_mask(one, masks).mask).tolist()) for one in parts]
+        assert all(5 < len(found) < NUM - 5 for found in expected)
+        for time, found in zip((0.2, 0.8), (expected[0], expected[-1]), strict=True):
+            page.page.evaluate("(t) => foldgauss.seek(t)", time)
+            assert picked(page) == found
+        page.page.keyboard.press("z")
+        assert not picked(page)
+        page.check()
+        page.close()
+    plain = Opened(browser).go(tmp_path / "clip.html")
+    path.write_text(html_page(compact))
+    plain.go(path).ready().page.keyboard.press("e")
+    assert plain.page.locator("#select-moving").is_hidden()
+    plain.close()
+    masks[:, :, 1:] = False  # a column of pixels
+    with pytest.raises(NothingMoves, match="moving: expected an object that has Gaussians of its own, got none"):
+        html_page(compact, moving=True)
 
 
 def test_a_selection_grows_and_shrinks(opened, compact):

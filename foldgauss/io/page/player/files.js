@@ -67,6 +67,7 @@ export class Files {
     };
     for (const one of document.querySelectorAll(".with-edit")) one.hidden = false;
     element("save-disk").hidden = element("save-about").hidden = !server || !this.isOfPage;
+    element("select-moving").hidden = !this.isOfPage || !element("moving");
     if (server) put("save-about", `As ${server.script}`);
     element("download-model").disabled = segments.spans.length > 1;
     this.storage.version = server && this.isOfPage ? element("script")?.dataset.version ?? NO_SCRIPT : undefined;
