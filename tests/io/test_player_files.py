@@ -98,6 +98,7 @@ def test_a_3dgs_frame_looks_like_the_frame_it_was_exported_from(opened, tmp_path
     far = np.abs(bare.picture() - wanted)
     assert (far.mean() < LEVELS) & (far.max() <= WORST)
     assert bare.page.locator("#toast").is_hidden()
+    assert "still image" in bare.page.locator("#facts").inner_text()
     bare.page.keyboard.press("e")
     select(bare, range(5))
     assert bare.page.locator("#shift").is_disabled()  # a still image has no time
