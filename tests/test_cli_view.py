@@ -23,6 +23,7 @@ from foldgauss.cli.viewing import page_server
 from foldgauss.io import html_page, load_video_model, save_video_model
 from foldgauss.io.page.player_page import script_version, with_script
 from foldgauss.video import edit
+from foldgauss.video.selection import selectors
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +50,17 @@ def served(work, monkeypatch, capsys):
         return code, servers, capsys.readouterr(), opened
 
     return view
+
+
+def test_view_finds_what_moves(served, work, monkeypatch):
+    told, pages = served(work / "model.safetensors", "--moving")[2:0:-1]
+    assert "The page has no button for the moving object: moving: expected" in " ".join(told.err.split())
+    assert 'id="moving"' not in pages[0][1]
+    masks = np.ones((NUM_FRAMES, *load_video_model(work / "model.safetensors").size), bool)
+    monkeypatch.setattr(selectors, "find_moving_object", lambda frames: masks)
+    code, ((_, page),), told, _ = served(work / "model.safetensors", "--moving")
+    assert (code, told.err) == (0, "")
+    assert re.search(r'id="moving">{"0": "0-\d+', page)
 
 
 def test_view_serves_a_page_and_opens_it(served, work):

@@ -6,12 +6,15 @@ import threading
 from contextlib import contextmanager
 
 import cv2
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from browser import Opened
 from editor_page import (
     EDITS,
     IT,
+    LEVELS,
+    WORST,
     assert_shows,
     download,
     drop,
@@ -22,10 +25,19 @@ from editor_page import (
 from soft_models import NUM, SIZE, soft_model
 
 from foldgauss.cli.viewing.page_server import PageServer, make_token
-from foldgauss.io import export, html_page, import_model, load_video_model, read_video, save_video_model
+from foldgauss.io import (
+    export,
+    html_page,
+    import_model,
+    load_video_model,
+    read_video,
+    save_video_model,
+    write_gaussians_ply,
+)
 from foldgauss.io.edit_script import parse_edit_script, read_edit_script
 from foldgauss.io.page.player_page import SaveTarget
-from foldgauss.render import RenderOptions
+from foldgauss.render import Camera, Gaussians3D, RenderOptions, project, render
+from foldgauss.video.models.renderer import VideoRenderer
 
 
 def thinned():
@@ -77,6 +89,53 @@ def test_a_vegas_file_without_a_size_is_asked_for_it(opened, tmp_path):
     assert bare.page.locator("#whole").inner_text() == "/ 0:00.50"
 
 
+@pytest.mark.parametrize("how", [{}, {"axes": "y-up", "depth_step": 2e-3, "sh_degree": 0}])
+def test_a_3dgs_frame_looks_like_the_frame_it_was_exported_from(opened, tmp_path, how):
+    bare, model = opened(None, fresh=True), soft_model(options=RenderOptions(low_pass=0.5))
+    drop(bare, export(model, "ply3dgs", tmp_path / "frame.ply", times=[0.4], **how))
+    bare.until("foldgauss.seek")
+    wanted = VideoRenderer(model).frame(0.4).astype(float)
+    far = np.abs(bare.picture() - wanted)
+    assert (far.mean() < LEVELS) & (far.max() <= WORST)
+    assert bare.page.locator("#toast").is_hidden()
+    assert "still image" in bare.page.locator("#facts").inner_text()
+    bare.page.keyboard.press("e")
+    select(bare, range(5))
+    assert bare.page.locator("#shift").is_disabled()  # a still image has no time
+    bare.page.locator("#gain").fill("3")
+    download(bare, "#download-model", tmp_path / "still.safetensors")
+    still = load_video_model(tmp_path / "still.safetensors")
+    assert (still.size, still.num_frames) == (SIZE, 1)
+    assert_shows(bare, still, (0.0,))
+    assert np.abs(bare.picture() - wanted).max() > 20
+
+
+def test_a_3dgs_scene_is_seen_along_z(opened, tmp_path):
+    rng, num = np.random.default_rng(0), 300
+    mean = rng.normal(size=(num, 3)) * [4, 2, 3] + [10, -5, 7]
+    mean[:2, 2] = -40, 4  # the first is behind the camera
+    quaternion, scale = rng.normal(size=(num, 4)), np.exp(rng.normal(-1, 0.6, (num, 3)))
+    leaves = (mean, quaternion, scale, rng.uniform(0.1, 1, num), rng.uniform(size=(num, 3)))
+    scene = Gaussians3D.from_quaternions(*(jnp.asarray(own, jnp.float32) for own in leaves))
+    bare = opened(None, fresh=True)
+    drop(bare, write_gaussians_ply(tmp_path / "scene.ply", scene))
+    bare.until("foldgauss.seek")
+    assert "as a still image along its z-axis" in bare.page.locator("#toast").inner_text()
+    bulk = np.sort(mean, axis=0)[[2, -3]]  # of 300, 1% at either end
+    box = bulk[1] - bulk[0]
+    side = max(box[:2])
+    size = bare.stats["height"], bare.stats["width"]
+    assert size == (round(1280 * box[1] / side), round(1280 * box[0] / side))
+    at = [*bulk.mean(axis=0)[:2], bulk[0, 2]]
+    placed = dataclasses.replace(scene, mean=jnp.float32((mean - at) / side), factor=scene.factor / side)
+    splats = project(placed, Camera.front(size[0] / size[1]), size)
+    assert not splats.opacity.all()
+    wanted = 255 * np.clip(render(splats, size, options=RenderOptions()), 0, 1)
+    far = np.abs(bare.picture() - wanted)
+    assert wanted.mean() > 30
+    assert (far.mean() < 0.4) & (far.max() <= 1)  # rounding to whole levels alone is 0.25
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
@@ -89,12 +148,13 @@ def test_a_vegas_file_without_a_size_is_asked_for_it(opened, tmp_path):
         (
             "a.ply",
             b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
-            "is no video of VeGaS",
+            "neither a video of VeGaS",
         ),
         (
             "b.ply",
-            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float f_dc_0\nend_header\n1\n",
-            "a still 3DGS scene",
+            b"ply\nformat ascii 1.0\nelement chunk 1\nproperty float min_x\nelement vertex 1\n"
+            b"property uint packed_position\nend_header\n1\n1\n",
+            "a compressed 3DGS scene. Save it in SuperSplat",
         ),
         (
             "c.ply",
@@ -116,10 +176,12 @@ def test_files_that_cannot_be_opened_are_told(opened, tmp_path, name, content, m
 def test_damaged_models_are_told(opened, compact, tmp_path):
     bare = opened(None)
     good = save_video_model(tmp_path / "m.safetensors", soft_model()).read_bytes()
+    scene = export(soft_model(), "ply3dgs", tmp_path / "m.ply", times=[0.4]).read_bytes()
     for name, content in (
         ("cut.safetensors", good[:-100]),
         ("nan.safetensors", good[:-8] + np.float32([np.nan, 1]).tobytes()),
         ("cut.fgz", compact.read_bytes()[:-50]),
+        ("nan.ply", scene[:-4] + np.float32(np.nan).tobytes()),
     ):
         (tmp_path / name).write_bytes(content)
         bare.page.evaluate("document.getElementById('toast').hidden = true")

@@ -2,11 +2,15 @@
 
 import numpy as np
 import pytest
-from editor_page import assert_shows, drag, in_box, picked, screen_at, script_of, select
-from soft_models import NUM, SIZE
+from browser import Opened
+from editor_page import EDITS, IT, assert_shows, drag, in_box, picked, read_script, screen_at, script_of, select
+from soft_models import NUM, NUM_FRAMES, SIZE, soft_model
 
-from foldgauss.io import load_video_model
+from foldgauss.io import html_page, load_video_model
 from foldgauss.io.edit_script import parse_edit_script
+from foldgauss.render import RenderOptions
+from foldgauss.video import NothingMoves, SegmentedVideo, by_mask
+from foldgauss.video.selection import selectors
 from foldgauss.video.selection.tracking import to_lab
 
 
@@ -77,6 +81,36 @@ def test_the_eyedropper_sees_the_color_that_is_shown(opened, compact):
             [x, y],
         )
         np.testing.assert_allclose(np.array(color) * 255, shown[row, column], atol=4)
+
+
+def test_a_button_selects_what_moves(browser, compact, tmp_path, monkeypatch):
+    masks = np.zeros((NUM_FRAMES, *SIZE), bool)
+    masks[:, :, : SIZE[1] // 2] = True
+    monkeypatch.setattr(selectors, "find_moving_object", lambda frames: masks)
+    path, other = tmp_path / "clip.html", soft_model(options=RenderOptions(), seed=3)
+    video = SegmentedVideo.from_models([(0, load_video_model(compact)), (NUM_FRAMES, other)])
+    for model, parts in ((compact, [load_video_model(compact)]), (video, [load_video_model(compact), other])):
+        path.write_text(html_page(model, moving=True))
+        page = Opened(browser, path).ready()
+        page.page.keyboard.press("e")
+        page.page.click("#select-moving")
+        expected = [set(np.flatnonzero(by_mask(one, masks).mask).tolist()) for one in parts]
+        assert all(5 < len(found) < NUM - 5 for found in expected)
+        for time, found in zip((0.2, 0.8), (expected[0], expected[-1]), strict=True):
+            page.page.evaluate("(t) => foldgauss.seek(t)", time)
+            assert picked(page) == found
+        page.page.keyboard.press("z")
+        assert not picked(page)
+        page.check()
+        page.close()
+    plain = Opened(browser).go(tmp_path / "clip.html")
+    path.write_text(html_page(compact))
+    plain.go(path).ready().page.keyboard.press("e")
+    assert plain.page.locator("#select-moving").is_hidden()
+    plain.close()
+    masks[:, :, 1:] = False  # a column of pixels
+    with pytest.raises(NothingMoves, match="moving: expected an object that has Gaussians of its own, got none"):
+        html_page(compact, moving=True)
 
 
 def test_a_selection_grows_and_shrinks(opened, compact):
@@ -167,6 +201,76 @@ def test_fields_make_the_edits_that_they_name(opened, compact):
     page.page.click("#vanish")
     assert [step.get("do") for step in page.stats["steps"][-3:]] == ["to_back", "freeze", "vanish"]
     assert page.page.locator("#to-back").is_disabled()  # nothing is selected any more
+
+
+FIELDS = "move-x", "scale", "rotate", "hue-value", "gain-value", "opacity-value", "shift", "stretch"
+
+
+def fields(page):
+    return [page.page.locator(f"#{name}").input_value() for name in FIELDS]
+
+
+def test_numbers_show_what_the_edits_of_the_selection_add_up_to(opened, compact):
+    page, model = opened(compact), load_video_model(compact)
+    page.page.keyboard.press("e")
+    begun = ["0", "100", "0", "", "1", "1", "0", "1"]
+    assert fields(page) == begun
+    select(page, range(12))
+    seen = [fields(page)]
+    for name, value in (
+        ("gain", "2"),
+        ("hue", "200"),
+        ("move-x", "8"),
+        ("gain-value", "1.2"),
+        ("scale", "150"),
+        ("move-x", "5"),
+    ):
+        page.page.locator(f"#{name}").fill(value)
+        seen.append(fields(page))
+    for name, value in (
+        ("scale", "50"),
+        ("rotate", "40"),
+        ("shift", "2"),
+        ("rotate", "-5"),
+        ("shift", "3"),
+        ("stretch", "-2"),
+    ):
+        page.page.locator(f"#{name}").fill(value)
+        seen.append(fields(page))
+    assert seen[6] == ["5", "150", "0", "200", "1.2", "1", "0", "1"]
+    assert seen[-1] == ["5", "50", "-5", "200", "1.2", "1", "3", "-2"]
+    assert page.page.locator("#hue").input_value() == "200"
+    gains = [step["gain"] for step in page.stats["steps"] if "gain" in step]
+    assert gains == [2, 0.6]
+    page.page.keyboard.press("Escape")
+    assert_shows(page, parse_edit_script(script_of(page)).apply(model), (0.5,))
+    page.page.keyboard.press("e")
+    page.page.evaluate("document.activeElement.blur()")
+    for key, order in (("Control+z", reversed(seen[:-1])), ("Control+Shift+z", seen[1:])):
+        for expected in order:
+            page.page.keyboard.press(key)
+            assert fields(page) == expected
+    select(page, range(12, 20))  # another selection has had no edit
+    assert fields(page) == begun
+    select(page, range(8, 16))  # some have, some have not
+    assert fields(page) == [""] * 5 + ["1", "", ""]
+    page.page.locator("#gain-value").fill("3")  # a change by that much
+    assert (page.stats["steps"][-1], fields(page)[4]) == ({"do": "recolor", "gain": 3}, "3")
+    page.page.locator("#opacity-value").fill("0.5")
+    assert fields(page)[3:6] == ["", "", "0.5"]
+    select(page, range(8, 12))
+    assert fields(page) == [*seen[-1][:4], "3.6", "0.5", *seen[-1][6:]]
+    page.page.click("#duplicate")  # to the right by 20 pixels
+    assert fields(page)[:5] == ["25", *seen[-1][1:4], "3.6"]
+
+
+def test_the_numbers_of_a_script_are_those_of_its_edits(opened, compact):
+    page = opened(compact)
+    page.page.keyboard.press("e")
+    read_script(page, IT + EDITS["scale"] + "\n[[edits]]\n" + EDITS["gain"] + "\n[[edits]]\n" + EDITS["hue"])
+    assert fields(page) == ["0", "160", "0", "216", "", "1", "0", "1"]  # a gain for each channel is no brightness
+    read_script(page, IT + EDITS["transform"] + "\n[[edits]]\n" + EDITS["later"])
+    assert fields(page) == ["", "", "", "", "1", "1", "0.9", "1"]
 
 
 def test_keys_work_while_a_number_has_the_focus(opened, compact):

@@ -1,6 +1,7 @@
 """The command `view`."""
 
 import webbrowser
+from functools import partial
 from typing import Annotated
 
 import typer
@@ -11,6 +12,7 @@ from foldgauss.cli.shared.clips import read_fitted_clip
 from foldgauss.cli.viewing.page_server import PageServer, make_token, script_path
 from foldgauss.io.models.video_model import load_video_model
 from foldgauss.io.page.player_page import QUALITY, SaveTarget, html_page, warn_of_size
+from foldgauss.video.motion.moving_object import NothingMoves
 
 
 @app.command(name="view")
@@ -18,6 +20,9 @@ def view_command(
     model_path: ModelFile,
     original: Original = None,
     original_quality: OriginalQuality = QUALITY,
+    moving: Annotated[
+        bool, typer.Option("--moving", help="Find the object that moves (about 1 s per frame): a button selects it.")
+    ] = False,
     port: Annotated[int, typer.Option(help="Serve at this port.", min=0, max=65535, show_default="a free one")] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the browser.")] = True,
 ) -> None:
@@ -30,9 +35,14 @@ def view_command(
     if original is not None:
         frames = read_fitted_clip(load_video_model(model_path), model_path, original, None)
     script, token = script_path(model_path), make_token()
-    with err.status("Writing the page"):
-        target = SaveTarget(script.name, token)
-        page = html_page(model_path, original=frames, quality=original_quality, save_to=target)
+    target = SaveTarget(script.name, token)
+    make_page = partial(html_page, model_path, original=frames, quality=original_quality, save_to=target)
+    with err.status("Searching for what moves, writing the page" if moving else "Writing the page"):
+        try:
+            page = make_page(moving=moving)
+        except NothingMoves as error:
+            err.print(f"The page has no button for the moving object: {error}", soft_wrap=True)
+            page = make_page()
     warn_of_size(page, original is not None)
     try:
         server = PageServer(page.encode(), port, script=script, token=token)

@@ -1,5 +1,7 @@
 """3DGS PLY files: static scenes of Gaussians, which ordinary viewers open."""
 
+import dataclasses
+import json
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -12,7 +14,7 @@ from scipy.special import expit, logit
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_within, short_repr
 from foldgauss.io._atomic import atomic_folder
-from foldgauss.io.exchange.ply_file import format_error, is_3dgs, is_vegas, read_ply, to_float32, write_ply
+from foldgauss.io.exchange.ply_file import NOTE, format_error, is_3dgs, is_vegas, read_ply, to_float32, write_ply
 from foldgauss.render import Camera, Gaussians3D, pixels_per_unit
 from foldgauss.render.camera import THICKNESS
 from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer
@@ -94,6 +96,12 @@ def write_gaussians_ply(
 
     **Source:** Kerbl et al. 2023, 3D Gaussian Splatting, and the file layout of its published code.
     """
+    return _write(path, gaussians, axes, sh_degree)
+
+
+def _write(
+    path: str | os.PathLike, gaussians: Gaussians3D, axes: str, sh_degree: int, comments: Sequence[str] = ()
+) -> Path:
     check_one_of("axes", axes, AXES)
     if sh_degree not in _NUM_REST:
         raise invalid("sh_degree", expected="0, 1, 2 or 3", got=repr(sh_degree))
@@ -111,7 +119,21 @@ def write_gaussians_ply(
         columns["opacity"] = np.clip(logit(opacity), -_LOGIT_MAX, _LOGIT_MAX)
     columns |= {f"scale_{k}": np.log(np.maximum(scale[:, k], _SMALLEST)) for k in range(3)}
     columns |= {f"rot_{k}": quaternion[:, k] for k in range(4)}
-    return write_ply(path, {"vertex": columns})
+    return write_ply(path, {"vertex": columns}, comments=comments)
+
+
+def _write_frame(
+    path: str | os.PathLike,
+    model: RenderableVideo | VideoRenderer,
+    t: float,
+    depth_step: float,
+    axes: str,
+    sh_degree: int,
+) -> Path:
+    """One frame, with what the player needs to show it as it was in a comment."""
+    video = model.model if isinstance(model, VideoRenderer) else model
+    note = {"size": list(video.size), "axes": axes, "options": dataclasses.asdict(video.options)}
+    return _write(path, frame_gaussians(model, t, depth_step=depth_step), axes, sh_degree, [NOTE + json.dumps(note)])
 
 
 def write_3dgs_ply(
@@ -125,7 +147,8 @@ def write_3dgs_ply(
 ) -> Path:
     """Write the frame at time t as a 3DGS PLY file; returns the path.
 
-    See `frame_gaussians` for the geometry and `write_gaussians_ply` for the layout.
+    See `frame_gaussians` for the geometry and `write_gaussians_ply` for the layout. A comment, the header's last line,
+    has the frame's size, for the player.
 
     **Raises:** as these two, and ValueError for a model with compositing "sum", whose Gaussians do not occlude: viewers
     cannot render it.
@@ -133,8 +156,7 @@ def write_3dgs_ply(
     **Example:** `write_3dgs_ply("frame.ply", model, 0.5)`
     """
     _check_compositing(model)
-    gaussians = frame_gaussians(model, t, depth_step=depth_step)
-    return write_gaussians_ply(path, gaussians, axes=axes, sh_degree=sh_degree)
+    return _write_frame(path, model, t, depth_step, axes, sh_degree)
 
 
 def write_3dgs_frames(
@@ -162,8 +184,7 @@ def write_3dgs_frames(
     with atomic_folder(folder, overwrite, pattern=r"frame_[0-9]{4,}\.ply") as temporary:
         renderer = VideoRenderer(model)
         for number, t in enumerate(times):
-            gaussians = frame_gaussians(renderer, t, depth_step=depth_step)
-            write_gaussians_ply(temporary / f"frame_{number:04d}.ply", gaussians, axes=axes, sh_degree=sh_degree)
+            _write_frame(temporary / f"frame_{number:04d}.ply", renderer, t, depth_step, axes, sh_degree)
             on_frame()
     return folder
 

@@ -27,6 +27,8 @@ _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 #: Bytes; a header names each frame of a VeGaS video in about 30, so this allows some 100,000 frames.
 MAX_HEADER = 4 << 20
 _END_OF_HEADER = re.compile(rb"^[ \t]*end_header[ \t\r]*\n", re.MULTILINE)
+#: Prefix of our metadata in a comment of the header, which other programs skip.
+NOTE = "foldgauss "
 #: Characters of the longest accepted number.
 LONGEST_WORD = 64
 
@@ -292,10 +294,13 @@ def write_ply(
 
 
 def _encode(elements: Mapping[str, Mapping[str, np.ndarray]], comments: Sequence[str]) -> Iterator[bytes]:
-    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
+    lines = ["ply", "format binary_little_endian 1.0"]
     for name, columns in elements.items():
         lines.append(f"element {name} {len(next(iter(columns.values())))}")
         lines.extend(f"property float {column}" for column in columns)
+    lines.extend(
+        f"comment {comment}" for comment in comments
+    )  # last: some viewers expect the vertices in the third line
     yield ("\n".join(lines) + "\nend_header\n").encode("ascii")
     for columns in elements.values():
         yield np.stack([np.asarray(column, "<f4") for column in columns.values()], axis=1).tobytes()

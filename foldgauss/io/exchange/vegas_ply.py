@@ -13,6 +13,7 @@ from jaxtyping import Float
 from foldgauss._runtime.checks import invalid, is_within
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io.exchange.ply_file import (
+    NOTE,
     Ply,
     facts_error,
     format_error,
@@ -37,8 +38,6 @@ VEGAS_POWER = 2.0
 VEGAS_SCALE_CUTOFF = 1e-4
 #: `scale_1`, across the plane, has no effect on the image; this eps is written.
 _VEGAS_ACROSS = math.log(1e-8)
-#: Prefix of our metadata in a comment of the header, which other programs skip.
-_NOTE = "foldgauss "
 
 
 def read_vegas_ply(
@@ -141,7 +140,7 @@ def write_vegas_ply(path: str | os.PathLike, model: VideoModel) -> Path:
     note["scale_cutoff"] = model.scale_cutoff
     if np.unique(powers).size == 1:
         note["power"] = float(np.unique(powers)[0])
-    return write_ply(path, {"vertex": columns, "time": time_weights}, comments=[_NOTE + json.dumps(note)])
+    return write_ply(path, {"vertex": columns, "time": time_weights}, comments=[NOTE + json.dumps(note)])
 
 
 def _convert_time_scale(
@@ -224,7 +223,7 @@ def _fill_in(
 
 def _read_note(ply: Ply) -> dict:
     """The metadata that `write_vegas_ply` stores in a comment; empty for files of other programs."""
-    texts = [comment[len(_NOTE) :] for comment in ply.comments if comment.startswith(_NOTE)]
+    texts = [comment[len(NOTE) :] for comment in ply.comments if comment.startswith(NOTE)]
     try:
         note = json.loads(texts[0]) if texts else {}
     except (ValueError, RecursionError):

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Int, UInt8
 
 from foldgauss._runtime.checks import invalid, is_integer, short_repr
 from foldgauss.io._atomic import atomic_path, check_path
@@ -30,13 +30,16 @@ from foldgauss.video.compression.quantize import (
     Rule,
     column_names,
     compute_columns,
+    dequantize,
     is_integral,
     quantize,
 )
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.motion.moving_object import NothingMoves, nothing_moves
 from foldgauss.video.segmented.flatten import flatten_video
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
+from foldgauss.video.selection.selectors import by_motion
 
 HTML_SUFFIX = ".html"
 #: WebP quality of the original's frames.
@@ -124,6 +127,7 @@ def html_page(
     original: Frames | None = None,
     quality: int = QUALITY,
     title: str | None = None,
+    moving: bool = False,
     save_to: SaveTarget | None = None,
 ) -> str:
     """The page as text.
@@ -131,10 +135,11 @@ def html_page(
     `model`: a model; or the path of a file with one, of which a compact one goes in as it is. Any other is quantized
     finely, and so is each segment of a video in segments: see docs/player.md for the accuracy.
     `original`: the clip's frames, of the model's number and size, shown beside it; as WebP of `quality`, 1 to 100.
+    `moving`: find the object that moves, which takes about a second per frame; a button of the page selects it.
     `save_to`: of a page that a local server serves; it may then make requests to that server, and to nothing else.
 
     Raises ValueError for edits that no folded model holds, several envelopes or a degree above 15, in a segment, too,
-    and for frames that do not fit; errors of reading as `load_video_model`.
+    and for frames that do not fit; `NothingMoves`, which is one; errors of reading as `load_video_model`.
 
     Example: `html_page(model, title="holiday")`.
     """
@@ -142,7 +147,8 @@ def html_page(
         raise invalid("quality", expected="a whole number from 1 to 100", got=quality)
     plain, name = _load(model)
     pictures = [] if original is None else _encode_original(original, plain, quality)
-    return _assemble(_encode_model(model, plain), pictures, name if title is None else title, save_to)
+    blocks = [*_encode_model(model, plain), *([_encode_moving(plain)] if moving else [])]
+    return _assemble(blocks, pictures, name if title is None else title, save_to)
 
 
 def empty_page() -> str:
@@ -193,6 +199,29 @@ def _encode_model(model: Model, loaded: Loaded) -> Iterator[str]:
         yield _block("model", Path(model).read_bytes())
     else:
         yield _block("model", pack_compact(quantize_finely(flatten_video(loaded))))
+
+
+def _encode_moving(model: Loaded) -> str:
+    """The Gaussians of the moving object, by segment, as the page writes selections."""
+    whole = dequantize(model) if isinstance(model, Quantized) else model
+    found, missing = {}, None
+    for number, one in enumerate(whole.segments if isinstance(whole, SegmentedVideo) else [whole]):
+        try:
+            mask = by_motion(flatten_video(one.model if isinstance(whole, SegmentedVideo) else one)).mask
+        except NothingMoves as error:
+            missing = error
+        else:
+            found[number] = _format_ranges(np.flatnonzero(mask))
+    found = {number: text for number, text in found.items() if text}
+    if not found:
+        raise missing or nothing_moves("an object that has Gaussians of its own", "none")
+    return f'<script type="application/json" id="moving">{json.dumps(found)}</script>'
+
+
+def _format_ranges(indices: Int[np.ndarray, " num"]) -> str:
+    """Rising indices as in edit scripts: "3,17,40-52"."""
+    runs = np.split(indices, np.flatnonzero(np.diff(indices) > 1) + 1) if len(indices) else []
+    return ",".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
 
 
 def _flatten_segment(number: int, model: VideoModel | EditedVideo) -> VideoModel:

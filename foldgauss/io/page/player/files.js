@@ -67,6 +67,7 @@ export class Files {
     };
     for (const one of document.querySelectorAll(".with-edit")) one.hidden = false;
     element("save-disk").hidden = element("save-about").hidden = !server || !this.isOfPage;
+    element("select-moving").hidden = !this.isOfPage || !element("moving");
     if (server) put("save-about", `As ${server.script}`);
     element("download-model").disabled = segments.spans.length > 1;
     this.storage.version = server && this.isOfPage ? element("script")?.dataset.version ?? NO_SCRIPT : undefined;
@@ -109,6 +110,7 @@ export class Files {
       const model = await decoder.decode(0, (fraction) => this.onProgress(`Opening ${name}`, fraction));
       this.isOfPage = false;
       this.show(new Segments(model, null, decoder), name.replace(/\.\w+$/, ""));
+      if (model.header.about) toast(model.header.about, LONG);
     } catch (error) {
       if (error.missing) return this.askFacts(data, name);
       this.onProgress("");

@@ -1,7 +1,9 @@
-// Files that the player opens, told apart by their first bytes: compact models, model files and PLY files of VeGaS.
+// Files that the player opens, told apart by their first bytes: compact models, model files and PLY files of VeGaS and 3DGS.
 import { decode } from "./compact.js";
-import { readVegas } from "./vegas.js";
+import { readPly } from "./ply.js";
 import { readSafetensors } from "./safetensors.js";
+import { isScene, readScene } from "./scene.js";
+import { readVegas } from "./vegas.js";
 
 const COMPACT = [0x8b, 0x46, 0x47, 0x5a];
 
@@ -18,11 +20,19 @@ export function readModel(buffer, given = {}, onProgress = () => {}) {
   const bytes = new Uint8Array(buffer), start = String.fromCharCode(...bytes.subarray(0, 32));
   if (!bytes.length) throw new Error("The file is empty.");
   if (COMPACT.every((own, k) => bytes[k] === own)) return checked(decode(buffer, onProgress));
-  if (/^ply\r?\n/.test(start)) return checked(readVegas(buffer, given));
+  if (/^ply\r?\n/.test(start)) return checked(readPlyModel(buffer, given));
   if (start[8] === "{") return checked(readSafetensors(buffer));
   const known = OTHERS.find(([pattern]) => pattern.test(start));
   const got = known ? known[1] : "something else";
-  throw new Error(`This is ${got}. Expected a model: .safetensors or .fgz of foldgauss, or a .ply of VeGaS. ${known ? known[2] : "Is it the right file?"}`);
+  throw new Error(`This is ${got}. Expected a model: .safetensors or .fgz of foldgauss, or a .ply of VeGaS or 3DGS. ${known ? known[2] : "Is it the right file?"}`);
+}
+
+function readPlyModel(buffer, given) {
+  const found = readPly(buffer), { vertex, chunk } = found.elements;
+  if (vertex?.m_0) return readVegas(found, given);
+  if (isScene(vertex)) return readScene(found);
+  if (chunk && vertex?.packed_position) throw new Error("This is a compressed 3DGS scene. Save it in SuperSplat as a .ply without compression, and open that.");
+  throw new Error("This PLY file is neither a video of VeGaS, which has m_0, nor a 3DGS scene, which has f_dc_0, opacity, scale_2 and rot_3. It may be a mesh or a point cloud.");
 }
 
 /** Refuse values that cannot be rendered. */

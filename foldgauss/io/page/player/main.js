@@ -9,7 +9,7 @@ import { Renderer } from "./renderer.js";
 import { Segments } from "./segments.js";
 import { bindShell } from "./shell.js";
 
-const WELCOME = "Open a model, or drop one here: .safetensors or .fgz of foldgauss, or a .ply of VeGaS. It stays on this computer.";
+const WELCOME = "Open a model, or drop one here: .safetensors or .fgz of foldgauss, or a .ply of VeGaS or 3DGS. It stays on this computer.";
 
 /** Restore the player after the graphics card has lost its context. */
 function restoreOnLoss(canvas, player) {

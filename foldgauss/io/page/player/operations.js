@@ -1,6 +1,7 @@
 // What an edit does: the actions of edit scripts (foldgauss.io.edit_script.ACTIONS) that a folded model holds exactly.
 import { applyAffine, applyColors, applyFreeze, applyOpacity, applyRetiming, withColor, withHue } from "./parameters.js";
 import { countOf, gathered, indicesOf } from "./state.js";
+import { withTotals } from "./totals.js";
 
 const IDENTITY = [[1, 0], [0, 1]];
 const MOST_COPIES = 1000;
@@ -65,10 +66,10 @@ function multiplied(state, { offsets, delays = 0, scale = 1, degrees = 0, about,
   const selected = Uint8Array.from(copy, (k) => (k > 0 ? 1 : 0));
   offsets.forEach((offset, k) => {
     after = { ...after, selected: Uint8Array.from(copy, (own) => (own === k + 1 ? 1 : 0)) };
-    if (each(scale, k) !== 1) after = scaled(after, each(scale, k), about);
-    if (each(degrees, k) !== 0) after = affine(after, turn(each(degrees, k)), about);
-    after = affine(after, IDENTITY, [0, 0], offset);
-    if (each(delays, k) !== 0) after = applyRetiming(after, each(delays, k), 1, 0);
+    if (each(scale, k) !== 1) after = applyStep(after, { do: "scale", factor: each(scale, k), about });
+    if (each(degrees, k) !== 0) after = applyStep(after, { do: "rotate", degrees: each(degrees, k), about });
+    after = applyStep(after, { do: "move", offset });
+    if (each(delays, k) !== 0) after = applyStep(after, { do: "retime", shift: each(delays, k) });
   });
   return { ...after, selected: originals ? Uint8Array.from(source, (i, k) => Math.max(state.selected[i], selected[k])) : selected };
 }
@@ -152,6 +153,7 @@ export function problemOf(step) {
 }
 
 /** The state after a step; the same one if nothing is selected. */
-export function applyStep(state, { do: name, ...keys }, context) {
-  return countOf(state) ? ACTIONS[name].apply(state, keys, context) : state;
+export function applyStep(state, step, context) {
+  const { do: name, ...keys } = step;
+  return countOf(state) ? withTotals(ACTIONS[name].apply(state, keys, context), step) : state;
 }

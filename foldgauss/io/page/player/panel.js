@@ -1,41 +1,52 @@
 // The editor's panel: tools, and edits of the selection by buttons, sliders and numbers.
 import { element, fill, on, press, pressOne, put, toast } from "./elements.js";
 import { isAlike } from "./editing.js";
+import { filled, totalOf, totalOfStep } from "./totals.js";
 
 const BUTTONS = {
-  "select-all": "selectAll", "select-none": "selectNone", invert: "invert", grow: "grow", shrink: "shrink",
+  "select-all": "selectAll", "select-none": "selectNone", "select-moving": "selectMoving", invert: "invert", grow: "grow", shrink: "shrink",
 };
 const round = (own, digits = 6) => Number(own.toFixed(digits));
 const value = (name) => Number(element(name).value);
 
-/** Inputs of an edit: their values from its keys, and its keys from their values; `model`: side, last frame, time. */
+/**
+ * Inputs of an edit. `show(total, facts)`: their values, of what the edits of the selection add up to. `step(values, facts,
+ * total)`: the edit that makes these of a total; `total` is known in all its numbers then. `empty`: while nothing is known.
+ * The inputs of copies show and name the step itself.
+ */
 const FORMS = {
   move: {
     inputs: ["move-x", "move-y"], empty: [0, 0],
-    show: ({ offset }, { side }) => offset.map((own) => round(own * side, 2)),
-    step: ([x, y], { side }) => ({ do: "move", offset: [round(x / side), round(y / side)] }),
+    show: ({ right, down }, { side }) => [round(right * side, 2), round(down * side, 2)],
+    step: ([x, y], { side }, { right, down }) => ({ do: "move", offset: [round(x / side - right), round(y / side - down)] }),
   },
   scale: {
-    inputs: ["scale"], empty: [100], show: ({ factor }) => [round(100 * [factor].flat()[0], 2)],
-    step: ([percent], { center, last }) => percent > 0 && { do: "scale", factor: round(percent / 100), about: last?.about ?? center },
+    inputs: ["scale"], empty: [100], show: ({ scale }) => [round(100 * scale, 2)],
+    step: ([percent], { center, last }, { scale }) => percent > 0 && { do: "scale", factor: round(percent / 100 / scale), about: last?.about ?? center },
   },
   rotate: {
-    inputs: ["rotate"], empty: [0], show: ({ degrees }) => [degrees],
-    step: ([degrees], { center, last }) => ({ do: "rotate", degrees, about: last?.about ?? center }),
+    inputs: ["rotate"], empty: [0], show: ({ degrees }) => [round(degrees, 3)],
+    step: ([degrees], { center, last }, total) => ({ do: "rotate", degrees: round(degrees - total.degrees), about: last?.about ?? center }),
   },
   hue: {
     inputs: ["hue"], empty: [0], slides: true, show: ({ hue }) => [Math.round(360 * hue)],
     step: ([degrees]) => degrees >= 0 && degrees <= 360 && { do: "recolor", hue: round(degrees / 360) },
   },
-  gain: { inputs: ["gain"], empty: [1], slides: true, show: ({ gain }) => [[gain].flat()[0]], step: ([gain]) => gain >= 0 && { do: "recolor", gain } },
-  opacity: { inputs: ["opacity"], empty: [1], slides: true, show: ({ factor }) => [factor], step: ([factor]) => factor > 0 && { do: "opacity", factor } },
+  gain: {
+    inputs: ["gain"], empty: [1], slides: true, show: ({ gain }) => [round(gain, 4)],
+    step: ([gain], _, total) => gain >= 0 && { do: "recolor", gain: round(gain / (total.gain || 1)) }, // what is black stays so
+  },
+  opacity: {
+    inputs: ["opacity"], empty: [1], slides: true, show: ({ opacity }) => [round(opacity, 4)],
+    step: ([opacity], _, total) => opacity > 0 && { do: "opacity", factor: round(opacity / total.opacity) },
+  },
   shift: {
     inputs: ["shift"], empty: [0], timed: true, show: ({ shift }, { frames }) => [round(shift * frames, 3)],
-    step: ([later], { frames }) => ({ do: "retime", shift: round(later / frames) }),
+    step: ([later], { frames }, { shift }) => ({ do: "retime", shift: round(later / frames - shift) }),
   },
   stretch: {
-    inputs: ["stretch"], empty: [1], timed: true, show: ({ stretch }) => [round(1 / stretch, 3)],
-    step: ([speed], { time, last }) => Math.abs(speed) >= 0.01 && { do: "retime", stretch: round(1 / speed), about: last?.about ?? round(time) },
+    inputs: ["stretch"], empty: [1], timed: true, show: ({ speed }) => [round(speed, 3)],
+    step: ([speed], { time, last }, total) => Math.abs(speed) >= 0.01 && { do: "retime", stretch: round(total.speed / speed), about: last?.about ?? round(time) },
   },
   multiply: {
     inputs: ["copies", "delay", "apart-x", "apart-y"], empty: null,
@@ -93,9 +104,9 @@ export class Panel {
     return editing.count(lead.number, lead.base) > 0 || Object.keys(selection).some((number) => Number(number) !== lead.number);
   }
 
-  act(step) {
+  act(step, amends = false) {
     try {
-      if (this.hasSelection) this.player.editing.edit(step);
+      if (this.hasSelection) this.player.editing.edit(step, amends);
     } catch (error) {
       toast(error.message, 8000);
     }
@@ -120,11 +131,16 @@ export class Panel {
   changed(name, input) {
     const form = FORMS[name], values = form.inputs.map((own) => value(own === input || !form.slides ? own : input));
     if (!values.every(Number.isFinite) || element(input).value === "") return;
-    const facts = this.facts(), { editing } = this.player, step = form.step(values, { ...facts, last: null });
-    if (!step) return;
-    const amends = isAlike(editing.history.last, step);
-    if (amends) editing.edit(form.step(values, facts), true);
-    else if (name !== "multiply") this.act(step);
+    const facts = this.facts(), like = form.step(values, { ...facts, last: null }, filled({}));
+    if (!like) return;
+    const amends = isAlike(facts.last, like);
+    if (amends || name !== "multiply") this.act(form.step(values, amends ? facts : { ...facts, last: null }, this.totalBefore(amends)), amends);
+  }
+
+  /** What the edits of the selection add up to, without the last one on demand. */
+  totalBefore(last) {
+    const { editing, lead } = this.player, { current } = editing.history;
+    return filled(totalOf(editing.stateOf(lead.number, lead.base, last ? current.slice(0, -1) : current)));
   }
 
   update() {
@@ -143,7 +159,7 @@ export class Panel {
     const { hasSelection } = this;
     for (const name of ["select-none", "grow", "shrink"]) element(name).disabled = !count;
     element("edits").disabled = !hasSelection;
-    for (const name of ["shift", "stretch", "freeze", "delay"]) element(name).disabled = segments.spans.length > 1;
+    for (const name of ["shift", "stretch", "freeze", "delay"]) element(name).disabled = segments.spans.length > 1 || player.timeline.last === 0; // a still image has no time
     for (const name of ["radius", "tolerance"]) this.showSlide(name, tools[name]);
     element("radius").parentElement.hidden = tools.name !== "brush";
     element("tolerance").parentElement.hidden = tools.name !== "eyedropper";
@@ -164,24 +180,26 @@ export class Panel {
     this.showNumber(`${name}-value`, own);
   }
 
-  /** Show a number, unless it is the one being typed. */
+  /** Show a number, unless it is the one being typed; none for NaN. */
   showNumber(name, own) {
     const input = element(name), isTyped = document.activeElement === input && (input.value === "" || Number(input.value) === own);
-    if (!isTyped) input.value = own;
+    if (!isTyped) input.value = Number.isFinite(own) ? own : "";
   }
 
-  /** Show the last edit in its form; all others are empty. */
+  /** Show what the edits of the selection add up to; where its Gaussians differ the last edit, if it is of that kind. */
   showForms() {
-    const facts = { side: Math.max(...this.player.base.header.size), frames: Math.max(this.player.timeline.last, 1) }, { last } = this.player.editing.history;
-    for (const form of Object.values(FORMS)) {
-      const like = form.step(form.empty ?? [1, 0, 0, 0], { ...facts, time: 0, center: [0, 0], last: null });
-      const shown = isAlike(last, like) ? form.show(last, facts) : form.empty;
-      if (shown) form.inputs.forEach((name, k) => this.showInput(form, name, shown[k]));
+    const { state, base, timeline, editing } = this.player, { last } = editing.history, total = totalOf(state);
+    const facts = { side: Math.max(...base.header.size), frames: Math.max(timeline.last, 1), time: 0, center: [0, 0], last: null };
+    for (const [own, form] of Object.entries(FORMS)) {
+      const isLast = isAlike(last, form.step(form.empty ?? [1, 0, 0, 0], facts, filled({})));
+      if (own === "multiply" && !isLast) continue;
+      const shown = form.show(own === "multiply" ? last : total, facts), ofLast = isLast && own !== "multiply" ? form.show(totalOfStep(last), facts) : [];
+      form.inputs.forEach((name, k) => this.showInput(form, name, Number.isFinite(shown[k]) ? shown[k] : ofLast[k], form.empty?.[k]));
     }
   }
 
-  showInput(form, name, own) {
-    if (form.slides) this.showSlide(name, own);
-    else this.showNumber(name, own);
+  showInput(form, name, own, empty) {
+    if (form.slides) fill(element(name), Number.isFinite(own) ? own : empty);
+    this.showNumber(form.slides ? `${name}-value` : name, own);
   }
 }

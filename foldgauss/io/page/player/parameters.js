@@ -49,7 +49,7 @@ function mapAxes({ log_scale: scale, angle_logit: angles }, i, [a, b, c, d]) {
 }
 
 /** The angle is defined modulo pi; in [pi/2, 3 pi/2) its logit is best conditioned. */
-function angleLogit(angle) {
+export function angleLogit(angle) {
   const turned = angle - Math.PI / 2;
   return logit((turned - Math.PI * Math.floor(turned / Math.PI) + Math.PI / 2) / (2 * Math.PI));
 }

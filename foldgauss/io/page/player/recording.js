@@ -65,11 +65,11 @@ export class Recording {
   }
 
   /** Start a recorder; its encoder takes a while, in which frames would be lost. */
-  async start(recorder, track) {
+  async start(recorder, source) {
     let started = false;
     recorder.onstart = () => (started = true);
     recorder.start();
-    for (const begun = performance.now(); !started && performance.now() - begun < LONGEST_START; await pause(10)) track.requestFrame();
+    for (const begun = performance.now(); !started && performance.now() - begun < LONGEST_START; await pause(10)) source.requestFrame();
   }
 
   async run() {
@@ -78,18 +78,19 @@ export class Recording {
     const tick = 1000 / Math.min(Math.max(rate, 24), 60), length = (last - first + 1) / rate;
     player.pause();
     const stream = canvas.captureStream(0), [track] = stream.getVideoTracks(), pixels = width * height * (1000 / tick);
+    const source = track.requestFrame ? track : stream; // in Firefox it is the stream's
     const recorder = new MediaRecorder(stream, { mimeType: this.type, videoBitsPerSecond: Math.min(Math.max(BITS_PER_PIXEL * pixels, LEAST_BITS), MOST_BITS) });
     recorder.ondataavailable = (event) => parts.push(event.data);
     const ended = new Promise((done) => (recorder.onstop = done)), at = async (position) => {
       player.goTo(position); // the screen need not show it
       await player.segments.ready();
       this.draw(context, width, height);
-      track.requestFrame();
+      source.requestFrame();
     };
     [this.running, this.stopped] = [true, false];
     try {
       await at(first);
-      await this.start(recorder, track);
+      await this.start(recorder, source);
       const begun = performance.now();
       for (let seconds = 0; seconds < length && !this.stopped; seconds = (performance.now() - begun) / 1000) {
         const now = performance.now();
@@ -98,7 +99,7 @@ export class Recording {
         await pause(Math.max(tick - (performance.now() - now), LEAST_PAUSE));
       }
       if (!this.stopped) await at(last); // where the computer is slow, frames are left out, but never this one
-      for (let k = 0; k < 3; k++, await pause(tick)) track.requestFrame();
+      for (let k = 0; k < 3; k++, await pause(tick)) source.requestFrame();
       recorder.stop();
       await ended;
       download(new Blob(parts, { type: this.type }), `${this.files.stem}.${this.suffix}`);

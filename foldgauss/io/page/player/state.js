@@ -1,9 +1,12 @@
-// A state of an edit: the Gaussians as edited, which of them are selected, and which of the file's each one stems from.
+// A state of an edit: the Gaussians as edited, which of them are selected, which of the file's each one stems from, and
+// what its edits add up to.
 import { TEXTURE_WIDTH, WIDTHS, fillTexels } from "./gaussians.js";
+import { beginTotals } from "./totals.js";
 
 /** The state before any edit, with nothing selected. */
 export function begin(model) {
-  return { model, selected: new Uint8Array(model.num), origin: Uint32Array.from({ length: model.num }, (_, i) => i) };
+  const { num } = model;
+  return { model, selected: new Uint8Array(num), origin: Uint32Array.from({ length: num }, (_, i) => i), ...beginTotals(num) };
 }
 
 const sum = (mask) => mask.reduce((total, own) => total + own, 0);
@@ -71,5 +74,5 @@ export function gathered(state, source, selected) {
   const leaves = Object.fromEntries(Object.entries(WIDTHS).map(([name, width]) => [name, take(model.leaves[name], width(degree))]));
   const values = take(model.values, 4 * texels, new Float32Array(4 * TEXTURE_WIDTH * rows));
   const changed = { ...model, num, rows, leaves, values, windows: take(model.windows, 2) };
-  return { model: changed, selected, origin: take(state.origin, 1) };
+  return { model: changed, selected, origin: take(state.origin, 1), totals: state.totals, rows: take(state.rows, 1) };
 }

@@ -27,7 +27,7 @@ export class Transport {
     const { base, timeline, segments } = this.player, [height, width] = base.header.size, bytes = segments.decoder.numBytes;
     const size = bytes < 1e6 ? `${Math.round(bytes / 1e3)} kB` : `${(bytes / 1e6).toFixed(1)} MB`;
     const parts = segments.spans.length > 1 ? ` in ${segments.spans.length} segments` : "";
-    put("facts", `${width} × ${height} · ${timeline.last + 1} frames${parts} · ${size}`);
+    put("facts", `${width} × ${height} · ${timeline.last ? `${timeline.last + 1} frames` : "still image"}${parts} · ${size}`);
     element("scrub").max = timeline.last;
   }
 
