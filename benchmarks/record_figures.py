@@ -67,7 +67,7 @@ def quality_time(records: Path) -> plt.Figure:
         points = [(runs[name]["seconds"] / 60, runs[name]["psnr"]) for name in names if name in runs]
         ax.plot(*zip(*points, strict=True), "o-", color=color, label=f"foldgauss, {size}, 2 CPU cores")
         for minutes, psnr in points:
-            ax.annotate(f"{psnr:.1f}", (minutes, psnr), (0, 7), textcoords="offset points", ha="center", color=color)
+            ax.annotate(f"{psnr:.1f}", (minutes, psnr), (-4, 5), textcoords="offset points", ha="right", color=color)
     minutes, psnr = zip(*((_to_minutes(time), psnr) for psnr, _, time in PAPER_STARTS.values()), strict=True)
     ax.plot(minutes, psnr, "x", color=ORANGE, mew=2, label="VeGaS as published, 640x1280")
     most = max(psnr)
@@ -77,7 +77,7 @@ def quality_time(records: Path) -> plt.Figure:
     ticks = [1, 2, 5, 10, 20, 60]
     ax.set_xticks(ticks, [str(tick) for tick in ticks])
     ax.minorticks_off()
-    ax.set_xlim(0.8, 90)
+    ax.set_xlim(0.6, 90)
     low, high = ax.get_ylim()
     ax.set_ylim(low - 0.5, high + 0.6)
     fig.legend(loc="outside upper left", fontsize=9.5)

@@ -19,13 +19,15 @@ from threadpoolctl import threadpool_info
 from foldgauss.video import Economy, FitConfig, Growth, compress, evaluate, fit
 
 SIZE, NUM_FRAMES = (32, 48), 5
+#: The default when the bits were recorded; of the radius in pixels nothing is pruned by default now.
+GROWTH = Growth(prune_radius=20.0)
 CONFIGS = {
     "plain": FitConfig(num_gaussians=120, steps=60, seed=2, interpolation_fraction=0.0),
     "economical": FitConfig(num_gaussians=120, steps=120, seed=2, economy=Economy()),
     "growing": FitConfig.preset(
-        "paper", num_gaussians=80, steps=120, seed=2, degree=3, growth=Growth(), final_rate=1.0, initialization="clip"
+        "paper", num_gaussians=80, steps=120, seed=2, degree=3, growth=GROWTH, final_rate=1.0, initialization="clip"
     ),
-    "published": FitConfig.preset("paper", num_gaussians=200, steps=150),
+    "published": FitConfig.preset("paper", num_gaussians=200, steps=150, growth=GROWTH),
 }
 
 

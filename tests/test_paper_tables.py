@@ -451,6 +451,16 @@ class TestReproduce:
             changed = [field for field in vars(first) if getattr(first, field) != getattr(config, field)]
             assert len(changed) == 1
 
+    def test_a_smaller_fit_is_the_same_in_pixels(self):
+        full, half = (reproduce.config_of("as published", size, 30_000, 0) for size in ((640, 1280), (320, 640)))
+        assert half.num_gaussians == full.num_gaussians / 4
+        # A Gaussian of as many pixels is twice as long, and moves twice as far; each pixel weighs four times as much in
+        # the mean, and is twice as wide in half widths.
+        for length in "clone_below", "prune_scale", "screen_gradient", "time_gradient":
+            assert getattr(half.growth, length) == 2 * getattr(full.growth, length)
+        assert (half.rates.loc, half.rates.coefficients) == (2 * full.rates.loc, 2 * full.rates.coefficients)
+        assert half.rates.log_scale == full.rates.log_scale
+
     def test_an_interrupted_fit_continues(self, tmp_path, monkeypatch):
         """Stopped between checkpoints, it goes on from the last one: model and curve are those of a whole run."""
         monkeypatch.setattr(reproduce, "EVERY", 2)

@@ -5,7 +5,7 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -79,7 +79,7 @@ def _name_output(path: Path, temporary: Path) -> Iterator[None]:
         raise
 
 
-def _new_file(path: Path, suffix: str) -> Path:
+def _new_file(path: Path) -> Path:
     """Create the empty temporary file that is to become `path`."""
     _check_target(path)
     try:
@@ -91,7 +91,7 @@ def _new_file(path: Path, suffix: str) -> Path:
     # os.path, not Path: it returns False for any OSError, and opening then reports the reason.
     if os.path.exists(path) and not os.path.isfile(path):
         raise OutputError(f"path: expected a file's path, got {str(path)!r}, which is not a regular file.")
-    temporary = temporary_name(path, suffix)
+    temporary = temporary_name(path, path.suffix)
     try:
         # O_EXCL and mode 0o666: no clash, and the user's umask holds (mkstemp would give 0o600).
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
@@ -102,22 +102,21 @@ def _new_file(path: Path, suffix: str) -> Path:
 
 def check_writable(path: str | os.PathLike) -> None:
     """Check before long work whether `atomic_path(path)` will succeed. Raises `OutputError`."""
-    path = Path(path)
-    _new_file(path, path.suffix).unlink(missing_ok=True)  # the holder of the lock may have removed it
+    _new_file(Path(path)).unlink(missing_ok=True)  # the holder of the lock may have removed it
 
 
 @contextmanager
-def atomic_path(path: str | os.PathLike, *, suffix: str | None = None) -> Iterator[Path]:
+def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     """Provide a temporary path in the folder of `path`, and rename it to `path` when the block ends without an error.
 
-    The temporary file exists (empty) when the block starts and keeps the extension of `path`, or `suffix`
-    where given, since some writers choose the format by it. It is flushed to disk before the rename.
+    The temporary file exists (empty) when the block starts and keeps the extension of `path`, since some writers choose
+    the format by it. It is flushed to disk before the rename.
     On any exception, including `KeyboardInterrupt`, it is removed and an existing `path` stays unchanged.
 
     Raises `OutputError` if the parent folder is missing or not writable, or if `path` is not a regular file.
     """
     path = Path(path)
-    temporary = _new_file(path, path.suffix if suffix is None else suffix)
+    temporary = _new_file(path)
     try:
         with _name_output(path, temporary):
             yield temporary
@@ -132,15 +131,19 @@ def atomic_path(path: str | os.PathLike, *, suffix: str | None = None) -> Iterat
 
 
 @contextmanager
-def atomic_folder(folder: str | os.PathLike, *, check: Callable[[], object] = lambda: None) -> Iterator[Path]:
+def atomic_folder(
+    folder: str | os.PathLike, overwrite: bool = False, *, pattern: str, what: str = "frames"
+) -> Iterator[Path]:
     """Provide a temporary folder beside `folder`, and rename it to `folder` when the block ends without an error.
 
-    An existing folder is moved aside first and deleted last, so at any moment one of the two is whole. `check` is
-    called just before and raises where the folder must not be replaced, since the block may have taken hours.
+    An existing folder is moved aside first and deleted last, so at any moment one of the two is whole. It is refused,
+    before the block and again after it, since that may have taken hours, unless it is empty, or contains only `what`
+    and `overwrite` is given. `pattern` matches the names of `what`; other files are never deleted.
 
-    Raises `OutputError` if the parent folder is missing or not writable.
+    Raises `OutputError` if the folder is refused, or its parent is missing or not writable.
     """
-    folder = Path(folder).resolve()
+    given, folder = Path(folder), Path(folder).resolve()
+    _check_replaceable(given, overwrite, pattern, what)
     _check_target(folder)
     temporary, aside = temporary_name(folder, ""), temporary_name(folder, "")
     try:
@@ -151,7 +154,7 @@ def atomic_folder(folder: str | os.PathLike, *, check: Callable[[], object] = la
         with _name_output(folder, temporary):
             yield temporary
         try:
-            check()
+            _check_replaceable(given, overwrite, pattern, what)
             if folder.exists():
                 os.replace(folder, aside)
             os.replace(temporary, folder)
@@ -164,11 +167,8 @@ def atomic_folder(folder: str | os.PathLike, *, check: Callable[[], object] = la
         shutil.rmtree(aside, ignore_errors=True)
 
 
-def check_replaceable(folder: Path, overwrite: bool, *, pattern: str, what: str = "frames") -> None:
-    """Raise `OutputError` unless `folder` is missing, empty, or contains only `what` and `overwrite` is given.
-
-    `pattern` matches the names of `what`; other files are never deleted.
-    """
+def _check_replaceable(folder: Path, overwrite: bool, pattern: str, what: str) -> None:
+    """Raise `OutputError` unless `atomic_folder` may replace `folder`."""
     if not os.path.exists(folder):
         return
     if not folder.is_dir():

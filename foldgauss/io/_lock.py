@@ -36,26 +36,25 @@ def lock_output(path: Path, *, own: tuple[Path, ...] = (), what: str = "fit") ->
         except OSError as error:
             raise output_error(path, error) from error
         for target in own:
-            _remove_unfinished(target, "tmp", 0.0 if _has_full_stem(target) else STALE_AGE)
-        _remove_unfinished(path, "own", 0.0 if _has_full_stem(path) else STALE_AGE)
-        _remove_unfinished(path, "tmp", STALE_AGE)
+            _remove_unfinished(target, "tmp", held=True)
+        _remove_unfinished(path, "own", held=True)
+        _remove_unfinished(path, "tmp", held=False)
         stack.callback(OWNED.discard, path.absolute())
         OWNED.add(path.absolute())
         yield
 
 
-def _remove_unfinished(path: Path, kind: str, age: float) -> None:
-    """Remove temporary files of `path` that are at least `age` seconds old, see `temporary_name`."""
+def _remove_unfinished(path: Path, kind: str, *, held: bool) -> None:
+    """Remove temporary files of `path`, see `temporary_name`: stale ones, or all if only the lock's holder writes them.
+
+    Where the names contain a part of its stem, they may belong to another output.
+    """
+    age = 0.0 if held and len(path.stem) <= KEPT else STALE_AGE
     name = re.compile(rf"\.{re.escape(path.stem[:KEPT])}\.{kind}-[0-9a-f]{{8}}{re.escape(path.suffix)}")
     for found in path.parent.iterdir():
         with suppress(OSError):  # removed by another process, of another user, or a folder
             if name.fullmatch(found.name) and time.time() - found.stat().st_mtime >= age:
                 found.unlink()
-
-
-def _has_full_stem(path: Path) -> bool:
-    """Whether the names of its temporary files contain its whole stem, and so belong to no other output."""
-    return len(path.stem) <= KEPT
 
 
 def _shorten(name: str) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.io.media.clip import Clip
-from foldgauss.io.media.image_files import image_paths, image_size
+from foldgauss.io.media.image_files import image_paths, read_image
 from foldgauss.io.media.masks import read_labels
 from foldgauss.io.media.resizing import center_window
 from foldgauss.io.media.video_reading import read_video
@@ -194,7 +194,7 @@ def davis(
     found = [path for path in paths if path.is_file()]
     if len(found) < len(paths):
         return MaskedClip(clip, None, f"{len(found)} of {len(paths)} frames have a mask in {str(place)!r}")
-    masks, whole = read_labels(paths), image_size(shown[0])
+    masks, whole = read_labels(paths), read_image(shown[0]).shape[:2]
     if masks.shape[1:] != whole:
         raise invalid(
             "root",

@@ -140,7 +140,7 @@ _READ = {
             "stack_frames",
         ),
         "decoder": (),
-        "image_files": ("natural_sort_key", "_is_jpeg_sequence", "image_size"),
+        "image_files": ("natural_sort_key", "_is_jpeg_sequence"),
         "video_decoding": (),
         "video_reading": (),
         "format_detection": (),

@@ -428,7 +428,7 @@ COMPACT = Target(
             "_is_text",
             "_is_range",
         ),
-        "foldgauss.io.models.range_coder": ("encode", "_encode", "_encode_bit", "_encode_adaptive"),
+        "foldgauss.io.models.range_coder": ("encode",),
     },
     _compact_body,
     lambda size: 4 * CONSTANT + 20_000 * size,  # a byte may hold 8 Gaussians of 16 powers: the format's own limit

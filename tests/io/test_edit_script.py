@@ -18,7 +18,7 @@ from soft_models import NUM, NUM_FRAMES, OBJECT, SIZE, soft_model
 from foldgauss.io import save_selection, save_video_model
 from foldgauss.io._toml_lines import key_lines
 from foldgauss.io.edit_script import ACTIONS, EditScriptError, parse_edit_script, read_edit_script
-from foldgauss.io.models.selections import format_indices, parse_indices
+from foldgauss.io.models.selections import parse_indices
 from foldgauss.render import Camera
 from foldgauss.video import EditedVideo, SegmentedVideo, Selection, VideoModel, edit, layers, select
 
@@ -61,11 +61,11 @@ def test_indices_select_these_gaussians(indices):
     assert same(made(behind, several), edit(several).select(both).vanish().video())
 
 
-@given(mask=st.lists(st.booleans(), min_size=1, max_size=40).filter(any))
-def test_indices_round_trip_as_text(mask):
-    text = format_indices(Selection(np.array(mask)))
-    assert np.array_equal(parse_indices(text, len(mask)).mask, mask)
-    assert len(re.findall(r"\d+", text)) <= sum(mask)
+@given(ends=st.lists(st.tuples(st.integers(0, 39), st.integers(0, 39)).map(sorted), min_size=1))
+def test_indices_are_numbers_and_ranges_with_both_ends(ends):
+    text = ",".join(f"{first}" if first == last else f"{first}-{last}" for first, last in ends)
+    expected = np.isin(np.arange(40), [k for first, last in ends for k in range(first, last + 1)])
+    assert np.array_equal(parse_indices(text, 40).mask, expected)
 
 
 def test_indices_of_segments_are_those_of_one_of_them():

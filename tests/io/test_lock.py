@@ -150,7 +150,7 @@ def test_a_folder_is_there_whenever_its_replacement_is_stopped(tmp_path, monkeyp
             raise KeyboardInterrupt
 
     monkeypatch.setattr(os, "replace", moving)
-    with pytest.raises(KeyboardInterrupt), atomic_folder(folder) as temporary:
+    with pytest.raises(KeyboardInterrupt), atomic_folder(folder, True, pattern="old") as temporary:
         (temporary / "new").touch()
     assert os.listdir(tmp_path) == ["frames"]
     assert os.listdir(folder) == [["old"], ["new"]][at - 1]

@@ -94,6 +94,16 @@ def saved(tmp_path):
 # ------------------------------------------------------------------------------------------ round trips
 
 
+def test_a_header_as_long_as_the_first_bytes_of_an_archive(tmp_path):
+    """Its length opens the file: 19,280 bytes are "PK", as in a zip archive."""
+    path = tmp_path / "toy.safetensors"
+    save_model(path, _toy(), metadata={"clip": ""})
+    missing = int.from_bytes(b"PK", "little") - int.from_bytes(path.read_bytes()[:8], "little")
+    save_model(path, _toy(), metadata={"clip": "x" * missing})
+    assert path.read_bytes()[:8] == b"PK" + bytes(6)
+    assert read_header(path)["metadata"] == {"clip": "x" * missing}
+
+
 def test_every_dtype_layout_and_kind_of_leaf(tmp_path):
     numbers = np.random.default_rng(0).normal(size=(3, 4))
     parts = {

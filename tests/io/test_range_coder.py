@@ -36,7 +36,7 @@ def known(values, seed):
     near = np.minimum(rng.integers(-1, max(num, 1), (num, 3)), np.arange(num)[:, None] - 1).astype(np.int32)
     contexts = rng.integers(0, coder.CONTEXTS, (num, 2)).astype(np.uint8)
     numbers = rng.normal(size=num), np.exp(rng.normal(size=num)), np.exp(rng.normal(size=num))
-    return coder.Column(rng.random(num) < 0.8, contexts, *numbers, near, 0.5)
+    return coder.Column(rng.random(num) < 0.8, contexts, *numbers, near)
 
 
 @pytest.mark.parametrize("scale", [0.2, 1.0, 5.0, 50.0])

@@ -153,9 +153,9 @@ def loaded(monkeypatch):
     """The prefixes of the models as they are read."""
     found, load = [], segmented.load_part
 
-    def noted(path, kind, header, tensors, prefix=""):
+    def noted(path, about, prefix=""):
         found.append(prefix)
-        return load(path, kind, header, tensors, prefix)
+        return load(path, about, prefix)
 
     monkeypatch.setattr(segmented, "load_part", noted)
     return found

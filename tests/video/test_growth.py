@@ -120,9 +120,10 @@ def test_big_gaussians_are_pruned_late():
     rows[1, PLACE["log_scale"]] = np.log([SMALL, 1.01 * 20 / 3 / PIXELS])
     rows[2, PLACE["log_scale"]] = np.log([SMALL, 0.99 * 20 / 3 / PIXELS])
     assert change(rows, statistics(), step=3000)[0].tolist() == [0, 1, 2, 3, 4]
-    assert change(rows, statistics(), step=3100)[0].tolist() == [2, 3, 4]
-    few = dataclasses.replace(GROWTH, prune_radius=1e6)
-    assert change(rows, statistics(), step=3100, growth=few)[0].tolist() == [1, 2, 3, 4]
+    assert change(rows, statistics(), step=3100)[0].tolist() == [1, 2, 3, 4]
+    narrow = dataclasses.replace(GROWTH, prune_radius=20.0)
+    assert change(rows, statistics(), step=3000, growth=narrow)[0].tolist() == [0, 1, 2, 3, 4]
+    assert change(rows, statistics(), step=3100, growth=narrow)[0].tolist() == [2, 3, 4]
 
 
 def test_largest_gradients_come_first_at_the_limit():
@@ -227,7 +228,6 @@ QUICK = Growth(
     time_gradient=1.0,
     clone_below=0.05,
     big_from=25,
-    prune_radius=1e3,
     prune_scale=10.0,
     reset_every=20,
 )

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.table import Column, Table
 
 from foldgauss.cli.app.application import WrongUse, app, name_option, out, warn
@@ -175,7 +176,8 @@ def _row(outcome: Outcome) -> dict[str, Any]:
 
 def _print_table(title: str, outcomes: list[Outcome]) -> None:
     failed = sum(outcome.failure is not None for outcome in outcomes)
-    table = Table(Column("clip", overflow="fold"), title=title)
+    columns = Column("clip", overflow="fold")
+    table = Table(columns, title=title, box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
     for name in ("frames", "PSNR (dB)", "SSIM", "Gaussians", "bytes", "seconds"):
         table.add_column(name, justify="right", no_wrap=True)
     if len(outcomes) <= MAX_ROWS:

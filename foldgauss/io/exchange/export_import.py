@@ -2,13 +2,12 @@
 
 import os
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid
-from foldgauss.io._atomic import OutputError, atomic_folder, check_path, check_replaceable, check_writable
+from foldgauss.io._atomic import OutputError, atomic_folder, check_path, check_writable
 from foldgauss.io.exchange.gaussians_ply import AXES, DEPTH_STEP, write_3dgs_frames, write_3dgs_ply
 from foldgauss.io.exchange.ply_file import format_error
 from foldgauss.io.exchange.pseudomesh import write_pseudomesh
@@ -100,9 +99,7 @@ def _write_vegas_segments(folder: Path, video: SegmentedVideo, overwrite: bool) 
     if folder.suffix.lower() == ".ply" and not folder.is_dir():
         cure = "Each segment becomes a file in it: leave the extension out."
         raise invalid("out", expected="a folder", got=repr(str(folder)), cure=cure)
-    check = partial(check_replaceable, folder, overwrite, pattern=r"segment-[0-9]{3,}\.ply", what="segments")
-    check()
-    with atomic_folder(folder, check=check) as temporary:
+    with atomic_folder(folder, overwrite, pattern=r"segment-[0-9]{3,}\.ply", what="segments") as temporary:
         for number, segment in enumerate(video.segments):
             write_vegas_ply(temporary / f"segment-{number:03d}.ply", segment.model)
     return folder

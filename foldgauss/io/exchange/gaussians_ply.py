@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -12,7 +11,7 @@ from jaxtyping import Float
 from scipy.special import expit, logit
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_within, short_repr
-from foldgauss.io._atomic import atomic_folder, check_replaceable
+from foldgauss.io._atomic import atomic_folder
 from foldgauss.io.exchange.ply_file import format_error, is_3dgs, is_vegas, read_ply, to_float32, write_ply
 from foldgauss.render import Camera, Gaussians3D, pixels_per_unit
 from foldgauss.render.camera import THICKNESS
@@ -160,10 +159,8 @@ def write_3dgs_frames(
     """
     folder, times = Path(folder), check_times(model, times)
     _check_compositing(model)
-    check = partial(check_replaceable, folder, overwrite, pattern=r"frame_[0-9]{4,}\.ply")
-    check()
-    renderer = VideoRenderer(model)
-    with atomic_folder(folder, check=check) as temporary:
+    with atomic_folder(folder, overwrite, pattern=r"frame_[0-9]{4,}\.ply") as temporary:
+        renderer = VideoRenderer(model)
         for number, t in enumerate(times):
             gaussians = frame_gaussians(renderer, t, depth_step=depth_step)
             write_gaussians_ply(temporary / f"frame_{number:04d}.ply", gaussians, axes=axes, sh_degree=sh_degree)

@@ -7,6 +7,7 @@ Source of the layout: G. Turk, "The PLY Polygon File Format" (1994).
 """
 
 import os
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,7 @@ _SIZES = {
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 #: Bytes; a header names each frame of a VeGaS video in about 30, so this allows some 100,000 frames.
 MAX_HEADER = 4 << 20
+_END_OF_HEADER = re.compile(rb"^[ \t]*end_header[ \t\r]*\n", re.MULTILINE)
 #: Characters of the longest accepted number.
 LONGEST_WORD = 64
 
@@ -108,11 +110,11 @@ def read_ply(path: str | os.PathLike, wanted: Iterable[str]) -> Ply:
     a file that is not PLY, breaks off, declares more rows than it holds, or has lists in a wanted element.
     """
     path = Path(path)
-    data = _read_bytes(path)
+    data = read_bytes(path)
     header, start = _split_header(path, data)
     order, elements, comments = _parse_header(path, header)
     wanted = set(wanted)
-    body = _TextBody(path, data[start:]) if order == "" else _BinaryBody(path, data, start, order)
+    body = _Body(path, memoryview(data)[start:], order)
     found = {}
     for element in elements:
         if wanted <= found.keys():
@@ -129,7 +131,8 @@ def read_ply(path: str | os.PathLike, wanted: Iterable[str]) -> Ply:
     return Ply(path, found, comments)
 
 
-def _read_bytes(path: Path) -> bytes:
+def read_bytes(path: Path) -> bytes:
+    """The content of a file. Raises `FileNotFoundError`, and `FormatError` where it cannot be read."""
     try:
         return path.read_bytes()
     except FileNotFoundError:
@@ -146,18 +149,11 @@ def _split_header(path: Path, data: bytes) -> tuple[list[str], int]:
     if data[:4] not in (b"ply\n", b"ply\r"):
         got = "an empty file" if not data else f"one that starts with {data[:8]!r}"
         raise format_error(path, expected="a PLY file, which starts with 'ply'", got=got, cure="Check the path.")
-    head = data[:MAX_HEADER]
-    lines, start = [], 0
-    while True:
-        end = head.find(b"\n", start)
-        if end < 0:
-            got = f"none in {len(head)} bytes"
-            raise format_error(path, expected="a line 'end_header'", got=got, cure="Copy the file again.")
-        line = head[start:end].rstrip(b"\r").decode("ascii", errors="replace")
-        start = end + 1
-        if line.strip() == "end_header":
-            return lines[1:], start
-        lines.append(line)
+    found = _END_OF_HEADER.search(data[:MAX_HEADER])
+    if found is None:
+        got = f"none in {min(len(data), MAX_HEADER)} bytes"
+        raise format_error(path, expected="a line 'end_header'", got=got, cure="Copy the file again.")
+    return data[: found.start()].decode("ascii", errors="replace").split("\n")[1:-1], found.end()
 
 
 def _parse_header(path: Path, lines: list[str]) -> tuple[str, list[_Element], tuple[str, ...]]:
@@ -181,7 +177,7 @@ def _parse_header(path: Path, lines: list[str]) -> tuple[str, list[_Element], tu
             elements[-1][2].append(_parse_property(where, rest))
         else:
             expected = "format ascii|binary_little_endian|binary_big_endian 1.0, element NAME COUNT, property TYPE NAME"
-            raise format_error(where, expected=expected, got=repr(line[:80]), cure="The header is damaged.")
+            raise format_error(where, expected=expected, got=repr(line.rstrip()[:80]), cure="The header is damaged.")
     if order is None:
         raise format_error(path, expected="a line 'format ...' in the header", got="none", cure="Copy it again.")
     for name, _, properties in elements:
@@ -206,57 +202,46 @@ def _is_count(text: str) -> bool:
     return text.isascii() and text.isdigit() and len(text) <= 15
 
 
-class _BinaryBody:
-    """Rows as bytes, element after element."""
+class _Body:
+    """Rows element after element: of bytes in an `order`, or of a text's words where it is empty."""
 
-    def __init__(self, path: Path, data: bytes, start: int, order: str):
-        self.path, self.data, self.at, self.order = path, data, start, order
+    def __init__(self, path: Path, data: memoryview, order: str):
+        self.path, self.order, self.at = path, order, 0
+        self.values = data if order else bytes(data).split()
 
     def read(self, element: _Element) -> np.ndarray:
-        dtype = element.dtype(self.order)
-        self._need(element, element.count * dtype.itemsize)
-        rows = np.frombuffer(self.data, dtype, element.count, self.at)
-        self.at += rows.nbytes
-        return rows
+        values = self._take(element, element.count * sum(self._sizes(element)))
+        return np.frombuffer(values, element.dtype(self.order)) if self.order else self._parse(element, values)
 
     def skip(self, element: _Element) -> None:
+        sizes = self._sizes(element)
         if not element.has_lists:
-            num_bytes = element.count * element.dtype(self.order).itemsize
-            self._need(element, num_bytes)
-            self.at += num_bytes
+            self._take(element, element.count * sum(sizes))
             return
-        codes = [[np.dtype(self.order + part) for part in code.split(",")] for _, code in element.properties]
-        self._need(element, element.count * sum(code[0].itemsize for code in codes))
+        self._need(element, element.count * sum(sizes))
+        items = [np.dtype(code.split(",")[1]).itemsize if "," in code else 0 for _, code in element.properties]
         for _ in range(element.count):
-            for code in codes:
-                self._skip_one(element, code)
+            for (_, code), size, item in zip(element.properties, sizes, items, strict=True):
+                first = self._take(element, size)
+                if item:
+                    self._take(element, self._length(element, first, code) * (item if self.order else 1))
 
-    def _skip_one(self, element: _Element, code: list[np.dtype]) -> None:
-        self._need(element, code[0].itemsize)
-        if len(code) == 2:
-            num = int(np.frombuffer(self.data, code[0], 1, self.at)[0])
-            if num < 0:
-                raise format_error(self.path, expected=f"lengths of lists in {element.name!r}", got=str(num))
-            self._need(element, code[0].itemsize + num * code[1].itemsize)
-            self.at += num * code[1].itemsize
-        self.at += code[0].itemsize
+    def _sizes(self, element: _Element) -> list[int]:
+        """Bytes or words of each property; of a list those of its length."""
+        return [np.dtype(code.split(",")[0]).itemsize if self.order else 1 for _, code in element.properties]
 
-    def _need(self, element: _Element, num_bytes: int) -> None:
-        left = len(self.data) - self.at
-        if num_bytes > left:
-            expected = f"{element.count} rows of element {element.name!r}, {num_bytes} bytes or more"
-            raise format_error(self.path, expected=expected, got=f"{left} bytes", cure="The file is truncated.")
+    def _length(self, element: _Element, first: memoryview | list[bytes], code: str) -> int:
+        """The number of items of a list."""
+        if self.order:
+            number = str(np.frombuffer(first, self.order + code.split(",")[0])[0])
+        else:
+            number = first[0].decode("ascii", errors="replace")
+        if not _is_count(number):
+            raise format_error(self.path, expected=f"lengths of lists in {element.name!r}", got=repr(number[:40]))
+        return int(number)
 
-
-class _TextBody:
-    """Rows as words, element after element."""
-
-    def __init__(self, path: Path, data: bytes):
-        self.path, self.words, self.at = path, data.split(), 0
-
-    def read(self, element: _Element) -> np.ndarray:
+    def _parse(self, element: _Element, words: list[bytes]) -> np.ndarray:
         width = len(element.properties)
-        words = self._take(element, element.count * width)
         long = next((word for word in words if len(word) > LONGEST_WORD), None)
         if long is not None:  # an array of words gives each the room of the longest
             raise format_error(self.path, expected="numbers", got=f"a word of {len(long)} characters")
@@ -267,36 +252,18 @@ class _TextBody:
             name, where = element.properties[place % width][0], f"{element.name} {place // width}"
             got = f"{words[place][:40]!r} in {name} of {where}"
             raise format_error(self.path, expected="numbers", got=got, cure="The file is damaged.") from None
-        rows = np.empty(element.count, [(name, "f8") for name, _ in element.properties])
-        for column, (name, _) in enumerate(element.properties):
-            rows[name] = values[:, column]
-        return rows
+        return values.view([(name, "f8") for name, _ in element.properties])[:, 0]
 
-    def skip(self, element: _Element) -> None:
-        if not element.has_lists:
-            self._take(element, element.count * len(element.properties))
-            return
-        self._need(element, element.count * len(element.properties))
-        for _ in range(element.count):
-            for _, code in element.properties:
-                word = self._take(element, 1)[0]
-                if "," not in code:
-                    continue
-                if not _is_count(word.decode("ascii", errors="replace")):
-                    raise format_error(self.path, expected=f"lengths of lists in {element.name!r}", got=repr(word[:40]))
-                self._take(element, int(word))
-
-    def _take(self, element: _Element, num: int) -> list[bytes]:
+    def _take(self, element: _Element, num: int) -> memoryview | list[bytes]:
         self._need(element, num)
-        words = self.words[self.at : self.at + num]
         self.at += num
-        return words
+        return self.values[self.at - num : self.at]
 
     def _need(self, element: _Element, num: int) -> None:
-        left = len(self.words) - self.at
+        left, unit = len(self.values) - self.at, "bytes" if self.order else "numbers"
         if num > left:
-            expected = f"{element.count} rows of element {element.name!r}, {num} numbers or more"
-            raise format_error(self.path, expected=expected, got=str(left), cure="The file is truncated.")
+            expected = f"{element.count} rows of element {element.name!r}, {num} {unit} or more"
+            raise format_error(self.path, expected=expected, got=f"{left} {unit}", cure="The file is truncated.")
 
 
 def _is_number(word: bytes) -> bool:

@@ -9,7 +9,6 @@ import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -17,9 +16,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from foldgauss._runtime.checks import check_one_of, invalid
-from foldgauss.io._atomic import atomic_folder, check_replaceable
+from foldgauss.io._atomic import atomic_folder
 from foldgauss.io.exchange.gaussians_ply import check_times, frame_gaussians, read_3dgs_ply, write_gaussians_ply
-from foldgauss.io.exchange.ply_file import facts_error, format_error
+from foldgauss.io.exchange.ply_file import facts_error, format_error, read_bytes
 from foldgauss.io.media.frame_rate import DEFAULT_FPS
 from foldgauss.io.media.image_files import natural_sort_key
 from foldgauss.render import COMPOSITINGS, Camera, Gaussians3D, RenderOptions, Splats2D, Triangles, cpu, project
@@ -139,9 +138,7 @@ def write_pseudomesh(
     **Source:** VeGaS eq:traingle_face; Waczyńska et al. 2024, GaMeS (pseudomesh).
     """
     folder, times = Path(folder), check_times(model, times)
-    check = partial(check_replaceable, folder, overwrite, pattern=_FILES, what="frames of a pseudomesh")
-    check()
-    with atomic_folder(folder, check=check) as temporary:
+    with atomic_folder(folder, overwrite, pattern=_FILES, what="frames of a pseudomesh") as temporary:
         renderer = VideoRenderer(model)
         for number, t in enumerate(times):
             gaussians = frame_gaussians(renderer, t, depth_step=0.0)
@@ -321,15 +318,9 @@ def read_obj(path: str | os.PathLike) -> Float[np.ndarray, "faces 3 3"]:
 
 def _obj_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Numbered lines of words, those that a backslash continues as one, without comments and blank ones."""
-    try:
-        text = path.read_text(encoding="utf-8", errors="replace")
-    except FileNotFoundError:
-        raise FileNotFoundError(f"path: expected a file, got {str(path)!r}, which is missing.") from None
-    except OSError as error:
-        raise format_error(path, expected="a file that can be read", got=error.strerror or str(error)) from error
     parts: list[str] = []  # of a line that goes on; joined once, as there may be a million
-    for number, line in enumerate(text.split("\n"), start=1):
-        line = line.rstrip("\r")
+    for number, data in enumerate(read_bytes(path).splitlines(), start=1):  # of bytes: not at the separators of Unicode
+        line = data.decode("utf-8", errors="replace")
         if line.endswith("\\"):
             parts.append(line[:-1])
             continue

@@ -140,11 +140,15 @@ def encode_video(
     pixel_format = av.VideoFormat(encoding.pixel_format, 64, 64)
     matrix = None if pixel_format.is_rgb else Colorspace.ITU709
     steps = 64 // pixel_format.chroma_height(), 64 // pixel_format.chroma_width()
-    container = av.open(str(path), "w", options={"movflags": "+faststart"} if path.suffix in (".mp4", ".mov") else {})
+    suffix = path.suffix.lower()
+    container = av.open(str(path), "w", options={"movflags": "+faststart"} if suffix in (".mp4", ".mov") else {})
     with container:
         stream = container.add_stream(encoding.codec.encoder, rate=rate, options=options)
         stream.pix_fmt = encoding.pixel_format
-        packets, waiting = _encode_sound(container, sound, path.suffix.lower()), None
+        packets, waiting = iter(()), None
+        if sound is not None:
+            codec = "libopus" if suffix == ".webm" else "aac"
+            packets = _encode_sound(container.add_stream(codec, rate=SAMPLE_RATE, layout="stereo"), sound)
         for number, frame in enumerate(frames):
             image = _pad(frame, steps)
             if image.shape[2] == 4:
@@ -163,15 +167,8 @@ def encode_video(
         container.mux(stream.encode())
 
 
-def _encode_sound(container: av.container.OutputContainer, sound: Sound | None, suffix: str) -> Iterator[av.Packet]:
-    """Add a stream of sound to the container; its packets, as they are asked for."""
-    if sound is None:
-        return iter(())
-    stream = container.add_stream("libopus" if suffix == ".webm" else "aac", rate=SAMPLE_RATE, layout="stereo")
-    return _read_sound(stream, sound)
-
-
-def _read_sound(stream: av.AudioStream, sound: Sound) -> Iterator[av.Packet]:
+def _encode_sound(stream: av.AudioStream, sound: Sound) -> Iterator[av.Packet]:
+    """The packets of the sound, as they are asked for."""
     with open_container(Path(sound.path), SOUND_DEMUXERS) as source:
         of_file = source.streams.best("audio")
         graph = Graph()

@@ -182,27 +182,6 @@ def _check_shapes(arrays: dict[str, np.ndarray]) -> None:
 # --------------------------------------------------------------------------------------------- indexing
 
 
-class _FrameRecorder:
-    """Takes frames one by one and records what the index needs."""
-
-    def __init__(self, find_cuts: bool, on_frame: Callable[[], object]):
-        self.digests, self.transparent, self.size = bytearray(), bytearray(), (0, 0)
-        self._cuts, self._on_frame = CutFinder() if find_cuts else None, on_frame
-
-    def __call__(self, image: np.ndarray) -> int:
-        self.size = image.shape[:2]
-        self.digests += digest_frame(image)
-        self.transparent.append(int(image.shape[2] == 4 and image[..., 3].min() < 255))
-        if self._cuts is not None:
-            self._cuts.add(cv2.cvtColor(image, cv2.COLOR_BGR2RGB if image.shape[2] == 3 else cv2.COLOR_BGRA2RGB))
-        self._on_frame()
-        return len(self.transparent)
-
-    @property
-    def cuts(self) -> list[int]:
-        return [] if self._cuts is None else self._cuts.found
-
-
 def digest_frame(image: np.ndarray) -> bytes:
     return hashlib.blake2b(np.ascontiguousarray(image), digest_size=DIGEST_BYTES).digest()
 
@@ -228,7 +207,18 @@ def index_video(
     start, stop = check_range(frames)
     if fps is not None:
         check_fps(fps)
-    record, report, names = _FrameRecorder(find_cuts, on_frame), None, []
+    digests, transparent, finder = bytearray(), bytearray(), CutFinder() if find_cuts else None
+    report, names = None, []
+
+    def record(image: np.ndarray) -> tuple[int, int]:
+        """Record what the index needs of a frame; its size."""
+        digests.extend(digest_frame(image))
+        transparent.append(int(image.shape[2] == 4 and image[..., 3].min() < 255))
+        if finder is not None:
+            finder.add(cv2.cvtColor(image, cv2.COLOR_BGR2RGB if image.shape[2] == 3 else cv2.COLOR_BGRA2RGB))
+        on_frame()
+        return image.shape[:2]
+
     with translate_os_errors(path):
         reader = choose_reader(path)
         if reader is read_video_file:
@@ -252,10 +242,10 @@ def index_video(
         "start": start,
         "fixed_fps": None if fps is None else float(fps),
         "fps": float(rate.fps if fps is None else fps),
-        "size": [int(side) for side in record.size],
+        "size": [int(side) for side in kept[-1]],
         "num_declared": int(num_declared),
         "notes": list(notes),
-        "cuts": record.cuts,
+        "cuts": [] if finder is None else finder.found,
         "names": names,
         "rate": float(report.fps if report else rate.fps),
         "num_total": int(report.num_total) if report else 0,
@@ -264,6 +254,6 @@ def index_video(
         "deinterlace": bool(deinterlace),
         "shape_notes": list(report.notes) if report else [],
     }
-    digests = np.frombuffer(bytes(record.digests), np.uint8).reshape(-1, DIGEST_BYTES)
-    transparent = np.frombuffer(bytes(record.transparent), np.uint8).astype(bool)
+    digests = np.frombuffer(bytes(digests), np.uint8).reshape(-1, DIGEST_BYTES)
+    transparent = np.frombuffer(transparent, np.uint8).astype(bool)
     return FrameIndex(about, stamps, places, digests, transparent, rate.times if fps is None else None)

@@ -144,11 +144,6 @@ def read_images(paths: list[Path], prepare: Callable) -> ReadResult:
     return kept, len(paths), FrameRate(DEFAULT_FPS), ()
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """(height, width) of an image, in pixels."""
-    return read_image(path).shape[:2]
-
-
 def read_image(path: Path) -> np.ndarray:
     """One image as uint8 BGR, shape (height, width, 3), or premultiplied BGRA, (height, width, 4)."""
     head = read_head(path)

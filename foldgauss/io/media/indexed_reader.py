@@ -99,13 +99,14 @@ class IndexedReader:
         self, first: int, stop: int, size: tuple[int, int] | None
     ) -> tuple[np.ndarray, int, FrameRate, tuple[str, ...]]:
         """Frames `first` up to `stop` of those that decode, as `Clip.frames`, and the rest of a `ReadResult`."""
-        channels, prepare, buffer = 4 if self.has_alpha(size) else 3, make_resizer(size), _FrameBuffer(stop - first)
+        channels, prepare = 4 if self.has_alpha(size) else 3, make_resizer(size)
+        frames = np.empty((stop - first, *(size or self.index.size), channels), np.uint8)
+        rows = iter(frames)
 
         def take(image: np.ndarray) -> None:
-            buffer.add(convert_channels(prepare(image), channels))
+            next(rows)[:] = convert_channels(prepare(image), channels)
 
-        facts = self._read_each(first, stop, take)
-        return buffer.frames, *facts
+        return frames, *self._read_each(first, stop, take)
 
     def has_alpha(self, size: tuple[int, int] | None) -> bool:
         """Whether any frame of the whole clip is transparent anywhere within the crop to `size`."""
@@ -208,19 +209,6 @@ class IndexedReader:
             return after
         near = np.flatnonzero(known[after:] == stamp)
         return after + int(near[0]) if len(near) else None
-
-
-class _FrameBuffer:
-    """An array filled frame by frame, allocated when the first frame shows its shape."""
-
-    def __init__(self, num_frames: int):
-        self._num, self._filled, self.frames = num_frames, 0, np.empty((0, 0, 0, 0), np.uint8)
-
-    def add(self, frame: np.ndarray) -> None:
-        if not self._filled:
-            self.frames = np.empty((self._num, *frame.shape), np.uint8)
-        self.frames[self._filled] = frame
-        self._filled += 1
 
 
 def _changed_error(index: FrameIndex, number: int) -> VideoError:

@@ -106,10 +106,6 @@ def _select_label(paths: list[Path], label: int | None, source: Path) -> Bool[np
 # ----------------------------------------------------------------------------------------------- labels
 
 
-class _TooLarge(Exception):
-    """More pixels than the file can hold."""
-
-
 def read_labels(paths: Sequence[Path]) -> np.ndarray:
     """Label images as uint8 (num_masks, height, width): 0 is the background, k the object k, 255 void.
 
@@ -141,7 +137,7 @@ def _read_label_image(path: Path) -> tuple[np.ndarray, str]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about damage: the image either decodes or raises
             mode, pixels = _decode(path)
-    except (_TooLarge, Image.DecompressionBombError) as error:
+    except Image.DecompressionBombError as error:
         most = max(MAX_PIXELS, MAX_PIXELS_PER_BYTE * path.stat().st_size)
         most = min(most, 2 * (Image.MAX_IMAGE_PIXELS or most))  # Pillow's own limit
         raise invalid(
@@ -171,5 +167,5 @@ def _decode(path: Path) -> tuple[str, np.ndarray]:
     with Image.open(path, formats=_FORMATS) as image:
         width, height = image.size
         if width * height > max(MAX_PIXELS, MAX_PIXELS_PER_BYTE * path.stat().st_size):
-            raise _TooLarge
+            raise Image.DecompressionBombError
         return image.mode, np.array(image)

@@ -1,7 +1,6 @@
 """Writing clips: videos, animations, folders of images and single images."""
 
 from collections.abc import Iterable, Iterator
-from functools import partial
 from itertools import chain
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from foldgauss._runtime.checks import check_one_of
-from foldgauss.io._atomic import atomic_folder, atomic_path, check_path, check_replaceable, output_error
+from foldgauss.io._atomic import atomic_folder, atomic_path, check_path, output_error
 from foldgauss.io.media.clip import PathLike, check_fps, format_size, video_error
 from foldgauss.io.media.encoder import VIDEO_SUFFIXES, Sound, check_sound, choose_encoding, encode_video, straighten
 
@@ -86,7 +85,7 @@ def write_video(
     encoding = choose_encoding(suffix, codec, crf, pixel_format, first.shape)
     if sound is not None:
         check_sound(sound)
-    with atomic_path(path, suffix=suffix) as temporary:
+    with atomic_path(path) as temporary:
         try:
             encode_video(temporary, chain([first], frames), float(fps), encoding, sound)
         except OSError as error:
@@ -114,9 +113,7 @@ def write_frames(
     """
     check_one_of("image_format", image_format, IMAGE_FORMATS)
     folder, encode = Path(folder), _encode_png if image_format == "png" else _encode_webp
-    check = partial(check_replaceable, folder, overwrite, pattern=r"[0-9]{5,}\.(png|webp)")
-    check()
-    with atomic_folder(folder, check=check) as temporary:
+    with atomic_folder(folder, overwrite, pattern=r"[0-9]{5,}\.(png|webp)") as temporary:
         for number, frame in enumerate(_check_frames(frames, channels=(3, 4))):
             (temporary / f"{number:05d}.{image_format}").write_bytes(encode(frame))
     return folder

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.io.models.model_file import load_part, read_header, register_model, save_model
+from foldgauss.io.models.model_file import load_part, register_model, save_model
 from foldgauss.io.models.video_model import read_header_of_kind
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.state import FitState, Sizes
@@ -25,7 +25,8 @@ def save_checkpoint(path: str | os.PathLike, state: FitState, *, config: FitConf
 
 def load_checkpoint(path: str | os.PathLike, *, config: FitConfig, source: dict) -> FitState:
     """Read a running fit. Raises ValueError if it was started with other settings or other frames."""
-    kept = read_header(path)["metadata"]
+    about = read_header_of_kind(path, CHECKPOINT)
+    kept = about["metadata"]
     for part, now in (("config", dataclasses.asdict(config)), ("source", source)):
         before = kept.get(part)
         before = before if isinstance(before, dict) else {}
@@ -41,8 +42,7 @@ def load_checkpoint(path: str | os.PathLike, *, config: FitConfig, source: dict)
                 got=", ".join(f"{name}={now.get(name)!r}" for name in changed),
                 cure=cure,
             )
-    about = read_header_of_kind(path, CHECKPOINT)
-    state = load_part(Path(path), about["kind"], about["header"], about["tensors"])
+    state = load_part(Path(path), about)
     return jax.tree.map(np.array, state)  # the fit updates its arrays in place, so they must be its own
 
 

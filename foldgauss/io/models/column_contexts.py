@@ -94,15 +94,11 @@ def quantize_magnitude(numbers: Int32[np.ndarray, " num"]) -> Int[np.ndarray, " 
     return np.searchsorted(_MAGNITUDE_BOUNDS, np.abs(numbers), side="right")
 
 
-def find_latest_in_cell(cell: Int32[np.ndarray, " num"], num_cells: int) -> Int32[np.ndarray, "num 4"]:
-    """The latest Gaussians before each in its cell; without any, the one before it. -1: no further one."""
-    out = np.full((len(cell), NEIGHBORS), -1, np.int32)
-    _find_latest(cell, np.full(num_cells, -1, np.int32), np.full(len(cell), -1, np.int32), out)
-    return out
-
-
 @exact_kernel
-def _find_latest(cell, last, before, out):
+def find_latest_in_cell(cell, num_cells):
+    """The latest Gaussians before each in its cell, (num, 4); without any, the one before it. -1: no further one."""
+    last, before = np.full(num_cells, -1, np.int32), np.full(len(cell), -1, np.int32)
+    out = np.full((len(cell), NEIGHBORS), -1, np.int32)
     for i in range(len(cell)):
         j, count = last[cell[i]], 0
         before[i] = j
@@ -113,6 +109,7 @@ def _find_latest(cell, last, before, out):
         if count == 0:
             out[i, 0] = i - 1
         last[cell[i]] = i
+    return out
 
 
 def find_nearest(

@@ -18,7 +18,14 @@ from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_with
 from foldgauss.io._atomic import atomic_path, check_path
 from foldgauss.io.models import range_coder
 from foldgauss.io.models.column_contexts import ColumnContexts
-from foldgauss.io.models.model_file import ModelFileError, model_file_error, to_json, to_json_types
+from foldgauss.io.models.model_file import (
+    HEADER_ERRORS,
+    ModelFileError,
+    model_file_error,
+    one_line,
+    to_json,
+    to_json_types,
+)
 from foldgauss.render import COMPOSITINGS, RenderOptions
 from foldgauss.video.compression.quantize import (
     FEATURES,
@@ -119,7 +126,13 @@ def load_compact(path: str | os.PathLike) -> Quantized:
     Raises `ModelFileError` for a file that is damaged, cut off, of a later version or of another kind.
     """
     path = check_path(path)
-    return _unpack(path, path.read_bytes())[0]
+    data = path.read_bytes()
+    header, body = _read_header(path, data)
+    try:
+        return _decode(header, body, len(data))
+    except HEADER_ERRORS as error:
+        got = f"one that does not fit together ({type(error).__name__}: {one_line(error)})"
+        raise _unreadable(path, got) from error
 
 
 def load_compact_model(path: str | os.PathLike) -> VideoModel:
@@ -136,15 +149,6 @@ def compact_metadata(path: str | os.PathLike) -> dict:
     """The `metadata` that `save_compact` stored. Raises as `load_compact`."""
     path = check_path(path)
     return _read_header(path, path.read_bytes())[0]["metadata"]
-
-
-def _unpack(path: Path, data: bytes) -> tuple[Quantized, dict]:
-    header, body = _read_header(path, data)
-    try:
-        return _decode(header, body, len(data)), header["metadata"]
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
-        text = " ".join(str(error).split())[:200]
-        raise _unreadable(path, f"one that does not fit together ({type(error).__name__}: {text})") from error
 
 
 def _read_header(path: Path, data: bytes) -> tuple[dict, bytes]:
@@ -185,14 +189,9 @@ def _decode(header: dict, body: bytes, whole_length: int) -> Quantized:
     _check(isinstance(descriptions, list) and len(descriptions) == len(names), "columns", "others")
     lengths = [own[0] for own in descriptions] + [header["intervals"]]
     _check(all(is_integer(own, 1) for own in lengths) and sum(lengths) == len(body), "bytes", "others")
-    rules = {
-        name: _parse_rule(name, own[1:]) for name, own in zip(names, descriptions, strict=True) if not is_integral(name)
-    }
-    _check(
-        all(is_integral(name) == (len(own) == 1) for name, own in zip(names, descriptions, strict=True)),
-        "rule",
-        "none",
-    )
+    described = dict(zip(names, (own[1:] for own in descriptions), strict=True))
+    rules = {name: _parse_rule(name, numbers) for name, numbers in described.items() if not is_integral(name)}
+    _check(not any(described[name] for name in names if is_integral(name)), "rule", "none")
     contexts, columns, start = ColumnContexts(rules, info), {}, 0
     for name, length in zip(names, lengths[:-1], strict=True):
         numbers = range_coder.decode(body[start : start + length], contexts.describe_next(name))

@@ -27,13 +27,12 @@ _DTYPES = {
     "uint64": "U64", "uint32": "U32", "uint16": "U16", "uint8": "U8",
 }  # fmt: skip
 #: Bytes of an element of each.
-_ITEM_BYTES = {
-    "F64": 8, "F32": 4, "F16": 2, "BF16": 2, "BOOL": 1,
-    "I64": 8, "I32": 4, "I16": 2, "I8": 1, "U64": 8, "U32": 4, "U16": 2, "U8": 1,
-}  # fmt: skip
+_ITEM_BYTES = {code: jax.numpy.dtype(name).itemsize for name, code in _DTYPES.items()}
 _LONGEST_HEADER = 100_000_000  # bytes; the limit of the safetensors library
 _PREFIX = 8  # bytes: the length of the JSON header, little-endian, opens a safetensors file
 _RESERVED = "__metadata__"  # reserved by safetensors
+#: What functions raise that are given a header with other types or values.
+HEADER_ERRORS = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError)
 _MAGIC = {
     b"\x89PNG": "a PNG image",
     b"\xff\xd8\xff": "a JPEG image",
@@ -259,52 +258,54 @@ def load_model(path: str | os.PathLike) -> Any:
     Raises `FileNotFoundError` for a missing file, `ModelFileError` for one of another kind or version, a
     damaged one, or one whose tensors differ from what its header describes.
     """
-    path = Path(path)
-    about = read_header(path)
-    return load_part(path, about["kind"], about["header"], about["tensors"])
+    return load_part(Path(path), read_header(path))
 
 
-def load_part(path: Path, kind_name: str, header: dict, tensors: dict[str, dict], prefix: str = "") -> Any:
-    """The model of that kind and header whose `tensors` are stored under `prefix` and their keys.
+def load_part(path: Path, about: dict, prefix: str = "") -> Any:
+    """The model that `about`, with the keys of `read_header`, describes: its tensors have `prefix` before their keys.
 
     Raises `ModelFileError` as `load_model`.
     """
-    kind, skeleton = _match_kind(path, kind_name, header, tensors)
+    kind, skeleton = match_kind(path, about)
     check_not_forked()
     filled = _read_leaves(skeleton, path, prefix)
     try:
         return kind.from_stored(filled)
     except ValueError as error:
-        got = f"others in {str(path)!r} ({_one_line(error)})"
+        got = f"others in {str(path)!r} ({one_line(error)})"
         raise model_file_error("path", expected="tensors that fit each other", got=got) from error
 
 
-def check_part(path: Path, kind_name: str, header: dict, tensors: dict[str, dict]) -> None:
-    """Raise `ModelFileError` unless the header describes these tensors; none of them is read."""
-    _match_kind(path, kind_name, header, tensors)
-
-
-def _match_kind(path: Path, kind_name: str, header: dict, tensors: dict[str, dict]) -> tuple[_Kind, Any]:
-    """The kind, and the skeleton made from the header, checked against the tensors."""
-    kind = _KINDS.get(kind_name)
+def match_kind(path: Path, about: dict) -> tuple[_Kind, Any]:
+    """The kind of model, and the skeleton made from the header, checked against the tensors, of which none is read."""
+    kind = _KINDS.get(about["kind"])
     if kind is None:
         raise model_file_error(
             "path",
             expected="a model of kind " + (" or ".join(map(repr, sorted(_KINDS))) or "(none registered)"),
-            got=f"kind {kind_name!r} in {str(path)!r}",
+            got=f"kind {about['kind']!r} in {str(path)!r}",
             cure="Load it with the program that wrote it.",
         )
+    with translate_header_errors(path, kind.name):
+        skeleton = kind.from_header(about["header"])
+    described = _get_specs(_array_leaves(skeleton))
+    _check_tensors(_widen_half_precision(about["tensors"], described), described, str(path))
+    return kind, skeleton
+
+
+@contextmanager
+def translate_header_errors(path: Path, kind: str) -> Iterator[None]:
+    """Raise the errors of making a model of a header, which is not trusted, as `ModelFileError`."""
     try:
-        skeleton = kind.from_header(header)
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
+        yield
+    except ModelFileError:
+        raise
+    except HEADER_ERRORS as error:
         raise model_file_error(
             "path",
-            expected=f"the header of a model of kind {kind.name!r}",
-            got=f"one that does not describe it in {str(path)!r} ({type(error).__name__}: {_one_line(error)})",
+            expected=f"the header of a model of kind {kind!r}",
+            got=f"one that does not describe it in {str(path)!r} ({type(error).__name__}: {one_line(error)})",
         ) from error
-    described = _get_specs(_array_leaves(skeleton))
-    _check_tensors(_widen_half_precision(tensors, described), described, str(path))
-    return kind, skeleton
 
 
 def read_header(path: str | os.PathLike) -> dict:
@@ -341,12 +342,10 @@ def _check_container(path: Path) -> None:
         first = file.read(_PREFIX + 1)
     if size == 0:
         raise _unreadable_error(path, "an empty file")
-    for magic, name in _MAGIC.items():
-        if first.startswith(magic):
-            raise _unreadable_error(path, name)
     length = int.from_bytes(first[:_PREFIX], "little")
     if size < _PREFIX + 2 or not first[_PREFIX:].startswith(b"{"):
-        raise _unreadable_error(path, "a file of another kind, or one cut off within its first bytes")
+        names = (name for magic, name in _MAGIC.items() if first.startswith(magic))
+        raise _unreadable_error(path, next(names, "a file of another kind, or one cut off within its first bytes"))
     if length > size - _PREFIX:
         raise _unreadable_error(
             path, f"a file of {size} bytes whose header claims {length}, so it is cut off or damaged"
@@ -372,7 +371,7 @@ def _parse_json(path: Path, name: str, strings: dict[str, str]) -> dict:
     try:
         value = json.loads(strings[name])
     except (ValueError, RecursionError) as error:
-        raise _unreadable_error(path, f"one whose field {name!r} is not JSON ({_one_line(error)})") from error
+        raise _unreadable_error(path, f"one whose field {name!r} is not JSON ({one_line(error)})") from error
     if not isinstance(value, dict):
         raise _unreadable_error(path, f"one whose field {name!r} is not a JSON object")
     return value
@@ -426,7 +425,7 @@ def open_tensors(path: Path) -> Iterator[Any]:
         with safe_open(path, framework="numpy") as file:
             yield file
     except SafetensorError as error:
-        raise _unreadable_error(path, f"a damaged or truncated file ({_one_line(error)})") from error
+        raise _unreadable_error(path, f"a damaged or truncated file ({one_line(error)})") from error
 
 
 def _to_leaf(key: str, array: np.ndarray) -> jax.Array | np.ndarray:
@@ -455,5 +454,5 @@ def _spec_text(spec: dict | None) -> str:
     return "no such tensor" if spec is None else f"{spec['dtype']} of shape {spec['shape']}"
 
 
-def _one_line(error: BaseException) -> str:
+def one_line(error: BaseException) -> str:
     return " ".join(str(error).split())[:200]

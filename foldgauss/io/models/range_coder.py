@@ -60,7 +60,7 @@ class Column:
 
     `present`: which rows have an integer; others are 0. `contexts`: below 256. An integer q encodes the value
     `origin + q step`. A row's value is predicted by the mean over the rows `near` (-1: none) of value / `scale`, times
-    its own scale. Absent rows count as `fill`.
+    its own scale. Absent rows count as 0.
     """
 
     present: Bool[np.ndarray, " num"]
@@ -69,7 +69,6 @@ class Column:
     step: Float[np.ndarray, " num"]
     scale: Float[np.ndarray, " num"]
     near: Int32[np.ndarray, "num neighbours"]
-    fill: float = 0.0
 
     @classmethod
     def without_contexts(cls, num: int) -> "Column":
@@ -80,7 +79,7 @@ class Column:
     def as_arrays(self) -> tuple:
         floats = (np.ascontiguousarray(one, np.float64) for one in (self.origin, self.step, self.scale))
         near = np.ascontiguousarray(self.near, np.int32)
-        return self.present, np.ascontiguousarray(self.contexts, np.uint8), *floats, near, float(self.fill)
+        return self.present, np.ascontiguousarray(self.contexts, np.uint8), *floats, near
 
 
 # ------------------------------------------------------------------------------------------ adaptive model
@@ -137,148 +136,95 @@ def _split_interval(low, high, p):
     return low + (span >> 16) * p + (((span & 0xFFFF) * p) >> 16)
 
 
-# ------------------------------------------------------------------------------------------ encoder
+# ------------------------------------------------------------------------------------------ coding
 
 
 @exact_kernel
-def _encode_bit(out, place, interval, p, bit):
+def _code_bit(data, interval, decodes, p, bit):
+    """Code a bit and return it; the interval is (low, high, the decoder's number in it, place of the next byte)."""
     middle = _split_interval(interval[0], interval[1], p)
+    if decodes:
+        bit = interval[2] <= middle
     if bit:
         interval[1] = middle
     else:
         interval[0] = middle + 1
     while (interval[0] ^ interval[1]) & 0xFF000000 == 0:
-        out[place] = interval[1] >> 24
-        place += 1
+        place = interval[3]
+        if decodes:
+            interval[2] = ((interval[2] << 8) & 0xFFFFFFFF) | (_i(data[place]) if place < len(data) else 0)
+        else:
+            data[place] = interval[1] >> 24
         interval[0] = (interval[0] << 8) & 0xFFFFFFFF
         interval[1] = ((interval[1] << 8) & 0xFFFFFFFF) | 255
-    return place
-
-
-@exact_kernel
-def _encode_adaptive(out, place, interval, state, node, bit):
-    own, chances, weights, logits, logistic, logit = state
-    p = _mix(node, own, chances, weights, logits, logistic, logit)
-    place = _encode_bit(out, place, interval, p, bit)
-    _update(node, own, chances, weights, logits, p, bit)
-    return place
-
-
-@exact_kernel
-def _encode(values, present, contexts, origin, step, scale, near, fill, state, out):
-    interval, place, seen, own = np.zeros(2, np.int64), 0, np.full(len(values), fill), state[0]
-    interval[1] = 0xFFFFFFFF
-    for k in range(len(values)):
-        if not present[k]:
-            continue
-        if place + MAX_CODE_BYTES > len(out):
-            return 0
-        value = _i(values[k])
-        own[0], own[1] = contexts[k, 0], contexts[k, 1]
-        own[2] = _predict_context(k, near, seen, origin, step, scale)
-        seen[k] = (origin[k] + value * step[k]) / scale[k]
-        place = _encode_adaptive(out, place, interval, state, 0, value == 0)
-        if value == 0:
-            continue
-        place = _encode_adaptive(out, place, interval, state, 1, value < 0)
-        magnitude, exponent = abs(value), 0
-        while magnitude >> (exponent + 1):
-            place = _encode_adaptive(out, place, interval, state, 2 + exponent, True)
-            exponent += 1
-        place = _encode_adaptive(out, place, interval, state, 2 + exponent, False)
-        leading = 1
-        for b in range(exponent - 1, -1, -1):
-            bit = (magnitude >> b) & 1
-            if leading < 4:
-                place = _encode_adaptive(out, place, interval, state, 34 + 3 * exponent + leading - 1, bit == 1)
-                leading = 2 * leading + bit
-            else:
-                place = _encode_bit(out, place, interval, 32768, bit == 1)
-    # The shortest bytes that identify the interval: zeros are read after the end.
-    out[place] = (interval[0] >> 24) + (1 if interval[0] & 0xFFFFFF else 0)
-    return place + 1
-
-
-# ------------------------------------------------------------------------------------------ decoder
-
-
-@exact_kernel
-def _decode_bit(data, reader, p):
-    """One bit; the reader is (low, high, code, next byte)."""
-    middle = _split_interval(reader[0], reader[1], p)
-    bit = reader[2] <= middle
-    if bit:
-        reader[1] = middle
-    else:
-        reader[0] = middle + 1
-    while (reader[0] ^ reader[1]) & 0xFF000000 == 0:
-        reader[0] = (reader[0] << 8) & 0xFFFFFFFF
-        reader[1] = ((reader[1] << 8) & 0xFFFFFFFF) | 255
-        byte = _i(data[reader[3]]) if reader[3] < len(data) else 0
-        reader[2] = ((reader[2] << 8) & 0xFFFFFFFF) | byte
-        reader[3] += 1
+        interval[3] = place + 1
     return bit
 
 
 @exact_kernel
-def _decode_adaptive(data, reader, state, node):
+def _code_adaptive(data, interval, decodes, state, node, bit):
     own, chances, weights, logits, logistic, logit = state
     p = _mix(node, own, chances, weights, logits, logistic, logit)
-    bit = _decode_bit(data, reader, p)
+    bit = _code_bit(data, interval, decodes, p, bit)
     _update(node, own, chances, weights, logits, p, bit)
     return bit
 
 
 @exact_kernel
-def _decode(data, present, contexts, origin, step, scale, near, fill, most, state, values):
-    """Decode into `values`; whether the encoder may have written the data."""
-    reader, seen, own = np.zeros(4, np.int64), np.full(len(values), fill), state[0]
-    reader[1] = 0xFFFFFFFF
-    for k in range(4):
-        reader[2] = (reader[2] << 8) | (_i(data[k]) if k < len(data) else 0)
-    reader[3] = 4
+def _code(values, present, contexts, origin, step, scale, near, state, data, interval, decodes, room):
+    """Encode the values into `data`, or decode them from it; False where `room` bytes are too few, or were not encoded.
+
+    Both directions take the same steps: the bits that are given to `_code_adaptive` only matter to the encoder.
+    """
+    seen, own = np.zeros(len(values)), state[0]
     for k in range(len(values)):
-        values[k] = 0
         if not present[k]:
             continue
-        if reader[3] > len(data) + 4:
+        if interval[3] > room:
             return False
         own[0], own[1] = contexts[k, 0], contexts[k, 1]
         own[2] = _predict_context(k, near, seen, origin, step, scale)
-        if not _decode_adaptive(data, reader, state, 0):
-            negative = _decode_adaptive(data, reader, state, 1)
-            exponent = 0
-            while _decode_adaptive(data, reader, state, 2 + exponent):
+        value = _i(values[k])
+        if not _code_adaptive(data, interval, decodes, state, 0, value == 0):
+            negative = _code_adaptive(data, interval, decodes, state, 1, value < 0)
+            magnitude, exponent = abs(value), 0
+            while _code_adaptive(data, interval, decodes, state, 2 + exponent, magnitude >> (exponent + 1) > 0):
                 exponent += 1
-                if exponent >= most:
+                if decodes and exponent >= LARGEST_BITS:
                     return False
-            magnitude, leading = 1, 1
-            for _ in range(exponent):
+            coded, leading = 1, 1
+            for b in range(exponent - 1, -1, -1):
+                bit = (magnitude >> b) & 1 == 1
                 if leading < 4:
-                    bit = _decode_adaptive(data, reader, state, 34 + 3 * exponent + leading - 1)
+                    bit = _code_adaptive(data, interval, decodes, state, 34 + 3 * exponent + leading - 1, bit)
                     leading = 2 * leading + bit
                 else:
-                    bit = _decode_bit(data, reader, 32768)
-                magnitude = 2 * magnitude + bit
-            values[k] = -magnitude if negative else magnitude
+                    bit = _code_bit(data, interval, decodes, 32768, bit)
+                coded = 2 * coded + bit
+            values[k] = -coded if negative else coded
         seen[k] = (origin[k] + values[k] * step[k]) / scale[k]
-    return reader[3] == len(data) + 3  # the encoder ends with one byte, the decoder reads four
+    return True
 
 
 def encode(values: Int32[np.ndarray, " num"], column: Column) -> bytes:
     """The bytes of a column; magnitudes below 2^30."""
-    room = 4 * len(values) + 2 * MAX_CODE_BYTES
+    values, num_bytes = np.array(values, np.int32), 4 * len(values) + 2 * MAX_CODE_BYTES
     while True:
-        out = np.empty(room, np.uint8)
-        if length := _encode(values, *column.as_arrays(), _initial_state(), out):
-            return out[:length].tobytes()
-        room *= 4  # its code is longer than four bytes per value
+        data, interval = np.empty(num_bytes, np.uint8), np.array([0, 0xFFFFFFFF, 0, 0])
+        if _code(values, *column.as_arrays(), _initial_state(), data, interval, False, num_bytes - MAX_CODE_BYTES):
+            low, place = interval[0], interval[3]
+            # The shortest bytes that identify the interval: zeros are read after the end.
+            data[place] = (low >> 24) + (1 if low & 0xFFFFFF else 0)
+            return data[: place + 1].tobytes()
+        num_bytes *= 4  # its code is longer than four bytes per value
 
 
 def decode(data: bytes, column: Column) -> Int32[np.ndarray, " num"]:
     """The inverse of `encode`. Raises ValueError for bytes that it cannot have written."""
-    values = np.empty(len(column.present), np.int32)
-    if not _decode(np.frombuffer(data, np.uint8), *column.as_arrays(), LARGEST_BITS, _initial_state(), values):
+    values, buffer = np.zeros(len(column.present), np.int32), np.frombuffer(bytearray(data), np.uint8)
+    interval = np.array([0, 0xFFFFFFFF, int.from_bytes(data[:4].ljust(4, b"\0"), "big"), 4])
+    fits = _code(values, *column.as_arrays(), _initial_state(), buffer, interval, True, len(data) + 4)
+    if not fits or interval[3] != len(data) + 3:  # the encoder ends with one byte, the decoder reads four
         raise ValueError("a column of numbers is damaged")
     return values
 

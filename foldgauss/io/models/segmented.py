@@ -17,12 +17,14 @@ from foldgauss.io._atomic import check_path, check_writable
 from foldgauss.io.models.compact import is_compact
 from foldgauss.io.models.model_file import (
     ModelFileError,
-    check_part,
     load_model,
     load_part,
+    match_kind,
+    model_file_error,
     open_tensors,
     read_header,
     save_model,
+    translate_header_errors,
     write_tensors,
 )
 from foldgauss.render import COMPOSITINGS, RenderOptions
@@ -59,7 +61,7 @@ def join_segments(
         about = read_header(file)
         if about["kind"] not in PARTS:
             raise _unfit(file, f"one of kind {about['kind']!r}", "Join the files that it was made of.")
-        check_part(file, about["kind"], about["header"], about["tensors"])
+        match_kind(file, about)
         files.append(file)
         entries.append({"first": first} | {name: about[name] for name in ("kind", "header", "metadata")})
         specs |= {f"segments.{number}.{key}": spec for key, spec in about["tensors"].items()}
@@ -113,8 +115,7 @@ def _source(number: int, source: object) -> tuple[int, Path]:
 
 
 def _unfit(file: Path, got: str, cure: str) -> ModelFileError:
-    error = invalid("sources", expected="ordinary models", got=f"{got}, {str(file)!r}", cure=cure)
-    return ModelFileError(str(error))
+    return model_file_error("sources", expected="ordinary models", got=f"{got}, {str(file)!r}", cure=cure)
 
 
 # ---------------------------------------------------------------------------------------------- loading
@@ -131,15 +132,8 @@ def load_segmented(path: Path, about: dict) -> SegmentedVideo:
 
     A segment's model is checked when it is loaded. Raises `ModelFileError`, then as now.
     """
-    try:
+    with translate_header_errors(path, SEGMENTED):
         return SegmentedVideo(_segments(path, about))
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
-        if isinstance(error, ModelFileError):
-            raise
-        text = " ".join(str(error).split())[:200]
-        got = f"one that does not describe it in {str(path)!r} ({type(error).__name__}: {text})"
-        expected = f"the header of a model of kind {SEGMENTED!r}"
-        raise ModelFileError(str(invalid("path", expected=expected, got=got))) from error
 
 
 def _segments(path: Path, about: dict) -> list[Segment]:
@@ -157,11 +151,9 @@ def _segments(path: Path, about: dict) -> list[Segment]:
     @lru_cache(maxsize=MAX_PREPARED)
     def load(number: int) -> VideoModel | EditedVideo:
         if _stamp(path) != stamp:
-            cure = "Load it again."
-            error = invalid("path", expected="the file as it was opened", got=f"a changed {str(path)!r}", cure=cure)
-            raise ModelFileError(str(error))
-        entry = entries[number]
-        return load_part(path, entry["kind"], entry["header"], own[number], f"segments.{number}.")
+            expected, got = "the file as it was opened", f"a changed {str(path)!r}"
+            raise model_file_error("path", expected=expected, got=got, cure="Load it again.")
+        return load_part(path, entries[number] | {"tensors": own[number]}, f"segments.{number}.")
 
     return [_segment(entry, own[number], partial(load, number)) for number, entry in enumerate(entries)]
 

@@ -88,7 +88,7 @@ def load_video_model(path: str | os.PathLike) -> VideoModel | EditedVideo | Segm
     about = read_header_of_kind(path, VIDEO, EDITED, SEGMENTED)
     if about["kind"] == SEGMENTED:
         return load_segmented(path, about)
-    return load_part(path, about["kind"], about["header"], about["tensors"])
+    return load_part(path, about)
 
 
 def read_metadata(path: str | os.PathLike) -> dict:

@@ -34,7 +34,6 @@ from foldgauss.video.compression.quantize import (
     quantize,
 )
 from foldgauss.video.editing.edited_video import EditedVideo
-from foldgauss.video.models.background import BLACK, composite
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.flatten import flatten_video
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
@@ -259,8 +258,8 @@ def _frame_size_and_count(model: Loaded) -> tuple[tuple[int, int], int]:
 
 
 def _encode_webp(frame: UInt8[np.ndarray, "height width channels"], quality: int) -> bytes:
-    opaque = frame if frame.shape[-1] == 3 else composite(frame, np.float32(BLACK))
-    done, data = cv2.imencode(".webp", opaque[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, quality])
+    bgr = frame[..., 2::-1]  # premultiplied colors without their alpha are the image over black
+    done, data = cv2.imencode(".webp", bgr, [cv2.IMWRITE_WEBP_QUALITY, quality])
     if not done:
         raise invalid("original", expected="frames that WebP can hold, up to 16,383 pixels a side", got=frame.shape)
     return data.tobytes()

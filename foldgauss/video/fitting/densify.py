@@ -115,7 +115,8 @@ def _survives(rows: np.ndarray, growth: Growth, place: dict[str, slice], pixels:
     """Which rows are neither too faint nor, after `big_from`, too big."""
     lives = rows[:, place["opacity_logit"]][:, 0] >= _logit(growth.prune_opacity)
     if step > growth.big_from:
-        widest = min(growth.prune_scale, growth.prune_radius / (_RADIUS * pixels))
+        radius = math.inf if growth.prune_radius is None else growth.prune_radius
+        widest = min(growth.prune_scale, radius / (_RADIUS * pixels))
         lives &= rows[:, place["log_scale"]].max(axis=1) <= np.float32(np.log(widest))
     return lives
 

@@ -61,10 +61,14 @@ class Growth:
     shrinking: float = field(default=1.6, metadata=setting("Factor by which halves are smaller", bounds="[1, inf)"))
     prune_opacity: float = field(default=0.01, metadata=setting("Least opacity; 3DGS has 0.005", bounds="(0, 1)"))
     big_from: int = field(default=3000, metadata=setting("Step from which on big Gaussians are pruned"))
-    prune_radius: float = field(
-        default=20.0,
+    prune_radius: float | None = field(
+        default=None,
         metadata=setting(
-            "Largest radius in pixels: 3 standard deviations at the Gaussian's own time", bounds="(0, inf)"
+            "Largest radius in pixels: 3 standard deviations at the Gaussian's own time",
+            "3DGS states 20, but its code never applies it, as its authors say (issues 123 and 643 of its repository). "
+            "Applied, it prunes what covers smooth areas, and the fit fails (`benchmarks.reproduce`).",
+            bounds="(0, inf)",
+            unset="no limit",
         ),
     )
     prune_scale: float = field(default=0.1 * EXTENT, metadata=setting("Largest standard deviation", bounds="(0, inf)"))

@@ -88,7 +88,11 @@ class CpuStepper:
             alive.append(done.alive)
         if state.statistics is not None:
             state.statistics.add(seen, self.grad[:, columns(config.degree)["time_loc_logit"]][:, 0])
-        touched = alive[0] if len(alive) == 1 else np.unique(np.concatenate(alive))
+        touched = alive[0]
+        if len(alive) > 1:  # np.unique sorts: a tenth of a step
+            marked = np.zeros(len(state.rows), bool)
+            marked[np.concatenate(alive)] = True
+            touched = np.flatnonzero(marked).astype(np.int32)
         num_alive = len(touched)
         if not config.sparse_updates:
             touched = np.arange(len(state.rows))
