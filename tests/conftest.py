@@ -1,5 +1,6 @@
 """House rules of the whole suite: promotion raises, so a shape or dtype slip is a failing test."""
 
+import gc
 import os
 import shutil
 import signal
@@ -27,6 +28,10 @@ import pytest  # noqa: E402
 # A shell starts what runs in its background without Ctrl-C, and our tests of Ctrl-C are heirs to that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and threading.current_thread() is threading.main_thread():
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Tracing makes many objects that live on: collecting them as often as by default takes a twentieth of the time.
+gc.freeze()
+gc.set_threshold(200_000, 50, 50)
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
