@@ -1,8 +1,10 @@
 """House rules of the whole suite: promotion raises, so a shape or dtype slip is a failing test."""
 
+import gc
 import os
 import shutil
 import signal
+import sys
 import tempfile
 import threading
 
@@ -13,6 +15,12 @@ _own_cache = None if _CACHE in os.environ else os.environ.setdefault(_CACHE, tem
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 # Most of the time goes into XLA's compilation, which takes a quarter less like this. `.ci/slow` runs with optimization.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+# The suite has a process for each core already: further threads of BLAS only wait for each other.
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+# Many tests start processes of Python, which would compile the package anew where bytecode is not written.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
@@ -20,6 +28,10 @@ import pytest  # noqa: E402
 # A shell starts what runs in its background without Ctrl-C, and our tests of Ctrl-C are heirs to that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and threading.current_thread() is threading.main_thread():
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Tracing makes many objects that live on: collecting them as often as by default takes a twentieth of the time.
+gc.freeze()
+gc.set_threshold(200_000, 50, 50)
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")

@@ -154,7 +154,9 @@ def test_last_finite_of_a_history_without_one_is_minus_infinity():
     assert loop._last_finite([np.nan, np.inf]) == -np.inf
 
 
-@pytest.mark.parametrize("covariance", ["full", "diag", "spherical", "tied"])
+@pytest.mark.parametrize(
+    "covariance", ["full", "spherical", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("diag", "tied"))]
+)
 def test_newton_gain_matches_profile_derivatives(x64, covariance):
     """The Newton step's promise, g . step, against differences of the profile_log_likelihood itself."""
     params, model = _params(), _model(covariance)
@@ -196,10 +198,10 @@ def test_changing_the_reference_equals_recomputing(x64):
     ("power", "covariance"),
     [
         ("1", "full"),
-        ("2", "full"),
         *(
             pytest.param(*case, marks=pytest.mark.slow)
             for case in [
+                ("2", "full"),
                 ("0", "full"),
                 ("0", "tied"),
                 ("1", "tied"),

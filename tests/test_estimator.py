@@ -83,7 +83,7 @@ def test_passes_quick_checks(check):
         getattr(estimator_checks, check)("FoldedGaussianMixture", estimator)
 
 
-@pytest.mark.parametrize(("kind", "degree"), [("full", 1), ("diag", 0)])
+@pytest.mark.parametrize(("kind", "degree"), [("full", 1), pytest.param("diag", 0, marks=pytest.mark.slow)])
 def test_linear_folds_match_scikit_learn(kind, degree):
     """A linear fold is a full covariance, no fold a diagonal one: the same start, the same iterations."""
     x = _blobs() + np.array([100.0, -5.0, 3.0])
@@ -232,7 +232,8 @@ def test_crossing_tracks_are_found():
     np.testing.assert_allclose(np.sqrt(fitted.space_covariances_.ravel()), 0.03, rtol=0.3)
 
 
-@pytest.mark.parametrize("start", ["kmeans", pytest.param("random_from_data", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("start", ["kmeans", "random_from_data"])
 def test_annealing_finds_the_best_optimum(start):
     """Groups of neighbours, where tracks cross: from heat on, every start ends at the same best."""
     x, labels = _tracks()

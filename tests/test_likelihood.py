@@ -163,7 +163,7 @@ def _covered(points, power, floor):
     return jax.vmap(one)(points)
 
 
-@pytest.mark.parametrize(("power", "floor"), [(1.0, 1e-3), (2.0, 0.0)])
+@pytest.mark.parametrize(("power", "floor"), [(1.0, 1e-3), pytest.param(2.0, 0.0, marks=pytest.mark.slow)])
 def test_intervals_have_stated_coverage(x64, power, floor):
     # 16,000 replicates: sd of a rate 0.17%. Ten rates of a correct method leave 4.5 sd with p < 1e-4, and 1.96 instead
     # of Student's 2.11 (a rate of 93.3%) is 9 sd off.

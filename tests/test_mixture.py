@@ -275,7 +275,8 @@ def test_batches_have_their_own_moments_and_responsibilities(x64):
         np.testing.assert_allclose(responsibilities[k], alone.responsibilities(x[k]), rtol=1e-9)
 
 
-@pytest.mark.parametrize("by_steps", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("by_steps", [True, False])
 def test_conditioning_the_marginal_over_space_leaves_time_out(x64, by_steps):
     """Its density is a ratio of the marginals' densities: of the marginal over space, and of the mixture itself."""
     mixture, x = _mixture(envelope=TimeLikelihood(1.0, 0.05)), _points(3)

@@ -320,7 +320,7 @@ def test_a_second_call_compiles_nothing(caplog):
 
 @pytest.mark.parametrize(
     ("engine", "channels"),
-    [("cpu", 1), ("cpu", 5), *(pytest.param("xla", num, marks=pytest.mark.slow) for num in (1, 5))],
+    [("cpu", 1), *(pytest.param(*case, marks=pytest.mark.slow) for case in [("cpu", 5), ("xla", 1), ("xla", 5)])],
 )
 def test_channels(engine, channels):
     splats, size = scene("plain")

@@ -55,6 +55,7 @@ def test_each_of_rounds_and_tiles_changes_nothing(kind, compositing, tile_size, 
     check_same(picture_and_grads(splats, size, compositing), found, 1e-5)
 
 
+@pytest.mark.slow
 def test_capacity_does_not_change_the_image(monkeypatch):
     """Eager, too: the room is counted, and bounded."""
     splats, size = scene("huge")

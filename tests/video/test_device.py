@@ -337,6 +337,7 @@ def compiled_by(function) -> int:
     return len(count)
 
 
+@pytest.mark.slow
 def test_densification_compiles_nothing():
     steps, numbers = fit_steps(FRAMES, GROWING), []
     numbers.append(next(steps)[0].num_gaussians)

@@ -58,7 +58,10 @@ def overlap(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return (one & other).sum((1, 2)) / (one | other).sum((1, 2))
 
 
-@pytest.mark.parametrize(("pan", "speed"), [(3.0, 2.0), (0.0, 2.0), (3.0, 0.0), (-4.0, 1.0)])
+@pytest.mark.parametrize(
+    ("pan", "speed"),
+    [(3.0, 2.0), (3.0, 0.0), *(pytest.param(*case, marks=pytest.mark.slow) for case in [(0.0, 2.0), (-4.0, 1.0)])],
+)
 def test_a_disc_is_found(pan, speed):
     frames, _, truth = disc_clip(pan, speed)
     masks = find_moving_object(frames)
@@ -93,7 +96,7 @@ def test_the_kernel_takes_the_lower_median_of_what_is_known():
         np.testing.assert_array_equal(plate[place], values[(len(values) - 1) // 2] if len(values) else 0)
 
 
-@pytest.mark.parametrize("pan", [0.0, 3.0])
+@pytest.mark.parametrize("pan", [pytest.param(0.0, marks=pytest.mark.slow), 3.0])
 def test_where_nothing_moves_this_is_an_error(pan):
     frames, _, _ = disc_clip(pan, disc=False)
     noisy = frames + np.random.default_rng(0).normal(scale=3.0, size=frames.shape)
