@@ -13,13 +13,15 @@ their lines: each is either equivalent, or shows what no test checks.
 
 import argparse
 import ast
+import json
 import os
 import random
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+import time
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import SimpleQueue
@@ -172,29 +174,38 @@ def draw(num: int, seed: int, modules: list[str]) -> list[Mutant]:
     return in_turn[:num]
 
 
-def run_tests(folder: Path, module: str) -> tuple[bool, str]:
-    """Whether the tests of a module pass in a copy of the checkout, and the last line that they print."""
-    files = [f"tests/{name}.py" for name in TARGETS[module]]
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "--no-header", "--durations=0", *files]
+def run_tests(folder: Path, modules: list[str], first: Iterable[str] = ()) -> tuple[bool, str]:
+    """Whether the tests of modules pass in a copy of the checkout, and the last line that they print.
+
+    The tests `first` run before the others. What JAX compiles is kept beside the copy for the next mutants.
+    """
+    failed = folder / ".pytest_cache/v/cache/lastfailed"
+    failed.parent.mkdir(parents=True, exist_ok=True)
+    failed.write_text(json.dumps(dict.fromkeys(first, True)))
+    files = dict.fromkeys(f"tests/{name}.py" for module in modules for name in TARGETS[module])
+    command = [sys.executable, "-m", "pytest", "-x", "--ff", "-q", "-n", "0", "--no-header", *files]
     env = dict(os.environ, PYTHONPATH=str(folder), PYTHONDONTWRITEBYTECODE="1")
+    env.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder.parent / "jax"))
     try:
-        done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=TIMEOUT)
+        done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=TIMEOUT * len(modules))
     except subprocess.TimeoutExpired:
-        return False, f"more than {TIMEOUT} s"
+        return False, f"more than {TIMEOUT * len(modules)} s"
     lines = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
     return done.returncode == 0, (lines or done.stdout.splitlines() or [""])[-1]
 
 
-def try_mutant(mutant: Mutant, folder: Path) -> Run:
+def try_mutant(mutant: Mutant, folder: Path, killers: Iterable[str] = ()) -> Run:
     path = folder / "foldgauss" / f"{mutant.module}.py"
-    source = path.read_text()
+    source, begun = path.read_text(), time.monotonic()
     try:
         path.write_text(mutate(source, mutant.index))
-        passed, last = run_tests(folder, mutant.module)
+        passed, last = run_tests(folder, [mutant.module], killers)
     finally:
         path.write_text(source)
     code = source.splitlines()[mutant.line - 1].strip()
-    return {"killed": not passed, "by": "" if passed else last, "code": code, "module": mutant.module}
+    by = "" if passed else last.removeprefix("FAILED ")
+    seconds = round(time.monotonic() - begun)
+    return {"killed": not passed, "by": by, "code": code, "module": mutant.module, "seconds": seconds}
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -209,15 +220,16 @@ def main(arguments: list[str] | None = None) -> None:
             folder = Path(parent) / str(k)
             shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(".git", "__pycache__", "site"))
             folders.put(folder)
-        for module in dict.fromkeys(mutant.module for mutant in left):
-            passed, last = run_tests(Path(parent) / "0", module)
+        if left:
+            passed, last = run_tests(Path(parent) / "0", list(dict.fromkeys(mutant.module for mutant in left)))
             if not passed:
-                raise SystemExit(f"{module}: its tests fail without a change: {last}")
+                raise SystemExit(f"The tests fail without a change: {last}")
 
         def one(mutant: Mutant) -> None:
             folder = folders.get()
+            killers = {run["by"].split(" - ")[0] for run in list(runs.done.values()) if run["module"] == mutant.module}
             try:
-                runs.get(mutant.name, lambda: try_mutant(mutant, folder))
+                runs.get(mutant.name, lambda: try_mutant(mutant, folder, killers))
             finally:
                 folders.put(folder)
 
