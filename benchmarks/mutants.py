@@ -215,12 +215,13 @@ def main(arguments: list[str] | None = None) -> None:
     modules = list(TARGETS) if options.only is None else options.only
     mutants = draw(options.num, options.seed, modules)
     runs = Runs(options.json, {"seed": options.seed})
-    left = [mutant for mutant in mutants if mutant.name not in runs.done]
+    # One module after the other: after a mutant of another one, the kernels of that file are compiled again.
+    left = sorted(mutant for mutant in mutants if mutant.name not in runs.done)
     with tempfile.TemporaryDirectory() as parent, ThreadPoolExecutor(options.workers) as pool:
         folders: SimpleQueue[Path] = SimpleQueue()
         for k in range(options.workers):
             folder = Path(parent) / str(k)
-            shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(".git", "__pycache__", "site"))
+            shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(".git", "site"))
             folders.put(folder)
         if left:
             passed, last = run_tests(Path(parent) / "0", list(dict.fromkeys(mutant.module for mutant in left)))

@@ -10,7 +10,13 @@ from scipy import special
 from foldgauss.envelope import Constant, TimeLikelihood, plain_envelope
 from foldgauss.estimator.em import components, loop
 from foldgauss.estimator.em.loop import EMStatus, broadcast_degrees, run_em, select_best
-from foldgauss.estimator.em.m_step import Model, newton_step, profile_log_likelihood, update_components
+from foldgauss.estimator.em.m_step import (
+    Model,
+    _profile_derivatives,
+    newton_step,
+    profile_log_likelihood,
+    update_components,
+)
 from foldgauss.estimator.em.online import change_reference
 from foldgauss.estimator.em.scaling import Scaling, to_mixture
 from foldgauss.estimator.em.statistics import Times, _divide_by_a, accumulate, make_points, step_times
@@ -154,9 +160,56 @@ def test_last_finite_of_a_history_without_one_is_minus_infinity():
     assert loop._last_finite([np.nan, np.inf]) == -np.inf
 
 
+@pytest.mark.parametrize(
+    ("stuck_mass", "rejected", "status"),
+    [(0.0, 0.0, EMStatus.CONVERGED), (1.0, 0.0, EMStatus.SINGULAR), (0.0, 1e-3, EMStatus.NOT_CONVERGED)],
+)
+def test_end_of_a_run(x64, monkeypatch, stuck_mass, rejected, status):
+    """A component without mass may be stuck; a rejected gain of `tol` is one that may still be had."""
+    info = loop.Info(*(jnp.asarray(z) for z in ([1.0], [[stuck_mass, 1.0]], [[True, False]], [rejected])))
+    monkeypatch.setattr(loop, "_step_restarts", lambda states, *rest: (states, info))
+    observed = []
+    run = _run(None, _params(), Constant(), _model(), 1.0, tol=1e-3, max_steps=4, observe=lambda *z: observed.append(z))
+    assert run.status == status
+    assert [number for number, _ in observed] == list(range(1, run.num_steps + 1))
+    assert run.num_steps == (4 if status == EMStatus.NOT_CONVERGED else 2)
+
+
+def test_temperatures_of_annealing(x64, monkeypatch):
+    """From the first one to 1 in as many steps as stated, evenly in the logarithm."""
+    seen = []
+
+    def step(states, frozen, points, envelope, model, inverse_temperature):
+        seen.append(inverse_temperature)
+        return states, loop.Info(jnp.ones(1), jnp.ones((1, K)), jnp.zeros((1, K), bool), jnp.zeros(1))
+
+    monkeypatch.setattr(loop, "_step_restarts", step)
+    run = _run(None, _params(), Constant(), _model(), 1.0, annealing=0.5, max_steps=200)
+    num = loop.ANNEALING_STEPS
+    np.testing.assert_allclose(np.array(seen[:num], float), 0.5 ** (1 - np.arange(num) / num), rtol=1e-6)
+    assert set(seen[num:]) == {None}
+    assert run.num_steps == num + loop.SETTLING_STEPS
+
+
+def test_reset_halves_the_heaviest_and_shifts_both_along_its_longest_axis(x64):
+    params = _params()
+    state = loop.State(jax.tree.map(lambda z: z[None], params), jnp.ones((1, K)))
+    empty, mass = np.array([True, False, False]), np.array([1e9, 5.0, 3.0])
+    new = jax.tree.map(lambda z: z[0], loop._reset_components(state, 0, empty, mass).params)
+    np.testing.assert_allclose(np.exp(new.log_weights), [0.25, 0.25, 0.3])
+    for one, old in zip(new[1:], params[1:], strict=True):
+        one, old = (np.asarray(z)[:, 1:] if z is new.curve or z is params.curve else np.asarray(z) for z in (one, old))
+        np.testing.assert_array_equal(one, old[[1, 1, 2]])
+    np.testing.assert_allclose((new.curve[0, 0] + new.curve[1, 0]) / 2, params.curve[1, 0])
+    apart, sigma = new.curve[1, 0] - new.curve[0, 0], params.tril[1] @ params.tril[1].T
+    longest = np.linalg.eigvalsh(sigma).max()
+    np.testing.assert_allclose(apart @ apart, longest)
+    np.testing.assert_allclose(sigma @ apart, longest * apart)
+
+
 @pytest.mark.parametrize("covariance", ["full", "diag", "spherical", "tied"])
-def test_newton_gain_matches_profile_derivatives(x64, covariance):
-    """The Newton step's promise, g . step, against differences of the profile_log_likelihood itself."""
+def test_newton_step_matches_profile_derivatives(x64, covariance):
+    """Slopes, curvatures and the step's promise, g . step, against differences of the profile_log_likelihood itself."""
     params, model = _params(), _model(covariance)
     if covariance != "full":
         params = params._replace(tril=0.7 * jnp.broadcast_to(jnp.eye(2)[None], (K, 2, 2)))
@@ -165,19 +218,23 @@ def test_newton_gain_matches_profile_derivatives(x64, covariance):
     @jax.jit
     def propose():
         here = accumulate(params, envelope, points, order=2)
-        return here, *newton_step(here, model, DEGREE)
+        return here, newton_step(here, model, DEGREE), _profile_derivatives(here, model, DEGREE)
 
-    here, steps, promise = propose()
+    here, (steps, promise), (slopes, curvatures) = propose()
 
     @jax.jit
-    def value(share):
-        moved = share * steps
+    def value(moved):
         times = step_times(Times(params.time_loc, params.time_scale), moved)
         there = accumulate(params, envelope, points, times=times)
         return profile_log_likelihood(here, model, DEGREE, moved, there.gram[0], there.log_a[0])
 
-    np.testing.assert_allclose((value(1e-5) - value(-1e-5)) / 2e-5, promise, rtol=1e-5)
+    np.testing.assert_allclose((value(1e-5 * steps) - value(-1e-5 * steps)) / 2e-5, promise, rtol=1e-5)
     assert (np.asarray(promise) > 0).all()
+    (g0, g1), (h00, h01, h11), h = slopes, curvatures, 1e-3
+    for direction, slope, curvature in (([1, 0], g0, h00), ([0, 1], g1, h11), ([1, 1], g0 + g1, h00 + 2 * h01 + h11)):
+        up, middle, down = (value(h * sign * np.repeat(direction, K).reshape(2, K)) for sign in (1, 0, -1))
+        np.testing.assert_allclose((up - down) / (2 * h), slope, rtol=1e-4, atol=1e-3)
+        np.testing.assert_allclose((up - 2 * middle + down) / h**2, curvature, rtol=1e-4, atol=1e-3)
 
 
 def test_changing_the_reference_equals_recomputing(x64):
