@@ -7,8 +7,9 @@ evenly over the modules of `TARGETS`, and each runs the test files of its module
 failure). A mutant is killed where a test fails or the tests take `TIMEOUT` seconds. Messages, annotations, docstrings
 and definitions of types are not mutated.
 
-With --json each mutant that is done is kept there, and the same command continues after it. Survivors are listed with
-their lines: each is either equivalent, or shows what no test checks.
+With --json each mutant that is done is kept there, and the same command continues after it; remove a run from the file
+to try it again. Survivors are listed with their lines: each is either equivalent, or shows what no test checks. Those
+that were found to be equivalent (no test of behaviour can see them) are in `REVIEWED` with the reason, by their lines.
 """
 
 import argparse
@@ -37,6 +38,8 @@ ROOT = Path(__file__).parent.parent
 _PARSING = Lock()
 #: Seconds that the tests of a mutant may take.
 TIMEOUT = 900
+#: Equivalent mutants: for each module, the mutated line and the reason.
+REVIEWED = Path(__file__).parent / "records" / "mutants-equivalent.json"
 #: The modules, and the test files of each, those that take the least time first.
 TARGETS = {
     "distribution": [
@@ -165,6 +168,13 @@ def mutate(source: str, index: int) -> str:
         return ast.unparse(ast.fix_missing_locations(_Mutator(index).visit(ast.parse(source))))
 
 
+def find_mutated_line(source: str, mutated: str) -> tuple[str, str]:
+    """The line that differs, before and after, without comments and in one piece."""
+    with _PARSING:
+        before = ast.unparse(ast.parse(source)).splitlines()
+    return next((a.strip(), b.strip()) for a, b in zip(before, mutated.splitlines(), strict=True) if a != b)
+
+
 def draw(num: int, seed: int, modules: list[str]) -> list[Mutant]:
     """`num` mutants, as many of every module as there are, one module after the other in turn."""
     shuffled = [
@@ -199,15 +209,16 @@ def run_tests(folder: Path, modules: list[str], first: Iterable[str] = ()) -> tu
 def try_mutant(mutant: Mutant, folder: Path, killers: Iterable[str] = ()) -> Run:
     path = folder / "foldgauss" / f"{mutant.module}.py"
     source, begun = path.read_text(), time.monotonic()
+    mutated = mutate(source, mutant.index)
     try:
-        path.write_text(mutate(source, mutant.index))
+        path.write_text(mutated)
         passed, last = run_tests(folder, [mutant.module], killers)
     finally:
         path.write_text(source)
-    code = source.splitlines()[mutant.line - 1].strip()
+    code, became = find_mutated_line(source, mutated)
     by = "" if passed else last.removeprefix("FAILED ")
-    seconds = round(time.monotonic() - begun)
-    return {"killed": not passed, "by": by, "code": code, "module": mutant.module, "seconds": seconds}
+    run = {"killed": not passed, "by": by, "code": code, "mutated": became, "module": mutant.module}
+    return run | {"seconds": round(time.monotonic() - begun)}
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -237,23 +248,32 @@ def main(arguments: list[str] | None = None) -> None:
                 folders.put(folder)
 
         list(pool.map(one, left))
-    show({mutant.name: runs.done[mutant.name] for mutant in mutants}, options.json)
+    show({mutant.name: runs.done[mutant.name] for mutant in mutants})
 
 
-def show(rows: dict[str, Run], path: Path | None) -> None:
-    table = _common.table("Mutants", "module", "mutants", "killed", "fraction")
+def show(rows: dict[str, Run]) -> None:
+    reviewed = json.loads(REVIEWED.read_text())
+    reasons = {
+        name: reason
+        for name, row in rows.items()
+        if not row["killed"] and (reason := reviewed.get(row["module"], {}).get(row["mutated"]))
+    }
+    columns = "mutants", "killed", "equivalent", "survived", "killed of those that are not equivalent"
+    table = _common.table("Mutants", "module", *columns)
     figures = {}
-    for module in dict.fromkeys(row["module"] for row in rows.values()):
-        killed = [row["killed"] for row in rows.values() if row["module"] == module]
-        figures |= {f"mutants_{module}": len(killed), f"killed_{module}": sum(killed)}
-        table.add_row(module, str(len(killed)), str(sum(killed)), f"{sum(killed) / len(killed):.0%}")
-    killed = sum(row["killed"] for row in rows.values())
-    table.add_row("all", str(len(rows)), str(killed), f"{killed / len(rows):.1%}")
+    for module in [*dict.fromkeys(row["module"] for row in rows.values()), "all"]:
+        own = {name: row for name, row in rows.items() if module in (row["module"], "all")}
+        killed, equivalent = sum(row["killed"] for row in own.values()), len(own.keys() & reasons)
+        figures |= {f"mutants_{module}": len(own), f"killed_{module}": killed, f"equivalent_{module}": equivalent}
+        counts = len(own), killed, equivalent, len(own) - killed - equivalent
+        table.add_row(module, *map(str, counts), f"{killed / max(len(own) - equivalent, 1):.1%}")
     console.print(table)
     for name, row in rows.items():
         if not row["killed"]:
-            console.print(f"survived: {name}\n    {row['code']}", soft_wrap=True, highlight=False, markup=False)
-    _common.finish(None, figures | {"mutants": len(rows), "killed": killed}, _common.describe_machine())
+            told = f"equivalent: {reasons[name]}" if name in reasons else "survived"
+            lines = f"{name}: {told}\n  - {row['code']}\n  + {row['mutated']}"
+            console.print(lines, soft_wrap=True, highlight=False, markup=False)
+    _common.finish(None, figures, _common.describe_machine())
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -19,7 +19,15 @@ from foldgauss.estimator.em.m_step import (
 )
 from foldgauss.estimator.em.online import change_reference
 from foldgauss.estimator.em.scaling import Scaling, to_mixture
-from foldgauss.estimator.em.statistics import Times, _divide_by_a, accumulate, make_points, step_times
+from foldgauss.estimator.em.statistics import (
+    Points,
+    Times,
+    _divide_by_a,
+    accumulate,
+    log_densities,
+    make_points,
+    step_times,
+)
 
 K, N, DEGREE = 3, 200, 2
 NO_SCALING = Scaling(np.zeros(3), np.ones(3))
@@ -77,6 +85,7 @@ def _model(covariance="full", floor=0.0, degree=DEGREE, dtype=np.float64):
 
 
 densities = eqx.filter_jit(components.evaluate_densities)
+SUMS = eqx.filter_jit(accumulate)
 
 
 def log_density(params, envelope, x):
@@ -113,8 +122,7 @@ def test_density_in_many_space_dimensions(x64):
 def test_gram_is_the_sum_over_pairs(x64):
     """Chunks, padding, weights: against the sum written out in NumPy."""
     params, x, weights = _params(), _data(), np.random.default_rng(2).uniform(0, 2, N)
-    summed = eqx.filter_jit(lambda points: accumulate(params, ENVELOPES["1"], points))
-    sums = summed(make_points(x, weights, K))
+    sums = SUMS(params, ENVELOPES["1"], make_points(x, weights, K))
     pairs = densities(params, ENVELOPES["1"], jnp.asarray(x))
     log_density = np.asarray(pairs.log_density)
     shares = weights[:, None] * np.exp(log_density - np.logaddexp.reduce(log_density, axis=1)[:, None])
@@ -123,8 +131,42 @@ def test_gram_is_the_sum_over_pairs(x64):
     np.testing.assert_allclose(sums.mass, shares.sum(0), rtol=1e-12)
     gram = np.einsum("nk,nka,nkb->kab", shares * np.exp(-np.asarray(pairs.log_a)), z, z)
     np.testing.assert_allclose(sums.gram[0], gram, rtol=1e-10, atol=1e-9)
-    split = summed(make_points(x, weights, 2**13))  # 16 rows a chunk
+    split = SUMS(params, ENVELOPES["1"], make_points(x, weights, 2**13))  # 16 rows a chunk
     np.testing.assert_allclose(split.gram, sums.gram, rtol=1e-10, atol=1e-9)
+
+
+def test_points_are_padded_to_few_shapes():
+    assert [make_points(np.zeros((n, 3)), np.ones(n), K).x.shape[:3] for n in (5, 256, 257, 600)] == [
+        (1, 1, 256),
+        (1, 1, 256),
+        (1, 1, 512),
+        (1, 1, 1024),
+    ]
+    many = make_points(np.zeros((3 * 2**15, 3)), np.ones(3 * 2**15), K)
+    assert many.x.shape[:3] == (1, 3, 2**15)
+
+
+def test_log_densities_of_points_on_two_devices(x64):
+    """In the order of the rows; the arrays of both devices are on one here."""
+    params, x = _params(), _data()
+    one = make_points(x, np.ones(N), K)
+    two = Points(*(z.reshape(2, 1, 128, *z.shape[3:]) for z in (one.x, one.weights)), N)
+    expected = log_density(params, ENVELOPES["1"], one.x[0, 0])
+    found = eqx.filter_jit(log_densities)(params, ENVELOPES["1"], two)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("covariance", ["full", "diag", "spherical", "tied"])
+def test_floor_is_added_to_variances(x64, covariance):
+    params = _params()._replace(tril=0.7 * jnp.broadcast_to(jnp.eye(2)[None], (K, 2, 2)))
+    sums, degrees = SUMS(params, Constant(), make_points(_data(), np.ones(N), K)), broadcast_degrees(DEGREE, K)
+    update = jax.jit(lambda floor: update_components(params, sums, Model(degrees, floor, covariance))[0])
+    floor = np.array([0.1, 0.3, 0.5])
+    plain, floored = update(0 * floor), update(floor)
+    sigma = [one.tril @ one.tril.swapaxes(1, 2) for one in (plain, floored)]
+    added = np.diag(floor[:2]) if covariance != "spherical" else 0.2 * np.eye(2)
+    np.testing.assert_allclose(sigma[1] - sigma[0], np.broadcast_to(added, (K, 2, 2)), atol=1e-12)
+    np.testing.assert_allclose(floored.time_scale**2 - plain.time_scale**2, 0.5)
 
 
 def test_mass_divided_by_a_and_its_derivatives(x64):
