@@ -286,6 +286,10 @@ def test_space_given_space_against_its_definition():
     error = draws.std(0) / np.sqrt(len(draws))
     assert (np.abs(draws.mean(0) - given.mean[0]) < 5 * error).all()
     np.testing.assert_allclose(np.cov(draws.T), given.covariance_matrix[0], atol=3e-3)
+    np.testing.assert_array_equal(given.variance, np.diagonal(given.covariance_matrix, axis1=1, axis2=2))
+    space = dist.marginal([0, 1, 2]).condition([1], _repeated(-0.3))
+    assert space.event_shape == (2,)
+    np.testing.assert_allclose(space.mean, given.mean[:, :2], rtol=1e-12)
 
 
 @pytest.mark.slow  # it compiles for long
