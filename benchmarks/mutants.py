@@ -4,7 +4,7 @@
 
 A mutant is one changed operator, comparison, constant, condition or argument. N of them (300) are drawn with a seed,
 evenly over the modules of `TARGETS`, and each runs the test files of its module (`-m "not slow"`, until the first
-failure). A mutant is killed where a test fails or the tests take `TIMEOUT` seconds. Messages, annotations, docstrings
+failure). A mutant is killed where a test fails or a test takes minutes. Messages, annotations, docstrings
 and definitions of types are not mutated.
 
 With --json each mutant that is done is kept there, and the same command continues after it; remove a run from the file
@@ -36,8 +36,6 @@ from benchmarks._runs import Run, Runs
 ROOT = Path(__file__).parent.parent
 #: CPython 3.11's parser counts its recursion wrongly where several threads parse at once.
 _PARSING = Lock()
-#: Seconds that the tests of a mutant may take.
-TIMEOUT = 900
 #: Equivalent mutants: for each module, the mutated line and the reason.
 REVIEWED = Path(__file__).parent / "records" / "mutants-equivalent.json"
 #: The modules, and the test files of each, those that take the least time first.
@@ -184,35 +182,39 @@ def draw(num: int, seed: int, modules: list[str]) -> list[Mutant]:
     return in_turn[:num]
 
 
-def run_tests(folder: Path, modules: list[str], first: Iterable[str] = ()) -> tuple[bool, str]:
-    """Whether the tests of modules pass in a copy of the checkout, and the last line that they print.
+class Checkout:
+    """A copy of the checkout in a folder, and a process that runs its tests."""
 
-    The tests `first` run before the others. What JAX compiles is kept beside the copy for the next mutants.
-    """
-    failed = folder / ".pytest_cache/v/cache/lastfailed"
-    failed.parent.mkdir(parents=True, exist_ok=True)
-    failed.write_text(json.dumps(dict.fromkeys(first, True)))
-    files = dict.fromkeys(f"tests/{name}.py" for module in modules for name in TARGETS[module])
-    command = [sys.executable, "-m", "pytest", "-x", "--ff", "-q", "-n", "0", "--no-header", *files]
-    env = dict(os.environ, PYTHONPATH=str(folder), PYTHONDONTWRITEBYTECODE="1")
-    env.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder.parent / "jax"))
-    try:
-        done = subprocess.run(
-            command, cwd=folder, env=env, capture_output=True, text=True, timeout=TIMEOUT * len(modules)
-        )
-    except subprocess.TimeoutExpired:
-        return False, f"more than {TIMEOUT * len(modules)} s"
-    lines = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
-    return done.returncode == 0, (lines or done.stdout.splitlines() or [""])[-1]
+    def __init__(self, folder: Path):
+        self.folder = folder
+        shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(".git", "site"))
+        env = dict(os.environ, PYTHONPATH=str(folder), PYTHONDONTWRITEBYTECODE="1", PYTHONWARNINGS="ignore")
+        env.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder.parent / "jax"))  # what one mutant compiled is there
+        command = [sys.executable, "benchmarks/_forked_pytest.py"]
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+        self._process = subprocess.Popen(command, cwd=folder, env=env, **pipes)
+
+    def run_tests(self, modules: list[str], first: Iterable[str] = ()) -> tuple[bool, str]:
+        """Whether the tests of modules pass, and the last line that they print. The tests `first` run first."""
+        failed = self.folder / ".pytest_cache/v/cache/lastfailed"
+        failed.parent.mkdir(parents=True, exist_ok=True)
+        failed.write_text(json.dumps(dict.fromkeys(first, True)))
+        files = dict.fromkeys(f"tests/{name}.py" for module in modules for name in TARGETS[module])
+        arguments = ["-x", "--ff", "-q", "-n", "0", "--no-header", *files]
+        self._process.stdin.write(json.dumps(arguments) + "\n")
+        self._process.stdin.flush()
+        code, lines = json.loads(self._process.stdout.readline())
+        failures = [line for line in lines if line.startswith(("FAILED", "ERROR"))]
+        return code == 0, (failures or lines or [""])[-1]
 
 
-def try_mutant(mutant: Mutant, folder: Path, killers: Iterable[str] = ()) -> Run:
-    path = folder / "foldgauss" / f"{mutant.module}.py"
+def try_mutant(mutant: Mutant, checkout: Checkout, killers: Iterable[str] = ()) -> Run:
+    path = checkout.folder / "foldgauss" / f"{mutant.module}.py"
     source, begun = path.read_text(), time.monotonic()
     mutated = mutate(source, mutant.index)
     try:
         path.write_text(mutated)
-        passed, last = run_tests(folder, [mutant.module], killers)
+        passed, last = checkout.run_tests([mutant.module], killers)
     finally:
         path.write_text(source)
     code, became = find_mutated_line(source, mutated)
@@ -229,23 +231,23 @@ def main(arguments: list[str] | None = None) -> None:
     # One module after the other: after a mutant of another one, the kernels of that file are compiled again.
     left = sorted(mutant for mutant in mutants if mutant.name not in runs.done)
     with tempfile.TemporaryDirectory() as parent, ThreadPoolExecutor(options.workers) as pool:
-        folders: SimpleQueue[Path] = SimpleQueue()
-        for k in range(options.workers):
-            folder = Path(parent) / str(k)
-            shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(".git", "site"))
-            folders.put(folder)
+        checkouts: SimpleQueue[Checkout] = SimpleQueue()
+        for k in range(options.workers if left else 0):
+            checkouts.put(Checkout(Path(parent) / str(k)))
         if left:
-            passed, last = run_tests(Path(parent) / "0", list(dict.fromkeys(mutant.module for mutant in left)))
+            checkout = checkouts.get()
+            passed, last = checkout.run_tests(list(dict.fromkeys(mutant.module for mutant in left)))
             if not passed:
                 raise SystemExit(f"The tests fail without a change: {last}")
+            checkouts.put(checkout)
 
         def one(mutant: Mutant) -> None:
-            folder = folders.get()
+            checkout = checkouts.get()
             killers = {run["by"].split(" - ")[0] for run in list(runs.done.values()) if run["module"] == mutant.module}
             try:
-                runs.get(mutant.name, lambda: try_mutant(mutant, folder, killers))
+                runs.get(mutant.name, lambda: try_mutant(mutant, checkout, killers))
             finally:
-                folders.put(folder)
+                checkouts.put(checkout)
 
         list(pool.map(one, left))
     show({mutant.name: runs.done[mutant.name] for mutant in mutants})
