@@ -13,7 +13,6 @@ import sys
 runpy.run_path("tests/conftest.py")  # its settings must precede the import of JAX
 
 import equinox  # noqa: E402, F401
-import hypothesis.strategies  # noqa: E402, F401
 import numba.core.caching  # noqa: E402, F401
 import optax  # noqa: E402, F401
 import pytest  # noqa: E402
@@ -33,7 +32,10 @@ def run(arguments: list[str]) -> tuple[int, list[str]]:
             resource.setrlimit(resource.RLIMIT_CPU, (LIMIT, LIMIT))
             os.dup2(output.fileno(), 1)
             os.dup2(output.fileno(), 2)
-            os._exit(pytest.main(arguments))
+            # JAX's libraries import a plugin of pytest, which warns that it cannot rewrite its assertions.
+            code = pytest.main(["-W", "ignore::pytest.PytestAssertRewriteWarning", *arguments])
+            sys.stdout.flush()
+            os._exit(code)
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         output.seek(0)
         return code, output.read().splitlines()[-50:]

@@ -204,8 +204,11 @@ class Checkout:
         self._process.stdin.write(json.dumps(arguments) + "\n")
         self._process.stdin.flush()
         code, lines = json.loads(self._process.stdout.readline())
-        failures = [line for line in lines if line.startswith(("FAILED", "ERROR"))]
-        return code == 0, (failures or lines or [""])[-1]
+        # E: an import that fails in a conftest
+        failures = [line for line in lines if line.startswith(("FAILED ", "ERROR ", "E  "))]
+        if code > 0 and not failures:
+            raise RuntimeError("pytest: expected passed or failed tests, got\n" + "\n".join(lines))
+        return code == 0, failures[-1] if failures else f"signal {-code}"
 
 
 def try_mutant(mutant: Mutant, checkout: Checkout, killers: Iterable[str] = ()) -> Run:

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from foldgauss.analysis.conditional import TimeDensity, TimeMixture
+from foldgauss.analysis.conditional import TimeDensity, TimeMixture, _mixture_moments
 from foldgauss.analysis.quadrature import SEARCH_GRID, adaptive_panels, find_peaks, gauss_hermite, normal_rule
 from foldgauss.distribution import FoldedGaussian
-from foldgauss.envelope import TimeLikelihood
+from foldgauss.envelope import CallableEnvelope, TimeLikelihood
 from foldgauss.fold import PolynomialFold, ZeroFold
 from foldgauss.gaussian import Gaussian
 
@@ -138,8 +138,9 @@ def test_time_given_space_integrates_to_one(dim):
     nodes, weights = np.polynomial.legendre.leggauss(20)
     for power, floor in [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (2.0, 0.01)]:
         dist = _dist(dim, power, floor)
-        # At s = 1.5 the curve of one space coordinate passes at tau = 6.7 too, in a width of 1e-5.
-        s = jnp.concatenate([_points(dist, MANY - 1)[:, :-1], jnp.full((1, dim), 1.5)])
+        # At s = 1.5 and 1.95 the curve of one space coordinate passes at tau = 6.7 and 7.5, too, in widths of 1e-5;
+        # just above -0.16, where it turns back, the density has a flat top.
+        s = jnp.concatenate([_points(dist, MANY - 3)[:, :-1], jnp.outer(jnp.array([1.5, 1.95, -0.15]), jnp.ones(dim))])
         density = dist.time_given_space(s)
         assert isinstance(density, TimeDensity)
         assert (density.error_estimate < 1e-9).all()
@@ -147,7 +148,11 @@ def test_time_given_space_integrates_to_one(dim):
         edges = np.stack([_edges(m[np.isfinite(m)]) for m in modes], axis=-1)
         half = 0.5 * np.diff(edges, axis=0)[:, None]
         t = edges[:-1, None] + half * (1 + nodes[:, None])
-        p = np.exp(LOG_PROB(density, jnp.asarray(t.reshape(-1, MANY)))).reshape(t.shape)
+        log_p = np.asarray(LOG_PROB(density, jnp.concatenate([t.reshape(-1, MANY), modes.T])))
+        for own, height in zip(modes, log_p[-modes.shape[1] :].T, strict=True):  # highest first, and apart
+            assert (np.diff(height[height > -20]) < 0.01).all()
+            assert (np.diff(np.sort(own[np.isfinite(own)])) > 1e-4).all()
+        p = np.exp(log_p[: -modes.shape[1]]).reshape(t.shape)
         np.testing.assert_allclose((half * weights[:, None] * p).sum((0, 1)), 1, rtol=1e-8)
         assert power == 0 or dim == 2 or (np.isfinite(modes).sum(-1) > 1).any()  # bimodal ones are among them
         np.testing.assert_allclose(density.panels.probabilities.sum(-1), 1, atol=1e-12)
@@ -200,6 +205,29 @@ def test_chain_rule_both_ways():
     as_mixture = dist.condition([0, 1], x[:, :2])
     np.testing.assert_allclose(as_mixture.log_prob(x[:, 2:]), time.log_prob(x[:, 2]), rtol=1e-12)
     np.testing.assert_allclose(as_mixture.cdf(x[:, 2:]), time.cdf(x[:, 2]), rtol=1e-12)
+
+
+def test_narrow_curves_are_found_far_from_the_middle():
+    """In two space coordinates, where a grid would miss them: p(s) of Laplace's method, which is exact for these."""
+    scale, tau = 1e-12, np.resize([-2.5, 0.3, 2.0], MANY)
+    dist = _dist(2, 0.0, scale_tril=scale * np.eye(2))
+    at = CONDITION_TIME(dist, 0.4 + 0.3 * tau)
+    density = dist.time_given_space(at.loc)
+    u = -0.3 * tau[:, None]
+    speed = 0.3 * np.linalg.norm(BEND[0, :2] + 2 * u * BEND[1, :2], axis=1)
+    log_p = -0.5 * tau**2 - np.log(2 * np.pi * scale * speed)
+    np.testing.assert_allclose(density.log_normalizer, log_p, atol=1e-3)
+    np.testing.assert_allclose(density.mean, 0.4 + 0.3 * tau, atol=1e-9)
+
+
+def test_moments_with_an_own_envelope_equal_those_with_the_same_built_in():
+    """An own envelope may depend on t itself, so that times are not centered."""
+    own = CallableEnvelope(lambda t, m, scale: -0.5 * ((t - m) / scale) ** 2)
+    density = _dist(1).time_given_space(_repeated(0.3))
+    panels = jax.tree.map(lambda leaf: leaf[0], density.panels)
+    mean, covariance = eqx.filter_jit(_mixture_moments)(_dist(1, envelope=own), jnp.array([0.3]), panels)
+    np.testing.assert_allclose(mean, density.mean[:1], rtol=1e-12)
+    np.testing.assert_allclose(covariance[0], density.variance[:1], rtol=1e-9)
 
 
 def test_modes_of_time_are_where_the_parabola_passes():
