@@ -45,6 +45,7 @@ TARGETS = {
         "test_distribution_normalisation",
         "test_distribution_moments",
         "test_distribution_extremes",
+        "test_distribution_conditional",
     ],
     "analysis/conditional": ["test_distribution_conditional"],
     "envelope": ["test_envelope", "test_distribution"],

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from foldgauss.analysis.conditional import TimeDensity, TimeMixture, _mixture_moments
+from foldgauss.analysis.conditional import TimeDensity, TimeMixture, _mixture_moments, _nearer
 from foldgauss.analysis.quadrature import SEARCH_GRID, adaptive_panels, find_peaks, gauss_hermite, normal_rule
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import CallableEnvelope, TimeLikelihood
@@ -24,6 +24,7 @@ LOG_PROB = eqx.filter_jit(lambda dist, x: dist.log_prob(x))
 CDF = eqx.filter_jit(lambda dist, x: dist.cdf(x))
 SAMPLE = eqx.filter_jit(lambda dist, key, n: dist.sample(key, (n,)))
 MEAN_AND_VARIANCE = eqx.filter_jit(lambda dist: (dist.mean, dist.variance))
+NEARER = eqx.filter_jit(_nearer)
 CONDITION_TIME = eqx.filter_jit(FoldedGaussian.condition_time)
 
 # An integral over time takes seconds to compile for each shape: what is given has this many points in most tests.
@@ -207,17 +208,13 @@ def test_chain_rule_both_ways():
     np.testing.assert_allclose(as_mixture.cdf(x[:, 2:]), time.cdf(x[:, 2]), rtol=1e-12)
 
 
-def test_narrow_curves_are_found_far_from_the_middle():
-    """In two space coordinates, where a grid would miss them: p(s) of Laplace's method, which is exact for these."""
-    scale, tau = 1e-12, np.resize([-2.5, 0.3, 2.0], MANY)
-    dist = _dist(2, 0.0, scale_tril=scale * np.eye(2))
-    at = CONDITION_TIME(dist, 0.4 + 0.3 * tau)
-    density = dist.time_given_space(at.loc)
-    u = -0.3 * tau[:, None]
-    speed = 0.3 * np.linalg.norm(BEND[0, :2] + 2 * u * BEND[1, :2], axis=1)
-    log_p = -0.5 * tau**2 - np.log(2 * np.pi * scale * speed)
-    np.testing.assert_allclose(density.log_normalizer, log_p, atol=1e-3)
-    np.testing.assert_allclose(density.mean, 0.4 + 0.3 * tau, atol=1e-9)
+def test_nearest_times_are_refined_by_short_steps_only():
+    dist, tau = _dist(2), np.array([-2.5, 0.3, 2.0])
+    for away, reached in [(1e-6, 0.0), (-1e-4, 0.0), (0.1, 0.1)]:
+        for one in tau:
+            s = CONDITION_TIME(dist, jnp.asarray(0.4 + 0.3 * one)).loc
+            found = NEARER(dist, s, jnp.array([one + away]))
+            np.testing.assert_allclose(found, one + reached, atol=20 * away**2 if reached == 0 else 0)
 
 
 def test_moments_with_an_own_envelope_equal_those_with_the_same_built_in():

@@ -138,6 +138,12 @@ def test_bad_input_names_the_parameter(arguments, name):
         TimeLikelihood(**arguments)
 
 
+def test_integers_and_weak_types_become_floats():
+    envelope = TimeLikelihood(np.array([1, 2]), 0)
+    assert (envelope.power.dtype, envelope.floor.dtype) == (jnp.float32, jnp.float32)
+    assert not envelope.floor.weak_type  # jitted code is compiled once for numbers and arrays
+
+
 def test_nan_propagates():
     assert jnp.isnan(_at(TimeLikelihood(jnp.nan), 1.0))
     assert jnp.isnan(_at(TimeLikelihood(1.0, 0.1), jnp.nan))
