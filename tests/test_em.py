@@ -11,6 +11,8 @@ from foldgauss.envelope import Constant, TimeLikelihood, plain_envelope
 from foldgauss.estimator.em import components, loop
 from foldgauss.estimator.em.loop import EMStatus, broadcast_degrees, run_em, select_best
 from foldgauss.estimator.em.m_step import (
+    _MAX_STEP,
+    _MIN_CURVATURE,
     Model,
     _profile_derivatives,
     newton_step,
@@ -277,6 +279,13 @@ def test_newton_step_matches_profile_derivatives(x64, covariance):
         up, middle, down = (value(h * sign * np.repeat(direction, K).reshape(2, K)) for sign in (1, 0, -1))
         np.testing.assert_allclose((up - down) / (2 * h), slope, rtol=1e-4, atol=1e-3)
         np.testing.assert_allclose((up - 2 * middle + down) / h**2, curvature, rtol=1e-4, atol=1e-3)
+    # The step of each component: eigenvalues are lifted to a fraction of its mass, and it has a longest length.
+    for k, mass in enumerate(here.mass):
+        negative = -np.array([[h00[k], h01[k]], [h01[k], h11[k]]])
+        lift = max(_MIN_CURVATURE * mass - np.linalg.eigvalsh(negative)[0], 0)
+        step = np.linalg.solve(negative + lift * np.eye(2), slopes[:, k])
+        step *= min(1, _MAX_STEP / np.abs(step).max())
+        np.testing.assert_allclose(steps[:, k], step, rtol=1e-7)
 
 
 def test_changing_the_reference_equals_recomputing(x64):
