@@ -332,6 +332,8 @@ def test_moment_updates_of_time_can_decrease_the_likelihood(x64):
     """Power check of the test above: from its end, plain moments of time go down."""
     envelope, model, points = ENVELOPES["1"], _model(), make_points(_data(), np.ones(N), K)
     params = _run(points, _params(), envelope, model, tol=1e-8, max_steps=60).params
+    promise = jax.jit(lambda sums: newton_step(sums, model, DEGREE)[1])(SUMS(params, envelope, points, order=2))
+    assert (promise < 1e-4).all()  # the times are where another step gains nothing
 
     @jax.jit
     def by_moments(params):
