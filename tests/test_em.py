@@ -219,6 +219,23 @@ def test_end_of_a_run(x64, monkeypatch, stuck_mass, rejected, status):
     assert run.num_steps == (4 if status == EMStatus.NOT_CONVERGED else 2)
 
 
+def test_each_restart_ends_for_itself(x64, monkeypatch):
+    """Converged at once, not finite at the second step, and converged after some steps."""
+    values = np.array([[1.0, 1.0, 0.0], [1.0, np.nan, 1.0], [5.0, 1.0, 2.0], [6.0, 1.0, 2.0]])
+    numbers = iter(range(4))
+
+    def step(states, *rest):
+        info = loop.Info(values[next(numbers)], np.ones((3, K)), np.zeros((3, K), bool), np.zeros(3))
+        return states, jax.tree.map(jnp.asarray, info)
+
+    monkeypatch.setattr(loop, "_step_restarts", step)
+    starts = jax.tree.map(lambda z: jnp.stack([z] * 3), _params())
+    runs = run_em(starts, None, Constant(), _model(), total=1.0, tol=1e-3, max_steps=9)
+    assert [run.num_steps for run in runs] == [len(run.history) for run in runs] == [2, 2, 4]
+    assert [run.status for run in runs] == [EMStatus.CONVERGED, EMStatus.NOT_FINITE, EMStatus.CONVERGED]
+    assert [run.log_likelihood for run in runs] == [1.0, 1.0, 2.0]
+
+
 def test_temperatures_of_annealing(x64, monkeypatch):
     """From the first one to 1 in as many steps as stated, evenly in the logarithm."""
     seen = []
