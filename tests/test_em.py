@@ -112,13 +112,17 @@ def test_density_matches_mixture(x64, power):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), again, params)
 
 
-def test_density_in_many_space_dimensions(x64):
+def test_density_and_gram_in_many_space_dimensions(x64):
     rng = np.random.default_rng(0)
     tril = np.tril(rng.normal(size=(2, 9, 9))) * 0.1 + np.eye(9)
     parts = (np.log([0.4, 0.6]), np.zeros(2), np.ones(2), rng.normal(size=(2, 3, 9)), tril)
-    params, x = components.Parameters(*map(jnp.asarray, parts)), jnp.asarray(rng.normal(size=(5, 10)))
+    params, x = components.Parameters(*map(jnp.asarray, parts)), rng.normal(size=(5, 10))
     mixture = to_mixture(params, Scaling(np.zeros(10), np.ones(10)), Constant())
-    np.testing.assert_allclose(log_density(params, Constant(), x), mixture.log_prob(x), rtol=1e-12)
+    np.testing.assert_allclose(log_density(params, Constant(), jnp.asarray(x)), mixture.log_prob(x), rtol=1e-12)
+    sums, pairs = SUMS(params, Constant(), make_points(x, np.ones(5), 2)), densities(params, Constant(), jnp.asarray(x))
+    shares, v = special.softmax(pairs.log_density, axis=1), np.asarray(pairs.v)
+    z = np.concatenate([np.stack([np.ones_like(v), v, (v * v - 1) / np.sqrt(2)], -1), pairs.whitened[0]], -1)
+    np.testing.assert_allclose(sums.gram[0], np.einsum("nk,nka,nkb->kab", shares, z, z), rtol=1e-9, atol=1e-12)
 
 
 def test_gram_is_the_sum_over_pairs(x64):
