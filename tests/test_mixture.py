@@ -661,6 +661,18 @@ def test_as_scipy_object():
     assert frozen.marginal([0, 2]).dim == 2
 
 
+def test_draws_are_of_their_component_where_the_fold_is_a_function():
+    loc = np.array([[0.0, 1.0], [50.0, 2.0]])
+    components = FoldedGaussian(
+        loc, scale=np.full((2, 2), 1e-3), time_loc=[0.2, 0.8], time_scale=0.1, fold=lambda u: jnp.stack([u, u**2])
+    )
+    mixture = FoldedMixture(components, weights=[0.4, 0.6])
+    x, component = (np.asarray(z) for z in mixture.sample(jax.random.key(0), (20,), return_component=True))
+    assert set(component) == {0, 1}
+    u = np.array([0.2, 0.8])[component] - x[:, 2]
+    np.testing.assert_allclose(x[:, :2] - loc[component], np.stack([u, u**2], 1), atol=1e-2)
+
+
 def test_nan_asked_is_nan_answered():
     assert jnp.isnan(_mixture().expected_space(jnp.nan)).all()
     assert jnp.isnan(_mixture().space_covariance(jnp.nan)).all()
