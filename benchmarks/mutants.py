@@ -4,22 +4,25 @@
 
 A mutant is one changed operator, comparison, constant, condition or argument. N of them (300) are drawn with a seed,
 evenly over the modules of `TARGETS`, and each runs the test files of its module (`-m "not slow"`, until the first
-failure). A mutant is killed where a test fails or the tests take `TIMEOUT` seconds. Messages, annotations, docstrings
+failure). A mutant is killed where a test fails or a test takes minutes. Messages, annotations, docstrings
 and definitions of types are not mutated.
 
-With --json each mutant that is done is kept there, and the same command continues after it. Survivors are listed with
-their lines: each is either equivalent, or shows what no test checks.
+With --json each mutant that is done is kept there, and the same command continues after it; remove a run from the file
+to try it again. Survivors are listed with their lines: each is either equivalent, or shows what no test checks. Those
+that were found to be equivalent (no test of behaviour can see them) are in `REVIEWED` with the reason, by their lines.
 """
 
 import argparse
 import ast
+import json
 import os
 import random
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+import time
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import SimpleQueue
@@ -33,8 +36,8 @@ from benchmarks._runs import Run, Runs
 ROOT = Path(__file__).parent.parent
 #: CPython 3.11's parser counts its recursion wrongly where several threads parse at once.
 _PARSING = Lock()
-#: Seconds that the tests of a mutant may take.
-TIMEOUT = 900
+#: Equivalent mutants: for each module, the mutated line and the reason.
+REVIEWED = Path(__file__).parent / "records" / "mutants-equivalent.json"
 #: The modules, and the test files of each, those that take the least time first.
 TARGETS = {
     "distribution": [
@@ -42,6 +45,7 @@ TARGETS = {
         "test_distribution_normalisation",
         "test_distribution_moments",
         "test_distribution_extremes",
+        "test_distribution_conditional",
     ],
     "analysis/conditional": ["test_distribution_conditional"],
     "envelope": ["test_envelope", "test_distribution"],
@@ -53,7 +57,7 @@ TARGETS = {
     "render/_cpu_kernels": ["render/test_cpu", "render/test_weights", "render/test_engines"],
     "video/models/conditioning": ["video/test_conditioning"],
     "video/models/frame_times": ["video/test_frame_times"],
-    "video/fitting/adam": ["video/test_adam", "video/test_fit", "video/test_device"],
+    "video/fitting/adam": ["video/test_adam"],
     "io/models/compact": ["io/test_compact"],
     "io/models/range_coder": ["io/test_range_coder"],
 }
@@ -163,6 +167,13 @@ def mutate(source: str, index: int) -> str:
         return ast.unparse(ast.fix_missing_locations(_Mutator(index).visit(ast.parse(source))))
 
 
+def find_mutated_line(source: str, mutated: str) -> tuple[str, str]:
+    """The line that differs, before and after, without comments and in one piece."""
+    with _PARSING:
+        before = ast.unparse(ast.parse(source)).splitlines()
+    return next((a.strip(), b.strip()) for a, b in zip(before, mutated.splitlines(), strict=True) if a != b)
+
+
 def draw(num: int, seed: int, modules: list[str]) -> list[Mutant]:
     """`num` mutants, as many of every module as there are, one module after the other in turn."""
     shuffled = [
@@ -172,29 +183,48 @@ def draw(num: int, seed: int, modules: list[str]) -> list[Mutant]:
     return in_turn[:num]
 
 
-def run_tests(folder: Path, module: str) -> tuple[bool, str]:
-    """Whether the tests of a module pass in a copy of the checkout, and the last line that they print."""
-    files = [f"tests/{name}.py" for name in TARGETS[module]]
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "--no-header", "--durations=0", *files]
-    env = dict(os.environ, PYTHONPATH=str(folder), PYTHONDONTWRITEBYTECODE="1")
-    try:
-        done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=TIMEOUT)
-    except subprocess.TimeoutExpired:
-        return False, f"more than {TIMEOUT} s"
-    lines = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
-    return done.returncode == 0, (lines or done.stdout.splitlines() or [""])[-1]
+class Checkout:
+    """A copy of the checkout in a folder, and a process that runs its tests."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(".git", "site"))
+        env = dict(os.environ, PYTHONPATH=str(folder), PYTHONDONTWRITEBYTECODE="1", PYTHONWARNINGS="ignore")
+        env.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder.parent / "jax"))  # what one mutant compiled is there
+        command = [sys.executable, "benchmarks/_forked_pytest.py"]
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+        self._process = subprocess.Popen(command, cwd=folder, env=env, **pipes)
+
+    def run_tests(self, modules: list[str], first: Iterable[str] = ()) -> tuple[bool, str]:
+        """Whether the tests of modules pass, and the last line that they print. The tests `first` run first."""
+        failed = self.folder / ".pytest_cache/v/cache/lastfailed"
+        failed.parent.mkdir(parents=True, exist_ok=True)
+        failed.write_text(json.dumps(dict.fromkeys(first, True)))
+        files = dict.fromkeys(f"tests/{name}.py" for module in modules for name in TARGETS[module])
+        arguments = ["-x", "--ff", "-q", "-n", "0", "--no-header", *files]
+        self._process.stdin.write(json.dumps(arguments) + "\n")
+        self._process.stdin.flush()
+        code, lines = json.loads(self._process.stdout.readline())
+        # E: an import that fails in a conftest
+        failures = [line for line in lines if line.startswith(("FAILED ", "ERROR ", "E  "))]
+        if code > 0 and not failures:
+            raise RuntimeError("pytest: expected passed or failed tests, got\n" + "\n".join(lines))
+        return code == 0, failures[-1] if failures else f"signal {-code}"
 
 
-def try_mutant(mutant: Mutant, folder: Path) -> Run:
-    path = folder / "foldgauss" / f"{mutant.module}.py"
-    source = path.read_text()
+def try_mutant(mutant: Mutant, checkout: Checkout, killers: Iterable[str] = ()) -> Run:
+    path = checkout.folder / "foldgauss" / f"{mutant.module}.py"
+    source, begun = path.read_text(), time.monotonic()
+    mutated = mutate(source, mutant.index)
     try:
-        path.write_text(mutate(source, mutant.index))
-        passed, last = run_tests(folder, mutant.module)
+        path.write_text(mutated)
+        passed, last = checkout.run_tests([mutant.module], killers)
     finally:
         path.write_text(source)
-    code = source.splitlines()[mutant.line - 1].strip()
-    return {"killed": not passed, "by": "" if passed else last, "code": code, "module": mutant.module}
+    code, became = find_mutated_line(source, mutated)
+    by = "" if passed else last.removeprefix("FAILED ")
+    run = {"killed": not passed, "by": by, "code": code, "mutated": became, "module": mutant.module}
+    return run | {"seconds": round(time.monotonic() - begun)}
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -202,43 +232,54 @@ def main(arguments: list[str] | None = None) -> None:
     modules = list(TARGETS) if options.only is None else options.only
     mutants = draw(options.num, options.seed, modules)
     runs = Runs(options.json, {"seed": options.seed})
-    left = [mutant for mutant in mutants if mutant.name not in runs.done]
+    # One module after the other: after a mutant of another one, the kernels of that file are compiled again.
+    left = sorted(mutant for mutant in mutants if mutant.name not in runs.done)
     with tempfile.TemporaryDirectory() as parent, ThreadPoolExecutor(options.workers) as pool:
-        folders: SimpleQueue[Path] = SimpleQueue()
-        for k in range(options.workers):
-            folder = Path(parent) / str(k)
-            shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(".git", "__pycache__", "site"))
-            folders.put(folder)
-        for module in dict.fromkeys(mutant.module for mutant in left):
-            passed, last = run_tests(Path(parent) / "0", module)
+        checkouts: SimpleQueue[Checkout] = SimpleQueue()
+        for k in range(options.workers if left else 0):
+            checkouts.put(Checkout(Path(parent) / str(k)))
+        if left:
+            checkout = checkouts.get()
+            passed, last = checkout.run_tests(list(dict.fromkeys(mutant.module for mutant in left)))
             if not passed:
-                raise SystemExit(f"{module}: its tests fail without a change: {last}")
+                raise SystemExit(f"The tests fail without a change: {last}")
+            checkouts.put(checkout)
 
         def one(mutant: Mutant) -> None:
-            folder = folders.get()
+            checkout = checkouts.get()
+            killers = {run["by"].split(" - ")[0] for run in list(runs.done.values()) if run["module"] == mutant.module}
             try:
-                runs.get(mutant.name, lambda: try_mutant(mutant, folder))
+                runs.get(mutant.name, lambda: try_mutant(mutant, checkout, killers))
             finally:
-                folders.put(folder)
+                checkouts.put(checkout)
 
         list(pool.map(one, left))
-    show({mutant.name: runs.done[mutant.name] for mutant in mutants}, options.json)
+    show({mutant.name: runs.done[mutant.name] for mutant in mutants})
 
 
-def show(rows: dict[str, Run], path: Path | None) -> None:
-    table = _common.table("Mutants", "module", "mutants", "killed", "fraction")
+def show(rows: dict[str, Run]) -> None:
+    reviewed = json.loads(REVIEWED.read_text())
+    reasons = {
+        name: reason
+        for name, row in rows.items()
+        if not row["killed"] and (reason := reviewed.get(row["module"], {}).get(row["mutated"]))
+    }
+    columns = "mutants", "killed", "equivalent", "survived", "killed of those that are not equivalent"
+    table = _common.table("Mutants", "module", *columns)
     figures = {}
-    for module in dict.fromkeys(row["module"] for row in rows.values()):
-        killed = [row["killed"] for row in rows.values() if row["module"] == module]
-        figures |= {f"mutants_{module}": len(killed), f"killed_{module}": sum(killed)}
-        table.add_row(module, str(len(killed)), str(sum(killed)), f"{sum(killed) / len(killed):.0%}")
-    killed = sum(row["killed"] for row in rows.values())
-    table.add_row("all", str(len(rows)), str(killed), f"{killed / len(rows):.1%}")
+    for module in [*dict.fromkeys(row["module"] for row in rows.values()), "all"]:
+        own = {name: row for name, row in rows.items() if module in (row["module"], "all")}
+        killed, equivalent = sum(row["killed"] for row in own.values()), len(own.keys() & reasons)
+        figures |= {f"mutants_{module}": len(own), f"killed_{module}": killed, f"equivalent_{module}": equivalent}
+        counts = len(own), killed, equivalent, len(own) - killed - equivalent
+        table.add_row(module, *map(str, counts), f"{killed / max(len(own) - equivalent, 1):.1%}")
     console.print(table)
     for name, row in rows.items():
         if not row["killed"]:
-            console.print(f"survived: {name}\n    {row['code']}", soft_wrap=True, highlight=False, markup=False)
-    _common.finish(None, figures | {"mutants": len(rows), "killed": killed}, _common.describe_machine())
+            told = f"equivalent: {reasons[name]}" if name in reasons else "survived"
+            lines = f"{name}: {told}\n  - {row['code']}\n  + {row['mutated']}"
+            console.print(lines, soft_wrap=True, highlight=False, markup=False)
+    _common.finish(None, figures, _common.describe_machine())
 
 
 def _parser() -> argparse.ArgumentParser:

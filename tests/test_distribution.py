@@ -245,6 +245,7 @@ def test_samples_have_pathwise_gradients():
     def mean(dist):
         return dist.sample(jax.random.key(0), (5,)).mean()
 
+    assert FoldedGaussian.has_rsample
     grad = jax.jit(jax.grad(mean))(_dist())
     assert all(np.isfinite(g).all() for g in jax.tree.leaves(grad))
     _close(grad.loc, np.full(2, 1 / 3), 1e-6)

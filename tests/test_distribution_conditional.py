@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from foldgauss.analysis.conditional import TimeDensity, TimeMixture
+from foldgauss.analysis.conditional import TimeDensity, TimeMixture, _mixture_moments, _nearer
 from foldgauss.analysis.quadrature import SEARCH_GRID, adaptive_panels, find_peaks, gauss_hermite, normal_rule
 from foldgauss.distribution import FoldedGaussian
-from foldgauss.envelope import TimeLikelihood
+from foldgauss.envelope import CallableEnvelope, TimeLikelihood
 from foldgauss.fold import PolynomialFold, ZeroFold
 from foldgauss.gaussian import Gaussian
 
@@ -24,6 +24,7 @@ LOG_PROB = eqx.filter_jit(lambda dist, x: dist.log_prob(x))
 CDF = eqx.filter_jit(lambda dist, x: dist.cdf(x))
 SAMPLE = eqx.filter_jit(lambda dist, key, n: dist.sample(key, (n,)))
 MEAN_AND_VARIANCE = eqx.filter_jit(lambda dist: (dist.mean, dist.variance))
+NEARER = eqx.filter_jit(_nearer)
 CONDITION_TIME = eqx.filter_jit(FoldedGaussian.condition_time)
 
 # An integral over time takes seconds to compile for each shape: what is given has this many points in most tests.
@@ -138,8 +139,9 @@ def test_time_given_space_integrates_to_one(dim):
     nodes, weights = np.polynomial.legendre.leggauss(20)
     for power, floor in [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (2.0, 0.01)]:
         dist = _dist(dim, power, floor)
-        # At s = 1.5 the curve of one space coordinate passes at tau = 6.7 too, in a width of 1e-5.
-        s = jnp.concatenate([_points(dist, MANY - 1)[:, :-1], jnp.full((1, dim), 1.5)])
+        # At s = 1.5 and 1.95 the curve of one space coordinate passes at tau = 6.7 and 7.5, too, in widths of 1e-5;
+        # just above -0.16, where it turns back, the density has a flat top.
+        s = jnp.concatenate([_points(dist, MANY - 3)[:, :-1], jnp.outer(jnp.array([1.5, 1.95, -0.15]), jnp.ones(dim))])
         density = dist.time_given_space(s)
         assert isinstance(density, TimeDensity)
         assert (density.error_estimate < 1e-9).all()
@@ -147,7 +149,11 @@ def test_time_given_space_integrates_to_one(dim):
         edges = np.stack([_edges(m[np.isfinite(m)]) for m in modes], axis=-1)
         half = 0.5 * np.diff(edges, axis=0)[:, None]
         t = edges[:-1, None] + half * (1 + nodes[:, None])
-        p = np.exp(LOG_PROB(density, jnp.asarray(t.reshape(-1, MANY)))).reshape(t.shape)
+        log_p = np.asarray(LOG_PROB(density, jnp.concatenate([t.reshape(-1, MANY), modes.T])))
+        for own, height in zip(modes, log_p[-modes.shape[1] :].T, strict=True):  # highest first, and apart
+            assert (np.diff(height[height > -20]) < 0.01).all()
+            assert (np.diff(np.sort(own[np.isfinite(own)])) > 1e-4).all()
+        p = np.exp(log_p[: -modes.shape[1]]).reshape(t.shape)
         np.testing.assert_allclose((half * weights[:, None] * p).sum((0, 1)), 1, rtol=1e-8)
         assert power == 0 or dim == 2 or (np.isfinite(modes).sum(-1) > 1).any()  # bimodal ones are among them
         np.testing.assert_allclose(density.panels.probabilities.sum(-1), 1, atol=1e-12)
@@ -200,6 +206,25 @@ def test_chain_rule_both_ways():
     as_mixture = dist.condition([0, 1], x[:, :2])
     np.testing.assert_allclose(as_mixture.log_prob(x[:, 2:]), time.log_prob(x[:, 2]), rtol=1e-12)
     np.testing.assert_allclose(as_mixture.cdf(x[:, 2:]), time.cdf(x[:, 2]), rtol=1e-12)
+
+
+def test_nearest_times_are_refined_by_short_steps_only():
+    dist, tau = _dist(2), np.array([-2.5, 0.3, 2.0])
+    for away, reached in [(1e-6, 0.0), (-1e-4, 0.0), (0.1, 0.1)]:
+        for one in tau:
+            s = CONDITION_TIME(dist, jnp.asarray(0.4 + 0.3 * one)).loc
+            found = NEARER(dist, s, jnp.array([one + away]))
+            np.testing.assert_allclose(found, one + reached, atol=20 * away**2 if reached == 0 else 0)
+
+
+def test_moments_with_an_own_envelope_equal_those_with_the_same_built_in():
+    """An own envelope may depend on t itself, so that times are not centered."""
+    own = CallableEnvelope(lambda t, m, scale: -0.5 * ((t - m) / scale) ** 2)
+    density = _dist(1).time_given_space(_repeated(0.3))
+    panels = jax.tree.map(lambda leaf: leaf[0], density.panels)
+    mean, covariance = eqx.filter_jit(_mixture_moments)(_dist(1, envelope=own), jnp.array([0.3]), panels)
+    np.testing.assert_allclose(mean, density.mean[:1], rtol=1e-12)
+    np.testing.assert_allclose(covariance[0], density.variance[:1], rtol=1e-9)
 
 
 def test_modes_of_time_are_where_the_parabola_passes():
@@ -286,6 +311,10 @@ def test_space_given_space_against_its_definition():
     error = draws.std(0) / np.sqrt(len(draws))
     assert (np.abs(draws.mean(0) - given.mean[0]) < 5 * error).all()
     np.testing.assert_allclose(np.cov(draws.T), given.covariance_matrix[0], atol=3e-3)
+    np.testing.assert_array_equal(given.variance, np.diagonal(given.covariance_matrix, axis1=1, axis2=2))
+    space = dist.marginal([0, 1, 2]).condition([1], _repeated(-0.3))
+    assert space.event_shape == (2,)
+    np.testing.assert_allclose(space.mean, given.mean[:, :2], rtol=1e-12)
 
 
 @pytest.mark.slow  # it compiles for long

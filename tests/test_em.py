@@ -10,10 +10,26 @@ from scipy import special
 from foldgauss.envelope import Constant, TimeLikelihood, plain_envelope
 from foldgauss.estimator.em import components, loop
 from foldgauss.estimator.em.loop import EMStatus, broadcast_degrees, run_em, select_best
-from foldgauss.estimator.em.m_step import Model, newton_step, profile_log_likelihood, update_components
+from foldgauss.estimator.em.m_step import (
+    _MAX_STEP,
+    _MIN_CURVATURE,
+    Model,
+    _profile_derivatives,
+    newton_step,
+    profile_log_likelihood,
+    update_components,
+)
 from foldgauss.estimator.em.online import change_reference
 from foldgauss.estimator.em.scaling import Scaling, to_mixture
-from foldgauss.estimator.em.statistics import Times, _divide_by_a, accumulate, make_points, step_times
+from foldgauss.estimator.em.statistics import (
+    Points,
+    Times,
+    _divide_by_a,
+    accumulate,
+    log_densities,
+    make_points,
+    step_times,
+)
 
 K, N, DEGREE = 3, 200, 2
 NO_SCALING = Scaling(np.zeros(3), np.ones(3))
@@ -71,6 +87,7 @@ def _model(covariance="full", floor=0.0, degree=DEGREE, dtype=np.float64):
 
 
 densities = eqx.filter_jit(components.evaluate_densities)
+SUMS = eqx.filter_jit(accumulate)
 
 
 def log_density(params, envelope, x):
@@ -95,20 +112,23 @@ def test_density_matches_mixture(x64, power):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), again, params)
 
 
-def test_density_in_many_space_dimensions(x64):
+def test_density_and_gram_in_many_space_dimensions(x64):
     rng = np.random.default_rng(0)
     tril = np.tril(rng.normal(size=(2, 9, 9))) * 0.1 + np.eye(9)
     parts = (np.log([0.4, 0.6]), np.zeros(2), np.ones(2), rng.normal(size=(2, 3, 9)), tril)
-    params, x = components.Parameters(*map(jnp.asarray, parts)), jnp.asarray(rng.normal(size=(5, 10)))
+    params, x = components.Parameters(*map(jnp.asarray, parts)), rng.normal(size=(5, 10))
     mixture = to_mixture(params, Scaling(np.zeros(10), np.ones(10)), Constant())
-    np.testing.assert_allclose(log_density(params, Constant(), x), mixture.log_prob(x), rtol=1e-12)
+    np.testing.assert_allclose(log_density(params, Constant(), jnp.asarray(x)), mixture.log_prob(x), rtol=1e-12)
+    sums, pairs = SUMS(params, Constant(), make_points(x, np.ones(5), 2)), densities(params, Constant(), jnp.asarray(x))
+    shares, v = special.softmax(pairs.log_density, axis=1), np.asarray(pairs.v)
+    z = np.concatenate([np.stack([np.ones_like(v), v, (v * v - 1) / np.sqrt(2)], -1), pairs.whitened[0]], -1)
+    np.testing.assert_allclose(sums.gram[0], np.einsum("nk,nka,nkb->kab", shares, z, z), rtol=1e-9, atol=1e-12)
 
 
 def test_gram_is_the_sum_over_pairs(x64):
     """Chunks, padding, weights: against the sum written out in NumPy."""
     params, x, weights = _params(), _data(), np.random.default_rng(2).uniform(0, 2, N)
-    summed = eqx.filter_jit(lambda points: accumulate(params, ENVELOPES["1"], points))
-    sums = summed(make_points(x, weights, K))
+    sums = SUMS(params, ENVELOPES["1"], make_points(x, weights, K))
     pairs = densities(params, ENVELOPES["1"], jnp.asarray(x))
     log_density = np.asarray(pairs.log_density)
     shares = weights[:, None] * np.exp(log_density - np.logaddexp.reduce(log_density, axis=1)[:, None])
@@ -117,8 +137,42 @@ def test_gram_is_the_sum_over_pairs(x64):
     np.testing.assert_allclose(sums.mass, shares.sum(0), rtol=1e-12)
     gram = np.einsum("nk,nka,nkb->kab", shares * np.exp(-np.asarray(pairs.log_a)), z, z)
     np.testing.assert_allclose(sums.gram[0], gram, rtol=1e-10, atol=1e-9)
-    split = summed(make_points(x, weights, 2**13))  # 16 rows a chunk
+    split = SUMS(params, ENVELOPES["1"], make_points(x, weights, 2**13))  # 16 rows a chunk
     np.testing.assert_allclose(split.gram, sums.gram, rtol=1e-10, atol=1e-9)
+
+
+def test_points_are_padded_to_few_shapes():
+    assert [make_points(np.zeros((n, 3)), np.ones(n), K).x.shape[:3] for n in (5, 256, 257, 600)] == [
+        (1, 1, 256),
+        (1, 1, 256),
+        (1, 1, 512),
+        (1, 1, 1024),
+    ]
+    many = make_points(np.zeros((3 * 2**15, 3)), np.ones(3 * 2**15), K)
+    assert many.x.shape[:3] == (1, 3, 2**15)
+
+
+def test_log_densities_of_points_on_two_devices(x64):
+    """In the order of the rows; the arrays of both devices are on one here."""
+    params, x = _params(), _data()
+    one = make_points(x, np.ones(N), K)
+    two = Points(*(z.reshape(2, 1, 128, *z.shape[3:]) for z in (one.x, one.weights)), N)
+    expected = log_density(params, ENVELOPES["1"], one.x[0, 0])
+    found = eqx.filter_jit(log_densities)(params, ENVELOPES["1"], two)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("covariance", ["full", "diag", "spherical", "tied"])
+def test_floor_is_added_to_variances(x64, covariance):
+    params = _params()._replace(tril=0.7 * jnp.broadcast_to(jnp.eye(2)[None], (K, 2, 2)))
+    sums, degrees = SUMS(params, Constant(), make_points(_data(), np.ones(N), K)), broadcast_degrees(DEGREE, K)
+    update = jax.jit(lambda floor: update_components(params, sums, Model(degrees, floor, covariance))[0])
+    floor = np.array([0.1, 0.3, 0.5])
+    plain, floored = update(0 * floor), update(floor)
+    sigma = [one.tril @ one.tril.swapaxes(1, 2) for one in (plain, floored)]
+    added = np.diag(floor[:2]) if covariance != "spherical" else 0.2 * np.eye(2)
+    np.testing.assert_allclose(sigma[1] - sigma[0], np.broadcast_to(added, (K, 2, 2)), atol=1e-12)
+    np.testing.assert_allclose(floored.time_scale**2 - plain.time_scale**2, 0.5)
 
 
 def test_mass_divided_by_a_and_its_derivatives(x64):
@@ -155,10 +209,72 @@ def test_last_finite_of_a_history_without_one_is_minus_infinity():
 
 
 @pytest.mark.parametrize(
-    "covariance", ["full", "spherical", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("diag", "tied"))]
+    ("stuck_mass", "rejected", "status"),
+    [(0.0, 0.0, EMStatus.CONVERGED), (1.0, 0.0, EMStatus.SINGULAR), (0.0, 1e-3, EMStatus.NOT_CONVERGED)],
 )
-def test_newton_gain_matches_profile_derivatives(x64, covariance):
-    """The Newton step's promise, g . step, against differences of the profile_log_likelihood itself."""
+def test_end_of_a_run(x64, monkeypatch, stuck_mass, rejected, status):
+    """A component without mass may be stuck; a rejected gain of `tol` is one that may still be had."""
+    info = loop.Info(*(jnp.asarray(z) for z in ([1.0], [[stuck_mass, 1.0]], [[True, False]], [rejected])))
+    monkeypatch.setattr(loop, "_step_restarts", lambda states, *rest: (states, info))
+    observed = []
+    run = _run(None, _params(), Constant(), _model(), 1.0, tol=1e-3, max_steps=4, observe=lambda *z: observed.append(z))
+    assert run.status == status
+    assert [number for number, _ in observed] == list(range(1, run.num_steps + 1))
+    assert run.num_steps == (4 if status == EMStatus.NOT_CONVERGED else 2)
+
+
+def test_each_restart_ends_for_itself(x64, monkeypatch):
+    """Converged at once, not finite at the second step, and converged after some steps."""
+    values = np.array([[1.0, 1.0, 0.0], [1.0, np.nan, 1.0], [5.0, 1.0, 2.0], [6.0, 1.0, 2.0]])
+    numbers = iter(range(4))
+
+    def step(states, *rest):
+        info = loop.Info(values[next(numbers)], np.ones((3, K)), np.zeros((3, K), bool), np.zeros(3))
+        return states, jax.tree.map(jnp.asarray, info)
+
+    monkeypatch.setattr(loop, "_step_restarts", step)
+    starts = jax.tree.map(lambda z: jnp.stack([z] * 3), _params())
+    runs = run_em(starts, None, Constant(), _model(), total=1.0, tol=1e-3, max_steps=9)
+    assert [run.num_steps for run in runs] == [len(run.history) for run in runs] == [2, 2, 4]
+    assert [run.status for run in runs] == [EMStatus.CONVERGED, EMStatus.NOT_FINITE, EMStatus.CONVERGED]
+    assert [run.log_likelihood for run in runs] == [1.0, 1.0, 2.0]
+
+
+def test_temperatures_of_annealing(x64, monkeypatch):
+    """From the first one to 1 in as many steps as stated, evenly in the logarithm."""
+    seen = []
+
+    def step(states, frozen, points, envelope, model, inverse_temperature):
+        seen.append(inverse_temperature)
+        return states, loop.Info(jnp.ones(1), jnp.ones((1, K)), jnp.zeros((1, K), bool), jnp.zeros(1))
+
+    monkeypatch.setattr(loop, "_step_restarts", step)
+    run = _run(None, _params(), Constant(), _model(), 1.0, annealing=0.5, max_steps=200)
+    num = loop.ANNEALING_STEPS
+    np.testing.assert_allclose(np.array(seen[:num], float), 0.5 ** (1 - np.arange(num) / num), rtol=1e-6)
+    assert set(seen[num:]) == {None}
+    assert run.num_steps == num + loop.SETTLING_STEPS
+
+
+def test_reset_halves_the_heaviest_and_shifts_both_along_its_longest_axis(x64):
+    params = _params()
+    state = loop.State(jax.tree.map(lambda z: z[None], params), jnp.ones((1, K)))
+    empty, mass = np.array([True, False, False]), np.array([1e9, 5.0, 3.0])
+    new = jax.tree.map(lambda z: z[0], loop._reset_components(state, 0, empty, mass).params)
+    np.testing.assert_allclose(np.exp(new.log_weights), [0.25, 0.25, 0.3])
+    for one, old in zip(new[1:], params[1:], strict=True):
+        one, old = (np.asarray(z)[:, 1:] if z is new.curve or z is params.curve else np.asarray(z) for z in (one, old))
+        np.testing.assert_array_equal(one, old[[1, 1, 2]])
+    np.testing.assert_allclose((new.curve[0, 0] + new.curve[1, 0]) / 2, params.curve[1, 0])
+    apart, sigma = new.curve[1, 0] - new.curve[0, 0], params.tril[1] @ params.tril[1].T
+    longest = np.linalg.eigvalsh(sigma).max()
+    np.testing.assert_allclose(apart @ apart, longest)
+    np.testing.assert_allclose(sigma @ apart, longest * apart)
+
+
+@pytest.mark.parametrize("covariance", ["full", "diag", "spherical", "tied"])
+def test_newton_step_matches_profile_derivatives(x64, covariance):
+    """Slopes, curvatures and the step's promise, g . step, against differences of the profile_log_likelihood itself."""
     params, model = _params(), _model(covariance)
     if covariance != "full":
         params = params._replace(tril=0.7 * jnp.broadcast_to(jnp.eye(2)[None], (K, 2, 2)))
@@ -167,19 +283,30 @@ def test_newton_gain_matches_profile_derivatives(x64, covariance):
     @jax.jit
     def propose():
         here = accumulate(params, envelope, points, order=2)
-        return here, *newton_step(here, model, DEGREE)
+        return here, newton_step(here, model, DEGREE), _profile_derivatives(here, model, DEGREE)
 
-    here, steps, promise = propose()
+    here, (steps, promise), (slopes, curvatures) = propose()
 
     @jax.jit
-    def value(share):
-        moved = share * steps
+    def value(moved):
         times = step_times(Times(params.time_loc, params.time_scale), moved)
         there = accumulate(params, envelope, points, times=times)
         return profile_log_likelihood(here, model, DEGREE, moved, there.gram[0], there.log_a[0])
 
-    np.testing.assert_allclose((value(1e-5) - value(-1e-5)) / 2e-5, promise, rtol=1e-5)
+    np.testing.assert_allclose((value(1e-5 * steps) - value(-1e-5 * steps)) / 2e-5, promise, rtol=1e-5)
     assert (np.asarray(promise) > 0).all()
+    (g0, g1), (h00, h01, h11), h = slopes, curvatures, 1e-3
+    for direction, slope, curvature in (([1, 0], g0, h00), ([0, 1], g1, h11), ([1, 1], g0 + g1, h00 + 2 * h01 + h11)):
+        up, middle, down = (value(h * sign * np.repeat(direction, K).reshape(2, K)) for sign in (1, 0, -1))
+        np.testing.assert_allclose((up - down) / (2 * h), slope, rtol=1e-4, atol=1e-3)
+        np.testing.assert_allclose((up - 2 * middle + down) / h**2, curvature, rtol=1e-4, atol=1e-3)
+    # The step of each component: eigenvalues are lifted to a fraction of its mass, and it has a longest length.
+    for k, mass in enumerate(here.mass):
+        negative = -np.array([[h00[k], h01[k]], [h01[k], h11[k]]])
+        lift = max(_MIN_CURVATURE * mass - np.linalg.eigvalsh(negative)[0], 0)
+        step = np.linalg.solve(negative + lift * np.eye(2), slopes[:, k])
+        step *= min(1, _MAX_STEP / np.abs(step).max())
+        np.testing.assert_allclose(steps[:, k], step, rtol=1e-7)
 
 
 def test_changing_the_reference_equals_recomputing(x64):
@@ -226,6 +353,8 @@ def test_moment_updates_of_time_can_decrease_the_likelihood(x64):
     """Power check of the test above: from its end, plain moments of time go down."""
     envelope, model, points = ENVELOPES["1"], _model(), make_points(_data(), np.ones(N), K)
     params = _run(points, _params(), envelope, model, tol=1e-8, max_steps=60).params
+    promise = jax.jit(lambda sums: newton_step(sums, model, DEGREE)[1])(SUMS(params, envelope, points, order=2))
+    assert (promise < 1e-4).all()  # the times are where another step gains nothing
 
     @jax.jit
     def by_moments(params):

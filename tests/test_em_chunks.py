@@ -198,7 +198,7 @@ def test_first_of_equal_runs_is_selected():
     run = loop.Run(params, 2.0, [2.0], 1, loop.EMStatus.CONVERGED, 0)
     broken = run._replace(status=loop.EMStatus.NOT_FINITE, log_likelihood=9.0)
     lost = broken._replace(log_likelihood=-np.inf)
-    for ends, expected in [((2, 2 + 1e-14), 0), ((2, 2 + 1e-12), 1), ((2 - 1e-14, 1, 2), 0), ((1, 3, 2), 1)]:
+    for ends, expected in [((2, 2 + 1e-14), 0), ((2, 2 + 3.5e-14), 1), ((2 - 1e-14, 1, 2), 0), ((1, 3, 2), 1)]:
         runs = [run._replace(log_likelihood=end) for end in ends]
         assert loop.select_best([broken, *runs]) is runs[expected]
     assert loop.select_best([lost, broken]) is broken

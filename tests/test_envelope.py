@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope, CallableEnvelope, Constant, TimeLikelihood, as_envelope, plain_envelope
 
 TAUS = [0.0, 5.0, 13.3, 14.0, 19.0, 40.0, 1e3]
@@ -138,6 +139,12 @@ def test_bad_input_names_the_parameter(arguments, name):
         TimeLikelihood(**arguments)
 
 
+def test_integers_and_weak_types_become_floats():
+    envelope = TimeLikelihood(np.array([1, 2]), 0)
+    assert (envelope.power.dtype, envelope.floor.dtype) == (jnp.float32, jnp.float32)
+    assert not envelope.floor.weak_type  # jitted code is compiled once for numbers and arrays
+
+
 def test_nan_propagates():
     assert jnp.isnan(_at(TimeLikelihood(jnp.nan), 1.0))
     assert jnp.isnan(_at(TimeLikelihood(1.0, 0.1), jnp.nan))
@@ -160,6 +167,18 @@ def test_callable_envelope_is_its_function_and_batches_and_trains():
     assert slope.parameters.rate == -2
     assert as_envelope(mapped) is mapped
     assert isinstance(as_envelope(_laplace), CallableEnvelope)
+
+
+def test_gradient_reaches_what_an_own_envelope_closes_over():
+    @jax.jit
+    @jax.grad
+    def slope(rate):
+        envelope = CallableEnvelope(lambda t, m, scale: -rate * jnp.abs(t - m) / scale)
+        dist = FoldedGaussian([0.0], [[1.0]], time_loc=0.0, time_scale=1.0, envelope=envelope)
+        return dist.log_prob(jnp.array([0.5, 2.0]))
+
+    # log p = -s^2 / (2 a) - log(a) / 2 + ..., log a = -2 rate
+    np.testing.assert_allclose(slope(0.3), 1 - 0.25 * np.exp(0.6), rtol=1e-5)
 
 
 @pytest.mark.parametrize(("dtype", "edge"), [(jnp.float32, 13.2), (jnp.float64, 37.6)])

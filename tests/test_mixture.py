@@ -1,5 +1,7 @@
 """Mixtures of Folded-Gaussians: against scipy, their own components, quadrature and samples; zero weights; far out."""
 
+from types import SimpleNamespace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,6 +10,7 @@ import pytest
 from scipy import special, stats
 
 from foldgauss import mixture as mixture_module
+from foldgauss.analysis.conditional import TimeMixture
 from foldgauss.distribution import FoldedGaussian, Gaussian
 from foldgauss.envelope import CallableEnvelope, Constant, TimeLikelihood
 from foldgauss.fold import CallableFold, FourierFold, PolynomialFold, SplineFold, ZeroFold
@@ -143,6 +146,29 @@ def test_chunks_change_nothing(monkeypatch):
     x = jnp.concatenate([x, x[:1]])  # another shape: the programs above are not found again
     np.testing.assert_allclose(mixture.log_prob(x)[:40], whole[0], rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(mixture.responsibilities(x)[:40], whole[1], rtol=1e-5, atol=1e-6)
+
+
+def test_chunks_hold_few_pairs_of_point_and_component(monkeypatch):
+    seen = []
+
+    def chunks(pairs, function, rows, size):
+        seen.append(size)
+        return function(pairs(rows))
+
+    monkeypatch.setattr(mixture_module, "map_in_chunks", chunks)
+    monkeypatch.setattr(mixture_module, "_CHUNK", 100)
+    mixture_module._map_pairs(_mixture(), _points(40), lambda log_weights, log_p: log_p[0])
+    assert seen == [100 // 3]
+
+
+def test_evidence_of_further_values_is_a_ratio():
+    """p(given and values) / p(given), where the integrals over time are there already."""
+
+    def integrated(*log_normalizer):
+        return TimeMixture(None, jnp.zeros(1), SimpleNamespace(log_normalizer=jnp.array(log_normalizer)), True)
+
+    found = mixture_module._log_evidence(integrated(0.5, 1.0), integrated(-1.0, -jnp.inf), (0,), jnp.zeros(1))
+    np.testing.assert_array_equal(found, [-1.5, -np.inf])
 
 
 @pytest.mark.slow
@@ -636,9 +662,22 @@ def test_as_scipy_object():
     assert frozen.marginal([0, 2]).dim == 2
 
 
+def test_draws_are_of_their_component_where_the_fold_is_a_function():
+    loc = np.array([[0.0, 1.0], [50.0, 2.0]])
+    components = FoldedGaussian(
+        loc, scale=np.full((2, 2), 1e-3), time_loc=[0.2, 0.8], time_scale=0.1, fold=lambda u: jnp.stack([u, u**2])
+    )
+    mixture = FoldedMixture(components, weights=[0.4, 0.6])
+    x, component = (np.asarray(z) for z in mixture.sample(jax.random.key(0), (20,), return_component=True))
+    assert set(component) == {0, 1}
+    u = np.array([0.2, 0.8])[component] - x[:, 2]
+    np.testing.assert_allclose(x[:, :2] - loc[component], np.stack([u, u**2], 1), atol=1e-2)
+
+
 def test_nan_asked_is_nan_answered():
     assert jnp.isnan(_mixture().expected_space(jnp.nan)).all()
     assert jnp.isnan(_mixture().space_covariance(jnp.nan)).all()
+    assert jnp.isnan(_mixture().condition([2], [jnp.nan]).weights).all()
     mixture = FoldedMixture(
         FoldedGaussian(jnp.zeros((2, 2)), scale=jnp.ones((2, 2)), time_loc=[0.3, 0.7], time_scale=[0.2, 0.1]),
         weights=[0.4, 0.6],

@@ -467,13 +467,13 @@ def good():
     return pack_compact(fine(soft_model(), -12.0), {"clip": "x"})
 
 
-def resealed(data, change=lambda header: None, cut=None):
-    """The file with another header, and the checksum it then has: what a stranger may send."""
+def resealed(data, change=lambda header: None, cut=None, spaces=0):
+    """The file with another header, spaces after it, and the checksum it then has: what a stranger may send."""
     start = len(MAGIC) + 12
     length = int.from_bytes(data[len(MAGIC) + 4 : len(MAGIC) + 8], "little")
     header = json.loads(data[start : start + length])
     change(header)
-    text = json.dumps(header).encode()
+    text = json.dumps(header).encode() + b" " * spaces
     body = text + data[start + length :][:cut]
     numbers = (VERSION, len(text), zlib.crc32(body))
     return MAGIC + b"".join(number.to_bytes(4, "little") for number in numbers) + body
@@ -564,6 +564,18 @@ def test_forged_header_is_rejected(tmp_path, good, key, value):
     refused(tmp_path, resealed(good, change), "compact model")
 
 
+def test_largest_sizes_and_degrees_are_read(tmp_path):
+    quantized, path = fine(soft_model(degree=15), -12.0), tmp_path / "m.fgz"
+
+    def pack(size):
+        return pack_compact(dataclasses.replace(quantized, info=dataclasses.replace(quantized.info, size=size)))
+
+    path.write_bytes(pack((1 << 20, 5)))
+    again = load_video_model(path)
+    assert (again.size, again.degree) == ((1 << 20, 5), 15)
+    refused(tmp_path, pack((5, (1 << 20) + 1)), "size")
+
+
 def test_forged_columns_are_rejected(tmp_path, good):
     def changed(own):
         return lambda header: header["columns"].__setitem__(5, own)
@@ -616,14 +628,18 @@ def test_forged_kinds_are_rejected(tmp_path, name, number):
 
 def test_file_has_a_byte_for_every_eight_gaussians(tmp_path):
     """All alike, they need next to nothing, and the file is filled up: none may claim more than its length allows."""
-    described = compute_columns(only(soft_model(degree=0), np.full(100_000, 20)))
+    num = 100_000 - soft_model().num_frames
+    described = compute_columns(only(soft_model(degree=0), np.full(num, 20)))
     origins = {name: float(value[0]) for name, value in described.values.items()}
     rules = {name: Rule(origins.get(name, 0.0), 3.0) for name in column_names(0) if not is_integral(name)}
-    path = save_compact(tmp_path / "m.fgz", quantize(described, np.zeros(100_000, np.int32), rules))
+    path = save_compact(tmp_path / "m.fgz", quantize(described, np.zeros(num, np.int32), rules))
     assert 100_000 / 8 <= path.stat().st_size < 100_000 / 8 + 30
-    assert load_video_model(path).num_gaussians == 100_000
-    shorter = resealed(path.read_bytes())  # the same without spaces
-    refused(tmp_path, shorter, "num_gaussians")
+    assert load_video_model(path).num_gaussians == num
+    data = path.read_bytes()
+    spaces = 100_000 // 8 - len(resealed(data))
+    path.write_bytes(resealed(data, spaces=spaces))
+    assert load_video_model(path).num_gaussians == num
+    refused(tmp_path, resealed(data, spaces=spaces - 1), "num_gaussians")
 
 
 def test_names(tmp_path):

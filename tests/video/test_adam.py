@@ -18,6 +18,7 @@ from foldgauss.video.fitting.adam import (
 )
 from foldgauss.video.models.frame_times import FrameTimes, make_time_logits
 from foldgauss.video.models.row_layout import columns
+from foldgauss.video.models.sparse_storage import OPAQUE_BIT, STATIC_BIT
 
 
 @pytest.mark.parametrize("width", [11, 17, 25])
@@ -114,12 +115,34 @@ def test_all_implementations_take_the_same_steps():
     np.testing.assert_allclose(by_optax, own[0], atol=2e-5)  # its bias corrections are float32
 
 
+@pytest.mark.parametrize("units", [RateUnits(), RateUnits(0.06, 0.01)])
+def test_masked_adam_matches_sparse_adam(units):
+    """Rows of all kinds, after any number of steps; those that took no part stay to the bit."""
+    rng, num, width = np.random.default_rng(0), 400, 17
+    rows, grad, first = (rng.normal(size=(num, width)).astype(np.float32) for _ in range(3))
+    second = (rng.normal(size=(num, width)) ** 2).astype(np.float32)
+    counts = rng.integers(0, 30_000, num).astype(np.int32)
+    counts[:50] = np.arange(50)
+    kinds = rng.integers(0, 4, num).astype(np.uint8) + STATIC_BIT * rng.integers(0, 2, num).astype(np.uint8)
+    kinds |= (OPAQUE_BIT * rng.integers(0, 2, num)).astype(np.uint8)
+    touched, rates = rng.random(num) < 0.7, rng.random(width).astype(np.float32)
+    arrays = rows, grad, first, second, counts
+    how = {"kinds": kinds, "units": units}
+    own = jax.jit(lambda *arrays: masked_adam(*arrays, touched, rates, **how))(*arrays)
+    judge = [array.copy() for array in arrays]
+    sparse_adam(*judge, np.flatnonzero(touched), rates, **how)
+    for one, other, before in zip(own, (judge[0], *judge[2:]), (rows, *arrays[2:]), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
+        np.testing.assert_array_equal(np.asarray(one)[~touched], before[~touched])
+
+
 def test_the_gap_of_a_cut_moves_as_far_in_time_as_other_intervals():
     """Its weight alone is hundreds of frames long."""
     logits = make_time_logits(40, [20])
     before = np.diff(FrameTimes(logits).times())
     for by_time in np.eye(40, dtype=np.float32)[[5, 30]]:
         updated, _ = update_frame_times(logits, FRAME_TIME_ADAM.init(logits), by_time, 1e-3)
+        assert FrameTimes(updated).times() @ by_time < FrameTimes(logits).times() @ by_time
         steps = np.abs(np.asarray(updated) - logits) * before
         assert steps[19] == pytest.approx(np.median(steps), rel=0.05)  # Adam's epsilon counts where gradients are small
     even = np.zeros(39, np.float32)

@@ -10,7 +10,13 @@ import pytest
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions
 from foldgauss.video import FrameTimes, VideoModel
-from foldgauss.video.models.conditioning import ConditioningSpec, backpropagate, condition, update_windows
+from foldgauss.video.models.conditioning import (
+    ConditioningSpec,
+    apply_scale_cutoff,
+    backpropagate,
+    condition,
+    update_windows,
+)
 from foldgauss.video.models.row_layout import columns, pack, unpack
 from foldgauss.video.models.splats import FoldedSplats
 
@@ -97,6 +103,24 @@ def test_kernel_gradients_match_autodiff(degree, power, floor):
         largest = max(np.abs(truth).max(initial=0), 1e-3)
         np.testing.assert_allclose(grad[:, place] / largest, truth / largest, atol=1e-5, err_msg=name)
     assert d_time == pytest.approx(float(by_time), rel=1e-3, abs=1e-6 * float(np.abs(grad).sum()))
+
+
+@pytest.mark.parametrize(("power", "floor"), [(1.0, 0.0), (2.0, 0.02)])
+def test_scale_cutoff_keeps_the_times_when_both_scales_exceed_it(power, floor):
+    cutoff = 0.02
+    rows, spec, _ = twin(random_splats(power=power, floor=floor), power, floor)
+    window = np.empty((len(rows), 2), np.float32)
+    update_windows(rows, np.arange(len(rows)), window)
+    cut = window.copy()
+    apply_scale_cutoff(rows, cut, spec, cutoff)
+    at = columns(spec.degree)
+    centre, spread = 1 / (1 + np.exp(-rows[:, at["time_loc_logit"]])), np.exp(rows[:, at["log_time_scale"]])
+    t = np.linspace(window.min(1), window.max(1), 102, axis=1)[:, 1:-1]
+    a = floor + (1 - floor) * np.exp(-0.5 * power * ((t - centre) / spread) ** 2)
+    smaller = np.exp(rows[:, at["log_scale"]].min(1, keepdims=True)) * np.sqrt(a)
+    kept = (cut[:, :1] < t) & (t < cut[:, 1:])
+    np.testing.assert_array_equal(kept, smaller > cutoff)
+    assert 0.2 < kept.mean() < 0.8
 
 
 def test_wrong_fold_sign_is_caught():

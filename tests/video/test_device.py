@@ -30,7 +30,6 @@ from foldgauss.video import (
     fit,
     fit_steps,
 )
-from foldgauss.video.fitting.adam import RateUnits, masked_adam, sparse_adam
 from foldgauss.video.fitting.loop import start
 from foldgauss.video.fitting.schedule import choose_views, plan_levels
 from foldgauss.video.fitting.state import FitState
@@ -42,7 +41,6 @@ from foldgauss.video.fitting.steppers.jax_stepper import HeldArrays, JaxStepper
 from foldgauss.video.fitting.steppers.loss import image_loss, squared_loss, ssim_map
 from foldgauss.video.models.conditioning import ConditioningSpec, condition, update_windows
 from foldgauss.video.models.row_layout import columns
-from foldgauss.video.models.sparse_storage import OPAQUE_BIT, STATIC_BIT
 
 #: Nothing in it is black: at a colour of 0 the slope is one thing or another by rounding.
 FRAMES = moving_blobs(height=32, width=40) // 2 + 40
@@ -208,27 +206,6 @@ def test_ssim_matches_the_cpu():
     rendered, target = (np.ascontiguousarray(one[0, ..., 0]) for one in pictures_of())
     own = jax.jit(ssim)(rendered[..., None], target[..., None])
     close(own[..., 0], ssim_map(rendered, target))
-
-
-@pytest.mark.parametrize("units", [RateUnits(), RateUnits(0.06, 0.01)])
-def test_adam_matches_the_cpu(units):
-    """Of rows with any number of steps behind them, of all kinds; those that took no part stay to the bit."""
-    rng, num, width = np.random.default_rng(0), 400, 17
-    rows, grad, first = (rng.normal(size=(num, width)).astype(np.float32) for _ in range(3))
-    second = (rng.normal(size=(num, width)) ** 2).astype(np.float32)
-    counts = rng.integers(0, 30_000, num).astype(np.int32)
-    counts[:50] = np.arange(50)
-    kinds = rng.integers(0, 4, num).astype(np.uint8) + STATIC_BIT * rng.integers(0, 2, num).astype(np.uint8)
-    kinds |= (OPAQUE_BIT * rng.integers(0, 2, num)).astype(np.uint8)
-    touched, rates = rng.random(num) < 0.7, rng.random(width).astype(np.float32)
-    arrays = rows, grad, first, second, counts
-    how = {"kinds": kinds, "units": units}
-    own = jax.jit(lambda *arrays: masked_adam(*arrays, touched, rates, **how))(*arrays)
-    judge = [array.copy() for array in arrays]
-    sparse_adam(*judge, np.flatnonzero(touched), rates, **how)
-    for one, other, before in zip(own, (judge[0], *judge[2:]), (rows, *arrays[2:]), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
-        np.testing.assert_array_equal(np.asarray(one)[~touched], before[~touched])
 
 
 @pytest.mark.parametrize(("power", "floor"), [(1.0, 0.0), (2.0, 0.1)])

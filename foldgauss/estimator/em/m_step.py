@@ -181,9 +181,7 @@ def _profile_derivatives(sums: SufficientStatistics, model: Model, degree: int):
     curvatures = trace(second)
     if model.covariance != "tied":  # the second derivative of the logarithm itself
         product = lambda i, j: (first[i] * first[j]).sum((-2, -1))  # noqa: E731
-        curvatures = curvatures - jnp.stack([product(0, 0), product(0, 1), product(1, 1)]) / (
-            dim if model.covariance == "spherical" else 1
-        )
+        curvatures = curvatures - jnp.stack([product(0, 0), product(0, 1), product(1, 1)])
     curvatures = -0.5 * mass[None] * curvatures - 0.5 * dim * sums.log_a[3:]
     slopes = slopes + jnp.stack([-sums.first, sums.second - sums.mass])
     return slopes, curvatures + jnp.stack([-sums.mass, 2 * sums.first, -2 * sums.second])
