@@ -64,7 +64,9 @@ def run(path, *more):
     return json.loads(path.read_text())
 
 
-def test_it_writes_a_table_and_goes_on_after_a_stop(tmp_path, monkeypatch):
+@pytest.mark.parametrize("fitted", ["KernelDensity", pytest.param("foldgauss", marks=pytest.mark.slow)])
+def test_it_writes_a_table_and_goes_on_after_a_stop(tmp_path, monkeypatch, fitted):
+    monkeypatch.setitem(_density_methods.METHODS, "foldgauss", _density_methods.METHODS[fitted])
     path = tmp_path / "density.json"
     one = run(path, "--splits", "1")
     asked = []

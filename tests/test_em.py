@@ -154,27 +154,30 @@ def test_last_finite_of_a_history_without_one_is_minus_infinity():
     assert loop._last_finite([np.nan, np.inf]) == -np.inf
 
 
+# Compiled once for all kinds of covariance.
+_sums_for_newton = jax.jit(lambda params, points: accumulate(params, ENVELOPES["1"], points, order=2))
+
+
+@jax.jit
+def _sums_at(params, points, steps):
+    times = step_times(Times(params.time_loc, params.time_scale), steps)
+    return accumulate(params, ENVELOPES["1"], points, times=times)
+
+
 @pytest.mark.parametrize("covariance", ["full", "diag", "spherical", "tied"])
 def test_newton_gain_matches_profile_derivatives(x64, covariance):
     """The Newton step's promise, g . step, against differences of the profile_log_likelihood itself."""
     params, model = _params(), _model(covariance)
     if covariance != "full":
         params = params._replace(tril=0.7 * jnp.broadcast_to(jnp.eye(2)[None], (K, 2, 2)))
-    points, envelope = make_points(_data(), np.ones(N), K), ENVELOPES["1"]
+    points = make_points(_data(), np.ones(N), K)
+    here = _sums_for_newton(params, points)
+    steps, promise = jax.jit(lambda here: newton_step(here, model, DEGREE))(here)
+    profile = jax.jit(lambda *parts: profile_log_likelihood(here, model, DEGREE, *parts))
 
-    @jax.jit
-    def propose():
-        here = accumulate(params, envelope, points, order=2)
-        return here, *newton_step(here, model, DEGREE)
-
-    here, steps, promise = propose()
-
-    @jax.jit
     def value(share):
-        moved = share * steps
-        times = step_times(Times(params.time_loc, params.time_scale), moved)
-        there = accumulate(params, envelope, points, times=times)
-        return profile_log_likelihood(here, model, DEGREE, moved, there.gram[0], there.log_a[0])
+        there = _sums_at(params, points, share * steps)
+        return profile(share * steps, there.gram[0], there.log_a[0])
 
     np.testing.assert_allclose((value(1e-5) - value(-1e-5)) / 2e-5, promise, rtol=1e-5)
     assert (np.asarray(promise) > 0).all()
