@@ -14,8 +14,8 @@ _own_cache = None if _CACHE in os.environ else os.environ.setdefault(_CACHE, tem
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 # Most of the time goes into XLA's compilation, which takes a quarter less like this. `.ci/slow` runs with optimization.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
-# The suite has a process for each core already: further threads of BLAS and OpenCV only wait for each other.
-for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
+# The suite has a process for each core already: further threads of BLAS only wait for each other.
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 # Many tests start processes of Python, which would compile the package anew where bytecode is not written.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)

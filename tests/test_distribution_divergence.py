@@ -57,9 +57,11 @@ def test_divergence_from_the_same_envelope_of_ones_own_is_zero():
 @pytest.mark.parametrize(
     "pair",
     [
-        ({}, {"power": 0.5, "time_loc": 0.5, "time_scale": 0.4, "bend": 1.1 * BEND}),
+        pytest.param(
+            ({}, {"power": 0.5, "time_loc": 0.5, "time_scale": 0.4, "bend": 1.1 * BEND}), marks=pytest.mark.slow
+        ),
         ({"power": 2.0}, {"power": 0.5, "floor": 0.05, "time_loc": 0.5, "time_scale": 0.4, "bend": 1.1 * BEND}),
-        ({"floor": 0.2}, {"power": 0.5, "time_scale": 0.5, "loc": (0.0, 0.0)}),
+        pytest.param(({"floor": 0.2}, {"power": 0.5, "time_scale": 0.5, "loc": (0.0, 0.0)}), marks=pytest.mark.slow),
         ({"power": 0.0}, {"power": 0.2, "time_scale": 0.4, "tril": np.diag([0.4, 0.3])}),
         ({"envelope": OwnLikelihood()}, {"power": 0.3, "time_scale": 0.4}),
     ],
@@ -160,7 +162,9 @@ def test_eager_divergence_and_its_gradient():
     np.testing.assert_allclose(slope, (high - low) / 2e-5, rtol=1e-6)
 
 
-@pytest.mark.parametrize("floors", [[0.0], [0.05], [0.05, 0.0]])
+@pytest.mark.parametrize(
+    "floors", [*(pytest.param(floors, marks=pytest.mark.slow) for floors in ([0.0], [0.05])), [0.05, 0.0]]
+)
 def test_batches_in_float32_agree_with_a_loop_in_float64(floors):
     # Offsets 0 and 1e4, time scales 1e-12, 0.3 and 1e6, time_loc of q a half, 1e3 or 1e10 scales away.
     offset, scale = (x.ravel() for x in np.meshgrid([0.0, 1e4], [1e-12, 0.3, 1e6]))

@@ -20,8 +20,6 @@ NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 SWITCH = 'SMALL = os.environ.get("FOLDGAUSS_SMALL") == "1"'
 #: Size limit of a notebook, since it is part of the repository.
 MOST_BYTES = 1_500_000
-#: It takes a few seconds, and runs by default; of the others by default all names and options are checked.
-QUICK = "03_fit_and_edit"
 
 
 def code_of(notebook) -> list:
@@ -132,12 +130,10 @@ def test_names_and_options_that_they_use_exist(path):
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
-# Processor seconds at small size, nearly all of it spent in compiling: 45, 55, 11, 28 and 35.
-@pytest.mark.parametrize(
-    "path",
-    [pytest.param(path, marks=() if path.stem == QUICK else pytest.mark.slow) for path in NOTEBOOKS],
-    ids=lambda path: path.stem,
-)
+# Processor seconds at small size, nearly all of it spent in compiling: 45, 55, 11, 28 and 35. By default all names and
+# options that they use are checked, and `test_guides.py` runs a fit as the third notebook does.
+@pytest.mark.slow
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_it_runs_from_top_to_bottom(path, tmp_path, monkeypatch):
     """Small, in a kernel of its own and an empty folder; every cell shows what its stored output shows."""
     nbformat = pytest.importorskip("nbformat", reason="nbformat comes with the extra test")

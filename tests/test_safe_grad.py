@@ -130,6 +130,7 @@ def test_python_scalars_and_two_dtypes_through_a_users_function():
     np.testing.assert_allclose(found, backward, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_gradients_inside_shard_map():
     mesh = jax.make_mesh((1,), ("i",), axis_types=(jax.sharding.AxisType.Auto,))
     dist = FoldedGaussian([0.0], [[1.0]], time_loc=0.4, time_scale=0.3, fold=PolynomialFold([[0.7]]))

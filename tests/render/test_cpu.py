@@ -45,7 +45,8 @@ def assert_agrees(leaves, size, compositing="over", options=None):
 
 @pytest.mark.parametrize("compositing", ["over", "sum"])
 @pytest.mark.parametrize(
-    "channels", [pytest.param(1, marks=pytest.mark.slow), 4, pytest.param(5, marks=pytest.mark.slow), 11]
+    "channels",
+    [pytest.param(1, marks=pytest.mark.slow), 4, *(pytest.param(num, marks=pytest.mark.slow) for num in (5, 11))],
 )
 def test_any_number_of_channels(channels, compositing):
     assert_agrees(*leaves_of("plain", channels), compositing)
@@ -154,7 +155,7 @@ def results(leaves, size, weights, **how):
     return [trace.image, trace.transmittance, *trace.visibility, *cpu.backward(trace, weights)]
 
 
-@pytest.mark.parametrize("channels", [3, 6])
+@pytest.mark.parametrize("channels", [3, pytest.param(6, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", ["plain", "curtain"])
 def test_bits_do_not_depend_on_threads(kind, channels):
     leaves, size = leaves_of(kind, channels)

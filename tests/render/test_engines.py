@@ -84,7 +84,7 @@ def test_agrees_with_reference(engine, compositing, options, kind):
 def test_cpu_in_chunks(monkeypatch):
     """Splats are shared out in chunks; a scene of several gives the same picture and gradients as one."""
     splats, size = scene("plain")
-    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(splats)] + [np.zeros(3, np.float32)]
+    leaves = [np.array(leaf) for leaf in jax.tree.leaves(splats)] + [np.zeros(3, np.float32)]
     weights = np.random.default_rng(0).normal(size=(3, *size)).astype(np.float32)
     results = []
     for chunk in (cpu.SPLATS_PER_TASK, 32):
@@ -97,7 +97,7 @@ def test_cpu_in_chunks(monkeypatch):
 
 def test_lists_end_where_all_pixels_are_finished():
     splats, size = scene("curtain")
-    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(splats)] + [np.zeros(3, np.float32)]
+    leaves = [np.array(leaf) for leaf in jax.tree.leaves(splats)] + [np.zeros(3, np.float32)]
     trace = cpu.forward(*leaves, size)
     assert sum(len(listed) for _, listed, _ in trace.lists) * cpu.PIXELS < trace.num_pairs / 2
 
@@ -205,7 +205,7 @@ def test_kernels_work_after_fork():
     assert _run(script).strip() == "0"
 
 
-@pytest.mark.parametrize("engine", ["cpu", "xla"])
+@pytest.mark.parametrize("engine", ["cpu", pytest.param("xla", marks=pytest.mark.slow)])
 def test_jit_and_vmap(engine):
     splats, size = scene("plain")
     draw = functools.partial(render, size=size, engine=engine, background=BACKGROUND)
@@ -320,7 +320,7 @@ def test_a_second_call_compiles_nothing(caplog):
 
 @pytest.mark.parametrize(
     ("engine", "channels"),
-    [("cpu", 1), ("cpu", 5), *(pytest.param("xla", num, marks=pytest.mark.slow) for num in (1, 5))],
+    [("cpu", 1), *(pytest.param(*case, marks=pytest.mark.slow) for case in (("cpu", 5), ("xla", 1), ("xla", 5)))],
 )
 def test_channels(engine, channels):
     splats, size = scene("plain")
