@@ -37,7 +37,13 @@ def written(folder, frames):
     return folder
 
 
-@pytest.mark.parametrize("name", CLIPS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("one", "two, 16 bits", "line", "black"),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("tiny", "column", "white")),
+    ],
+)
 def test_from_a_clip_to_its_pictures(tmp_path, capsys, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     frames = CLIPS[name]

@@ -176,7 +176,7 @@ def here(work, tmp_path, monkeypatch):
         ("export holiday.safetensors --format ply3dgs", "holiday-3dgs"),
         ("export holiday.safetensors --format ply3dgs --times 0.5", "holiday.3dgs.ply"),
         ("export holiday.safetensors --format obj", "holiday-obj"),
-        ("export holiday.safetensors --format html", "holiday.html"),
+        pytest.param("export holiday.safetensors --format html", "holiday.html", marks=pytest.mark.slow),
         ("figure interpolation holiday.safetensors", "holiday.interpolation.png"),
         ("figure reconstruction holiday.safetensors holiday.mp4", "holiday.reconstruction.png"),
     ],

@@ -115,6 +115,7 @@ def test_a_finished_run_says_so_and_others_are_kept(work, done, capsys, no_pictu
     assert {path.name for path in done.iterdir()} == FILES
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_to_the_same_draws(work, done, tmp_path, capsys, no_pictures):
     """Killed without warning once something is kept; called again, it draws what it would have drawn."""
     target = tmp_path / "killed"

@@ -67,7 +67,10 @@ def compiled():
     jax.monitoring.unregister_event_duration_listener(listen)
 
 
-@pytest.mark.parametrize("name", CASES)
+SLOW_CASES = ("seven", "large batch", "batches", "many components", "mixtures")
+
+
+@pytest.mark.parametrize("name", [pytest.param(k, marks=pytest.mark.slow if k in SLOW_CASES else []) for k in CASES])
 def test_it_shows(name, compiled):
     jax.clear_caches()
     shown = CASES[name]

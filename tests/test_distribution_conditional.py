@@ -182,6 +182,7 @@ def test_time_given_space_by_scipy():
     assert 1e-7 < 1 - integral(lambda t: 1.0, np.sort(modes)) < 1e-5  # so it is, and this is what it then loses
 
 
+@pytest.mark.slow
 def test_time_given_space_by_plain_quadrature():
     dist = _dist(2)
     density = dist.time_given_space(_repeated([0.1, -0.4], [0.6, -0.5], [-0.4, 0.3]))

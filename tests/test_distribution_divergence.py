@@ -57,9 +57,11 @@ def test_divergence_from_the_same_envelope_of_ones_own_is_zero():
 @pytest.mark.parametrize(
     "pair",
     [
-        ({}, {"power": 0.5, "time_loc": 0.5, "time_scale": 0.4, "bend": 1.1 * BEND}),
+        pytest.param(
+            ({}, {"power": 0.5, "time_loc": 0.5, "time_scale": 0.4, "bend": 1.1 * BEND}), marks=pytest.mark.slow
+        ),
         ({"power": 2.0}, {"power": 0.5, "floor": 0.05, "time_loc": 0.5, "time_scale": 0.4, "bend": 1.1 * BEND}),
-        ({"floor": 0.2}, {"power": 0.5, "time_scale": 0.5, "loc": (0.0, 0.0)}),
+        pytest.param(({"floor": 0.2}, {"power": 0.5, "time_scale": 0.5, "loc": (0.0, 0.0)}), marks=pytest.mark.slow),
         ({"power": 0.0}, {"power": 0.2, "time_scale": 0.4, "tril": np.diag([0.4, 0.3])}),
         ({"envelope": OwnLikelihood()}, {"power": 0.3, "time_scale": 0.4}),
     ],

@@ -111,7 +111,9 @@ def test_linear_folds_match_scikit_learn(kind, degree):
     assert (ours.n_iter_, ours.converged_) == (theirs.n_iter_, theirs.converged_)
 
 
-@pytest.mark.parametrize(("kind", "degree"), [("full", 1), ("diag", 0), ("spherical", 2), ("tied", 2)])
+@pytest.mark.parametrize(
+    ("kind", "degree"), [("full", 1), ("diag", 0), pytest.param("spherical", 2, marks=pytest.mark.slow), ("tied", 2)]
+)
 def test_covariances_are_of_their_kind_and_precisions_their_inverses(kind, degree):
     """Given means make a covariance for each component; those of a fit are of its kind all the same."""
     x, mixture = _blobs(), FoldedGaussianMixture(K, degree=degree, covariance_type=kind, time_column=1, random_state=0)
@@ -269,6 +271,7 @@ def test_annealing_ends_at_temperature_one():
     assert cut.status_ == EMStatus.NOT_CONVERGED
 
 
+@pytest.mark.slow
 def test_annealed_components_separate_before_a_fit_converges():
     """On two concentric rings all components coincide when temperature 1 is reached."""
     rng = np.random.default_rng(0)
@@ -513,7 +516,7 @@ def test_sums_of_many_points_are_in_float64():
     assert fitted.aic(x) == pytest.approx(-2 * each.astype(np.float64).sum() + 2 * penalty, rel=1e-14)
 
 
-@pytest.mark.parametrize("degree", [4, *(pytest.param(degree, marks=pytest.mark.slow) for degree in (6, 10))])
+@pytest.mark.parametrize("degree", [pytest.param(degree, marks=pytest.mark.slow) for degree in (4, 6, 10)])
 def test_float32_fits_high_degrees(degree):
     """Times in two heaps, for which Hermite polynomials are nearly dependent: as good as NumPy's least squares."""
     rng = np.random.default_rng(0)

@@ -56,7 +56,7 @@ def test_passes_scikit_learns_checks(regressor):
 @pytest.mark.parametrize(
     "check",
     ["check_no_attributes_set_in_init", "check_parameters_default_constructible", "check_estimators_unfitted",
-     "check_non_transformer_estimators_n_iter", "check_regressors_no_decision_function"],
+     "check_regressors_no_decision_function"],
 )  # fmt: skip
 def test_passes_quick_checks(check):
     with warnings.catch_warnings():

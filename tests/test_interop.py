@@ -149,7 +149,7 @@ EVERY = {
 
 
 #: Those tested in the quick suite; compiling takes the time.
-QUICK = {"batched", "normal", "mixture"}
+QUICK = {"batched", "normal"}
 
 
 @pytest.fixture(params=[pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in EVERY])

@@ -428,6 +428,7 @@ class TestFrameTimes:
         assert min(cv2.imread(str(tmp_path / "t.png")).shape[:2]) > 300
         assert "1 left out, 1 shown twice" in printed(capsys)
 
+    @pytest.mark.slow
     def test_learned_times_find_what_was_done(self, tmp_path):
         """A blob at a constant pace: the true times are what makes its fold simple."""
         write_video(tmp_path / "long", blob(24, (32, 64)), 12.0)

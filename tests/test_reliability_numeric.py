@@ -75,7 +75,7 @@ HIGHEST = ("loc", "log_scale", "opacity_logit")
 @pytest.mark.parametrize(
     ("leaf", "power"),
     [
-        *((leaf, 3) for leaf in NAMED),
+        *(pytest.param(leaf, 3, marks=[pytest.mark.slow] if leaf in HIGHEST else []) for leaf in NAMED),
         *(pytest.param(leaf, 6, marks=[] if leaf in HIGHEST else [pytest.mark.slow]) for leaf in NAMED),
     ],
 )

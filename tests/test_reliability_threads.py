@@ -625,6 +625,7 @@ def made_with(folder, threads, length="short") -> list[str]:
     return run_script(MADE, folder, length, **dict.fromkeys(names, str(threads))).splitlines()
 
 
+@pytest.mark.slow
 def test_the_same_bits_for_any_number_of_threads(tmp_path):
     """Model files, with learned frame times and with alpha, and PNG files. The slow test has all the rest."""
     alone = made_with(tmp_path / "1", 1)

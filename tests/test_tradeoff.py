@@ -294,6 +294,7 @@ def test_commands_reproduce_their_points(done, tmp_path, monkeypatch):
         assert psnr == pytest.approx(rows[name]["psnr"], abs=0.01), name
 
 
+@pytest.mark.slow
 def test_killed_run_resumes(clip, tmp_path, capsys, monkeypatch):
     target, axes = tmp_path / "results", "time"
     arguments = ["tradeoff", str(clip), "--out", str(target), "--axes", axes, *QUICK]

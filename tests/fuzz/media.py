@@ -27,10 +27,6 @@ from .models import written
 from .mutate import by_chance, png_resealed, png_sized, zip_resealed
 from .target import CONSTANT, Target, chance
 
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")
-    import_optional("arviz")
-
 _NUMBERS = np.array([[0, 1, 1, 2], [0, 0, 2, 255], [3, 1, 0, 0]], np.uint8)
 
 
@@ -352,6 +348,13 @@ def _chains(steps: int, version: str, done: bool = True) -> bytes:
     return written(write, ".h5")
 
 
+def _import_arviz(folder: Path) -> None:
+    """Before memory is measured."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import_optional("arviz")
+
+
 def _read_chains(path: Path) -> None:
     there = path.exists()
     kept = draws_file.DrawsFile(path, _FINGERPRINT, _SHAPE)
@@ -434,6 +437,7 @@ CHAINS = Target(
     lambda size: 4 * CONSTANT + 64 * size,
     (h5_changed,),
     past_header=1,
+    prepare=_import_arviz,
     share=0.4,
 )  # fmt: skip
 

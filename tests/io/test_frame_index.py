@@ -78,6 +78,8 @@ KINDS = {
     "turned.mp4": [*X264, "-g", "30", "-metadata:s:v", "rotate=90"],
 }
 SPANS = [(0, 7), (83, 84), (110, 120), (17, 30)]
+#: A kind of group, codec, container and clock each; the long runs take the rest.
+QUICK = ("long.mp4", "open.mkv", "vp9.webm", "stream.ts", "raw.h264", "uneven.mp4", "turned.mp4")
 
 
 def _same(got, expected):
@@ -106,7 +108,7 @@ def _described(index, clip):
     np.testing.assert_array_equal(index.times, clip.times)
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", [pytest.param(k, marks=[] if k in QUICK else pytest.mark.slow) for k in KINDS])
 def test_spans_are_what_decoding_from_the_start_gives(tmp_path, name):
     path = _encoded(tmp_path / name, _moving(120), *KINDS[name])
     clip, index = read_video(path), index_video(path)
@@ -182,7 +184,9 @@ def test_cuts_are_found_in_passing(long, long_index):
     assert index_video(long, find_cuts=False).cuts == []
 
 
-@pytest.mark.parametrize("name", ["bunny", "bikes", "carphone"])
+@pytest.mark.parametrize(
+    "name", ["bikes", *(pytest.param(name, marks=pytest.mark.slow) for name in ("bunny", "carphone"))]
+)
 def test_sample_clips(name):
     path, stop = sample_clip(name), 33 if name == "bikes" else 12
     clip, index = read_video(path, frames=(0, stop)), index_video(path, frames=(0, stop))
@@ -227,7 +231,13 @@ def test_a_seek_that_lands_amid_blemishes_goes_further_back(tmp_path, counting):
     assert thrown_away[1] == 0  # for the margin is kept that was needed
 
 
-@pytest.mark.parametrize("name", ["long.mp4", "open.mp4", "stream.ts", "mpeg4.avi", "late.mkv", "vp9.webm"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("long.mp4", "stream.ts", "vp9.webm"),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("open.mp4", "mpeg4.avi", "late.mkv")),
+    ],
+)
 def test_damaged_clips(tmp_path, name):
     path = _encoded(tmp_path / name, _moving(120), *KINDS[name], *([] if name == "long.mp4" else ["-g", "20"]))
     data = bytearray(path.read_bytes())
@@ -611,6 +621,7 @@ def test_what_arrays_refuse_is_refused(long_index):
             LazyFrames(long_index, **options)
 
 
+@pytest.mark.slow
 def test_nothing_is_said_on_stderr(tmp_path, long):
     """By the decoder, in a fresh process."""
     data = bytearray(long.read_bytes())

@@ -141,7 +141,7 @@ def test_values_that_are_not_finite_raise():
         solve_colors(recolored(splats, splats.color.at[2, 1].set(jnp.nan)), np.zeros_like(image))
 
 
-@pytest.mark.parametrize("dtype", [jnp.float16, jnp.bfloat16])
+@pytest.mark.parametrize("dtype", [jnp.float16, pytest.param(jnp.bfloat16, marks=pytest.mark.slow)])
 def test_half_precision_is_solved_in_single(dtype):
     splats, size = scene("plain")
     image = render(splats, size).astype(dtype)

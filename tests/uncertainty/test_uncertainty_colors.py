@@ -60,8 +60,9 @@ def _by_hand(equations, k, t, prior_scale=PRIOR):
     covariance = np.linalg.inv(precision)
     colour, a = equations.color + covariance @ rhs, equations.weights(t).toarray()
     pixels = equations.variance[k] * np.eye(len(a)) + a @ covariance @ a.T
-    expected = a @ colour
-    return sum(scipy.stats.multivariate_normal(expected[:, c], pixels).logpdf(frames[k][:, c]) for c in range(3))
+    pixels = scipy.stats.Covariance.from_cholesky(np.linalg.cholesky(pixels))  # one factorization for all channels
+    logpdf = scipy.stats.multivariate_normal.logpdf
+    return sum(logpdf(x, mean, pixels) for x, mean in zip(frames[k].T, (a @ colour).T, strict=True))
 
 
 def _times(equations, k):
@@ -85,13 +86,13 @@ def test_estimated_profile_with_all_probes_is_exact(over):
     num_pixels = SIZE[0] * SIZE[1]
     exact = module._Dense(equations, FRAME)
     estimated = module._Estimated(equations, FRAME, np.sqrt(num_pixels) * np.eye(num_pixels))
-    for t in equations.times[FRAME] + np.linspace(-0.3, 0.3, 31):
+    for t in equations.times[FRAME] + np.linspace(-0.3, 0.3, 13):
         exact.evaluate(t)
         estimated.evaluate(t)
     without = np.array([point.log_likelihood for point in estimated.points])
     expected, found = exact.values() - without, estimated.values() - without
     assert np.ptp(expected) > 0.5
-    np.testing.assert_allclose(found - found[15], expected - expected[15], atol=0.01 * np.ptp(expected))
+    np.testing.assert_allclose(found - found[6], expected - expected[6], atol=0.01 * np.ptp(expected))
 
 
 def test_estimate_is_near_the_exact_profile(over):

@@ -153,7 +153,7 @@ def test_many_flat_profiles_need_few_grid_points():
     assert_near(found, [150], [scipy.stats.beta(150, 149)], [0], [1])
 
 
-@pytest.mark.parametrize("concentration", [0.2, 1.0, 3.0, 20.0])
+@pytest.mark.parametrize("concentration", [0.2, 1.0, *(pytest.param(c, marks=pytest.mark.slow) for c in (3.0, 20.0))])
 @pytest.mark.parametrize("known", [(), (5,)])
 def test_increments_of_draws_follow_the_prior(concentration, known):
     num, many = 12, 3000

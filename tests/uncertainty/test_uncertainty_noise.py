@@ -90,7 +90,7 @@ def test_rings_are_means_by_distance():
     np.testing.assert_array_equal(found, [0, 1, 2, 3, 4])
 
 
-@pytest.mark.parametrize("spread", [0.01, 1.0, 2.0])
+@pytest.mark.parametrize("spread", [0.01, *(pytest.param(spread, marks=pytest.mark.slow) for spread in (1.0, 2.0))])
 def test_score_fraction_matches_the_variance_of_the_score(spread):
     # The score of a time is the sum over pixels of residual times slope: its variance is estimated over many noise
     # images.

@@ -108,7 +108,7 @@ def test_draws_keep_their_order_and_their_ends(near):
     assert near.draws.shape == (near.times[..., 0].size, 5)
 
 
-@pytest.mark.parametrize("concentration", [0.5, 3.0])
+@pytest.mark.parametrize("concentration", [0.5, pytest.param(3.0, marks=pytest.mark.slow)])
 def test_block_sweeps_sample_the_known_posterior(concentration):
     log_prob = toy((0.2, 0.25, 0.4, 0.42, 0.75), (0.03, 0.04, 0.03, 0.05, 0.06), concentration)
     found = sampled(log_prob, moves=BlockSweep(log_prob, block=2), walkers=16)
@@ -288,6 +288,7 @@ def test_file_of_draws_has_one_writer(tmp_path):
     assert [one.name for one in tmp_path.iterdir()] == ["run.h5"]
 
 
+@pytest.mark.slow
 def test_lock_of_another_process_is_respected(tmp_path):
     """The lock ends with its process; the remaining file does not block others."""
     path = tmp_path / "run.h5"

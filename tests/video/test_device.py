@@ -535,7 +535,7 @@ def test_the_command(tmp_path, capsys):
     for k, frame in enumerate(FRAMES):
         write_image(tmp_path / "clip" / f"{k:02}.png", frame)
     model = tmp_path / "model.safetensors"
-    options = ["--gaussians", "150", "--steps", "40", "--out", str(model)]
+    options = ["--gaussians", "150", "--steps", "40", "--interpolation-fraction", "0", "--out", str(model)]
     assert run("fit", tmp_path / "clip", *options, "--engine", "xla") == 0
     assert "engine xla on " in capsys.readouterr().out
     assert evaluate(load_video_model(model), FRAMES).mean_psnr > 25

@@ -142,7 +142,7 @@ def _clips():
 
 
 @pytest.mark.parametrize("name", list(_clips()))
-@pytest.mark.parametrize("num", [3, 200])
+@pytest.mark.parametrize("num", [3, pytest.param(200, marks=pytest.mark.slow)])
 def test_good_fits_raise_no_warning(name, num):
     with warnings.catch_warnings():
         warnings.simplefilter("error", DivergenceWarning)

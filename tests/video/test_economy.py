@@ -617,7 +617,7 @@ def test_unreachable_psnr_is_reported():
 @pytest.mark.parametrize(
     ("changes", "at"),
     [
-        ({"economy": Economy(rounds=4)}, (30, 60, 110)),
+        pytest.param({"economy": Economy(rounds=4)}, (30, 60, 110), marks=pytest.mark.slow),
         ({"economy": Economy(psnr=60)}, (60, 130)),  # in overtime
         ({"growth": Growth(from_step=0, screen_gradient=1e-6), "economy": Economy(rounds=2)}, (50, 90)),
     ],

@@ -62,7 +62,7 @@ def test_learns_a_clip():
         {"num_gaussians": 1},
         {"final_rate": 0.0},
         {"floor": 0.1},
-        {"steps": None, "minutes": 0.01},
+        {"steps": None, "minutes": 0.005},
         {"follow_motion": False},
         {"scale_rates_by_duration": False},
         {"l2_fraction": 0.0},
@@ -253,10 +253,10 @@ def test_planned_steps():
     ("budgets", "binds"),
     [
         ({"steps": 7, "minutes": 10.0}, "steps"),
-        ({"steps": 10**6, "minutes": 0.02}, "minutes"),
+        ({"steps": 10**6, "minutes": 0.005}, "minutes"),
         ({"steps": 400, "target_psnr": 20.0}, "target_psnr"),
         ({"steps": 7, "target_psnr": 99.0}, "steps"),
-        ({"steps": None, "minutes": 0.02, "target_psnr": 99.0}, "minutes"),
+        ({"steps": None, "minutes": 0.005, "target_psnr": 99.0}, "minutes"),
     ],
     ids=str,
 )

@@ -9,7 +9,8 @@ from skimage.metrics import structural_similarity
 from foldgauss._runtime import threads as _threads
 from foldgauss.video.fitting.steppers.loss import C1, C2, RADIUS, SIGMA, image_loss, ssim_map
 
-SIZES = [(97, 83), (40, 16), (41, 200), (11, 11), (3, 50), (1, 1)]
+SLOW_SIZES = [pytest.param(*size, marks=pytest.mark.slow) for size in ((97, 83), (40, 16), (11, 11))]
+SIZES = [(41, 200), (3, 50), (1, 1), *SLOW_SIZES]
 
 
 def pictures(height, width, seed=0):

@@ -22,7 +22,9 @@ def _model(power=2.0, floor=0.0, size=(37, 50)) -> VideoModel:
 
 
 @pytest.mark.parametrize(("power", "floor"), [(1.0, 0.0), (2.0, 0.1)])
-@pytest.mark.parametrize("size", [None, (37, 50), (60, 41), (16, 90)])
+@pytest.mark.parametrize(
+    "size", [None, (60, 41), *(pytest.param(s, marks=pytest.mark.slow) for s in ((37, 50), (16, 90)))]
+)
 def test_renderer_matches_model_render(size, power, floor):
     model = _model(power, floor)
     for t in (0.0, 0.31, 1.0):

@@ -78,10 +78,10 @@ def together(video, front_video, k, *, before=True):
     ("kind", "evenly"),
     [
         ("plain", False),
-        ("plain", True),
         ("short-lived", False),
         ("one frame", False),
-        ("spans", False),
+        pytest.param("plain", True, marks=pytest.mark.slow),
+        pytest.param("spans", False, marks=pytest.mark.slow),
         ("spans", True),
         ("clocks", False),
         ("function", False),
