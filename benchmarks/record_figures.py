@@ -127,7 +127,7 @@ def tradeoff_clips(records: Path) -> plt.Figure:
         _draw(by_bytes, compact, "bytes", 1e-6, color=color)
     by_time.set(xlabel="time to fit, CPU seconds (one core)", ylabel="PSNR (dB)", xscale="log")
     by_bytes.set(xlabel="size, megabytes", ylabel="PSNR (dB)", xscale="log")
-    for axes, ticks in ((by_time, (5, 10, 20, 40, 80, 160)), (by_bytes, (0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10))):
+    for axes, ticks in ((by_time, (5, 10, 20, 40, 80, 160, 320)), (by_bytes, (0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10))):
         low, high = axes.get_xlim()
         shown = [tick for tick in ticks if low <= tick <= high]
         axes.set_xticks(shown, [f"{tick:g}" for tick in shown])

@@ -27,7 +27,7 @@ from foldgauss.video.fitting.state import to_model
 
 NUM_FRAMES = 48
 SIZES = {"bunny": (160, 320), "bikes": (136, 320), "carphone": (144, 176)}
-BUDGETS = (10.0, 20.0, 40.0, 80.0)
+BUDGETS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0)
 
 
 def configurations(budgets: list[float]) -> dict[str, FitConfig]:
