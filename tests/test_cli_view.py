@@ -53,12 +53,12 @@ def served(work, monkeypatch, capsys):
 
 
 def test_view_finds_what_moves(served, work, monkeypatch):
-    told, pages = served(work / "model.safetensors", "--moving")[2:0:-1]
+    told, pages = served(work / "model.safetensors", "--moving-object")[2:0:-1]
     assert "The page has no button for the moving object: moving: expected" in " ".join(told.err.split())
     assert 'id="moving"' not in pages[0][1]
     masks = np.ones((NUM_FRAMES, *load_video_model(work / "model.safetensors").size), bool)
     monkeypatch.setattr(selectors, "find_moving_object", lambda frames: masks)
-    code, ((_, page),), told, _ = served(work / "model.safetensors", "--moving")
+    code, ((_, page),), told, _ = served(work / "model.safetensors", "--moving-object")
     assert (code, told.err) == (0, "")
     assert re.search(r'id="moving">{"0": "0-\d+', page)
 
