@@ -18,7 +18,7 @@ from soft_models import NUM, NUM_FRAMES, OBJECT, SIZE, soft_model
 from foldgauss.io import save_selection, save_video_model
 from foldgauss.io._toml_lines import key_lines
 from foldgauss.io.edit_script import ACTIONS, EditScriptError, parse_edit_script, read_edit_script
-from foldgauss.io.models.selections import parse_indices
+from foldgauss.io.models.selections import format_indices, parse_indices
 from foldgauss.render import Camera
 from foldgauss.video import EditedVideo, SegmentedVideo, Selection, VideoModel, edit, layers, select
 
@@ -59,6 +59,13 @@ def test_indices_select_these_gaussians(indices):
     behind = text.replace("17,", "17,63,").replace(f"= {NUM}", f"= {2 * NUM}")
     both = np.concatenate([these, np.arange(NUM) == 63 - NUM])
     assert same(made(behind, several), edit(several).select(both).vanish().video())
+
+
+@given(mask=st.lists(st.booleans(), min_size=1, max_size=40).filter(any))
+def test_indices_round_trip_as_text(mask):
+    text = format_indices(Selection(np.array(mask)))
+    assert np.array_equal(parse_indices(text, len(mask)).mask, mask)
+    assert len(re.findall(r"\d+", text)) <= sum(mask)
 
 
 @given(ends=st.lists(st.tuples(st.integers(0, 39), st.integers(0, 39)).map(sorted), min_size=1))

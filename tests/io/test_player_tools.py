@@ -217,24 +217,9 @@ def test_numbers_show_what_the_edits_of_the_selection_add_up_to(opened, compact)
     assert fields(page) == begun
     select(page, range(12))
     seen = [fields(page)]
-    for name, value in (
-        ("gain", "2"),
-        ("hue", "200"),
-        ("move-x", "8"),
-        ("gain-value", "1.2"),
-        ("scale", "150"),
-        ("move-x", "5"),
-    ):
-        page.page.locator(f"#{name}").fill(value)
-        seen.append(fields(page))
-    for name, value in (
-        ("scale", "50"),
-        ("rotate", "40"),
-        ("shift", "2"),
-        ("rotate", "-5"),
-        ("shift", "3"),
-        ("stretch", "-2"),
-    ):
+    colors = [("gain", "2"), ("hue", "200"), ("move-x", "8"), ("gain-value", "1.2"), ("scale", "150"), ("move-x", "5")]
+    places = [("scale", "50"), ("rotate", "40"), ("shift", "2"), ("rotate", "-5"), ("shift", "3"), ("stretch", "-2")]
+    for name, value in colors + places:
         page.page.locator(f"#{name}").fill(value)
         seen.append(fields(page))
     assert seen[6] == ["5", "150", "0", "200", "1.2", "1", "0", "1"]

@@ -77,6 +77,13 @@ def load_selection(path: str | os.PathLike, model: VideoModel) -> Selection:
 _INDEX_RANGE = re.compile(r"\s*([0-9]{1,9})(?:-([0-9]{1,9}))?\s*")
 
 
+def format_indices(selection: Selection) -> str:
+    """The indices as a text of numbers and ranges whose ends are included: "3,17,40-52". See `parse_indices`."""
+    edges = np.flatnonzero(np.diff(np.r_[False, selection.mask, False].astype(np.int8)))
+    ends = zip(edges[::2], edges[1::2] - 1, strict=True)
+    return ",".join(f"{first}" if first == last else f"{first}-{last}" for first, last in ends)
+
+
 def parse_indices(text: str, num_gaussians: int) -> Selection:
     """The selection, of `num_gaussians`, that a text of numbers and ranges describes, as "3,17,40-52".
 

@@ -17,12 +17,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import UInt8
 
 from foldgauss._runtime.checks import invalid, is_integer, short_repr
 from foldgauss.io._atomic import atomic_path, check_path
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.compact import is_compact, pack_compact
+from foldgauss.io.models.selections import format_indices
 from foldgauss.io.models.video_model import load_video_model, read_origin
 from foldgauss.video.compression.quantize import (
     COLORS,
@@ -139,7 +140,7 @@ def html_page(
     `save_to`: of a page that a local server serves; it may then make requests to that server, and to nothing else.
 
     Raises ValueError for edits that no folded model holds, several envelopes or a degree above 15, in a segment, too,
-    and for frames that do not fit; `NothingMoves`, which is one; errors of reading as `load_video_model`.
+    and for frames that do not fit; its subclass `NothingMoves`; errors of reading as `load_video_model`.
 
     Example: `html_page(model, title="holiday")`.
     """
@@ -207,21 +208,15 @@ def _encode_moving(model: Loaded) -> str:
     found, missing = {}, None
     for number, one in enumerate(whole.segments if isinstance(whole, SegmentedVideo) else [whole]):
         try:
-            mask = by_motion(flatten_video(one.model if isinstance(whole, SegmentedVideo) else one)).mask
+            moving = by_motion(flatten_video(one.model if isinstance(whole, SegmentedVideo) else one))
         except NothingMoves as error:
             missing = error
         else:
-            found[number] = _format_ranges(np.flatnonzero(mask))
+            found[number] = format_indices(moving)
     found = {number: text for number, text in found.items() if text}
     if not found:
         raise missing or nothing_moves("an object that has Gaussians of its own", "none")
     return f'<script type="application/json" id="moving">{json.dumps(found)}</script>'
-
-
-def _format_ranges(indices: Int[np.ndarray, " num"]) -> str:
-    """Rising indices as in edit scripts: "3,17,40-52"."""
-    runs = np.split(indices, np.flatnonzero(np.diff(indices) > 1) + 1) if len(indices) else []
-    return ",".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
 
 
 def _flatten_segment(number: int, model: VideoModel | EditedVideo) -> VideoModel:
