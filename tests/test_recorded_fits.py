@@ -3,6 +3,9 @@
 import dataclasses
 import hashlib
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +24,12 @@ ELSEWHERE_DB = 0.5
 
 
 @pytest.fixture(scope="module")
-def now(optimized):
-    return recorded_fits.record()
+def now():
+    """Recorded in a process of its own, compiled as for users: see conftest.py."""
+    settings = {"JAX_DISABLE_MOST_OPTIMIZATIONS", "XLA_FLAGS"}
+    environment = {name: value for name, value in os.environ.items() if name not in settings}
+    command = [sys.executable, recorded_fits.__file__]
+    return json.loads(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
 
 
 @pytest.mark.parametrize("name", RECORDED["digests"])
