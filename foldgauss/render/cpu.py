@@ -140,11 +140,18 @@ def _check_leaves(mean, factor, opacity, color, background) -> None:
         raise invalid(names, expected="float32 NumPy arrays", got=got)
 
 
+def _read_only(array: np.ndarray) -> np.ndarray:
+    """A view of the array: Numba would compile the kernels again for arrays that may be written."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
 class _ForwardPass:
     """The forward pass of one frame. Methods run in order; `project`, `composite` and `gather` in parallel parts."""
 
     def __init__(self, frame, size, compositing, options, visibility) -> None:
-        self.mean, self.factor, self.opacity, self.color, background = frame
+        self.mean, self.factor, self.opacity, self.color, background = map(_read_only, frame)
         self.size, self.options = size, options
         num, channels, over = len(self.opacity), len(background), compositing == "over"
         self.chunks = range(0, num, SPLATS_PER_TASK)
@@ -231,7 +238,7 @@ def backward_frames(traces: Sequence[Trace], grad_images: Sequence[np.ndarray]) 
     for trace, grad_image in zip(traces, grad_images, strict=True):
         if grad_image.shape != trace.image.shape:
             raise invalid("grad_image", expected=f"the image's shape {trace.image.shape}", got=grad_image.shape)
-    jobs = [(trace, grad, *_empty_sums(trace)) for trace, grad in zip(traces, grad_images, strict=True)]
+    jobs = [(trace, _read_only(grad), *_empty_sums(trace)) for trace, grad in zip(traces, grad_images, strict=True)]
 
     def sum_rows(task) -> None:
         (trace, grad_image, slots, _), part = task
