@@ -281,6 +281,23 @@ def test_codecs_and_pixel_formats(tmp_path, name, options, quality):
         assert _psnr(clip.frames, frames) >= quality
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="priorities of threads are read from /proc")
+def test_encoders_keep_the_priority_of_the_process(tmp_path):
+    """SVT-AV1 makes the threads of root real-time threads; they are looked at while it encodes, and after."""
+
+    def policies():
+        return {os.sched_getscheduler(int(thread)) for thread in os.listdir("/proc/self/task")}
+
+    def frames():
+        for frame in _moving(4, 64, 96):
+            yield frame
+            seen.extend(policies())
+
+    seen, before = [], policies()
+    write_video(tmp_path / "a.mp4", frames(), 25, codec="av1")
+    assert {*seen, *policies()} == before
+
+
 @pytest.mark.parametrize("image_format", ["png", "webp"])
 def test_alpha_of_images_is_written_and_read_back(tmp_path, image_format):
     frames = np.concatenate([_moving(3), _moving(3)[..., :1]], -1)

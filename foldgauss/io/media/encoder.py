@@ -2,6 +2,7 @@
 
 import math
 import os
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from fractions import Fraction
@@ -157,6 +158,7 @@ def encode_video(
                 stream.height, stream.width = image.shape[:2]
                 if matrix is not None:
                     _declare_bt709(stream.codec_context)
+                _open_with_own_priority(stream.codec_context)
             given = av.VideoFrame.from_ndarray(image, format="rgba" if image.shape[2] == 4 else "rgb24")
             given = given.reformat(format=pixel_format.name, dst_colorspace=matrix, interpolation=CONVERSION)
             given.pts, given.time_base = number, 1 / rate
@@ -213,6 +215,22 @@ def check_sound(sound: Sound) -> None:
 def _declare_bt709(context: av.VideoCodecContext) -> None:
     context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
     context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
+
+
+def _open_with_own_priority(context: av.VideoCodecContext) -> None:
+    """Open an encoder whose threads are scheduled as the caller is.
+
+    SVT-AV1 makes its threads and its caller real-time threads where it may, as root, and they would starve all others.
+    """
+    if sys.platform != "linux":  # no other has such priorities
+        context.open()
+        return
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    context.open()
+    for thread in map(int, os.listdir("/proc/self/task")):
+        with suppress(OSError):  # it has ended
+            if os.sched_getscheduler(thread) != policy:
+                os.sched_setscheduler(thread, policy, parameters)
 
 
 def _pad(frame: np.ndarray, steps: tuple[int, int]) -> np.ndarray:
