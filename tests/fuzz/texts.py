@@ -17,6 +17,7 @@ from foldgauss.io.edit_script import EditScriptError, read_edit_script
 from foldgauss.io.history import info_line
 from foldgauss.video import edit
 from foldgauss.video.fitting.loop import FitInfo
+from foldgauss.video.segmented.segmented_video import SegmentedVideo
 from foldgauss.video.selection.selectors import Selection
 
 from .branches import ONLY
@@ -138,7 +139,37 @@ select = "most"
 [[layers]]
 model = "other.safetensors"
 """
+_SIXTH = b"""\
+[selections.brushed]
+indices = "0-1"
+num_gaussians = 3
+[selections.parted]
+indices = "0,2"
+segment = 1
+[selections.painted]
+indices = "1"
+[[edits]]
+do = "vanish"
+select = "brushed"
+[[edits]]
+do = "opacity"
+select = "brushed"
+factor = 0.5
+"""
+_SEVENTH = b"""\
+[selections.parted]
+indices = "0-1"
+num_gaussians = 3
+segment = 1
+[[edits]]
+do = "opacity"
+select = "parted"
+factor = 0.5
+"""
 _KEYS = (
+    b"indices",
+    b"segment",
+    b"num_gaussians",
     b"do",
     b"select",
     b"offset",
@@ -196,9 +227,11 @@ def toml_changed(data: bytes, random: Random) -> bytes:
 
 def _apply_script(path: Path) -> None:
     """What the script asks for, too: selections, masks, other models, a camera."""
-    video = tiny_model()
-    if chance(path) % 8 == 0:
+    video, which = tiny_model(), chance(path) % 8
+    if which == 0:
         video = edit(video).opacity(0.5, frames=(0, 1)).video()  # of layers, or overlays, which files do not fit to
+    elif which == 1:
+        video = SegmentedVideo.from_models([(0, video), (video.num_frames - 1, tiny_model(seed=1))])
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # of units that look mistaken
         read_edit_script(path).apply(video)
 
@@ -221,7 +254,15 @@ def _beside_scripts(folder: Path) -> None:
 SCRIPT = Target(
     "edit-script",
     ".toml",
-    lambda: [_SCRIPT, _FOURTH, _THIRD, _OTHER.replace(b', script = "again.toml"', b""), b"", b"\xef\xbb\xbf" + _THIRD],
+    lambda: [
+        _SCRIPT,
+        _FOURTH,
+        _THIRD,
+        _SIXTH,
+        _OTHER.replace(b', script = "again.toml"', b""),
+        b"",
+        b"\xef\xbb\xbf" + _THIRD,
+    ],
     read_edit_script,
     (EditScriptError,),
     {"foldgauss.io.edit_script": (), "foldgauss.io._toml_lines": ()},
@@ -237,7 +278,7 @@ SCRIPT = Target(
 APPLIED = dataclasses.replace(
     SCRIPT,
     name="edit-applied",
-    seeds=lambda: [_SCRIPT, _FOURTH, _THIRD, _FIFTH],
+    seeds=lambda: [_SCRIPT, _FOURTH, _THIRD, _FIFTH, _SIXTH, _SEVENTH],
     parse=_apply_script,
     errors=(EditScriptError, FileNotFoundError),
     memory=lambda size: (256 << 20) + 400 * size,
