@@ -143,18 +143,15 @@ _SIXTH = b"""\
 [selections.brushed]
 indices = "0-1"
 num_gaussians = 3
-[selections.parted]
-indices = "0,2"
-segment = 1
 [selections.painted]
 indices = "1"
-[[edits]]
-do = "vanish"
-select = "brushed"
 [[edits]]
 do = "opacity"
 select = "brushed"
 factor = 0.5
+[[edits]]
+do = "vanish"
+select = "brushed"
 """
 _SEVENTH = b"""\
 [selections.parted]
@@ -227,11 +224,11 @@ def toml_changed(data: bytes, random: Random) -> bytes:
 
 def _apply_script(path: Path) -> None:
     """What the script asks for, too: selections, masks, other models, a camera."""
-    video, which = tiny_model(), chance(path) % 8
-    if which == 0:
-        video = edit(video).opacity(0.5, frames=(0, 1)).video()  # of layers, or overlays, which files do not fit to
-    elif which == 1:
+    video = tiny_model()
+    if b"segment" in path.read_bytes():
         video = SegmentedVideo.from_models([(0, video), (video.num_frames - 1, tiny_model(seed=1))])
+    elif chance(path) % 8 == 0:
+        video = edit(video).opacity(0.5, frames=(0, 1)).video()  # of layers, or overlays, which files do not fit to
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # of units that look mistaken
         read_edit_script(path).apply(video)
 
