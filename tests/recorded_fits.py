@@ -1,7 +1,7 @@
 """Four tiny fits and their recorded digests: plain, economical, growing and published.
 
-The digest of the published recipe is that of before the restructuring; the others changed with the defaults. The plain
-fit is without the interpolated frames that are the default since.
+The digests changed with the defaults; those of the growing and the published fit also with the uniform starts, and with
+what the gradient of m_t clones. The plain fit is without the interpolated frames that are the default since.
 
 python tests/recorded_fits.py   prints what test_recorded_fits.py compares with, as JSON
 """

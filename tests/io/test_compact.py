@@ -17,7 +17,7 @@ from soft_models import SIZE, soft_model
 import foldgauss.io.page
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import ModelFileError, load_compact, load_video_model, save_compact, save_video_model
-from foldgauss.io.models.compact import MAGIC, VERSION, pack_compact
+from foldgauss.io.models.compact import MAGIC, VERSION, is_compact, pack_compact
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.render import RenderOptions
 from foldgauss.video import compress, layers
@@ -658,3 +658,8 @@ def test_names(tmp_path):
     assert load_video_model(plain).num_gaussians == 40
     with pytest.raises(FileNotFoundError):
         load_video_model(tmp_path / "missing.fgz")
+
+
+def test_a_file_that_cannot_be_read_is_not_compact(tmp_path):
+    assert not is_compact(tmp_path / "missing.fgz")
+    assert not is_compact(tmp_path)

@@ -27,6 +27,7 @@ SMALL, LARGE = 0.5 * GROWTH.clone_below, 2 * GROWTH.clone_below
 def gaussians(num=5, scale=SMALL, opacity_logit=1.0):
     rows = np.random.default_rng(0).normal(size=(num, 11 + 2 * DEGREE)).astype(np.float32)
     rows[:, PLACE["log_scale"]] = np.log(scale)
+    rows[:, PLACE["log_time_scale"]] = np.log(0.1)
     rows[:, PLACE["opacity_logit"]] = opacity_logit
     return rows
 
@@ -53,7 +54,8 @@ def test_nothing_happens_below_the_thresholds():
 
 @pytest.mark.parametrize("criterion", ["screen", "time"])
 def test_small_gaussians_are_cloned(criterion):
-    rows = gaussians()
+    """By the screen gradient those that are small, by the time gradient those that live no longer than the clip."""
+    rows = gaussians(scale=SMALL if criterion == "screen" else LARGE)
     stay, born = change(rows, statistics(**{criterion: {3: 2.1e-4}}))
     assert stay.tolist() == [0, 1, 2, 3, 4]
     np.testing.assert_array_equal(born, rows[[3]])
@@ -61,7 +63,9 @@ def test_small_gaussians_are_cloned(criterion):
 
 @pytest.mark.parametrize("criterion", ["screen", "time"])
 def test_large_gaussians_are_split(criterion):
+    """By the screen gradient those that are wide, by the time gradient those that live longer than the clip."""
     rows = gaussians(scale=LARGE)
+    rows[:, PLACE["log_time_scale"]] = np.log(0.9 if criterion == "screen" else 1.1)
     stay, born = change(rows, statistics(**{criterion: {1: 2.1e-4}}))
     assert stay.tolist() == [0, 2, 3, 4]
     assert born.shape == (2, rows.shape[1])
@@ -69,6 +73,14 @@ def test_large_gaussians_are_split(criterion):
     others = [c for name in PLACE if name not in ("loc", "log_scale") for c in range(*PLACE[name].indices(99))]
     np.testing.assert_array_equal(born[:, others], rows[[1, 1]][:, others])
     assert not np.array_equal(born[0, PLACE["loc"]], born[1, PLACE["loc"]])
+
+
+def test_both_gradients_together_clone_and_split():
+    rows = gaussians(scale=LARGE)
+    stay, born = change(rows, statistics(screen={2: 3e-4}, time={2: 3e-4}))
+    assert stay.tolist() == [0, 1, 3, 4]
+    np.testing.assert_array_equal(born[0], rows[2])
+    np.testing.assert_allclose(np.exp(born[1:, PLACE["log_scale"]]), LARGE / 1.6, rtol=1e-5)
 
 
 def test_either_axis_makes_a_gaussian_large():
@@ -129,7 +141,7 @@ def test_big_gaussians_are_pruned_late():
 def test_largest_gradients_come_first_at_the_limit():
     rows = gaussians(6)
     rows[4, PLACE["log_scale"]] = np.log(LARGE)
-    wanted = statistics(6, screen={0: 3e-4, 2: 9e-4}, time={3: 5e-4, 4: 8e-4})
+    wanted = statistics(6, screen={0: 3e-4, 2: 9e-4, 4: 8e-4}, time={3: 5e-4})
     stay, born = change(rows, wanted, max_num=8)
     assert stay.tolist() == [0, 1, 2, 3, 5]
     assert len(stay) + len(born) == 8

@@ -80,13 +80,12 @@ def test_uniform_starts_are_as_published():
     sigmoid = lambda x: 1 / (1 + np.exp(-x))  # noqa: E731
     # Mean and variance of each uniform law, to five standard errors of 5000 draws or more.
     for values, low, high in (
-        (splats.loc[:, 0], -0.55, 0.55),
-        (splats.loc[:, 1], -0.55 * 0.6, 0.55 * 0.6),
+        (splats.loc[:, 0], -0.5, 0.5),
+        (splats.loc[:, 1], -0.5 * 0.6, 0.5 * 0.6),
         (sigmoid(splats.time_loc_logit), 0, 1),
         (sigmoid(splats.angle_logit), 0, 1),
         (np.exp(splats.log_time_scale), 0.01, 1),
         (splats.coefficients * 2 * TAN, -1, 1),
-        (0.5 + SH_C0 * splats.color_dc, 0, 1 / 255),
     ):
         wide, values = high - low, np.ravel(values)
         assert values.min() >= low - 1e-6
@@ -94,11 +93,13 @@ def test_uniform_starts_are_as_published():
         assert abs(values.mean() - (low + high) / 2) < 5 * wide / np.sqrt(12 * len(values))
         assert abs(values.var() - wide**2 / 12) < 5 * wide**2 / 12 * np.sqrt(0.8 / len(values))
     np.testing.assert_allclose(sigmoid(splats.opacity_logit), 0.1, rtol=1e-5)
+    np.testing.assert_allclose(0.5 + SH_C0 * splats.color_dc, 127 / 255, rtol=1e-5)
 
 
 def test_uniform_starts_are_as_wide_as_the_distance_to_neighbors():
     splats = uniform(60)
-    far = np.sort(np.linalg.norm(splats.loc[:, None] - splats.loc[None], axis=-1), axis=1)[:, 1:4].mean(1)
+    square = np.sort(((splats.loc[:, None] - splats.loc[None]) ** 2).sum(-1), axis=1)[:, 1:4].mean(1)
+    far = np.sqrt(square)
     np.testing.assert_allclose(np.exp(splats.log_scale), np.stack([far, far], -1), rtol=1e-4)
 
 

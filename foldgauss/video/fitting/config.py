@@ -396,8 +396,7 @@ class FitConfig:
           7, batches of 3, 30,000 steps, L1 + 0.2 D-SSIM, two opposite cameras, the published learning rates, of which
           only that of positions decays (to 1/100), Adam updates of all Gaussians, the published rasterizer's constants.
           Other numbers of steps scale the growth schedule in proportion, but not the learning rates, so fits of a few
-          thousand steps stop early. The box of the initial positions and the threshold of the time gradient are
-          unknown, and so our choice. Not reproduced: the published code skips Gaussians thinner than 1e-4 of its units.
+          thousand steps stop early. Not reproduced: the published code skips Gaussians thinner than 1e-4 of its units.
           Source: VeGaS, "Implementation Details", and constants of its published code.
 
         Raises ValueError for an unknown name or change. Example: `FitConfig.preset("paper", steps=3000)`.

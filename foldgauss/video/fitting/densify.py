@@ -65,9 +65,8 @@ def densify(
     Source: Kerbl et al. 2023, section 5.2.
     """
     place, num = columns(degree), len(rows)
-    chosen = _choose_parents(statistics, growth, max_num - num)
-    small = np.exp(rows[chosen, place["log_scale"]].max(axis=1)) <= growth.clone_below
-    clones, parents = rows[chosen[small]], chosen[~small]
+    cloned, parents = _choose_parents(rows, statistics, growth, place, max_num - num)
+    clones = rows[cloned]
     rng = np.random.default_rng([seed, 2, step])
     halves = [_draw_half(rows[parents], rng, growth.shrinking, place) for _ in range(2)]
     stays = np.ones(num, bool)
@@ -88,16 +87,22 @@ def reset_opacities(rows: np.ndarray, first: np.ndarray, second: np.ndarray, gro
     second[:, place] = 0
 
 
-def _choose_parents(statistics: GradientStatistics, growth: Growth, room: int) -> np.ndarray:
-    """Indices, in order, of at most `room` Gaussians whose mean gradients reach a threshold."""
+def _choose_parents(
+    rows: np.ndarray, statistics: GradientStatistics, growth: Growth, place: dict[str, slice], room: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Indices, in order, of the Gaussians to be cloned and of those to be split, at most `room` together.
+
+    Those come first whose mean gradients exceed their thresholds by most. One may be both, by either gradient.
+    """
+    small = np.exp(rows[:, place["log_scale"]].max(axis=1)) <= growth.clone_below
+    brief = np.exp(rows[:, place["log_time_scale"]][:, 0]) <= growth.clone_below_time
     steps = np.maximum(statistics.seen, 1).astype(np.float32)
-    excess = np.maximum(
-        statistics.screen / (steps * np.float32(growth.screen_gradient)),
-        statistics.time / (steps * np.float32(growth.time_gradient)),
-    )
+    screen = statistics.screen / (steps * np.float32(growth.screen_gradient))
+    time = statistics.time / (steps * np.float32(growth.time_gradient))
+    excess = np.concatenate([np.maximum(screen * one, time * two) for one, two in ((small, brief), (~small, ~brief))])
     wanted = np.flatnonzero(excess >= 1)
-    first = np.argsort(-excess[wanted], kind="stable")[: max(room, 0)]
-    return np.sort(wanted[first])
+    first = np.sort(wanted[np.argsort(-excess[wanted], kind="stable")[: max(room, 0)]])
+    return first[first < len(rows)], first[first >= len(rows)] - len(rows)
 
 
 def _draw_half(parents: np.ndarray, rng: np.random.Generator, shrinking: float, place: dict[str, slice]) -> np.ndarray:

@@ -28,9 +28,10 @@ MIN_EVERY, MIN_RESET_EVERY = 10, 200
 class Growth:
     """When Gaussians are cloned, split, pruned and reset. For a fit of `PUBLISHED_STEPS`, see `for_plan`.
 
-    After `from_step` and before `until_step`, on every `every`-th step: where the mean screen gradient or the mean time
-    gradient of a Gaussian reaches its threshold, it is cloned if small and split in two if not; then Gaussians that are
-    faint or too big are pruned. Every `reset_every` steps, opacities above `reset_opacity` fall to it.
+    After `from_step` and before `until_step`, on every `every`-th step: a Gaussian whose mean screen gradient reaches
+    its threshold is cloned if small and split in two if not; one whose mean time gradient does, is cloned if its
+    sigma_t is at most `clone_below_time` and split if not. Then Gaussians that are faint or too big are pruned. Every
+    `reset_every` steps, opacities above `reset_opacity` fall to it.
 
     * The screen gradient is |dL/dmean| in units of half the image's width and height, the largest of a step's
       batch; the time gradient is |dL/dm_t| by the raw m_t, before its sigmoid. L is the mean over the batch: with it
@@ -50,13 +51,17 @@ class Growth:
         default=2e-4,
         metadata=setting(
             "Time gradient that densifies",
-            "The paper does not give it; that of the screen gradient is the plainest reading of 'by either'. Few "
-            "Gaussians then pass by time alone: their median time gradient is a quarter of their screen gradient.",
+            "The published code has one threshold for both. Few Gaussians pass by time alone: their median time "
+            "gradient is a quarter of their screen gradient.",
             bounds="(0, inf)",
         ),
     )
     clone_below: float = field(
         default=0.01 * EXTENT, metadata=setting("Larger standard deviation up to which to clone", bounds="(0, inf)")
+    )
+    clone_below_time: float = field(
+        default=1.0,
+        metadata=setting("sigma_t up to which the time gradient clones, in durations of the clip", bounds="(0, inf)"),
     )
     shrinking: float = field(default=1.6, metadata=setting("Factor by which halves are smaller", bounds="[1, inf)"))
     prune_opacity: float = field(default=0.01, metadata=setting("Least opacity; 3DGS has 0.005", bounds="(0, 1)"))

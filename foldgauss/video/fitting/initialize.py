@@ -47,11 +47,9 @@ FEW_STARTS = 16
 #: more, the worst frames get better and the mean worse.
 EVEN_FRAMES = 0.2
 #: Uniform starts. VeGaS: sigma_t and fold coefficients lie between these (the latter in published units), opacity is
-#: 0.1, colors are below one step of 8 bits. 3DGS: scales are the mean distance to so many neighbors.
-UNIFORM_TIME_SCALES, UNIFORM_FOLD, UNIFORM_OPACITY, UNIFORM_COLOR, NEIGHBORS = (0.01, 1.0), 1.0, 0.1, 1 / 255, 3
-#: Their box is the frame, larger by this factor. The paper does not give the size of its "bounding box"; folds move
-#: Gaussians into the frame and out of it anyway.
-UNIFORM_BOX = 1.1
+#: 0.1, colors are gray: its code stores them in 8 bits. 3DGS: scales are the root mean square distance to so many
+#: neighbors.
+UNIFORM_TIME_SCALES, UNIFORM_FOLD, UNIFORM_OPACITY, UNIFORM_COLOR, NEIGHBORS = (0.01, 1.0), 1.0, 0.1, 127 / 255, 3
 
 
 def initialize(
@@ -135,16 +133,17 @@ def initialize_uniform(
 ) -> FoldedSplats:
     """The published initial splats for frames of `size` (height, width): uniform, whatever the clip shows.
 
-    Positions lie in a box `UNIFORM_BOX` times the frame, m_t in (0, 1), sigma_t, folds and angles likewise uniformly;
-    Gaussians are round, as wide as the mean distance to their `NEIGHBORS` nearest, faint and almost black.
+    Positions lie in the frame, m_t in (0, 1), sigma_t, folds and angles likewise uniformly; Gaussians are round, as
+    wide as the distance to their `NEIGHBORS` nearest, faint and gray.
     Source: VeGaS, "Implementation Details", and constants of its published code.
     """
     rng = np.random.default_rng([seed, 0])
     frame = np.array(size[::-1]) / max(size)
-    loc = rng.uniform(-0.5, 0.5, (num_gaussians, 2)) * UNIFORM_BOX * frame
+    loc = rng.uniform(-0.5, 0.5, (num_gaussians, 2)) * frame
     near = min(NEIGHBORS, num_gaussians - 1)
     # The nearest is the point itself; a single one is as wide as the frame.
-    scale = scipy.spatial.cKDTree(loc).query(loc, near + 1)[0][:, 1:].mean(axis=1) if near else np.ones(1)
+    away = scipy.spatial.cKDTree(loc).query(loc, near + 1)[0][:, 1:] if near else np.ones((1, 1))
+    scale = np.sqrt(np.mean(away**2, axis=1))
     limit = UNIFORM_FOLD * PUBLISHED_UNIT
     unit = lambda: rng.uniform(1e-6, 1 - 1e-6, num_gaussians)  # noqa: E731
     leaves = {
@@ -155,7 +154,7 @@ def initialize_uniform(
         "log_time_scale": np.log(rng.uniform(*UNIFORM_TIME_SCALES, num_gaussians)),
         "coefficients": rng.uniform(-limit, limit, (num_gaussians, degree, 2)),
         "opacity_logit": _logit(np.full(num_gaussians, UNIFORM_OPACITY)),
-        "color_dc": (rng.uniform(0, UNIFORM_COLOR, (num_gaussians, 3)) - 0.5) / SH_C0,
+        "color_dc": np.full((num_gaussians, 3), (UNIFORM_COLOR - 0.5) / SH_C0),
     }
     return FoldedSplats(**{name: np.float32(leaf) for name, leaf in leaves.items()}, envelope=envelope)
 
