@@ -569,6 +569,11 @@ def test_forged_header_is_rejected(tmp_path, good, key, value):
     refused(tmp_path, resealed(good, change), "compact model")
 
 
+@pytest.mark.parametrize("cells", [[0, 0], [0, 0, -1], {"a": 0, "b": 0, "c": 0}])
+def test_the_error_names_the_entry(tmp_path, good, cells):
+    refused(tmp_path, resealed(good, lambda header: header.update(cells=cells)), "cells: expected")
+
+
 def test_largest_sizes_and_degrees_are_read(tmp_path):
     quantized, path = fine(soft_model(degree=15), -12.0), tmp_path / "m.fgz"
 
