@@ -9,7 +9,8 @@ Without options: *bunny* and *bikes* at 160x320, 5 minutes each, with as many Ga
 the same neighbours:
 
 - their mean, and their mean after warping each half way by OpenCV's DIS flow between the two;
-- both again, of the model's own pictures of the neighbours: then all start from the same quality.
+- what the fit learns from between frames, `Motion.interpolate`;
+- the first two again, of the model's own pictures of the neighbours: then all start from the same quality.
 
 PSNR and SSIM of 8-bit pictures, means over the frames; "without cuts" leaves out frames between two shots, which
 nothing can know. `--sheet` draws the held-out frames on which ours and the best rival differ most. `--cost` instead
@@ -38,6 +39,7 @@ from foldgauss.video.fitting.loop import fit_steps, to_model
 from foldgauss.video.models.frame_times import is_cut
 from foldgauss.video.models.metrics import psnr, ssim
 from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.motion.optical_flow import Motion
 
 CLIPS, SIZE, MINUTES = ("bunny", "bikes"), (160, 320), 5.0
 SHOWN = 4
@@ -59,6 +61,13 @@ def warped_half_way(one: np.ndarray, other: np.ndarray) -> np.ndarray:
         flow = search.calc(*pair, None)
         moved.append(cv2.remap(picture, grid - flow / 2, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
     return mean_of_two(*moved)
+
+
+def interpolated_half_way(frames: np.ndarray) -> list[np.ndarray]:
+    """What the optical flow predicts between each frame and the next."""
+    motion = Motion.from_frames(np.ascontiguousarray(frames))
+    made = (motion.interpolate(frames, k, 0.5, frames.shape[1:3]) for k in range(len(frames) - 1))
+    return [np.clip(np.rint(picture), 0, 255).astype(np.uint8) for picture in made]
 
 
 def fit_model(frames: np.ndarray, config: FitConfig, fps: float, cpu_time: bool) -> VideoModel:
@@ -96,6 +105,7 @@ def measure(clip: Clip, config: FitConfig, name: str, sheet: Path | None, cpu_ti
         pairs = list(itertools.pairwise(frames))
         pictures[f"blending, {whose}"] = [mean_of_two(*pair) for pair in pairs]
         pictures[f"DIS warping, {whose}"] = [warped_half_way(*pair) for pair in pairs]
+    pictures["Motion.interpolate, frames"] = interpolated_half_way(seen)
     scores = {
         way: np.array([psnr(target, made) for target, made in zip(held_out, every, strict=True)])
         for way, every in pictures.items()
@@ -109,7 +119,7 @@ def measure(clip: Clip, config: FitConfig, name: str, sheet: Path | None, cpu_ti
     _show(scores, likeness, training, whole, f"{name}: {len(seen)} frames of {clip.size[0]}x{clip.size[1]} fitted")
     if sheet is not None:
         _draw(sheet.with_stem(f"{sheet.stem}-{name}"), held_out, pictures, scores, whole)
-    names = {"blending, frames": "blend", "DIS warping, frames": "warp"}
+    names = {"blending, frames": "blend", "DIS warping, frames": "warp", "Motion.interpolate, frames": "motion"}
     names |= {"blending, own pictures": "own_blend", "DIS warping, own pictures": "own_warp"}
     figures = {f"held_out_{name}": ours.mean(), f"training_{name}": training}
     figures |= {f"{short}_{name}": scores[way].mean() for way, short in names.items()}

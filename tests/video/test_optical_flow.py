@@ -72,6 +72,41 @@ def test_interpolation_beats_plain_warping_at_occlusions():
         assert np.square(found - target).mean() < 0.85 * np.square(plain - target).mean()
 
 
+def test_what_is_uncovered_and_covered_is_nearer_to_the_truth():
+    """In strips beside a square that moves over a panning texture, where one frame only shows the background."""
+    finer = passing(17, before=(1.0, 0.0), behind=(-1.0, 0.5))
+    seen = np.ascontiguousarray(finer[::4])
+    motion = Motion.from_frames(seen)
+    for k in (1, 2):
+        found, plain = motion.interpolate(seen, k, 0.5, (96, 160)), plainly_warped(*seen[k : k + 2], 0.5)
+        left, target = 40 + 4 * k + 2, finer[4 * k + 2]
+        for strip in (np.s_[30:70, left - 10 : left], np.s_[30:70, left + 40 : left + 50]):
+            assert np.square(found - target)[strip].mean() < 0.7 * np.square(plain - target)[strip].mean()
+
+
+def test_interpolation_follows_accelerated_motion():
+    """Half way in time is not half way along the path. What is beyond a cut does not change it."""
+    finer = np.stack([panning(2, (0.06 * k * k, 0.0))[1] for k in range(17)])
+    seen = np.ascontiguousarray(finer[::4])
+    motion, inner = Motion.from_frames(seen), np.s_[8:-8, 16:-16]
+    for k in range(4):
+        for share in (0.25, 0.5, 0.75):
+            found, plain = motion.interpolate(seen, k, share, (96, 160)), plainly_warped(*seen[k : k + 2], share)
+            target = finer[round(4 * (k + share))]
+            assert np.square(found - target)[inner].mean() < 0.2 * np.square(plain - target)[inner].mean()
+    cut = np.concatenate([panning(3, (0.0, 2.0), seed=5), seen, panning(3, (3.0, 0.0), seed=9)])
+    beside = Motion.from_frames(cut)
+    for k in (0, 3):
+        found = beside.interpolate(cut, 3 + k, 0.5, (96, 160))
+        np.testing.assert_array_equal(found, motion.interpolate(seen, k, 0.5, (96, 160)))
+
+
+def test_interpolation_of_a_still_clip_is_the_clip():
+    still = np.repeat(panning(1, (0.0, 0.0)), 4, axis=0)
+    for k in range(3):
+        np.testing.assert_allclose(Motion.from_frames(still).interpolate(still, k, 0.3, (96, 160)), still[0], atol=1e-3)
+
+
 def passing(num_frames: int, before: tuple[float, float], behind: tuple[float, float]):
     """A textured square moving over another texture."""
     frames, square = panning(num_frames, behind), panning(num_frames, before, seed=3)

@@ -30,6 +30,17 @@ FLOW_SIDE, KEPT_SIDE = 640, 320
 STILL = 0.1
 #: Fixed-point iterations of the flow at a time between two frames.
 FLOW_ITERATIONS = 2
+#: Paths are bent as the flow of the intervals before and after says, where that agrees forward and backward within
+#: about a pixel; a straight path has this weight.
+STRAIGHT = 0.1
+#: At a pixel of an image between two frames, the motions so far away on four sides are tried too, in pixels of the
+#: images that flow is computed on: at edges of what moves, the flow at the pixel is often that of the other side.
+ASIDE = 8
+#: Two frames, moved, are compared by squared differences of colors (of 255), averaged with a Gaussian weight of this
+#: width in pixels. A pixel that one of them lacks counts as this difference.
+COMPARED_WIDTH, LACKING = 7 / 3, 30.0
+#: Motions weigh about the same if these differ by less than this and this fraction of the least.
+ALIKE, ALIKE_FRACTION = 20.0, 0.5
 #: The maps of long clips are smaller, so that they take no more bytes than this, or than this fraction of the frames.
 MAP_BYTES, MAP_FRACTION, BYTES_PER_CELL = 256e6, 0.25, 11
 #: With fewer points than this per frame on average, the points of all frames are sampled at once.
@@ -104,6 +115,10 @@ class Motion:
         """The frames, in order, that begin a new shot."""
         return [k + 1 for k, known in enumerate(self.measure_tracked()) if known < CUT_FRACTION]
 
+    @functools.cached_property
+    def _cuts(self) -> list[int]:
+        return self.find_cuts()
+
     def find_still(self) -> list[int]:
         """The intervals, k for that between frames k and k + 1, in which nothing moves by `STILL` pixels."""
         return [k for k, flow in enumerate(self.there) if np.abs(flow).max() < STILL]
@@ -150,24 +165,61 @@ class Motion:
     ) -> Float32[np.ndarray, "rows columns 3"]:
         """The image at a `fraction` of the way from frame k to k + 1, of `size` (height, width); values about [0, 255].
 
-        Both frames are warped along the flow and averaged, weighted by how near in time they are. Pixels from outside
-        one of them are taken from the other.
+        Both frames are warped along the paths of their points and averaged, weighted by how near in time they are.
+        Pixels from outside one of them are taken from the other. This is done for several motions, and the images are
+        averaged with weights: where both frames agree better, a motion has a larger one.
+
+        Source of the bent paths: Xu et al. 2019, Quadratic Video Interpolation; here cubic, from four frames.
         """
         rows, columns = size
         pair = [
             frame if frame.shape[:2] == size else cv2.resize(frame, (columns, rows), interpolation=cv2.INTER_AREA)
             for frame in frames[k : k + 2]
         ]
-        flow, grid, edge = (
-            self._interpolate_flow(pair, k, fraction),
-            pixel_grid(rows, columns),
-            np.float32([columns, rows]) - 0.5,
-        )
-        origins = grid - np.float32(fraction) * flow, grid + np.float32(1 - fraction) * flow
-        moved = [warp_image(image, origin).astype(np.float32) for image, origin in zip(pair, origins, strict=True)]
-        inside = [((origin >= -0.5) & (origin < edge)).all(-1) for origin in origins]
-        weight = np.where(inside[0] == inside[1], fraction, inside[1]).astype(np.float32)[..., None]
-        return (1 - weight) * moved[0] + weight * moved[1]
+        flow_size = _fit_size(_flow_side(rows, columns), rows, columns)
+        small = [cv2.resize(image, flow_size, interpolation=cv2.INTER_AREA) for image in pair]
+        motions = self._find_motions(small, k, fraction)
+        differences = np.stack([_compare_moved(small, motion) for motion in motions])
+        least = differences.min(0)
+        weights = np.exp((least - differences) / (ALIKE + ALIKE_FRACTION * least))
+        weights /= weights.sum(0)
+        image = np.zeros((rows, columns, 3), np.float32)
+        for motion, weight in zip(motions, weights, strict=True):
+            motion = [_resize_flow(move, flow_size[::-1], size) for move in motion]
+            moved, inside = _move(pair, motion, cv2.INTER_CUBIC)
+            _add_average(*moved, *inside, np.float32(fraction), cv2.resize(weight, (columns, rows)), image)
+        return image
+
+    def _find_motions(self, pair: list[np.ndarray], k: int, fraction: float) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Motions that may be right at a pixel of the image between two: the ways from it to its place in each of them.
+
+        All are (rows, columns, 2) in pixels of the images. First along the flow between the two, then along those of
+        the intervals before and after, then as the first at pixels around.
+        """
+        rows, columns = pair[0].shape[:2]
+        flow, past, ahead = self._interpolate_flow(pair, k, fraction), np.float32(fraction), np.float32(1 - fraction)
+        grid, flows = pixel_grid(rows, columns), [flow]
+        bend, total = np.zeros_like(flow), np.full((rows, columns, 1), STRAIGHT, np.float32)
+        # The cubic through a point's places in four frames differs from the line through the inner two by -fraction
+        # (1 - fraction) / 2 times the mean of both second differences, of weights 2 - fraction and 1 + fraction.
+        for near, sign, origin in ((k - 1, -1, grid - past * flow), (k + 1, 1, grid + ahead * flow)):
+            if not 0 <= near < len(self.there) or near + 1 in self._cuts:
+                continue
+            out, home = (self.there, self.back) if sign > 0 else (self.back, self.there)
+            step = warp_image(_resize_flow(out[near], self.size, (rows, columns)), origin, cv2.INTER_LINEAR)
+            home = _resize_flow(home[near], self.size, (rows, columns))
+            returned = warp_image(home, origin + step, cv2.INTER_LINEAR)
+            miss = step + returned
+            trust = (1 + (past if sign > 0 else ahead)) * np.exp(-np.einsum("yxc,yxc->yx", miss, miss))[..., None]
+            bend += trust * (step - sign * flow)
+            total += trust
+            flows.append(sign * step)
+        bend *= -past * ahead / 2 / total
+        motions = [(-bend - past * flow, ahead * flow - bend) for flow in flows]
+        wide = [cv2.copyMakeBorder(move, *4 * [ASIDE], cv2.BORDER_REPLICATE) for move in motions[0]]
+        for x, y in ((0, ASIDE), (2 * ASIDE, ASIDE), (ASIDE, 0), (ASIDE, 2 * ASIDE)):
+            motions.append(tuple(move[y : y + rows, x : x + columns] for move in wide))
+        return motions
 
     def _interpolate_flow(
         self, pair: list[np.ndarray], k: int, fraction: float
@@ -177,21 +229,17 @@ class Motion:
         First it is looked up at the positions in either image that it leads here from; then the images are warped
         along it, and the remaining flow between them is added.
         """
-        height, width = pair[0].shape[:2]
-        columns, rows = _fit_size(_flow_side(height, width), height, width)
-        small = [cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA) for image in pair]
-        unit = np.float32([columns / self.size[1], rows / self.size[0]])
-        there, back = (cv2.resize(own[k].astype(np.float32), (columns, rows)) * unit for own in (self.there, self.back))
+        rows, columns = pair[0].shape[:2]
+        there, back = (_resize_flow(own[k], self.size, (rows, columns)) for own in (self.there, self.back))
         grid, past, ahead = pixel_grid(rows, columns), np.float32(fraction), np.float32(1 - fraction)
         flow = ahead * there - past * back
         for _ in range(FLOW_ITERATIONS):
             from_there = warp_image(there, grid - past * flow, cv2.INTER_LINEAR)
             from_back = warp_image(back, grid + ahead * flow, cv2.INTER_LINEAR)
             flow = ahead * from_there - past * from_back
-        met = warp_image(small[0], grid - past * flow), warp_image(small[1], grid + ahead * flow)
-        there, back = both_flows(*(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in met))
-        flow += ahead * there - past * back
-        return cv2.resize(flow, (width, height)) * np.float32([width / columns, height / rows])
+        met = warp_image(pair[0], grid - past * flow), warp_image(pair[1], grid + ahead * flow)
+        search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        return flow + search.calc(*(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in met), None)
 
     def _step(self, at, here, direction: int, color) -> tuple[np.ndarray, np.ndarray]:
         """The positions of points of frames `at` in the next frame (or the one before), and which are reliable."""
@@ -269,6 +317,44 @@ def pixel_grid(rows: int, columns: int) -> Float32[np.ndarray, "rows columns 2"]
 def warp_image(image, origin, order: int = cv2.INTER_CUBIC) -> np.ndarray:
     """The image sampled at `origin`; beyond the border, the nearest pixel of it."""
     return cv2.remap(image, origin, None, order, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _resize_flow(
+    flow: np.ndarray, unit: tuple[int, int], size: tuple[int, int]
+) -> Float32[np.ndarray, "rows columns 2"]:
+    """A flow map for images of `size` (height, width), in their pixels; it is in pixels of images of size `unit`."""
+    flow = flow.astype(np.float32, copy=False)
+    flow = flow if flow.shape[:2] == size else cv2.resize(flow, size[::-1])
+    return flow if unit == size else flow * np.float32([size[1] / unit[1], size[0] / unit[0]])
+
+
+def _move(pair: list[np.ndarray], motion, order: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Both images, moved to the one between them, and where the pixels of it lie inside them: 255, else 0."""
+    rows, columns = pair[0].shape[:2]
+    origins = [pixel_grid(rows, columns) + move for move in motion]
+    moved = [warp_image(image, origin, order) for image, origin in zip(pair, origins, strict=True)]
+    return moved, [cv2.inRange(origin, (-0.5, -0.5), (columns - 0.5, rows - 0.5)) for origin in origins]
+
+
+def _compare_moved(pair: list[np.ndarray], motion) -> Float32[np.ndarray, "rows columns"]:
+    """How much two images differ around each pixel of the image between them, moved to it."""
+    moved, inside = _move(pair, motion, cv2.INTER_LINEAR)
+    difference = cv2.absdiff(*moved)
+    square = cv2.transform(cv2.multiply(difference, difference, dtype=cv2.CV_32F), np.full((1, 3), 1 / 3))
+    square[cv2.min(*inside) == 0] = LACKING
+    return cv2.GaussianBlur(square, (0, 0), COMPARED_WIDTH)
+
+
+@kernel
+def _add_average(one, other, in_one, in_other, fraction, weight, image):
+    """Add `weight` times the average of two moved images; pixels from outside one of them are taken from the other."""
+    for y in range(image.shape[0]):
+        for x in range(image.shape[1]):
+            outside = np.float32(1.0) if in_other[y, x] else np.float32(0.0)
+            later = weight[y, x] * (fraction if in_one[y, x] == in_other[y, x] else outside)
+            earlier = weight[y, x] - later
+            for c in range(3):
+                image[y, x, c] += earlier * one[y, x, c] + later * other[y, x, c]
 
 
 def _sample(stack, index, position, size) -> np.ndarray:
