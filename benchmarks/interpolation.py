@@ -5,8 +5,8 @@
                                        [--seed S] [--set NAME=VALUE ...] [--sheet FILE] [--cost]
 
 Without options: *bunny* and *bikes* at 160x320, 5 minutes each, with as many Gaussians as the fit chooses. Frames 0, 2,
-4, ... are fitted, and frames 1, 3, 5, ... drawn half way between the learned times of their neighbours. Beside them, of
-the same neighbours:
+4, ... are fitted, and frames 1, 3, 5, ... drawn half way between the learned times of their neighbours, as `foldgauss
+render` does (`interpolate_frames`) and by the Gaussians alone. Beside them, of the same neighbours:
 
 - their mean, and their mean after warping each half way by OpenCV's DIS flow between the two;
 - what the fit learns from between frames, `Motion.interpolate`;
@@ -33,7 +33,7 @@ from foldgauss._runtime.threads import set_num_threads
 from foldgauss.io import Clip, read_video, write_image
 from foldgauss.io.datasets import sample_clip
 from foldgauss.io.media.contact_sheet import make_comparison_sheet
-from foldgauss.video import interpolated_times
+from foldgauss.video import interpolate_frames, interpolated_times
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.loop import fit_steps, to_model
 from foldgauss.video.models.frame_times import is_cut
@@ -43,6 +43,7 @@ from foldgauss.video.motion.optical_flow import Motion
 
 CLIPS, SIZE, MINUTES = ("bunny", "bikes"), (160, 320), 5.0
 SHOWN = 4
+OURS = "interpolate_frames"
 
 
 def mean_of_two(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -98,9 +99,9 @@ def measure(clip: Clip, config: FitConfig, name: str, sheet: Path | None, cpu_ti
     model = fit_model(np.ascontiguousarray(seen), config, clip.fps / 2, cpu_time)
     times = np.asarray(model.frame_times.times())
     own = list(model.frames())
-    between = list(model.frames(interpolated_times(times, 2)[1::2]))
+    half_way = interpolated_times(times, 2)[1::2]
     whole = ~np.asarray(is_cut(times))
-    pictures = {"folded Gaussians": between}
+    pictures = {OURS: list(interpolate_frames(model, half_way)), "folded Gaussians alone": list(model.frames(half_way))}
     for whose, frames in (("frames", seen), ("own pictures", own)):
         pairs = list(itertools.pairwise(frames))
         pictures[f"blending, {whose}"] = [mean_of_two(*pair) for pair in pairs]
@@ -115,16 +116,20 @@ def measure(clip: Clip, config: FitConfig, name: str, sheet: Path | None, cpu_ti
         for way, every in pictures.items()
     }
     training = float(np.mean([psnr(target, made) for target, made in zip(seen, own, strict=True)]))
-    ours = scores["folded Gaussians"]
+    ours = scores[OURS]
     _show(scores, likeness, training, whole, f"{name}: {len(seen)} frames of {clip.size[0]}x{clip.size[1]} fitted")
     if sheet is not None:
         _draw(sheet.with_stem(f"{sheet.stem}-{name}"), held_out, pictures, scores, whole)
     names = {"blending, frames": "blend", "DIS warping, frames": "warp", "Motion.interpolate, frames": "motion"}
-    names |= {"blending, own pictures": "own_blend", "DIS warping, own pictures": "own_warp"}
+    names |= {
+        "folded Gaussians alone": "alone",
+        "blending, own pictures": "own_blend",
+        "DIS warping, own pictures": "own_warp",
+    }
     figures = {f"held_out_{name}": ours.mean(), f"training_{name}": training}
     figures |= {f"{short}_{name}": scores[way].mean() for way, short in names.items()}
     figures |= {f"{short}_ssim_{name}": likeness[way] for way, short in names.items()}
-    figures[f"held_out_ssim_{name}"] = likeness["folded Gaussians"]
+    figures[f"held_out_ssim_{name}"] = likeness[OURS]
     figures[f"loss_{name}"] = training - ours.mean()
     figures[f"held_out_whole_{name}"] = ours[whole].mean()
     figures[f"warp_whole_{name}"] = scores["DIS warping, frames"][whole].mean()
@@ -144,11 +149,11 @@ def _show(
 
 
 def _draw(path: Path, held_out, pictures, scores, whole) -> None:
-    ours, rival = "folded Gaussians", "DIS warping, frames"
-    gain = np.where(whole, scores[ours] - scores[rival], 0)
+    rival = "DIS warping, frames"
+    gain = np.where(whole, scores[OURS] - scores[rival], 0)
     order = np.argsort(gain)
     shown = [*order[: SHOWN // 2], *order[-(SHOWN // 2) :]]
-    for way, where in ((ours, path), (rival, path.with_stem(f"{path.stem}-warped"))):
+    for way, where in ((OURS, path), (rival, path.with_stem(f"{path.stem}-warped"))):
         captions = [f"frame {2 * k + 1}, {scores[way][k]:.1f} dB" for k in shown]
         write_image(
             where, make_comparison_sheet([held_out[k] for k in shown], [pictures[way][k] for k in shown], captions)

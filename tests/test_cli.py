@@ -24,6 +24,7 @@ from foldgauss.cli.viewing import info as drawing
 from foldgauss.io import load_video_model, read_video, save_video_model, write_image, write_video
 from foldgauss.io.models.model_file import read_header
 from foldgauss.jobs import runner
+from foldgauss.video import interpolate_frames
 
 SIZE = (48, 64)
 QUICK = ["--gaussians", "400", "--steps", "30"]
@@ -153,8 +154,12 @@ def test_one_picture(work, tmp_path, capsys):
     assert not target.exists()
     assert run("render", model, "--out", target, "--times", "0.5", "--size", "24x32") == 0
     assert f"{target}: the image at time 0.5" in capsys.readouterr().out.replace("\n", "")
-    own = next(load_video_model(model).frames(np.array([0.5]), (24, 32)))
-    np.testing.assert_array_equal(cv2.imread(str(target))[..., ::-1], own)
+    video, time = load_video_model(model), np.array([0.5])
+    np.testing.assert_array_equal(cv2.imread(str(target))[..., ::-1], next(interpolate_frames(video, time, (24, 32))))
+    alone = ("--times", "0.5", "--size", "24x32", "--no-flow", "--overwrite")
+    assert run("render", model, "--out", target, *alone) == 0
+    np.testing.assert_array_equal(cv2.imread(str(target))[..., ::-1], next(video.frames(time, (24, 32))))
+    capsys.readouterr()
     assert run("render", model, "--out", target, "--times", "0.5") == 2
     assert "--overwrite" in capsys.readouterr().err
     assert run("render", model, "--out", tmp_path / "folder", "--times", "0.5") == 0

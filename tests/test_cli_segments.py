@@ -14,7 +14,7 @@ from soft_models import NUM, soft_model
 from foldgauss.cli.viewing import view as viewing
 from foldgauss.io import load_video_model, read_video, save_video_model, write_image
 from foldgauss.io.models.video_model import read_metadata
-from foldgauss.video import Segment, SegmentedVideo, edit, evaluate, psnr, times_at
+from foldgauss.video import Segment, SegmentedVideo, edit, evaluate, interpolate_frames, psnr, times_at
 
 #: Spans 0:7, 4:13 (three frames shared) and 13:18 (a cut).
 FIRSTS, LENGTHS, NUM_FRAMES = (0, 4, 13), (7, 9, 5), 18
@@ -61,6 +61,7 @@ def pictures(folder):
     [
         ([], range(NUM_FRAMES)),
         (["--upsample", 3], np.arange(52) / 3),
+        (["--upsample", 2, "--no-flow"], np.arange(35) / 2),
         (["--speed", "-0.5"], 17 - np.arange(35) / 2),
         (["--remap", "0=0.48,0.08=0.24"], [12, 9, 6]),
         (["--times", "0:1:5"], np.linspace(0, 17, 5)),
@@ -75,7 +76,8 @@ def test_render_shows_what_the_model_does(options, positions, here, tmp_path):
     clip = video()
     times = times_at(clip.frame_times.times(), np.asarray(positions))
     how = {"size": (20, 32), "background": (0.0, 1.0, 0.0)} if size else {}
-    np.testing.assert_array_equal(pictures(tmp_path / "frames"), list(clip.frames(times, **how)))
+    own = clip.frames(times, **how) if "--no-flow" in options else interpolate_frames(clip, times, **how)
+    np.testing.assert_array_equal(pictures(tmp_path / "frames"), list(own))
 
 
 def test_render_takes_constants_of_the_picture(here, tmp_path):

@@ -21,6 +21,7 @@ from foldgauss.io.media.lazy_frames import LazyFrames
 from foldgauss.io.media.video_writing import MAX_GIF_FPS, write_image, write_video
 from foldgauss.video.models.background import BLACK, Background
 from foldgauss.video.models.metrics import Evaluation, evaluate
+from foldgauss.video.motion.slow_motion import interpolate_frames
 
 CodecName = Annotated[
     str | None,
@@ -121,16 +122,23 @@ def render_to_file(
     image_format: str = "png",
     overwrite: bool = False,
     options: VideoOptions = VideoOptions(),  # noqa: B008
+    flow: bool = False,
 ) -> None:
-    """Write the images at `times` as a video or to a folder, or a single image to a .png."""
+    """Write the images at `times` as a video or to a folder, or a single image to a .png.
+
+    `flow`: between frames, averages with predictions by optical flow, see `interpolate_frames`.
+    """
+    if flow:
+        images = interpolate_frames(model, times, size, background=background)
+    else:
+        images = model.frames(times, size, background=background)
     if path.suffix.lower() == IMAGE_SUFFIX and not path.is_dir():
         if len(times) != 1:
             cure = "Choose it by --times T, or write to a folder (a name without extension)."
             raise wrong_use("--out", expected="one image for a .png", got=f"{len(times):,} images", cure=cure)
-        write_image(path, next(model.frames(times, size, background=background)))
+        write_image(path, next(images))
         out.print(f"{path}: the image at time {times[0]:g}", soft_wrap=True)
         return
-    images = model.frames(times, size, background=background)
     write_images(path, images, len(times), fps, image_format=image_format, overwrite=overwrite, options=options)
 
 

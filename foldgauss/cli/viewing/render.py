@@ -90,6 +90,9 @@ def render(
     crf: Crf = None,
     pixel_format: PixelFormat = None,
     sound: SoundFile = None,
+    flow: Annotated[
+        bool, typer.Option(help="Between frames, average with a prediction by optical flow from the frames around.")
+    ] = True,
     overwrite: Overwrite = False,
 ) -> None:
     """Render a model as a video, also between its frames."""
@@ -123,6 +126,7 @@ def render(
         image_format=image_format or "png",
         overwrite=overwrite,
         options=options,
+        flow=flow,
     )
 
 

@@ -2,4 +2,5 @@
 
 `optical_flow.Motion` holds the flow of a clip and follows points through it. `camera_path.estimate_camera_path` finds
 how the background moves, and `stabilization.stabilize` renders a video as a steadier camera would show it.
+`slow_motion.interpolate_frames` renders images between frames.
 """

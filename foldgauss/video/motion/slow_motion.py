@@ -1,0 +1,74 @@
+"""Images between frames: the video's own, averaged with what optical flow predicts from its images at the frames."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from foldgauss.video.models.background import BLACK, Background
+from foldgauss.video.models.frame_times import is_cut
+from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer
+from foldgauss.video.motion.optical_flow import Motion
+
+#: Weight of the prediction by optical flow. Its errors and those of the video's own image are different, so the mean
+#: of both is better than each.
+FLOW_WEIGHT = 0.5
+#: So near to a frame, in intervals, its own image is shown.
+NEAR = 1e-3
+
+
+def interpolate_frames(
+    video: RenderableVideo,
+    times: Float[np.ndarray, " shown"] | None = None,
+    size: tuple[int, int] | None = None,
+    *,
+    background: Background = BLACK,
+) -> Iterator[UInt8[np.ndarray, "height width channels"]]:
+    """As `video.frames`, but coherent between frames: slow motion.
+
+    An image between two frames is the mean of the video's own and of one that `Motion.interpolate` makes of its images
+    at the four frames around. At frames, at cuts and for images with alpha (`background=None`) it is the video's own.
+    Images between the same two frames should follow each other: the flow of one interval is kept.
+
+    Raises ValueError as `VideoRenderer` does. Example: `interpolate_frames(model, interpolated_times(times, 4))`.
+    """
+    renderer = VideoRenderer(video, size, background=background)
+    frame_times = np.asarray(video.frame_times.times(), np.float64)
+    shown = frame_times if times is None else np.asarray(times)
+    window = None
+    for t, image in zip(shown, renderer.frames(times), strict=True):
+        k = min(max(int(np.searchsorted(frame_times, t, side="right")) - 1, 0), len(frame_times) - 1)
+        if image.shape[2] != 3 or not _is_between(frame_times, k, t):
+            yield image
+            continue
+        if window is None or window.interval != k:
+            window = _Window(renderer, frame_times, k, window)
+        yield window.average(image, (t - frame_times[k]) / (frame_times[k + 1] - frame_times[k]))
+
+
+def _is_between(times: Float[np.ndarray, " num_frames"], k: int, t: float) -> bool:
+    """Whether t lies between frames k and k + 1 of one shot."""
+    if k + 1 == len(times) or is_cut(times)[k]:
+        return False
+    return NEAR < (t - times[k]) / (times[k + 1] - times[k]) < 1 - NEAR
+
+
+class _Window:
+    """The images at the frames around an interval and the flow between them; those of `before` are used again."""
+
+    def __init__(self, renderer: VideoRenderer, times: np.ndarray, interval: int, before: "_Window | None"):
+        known = {} if before is None else before.images
+        around = range(max(interval - 1, 0), min(interval + 3, len(times)))
+        self.interval, self.inner = interval, interval - around[0]
+        self.images = {k: known[k] if k in known else renderer.frame(times[k]) for k in around}
+        self.frames = np.stack(list(self.images.values()))
+        self.motion = Motion.from_frames(self.frames)
+        self.is_cut = self.inner + 1 in self.motion.find_cuts()
+
+    def average(self, image: np.ndarray, fraction: float) -> UInt8[np.ndarray, "height width 3"]:
+        """The mean of the video's own image and the prediction at a fraction of the way through the interval."""
+        if self.is_cut:
+            return image
+        predicted = self.motion.interpolate(self.frames, self.inner, fraction, image.shape[:2])
+        mean = (1 - FLOW_WEIGHT) * image + FLOW_WEIGHT * np.clip(predicted, 0, 255)
+        return np.rint(mean).astype(np.uint8)
