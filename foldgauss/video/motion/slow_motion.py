@@ -35,22 +35,18 @@ def interpolate_frames(
     renderer = VideoRenderer(video, size, background=background)
     frame_times = np.asarray(video.frame_times.times(), np.float64)
     shown = frame_times if times is None else np.asarray(times)
-    window = None
+    cuts, window = is_cut(frame_times), None
     for t, image in zip(shown, renderer.frames(times), strict=True):
         k = min(max(int(np.searchsorted(frame_times, t, side="right")) - 1, 0), len(frame_times) - 1)
-        if image.shape[2] != 3 or not _is_between(frame_times, k, t):
+        fraction = 0.0
+        if image.shape[2] == 3 and k + 1 < len(frame_times) and not cuts[k]:
+            fraction = (t - frame_times[k]) / (frame_times[k + 1] - frame_times[k])
+        if not NEAR < fraction < 1 - NEAR:
             yield image
             continue
         if window is None or window.interval != k:
             window = _Window(renderer, frame_times, k, window)
-        yield window.average(image, (t - frame_times[k]) / (frame_times[k + 1] - frame_times[k]))
-
-
-def _is_between(times: Float[np.ndarray, " num_frames"], k: int, t: float) -> bool:
-    """Whether t lies between frames k and k + 1 of one shot."""
-    if k + 1 == len(times) or is_cut(times)[k]:
-        return False
-    return NEAR < (t - times[k]) / (times[k + 1] - times[k]) < 1 - NEAR
+        yield window.average(image, fraction)
 
 
 class _Window:
