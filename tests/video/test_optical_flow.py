@@ -206,3 +206,16 @@ def test_fitted_powers_are_the_weighted_least_squares(used):
         left = root[:, None] * (shift[n] - powers @ own)
         np.testing.assert_allclose(miss[n], np.sqrt((left**2).sum() / (root**2).sum()), rtol=1e-3, atol=1e-4)
     assert (coefficients[:, used:] == 0).all()
+
+
+def test_averages_equal_numpy():
+    """The kernel beside the same in NumPy: where one image is left, it counts alone."""
+    rng = np.random.default_rng(0)
+    one, other = rng.integers(0, 256, (2, 20, 30, 3), dtype=np.uint8)
+    in_one, in_other = np.where(rng.random((2, 20, 30)) < 0.7, 255, 0).astype(np.uint8)
+    weight, fraction = rng.random((20, 30), np.float32), np.float32(0.3)
+    image = rng.random((20, 30, 3), np.float32)
+    later = np.where((in_one > 0) == (in_other > 0), fraction, in_other > 0)[..., None]
+    expected = image + weight[..., None] * ((1 - later) * one + later * other)
+    motion._add_average(one, other, in_one, in_other, fraction, weight, image)
+    np.testing.assert_allclose(image, expected, rtol=1e-5)

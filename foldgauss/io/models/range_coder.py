@@ -171,18 +171,18 @@ def _code_adaptive(data, interval, decodes, state, node, bit):
 
 
 @exact_kernel
-def _code(values, present, contexts, origin, step, scale, near, state, data, interval, decodes, room):
+def _code(values, present, contexts, origin, step, scale, near, state, data, interval, decodes, last_start):
     """Encode `values` into `data`, or, if `decodes`, decode `data` into `values`. Returns False on failure.
 
     Encoding fails if the next value might not fit into the array; decoding fails for bytes that `encode` cannot have
-    written. `room` is the largest position of the next byte at which another value may be coded. Both directions take
-    the same steps: the decoder ignores the bits that are passed to `_code_adaptive`.
+    written. `last_start` is the last offset in `data` at which coding a value may begin. Both directions take the same
+    steps: the decoder ignores the bits that are passed to `_code_adaptive`.
     """
     seen, own = np.zeros(len(values)), state[0]
     for k in range(len(values)):
         if not present[k]:
             continue
-        if interval[3] > room:  # the position of the next byte
+        if interval[3] > last_start:  # the offset of the next byte
             return False
         own[0], own[1] = contexts[k, 0], contexts[k, 1]
         own[2] = _predict_context(k, near, seen, origin, step, scale)

@@ -88,9 +88,9 @@ def reset_opacities(rows: np.ndarray, first: np.ndarray, second: np.ndarray, gro
 
 
 def _choose_parents(
-    rows: np.ndarray, statistics: GradientStatistics, growth: Growth, place: dict[str, slice], room: int
+    rows: np.ndarray, statistics: GradientStatistics, growth: Growth, place: dict[str, slice], max_births: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Indices, in order, of the Gaussians to be cloned and of those to be split, at most `room` together.
+    """Indices, in order, of the Gaussians to be cloned and of those to be split, at most `max_births` together.
 
     Those come first whose mean gradients exceed their thresholds by most. One may be both, by either gradient.
     """
@@ -101,7 +101,7 @@ def _choose_parents(
     time = statistics.time / (steps * np.float32(growth.time_gradient))
     excess = np.concatenate([np.maximum(screen * one, time * two) for one, two in ((small, brief), (~small, ~brief))])
     wanted = np.flatnonzero(excess >= 1)
-    first = np.sort(wanted[np.argsort(-excess[wanted], kind="stable")[: max(room, 0)]])
+    first = np.sort(wanted[np.argsort(-excess[wanted], kind="stable")[: max(max_births, 0)]])
     return first[first < len(rows)], first[first >= len(rows)] - len(rows)
 
 
