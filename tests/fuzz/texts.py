@@ -163,6 +163,14 @@ do = "opacity"
 select = "parted"
 factor = 0.5
 """
+_EIGHTH = b"""\
+# of a segment
+[selections.left]
+box = [0, 0, 6, 4]
+[selections.parted]
+indices = "0-1"
+segment = 1
+"""
 _KEYS = (
     b"indices",
     b"segment",
@@ -180,8 +188,9 @@ _KEYS = (
     b"degrees",
     b"x",
 )
+_LINES = (b'file = "one.selection"', b"segment = 7", b"num_gaussians = 7", b"box = [90, 90, 91, 91]")
 _MADE = (
-    b"[0, 1]", b'"10:"', b'"a"', b"true", b"-1", b"1e300", b"nan", b"inf", b"1979-05-27T07:32:00Z", b"[[1.0, 2.0]]",
+    b"[0, 1]", b'"10:"', b'"a"', b"true", b"-1", b"7", b"1e300", b"nan", b"inf", b"1979-05-27T07:32:00Z", b"[[1.0, 2.0]]",
     b"{}", b"{a.b = 1}", b"[" * 500, b"0x" + b"f" * 4000, b"1" * 4400, b'"""a\nb"""', b"'''", b'"\\u0000"',
     b'"a\\u0000b"', b"[]", b'"one.selection"', b'"case.toml"', b'"again.toml"', b'"mask.png"', b'"none"',
     b'"rest"', b'"/"',
@@ -199,6 +208,8 @@ def toml_changed(data: bytes, random: Random) -> bytes:
         lines[at] = key + b" = " + random.choice(_MADE)
     elif how == 2:
         lines.insert(at, random.choice(_KEYS) + b" = " + random.choice(_MADE))
+    elif how == 3 and equals and random.random() < 0.3:
+        lines[at] = random.choice(_LINES)
     elif how == 3 and equals:
         lines[at] = random.choice(_KEYS) + b" = " + lines[at].partition(b" = ")[2]
     elif how == 4:
@@ -275,7 +286,7 @@ SCRIPT = Target(
 APPLIED = dataclasses.replace(
     SCRIPT,
     name="edit-applied",
-    seeds=lambda: [_SCRIPT, _FOURTH, _THIRD, _FIFTH, _SIXTH, _SEVENTH],
+    seeds=lambda: [_SCRIPT, _FOURTH, _THIRD, _FIFTH, _SIXTH, _SEVENTH, _EIGHTH],
     parse=_apply_script,
     errors=(EditScriptError, FileNotFoundError),
     memory=lambda size: (256 << 20) + 400 * size,
