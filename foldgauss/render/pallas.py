@@ -12,6 +12,7 @@ On a CPU programs are interpreted: correct, but too slow for anything but tests.
 engine "auto" does not choose this one.
 """
 
+import dataclasses
 import functools
 
 import jax
@@ -56,6 +57,9 @@ TILES, TILE_SIZE, WARPS = (8, 16, 32), 16, 1
 CHUNK = 16
 #: The largest alpha ceiling: the backward pass divides by 1 - alpha.
 HIGHEST_CEILING = 0.999
+#: The smallest transmittance at which a pixel is finished: from one that has underflowed to 0 the backward pass could
+#: not go back. Times 1 - HIGHEST_CEILING it is still a normal number of float32.
+LOWEST_STOP = 1e-30
 
 
 def render_pallas(
@@ -79,6 +83,7 @@ def check_options(options: RenderOptions) -> None:
 
 
 def _plan(leaves, size, compositing, options) -> Plan:
+    options = dataclasses.replace(options, transmittance_stop=max(options.transmittance_stop, LOWEST_STOP))
     return make_plan(leaves, size, compositing, options, tile=options.tile_size or TILE_SIZE, batch_pixels=1)
 
 
