@@ -239,7 +239,7 @@ def test_numpyro_shapes(each):
     x, (of_expanded, of_joint), of_hidden, supported = drawn(bridge, key)
     assert x.shape == (2, 3, *batch, *event)
     assert supported.all()
-    np.testing.assert_allclose(*of_expanded, rtol=1e-6)
+    np.testing.assert_allclose(*of_expanded, rtol=1e-6, atol=2e-7)  # sums of terms about 1, which may cancel
     np.testing.assert_allclose(*of_joint, rtol=1e-5)
     np.testing.assert_array_equal(of_hidden, jnp.zeros(batch))
 
