@@ -23,6 +23,7 @@ from foldgauss.cli.viewing import page_server
 from foldgauss.io import html_page, load_video_model, save_video_model
 from foldgauss.io.page.player_page import script_version, with_script
 from foldgauss.video import edit
+from foldgauss.video.motion.moving_object import nothing_moves
 from foldgauss.video.selection import selectors
 
 
@@ -53,6 +54,10 @@ def served(work, monkeypatch, capsys):
 
 
 def test_view_finds_what_moves(served, work, monkeypatch):
+    def search(frames):
+        raise nothing_moves("an object", "none")
+
+    monkeypatch.setattr(selectors, "find_moving_object", search)
     told, pages = served(work / "model.safetensors", "--moving-object")[2:0:-1]
     assert "The page has no button for the moving object: moving: expected" in " ".join(told.err.split())
     assert 'id="moving"' not in pages[0][1]

@@ -107,15 +107,19 @@ def unify_channels(frames: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def copy_to_blocks(frames: Iterable[np.ndarray]) -> list[np.ndarray]:
-    """Copies of the frames in large blocks, each of which is returned to the system when its last frame is freed."""
-    kept, block, used = [], np.empty((0, 0), np.uint8), 0
+    """Copies of the frames in large blocks, each of which is returned to the system when its last frame is freed.
+
+    Views of the frames are made last: made in between, these small objects would lie where large ones of the decoder
+    were, and it would take new memory for each frame.
+    """
+    blocks, used = [], []
     for frame in frames:
-        if used == len(block) or block.shape[1:] != frame.shape:
-            block, used = np.empty((max(1, BLOCK_BYTES // frame.nbytes), *frame.shape), np.uint8), 0
-        block[used] = frame
-        kept.append(block[used])
-        used += 1
-    return kept
+        if not blocks or used[-1] == len(blocks[-1]) or blocks[-1].shape[1:] != frame.shape:
+            blocks.append(np.empty((max(1, BLOCK_BYTES // frame.nbytes), *frame.shape), np.uint8))
+            used.append(0)
+        blocks[-1][used[-1]] = frame
+        used[-1] += 1
+    return [frame for block, num in zip(blocks, used, strict=True) for frame in block[:num]]
 
 
 def stack_frames(frames: list[np.ndarray]) -> np.ndarray:
