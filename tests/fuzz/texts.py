@@ -190,8 +190,8 @@ _KEYS = (
 )
 _LINES = (b'file = "one.selection"', b"segment = 7", b"num_gaussians = 7", b"box = [90, 90, 91, 91]")
 _MADE = (
-    b"[0, 1]", b'"10:"', b'"a"', b"true", b"-1", b"7", b"1e300", b"nan", b"inf", b"1979-05-27T07:32:00Z", b"[[1.0, 2.0]]",
-    b"{}", b"{a.b = 1}", b"[" * 500, b"0x" + b"f" * 4000, b"1" * 4400, b'"""a\nb"""', b"'''", b'"\\u0000"',
+    b"[0, 1]", b'"10:"', b'"a"', b"true", b"-1", b"1e300", b"nan", b"inf", b"1979-05-27T07:32:00Z", b"[[1.0, 2.0]]",
+    b"7", b"{}", b"{a.b = 1}", b"[" * 500, b"0x" + b"f" * 4000, b"1" * 4400, b'"""a\nb"""', b"'''", b'"\\u0000"',
     b'"a\\u0000b"', b"[]", b'"one.selection"', b'"case.toml"', b'"again.toml"', b'"mask.png"', b'"none"',
     b'"rest"', b'"/"',
     b"1_000", b'["one"]', b'["none"]', b"{ do = 1 }",
