@@ -26,7 +26,12 @@ _PIXELS = """async ([time, width, height]) => {
   return [rows, columns, btoa(parts.join(""))];
 }"""
 #: Small, so that it is quickly drawn.
-_VIEW = {"viewport": {"width": 480, "height": 520}, "reduced_motion": "reduce", "color_scheme": "dark"}
+_VIEW = {
+    "viewport": {"width": 480, "height": 520},
+    "device_scale_factor": 0.5,
+    "reduced_motion": "reduce",
+    "color_scheme": "dark",
+}
 #: The page as it was opened: without its edit, what the browser keeps, and what was chosen.
 _RESET = """async () => {
   const toast = document.getElementById("toast"), { player, controls, files } = foldgauss;

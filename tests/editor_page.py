@@ -131,7 +131,8 @@ def screen_at(page, x, y):
     left, top, _ = page.page.evaluate(
         "([x, y]) => { const { view } = foldgauss.player; return view.toScreen(x, y, view.panes(1)[0]); }", [x, y]
     )
-    return box["x"] + left, box["y"] + top
+    ratio = page.page.evaluate("devicePixelRatio")
+    return box["x"] + left / ratio, box["y"] + top / ratio
 
 
 def drag(page, points, *, modifiers=()):

@@ -139,9 +139,8 @@ def test_handles_and_numbers_are_one_edit(opened, compact):
     page.settle()
     frame = page.page.locator("#handle-move").bounding_box()
     middle = frame["x"] + frame["width"] / 2, frame["y"] + frame["height"] / 2
-    unit = page.page.evaluate(
-        "(() => { const { view } = foldgauss.player; return view.toScreen(0, 0, view.panes(1)[0])[2] })()"
-    )
+    (left, _), (right, _) = screen_at(page, 0, 0), screen_at(page, 1, 0)
+    unit = right - left
     page.page.mouse.move(*middle)
     page.page.mouse.down()
     page.page.mouse.move(middle[0] + 0.1 * unit, middle[1] - 0.05 * unit, steps=5)
