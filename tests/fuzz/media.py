@@ -126,11 +126,11 @@ def _read_picture(path: Path) -> None:
     assert (clip.frames.dtype, clip.frames.ndim) == (np.uint8, 4)
 
 
-#: The parts of `foldgauss.io.media` that read clips.
+#: The parts of `foldgauss.io.media` that read clips; what a path is, no contents change.
 _READ = {
     f"foldgauss.io.media.{module}": names
     for module, names in {
-        "clip": (ONLY, "check_readable", "read_head", "check_range_within", "check_num_pixels"),
+        "clip": (ONLY, "check_range_within", "check_num_pixels"),
         "resizing": (
             ONLY, "make_resizer", "aspect_window", "convert_channels", "unify_channels", "copy_to_blocks",
             "stack_frames",
