@@ -132,7 +132,7 @@ _READ = {
     for module, names in {
         "clip": (ONLY, "check_range_within", "check_num_pixels"),
         "resizing": (
-            ONLY, "make_resizer", "aspect_window", "convert_channels", "unify_channels", "copy_to_blocks",
+            ONLY, "make_resizer", "convert_channels", "unify_channels", "copy_to_blocks",
             "stack_frames",
         ),
         "decoder": (),

@@ -3,6 +3,7 @@
 All of it: `python -m tests.fuzz`.
 """
 
+import ast
 import json
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import hypothesis
 import pytest
 from hypothesis import strategies as st
 
-from .branches import Branches
+from .branches import ONLY, Branches
 from .models import tiny_model
 from .mutate import json_changed, png_chunks, png_of
 from .target import Broken, Target, judge
@@ -133,6 +134,15 @@ def test_seeds_are_small_and_of_all_kinds():
         seeds = target.seeds()
         assert len(set(seeds)) == len(seeds)
         assert max(map(len, seeds)) < 30_000, target.name
+
+
+def test_names_of_functions_exist():
+    """Those whose branches are left out, or alone are counted: a function may have been renamed since."""
+    for target in TARGETS.values():
+        for module, names in target.modules.items():
+            source = Path(__file__).parents[2].joinpath(*module.split(".")).with_suffix(".py").read_text()
+            nodes = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.FunctionDef | ast.ClassDef)]
+            assert {name.removeprefix("-") for name in names} <= {ONLY, *(node.name for node in nodes)}, module
 
 
 @pytest.mark.slow
