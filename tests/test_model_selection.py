@@ -85,7 +85,6 @@ def test_gradient_fit_trains_a_custom_fold():
     assert abs(float(jax.tree.leaves(result.mixture.components.fold)[0].ravel()[0]) + 1) < 0.05
 
 
-@pytest.mark.slow
 def test_gradient_fit_never_returns_nan():
     x = _two_parabolas()
     x[3] = np.nan
