@@ -303,10 +303,14 @@ def _selected() -> VideoModel:
     return tiny_model()
 
 
+@functools.cache
+def _in_segments() -> SegmentedVideo:
+    return SegmentedVideo.from_models([(0, _selected()), (2, _selected())])
+
+
 def _load_selection(path: Path) -> None:
     """Now and then for what has no selections of its own."""
-    other = {2: _edited, 3: lambda: SegmentedVideo.from_models([(0, _selected()), (2, _selected())])}
-    load_selection(path, other.get(chance(path) % 32, _selected)())
+    load_selection(path, {2: _edited, 3: _in_segments}.get(chance(path) % 32, _selected)())
 
 
 SELECTION = Target(
@@ -323,6 +327,7 @@ SELECTION = Target(
     lambda size: 2 * CONSTANT + 400 * size,
     _MODEL_MUTATIONS,
     share=1.0,
+    prepare=lambda folder: (_edited(), _in_segments()),  # once, and not while memory is measured
 )
 
 
