@@ -272,7 +272,7 @@ VIDEO = Target(
     _clip_body,
     lambda size: 1 << 32,
     (by_chance, by_chance, _marked, _another_kind),
-    share=0.7,
+    share=1.0,
 )
 
 
