@@ -592,7 +592,7 @@ def test_a_long_clip(tmp_path):
     """`python -m benchmarks.reliability long`: 2,000 frames of 320x640 within their bounds, told truly."""
     num, size, gaussians = 2000, (320, 640), 80_000
     write_clip(tmp_path / "clip.avi", num, size)
-    ran = _long.long_clip(tmp_path / "clip.avi", tmp_path, gaussians, 1000)  # steps of a quarter of a minute
+    ran = _long.long_clip(tmp_path / "clip.avi", tmp_path, gaussians, 1000)  # long enough for ten lines
     for command, own in ran.items():
         assert own.peak <= _long.bound(command, num * size[0] * size[1] * 3, gaussians), command
     told = _long.progress(ran["fit"].lines)
