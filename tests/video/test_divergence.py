@@ -95,6 +95,22 @@ def test_exploding_folds_are_named(usual):
     assert got > usual - 3
 
 
+def test_a_single_frame_that_is_worse_for_a_while_raises_no_warning():
+    config = dataclasses.replace(CONFIG, quarter_fraction=0, half_fraction=0)
+
+    def spoil(num):
+        def change(state):
+            state.frame_errors[:num] = 0.1
+
+        return change
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DivergenceWarning)
+        _fit_with(spoil(1), config, 150)
+    with pytest.warns(DivergenceWarning, match="dB worse than they were"):
+        _fit_with(spoil(3), config, 150)  # one of them may be seen again in the next step
+
+
 def test_exhausted_backoffs_raise():
     def spoiled():
         for state, _ in fit_steps(CLIP, CONFIG):

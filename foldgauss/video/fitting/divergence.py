@@ -52,9 +52,10 @@ class FitDiverged(ArithmeticError):
 class Guard:
     """Watches the steps of a fit. All that it decides by is in the state, so that resuming changes nothing.
 
-    Errors are those of the same frames at the same size, each as it was last seen: a single frame much harder than the
-    others raises no alarm. Where errors may rise for other reasons, only finiteness is tested: where Gaussians are
-    added and pruned, and over the random backgrounds of frames with alpha.
+    Errors are those of the same frames at the same size, each as it was last seen. A single frame raises no alarm,
+    neither by being much harder than the others nor by being worse for a few steps: the worst one is left out. Where
+    errors may rise for other reasons, only finiteness is tested: where Gaussians are added and pruned, and over the
+    random backgrounds of frames with alpha.
     """
 
     def __init__(self, state: FitState, config: FitConfig, steps_per_pass: int, *, alpha: bool):
@@ -92,7 +93,7 @@ class Guard:
         if state.step >= state.improve_by and self._start_ratio(state) > NOT_BETTER:
             moved = self._most_moved(state)
             return f"frames are worse than at the start after {START_PASSES} passes; {moved} moved most"
-        error = float(state.frame_errors.mean())
+        error = _mean_without_worst(state.frame_errors)
         state.best_error = min(error, state.best_error or error)
         return ""
 
@@ -160,7 +161,7 @@ class Guard:
 
     def _error_ratio(self, state: FitState) -> float:
         """The error divided by the lowest one known."""
-        error = float(state.frame_errors.mean())
+        error = _mean_without_worst(state.frame_errors)
         of_all = error / state.best_error if state.best_error > 0 and error > GOOD_ERROR else 0.0
         return max(of_all, self._start_ratio(state))
 
@@ -186,6 +187,11 @@ class Guard:
             }
         moved["frame times"] = _time_move(state)
         return max(moved, key=moved.get)
+
+
+def _mean_without_worst(errors: np.ndarray) -> float:
+    """The mean error of all frames but the worst one; of a single frame, its error."""
+    return float(np.sort(errors)[: max(len(errors) - 1, 1)].mean())
 
 
 def _time_move(state: FitState) -> float:
