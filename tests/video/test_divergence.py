@@ -100,7 +100,7 @@ def test_a_single_frame_that_is_worse_for_a_while_raises_no_warning():
 
     def spoil(num):
         def change(state):
-            state.frame_errors[:num] = 0.1
+            state.frame_errors[-num:] = 0.1
 
         return change
 
