@@ -637,6 +637,7 @@ def test_names_with_brackets_are_names(tmp_path, capsys):
     assert "none[/b]" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_upsampling_beyond_any_frame_rate(work, tmp_path, capsys):
     model = work / "model.safetensors"
     assert run("render", model, "--out", tmp_path / "v.mp4", "--upsample", "100") == 2

@@ -40,8 +40,8 @@ def written(folder, frames):
 @pytest.mark.parametrize(
     "name",
     [
-        *("one", "two, 16 bits", "line", "black"),
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("tiny", "column", "white")),
+        *("one", "two, 16 bits"),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("tiny", "line", "column", "black", "white")),
     ],
 )
 def test_from_a_clip_to_its_pictures(tmp_path, capsys, monkeypatch, name):

@@ -67,7 +67,7 @@ def compiled():
     jax.monitoring.unregister_event_duration_listener(listen)
 
 
-SLOW_CASES = ("seven", "large batch", "batches", "many components", "mixtures")
+SLOW_CASES = ("plane", "seven", "large batch", "batches", "many components", "mixtures")
 
 
 @pytest.mark.parametrize("name", [pytest.param(k, marks=pytest.mark.slow if k in SLOW_CASES else []) for k in CASES])

@@ -1,6 +1,7 @@
 """The notebooks: stored outputs are complete, small and in order, and the notebooks run from top to bottom.
 
-They run with FOLDGAUSS_SMALL=1, which a cell of each reads; their stored outputs are those of the full size.
+They run, as slow tests, with FOLDGAUSS_SMALL=1, which a cell of each reads; their stored outputs are those of the
+full size. Among the quick tests, all names and options in them are checked.
 """
 
 import ast
@@ -20,8 +21,6 @@ NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 SWITCH = 'SMALL = os.environ.get("FOLDGAUSS_SMALL") == "1"'
 #: Size limit of a notebook, since it is part of the repository.
 MOST_BYTES = 1_500_000
-#: It takes a few seconds, and runs by default; of the others by default all names and options are checked.
-QUICK = "03_fit_and_edit"
 
 
 def code_of(notebook) -> list:
@@ -133,11 +132,8 @@ def test_names_and_options_that_they_use_exist(path):
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
 # Processor seconds at small size, nearly all of it spent in compiling: 45, 55, 11, 28 and 35.
-@pytest.mark.parametrize(
-    "path",
-    [pytest.param(path, marks=() if path.stem == QUICK else pytest.mark.slow) for path in NOTEBOOKS],
-    ids=lambda path: path.stem,
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_it_runs_from_top_to_bottom(path, tmp_path, monkeypatch):
     """Small, in a kernel of its own and an empty folder; every cell shows what its stored output shows."""
     nbformat = pytest.importorskip("nbformat", reason="nbformat comes with the extra test")

@@ -109,7 +109,14 @@ def test_exhausted_backoffs_restore_the_last_finite_state(at_start):
     assert psnr == pytest.approx(at_start, abs=0.3)
 
 
-@pytest.mark.parametrize(("leaf", "power"), [("loc", 6), ("color_dc", 6), ("log_scale", 3)])
+@pytest.mark.parametrize(
+    ("leaf", "power"),
+    [
+        pytest.param("loc", 6, marks=pytest.mark.slow),
+        ("color_dc", 6),
+        pytest.param("log_scale", 3, marks=pytest.mark.slow),
+    ],
+)
 def test_resuming_keeps_divergence_and_recovery(tmp_path, leaf, power):
     """While it is taken back, and before it is seen to come apart: what was sound is kept with it."""
     config, path = too_high(leaf, 10.0**power), tmp_path / "kept.safetensors"

@@ -333,6 +333,7 @@ def test_killed_run_resumes(clip, tmp_path, capsys, monkeypatch):
     assert record_of(target)["points"] == after
 
 
+@pytest.mark.slow
 def test_motion_is_found_once_and_counted_in_every_fit(clip, tmp_path, monkeypatch):
     """`fit` finds it anew each time; so it is in each fit's seconds, though it was found once."""
     found, given, steps, of = [], [], command.fit_steps, Motion.from_frames

@@ -399,6 +399,7 @@ def test_what_is_brushed_is_followed_through_the_clip(opened):
     assert page.page.evaluate(PICKED) == [0, 1]
 
 
+@pytest.mark.slow
 def test_the_original_is_shown_beside_it(opened):
     model, clip = soft_model(), np.zeros((7, *SIZE, 3), np.uint8)
     clip[..., 1] = 200
@@ -456,6 +457,7 @@ def test_buttons_have_names_and_themes_change(opened):
     assert page.evaluate("document.documentElement.dataset.theme") == "dark"
 
 
+@pytest.mark.slow
 def test_nothing_is_drawn_where_nothing_changes(opened):
     page = opened(soft_model(), fresh=True)
     # The first picture has been sharpened, at the size that the page has come to.
@@ -492,6 +494,7 @@ def test_without_webgl_the_page_says_so(browser, tmp_path):
     context.close()
 
 
+@pytest.mark.slow
 def test_the_player_works_in_a_notebooks_frame(browser, tmp_path):
     """In a frame of no origin, which may keep nothing."""
     path = tmp_path / "book.html"
@@ -576,6 +579,7 @@ def test_pictures_of_segments_are_those_of_the_engine(opened, compositing):
     assert np.abs(page.picture(5 / 18, (60, 100)).astype(float) - larger).mean() < 0.5
 
 
+@pytest.mark.slow
 def test_few_segments_are_held_whatever_the_length(opened):
     parts = [(6 * k, soft_model(seed=k, options=RenderOptions(), num_frames=7)) for k in range(9)]
     video = SegmentedVideo.from_models(parts)
@@ -620,6 +624,7 @@ def test_controls_work_on_the_whole_clip(opened):
     assert abs(int(shot[shot.shape[0] // 2, shot.shape[1] // 2, 1]) - 12 * 14) <= 4
 
 
+@pytest.mark.slow
 def test_play_goes_over_the_seams(opened):
     page = opened(segmented(), fresh=True)
     page.page.evaluate(
@@ -651,6 +656,7 @@ _HELD_BACK = """() => {
 }"""
 
 
+@pytest.mark.slow
 def test_play_waits_for_a_segment_that_is_not_decoded(opened):
     video = segmented()
     page, play = opened(video), VideoRenderer(video)
@@ -697,6 +703,7 @@ def test_a_segment_that_cannot_be_decoded_is_told(browser, tmp_path):
     assert not page.said
 
 
+@pytest.mark.slow
 def test_the_brush_acts_on_the_segment_seen(opened):
     video = segmented()
     page = opened(video, fresh=True, **LARGE)

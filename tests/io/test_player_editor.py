@@ -268,6 +268,7 @@ def test_too_many_copies_by_the_panel_are_told(opened, compact):
 _COPIES = f'do = "multiply"\noffsets = {[[0.1, 0.0]] * 250}\noriginals = true\n'
 
 
+@pytest.mark.slow
 def test_too_many_copies_in_a_segment_that_is_not_decoded_are_told(opened):
     parts = [(6 * k, soft_model(seed=k, options=RenderOptions(), num_frames=7)) for k in range(4)]
     page = opened(SegmentedVideo.from_models(parts), fresh=True)
@@ -290,6 +291,7 @@ def test_too_many_copies_in_a_segment_that_is_not_decoded_are_told(opened):
     assert page.stats["undoable"] == 2
 
 
+@pytest.mark.slow
 def test_what_the_browser_kept_is_discarded_if_it_cannot_be_applied(opened, compact):
     page = opened(compact)
     read_script(page, IT + EDITS["hue"])

@@ -110,6 +110,7 @@ def test_a_3dgs_frame_looks_like_the_frame_it_was_exported_from(opened, tmp_path
     assert np.abs(bare.picture() - wanted).max() > 20
 
 
+@pytest.mark.slow
 def test_a_3dgs_scene_is_seen_along_z(opened, tmp_path):
     rng, num = np.random.default_rng(0), 300
     mean = rng.normal(size=(num, 3)) * [4, 2, 3] + [10, -5, 7]
@@ -281,6 +282,7 @@ def test_a_picture_is_what_is_shown(opened, compact, tmp_path):
     np.testing.assert_array_equal(saved, page.picture(size=(80, 128)))  # without the marks of the selection
 
 
+@pytest.mark.slow
 def test_a_video_is_recorded(opened, compact, tmp_path):
     page = opened(compact)
     page.page.keyboard.press("s")

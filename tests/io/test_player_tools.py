@@ -130,6 +130,7 @@ def test_a_selection_grows_and_shrinks(opened, compact):
     assert picked(page) < grown
 
 
+@pytest.mark.slow
 def test_handles_and_numbers_are_one_edit(opened, compact):
     page, model = opened(compact, viewport={"width": 480, "height": 760}), load_video_model(compact)
     page.page.evaluate("foldgauss.seek(0.5)")
@@ -209,6 +210,7 @@ def fields(page):
     return [page.page.locator(f"#{name}").input_value() for name in FIELDS]
 
 
+@pytest.mark.slow
 def test_numbers_show_what_the_edits_of_the_selection_add_up_to(opened, compact):
     page, model = opened(compact), load_video_model(compact)
     page.page.keyboard.press("e")

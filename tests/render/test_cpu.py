@@ -44,7 +44,7 @@ def assert_agrees(leaves, size, compositing="over", options=None):
 
 
 @pytest.mark.parametrize("compositing", ["over", "sum"])
-@pytest.mark.parametrize("channels", [4, *(pytest.param(num, marks=pytest.mark.slow) for num in (1, 5, 11))])
+@pytest.mark.parametrize("channels", [6, *(pytest.param(num, marks=pytest.mark.slow) for num in (1, 4, 5, 11))])
 def test_any_number_of_channels(channels, compositing):
     assert_agrees(*leaves_of("plain", channels), compositing)
 

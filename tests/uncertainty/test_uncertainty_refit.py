@@ -195,7 +195,8 @@ def test_default_steps_are_the_end_of_the_schedule(model, frames):
     np.testing.assert_array_equal(*steps)  # 30% of 100 steps, independent of minutes and target
 
 
-@pytest.mark.parametrize("place", ["kept", pytest.param("moved", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("place", ["kept", "moved"])
 def test_spread_with_held_splats_matches_the_profiles(place):
     """New noise and held splats: the spread of times matches the likelihood of independent pixels.
 

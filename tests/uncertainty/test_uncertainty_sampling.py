@@ -478,6 +478,7 @@ def test_missing_model_and_density_raise():
         frame_time_posterior(progress=False)
 
 
+@pytest.mark.slow
 def test_some_frames_of_a_clip():
     found = frame_time_posterior(model(), clip(uneven()), frames=[3, 4], noise=white(), progress=False)
     assert found.converged

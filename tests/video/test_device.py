@@ -122,7 +122,8 @@ def test_step_matches_the_cpu(progress):
     assert np.abs(there.rows - warm_state(CONFIG).rows).max() > 1e-3  # it did step
 
 
-@pytest.mark.parametrize("progress", [0.1, pytest.param(0.8, marks=pytest.mark.slow)], ids=["mixed", "frames alone"])
+@pytest.mark.slow
+@pytest.mark.parametrize("progress", [0.1, 0.8], ids=["mixed", "frames alone"])
 def test_step_with_interpolated_frames_matches_the_cpu(progress):
     """A batch of frames and of images between frames, and later one of frames alone."""
     config = dataclasses.replace(CONFIG, batch_size=4, interpolation_fraction=0.5)
@@ -236,6 +237,7 @@ def test_conditioning_matches_the_cpu(power, floor):
         assert not np.asarray(find_alive(program, state.rows, np.int32(7), t))[7:].any()
 
 
+@pytest.mark.slow
 def test_quality_matches_the_cpu():
     scores = {
         engine: evaluate(fit(FRAMES, dataclasses.replace(CONFIG, engine=engine)).model, FRAMES).mean_psnr
@@ -474,7 +476,9 @@ def test_unknown_engines_are_refused():
         FitConfig(engine="reference")
 
 
-@pytest.mark.parametrize("config", [CONFIG, GROWING], ids=["plain", "growing"])
+@pytest.mark.parametrize(
+    "config", [pytest.param(CONFIG, id="plain"), pytest.param(GROWING, id="growing", marks=pytest.mark.slow)]
+)
 def test_resuming_keeps_the_bits(config, tmp_path):
     """From a checkpoint, written while the arrays are on the device."""
     path = tmp_path / "kept.safetensors"

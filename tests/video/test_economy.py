@@ -70,6 +70,7 @@ def weights(model) -> np.ndarray:
 # ---------------------------------------------------------------------------------------------- what scenes require
 
 
+@pytest.mark.slow
 def test_still_clip_takes_as_many_parameters_as_one_frame():
     _, one, _, _ = fitted("one")
     frames, many, _, _ = fitted("still")
@@ -80,7 +81,7 @@ def test_still_clip_takes_as_many_parameters_as_one_frame():
     assert evaluate(many, frames).mean_psnr > 45
 
 
-@pytest.mark.parametrize(("name", "degree"), [("line", 1), ("parabola", 2)])
+@pytest.mark.parametrize(("name", "degree"), [pytest.param("line", 1, marks=pytest.mark.slow), ("parabola", 2)])
 def test_degree_is_that_of_the_motion(name, degree):
     frames, model, _, _ = fitted(name)
     assert evaluate(model, frames).mean_psnr > 38
@@ -534,7 +535,7 @@ def test_rates_decayed_to_zero_stay_zero():
     states = [(info.step, info.loss) for _, info in fit_steps(frames, config)]
     assert states[-1][0] == 300
     late = [loss for step, loss in states if step > 200]
-    assert max(late) < 3 * np.median([loss for step, loss in states if 180 < step <= 200])
+    assert max(late) < 1.5 * max(loss for step, loss in states if 180 < step <= 200)  # below 0: 200 times
 
 
 @pytest.mark.parametrize("value", [0, 255])
@@ -545,6 +546,7 @@ def test_clip_of_one_color_is_fitted(value):
     assert model.num_gaussians <= (20 if value == 0 else 300)  # white has to be covered
 
 
+@pytest.mark.slow
 def test_description_length_decreases():
     frames = disc(lambda s: (15 + 50 * s, 24), num_frames=8)
 
@@ -619,7 +621,11 @@ def test_unreachable_psnr_is_reported():
     [
         pytest.param({"economy": Economy(rounds=4)}, (30, 60, 110), marks=pytest.mark.slow),
         ({"economy": Economy(psnr=60)}, (60, 130)),  # in overtime
-        ({"growth": Growth(from_step=0, screen_gradient=1e-6), "economy": Economy(rounds=2)}, (50, 90)),
+        pytest.param(
+            {"growth": Growth(from_step=0, screen_gradient=1e-6), "economy": Economy(rounds=2)},
+            (50, 90),
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["priced", "smallest", "grown"],
 )

@@ -60,7 +60,7 @@ def overlap(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("pan", "speed"),
-    [(3.0, 2.0), (3.0, 0.0), *(pytest.param(*case, marks=pytest.mark.slow) for case in [(0.0, 2.0), (-4.0, 1.0)])],
+    [(3.0, 0.0), *(pytest.param(*case, marks=pytest.mark.slow) for case in [(3.0, 2.0), (0.0, 2.0), (-4.0, 1.0)])],
 )
 def test_a_disc_is_found(pan, speed):
     frames, _, truth = disc_clip(pan, speed)

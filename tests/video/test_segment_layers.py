@@ -79,11 +79,11 @@ def together(video, front_video, k, *, before=True):
     [
         ("plain", False),
         ("short-lived", False),
-        ("one frame", False),
+        pytest.param("one frame", False, marks=pytest.mark.slow),
         pytest.param("plain", True, marks=pytest.mark.slow),
         pytest.param("spans", False, marks=pytest.mark.slow),
         ("spans", True),
-        ("clocks", False),
+        pytest.param("clocks", False, marks=pytest.mark.slow),
         ("function", False),
     ],
 )
