@@ -247,6 +247,13 @@ def test_frames_of_another_size_are_stretched(tmp_path):
     assert np.abs(clip.frames[-6:].astype(int) - expected).mean() < 4
 
 
+def test_a_declared_size_that_cannot_be_converted_to_is_an_error():
+    """Found by fuzzing a header: FFmpeg's conversion refuses to stretch so much."""
+    frame = decoder.DecodedFrame(0, 0, av.VideoFrame(24, 16, "yuv420p"), (63693, 2782))
+    with pytest.raises(VideoError, match=r"expected frames that FFmpeg converts to RGB, got .* 63693x2782\)"):
+        frame.to_array()
+
+
 def test_pixels_that_are_not_square_are_told(tmp_path):
     _ffmpeg("-vf", "setsar=16/15", "-c:v", "ffv1", tmp_path / "a.mkv", frames=_waves())
     clip = read_video(tmp_path / "a.mkv")

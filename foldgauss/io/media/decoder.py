@@ -47,12 +47,21 @@ class DecodedFrame:
     size: tuple[int, int]
 
     def to_array(self) -> np.ndarray:
-        """Upright and uint8: BGR of shape (height, width, 3), or premultiplied BGRA of shape (height, width, 4)."""
+        """Upright and uint8: BGR of shape (height, width, 3), or premultiplied BGRA of shape (height, width, 4).
+
+        Raises `VideoError` for what FFmpeg cannot convert, such as the extreme sizes of a damaged file.
+        """
         has_alpha = any(part.is_alpha for part in self.decoded.format.components)
         height, width = self.size
-        image = self.decoded.to_ndarray(
-            width=width, height=height, format="bgra" if has_alpha else "bgr24", interpolation=CONVERSION
-        )
+        try:
+            image = self.decoded.to_ndarray(
+                width=width, height=height, format="bgra" if has_alpha else "bgr24", interpolation=CONVERSION
+            )
+        except av.FFmpegError as error:
+            given = f"{self.decoded.format.name}, {self.decoded.height}x{self.decoded.width}"
+            got = f"one that it cannot ({given}, to be shown at {height}x{width})"
+            cure = "The file is damaged, or convert it with ffmpeg."
+            raise video_error("path", expected="frames that FFmpeg converts to RGB", got=got, cure=cure) from error
         if has_alpha:
             opaque = image[..., 3].min() == 255
             image = np.ascontiguousarray(image[..., :3]) if opaque else premultiply(image)
