@@ -4,6 +4,7 @@ import os
 import struct
 import subprocess
 import sys
+from fractions import Fraction
 
 import av
 import cv2
@@ -362,10 +363,34 @@ def test_sound_is_added_and_stretched_at_its_pitch(tmp_path, sound_file, name, s
     assert read_video(path).num_frames == read_video(path).num_declared == 10
 
 
+@pytest.mark.parametrize(("video_from", "sound_from"), [(0.0, 0.5), (0.5, 0.0)])
+def test_sound_stays_with_the_frames_where_one_of_them_begins_later(tmp_path, video_from, sound_from):
+    """A tone of 880 Hz from 1 s on, in a file whose first frame, or first sound, is half a second late."""
+    source, frames = tmp_path / "a.mkv", _moving(20)
+    with av.open(str(source), "w") as container:
+        video, sound = container.add_stream("ffv1", rate=10), container.add_stream("pcm_s16le", rate=48_000)
+        video.height, video.width, video.pix_fmt = *frames.shape[1:3], "bgr0"
+        sound.layout = "mono"
+        for number, image in enumerate(frames):
+            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+            frame.pts, frame.time_base = number + round(10 * video_from), Fraction(1, 10)
+            container.mux(video.encode(frame))
+        seconds = np.arange(round(48_000 * sound_from), 96_000) / 48_000
+        samples = np.int16(9000 * np.sin(2 * np.pi * seconds * np.where(seconds < 1, 440, 880)))
+        frame = av.AudioFrame.from_ndarray(samples[None], format="s16", layout="mono")
+        frame.sample_rate, frame.pts = 48_000, round(48_000 * sound_from)
+        container.mux([*sound.encode(frame), *sound.encode(), *video.encode()])
+    assert read_video(source).num_frames == read_video(source).num_declared == 20
+    path = write_video(tmp_path / "b.mp4", frames, 10, sound=Sound(source))
+    before, after = 0.7 - video_from, 1.05 - video_from
+    assert _tones(path, [before, after])[1] == pytest.approx([440, 880], abs=10)
+
+
 def test_sound_that_is_none_is_refused(tmp_path, sound_file, clip_file):
     out = tmp_path / "a.mp4"
     for sound, words in (
         (Sound(clip_file), ("sound: expected a file with sound", "clip.webm")),
+        (Sound(__file__), ("sound: expected a file with sound", "does not open")),
         (Sound(sound_file, -1.0), ("sound.start", "-1.0")),
         (Sound(sound_file, 0.0, 0.001), ("sound.speed", "0.01 to 100")),
     ):

@@ -235,6 +235,17 @@ def test_videos_are_turned_upright(tmp_path, mp4, turns):
     np.testing.assert_array_equal(read_video(tmp_path / "turned.mp4").frames, np.rot90(stored, -turns, (1, 2)))
 
 
+def test_columns_at_the_left_are_cropped_to_the_pixel(tmp_path):
+    """FFmpeg's decoders keep some of them by default, for the alignment of what is left."""
+    whole, cropped = tmp_path / "whole.mp4", tmp_path / "cropped.mp4"
+    _ffmpeg("-c:v", "libx264", "-crf", "10", "-pix_fmt", "yuv420p", whole, frames=_waves(5))
+    cut = "h264_metadata=crop_left=8:crop_right=16:crop_top=4:crop_bottom=10"
+    _ffmpeg("-i", whole, "-c", "copy", "-bsf:v", cut, cropped)
+    found, expected = read_video(cropped).frames, read_video(whole).frames[:, 4:-10, 8:-16]
+    assert found.shape == expected.shape
+    assert np.abs(found.astype(int) - expected)[:, 2:-2, 2:-2].max() <= 1  # chroma is interpolated across borders
+
+
 def test_frames_of_another_size_are_stretched(tmp_path):
     """As calls are recorded, whose resolution follows the network."""
     for name, size in (("a.ts", (48, 64)), ("b.ts", (96, 128))):

@@ -70,7 +70,7 @@ def choose_sound(path: Path | None, timeline: Timeline, about: dict[str, Any], f
     if not path.is_file():
         raise wrong_use("--sound", expected="a file", got=f"{str(path)!r}, which is missing")
     first = (about.get("frames") or (0,))[0] or 0
-    return Sound(path, first / fps, timeline.speed or 1.0)
+    return Sound(path, first / fps, timeline.playing_speed(fps))
 
 
 #: Columns of a progress bar after the elapsed time.
@@ -136,6 +136,10 @@ def render_to_file(
         if len(times) != 1:
             cure = "Choose it by --times T, or write to a folder (a name without extension)."
             raise wrong_use("--out", expected="one image for a .png", got=f"{len(times):,} images", cure=cure)
+        given = [name for name, value in options._asdict().items() if value is not None]
+        if given:
+            name = f"--{given[0].replace('_', '-')}"
+            raise wrong_use(name, expected="a video file for it", got=repr(path.name))
         write_image(path, next(images))
         out.print(f"{path}: the image at time {times[0]:g}", soft_wrap=True)
         return

@@ -61,6 +61,10 @@ class Timeline:
         """Frames per second of the output, given those of the clip."""
         return fps * (self.upsample or 1) if self.fps is None else self.fps
 
+    def playing_speed(self, fps: float) -> float:
+        """How many times as fast as the clip the output plays, where that is constant."""
+        return self.rate(fps) / (fps * self.upsample) if self.upsample else self.speed or 1.0
+
     def times(self, frame_times: np.ndarray, fps: float) -> np.ndarray:
         """The model times to render, in order."""
         if self.chosen is not None:

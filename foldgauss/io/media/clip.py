@@ -139,15 +139,12 @@ def check_range_within(start: int, stop: int | None, num_total: int, path: Path)
 def check_frame_size(size: tuple[int, int] | None, parameter: str = "size") -> tuple[int, int] | None:
     if size is None:
         return None
-    height, width = size
-    if height != int(height) or width != int(width) or min(height, width) < 1:
-        raise video_error(
-            parameter,
-            expected="height and width of whole pixels, at least 1",
-            got=f"{height}x{width}",
-            cure="Write it as HEIGHTxWIDTH, such as 160x320.",
-        )
-    return int(height), int(width)
+    sides = tuple(size) if isinstance(size, tuple | list | np.ndarray) else ()
+    if len(sides) != 2 or not all(is_within(side, "[1, inf)") and side == int(side) for side in sides):
+        got = f"{sides[0]}x{sides[1]}" if len(sides) == 2 else repr(size)
+        cure = "Write it as HEIGHTxWIDTH, such as 160x320."
+        raise video_error(parameter, expected="height and width of whole pixels, at least 1", got=got, cure=cure)
+    return int(sides[0]), int(sides[1])
 
 
 def check_fps(fps: float) -> None:

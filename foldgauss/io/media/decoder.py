@@ -9,6 +9,7 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
+from av.codec.context import Flags
 from av.filter import Graph
 from av.stream import Disposition
 from av.video.reformatter import Interpolation
@@ -143,13 +144,17 @@ class VideoDecoder:
         if not self._container.duration or self._container.duration < 0:
             return None
         seconds = self._container.duration / av.time_base
-        if not self._container.streams.audio:
-            return seconds
-        # Matroska: each stream's own, written by FFmpeg.
+        if "matroska" not in kind:
+            return None if self._container.streams.audio else seconds
+        # Matroska counts to the end of the last frame from 0, where another stream may begin; FFmpeg writes the
+        # duration of each stream, too.
+        begin = float((stream.start_time or 0) * stream.time_base)
+        if len(self._container.streams) == 1:
+            return seconds - begin
         hours, _, rest = stream.metadata.get("DURATION", "").partition(":")
         minutes, _, own = rest.partition(":")
         try:
-            return min(seconds, 3600 * int(hours) + 60 * int(minutes) + float(own))
+            return min(seconds, 3600 * int(hours) + 60 * int(minutes) + float(own)) - begin
         except ValueError:
             return None
 
@@ -243,6 +248,7 @@ class VideoDecoder:
         if self._stream.metadata.get("alpha_mode") == "1" and name is not None:
             codec = av.CodecContext.create(name, "r")
         codec.thread_type = "AUTO"
+        codec.flags |= Flags.unaligned  # crop to the pixel: else columns are kept at the left, for alignment
         codec.thread_count = threads or min(MAX_THREADS, cv2.getNumberOfCPUs())
         return codec
 

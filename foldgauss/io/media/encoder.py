@@ -13,10 +13,11 @@ from typing import NamedTuple
 import av
 import numpy as np
 from av.filter import Graph
+from av.stream import Disposition
 from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
-from foldgauss.io.media.clip import PathLike, check_readable, video_error
+from foldgauss.io.media.clip import PathLike, VideoError, check_readable, video_error
 from foldgauss.io.media.decoder import CONVERSION, open_container, pull_frames
 from foldgauss.io.media.format_detection import SOUND_DEMUXERS
 
@@ -73,7 +74,8 @@ VIDEO_SUFFIXES = tuple(DEFAULT_CODECS)
 
 
 class Sound(NamedTuple):
-    """The sound of a video: that of the file `path` from second `start` on.
+    """The sound of a video: that of the file `path` from second `start` on, counted from the first frame of the video
+    in that file, or from its first sound if it has none. Silence fills what is before the first sound.
 
     `speed`: the video is played that many times as fast as that file; the sound is stretched, its pitch kept. It ends
     with the video or with the file, whichever is first.
@@ -120,6 +122,8 @@ def choose_encoding(
     check_one_of("pixel_format", pixel_format, chosen.pixel_formats)
     if has_alpha and not _has_alpha(pixel_format):
         cure = "Take vp9 in a .webm, prores in a .mov or ffv1 in a .mkv, or composite the frames over a color."
+        if chosen.alpha_format:
+            cure = f"Take {chosen.alpha_format}."
         raise video_error("frames", expected=f"RGB for {name} in {pixel_format}", got="RGBA", cure=cure)
     return Encoding(chosen, crf if crf is not None else chosen.crf and chosen.crf[0], pixel_format)
 
@@ -177,7 +181,9 @@ def _encode_sound(stream: av.AudioStream, sound: Sound) -> Iterator[av.Packet]:
         # atempo takes factors from 0.5 to 100.
         slow = max(0, math.ceil(-math.log2(sound.speed)))
         tempo = [("atempo", f"{(sound.speed ** (1 / max(slow, 1))):.9f}")] * max(slow, 1)
-        steps = [("atrim", f"start={sound.start}"), ("asetpts", "PTS-STARTPTS"), *tempo]
+        begin = _first_shown(source, of_file) + sound.start
+        steps = [("atrim", f"start={begin:.6f}"), ("asetpts", f"PTS-({begin:.6f})/TB")]
+        steps += [("aresample", "async=1:first_pts=0"), *tempo]  # silence where there is none
         steps += [("aformat", f"sample_fmts={stream.format.name}:sample_rates={SAMPLE_RATE}:channel_layouts=stereo")]
         nodes = [graph.add(*step) for step in (*steps, ("abuffersink",))]
         graph.link_nodes(graph.add_abuffer(template=of_file), *nodes).configure()
@@ -188,6 +194,13 @@ def _encode_sound(stream: av.AudioStream, sound: Sound) -> Iterator[av.Packet]:
             for filtered in pull_frames(graph):
                 yield from stream.encode(filtered)
         yield from stream.encode()
+
+
+def _first_shown(source: av.container.InputContainer, of_file: av.AudioStream) -> float:
+    """The time stamp in seconds of the first frame of the video, or of the first sound where there is no video."""
+    moving = (one for one in source.streams.video if not one.disposition & Disposition.attached_pic)
+    stream = next(moving, of_file)
+    return float((stream.start_time or 0) * stream.time_base)
 
 
 def _decode_sound(source: av.container.InputContainer, stream: av.AudioStream) -> Iterator[av.AudioFrame | None]:
@@ -206,10 +219,12 @@ def check_sound(sound: Sound) -> None:
         raise invalid(
             "sound.speed", expected="a speed from 0.01 to 100", got=f"{sound.speed:g}", cure="Leave sound out."
         )
-    with open_container(check_readable(sound.path), SOUND_DEMUXERS) as source:
-        if not source.streams.audio:
-            got = f"{str(sound.path)!r}, which has none"
-            raise video_error("sound", expected="a file with sound", got=got, cure="Leave it out.")
+    got = f"{str(sound.path)!r}, which does not open"
+    with suppress(VideoError), open_container(check_readable(sound.path), SOUND_DEMUXERS) as source:
+        if source.streams.audio:
+            return
+        got = f"{str(sound.path)!r}, which has none"
+    raise video_error("sound", expected="a file with sound", got=got, cure="Leave it out.")
 
 
 def _declare_bt709(context: av.VideoCodecContext) -> None:

@@ -151,12 +151,13 @@ def _check_frame(
     frame = np.asarray(frame)
     fits = frame.ndim == 3 and frame.shape[2] in channels and min(frame.shape) > 0 and frame.dtype == np.uint8
     if not fits or (shape is not None and frame.shape != shape):
-        raise video_error(
-            parameter,
-            expected=f"uint8 RGB of shape {shape or '(height, width, 3)'}",
-            got=f"{frame.dtype} of shape {frame.shape}",
-            cure="For floats in [0, 1]: np.rint(255 * np.clip(frame, 0, 1)).astype(np.uint8).",
-        )
+        cure = ""
+        if frame.dtype != np.uint8:
+            cure = "For floats in [0, 1]: np.rint(255 * np.clip(frame, 0, 1)).astype(np.uint8)."
+        elif frame.ndim == 3 and frame.shape[2] == 4:
+            cure = "Composite it over a color, or take a kind of file that has alpha: .webm, .mov, .mkv or images."
+        expected, got = f"uint8 RGB of shape {shape or '(height, width, 3)'}", f"{frame.dtype} of shape {frame.shape}"
+        raise video_error(parameter, expected=expected, got=got, cure=cure)
     return np.ascontiguousarray(frame)
 
 
