@@ -162,6 +162,7 @@ def counting(monkeypatch):
     return _Counting
 
 
+@pytest.mark.slow
 def test_a_span_late_in_a_clip_takes_few_frames(long, long_index, counting):
     found = read_indexed(long_index, 500, 520).frames
     assert counting.decoded <= 25

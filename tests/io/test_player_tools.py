@@ -14,6 +14,7 @@ from foldgauss.video.selection import selectors
 from foldgauss.video.selection.tracking import to_lab
 
 
+@pytest.mark.slow
 def test_outlines_select_and_combine_by_keys(opened, compact):
     page, model = opened(compact), load_video_model(compact)
     page.page.evaluate("foldgauss.seek(0.5)")

@@ -811,6 +811,7 @@ def test_output_that_cannot_be_written(tmp_path, name):
     assert len(list(tmp_path.iterdir())) == 1
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_noticed(tmp_path):
     """A limit on file size stands in for the full disk."""
     program = """

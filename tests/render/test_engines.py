@@ -156,6 +156,7 @@ def _run(script: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="core affinity exists on Linux only; CI runs it there")
 def test_jit_pinned_to_one_core():
     """A callback inside jit was seen to hang on one core; `jax_cpu_enable_async_dispatch=False` is the known cure."""
@@ -185,6 +186,7 @@ def test_jit_pinned_to_one_core():
     assert count == "4"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="os.fork exists on POSIX only; CI runs it on Linux")
 def test_kernels_work_after_fork():
     script = """

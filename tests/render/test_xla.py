@@ -169,7 +169,8 @@ def test_a_hundred_thousand_splats_on_one_pixel():
     np.testing.assert_allclose(np.asarray(gradient)[num // 2 :], 0, atol=1e-3)
 
 
-@pytest.mark.parametrize("compositing", ["over", pytest.param("sum", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("compositing", ["over", "sum"])
 def test_long_needles(compositing):
     """1e4 : 1, at all angles; the judge in double precision on the same numbers."""
     rng, num, size = np.random.default_rng(0), 150, (50, 70)

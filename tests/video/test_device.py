@@ -332,6 +332,7 @@ def test_densification_compiles_nothing():
     assert compiled_by(lambda: jax.jit(lambda x: x + 17)(1.0)) == 1  # it would have been seen
 
 
+@pytest.mark.slow
 def test_densification_matches_the_cpu():
     """From one state, at the step of the first births: clones, halves at the same places, and moments that are 0."""
     kept, after = None, {}

@@ -90,6 +90,7 @@ def test_minutes_are_divided_by_the_last_speed():
     assert both.plan(0) == 20
 
 
+@pytest.mark.slow
 def test_minutes_end_the_fits():
     done = []
     made = independent_frames(FRAMES, 9 * 100, FitConfig(minutes=0.02), on_frame=lambda k, model: done.append(k))
