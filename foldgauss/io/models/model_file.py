@@ -55,10 +55,6 @@ class _Kind:
     from_stored: Callable[[Any], Any]
 
 
-def _identity(model: Any) -> Any:
-    return model
-
-
 _KINDS: dict[str, _Kind] = {}
 
 
@@ -68,8 +64,8 @@ def register_model(
     *,
     to_header: Callable[[Any], dict],
     from_header: Callable[[dict], Any],
-    to_stored: Callable[[Any], Any] = _identity,
-    from_stored: Callable[[Any], Any] = _identity,
+    to_stored: Callable[[Any], Any] = lambda model: model,
+    from_stored: Callable[[Any], Any] = lambda model: model,
 ) -> None:
     """Register `model_type` for saving and loading under the name `kind`.
 
@@ -106,11 +102,8 @@ def save_model(path: str | os.PathLike, model: Any, *, metadata: dict | None = N
     arrays = {key: _to_numpy(key, leaf) for key, leaf in _array_leaves(model).items()}
     header = kind.to_header(model)
     _check_described(kind, model, to_json("header", header))
-    specs = {key: {"dtype": _DTYPES[one.dtype.name], "shape": list(one.shape)} for key, one in arrays.items()}
-    path = Path(path)
     about = {"kind": kind.name, "header": header, "metadata": metadata or {}}
-    write_tensors(path, specs, lambda keys: (arrays[key] for key in keys), **about)
-    return path
+    return write_tensors(Path(path), _get_specs(arrays), lambda keys: (arrays[key] for key in keys), **about)
 
 
 def write_tensors(
@@ -121,8 +114,8 @@ def write_tensors(
     kind: str,
     header: dict,
     metadata: dict,
-) -> None:
-    """Write a model file, whole or not at all: tensors with `specs` as in `read_header`.
+) -> Path:
+    """Write a model file, whole or not at all: tensors with `specs` as in `read_header`; returns the path.
 
     `tensors(keys)` yields them in that order, little-endian. Raises as `save_model`.
     """
@@ -150,6 +143,7 @@ def write_tensors(
         file.write(len(text).to_bytes(_PREFIX, "little") + text)
         for array in tensors(order):
             file.write(array.tobytes())
+    return path
 
 
 def _array_leaves(tree: Any) -> dict[str, Any]:
@@ -193,12 +187,8 @@ def _find_kind(model: Any) -> _Kind:
     for kind in _KINDS.values():
         if type(model) is kind.model_type:
             return kind
-    raise model_file_error(
-        "model",
-        expected="one of the registered types " + (", ".join(sorted(_KINDS)) or "(none yet)"),
-        got=type(model).__name__,
-        cure="Register it with register_model.",
-    )
+    expected, cure = "one of the registered types " + ", ".join(sorted(_KINDS)), "Register it with register_model."
+    raise model_file_error("model", expected=expected, got=type(model).__name__, cure=cure)
 
 
 def _check_described(kind: _Kind, model: Any, header: str) -> None:
@@ -280,12 +270,9 @@ def match_kind(path: Path, about: dict) -> tuple[_Kind, Any]:
     """The kind of model, and the skeleton made from the header, checked against the tensors, of which none is read."""
     kind = _KINDS.get(about["kind"])
     if kind is None:
-        raise model_file_error(
-            "path",
-            expected="a model of kind " + (" or ".join(map(repr, sorted(_KINDS))) or "(none registered)"),
-            got=f"kind {about['kind']!r} in {str(path)!r}",
-            cure="Load it with the program that wrote it.",
-        )
+        expected = "a model of kind " + " or ".join(map(repr, sorted(_KINDS)))
+        got, cure = f"kind {about['kind']!r} in {str(path)!r}", "Load it with the program that wrote it."
+        raise model_file_error("path", expected=expected, got=got, cure=cure)
     with translate_header_errors(path, kind.name):
         skeleton = kind.from_header(about["header"])
     described = _get_specs(_array_leaves(skeleton))
@@ -301,11 +288,8 @@ def translate_header_errors(path: Path, kind: str) -> Iterator[None]:
     except ModelFileError:
         raise
     except HEADER_ERRORS as error:
-        raise model_file_error(
-            "path",
-            expected=f"the header of a model of kind {kind!r}",
-            got=f"one that does not describe it in {str(path)!r} ({type(error).__name__}: {one_line(error)})",
-        ) from error
+        got = f"one that does not describe it in {str(path)!r} ({type(error).__name__}: {one_line(error)})"
+        raise model_file_error("path", expected=f"the header of a model of kind {kind!r}", got=got) from error
 
 
 def read_header(path: str | os.PathLike) -> dict:
