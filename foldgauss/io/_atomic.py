@@ -31,6 +31,12 @@ def check_path(path: object, order: str = "") -> Path:
     return Path(path)
 
 
+def missing_error(path: str | os.PathLike, expected: str) -> FileNotFoundError:
+    """The error for an input that does not exist."""
+    text = f"path: expected {expected}, got {str(path)!r}, which is missing."
+    return FileNotFoundError(f"{text} Check the spelling and the current folder.")
+
+
 def _check_target(path: Path) -> None:
     """Raise where a rename to `path` would fail, before any work is done."""
     if not path.name:

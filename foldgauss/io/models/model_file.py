@@ -15,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 
 from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.threads import check_not_forked
-from foldgauss.io._atomic import atomic_path
+from foldgauss.io._atomic import atomic_path, missing_error
 
 FORMAT = "foldgauss-model"
 VERSION = "1"  # increased when older programs cannot read the file
@@ -171,12 +171,9 @@ def _array_leaves(tree: Any) -> dict[str, Any]:
 def _to_numpy(key: str, leaf: Any) -> np.ndarray:
     """Little-endian, of a type that the format holds; nothing is converted but the byte order."""
     if not hasattr(leaf, "dtype") or leaf.dtype.name not in _DTYPES:
-        raise model_file_error(
-            key,
-            expected="a real, integer or boolean array",
-            got=f"dtype {getattr(leaf, 'dtype', type(leaf).__name__)}",
-            cure="Store complex numbers as two arrays and PRNG keys by jax.random.key_data.",
-        )
+        got = f"dtype {getattr(leaf, 'dtype', type(leaf).__name__)}"
+        cure = "Store complex numbers as two arrays and PRNG keys by jax.random.key_data."
+        raise model_file_error(key, expected="a real, integer or boolean array", got=got, cure=cure)
     array = np.asarray(leaf)
     if array.dtype.byteorder == ">":
         array = array.astype(array.dtype.newbyteorder("<"))
@@ -211,9 +208,8 @@ def to_json(parameter: str, value: Any) -> str:
     try:
         return json.dumps(value, allow_nan=False, sort_keys=True, default=_encode_scalar)
     except (TypeError, ValueError, RecursionError) as error:
-        raise model_file_error(
-            parameter, expected="a dict that JSON can hold", got=str(error), cure="Use plain types."
-        ) from error
+        expected = "a dict that JSON can hold"
+        raise model_file_error(parameter, expected=expected, got=str(error), cure="Use plain types.") from error
 
 
 def _encode_scalar(value: Any) -> Any:
@@ -304,21 +300,19 @@ def read_header(path: str | os.PathLike) -> dict:
     _check_container(path)
     with open_tensors(path) as file:
         strings = file.metadata() or {}
-        tensors = {}
-        for key in file.keys():  # noqa: SIM118 - it is not a dict
-            part = file.get_slice(key)
-            tensors[key] = {"dtype": part.get_dtype(), "shape": list(part.get_shape())}
+        parts = {key: file.get_slice(key) for key in file.keys()}  # noqa: SIM118 - it is not a dict
+        tensors = {key: {"dtype": part.get_dtype(), "shape": list(part.get_shape())} for key, part in parts.items()}
     _check_version(path, strings)
     about = {name: strings[name] for name in ("format", "version", "kind")}
-    return about | {name: _parse_json(path, name, strings) for name in ("header", "metadata")} | {"tensors": tensors}
+    return (
+        about | {name: _parse_json(path, name, strings[name]) for name in ("header", "metadata")} | {"tensors": tensors}
+    )
 
 
 def _check_container(path: Path) -> None:
     """Check the first bytes against the file's size, before the library allocates memory."""
     if not os.path.exists(path):
-        raise FileNotFoundError(
-            f"path: expected a model file, got {str(path)!r}, which is missing. Check the spelling."
-        )
+        raise missing_error(path, "a model file")
     if not path.is_file():
         raise _unreadable_error(path, "not a plain file")
     size = path.stat().st_size
@@ -331,29 +325,26 @@ def _check_container(path: Path) -> None:
         names = (name for magic, name in _MAGIC.items() if first.startswith(magic))
         raise _unreadable_error(path, next(names, "a file of another kind, or one cut off within its first bytes"))
     if length > size - _PREFIX:
-        raise _unreadable_error(
-            path, f"a file of {size} bytes whose header claims {length}, so it is cut off or damaged"
-        )
+        got = f"a file of {size} bytes whose header claims {length}, so it is cut off or damaged"
+        raise _unreadable_error(path, got)
 
 
 def _check_version(path: Path, strings: dict[str, str]) -> None:
     if strings.get("format") != FORMAT:
         raise _unreadable_error(path, f"a safetensors file of format {strings.get('format', 'unknown')!r}")
     if strings.get("version") != VERSION:
-        raise model_file_error(
-            "path",
-            expected=f"a model file of version {VERSION}, which this program reads",
-            got=f"version {strings.get('version')} in {str(path)!r}",
-            cure="Update foldgauss, or load it with the one that wrote it.",
-        )
+        expected = f"a model file of version {VERSION}, which this program reads"
+        got = f"version {strings.get('version')} in {str(path)!r}"
+        cure = "Update foldgauss, or load it with the one that wrote it."
+        raise model_file_error("path", expected=expected, got=got, cure=cure)
     for name in ("kind", "header", "metadata"):
         if name not in strings:
             raise _unreadable_error(path, f"one without the field {name!r}")
 
 
-def _parse_json(path: Path, name: str, strings: dict[str, str]) -> dict:
+def _parse_json(path: Path, name: str, text: str) -> dict:
     try:
-        value = json.loads(strings[name])
+        value = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise _unreadable_error(path, f"one whose field {name!r} is not JSON ({one_line(error)})") from error
     if not isinstance(value, dict):
@@ -381,11 +372,8 @@ def _check_tensors(have: dict[str, dict], want: dict[str, dict], where: str) -> 
     """Raise unless the tensors have the keys, shapes and types that the header describes."""
     for key in sorted(have.keys() | want.keys()):
         if have.get(key) != want.get(key):
-            raise model_file_error(
-                f"tensor {key!r} of {where!r}",
-                expected=_spec_text(want.get(key)),
-                got=_spec_text(have.get(key)),
-            )
+            expected, got = _spec_text(want.get(key)), _spec_text(have.get(key))
+            raise model_file_error(f"tensor {key!r} of {where!r}", expected=expected, got=got)
 
 
 def _read_leaves(skeleton: Any, path: Path, prefix: str) -> Any:
@@ -397,7 +385,12 @@ def _read_leaves(skeleton: Any, path: Path, prefix: str) -> Any:
                 return leaf
             key = jax.tree_util.keystr(keys, simple=True, separator=".")
             array = file.get_tensor(prefix + key)
-            return _to_leaf(key, array.astype(leaf.dtype) if array.dtype == np.float16 else array)
+            if array.dtype == np.bool_ and array.size and array.view(np.uint8).max() > 1:
+                raise model_file_error(key, expected="booleans 0 or 1", got=f"the byte {array.view(np.uint8).max()}")
+            array = array.astype(leaf.dtype) if array.dtype == np.float16 else array
+            if jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype:
+                return jax.device_put(array)  # jnp.asarray compiles, and keeps, a program for every shape
+            return np.array(array)
 
         return jax.tree_util.tree_map_with_path(fill, skeleton)
 
@@ -412,26 +405,14 @@ def open_tensors(path: Path) -> Iterator[Any]:
         raise _unreadable_error(path, f"a damaged or truncated file ({one_line(error)})") from error
 
 
-def _to_leaf(key: str, array: np.ndarray) -> jax.Array | np.ndarray:
-    if array.dtype == np.bool_ and array.size and array.view(np.uint8).max() > 1:
-        raise model_file_error(key, expected="booleans 0 or 1", got=f"the byte {array.view(np.uint8).max()}")
-    if jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype:
-        return jax.device_put(array)  # jnp.asarray compiles, and keeps, a program for every shape
-    return np.array(array)
-
-
 def model_file_error(parameter: str, *, expected: str, got: object, cure: str = "") -> ModelFileError:
     """The error with the text of `invalid`."""
     return ModelFileError(str(invalid(parameter, expected=expected, got=got, cure=cure)))
 
 
 def _unreadable_error(path: Path, got: str) -> ModelFileError:
-    return model_file_error(
-        "path",
-        expected=f"a {FORMAT} file",
-        got=f"{got}: {str(path)!r}",
-        cure="Give a file that `foldgauss fit` wrote.",
-    )
+    cure = "Give a file that `foldgauss fit` wrote."
+    return model_file_error("path", expected=f"a {FORMAT} file", got=f"{got}: {str(path)!r}", cure=cure)
 
 
 def _spec_text(spec: dict | None) -> str:
