@@ -6,7 +6,7 @@ import re
 import secrets
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from foldgauss._runtime.checks import invalid, short_repr
@@ -29,6 +29,12 @@ def check_path(path: object, order: str = "") -> Path:
         cure = f"The order is ({order})." if order else ""
         raise invalid("path", expected="a path", got=short_repr(path), cure=cure)
     return Path(path)
+
+
+def missing_error(path: str | os.PathLike, expected: str) -> FileNotFoundError:
+    """The error for an input that does not exist."""
+    text = f"path: expected {expected}, got {str(path)!r}, which is missing."
+    return FileNotFoundError(f"{text} Check the spelling and the current folder.")
 
 
 def _check_target(path: Path) -> None:
@@ -66,6 +72,15 @@ def output_error(path: Path, error: OSError) -> OutputError:
 
 
 @contextmanager
+def translate_output_errors(path: Path) -> Iterator[None]:
+    """Raise an OSError of writing `path` in its one-line form."""
+    try:
+        yield
+    except OSError as error:
+        raise output_error(path, error) from error
+
+
+@contextmanager
 def _name_output(path: Path, temporary: Path) -> Iterator[None]:
     """Make errors during a write name `path`: those of a full disk name no file, or the temporary one."""
     try:
@@ -82,21 +97,15 @@ def _name_output(path: Path, temporary: Path) -> Iterator[None]:
 def _new_file(path: Path) -> Path:
     """Create the empty temporary file that is to become `path`."""
     _check_target(path)
-    try:
-        os.lstat(path)
-    except FileNotFoundError:
-        pass
-    except OSError as error:  # a name that is too long for `path`, though not for the temporary file
-        raise output_error(path, error) from error
+    with translate_output_errors(path), suppress(FileNotFoundError):
+        os.lstat(path)  # raises for a name that is too long for `path`, though not for the temporary file
     # os.path, not Path: it returns False for any OSError, and opening then reports the reason.
     if os.path.exists(path) and not os.path.isfile(path):
         raise OutputError(f"path: expected a file's path, got {str(path)!r}, which is not a regular file.")
     temporary = temporary_name(path, path.suffix)
-    try:
+    with translate_output_errors(path):
         # O_EXCL and mode 0o666: no clash, and the user's umask holds (mkstemp would give 0o600).
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
-    except OSError as error:
-        raise output_error(path, error) from error
     return temporary
 
 
@@ -122,10 +131,8 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
             yield temporary
             with open(temporary, "rb") as file:
                 os.fsync(file.fileno())
-        try:
+        with translate_output_errors(path):
             os.replace(temporary, path)
-        except OSError as error:
-            raise output_error(path, error) from error
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -146,10 +153,8 @@ def atomic_folder(
     _check_replaceable(given, overwrite, pattern, what)
     _check_target(folder)
     temporary, aside = temporary_name(folder, ""), temporary_name(folder, "")
-    try:
+    with translate_output_errors(folder):
         temporary.mkdir()
-    except OSError as error:
-        raise output_error(folder, error) from error
     try:
         with _name_output(folder, temporary):
             yield temporary
@@ -173,10 +178,8 @@ def _check_replaceable(folder: Path, overwrite: bool, pattern: str, what: str) -
         return
     if not folder.is_dir():
         raise OutputError(f"path: expected a folder for {what}, got the file {str(folder)!r}. Choose another name.")
-    try:
+    with translate_output_errors(folder):
         names = [entry.name for entry in folder.iterdir()]
-    except OSError as error:
-        raise output_error(folder, error) from error
     foreign = [name for name in names if not re.fullmatch(pattern, name)]
     if foreign:
         raise OutputError(

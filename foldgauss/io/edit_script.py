@@ -25,7 +25,7 @@ import os
 import re
 import tomllib
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -78,6 +78,14 @@ def _is_number(value: Any) -> bool:
 
 def _is_whole(value: Any) -> bool:
     return _is_number(value) and isinstance(value, int) and value >= 0
+
+
+def _is_table(value: Any) -> bool:
+    return isinstance(value, dict)
+
+
+def _is_array_of_tables(value: Any) -> bool:
+    return isinstance(value, list) and all(map(_is_table, value))
 
 
 def _is_range(value: Any) -> bool:
@@ -144,7 +152,15 @@ _CRITERIA: _Keys = {
 }
 _LAYER: _Keys = {"model": _PATH, "where": _TEXT, "freeze": _NUMBER, "script": _PATH}
 _CAMERA: _Keys = {"azimuth": _NUMBER, "elevation": _NUMBER}
-_TABLES = ("selections", "edits", "layers", "camera")
+_TABLES: _Keys = {
+    "selections": _Kind(
+        "tables, each begun by [selections.NAME]",
+        lambda value: _is_table(value) and all(map(_is_table, value.values())),
+    ),
+    "edits": _Kind("tables, each begun by [[edits]]", _is_array_of_tables),
+    "layers": _Kind("tables, each begun by [[layers]]", _is_array_of_tables),
+    "camera": _Kind("a table begun by [camera]", _is_table),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -330,32 +346,29 @@ def parse_edit_script(text: str, *, source: str = "script", folder: str | os.Pat
         tables = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise _toml_error(source, text, error) from error
-    _check_names(_TableContext(source, text, ()), tables, _TABLES)
-    selections = tables.get("selections", {})
-    _check_selections(source, text, selections)
-    for name, check in (("edits", _check_edit), ("layers", _check_layer)):
-        rows = tables.get(name, [])
-        if not (isinstance(rows, list) and all(isinstance(row, dict) for row in rows)):
-            raise _TableContext(source, text, ()).error(name, f"tables, each begun by [[{name}]]", "something else")
-        for number, row in enumerate(rows):
-            check(_TableContext(source, text, (name, number)), row, selections)
-    if not isinstance(tables.get("camera", {}), dict):
-        raise _TableContext(source, text, ()).error("camera", "a table begun by [camera]", "something else")
-    _check_keys(_TableContext(source, text, ("camera",)), tables.get("camera", {}), _CAMERA)
-    return EditScript(tables, source, text, Path(folder))
+    script = EditScript(tables, source, text, Path(folder))
+    _check_keys(script._context(), tables, _TABLES)
+    selections: dict[str, dict] = tables.get("selections", {})
+    known: list[str] = []
+    for name, table in selections.items():
+        _check_selection(script._context("selections", name), table, known)
+        known.append(name)
+    for number, table in enumerate(tables.get("edits", ())):
+        _check_edit(script._context("edits", number), table, known)
+    for number, table in enumerate(tables.get("layers", ())):
+        _check_layer(script._context("layers", number), table)
+    _check_keys(script._context("camera"), tables.get("camera", {}), _CAMERA)
+    return script
 
 
 def _toml_error(source: str, text: str, error: Exception) -> EditScriptError:
     """An error with the message of `tomllib`, whose line number is put where other errors have it."""
     message = " ".join(str(error).split()) or "endless nesting"
-    line = re.search(r" \(at line (\d+), (column \d+)\)$", message)
-    if line:
-        return EditScriptError(f"{source}, line {line[1]}: expected TOML, got: {message[: line.start()]}, {line[2]}.")
-    end = re.search(r" \(at end of document\)$", message)
-    if end:
-        line = text.count("\n") + 1
-        return EditScriptError(f"{source}, line {line}: expected TOML, got: {message[: end.start()]}, the text's end.")
-    return EditScriptError(f"{source}: expected TOML, got: {message}.")
+    place = re.search(r" \(at (?:line (\d+), (column \d+)|end of document)\)$", message)
+    if place is None:
+        return EditScriptError(f"{source}: expected TOML, got: {message}.")
+    line, where = place[1] or text.count("\n") + 1, place[2] or "the text's end"
+    return EditScriptError(f"{source}, line {line}: expected TOML, got: {message[: place.start()]}, {where}.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -409,7 +422,8 @@ class _TableContext:
 
 def _check_keys(context: _TableContext, table: dict[str, Any], known: _Keys, needed: _Keys | None = None) -> None:
     """Raise for unknown keys, missing required keys, and values of a wrong type."""
-    _check_names(context, table, known)
+    for key in table:
+        _check_known(context, key, "one of ", key, sorted(known))
     missing = [key for key in needed or {} if key not in table]
     if missing:
         raise context.error(None, f"the key {missing[0]!r}", ", ".join(sorted(table)) or "an empty table")
@@ -418,15 +432,12 @@ def _check_keys(context: _TableContext, table: dict[str, Any], known: _Keys, nee
             raise context.error(key, known[key].expected, _truncated_repr(value))
 
 
-def _check_names(context: _TableContext, table: dict[str, Any], known: Mapping[str, Any] | tuple[str, ...]) -> None:
-    for key in table:
-        if key not in known:
-            raise context.error(key, "one of " + ", ".join(sorted(known)), repr(key), _suggest(key, known))
-
-
-def _suggest(word: str, known: Mapping[str, Any] | tuple[str, ...]) -> str:
-    near = difflib.get_close_matches(word, known, 1)
-    return f"Did you mean {near[0]!r}?" if near else ""
+def _check_known(context: _TableContext, key: str, expected: str, word: str, known: Collection[str]) -> None:
+    """Raise unless a word is known; `expected` says what it is one of."""
+    if word not in known:
+        near = difflib.get_close_matches(word, known, 1)
+        cure = f"Did you mean {near[0]!r}?" if near else ""
+        raise context.error(key, expected + (", ".join(known) or "there is none"), _truncated_repr(word), cure)
 
 
 def _truncated_repr(value: Any) -> str:
@@ -437,53 +448,37 @@ def _truncated_repr(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _check_selections(source: str, text: str, selections: Any) -> None:
-    if not (isinstance(selections, dict) and all(isinstance(table, dict) for table in selections.values())):
-        expected = "tables, each begun by [selections.NAME]"
-        raise _TableContext(source, text, ()).error("selections", expected, "something else")
-    known: dict[str, None] = {}
-    for name, table in selections.items():
-        context = _TableContext(source, text, ("selections", name))
-        if not table:
-            raise context.error(None, "at least one criterion", "none")
-        if table.keys() & _COMBINATION.keys():
-            _check_keys(context, table, _COMBINATION)
-            _check_combined(context, table, known)
-        elif "indices" in table:
-            _check_keys(context, table, _INDICES)
-            with context:
-                deque(parse_ranges(table["indices"]), maxlen=0)
-        else:
-            _check_keys(context, table, {**_CRITERIA, **(_MASK_FILE if "mask" in table else {})})
-            if "mask" in table and "file" in table:
-                raise context.error("file", "a mask or a file", "both", "Combine two selections with all=[...].")
-        known[name] = None
+def _check_selection(context: _TableContext, table: dict[str, Any], known: list[str]) -> None:
+    """Check a selection after those that are `known`."""
+    if not table:
+        raise context.error(None, "at least one criterion", "none")
+    if table.keys() & _COMBINATION.keys():
+        _check_keys(context, table, _COMBINATION)
+        for key, names in table.items():
+            for name in names:
+                _check_known(context, key, "a selection from before: ", name, known)
+    elif "indices" in table:
+        _check_keys(context, table, _INDICES)
+        with context:
+            deque(parse_ranges(table["indices"]), maxlen=0)
+    else:
+        _check_keys(context, table, {**_CRITERIA, **(_MASK_FILE if "mask" in table else {})})
+        if "mask" in table and "file" in table:
+            raise context.error("file", "a mask or a file", "both", "Combine two selections with all=[...].")
 
 
-def _check_combined(context: _TableContext, table: dict[str, list[str]], known: dict[str, None]) -> None:
-    for key, names in table.items():
-        for name in names:
-            if name not in known:
-                expected = "a selection from before: " + (", ".join(known) or "there is none")
-                raise context.error(key, expected, repr(name), _suggest(name, tuple(known)))
-
-
-def _check_edit(context: _TableContext, table: dict[str, Any], selections: dict[str, Any]) -> None:
+def _check_edit(context: _TableContext, table: dict[str, Any], selections: list[str]) -> None:
     do = table.get("do")
-    if not isinstance(do, str) or do not in ACTIONS:
-        got = "none" if do is None else _truncated_repr(do)
-        raise context.error(
-            "do", "one of " + ", ".join(ACTIONS), got, _suggest(do, ACTIONS) if isinstance(do, str) else ""
-        )
+    if not isinstance(do, str):
+        raise context.error("do", "one of " + ", ".join(ACTIONS), "none" if do is None else _truncated_repr(do))
+    _check_known(context, "do", "one of ", do, ACTIONS)
     action = ACTIONS[do]
     _check_keys(context, table, {"do": _TEXT, "select": _TEXT, **action.keys}, action.required)
-    name = table.get("select")
-    if name is not None and name not in selections:
-        expected = "the name of a selection: " + (", ".join(selections) or "there is none")
-        raise context.error("select", expected, repr(name), _suggest(name, selections))
+    if "select" in table:
+        _check_known(context, "select", "the name of a selection: ", table["select"], selections)
 
 
-def _check_layer(context: _TableContext, table: dict[str, Any], selections: dict[str, Any]) -> None:
+def _check_layer(context: _TableContext, table: dict[str, Any]) -> None:
     _check_keys(context, table, _LAYER, {"model": _PATH})
     if table.get("where", "behind") not in ("front", "behind"):
         raise context.error("where", "'front' or 'behind'", repr(table["where"]))

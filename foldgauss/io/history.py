@@ -10,7 +10,7 @@ from typing import Any, Self
 
 from foldgauss._runtime.checks import invalid, is_integer
 from foldgauss.analysis.plot import plot_history
-from foldgauss.io._atomic import atomic_path, output_error
+from foldgauss.io._atomic import atomic_path, translate_output_errors
 from foldgauss.io.figures import write_figure
 from foldgauss.video.fitting.loop import FitInfo, FitState
 
@@ -53,12 +53,10 @@ class HistoryFile:
         if info.step <= self._last:
             return  # a finished checkpoint reports its last step again
         self._last = info.step
-        try:
+        with translate_output_errors(self.path):
             self._file = self._file or self.path.open("a" if self._append else "w", encoding="utf-8")
             self._file.write(json.dumps(info_line(info)) + "\n")
             self._file.flush()
-        except OSError as error:
-            raise output_error(self.path, error) from error
 
     def __enter__(self) -> Self:
         return self

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.io._atomic import atomic_path
+from foldgauss.io._atomic import atomic_path, missing_error
 
 _SIZES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
@@ -138,9 +138,7 @@ def read_bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except FileNotFoundError:
-        raise FileNotFoundError(
-            f"path: expected a file, got {str(path)!r}, which is missing. Check the spelling and the current folder."
-        ) from None
+        raise missing_error(path, "a file") from None
     except OSError as error:
         expected, got = "a file that can be read", error.strerror or str(error)
         raise format_error(path, expected=expected, got=got, cure="Give the path of a file.") from error
@@ -298,9 +296,8 @@ def _encode(elements: Mapping[str, Mapping[str, np.ndarray]], comments: Sequence
     for name, columns in elements.items():
         lines.append(f"element {name} {len(next(iter(columns.values())))}")
         lines.extend(f"property float {column}" for column in columns)
-    lines.extend(
-        f"comment {comment}" for comment in comments
-    )  # last: some viewers expect the vertices in the third line
+    # Comments are last: some viewers expect the vertices in the third line.
+    lines.extend(f"comment {comment}" for comment in comments)
     yield ("\n".join(lines) + "\nend_header\n").encode("ascii")
     for columns in elements.values():
         yield np.stack([np.asarray(column, "<f4") for column in columns.values()], axis=1).tobytes()

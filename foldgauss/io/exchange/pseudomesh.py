@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from foldgauss._runtime.checks import check_one_of, invalid
-from foldgauss.io._atomic import atomic_folder
+from foldgauss.io._atomic import atomic_folder, missing_error
 from foldgauss.io.exchange.gaussians_ply import check_times, frame_gaussians, read_3dgs_ply, write_gaussians_ply
 from foldgauss.io.exchange.ply_file import facts_error, format_error, read_bytes
 from foldgauss.io.media.frame_rate import DEFAULT_FPS
@@ -207,9 +207,7 @@ def read_pseudomesh(
     check_one_of("axes", axes, ("y-up", "y-down"))
     folder = Path(folder)
     if not os.path.exists(folder):
-        raise FileNotFoundError(
-            f"path: expected a folder, got {str(folder)!r}, which is missing. Check the current folder."
-        )
+        raise missing_error(folder, "a folder")
     paths = sorted(folder.glob("*.obj"), key=lambda path: natural_sort_key(path.name)) if folder.is_dir() else []
     if not paths:
         cure = "Give the folder that write_pseudomesh or `foldgauss export --format obj` made."

@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from foldgauss._runtime.checks import invalid, is_within
-from foldgauss.io._atomic import check_path
+from foldgauss.io._atomic import check_path, missing_error
 from foldgauss.io.media.format_detection import HEAD_BYTES
 from foldgauss.io.media.frame_rate import MAX_FPS, FrameRate
 
 MAX_PIXELS = 1 << 28  # of one image, 16384x16384: a header may claim any size
+VIDEO = "a video file or a folder of images"
 Range = tuple[int | None, int | None]
 PathLike = str | os.PathLike
 #: (prepared frames, frames declared within the range, frame rate, notes)
@@ -70,25 +71,14 @@ class Clip:
 def check_readable(path: PathLike) -> Path:
     """The path of an existing file or folder. Raises `FileNotFoundError`, or `VideoError` for pipes and devices."""
     address, path = str(path), check_path(path)
-    if not os.path.exists(path):
-        raise FileNotFoundError(_missing_text(address))
-    if not (path.is_dir() or path.is_file()):
-        raise video_error(
-            "path",
-            expected="a video file or a folder of images",
-            got=f"{str(path)!r}, a pipe or a device",
-            cure="Save its output to a file.",
-        )
-    return path
-
-
-def _missing_text(address: str) -> str:
+    if os.path.isdir(path) or os.path.isfile(path):
+        return path
+    if os.path.exists(path):
+        got, cure = f"{str(path)!r}, a pipe or a device", "Save its output to a file."
+        raise video_error("path", expected=VIDEO, got=got, cure=cure)
     if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", address):
-        return f"path: expected a file or a folder, got the address {address!r}. Download it first."
-    return (
-        f"path: expected a video file or a folder of images, got {address!r}, which is missing. "
-        "Check the spelling and the current folder."
-    )
+        raise FileNotFoundError(f"path: expected {VIDEO}, got the address {address!r}. Download it first.")
+    raise missing_error(address, VIDEO)
 
 
 @contextmanager
@@ -128,12 +118,11 @@ def check_range(frames: Range | None) -> tuple[int, int | None]:
 
 def check_range_within(start: int, stop: int | None, num_total: int, path: Path) -> None:
     if start >= num_total or (stop is not None and stop > num_total):
-        raise video_error(
-            "frames",
-            expected=f"A:B within 0:{num_total}, the frames of {str(path)!r}",
-            got=format_range(start, stop),
-            cure=f"Choose B <= {num_total} and A below it.",
+        expected, cure = (
+            f"A:B within 0:{num_total}, the frames of {str(path)!r}",
+            f"Choose B <= {num_total} and A below it.",
         )
+        raise video_error("frames", expected=expected, got=format_range(start, stop), cure=cure)
 
 
 def check_frame_size(size: tuple[int, int] | None, parameter: str = "size") -> tuple[int, int] | None:
@@ -155,12 +144,12 @@ def check_fps(fps: float) -> None:
 def check_num_pixels(path: Path, size: tuple[int, int] | None) -> None:
     """Raise where a header claims more than `MAX_PIXELS`, before memory is allocated for them."""
     if size is not None and size[0] * size[1] > MAX_PIXELS:
-        raise video_error(
-            "path",
-            expected=f"images of at most {MAX_PIXELS:,} pixels",
-            got=f"{size[0]}x{size[1]} (height x width) in the header of {str(path)!r}",
-            cure="The file is damaged, or must be scaled down first.",
+        expected, got = (
+            f"images of at most {MAX_PIXELS:,} pixels",
+            f"{format_size(size)} in the header of {str(path)!r}",
         )
+        cure = "The file is damaged, or must be scaled down first."
+        raise video_error("path", expected=expected, got=got, cure=cure)
 
 
 def video_error(parameter: str, *, expected: str, got: str, cure: str = "") -> VideoError:

@@ -14,7 +14,7 @@ from av.filter import Graph
 from av.stream import Disposition
 from av.video.reformatter import Interpolation
 
-from foldgauss.io.media.clip import VideoError, check_num_pixels, format_num_bytes, read_head, video_error
+from foldgauss.io.media.clip import VIDEO, VideoError, check_num_pixels, format_num_bytes, read_head, video_error
 from foldgauss.io.media.format_detection import DEMUXERS, LIST, describe_kind
 from foldgauss.io.media.frame_rate import DEFAULT_FPS
 from foldgauss.io.media.image_files import premultiply
@@ -213,12 +213,9 @@ class VideoDecoder:
                 yield frame
                 continue
             if not self._deinterlace:
-                raise video_error(
-                    "path",
-                    expected="a video of progressive frames",
-                    got=f"one of interlaced fields, {str(self._path)!r}",
-                    cure="Convert it while reading, with deinterlace=True.",
-                )
+                got = f"one of interlaced fields, {str(self._path)!r}"
+                cure = "Convert it while reading, with deinterlace=True."
+                raise video_error("path", expected="a video of progressive frames", got=got, cure=cure)
             kind = frame.height, frame.width, frame.format.name
             if graph is None or kind != of_graph:
                 yield from flush_frames(graph)
@@ -257,24 +254,17 @@ def open_container(path: Path, demuxers: str = DEMUXERS) -> av.container.InputCo
     """An open file, restricted to itself. Raises `VideoError`."""
     kind = describe_kind(read_head(path))
     if kind == LIST:
-        raise video_error(
-            "path",
-            expected="a video file or a folder of images",
-            got=f"{kind}, {str(path)!r}",
-            cure="The files that it names are not opened: give the video itself.",
-        )
+        got, cure = f"{kind}, {str(path)!r}", "The files that it names are not opened: give the video itself."
+        raise video_error("path", expected=VIDEO, got=got, cure=cure)
     # An absolute path, because FFmpeg takes 'name:rest' for a protocol. One local file and nothing that it refers to.
     options = {"protocol_whitelist": "file", "format_whitelist": demuxers}
     try:
         return av.open(f"file:{path.resolve()}", options=options, metadata_errors="replace")
     except (av.FFmpegError, ValueError) as error:
         about = format_num_bytes(path) + (f", {kind}" if kind else "")
-        raise video_error(
-            "path",
-            expected="a video file or a folder of images",
-            got=f"{str(path)!r} ({about}), which does not open as a video",
-            cure="Check that it is a video and that its copy or download is complete.",
-        ) from error
+        got = f"{str(path)!r} ({about}), which does not open as a video"
+        cure = "Check that it is a video and that its copy or download is complete."
+        raise video_error("path", expected=VIDEO, got=got, cure=cure) from error
 
 
 def _choose_stream(container: av.container.InputContainer, path: Path) -> av.VideoStream:
@@ -292,18 +282,15 @@ def _choose_stream(container: av.container.InputContainer, path: Path) -> av.Vid
         got = f"audio with a cover image, {str(path)!r}"
         raise video_error("path", expected="a video", got=got, cure="Give a file with moving images.")
     got = f"{str(path)!r} ({'audio' if container.streams.audio else 'no video stream'}), which does not open as a video"
-    raise video_error("path", expected="a video file or a folder of images", got=got)
+    raise video_error("path", expected=VIDEO, got=got)
 
 
 def _make_deinterlacer(frame: av.VideoFrame, clock: Fraction) -> Graph:
     graph = Graph()
     source = graph.add_buffer(width=frame.width, height=frame.height, format=frame.format, time_base=clock)
-    # One frame for each frame, and its clock: bwdif's would be twice as fast.
-    nodes = (
-        graph.add("bwdif", "mode=send_frame:deint=interlaced"),
-        graph.add("settb", f"{clock.numerator}/{clock.denominator}"),
-    )
-    graph.link_nodes(source, *nodes, graph.add("buffersink")).configure()
+    filtered = graph.add("bwdif", "mode=send_frame:deint=interlaced")  # one frame for each frame
+    same_clock = graph.add("settb", f"{clock.numerator}/{clock.denominator}")  # bwdif's would be twice as fast
+    graph.link_nodes(source, filtered, same_clock, graph.add("buffersink")).configure()
     return graph
 
 

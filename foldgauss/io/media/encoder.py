@@ -120,16 +120,12 @@ def choose_encoding(
     if pixel_format is None:
         pixel_format = chosen.alpha_format if has_alpha and chosen.alpha_format else chosen.pixel_formats[0]
     check_one_of("pixel_format", pixel_format, chosen.pixel_formats)
-    if has_alpha and not _has_alpha(pixel_format):
+    if has_alpha and not any(part.is_alpha for part in av.VideoFormat(pixel_format).components):
         cure = "Take vp9 in a .webm, prores in a .mov or ffv1 in a .mkv, or composite the frames over a color."
         if chosen.alpha_format:
             cure = f"Take {chosen.alpha_format}."
         raise video_error("frames", expected=f"RGB for {name} in {pixel_format}", got="RGBA", cure=cure)
     return Encoding(chosen, crf if crf is not None else chosen.crf and chosen.crf[0], pixel_format)
-
-
-def _has_alpha(pixel_format: str) -> bool:
-    return any(part.is_alpha for part in av.VideoFormat(pixel_format).components)
 
 
 def encode_video(
@@ -161,7 +157,9 @@ def encode_video(
             if number == 0:
                 stream.height, stream.width = image.shape[:2]
                 if matrix is not None:
-                    _declare_bt709(stream.codec_context)
+                    context = stream.codec_context
+                    context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
+                    context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
                 _open_with_own_priority(stream.codec_context)
             given = av.VideoFrame.from_ndarray(image, format="rgba" if image.shape[2] == 4 else "rgb24")
             given = given.reformat(format=pixel_format.name, dst_colorspace=matrix, interpolation=CONVERSION)
@@ -216,20 +214,14 @@ def check_sound(sound: Sound) -> None:
     if not is_within(sound.start, "[0, inf)"):
         raise invalid("sound.start", expected="seconds, at least 0", got=repr(sound.start))
     if not is_within(sound.speed, "[0.01, 100]"):
-        raise invalid(
-            "sound.speed", expected="a speed from 0.01 to 100", got=f"{sound.speed:g}", cure="Leave sound out."
-        )
+        expected, cure = "a speed from 0.01 to 100", "Leave sound out."
+        raise invalid("sound.speed", expected=expected, got=f"{sound.speed:g}", cure=cure)
     got = f"{str(sound.path)!r}, which does not open"
     with suppress(VideoError), open_container(check_readable(sound.path), SOUND_DEMUXERS) as source:
         if source.streams.audio:
             return
         got = f"{str(sound.path)!r}, which has none"
     raise video_error("sound", expected="a file with sound", got=got, cure="Leave it out.")
-
-
-def _declare_bt709(context: av.VideoCodecContext) -> None:
-    context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
-    context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
 
 
 def _open_with_own_priority(context: av.VideoCodecContext) -> None:

@@ -17,15 +17,17 @@ from foldgauss.io._atomic import atomic_path, check_path
 from foldgauss.io.media.clip import (
     PathLike,
     Range,
+    VideoError,
     check_fps,
     check_range,
     check_readable,
+    format_range,
     translate_os_errors,
     video_error,
 )
 from foldgauss.io.media.frame_rate import describe_rate, make_increasing
 from foldgauss.io.media.image_files import image_paths, read_folder
-from foldgauss.io.media.video_decoding import DecodeReport, FramePlace, decode_file, describe_span, read_video_file
+from foldgauss.io.media.video_decoding import DecodeReport, decode_file, describe_span, read_video_file
 from foldgauss.io.media.video_reading import choose_reader
 from foldgauss.video.motion.optical_flow import CutFinder
 
@@ -61,18 +63,12 @@ class FrameIndex:
     # Beyond these, for the reader: `path`, absolute; `start`, the first frame of the range in the file; of all frames
     # decoded from the file's first on `stamps` and `places`; of those indexed `digests` and `transparent`.
 
-    def __init__(
-        self,
-        about: dict,
-        stamps: np.ndarray,
-        places: np.ndarray,
-        digests: np.ndarray,
-        transparent: np.ndarray,
-        times: np.ndarray | None,
-    ):
-        self._about = about
-        self.stamps, self.places, self.digests, self.transparent = stamps, places, digests, transparent
-        self.times = times
+    def __init__(self, about: dict, arrays: dict[str, np.ndarray]):
+        """`about`, JSON types, and `arrays` are what a file holds."""
+        self._about, self._arrays = about, arrays
+        self.stamps, self.places = arrays["stamps"], arrays["places"]
+        self.digests, self.transparent = arrays["digests"], arrays["transparent"]
+        self.times: np.ndarray | None = arrays.get("times")
         self.source: str = about["source"]
         self.path = Path(about["path"])
         self.kind: str = about["kind"]
@@ -85,10 +81,10 @@ class FrameIndex:
         self.num_declared: int = about["num_declared"]
         self.notes: tuple[str, ...] = tuple(about["notes"])
         self.cuts: list[int] = list(about["cuts"])
-        self.num_frames = len(digests)
-        self.has_alpha = bool(transparent.any())
-        self.num_before = len(places) - len(digests)  # frames decoded before the first one indexed
-        self.positions = places[self.num_before :] - self.start
+        self.num_frames = len(self.digests)
+        self.has_alpha = bool(self.transparent.any())
+        self.num_before = len(self.places) - self.num_frames  # frames decoded before the first one indexed
+        self.positions = self.places[self.num_before :] - self.start
         self.alpha_at_size: dict[tuple[int, int], bool] = {}  # found by the reader
         self.last_margin = 0  # of the reader's last seek, in frames
 
@@ -124,28 +120,20 @@ class FrameIndex:
         """A range of frames that decode. Raises `VideoError` for one that is empty or beyond the clip."""
         first, stop = operator.index(first), self.num_frames if stop is None else operator.index(stop)
         if not 0 <= first < stop <= self.num_frames:
-            raise video_error(
-                "first, stop",
-                expected=f"a range within 0:{self.num_frames}, the frames of {self.source!r}",
-                got=f"{first}:{stop}",
-                cure="Choose first < stop.",
-            )
+            raise self.range_error(first, stop, self.num_frames)
         return first, stop
+
+    def range_error(self, first: int, stop: int | None, num: int) -> VideoError:
+        """The error for a range that is empty or beyond the `num` frames of the clip."""
+        expected = f"a range within 0:{num}, the frames of {self.source!r}"
+        cure = f"Choose stop <= {num} and first below it."
+        return video_error("first, stop", expected=expected, got=format_range(first, stop), cure=cure)
 
     def save(self, path: PathLike) -> Path:
         """Write to a file (.npz), whole or not at all; returns the path. Raises `OutputError`."""
-        path = check_path(path)
-        arrays = {
-            "about": np.frombuffer(json.dumps({"format": _FORMAT, **self._about}).encode(), np.uint8),
-            "stamps": self.stamps,
-            "places": self.places,
-            "digests": self.digests,
-            "transparent": self.transparent,
-        }
-        if self.times is not None:
-            arrays["times"] = self.times
+        path, about = check_path(path), json.dumps({"format": _FORMAT, **self._about})
         with atomic_path(path) as temporary, open(temporary, "wb") as file:
-            np.savez(file, **arrays)
+            np.savez(file, about=np.frombuffer(about.encode(), np.uint8), **self._arrays)
         return path
 
     @classmethod
@@ -159,24 +147,17 @@ class FrameIndex:
                 about = json.loads(arrays.pop("about").tobytes())
                 if about.pop("format") != _FORMAT:
                     raise ValueError("format")
-                _check_shapes(arrays)
-                return cls(about, times=arrays.pop("times", None), **arrays)
+                num, num_passed = len(arrays["transparent"]), len(arrays["places"])
+                shapes = arrays["digests"].shape, arrays["stamps"].shape
+                if not 0 < num <= num_passed or shapes != ((num, DIGEST_BYTES), (num_passed,)):
+                    raise ValueError("shapes")
+                return cls(about, arrays)
         except FileNotFoundError:
             raise
         except _LOAD_ERRORS as error:
-            raise video_error(
-                "path",
-                expected="an index of a clip, as FrameIndex.save writes it",
-                got=f"{str(path)!r}",
-                cure="Make it again: index_video(CLIP).save(PATH).",
-            ) from error
-
-
-def _check_shapes(arrays: dict[str, np.ndarray]) -> None:
-    num, num_passed = len(arrays["transparent"]), len(arrays["places"])
-    shapes = arrays["digests"].shape, arrays["stamps"].shape
-    if not 0 < num <= num_passed or shapes != ((num, DIGEST_BYTES), (num_passed,)):
-        raise ValueError("shapes")
+            expected, got = "an index of a clip, as FrameIndex.save writes it", repr(str(path))
+            cure = "Make it again: index_video(CLIP).save(PATH)."
+            raise video_error("path", expected=expected, got=got, cure=cure) from error
 
 
 # --------------------------------------------------------------------------------------------- indexing
@@ -227,7 +208,7 @@ def index_video(
             )
         else:
             kept, num_declared, rate, notes = reader(path, start, stop, record)
-            passed = [FramePlace(start + k, 0) for k in range(len(kept))]
+            passed = [(start + k, 0) for k in range(len(kept))]
             if reader is read_folder:
                 names = [entry.name for entry in image_paths(path)[start:stop]]
     places, stamps = np.array(passed, np.int64).T.copy()
@@ -254,6 +235,10 @@ def index_video(
         "deinterlace": bool(deinterlace),
         "shape_notes": list(report.notes) if report else [],
     }
-    digests = np.frombuffer(bytes(digests), np.uint8).reshape(-1, DIGEST_BYTES)
-    transparent = np.frombuffer(transparent, np.uint8).astype(bool)
-    return FrameIndex(about, stamps, places, digests, transparent, rate.times if fps is None else None)
+    arrays = {
+        "stamps": stamps,
+        "places": places,
+        "digests": np.frombuffer(bytes(digests), np.uint8).reshape(-1, DIGEST_BYTES),
+        "transparent": np.frombuffer(transparent, np.uint8).astype(bool),
+    }
+    return FrameIndex(about, arrays if fps is not None or rate.times is None else arrays | {"times": rate.times})

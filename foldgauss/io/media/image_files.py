@@ -64,23 +64,17 @@ def read_folder(folder: Path, start: int, stop: int | None, prepare: Callable) -
     """The images of a folder."""
     images = image_paths(folder)
     if not images:
-        raise video_error(
-            "path",
-            expected="a folder with images (" + ", ".join(s[1:] for s in IMAGE_SUFFIXES) + ")",
-            got=f"{str(folder)!r} without any",
-            cure="Give the folder that holds the frames, or a video file.",
-        )
+        expected = "a folder with images (" + ", ".join(s[1:] for s in IMAGE_SUFFIXES) + ")"
+        got, cure = f"{str(folder)!r} without any", "Give the folder that holds the frames, or a video file."
+        raise video_error("path", expected=expected, got=got, cure=cure)
     check_range_within(start, stop, len(images), folder)
     return read_images(images[start:stop], prepare)
 
 
 def image_paths(folder: Path) -> list[Path]:
     """The images in `folder` in the order in which `read_video` reads them."""
-    images = (
-        entry
-        for entry in folder.iterdir()
-        if entry.suffix.lower() in IMAGE_SUFFIXES and not entry.name.startswith(".") and entry.is_file()
-    )
+    visible = (entry for entry in folder.iterdir() if not entry.name.startswith("."))
+    images = (entry for entry in visible if entry.suffix.lower() in IMAGE_SUFFIXES and entry.is_file())
     return sorted(images, key=lambda entry: natural_sort_key(entry.name))
 
 
@@ -134,12 +128,12 @@ def read_images(paths: list[Path], prepare: Callable) -> ReadResult:
         image = read_image(path)
         first_shape = first_shape or image.shape[:2]
         if image.shape[:2] != first_shape:
-            raise video_error(
-                "path",
-                expected=f"images of one size, {format_size(first_shape)} as in {paths[0].name!r}",
-                got=f"{format_size(image.shape)} in {path.name!r}",
-                cure="Resize the images, or choose others with frames=(A, B).",
+            expected = f"images of one size, {format_size(first_shape)} as in {paths[0].name!r}"
+            got, cure = (
+                f"{format_size(image.shape)} in {path.name!r}",
+                "Resize the images, or choose others with frames=(A, B).",
             )
+            raise video_error("path", expected=expected, got=got, cure=cure)
         kept.append(prepare(image))
     return kept, len(paths), FrameRate(DEFAULT_FPS), ()
 
@@ -160,15 +154,11 @@ def read_image(path: Path) -> np.ndarray:
     if image.dtype == np.uint16:
         image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)  # 65535 = 255 * 257, to nearest
     if image.dtype != np.uint8:
-        raise video_error(
-            "path",
-            expected="images of 8 or 16 bits",
-            got=f"{image.dtype} in {str(path)!r}",
-            cure="Convert it to an 8-bit PNG.",
-        )
-    if image.ndim == 3 and image.shape[2] == 4:
-        return premultiply(image)
-    return image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+        got, cure = f"{image.dtype} in {str(path)!r}", "Convert it to an 8-bit PNG."
+        raise video_error("path", expected="images of 8 or 16 bits", got=got, cure=cure)
+    if image.ndim == 2:
+        return cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    return premultiply(image) if image.shape[2] == 4 else image
 
 
 def premultiply(image: np.ndarray) -> np.ndarray:
@@ -229,7 +219,7 @@ def read_animation(path: Path, start: int, stop: int | None, prepare: Callable) 
     shown = np.array(delays[start:])
     rate = estimate_rate(np.concatenate([[0], np.cumsum(shown)]) / 1000, 1000 * len(shown) / shown.sum())
     if rate.times is not None:
-        rate = FrameRate(rate.fps, rate.times[:-1])
+        rate = rate._replace(times=rate.times[:-1])
     return kept, (num_total if stop is None else stop) - start, replace_unusable_rate(rate), ()
 
 

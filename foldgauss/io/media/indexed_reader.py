@@ -11,7 +11,6 @@ from foldgauss.io.media.clip import (
     check_frame_size,
     check_range,
     check_readable,
-    format_range,
     no_frames_error,
     translate_os_errors,
     video_error,
@@ -43,7 +42,10 @@ def read_indexed(index: FrameIndex, first: int, stop: int | None, *, size: tuple
     Raises `FileNotFoundError` for a missing path; `VideoError` for a range outside the clip, one in which no frame
     decodes, and a file that is not the one indexed.
     """
-    first, stop = _check_span(index, first, stop)
+    first, stop = check_range((operator.index(first), None if stop is None else operator.index(stop)))
+    num = max(index.num_positions, index.num_declared)
+    if first >= num or (stop is not None and stop > num):
+        raise index.range_error(first, stop, num)
     path = check_readable(index.path)
     size = check_frame_size(size)
     low, high = np.searchsorted(index.positions, [first, index.num_positions if stop is None else stop]).tolist()
@@ -66,19 +68,6 @@ def read_indexed(index: FrameIndex, first: int, stop: int | None, *, size: tuple
     if index.fixed_fps is not None:
         return Clip(frames, index.fixed_fps, index.source, num_declared, None, notes + crop)
     return Clip(frames, float(rate.fps), index.source, num_declared, rate.times, notes + describe_rate(rate) + crop)
-
-
-def _check_span(index: FrameIndex, first: int, stop: int | None) -> tuple[int, int | None]:
-    first, stop = check_range((operator.index(first), None if stop is None else operator.index(stop)))
-    num = max(index.num_positions, index.num_declared)
-    if first >= num or (stop is not None and stop > num):
-        raise video_error(
-            "first, stop",
-            expected=f"a range within 0:{num}, the frames indexed of {index.source!r}",
-            got=format_range(first, stop),
-            cure=f"Choose stop <= {num} and first below it.",
-        )
-    return first, stop
 
 
 class IndexedReader:
@@ -205,16 +194,14 @@ class IndexedReader:
         """Number of the frame with that time stamp among all frames; where several have it, the next one."""
         known = self.index.stamps
         after = 0 if self._last is None else self._last + 1
-        if self._last is not None and after < len(known) and known[after] == stamp:
+        if after < len(known) and known[after] == stamp:  # mostly, and then no search is needed
             return after
         near = np.flatnonzero(known[after:] == stamp)
         return after + int(near[0]) if len(near) else None
 
 
 def _changed_error(index: FrameIndex, number: int) -> VideoError:
-    return video_error(
-        "path",
-        expected=f"the file that was indexed, {index.num_frames} frames with the digest {index.digest}",
-        got=f"{str(index.path)!r}, in which frame {number} differs",
-        cure="It has changed, or another FFmpeg decodes it: index it again with index_video, or restore the file.",
-    )
+    expected = f"the file that was indexed, {index.num_frames} frames with the digest {index.digest}"
+    got = f"{str(index.path)!r}, in which frame {number} differs"
+    cure = "It has changed, or another FFmpeg decodes it: index it again with index_video, or restore the file."
+    return video_error("path", expected=expected, got=got, cure=cure)

@@ -76,7 +76,13 @@ class LazyFrames:
 
     def __getitem__(self, which: int | slice) -> np.ndarray:
         if isinstance(which, slice):
-            return self._read_slice(which)
+            chosen = range(len(self))[which]
+            if chosen and chosen.step == 1:
+                return self._read(chosen.start, chosen.stop)
+            frames = np.empty((len(chosen), *self.shape[1:]), np.uint8)
+            for place, number in enumerate(chosen):
+                frames[place] = self._read_one(number)
+            return frames
         try:
             number = operator.index(which)
         except TypeError as error:
@@ -89,17 +95,6 @@ class LazyFrames:
 
     def __array__(self, dtype=None, copy=None) -> np.ndarray:
         return np.asarray(self[:], dtype)
-
-    def _read_slice(self, which: slice) -> np.ndarray:
-        chosen = range(len(self))[which]
-        if not chosen:
-            return np.empty((0, *self.shape[1:]), np.uint8)
-        if chosen.step == 1:
-            return self._read(chosen.start, chosen.stop)
-        frames = np.empty((len(chosen), *self.shape[1:]), np.uint8)
-        for place, number in enumerate(chosen):
-            frames[place] = self._read_one(number)
-        return frames
 
     def _read_one(self, number: int) -> np.ndarray:
         """A copy of one frame, by way of the cache."""

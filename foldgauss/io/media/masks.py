@@ -10,7 +10,7 @@ from jaxtyping import Bool
 from PIL import Image
 
 from foldgauss._runtime.checks import invalid, is_integer, is_within
-from foldgauss.io._atomic import check_path
+from foldgauss.io._atomic import check_path, missing_error
 from foldgauss.io.media.clip import Range, format_size
 from foldgauss.io.media.image_files import IMAGE_SUFFIXES, image_paths
 from foldgauss.io.media.resizing import aspect_window
@@ -55,7 +55,7 @@ def read_masks(
     """
     path = check_path(path)
     if not os.path.exists(path):
-        raise FileNotFoundError(f"path: expected an image, a folder or a video, got {str(path)!r}, which is missing.")
+        raise missing_error(path, "an image, a folder or a video")
     if label is not None and not (is_integer(label, 1) and label < VOID):
         raise invalid("label", expected=f"an object's label, 1 to {VOID - 1}", got=repr(label))
     masks = _read(path, label, frames, level)
@@ -119,11 +119,8 @@ def read_labels(paths: Sequence[Path]) -> np.ndarray:
         mask, mode = _read_label_image(path)
         gray = gray and mode != "P"
         if masks and mask.shape != masks[0].shape:
-            raise invalid(
-                "path",
-                expected=f"masks of one size, {format_size(masks[0].shape)} as in {paths[0].name!r}",
-                got=f"{format_size(mask.shape)} in {str(path)!r}",
-            )
+            expected = f"masks of one size, {format_size(masks[0].shape)} as in {paths[0].name!r}"
+            raise invalid("path", expected=expected, got=f"{format_size(mask.shape)} in {str(path)!r}")
         masks.append(mask)
     labels = np.stack(masks)
     if gray and set(np.unique(labels)) <= {0, _WHITE}:
@@ -140,25 +137,18 @@ def _read_label_image(path: Path) -> tuple[np.ndarray, str]:
     except Image.DecompressionBombError as error:
         most = max(MAX_PIXELS, MAX_PIXELS_PER_BYTE * path.stat().st_size)
         most = min(most, 2 * (Image.MAX_IMAGE_PIXELS or most))  # Pillow's own limit
-        raise invalid(
-            "path",
-            expected=f"a mask of at most {most:,} pixels, as its file has {path.stat().st_size:,} bytes",
-            got=f"more in {str(path)!r}",
-            cure="Is it a mask? If so, crop it, or store it uncompressed.",
-        ) from error
+        expected = f"a mask of at most {most:,} pixels, as its file has {path.stat().st_size:,} bytes"
+        cure = "Is it a mask? If so, crop it, or store it uncompressed."
+        raise invalid("path", expected=expected, got=f"more in {str(path)!r}", cure=cure) from error
     except Exception as error:  # Pillow's decoders raise anything: SyntaxError, struct.error, zlib.error, IndexError
-        raise invalid(
-            "path", expected="masks that decode", got=f"{str(path)!r}, which does not", cure="Copy it again."
-        ) from error
+        got = f"{str(path)!r}, which does not"
+        raise invalid("path", expected="masks that decode", got=got, cure="Copy it again.") from error
     if mode in _COLOR_MODES and (pixels[..., :3] == pixels[..., :1]).all():  # grayscale as paint programs store it
         mode, pixels = "L", pixels[..., 0]
     if mode not in _LABEL_MODES:
-        raise invalid(
-            "path",
-            expected="masks with a label per pixel (palette or grayscale)",
-            got=f"an image of mode {mode!r} in {str(path)!r}",
-            cure="Its colors were stored in place of the labels; use the original PNG.",
-        )
+        got = f"an image of mode {mode!r} in {str(path)!r}"
+        cure = "Its colors were stored in place of the labels; use the original PNG."
+        raise invalid("path", expected="masks with a label per pixel (palette or grayscale)", got=got, cure=cure)
     return pixels.astype(np.uint8) * (_WHITE if mode == "1" else 1), mode
 
 

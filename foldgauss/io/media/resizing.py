@@ -38,14 +38,14 @@ def make_resizer(
         channels = image.shape[2]
         num_bytes, num_frames = num_bytes + channels * height * width, num_frames + 1
         if num_bytes > limit:
-            raise video_error(
-                "size",
-                expected=f"a clip of at most {limit / 2**30:.1f} GiB, a third of this machine's memory",
-                got=f"more, at frame {num_frames} of {height}x{width}",
-                cure="Take fewer frames or a smaller size.",
-            )
+            expected = f"a clip of at most {limit / 2**30:.1f} GiB, a third of this machine's memory"
+            got = f"more, at frame {num_frames} of {height}x{width}"
+            raise video_error("size", expected=expected, got=got, cure="Take fewer frames or a smaller size.")
         if size is not None and image.shape[:2] != size:
-            image = _resize(image[aspect_window(image.shape[:2], size)], size)
+            image = image[aspect_window(image.shape[:2], size)]
+        if image.shape[:2] != (height, width):
+            shrinks = image.shape[0] >= height and image.shape[1] >= width
+            image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB if channels == 3 else cv2.COLOR_BGRA2RGBA)
 
     return prepare
@@ -84,13 +84,6 @@ def center_window(have: tuple[int, int], window: tuple[int, int]) -> tuple[slice
         )
     top, left = (have[0] - window[0]) // 2, (have[1] - window[1]) // 2
     return slice(top, top + window[0]), slice(left, left + window[1])
-
-
-def _resize(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    if image.shape[:2] == size:
-        return image
-    shrinks = image.shape[0] >= size[0] and image.shape[1] >= size[1]
-    return cv2.resize(image, (size[1], size[0]), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
 
 
 def convert_channels(frame: np.ndarray, channels: int) -> np.ndarray:

@@ -28,7 +28,7 @@ def read_video_file(
     kept, passed, report = decode_file(
         path, start, stop, lambda frames: copy_to_blocks(map(prepare, frames)), deinterlace=deinterlace
     )
-    stamps, positions = [one.stamp for one in passed], [one.position for one in passed]
+    positions, stamps = zip(*passed, strict=True)
     return kept, *describe_span(report, stamps, positions, len(kept), start, stop)
 
 
@@ -48,13 +48,6 @@ class DecodeReport(NamedTuple):
     threads: int
 
 
-class FramePlace(NamedTuple):
-    """The position of a frame that decodes, and its time stamp."""
-
-    position: int
-    stamp: int
-
-
 def decode_file(
     path: Path,
     start: int,
@@ -62,27 +55,26 @@ def decode_file(
     keep: Callable[[Iterator[np.ndarray]], list],
     *,
     deinterlace: bool = True,
-) -> tuple[list, list[FramePlace], DecodeReport]:
+) -> tuple[list, list[tuple[int, int]], DecodeReport]:
     """Decode a video file once. Returns what `keep` makes of its BGR or BGRA frames from `start` up to `stop`, the
-    places of all frames decoded, and a report. Raises `VideoError` for a file that cannot be read."""
-    passed: list[FramePlace] = []
+    positions and time stamps of all frames decoded, and a report. Raises `VideoError` for a file that cannot be read.
+    """
+    passed: list[tuple[int, int]] = []
     with VideoDecoder(path, deinterlace=deinterlace) as decoder:
         fps = decoder.fps if 0 < decoder.fps <= MAX_FPS else DEFAULT_FPS
         kept = keep(select_frames(decoder.frames(), start, stop, passed))
         if not passed:
-            raise video_error(
-                "path",
-                expected="a video with frames that decode",
-                got=f"none in {str(path)!r}",
-                cure="The file is damaged or its codec is unknown here; convert it with ffmpeg.",
-            )
+            cure = "The file is damaged or its codec is unknown here; convert it with ffmpeg."
+            got = f"none in {str(path)!r}"
+            raise video_error("path", expected="a video with frames that decode", got=got, cure=cure)
         time_base = float(decoder.time_base)
-        seconds = make_increasing([one.stamp * time_base for one in passed], fps)
-        num_total = max(_count_declared(decoder, seconds, fps, passed[-1].position + 1), passed[-1].position + 1)
-        notes = _describe_pixel_aspect(decoder.pixel_aspect)
+        seconds, num_reached = make_increasing([stamp * time_base for _, stamp in passed], fps), passed[-1][0] + 1
+        num_total = max(_count_declared(decoder, seconds, fps, num_reached), num_reached)
+        notes, aspect, threads = (), decoder.pixel_aspect, decoder.threads
+        if abs(aspect - 1) > 0.01:
+            notes += (f"pixels are {aspect:.3g} times as wide as high; frames are kept as stored, not stretched.",)
         if decoder.has_converted:
             notes += ("interlaced frames are converted to progressive ones.",)
-        threads = decoder.threads
     # The container's count may be an estimate, so the range is checked against the decoded frames as well.
     check_range_within(start, stop, num_total, path)
     if not kept:
@@ -91,16 +83,16 @@ def decode_file(
 
 
 def select_frames(
-    frames: Iterable[DecodedFrame], start: int, stop: int | None, passed: list[FramePlace]
+    frames: Iterable[DecodedFrame], start: int, stop: int | None, passed: list[tuple[int, int]]
 ) -> Iterator[np.ndarray]:
-    """The frames from `start` up to `stop`; the place of every frame decoded on the way is added to `passed`.
+    """The frames from `start` up to `stop`; position and stamp of each decoded on the way are added to `passed`.
 
     Frames before `start` are decoded and dropped: seeking stops at key frames.
     """
     for frame in frames:
         if stop is not None and frame.position >= stop:
             return
-        passed.append(FramePlace(frame.position, frame.stamp))
+        passed.append((frame.position, frame.stamp))
         if frame.position >= start:
             yield frame.to_array()
         if stop is not None and frame.position == stop - 1:
@@ -158,10 +150,3 @@ def _describe_gaps(positions: list[int]) -> tuple[str, ...]:
     intact = f"frames {positions[0] + 1}:{first} are intact" if first > positions[0] + 1 else "throughout"
     which = which if len(gaps) == 1 else f"{num} frames, the first of them {first},"
     return (f"{which} cannot be decoded and are left out; what follows may show artifacts, {intact}.",)
-
-
-def _describe_pixel_aspect(aspect: float) -> tuple[str, ...]:
-    """A note about pixels that are not square."""
-    if abs(aspect - 1) <= 0.01:
-        return ()
-    return (f"pixels are {aspect:.3g} times as wide as high; frames are kept as stored, not stretched.",)

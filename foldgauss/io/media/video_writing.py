@@ -74,12 +74,9 @@ def write_video(
     if suffix in ANIMATION_SUFFIXES:
         return _write_animation(path, suffix, frames, float(fps))
     if suffix not in VIDEO_SUFFIXES:
-        raise video_error(
-            "path",
-            expected="a name ending in .mp4, .webm, .mov, .mkv, .gif or .webp, or a folder (no extension) for images",
-            got=repr(path.name),
-            cure="For one image: write_image." if suffix == ".png" else "Rename the output.",
-        )
+        expected = "a name ending in .mp4, .webm, .mov, .mkv, .gif or .webp, or a folder (no extension) for images"
+        cure = "For one image: write_image." if suffix == ".png" else "Rename the output."
+        raise video_error("path", expected=expected, got=repr(path.name), cure=cure)
     frames = _check_frames(frames, channels=(3, 4))
     first = next(frames)
     encoding = choose_encoding(suffix, codec, crf, pixel_format, first.shape)
@@ -186,19 +183,15 @@ def _encode_webp(frame: np.ndarray) -> bytes:
 def _write_animation(path: Path, suffix: str, frames: Iterable[np.ndarray], fps: float) -> Path:
     """Write an animated GIF or WebP that repeats forever."""
     if suffix == ".gif" and fps > MAX_GIF_FPS:
-        raise video_error(
-            "fps",
-            expected=f"at most {MAX_GIF_FPS:g} for a GIF",
-            got=f"{fps:g}",
-            cure="Take fewer frames, or a .webp or .webm.",
-        )
+        expected, cure = f"at most {MAX_GIF_FPS:g} for a GIF", "Take fewer frames, or a .webp or .webm."
+        raise video_error("fps", expected=expected, got=f"{fps:g}", cure=cure)
     with atomic_path(path) as temporary:
-        images = [_to_pillow(frame, suffix) for frame in _check_frames(frames)]
-        first, *rest = images
+        images = map(Image.fromarray, _check_frames(frames))
+        first, *rest = (image.quantize(256) for image in images) if suffix == ".gif" else images
         shared = {"save_all": True, "append_images": rest, "loop": 0}
         try:
             if suffix == ".gif":
-                first.save(temporary, "GIF", duration=_gif_durations(len(images), fps), optimize=False, **shared)
+                first.save(temporary, "GIF", duration=_gif_durations(1 + len(rest), fps), optimize=False, **shared)
             else:
                 first.save(temporary, "WEBP", duration=1000 / fps, quality=WEBP_QUALITY, **shared)
         except OSError as error:
@@ -207,11 +200,6 @@ def _write_animation(path: Path, suffix: str, frames: Iterable[np.ndarray], fps:
             expected, got = f"a size and a rate that {suffix} can hold", f"{first.height}x{first.width} at {fps:g} fps"
             raise video_error("frames", expected=expected, got=got, cure="Take an .mp4 or .webm.") from error
     return path
-
-
-def _to_pillow(frame: np.ndarray, suffix: str) -> Image.Image:
-    image = Image.fromarray(frame)
-    return image.quantize(256) if suffix == ".gif" else image
 
 
 def _gif_durations(num_frames: int, fps: float) -> list[int]:

@@ -15,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 
 from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.threads import check_not_forked
-from foldgauss.io._atomic import atomic_path
+from foldgauss.io._atomic import atomic_path, missing_error
 
 FORMAT = "foldgauss-model"
 VERSION = "1"  # increased when older programs cannot read the file
@@ -55,10 +55,6 @@ class _Kind:
     from_stored: Callable[[Any], Any]
 
 
-def _identity(model: Any) -> Any:
-    return model
-
-
 _KINDS: dict[str, _Kind] = {}
 
 
@@ -68,8 +64,8 @@ def register_model(
     *,
     to_header: Callable[[Any], dict],
     from_header: Callable[[dict], Any],
-    to_stored: Callable[[Any], Any] = _identity,
-    from_stored: Callable[[Any], Any] = _identity,
+    to_stored: Callable[[Any], Any] = lambda model: model,
+    from_stored: Callable[[Any], Any] = lambda model: model,
 ) -> None:
     """Register `model_type` for saving and loading under the name `kind`.
 
@@ -106,11 +102,8 @@ def save_model(path: str | os.PathLike, model: Any, *, metadata: dict | None = N
     arrays = {key: _to_numpy(key, leaf) for key, leaf in _array_leaves(model).items()}
     header = kind.to_header(model)
     _check_described(kind, model, to_json("header", header))
-    specs = {key: {"dtype": _DTYPES[one.dtype.name], "shape": list(one.shape)} for key, one in arrays.items()}
-    path = Path(path)
     about = {"kind": kind.name, "header": header, "metadata": metadata or {}}
-    write_tensors(path, specs, lambda keys: (arrays[key] for key in keys), **about)
-    return path
+    return write_tensors(Path(path), _get_specs(arrays), lambda keys: (arrays[key] for key in keys), **about)
 
 
 def write_tensors(
@@ -121,8 +114,8 @@ def write_tensors(
     kind: str,
     header: dict,
     metadata: dict,
-) -> None:
-    """Write a model file, whole or not at all: tensors with `specs` as in `read_header`.
+) -> Path:
+    """Write a model file, whole or not at all: tensors with `specs` as in `read_header`; returns the path.
 
     `tensors(keys)` yields them in that order, little-endian. Raises as `save_model`.
     """
@@ -150,6 +143,7 @@ def write_tensors(
         file.write(len(text).to_bytes(_PREFIX, "little") + text)
         for array in tensors(order):
             file.write(array.tobytes())
+    return path
 
 
 def _array_leaves(tree: Any) -> dict[str, Any]:
@@ -177,12 +171,9 @@ def _array_leaves(tree: Any) -> dict[str, Any]:
 def _to_numpy(key: str, leaf: Any) -> np.ndarray:
     """Little-endian, of a type that the format holds; nothing is converted but the byte order."""
     if not hasattr(leaf, "dtype") or leaf.dtype.name not in _DTYPES:
-        raise model_file_error(
-            key,
-            expected="a real, integer or boolean array",
-            got=f"dtype {getattr(leaf, 'dtype', type(leaf).__name__)}",
-            cure="Store complex numbers as two arrays and PRNG keys by jax.random.key_data.",
-        )
+        got = f"dtype {getattr(leaf, 'dtype', type(leaf).__name__)}"
+        cure = "Store complex numbers as two arrays and PRNG keys by jax.random.key_data."
+        raise model_file_error(key, expected="a real, integer or boolean array", got=got, cure=cure)
     array = np.asarray(leaf)
     if array.dtype.byteorder == ">":
         array = array.astype(array.dtype.newbyteorder("<"))
@@ -193,12 +184,8 @@ def _find_kind(model: Any) -> _Kind:
     for kind in _KINDS.values():
         if type(model) is kind.model_type:
             return kind
-    raise model_file_error(
-        "model",
-        expected="one of the registered types " + (", ".join(sorted(_KINDS)) or "(none yet)"),
-        got=type(model).__name__,
-        cure="Register it with register_model.",
-    )
+    expected, cure = "one of the registered types " + ", ".join(sorted(_KINDS)), "Register it with register_model."
+    raise model_file_error("model", expected=expected, got=type(model).__name__, cure=cure)
 
 
 def _check_described(kind: _Kind, model: Any, header: str) -> None:
@@ -221,9 +208,8 @@ def to_json(parameter: str, value: Any) -> str:
     try:
         return json.dumps(value, allow_nan=False, sort_keys=True, default=_encode_scalar)
     except (TypeError, ValueError, RecursionError) as error:
-        raise model_file_error(
-            parameter, expected="a dict that JSON can hold", got=str(error), cure="Use plain types."
-        ) from error
+        expected = "a dict that JSON can hold"
+        raise model_file_error(parameter, expected=expected, got=str(error), cure="Use plain types.") from error
 
 
 def _encode_scalar(value: Any) -> Any:
@@ -280,12 +266,9 @@ def match_kind(path: Path, about: dict) -> tuple[_Kind, Any]:
     """The kind of model, and the skeleton made from the header, checked against the tensors, of which none is read."""
     kind = _KINDS.get(about["kind"])
     if kind is None:
-        raise model_file_error(
-            "path",
-            expected="a model of kind " + (" or ".join(map(repr, sorted(_KINDS))) or "(none registered)"),
-            got=f"kind {about['kind']!r} in {str(path)!r}",
-            cure="Load it with the program that wrote it.",
-        )
+        expected = "a model of kind " + " or ".join(map(repr, sorted(_KINDS)))
+        got, cure = f"kind {about['kind']!r} in {str(path)!r}", "Load it with the program that wrote it."
+        raise model_file_error("path", expected=expected, got=got, cure=cure)
     with translate_header_errors(path, kind.name):
         skeleton = kind.from_header(about["header"])
     described = _get_specs(_array_leaves(skeleton))
@@ -301,11 +284,8 @@ def translate_header_errors(path: Path, kind: str) -> Iterator[None]:
     except ModelFileError:
         raise
     except HEADER_ERRORS as error:
-        raise model_file_error(
-            "path",
-            expected=f"the header of a model of kind {kind!r}",
-            got=f"one that does not describe it in {str(path)!r} ({type(error).__name__}: {one_line(error)})",
-        ) from error
+        got = f"one that does not describe it in {str(path)!r} ({type(error).__name__}: {one_line(error)})"
+        raise model_file_error("path", expected=f"the header of a model of kind {kind!r}", got=got) from error
 
 
 def read_header(path: str | os.PathLike) -> dict:
@@ -320,21 +300,19 @@ def read_header(path: str | os.PathLike) -> dict:
     _check_container(path)
     with open_tensors(path) as file:
         strings = file.metadata() or {}
-        tensors = {}
-        for key in file.keys():  # noqa: SIM118 - it is not a dict
-            part = file.get_slice(key)
-            tensors[key] = {"dtype": part.get_dtype(), "shape": list(part.get_shape())}
+        parts = {key: file.get_slice(key) for key in file.keys()}  # noqa: SIM118 - it is not a dict
+        tensors = {key: {"dtype": part.get_dtype(), "shape": list(part.get_shape())} for key, part in parts.items()}
     _check_version(path, strings)
     about = {name: strings[name] for name in ("format", "version", "kind")}
-    return about | {name: _parse_json(path, name, strings) for name in ("header", "metadata")} | {"tensors": tensors}
+    return (
+        about | {name: _parse_json(path, name, strings[name]) for name in ("header", "metadata")} | {"tensors": tensors}
+    )
 
 
 def _check_container(path: Path) -> None:
     """Check the first bytes against the file's size, before the library allocates memory."""
     if not os.path.exists(path):
-        raise FileNotFoundError(
-            f"path: expected a model file, got {str(path)!r}, which is missing. Check the spelling."
-        )
+        raise missing_error(path, "a model file")
     if not path.is_file():
         raise _unreadable_error(path, "not a plain file")
     size = path.stat().st_size
@@ -347,29 +325,26 @@ def _check_container(path: Path) -> None:
         names = (name for magic, name in _MAGIC.items() if first.startswith(magic))
         raise _unreadable_error(path, next(names, "a file of another kind, or one cut off within its first bytes"))
     if length > size - _PREFIX:
-        raise _unreadable_error(
-            path, f"a file of {size} bytes whose header claims {length}, so it is cut off or damaged"
-        )
+        got = f"a file of {size} bytes whose header claims {length}, so it is cut off or damaged"
+        raise _unreadable_error(path, got)
 
 
 def _check_version(path: Path, strings: dict[str, str]) -> None:
     if strings.get("format") != FORMAT:
         raise _unreadable_error(path, f"a safetensors file of format {strings.get('format', 'unknown')!r}")
     if strings.get("version") != VERSION:
-        raise model_file_error(
-            "path",
-            expected=f"a model file of version {VERSION}, which this program reads",
-            got=f"version {strings.get('version')} in {str(path)!r}",
-            cure="Update foldgauss, or load it with the one that wrote it.",
-        )
+        expected = f"a model file of version {VERSION}, which this program reads"
+        got = f"version {strings.get('version')} in {str(path)!r}"
+        cure = "Update foldgauss, or load it with the one that wrote it."
+        raise model_file_error("path", expected=expected, got=got, cure=cure)
     for name in ("kind", "header", "metadata"):
         if name not in strings:
             raise _unreadable_error(path, f"one without the field {name!r}")
 
 
-def _parse_json(path: Path, name: str, strings: dict[str, str]) -> dict:
+def _parse_json(path: Path, name: str, text: str) -> dict:
     try:
-        value = json.loads(strings[name])
+        value = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise _unreadable_error(path, f"one whose field {name!r} is not JSON ({one_line(error)})") from error
     if not isinstance(value, dict):
@@ -397,11 +372,8 @@ def _check_tensors(have: dict[str, dict], want: dict[str, dict], where: str) -> 
     """Raise unless the tensors have the keys, shapes and types that the header describes."""
     for key in sorted(have.keys() | want.keys()):
         if have.get(key) != want.get(key):
-            raise model_file_error(
-                f"tensor {key!r} of {where!r}",
-                expected=_spec_text(want.get(key)),
-                got=_spec_text(have.get(key)),
-            )
+            expected, got = _spec_text(want.get(key)), _spec_text(have.get(key))
+            raise model_file_error(f"tensor {key!r} of {where!r}", expected=expected, got=got)
 
 
 def _read_leaves(skeleton: Any, path: Path, prefix: str) -> Any:
@@ -413,7 +385,12 @@ def _read_leaves(skeleton: Any, path: Path, prefix: str) -> Any:
                 return leaf
             key = jax.tree_util.keystr(keys, simple=True, separator=".")
             array = file.get_tensor(prefix + key)
-            return _to_leaf(key, array.astype(leaf.dtype) if array.dtype == np.float16 else array)
+            if array.dtype == np.bool_ and array.size and array.view(np.uint8).max() > 1:
+                raise model_file_error(key, expected="booleans 0 or 1", got=f"the byte {array.view(np.uint8).max()}")
+            array = array.astype(leaf.dtype) if array.dtype == np.float16 else array
+            if jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype:
+                return jax.device_put(array)  # jnp.asarray compiles, and keeps, a program for every shape
+            return np.array(array)
 
         return jax.tree_util.tree_map_with_path(fill, skeleton)
 
@@ -428,26 +405,14 @@ def open_tensors(path: Path) -> Iterator[Any]:
         raise _unreadable_error(path, f"a damaged or truncated file ({one_line(error)})") from error
 
 
-def _to_leaf(key: str, array: np.ndarray) -> jax.Array | np.ndarray:
-    if array.dtype == np.bool_ and array.size and array.view(np.uint8).max() > 1:
-        raise model_file_error(key, expected="booleans 0 or 1", got=f"the byte {array.view(np.uint8).max()}")
-    if jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype:
-        return jax.device_put(array)  # jnp.asarray compiles, and keeps, a program for every shape
-    return np.array(array)
-
-
 def model_file_error(parameter: str, *, expected: str, got: object, cure: str = "") -> ModelFileError:
     """The error with the text of `invalid`."""
     return ModelFileError(str(invalid(parameter, expected=expected, got=got, cure=cure)))
 
 
 def _unreadable_error(path: Path, got: str) -> ModelFileError:
-    return model_file_error(
-        "path",
-        expected=f"a {FORMAT} file",
-        got=f"{got}: {str(path)!r}",
-        cure="Give a file that `foldgauss fit` wrote.",
-    )
+    cure = "Give a file that `foldgauss fit` wrote."
+    return model_file_error("path", expected=f"a {FORMAT} file", got=f"{got}: {str(path)!r}", cure=cure)
 
 
 def _spec_text(spec: dict | None) -> str:
