@@ -392,6 +392,7 @@ def test_sound_that_is_none_is_refused(tmp_path, sound_file, clip_file):
         (Sound(clip_file), ("sound: expected a file with sound", "clip.webm")),
         (Sound(__file__), ("sound: expected a file with sound", "does not open")),
         (Sound(sound_file, -1.0), ("sound.start", "-1.0")),
+        (str(sound_file), ("sound: expected a foldgauss.io.Sound", "str")),
         (Sound(sound_file, 0.0, 0.001), ("sound.speed", "0.01 to 100")),
     ):
         with pytest.raises(ValueError, match="expected") as caught:
@@ -400,6 +401,29 @@ def test_sound_that_is_none_is_refused(tmp_path, sound_file, clip_file):
     with pytest.raises(FileNotFoundError):
         write_video(out, _moving(), 10, sound=Sound(tmp_path / "missing.mp4"))
     assert not out.exists()
+
+
+def test_an_error_of_making_frames_is_not_taken_for_one_of_writing(tmp_path):
+    def frames():
+        yield from _moving(2)
+        (tmp_path / "missing.png").read_bytes()
+
+    with pytest.raises(FileNotFoundError, match=r"missing\.png"):
+        write_video(tmp_path / "a.mp4", frames(), 10)
+    assert not list(tmp_path.iterdir())
+
+
+def test_alpha_that_an_mp4_would_lose_is_refused(tmp_path):
+    frames = np.concatenate([_moving(2), _moving(2)[..., :1]], -1)
+    with pytest.raises(VideoError, match=r"expected RGB for vp9 in \.mp4, .* got RGBA\. Take vp9 in a \.webm"):
+        write_video(tmp_path / "a.mp4", frames, 10, codec="vp9")
+    with pytest.raises(VideoError, match=r"got RGBA\. Take yuva420p\."):
+        write_video(tmp_path / "a.webm", frames, 10, pixel_format="yuv420p")
+
+
+def test_a_relative_name_may_have_a_colon(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert read_video(write_video("a:b.mp4", _moving(2), 10)).num_frames == 2
 
 
 def test_an_mp4_can_be_played_while_it_is_loaded(tmp_path):

@@ -223,16 +223,19 @@ def test_odd_sizes(tmp_path, size):
     np.testing.assert_array_equal(read_video(_exact_avi(tmp_path / "a.avi", frames)).frames, frames)
 
 
-@pytest.mark.parametrize("turns", [1, 2, 3])
-def test_videos_are_turned_upright(tmp_path, mp4, turns):
-    """The matrix of a track (tkhd) turns it clockwise, by quarters; phones write that."""
+@pytest.mark.parametrize(("turns", "across"), [(1, 1), (2, 1), (3, 1), (0, -1), (1, -1), (2, -1), (3, -1)])
+def test_videos_are_turned_upright(tmp_path, mp4, turns, across):
+    """The matrix of a track (tkhd) turns it clockwise, by quarters, and may mirror it; phones write that."""
     cos, sin = ((1, 0), (0, 1), (-1, 0), (0, -1))[turns]
-    matrix = struct.pack(">9i", cos << 16, sin << 16, 0, -sin << 16, cos << 16, 0, 0, 0, 1 << 30)
+    matrix = (across * cos << 16, sin << 16, 0, across * -sin << 16, cos << 16, 0, 0, 0, 1 << 30)
+    matrix = struct.pack(">9i", *matrix)
     turned = _with_box(mp4, b"tkhd", lambda content: content[:40] + matrix + content[76:])
     (tmp_path / "a.mp4").write_bytes(mp4)
     (tmp_path / "turned.mp4").write_bytes(turned)
     stored = read_video(tmp_path / "a.mp4").frames
-    np.testing.assert_array_equal(read_video(tmp_path / "turned.mp4").frames, np.rot90(stored, -turns, (1, 2)))
+    np.testing.assert_array_equal(
+        read_video(tmp_path / "turned.mp4").frames, np.rot90(stored, -turns, (1, 2))[:, :, ::across]
+    )
 
 
 def test_columns_at_the_left_are_cropped_to_the_pixel(tmp_path):

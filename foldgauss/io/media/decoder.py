@@ -66,8 +66,19 @@ class DecodedFrame:
         if has_alpha:
             opaque = image[..., 3].min() == 255
             image = np.ascontiguousarray(image[..., :3]) if opaque else premultiply(image)
-        quarters = round(self.decoded.rotation / 90) % 4
-        return np.ascontiguousarray(np.rot90(image, quarters)) if quarters else image
+        return _turn_upright(image, self.decoded)
+
+
+def _turn_upright(image: np.ndarray, frame: av.VideoFrame) -> np.ndarray:
+    """The image turned and mirrored by the display matrix of its frame, if there is one, by whole quarters."""
+    data = frame.side_data.get("DISPLAYMATRIX")
+    if data is None:
+        return image
+    # Right is shown along (a, b) and down along (c, d), in units of 2^-16.
+    a, b, _, c, d = np.frombuffer(data, np.int32)[:5].tolist()
+    if abs(b) > abs(a):
+        image, a, d = image.swapaxes(0, 1), c, b
+    return np.ascontiguousarray(image[:: 1 if d >= 0 else -1, :: 1 if a >= 0 else -1])
 
 
 class VideoDecoder:

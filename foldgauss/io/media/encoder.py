@@ -120,11 +120,12 @@ def choose_encoding(
     if pixel_format is None:
         pixel_format = chosen.alpha_format if has_alpha and chosen.alpha_format else chosen.pixel_formats[0]
     check_one_of("pixel_format", pixel_format, chosen.pixel_formats)
-    if has_alpha and not any(part.is_alpha for part in av.VideoFormat(pixel_format).components):
+    # An MP4 has no place for the alpha of VP9.
+    if has_alpha and (suffix == ".mp4" or not any(part.is_alpha for part in av.VideoFormat(pixel_format).components)):
         cure = "Take vp9 in a .webm, prores in a .mov or ffv1 in a .mkv, or composite the frames over a color."
-        if chosen.alpha_format:
+        if chosen.alpha_format and suffix != ".mp4":
             cure = f"Take {chosen.alpha_format}."
-        raise video_error("frames", expected=f"RGB for {name} in {pixel_format}", got="RGBA", cure=cure)
+        raise video_error("frames", expected=f"RGB for {name} in {suffix}, {pixel_format}", got="RGBA", cure=cure)
     return Encoding(chosen, crf if crf is not None else chosen.crf and chosen.crf[0], pixel_format)
 
 
@@ -142,7 +143,7 @@ def encode_video(
     matrix = None if pixel_format.is_rgb else Colorspace.ITU709
     steps = 64 // pixel_format.chroma_height(), 64 // pixel_format.chroma_width()
     suffix = path.suffix.lower()
-    container = av.open(str(path), "w", options={"movflags": "+faststart"} if suffix in (".mp4", ".mov") else {})
+    container = av.open(f"file:{path}", "w", options={"movflags": "+faststart"} if suffix in (".mp4", ".mov") else {})
     with container:
         stream = container.add_stream(encoding.codec.encoder, rate=rate, options=options)
         stream.pix_fmt = encoding.pixel_format
@@ -176,9 +177,9 @@ def _encode_sound(stream: av.AudioStream, sound: Sound) -> Iterator[av.Packet]:
     with open_container(Path(sound.path), SOUND_DEMUXERS) as source:
         of_file = source.streams.best("audio")
         graph = Graph()
-        # atempo takes factors from 0.5 to 100.
-        slow = max(0, math.ceil(-math.log2(sound.speed)))
-        tempo = [("atempo", f"{(sound.speed ** (1 / max(slow, 1))):.9f}")] * max(slow, 1)
+        # atempo takes factors from 0.5 to 100; at 1 it would still shift the sound.
+        num = 0 if sound.speed == 1 else max(1, math.ceil(-math.log2(sound.speed)))
+        tempo = [("atempo", f"{sound.speed ** (1 / max(num, 1)):.9f}")] * num
         begin = _first_shown(source, of_file) + sound.start
         steps = [("atrim", f"start={begin:.6f}"), ("asetpts", f"PTS-({begin:.6f})/TB")]
         steps += [("aresample", "async=1:first_pts=0"), *tempo]  # silence where there is none
@@ -211,8 +212,11 @@ def _decode_sound(source: av.container.InputContainer, stream: av.AudioStream) -
 
 def check_sound(sound: Sound) -> None:
     """Raise `VideoError` for a file without sound, ValueError for other values that are refused."""
-    if not is_within(sound.start, "[0, inf)"):
-        raise invalid("sound.start", expected="seconds, at least 0", got=repr(sound.start))
+    if not isinstance(sound, Sound):
+        cure = "Write Sound('clip.mp4')."
+        raise invalid("sound", expected="a foldgauss.io.Sound", got=type(sound).__name__, cure=cure)
+    if not is_within(sound.start, "[0, 1e9]"):
+        raise invalid("sound.start", expected="seconds from 0 to 1e9", got=repr(sound.start))
     if not is_within(sound.speed, "[0.01, 100]"):
         expected, cure = "a speed from 0.01 to 100", "Leave sound out."
         raise invalid("sound.speed", expected=expected, got=f"{sound.speed:g}", cure=cure)

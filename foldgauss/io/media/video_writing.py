@@ -77,7 +77,8 @@ def write_video(
         expected = "a name ending in .mp4, .webm, .mov, .mkv, .gif or .webp, or a folder (no extension) for images"
         cure = "For one image: write_image." if suffix == ".png" else "Rename the output."
         raise video_error("path", expected=expected, got=repr(path.name), cure=cure)
-    frames = _check_frames(frames, channels=(3, 4))
+    failures: list[OSError] = []
+    frames = _check_frames(_noting_failures(frames, failures), channels=(3, 4))
     first = next(frames)
     encoding = choose_encoding(suffix, codec, crf, pixel_format, first.shape)
     if sound is not None:
@@ -86,6 +87,8 @@ def write_video(
         try:
             encode_video(temporary, chain([first], frames), float(fps), encoding, sound)
         except OSError as error:
+            if error in failures:
+                raise
             raise output_error(path, error) from error
         except av.FFmpegError as error:
             expected, got = f"frames that {encoding.codec.encoder} takes", f"{format_size(first.shape)} at {fps:g} fps"
@@ -130,6 +133,15 @@ def write_image(path: PathLike, image: np.ndarray) -> Path:
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
     return path
+
+
+def _noting_failures(frames: Iterable[np.ndarray], failures: list[OSError]) -> Iterator[np.ndarray]:
+    """The frames; an OSError of making them is added to `failures`, to be told from those of writing."""
+    try:
+        yield from frames
+    except OSError as error:
+        failures.append(error)
+        raise
 
 
 def _check_frames(frames: Iterable[np.ndarray], channels: tuple[int, ...] = (3,)) -> Iterator[np.ndarray]:
