@@ -55,14 +55,7 @@ def facts_error(path: object, error: Exception) -> FormatError:
 class _Element:
     name: str
     count: int
-    properties: tuple[tuple[str, str], ...]  # (name, type code); of a list "count type, item type"
-
-    @property
-    def has_lists(self) -> bool:
-        return any("," in code for _, code in self.properties)
-
-    def dtype(self, order: str) -> np.dtype:
-        return np.dtype([(name, order + code) for name, code in self.properties])
+    properties: list[tuple[str, str]]  # (name, type code); of a list "count type, item type"
 
 
 @dataclass(frozen=True)
@@ -124,10 +117,9 @@ def read_ply(path: str | os.PathLike, wanted: Iterable[str]) -> Ply:
         if element.name not in wanted:
             body.skip(element)
             continue
-        if element.has_lists:
-            lists = [name for name, code in element.properties if "," in code]
-            got = f"the list {lists[0]!r}"
-            expected = f"plain numbers only in element {element.name!r}"
+        lists = [name for name, code in element.properties if "," in code]
+        if lists:
+            expected, got = f"plain numbers only in element {element.name!r}", f"the list {lists[0]!r}"
             raise format_error(path, expected=expected, got=got, cure="It is a mesh, or made by another program.")
         found[element.name] = body.read(element)
     return Ply(path, found, comments)
@@ -159,7 +151,7 @@ def _split_header(path: Path, data: bytes) -> tuple[list[str], int]:
 def _parse_header(path: Path, lines: list[str]) -> tuple[str, list[_Element], tuple[str, ...]]:
     """(byte order, elements, comments); see `_ORDERS`."""
     order, comments = None, []
-    elements: list[tuple[str, int, list[tuple[str, str]]]] = []
+    elements: list[_Element] = []
     for number, line in enumerate(lines, start=2):
         word, *rest = line.split() or [""]
         where = f"{path}, line {number}"
@@ -170,22 +162,22 @@ def _parse_header(path: Path, lines: list[str]) -> tuple[str, list[_Element], tu
         elif word == "format" and order is None and len(rest) == 2 and rest[0] in _ORDERS and rest[1] == "1.0":
             order = _ORDERS[rest[0]]
         elif word == "element" and len(rest) == 2 and _is_count(rest[1]):
-            if any(rest[0] == name for name, _, _ in elements):
+            if any(rest[0] == known.name for known in elements):
                 raise format_error(where, expected="elements of different names", got=f"{rest[0]!r} twice")
-            elements.append((rest[0], int(rest[1]), []))
+            elements.append(_Element(rest[0], int(rest[1]), []))
         elif word == "property" and elements:
-            elements[-1][2].append(_parse_property(where, rest))
+            elements[-1].properties.append(_parse_property(where, rest))
         else:
             expected = "format ascii|binary_little_endian|binary_big_endian 1.0, element NAME COUNT, property TYPE NAME"
             raise format_error(where, expected=expected, got=repr(line.rstrip()[:80]), cure="The header is damaged.")
     if order is None:
         raise format_error(path, expected="a line 'format ...' in the header", got="none", cure="Copy it again.")
-    for name, _, properties in elements:
-        names = [own for own, _ in properties]
+    for element in elements:
+        names = [name for name, _ in element.properties]
         if len(set(names)) < len(names) or not names:
             got = "none" if not names else f"{max(names, key=names.count)!r} twice"
-            raise format_error(path, expected=f"different properties of element {name!r}", got=got)
-    return order, [_Element(name, count, tuple(properties)) for name, count, properties in elements], tuple(comments)
+            raise format_error(path, expected=f"different properties of element {element.name!r}", got=got)
+    return order, elements, tuple(comments)
 
 
 def _parse_property(where: str, words: list[str]) -> tuple[str, str]:
@@ -211,15 +203,17 @@ class _Body:
 
     def read(self, element: _Element) -> np.ndarray:
         values = self._take(element, element.count * sum(self._sizes(element)))
-        return np.frombuffer(values, element.dtype(self.order)) if self.order else self._parse(element, values)
+        if not self.order:
+            return self._parse(element, values)
+        return np.frombuffer(values, [(name, self.order + code) for name, code in element.properties])
 
     def skip(self, element: _Element) -> None:
         sizes = self._sizes(element)
-        if not element.has_lists:
+        items = [np.dtype(code.split(",")[1]).itemsize if "," in code else 0 for _, code in element.properties]
+        if not any(items):
             self._take(element, element.count * sum(sizes))
             return
         self._need(element, element.count * sum(sizes))
-        items = [np.dtype(code.split(",")[1]).itemsize if "," in code else 0 for _, code in element.properties]
         for _ in range(element.count):
             for (_, code), size, item in zip(element.properties, sizes, items, strict=True):
                 first = self._take(element, size)

@@ -77,9 +77,12 @@ def read_vegas_ply(
     ply = read_ply(path, ("vertex", "time"))
     _check_is_vegas(ply)
     size, fps, options, scale_cutoff, power = _fill_in(ply, size, fps)
-    degree = _degree(ply)
+    num_weights = sum(name.startswith("w1_") for name in ply.names("vertex"))
+    if num_weights % 2:
+        expected = "an even number of w1 columns, pairs (x, z)"
+        raise format_error(ply.path, expected=expected, got=str(num_weights), cure="The file is damaged.")
     names = ["x", "z", "scale_0", "scale_2", "rot_0", "m_0", "sigma_0", "opacity", "f_dc_0", "f_dc_1", "f_dc_2"]
-    columns = ply.columns("vertex", [*names, *(f"w1_{k}" for k in range(2 * degree))])
+    columns = ply.columns("vertex", [*names, *(f"w1_{k}" for k in range(num_weights))])
     unit = _vegas_unit(size)
     plane = unit * np.array([1.0, -1.0])
     angle, time_loc, log_time_scale, opacity = columns[:, 4:8].T
@@ -89,7 +92,7 @@ def read_vegas_ply(
         "angle_logit": angle,
         "time_loc_logit": time_loc,
         "log_time_scale": _convert_time_scale(log_time_scale, VEGAS_POWER, power),
-        "coefficients": plane * columns[:, 11:].reshape(len(columns), degree, 2),
+        "coefficients": plane * columns[:, 11:].reshape(len(columns), num_weights // 2, 2),
         "opacity_logit": opacity,
         "color_dc": columns[:, 8:11],
     }
@@ -133,23 +136,20 @@ def write_vegas_ply(path: str | os.PathLike, model: VideoModel) -> Path:
     columns |= {"rot_0": splats.angle_logit, "m_0": splats.time_loc_logit, "sigma_0": spread}
     weights = (plane * np.asarray(splats.coefficients, np.float64)).reshape(len(loc), -1)
     columns |= {f"w1_{k}": weights[:, k] for k in range(weights.shape[1])}
-    time_weights = {
-        f"time_func_{k}": [weight] for k, weight in enumerate(np.asarray(model.frame_times.logits, np.float64))
-    }
+    times = {f"time_func_{k}": [weight] for k, weight in enumerate(np.asarray(model.frame_times.logits))}
     note = {"size": list(model.size), "fps": model.fps, "options": dataclasses.asdict(model.options)}
     note["scale_cutoff"] = model.scale_cutoff
     if np.unique(powers).size == 1:
         note["power"] = float(np.unique(powers)[0])
-    return write_ply(path, {"vertex": columns, "time": time_weights}, comments=[NOTE + json.dumps(note)])
+    return write_ply(path, {"vertex": columns, "time": times}, comments=[NOTE + json.dumps(note)])
 
 
 def _convert_time_scale(
     log_time_scale: Float[np.ndarray, " num"], power: float | Float[np.ndarray, "*#num"], other: float
 ) -> Float[np.ndarray, " num"]:
     """log sigma_t that gives an envelope of power `other` the same values; static Gaussians keep the value 1."""
-    return np.where(
-        log_time_scale == STATIC_LOG_TIME_SCALE, log_time_scale, log_time_scale + 0.5 * np.log(other / power)
-    )
+    other_scale = log_time_scale + 0.5 * np.log(other / power)
+    return np.where(log_time_scale == STATIC_LOG_TIME_SCALE, log_time_scale, other_scale)
 
 
 def _vegas_unit(size: tuple[int, int]) -> float:
@@ -172,14 +172,6 @@ def _check_is_vegas(ply: Ply) -> None:
     if rest and np.any(ply.columns("vertex", rest)):
         expected = "colours of degree 0, as VeGaS has them"
         raise format_error(ply.path, expected=expected, got="f_rest columns that are not 0")
-
-
-def _degree(ply: Ply) -> int:
-    num = sum(name.startswith("w1_") for name in ply.names("vertex"))
-    if num % 2:
-        expected = "an even number of w1 columns, pairs (x, z)"
-        raise format_error(ply.path, expected=expected, got=str(num), cure="The file is damaged.")
-    return num // 2
 
 
 def _time_logits(ply: Ply) -> Float[np.ndarray, " intervals"]:
@@ -229,9 +221,8 @@ def _read_note(ply: Ply) -> dict:
     except (ValueError, RecursionError):
         note = None
     if not isinstance(note, dict) or not isinstance(note.get("options", {}), dict):
-        raise format_error(
-            ply.path, expected="metadata in the comment 'foldgauss'", got=texts[0][:60], cure="Remove it."
-        )
+        expected = "metadata in the comment 'foldgauss'"
+        raise format_error(ply.path, expected=expected, got=texts[0][:60], cure="Remove it.")
     return note
 
 
@@ -247,13 +238,8 @@ def _check_writable_as_vegas(model: VideoModel) -> None:
         "compositing": (np.array([model.compositing]), "over", "Fit it with --compositing over."),
     }
     if model.num_frames < 2:
-        cure = "Write the picture as a still scene, ply3dgs."
-        raise invalid(
-            "model",
-            expected="at least 2 frames, as a VeGaS file stores the intervals between frames",
-            got="1",
-            cure=cure,
-        )
+        expected = "at least 2 frames, as a VeGaS file stores the intervals between frames"
+        raise invalid("model", expected=expected, got="1", cure="Write the picture as a still scene, ply3dgs.")
     for name, (found, known, cure) in facts.items():
         if not (found == known).all():
             got, expected = ", ".join(map(str, found[:3])), f"{known}, the only one in a VeGaS file"

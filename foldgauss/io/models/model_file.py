@@ -97,7 +97,10 @@ def save_model(path: str | os.PathLike, model: Any, *, metadata: dict | None = N
     Raises `ModelFileError` for an unregistered type, a leaf that would be lost (a plain number, a PRNG key)
     or a header that does not describe the model; `OutputError` where the path cannot be written.
     """
-    kind = _find_kind(model)
+    kind = next((kind for kind in _KINDS.values() if type(model) is kind.model_type), None)
+    if kind is None:
+        expected, cure = "one of the registered types " + ", ".join(sorted(_KINDS)), "Register it with register_model."
+        raise model_file_error("model", expected=expected, got=type(model).__name__, cure=cure)
     model = kind.to_stored(model)
     arrays = {key: _to_numpy(key, leaf) for key, leaf in _array_leaves(model).items()}
     header = kind.to_header(model)
@@ -132,12 +135,11 @@ def write_tensors(
     end = 0
     for key in order:
         start, end = end, end + math.prod(specs[key]["shape"]) * _ITEM_BYTES[specs[key]["dtype"]]
-        entries[key] = {**specs[key], "data_offsets": [start, end]}
+        entries[key] = specs[key] | {"data_offsets": [start, end]}
     text = json.dumps(entries, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
     if len(text) > _LONGEST_HEADER:
-        got = f"one of {len(text):,} bytes for {len(specs):,} tensors"
-        cure = "Write the clip as several files."
+        got, cure = f"one of {len(text):,} bytes for {len(specs):,} tensors", "Write the clip as several files."
         raise model_file_error("path", expected=f"a header of at most {_LONGEST_HEADER:,} bytes", got=got, cure=cure)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write(len(text).to_bytes(_PREFIX, "little") + text)
@@ -152,18 +154,13 @@ def _array_leaves(tree: Any) -> dict[str, Any]:
     for keys, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         key = jax.tree_util.keystr(keys, simple=True, separator=".")
         if isinstance(leaf, bool | int | float | complex) and not isinstance(leaf, np.generic):
-            raise model_file_error(
-                key,
-                expected="an array or a static field",
-                got=f"the plain number {leaf!r}",
-                cure="Make it an array, or a static field that the header holds.",
-            )
+            got, cure = f"the plain number {leaf!r}", "Make it an array, or a static field that the header holds."
+            raise model_file_error(key, expected="an array or a static field", got=got, cure=cure)
         if not isinstance(leaf, jax.Array | np.ndarray | np.generic | jax.ShapeDtypeStruct):
             continue  # a function or a name, which the skeleton contains
         if key in found or key == _RESERVED:
-            raise model_file_error(
-                key, expected="one leaf per path", got="a clash", cure="Rename the field or dictionary key."
-            )
+            cure = "Rename the field or dictionary key."
+            raise model_file_error(key, expected="one leaf per path", got="a clash", cure=cure)
         found[key] = leaf
     return found
 
@@ -180,14 +177,6 @@ def _to_numpy(key: str, leaf: Any) -> np.ndarray:
     return array  # tobytes gives C order whatever the strides
 
 
-def _find_kind(model: Any) -> _Kind:
-    for kind in _KINDS.values():
-        if type(model) is kind.model_type:
-            return kind
-    expected, cure = "one of the registered types " + ", ".join(sorted(_KINDS)), "Register it with register_model."
-    raise model_file_error("model", expected=expected, got=type(model).__name__, cure=cure)
-
-
 def _check_described(kind: _Kind, model: Any, header: str) -> None:
     """Raise unless the header alone gives back the model's tree, static fields, shapes and types."""
     skeleton = kind.from_header(json.loads(header))
@@ -195,12 +184,9 @@ def _check_described(kind: _Kind, model: Any, header: str) -> None:
     _check_tensors(described, _widen_half_precision(_get_specs(_array_leaves(model)), described), "header")
     have, want = jax.tree_util.tree_structure(skeleton), jax.tree_util.tree_structure(model)
     if have != want:
-        raise model_file_error(
-            "header",
-            expected=f"every static field of the model of kind {kind.name!r}",
-            got="a skeleton of another structure",
-            cure="Let to_header and from_header carry each static field.",
-        )
+        expected = f"every static field of the model of kind {kind.name!r}"
+        cure = "Let to_header and from_header carry each static field."
+        raise model_file_error("header", expected=expected, got="a skeleton of another structure", cure=cure)
 
 
 def to_json(parameter: str, value: Any) -> str:
