@@ -207,11 +207,9 @@ def read_3dgs_ply(path: str | os.PathLike, *, axes: str = "y-down") -> Gaussians
     if (lengths < _SMALLEST).any():
         got = f"0 in vertex {np.argmax(lengths < _SMALLEST)}"
         raise format_error(ply.path, expected="quaternions of nonzero length", got=got, cure="Drop that row.")
-    rotation = (
-        scipy.spatial.transform.Rotation.from_quat(turn[:, [1, 2, 3, 0]]).as_matrix()
-        if len(turn)
-        else np.empty((0, 3, 3))
-    )
+    rotation = np.empty((0, 3, 3))
+    if len(turn):
+        rotation = scipy.spatial.transform.Rotation.from_quat(turn[:, [1, 2, 3, 0]]).as_matrix()
     with np.errstate(over="ignore", invalid="ignore"):
         factor = to_float32(ply, "scale", rotation * np.exp(spatial[:, None, 3:]))
     rgb = np.maximum(0.5 + SH_C0 * np.stack(color, axis=1), 0)

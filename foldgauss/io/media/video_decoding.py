@@ -1,6 +1,7 @@
 """One pass through a video file: its frames, and what the container reports about them."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -60,7 +61,7 @@ def decode_file(
     positions and time stamps of all frames decoded, and a report. Raises `VideoError` for a file that cannot be read.
     """
     passed: list[tuple[int, int]] = []
-    with VideoDecoder(path, deinterlace=deinterlace) as decoder:
+    with closing(VideoDecoder(path, deinterlace=deinterlace)) as decoder:
         fps = decoder.fps if 0 < decoder.fps <= MAX_FPS else DEFAULT_FPS
         kept = keep(select_frames(decoder.frames(), start, stop, passed))
         if not passed:
