@@ -95,12 +95,12 @@ def _is_range(value: Any) -> bool:
 
 def _list_check(*lengths: int, is_item: Callable[[Any], bool] = _is_number) -> Callable[[Any], bool]:
     """A check for lists of one of these lengths, or of any length above 0 if none is given."""
-    return lambda value: (
-        isinstance(value, list)
-        and bool(value)
-        and len(value) in (lengths or (len(value),))
-        and all(map(is_item, value))
-    )
+
+    def holds(value: Any) -> bool:
+        fits = isinstance(value, list) and (len(value) in lengths if lengths else bool(value))
+        return fits and all(map(is_item, value))
+
+    return holds
 
 
 def _any_of(*ways: Callable[[Any], bool]) -> Callable[[Any], bool]:
@@ -329,9 +329,8 @@ def read_edit_script(path: str | os.PathLike) -> EditScript:
     try:
         text = path.read_bytes().decode("utf-8-sig")  # some editors of Windows write a byte order mark
     except UnicodeDecodeError as error:
-        raise EditScriptError(
-            f"{path}: expected a text in UTF-8, got other bytes at {error.start}. Is it a model?"
-        ) from error
+        got = f"other bytes at {error.start}"
+        raise EditScriptError(f"{path}: expected a text in UTF-8, got {got}. Is it a model?") from error
     except OSError as error:
         raise EditScriptError(f"{path}: expected a file that can be read, got {error}.") from error
     script = parse_edit_script(text, source=str(path), folder=path.parent)
@@ -349,10 +348,10 @@ def parse_edit_script(text: str, *, source: str = "script", folder: str | os.Pat
     script = EditScript(tables, source, text, Path(folder))
     _check_keys(script._context(), tables, _TABLES)
     selections: dict[str, dict] = tables.get("selections", {})
-    known: list[str] = []
+    known: dict[str, None] = {}
     for name, table in selections.items():
         _check_selection(script._context("selections", name), table, known)
-        known.append(name)
+        known[name] = None
     for number, table in enumerate(tables.get("edits", ())):
         _check_edit(script._context("edits", number), table, known)
     for number, table in enumerate(tables.get("layers", ())):
@@ -448,7 +447,7 @@ def _truncated_repr(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _check_selection(context: _TableContext, table: dict[str, Any], known: list[str]) -> None:
+def _check_selection(context: _TableContext, table: dict[str, Any], known: Collection[str]) -> None:
     """Check a selection after those that are `known`."""
     if not table:
         raise context.error(None, "at least one criterion", "none")
@@ -467,7 +466,7 @@ def _check_selection(context: _TableContext, table: dict[str, Any], known: list[
             raise context.error("file", "a mask or a file", "both", "Combine two selections with all=[...].")
 
 
-def _check_edit(context: _TableContext, table: dict[str, Any], selections: list[str]) -> None:
+def _check_edit(context: _TableContext, table: dict[str, Any], selections: Collection[str]) -> None:
     do = table.get("do")
     if not isinstance(do, str):
         raise context.error("do", "one of " + ", ".join(ACTIONS), "none" if do is None else _truncated_repr(do))

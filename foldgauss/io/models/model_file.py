@@ -298,8 +298,8 @@ def _check_container(path: Path) -> None:
         first = file.read(_PREFIX + 1)
     length = int.from_bytes(first[:_PREFIX], "little")
     if size < _PREFIX + 2 or not first[_PREFIX:].startswith(b"{"):
-        unknown = "a file of another kind, or one cut off within its first bytes" if first else "an empty file"
-        raise _unreadable_error(path, describe_kind(first[:_PREFIX]) or unknown)
+        kind = describe_kind(first[:_PREFIX]) or ("or one cut off within its first bytes" if first else "an empty one")
+        raise _unreadable_error(path, f"a file of another kind, {kind}")
     if length > size - _PREFIX:
         raise _unreadable_error(path, f"a file of {size} bytes whose header claims {length}: it is cut off or damaged")
 
