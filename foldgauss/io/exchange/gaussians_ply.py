@@ -14,7 +14,7 @@ from scipy.special import expit, logit
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_within, short_repr
 from foldgauss.io._atomic import atomic_folder
-from foldgauss.io.exchange.ply_file import NOTE, format_error, is_3dgs, is_vegas, read_ply, to_float32, write_ply
+from foldgauss.io.exchange.ply_file import NOTE, read_ply, write_ply
 from foldgauss.render import Camera, Gaussians3D, pixels_per_unit
 from foldgauss.render.camera import THICKNESS
 from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer
@@ -195,23 +195,23 @@ def read_3dgs_ply(path: str | os.PathLike, *, axes: str = "y-down") -> Gaussians
     """
     check_one_of("axes", axes, AXES)
     ply = read_ply(path, ("vertex",))
-    if not is_3dgs(ply):
+    if not ply.is_3dgs():
         got = ply.describe_vertices()
-        cure = "For a video use read_vegas_ply." if is_vegas(ply) else "It may be a mesh or a point cloud."
+        cure = "For a video use read_vegas_ply." if ply.is_vegas() else "It may be a mesh or a point cloud."
         expected = "a 3DGS scene, with f_dc_0, opacity, scale_2 and rot_3"
-        raise format_error(ply.path, expected=expected, got=got, cure=cure)
+        raise ply.error(expected=expected, got=got, cure=cure)
     spatial = ply.columns("vertex", ["x", "y", "z", "scale_0", "scale_1", "scale_2"])
     turn = ply.columns("vertex", [f"rot_{k}" for k in range(4)])
     opacity, *color = ply.columns("vertex", ["opacity", "f_dc_0", "f_dc_1", "f_dc_2"]).T
     lengths = np.linalg.norm(turn, axis=1)
     if (lengths < _SMALLEST).any():
         got = f"0 in vertex {np.argmax(lengths < _SMALLEST)}"
-        raise format_error(ply.path, expected="quaternions of nonzero length", got=got, cure="Drop that row.")
+        raise ply.error(expected="quaternions of nonzero length", got=got, cure="Drop that row.")
     rotation = np.empty((0, 3, 3))
     if len(turn):
         rotation = scipy.spatial.transform.Rotation.from_quat(turn[:, [1, 2, 3, 0]]).as_matrix()
     with np.errstate(over="ignore", invalid="ignore"):
-        factor = to_float32(ply, "scale", rotation * np.exp(spatial[:, None, 3:]))
+        factor = ply.to_float32("scale", rotation * np.exp(spatial[:, None, 3:]))
     rgb = np.maximum(0.5 + SH_C0 * np.stack(color, axis=1), 0)
     leaves = (spatial[:, :3], factor, expit(opacity), rgb)
     return _turn(Gaussians3D(*(np.asarray(leaf, np.float32) for leaf in leaves)), axes)

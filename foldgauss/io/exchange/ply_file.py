@@ -70,6 +70,26 @@ class Ply:
         """The properties of an element in their order; none where it is missing."""
         return self.elements[element].dtype.names if element in self.elements else ()
 
+    def is_vegas(self) -> bool:
+        """Whether it is a published VeGaS video, by the columns that only those have."""
+        return {"m_0", "sigma_0", "rot_0"} <= set(self.names("vertex"))
+
+    def is_3dgs(self) -> bool:
+        """Whether it is a 3DGS scene, by the columns that distinguish it from meshes and from VeGaS."""
+        return {"f_dc_0", "opacity", "scale_2", "rot_3"} <= set(self.names("vertex"))
+
+    def error(self, expected: str, got: str, cure: str = "") -> FormatError:
+        """The error for what it holds."""
+        return format_error(self.path, expected=expected, got=got, cure=cure)
+
+    def to_float32(self, name: str, leaf: np.ndarray) -> np.ndarray:
+        """The leaf in float32, contiguous. Raises `FormatError` where a change of units overflows it."""
+        with np.errstate(over="ignore"):
+            leaf = np.ascontiguousarray(leaf, np.float32)
+        if not np.isfinite(leaf).all():
+            raise self.error(f"a {name} that float32 can represent in model space", "a larger one")
+        return leaf
+
     def describe_vertices(self) -> str:
         """The properties of the element `vertex`, for an error message."""
         return "properties " + ", ".join(self.names("vertex")[:20]) if self.names("vertex") else "no element 'vertex'"
@@ -81,7 +101,7 @@ class Ply:
         if missing:
             has = "the properties " + ", ".join(found[:40]) if found else "no such element"
             expected = f"properties {', '.join(missing)} of element {element!r}"
-            raise format_error(self.path, expected=expected, got=has, cure="It holds another kind of data.")
+            raise self.error(expected=expected, got=has, cure="It holds another kind of data.")
         rows = self.elements[element]
         columns = np.empty((len(rows), len(names)), np.float64)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -91,7 +111,7 @@ class Ply:
         if len(wrong):
             row, place = wrong[0]
             got = f"{columns[row, place]} in {names[place]} of {element} {row}"
-            raise format_error(self.path, expected="numbers that float32 can represent", got=got, cure="Drop that row.")
+            raise self.error(expected="numbers that float32 can represent", got=got, cure="Drop that row.")
         return columns
 
 
@@ -295,25 +315,3 @@ def _encode(elements: Mapping[str, Mapping[str, np.ndarray]], comments: Sequence
     yield ("\n".join(lines) + "\nend_header\n").encode("ascii")
     for columns in elements.values():
         yield np.stack([np.asarray(column, "<f4") for column in columns.values()], axis=1).tobytes()
-
-
-# ---------------------------------------------------------------------------------------------- layouts
-
-
-def is_vegas(ply: Ply) -> bool:
-    """Whether a PLY file is a published VeGaS video, by the columns that only those have."""
-    return {"m_0", "sigma_0", "rot_0"} <= set(ply.names("vertex"))
-
-
-def is_3dgs(ply: Ply) -> bool:
-    """Whether a PLY file is a 3DGS scene, by the columns that distinguish it from meshes and from VeGaS."""
-    return {"f_dc_0", "opacity", "scale_2", "rot_3"} <= set(ply.names("vertex"))
-
-
-def to_float32(ply: Ply, name: str, leaf: np.ndarray) -> np.ndarray:
-    """The leaf in float32, contiguous. Raises `FormatError` where a change of units overflows it."""
-    with np.errstate(over="ignore"):
-        leaf = np.ascontiguousarray(leaf, np.float32)
-    if not np.isfinite(leaf).all():
-        raise format_error(ply.path, expected=f"a {name} that float32 can represent in model space", got="a larger one")
-    return leaf

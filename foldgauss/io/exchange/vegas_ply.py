@@ -12,17 +12,7 @@ from jaxtyping import Float
 
 from foldgauss._runtime.checks import invalid, is_within
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.io.exchange.ply_file import (
-    NOTE,
-    Ply,
-    facts_error,
-    format_error,
-    is_3dgs,
-    is_vegas,
-    read_ply,
-    to_float32,
-    write_ply,
-)
+from foldgauss.io.exchange.ply_file import NOTE, Ply, facts_error, read_ply, write_ply
 from foldgauss.io.media.frame_rate import DEFAULT_FPS, MAX_FPS
 from foldgauss.render import RenderOptions
 from foldgauss.render.camera import FIELD_OF_VIEW
@@ -80,7 +70,7 @@ def read_vegas_ply(
     num_weights = sum(name.startswith("w1_") for name in ply.names("vertex"))
     if num_weights % 2:
         expected = "an even number of w1 columns, pairs (x, z)"
-        raise format_error(ply.path, expected=expected, got=str(num_weights), cure="The file is damaged.")
+        raise ply.error(expected=expected, got=str(num_weights), cure="The file is damaged.")
     names = ["x", "z", "scale_0", "scale_2", "rot_0", "m_0", "sigma_0", "opacity", "f_dc_0", "f_dc_1", "f_dc_2"]
     columns = ply.columns("vertex", [*names, *(f"w1_{k}" for k in range(num_weights))])
     unit = _vegas_unit(size)
@@ -96,10 +86,8 @@ def read_vegas_ply(
         "opacity_logit": opacity,
         "color_dc": columns[:, 8:11],
     }
-    splats = FoldedSplats(
-        **{name: to_float32(ply, name, leaf) for name, leaf in leaves.items()},
-        envelope=TimeLikelihood(np.float32(power), np.float32(0)),
-    )
+    leaves = {name: ply.to_float32(name, leaf) for name, leaf in leaves.items()}
+    splats = FoldedSplats(**leaves, envelope=TimeLikelihood(np.float32(power), np.float32(0)))
     return VideoModel(splats, FrameTimes(_time_logits(ply)), size, fps, options, scale_cutoff=scale_cutoff)
 
 
@@ -159,19 +147,18 @@ def _vegas_unit(size: tuple[int, int]) -> float:
 
 
 def _check_is_vegas(ply: Ply) -> None:
-    if not is_vegas(ply):
-        cure = "For a still scene use read_3dgs_ply." if is_3dgs(ply) else "Check that it is the right file."
+    if not ply.is_vegas():
+        cure = "For a still scene use read_3dgs_ply." if ply.is_3dgs() else "Check that it is the right file."
         got = ply.describe_vertices()
-        raise format_error(ply.path, expected="a VeGaS video, with m_0, sigma_0 and rot_0", got=got, cure=cure)
+        raise ply.error(expected="a VeGaS video, with m_0, sigma_0 and rot_0", got=got, cure=cure)
     if "time" not in ply.elements:
         cure = "It may be of another version of the published code."
-        raise format_error(ply.path, expected="an element 'time' with the frames' weights", got="none", cure=cure)
+        raise ply.error(expected="an element 'time' with the frames' weights", got="none", cure=cure)
     if len(ply.elements["vertex"]) == 0:
-        raise format_error(ply.path, expected="Gaussians", got="none")
+        raise ply.error(expected="Gaussians", got="none")
     rest = [name for name in ply.names("vertex") if name.startswith("f_rest_")]
     if rest and np.any(ply.columns("vertex", rest)):
-        expected = "colours of degree 0, as VeGaS has them"
-        raise format_error(ply.path, expected=expected, got="f_rest columns that are not 0")
+        raise ply.error(expected="colours of degree 0, as VeGaS has them", got="f_rest columns that are not 0")
 
 
 def _time_logits(ply: Ply) -> Float[np.ndarray, " intervals"]:
@@ -180,10 +167,10 @@ def _time_logits(ply: Ply) -> Float[np.ndarray, " intervals"]:
     weights = ply.columns("time", names)
     if 1 not in weights.shape or weights.size == 0:
         got = f"{weights.shape[0]} rows of {weights.shape[1]}"
-        raise format_error(ply.path, expected="one row of weights in element 'time'", got=got)
+        raise ply.error(expected="one row of weights in element 'time'", got=got)
     if weights.shape[0] == 1 and names != [f"time_func_{k}" for k in range(len(names))]:
         got = ", ".join(names[:9])
-        raise format_error(ply.path, expected="time_func_0, time_func_1, ... in element 'time'", got=got)
+        raise ply.error(expected="time_func_0, time_func_1, ... in element 'time'", got=got)
     return weights.astype(np.float32).ravel()
 
 
@@ -194,7 +181,7 @@ def _fill_in(
     note = _read_note(ply)
     if size is None and "size" not in note:
         cure = "Give the size of the video that it was made from, such as size=(480, 854)."
-        raise format_error(ply.path, expected="a size, which a VeGaS file does not hold", got="none", cure=cure)
+        raise ply.error(expected="a size, which a VeGaS file does not hold", got="none", cure=cure)
     try:
         options = RenderOptions(**note.get("options", {}))
         size = note["size"] if size is None else size
@@ -221,8 +208,7 @@ def _read_note(ply: Ply) -> dict:
     except (ValueError, RecursionError):
         note = None
     if not isinstance(note, dict) or not isinstance(note.get("options", {}), dict):
-        expected = "metadata in the comment 'foldgauss'"
-        raise format_error(ply.path, expected=expected, got=texts[0][:60], cure="Remove it.")
+        raise ply.error(expected="metadata in the comment 'foldgauss'", got=texts[0][:60], cure="Remove it.")
     return note
 
 

@@ -63,7 +63,7 @@ def read_indexed(index: FrameIndex, first: int, stop: int | None, *, size: tuple
         num_declared = index.num_declared - first
     crop = () if size is None else describe_crop([index.size], size)
     if index.fixed_fps is not None:
-        return Clip(frames, index.fixed_fps, index.source, num_declared, None, notes + crop)
+        rate = FrameRate(index.fixed_fps)
     return Clip(frames, float(rate.fps), index.source, num_declared, rate.times, notes + describe_rate(rate) + crop)
 
 

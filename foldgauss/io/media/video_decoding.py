@@ -17,7 +17,6 @@ from foldgauss.io.media.frame_rate import (
     estimate_num_frames,
     estimate_rate,
     make_increasing,
-    replace_unusable_rate,
 )
 from foldgauss.io.media.resizing import copy_to_blocks
 
@@ -133,7 +132,6 @@ def describe_span(
     """
     num_passed = len(positions)
     rate = estimate_rate(report.seconds[num_passed - num_kept : num_passed], report.fps)
-    rate = replace_unusable_rate(rate)
     if np.ptp(stamps) == 0 and num_passed > 1:  # a raw stream: the rate is FFmpeg's guess
         rate = rate._replace(guessed=True)
     gaps = _describe_gaps([start - 1, *positions[num_passed - num_kept :]])
