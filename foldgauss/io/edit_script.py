@@ -95,12 +95,12 @@ def _is_range(value: Any) -> bool:
 
 def _list_check(*lengths: int, is_item: Callable[[Any], bool] = _is_number) -> Callable[[Any], bool]:
     """A check for lists of one of these lengths, or of any length above 0 if none is given."""
-    return lambda value: (
-        isinstance(value, list)
-        and bool(value)
-        and len(value) in (lengths or (len(value),))
-        and all(map(is_item, value))
-    )
+
+    def holds(value: Any) -> bool:
+        fits = isinstance(value, list) and (len(value) in lengths if lengths else bool(value))
+        return fits and all(map(is_item, value))
+
+    return holds
 
 
 def _any_of(*ways: Callable[[Any], bool]) -> Callable[[Any], bool]:
@@ -165,46 +165,37 @@ _TABLES: _Keys = {
 
 @dataclasses.dataclass(frozen=True)
 class _Action:
-    """A value of `do`: a method of `Edit`, its required and optional keys, and the method's names for some of them.
+    """A value of `do`, a method of `Edit`: its required and optional keys, and the method's name for "degrees".
 
-    Values of the key "degrees" are converted to radians.
+    Values of that key are converted to radians.
     """
 
-    method: str
     required: _Keys = dataclasses.field(default_factory=dict)
     optional: _Keys = dataclasses.field(default_factory=dict)
-    named: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    angle: str = "angle"
     spans: bool = True
 
     @property
     def keys(self) -> _Keys:
         return {**self.required, **self.optional, **(_WHEN if self.spans else {})}
 
-    def apply(self, edit: Chain, given: dict[str, Any]) -> Chain:
-        given = {key: _to_radians(value) if key == "degrees" else value for key, value in given.items()}
-        return getattr(edit, self.method)(**{self.named.get(key, key): value for key, value in given.items()})
-
 
 #: The actions of edits, each a method of `foldgauss.video.Edit`.
 ACTIONS = {
-    "move": _Action("move", {"offset": _PAIR}),
-    "scale": _Action("scale", {"factor": _ONE_OR_TWO}, {"about": _PAIR}),
-    "rotate": _Action("rotate", {"degrees": _NUMBER}, {"about": _PAIR}, {"degrees": "angle"}),
+    "move": _Action({"offset": _PAIR}),
+    "scale": _Action({"factor": _ONE_OR_TWO}, {"about": _PAIR}),
+    "rotate": _Action({"degrees": _NUMBER}, {"about": _PAIR}),
     "transform": _Action(
-        "transform",
         {"matrix": _Kind("two rows of two numbers, as [[1.0, 0.2], [0.0, 1.0]]", _rows_check(2, 2))},
         {"offset": _PAIR, "about": _PAIR},
     ),
     "multiply": _Action(
-        "multiply",
         {"offsets": _PAIRS},
         {"delays": _EACH, "scale": _EACH, "degrees": _EACH, "about": _PAIR, "originals": _BOOL},
-        {"degrees": "angle"},
     ),
-    "vanish": _Action("vanish"),
-    "opacity": _Action("opacity", {"factor": _NUMBER}),
+    "vanish": _Action(),
+    "opacity": _Action({"factor": _NUMBER}),
     "recolor": _Action(
-        "recolor",
         optional={
             "color": _THREE,
             "hue": _NUMBER,
@@ -213,13 +204,11 @@ ACTIONS = {
             "matrix": _Kind("three rows of three numbers", _rows_check(3, 3)),
         },
     ),
-    "retime": _Action("retime", optional={"shift": _NUMBER, "stretch": _NUMBER, "about": _NUMBER, "outside": _TEXT}),
-    "freeze": _Action("freeze", {"at": _NUMBER}),
-    "to_front": _Action("to_front", spans=False),
-    "to_back": _Action("to_back", spans=False),
-    "place": _Action(
-        "place", optional={"depth": _NUMBER, "degrees": _THREE, "about": _PAIR}, named={"degrees": "rotate"}
-    ),
+    "retime": _Action(optional={"shift": _NUMBER, "stretch": _NUMBER, "about": _NUMBER, "outside": _TEXT}),
+    "freeze": _Action({"at": _NUMBER}),
+    "to_front": _Action(spans=False),
+    "to_back": _Action(spans=False),
+    "place": _Action(optional={"depth": _NUMBER, "degrees": _THREE, "about": _PAIR}, angle="rotate"),
 }
 
 
@@ -243,12 +232,11 @@ class EditScript:
             with self._context("selections", name, path="file" if "file" in table else "mask"):
                 named[name] = self._select(video, table, named)
         for number, table in enumerate(self.tables.get("edits", ())):
-            action = ACTIONS[table["do"]]
-            context = self._context("edits", number, **{own: key for key, own in action.named.items()})
+            context = self._context("edits", number, **{ACTIONS[table["do"]].angle: "degrees"})
             with context:
                 if isinstance(edits, SegmentedEdit):
                     edits = edits.with_error_context(context)  # for errors that occur when models are loaded
-                edits = self._apply_edit(edits, action, table, named)
+                edits = self._apply_edit(edits, table, named)
         video = self._add_layers(edits.video())
         if "camera" in self.tables:
             with self._context("camera"):
@@ -274,14 +262,16 @@ class EditScript:
             criteria["mask"] = _masks_of_frames(masks, video.num_frames, criteria)
         return edit(video).select(**criteria).selection
 
-    def _apply_edit(self, edits: Chain, action: _Action, table: dict[str, Any], named: dict[str, Selected]) -> Chain:
+    def _apply_edit(self, edits: Chain, table: dict[str, Any], named: dict[str, Selected]) -> Chain:
         if "select" in table:
             edits = edits.select_begun(named[table["select"]])
             if not len(edits.selection):
                 got = f"{table['select']!r}, which found nothing, or only deleted Gaussians"
                 raise invalid("select", expected="a selection of at least one Gaussian", got=got)
         given = {key: value for key, value in _convert_spans(table).items() if key not in ("do", "select")}
-        return action.apply(edits, given)
+        if "degrees" in given:
+            given[ACTIONS[table["do"]].angle] = _to_radians(given.pop("degrees"))
+        return getattr(edits, table["do"])(**given)
 
     def _add_layers(self, video: Video) -> Video:
         front, behind = [], []
@@ -329,9 +319,8 @@ def read_edit_script(path: str | os.PathLike) -> EditScript:
     try:
         text = path.read_bytes().decode("utf-8-sig")  # some editors of Windows write a byte order mark
     except UnicodeDecodeError as error:
-        raise EditScriptError(
-            f"{path}: expected a text in UTF-8, got other bytes at {error.start}. Is it a model?"
-        ) from error
+        got = f"other bytes at {error.start}"
+        raise EditScriptError(f"{path}: expected a text in UTF-8, got {got}. Is it a model?") from error
     except OSError as error:
         raise EditScriptError(f"{path}: expected a file that can be read, got {error}.") from error
     script = parse_edit_script(text, source=str(path), folder=path.parent)
@@ -349,10 +338,10 @@ def parse_edit_script(text: str, *, source: str = "script", folder: str | os.Pat
     script = EditScript(tables, source, text, Path(folder))
     _check_keys(script._context(), tables, _TABLES)
     selections: dict[str, dict] = tables.get("selections", {})
-    known: list[str] = []
+    known: dict[str, None] = {}
     for name, table in selections.items():
         _check_selection(script._context("selections", name), table, known)
-        known.append(name)
+        known[name] = None
     for number, table in enumerate(tables.get("edits", ())):
         _check_edit(script._context("edits", number), table, known)
     for number, table in enumerate(tables.get("layers", ())):
@@ -448,7 +437,7 @@ def _truncated_repr(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _check_selection(context: _TableContext, table: dict[str, Any], known: list[str]) -> None:
+def _check_selection(context: _TableContext, table: dict[str, Any], known: Collection[str]) -> None:
     """Check a selection after those that are `known`."""
     if not table:
         raise context.error(None, "at least one criterion", "none")
@@ -467,7 +456,7 @@ def _check_selection(context: _TableContext, table: dict[str, Any], known: list[
             raise context.error("file", "a mask or a file", "both", "Combine two selections with all=[...].")
 
 
-def _check_edit(context: _TableContext, table: dict[str, Any], selections: list[str]) -> None:
+def _check_edit(context: _TableContext, table: dict[str, Any], selections: Collection[str]) -> None:
     do = table.get("do")
     if not isinstance(do, str):
         raise context.error("do", "one of " + ", ".join(ACTIONS), "none" if do is None else _truncated_repr(do))

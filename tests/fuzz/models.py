@@ -183,7 +183,7 @@ _MODEL_MUTATIONS = (facts_changed, table_changed, resized, halved)
 #: `_array_leaves` refuses models that are saved; what is loaded comes with the shapes of a skeleton.
 _MODEL_FILE = {
     "foldgauss.io.models.model_file": (
-        "register_model", "save_model", "write_tensors", "_to_numpy", "_find_kind", "_check_described", "to_json",
+        "register_model", "save_model", "write_tensors", "_to_numpy", "_check_described", "to_json",
         "_array_leaves",
         "_encode_scalar", "to_json_types",
     ),
@@ -428,7 +428,7 @@ COMPACT = Target(
     _read_compact,
     (ModelFileError,),
     {
-        "foldgauss.io.models.compact": ("save_compact", "check_compact_name", "pack_compact", "_wrapped_differences"),
+        "foldgauss.io.models.compact": ("save_compact", "check_compact_name", "pack_compact"),
         "foldgauss.io.models.column_contexts": (),
         "foldgauss.io.models.video_model": (
             ONLY,

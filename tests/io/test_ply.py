@@ -31,7 +31,6 @@ from foldgauss.io import (
     write_vegas_ply,
 )
 from foldgauss.io._atomic import OutputError
-from foldgauss.io.exchange import ply_file
 from foldgauss.io.exchange.ply_file import read_ply, write_ply
 from foldgauss.render import Gaussians3D, RenderOptions, Splats2D, cpu
 from foldgauss.video import FitConfig, FrameTimes, VideoModel, fit, psnr
@@ -664,7 +663,7 @@ def test_structured_rows_are_plain_numbers(tmp_path):
     rows = read_ply(write_raw(tmp_path / "x.ply", columns, layout="binary_big_endian"), ["vertex"]).elements["vertex"]
     expected = np.stack([np.float32(column) for column in columns.values()], axis=1)
     np.testing.assert_array_equal(recfunctions.structured_to_unstructured(rows), expected)
-    assert ply_file.is_vegas(read_ply(tmp_path / "x.ply", ["vertex"])) is False
+    assert read_ply(tmp_path / "x.ply", ["vertex"]).is_vegas() is False
 
 
 def test_within_a_cut_it_is_the_nearer_frame():

@@ -8,11 +8,11 @@ import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid
 from foldgauss.io._atomic import OutputError, atomic_folder, check_path, check_writable
-from foldgauss.io.exchange.gaussians_ply import AXES, DEPTH_STEP, write_3dgs_frames, write_3dgs_ply
+from foldgauss.io.exchange.gaussians_ply import write_3dgs_frames, write_3dgs_ply
 from foldgauss.io.exchange.ply_file import format_error
 from foldgauss.io.exchange.pseudomesh import write_pseudomesh
 from foldgauss.io.exchange.vegas_ply import read_vegas_ply, write_vegas_ply
-from foldgauss.io.page.player_page import HTML_SUFFIX, QUALITY, Frames, write_html
+from foldgauss.io.page.player_page import HTML_SUFFIX, Frames, write_html
 from foldgauss.video.editing.chain import Edit
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.video_model import VideoModel
@@ -61,11 +61,9 @@ def export(
         raise invalid("model", expected="a VideoModel or an EditedVideo", got=type(model).__name__, cure=cure)
     check_one_of("format", format, FORMATS)
     out = check_path(out, "model, format, out")
-    of_scenes = {"depth_step": depth_step, "axes": axes, "sh_degree": sh_degree}
-    of_pages = {"original": original, "quality": quality, "title": title}
-    given = {name: value for name, value in of_scenes.items() if value is not None}
-    unknown = list(given) if format != "ply3dgs" else []
-    unknown += [name for name, value in of_pages.items() if format != "html" and value is not None]
+    of_scenes = _without_none(depth_step=depth_step, axes=axes, sh_degree=sh_degree)
+    of_pages = _without_none(original=original, quality=quality, title=title)
+    unknown = [*(of_scenes if format != "ply3dgs" else ()), *(of_pages if format != "html" else ())]
     unknown += ["times"] if format in ("ply", "html") and times is not None else []
     if unknown:
         got = f"it for {format!r}"
@@ -78,21 +76,24 @@ def export(
     if format == "html":
         if out.suffix.lower() == HTML_SUFFIX:
             _check_new(out, overwrite)
-        return write_html(out, model, **of_pages | {"quality": QUALITY if quality is None else quality})
+        return write_html(out, model, **of_pages)
     if format == "obj":
         if out.suffix.lower() == ".obj" and not out.is_dir():
             cure = "Each frame becomes a file in it: leave the extension out."
             raise invalid("out", expected="a folder", got=repr(str(out)), cure=cure)
         return write_pseudomesh(out, model, times, overwrite=overwrite, on_frame=on_frame)
-    given = {"depth_step": DEPTH_STEP, "axes": AXES[0], "sh_degree": 3} | given
     if out.suffix.lower() != ".ply" or out.is_dir():
-        return write_3dgs_frames(out, model, times, overwrite=overwrite, on_frame=on_frame, **given)
+        return write_3dgs_frames(out, model, times, overwrite=overwrite, on_frame=on_frame, **of_scenes)
     if times is None or np.size(times) != 1:
         got = "all frames" if times is None else str(np.size(times))
         cure = "Give one time, or a folder (a name without .ply)."
         raise invalid("times", expected="one for a single file", got=got, cure=cure)
     _check_new(out, overwrite)
-    return write_3dgs_ply(out, model, float(np.ravel(times)[0]), **given)
+    return write_3dgs_ply(out, model, float(np.ravel(times)[0]), **of_scenes)
+
+
+def _without_none(**options: object) -> dict[str, object]:
+    return {name: value for name, value in options.items() if value is not None}
 
 
 def _write_vegas_segments(folder: Path, video: SegmentedVideo, overwrite: bool) -> Path:
@@ -108,9 +109,8 @@ def _write_vegas_segments(folder: Path, video: SegmentedVideo, overwrite: bool) 
 def _check_new(path: Path, overwrite: bool) -> None:
     check_writable(path)
     if path.exists() and not overwrite:
-        raise OutputError(
-            f"path: expected a new file, got {str(path)!r}, which exists. Choose another path, or allow overwriting."
-        )
+        text = f"path: expected a new file, got {str(path)!r}, which exists."
+        raise OutputError(f"{text} Choose another path, or allow overwriting.")
 
 
 def import_model(

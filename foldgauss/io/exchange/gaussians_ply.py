@@ -14,7 +14,7 @@ from scipy.special import expit, logit
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_within, short_repr
 from foldgauss.io._atomic import atomic_folder
-from foldgauss.io.exchange.ply_file import NOTE, format_error, is_3dgs, is_vegas, read_ply, to_float32, write_ply
+from foldgauss.io.exchange.ply_file import NOTE, read_ply, write_ply
 from foldgauss.render import Camera, Gaussians3D, pixels_per_unit
 from foldgauss.render.camera import THICKNESS
 from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer
@@ -56,8 +56,12 @@ def frame_gaussians(model: RenderableVideo | VideoRenderer, t: float, *, depth_s
     if not is_within(float(t), "[0, 1]"):
         raise invalid("t", expected="a time in [0, 1]", got=repr(t))
     renderer = model if isinstance(model, VideoRenderer) else VideoRenderer(model)
-    mean, factor, opacity, color = _visible_splats(renderer, float(t))
-    height, width = renderer.model.size
+    splats = renderer.dominant_splats(float(t))
+    seen = np.asarray(splats.opacity) > 0
+    leaves = (splats.mean, splats.factor, splats.opacity, splats.color)
+    mean, factor, opacity, color = (np.asarray(leaf, np.float64)[seen] for leaf in leaves)
+    (height, width), unit = renderer.size, pixels_per_unit(renderer.size)
+    mean, factor = (mean - [width / 2, height / 2]) / unit, factor / unit
     distance = -float(Camera.front(height / width).position[2])
     depth = depth_step * np.arange(len(mean))
     grown = (1 + depth / distance)[:, None]
@@ -65,16 +69,6 @@ def frame_gaussians(model: RenderableVideo | VideoRenderer, t: float, *, depth_s
     flat[:, :2, :2], flat[:, 2, 2] = factor * grown[..., None], THICKNESS
     mean = np.concatenate([mean * grown, depth[:, None]], axis=1)
     return Gaussians3D(*(leaf.astype(np.float32) for leaf in (mean, flat, opacity, color)))
-
-
-def _visible_splats(renderer: VideoRenderer, t: float) -> tuple[np.ndarray, ...]:
-    """(mean, factor, opacity, color) of the Gaussians visible at t (near it, at a cut), in model space, float64."""
-    splats = renderer.dominant_splats(t)
-    seen = np.asarray(splats.opacity) > 0
-    leaves = (splats.mean, splats.factor, splats.opacity, splats.color)
-    mean, factor, opacity, color = (np.asarray(leaf, np.float64)[seen] for leaf in leaves)
-    (height, width), unit = renderer.size, pixels_per_unit(renderer.size)
-    return (mean - [width / 2, height / 2]) / unit, factor / unit, opacity, color
 
 
 def write_gaussians_ply(
@@ -96,12 +90,10 @@ def write_gaussians_ply(
 
     **Source:** Kerbl et al. 2023, 3D Gaussian Splatting, and the file layout of its published code.
     """
-    return _write(path, gaussians, axes, sh_degree)
+    return write_ply(path, {"vertex": _columns(gaussians, axes, sh_degree)})
 
 
-def _write(
-    path: str | os.PathLike, gaussians: Gaussians3D, axes: str, sh_degree: int, comments: Sequence[str] = ()
-) -> Path:
+def _columns(gaussians: Gaussians3D, axes: str, sh_degree: int) -> dict[str, np.ndarray]:
     check_one_of("axes", axes, AXES)
     if sh_degree not in _NUM_REST:
         raise invalid("sh_degree", expected="0, 1, 2 or 3", got=repr(sh_degree))
@@ -118,27 +110,12 @@ def _write(
     with np.errstate(divide="ignore"):
         columns["opacity"] = np.clip(logit(opacity), -_LOGIT_MAX, _LOGIT_MAX)
     columns |= {f"scale_{k}": np.log(np.maximum(scale[:, k], _SMALLEST)) for k in range(3)}
-    columns |= {f"rot_{k}": quaternion[:, k] for k in range(4)}
-    return write_ply(path, {"vertex": columns}, comments=comments)
-
-
-def _write_frame(
-    path: str | os.PathLike,
-    model: RenderableVideo | VideoRenderer,
-    t: float,
-    depth_step: float,
-    axes: str,
-    sh_degree: int,
-) -> Path:
-    """One frame, with what the player needs to show it as it was in a comment."""
-    video = model.model if isinstance(model, VideoRenderer) else model
-    note = {"size": list(video.size), "axes": axes, "options": dataclasses.asdict(video.options)}
-    return _write(path, frame_gaussians(model, t, depth_step=depth_step), axes, sh_degree, [NOTE + json.dumps(note)])
+    return columns | {f"rot_{k}": quaternion[:, k] for k in range(4)}
 
 
 def write_3dgs_ply(
     path: str | os.PathLike,
-    model: RenderableVideo,
+    model: RenderableVideo | VideoRenderer,
     t: float,
     *,
     depth_step: float = DEPTH_STEP,
@@ -148,15 +125,20 @@ def write_3dgs_ply(
     """Write the frame at time t as a 3DGS PLY file; returns the path.
 
     See `frame_gaussians` for the geometry and `write_gaussians_ply` for the layout. A comment, the header's last line,
-    has the frame's size, for the player.
+    has what the player needs to show the frame as it was.
 
     **Raises:** as these two, and ValueError for a model with compositing "sum", whose Gaussians do not occlude: viewers
     cannot render it.
 
     **Example:** `write_3dgs_ply("frame.ply", model, 0.5)`
     """
-    _check_compositing(model)
-    return _write_frame(path, model, t, depth_step, axes, sh_degree)
+    video = model.model if isinstance(model, VideoRenderer) else model
+    if video.compositing != "over":
+        cure = "Fit it with --compositing over."
+        raise invalid("model's compositing", expected="over, as viewers blend", got=video.compositing, cure=cure)
+    columns = _columns(frame_gaussians(model, t, depth_step=depth_step), axes, sh_degree)
+    note = {"size": list(video.size), "axes": axes, "options": dataclasses.asdict(video.options)}
+    return write_ply(path, {"vertex": columns}, comments=[NOTE + json.dumps(note)])
 
 
 def write_3dgs_frames(
@@ -180,19 +162,13 @@ def write_3dgs_frames(
     **Example:** `write_3dgs_frames("frames", model)`
     """
     folder, times = Path(folder), check_times(model, times)
-    _check_compositing(model)
+    options = {"depth_step": depth_step, "axes": axes, "sh_degree": sh_degree}
     with atomic_folder(folder, overwrite, pattern=r"frame_[0-9]{4,}\.ply") as temporary:
         renderer = VideoRenderer(model)
         for number, t in enumerate(times):
-            _write_frame(temporary / f"frame_{number:04d}.ply", renderer, t, depth_step, axes, sh_degree)
+            write_3dgs_ply(temporary / f"frame_{number:04d}.ply", renderer, t, **options)
             on_frame()
     return folder
-
-
-def _check_compositing(model: RenderableVideo) -> None:
-    if model.compositing != "over":
-        cure = "Fit it with --compositing over."
-        raise invalid("model's compositing", expected="over, as viewers blend", got=model.compositing, cure=cure)
 
 
 def check_times(model: RenderableVideo, times: Sequence[float] | None) -> Float[np.ndarray, " frames"]:
@@ -219,25 +195,23 @@ def read_3dgs_ply(path: str | os.PathLike, *, axes: str = "y-down") -> Gaussians
     """
     check_one_of("axes", axes, AXES)
     ply = read_ply(path, ("vertex",))
-    if not is_3dgs(ply):
+    if not ply.is_3dgs():
         got = ply.describe_vertices()
-        cure = "For a video use read_vegas_ply." if is_vegas(ply) else "It may be a mesh or a point cloud."
+        cure = "For a video use read_vegas_ply." if ply.is_vegas() else "It may be a mesh or a point cloud."
         expected = "a 3DGS scene, with f_dc_0, opacity, scale_2 and rot_3"
-        raise format_error(ply.path, expected=expected, got=got, cure=cure)
+        raise ply.error(expected=expected, got=got, cure=cure)
     spatial = ply.columns("vertex", ["x", "y", "z", "scale_0", "scale_1", "scale_2"])
     turn = ply.columns("vertex", [f"rot_{k}" for k in range(4)])
     opacity, *color = ply.columns("vertex", ["opacity", "f_dc_0", "f_dc_1", "f_dc_2"]).T
     lengths = np.linalg.norm(turn, axis=1)
     if (lengths < _SMALLEST).any():
         got = f"0 in vertex {np.argmax(lengths < _SMALLEST)}"
-        raise format_error(ply.path, expected="quaternions of nonzero length", got=got, cure="Drop that row.")
-    rotation = (
-        scipy.spatial.transform.Rotation.from_quat(turn[:, [1, 2, 3, 0]]).as_matrix()
-        if len(turn)
-        else np.empty((0, 3, 3))
-    )
+        raise ply.error(expected="quaternions of nonzero length", got=got, cure="Drop that row.")
+    rotation = np.empty((0, 3, 3))
+    if len(turn):
+        rotation = scipy.spatial.transform.Rotation.from_quat(turn[:, [1, 2, 3, 0]]).as_matrix()
     with np.errstate(over="ignore", invalid="ignore"):
-        factor = to_float32(ply, "scale", rotation * np.exp(spatial[:, None, 3:]))
+        factor = ply.to_float32("scale", rotation * np.exp(spatial[:, None, 3:]))
     rgb = np.maximum(0.5 + SH_C0 * np.stack(color, axis=1), 0)
     leaves = (spatial[:, :3], factor, expit(opacity), rgb)
     return _turn(Gaussians3D(*(np.asarray(leaf, np.float32) for leaf in leaves)), axes)

@@ -55,14 +55,7 @@ def facts_error(path: object, error: Exception) -> FormatError:
 class _Element:
     name: str
     count: int
-    properties: tuple[tuple[str, str], ...]  # (name, type code); of a list "count type, item type"
-
-    @property
-    def has_lists(self) -> bool:
-        return any("," in code for _, code in self.properties)
-
-    def dtype(self, order: str) -> np.dtype:
-        return np.dtype([(name, order + code) for name, code in self.properties])
+    properties: list[tuple[str, str]]  # (name, type code); of a list "count type, item type"
 
 
 @dataclass(frozen=True)
@@ -77,6 +70,26 @@ class Ply:
         """The properties of an element in their order; none where it is missing."""
         return self.elements[element].dtype.names if element in self.elements else ()
 
+    def is_vegas(self) -> bool:
+        """Whether it is a published VeGaS video, by the columns that only those have."""
+        return {"m_0", "sigma_0", "rot_0"} <= set(self.names("vertex"))
+
+    def is_3dgs(self) -> bool:
+        """Whether it is a 3DGS scene, by the columns that distinguish it from meshes and from VeGaS."""
+        return {"f_dc_0", "opacity", "scale_2", "rot_3"} <= set(self.names("vertex"))
+
+    def error(self, expected: str, got: str, cure: str = "") -> FormatError:
+        """The error for what it holds."""
+        return format_error(self.path, expected=expected, got=got, cure=cure)
+
+    def to_float32(self, name: str, leaf: np.ndarray) -> np.ndarray:
+        """The leaf in float32, contiguous. Raises `FormatError` where a change of units overflows it."""
+        with np.errstate(over="ignore"):
+            leaf = np.ascontiguousarray(leaf, np.float32)
+        if not np.isfinite(leaf).all():
+            raise self.error(f"a {name} that float32 can represent in model space", "a larger one")
+        return leaf
+
     def describe_vertices(self) -> str:
         """The properties of the element `vertex`, for an error message."""
         return "properties " + ", ".join(self.names("vertex")[:20]) if self.names("vertex") else "no element 'vertex'"
@@ -88,7 +101,7 @@ class Ply:
         if missing:
             has = "the properties " + ", ".join(found[:40]) if found else "no such element"
             expected = f"properties {', '.join(missing)} of element {element!r}"
-            raise format_error(self.path, expected=expected, got=has, cure="It holds another kind of data.")
+            raise self.error(expected=expected, got=has, cure="It holds another kind of data.")
         rows = self.elements[element]
         columns = np.empty((len(rows), len(names)), np.float64)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -98,7 +111,7 @@ class Ply:
         if len(wrong):
             row, place = wrong[0]
             got = f"{columns[row, place]} in {names[place]} of {element} {row}"
-            raise format_error(self.path, expected="numbers that float32 can represent", got=got, cure="Drop that row.")
+            raise self.error(expected="numbers that float32 can represent", got=got, cure="Drop that row.")
         return columns
 
 
@@ -124,10 +137,9 @@ def read_ply(path: str | os.PathLike, wanted: Iterable[str]) -> Ply:
         if element.name not in wanted:
             body.skip(element)
             continue
-        if element.has_lists:
-            lists = [name for name, code in element.properties if "," in code]
-            got = f"the list {lists[0]!r}"
-            expected = f"plain numbers only in element {element.name!r}"
+        lists = [name for name, code in element.properties if "," in code]
+        if lists:
+            expected, got = f"plain numbers only in element {element.name!r}", f"the list {lists[0]!r}"
             raise format_error(path, expected=expected, got=got, cure="It is a mesh, or made by another program.")
         found[element.name] = body.read(element)
     return Ply(path, found, comments)
@@ -159,7 +171,7 @@ def _split_header(path: Path, data: bytes) -> tuple[list[str], int]:
 def _parse_header(path: Path, lines: list[str]) -> tuple[str, list[_Element], tuple[str, ...]]:
     """(byte order, elements, comments); see `_ORDERS`."""
     order, comments = None, []
-    elements: list[tuple[str, int, list[tuple[str, str]]]] = []
+    elements: list[_Element] = []
     for number, line in enumerate(lines, start=2):
         word, *rest = line.split() or [""]
         where = f"{path}, line {number}"
@@ -170,22 +182,22 @@ def _parse_header(path: Path, lines: list[str]) -> tuple[str, list[_Element], tu
         elif word == "format" and order is None and len(rest) == 2 and rest[0] in _ORDERS and rest[1] == "1.0":
             order = _ORDERS[rest[0]]
         elif word == "element" and len(rest) == 2 and _is_count(rest[1]):
-            if any(rest[0] == name for name, _, _ in elements):
+            if any(rest[0] == known.name for known in elements):
                 raise format_error(where, expected="elements of different names", got=f"{rest[0]!r} twice")
-            elements.append((rest[0], int(rest[1]), []))
+            elements.append(_Element(rest[0], int(rest[1]), []))
         elif word == "property" and elements:
-            elements[-1][2].append(_parse_property(where, rest))
+            elements[-1].properties.append(_parse_property(where, rest))
         else:
             expected = "format ascii|binary_little_endian|binary_big_endian 1.0, element NAME COUNT, property TYPE NAME"
             raise format_error(where, expected=expected, got=repr(line.rstrip()[:80]), cure="The header is damaged.")
     if order is None:
         raise format_error(path, expected="a line 'format ...' in the header", got="none", cure="Copy it again.")
-    for name, _, properties in elements:
-        names = [own for own, _ in properties]
+    for element in elements:
+        names = [name for name, _ in element.properties]
         if len(set(names)) < len(names) or not names:
             got = "none" if not names else f"{max(names, key=names.count)!r} twice"
-            raise format_error(path, expected=f"different properties of element {name!r}", got=got)
-    return order, [_Element(name, count, tuple(properties)) for name, count, properties in elements], tuple(comments)
+            raise format_error(path, expected=f"different properties of element {element.name!r}", got=got)
+    return order, elements, tuple(comments)
 
 
 def _parse_property(where: str, words: list[str]) -> tuple[str, str]:
@@ -211,15 +223,17 @@ class _Body:
 
     def read(self, element: _Element) -> np.ndarray:
         values = self._take(element, element.count * sum(self._sizes(element)))
-        return np.frombuffer(values, element.dtype(self.order)) if self.order else self._parse(element, values)
+        if not self.order:
+            return self._parse(element, values)
+        return np.frombuffer(values, [(name, self.order + code) for name, code in element.properties])
 
     def skip(self, element: _Element) -> None:
         sizes = self._sizes(element)
-        if not element.has_lists:
+        items = [np.dtype(code.split(",")[1]).itemsize if "," in code else 0 for _, code in element.properties]
+        if not any(items):
             self._take(element, element.count * sum(sizes))
             return
         self._need(element, element.count * sum(sizes))
-        items = [np.dtype(code.split(",")[1]).itemsize if "," in code else 0 for _, code in element.properties]
         for _ in range(element.count):
             for (_, code), size, item in zip(element.properties, sizes, items, strict=True):
                 first = self._take(element, size)
@@ -301,25 +315,3 @@ def _encode(elements: Mapping[str, Mapping[str, np.ndarray]], comments: Sequence
     yield ("\n".join(lines) + "\nend_header\n").encode("ascii")
     for columns in elements.values():
         yield np.stack([np.asarray(column, "<f4") for column in columns.values()], axis=1).tobytes()
-
-
-# ---------------------------------------------------------------------------------------------- layouts
-
-
-def is_vegas(ply: Ply) -> bool:
-    """Whether a PLY file is a published VeGaS video, by the columns that only those have."""
-    return {"m_0", "sigma_0", "rot_0"} <= set(ply.names("vertex"))
-
-
-def is_3dgs(ply: Ply) -> bool:
-    """Whether a PLY file is a 3DGS scene, by the columns that distinguish it from meshes and from VeGaS."""
-    return {"f_dc_0", "opacity", "scale_2", "rot_3"} <= set(ply.names("vertex"))
-
-
-def to_float32(ply: Ply, name: str, leaf: np.ndarray) -> np.ndarray:
-    """The leaf in float32, contiguous. Raises `FormatError` where a change of units overflows it."""
-    with np.errstate(over="ignore"):
-        leaf = np.ascontiguousarray(leaf, np.float32)
-    if not np.isfinite(leaf).all():
-        raise format_error(ply.path, expected=f"a {name} that float32 can represent in model space", got="a larger one")
-    return leaf

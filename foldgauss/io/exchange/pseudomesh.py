@@ -81,11 +81,7 @@ class Pseudomesh:
         return Splats2D(mean, factor, faces.opacity, faces.color)
 
     def frame(
-        self,
-        number: int,
-        size: tuple[int, int] | None = None,
-        *,
-        background: tuple[float, float, float] = BLACK,
+        self, number: int, size: tuple[int, int] | None = None, *, background: tuple[float, float, float] = BLACK
     ) -> UInt8[np.ndarray, "height width 3"]:
         """The image of a frame over `background`. Raises ValueError for an invalid size or background."""
         size = self.size if size is None else tuple(size)
@@ -184,11 +180,7 @@ def _axes(factor: Float[np.ndarray, "num 2 2"]) -> Float[np.ndarray, "num 2 2"]:
 
 
 def read_pseudomesh(
-    folder: str | os.PathLike,
-    *,
-    size: tuple[int, int] | None = None,
-    fps: float | None = None,
-    axes: str = "y-up",
+    folder: str | os.PathLike, *, size: tuple[int, int] | None = None, fps: float | None = None, axes: str = "y-up"
 ) -> Pseudomesh:
     """Read frames as triangles, after editing in a mesh tool or straight from `write_pseudomesh`.
 
@@ -212,10 +204,9 @@ def read_pseudomesh(
     if not paths:
         cure = "Give the folder that write_pseudomesh or `foldgauss export --format obj` made."
         raise format_error(folder, expected="a folder with .obj files", got="none", cure=cure)
-    notes = _read_notes(folder, len(paths))
     given = {"size": size, "fps": fps}
-    notes |= {name: value for name, value in given.items() if value is not None}
-    facts = _check_notes(folder, notes, len(paths))
+    given = {name: value for name, value in given.items() if value is not None}
+    facts = _check_notes(folder, _read_notes(folder, len(paths)) | given, len(paths))
     return Pseudomesh(tuple(_read_frame(path, axes) for path in paths), **facts)
 
 
@@ -252,8 +243,7 @@ def _check_notes(folder: Path, notes: dict, num_frames: int) -> dict:
             raise invalid("times", expected=expected, got=f"shape {times.shape}", cure=cure)
     except (TypeError, ValueError, OverflowError) as error:
         raise facts_error(folder / NOTES, error) from error
-    facts = {"times": times, "size": (int(size[0]), int(size[1])), "fps": fps, "options": options}
-    return facts | {"compositing": notes["compositing"]}
+    return notes | {"times": times, "size": (int(size[0]), int(size[1])), "fps": fps, "options": options}
 
 
 def _read_frame(path: Path, axes: str) -> Triangles:
@@ -280,10 +270,8 @@ def _check_area(path: Path, edges: Float[np.ndarray, "num 2 3"]) -> None:
         area = np.linalg.norm(np.cross(first, second), axis=-1)
         valid = area > _COLLINEAR * np.linalg.norm(first, axis=-1) * np.linalg.norm(second, axis=-1)
     if not valid.all():
-        cure = "Move a vertex off the line through the other two."
-        raise format_error(
-            path, expected="faces of nonzero area", got=f"none in face {np.argmin(valid) + 1}", cure=cure
-        )
+        got, cure = f"none in face {np.argmin(valid) + 1}", "Move a vertex off the line through the other two."
+        raise format_error(path, expected="faces of nonzero area", got=got, cure=cure)
 
 
 def read_obj(path: str | os.PathLike) -> Float[np.ndarray, "faces 3 3"]:
@@ -353,12 +341,12 @@ def _parse_face(path: Path, number: int, words: list[str], num_vertices: int) ->
 
 
 def _check_soup(path: Path, faces: list[tuple[int, list[int]]], num_vertices: int) -> None:
-    """Every face has three vertices of its own, in the order in which they were written."""
+    """Raise unless every face has three vertices of its own, in the order in which they were written."""
     for line, indices in faces:
-        if not all(0 <= index < num_vertices for index in indices):
-            outside = next(index for index in indices if not 0 <= index < num_vertices)
-            expected, got = f"vertices from 1 to {num_vertices}", str(outside + 1)
-            raise format_error(f"{path}, line {line}", expected=expected, got=got, cure="The file is damaged.")
+        for index in indices:
+            if not 0 <= index < num_vertices:
+                expected, cure = f"vertices from 1 to {num_vertices}", "The file is damaged."
+                raise format_error(f"{path}, line {line}", expected=expected, got=str(index + 1), cure=cure)
     cure = "Export with the vertices' order kept, and merge none by distance."
     if num_vertices != 3 * len(faces):
         got = f"{num_vertices} vertices for {len(faces)} faces: a tool merged, split or dropped some"

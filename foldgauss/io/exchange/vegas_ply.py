@@ -12,17 +12,7 @@ from jaxtyping import Float
 
 from foldgauss._runtime.checks import invalid, is_within
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.io.exchange.ply_file import (
-    NOTE,
-    Ply,
-    facts_error,
-    format_error,
-    is_3dgs,
-    is_vegas,
-    read_ply,
-    to_float32,
-    write_ply,
-)
+from foldgauss.io.exchange.ply_file import NOTE, Ply, facts_error, read_ply, write_ply
 from foldgauss.io.media.frame_rate import DEFAULT_FPS, MAX_FPS
 from foldgauss.render import RenderOptions
 from foldgauss.render.camera import FIELD_OF_VIEW
@@ -77,9 +67,12 @@ def read_vegas_ply(
     ply = read_ply(path, ("vertex", "time"))
     _check_is_vegas(ply)
     size, fps, options, scale_cutoff, power = _fill_in(ply, size, fps)
-    degree = _degree(ply)
+    num_weights = sum(name.startswith("w1_") for name in ply.names("vertex"))
+    if num_weights % 2:
+        expected = "an even number of w1 columns, pairs (x, z)"
+        raise ply.error(expected=expected, got=str(num_weights), cure="The file is damaged.")
     names = ["x", "z", "scale_0", "scale_2", "rot_0", "m_0", "sigma_0", "opacity", "f_dc_0", "f_dc_1", "f_dc_2"]
-    columns = ply.columns("vertex", [*names, *(f"w1_{k}" for k in range(2 * degree))])
+    columns = ply.columns("vertex", [*names, *(f"w1_{k}" for k in range(num_weights))])
     unit = _vegas_unit(size)
     plane = unit * np.array([1.0, -1.0])
     angle, time_loc, log_time_scale, opacity = columns[:, 4:8].T
@@ -89,14 +82,12 @@ def read_vegas_ply(
         "angle_logit": angle,
         "time_loc_logit": time_loc,
         "log_time_scale": _convert_time_scale(log_time_scale, VEGAS_POWER, power),
-        "coefficients": plane * columns[:, 11:].reshape(len(columns), degree, 2),
+        "coefficients": plane * columns[:, 11:].reshape(len(columns), num_weights // 2, 2),
         "opacity_logit": opacity,
         "color_dc": columns[:, 8:11],
     }
-    splats = FoldedSplats(
-        **{name: to_float32(ply, name, leaf) for name, leaf in leaves.items()},
-        envelope=TimeLikelihood(np.float32(power), np.float32(0)),
-    )
+    leaves = {name: ply.to_float32(name, leaf) for name, leaf in leaves.items()}
+    splats = FoldedSplats(**leaves, envelope=TimeLikelihood(np.float32(power), np.float32(0)))
     return VideoModel(splats, FrameTimes(_time_logits(ply)), size, fps, options, scale_cutoff=scale_cutoff)
 
 
@@ -133,23 +124,20 @@ def write_vegas_ply(path: str | os.PathLike, model: VideoModel) -> Path:
     columns |= {"rot_0": splats.angle_logit, "m_0": splats.time_loc_logit, "sigma_0": spread}
     weights = (plane * np.asarray(splats.coefficients, np.float64)).reshape(len(loc), -1)
     columns |= {f"w1_{k}": weights[:, k] for k in range(weights.shape[1])}
-    time_weights = {
-        f"time_func_{k}": [weight] for k, weight in enumerate(np.asarray(model.frame_times.logits, np.float64))
-    }
+    times = {f"time_func_{k}": [weight] for k, weight in enumerate(np.asarray(model.frame_times.logits))}
     note = {"size": list(model.size), "fps": model.fps, "options": dataclasses.asdict(model.options)}
     note["scale_cutoff"] = model.scale_cutoff
     if np.unique(powers).size == 1:
         note["power"] = float(np.unique(powers)[0])
-    return write_ply(path, {"vertex": columns, "time": time_weights}, comments=[NOTE + json.dumps(note)])
+    return write_ply(path, {"vertex": columns, "time": times}, comments=[NOTE + json.dumps(note)])
 
 
 def _convert_time_scale(
     log_time_scale: Float[np.ndarray, " num"], power: float | Float[np.ndarray, "*#num"], other: float
 ) -> Float[np.ndarray, " num"]:
     """log sigma_t that gives an envelope of power `other` the same values; static Gaussians keep the value 1."""
-    return np.where(
-        log_time_scale == STATIC_LOG_TIME_SCALE, log_time_scale, log_time_scale + 0.5 * np.log(other / power)
-    )
+    other_scale = log_time_scale + 0.5 * np.log(other / power)
+    return np.where(log_time_scale == STATIC_LOG_TIME_SCALE, log_time_scale, other_scale)
 
 
 def _vegas_unit(size: tuple[int, int]) -> float:
@@ -159,27 +147,18 @@ def _vegas_unit(size: tuple[int, int]) -> float:
 
 
 def _check_is_vegas(ply: Ply) -> None:
-    if not is_vegas(ply):
-        cure = "For a still scene use read_3dgs_ply." if is_3dgs(ply) else "Check that it is the right file."
+    if not ply.is_vegas():
+        cure = "For a still scene use read_3dgs_ply." if ply.is_3dgs() else "Check that it is the right file."
         got = ply.describe_vertices()
-        raise format_error(ply.path, expected="a VeGaS video, with m_0, sigma_0 and rot_0", got=got, cure=cure)
+        raise ply.error(expected="a VeGaS video, with m_0, sigma_0 and rot_0", got=got, cure=cure)
     if "time" not in ply.elements:
         cure = "It may be of another version of the published code."
-        raise format_error(ply.path, expected="an element 'time' with the frames' weights", got="none", cure=cure)
+        raise ply.error(expected="an element 'time' with the frames' weights", got="none", cure=cure)
     if len(ply.elements["vertex"]) == 0:
-        raise format_error(ply.path, expected="Gaussians", got="none")
+        raise ply.error(expected="Gaussians", got="none")
     rest = [name for name in ply.names("vertex") if name.startswith("f_rest_")]
     if rest and np.any(ply.columns("vertex", rest)):
-        expected = "colours of degree 0, as VeGaS has them"
-        raise format_error(ply.path, expected=expected, got="f_rest columns that are not 0")
-
-
-def _degree(ply: Ply) -> int:
-    num = sum(name.startswith("w1_") for name in ply.names("vertex"))
-    if num % 2:
-        expected = "an even number of w1 columns, pairs (x, z)"
-        raise format_error(ply.path, expected=expected, got=str(num), cure="The file is damaged.")
-    return num // 2
+        raise ply.error(expected="colours of degree 0, as VeGaS has them", got="f_rest columns that are not 0")
 
 
 def _time_logits(ply: Ply) -> Float[np.ndarray, " intervals"]:
@@ -188,10 +167,10 @@ def _time_logits(ply: Ply) -> Float[np.ndarray, " intervals"]:
     weights = ply.columns("time", names)
     if 1 not in weights.shape or weights.size == 0:
         got = f"{weights.shape[0]} rows of {weights.shape[1]}"
-        raise format_error(ply.path, expected="one row of weights in element 'time'", got=got)
+        raise ply.error(expected="one row of weights in element 'time'", got=got)
     if weights.shape[0] == 1 and names != [f"time_func_{k}" for k in range(len(names))]:
         got = ", ".join(names[:9])
-        raise format_error(ply.path, expected="time_func_0, time_func_1, ... in element 'time'", got=got)
+        raise ply.error(expected="time_func_0, time_func_1, ... in element 'time'", got=got)
     return weights.astype(np.float32).ravel()
 
 
@@ -202,7 +181,7 @@ def _fill_in(
     note = _read_note(ply)
     if size is None and "size" not in note:
         cure = "Give the size of the video that it was made from, such as size=(480, 854)."
-        raise format_error(ply.path, expected="a size, which a VeGaS file does not hold", got="none", cure=cure)
+        raise ply.error(expected="a size, which a VeGaS file does not hold", got="none", cure=cure)
     try:
         options = RenderOptions(**note.get("options", {}))
         size = note["size"] if size is None else size
@@ -229,9 +208,7 @@ def _read_note(ply: Ply) -> dict:
     except (ValueError, RecursionError):
         note = None
     if not isinstance(note, dict) or not isinstance(note.get("options", {}), dict):
-        raise format_error(
-            ply.path, expected="metadata in the comment 'foldgauss'", got=texts[0][:60], cure="Remove it."
-        )
+        raise ply.error(expected="metadata in the comment 'foldgauss'", got=texts[0][:60], cure="Remove it.")
     return note
 
 
@@ -247,13 +224,8 @@ def _check_writable_as_vegas(model: VideoModel) -> None:
         "compositing": (np.array([model.compositing]), "over", "Fit it with --compositing over."),
     }
     if model.num_frames < 2:
-        cure = "Write the picture as a still scene, ply3dgs."
-        raise invalid(
-            "model",
-            expected="at least 2 frames, as a VeGaS file stores the intervals between frames",
-            got="1",
-            cure=cure,
-        )
+        expected = "at least 2 frames, as a VeGaS file stores the intervals between frames"
+        raise invalid("model", expected=expected, got="1", cure="Write the picture as a still scene, ply3dgs.")
     for name, (found, known, cure) in facts.items():
         if not (found == known).all():
             got, expected = ", ".join(map(str, found[:3])), f"{known}, the only one in a VeGaS file"

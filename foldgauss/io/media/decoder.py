@@ -82,7 +82,7 @@ def _turn_upright(image: np.ndarray, frame: av.VideoFrame) -> np.ndarray:
 
 
 class VideoDecoder:
-    """An open video file; a context manager.
+    """An open video file, which is to be closed.
 
     `threads`: of FFmpeg's decoder, 0 for its default. How damaged frames decode depends on their number.
     `deinterlace`: convert interlaced frames to progressive ones (FFmpeg's bwdif); otherwise they are refused.
@@ -100,45 +100,28 @@ class VideoDecoder:
             self.close()
             raise
         self.time_base = self._stream.time_base or Fraction(1, 1000)
-        self._size = self._codec.height, self._codec.width
+        self.fps = float(self._stream.guessed_rate or 0)  # that the container declares; 0 where there is none
+        self.pixel_aspect = float(self._stream.sample_aspect_ratio or 1) or 1.0  # width by height; 1 where unknown
+        #: Whether an edit list may hide frames that the container counts.
+        self.hides_frames = self._container.format.name.startswith("mov")
         self.has_converted = False  # whether any frame was interlaced
+        self._size = self._codec.height, self._codec.width
         self._last = -1  # position of the frame decoded last
         self._before: int | None = None  # its time stamp
         self._damaged = False  # since then
 
-    def __enter__(self) -> "VideoDecoder":
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
     def close(self) -> None:
         self._container.close()
-
-    @property
-    def fps(self) -> float:
-        """The rate that the container declares; 0 where there is none."""
-        return float(self._stream.guessed_rate or 0)
 
     @property
     def threads(self) -> int:
         return self._codec.thread_count
 
     @property
-    def pixel_aspect(self) -> float:
-        """Width by height of a pixel; 1 where it is not known."""
-        return float(self._stream.sample_aspect_ratio or 1) or 1.0
-
-    @property
     def num_declared(self) -> int:
         """The number of frames that the container counts, including those that an edit list hides; 0 where it does not
         count them."""
         return self._stream.frames if 0 < self._stream.frames < MAX_FRAMES else 0
-
-    @property
-    def hides_frames(self) -> bool:
-        """Whether an edit list may hide frames that the container counts."""
-        return self._container.format.name.startswith("mov")
 
     @property
     def declared_seconds(self) -> float | None:
@@ -162,9 +145,8 @@ class VideoDecoder:
         begin = float((stream.start_time or 0) * stream.time_base)
         if len(self._container.streams) == 1:
             return seconds - begin
-        hours, _, rest = stream.metadata.get("DURATION", "").partition(":")
-        minutes, _, own = rest.partition(":")
         try:
+            hours, minutes, own = stream.metadata.get("DURATION", "").split(":")
             return min(seconds, 3600 * int(hours) + 60 * int(minutes) + float(own)) - begin
         except ValueError:
             return None

@@ -26,19 +26,17 @@ class FrameRate(NamedTuple):
 
 
 def estimate_rate(seconds: Float[np.ndarray, " num_frames"], fps: float) -> FrameRate:
-    """The rate of frames shown at the increasing times `seconds`: the container's `fps` where they agree with it."""
+    """The rate of frames shown at the increasing times `seconds`: the container's `fps` where they agree with it.
+
+    It is the default one where theirs is above `MAX_FPS`.
+    """
     if len(seconds) < 2:
         return FrameRate(fps)
     times = seconds - seconds[0]
     mean = (len(times) - 1) / times[-1]
-    for rate in (fps, mean):
-        if np.abs(times - np.arange(len(times)) / rate).max() <= OFF_GRID / rate:
-            return FrameRate(rate)
-    return FrameRate(mean, times)
-
-
-def replace_unusable_rate(rate: FrameRate) -> FrameRate:
-    """The rate itself, or the default one where it is above `MAX_FPS`."""
+    grid, rates = np.arange(len(times)), (fps, mean)
+    even = [FrameRate(rate) for rate in rates if np.abs(times - grid / rate).max() <= OFF_GRID / rate]
+    rate = even[0] if even else FrameRate(mean, times)
     return rate if rate.fps <= MAX_FPS else FrameRate(DEFAULT_FPS, guessed=True)
 
 

@@ -25,7 +25,7 @@ from foldgauss.io.media.clip import (
     video_error,
 )
 from foldgauss.io.media.format_detection import is_image_format, min_file_bytes, parse_image_size
-from foldgauss.io.media.frame_rate import DEFAULT_FPS, FrameRate, estimate_rate, replace_unusable_rate
+from foldgauss.io.media.frame_rate import DEFAULT_FPS, FrameRate, estimate_rate
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 GIF_DELAY = 100.0  # milliseconds for which browsers show a frame that has no duration of its own
@@ -220,7 +220,7 @@ def read_animation(path: Path, start: int, stop: int | None, prepare: Callable) 
     rate = estimate_rate(np.concatenate([[0], np.cumsum(shown)]) / 1000, 1000 * len(shown) / shown.sum())
     if rate.times is not None:
         rate = rate._replace(times=rate.times[:-1])
-    return kept, (num_total if stop is None else stop) - start, replace_unusable_rate(rate), ()
+    return kept, (num_total if stop is None else stop) - start, rate, ()
 
 
 def _count_declared_images(animation: Image.Image) -> int:

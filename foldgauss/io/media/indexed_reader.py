@@ -2,6 +2,7 @@
 
 import operator
 from collections.abc import Callable, Iterator
+from contextlib import closing
 
 import numpy as np
 
@@ -51,12 +52,8 @@ def read_indexed(index: FrameIndex, first: int, stop: int | None, *, size: tuple
     low, high = np.searchsorted(index.positions, [first, index.num_positions if stop is None else stop]).tolist()
     if low == high:
         raise no_frames_error(first, stop, index.num_frames, index.num_positions, path)
-    with translate_os_errors(path):
-        reader = IndexedReader(index)
-        try:
-            frames, num_declared, rate, notes = reader.read(low, high, size)
-        finally:
-            reader.close()
+    with translate_os_errors(path), closing(IndexedReader(index)) as reader:
+        frames, num_declared, rate, notes = reader.read(low, high, size)
     if index.kind == "video":
         last = index.num_before + high
         end = index.start + (index.num_declared if stop is None else stop)
@@ -66,7 +63,7 @@ def read_indexed(index: FrameIndex, first: int, stop: int | None, *, size: tuple
         num_declared = index.num_declared - first
     crop = () if size is None else describe_crop([index.size], size)
     if index.fixed_fps is not None:
-        return Clip(frames, index.fixed_fps, index.source, num_declared, None, notes + crop)
+        rate = FrameRate(index.fixed_fps)
     return Clip(frames, float(rate.fps), index.source, num_declared, rate.times, notes + describe_rate(rate) + crop)
 
 

@@ -46,11 +46,8 @@ class LazyFrames:
         self._cache, self._cache_start = None, 0
         self._lock = threading.RLock()  # one decoder has one position in the file
 
-    def __getstate__(self) -> dict:
-        return {"index": self.index, "size": self._size, "first": self._first, "stop": self._stop, "run": self._run}
-
-    def __setstate__(self, state: dict) -> None:
-        self.__init__(**state)
+    def __reduce__(self) -> tuple:
+        return LazyFrames, (self.index, self._size, self._first, self._stop, self._run)
 
     def __repr__(self) -> str:
         return f"LazyFrames({self.index.source!r}, shape={self.shape})"

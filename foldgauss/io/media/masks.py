@@ -1,5 +1,6 @@
 """Object masks from images, folders of images and videos."""
 
+import math
 import os
 import warnings
 from collections.abc import Sequence
@@ -114,28 +115,30 @@ def read_labels(paths: Sequence[Path]) -> np.ndarray:
     those of DAVIS 2016, become 0 and 1. Raises ValueError for an image that does not decode, has colors instead of
     labels, or differs in size.
     """
-    masks, gray = [], True
+    masks, modes = [], set()
     for path in paths:
         mask, mode = _read_label_image(path)
-        gray = gray and mode != "P"
+        modes.add(mode)
         if masks and mask.shape != masks[0].shape:
             expected = f"masks of one size, {format_size(masks[0].shape)} as in {paths[0].name!r}"
             raise invalid("path", expected=expected, got=f"{format_size(mask.shape)} in {str(path)!r}")
         masks.append(mask)
     labels = np.stack(masks)
-    if gray and set(np.unique(labels)) <= {0, _WHITE}:
+    if "P" not in modes and set(np.unique(labels)) <= {0, _WHITE}:
         labels = (labels == _WHITE).astype(np.uint8)
     return labels
 
 
 def _read_label_image(path: Path) -> tuple[np.ndarray, str]:
-    """(labels, Pillow mode) of one mask."""
+    """(labels, Pillow mode) of one mask; the size is checked before memory is allocated."""
+    most = max(MAX_PIXELS, MAX_PIXELS_PER_BYTE * path.stat().st_size)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about damage: the image either decodes or raises
-            mode, pixels = _decode(path)
+        # Warnings are about damage: the image either decodes or raises.
+        with warnings.catch_warnings(action="ignore"), Image.open(path, formats=_FORMATS) as image:
+            if math.prod(image.size) > most:
+                raise Image.DecompressionBombError
+            mode, pixels = image.mode, np.array(image)
     except Image.DecompressionBombError as error:
-        most = max(MAX_PIXELS, MAX_PIXELS_PER_BYTE * path.stat().st_size)
         most = min(most, 2 * (Image.MAX_IMAGE_PIXELS or most))  # Pillow's own limit
         expected = f"a mask of at most {most:,} pixels, as its file has {path.stat().st_size:,} bytes"
         cure = "Is it a mask? If so, crop it, or store it uncompressed."
@@ -150,12 +153,3 @@ def _read_label_image(path: Path) -> tuple[np.ndarray, str]:
         cure = "Its colors were stored in place of the labels; use the original PNG."
         raise invalid("path", expected="masks with a label per pixel (palette or grayscale)", got=got, cure=cure)
     return pixels.astype(np.uint8) * (_WHITE if mode == "1" else 1), mode
-
-
-def _decode(path: Path) -> tuple[str, np.ndarray]:
-    """(Pillow mode, stored pixel values); the size is checked before memory is allocated."""
-    with Image.open(path, formats=_FORMATS) as image:
-        width, height = image.size
-        if width * height > max(MAX_PIXELS, MAX_PIXELS_PER_BYTE * path.stat().st_size):
-            raise Image.DecompressionBombError
-        return image.mode, np.array(image)

@@ -1,6 +1,7 @@
 """One pass through a video file: its frames, and what the container reports about them."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +17,6 @@ from foldgauss.io.media.frame_rate import (
     estimate_num_frames,
     estimate_rate,
     make_increasing,
-    replace_unusable_rate,
 )
 from foldgauss.io.media.resizing import copy_to_blocks
 
@@ -60,7 +60,7 @@ def decode_file(
     positions and time stamps of all frames decoded, and a report. Raises `VideoError` for a file that cannot be read.
     """
     passed: list[tuple[int, int]] = []
-    with VideoDecoder(path, deinterlace=deinterlace) as decoder:
+    with closing(VideoDecoder(path, deinterlace=deinterlace)) as decoder:
         fps = decoder.fps if 0 < decoder.fps <= MAX_FPS else DEFAULT_FPS
         kept = keep(select_frames(decoder.frames(), start, stop, passed))
         if not passed:
@@ -132,7 +132,6 @@ def describe_span(
     """
     num_passed = len(positions)
     rate = estimate_rate(report.seconds[num_passed - num_kept : num_passed], report.fps)
-    rate = replace_unusable_rate(rate)
     if np.ptp(stamps) == 0 and num_passed > 1:  # a raw stream: the rate is FFmpeg's guess
         rate = rate._replace(guessed=True)
     gaps = _describe_gaps([start - 1, *positions[num_passed - num_kept :]])

@@ -17,7 +17,7 @@ from foldgauss.io.media.clip import (
     translate_os_errors,
 )
 from foldgauss.io.media.format_detection import may_be_animation
-from foldgauss.io.media.frame_rate import describe_rate
+from foldgauss.io.media.frame_rate import FrameRate, describe_rate
 from foldgauss.io.media.image_files import is_image_file, read_animation, read_folder, read_image_file
 from foldgauss.io.media.resizing import describe_crop, make_resizer, stack_frames, unify_channels
 from foldgauss.io.media.video_decoding import read_video_file
@@ -69,13 +69,12 @@ def read_video(
         if reader is read_video_file:
             reader = partial(reader, deinterlace=deinterlace)
         kept, num_declared, rate, notes = reader(path, start, stop, prepare)
-    clip_fps, times = (rate.fps, rate.times) if fps is None else (fps, None)
-    if fps is None:
-        notes += describe_rate(rate)
+    rate = rate if fps is None else FrameRate(fps)
+    notes += describe_rate(rate)
     if size is not None and center_crop is None:
         notes += describe_crop(sizes, size)
     kept = unify_channels(kept)
-    return Clip(stack_frames(kept), float(clip_fps), str(path), num_declared, times, notes)
+    return Clip(stack_frames(kept), float(rate.fps), str(path), num_declared, rate.times, notes)
 
 
 def choose_reader(path: Path) -> Callable[..., ReadResult]:

@@ -78,7 +78,7 @@ def write_video(
         cure = "For one image: write_image." if suffix == ".png" else "Rename the output."
         raise video_error("path", expected=expected, got=repr(path.name), cure=cure)
     failures: list[OSError] = []
-    frames = _check_frames(_noting_failures(frames, failures), channels=(3, 4))
+    frames = _check_frames(_noting_failures(frames, failures))
     first = next(frames)
     encoding = choose_encoding(suffix, codec, crf, pixel_format, first.shape)
     if sound is not None:
@@ -114,7 +114,7 @@ def write_frames(
     check_one_of("image_format", image_format, IMAGE_FORMATS)
     folder, encode = Path(folder), _encode_png if image_format == "png" else _encode_webp
     with atomic_folder(folder, overwrite, pattern=r"[0-9]{5,}\.(png|webp)") as temporary:
-        for number, frame in enumerate(_check_frames(frames, channels=(3, 4))):
+        for number, frame in enumerate(_check_frames(frames)):
             (temporary / f"{number:05d}.{image_format}").write_bytes(encode(frame))
     return folder
 
@@ -129,7 +129,7 @@ def write_image(path: PathLike, image: np.ndarray) -> Path:
     path = Path(path)
     if path.suffix.lower() != ".png":
         raise video_error("path", expected="a name ending in .png", got=repr(path.name), cure="Rename the output.")
-    data = _encode_png(_check_frame(image, None, "image", channels=(3, 4)))
+    data = _encode_png(_check_frame(image, None, "image"))
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
     return path
@@ -144,7 +144,7 @@ def _noting_failures(frames: Iterable[np.ndarray], failures: list[OSError]) -> I
         raise
 
 
-def _check_frames(frames: Iterable[np.ndarray], channels: tuple[int, ...] = (3,)) -> Iterator[np.ndarray]:
+def _check_frames(frames: Iterable[np.ndarray], channels: tuple[int, ...] = (3, 4)) -> Iterator[np.ndarray]:
     shape = None
     for number, frame in enumerate(frames):
         frame = _check_frame(frame, shape, f"frames[{number}]", channels)
@@ -154,9 +154,7 @@ def _check_frames(frames: Iterable[np.ndarray], channels: tuple[int, ...] = (3,)
         raise video_error("frames", expected="at least 1 frame", got="none")
 
 
-def _check_frame(
-    frame: np.ndarray, shape: tuple | None, parameter: str, channels: tuple[int, ...] = (3,)
-) -> np.ndarray:
+def _check_frame(frame: np.ndarray, shape: tuple | None, parameter: str, channels=(3, 4)) -> np.ndarray:
     frame = np.asarray(frame)
     fits = frame.ndim == 3 and frame.shape[2] in channels and min(frame.shape) > 0 and frame.dtype == np.uint8
     if not fits or (shape is not None and frame.shape != shape):
@@ -198,7 +196,7 @@ def _write_animation(path: Path, suffix: str, frames: Iterable[np.ndarray], fps:
         expected, cure = f"at most {MAX_GIF_FPS:g} for a GIF", "Take fewer frames, or a .webp or .webm."
         raise video_error("fps", expected=expected, got=f"{fps:g}", cure=cure)
     with atomic_path(path) as temporary:
-        images = map(Image.fromarray, _check_frames(frames))
+        images = map(Image.fromarray, _check_frames(frames, channels=(3,)))
         first, *rest = (image.quantize(256) for image in images) if suffix == ".gif" else images
         shared = {"save_all": True, "append_images": rest, "loop": 0}
         try:

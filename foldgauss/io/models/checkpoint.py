@@ -36,12 +36,8 @@ def load_checkpoint(path: str | os.PathLike, *, config: FitConfig, source: dict)
         if part == "config" and now.keys() != before.keys():
             cure = "It is of another version of foldgauss: resume with that, or start a new fit with --overwrite."
         if changed:
-            raise invalid(
-                "resume",
-                expected=", ".join(f"{name}={before.get(name)!r}" for name in changed),
-                got=", ".join(f"{name}={now.get(name)!r}" for name in changed),
-                cure=cure,
-            )
+            expected, got = (", ".join(f"{name}={one.get(name)!r}" for name in changed) for one in (before, now))
+            raise invalid("resume", expected=expected, got=got, cure=cure)
     state = load_part(Path(path), about)
     return jax.tree.map(np.array, state)  # the fit updates its arrays in place, so they must be its own
 

@@ -76,9 +76,10 @@ def pack_compact(quantized: Quantized, metadata: dict | None = None) -> bytes:
     info, contexts = quantized.info, ColumnContexts(quantized.rules, quantized.info)
     streams, descriptions = [], []
     for name in column_names(info.degree, info.shared):
-        numbers = quantized.columns[name]
-        column = contexts.describe_next(name)
-        streams.append(range_coder.encode(_wrapped_differences(numbers, info) if name == "cell" else numbers, column))
+        numbers = coded = quantized.columns[name]
+        if name == "cell":  # from each to the next, around the end
+            coded = np.diff(numbers, prepend=0) & _last_cell(info)
+        streams.append(range_coder.encode(coded, contexts.describe_next(name)))
         contexts.add(name, numbers)
         rule = quantized.rules.get(name)
         own = [] if is_integral(name) else [rule.origin, rule.exponent, *rule.slopes]
@@ -99,13 +100,8 @@ def pack_compact(quantized: Quantized, metadata: dict | None = None) -> bytes:
     return MAGIC + b"".join(number.to_bytes(4, "little") for number in numbers) + body
 
 
-def _wrapped_differences(cells: np.ndarray, info: CompactInfo) -> np.ndarray:
-    """From each cell to the next, around the end."""
-    return np.diff(cells, prepend=0) & ((1 << sum(info.cells)) - 1)
-
-
-def _sum_differences(steps: np.ndarray, info: CompactInfo) -> np.ndarray:
-    return (np.cumsum(steps, dtype=np.int64) & ((1 << sum(info.cells)) - 1)).astype(np.int32)
+def _last_cell(info: CompactInfo) -> int:
+    return (1 << sum(info.cells)) - 1
 
 
 # ---------------------------------------------------------------------------------------------- reading
@@ -193,31 +189,26 @@ def _decode(header: dict, body: bytes, whole_length: int) -> Quantized:
     rules = {name: _parse_rule(name, numbers) for name, numbers in described.items() if not is_integral(name)}
     _check(not any(described[name] for name in names if is_integral(name)), "rule", "none")
     contexts, columns, start = ColumnContexts(rules, info), {}, 0
+    most = {"without": 3, "degree": info.degree, "shade": info.shared - 1}  # of the columns that are used as indices
     for name, length in zip(names, lengths[:-1], strict=True):
         numbers = range_coder.decode(body[start : start + length], contexts.describe_next(name))
-        columns[name] = _sum_differences(numbers, info) if name == "cell" else numbers
-        _check_indices(name, columns[name], info)
-        contexts.add(name, columns[name])
+        if name == "cell":
+            numbers = (np.cumsum(numbers, dtype=np.int64) & _last_cell(info)).astype(np.int32)
+        if name in most:
+            _check(numbers.min() >= 0 and numbers.max() <= most[name], name, "numbers out of range")
+        columns[name] = numbers
+        contexts.add(name, numbers)
         start += length
     intervals = range_coder.decode(body[start:], range_coder.Column.without_contexts(num_frames - 1))
     return Quantized(info, rules, columns, intervals)
 
 
-def _check_indices(name: str, numbers: np.ndarray, info: CompactInfo) -> None:
-    """Check the columns that are used as indices."""
-    most = {"without": 3, "degree": info.degree, "shade": info.shared - 1}.get(name)
-    if most is not None:
-        _check(numbers.min() >= 0 and numbers.max() <= most, name, "numbers out of range")
-
-
 def _parse_info(header: dict) -> CompactInfo:
-    size, options = header["size"], header["options"]
-    _check(
-        isinstance(size, list) and len(size) == 2 and all(is_integer(n, 1) and n <= _SIDE for n in size), "size", size
-    )
-    _check(is_integer(header["num_gaussians"], 1), "num_gaussians", header["num_gaussians"])
-    _check(is_integer(header["degree"], 0) and header["degree"] <= MAX_DEGREE, "degree", header["degree"])
-    cells, shared, num = header["cells"], header["shared"], header["num_gaussians"]
+    size, degree, cells, shared, num = (header[key] for key in ("size", "degree", "cells", "shared", "num_gaussians"))
+    _check(isinstance(size, list) and len(size) == 2, "size", size)
+    _check(all(is_integer(side, 1) and side <= _SIDE for side in size), "size", size)
+    _check(is_integer(num, 1), "num_gaussians", num)
+    _check(is_integer(degree, 0) and degree <= MAX_DEGREE, "degree", degree)
     _check(isinstance(cells, list) and len(cells) == 3 and all(is_integer(n, 0) for n in cells), "cells", cells)
     _check(sum(cells) <= MAX_CELL_BITS and 1 << max(sum(cells), 2 * max(cells[:2])) <= num, "cells", cells)
     _check(is_integer(shared, 0) and shared <= min(num, MAX_SHARED), "shared", shared)
@@ -225,11 +216,9 @@ def _parse_info(header: dict) -> CompactInfo:
     for name, interval in bounds.items():
         _check(is_within(header[name], interval), name, header[name])
     check_one_of("compositing", header["compositing"], COMPOSITINGS)
-    names = [field.name for field in dataclasses.fields(CompactInfo)]
-    return CompactInfo(
-        **{name: header[name] for name in names}
-        | {"size": tuple(size), "cells": tuple(cells), "options": RenderOptions(**options)}
-    )
+    known = {field.name: header[field.name] for field in dataclasses.fields(CompactInfo)}
+    made = {"size": tuple(size), "cells": tuple(cells), "options": RenderOptions(**header["options"])}
+    return CompactInfo(**known | made)
 
 
 def _parse_rule(name: str, numbers: list) -> Rule:

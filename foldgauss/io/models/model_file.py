@@ -16,6 +16,7 @@ from safetensors import SafetensorError, safe_open
 from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.threads import check_not_forked
 from foldgauss.io._atomic import atomic_path, missing_error
+from foldgauss.io.media.format_detection import describe_kind
 
 FORMAT = "foldgauss-model"
 VERSION = "1"  # increased when older programs cannot read the file
@@ -33,12 +34,6 @@ _PREFIX = 8  # bytes: the length of the JSON header, little-endian, opens a safe
 _RESERVED = "__metadata__"  # reserved by safetensors
 #: What functions raise that are given a header with other types or values.
 HEADER_ERRORS = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError)
-_MAGIC = {
-    b"\x89PNG": "a PNG image",
-    b"\xff\xd8\xff": "a JPEG image",
-    b"ply": "a PLY file",
-    b"PK": "a zip archive",
-}
 
 
 class ModelFileError(ValueError):
@@ -97,7 +92,10 @@ def save_model(path: str | os.PathLike, model: Any, *, metadata: dict | None = N
     Raises `ModelFileError` for an unregistered type, a leaf that would be lost (a plain number, a PRNG key)
     or a header that does not describe the model; `OutputError` where the path cannot be written.
     """
-    kind = _find_kind(model)
+    kind = next((kind for kind in _KINDS.values() if type(model) is kind.model_type), None)
+    if kind is None:
+        expected, cure = "one of the registered types " + ", ".join(sorted(_KINDS)), "Register it with register_model."
+        raise model_file_error("model", expected=expected, got=type(model).__name__, cure=cure)
     model = kind.to_stored(model)
     arrays = {key: _to_numpy(key, leaf) for key, leaf in _array_leaves(model).items()}
     header = kind.to_header(model)
@@ -132,12 +130,11 @@ def write_tensors(
     end = 0
     for key in order:
         start, end = end, end + math.prod(specs[key]["shape"]) * _ITEM_BYTES[specs[key]["dtype"]]
-        entries[key] = {**specs[key], "data_offsets": [start, end]}
+        entries[key] = specs[key] | {"data_offsets": [start, end]}
     text = json.dumps(entries, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
     if len(text) > _LONGEST_HEADER:
-        got = f"one of {len(text):,} bytes for {len(specs):,} tensors"
-        cure = "Write the clip as several files."
+        got, cure = f"one of {len(text):,} bytes for {len(specs):,} tensors", "Write the clip as several files."
         raise model_file_error("path", expected=f"a header of at most {_LONGEST_HEADER:,} bytes", got=got, cure=cure)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write(len(text).to_bytes(_PREFIX, "little") + text)
@@ -152,18 +149,13 @@ def _array_leaves(tree: Any) -> dict[str, Any]:
     for keys, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         key = jax.tree_util.keystr(keys, simple=True, separator=".")
         if isinstance(leaf, bool | int | float | complex) and not isinstance(leaf, np.generic):
-            raise model_file_error(
-                key,
-                expected="an array or a static field",
-                got=f"the plain number {leaf!r}",
-                cure="Make it an array, or a static field that the header holds.",
-            )
+            got, cure = f"the plain number {leaf!r}", "Make it an array, or a static field that the header holds."
+            raise model_file_error(key, expected="an array or a static field", got=got, cure=cure)
         if not isinstance(leaf, jax.Array | np.ndarray | np.generic | jax.ShapeDtypeStruct):
             continue  # a function or a name, which the skeleton contains
         if key in found or key == _RESERVED:
-            raise model_file_error(
-                key, expected="one leaf per path", got="a clash", cure="Rename the field or dictionary key."
-            )
+            cure = "Rename the field or dictionary key."
+            raise model_file_error(key, expected="one leaf per path", got="a clash", cure=cure)
         found[key] = leaf
     return found
 
@@ -180,27 +172,15 @@ def _to_numpy(key: str, leaf: Any) -> np.ndarray:
     return array  # tobytes gives C order whatever the strides
 
 
-def _find_kind(model: Any) -> _Kind:
-    for kind in _KINDS.values():
-        if type(model) is kind.model_type:
-            return kind
-    expected, cure = "one of the registered types " + ", ".join(sorted(_KINDS)), "Register it with register_model."
-    raise model_file_error("model", expected=expected, got=type(model).__name__, cure=cure)
-
-
 def _check_described(kind: _Kind, model: Any, header: str) -> None:
     """Raise unless the header alone gives back the model's tree, static fields, shapes and types."""
     skeleton = kind.from_header(json.loads(header))
-    described = _get_specs(_array_leaves(skeleton))
-    _check_tensors(described, _widen_half_precision(_get_specs(_array_leaves(model)), described), "header")
+    _check_tensors(_get_specs(_array_leaves(model)), _get_specs(_array_leaves(skeleton)), "model")
     have, want = jax.tree_util.tree_structure(skeleton), jax.tree_util.tree_structure(model)
     if have != want:
-        raise model_file_error(
-            "header",
-            expected=f"every static field of the model of kind {kind.name!r}",
-            got="a skeleton of another structure",
-            cure="Let to_header and from_header carry each static field.",
-        )
+        expected = f"every static field of the model of kind {kind.name!r}"
+        cure = "Let to_header and from_header carry each static field."
+        raise model_file_error("header", expected=expected, got="a skeleton of another structure", cure=cure)
 
 
 def to_json(parameter: str, value: Any) -> str:
@@ -271,8 +251,7 @@ def match_kind(path: Path, about: dict) -> tuple[_Kind, Any]:
         raise model_file_error("path", expected=expected, got=got, cure=cure)
     with translate_header_errors(path, kind.name):
         skeleton = kind.from_header(about["header"])
-    described = _get_specs(_array_leaves(skeleton))
-    _check_tensors(_widen_half_precision(about["tensors"], described), described, str(path))
+    _check_tensors(about["tensors"], _get_specs(_array_leaves(skeleton)), str(path))
     return kind, skeleton
 
 
@@ -304,9 +283,8 @@ def read_header(path: str | os.PathLike) -> dict:
         tensors = {key: {"dtype": part.get_dtype(), "shape": list(part.get_shape())} for key, part in parts.items()}
     _check_version(path, strings)
     about = {name: strings[name] for name in ("format", "version", "kind")}
-    return (
-        about | {name: _parse_json(path, name, strings[name]) for name in ("header", "metadata")} | {"tensors": tensors}
-    )
+    about |= {name: _parse_json(path, name, strings[name]) for name in ("header", "metadata")}
+    return about | {"tensors": tensors}
 
 
 def _check_container(path: Path) -> None:
@@ -318,15 +296,12 @@ def _check_container(path: Path) -> None:
     size = path.stat().st_size
     with open(path, "rb") as file:
         first = file.read(_PREFIX + 1)
-    if size == 0:
-        raise _unreadable_error(path, "an empty file")
     length = int.from_bytes(first[:_PREFIX], "little")
     if size < _PREFIX + 2 or not first[_PREFIX:].startswith(b"{"):
-        names = (name for magic, name in _MAGIC.items() if first.startswith(magic))
-        raise _unreadable_error(path, next(names, "a file of another kind, or one cut off within its first bytes"))
+        kind = describe_kind(first[:_PREFIX]) or ("or one cut off within its first bytes" if first else "an empty one")
+        raise _unreadable_error(path, f"a file of another kind, {kind}")
     if length > size - _PREFIX:
-        got = f"a file of {size} bytes whose header claims {length}, so it is cut off or damaged"
-        raise _unreadable_error(path, got)
+        raise _unreadable_error(path, f"a file of {size} bytes whose header claims {length}: it is cut off or damaged")
 
 
 def _check_version(path: Path, strings: dict[str, str]) -> None:
@@ -359,20 +334,12 @@ def _get_specs(leaves: dict[str, Any]) -> dict[str, dict]:
     }
 
 
-def _widen_half_precision(kept: dict[str, dict], described: dict[str, dict]) -> dict[str, dict]:
-    """The specs of tensors as read: those stored in half precision are widened to single where described so."""
-    pairs = {key: (spec, described.get(key, spec)) for key, spec in kept.items()}
-    return {
-        key: want if (have["dtype"], want["dtype"]) == ("F16", "F32") and have["shape"] == want["shape"] else have
-        for key, (have, want) in pairs.items()
-    }
-
-
-def _check_tensors(have: dict[str, dict], want: dict[str, dict], where: str) -> None:
-    """Raise unless the tensors have the keys, shapes and types that the header describes."""
-    for key in sorted(have.keys() | want.keys()):
-        if have.get(key) != want.get(key):
-            expected, got = _spec_text(want.get(key)), _spec_text(have.get(key))
+def _check_tensors(kept: dict[str, dict], described: dict[str, dict], where: str) -> None:
+    """Raise unless the tensors have the keys, shapes and types that the header describes, or half the precision."""
+    for key in sorted(kept.keys() | described.keys()):
+        have, want = kept.get(key), described.get(key)
+        if have != want and not (want and want["dtype"] == "F32" and have == want | {"dtype": "F16"}):
+            expected, got = _spec_text(want), _spec_text(have)
             raise model_file_error(f"tensor {key!r} of {where!r}", expected=expected, got=got)
 
 

@@ -129,20 +129,14 @@ def _update(node, own, chances, weights, logits, p, bit):
             chance[1] += 1
 
 
-@exact_kernel
-def _split_interval(low, high, p):
-    """The split of the interval: a one, of probability p / 65536, lies below."""
-    span = high - low
-    return low + (span >> 16) * p + (((span & 0xFFFF) * p) >> 16)
-
-
 # ------------------------------------------------------------------------------------------ coding
 
 
 @exact_kernel
 def _code_bit(data, interval, decodes, p, bit):
     """Code a bit and return it; the interval is (low, high, the decoder's number in it, place of the next byte)."""
-    middle = _split_interval(interval[0], interval[1], p)
+    span = interval[1] - interval[0]
+    middle = interval[0] + (span >> 16) * p + (((span & 0xFFFF) * p) >> 16)  # a one, of probability p / 65536, is below
     if decodes:
         bit = interval[2] <= middle
     if bit:

@@ -81,8 +81,7 @@ def join_segments(
                         raise _unfit(files[number], "one that has changed meanwhile", "Join them again.")
                     yield array
 
-    write_tensors(path, specs, tensors, kind=SEGMENTED, header={"segments": entries}, metadata=metadata or {})
-    return path
+    return write_tensors(path, specs, tensors, kind=SEGMENTED, header={"segments": entries}, metadata=metadata or {})
 
 
 def save_segmented(path: Path, video: SegmentedVideo, metadata: dict | None) -> Path:
@@ -180,12 +179,10 @@ def _segment(entry: dict, tensors: dict[str, dict], load: Any) -> Segment:
         models = {f"layers.{number}.model.": layer["model"] for number, layer in enumerate(header["layers"])}
         lead = list(models)[header["timeline"]]
     for prefix, model in models.items():
-        num, num_frames = (
-            tensors[f"{prefix}splats.loc"]["shape"][0],
-            tensors[f"{prefix}frame_times.logits"]["shape"][0] + 1,
-        )
+        num = tensors[f"{prefix}splats.loc"]["shape"][0]
         if not (is_integer(model["num_gaussians"], 1) and model["num_gaussians"] == num):
             raise ValueError("another number of Gaussians than are stored")
+        num_frames = tensors[f"{prefix}frame_times.logits"]["shape"][0] + 1
         if not (is_integer(model["num_frames"], 1) and model["num_frames"] == num_frames):
             raise ValueError("another number of frames than are stored")
         if not is_integer(model["degree"], 0) or model["degree"] > _MAX_DEGREE:

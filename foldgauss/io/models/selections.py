@@ -40,10 +40,7 @@ def save_selection(path: str | os.PathLike, selection: Selection, model: VideoMo
     if not isinstance(selection, Selection):
         cure = "The order is (path, selection, model); Selection(mask) makes one of a mask."
         raise invalid("selection", expected="a Selection", got=type(selection).__name__, cure=cure)
-    if not isinstance(model, VideoModel):
-        cure = "Save the selection with the model that it was made in."
-        cure = ONE_SEGMENT if isinstance(model, SegmentedVideo) else cure
-        raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
+    _check_model(model, "Save the selection with the model that it was made in.")
     num = model.splats.num_gaussians
     if selection.num_gaussians != num:
         raise invalid("selection", expected=f"one of the model's {num:,} Gaussians", got=f"{selection.num_gaussians:,}")
@@ -57,9 +54,7 @@ def load_selection(path: str | os.PathLike, model: VideoModel) -> Selection:
     `ModelFileError` for a file of another kind, a damaged or a newer one.
     """
     check_path(path, "path, model")
-    if not isinstance(model, VideoModel):
-        cure = ONE_SEGMENT if isinstance(model, SegmentedVideo) else "The order is (path, model)."
-        raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
+    _check_model(model, "The order is (path, model).")
     kind = read_header(path)["kind"]
     if kind != SELECTION:
         cure = "Give the file that save_selection wrote."
@@ -72,6 +67,12 @@ def load_selection(path: str | os.PathLike, model: VideoModel) -> Selection:
     if record.digest != compute_digest(model):
         raise invalid("path", expected="a selection of this model", got=f"another's in {str(path)!r}", cure=cure)
     return Selection(np.asarray(record.mask))
+
+
+def _check_model(model: object, cure: str) -> None:
+    if not isinstance(model, VideoModel):
+        cure = ONE_SEGMENT if isinstance(model, SegmentedVideo) else cure
+        raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
 
 
 _INDEX_RANGE = re.compile(r"\s*([0-9]{1,9})(?:-([0-9]{1,9}))?\s*")

@@ -67,12 +67,8 @@ def check_model_name(path: str | os.PathLike, parameter: str = "path") -> None:
         cure = "Images: write_video, or foldgauss render; other programs' formats: export."
         if path.suffix.lower() == COMPACT_SUFFIX:
             cure = "A compact file: foldgauss compress, or foldgauss.video.compress and foldgauss.io.save_compact."
-        raise invalid(
-            parameter,
-            expected=f"a name for the model, as {path.with_suffix(MODEL_SUFFIX).name}",
-            got=repr(str(path)),
-            cure=cure,
-        )
+        expected = f"a name for the model, as {path.with_suffix(MODEL_SUFFIX).name}"
+        raise invalid(parameter, expected=expected, got=repr(str(path)), cure=cure)
 
 
 def load_video_model(path: str | os.PathLike) -> VideoModel | EditedVideo | SegmentedVideo:
@@ -221,9 +217,8 @@ def _edited_skeleton(header: dict) -> EditedVideo:
 def _layer_skeleton(header: dict) -> Layer:
     model = _video_skeleton(header["model"])
     mask = jax.ShapeDtypeStruct((model.splats.num_gaussians,), np.bool_)
-    return Layer(
-        model, *(tuple(restore_overlay(edit, mask) for edit in header[name]) for name in ("overlays", "clocks"))
-    )
+    overlays, clocks = (tuple(restore_overlay(one, mask) for one in header[name]) for name in ("overlays", "clocks"))
+    return Layer(model, overlays, clocks)
 
 
 def _camera_skeleton(header: dict | None) -> Camera | None:

@@ -89,9 +89,9 @@ def write_html(
 def warn_of_size(page: str, has_original: bool) -> None:
     """Warn of a page that browsers open slowly."""
     if len(page) > LARGE:
-        cure = (
-            "Leave the original out, or lower its quality." if has_original else "Compress the model, or show a part."
-        )
+        cure = "Compress the model, or show a part."
+        if has_original:
+            cure = "Leave the original out, or lower its quality."
         warnings.warn(f"page: {len(page) / 1e6:.0f} MB, which browsers are slow to open. {cure}", stacklevel=3)
 
 
@@ -159,10 +159,15 @@ def empty_page() -> str:
 
 def make_notebook_iframe(model: VideoModel | EditedVideo | SegmentedVideo) -> str | None:
     """The page as an iframe for notebooks; None where it is too large or the model cannot be shown."""
+    blocks: list[str] = []
     try:
-        page = _assemble(_limit_size(_encode_model(model, model), LARGEST_IN_NOTEBOOK), [], "foldgauss")
+        for block in _encode_model(model, model):
+            blocks.append(block)
+            if sum(map(len, blocks)) > LARGEST_IN_NOTEBOOK:
+                return None
     except (ValueError, OSError):  # the file of a video in segments may be gone
         return None
+    page = _assemble(blocks, [], "foldgauss")
     if len(page) > LARGEST_IN_NOTEBOOK:
         return None
     height, width = model.size
@@ -205,14 +210,13 @@ def _encode_model(model: Model, loaded: Loaded) -> Iterator[str]:
 def _encode_moving(model: Loaded) -> str:
     """The Gaussians of the moving object, by segment, as the page writes selections."""
     whole = dequantize(model) if isinstance(model, Quantized) else model
+    models = (one.model for one in whole.segments) if isinstance(whole, SegmentedVideo) else [whole]
     found, missing = {}, None
-    for number, one in enumerate(whole.segments if isinstance(whole, SegmentedVideo) else [whole]):
+    for number, one in enumerate(models):
         try:
-            moving = by_motion(flatten_video(one.model if isinstance(whole, SegmentedVideo) else one))
+            found[number] = format_indices(by_motion(flatten_video(one)))
         except NothingMoves as error:
             missing = error
-        else:
-            found[number] = format_indices(moving)
     found = {number: text for number, text in found.items() if text}
     if not found:
         raise missing or nothing_moves("an object that has Gaussians of its own", "none")
@@ -224,16 +228,6 @@ def _flatten_segment(number: int, model: VideoModel | EditedVideo) -> VideoModel
         return flatten_video(model)
     except ValueError as error:
         raise ValueError(f"segment {number}: {error}") from error
-
-
-def _limit_size(blocks: Iterable[str], most: float) -> Iterator[str]:
-    """The blocks; raises ValueError once their total size exceeds `most`."""
-    total = 0
-    for block in blocks:
-        total += len(block)
-        if total > most:
-            raise invalid("model", expected=f"a page of at most {most / 1e6:g} MB", got="a larger one")
-        yield block
 
 
 def quantize_finely(model: VideoModel) -> Quantized:
@@ -266,19 +260,16 @@ def _fine_rules(degree: int) -> dict[str, Rule]:
 def _encode_original(original: Frames, model: Loaded, quality: int) -> list[bytes]:
     """The original's frames as WebP."""
     frames = original.frames if isinstance(original, Clip) else original
-    size, num = _frame_size_and_count(model)
+    if isinstance(model, Quantized):
+        size, num = tuple(model.info.size), len(model.intervals) + 1
+    else:
+        size, num = tuple(model.size), model.num_frames
     shape, dtype = np.shape(frames), getattr(frames, "dtype", None)
     if len(shape) != 4 or shape[:3] != (num, *size) or shape[3] not in (3, 4) or dtype != np.uint8:
         expected = f"frames uint8 ({num}, {size[0]}, {size[1]}, 3), those of the model"
         cure = "Read them with read_video(path, size=model.size)."
         raise invalid("original", expected=expected, got=f"{dtype} {shape}", cure=cure)
     return [_encode_webp(frame, quality) for frame in frames]
-
-
-def _frame_size_and_count(model: Loaded) -> tuple[tuple[int, int], int]:
-    if isinstance(model, Quantized):
-        return tuple(model.info.size), len(model.intervals) + 1
-    return tuple(model.size), model.num_frames
 
 
 def _encode_webp(frame: UInt8[np.ndarray, "height width channels"], quality: int) -> bytes:
