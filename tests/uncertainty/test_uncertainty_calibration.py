@@ -93,6 +93,7 @@ def test_wrong_prior_is_detected(monkeypatch):
 
 
 @slow
+@pytest.mark.timeout(1800)
 def test_emcee_is_calibrated():
     found = ranks(sampler="emcee", num_frames=5)
     assert found.inside(0.99).all()
