@@ -17,7 +17,7 @@ from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTr
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.io.media.clip import PathLike, check_readable, video_error
-from foldgauss.io.media.decoder import CONVERSION, open_container, pull_frames
+from foldgauss.io.media.decoder import CONVERSION, filter_frame, open_container
 from foldgauss.io.media.format_detection import SOUND_DEMUXERS
 
 os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 writes to stderr
@@ -182,8 +182,7 @@ def _encode_sound(stream: av.AudioStream, sound: Sound) -> Iterator[av.Packet]:
         if stream.codec_context.frame_size:
             graph.set_audio_frame_size(stream.codec_context.frame_size)
         for frame in _decode_sound(source, of_file):
-            graph.push(frame)
-            for filtered in pull_frames(graph):
+            for filtered in filter_frame(graph, frame):
                 yield from stream.encode(filtered)
         yield from stream.encode()
 
