@@ -211,11 +211,10 @@ class VideoDecoder:
                 raise video_error("path", expected="a video of progressive frames", got=got, cure=cure)
             kind = frame.height, frame.width, frame.format.name
             if graph is None or kind != of_graph:
-                yield from flush_frames(graph)
+                yield from filter_frame(graph, None)
                 graph, of_graph, self.has_converted = _make_deinterlacer(frame, self.time_base), kind, True
-            graph.push(frame)
-            yield from pull_frames(graph)
-        yield from flush_frames(graph)
+            yield from filter_frame(graph, frame)
+        yield from filter_frame(graph, None)
 
     def _find_stamp(self, frame: av.VideoFrame) -> int | None:
         """AVI stores no times: FFmpeg numbers its packets, in the order of decoding."""
@@ -287,17 +286,14 @@ def _make_deinterlacer(frame: av.VideoFrame, clock: Fraction) -> Graph:
     return graph
 
 
-def flush_frames(graph: Graph | None) -> Iterator[av.VideoFrame | av.AudioFrame]:
-    """The last frames of a graph of filters, if there is one."""
+def filter_frame(
+    graph: Graph | None, frame: av.VideoFrame | av.AudioFrame | None
+) -> Iterator[av.VideoFrame | av.AudioFrame]:
+    """The frames that a graph of filters, if there is one, has ready after another frame; None ends them."""
     if graph is not None:
-        graph.push(None)
-        yield from pull_frames(graph)
-
-
-def pull_frames(graph: Graph) -> Iterator[av.VideoFrame | av.AudioFrame]:
-    """The frames that a graph of filters has ready."""
-    while True:
-        try:
-            yield graph.pull()
-        except (av.BlockingIOError, av.EOFError):
-            return
+        graph.push(frame)
+        while True:
+            try:
+                yield graph.pull()
+            except (av.BlockingIOError, av.EOFError):
+                return

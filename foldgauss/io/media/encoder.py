@@ -18,7 +18,7 @@ from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTr
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.io.media.clip import PathLike, VideoError, check_readable, video_error
-from foldgauss.io.media.decoder import CONVERSION, open_container, pull_frames
+from foldgauss.io.media.decoder import CONVERSION, filter_frame, open_container
 from foldgauss.io.media.format_detection import SOUND_DEMUXERS
 
 os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 writes to stderr
@@ -26,13 +26,12 @@ os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 writes to stderr
 
 class Codec(NamedTuple):
     """`crf`: its default constant rate factor and the largest one; None for codecs without. `pixel_formats`: those
-    offered, the default first. `alpha_format`: the default of frames with alpha. `min_side`: the least height and
-    width; with less x265 ends the process, and SVT-AV1 waits forever."""
+    offered, the default first, and the first with alpha for frames with alpha. `min_side`: the least height and width;
+    with less x265 ends the process, and SVT-AV1 waits forever."""
 
     encoder: str
     suffixes: tuple[str, ...]
     pixel_formats: tuple[str, ...]
-    alpha_format: str | None = None
     crf: tuple[int, int] | None = None
     options: Mapping[str, str] = MappingProxyType({})
     min_side: int = 1
@@ -60,12 +59,11 @@ CODECS = {
         "libvpx-vp9",
         (".webm", ".mp4", ".mkv"),
         ("yuv420p", "yuv444p", "yuva420p"),
-        "yuva420p",
         (18, 63),
         {"b": "0", "row-mt": "1", "deadline": "good", "cpu-used": "4"},
     ),
-    "prores": Codec("prores_ks", (".mov", ".mkv"), ("yuv422p10le", "yuv444p10le", "yuva444p10le"), "yuva444p10le"),
-    "ffv1": Codec("ffv1", (".mkv",), ("bgr0", "bgra", "yuv420p", "yuv444p"), "bgra"),
+    "prores": Codec("prores_ks", (".mov", ".mkv"), ("yuv422p10le", "yuv444p10le", "yuva444p10le")),
+    "ffv1": Codec("ffv1", (".mkv",), ("bgr0", "bgra", "yuv420p", "yuv444p")),
 }
 #: The codec of each extension unless one is given.
 DEFAULT_CODECS = {".mp4": "h264", ".webm": "vp9", ".mov": "prores", ".mkv": "ffv1"}
@@ -117,14 +115,14 @@ def choose_encoding(
             raise invalid("crf", expected=f"none for {name}, which has no such factor", got=f"{crf}")
         if not (is_integer(crf, 0) and crf <= chosen.crf[1]):
             raise invalid("crf", expected=f"a whole number from 0 to {chosen.crf[1]} for {name}", got=repr(crf))
+    with_alpha = [one for one in chosen.pixel_formats if av.VideoFormat(one).components[-1].is_alpha]
     if pixel_format is None:
-        pixel_format = chosen.alpha_format if has_alpha and chosen.alpha_format else chosen.pixel_formats[0]
+        pixel_format = (with_alpha if has_alpha and with_alpha else chosen.pixel_formats)[0]
     check_one_of("pixel_format", pixel_format, chosen.pixel_formats)
-    # An MP4 has no place for the alpha of VP9.
-    if has_alpha and (suffix == ".mp4" or not any(part.is_alpha for part in av.VideoFormat(pixel_format).components)):
+    if has_alpha and (suffix == ".mp4" or pixel_format not in with_alpha):  # an MP4 has no place for the alpha of VP9
         cure = "Take vp9 in a .webm, prores in a .mov or ffv1 in a .mkv, or composite the frames over a color."
-        if chosen.alpha_format and suffix != ".mp4":
-            cure = f"Take {chosen.alpha_format}."
+        if with_alpha and suffix != ".mp4":
+            cure = f"Take {with_alpha[0]}."
         raise video_error("frames", expected=f"RGB for {name} in {suffix}, {pixel_format}", got="RGBA", cure=cure)
     return Encoding(chosen, crf if crf is not None else chosen.crf and chosen.crf[0], pixel_format)
 
@@ -189,8 +187,7 @@ def _encode_sound(stream: av.AudioStream, sound: Sound) -> Iterator[av.Packet]:
         if stream.codec_context.frame_size:
             graph.set_audio_frame_size(stream.codec_context.frame_size)
         for frame in _decode_sound(source, of_file):
-            graph.push(frame)
-            for filtered in pull_frames(graph):
+            for filtered in filter_frame(graph, frame):
                 yield from stream.encode(filtered)
         yield from stream.encode()
 

@@ -18,8 +18,6 @@ _PLAYLISTS = (b"#EXTM3U", b"ffconcat", b"v=0", b"[playlist]", b"[Reference]", b"
 _ADDRESS = (b"http://", b"https://", b"rtsp://", b"rtmp://", b"udp://", b"file://")
 LIST = "a list of other files or addresses"
 _KINDS = (
-    (_PNG[:4], "a PNG image"),
-    (b"\xff\xd8\xff", "a JPEG image"),
     (b"PK\x03\x04", "a zip archive"),
     (b"\x1f\x8b", "a gzip archive"),
     (b"%PDF", "a PDF"),

@@ -201,7 +201,10 @@ def _write_animation(path: Path, suffix: str, frames: Iterable[np.ndarray], fps:
         shared = {"save_all": True, "append_images": rest, "loop": 0}
         try:
             if suffix == ".gif":
-                first.save(temporary, "GIF", duration=_gif_durations(1 + len(rest), fps), optimize=False, **shared)
+                # Milliseconds, in whole hundredths of a second, whose sums are the true times rounded.
+                ends = np.rint(100 * np.arange(len(rest) + 2) / fps).astype(int)
+                durations = [10 * int(duration) for duration in np.diff(ends)]
+                first.save(temporary, "GIF", duration=durations, optimize=False, **shared)
             else:
                 first.save(temporary, "WEBP", duration=1000 / fps, quality=WEBP_QUALITY, **shared)
         except OSError as error:
@@ -210,9 +213,3 @@ def _write_animation(path: Path, suffix: str, frames: Iterable[np.ndarray], fps:
             expected, got = f"a size and a rate that {suffix} can hold", f"{first.height}x{first.width} at {fps:g} fps"
             raise video_error("frames", expected=expected, got=got, cure="Take an .mp4 or .webm.") from error
     return path
-
-
-def _gif_durations(num_frames: int, fps: float) -> list[int]:
-    """Milliseconds of each frame, in whole hundredths of a second, whose sums are the true times rounded."""
-    ends = np.rint(100 * np.arange(num_frames + 1) / fps).astype(int)
-    return [10 * int(duration) for duration in np.diff(ends)]

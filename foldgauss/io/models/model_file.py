@@ -16,7 +16,6 @@ from safetensors import SafetensorError, safe_open
 from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.threads import check_not_forked
 from foldgauss.io._atomic import atomic_path, missing_error
-from foldgauss.io.media.format_detection import describe_kind
 
 FORMAT = "foldgauss-model"
 VERSION = "1"  # increased when older programs cannot read the file
@@ -34,6 +33,12 @@ _PREFIX = 8  # bytes: the length of the JSON header, little-endian, opens a safe
 _RESERVED = "__metadata__"  # reserved by safetensors
 #: What functions raise that are given a header with other types or values.
 HEADER_ERRORS = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError)
+_MAGIC = {
+    b"\x89PNG": "a PNG image",
+    b"\xff\xd8\xff": "a JPEG image",
+    b"ply": "a PLY file",
+    b"PK": "a zip archive",
+}
 
 
 class ModelFileError(ValueError):
@@ -298,8 +303,9 @@ def _check_container(path: Path) -> None:
         first = file.read(_PREFIX + 1)
     length = int.from_bytes(first[:_PREFIX], "little")
     if size < _PREFIX + 2 or not first[_PREFIX:].startswith(b"{"):
-        kind = describe_kind(first[:_PREFIX]) or ("or one cut off within its first bytes" if first else "an empty one")
-        raise _unreadable_error(path, f"a file of another kind, {kind}")
+        names = (name for magic, name in _MAGIC.items() if first.startswith(magic))
+        unknown = "a file of another kind, or one cut off within its first bytes" if first else "an empty file"
+        raise _unreadable_error(path, next(names, unknown))
     if length > size - _PREFIX:
         raise _unreadable_error(path, f"a file of {size} bytes whose header claims {length}: it is cut off or damaged")
 

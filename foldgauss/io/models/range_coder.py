@@ -41,15 +41,8 @@ _KNOTS = [
 _i = nb.int64
 
 
-def _tabulate_logistic() -> np.ndarray:
-    """Probability times 65536 of the logit (place - 2048) / 256."""
-    place = np.arange(4096)
-    k, part = place >> 7, place & 127
-    knots = np.array(_KNOTS)
-    return (knots[k] * (128 - part) + knots[k + 1] * part + 64) >> 7
-
-
-LOGISTIC = _tabulate_logistic()
+#: Probability times 65536 of the logit (place - 2048) / 256, to nearest; exact, as lines have steps of 1/128.
+LOGISTIC = np.floor(np.interp(np.arange(4096), 128 * np.arange(33), _KNOTS) + 0.5).astype(np.int64)
 #: Its inverse, for the upper 12 bits of a probability: the least logit that gives as much.
 LOGIT = np.minimum(np.searchsorted(LOGISTIC, np.arange(4096) * 16 + 8), 4095) - 2048
 

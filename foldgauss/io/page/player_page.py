@@ -269,15 +269,14 @@ def _encode_original(original: Frames, model: Loaded, quality: int) -> list[byte
         expected = f"frames uint8 ({num}, {size[0]}, {size[1]}, 3), those of the model"
         cure = "Read them with read_video(path, size=model.size)."
         raise invalid("original", expected=expected, got=f"{dtype} {shape}", cure=cure)
-    return [_encode_webp(frame, quality) for frame in frames]
-
-
-def _encode_webp(frame: UInt8[np.ndarray, "height width channels"], quality: int) -> bytes:
-    bgr = frame[..., 2::-1]  # premultiplied colors without their alpha are the image over black
-    done, data = cv2.imencode(".webp", bgr, [cv2.IMWRITE_WEBP_QUALITY, quality])
-    if not done:
-        raise invalid("original", expected="frames that WebP can hold, up to 16,383 pixels a side", got=frame.shape)
-    return data.tobytes()
+    pictures = []
+    for frame in frames:
+        bgr = frame[..., 2::-1]  # premultiplied colors without their alpha are the image over black
+        done, data = cv2.imencode(".webp", bgr, [cv2.IMWRITE_WEBP_QUALITY, quality])
+        if not done:
+            raise invalid("original", expected="frames that WebP can hold, up to 16,383 pixels a side", got=frame.shape)
+        pictures.append(data.tobytes())
+    return pictures
 
 
 # ------------------------------------------------------------------------------------------------ the page
