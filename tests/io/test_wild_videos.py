@@ -4,6 +4,7 @@ Most are made here byte by byte: AVIs whose packets are PNGs or JPEGs, MP4s and 
 an encoder makes is made with ffmpeg, and skipped where there is none.
 """
 
+import gc
 import os
 import shutil
 import struct
@@ -236,6 +237,19 @@ def test_videos_are_turned_upright(tmp_path, mp4, turns, across):
     np.testing.assert_array_equal(
         read_video(tmp_path / "turned.mp4").frames, np.rot90(stored, -turns, (1, 2))[:, :, ::across]
     )
+
+
+def test_decoded_frames_are_not_kept(mp4, tmp_path):
+    """By cycles of references, which the garbage collector would find much later."""
+
+    def count():
+        return sum(isinstance(one, av.VideoFrame) for one in gc.get_objects())
+
+    (tmp_path / "a.mp4").write_bytes(mp4)
+    with decoder.VideoDecoder(tmp_path / "a.mp4") as video:
+        before = count()
+        assert len([frame.to_array() for frame in video.frames()]) > 5
+        assert count() - before <= 2  # the first one's display matrix is read
 
 
 def test_columns_at_the_left_are_cropped_to_the_pixel(tmp_path):

@@ -40,12 +40,14 @@ _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 class DecodedFrame:
     """A frame that decodes. `position`: in the file, with the frames lost to damage counted. `stamp`: in units of
     `VideoDecoder.time_base`; 0 for a stream without time stamps. `size`: (height, width) of the video as stored, to
-    which a frame of another size is stretched."""
+    which a frame of another size is stretched. `matrix`: (a, b, c, d), right is shown along (a, b), down along (c, d),
+    in units of 2^-16."""
 
     position: int
     stamp: int
     decoded: av.VideoFrame
     size: tuple[int, int]
+    matrix: tuple[int, int, int, int] = (1 << 16, 0, 0, 1 << 16)
 
     def to_array(self) -> np.ndarray:
         """Upright and uint8: BGR of shape (height, width, 3), or premultiplied BGRA of shape (height, width, 4).
@@ -66,19 +68,10 @@ class DecodedFrame:
         if has_alpha:
             opaque = image[..., 3].min() == 255
             image = np.ascontiguousarray(image[..., :3]) if opaque else premultiply(image)
-        return _turn_upright(image, self.decoded)
-
-
-def _turn_upright(image: np.ndarray, frame: av.VideoFrame) -> np.ndarray:
-    """The image turned and mirrored by the display matrix of its frame, if there is one, by whole quarters."""
-    data = frame.side_data.get("DISPLAYMATRIX")
-    if data is None:
-        return image
-    # Right is shown along (a, b) and down along (c, d), in units of 2^-16.
-    a, b, _, c, d = np.frombuffer(data, np.int32)[:5].tolist()
-    if abs(b) > abs(a):
-        image, a, d = image.swapaxes(0, 1), c, b
-    return np.ascontiguousarray(image[:: 1 if d >= 0 else -1, :: 1 if a >= 0 else -1])
+        a, b, c, d = self.matrix
+        if abs(b) > abs(a):
+            image, a, d = image.swapaxes(0, 1), c, b
+        return np.ascontiguousarray(image[:: 1 if d >= 0 else -1, :: 1 if a >= 0 else -1])
 
 
 class VideoDecoder:
@@ -106,6 +99,7 @@ class VideoDecoder:
         self.hides_frames = self._container.format.name.startswith("mov")
         self.has_converted = False  # whether any frame was interlaced
         self._size = self._codec.height, self._codec.width
+        self._angle: int | None = None  # of the display matrix
         self._last = -1  # position of the frame decoded last
         self._before: int | None = None  # its time stamp
         self._damaged = False  # since then
@@ -148,7 +142,7 @@ class VideoDecoder:
         try:
             hours, minutes, own = stream.metadata.get("DURATION", "").split(":")
             return min(seconds, 3600 * int(hours) + 60 * int(minutes) + float(own)) - begin
-        except ValueError:
+        except (ValueError, OverflowError):
             return None
 
     def seek(self, stamp: int) -> None:
@@ -165,7 +159,16 @@ class VideoDecoder:
             stamp = self._find_stamp(frame)
             self._last = self._find_position(stamp)
             self._size = self._size if all(self._size) else (frame.height, frame.width)
-            yield DecodedFrame(self._last, stamp or 0, frame, self._size)
+            yield DecodedFrame(self._last, stamp or 0, frame, self._size, self._find_matrix(frame))
+
+    def _find_matrix(self, frame: av.VideoFrame) -> tuple[int, int, int, int]:
+        """The display matrix of the frame, read anew where its angle is another: to read it keeps the frame in memory
+        until the next collection of garbage."""
+        if frame.rotation != self._angle:
+            data = frame.side_data.get("DISPLAYMATRIX")
+            numbers = [1 << 16, 0, 0, 0, 1 << 16] if data is None else np.frombuffer(data, np.int32)[:5].tolist()
+            self._angle, self._matrix = frame.rotation, (numbers[0], numbers[1], numbers[3], numbers[4])
+        return self._matrix
 
     def _decode(self) -> Iterator[av.VideoFrame]:
         for packet in self._read_packets():
