@@ -4,6 +4,7 @@ Most are made here byte by byte: AVIs whose packets are PNGs or JPEGs, MP4s and 
 an encoder makes is made with ffmpeg, and skipped where there is none.
 """
 
+import contextlib
 import gc
 import os
 import shutil
@@ -246,7 +247,7 @@ def test_decoded_frames_are_not_kept(mp4, tmp_path):
         return sum(isinstance(one, av.VideoFrame) for one in gc.get_objects())
 
     (tmp_path / "a.mp4").write_bytes(mp4)
-    with decoder.VideoDecoder(tmp_path / "a.mp4") as video:
+    with contextlib.closing(decoder.VideoDecoder(tmp_path / "a.mp4")) as video:
         before = count()
         assert len([frame.to_array() for frame in video.frames()]) > 5
         assert count() - before <= 2  # the first one's display matrix is read
