@@ -284,7 +284,7 @@ def _read_head(path: Path) -> None:
     claimed = format_detection.parse_image_size(head)
     assert claimed is None or format_detection.min_file_bytes(head, claimed) >= 0
     kind = format_detection.describe_kind(head)
-    if kind is not None and not kind.endswith(" image"):
+    if kind is not None:
         raise ValueError(f"expected a video or an image, got {kind}")
 
 
