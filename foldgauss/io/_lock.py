@@ -25,7 +25,7 @@ def lock_output(path: Path, *, own: tuple[Path, ...] = (), what: str = "fit") ->
     for target in (path, *own):
         check_writable(target)  # the lock would create a missing folder
     name = path.name
-    if len(name.encode()) > 240:  # there must be room for the suffix within the 255 bytes of file systems
+    if len(name.encode()) > 240:  # a file name has at most 255 bytes, including '.' and '.lock'
         name = hashlib.sha256(name.encode()).hexdigest()[:32]
     file = path.with_name(f".{name}.lock")
     with ExitStack() as stack:

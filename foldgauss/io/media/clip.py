@@ -118,10 +118,8 @@ def check_range(frames: Range | None) -> tuple[int, int | None]:
 
 def check_range_within(start: int, stop: int | None, num_total: int, path: Path) -> None:
     if start >= num_total or (stop is not None and stop > num_total):
-        expected, cure = (
-            f"A:B within 0:{num_total}, the frames of {str(path)!r}",
-            f"Choose B <= {num_total} and A below it.",
-        )
+        expected = f"A:B within 0:{num_total}, the frames of {str(path)!r}"
+        cure = f"Choose B <= {num_total} and A below it."
         raise video_error("frames", expected=expected, got=format_range(start, stop), cure=cure)
 
 
@@ -144,10 +142,8 @@ def check_fps(fps: float) -> None:
 def check_num_pixels(path: Path, size: tuple[int, int] | None) -> None:
     """Raise where a header claims more than `MAX_PIXELS`, before memory is allocated for them."""
     if size is not None and size[0] * size[1] > MAX_PIXELS:
-        expected, got = (
-            f"images of at most {MAX_PIXELS:,} pixels",
-            f"{format_size(size)} in the header of {str(path)!r}",
-        )
+        expected = f"images of at most {MAX_PIXELS:,} pixels"
+        got = f"{format_size(size)} in the header of {str(path)!r}"
         cure = "The file is damaged, or must be scaled down first."
         raise video_error("path", expected=expected, got=got, cure=cure)
 

@@ -129,10 +129,8 @@ def read_images(paths: list[Path], prepare: Callable) -> ReadResult:
         first_shape = first_shape or image.shape[:2]
         if image.shape[:2] != first_shape:
             expected = f"images of one size, {format_size(first_shape)} as in {paths[0].name!r}"
-            got, cure = (
-                f"{format_size(image.shape)} in {path.name!r}",
-                "Resize the images, or choose others with frames=(A, B).",
-            )
+            got = f"{format_size(image.shape)} in {path.name!r}"
+            cure = "Resize the images, or choose others with frames=(A, B)."
             raise video_error("path", expected=expected, got=got, cure=cure)
         kept.append(prepare(image))
     return kept, len(paths), FrameRate(DEFAULT_FPS), ()
