@@ -1,6 +1,7 @@
 """A GPU's figures: drawing and its gradients, a fit against time, playback. None has been measured so far.
 
-    python -m benchmarks.gpu [--json FILE] [--only engines quality playback] [--minutes M] [--gaussians N] [--rounds N]
+    python -m benchmarks.gpu [--json FILE] [--only engines quality playback] [--engines xla pallas cpu] [--minutes M]
+                             [--gaussians N] [--looks N] [--rounds N]
     python -m benchmarks.gpu --anyway --tiny   # on a processor: whether it runs, no more
 
 * *engines*: `pallas` and `xla`, 100k and 500k random splats (`_common.random_scene`) at 640x1280 and 1080x1920: wall
@@ -8,8 +9,8 @@
   arrays there, median over rounds that run all engines in turn. Divided by the *pairs* (a pixel of a 16x16 tile times a
   Gaussian that the engine `cpu` lists there) they are ns per pair. Beside them the floor: the larger one of what the
   bytes take at the device's bandwidth and what the operations take at its peak, by the counts below.
-* *quality*: the Bunny clip, 640x1280, all 132 frames, with each engine: mean PSNR of all frames as they are shown,
-  against seconds of the fit, which looking does not count among.
+* *quality*: the Bunny clip, 640x1280, all 132 frames, with each engine, `cpu` too if `--engines` names it: mean PSNR of
+  all frames as they are shown, against seconds of the fit, which looking does not count among.
 * *playback*: frames a second of the model that came out, conditioning included, as bytes on the device, a whole pass in
   one call.
 
@@ -40,7 +41,7 @@ PARTS = ("engines", "quality", "playback")
 SCENES = [(num, size) for num in (100_000, 500_000) for size in ((640, 1280), (1080, 1920))]
 TINY_SCENES = [(200, (24, 40))]
 SIZE, FRAMES, MINUTES, GAUSSIANS, BATCH = (640, 1280), (0, 132), 10.0, 620_000, 1
-LOOKS = 10  # of a fit, evenly spaced in time
+LOOKS = 10  # of a fit, evenly spaced in time; each renders all frames on the CPU
 #: Peak float32 operations and exponentials a second, and bytes a second, by the device's name. NVIDIA's data sheets;
 #: exponentials: 16 a cycle on each of 132 multiprocessors at 1.83 GHz.
 PEAKS = {"H100": (67e12, 3.9e12, 3.35e12), "H200": (67e12, 3.9e12, 4.8e12)}
@@ -170,10 +171,11 @@ def measure_playback(model: VideoModel, rounds: int) -> dict[str, float]:
 def main(arguments: list[str] | None = None) -> None:
     made = _common.parser(__doc__)
     made.add_argument("--only", nargs="+", choices=PARTS, default=PARTS, help="what to measure; default: all")
-    made.add_argument("--engines", nargs="+", choices=tuple(ENGINES), default=tuple(ENGINES), help="of the fits")
+    made.add_argument("--engines", nargs="+", choices=(*ENGINES, "cpu"), default=tuple(ENGINES), help="of the fits")
     made.add_argument("--minutes", type=float, default=MINUTES, help="of each fit")
     made.add_argument("--gaussians", type=_common.whole, default=GAUSSIANS, help="of each fit")
     made.add_argument("--batch-size", type=_common.whole, default=BATCH, help="of each fit")
+    made.add_argument("--looks", type=_common.whole, default=LOOKS, help="at each fit, evenly spaced in time")
     made.add_argument("--rounds", type=_common.whole, default=7)
     made.add_argument("--anyway", action="store_true", help="also without a GPU; with --tiny")
     made.add_argument("--tiny", action="store_true", help="small scenes, a short fit: whether it runs")
@@ -197,7 +199,7 @@ def measured(options: argparse.Namespace) -> dict[str, float]:
             else:
                 how = {"minutes": options.minutes, "batch_size": options.batch_size}
                 config = FitConfig(num_gaussians=options.gaussians, engine=engine, **how)
-            found, model = measure_quality(frames, config, LOOKS)
+            found, model = measure_quality(frames, config, options.looks)
             figures |= {f"quality_{engine}_{name}": value for name, value in found.items()}
         if "playback" in options.only:
             rounds = 1 if options.tiny else options.rounds

@@ -48,9 +48,9 @@ def render(
     - `compositing`: "over", as 3DGS and VeGaS; or "sum", the accumulated blend of GaussianImage, where all
       T_i are 1 and the background is added in full.
     - `engine`: "cpu" (Numba, float32 inside); "xla" (tiles in plain JAX, on CPU, GPU and TPU, float32 or float64);
-      "pallas" (a GPU program per tile, float32 inside; on a CPU interpreted, for tests only; not timed on a GPU so
-      far); "reference" (dense, slow); or "auto": "cpu" if JAX's default device is a CPU and "cpu" supports the
-      options, else "xla".
+      "pallas" (a GPU program per tile, float32 inside; on a CPU interpreted, for tests only); "reference" (dense,
+      slow); or "auto": "cpu" if JAX's default device is a CPU and "cpu" supports the options, "pallas" if it is a GPU,
+      "pallas" supports the options and the splats are float32, else "xla".
     - `options`: cutoffs and tiling, `RenderOptions`.
     - `return_alpha`: also return alpha, (height, width): sum_i alpha_i T_i, which is 1 - T_end up to rounding.
     - `return_depth`: also return the expected depth, (height, width), in model units along the camera's axis:
@@ -91,7 +91,7 @@ def render(
     if background.shape != (channels,):
         raise invalid("background", expected=f"shape ({channels},)", got=background.shape)
     if engine == "auto":
-        engine = "cpu" if jax.default_backend() == "cpu" and _cpu_takes(options) else "xla"
+        engine = choose_engine(options, dtype)
     if engine == "cpu":
         cpu.check_options(options)
     if engine == "pallas":
@@ -112,6 +112,13 @@ def render(
     if return_depth:
         outputs.append(image[..., -1] / jnp.where(alpha > 0, alpha, jnp.ones_like(alpha)))
     return tuple(outputs)
+
+
+def choose_engine(options: RenderOptions, dtype: np.dtype) -> str:
+    """The engine that "auto" stands for, by the options and the dtype of the splats."""
+    if jax.default_backend() == "cpu" and _cpu_takes(options):
+        return "cpu"
+    return "pallas" if dtype == jnp.float32 and pallas.is_preferred(options) else "xla"
 
 
 def _check_weighted(splats: Splats2D, compositing: str, depth: bool) -> None:

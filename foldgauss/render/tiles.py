@@ -165,7 +165,10 @@ def pack_fields(projected: Projected, mean, opacity, color) -> Float[Array, "num
 
 
 class Lists(NamedTuple):
-    """Splats of tile k, front to back: `splat[start[k] : start[k] + length[k]]`; tiles are padded to whole batches."""
+    """Splats of tile k, front to back: `splat[start[k] : start[k] + length[k]]`; tiles are padded to whole batches.
+
+    Empty slots, at the end, have the index of the invisible row of `pack_fields`.
+    """
 
     splat: Int[Array, " capacity"]
     start: Int[Array, " tiles"]
@@ -191,6 +194,7 @@ def make_lists(plan: Plan, projected: Projected, mean, begin) -> tuple[Lists, In
     used &= _reaches_tile(plan, projected, mean, owner, rows, columns)
     tile = jnp.where(used, rows * plan.grid[1] + columns, plan.num_tiles)
     tile, splat = _sort_by_tile(tile, owner, plan.num_tiles, num)
+    splat = jnp.where(tile < plan.num_tiles, splat, num)
     padded = plan.num_batches * plan.batch
     bounds = jnp.searchsorted(tile, indices(padded + 1), side="left").astype(jnp.int32)
     bounds = jnp.where(indices(padded + 1) <= plan.num_tiles, bounds, bounds[plan.num_tiles])

@@ -298,7 +298,7 @@ def _backward_batch(plan: Plan, fields, lists: Lists, transmittance, grad_planes
         chunk, sums, behind = carry
         splat, splats = _load(batch, lists, fields, chunk)
         own, behind = _backward_chunk(plan, batch, splats, grad, chunks[chunk - first], behind)
-        return chunk - 1, sums.at[splat].add(own), behind
+        return chunk - 1, sums.at[splat].add(own, mode="drop"), behind
 
     def walk_segment(carry):
         segment, sums, behind, chunks = carry
@@ -340,12 +340,13 @@ def _render_bwd(plan: Plan, residuals, grad_image):
         state = jax.lax.fori_loop(0, plan.num_batches, lambda k, state: backward(state, k), tuple(state))
         return number - 1, *state
 
-    sums = jnp.zeros((len(fields), MOMENTS + color.shape[1]), mean.dtype)
+    # Without a row for empty slots: on a GPU, additions to a single row wait for each other.
+    sums = jnp.zeros((len(mean), MOMENTS + color.shape[1]), mean.dtype)
     empty = jnp.zeros((_num_checkpoints(plan, len(mean)), plan.tile**2, plan.batch), mean.dtype)
     start = num - 1, sums, behind, Checkpoints(empty, empty)
     _, sums, *_ = jax.lax.while_loop(lambda carry: carry[0] >= 0, backward_round, start)
     d_background = jnp.sum(final_transmittance[None, :, :] * grad_planes, axis=(1, 2))
-    return ((*gradients_from_sums(projected, sums[:-1], factor, opacity), d_background),)
+    return ((*gradients_from_sums(projected, sums, factor, opacity), d_background),)
 
 
 _render.defvjp(_render_fwd, _render_bwd)

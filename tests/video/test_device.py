@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 
 import jax
 import jax.numpy as jnp
@@ -33,14 +34,17 @@ from foldgauss.video import (
 from foldgauss.video.fitting.loop import start
 from foldgauss.video.fitting.schedule import choose_views, plan_levels
 from foldgauss.video.fitting.state import FitState
+from foldgauss.video.fitting.steppers import jax_stepper
 from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
 from foldgauss.video.fitting.steppers.engines import choose_engine
+from foldgauss.video.fitting.steppers.interpolated_frames import InterpolatedFrames, Prefetcher, make_interpolated
 from foldgauss.video.fitting.steppers.jax_loss import compute_losses, ssim
 from foldgauss.video.fitting.steppers.jax_step import _splats, find_alive, lower_step
 from foldgauss.video.fitting.steppers.jax_stepper import HeldArrays, JaxStepper
 from foldgauss.video.fitting.steppers.loss import image_loss, squared_loss, ssim_map
 from foldgauss.video.models.conditioning import ConditioningSpec, condition, update_windows
 from foldgauss.video.models.row_layout import columns
+from foldgauss.video.motion.optical_flow import motion_finder
 
 #: Nothing in it is black: at a colour of 0 the slope is one thing or another by rounding.
 FRAMES = moving_blobs(height=32, width=40) // 2 + 40
@@ -132,6 +136,46 @@ def test_step_with_interpolated_frames_matches_the_cpu(progress):
     assert 0 < sum(chosen(20, 0.1, int(k)) is not None for k in views) < 4
     _, there = compare_steps(config, progress)
     assert np.abs(there.rows - warm_state(config).rows).max() > 1e-3  # it did step
+
+
+def test_prepared_images_are_the_same_and_are_dropped():
+    config = FitConfig(interpolation_fraction=0.9)
+    interpolation = make_interpolated(FRAMES, config, motion_finder(FRAMES))
+    prefetcher, made = Prefetcher(interpolation), []
+    for step in (3, 4):
+        prefetcher.prepare(step, 0.0, range(len(FRAMES)), (32, 40))
+    assert prefetcher.num_prepared > 0
+    direct, interpolation.interpolate = interpolation.interpolate, lambda *call: made.append(call)
+    for step in (3, 4):
+        for k in range(len(FRAMES)):
+            fraction = interpolation.choose(step, 0.0, k)
+            if fraction is not None:
+                image = prefetcher.interpolate(step, k, fraction, (32, 40))
+                np.testing.assert_array_equal(image, direct(k, fraction, (32, 40)))
+        prefetcher.drop(step)
+    assert prefetcher.num_prepared == 0
+    assert not made
+    prefetcher.interpolate(5, 0, 0.5, (32, 40))  # not prepared
+    assert made == [(0, 0.5, (32, 40))]
+
+
+def test_a_fit_prepares_its_interpolated_frames(monkeypatch):
+    """Most of them, and with the result that it has without."""
+    config, made = dataclasses.replace(CONFIG, steps=30, interpolation_fraction=0.5, interpolation_end=1.0), []
+    with monkeypatch.context() as patch:
+        patch.setattr(jax_stepper, "STEPS_AHEAD", 0)
+        expected = fit(FRAMES, config, every=1)
+    direct = InterpolatedFrames.interpolate
+
+    def note(self, *call):
+        made.append(threading.current_thread() is threading.main_thread())
+        return direct(self, *call)
+
+    monkeypatch.setattr(InterpolatedFrames, "interpolate", note)
+    found = fit(FRAMES, config, every=1)
+    assert [info.loss for info in found.history] == [info.loss for info in expected.history]
+    assert len(made) > 5
+    assert sum(made) < 0.3 * len(made)
 
 
 @pytest.mark.slow
@@ -439,7 +483,8 @@ def test_four_devices_match_one(tmp_path):
 def test_auto_is_the_cpu_without_a_gpu(monkeypatch):
     assert choose_engine(FRAMES, FitConfig()) == "cpu"
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert choose_engine(FRAMES, FitConfig()) == "xla"
+    assert choose_engine(FRAMES, FitConfig()) == "pallas"
+    assert choose_engine(FRAMES, FitConfig(options=RenderOptions(alpha_ceiling=1.0))) == "xla"
     assert choose_engine(FRAMES, FitConfig(economy=Economy())) == "cpu"
     assert choose_engine(FRAMES, FitConfig(engine="cpu")) == "cpu"
     assert choose_engine(FRAMES, FitConfig(engine="pallas")) == "pallas"

@@ -18,7 +18,8 @@ from foldgauss._runtime import threads
 from foldgauss._runtime.machine import cpu_model
 from foldgauss._runtime.threads import available_cores, num_threads
 from foldgauss.io.media.resizing import memory_limit
-from foldgauss.render import ENGINES, Splats2D, render
+from foldgauss.render import ENGINES, RenderOptions, Splats2D, render
+from foldgauss.render.api import choose_engine
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.loop import fit
 from foldgauss.video.models.metrics import psnr
@@ -141,11 +142,10 @@ def _instructions() -> str:
 
 def find_engines() -> dict[str, Any]:
     devices = [f"{device.platform} {device.device_kind}" for device in jax.devices()]
-    backend = jax.default_backend()
     return {
         "engines": [name for name in ENGINES if name != "auto"],
         "jax_devices": sorted(set(devices)),
-        "auto": "cpu" if backend == "cpu" else "xla",
+        "auto": choose_engine(RenderOptions(), np.dtype(np.float32)),
         "gpu": any(device.platform not in ("cpu",) for device in jax.devices()),
     }
 
@@ -162,7 +162,8 @@ def moving_blob(num_frames: int = 6) -> np.ndarray:
 def run_trials() -> Iterator[Trial]:
     """Small trials of rendering and fitting. An error makes a trial fail."""
     images: dict[str, np.ndarray] = {}
-    for engine in ("reference", "xla", "cpu"):
+    on_gpu = ("pallas",) if jax.default_backend() == "gpu" else ()
+    for engine in ("reference", "xla", "cpu", *on_gpu):
         yield _run_trial(f"render an image, engine {engine}", lambda engine=engine: _render(engine, images))
     yield _run_trial("fit a clip of 6 frames", _fit)
 

@@ -357,7 +357,7 @@ class FitConfig:
     engine: str = field(
         default="auto",
         metadata=setting(
-            "Engine that computes the steps: cpu, or on a GPU xla or pallas; auto: cpu unless there is a GPU",
+            "Engine that computes the steps: cpu, or on a GPU pallas or xla; auto: cpu unless there is a GPU",
             "See docs/gpu.md; auto also takes cpu where a setting needs it.",
             choices=FIT_ENGINES,
             option="--engine",

@@ -309,9 +309,12 @@ def both_flows(
     return search.calc(one, other, None), search.calc(other, one, None)
 
 
+@functools.lru_cache(maxsize=4)
 def pixel_grid(rows: int, columns: int) -> Float32[np.ndarray, "rows columns 2"]:
-    """(x, y) of every pixel, centers at whole numbers, as in OpenCV."""
-    return np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).astype(np.float32)
+    """(x, y) of every pixel, centers at whole numbers, as in OpenCV; the array is shared and read-only."""
+    grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).astype(np.float32)
+    grid.setflags(write=False)
+    return grid
 
 
 def warp_image(image, origin, order: int = cv2.INTER_CUBIC) -> np.ndarray:

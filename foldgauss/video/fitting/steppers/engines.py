@@ -24,7 +24,7 @@ def choose_engine(frames: np.ndarray, config: FitConfig, state: FitState | None 
         return "cpu"
     unsupported = _find_unsupported(frames, config, state)
     if config.engine == "auto":
-        return "cpu" if unsupported else "xla"
+        return "cpu" if unsupported else "pallas" if pallas.is_preferred(config.options) else "xla"
     if unsupported:
         cure = "Give engine='cpu', which supports all settings."
         raise invalid("engine", expected=f"'cpu' with {unsupported}", got=repr(config.engine), cure=cure)

@@ -5,11 +5,13 @@ what that frame lacks, and are wrong half way to the next. Only the steps before
 interpolated frames; the others recover the quality at the frames, and lose a part only of what was gained between.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 from jaxtyping import Float32
 
+from foldgauss._runtime.threads import num_threads
 from foldgauss.video.fitting.config import FitConfig, chosen_interpolation
 from foldgauss.video.motion.optical_flow import Motion
 
@@ -35,6 +37,42 @@ class InterpolatedFrames:
     def interpolate(self, k: int, fraction: float, size: tuple[int, int]) -> Float32[np.ndarray, "height width 3"]:
         """The image at a fraction of the way from frame k to the next; values about [0, 1]."""
         return self.motion.interpolate(self.frames, k, fraction, size) * np.float32(1 / 255)
+
+
+class Prefetcher:
+    """Makes images of later steps on threads, while a device computes; the same bits as without.
+
+    Which views a step has may depend on the steps before it. An image that was not prepared, since its step was
+    expected to have other views, is made when it is needed.
+    """
+
+    def __init__(self, interpolation: InterpolatedFrames):
+        self.interpolation = interpolation
+        self._pool = ThreadPoolExecutor(num_threads(), thread_name_prefix="foldgauss-interpolation")
+        self._images: dict[tuple[int, int, tuple[int, int]], Future] = {}  # by step, frame and size
+
+    @property
+    def num_prepared(self) -> int:
+        """Of images that are kept."""
+        return len(self._images)
+
+    def prepare(self, step: int, progress: float, frames: Iterable[int], size: tuple[int, int]) -> None:
+        """Start to make the images that a step needs if these are its frames."""
+        for k in frames:
+            fraction = self.interpolation.choose(step, progress, k)
+            if fraction is not None and (step, k, size) not in self._images:
+                future = self._pool.submit(self.interpolation.interpolate, k, fraction, size)
+                self._images[step, k, size] = future
+
+    def interpolate(self, step: int, k: int, fraction: float, size: tuple[int, int]) -> np.ndarray:
+        """`InterpolatedFrames.interpolate` of a frame of a step."""
+        future = self._images.get((step, k, size))
+        return self.interpolation.interpolate(k, fraction, size) if future is None else future.result()
+
+    def drop(self, step: int) -> None:
+        """Forget the images of this step and of those before it."""
+        for key in [key for key in self._images if key[0] <= step]:
+            self._images.pop(key).cancel()
 
 
 def make_interpolated(

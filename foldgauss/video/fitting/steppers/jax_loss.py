@@ -64,4 +64,4 @@ def compute_losses(
 
 def _mean(x: Float[Array, "batch height width channels"]) -> Float[Array, " batch"]:
     """Mean over rows first: float32 sums of millions of pixels one by one would lose digits."""
-    return jnp.mean(jnp.mean(x, axis=2), axis=(1, 2))
+    return jnp.mean(jnp.mean(x, axis=(2, 3)), axis=1)

@@ -22,7 +22,7 @@ from foldgauss.video.fitting.schedule import (
     steps_per_pass,
 )
 from foldgauss.video.fitting.state import DeviceArrays, FitState, Sizes, frame_times
-from foldgauss.video.fitting.steppers.interpolated_frames import make_interpolated
+from foldgauss.video.fitting.steppers.interpolated_frames import Prefetcher, make_interpolated
 from foldgauss.video.fitting.steppers.jax_step import (
     Between,
     Control,
@@ -39,6 +39,8 @@ from foldgauss.video.motion.optical_flow import Motion, motion_finder
 #: A fit whose growth has no limit that it could reach has capacity for so many times the Gaussians of its start; where
 #: that is not enough it doubles, and steps are compiled anew.
 CAPACITY_FACTOR = 4
+#: Interpolated frames are prepared so many steps ahead: one takes some tenths of a second, a step on a GPU some ms.
+STEPS_AHEAD = 64
 _FIELDS = FitState.array_fields()
 
 
@@ -93,6 +95,8 @@ class JaxStepper:
         self.levels, self.rates = plan_levels(config, self.size), RateSchedule(config)
         self.steps_per_pass = steps_per_pass(config, self.num_frames)
         self.interpolation = make_interpolated(frames, config, self.find_motion)
+        self.prefetcher = None if self.interpolation is None else Prefetcher(self.interpolation)
+        self._prepared = 0  # steps
         self._no_targets: dict[tuple[int, int], jax.Array] = {}  # by size
         self.capacity = 0
         self.adopt(state)
@@ -140,6 +144,7 @@ class JaxStepper:
             time_rate=time_rate,
             between=self._interpolate(views, state.step, progress, self.levels[level].size),
         )
+        self._prepare(state, progress, self.levels[level].size)
         arrays, report = compile_step(self.programs[level])(held.arrays, self.images[level], control)
         report = jax.device_get(report)
         state.hold(HeldArrays(arrays, held.num, held.growing, report))
@@ -154,12 +159,23 @@ class JaxStepper:
         for n, k in enumerate(views % self.num_frames):
             fraction = self.interpolation.choose(step, progress, int(k))
             if fraction is not None:
-                fractions[n], targets[n] = fraction, self.interpolation.interpolate(int(k), fraction, size)
+                fractions[n], targets[n] = fraction, self.prefetcher.interpolate(step, int(k), fraction, size)
         if (fractions < 0).all():  # the device has zeros already
             if size not in self._no_targets:
                 self._no_targets[size] = jax.device_put(targets, replicated(self.programs[-1]))
             targets = self._no_targets[size]
         return Between(fractions, targets)
+
+    def _prepare(self, state: FitState, progress: float, size: tuple[int, int]) -> None:
+        """Have the interpolated frames of the next steps prepared, which are chosen by the errors as they are now."""
+        if self.prefetcher is None:
+            return
+        self.prefetcher.drop(state.step)
+        end = state.step + 1 + STEPS_AHEAD
+        for step in range(max(state.step + 1, self._prepared), end):
+            views = choose_views(self.config, self.num_frames, step, state.frame_errors)
+            self.prefetcher.prepare(step, progress, map(int, views % self.num_frames), size)
+        self._prepared = end
 
     def grow(self, state: FitState) -> None:
         """Densification on the host, where any is due."""
