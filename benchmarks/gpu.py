@@ -1,4 +1,4 @@
-"""A GPU's figures: drawing and its gradients, a fit against time, playback. None has been measured so far.
+"""A GPU's figures: rendering and its gradients, a fit against time, playback. Those measured: docs/gpu.md.
 
     python -m benchmarks.gpu [--json FILE] [--only engines quality playback] [--engines xla pallas cpu] [--minutes M]
                              [--gaussians N] [--looks N] [--rounds N]
