@@ -12,7 +12,7 @@ from foldgauss import FoldedGaussian, FoldedMixture, PolynomialFold
 from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.video import FitConfig, evaluate, fit
 
-pytestmark = pytest.mark.gpu
+pytestmark = [pytest.mark.gpu, pytest.mark.usefixtures("optimized")]
 CPU = jax.devices("cpu")[0]
 SIZE = (120, 200)
 
