@@ -109,10 +109,10 @@ class Curve:
 
 
 def run_to_end(clip: Clip, name: str, config: FitConfig, folder: Path) -> Run:
-    """A fit, continued after its checkpoint where there is one of the same settings and frames."""
+    """A fit, continued after its checkpoint where there is one. Raises ValueError for one of other settings or frames."""
     stem = name.replace(" ", "-").replace(",", "").replace(".", "_")
     checkpoint = Checkpoint(folder / f"{stem}.checkpoint", config, fingerprint(clip))
-    state = checkpoint.load(required=False)
+    state = checkpoint.load(required=True) if checkpoint.path.exists() else None
     curve = Curve(folder / f"{stem}.csv", state)
     where = "" if state is None else f" continues after step {state.step:,}"
     console.print(f"{name}{where}", style="dim", soft_wrap=True)

@@ -482,6 +482,8 @@ class TestReproduce:
             reproduce.run_to_end(clip, "parts", config, tmp_path)
         assert sorted(path.name for path in tmp_path.iterdir()) == ["parts.checkpoint", "parts.csv", "whole.csv"]
         monkeypatch.setattr(reproduce, "fit_steps", steps)
+        with pytest.raises(ValueError, match="expected seed=0"):  # never overwritten
+            reproduce.run_to_end(clip, "parts", dataclasses.replace(config, seed=1), tmp_path)
         again = reproduce.run_to_end(clip, "parts", config, tmp_path)
         assert (again["psnr"], again["gaussians"], again["steps"]) == (whole["psnr"], whole["gaussians"], 6)
         rows = [line.split(",")[:3] for line in (tmp_path / "parts.csv").read_text().splitlines()]
