@@ -109,7 +109,7 @@ class Curve:
 
 
 def run_to_end(clip: Clip, name: str, config: FitConfig, folder: Path) -> Run:
-    """A fit, continued after its checkpoint where there is one. Raises ValueError for one of other settings or frames."""
+    """A fit, continued after its checkpoint. Raises ValueError for a checkpoint of other settings or frames."""
     stem = name.replace(" ", "-").replace(",", "").replace(".", "_")
     checkpoint = Checkpoint(folder / f"{stem}.checkpoint", config, fingerprint(clip))
     state = checkpoint.load(required=True) if checkpoint.path.exists() else None

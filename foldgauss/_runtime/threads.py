@@ -17,6 +17,7 @@ from foldgauss._runtime.checks import invalid
 _lock = threading.Lock()
 _pool: ThreadPoolExecutor | None = None
 _num_threads: int | None = None
+_local = threading.local()  # `in_task`: whether this thread runs a task of several
 _forked = False  # whether this process was forked after JAX had started
 
 
@@ -98,11 +99,11 @@ def _call(task: Callable[[int], object], item: int) -> None:
 def run_tasks(task: Callable[[int], object], items: Iterable[int], *, serial: bool = False) -> None:
     """Call `task(item)` for every item on the pool, or all on this thread, and wait; the first error is raised here.
 
-    Tasks must not call `run_tasks`. If no more threads can be started, fewer are used.
+    What a task of several calls itself runs on its thread. If no more threads can be started, fewer are used.
     """
     global _pool
     items = list(items)
-    if serial or len(items) <= 1 or num_threads() == 1:
+    if serial or len(items) <= 1 or num_threads() == 1 or getattr(_local, "in_task", False):
         for item in items:
             _call(task, item)
         return
@@ -125,12 +126,14 @@ def run_tasks(task: Callable[[int], object], items: Iterable[int], *, serial: bo
                 if item is None:
                     return
                 in_work.append(None)
+            _local.in_task = True
             try:
                 _call(task, item)
             except BaseException as error:
                 errors.append(error)
                 raise
             finally:
+                _local.in_task = False
                 in_work.pop()
 
     all_known = True

@@ -9,6 +9,7 @@ import numpy as np
 import scipy
 from jaxtyping import UInt8
 
+from foldgauss._runtime.threads import run_tasks
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.fitting.growth import PUBLISHED_UNIT
 from foldgauss.video.models.splats import SH_C0, STATIC_LOG_TIME_SCALE, TAU_MAX, FoldedSplats
@@ -37,7 +38,7 @@ MISS, SHORTENING, SHORTENINGS = 0.7, 0.6, 4
 #: A pixel is constant whose color changes by less than this (of 1, root mean square over the channels) in any of so
 #: many frames.
 CONSTANT, CONSTANT_FRAMES = 0.03, 64
-CHUNK = 12_000  # tracks held at once: some 3 kB each on the way
+CHUNK = 12_000  # tracks held at once by each thread: some 3 kB each on the way
 #: Trial starts per frame, from which follows how long starts are visible: so many sigma_t to either side. In long clips
 #: at most `MAX_PILOTS` in all, since they would take longer than the fit.
 PILOT, CORE, ROUNDS, MAX_PILOTS = 32, 1.5, 50, 40_000
@@ -240,11 +241,12 @@ def follow_tracks(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Folds (num, degree, 2), in pixels per frame^k, and sigma_t (num,) in frames, of points at `home`."""
     coefficients, spread = np.empty((len(home), degree, 2), np.float32), np.empty(len(home))
-    for start in range(0, len(home), CHUNK):
+    fractions = np.exp(rng.uniform(*np.log(TRACK_FRACTIONS), len(home)))
+
+    def follow(start: int) -> None:
         part = slice(start, start + CHUNK)
         tracks = motion.follow(home[part], position[part].astype(np.float32))
-        fractions = np.exp(rng.uniform(*np.log(TRACK_FRACTIONS), len(tracks.known)))
-        wide = np.maximum(fractions * tracks.reach / 2, MIN_FRAMES)
+        wide = np.maximum(fractions[part] * tracks.reach / 2, MIN_FRAMES)
         wide[tracks.reach == 0] = UNTRACKED_FRAMES
         folds, miss = fit_folds(tracks, wide, degree)
         for _ in range(SHORTENINGS):
@@ -254,6 +256,8 @@ def follow_tracks(
             wide[off] = np.maximum(wide[off] * SHORTENING, MIN_FRAMES)
             folds[off], miss[off] = fit_folds(tracks[off], wide[off], degree)
         coefficients[part], spread[part] = folds, wide
+
+    run_tasks(follow, range(0, len(home), CHUNK))
     return coefficients, spread
 
 
