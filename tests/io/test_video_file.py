@@ -480,6 +480,21 @@ def test_alpha_of_images_is_kept_and_premultiplied(tmp_path, depth):
     assert not clip.frames[:, 36:].any()  # hidden colours are gone
 
 
+@pytest.mark.parametrize(("mode", "associated"), [("RGBA", 0), ("RGBA", 1), ("LA", 0), ("LA", 1)])
+def test_alpha_of_tiffs_is_premultiplied_once(tmp_path, mode, associated):
+    Image.new(mode, (4, 4), (100 if associated else 200,) * (len(mode) - 1) + (128,)).save(tmp_path / "a.tif")
+    tag = struct.pack("<HHI", 338, 3, 1)  # ExtraSamples: 2 is straight alpha, 1 is associated
+    data = (tmp_path / "a.tif").read_bytes()
+    assert data.count(tag + b"\2") == 1
+    (tmp_path / "a.tif").write_bytes(data.replace(tag + b"\2", tag + bytes([2 - associated])))
+    assert (read_video(tmp_path / "a.tif").frames == [100, 100, 100, 128]).all()
+
+
+def test_alpha_of_gray_pngs_with_a_transparent_level_is_kept(tmp_path):
+    Image.fromarray(np.array([[200, 100]], np.uint8)).save(tmp_path / "a.png", transparency=200)
+    assert read_video(tmp_path / "a.png").frames.tolist() == [[[[0] * 4, [100, 100, 100, 255]]]]
+
+
 def test_alpha_is_resized_with_the_colour_it_weighs(tmp_path):
     """A red pixel beside a hidden green one: half of the light, all of it red."""
     image = np.zeros((32, 32, 4), np.uint8)
