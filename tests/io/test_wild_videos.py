@@ -816,6 +816,18 @@ def _jpeg_of(height, width, progressive=0):
     return data[:at] + struct.pack(">HH", height, width) + data[at + 4 :]
 
 
+def _late_jpeg_of(height, width):
+    """The size follows 130,000 bytes of application data."""
+    data = _jpeg_of(height, width)
+    return data[:2] + 2 * (b"\xff\xe1" + struct.pack(">H", 65_000) + bytes(64_998)) + data[2:]
+
+
+def _tif_of(height, width):
+    tags = [(256, 4, 1, width), (257, 4, 1, height), (258, 3, 1, 8), (259, 3, 1, 1), (262, 3, 1, 1), (273, 4, 1, 8)]
+    entries = b"".join(struct.pack("<HHII", *tag) for tag in [*tags, (277, 3, 1, 1), (279, 4, 1, 16)])
+    return b"II*\0" + struct.pack("<I", 24) + bytes(16) + struct.pack("<H", 8) + entries + bytes(4)
+
+
 def _gif_of(height, width):
     return b"GIF89a" + struct.pack("<HH", width, height) + bytes(100)
 
@@ -830,11 +842,11 @@ def _bmp_of(height, width):
     return data[:18] + struct.pack("<ii", width, -height) + data[26:]
 
 
-@pytest.mark.parametrize("made", [_png_of, _jpeg_of, _gif_of, _webp_of, _bmp_of])
+@pytest.mark.parametrize("made", [_png_of, _jpeg_of, _late_jpeg_of, _tif_of, _gif_of, _webp_of, _bmp_of])
 @pytest.mark.parametrize("in_folder", [False, True])
 def test_huge_images_are_refused_by_their_header(tmp_path, monkeypatch, made, in_folder):
     monkeypatch.setattr(cv2, "imread", None)  # as memory is taken there
-    suffix = made.__name__[1:-3]
+    suffix = made.__name__[1:-3].removeprefix("late_")
     path = tmp_path / f"0.{suffix}"
     path.write_bytes(made(60_000, 65_000))
     if in_folder and suffix != "gif":  # whose frames are none of a folder

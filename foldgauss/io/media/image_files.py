@@ -201,7 +201,11 @@ def premultiply(image: np.ndarray) -> np.ndarray:
 
 def _check_image_header(path: Path, head: bytes) -> None:
     """Raise for an image whose header claims more pixels than are accepted, or than its bytes can hold."""
-    size = parse_image_size(head)
+    tags = _read_tiff_tags(path)
+    if {_HEIGHT, _WIDTH} <= tags.keys():
+        size = tags[_HEIGHT][0], tags[_WIDTH][0]
+    else:  # the size of a JPEG may follow any number of bytes about the camera
+        size = parse_image_size(path.read_bytes() if head.startswith(b"\xff\xd8") else head)
     check_num_pixels(path, size)
     if size is not None and path.stat().st_size < min_file_bytes(head, size):
         raise _undecodable_error(path)
