@@ -386,6 +386,24 @@ def test_sound_stays_with_the_frames_where_one_of_them_begins_later(tmp_path, vi
     assert _tones(path, [before, after])[1] == pytest.approx([440, 880], abs=10)
 
 
+def _tone_bytes(path, hertz, rate, layout):
+    """A second of sound as AAC without container."""
+    with av.open(str(path), "w", format="adts") as container:
+        stream = container.add_stream("aac", rate=rate, layout=layout)
+        samples = 0.3 * np.sin(2 * np.pi * hertz * np.arange(rate) / rate, dtype=np.float32)
+        frame = av.AudioFrame.from_ndarray(np.stack([samples] * stream.channels), format="fltp", layout=layout)
+        frame.sample_rate, frame.pts = rate, 0
+        container.mux([*stream.encode(frame), *stream.encode()])
+    return path.read_bytes()
+
+
+def test_sound_may_change_its_format(tmp_path):
+    source = tmp_path / "a.aac"
+    source.write_bytes(_tone_bytes(source, 440, 44_100, "stereo") + _tone_bytes(source, 880, 24_000, "mono"))
+    path = write_video(tmp_path / "a.mp4", _moving(16), 10, sound=Sound(source))
+    assert _tones(path, [0.3, 1.2])[1] == pytest.approx([440, 880], abs=10)
+
+
 def test_sound_that_is_none_is_refused(tmp_path, sound_file, clip_file):
     out = tmp_path / "a.mp4"
     for sound, words in (

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from fractions import Fraction
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -171,25 +172,34 @@ def encode_video(
 
 
 def _encode_sound(stream: av.AudioStream, sound: Sound) -> Iterator[av.Packet]:
-    """The packets of the sound, as they are asked for."""
-    with open_container(Path(sound.path), SOUND_DEMUXERS) as source:
-        of_file = source.streams.best("audio")
-        graph = Graph()
-        # atempo takes factors from 0.5 to 100; at 1 it would still shift the sound.
-        num = 0 if sound.speed == 1 else max(1, math.ceil(-math.log2(sound.speed)))
-        tempo = [("atempo", f"{sound.speed ** (1 / max(num, 1)):.9f}")] * num
-        begin = _first_shown(source, of_file) + sound.start
-        steps = [("atrim", f"start={begin:.6f}"), ("asetpts", f"PTS-({begin:.6f})/TB")]
-        steps += [("aresample", "async=1:first_pts=0"), *tempo]  # silence where there is none
-        steps += [("aformat", f"sample_fmts={stream.format.name}:sample_rates={SAMPLE_RATE}:channel_layouts=stereo")]
-        nodes = [graph.add(*step) for step in (*steps, ("abuffersink",))]
-        graph.link_nodes(graph.add_abuffer(template=of_file), *nodes).configure()
-        if stream.codec_context.frame_size:
-            graph.set_audio_frame_size(stream.codec_context.frame_size)
-        for frame in _decode_sound(source, of_file):
-            for filtered in filter_frame(graph, frame):
-                yield from stream.encode(filtered)
-        yield from stream.encode()
+    """The packets of the sound, as they are asked for. Raises `VideoError` where FFmpeg cannot convert it."""
+    try:
+        with open_container(Path(sound.path), SOUND_DEMUXERS) as source:
+            of_file = source.streams.best("audio")
+            # atempo takes factors from 0.5 to 100; at 1 it would still shift the sound.
+            num = 0 if sound.speed == 1 else max(1, math.ceil(-math.log2(sound.speed)))
+            tempo = [("atempo", f"{sound.speed ** (1 / max(num, 1)):.9f}")] * num
+            begin = _first_shown(source, of_file) + sound.start
+            steps = [("atrim", f"start={begin:.6f}"), ("asetpts", f"PTS-({begin:.6f})/TB")]
+            steps += [("aresample", "async=1:first_pts=0"), *tempo]  # silence where there is none
+            steps += [("aformat", f"sample_fmts={stream.format.name}")]
+            graph = _link_sound_filters(steps, SAMPLE_RATE, "fltp", "stereo", Fraction(1, SAMPLE_RATE))
+            if stream.codec_context.frame_size:
+                graph.set_audio_frame_size(stream.codec_context.frame_size)
+            for frame in chain(_unify_sound(source, of_file), [None]):
+                for filtered in filter_frame(graph, frame):
+                    yield from stream.encode(filtered)
+            yield from stream.encode()
+    except av.FFmpegError as error:
+        got, cure = f"{str(sound.path)!r} ({error.strerror})", "Convert it with ffmpeg, or leave it out."
+        raise video_error("sound", expected="sound that FFmpeg converts", got=got, cure=cure) from error
+
+
+def _link_sound_filters(steps: list[tuple[str, str]], rate: int, kind: str, layout: str, clock: Fraction) -> Graph:
+    graph = Graph()
+    source = graph.add_abuffer(sample_rate=rate, format=kind, layout=layout, time_base=clock)
+    graph.link_nodes(source, *(graph.add(*step) for step in (*steps, ("abuffersink",)))).configure()
+    return graph
 
 
 def _first_shown(source: av.container.InputContainer, of_file: av.AudioStream) -> float:
@@ -199,12 +209,22 @@ def _first_shown(source: av.container.InputContainer, of_file: av.AudioStream) -
     return float((stream.start_time or 0) * stream.time_base)
 
 
-def _decode_sound(source: av.container.InputContainer, stream: av.AudioStream) -> Iterator[av.AudioFrame | None]:
-    """The frames of sound that decode, and None at the end."""
+def _unify_sound(source: av.container.InputContainer, stream: av.AudioStream) -> Iterator[av.AudioFrame]:
+    """The frames of sound that decode, in one format, though that of the file may change."""
+    graph, of_graph = None, None
+    steps = [("aformat", f"sample_fmts=fltp:sample_rates={SAMPLE_RATE}:channel_layouts=stereo")]
+    steps += [("asettb", f"1/{SAMPLE_RATE}")]
     for packet in source.demux(stream):
+        found = []
         with suppress(av.FFmpegError):
-            yield from packet.decode()
-    yield None
+            found = packet.decode()
+        for frame in found:
+            kind = frame.sample_rate, frame.format.name, frame.layout.name
+            if kind != of_graph:
+                yield from filter_frame(graph, None)
+                graph, of_graph = _link_sound_filters(steps, *kind, stream.time_base), kind
+            yield from filter_frame(graph, frame)
+    yield from filter_frame(graph, None)
 
 
 def check_sound(sound: Sound) -> None:
