@@ -4,6 +4,7 @@ import os
 import struct
 import subprocess
 import sys
+import wave
 from fractions import Fraction
 
 import av
@@ -318,12 +319,16 @@ def test_a_smaller_crf_is_better_and_larger(tmp_path):
     assert errors[0] > errors[1] > errors[2]
 
 
-def _tones(path, at):
-    """Seconds of sound, and the frequency in Hz at each of the given seconds."""
+def _samples(path):
     with av.open(str(path)) as container:
         resampler = av.AudioResampler(format="flt", layout="mono", rate=48_000)
         parts = [part.to_ndarray() for frame in container.decode(audio=0) for part in resampler.resample(frame)]
-    samples = np.concatenate(parts, 1)[0]
+    return np.concatenate(parts, 1)[0]
+
+
+def _tones(path, at):
+    """Seconds of sound, and the frequency in Hz at each of the given seconds."""
+    samples = _samples(path)
     chosen = [samples[int(48_000 * second) :][:9600] for second in at]
     return len(samples) / 48_000, [5 * int(np.abs(np.fft.rfft(part * np.hanning(9600))).argmax()) for part in chosen]
 
@@ -384,6 +389,22 @@ def test_sound_stays_with_the_frames_where_one_of_them_begins_later(tmp_path, vi
     path = write_video(tmp_path / "b.mp4", frames, 10, sound=Sound(source))
     before, after = 0.7 - video_from, 1.05 - video_from
     assert _tones(path, [before, after])[1] == pytest.approx([440, 880], abs=10)
+
+
+@pytest.mark.parametrize("speed", [1.0, 0.5, 0.25])
+def test_stretched_sound_stays_with_the_frames(tmp_path, speed):
+    """Clicks, on average within 6 ms of the source, in which they are 83 ms apart."""
+    source, clicks = tmp_path / "a.wav", 0.2 + np.arange(20) / 12
+    samples = np.zeros(96_000, "<i2")
+    samples[np.rint(48_000 * clicks).astype(int)] = 32_000
+    with wave.open(str(source), "wb") as file:
+        file.setparams((1, 2, 48_000, 0, "NONE", ""))
+        file.writeframes(samples.tobytes())
+    path = write_video(tmp_path / "a.mp4", _moving(int(20 / speed)), 10, sound=Sound(source, 0.0, speed))
+    heard = np.abs(_samples(path))
+    windows = [(int(48_000 * (click - 0.04) / speed), int(48_000 * (click + 0.04) / speed)) for click in clicks]
+    found = np.array([first + heard[first:stop].argmax() for first, stop in windows]) / 48_000
+    assert abs((speed * found - clicks).mean()) < 0.006
 
 
 def _tone_bytes(path, hertz, rate, layout):

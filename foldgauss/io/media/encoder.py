@@ -69,6 +69,8 @@ CODECS = {
 #: The codec of each extension unless one is given.
 DEFAULT_CODECS = {".mp4": "h264", ".webm": "vp9", ".mov": "prores", ".mkv": "ffv1"}
 SAMPLE_RATE = 48_000
+#: Seconds of the source by which atempo is early, measured below speed 1: clicks by 12 +- 8 ms, noise 15, tones 7.
+TEMPO_LEAD = 0.012
 VIDEO_SUFFIXES = tuple(DEFAULT_CODECS)
 
 
@@ -179,7 +181,7 @@ def _encode_sound(stream: av.AudioStream, sound: Sound) -> Iterator[av.Packet]:
             # atempo takes factors from 0.5 to 100; at 1 it would still shift the sound.
             num = 0 if sound.speed == 1 else max(1, math.ceil(-math.log2(sound.speed)))
             tempo = [("atempo", f"{sound.speed ** (1 / max(num, 1)):.9f}")] * num
-            begin = _first_shown(source, of_file) + sound.start
+            begin = _first_shown(source, of_file) + sound.start - (TEMPO_LEAD if num else 0)
             steps = [("atrim", f"start={begin:.6f}"), ("asetpts", f"PTS-({begin:.6f})/TB")]
             steps += [("aresample", "async=1:first_pts=0"), *tempo]  # silence where there is none
             steps += [("aformat", f"sample_fmts={stream.format.name}")]
