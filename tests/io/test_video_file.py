@@ -676,7 +676,7 @@ def test_bad_size(clip_file, size):
     _one_line(caught, "size: expected", f"{size[0]}x{size[1]}")
 
 
-@pytest.mark.parametrize("fps", [0, -1, float("nan"), float("inf")])
+@pytest.mark.parametrize("fps", [0, 1e-6, -1, float("nan"), float("inf")])
 def test_bad_rate(tmp_path, clip_file, fps):
     with pytest.raises(VideoError, match="fps"):
         read_video(clip_file, fps=fps)

@@ -52,7 +52,7 @@ def write_video(
     frames per second, which browsers slow down, are refused. An animated WebP has 4:2:0 at quality 90.
 
     A path without extension, or an existing folder, goes to `write_frames`, with `overwrite` and `image_format`; an
-    existing *file* is replaced. `fps` is in (0, 1000].
+    existing *file* is replaced. `fps` is in [1e-5, 1000].
 
     Raises `VideoError` for another extension, no frames, or frames of other shapes or types, or which the codec does
     not take; ValueError for options that do not fit together; `OutputError` where the path cannot be written.
