@@ -879,7 +879,9 @@ def test_other_extensions_list_the_choices(tmp_path, name):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", ["missing/out.mp4", "missing/out", "file/out.webm", "file"])
+@pytest.mark.parametrize(
+    "name", ["missing/out.mp4", "missing/out", "file/out.webm", "file", 256 * "n", 256 * "n" + ".mp4"]
+)
 def test_output_that_cannot_be_written(tmp_path, name):
     (tmp_path / "file").write_text("a file")
     with pytest.raises(OutputError) as caught:

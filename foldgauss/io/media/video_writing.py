@@ -1,5 +1,6 @@
 """Writing clips: videos, animations, folders of images and single images."""
 
+import os
 from collections.abc import Iterable, Iterator
 from itertools import chain
 from pathlib import Path
@@ -69,7 +70,7 @@ def write_video(
     if given and suffix not in VIDEO_SUFFIXES:
         got, cure = repr(path.name), f"Take {', '.join(VIDEO_SUFFIXES)}."
         raise video_error(given[0], expected="a video file for it", got=got, cure=cure)
-    if path.is_dir() or not path.suffix:
+    if os.path.isdir(path) or not path.suffix:  # not Path's, which raises for a name that is too long
         return write_frames(path, frames, overwrite=overwrite, image_format=image_format)
     if suffix in ANIMATION_SUFFIXES:
         return _write_animation(path, suffix, frames, float(fps))
