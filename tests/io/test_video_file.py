@@ -426,8 +426,16 @@ def test_sound_may_change_its_format(tmp_path):
 
 
 def test_sound_that_is_none_is_refused(tmp_path, sound_file, clip_file):
-    out = tmp_path / "a.mp4"
+    out, unknown = tmp_path / "a.mp4", tmp_path / "b.mkv"
+    with av.open(str(unknown), "w") as container:
+        stream = container.add_stream("pcm_s16le", rate=8000, layout="mono")
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 8000), np.int16), "s16", "mono")
+        frame.sample_rate = 8000
+        container.mux(stream.encode(frame))
+    unknown.write_bytes(unknown.read_bytes().replace(b"A_PCM/INT/LIT", b"A_XYZ/INT/LIT"))
     for sound, words in (
+        (Sound(unknown), ("sound: expected a file with sound", "whose codec is known")),
+        (Sound(tmp_path), ("sound: expected a file with sound", "does not open")),
         (Sound(clip_file), ("sound: expected a file with sound", "clip.webm")),
         (Sound(__file__), ("sound: expected a file with sound", "does not open")),
         (Sound(sound_file, -1.0), ("sound.start", "-1.0")),

@@ -240,10 +240,11 @@ def check_sound(sound: Sound) -> None:
         expected, cure = "a speed from 0.01 to 100", "Leave sound out."
         raise invalid("sound.speed", expected=expected, got=f"{sound.speed:g}", cure=cure)
     got = f"{str(sound.path)!r}, which does not open"
-    with suppress(VideoError), open_container(check_readable(sound.path), SOUND_DEMUXERS) as source:
-        if source.streams.audio:
+    path = check_readable(sound.path)
+    with suppress(VideoError, IsADirectoryError, PermissionError), open_container(path, SOUND_DEMUXERS) as source:
+        if getattr(source.streams.best("audio"), "codec_context", None) is not None:
             return
-        got = f"{str(sound.path)!r}, which has none"
+        got = f"{str(sound.path)!r}, which has none{' whose codec is known here' if source.streams.audio else ''}"
     raise video_error("sound", expected="a file with sound", got=got, cure="Leave it out.")
 
 
