@@ -426,6 +426,12 @@ def test_interlaced_is_refused_or_converted(tmp_path, codec):
         assert np.abs(clip.frames - expected.astype(int)).mean() < 8
 
 
+def test_frames_too_small_to_deinterlace_are_refused(tmp_path):
+    options = ("-vf", "setfield=tff", "-c:v", "ffv1", "-flags", "+ildct")
+    _ffmpeg(*options, tmp_path / "a.mkv", frames=_noise(2, 4, 2), rate=25)
+    _refused(tmp_path / "a.mkv", "bwdif", "4x2 (height x width)", "a.mkv")
+
+
 def test_fields_of_different_times_are_separated(tmp_path):
     """A bar that moves between the fields is torn into a comb; converted, its rows agree."""
     rows = np.arange(64)
