@@ -391,6 +391,29 @@ def test_sound_stays_with_the_frames_where_one_of_them_begins_later(tmp_path, vi
     assert _tones(path, [before, after])[1] == pytest.approx([440, 880], abs=10)
 
 
+def test_sound_of_a_stream_cut_between_key_frames_stays_with_the_frames(tmp_path):
+    """The tone rises at 3 s; the first frame that decodes is that at 2 s."""
+    source = tmp_path / "a.ts"
+    with av.open(str(source), "w") as container:
+        options = {"g": "20", "x264-params": "scenecut=0"}
+        video = container.add_stream("libx264", rate=10, options=options, height=48, width=64)
+        sound = container.add_stream("aac", rate=48_000, layout="mono")
+        for number, image in enumerate(_moving(40)):
+            container.mux(video.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+            seconds = number / 10 + np.arange(4800) / 48_000
+            samples = 0.3 * np.sin(2 * np.pi * seconds * (440 if number < 30 else 880), dtype=np.float32)
+            frame = av.AudioFrame.from_ndarray(samples[None], format="fltp", layout="mono")
+            frame.sample_rate, frame.pts = 48_000, 4800 * number
+            container.mux(sound.encode(frame))
+        container.mux([*video.encode(), *sound.encode()])
+    data = source.read_bytes()
+    source.write_bytes(data[188 * (len(data) // 188 // 3) :])
+    frames = read_video(source).frames
+    assert len(frames) == 20
+    path = write_video(tmp_path / "b.mp4", frames, 10, sound=Sound(source))
+    assert _tones(path, [0.7, 1.1])[1] == pytest.approx([440, 880], abs=10)
+
+
 @pytest.mark.parametrize("speed", [1.0, 0.5, 0.25])
 def test_stretched_sound_stays_with_the_frames(tmp_path, speed):
     """Clicks, on average within 6 ms of the source, in which they are 83 ms apart."""

@@ -4,7 +4,7 @@ import math
 import os
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from contextlib import closing, suppress
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
@@ -14,12 +14,11 @@ from typing import NamedTuple
 import av
 import numpy as np
 from av.filter import Graph
-from av.stream import Disposition
 from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.io.media.clip import PathLike, VideoError, check_readable, video_error
-from foldgauss.io.media.decoder import CONVERSION, filter_frame, open_container
+from foldgauss.io.media.decoder import CONVERSION, VideoDecoder, filter_frame, open_container
 from foldgauss.io.media.format_detection import SOUND_DEMUXERS
 
 os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 writes to stderr
@@ -181,7 +180,7 @@ def _encode_sound(stream: av.AudioStream, sound: Sound) -> Iterator[av.Packet]:
             # atempo takes factors from 0.5 to 100; at 1 it would still shift the sound.
             num = 0 if sound.speed == 1 else max(1, math.ceil(-math.log2(sound.speed)))
             tempo = [("atempo", f"{sound.speed ** (1 / max(num, 1)):.9f}")] * num
-            begin = _first_shown(source, of_file) + sound.start - (TEMPO_LEAD if num else 0)
+            begin = _first_shown(Path(sound.path), of_file) + sound.start - (TEMPO_LEAD if num else 0)
             steps = [("atrim", f"start={begin:.6f}"), ("asetpts", f"PTS-({begin:.6f})/TB")]
             steps += [("aresample", "async=1:first_pts=0"), *tempo]  # silence where there is none
             steps += [("aformat", f"sample_fmts={stream.format.name}")]
@@ -204,11 +203,11 @@ def _link_sound_filters(steps: list[tuple[str, str]], rate: int, kind: str, layo
     return graph
 
 
-def _first_shown(source: av.container.InputContainer, of_file: av.AudioStream) -> float:
-    """The time stamp in seconds of the first frame of the video, or of the first sound where there is no video."""
-    moving = (one for one in source.streams.video if not one.disposition & Disposition.attached_pic)
-    stream = next(moving, of_file)
-    return float((stream.start_time or 0) * stream.time_base)
+def _first_shown(path: Path, of_file: av.AudioStream) -> float:
+    """The time stamp in seconds of the first frame that decodes, or of the first sound where there is no video."""
+    with suppress(VideoError, StopIteration), closing(VideoDecoder(path)) as decoder:
+        return float(next(decoder.frames()).stamp * decoder.time_base)
+    return float((of_file.start_time or 0) * of_file.time_base)
 
 
 def _unify_sound(source: av.container.InputContainer, stream: av.AudioStream) -> Iterator[av.AudioFrame]:
