@@ -49,6 +49,8 @@ VERSION = 2
 _FIXED = len(MAGIC) + 12
 #: Limit of numbers per byte, so that a small file cannot claim much memory; files are padded with spaces. Clips need 1.
 _MOST_PER_BYTE = 32
+#: A file may have so many in any case: earlier versions wrote alike Gaussians without padding.
+_ALWAYS_ALLOWED = 1 << 18
 _SIDE = 1 << 20  # largest side of an image: a decoder holds it in memory
 
 
@@ -181,7 +183,8 @@ def _decode(header: dict, body: bytes, whole_length: int) -> Quantized:
     num, num_frames = info.num_gaussians, header["num_frames"]
     _check(is_integer(num_frames, 1), "num_frames", num_frames)
     names = column_names(info.degree, info.shared)
-    _check(num * len(names) + num_frames <= _MOST_PER_BYTE * whole_length, "num_gaussians", num)
+    most = max(_MOST_PER_BYTE * whole_length, _ALWAYS_ALLOWED)
+    _check(num * len(names) + num_frames <= most, "num_gaussians", num)
     descriptions = header["columns"]
     _check(isinstance(descriptions, list) and len(descriptions) == len(names), "columns", "others")
     lengths = [own[0] for own in descriptions] + [header["intervals"]]
