@@ -48,6 +48,8 @@ def _check_target(path: Path) -> None:
         )
     if not path.parent.is_dir():
         raise OutputError(f"path: expected a folder, got the file {str(path.parent)!r}. Choose another path.")
+    with translate_output_errors(path), suppress(FileNotFoundError):
+        os.lstat(path)  # raises for a name that is too long for `path`, though not for the temporary file
 
 
 def temporary_name(path: Path, suffix: str) -> Path:
@@ -97,8 +99,6 @@ def _name_output(path: Path, temporary: Path) -> Iterator[None]:
 def _new_file(path: Path) -> Path:
     """Create the empty temporary file that is to become `path`."""
     _check_target(path)
-    with translate_output_errors(path), suppress(FileNotFoundError):
-        os.lstat(path)  # raises for a name that is too long for `path`, though not for the temporary file
     # os.path, not Path: it returns False for any OSError, and opening then reports the reason.
     if os.path.exists(path) and not os.path.isfile(path):
         raise OutputError(f"path: expected a file's path, got {str(path)!r}, which is not a regular file.")

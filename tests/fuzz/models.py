@@ -441,7 +441,7 @@ COMPACT = Target(
         "foldgauss.io.models.range_coder": ("encode",),
     },
     _compact_body,
-    lambda size: 4 * CONSTANT + 20_000 * size,  # a byte may hold 8 Gaussians of 16 powers: the format's own limit
+    lambda size: 4 * CONSTANT + 2_000 * size,  # a byte may hold 32 numbers: the format's own limit
     (numbers_changed, stream_changed, compact_header_changed),
     past_header=1,
     share=0.25,

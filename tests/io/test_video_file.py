@@ -4,6 +4,7 @@ import os
 import struct
 import subprocess
 import sys
+import wave
 from fractions import Fraction
 
 import av
@@ -318,12 +319,16 @@ def test_a_smaller_crf_is_better_and_larger(tmp_path):
     assert errors[0] > errors[1] > errors[2]
 
 
-def _tones(path, at):
-    """Seconds of sound, and the frequency in Hz at each of the given seconds."""
+def _samples(path):
     with av.open(str(path)) as container:
         resampler = av.AudioResampler(format="flt", layout="mono", rate=48_000)
         parts = [part.to_ndarray() for frame in container.decode(audio=0) for part in resampler.resample(frame)]
-    samples = np.concatenate(parts, 1)[0]
+    return np.concatenate(parts, 1)[0]
+
+
+def _tones(path, at):
+    """Seconds of sound, and the frequency in Hz at each of the given seconds."""
+    samples = _samples(path)
     chosen = [samples[int(48_000 * second) :][:9600] for second in at]
     return len(samples) / 48_000, [5 * int(np.abs(np.fft.rfft(part * np.hanning(9600))).argmax()) for part in chosen]
 
@@ -386,9 +391,74 @@ def test_sound_stays_with_the_frames_where_one_of_them_begins_later(tmp_path, vi
     assert _tones(path, [before, after])[1] == pytest.approx([440, 880], abs=10)
 
 
+def test_sound_of_a_stream_cut_between_key_frames_stays_with_the_frames(tmp_path):
+    """The tone rises at 3 s; the first frame that decodes is that at 2 s."""
+    source = tmp_path / "a.ts"
+    with av.open(str(source), "w") as container:
+        options = {"g": "20", "x264-params": "scenecut=0"}
+        video = container.add_stream("libx264", rate=10, options=options, height=48, width=64)
+        sound = container.add_stream("aac", rate=48_000, layout="mono")
+        for number, image in enumerate(_moving(40)):
+            container.mux(video.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+            seconds = number / 10 + np.arange(4800) / 48_000
+            samples = 0.3 * np.sin(2 * np.pi * seconds * (440 if number < 30 else 880), dtype=np.float32)
+            frame = av.AudioFrame.from_ndarray(samples[None], format="fltp", layout="mono")
+            frame.sample_rate, frame.pts = 48_000, 4800 * number
+            container.mux(sound.encode(frame))
+        container.mux([*video.encode(), *sound.encode()])
+    data = source.read_bytes()
+    source.write_bytes(data[188 * (len(data) // 188 // 3) :])
+    frames = read_video(source).frames
+    assert len(frames) == 20
+    path = write_video(tmp_path / "b.mp4", frames, 10, sound=Sound(source))
+    assert _tones(path, [0.7, 1.1])[1] == pytest.approx([440, 880], abs=10)
+
+
+@pytest.mark.parametrize("speed", [1.0, 0.5, 0.25])
+def test_stretched_sound_stays_with_the_frames(tmp_path, speed):
+    """Clicks, on average within 6 ms of the source, in which they are 83 ms apart."""
+    source, clicks = tmp_path / "a.wav", 0.2 + np.arange(20) / 12
+    samples = np.zeros(96_000, "<i2")
+    samples[np.rint(48_000 * clicks).astype(int)] = 32_000
+    with wave.open(str(source), "wb") as file:
+        file.setparams((1, 2, 48_000, 0, "NONE", ""))
+        file.writeframes(samples.tobytes())
+    path = write_video(tmp_path / "a.mp4", _moving(int(20 / speed)), 10, sound=Sound(source, 0.0, speed))
+    heard = np.abs(_samples(path))
+    windows = [(int(48_000 * (click - 0.04) / speed), int(48_000 * (click + 0.04) / speed)) for click in clicks]
+    found = np.array([first + heard[first:stop].argmax() for first, stop in windows]) / 48_000
+    assert abs((speed * found - clicks).mean()) < 0.006
+
+
+def _tone_bytes(path, hertz, rate, layout):
+    """A second of sound as AAC without container."""
+    with av.open(str(path), "w", format="adts") as container:
+        stream = container.add_stream("aac", rate=rate, layout=layout)
+        samples = 0.3 * np.sin(2 * np.pi * hertz * np.arange(rate) / rate, dtype=np.float32)
+        frame = av.AudioFrame.from_ndarray(np.stack([samples] * stream.channels), format="fltp", layout=layout)
+        frame.sample_rate, frame.pts = rate, 0
+        container.mux([*stream.encode(frame), *stream.encode()])
+    return path.read_bytes()
+
+
+def test_sound_may_change_its_format(tmp_path):
+    source = tmp_path / "a.aac"
+    source.write_bytes(_tone_bytes(source, 440, 44_100, "stereo") + _tone_bytes(source, 880, 24_000, "mono"))
+    path = write_video(tmp_path / "a.mp4", _moving(16), 10, sound=Sound(source))
+    assert _tones(path, [0.3, 1.2])[1] == pytest.approx([440, 880], abs=10)
+
+
 def test_sound_that_is_none_is_refused(tmp_path, sound_file, clip_file):
-    out = tmp_path / "a.mp4"
+    out, unknown = tmp_path / "a.mp4", tmp_path / "b.mkv"
+    with av.open(str(unknown), "w") as container:
+        stream = container.add_stream("pcm_s16le", rate=8000, layout="mono")
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 8000), np.int16), "s16", "mono")
+        frame.sample_rate = 8000
+        container.mux(stream.encode(frame))
+    unknown.write_bytes(unknown.read_bytes().replace(b"A_PCM/INT/LIT", b"A_XYZ/INT/LIT"))
     for sound, words in (
+        (Sound(unknown), ("sound: expected a file with sound", "whose codec is known")),
+        (Sound(tmp_path), ("sound: expected a file with sound", "does not open")),
         (Sound(clip_file), ("sound: expected a file with sound", "clip.webm")),
         (Sound(__file__), ("sound: expected a file with sound", "does not open")),
         (Sound(sound_file, -1.0), ("sound.start", "-1.0")),
@@ -478,6 +548,21 @@ def test_alpha_of_images_is_kept_and_premultiplied(tmp_path, depth):
     np.testing.assert_array_equal(clip.over_black[:, :24], _moving(3)[:, :24])
     np.testing.assert_allclose(clip.over_black[:, 24:36], _moving(3)[:, 24:36] * 0.2, atol=0.51)
     assert not clip.frames[:, 36:].any()  # hidden colours are gone
+
+
+@pytest.mark.parametrize(("mode", "associated"), [("RGBA", 0), ("RGBA", 1), ("LA", 0), ("LA", 1)])
+def test_alpha_of_tiffs_is_premultiplied_once(tmp_path, mode, associated):
+    Image.new(mode, (4, 4), (100 if associated else 200,) * (len(mode) - 1) + (128,)).save(tmp_path / "a.tif")
+    tag = struct.pack("<HHI", 338, 3, 1)  # ExtraSamples: 2 is straight alpha, 1 is associated
+    data = (tmp_path / "a.tif").read_bytes()
+    assert data.count(tag + b"\2") == 1
+    (tmp_path / "a.tif").write_bytes(data.replace(tag + b"\2", tag + bytes([2 - associated])))
+    assert (read_video(tmp_path / "a.tif").frames == [100, 100, 100, 128]).all()
+
+
+def test_alpha_of_gray_pngs_with_a_transparent_level_is_kept(tmp_path):
+    Image.fromarray(np.array([[200, 100]], np.uint8)).save(tmp_path / "a.png", transparency=200)
+    assert read_video(tmp_path / "a.png").frames.tolist() == [[[[0] * 4, [100, 100, 100, 255]]]]
 
 
 def test_alpha_is_resized_with_the_colour_it_weighs(tmp_path):
@@ -622,7 +707,7 @@ def test_bad_size(clip_file, size):
     _one_line(caught, "size: expected", f"{size[0]}x{size[1]}")
 
 
-@pytest.mark.parametrize("fps", [0, -1, float("nan"), float("inf")])
+@pytest.mark.parametrize("fps", [0, 1e-6, -1, float("nan"), float("inf")])
 def test_bad_rate(tmp_path, clip_file, fps):
     with pytest.raises(VideoError, match="fps"):
         read_video(clip_file, fps=fps)
@@ -825,7 +910,9 @@ def test_other_extensions_list_the_choices(tmp_path, name):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", ["missing/out.mp4", "missing/out", "file/out.webm", "file"])
+@pytest.mark.parametrize(
+    "name", ["missing/out.mp4", "missing/out", "file/out.webm", "file", 256 * "n", 256 * "n" + ".mp4"]
+)
 def test_output_that_cannot_be_written(tmp_path, name):
     (tmp_path / "file").write_text("a file")
     with pytest.raises(OutputError) as caught:

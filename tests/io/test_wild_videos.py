@@ -426,6 +426,12 @@ def test_interlaced_is_refused_or_converted(tmp_path, codec):
         assert np.abs(clip.frames - expected.astype(int)).mean() < 8
 
 
+def test_frames_too_small_to_deinterlace_are_refused(tmp_path):
+    options = ("-vf", "setfield=tff", "-c:v", "ffv1", "-flags", "+ildct")
+    _ffmpeg(*options, tmp_path / "a.mkv", frames=_noise(2, 4, 2), rate=25)
+    _refused(tmp_path / "a.mkv", "bwdif", "4x2 (height x width)", "a.mkv")
+
+
 def test_fields_of_different_times_are_separated(tmp_path):
     """A bar that moves between the fields is torn into a comb; converted, its rows agree."""
     rows = np.arange(64)
@@ -816,6 +822,18 @@ def _jpeg_of(height, width, progressive=0):
     return data[:at] + struct.pack(">HH", height, width) + data[at + 4 :]
 
 
+def _late_jpeg_of(height, width):
+    """The size follows 130,000 bytes of application data."""
+    data = _jpeg_of(height, width)
+    return data[:2] + 2 * (b"\xff\xe1" + struct.pack(">H", 65_000) + bytes(64_998)) + data[2:]
+
+
+def _tif_of(height, width):
+    tags = [(256, 4, 1, width), (257, 4, 1, height), (258, 3, 1, 8), (259, 3, 1, 1), (262, 3, 1, 1), (273, 4, 1, 8)]
+    entries = b"".join(struct.pack("<HHII", *tag) for tag in [*tags, (277, 3, 1, 1), (279, 4, 1, 16)])
+    return b"II*\0" + struct.pack("<I", 24) + bytes(16) + struct.pack("<H", 8) + entries + bytes(4)
+
+
 def _gif_of(height, width):
     return b"GIF89a" + struct.pack("<HH", width, height) + bytes(100)
 
@@ -830,11 +848,11 @@ def _bmp_of(height, width):
     return data[:18] + struct.pack("<ii", width, -height) + data[26:]
 
 
-@pytest.mark.parametrize("made", [_png_of, _jpeg_of, _gif_of, _webp_of, _bmp_of])
+@pytest.mark.parametrize("made", [_png_of, _jpeg_of, _late_jpeg_of, _tif_of, _gif_of, _webp_of, _bmp_of])
 @pytest.mark.parametrize("in_folder", [False, True])
 def test_huge_images_are_refused_by_their_header(tmp_path, monkeypatch, made, in_folder):
     monkeypatch.setattr(cv2, "imread", None)  # as memory is taken there
-    suffix = made.__name__[1:-3]
+    suffix = made.__name__[1:-3].removeprefix("late_")
     path = tmp_path / f"0.{suffix}"
     path.write_bytes(made(60_000, 65_000))
     if in_folder and suffix != "gif":  # whose frames are none of a folder

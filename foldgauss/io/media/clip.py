@@ -12,7 +12,7 @@ import numpy as np
 from foldgauss._runtime.checks import invalid, is_within
 from foldgauss.io._atomic import check_path, missing_error
 from foldgauss.io.media.format_detection import HEAD_BYTES
-from foldgauss.io.media.frame_rate import MAX_FPS, FrameRate
+from foldgauss.io.media.frame_rate import MAX_FPS, MIN_FPS, FrameRate
 
 MAX_PIXELS = 1 << 28  # of one image, 16384x16384: a header may claim any size
 VIDEO = "a video file or a folder of images"
@@ -135,8 +135,8 @@ def check_frame_size(size: tuple[int, int] | None, parameter: str = "size") -> t
 
 
 def check_fps(fps: float) -> None:
-    if not is_within(fps, f"(0, {MAX_FPS}]"):
-        raise video_error("fps", expected=f"a rate in (0, {MAX_FPS:g}]", got=repr(fps), cure="Try 25.")
+    if not is_within(fps, f"[{MIN_FPS}, {MAX_FPS}]"):
+        raise video_error("fps", expected=f"a rate in [{MIN_FPS:g}, {MAX_FPS:g}]", got=repr(fps), cure="Try 25.")
 
 
 def check_num_pixels(path: Path, size: tuple[int, int] | None) -> None:

@@ -215,7 +215,12 @@ class VideoDecoder:
             kind = frame.height, frame.width, frame.format.name
             if graph is None or kind != of_graph:
                 yield from filter_frame(graph, None)
-                graph, of_graph, self.has_converted = _make_deinterlacer(frame, self.time_base), kind, True
+                try:
+                    graph, of_graph, self.has_converted = _make_deinterlacer(frame, self.time_base), kind, True
+                except av.FFmpegError as error:  # bwdif takes at least 3 rows and columns of each channel
+                    got = f"interlaced ones of {frame.height}x{frame.width} (height x width) in {str(self._path)!r}"
+                    cure = "Convert it with ffmpeg."
+                    raise video_error("path", expected="frames that bwdif takes", got=got, cure=cure) from error
             yield from filter_frame(graph, frame)
         yield from filter_frame(graph, None)
 

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 DEFAULT_FPS = 25.0  # of a folder of images, and of a container without a usable rate
+MIN_FPS = 1e-5  # encoders take it as a fraction with a denominator of at most 100,000
 MAX_FPS = 1000.0  # time stamps of many containers are milliseconds
 #: Fraction of a frame interval. Times that deviate less from an even grid count as even: time stamps are rounded, in a
 #: GIF to 10 ms.

@@ -5,13 +5,14 @@ import re
 import struct
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import count, islice
 from pathlib import Path
 
 import cv2
 import numpy as np
 from PIL import Image
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from foldgauss.io.media.clip import (
     ReadResult,
@@ -32,6 +33,7 @@ GIF_DELAY = 100.0  # milliseconds for which browsers show a frame that has no du
 MAX_FRAMES = 1_000_000  # of an animation
 #: OpenCV's LOG_LEVEL_SILENT, which has no name up to OpenCV 4.
 _LOG_LEVEL_SILENT = 0
+_WIDTH, _HEIGHT, _BITS, _EXTRA_SAMPLES = 256, 257, 258, 338  # tags of a TIFF
 #: What Pillow raises for damaged files.
 _PILLOW_ERRORS = (
     EOFError,
@@ -155,8 +157,40 @@ def read_image(path: Path) -> np.ndarray:
         got, cure = f"{image.dtype} in {str(path)!r}", "Convert it to an 8-bit PNG."
         raise video_error("path", expected="images of 8 or 16 bits", got=got, cure=cure)
     if image.ndim == 2:
-        return cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
-    return premultiply(image) if image.shape[2] == 4 else image
+        with_alpha = _read_gray_with_alpha(path)
+        return cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if with_alpha is None else with_alpha
+    return premultiply(image) if image.shape[2] == 4 and not _is_premultiplied(path) else image
+
+
+def _is_premultiplied(path: Path) -> bool:
+    """Whether OpenCV returns colors times alpha: for a TIFF that declares it, unless it is straight and of 16 bits."""
+    tags = _read_tiff_tags(path)
+    return tags.get(_EXTRA_SAMPLES) == [1] or (tags.get(_EXTRA_SAMPLES) == [2] and tags.get(_BITS, [8])[0] == 8)
+
+
+def _read_gray_with_alpha(path: Path) -> np.ndarray | None:
+    """Premultiplied BGRA of a gray PNG or TIFF with alpha, which OpenCV drops; None without alpha, or where Pillow
+    cannot read it, as 16 bits."""
+    with (
+        suppress(*_PILLOW_ERRORS),
+        warnings.catch_warnings(action="ignore"),
+        Image.open(path, formats=("PNG", "TIFF")) as image,
+    ):
+        if image.mode in ("La", "LA") or "transparency" in image.info:
+            return premultiply(np.asarray(image.convert("LA").convert("RGBA")))
+    return None
+
+
+def _read_tiff_tags(path: Path) -> dict[int, list[int]]:
+    """What the first directory of a TIFF says of size, bits and alpha; empty for other files."""
+    with suppress(*_PILLOW_ERRORS), warnings.catch_warnings(action="ignore"), open(path, "rb") as file:
+        head = file.read(8)
+        directory = ImageFileDirectory_v2(head if head[2:3] != b"+" else head + file.read(8))  # "+": BigTIFF
+        file.seek(directory.next)
+        directory.load(file)
+        known = [tag for tag in (_WIDTH, _HEIGHT, _BITS, _EXTRA_SAMPLES) if tag in directory]
+        return {tag: np.ravel(directory[tag]).astype(int).tolist() for tag in known}
+    return {}
 
 
 def premultiply(image: np.ndarray) -> np.ndarray:
@@ -167,7 +201,11 @@ def premultiply(image: np.ndarray) -> np.ndarray:
 
 def _check_image_header(path: Path, head: bytes) -> None:
     """Raise for an image whose header claims more pixels than are accepted, or than its bytes can hold."""
-    size = parse_image_size(head)
+    tags = _read_tiff_tags(path)
+    if {_HEIGHT, _WIDTH} <= tags.keys():
+        size = tags[_HEIGHT][0], tags[_WIDTH][0]
+    else:  # the size of a JPEG may follow any number of bytes about the camera
+        size = parse_image_size(path.read_bytes() if head.startswith(b"\xff\xd8") else head)
     check_num_pixels(path, size)
     if size is not None and path.stat().st_size < min_file_bytes(head, size):
         raise _undecodable_error(path)

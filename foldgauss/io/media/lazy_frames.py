@@ -1,7 +1,9 @@
 """Frames of an indexed clip as an array that is decoded on access."""
 
+import ctypes
 import hashlib
 import operator
+import os
 import threading
 from functools import cached_property
 
@@ -22,8 +24,9 @@ class LazyFrames:
     `read_video(path, size=size).frames`, from `first` up to `stop`, which count frames that decode.
 
     `frames[k]` and `frames[a:b]` return C-contiguous copies. Forward access decodes each frame about once; `run`
-    frames are cached for access to single ones. The object can be pickled, and read by several threads. The file stays
-    open until `close()` or until the object is deleted. Reading raises what `read_indexed` does.
+    frames are cached for access to single ones. The object can be pickled, and read by several threads and by forked
+    processes. The file stays open until `close()` or until the object is deleted. Reading raises what `read_indexed`
+    does.
     """
 
     dtype, ndim = np.dtype(np.uint8), 4
@@ -42,9 +45,20 @@ class LazyFrames:
             raise video_error("run", expected="a whole number >= 1", got=str(run), cure=f"Try {RUN}.")
         self.index, self._size = index, check_frame_size(size)
         self._first, self._stop, self._run = first, stop, run
-        self._reader = IndexedReader(index)
-        self._cache, self._cache_start = None, 0
-        self._lock = threading.RLock()  # one decoder has one position in the file
+        self._open()
+
+    def _open(self) -> None:
+        self._reader, self._cache, self._cache_start = IndexedReader(self.index), None, 0
+        self._own_lock, self._process = threading.RLock(), os.getpid()
+
+    @property
+    def _lock(self) -> threading.RLock:
+        """One decoder has one position in the file. A forked process opens its own decoder, with its own lock."""
+        if self._process != os.getpid():
+            # The parent's is never freed: that would wait for threads of the decoder, which a fork does not copy.
+            ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._reader))
+            self._open()
+        return self._own_lock
 
     def __reduce__(self) -> tuple:
         return LazyFrames, (self.index, self._size, self._first, self._stop, self._run)
@@ -60,7 +74,7 @@ class LazyFrames:
 
     @cached_property
     def shape(self) -> tuple[int, int, int, int]:
-        with translate_os_errors(self.index.path):
+        with self._lock, translate_os_errors(self.index.path):
             channels = 4 if self._reader.has_alpha(self._size) else 3
         return len(self), *(self._size or self.index.size), channels
 

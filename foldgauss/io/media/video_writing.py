@@ -1,5 +1,6 @@
 """Writing clips: videos, animations, folders of images and single images."""
 
+import os
 from collections.abc import Iterable, Iterator
 from itertools import chain
 from pathlib import Path
@@ -52,7 +53,7 @@ def write_video(
     frames per second, which browsers slow down, are refused. An animated WebP has 4:2:0 at quality 90.
 
     A path without extension, or an existing folder, goes to `write_frames`, with `overwrite` and `image_format`; an
-    existing *file* is replaced. `fps` is in (0, 1000].
+    existing *file* is replaced. `fps` is in [1e-5, 1000].
 
     Raises `VideoError` for another extension, no frames, or frames of other shapes or types, or which the codec does
     not take; ValueError for options that do not fit together; `OutputError` where the path cannot be written.
@@ -69,7 +70,7 @@ def write_video(
     if given and suffix not in VIDEO_SUFFIXES:
         got, cure = repr(path.name), f"Take {', '.join(VIDEO_SUFFIXES)}."
         raise video_error(given[0], expected="a video file for it", got=got, cure=cure)
-    if path.is_dir() or not path.suffix:
+    if os.path.isdir(path) or not path.suffix:  # not Path's, which raises for a name that is too long
         return write_frames(path, frames, overwrite=overwrite, image_format=image_format)
     if suffix in ANIMATION_SUFFIXES:
         return _write_animation(path, suffix, frames, float(fps))

@@ -47,8 +47,10 @@ MAGIC = b"\x8bFGZ\r\n\x1a\n"
 VERSION = 2
 #: Magic, version, length of the header, checksum of all that follows.
 _FIXED = len(MAGIC) + 12
-#: Limit of Gaussians and frames per byte, so that a small file cannot claim much memory; files are padded with spaces.
-_MOST_PER_BYTE = 8
+#: Limit of numbers per byte, so that a small file cannot claim much memory; files are padded with spaces. Clips need 1.
+_MOST_PER_BYTE = 32
+#: A file may have so many in any case: earlier versions wrote alike Gaussians without padding.
+_ALWAYS_ALLOWED = 1 << 18
 _SIDE = 1 << 20  # largest side of an image: a decoder holds it in memory
 
 
@@ -94,7 +96,8 @@ def pack_compact(quantized: Quantized, metadata: dict | None = None) -> bytes:
     }
     text = to_json("header", header).encode()
     data = b"".join(streams)
-    text += b" " * (-(-(info.num_gaussians + header["num_frames"]) // _MOST_PER_BYTE) - len(text) - len(data))
+    num_values = info.num_gaussians * len(descriptions) + header["num_frames"]
+    text += b" " * (-(-num_values // _MOST_PER_BYTE) - len(text) - len(data))
     body = text + data
     numbers = (VERSION, len(text), zlib.crc32(body))
     return MAGIC + b"".join(number.to_bytes(4, "little") for number in numbers) + body
@@ -179,8 +182,9 @@ def _decode(header: dict, body: bytes, whole_length: int) -> Quantized:
     info = _parse_info(header)
     num, num_frames = info.num_gaussians, header["num_frames"]
     _check(is_integer(num_frames, 1), "num_frames", num_frames)
-    _check(num + num_frames <= _MOST_PER_BYTE * whole_length, "num_gaussians", num)
     names = column_names(info.degree, info.shared)
+    most = max(_MOST_PER_BYTE * whole_length, _ALWAYS_ALLOWED)
+    _check(num * len(names) + num_frames <= most, "num_gaussians", num)
     descriptions = header["columns"]
     _check(isinstance(descriptions, list) and len(descriptions) == len(names), "columns", "others")
     lengths = [own[0] for own in descriptions] + [header["intervals"]]
