@@ -209,14 +209,15 @@ def _differentiate(program: Program, rows, times, frames, control: Control) -> G
         whole = fractions < 0
         t = jnp.where(whole, t, (1 - fractions) * t + fractions * times[jnp.minimum(k + 1, program.num_frames - 1)])
         target = jnp.where(whole[:, None, None, None], target, targets)
-    alive = _map_views(len(k), lambda t: find_alive(program, rows, control.num, t), t)
+    alive = jax.vmap(lambda t: find_alive(program, rows, control.num, t))(t)
     target = jnp.where(mirrored[:, None, None, None], target[:, :, ::-1], target)
 
     def condition(rows, t):
-        return _map_views(len(k), functools.partial(_splats, program, rows), t, alive, mirrored)
+        return jax.vmap(functools.partial(_splats, program, rows))(t, alive, mirrored)
 
     splats, to_rows = jax.vjp(condition, rows, t)
-    images, to_splats = jax.vjp(functools.partial(_map_views, len(k), functools.partial(_render, program)), splats)
+    # One after another: `vmap` would compute both sides of the engine's branches, a third more time.
+    images, to_splats = jax.vjp(functools.partial(jax.lax.map, functools.partial(_render, program)), splats)
 
     def mean_loss(images):
         own, errors = compute_losses(images, target, control.squared, program.ssim_fraction)
@@ -233,14 +234,6 @@ def _differentiate(program: Program, rows, times, frames, control: Control) -> G
         jnp.any(alive, axis=0),
         _screen_gradient(program, splats, by_splats, alive) if program.grows else jnp.zeros_like(rows[:, 0]),
     )
-
-
-def _map_views(num: int, function, *batches):
-    """`function` of each of `num` views; of a single one without `vmap`, which would compute both sides of branches."""
-    if num == 1:
-        out = function(*jax.tree.map(lambda leaf: leaf[0], batches))
-        return jax.tree.map(lambda leaf: leaf[None], out)
-    return jax.vmap(function)(*batches)
 
 
 def find_alive(program: Program, rows, num, t) -> Bool[Array, " capacity"]:
