@@ -97,14 +97,21 @@ MASKS = Target(
 
 
 def _more_images() -> list[bytes]:
-    """What masks cannot be: of 16 bits, JPEG, and those that move."""
+    """What masks cannot be: of 16 bits, JPEG, gray with alpha, and those that move."""
     deep = cv2.imencode(".png", _NUMBERS.astype(np.uint16) << 8)[1].tobytes()
     frames = np.random.default_rng(0).integers(0, 255, (3, 6, 8, 3), np.uint8)
     moving = [written(lambda path: write_video(path, frames, 10), suffix) for suffix in (".webp", ".gif")]
     file = io.BytesIO()
     first, *others = (Image.fromarray(frame).convert("RGBA") for frame in frames)
     first.save(file, "PNG", save_all=True, append_images=others, duration=[40, 120, 40])
-    return [deep, _image("RGB", "JPEG"), _image("L", "JPEG", progressive=True), *moving, file.getvalue()]
+    return [
+        deep,
+        _image("LA", "TIFF"),
+        _image("RGB", "JPEG"),
+        _image("L", "JPEG", progressive=True),
+        *moving,
+        file.getvalue(),
+    ]
 
 
 @functools.cache
@@ -188,6 +195,13 @@ def _clips() -> tuple[bytes, ...]:
     return (*found, _with_edits(found[4]))
 
 
+@functools.cache
+def _tiny_fields() -> bytes:
+    """An interlaced clip too small for the filter that deinterlaces."""
+    frames = np.zeros((2, 4, 4, 3), np.uint8)
+    return written(lambda path: _encode(path, frames, "mpeg2video", "yuv420p", {"flags": "+ilme+ildct"}), ".mkv")
+
+
 def _with_edits(data: bytes) -> bytes:
     """An MP4 whose index stands last, with a list of edits in its first track that shows half of it."""
 
@@ -249,7 +263,7 @@ def _marked(data: bytes, random: Random) -> bytes:
 
 def _another_kind(data: bytes, random: Random) -> bytes:
     """The beginning of another file, with this one's rest or without."""
-    other = random.choice(_OTHERS)
+    other = random.choice((*_OTHERS, _tiny_fields()))
     return other + data[len(other) :] if random.random() < 0.5 else other
 
 
@@ -258,6 +272,9 @@ def _read_clip(path: Path) -> None:
     if number == 0:
         assert read_masks(path).dtype == bool
         _refused(path)
+    if number == 1:
+        with contextlib.suppress(VideoError):  # which an interlaced clip raises
+            read_video(path, deinterlace=False)
     clip = read_video(path, **_WANTED[number])
     assert clip.num_frames >= 1
 
