@@ -38,7 +38,8 @@ MISS, SHORTENING, SHORTENINGS = 0.7, 0.6, 4
 #: A pixel is constant whose color changes by less than this (of 1, root mean square over the channels) in any of so
 #: many frames.
 CONSTANT, CONSTANT_FRAMES = 0.03, 64
-CHUNK = 12_000  # tracks held at once by each thread: some 3 kB each on the way
+CHUNK = 12_000  # tracks held by a thread: some 3 kB each on the way
+AT_ONCE = 8 * CHUNK  # tracks held by all threads
 #: Trial starts per frame, from which follows how long starts are visible: so many sigma_t to either side. In long clips
 #: at most `MAX_PILOTS` in all, since they would take longer than the fit.
 PILOT, CORE, ROUNDS, MAX_PILOTS = 32, 1.5, 50, 40_000
@@ -257,7 +258,8 @@ def follow_tracks(
             folds[off], miss[off] = fit_folds(tracks[off], wide[off], degree)
         coefficients[part], spread[part] = folds, wide
 
-    run_tasks(follow, range(0, len(home), CHUNK))
+    for first in range(0, len(home), AT_ONCE):
+        run_tasks(follow, range(first, min(first + AT_ONCE, len(home)), CHUNK))
     return coefficients, spread
 
 
