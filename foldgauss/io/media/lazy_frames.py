@@ -24,9 +24,9 @@ class LazyFrames:
     `read_video(path, size=size).frames`, from `first` up to `stop`, which count frames that decode.
 
     `frames[k]` and `frames[a:b]` return C-contiguous copies. Forward access decodes each frame about once; `run`
-    frames are cached for access to single ones. The object can be pickled, and read by several threads and by forked
-    processes. The file stays open until `close()` or until the object is deleted. Reading raises what `read_indexed`
-    does.
+    frames are cached for access to single ones. The object can be pickled, and read by several threads. A forked
+    process opens the file anew; spawned ones are safer, since a fork copies no threads. The file stays open until
+    `close()` or until the object is deleted. Reading raises what `read_indexed` does.
     """
 
     dtype, ndim = np.dtype(np.uint8), 4
