@@ -5,6 +5,7 @@ import struct
 import subprocess
 import sys
 import wave
+import zlib
 from fractions import Fraction
 
 import av
@@ -448,6 +449,22 @@ def test_sound_may_change_its_format(tmp_path):
     assert _tones(path, [0.3, 1.2])[1] == pytest.approx([440, 880], abs=10)
 
 
+def test_sound_whose_packets_hold_several_frames_is_carried_over(tmp_path):
+    """Only the first of them has a time stamp."""
+    with av.open(str(tmp_path / "a.wav"), "w") as container:
+        stream = container.add_stream("adpcm_ima_wav", rate=44_100, layout="mono")
+        samples = (9000 * np.sin(2 * np.pi * 440 * np.arange(88_200) / 44_100)).astype(np.int16)
+        stream.codec_context.open()
+        size = stream.codec_context.frame_size
+        for first in range(0, len(samples) - size, size):
+            frame = av.AudioFrame.from_ndarray(samples[None, first : first + size], format="s16p", layout="mono")
+            frame.sample_rate, frame.pts = 44_100, first
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    path = write_video(tmp_path / "a.mp4", _moving(16), 10, sound=Sound(tmp_path / "a.wav"))
+    assert _tones(path, [0.3, 1.2])[1] == pytest.approx([440, 440], abs=10)
+
+
 def test_sound_that_is_none_is_refused(tmp_path, sound_file, clip_file):
     out, unknown = tmp_path / "a.mp4", tmp_path / "b.mkv"
     with av.open(str(unknown), "w") as container:
@@ -563,6 +580,16 @@ def test_alpha_of_tiffs_is_premultiplied_once(tmp_path, mode, associated):
 def test_alpha_of_gray_pngs_with_a_transparent_level_is_kept(tmp_path):
     Image.fromarray(np.array([[200, 100]], np.uint8)).save(tmp_path / "a.png", transparency=200)
     assert read_video(tmp_path / "a.png").frames.tolist() == [[[[0] * 4, [100, 100, 100, 255]]]]
+
+
+def test_a_gray_png_of_16_bits_with_a_transparent_level_keeps_its_levels(tmp_path):
+    """Its alpha is lost; Pillow, which could tell it, would clip the levels."""
+    cv2.imwrite(str(tmp_path / "a.png"), np.array([[0, 10_000, 60_000]], np.uint16))
+    data = (tmp_path / "a.png").read_bytes()
+    body, at = b"tRNS" + bytes(2), data.index(b"IDAT") - 4
+    chunk = struct.pack(">I", 2) + body + struct.pack(">I", zlib.crc32(body))
+    (tmp_path / "a.png").write_bytes(data[:at] + chunk + data[at:])
+    assert read_video(tmp_path / "a.png").frames[0, 0].tolist() == [[0] * 3, [39] * 3, [233] * 3]
 
 
 def test_alpha_is_resized_with_the_colour_it_weighs(tmp_path):

@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import json
+import math
 import os
 import subprocess
 import sys
@@ -141,10 +142,13 @@ def test_step_with_interpolated_frames_matches_the_cpu(progress):
 def test_prepared_images_are_the_same_and_are_dropped():
     config = FitConfig(interpolation_fraction=0.9)
     interpolation = make_interpolated(FRAMES, config, motion_finder(FRAMES))
-    prefetcher, made = Prefetcher(interpolation), []
+    chosen = [interpolation.choose(step, 0.0, k) is not None for step in (3, 4) for k in range(len(FRAMES))]
+    prefetcher, made = Prefetcher(interpolation, most=sum(chosen)), []
     for step in (3, 4):
-        prefetcher.prepare(step, 0.0, range(len(FRAMES)), (32, 40))
-    assert prefetcher.num_prepared > 0
+        assert prefetcher.prepare(step, 0.0, range(len(FRAMES)), (32, 40))
+    assert not prefetcher.prepare(5, 0.0, [*range(len(FRAMES))] * 9, (16, 20))  # no more are kept
+    prefetcher.drop(1)
+    assert prefetcher.num_prepared == sum(chosen) > 0
     direct, interpolation.interpolate = interpolation.interpolate, lambda *call: made.append(call)
     for step in (3, 4):
         for k in range(len(FRAMES)):
@@ -153,8 +157,9 @@ def test_prepared_images_are_the_same_and_are_dropped():
                 image = prefetcher.interpolate(step, k, fraction, (32, 40))
                 np.testing.assert_array_equal(image, direct(k, fraction, (32, 40)))
         prefetcher.drop(step)
-    assert prefetcher.num_prepared == 0
     assert not made
+    prefetcher.drop(math.inf)
+    assert prefetcher.num_prepared == 0
     prefetcher.interpolate(5, 0, 0.5, (32, 40))  # not prepared
     assert made == [(0, 0.5, (32, 40))]
 

@@ -212,7 +212,7 @@ def _first_shown(path: Path, of_file: av.AudioStream) -> float:
 
 def _unify_sound(source: av.container.InputContainer, stream: av.AudioStream) -> Iterator[av.AudioFrame]:
     """The frames of sound that decode, in one format, though that of the file may change."""
-    graph, of_graph = None, None
+    graph, of_graph, end = None, None, None
     steps = [("aformat", f"sample_fmts=fltp:sample_rates={SAMPLE_RATE}:channel_layouts=stereo")]
     steps += [("asettb", f"1/{SAMPLE_RATE}")]
     for packet in source.demux(stream):
@@ -220,6 +220,10 @@ def _unify_sound(source: av.container.InputContainer, stream: av.AudioStream) ->
         with suppress(av.FFmpegError):
             found = packet.decode()
         for frame in found:
+            if frame.pts is None:  # of a packet's frames only the first may have a time stamp
+                frame.pts = end
+            if frame.pts is not None:
+                end = frame.pts + round(Fraction(frame.samples, frame.sample_rate) / stream.time_base)
             kind = frame.sample_rate, frame.format.name, frame.layout.name
             if kind != of_graph:
                 yield from filter_frame(graph, None)

@@ -169,14 +169,14 @@ def _is_premultiplied(path: Path) -> bool:
 
 
 def _read_gray_with_alpha(path: Path) -> np.ndarray | None:
-    """Premultiplied BGRA of a gray PNG or TIFF with alpha, which OpenCV drops; None without alpha, or where Pillow
-    cannot read it, as 16 bits."""
+    """Premultiplied BGRA of a gray PNG or TIFF with alpha, which OpenCV drops; None without alpha, or of 16 bits, which
+    Pillow cannot read with alpha."""
     with (
         suppress(*_PILLOW_ERRORS),
         warnings.catch_warnings(action="ignore"),
         Image.open(path, formats=("PNG", "TIFF")) as image,
     ):
-        if image.mode in ("La", "LA") or "transparency" in image.info:
+        if image.mode in ("La", "LA") or (image.mode in ("1", "L") and "transparency" in image.info):
             return premultiply(np.asarray(image.convert("LA").convert("RGBA")))
     return None
 

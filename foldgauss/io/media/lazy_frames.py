@@ -1,6 +1,7 @@
 """Frames of an indexed clip as an array that is decoded on access."""
 
 import ctypes
+import gc
 import hashlib
 import operator
 import os
@@ -15,6 +16,11 @@ from foldgauss.io.media.frame_index import DIGEST_BYTES, FrameIndex
 from foldgauss.io.media.indexed_reader import IndexedReader
 
 RUN = 32
+
+
+if hasattr(os, "register_at_fork"):
+    # In a forked process the parent's decoders are never freed: that would wait for threads that a fork does not copy.
+    os.register_at_fork(after_in_child=gc.freeze)
 
 
 class LazyFrames:

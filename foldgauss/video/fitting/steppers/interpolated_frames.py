@@ -46,8 +46,9 @@ class Prefetcher:
     expected to have other views, is made when it is needed.
     """
 
-    def __init__(self, interpolation: InterpolatedFrames):
-        self.interpolation = interpolation
+    def __init__(self, interpolation: InterpolatedFrames, most: int | None = None):
+        """At most `most` images are kept, by default two for each thread: a process that ends waits for them."""
+        self.interpolation, self._most = interpolation, 2 * num_threads() if most is None else most
         self._pool = ThreadPoolExecutor(num_threads(), thread_name_prefix="foldgauss-interpolation")
         self._images: dict[tuple[int, int, tuple[int, int]], Future] = {}  # by step, frame and size
 
@@ -56,20 +57,23 @@ class Prefetcher:
         """Of images that are kept."""
         return len(self._images)
 
-    def prepare(self, step: int, progress: float, frames: Iterable[int], size: tuple[int, int]) -> None:
-        """Start to make the images that a step needs if these are its frames."""
+    def prepare(self, step: int, progress: float, frames: Iterable[int], size: tuple[int, int]) -> bool:
+        """Start to make the images that a step needs if these are its frames; False if no more are kept."""
         for k in frames:
             fraction = self.interpolation.choose(step, progress, k)
             if fraction is not None and (step, k, size) not in self._images:
+                if len(self._images) >= self._most:
+                    return False
                 future = self._pool.submit(self.interpolation.interpolate, k, fraction, size)
                 self._images[step, k, size] = future
+        return True
 
     def interpolate(self, step: int, k: int, fraction: float, size: tuple[int, int]) -> np.ndarray:
         """`InterpolatedFrames.interpolate` of a frame of a step."""
         future = self._images.get((step, k, size))
         return self.interpolation.interpolate(k, fraction, size) if future is None else future.result()
 
-    def drop(self, step: int) -> None:
+    def drop(self, step: float) -> None:
         """Forget the images of this step and of those before it."""
         for key in [key for key in self._images if key[0] <= step]:
             self._images.pop(key).cancel()

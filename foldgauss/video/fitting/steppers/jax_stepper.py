@@ -4,6 +4,7 @@ After each step only `jax_step.Report` is fetched, some hundred numbers. Arrays 
 state, and for densification and relocation, which run on the host.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -96,7 +97,7 @@ class JaxStepper:
         self.steps_per_pass = steps_per_pass(config, self.num_frames)
         self.interpolation = make_interpolated(frames, config, self.find_motion)
         self.prefetcher = None if self.interpolation is None else Prefetcher(self.interpolation)
-        self._prepared = 0  # steps
+        self._prepared, self._prepared_size = 0, self.size  # steps, and the size of their images
         self._no_targets: dict[tuple[int, int], jax.Array] = {}  # by size
         self.capacity = 0
         self.adopt(state)
@@ -170,12 +171,14 @@ class JaxStepper:
         """Have the interpolated frames of the next steps prepared, which are chosen by the errors as they are now."""
         if self.prefetcher is None:
             return
-        self.prefetcher.drop(state.step)
-        end = state.step + 1 + STEPS_AHEAD
-        for step in range(max(state.step + 1, self._prepared), end):
+        self.prefetcher.drop(state.step if size == self._prepared_size else math.inf)
+        first = max(state.step + 1, self._prepared if size == self._prepared_size else 0)
+        self._prepared, self._prepared_size = first, size
+        for step in range(first, state.step + 1 + STEPS_AHEAD):
             views = choose_views(self.config, self.num_frames, step, state.frame_errors)
-            self.prefetcher.prepare(step, progress, map(int, views % self.num_frames), size)
-        self._prepared = end
+            if not self.prefetcher.prepare(step, progress, map(int, views % self.num_frames), size):
+                break
+            self._prepared = step + 1
 
     def grow(self, state: FitState) -> None:
         """Densification on the host, where any is due."""
