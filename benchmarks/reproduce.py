@@ -6,11 +6,11 @@
 *Bunny*, by default all 132 frames of 640x1280, in the published 30,000 steps of 3 frames: hours on the CPU of a desktop
 machine; `--engine auto` uses a GPU where JAX sees one. A smaller `--size` has Gaussians at the start in proportion to
 its pixels, and lengths, rates of positions and thresholds of gradients that are the same in pixels (`config_of`).
-`VARIANTS` lists the fits: "as published", the power of the
-paper's text instead of its code's, other batches and degrees, and what the paper does not state or we chose. PSNR and
-SSIM are of 8-bit images, the mean over all frames, beside the published ones: 39.02 dB with 500,000 Gaussians at the
-start, 38.53 dB with 100,000 (table:init-gauss). Batches and degrees (table:bs-pol) start with 100,000: their 38.53 dB
-for batch 3 and degree 7 is the first row of the other table.
+`VARIANTS` lists the fits: "as published", the power of the paper's text instead of its code's, other batches and
+degrees, and what the paper does not state or we chose. PSNR and SSIM are of 8-bit images, the mean over all frames,
+beside the published ones: 39.02 dB with 500,000 Gaussians at the start, 38.53 dB with 100,000 (table:init-gauss).
+Batches and degrees (table:bs-pol) start with 100,000: their 38.53 dB for batch 3 and degree 7 is the first row of the
+other table.
 
 FOLDER keeps a checkpoint of the fit under way and, for each fit, the curve NAME.csv of PSNR (of the frames seen last)
 and number of Gaussians against steps. The same command continues a fit after its checkpoint; with --json also after the

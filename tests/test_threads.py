@@ -50,6 +50,25 @@ def test_work_is_shared():
     assert len(names) == 3
 
 
+def test_tasks_of_tasks_run_on_their_thread():
+    """All of them once, also after an error; the next ones are shared again."""
+    _threads.set_num_threads(3)
+    outer, inner = {}, []
+
+    def work(k):
+        outer[k] = threading.current_thread()
+        _threads.run_tasks(lambda j: inner.append((k, j, threading.current_thread())), range(5))
+        if k == 7:
+            raise RuntimeError("seven")
+        time.sleep(0.01)
+
+    with pytest.raises(RuntimeError, match="seven"):
+        _threads.run_tasks(work, range(12))
+    assert all(thread is outer[k] for k, _, thread in inner)
+    assert sorted((k, j) for k, j, _ in inner) == [(k, j) for k in sorted(outer) for j in range(5)]
+    test_work_is_shared()
+
+
 def test_environment_variable(monkeypatch):
     monkeypatch.setenv("FOLDGAUSS_NUM_THREADS", "3")
     assert _threads.num_threads() == 3

@@ -454,6 +454,15 @@ def test_a_forked_process_opens_the_file_anew(long, monkeypatch):
     assert sys.getrefcount(reader) > 2  # the parent's is never freed
 
 
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+def test_a_forked_process_frees_nothing_of_its_parent():
+    """Decoders in cycles, which its garbage collector would free, would wait for threads that it has not."""
+    code = "import gc, os, foldgauss.io.media.lazy_frames\nif os.fork():\n    print(os.wait()[1])\nelse:\n"
+    code += "    os._exit(gc.get_freeze_count() == 0)"
+    ran = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, timeout=120)
+    assert (ran.stdout, ran.stderr) == ("0\n", "")
+
+
 def test_one_image_is_a_clip(tmp_path):
     path = write_image(tmp_path / "a.png", _moving(1)[0])
     index = index_video(path)

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from clips import moving_blobs
 
+from foldgauss._runtime import threads
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video import Economy
+from foldgauss.video.fitting import initialize as start_module
 from foldgauss.video.fitting.config import (
     ALIVE_POWER,
     LIFETIME_POWER,
@@ -14,6 +16,7 @@ from foldgauss.video.fitting.config import (
     default_num_gaussians,
 )
 from foldgauss.video.fitting.initialize import ELONGATION, count_alive, initialize, sample_orientations
+from foldgauss.video.motion.optical_flow import Motion
 
 
 def stripes(angle: float, size: tuple[int, int] = (40, 60)) -> np.ndarray:
@@ -31,6 +34,23 @@ def test_edges_have_their_direction(angle):
     assert (found >= np.pi / 2 - 1e-6).all()  # far from the ends of the sigmoid
     assert (found <= 3 * np.pi / 2 + 1e-6).all()
     assert (straight > 0.99).all()
+
+
+def test_tracks_are_followed_alike_by_any_number_of_threads(monkeypatch):
+    monkeypatch.setattr(start_module, "CHUNK", 40)
+    monkeypatch.setattr(start_module, "AT_ONCE", 120)
+    rng = np.random.default_rng(0)
+    motion, home, position = Motion.from_frames(moving_blobs()), rng.integers(0, 6, 300), rng.uniform(4, 28, (300, 2))
+    found = []
+    for count in (1, 3):
+        threads.set_num_threads(count)
+        try:
+            found.append(start_module.follow_tracks(motion, home, position, 3, np.random.default_rng(1)))
+        finally:
+            threads.set_num_threads(None)
+    for own, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(own, other)
+    assert np.abs(found[0][0]).max() > 0
 
 
 def test_flat_frames_have_no_edges():

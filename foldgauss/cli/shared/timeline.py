@@ -8,7 +8,7 @@ import typer
 
 from foldgauss.cli.app.application import warn, wrong_use
 from foldgauss.cli.shared.arguments import MAX_TIMES
-from foldgauss.io.media.frame_rate import MAX_FPS
+from foldgauss.io.media.frame_rate import MAX_FPS, MIN_FPS
 from foldgauss.video.models.frame_times import interpolated_times, played_positions, remapped_positions, times_at
 
 MAX_UPSAMPLE, MAX_IMAGES = MAX_TIMES, 10 * MAX_TIMES
@@ -46,8 +46,8 @@ class Timeline:
         if self.upsample is not None and not 1 <= self.upsample <= MAX_UPSAMPLE:
             expected = f"a whole number from 1 to {MAX_UPSAMPLE:,}"
             raise wrong_use("--upsample", expected=expected, got=self.upsample)
-        if self.fps is not None and not 0 < self.fps <= MAX_FPS:
-            raise wrong_use("--fps", expected=f"a rate in (0, {MAX_FPS:g}]", got=self.fps)
+        if self.fps is not None and not MIN_FPS <= self.fps <= MAX_FPS:
+            raise wrong_use("--fps", expected=f"a rate in [{MIN_FPS:g}, {MAX_FPS:g}]", got=self.fps)
         if self.speed is not None and not MIN_SPEED <= abs(self.speed) <= 1 / MIN_SPEED:
             expected = f"a number from {MIN_SPEED:g} to {1 / MIN_SPEED:g}, or the same below 0"
             raise wrong_use("--speed", expected=expected, got=self.speed)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from foldgauss._runtime.checks import invalid, is_within
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io.exchange.ply_file import NOTE, Ply, facts_error, read_ply, write_ply
-from foldgauss.io.media.frame_rate import DEFAULT_FPS, MAX_FPS
+from foldgauss.io.media.frame_rate import DEFAULT_FPS, MAX_FPS, MIN_FPS
 from foldgauss.render import RenderOptions
 from foldgauss.render.camera import FIELD_OF_VIEW
 from foldgauss.render.splats import check_size
@@ -193,8 +193,8 @@ def _fill_in(
         power = note.get("power", VEGAS_POWER)
         if not is_within(power, "(0, 1e30]"):
             raise invalid("power", expected="a number in (0, 1e30]", got=repr(power))
-        if not is_within(fps, f"(0, {MAX_FPS}]"):
-            raise invalid("fps", expected=f"a rate in (0, {MAX_FPS:g}]", got=repr(fps), cure="Try 25.")
+        if not is_within(fps, f"[{MIN_FPS}, {MAX_FPS}]"):
+            raise invalid("fps", expected=f"a rate in [{MIN_FPS:g}, {MAX_FPS:g}]", got=repr(fps), cure="Try 25.")
     except (TypeError, ValueError) as error:
         raise facts_error(ply.path, error) from error
     return (int(size[0]), int(size[1])), float(fps), options, float(cutoff), float(power)

@@ -49,7 +49,7 @@ VERSION = 2
 _FIXED = len(MAGIC) + 12
 #: Limit of numbers per byte, so that a small file cannot claim much memory; files are padded with spaces. Clips need 1.
 _MOST_PER_BYTE = 32
-#: A file may have so many in any case: earlier versions wrote alike Gaussians without padding.
+#: A file may have so many in any case: earlier versions padded alike Gaussians to fewer bytes.
 _ALWAYS_ALLOWED = 1 << 18
 _SIDE = 1 << 20  # largest side of an image: a decoder holds it in memory
 
