@@ -1,7 +1,6 @@
 """A long clip through the commands: what each takes at most, and whether a fit's progress is true."""
 
 import json
-import os
 import subprocess
 import sys
 import threading
@@ -10,6 +9,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from benchmarks.memory import MEASURED
 
 #: Bytes beside the frames that a command may take: the interpreter, JAX, compiled kernels, one frame's work. A fit
 #: has its Gaussians and their moments beside.
@@ -28,8 +29,8 @@ class Ran(NamedTuple):
 
 def run(words: list[str]) -> Ran:
     """The command in a process of its own. Raises CalledProcessError with what it said."""
-    begun, lines = time.monotonic(), []
-    command = [sys.executable, "-m", "foldgauss", *words]
+    begun, lines, line = time.monotonic(), [], ""
+    command = [*MEASURED, sys.executable, "-m", "foldgauss", *words]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         said = []
         reader = threading.Thread(target=lambda: said.append(process.stderr.read()), daemon=True)
@@ -38,11 +39,9 @@ def run(words: list[str]) -> Ran:
             if line.startswith("{"):
                 lines.append((time.monotonic() - begun, json.loads(line)))
         reader.join()
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
         raise subprocess.CalledProcessError(process.returncode, command, stderr=said[0])
-    return Ran(time.monotonic() - begun, usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024), lines)
+    return Ran(time.monotonic() - begun, int(line), lines)
 
 
 def bound(command: str, frame_bytes: int, num_gaussians: int) -> int:

@@ -24,6 +24,16 @@ from foldgauss.io.datasets import sample_clip
 FRAMES, SIZE, LIMIT = (125, 250, 500, 1000, 2000), (320, 640), 2 * 1024**3
 
 
+#: Runs the command that follows, and prints its largest resident set in bytes at the end. It is a process of its own:
+#: on Linux the largest of a process is never below that of the one that started it, and other children count as well.
+MEASURED = [
+    *(sys.executable, "-c"),
+    "import resource, subprocess, sys; status = subprocess.run(sys.argv[1:]).returncode; "
+    "unit = 1 if sys.platform == 'darwin' else 1024; "
+    "print(unit * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss); sys.exit(status)",
+]
+
+
 def write_clip(path: Path, num: int, size: tuple[int, int]) -> None:
     """`num` frames of Bunny to and fro, moved by some pixels at each turn, in a quick codec."""
     frames = read_video(sample_clip("bunny"), size=size).frames
@@ -39,11 +49,8 @@ def peak_of(clip: Path, options) -> int:
     """Largest resident set, in bytes, of a fit of `clip` in another process."""
     command = [sys.executable, "-m", "foldgauss", "fit", str(clip), "--out", str(clip.with_suffix(".safetensors"))]
     command += ["--gaussians", str(options.gaussians), "--steps", str(options.steps), "--quiet"]
-    # A child of a fresh process: what other children used does not count.
-    script = "import resource, subprocess, sys; subprocess.run(sys.argv[1:], check=True); "
-    script += "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"
-    done = subprocess.run([sys.executable, "-c", script, *command], check=True, capture_output=True, text=True)
-    return int(done.stdout.split()[-1]) * (1 if sys.platform == "darwin" else 1024)
+    done = subprocess.run([*MEASURED, *command], check=True, capture_output=True, text=True)
+    return int(done.stdout.split()[-1])
 
 
 def main(arguments: list[str] | None = None) -> None:

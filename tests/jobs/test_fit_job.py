@@ -3,6 +3,8 @@
 import dataclasses
 import json
 import os
+import subprocess
+import sys
 import threading
 import warnings
 from concurrent.futures import ThreadPoolExecutor
@@ -235,3 +237,13 @@ def test_what_was_compiled_for_many_shapes_is_forgotten(monkeypatch):
     assert len(cleared) == 1
     programs.add((0, 8, 8, 3))
     assert len(cleared) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a process's largest memory is its own")
+def test_the_largest_memory_is_that_of_the_process_alone():
+    """Linux' `ru_maxrss` begins with that of the process that started it."""
+    own = bytearray(2**20) * 1500
+    program = "from foldgauss.jobs.runner import peak_bytes; print(peak_bytes())"
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120)
+    assert 2**26 < int(ran.stdout) < len(own) < fitting.peak_bytes()

@@ -1,5 +1,6 @@
 """The application: its commands, which are imported when one is called, its consoles and its errors."""
 
+import functools
 import importlib
 import re
 from typing import Annotated, Any
@@ -88,8 +89,15 @@ def root(
     del debug, version  # read by `main` before typer runs, and by the callback
 
 
+@functools.cache
+def root_command() -> Any:
+    """The application as one command, which is built once."""
+    return typer.main.get_command(app)
+
+
+@functools.cache
 def load_commands(*names: str) -> dict[str, Any]:
-    """All commands by name; those named, or all if none is, are imported. Unknown names are ignored."""
+    """The commands by name; those named, or all if none is, are imported. Unknown names are ignored."""
     with use_default_signals():
         for name in names or COMMANDS:
             if name in COMMANDS:

@@ -4,7 +4,7 @@ import sys
 import warnings
 
 from foldgauss._runtime.interrupts import raise_on_sigterm
-from foldgauss.cli.app.application import Stopped, WrongUse, app, err, load_commands, name_option, warn
+from foldgauss.cli.app.application import Stopped, WrongUse, err, load_commands, name_option, root_command, warn
 
 WRONG_USE, FAILURE = 2, 1
 
@@ -21,7 +21,7 @@ def _run(arguments: list[str] | None) -> None:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
-            app([argument for argument in arguments if argument != "--debug"], prog_name="foldgauss")
+            root_command()([argument for argument in arguments if argument != "--debug"], prog_name="foldgauss")
     except (Exception, KeyboardInterrupt) as error:
         if debug:
             raise
