@@ -678,6 +678,10 @@ def test_nan_asked_is_nan_answered():
     assert jnp.isnan(_mixture().expected_space(jnp.nan)).all()
     assert jnp.isnan(_mixture().space_covariance(jnp.nan)).all()
     assert jnp.isnan(_mixture().condition([2], [jnp.nan]).weights).all()
+
+
+@pytest.mark.slow
+def test_nan_asked_of_time_is_nan_answered():
     mixture = FoldedMixture(
         FoldedGaussian(jnp.zeros((2, 2)), scale=jnp.ones((2, 2)), time_loc=[0.3, 0.7], time_scale=[0.2, 0.1]),
         weights=[0.4, 0.6],

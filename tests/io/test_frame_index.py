@@ -146,7 +146,7 @@ class _Counting(decoder.VideoDecoder):
     def frames(self):
         for frame in super().frames():
             _Counting.decoded += 1
-            yield _CountedFrame(frame.position, frame.stamp, frame.decoded, frame.size)
+            yield _CountedFrame(**vars(frame))
 
 
 class _CountedFrame(decoder.DecodedFrame):

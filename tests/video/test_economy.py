@@ -36,7 +36,7 @@ from foldgauss.video.models.sparse_storage import (
 from foldgauss.video.models.splats import OPAQUE_LOGIT
 from foldgauss.video.selection.contributions import Contributions
 
-STEPS = 700
+STEPS = 500
 
 
 @functools.cache
@@ -50,7 +50,7 @@ def fitted(name: str, **changes):
         "noise": lambda: noise(24),
     }
     frames = clips[name]()
-    config = FitConfig(num_gaussians=300, steps=STEPS, economy=Economy(), **changes)
+    config = FitConfig(**{"num_gaussians": 300, "steps": STEPS, "economy": Economy()} | changes)
     counts, state = [], None
     for state, info in fit_steps(frames, config):
         counts.append(info.num_gaussians)
@@ -110,7 +110,7 @@ def test_gaussians_end_at_a_cut():
 
 
 def test_noise_ends_births():
-    _, model, _, counts = fitted("noise")
+    _, model, _, counts = fitted("noise", steps=700)
     assert max(counts) <= 1.5 * 300  # those born once do not pay, and none are born after them
     assert counts[-1] < 0.5 * 300
     assert model.num_gaussians == counts[-1]
@@ -405,7 +405,7 @@ def test_cost_of_another_shape_is_as_predicted(scene, own):
 
 
 def test_one_gaussian_always_stays():
-    _, model, state, _ = fitted("noise")
+    _, model, state, _ = fitted("noise", steps=700)
     rows = state.rows[:3]
     window = np.empty((3, 2), np.float32)
     update_windows(rows, np.arange(3), window)

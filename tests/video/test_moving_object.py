@@ -108,12 +108,13 @@ def test_where_nothing_moves_this_is_an_error(pan, noise):
 
 
 def test_each_shot_has_its_own_object_or_none():
-    (one, _, truth), (other, _, other_truth) = disc_clip(), disc_clip(pan=0.0, speed=-2.0, seed=5)
-    still, _, _ = disc_clip(pan=0.0, seed=9, disc=False)
-    masks = find_moving_object(np.concatenate([one, other[:, ::-1], still[:4]]))
-    assert overlap(masks[:6], truth).mean() >= 0.85
-    assert overlap(masks[6:12], other_truth[:, ::-1]).mean() >= 0.85
-    assert not masks[12:].any()
+    one, _, truth = disc_clip(num_frames=5)
+    other, _, other_truth = disc_clip(pan=0.0, speed=-2.0, seed=5, num_frames=5)
+    still, _, _ = disc_clip(pan=0.0, seed=9, disc=False, num_frames=3)
+    masks = find_moving_object(np.concatenate([one, other[:, ::-1], still]))
+    assert overlap(masks[:5], truth).mean() >= 0.85
+    assert overlap(masks[5:10], other_truth[:, ::-1]).mean() >= 0.85
+    assert not masks[10:].any()
 
 
 @pytest.mark.parametrize(

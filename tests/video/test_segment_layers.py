@@ -77,7 +77,7 @@ def together(video, front_video, k, *, before=True):
 @pytest.mark.parametrize(
     ("kind", "evenly"),
     [
-        ("plain", False),
+        pytest.param("plain", False, marks=pytest.mark.slow),
         ("short-lived", False),
         pytest.param("one frame", False, marks=pytest.mark.slow),
         pytest.param("plain", True, marks=pytest.mark.slow),

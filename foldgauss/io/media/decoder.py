@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 
@@ -12,7 +12,7 @@ import numpy as np
 from av.codec.context import Flags
 from av.filter import Graph
 from av.stream import Disposition
-from av.video.reformatter import Interpolation
+from av.video.reformatter import Interpolation, VideoReformatter
 
 from foldgauss.io.media.clip import VIDEO, VideoError, check_num_pixels, format_num_bytes, read_head, video_error
 from foldgauss.io.media.format_detection import DEMUXERS, LIST, describe_kind
@@ -41,13 +41,15 @@ class DecodedFrame:
     """A frame that decodes. `position`: in the file, with the frames lost to damage counted. `stamp`: in units of
     `VideoDecoder.time_base`; 0 for a stream without time stamps. `size`: (height, width) of the video as stored, to
     which a frame of another size is stretched. `matrix`: (a, b, c, d), right is shown along (a, b), down along (c, d),
-    in units of 2^-16."""
+    in units of 2^-16. `converter`: one for all frames, since FFmpeg takes longer to prepare it than to convert
+    a small frame."""
 
     position: int
     stamp: int
     decoded: av.VideoFrame
     size: tuple[int, int]
     matrix: tuple[int, int, int, int] = (1 << 16, 0, 0, 1 << 16)
+    converter: VideoReformatter = field(default_factory=VideoReformatter)
 
     def to_array(self) -> np.ndarray:
         """Upright and uint8: BGR of shape (height, width, 3), or premultiplied BGRA of shape (height, width, 4).
@@ -55,11 +57,9 @@ class DecodedFrame:
         Raises `VideoError` for what FFmpeg cannot convert, such as the extreme sizes of a damaged file.
         """
         has_alpha = any(part.is_alpha for part in self.decoded.format.components)
-        height, width = self.size
+        (height, width), kind = self.size, "bgra" if has_alpha else "bgr24"
         try:
-            image = self.decoded.to_ndarray(
-                width=width, height=height, format="bgra" if has_alpha else "bgr24", interpolation=CONVERSION
-            )
+            image = self.converter.reformat(self.decoded, width, height, kind, interpolation=CONVERSION).to_ndarray()
         except av.FFmpegError as error:
             given = f"{self.decoded.format.name}, {self.decoded.height}x{self.decoded.width}"
             got = f"one that it cannot ({given}, to be shown at {height}x{width})"
@@ -99,6 +99,7 @@ class VideoDecoder:
         self.hides_frames = self._container.format.name.startswith("mov")
         self.has_converted = False  # whether any frame was interlaced
         self._size = self._codec.height, self._codec.width
+        self._converter = VideoReformatter()
         self._angle: int | None = None  # of the display matrix
         self._last = -1  # position of the frame decoded last
         self._before: int | None = None  # its time stamp
@@ -159,7 +160,8 @@ class VideoDecoder:
             stamp = self._find_stamp(frame)
             self._last = self._find_position(stamp)
             self._size = self._size if all(self._size) else (frame.height, frame.width)
-            yield DecodedFrame(self._last, stamp or 0, frame, self._size, self._find_matrix(frame))
+            matrix = self._find_matrix(frame)
+            yield DecodedFrame(self._last, stamp or 0, frame, self._size, matrix, self._converter)
 
     def _find_matrix(self, frame: av.VideoFrame) -> tuple[int, int, int, int]:
         """The display matrix of the frame, read anew where its angle is another: to read it keeps the frame in memory

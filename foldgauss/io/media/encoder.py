@@ -14,7 +14,7 @@ from typing import NamedTuple
 import av
 import numpy as np
 from av.filter import Graph
-from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
+from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc, VideoReformatter
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.io.media.clip import PathLike, VideoError, check_readable, video_error
@@ -147,7 +147,7 @@ def encode_video(
     with container:
         stream = container.add_stream(encoding.codec.encoder, rate=rate, options=options)
         stream.pix_fmt = encoding.pixel_format
-        packets, waiting = iter(()), None
+        packets, waiting, converter = iter(()), None, VideoReformatter()
         if sound is not None:
             codec = "libopus" if suffix == ".webm" else "aac"
             packets = _encode_sound(container.add_stream(codec, rate=SAMPLE_RATE, layout="stereo"), sound)
@@ -163,7 +163,7 @@ def encode_video(
                     context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
                 _open_with_own_priority(stream.codec_context)
             given = av.VideoFrame.from_ndarray(image, format="rgba" if image.shape[2] == 4 else "rgb24")
-            given = given.reformat(format=pixel_format.name, dst_colorspace=matrix, interpolation=CONVERSION)
+            given = converter.reformat(given, format=pixel_format.name, dst_colorspace=matrix, interpolation=CONVERSION)
             given.pts, given.time_base = number, 1 / rate
             container.mux(stream.encode(given))
             while (waiting := waiting or next(packets, None)) and waiting.pts * waiting.time_base < (number + 1) / rate:
