@@ -213,7 +213,7 @@ def test_kinds_save_bytes():
 # ------------------------------------------------------------------------------------ stated loss
 
 
-@pytest.mark.parametrize("max_loss_db", [0.05, 0.5])
+@pytest.mark.parametrize("max_loss_db", [0.05, pytest.param(0.5, marks=pytest.mark.slow)])
 def test_loss_is_the_one_stated(max_loss_db):
     model = soft_model(options=RenderOptions())
     clip = clip_of(model)

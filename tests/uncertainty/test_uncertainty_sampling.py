@@ -182,7 +182,7 @@ def test_message_counts_identified_frames():
     assert found.message.endswith(" 2 of 3 frame times are identified.")
 
 
-@pytest.mark.parametrize(("num", "frames"), [(5, [3]), (7, [1, 3, 4]), (3, None)])
+@pytest.mark.parametrize(("num", "frames"), [pytest.param(5, [3], marks=pytest.mark.slow), (7, [1, 3, 4]), (3, None)])
 def test_single_frames_between_held_ones(num, frames):
     means = np.linspace(0, 1, num)
     curves = parabolas(means[1:-1], np.full(num - 2, 0.2 / num))

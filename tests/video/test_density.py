@@ -42,7 +42,7 @@ def _off(image, mixture, size=SIZE, t=0.45):
     return np.abs(np.asarray(image) - density).max() / density.max()
 
 
-@pytest.mark.parametrize("engine", ["cpu", "reference"])
+@pytest.mark.parametrize("engine", ["cpu", pytest.param("reference", marks=pytest.mark.slow)])
 def test_image_is_the_density(engine):
     mixture = _mixture()
     image = density_image(mixture, 0.45, SIZE, engine=engine)

@@ -21,9 +21,19 @@ def _model(power=2.0, floor=0.0, size=(37, 50)) -> VideoModel:
     return VideoModel(splats, FrameTimes.uniform(5), size, 25.0, RenderOptions())
 
 
-@pytest.mark.parametrize(("power", "floor"), [(1.0, 0.0), (2.0, 0.1)])
 @pytest.mark.parametrize(
-    "size", [None, (60, 41), *(pytest.param(s, marks=pytest.mark.slow) for s in ((37, 50), (16, 90)))]
+    ("size", "power", "floor"),
+    [
+        (None, 1.0, 0.0),
+        ((60, 41), 2.0, 0.1),
+        pytest.param(None, 2.0, 0.1, marks=pytest.mark.slow),
+        pytest.param((60, 41), 1.0, 0.0, marks=pytest.mark.slow),
+        *(
+            pytest.param(s, *of_a, marks=pytest.mark.slow)
+            for s in ((37, 50), (16, 90))
+            for of_a in ((1, 0.0), (2, 0.1))
+        ),
+    ],
 )
 def test_renderer_matches_model_render(size, power, floor):
     model = _model(power, floor)
