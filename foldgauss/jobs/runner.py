@@ -334,7 +334,8 @@ def clip_warnings(clip: Clip) -> list[str]:
 
 def peak_bytes() -> int | None:
     """The largest resident memory of this process so far; None where the system does not provide it."""
-    with suppress(OSError), open("/proc/self/status") as status:  # Linux, whose `ru_maxrss` starts at the parent's
+    # Linux, where `ru_maxrss` is at least that of the process that started this one.
+    with suppress(OSError, StopIteration), open("/proc/self/status") as status:
         return 1024 * next(int(line.split()[1]) for line in status if line.startswith("VmHWM:"))
     try:
         import resource
