@@ -30,7 +30,7 @@ MEASURED = [
     *(sys.executable, "-c"),
     "import resource, subprocess, sys; status = subprocess.run(sys.argv[1:]).returncode; "
     "unit = 1 if sys.platform == 'darwin' else 1024; "
-    "print(unit * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss); sys.exit(status)",
+    "print(); print(unit * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss); sys.exit(status)",
 ]
 
 

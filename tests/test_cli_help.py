@@ -232,3 +232,9 @@ def test_bars_show_the_time_left():
     assert {name for name in bars if "TIME_LEFT" not in sources[name]} == {"progress"}
     info = FitInfo(3, 0.5, 0.4, 30.0, 40, 40, 5.0, seconds_left=7.0, stopped_by=None)
     assert progress._FitColumn().render(SimpleNamespace(fields={"info": info})).rstrip().endswith("7 s left")
+
+
+def test_only_the_commands_asked_for_are_loaded():
+    """A command that was only listed so far must not replace one that another thread has imported."""
+    assert list(load_commands("info")) == ["info"]
+    assert load_commands("nonsense") == {}

@@ -335,8 +335,8 @@ def clip_warnings(clip: Clip) -> list[str]:
 def peak_bytes() -> int | None:
     """The largest resident memory of this process so far; None where the system does not provide it."""
     # Linux, where `ru_maxrss` is at least that of the process that started this one.
-    with suppress(OSError, StopIteration), open("/proc/self/status") as status:
-        return 1024 * next(int(line.split()[1]) for line in status if line.startswith("VmHWM:"))
+    with suppress(OSError, StopIteration), open("/proc/self/status", "rb") as status:
+        return 1024 * next(int(line.split()[1]) for line in status if line.startswith(b"VmHWM:"))
     try:
         import resource
     except ImportError:  # Windows

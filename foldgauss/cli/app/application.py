@@ -97,12 +97,13 @@ def root_command() -> Any:
 
 @functools.cache
 def load_commands(*names: str) -> dict[str, Any]:
-    """The commands by name; those named, or all if none is, are imported. Unknown names are ignored."""
+    """The commands of these names, or all without names, imported and built. Unknown names are ignored."""
+    known = [name for name in names or COMMANDS if name in COMMANDS]
     with use_default_signals():
-        for name in names or COMMANDS:
-            if name in COMMANDS:
-                importlib.import_module(f"foldgauss.cli.{COMMANDS[name].module}")
-    return typer.main.get_command(app).commands
+        for name in known:
+            importlib.import_module(f"foldgauss.cli.{COMMANDS[name].module}")
+    commands = typer.main.get_command(app).commands
+    return {name: commands[name] for name in known}
 
 
 def name_option(text: str) -> str:
