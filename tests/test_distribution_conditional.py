@@ -414,7 +414,7 @@ def test_mass_on_a_curve_narrower_than_numbers_lie_apart(dtype):
     [
         (np.float64, 1e-17, 0.09),
         pytest.param(np.float32, 1e-9, 0.09, marks=pytest.mark.slow),
-        (np.float64, 0.3, 30.0),
+        pytest.param(np.float64, 0.3, 30.0, marks=pytest.mark.slow),
     ],
 )
 def test_time_where_space_tells_it_to_the_last_digit(dtype, scale, s):

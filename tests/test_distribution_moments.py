@@ -150,7 +150,7 @@ def test_moments_of_splines_and_sines(name):
     assert np.abs((products.mean(0) - 1.04 * covariance) / error).max() > 5
 
 
-@pytest.mark.parametrize("time_scale", [1e-12, 0.3, 1e6])
+@pytest.mark.parametrize("time_scale", [1e-12, pytest.param(0.3, marks=pytest.mark.slow), 1e6])
 def test_moments_and_entropy_in_float32(time_scale):
     # Offsets 1e4 and the folds' coefficients scaled with time: the same numbers in float64, to float32's digits.
     def quantities(dtype):

@@ -40,7 +40,7 @@ QUICK_OVER = (*QUICK, "huge", "opaque", "giant")
 COMBINATIONS = [
     pytest.param(*case, kind, marks=[] if case == ("cpu", "over", "default") or kind in quick else [pytest.mark.slow])
     for case in CASES
-    for quick in [QUICK if case[1] == "sum" else QUICK_OVER]
+    for quick in [QUICK_OVER if case[1:] == ("over", "default") else QUICK]
     for kind in KINDS
 ]
 

@@ -505,7 +505,10 @@ def test_finetuning_keeps_the_kinds():
         {"economy": Economy(rounds=1)},
         {"economy": Economy(), "batch_size": 3, "two_cameras": True, "power": 2.0, "floor": 0.1},
         {"economy": Economy(psnr=25), "minutes": 0.03, "steps": None},
-        {"economy": Economy(), "degree": 0, "learn_frame_times": False, "follow_motion": False},
+        pytest.param(
+            {"economy": Economy(), "degree": 0, "learn_frame_times": False, "follow_motion": False},
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=str,
 )

@@ -239,7 +239,7 @@ def test_gaps_exist_only_where_they_are_detected_as_cuts(num_frames, cuts):
 # -------------------------------------------------------------------------------------------------- long
 
 
-@pytest.mark.parametrize("num", [400, *(pytest.param(num, marks=pytest.mark.slow) for num in (1000, 5000))])
+@pytest.mark.parametrize("num", [200, *(pytest.param(num, marks=pytest.mark.slow) for num in (400, 1000, 5000))])
 def test_thousands_of_frames_and_few_steps(num):
     """No frame is left dark, though most of them were never looked at; nor does it take long to begin."""
     frames = moving_blobs(50, 8, 8)[np.abs(np.arange(num) % 98 - 49)]

@@ -135,9 +135,9 @@ def test_places_in_depth_where_gaussians_are_static(some):
         ({"relocated_fraction": 0.0}, 0),
         ({"steps": 20}, 1),  # a pass takes 9 steps
         ({"sparse_updates": False}, 0),
-        ({"two_cameras": True, "batch_size": 2}, 3),
+        pytest.param({"two_cameras": True, "batch_size": 2}, 3, marks=pytest.mark.slow),
         ({"interpolation_fraction": 0.5}, 3),
-        ({"compositing": "sum"}, 3),
+        pytest.param({"compositing": "sum"}, 3, marks=pytest.mark.slow),
         ({"economy": Economy()}, 0),
         ({"growth": Growth()}, 0),
         ({"rates": LearningRates(color_dc=1e5)}, 0),  # it diverges
