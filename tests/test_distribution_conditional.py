@@ -138,7 +138,7 @@ ENVELOPES = [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (2.0, 0.01)]  # power and floor
 
 
 @pytest.mark.parametrize(
-    ("dim", "cases"), [(1, ENVELOPES[1::2]), *(pytest.param(dim, ENVELOPES, marks=pytest.mark.slow) for dim in (1, 2))]
+    ("dim", "cases"), [(1, ENVELOPES[3:]), *(pytest.param(dim, ENVELOPES, marks=pytest.mark.slow) for dim in (1, 2))]
 )
 def test_time_given_space_integrates_to_one(dim, cases):
     nodes, weights = np.polynomial.legendre.leggauss(20)

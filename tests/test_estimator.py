@@ -432,6 +432,7 @@ def test_auto_starts_without_empty_components(monkeypatch):
     assert (np.exp(begun[0].log_weights) > 0.4 / N).all()
 
 
+@pytest.mark.slow
 def test_normalized_weights_prune_alike():
     rng = np.random.default_rng(0)
     t = rng.normal(size=300)

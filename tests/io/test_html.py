@@ -270,7 +270,11 @@ def _with(model, **fields):
     return VideoModel(model.splats, own["frame_times"], *shared, own["scale_cutoff"])
 
 
-@pytest.mark.parametrize("name", MODELS)
+#: A setting each of conditioning, compositing and the clip; the long runs take the rest.
+QUICK = ("moved", "layers", "sum", "power 1, floor, no path", "cut")
+
+
+@pytest.mark.parametrize("name", [pytest.param(k, marks=[] if k in QUICK else pytest.mark.slow) for k in MODELS])
 def test_pictures_are_those_of_the_engine(opened, fitted, name):
     model = MODELS[name](fitted)
     page, play = opened(model), VideoRenderer(model)
@@ -555,7 +559,7 @@ def test_segments_that_no_page_holds_are_told(monkeypatch):
     assert len(made) == 2  # more have no room
 
 
-@pytest.mark.parametrize("compositing", ["over", "sum"])
+@pytest.mark.parametrize("compositing", ["over", pytest.param("sum", marks=pytest.mark.slow)])
 def test_pictures_of_segments_are_those_of_the_engine(opened, compositing):
     """Inside, in fades, of three at once, at cuts of both kinds, between frames, to and fro over the seams."""
     video = segmented(compositing=compositing)

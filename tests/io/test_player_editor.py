@@ -27,7 +27,7 @@ from foldgauss.video import SegmentedVideo, VideoModel
 from foldgauss.video.models.renderer import VideoRenderer
 
 #: Of each kind of edit one: of places, shapes, colors, times, copies and order.
-QUICK = ("move", "transform", "gain", "freeze", "copies", "front")
+QUICK = ("transform", "gain", "freeze", "copies")
 assert set(QUICK) <= EDITS.keys()
 
 
@@ -46,7 +46,13 @@ def test_an_edit_shows_what_foldgauss_edit_gives(opened, compact, name):
     np.testing.assert_array_equal(page.picture(0.9), before)
 
 
-@pytest.mark.parametrize("how", [{"power": 1.0, "floor": 0.1}, {"compositing": "sum"}, {"degree": 0}])
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"power": 1.0, "floor": 0.1},
+        *(pytest.param(own, marks=pytest.mark.slow) for own in ({"compositing": "sum"}, {"degree": 0})),
+    ],
+)
 def test_edits_are_those_of_any_model(opened, tmp_path, how):
     path = save_compact(tmp_path / "m.fgz", quantize_finely(soft_model(options=RenderOptions(), **how)))
     page = opened(path)

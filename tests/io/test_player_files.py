@@ -234,6 +234,7 @@ def test_view_saves_to_disk_and_takes_it_up_again(browser, compact, tmp_path):
     page.close()
 
 
+@pytest.mark.slow
 def test_view_keeps_what_others_wrote_to_the_script(browser, compact, tmp_path):
     script, token = tmp_path / "clip.edit.toml", make_token()
     with serving(html_page(compact, save_to=SaveTarget(script.name, token)), script, token) as url:

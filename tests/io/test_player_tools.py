@@ -84,6 +84,7 @@ def test_the_eyedropper_sees_the_color_that_is_shown(opened, compact):
         np.testing.assert_allclose(np.array(color) * 255, shown[row, column], atol=4)
 
 
+@pytest.mark.slow
 def test_a_button_selects_what_moves(browser, compact, tmp_path, monkeypatch):
     masks = np.zeros((NUM_FRAMES, *SIZE), bool)
     masks[:, :, : SIZE[1] // 2] = True

@@ -78,7 +78,8 @@ def bunny(size):
     return (frame[..., ::-1] / 255).astype(np.float32)
 
 
-@pytest.mark.parametrize("compositing", ["over", pytest.param("sum", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("compositing", ["over", "sum"])
 def test_beats_gradient_descent_on_a_real_frame(compositing):
     """The best of three rates of Adam, 200 steps each, from the same start; the solve has at most 60 iterations."""
     size = (90, 160)
