@@ -349,7 +349,6 @@ def test_likelihood_never_decreases(x64, power, covariance):
     assert (np.diff(history) >= -1e-10 * np.abs(history[1:])).all()
 
 
-@pytest.mark.slow
 def test_moment_updates_of_time_can_decrease_the_likelihood(x64):
     """Power check of the test above: from its end, plain moments of time go down."""
     envelope, model, points = ENVELOPES["1"], _model(), make_points(_data(), np.ones(N), K)
