@@ -46,7 +46,9 @@ def by_quadrature(curves, increments, far: float, points: int):
     return mean, covariance, np.log(weights.sum()) + heights.max() + num * np.log(z[1] - z[0])
 
 
-@pytest.mark.parametrize("concentration", [0.2, 1.0, 20.0])
+@pytest.mark.parametrize(
+    "concentration", [0.2, 1.0, 20.0, *(pytest.param(a, marks=pytest.mark.slow) for a in (0.5, 4.0))]
+)
 @pytest.mark.parametrize("means", [(0.4, 0.6), (0.5, 0.52), (0.62, 0.45), (0.1, 0.9)])
 def test_two_frames_agree_with_quadrature(concentration, means):
     # Also where frames are so near, or so far out of order, that only their order separates them.
