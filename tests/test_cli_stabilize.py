@@ -5,8 +5,8 @@ import pytest
 from commands import run
 from tiny_clips import NUM_FRAMES, model_of_12
 
-from foldgauss.io import read_video, save_video_model
-from foldgauss.video import FitConfig, fit
+from foldgauss.io import load_video_model, read_video, save_video_model
+from foldgauss.video import FitConfig, fit, interpolate_frames, interpolated_times, stabilize
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +21,15 @@ def test_a_camera_that_stands_still_stays(model, tmp_path, capsys):
     images = tmp_path / "images"
     assert run("stabilize", model, "--out", images, "--border", "keep", "--upsample", "2") == 0
     assert "23 frames" in capsys.readouterr().out
-    assert read_video(images).frames.shape == (2 * NUM_FRAMES - 1, 40, 64, 3)
+    frames = read_video(images).frames
+    assert frames.shape == (2 * NUM_FRAMES - 1, 40, 64, 3)
+    video = stabilize(load_video_model(model), border="keep")
+    times = interpolated_times(np.asarray(video.frame_times.times()), 2)
+    np.testing.assert_array_equal(frames, list(interpolate_frames(video, times)))
+    assert (
+        run("stabilize", model, "--out", images, "--border", "keep", "--upsample", "2", "--no-flow", "--overwrite") == 0
+    )
+    np.testing.assert_array_equal(read_video(images).frames, list(video.frames(times)))
 
 
 def test_options_reach_the_video(model, tmp_path, monkeypatch, capsys):

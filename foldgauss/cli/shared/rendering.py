@@ -45,6 +45,13 @@ SoundFile = Annotated[
     ),
 ]
 
+Flow = Annotated[
+    bool,
+    typer.Option(
+        "--flow/--no-flow", help="Between frames, average with a prediction by optical flow from the frames around."
+    ),
+]
+
 
 def video_option(suffix: str) -> Any:
     """The option `--out` of a command that writes a video, by default the model's name with this suffix."""
@@ -122,7 +129,7 @@ def render_to_file(
     image_format: str = "png",
     overwrite: bool = False,
     options: VideoOptions = VideoOptions(),  # noqa: B008
-    flow: bool = False,
+    flow: bool = True,
 ) -> None:
     """Write the images at `times` as a video or to a folder, or a single image to a .png.
 

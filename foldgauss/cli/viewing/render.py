@@ -31,6 +31,7 @@ from foldgauss.cli.shared.outputs import (
 from foldgauss.cli.shared.rendering import (
     CodecName,
     Crf,
+    Flow,
     PixelFormat,
     SoundFile,
     VideoOptions,
@@ -90,9 +91,7 @@ def render(
     crf: Crf = None,
     pixel_format: PixelFormat = None,
     sound: SoundFile = None,
-    flow: Annotated[
-        bool, typer.Option(help="Between frames, average with a prediction by optical flow from the frames around.")
-    ] = True,
+    flow: Flow = True,
     overwrite: Overwrite = False,
 ) -> None:
     """Render a model as a video, also between its frames."""

@@ -13,6 +13,7 @@ from foldgauss.cli.shared.outputs import check_image_path, name_after, refuse_ex
 from foldgauss.cli.shared.rendering import (
     CodecName,
     Crf,
+    Flow,
     PixelFormat,
     SoundFile,
     VideoOptions,
@@ -57,6 +58,7 @@ def stabilize_command(
     crf: Crf = None,
     pixel_format: PixelFormat = None,
     sound: SoundFile = None,
+    flow: Flow = True,
     overwrite: Overwrite = False,
 ) -> None:
     """Render a model as a steadier camera would show it."""
@@ -93,6 +95,7 @@ def stabilize_command(
         background=background_color,
         overwrite=overwrite,
         options=options,
+        flow=flow,
     )
 
 
