@@ -3,10 +3,10 @@
     python -m benchmarks.codecs [--json FILE] [--clips FOLDER] [--minutes M] [--figure FILE]
 
 The sample clips and the subfolders of FOLDER, 50 frames each, at 160x284 (carphone: 144x176). `foldgauss`: fits of M
-minutes each with several numbers of Gaussians, compressed for at most 0.3 dB. Codecs: FFmpeg's encoders through PyAV,
-4:2:0, at several constant rate factors, presets *medium* and *slow* (SVT-AV1: 6 and 3), all tuned for PSNR, whole
-Matroska files. Images: one JPEG or WebP for each frame. PSNR and SSIM of the decoded RGB frames, means; bits per pixel;
-seconds of wall time to encode (to fit and compress) and to decode all frames (to render them).
+minutes of processor time with several numbers of Gaussians, compressed for at most 0.3 dB. Codecs: FFmpeg's encoders
+through PyAV, 4:2:0, at several constant rate factors, presets *medium* and *slow* (SVT-AV1: 6 and 3), all tuned for
+PSNR, whole Matroska files. Images: one JPEG or WebP for each frame. PSNR and SSIM of the decoded RGB frames, means;
+bits per pixel; seconds of processor time to encode (to fit and compress) and to decode all frames (to render them).
 
 BD-rate (Bjontegaard 2001, VCEG-M33): how many more bytes a coder takes at equal PSNR than x264 medium, by piecewise
 cubic interpolation of log bytes over the common range of PSNR; none where there is no common range. With --json
@@ -32,9 +32,10 @@ from benchmarks import _common
 from benchmarks._clips import ClipSource, folder_sources, sample_sources
 from benchmarks._common import console
 from benchmarks._runs import Run, Runs
+from benchmarks.interpolation import fit_model
 from foldgauss.io import load_video_model, read_video, save_compact
 from foldgauss.io.media.decoder import CONVERSION
-from foldgauss.video import FitConfig, compress, fit, psnr, ssim
+from foldgauss.video import FitConfig, compress, psnr, ssim
 
 NUM_FRAMES, SIZE = 50, (160, 284)
 GAUSSIANS = (3_000, 12_000, 48_000)
@@ -68,8 +69,8 @@ def score(frames: np.ndarray, decoded: np.ndarray, num_bytes: int, encode: float
 
 
 def timed(task: Callable[[], object]) -> tuple[object, float]:
-    begun = time.perf_counter()
-    return task(), time.perf_counter() - begun
+    begun = time.process_time()
+    return task(), time.process_time() - begun
 
 
 def run_codec(frames: np.ndarray, fps: float, name: str, crf: int) -> Run:
@@ -113,7 +114,7 @@ def run_foldgauss(frames: np.ndarray, fps: float, num: int, minutes: float) -> R
     with tempfile.TemporaryDirectory() as folder:
 
         def encode() -> Path:
-            model = fit(frames, FitConfig(num_gaussians=num, minutes=minutes), fps=fps).model
+            model = fit_model(frames, FitConfig(num_gaussians=num, minutes=minutes), fps, cpu_time=True)
             made = compress(model, frames, max_loss_db=LOSS_DB)
             return save_compact(Path(folder) / "clip.fgz", made.quantized)
 
@@ -173,7 +174,7 @@ def draw(results: dict[str, dict[str, list[Run]]], path: Path) -> None:
 def main(arguments: list[str] | None = None) -> None:
     parser: argparse.ArgumentParser = _common.parser(__doc__)
     parser.add_argument("--clips", type=Path, metavar="FOLDER", help="a folder whose subfolders are further clips")
-    parser.add_argument("--minutes", type=float, default=MINUTES, help=f"of each fit [{MINUTES:g}]")
+    parser.add_argument("--minutes", type=float, default=MINUTES, help=f"of the processor, for each fit [{MINUTES:g}]")
     parser.add_argument("--figure", type=Path, metavar="FILE", help="draw PSNR over bits per pixel")
     options = _common.parse(parser, arguments)
     sources = sample_sources(("bunny", "bikes", "carphone"))
