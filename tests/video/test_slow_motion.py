@@ -10,6 +10,7 @@ from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, FrameTimes, VideoModel, edit, fit, interpolate_frames, interpolated_times, psnr
 from foldgauss.video.models.splats import FoldedSplats
+from foldgauss.video.motion.optical_flow import Motion
 
 NUM_FRAMES, SIZE, SPEED = 6, (64, 96), 4.0  # pixels per frame
 
@@ -46,15 +47,25 @@ def panned(num_frames: int, size: tuple[int, int] = (128, 192)) -> np.ndarray:
     return np.stack(frames)
 
 
-def test_it_is_nearer_to_the_truth_than_the_gaussians_alone():
-    frames = panned(7)
-    model = fit(frames[::2], FitConfig(num_gaussians=4000, steps=200, seed=0)).model
-    half_way = interpolated_times(np.asarray(model.frame_times.times()), 2)[1::2]
+@pytest.fixture(scope="module")
+def pan() -> VideoModel:
+    return fit(panned(7)[::2], FitConfig(num_gaussians=4000, steps=200, seed=0)).model
+
+
+def test_it_is_nearer_to_the_truth_than_the_gaussians_alone(pan):
+    half_way = interpolated_times(np.asarray(pan.frame_times.times()), 2)[1::2]
     alone, averaged = (
-        np.mean([psnr(truth, image) for truth, image in zip(frames[1::2], images, strict=True)])
-        for images in (model.frames(half_way), interpolate_frames(model, half_way))
+        np.mean([psnr(truth, image) for truth, image in zip(panned(7)[1::2], images, strict=True)])
+        for images in (pan.frames(half_way), interpolate_frames(pan, half_way))
     )
     assert averaged > alone + 0.3, (alone, averaged)
+
+
+def test_images_between_frames_are_weighted_averages(pan):
+    half_way = interpolated_times(np.asarray(pan.frame_times.times()), 2)[3:4]
+    (own,), (shown,), frames = pan.frames(half_way), interpolate_frames(pan, half_way), np.stack(list(pan.frames()))
+    predicted = Motion.from_frames(frames).interpolate(frames, 1, 0.5, pan.size)
+    np.testing.assert_allclose(shown, 0.3 * own + 0.7 * np.clip(predicted, 0, 255), atol=0.6)
 
 
 def test_frames_are_the_videos_own():

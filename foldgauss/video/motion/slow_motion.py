@@ -10,9 +10,9 @@ from foldgauss.video.models.frame_times import is_cut
 from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer
 from foldgauss.video.motion.optical_flow import Motion
 
-#: Weight of the prediction by optical flow. Its errors and those of the video's own image are different, so the mean
-#: of both is better than each.
-FLOW_WEIGHT = 0.5
+#: Weight of the prediction by optical flow. Its errors and those of the video's own image are different, so an average
+#: is better than each. (Every second frame of six clips hidden: 0.7 is better than 0.5 by 0.05 to 0.34 dB, 0.8 alike.)
+FLOW_WEIGHT = 0.7
 #: So near to a frame, in intervals, its own image is shown.
 NEAR = 1e-3
 
@@ -26,9 +26,9 @@ def interpolate_frames(
 ) -> Iterator[UInt8[np.ndarray, "height width channels"]]:
     """As `video.frames`, but coherent between frames: slow motion.
 
-    An image between two frames is the mean of the video's own and of one that `Motion.interpolate` makes of its images
-    at the four frames around. At frames, at cuts and for images with alpha (`background=None`) it is the video's own.
-    Images between the same two frames should follow each other: the flow of one interval is kept.
+    An image between two frames is a weighted average: 0.3 of the video's own, and 0.7 of one that `Motion.interpolate`
+    makes of its images at the four frames around. At frames, at cuts and for images with alpha (`background=None`) it
+    is the video's own. Images between the same two frames should follow each other: the flow of one interval is kept.
 
     Raises ValueError as `VideoRenderer` does. Example: `interpolate_frames(model, interpolated_times(times, 4))`.
     """
@@ -62,9 +62,9 @@ class _Window:
         self.is_cut = self.inner + 1 in self.motion.find_cuts()
 
     def average(self, image: np.ndarray, fraction: float) -> UInt8[np.ndarray, "height width 3"]:
-        """The mean of the video's own image and the prediction at a fraction of the way through the interval."""
+        """The weighted average of the video's own image and the prediction, at a fraction of the interval."""
         if self.is_cut:
             return image
         predicted = self.motion.interpolate(self.frames, self.inner, fraction, image.shape[:2])
-        mean = (1 - FLOW_WEIGHT) * image + FLOW_WEIGHT * np.clip(predicted, 0, 255)
-        return np.rint(mean).astype(np.uint8)
+        average = (1 - FLOW_WEIGHT) * image + FLOW_WEIGHT * np.clip(predicted, 0, 255)
+        return np.rint(average).astype(np.uint8)
