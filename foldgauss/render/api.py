@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from foldgauss._runtime.checks import check_one_of, invalid
+from foldgauss._runtime.device import default_platform
 from foldgauss._runtime.threads import check_not_forked, run_tasks
 from foldgauss.render import cpu, pallas
 from foldgauss.render.reference import render_reference
@@ -116,7 +117,7 @@ def render(
 
 def choose_engine(options: RenderOptions, dtype: np.dtype) -> str:
     """The engine that "auto" stands for, by the options and the dtype of the splats."""
-    if jax.default_backend() == "cpu" and _cpu_takes(options):
+    if default_platform() == "cpu" and _cpu_takes(options):
         return "cpu"
     return "pallas" if dtype == jnp.float32 and pallas.is_preferred(options) else "xla"
 

@@ -21,6 +21,7 @@ from jax.experimental import pallas as pl
 from jaxtyping import Array, Float
 
 from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.device import default_platform
 from foldgauss.render.footprint import cap_alpha, raw_alpha, squared_distance
 from foldgauss.render.splats import RenderOptions
 from foldgauss.render.tiles import (
@@ -84,7 +85,7 @@ def check_options(options: RenderOptions) -> None:
 
 def is_preferred(options: RenderOptions) -> bool:
     """Whether engine "auto" should use this one: a GPU that it compiles for is JAX's default device."""
-    if jax.default_backend() != "gpu" or CompilerParams is None:
+    if default_platform() != "gpu" or CompilerParams is None:
         return False
     return options.tile_size in (None, *TILES) and options.alpha_ceiling <= HIGHEST_CEILING
 

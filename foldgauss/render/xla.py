@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from foldgauss._runtime.device import default_platform
 from foldgauss.render.footprint import cap_alpha, raw_alpha, squared_distance
 from foldgauss.render.splats import RenderOptions
 from foldgauss.render.tiles import (
@@ -64,7 +65,7 @@ def render_xla(
 
 
 def _plan(leaves, size, compositing, options) -> Plan:
-    pixels = BATCH_PIXELS["cpu" if jax.default_backend() == "cpu" else "other"]
+    pixels = BATCH_PIXELS["cpu" if default_platform() == "cpu" else "other"]
     return make_plan(leaves, size, compositing, options, tile=options.tile_size or TILE_SIZE, batch_pixels=pixels)
 
 
@@ -127,7 +128,7 @@ def _num_chunks(batch: Batch) -> Int[Array, ""]:
 
 def _unroll() -> int:
     """XLA compiles an unrolled chunk to one kernel on a GPU, and to slow ones on a CPU."""
-    return 1 if jax.default_backend() == "cpu" else CHUNK
+    return 1 if default_platform() == "cpu" else CHUNK
 
 
 def _composite_batch(plan: Plan, fields, lists: Lists, canvas: Canvas, k) -> Canvas:

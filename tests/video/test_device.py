@@ -20,7 +20,7 @@ from benchmarks import gpu
 from foldgauss.io import write_image
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.io.models.video_model import load_video_model
-from foldgauss.render import RenderOptions
+from foldgauss.render import RenderOptions, api
 from foldgauss.video import (
     DivergenceWarning,
     Economy,
@@ -493,6 +493,11 @@ def test_auto_is_the_cpu_without_a_gpu(monkeypatch):
     assert choose_engine(FRAMES, FitConfig(economy=Economy())) == "cpu"
     assert choose_engine(FRAMES, FitConfig(engine="cpu")) == "cpu"
     assert choose_engine(FRAMES, FitConfig(engine="pallas")) == "pallas"
+    for device in (jax.devices("cpu")[0], "cpu"):
+        with jax.default_device(device):
+            assert choose_engine(FRAMES, FitConfig()) == "cpu"
+            assert api.choose_engine(RenderOptions(), np.dtype(np.float32)) == "cpu"
+    assert api.choose_engine(RenderOptions(), np.dtype(np.float32)) == "pallas"
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ import numpy as np
 
 from foldgauss import __version__
 from foldgauss._runtime import threads
+from foldgauss._runtime.device import default_platform
 from foldgauss._runtime.machine import cpu_model
 from foldgauss._runtime.threads import available_cores, num_threads
 from foldgauss.io.media.resizing import memory_limit
@@ -162,7 +163,7 @@ def moving_blob(num_frames: int = 6) -> np.ndarray:
 def run_trials() -> Iterator[Trial]:
     """Small trials of rendering and fitting. An error makes a trial fail."""
     images: dict[str, np.ndarray] = {}
-    on_gpu = ("pallas",) if jax.default_backend() == "gpu" else ()
+    on_gpu = ("pallas",) if default_platform() == "gpu" else ()
     for engine in ("reference", "xla", "cpu", *on_gpu):
         yield _run_trial(f"render an image, engine {engine}", lambda engine=engine: _render(engine, images))
     yield _run_trial("fit a clip of 6 frames", _fit)

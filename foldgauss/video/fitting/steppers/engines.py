@@ -6,6 +6,7 @@ import jax
 import numpy as np
 
 from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.device import default_platform
 from foldgauss.render import pallas
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.state import FitState
@@ -20,7 +21,7 @@ def choose_engine(frames: np.ndarray, config: FitConfig, state: FitState | None 
 
     Raises ValueError for an engine that does not support one of the settings.
     """
-    if config.engine == "cpu" or (config.engine == "auto" and jax.default_backend() == "cpu"):
+    if config.engine == "cpu" or (config.engine == "auto" and default_platform() == "cpu"):
         return "cpu"
     unsupported = _find_unsupported(frames, config, state)
     if config.engine == "auto":

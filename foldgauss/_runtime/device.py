@@ -1,0 +1,12 @@
+"""JAX's default device."""
+
+import jax
+
+
+def default_platform() -> str:
+    """The platform of JAX's default device, such as "cpu" or "gpu", also where `jax.default_device` has chosen it."""
+    device = jax.config.jax_default_device
+    if device is None:
+        return jax.default_backend()
+    platform = device if isinstance(device, str) else device.platform
+    return "gpu" if platform in ("cuda", "rocm") else platform
