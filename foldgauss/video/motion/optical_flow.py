@@ -6,7 +6,7 @@ Where the camera moves over texture, folds that start along tracks were worth 3 
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -110,6 +110,13 @@ class Motion:
         run_tasks(shrink, range(num))
         run_tasks(match, range(num - 1))
         return cls((height, width), small, flows[0], flows[1], MISS * float(unit.max()))
+
+    @classmethod
+    def join(cls, pairs: Sequence["Motion"]) -> "Motion":
+        """The motion of a short clip from that of each pair of neighboring frames."""
+        small = [pairs[0].small, *(pair.small[1:] for pair in pairs[1:])]
+        there, back = [pair.there for pair in pairs], [pair.back for pair in pairs]
+        return cls(pairs[0].size, *map(np.concatenate, (small, there, back)), pairs[0].miss)
 
     def find_cuts(self) -> list[int]:
         """The frames, in order, that begin a new shot."""

@@ -53,12 +53,14 @@ class _Window:
     """The images at the frames around an interval and the flow between them; those of `before` are used again."""
 
     def __init__(self, renderer: VideoRenderer, times: np.ndarray, interval: int, before: "_Window | None"):
-        known = {} if before is None else before.images
+        images, flows = ({}, {}) if before is None else (before.images, before.flows)
         around = range(max(interval - 1, 0), min(interval + 3, len(times)))
         self.interval, self.inner = interval, interval - around[0]
-        self.images = {k: known[k] if k in known else renderer.frame(times[k]) for k in around}
+        self.images = {k: images[k] if k in images else renderer.frame(times[k]) for k in around}
         self.frames = np.stack(list(self.images.values()))
-        self.motion = Motion.from_frames(self.frames)
+        pairs = {k: self.frames[n : n + 2] for n, k in enumerate(around[:-1])}
+        self.flows = {k: flows[k] if k in flows else Motion.from_frames(pair) for k, pair in pairs.items()}
+        self.motion = Motion.join(list(self.flows.values()))
         self.is_cut = self.inner + 1 in self.motion.find_cuts()
 
     def average(self, image: np.ndarray, fraction: float) -> UInt8[np.ndarray, "height width 3"]:
