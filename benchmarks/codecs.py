@@ -35,6 +35,7 @@ from benchmarks._runs import Run, Runs
 from benchmarks.interpolation import fit_model
 from foldgauss.io import load_video_model, read_video, save_compact
 from foldgauss.io.media.decoder import CONVERSION
+from foldgauss.io.media.encoder import open_with_own_priority
 from foldgauss.video import FitConfig, compress, psnr, ssim
 
 NUM_FRAMES, SIZE = 50, (160, 284)
@@ -83,6 +84,7 @@ def run_codec(frames: np.ndarray, fps: float, name: str, crf: int) -> Run:
             with av.open(str(path), "w") as container:
                 stream = container.add_stream(encoder, rate=rate, options={**options, "crf": str(crf)})
                 stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], "yuv420p"
+                open_with_own_priority(stream.codec_context)
                 for number, frame in enumerate(frames):
                     given = av.VideoFrame.from_ndarray(frame, format="rgb24")
                     given = given.reformat(format="yuv420p", interpolation=CONVERSION)

@@ -67,7 +67,7 @@ def warped_half_way(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 def interpolated_half_way(frames: np.ndarray) -> list[np.ndarray]:
     """What the optical flow predicts between each frame and the next."""
     motion = Motion.from_frames(np.ascontiguousarray(frames))
-    made = (motion.interpolate(frames, k, 0.5, frames.shape[1:3]) for k in range(len(frames) - 1))
+    made = (motion.interpolate(frames, k, 0.5, frames.shape[1:3]).image for k in range(len(frames) - 1))
     return [np.clip(np.rint(picture), 0, 255).astype(np.uint8) for picture in made]
 
 

@@ -50,12 +50,12 @@ def test_interpolated_frame_matches_the_motion():
     finer = panning(9, (1.0, 0.5))
     seen = np.ascontiguousarray(finer[::4])
     motion = Motion.from_frames(seen)
-    found = motion.interpolate(seen, 1, 0.75, (96, 160))
+    found = motion.interpolate(seen, 1, 0.75, (96, 160)).image
     inner = np.s_[8:-8, 8:-8]
     assert np.abs(found - finer[7])[inner].mean() < 0.15 * np.abs(np.float32(seen[2]) - finer[7])[inner].mean()
     # The left border comes from outside frame 1, not from a mean with what is not there.
     assert np.abs(found - finer[7])[8:-8, :2].mean() < 4
-    small = motion.interpolate(seen, 1, 0.75, (48, 80))
+    small = motion.interpolate(seen, 1, 0.75, (48, 80)).image
     assert small.shape == (48, 80, 3)
     same = cv2.resize(finer[7], (80, 48), interpolation=cv2.INTER_AREA)
     assert np.abs(small - same)[inner].mean() < 3
@@ -67,7 +67,7 @@ def test_interpolation_beats_plain_warping_at_occlusions():
     seen = np.ascontiguousarray(finer[::4])
     motion = Motion.from_frames(seen)
     for k, share, number in [(0, 0.25, 1), (0, 0.5, 2), (0, 0.75, 3), (1, 0.5, 6)]:
-        found, plain = motion.interpolate(seen, k, share, (96, 160)), plainly_warped(*seen[k : k + 2], share)
+        found, plain = motion.interpolate(seen, k, share, (96, 160)).image, plainly_warped(*seen[k : k + 2], share)
         target = finer[number]
         assert np.square(found - target).mean() < 0.85 * np.square(plain - target).mean()
 
@@ -78,7 +78,7 @@ def test_what_is_uncovered_and_covered_is_nearer_to_the_truth():
     seen = np.ascontiguousarray(finer[::4])
     motion = Motion.from_frames(seen)
     for k in (1, 2):
-        found, plain = motion.interpolate(seen, k, 0.5, (96, 160)), plainly_warped(*seen[k : k + 2], 0.5)
+        found, plain = motion.interpolate(seen, k, 0.5, (96, 160)).image, plainly_warped(*seen[k : k + 2], 0.5)
         left, target = 40 + 4 * k + 2, finer[4 * k + 2]
         for strip in (np.s_[30:70, left - 10 : left], np.s_[30:70, left + 40 : left + 50]):
             assert np.square(found - target)[strip].mean() < 0.7 * np.square(plain - target)[strip].mean()
@@ -91,20 +91,22 @@ def test_interpolation_follows_accelerated_motion():
     motion, inner = Motion.from_frames(seen), np.s_[8:-8, 16:-16]
     for k in range(4):
         for share in (0.25, 0.5, 0.75):
-            found, plain = motion.interpolate(seen, k, share, (96, 160)), plainly_warped(*seen[k : k + 2], share)
+            found, plain = motion.interpolate(seen, k, share, (96, 160)).image, plainly_warped(*seen[k : k + 2], share)
             target = finer[round(4 * (k + share))]
             assert np.square(found - target)[inner].mean() < 0.2 * np.square(plain - target)[inner].mean()
     cut = np.concatenate([panning(3, (0.0, 2.0), seed=5), seen, panning(3, (3.0, 0.0), seed=9)])
     beside = Motion.from_frames(cut)
     for k in (0, 3):
-        found = beside.interpolate(cut, 3 + k, 0.5, (96, 160))
-        np.testing.assert_array_equal(found, motion.interpolate(seen, k, 0.5, (96, 160)))
+        found = beside.interpolate(cut, 3 + k, 0.5, (96, 160)).image
+        np.testing.assert_array_equal(found, motion.interpolate(seen, k, 0.5, (96, 160)).image)
 
 
 def test_interpolation_of_a_still_clip_is_the_clip():
     still = np.repeat(panning(1, (0.0, 0.0)), 4, axis=0)
     for k in range(3):
-        np.testing.assert_allclose(Motion.from_frames(still).interpolate(still, k, 0.3, (96, 160)), still[0], atol=1e-3)
+        np.testing.assert_allclose(
+            Motion.from_frames(still).interpolate(still, k, 0.3, (96, 160)).image, still[0], atol=1e-3
+        )
 
 
 def passing(num_frames: int, before: tuple[float, float], behind: tuple[float, float]):

@@ -161,7 +161,7 @@ def encode_video(
                     context = stream.codec_context
                     context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
                     context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
-                _open_with_own_priority(stream.codec_context)
+                open_with_own_priority(stream.codec_context)
             given = av.VideoFrame.from_ndarray(image, format="rgba" if image.shape[2] == 4 else "rgb24")
             given = converter.reformat(given, format=pixel_format.name, dst_colorspace=matrix, interpolation=CONVERSION)
             given.pts, given.time_base = number, 1 / rate
@@ -251,7 +251,7 @@ def check_sound(sound: Sound) -> None:
     raise video_error("sound", expected="a file with sound", got=got, cure="Leave it out.")
 
 
-def _open_with_own_priority(context: av.VideoCodecContext) -> None:
+def open_with_own_priority(context: av.VideoCodecContext) -> None:
     """Open an encoder whose threads are scheduled as the caller is.
 
     SVT-AV1 makes its threads and its caller real-time threads where it may, as root, and they would starve all others.

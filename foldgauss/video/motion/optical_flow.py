@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -70,6 +71,17 @@ class Tracks:
 
     def __getitem__(self, which) -> "Tracks":
         return Tracks(self.shift[which], self.known[which])
+
+
+class Interpolated(NamedTuple):
+    """An image between two frames, predicted from them.
+
+    `image`: values about [0, 255]. `difference`: around each pixel, how much the frames differ after they are moved to
+    it: the mean squared difference of their values, a measure of the prediction's error.
+    """
+
+    image: Float32[np.ndarray, "rows columns 3"]
+    difference: Float32[np.ndarray, "rows columns"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,8 +181,8 @@ class Motion:
 
     def interpolate(
         self, frames: UInt8[np.ndarray, "frames height width 3"], k: int, fraction: float, size: tuple[int, int]
-    ) -> Float32[np.ndarray, "rows columns 3"]:
-        """The image at a `fraction` of the way from frame k to k + 1, of `size` (height, width); values about [0, 255].
+    ) -> Interpolated:
+        """The image at a `fraction` of the way from frame k to k + 1, of `size` (height, width).
 
         Both frames are warped along the paths of their points and averaged, weighted by how near in time they are.
         Pixels from outside one of them are taken from the other. This is done for several motions, and the images are
@@ -195,7 +207,7 @@ class Motion:
             motion = [_resize_flow(move, flow_size[::-1], size) for move in motion]
             moved, inside = _move(pair, motion, cv2.INTER_CUBIC)
             _add_average(*moved, *inside, np.float32(fraction), cv2.resize(weight, (columns, rows)), image)
-        return image
+        return Interpolated(image, cv2.resize(least, (columns, rows)))
 
     def _find_motions(self, pair: list[np.ndarray], k: int, fraction: float) -> list[tuple[np.ndarray, np.ndarray]]:
         """Motions that may be right at a pixel of the image between two: the ways from it to its place in each of them.

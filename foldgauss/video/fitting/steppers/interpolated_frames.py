@@ -36,7 +36,7 @@ class InterpolatedFrames:
 
     def interpolate(self, k: int, fraction: float, size: tuple[int, int]) -> Float32[np.ndarray, "height width 3"]:
         """The image at a fraction of the way from frame k to the next; values about [0, 1]."""
-        return self.motion.interpolate(self.frames, k, fraction, size) * np.float32(1 / 255)
+        return self.motion.interpolate(self.frames, k, fraction, size).image * np.float32(1 / 255)
 
 
 class Prefetcher:
