@@ -9,7 +9,7 @@ from tiny_clips import NUM_FRAMES, clip_of, model_of_12, write_both
 
 from foldgauss.io import load_video_model, save_video_model
 from foldgauss.io.media.contact_sheet import ERROR_GAIN
-from foldgauss.video import FrameTimes, VideoModel, layers
+from foldgauss.video import FrameTimes, VideoModel, interpolate_frames, layers
 from foldgauss.video.models.frame_times import make_time_logits
 
 #: Of a montage: what is left of each picture, what is above it, and what follows the last.
@@ -39,15 +39,16 @@ def titles(path):
     return int((cv2.imread(str(path))[:BAND, MARGIN:].max(-1) < 128).sum())
 
 
-def test_interpolation_shows_the_times_between(work, tmp_path, capsys):
+@pytest.mark.parametrize("flow", ["--flow", "--no-flow"])
+def test_interpolation_shows_the_times_between(work, tmp_path, capsys, flow):
     out = tmp_path / "between.png"
-    assert run("figure", "interpolation", work / "model.safetensors", "--at", "3,8", "--out", out) == 0
+    assert run("figure", "interpolation", work / "model.safetensors", "--at", "3,8", "--out", out, flow) == 0
     assert "from frame 3 to 4, from frame 8 to 9" in capsys.readouterr().out
     model = load_video_model(work / "model.safetensors")
     for row, k in zip(tiles(out, 2, 5), (3, 8), strict=True):
         for part, shown in enumerate(row):
-            t = np.float32((k + part / 4) / (NUM_FRAMES - 1))
-            expected = next(model.frames(np.array([t])))
+            t = np.array([np.float32((k + part / 4) / (NUM_FRAMES - 1))])
+            expected = next(interpolate_frames(model, t) if flow == "--flow" else model.frames(t))
             np.testing.assert_allclose(shown, expected, atol=1, err_msg=f"{k} + {part}/4")
         assert not np.array_equal(row[0], row[4])
     assert titles(out) > 50
@@ -59,9 +60,10 @@ def test_interpolation_follows_learned_times(tmp_path):
     logits[5] = 1.5
     model = VideoModel(model.splats, FrameTimes(logits), model.size, model.fps, model.options)
     save_video_model(tmp_path / "m.safetensors", model)
-    assert run("figure", "interpolation", tmp_path / "m.safetensors", "--parts", 2, "--out", tmp_path / "a.png") == 0
+    out = tmp_path / "a.png"
+    assert run("figure", "interpolation", tmp_path / "m.safetensors", "--parts", 2, "--no-flow", "--out", out) == 0
     times = np.asarray(model.frame_times.times())
-    (shown,) = tiles(tmp_path / "a.png", 1, 3)
+    (shown,) = tiles(out, 1, 3)
     expected = list(model.frames(np.array([times[5], (times[5] + times[6]) / 2, times[6]], np.float32)))
     np.testing.assert_allclose(shown, expected, atol=1)
 

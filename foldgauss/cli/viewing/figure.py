@@ -1,5 +1,6 @@
 """The commands `figure interpolation` and `figure reconstruction`: labeled figures of rendered images."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -12,12 +13,14 @@ from foldgauss.cli.app.help import App
 from foldgauss.cli.shared.arguments import FittedClip, ModelFile, Overwrite
 from foldgauss.cli.shared.clips import Video, read_fitted_clip
 from foldgauss.cli.shared.outputs import IMAGE_SUFFIX, name_after, refuse_existing, refuse_huge
+from foldgauss.cli.shared.rendering import Flow
 from foldgauss.io._atomic import check_writable
 from foldgauss.io.media.contact_sheet import make_comparison_sheet, make_contact_sheet
 from foldgauss.io.media.video_writing import write_image
 from foldgauss.io.models.video_model import load_video_model
 from foldgauss.video.models.frame_times import times_at
 from foldgauss.video.models.metrics import psnr
+from foldgauss.video.motion.slow_motion import interpolate_frames
 
 #: Parts of the interval between two frames; by default as in the paper: t, t + 1/4, t + 2/4, t + 3/4, t + 1.
 PARTS, MAX_PARTS = 4, 32
@@ -44,6 +47,7 @@ def interpolation(
     ] = None,
     parts: Annotated[int, typer.Option(help="Number of parts of the interval: 4 shows t, t+1/4, .. t+1.")] = PARTS,
     width: Width = None,
+    flow: Flow = True,
     overwrite: Overwrite = False,
 ) -> None:
     """Show images between two frames: t, t+1/4, t+2/4, t+3/4, t+1."""
@@ -59,7 +63,8 @@ def interpolation(
         if model.frame_times.cut_after(k):
             warn(f"--at: there is a cut between frames {k} and {k + 1}: each time shows the nearer frame.")
     fractions = np.arange(parts + 1) / parts
-    rows = [list(model.frames(times_at(times, k + fractions), size)) for k in chosen]
+    draw = partial(interpolate_frames, model) if flow else model.frames
+    rows = [list(draw(times_at(times, k + fractions), size)) for k in chosen]
     inner = [f"t + {part}/{parts}" for part in range(1, parts)]
     titles = [[f"t: frame {k}", *inner, f"t + 1: frame {k + 1}"] for k in chosen]
     _write(out_path, make_contact_sheet(rows, titles), ", ".join(f"from frame {k} to {k + 1}" for k in chosen))
