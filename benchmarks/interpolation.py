@@ -2,7 +2,7 @@
 
     python -m benchmarks.interpolation [--json FILE] [--clip bunny|bikes|carphone|PATH ...] [--size HxW]
                                        [--frames A:B] [--gaussians N] [--steps N | --minutes M [--cpu-time]]
-                                       [--seed S] [--set NAME=VALUE ...] [--sheet FILE] [--cost]
+                                       [--seed S] [--set NAME=VALUE ...] [--sheet FILE] [--cost] [--weight W ...]
 
 Without options: *bunny* and *bikes* at 160x320, 5 minutes each, with as many Gaussians as the fit chooses. Frames 0, 2,
 4, ... are fitted, and frames 1, 3, 5, ... drawn half way between the learned times of their neighbours, as `foldgauss
@@ -10,7 +10,8 @@ render` does (`interpolate_frames`) and by the Gaussians alone. Beside them, of 
 
 - their mean, and their mean after warping each half way by OpenCV's DIS flow between the two;
 - what the fit learns from between frames, `Motion.interpolate`;
-- the first two again, of the model's own pictures of the neighbours: then all start from the same quality.
+- the first two again, of the model's own pictures of the neighbours: then all start from the same quality;
+- with `--weight`, `interpolate_frames` with other weights of the prediction by optical flow, the same everywhere.
 
 PSNR and SSIM of 8-bit pictures, means over the frames; "without cuts" leaves out frames between two shots, which
 nothing can know. `--sheet` draws the held-out frames on which ours and the best rival differ most. `--cost` instead
@@ -23,6 +24,7 @@ import dataclasses
 import itertools
 import time
 from pathlib import Path
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -39,6 +41,7 @@ from foldgauss.video.fitting.loop import fit_steps, to_model
 from foldgauss.video.models.frame_times import is_cut
 from foldgauss.video.models.metrics import psnr, ssim
 from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.motion import slow_motion
 from foldgauss.video.motion.optical_flow import Motion
 
 CLIPS, SIZE, MINUTES = ("bunny", "bikes"), (160, 320), 5.0
@@ -93,7 +96,15 @@ def measure_cost(clip: Clip, config: FitConfig, name: str, cpu_time: bool) -> di
     return figures
 
 
-def measure(clip: Clip, config: FitConfig, name: str, sheet: Path | None, cpu_time: bool) -> dict[str, float]:
+def interpolate_with_weight(model: VideoModel, times: np.ndarray, weight: float) -> list[np.ndarray]:
+    """`interpolate_frames` with a weight of the prediction that does not depend on how much the frames differ."""
+    with mock.patch.multiple(slow_motion, FLOW_WEIGHT=weight, HALVING_DIFFERENCE=np.inf):
+        return list(interpolate_frames(model, times))
+
+
+def measure(
+    clip: Clip, config: FitConfig, name: str, sheet: Path | None, cpu_time: bool, weights: list[float]
+) -> dict[str, float]:
     """Figures of one clip, which are also shown."""
     seen, held_out = clip.frames[::2], clip.frames[1:-1:2] if len(clip.frames) % 2 else clip.frames[1::2][:-1]
     model = fit_model(np.ascontiguousarray(seen), config, clip.fps / 2, cpu_time)
@@ -102,6 +113,7 @@ def measure(clip: Clip, config: FitConfig, name: str, sheet: Path | None, cpu_ti
     half_way = interpolated_times(times, 2)[1::2]
     whole = ~np.asarray(is_cut(times))
     pictures = {OURS: list(interpolate_frames(model, half_way)), "folded Gaussians alone": list(model.frames(half_way))}
+    pictures |= {f"weight {weight:g}": interpolate_with_weight(model, half_way, weight) for weight in weights}
     for whose, frames in (("frames", seen), ("own pictures", own)):
         pairs = list(itertools.pairwise(frames))
         pictures[f"blending, {whose}"] = [mean_of_two(*pair) for pair in pairs]
@@ -126,6 +138,7 @@ def measure(clip: Clip, config: FitConfig, name: str, sheet: Path | None, cpu_ti
         "blending, own pictures": "own_blend",
         "DIS warping, own pictures": "own_warp",
     }
+    names |= {f"weight {weight:g}": f"weight_{weight:g}" for weight in weights}
     figures = {f"held_out_{name}": ours.mean(), f"training_{name}": training}
     figures |= {f"{short}_{name}": scores[way].mean() for way, short in names.items()}
     figures |= {f"{short}_ssim_{name}": likeness[way] for way, short in names.items()}
@@ -173,7 +186,7 @@ def main(arguments: list[str] | None = None) -> None:
         if options.cost:
             figures |= measure_cost(clip, config, Path(name).stem, options.cpu_time)
         else:
-            figures |= measure(clip, config, Path(name).stem, options.sheet, options.cpu_time)
+            figures |= measure(clip, config, Path(name).stem, options.sheet, options.cpu_time, options.weight or [])
     setting = {"size": options.size, "gaussians": options.gaussians, "seed": options.seed} | budget
     _common.finish(
         options.json, figures, _common.describe_machine(), setting=setting | {"set": dict(options.set or ())}
@@ -193,6 +206,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--cost", action="store_true", help="fit all frames, with interpolated frames and without")
     parser.add_argument("--seed", type=int, default=0, help="[0]")
     parser.add_argument("--set", action="append", type=fit_clip._setting, metavar="NAME=VALUE", help="of FitConfig")
+    parser.add_argument("--weight", type=float, action="append", metavar="W", help="may be given again")
     parser.add_argument("--sheet", type=Path, metavar="FILE", help="pictures of held-out frames go here (PNG)")
     return parser
 
