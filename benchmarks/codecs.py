@@ -3,7 +3,7 @@
     python -m benchmarks.codecs [--json FILE] [--clips FOLDER] [--minutes M] [--figure FILE]
 
 The sample clips and the subfolders of FOLDER, 50 frames each, at 160x284 (carphone: 144x176). `foldgauss`: fits of M
-minutes of processor time with several numbers of Gaussians, compressed for at most 0.3 dB. Codecs: FFmpeg's encoders
+minutes of one core with several numbers of Gaussians, compressed for at most 0.3 dB. Codecs: FFmpeg's encoders
 through PyAV, 4:2:0, at several constant rate factors, presets *medium* and *slow* (SVT-AV1: 6 and 3), all tuned for
 PSNR, whole Matroska files. Images: one JPEG or WebP for each frame. PSNR and SSIM of the decoded RGB frames, means;
 bits per pixel; seconds of processor time to encode (to fit and compress) and to decode all frames (to render them).
@@ -33,6 +33,7 @@ from benchmarks._clips import ClipSource, folder_sources, sample_sources
 from benchmarks._common import console
 from benchmarks._runs import Run, Runs
 from benchmarks.interpolation import fit_model
+from foldgauss._runtime.threads import set_num_threads
 from foldgauss.io import load_video_model, read_video, save_compact
 from foldgauss.io.media.decoder import CONVERSION
 from foldgauss.io.media.encoder import open_with_own_priority
@@ -182,7 +183,8 @@ def main(arguments: list[str] | None = None) -> None:
     sources = sample_sources(("bunny", "bikes", "carphone"))
     sources += folder_sources(options.clips) if options.clips else []
     sources = [one._replace(frames=NUM_FRAMES, size=None if one.name == "carphone" else SIZE) for one in sources]
-    runs = Runs(options.json, {"minutes": options.minutes, "clips": [one.describe() for one in sources]})
+    set_num_threads(1)
+    runs = Runs(options.json, {"processor_minutes": options.minutes, "clips": [one.describe() for one in sources]})
     results = {one.name: measure(one, runs, options.minutes) for one in sources}
     bd_rates = {}
     for clip, by_coder in results.items():

@@ -76,8 +76,9 @@ class Tracks:
 class Interpolated(NamedTuple):
     """An image between two frames, predicted from them.
 
-    `image`: values about [0, 255]. `difference`: around each pixel, how much the frames differ after they are moved to
-    it: the mean squared difference of their values, a measure of the prediction's error.
+    `image`: values about [0, 255]. `difference`, a measure of the image's error: the squared difference between the
+    frames after they are moved to it, by the motion of those tried for which it is least; the mean over the channels
+    and, with Gaussian weights, over a few pixels around. It is `LACKING` where one frame does not show the pixel.
     """
 
     image: Float32[np.ndarray, "rows columns 3"]
@@ -125,7 +126,7 @@ class Motion:
 
     @classmethod
     def join(cls, pairs: Sequence["Motion"]) -> "Motion":
-        """The motion of a short clip from that of each pair of neighboring frames."""
+        """The motion of a short clip from that of each pair of neighboring frames, of one pair at least."""
         small = [pairs[0].small, *(pair.small[1:] for pair in pairs[1:])]
         there, back = [pair.there for pair in pairs], [pair.back for pair in pairs]
         return cls(pairs[0].size, *map(np.concatenate, (small, there, back)), pairs[0].miss)

@@ -16,6 +16,8 @@ from foldgauss.video.motion.optical_flow import Motion
 FLOW_WEIGHT, HALVING_DIFFERENCE = 0.75, 4000.0
 #: So near to a frame, in intervals, its own image is shown.
 NEAR = 1e-3
+#: OpenCV moves images with fewer pixels than this on each side.
+MAX_SIDE = 2**15 - 1
 
 
 def interpolate_frames(
@@ -28,9 +30,10 @@ def interpolate_frames(
     """As `video.frames`, but coherent between frames: slow motion.
 
     An image between two frames is a weighted average of the video's own and of one that `Motion.interpolate` makes of
-    its images at the four frames around. The latter has weight 3/4, and less where the frames disagree. At frames, at
-    cuts and for images with alpha (`background=None`) the image is the video's own. Images between the same two frames
-    should follow each other: the flow of one interval is kept.
+    its images at the four frames around. The latter has weight 3/4, and less where the two images beside it, moved to
+    it, differ. At frames, at cuts, for images with alpha (`background=None`) and with sides of `MAX_SIDE` pixels or
+    more, the image is the video's own. Images between the same two frames should follow each other: the images and the
+    flow of an interval and of those beside it are kept.
 
     Raises ValueError as `VideoRenderer` does. Example: `interpolate_frames(model, interpolated_times(times, 4))`.
     """
@@ -41,7 +44,7 @@ def interpolate_frames(
     for t, image in zip(shown, renderer.frames(times), strict=True):
         k = min(max(int(np.searchsorted(frame_times, t, side="right")) - 1, 0), len(frame_times) - 1)
         fraction = 0.0
-        if image.shape[2] == 3 and k + 1 < len(frame_times) and not cuts[k]:
+        if image.shape[2] == 3 and max(image.shape) < MAX_SIDE and k + 1 < len(frame_times) and not cuts[k]:
             fraction = (t - frame_times[k]) / (frame_times[k + 1] - frame_times[k])
         if not NEAR < fraction < 1 - NEAR:
             yield image
