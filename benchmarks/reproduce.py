@@ -55,7 +55,6 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "time gradient not used": {"growth": {"time_gradient": 1e9}},
     "time gradient x0.25": {"growth": {"time_gradient": 5e-5}},
     "time gradient splits": {"growth": {"clone_below_time": 1e-9}},
-    "time gradient splits, batch 1": {"growth": {"clone_below_time": 1e-9}, "batch_size": 1},
     "half of the gradients": {"growth": {"screen_gradient": 1e-4, "time_gradient": 1e-4}},
     "opacity 0.005 pruned": {"growth": {"prune_opacity": 0.005}},
     "radius above 20 px pruned": {"growth": {"prune_radius": 20.0}},
