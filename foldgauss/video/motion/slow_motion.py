@@ -11,8 +11,8 @@ from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer
 from foldgauss.video.motion.optical_flow import Motion
 
 #: Weight of the prediction by optical flow where both frames agree, and their mean squared difference at which it is
-#: half of that. Its errors and those of the video's own image are different, so an average is better than each. (Every
-#: second frame of six clips hidden: better than a weight of 0.5 by 0.02 to 0.39 dB.)
+#: half of that. Its errors and those of the video's own image are different, so an average is better than each, or as
+#: good. (Every second frame of six clips hidden: better than a weight of 0.5 by 0.02 to 0.39 dB.)
 FLOW_WEIGHT, HALVING_DIFFERENCE = 0.75, 4000.0
 #: So near to a frame, in intervals, its own image is shown.
 NEAR = 1e-3
