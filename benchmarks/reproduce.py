@@ -1,16 +1,16 @@
 """The paper's recipe to its end: preset `paper` with all its steps, and with one thing changed.
 
-    python -m benchmarks.reproduce --folder FOLDER [--size HxW] [--frames A:B] [--steps N] [--only NAME ...]
-                                   [--seed S] [--engine E] [--json FILE]
+    python -m benchmarks.reproduce --folder FOLDER [--tables] [--size HxW] [--frames A:B] [--steps N]
+                                   [--only NAME ...] [--seed S] [--engine E] [--json FILE]
 
 *Bunny*, by default all 132 frames of 640x1280, in the published 30,000 steps of 3 frames: hours on the CPU of a desktop
 machine; `--engine auto` uses a GPU where JAX sees one. A smaller `--size` has Gaussians at the start in proportion to
 its pixels, and lengths, rates of positions and thresholds of gradients that are the same in pixels (`config_of`).
 `VARIANTS` lists the fits: "as published", the power of the paper's text instead of its code's, other batches and
-degrees, and what the paper does not state or we chose. PSNR and SSIM are of 8-bit images, the mean over all frames,
-beside the published ones: 39.02 dB with 500,000 Gaussians at the start, 38.53 dB with 100,000 (table:init-gauss).
-Batches and degrees (table:bs-pol) start with 100,000: their 38.53 dB for batch 3 and degree 7 is the first row of the
-other table.
+degrees, and what the paper does not state or we chose. With --tables they are the `CELLS` of the paper's tables of
+batches and degrees (table:bs-pol) and of Gaussians at the start (table:init-gauss), the most telling first. The former
+start with 100,000: their 38.53 dB for batch 3 and degree 7 is the first row of the other table. PSNR and SSIM are of
+8-bit images, the mean over all frames, beside the published PSNR.
 
 FOLDER keeps a checkpoint of the fit under way and, for each fit, the curve NAME.csv of PSNR (of the frames seen last)
 and number of Gaussians against steps. The same command continues a fit after its checkpoint; with --json also after the
@@ -37,8 +37,6 @@ from foldgauss.video.fitting.growth import PUBLISHED_STEPS
 from foldgauss.video.fitting.state import FitState, to_model
 
 FULL = (640, 1280)
-#: PSNR and number of Gaussians at the end, at `FULL`.
-PUBLISHED = {"as published": (39.02, 650_000), "100,000 at the start": (38.53, 620_000)}
 #: Steps between two points of a curve, and seconds between two checkpoints.
 EVERY, CHECKPOINT_SECONDS = 100, 120.0
 
@@ -51,7 +49,6 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "degree 3": {"degree": 3},
     "one camera": {"two_cameras": False},
     "start from the clip": {"initialization": "clip"},
-    "100,000 at the start": {"num_gaussians": 100_000},
     "time gradient not used": {"growth": {"time_gradient": 1e9}},
     "time gradient x0.25": {"growth": {"time_gradient": 5e-5}},
     "time gradient splits": {"growth": {"clone_below_time": 1e-9}},
@@ -64,6 +61,42 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "positions learn to the end": {"final_rate": 1.0},
 }
 
+#: table:bs-pol: by batch size and, in this order, degrees: PSNR in dB and number of Gaussians at the end, in millions.
+DEGREES = 1, 3, 5, 7, 9
+BATCHES_AND_DEGREES = {
+    1: ((36.73, 1.26), (37.31, 1.77), (37.30, 1.73), (37.36, 1.72), (37.42, 1.83)),
+    3: ((38.15, 0.57), (38.31, 0.58), (38.39, 0.59), (38.53, 0.62), (38.24, 0.59)),
+    5: ((37.84, 0.33), (37.94, 0.32), (37.95, 0.32), (37.92, 0.31), (37.94, 0.31)),
+}
+#: table:init-gauss: the same by number of Gaussians at the start, for batch size 3 and degree 7.
+STARTS = {
+    100_000: (38.53, 0.62),
+    200_000: (38.85, 0.62),
+    300_000: (38.99, 0.62),
+    400_000: (38.96, 0.64),
+    500_000: (39.02, 0.65),
+    600_000: (38.86, 0.66),
+}
+
+#: Gaussians at the start, batch size and degree of all cells of both tables; the most telling first.
+CELLS = {"as published": (500_000, 3, 7)} | {
+    f"{start:,}, batch {batch}, degree {degree}": (start, batch, degree)
+    for start, batch, degree in (
+        *((100_000, batch, 7) for batch in (3, 1, 5)),
+        *((100_000, 3, degree) for degree in (1, 3, 9, 5)),
+        *((start, 3, 7) for start in (300_000, 600_000, 200_000, 400_000)),
+        *((100_000, batch, degree) for degree in (1, 3, 9, 5) for batch in (1, 5)),
+    )
+}
+
+
+def published(name: str) -> tuple[float, float] | None:
+    """PSNR and millions of Gaussians at the end as the paper reports them, at `FULL`; None for other `VARIANTS`."""
+    if name not in CELLS:
+        return None
+    start, batch, degree = CELLS[name]
+    return STARTS[start] if (batch, degree) == (3, 7) else BATCHES_AND_DEGREES[batch][DEGREES.index(degree)]
+
 
 def config_of(name: str, size: tuple[int, int], steps: int, seed: int) -> FitConfig:
     """The settings of a fit, in pixels the same at every size.
@@ -72,7 +105,11 @@ def config_of(name: str, size: tuple[int, int], steps: int, seed: int) -> FitCon
     grow as that side gets fewer pixels; so do gradients of the mean over all pixels by a position in half widths.
     """
     zoom = max(FULL) / max(size)
-    preset, changes = PRESETS["paper"], dict(VARIANTS[name])
+    if name in CELLS:
+        changes = dict(zip(("num_gaussians", "batch_size", "degree"), CELLS[name], strict=True))
+    else:
+        changes = dict(VARIANTS[name])
+    preset = PRESETS["paper"]
     growth = dataclasses.replace(Growth(), **changes.pop("growth", {}))
     lengths = "screen_gradient", "time_gradient", "clone_below", "prune_scale"
     changes["growth"] = dataclasses.replace(growth, **{length: zoom * getattr(growth, length) for length in lengths})
@@ -130,16 +167,18 @@ def run_to_end(clip: Clip, name: str, config: FitConfig, folder: Path) -> Run:
 
 
 def show(runs: dict[str, Run], title: str) -> None:
-    table = _common.table(title, "fit", "PSNR, dB", "", "worst frame", "SSIM", "Gaussians", "steps", "CPU hours")
-    first = runs[next(iter(VARIANTS))]["psnr"] if next(iter(VARIANTS)) in runs else None
+    """Print the fits, with differences to the first, beside what the paper reports for `FULL`."""
+    columns = "fit", "PSNR, dB", "", "worst frame", "SSIM", "Gaussians", "CPU hours", "paper: PSNR", "", "million"
+    table = _common.table(title, *columns)
+    first = next(iter(runs))
     for name, run in runs.items():
-        gain = "" if first is None else f"{run['psnr'] - first:+.2f}"
+        gain = f"{run['psnr'] - runs[first]['psnr']:+.2f}"
         figures = f"{run['psnr']:.2f}", gain, f"{run['worst_psnr']:.2f}", f"{run['ssim']:.4f}"
-        table.add_row(name, *figures, f"{run['gaussians']:,}", f"{run['steps']:,}", f"{run['cpu_hours']:.2f}")
-    table.add_section()
-    full = "x".join(map(str, FULL))
-    for name, (psnr, gaussians) in PUBLISHED.items():
-        table.add_row(f"the paper at {full}, {name}", f"{psnr}", "", "", "", f"{gaussians:,}", "30,000", "")
+        theirs, reference = published(name), published(first)
+        beside = ("", "", "")
+        if theirs is not None:
+            beside = f"{theirs[0]}", "" if reference is None else f"{theirs[0] - reference[0]:+.2f}", f"{theirs[1]}"
+        table.add_row(name, *figures, f"{run['gaussians']:,}", f"{run['cpu_hours']:.2f}", *beside)
     console.print(table)
 
 
@@ -154,7 +193,7 @@ def main(arguments: list[str] | None = None) -> None:
     except (ValueError, OSError) as error:
         parser.error(str(error))
     done = {}
-    for name in options.only:
+    for name in options.only or (CELLS if options.tables else VARIANTS):
         config = config_of(name, clip.size, options.steps, options.seed)
         config = dataclasses.replace(config, engine=options.engine)
         done[name] = runs.get(name, lambda name=name, config=config: run_to_end(clip, name, config, options.folder))
@@ -170,8 +209,9 @@ def _parser():
     parser.add_argument("--size", type=_common.size, metavar="HxW", default=FULL, help="[640x1280]")
     parser.add_argument("--frames", type=fit_clip._frames, metavar="A:B", help="frames A <= i < B [all]")
     parser.add_argument("--steps", type=_common.whole, default=PUBLISHED_STEPS, help=f"[{PUBLISHED_STEPS:,}]")
-    names = tuple(VARIANTS)
-    parser.add_argument("--only", nargs="+", choices=names, default=names, metavar="NAME", help=f"[{', '.join(names)}]")
+    names = (*VARIANTS, *CELLS)
+    parser.add_argument("--tables", action="store_true", help="the cells of the paper's tables, not the variants")
+    parser.add_argument("--only", nargs="+", choices=names, metavar="NAME", help=f"these of {'; '.join(names)}")
     parser.add_argument("--seed", type=int, default=0, help="[0]")
     parser.add_argument("--engine", choices=FIT_ENGINES, default="auto", help="that computes the steps [auto]")
     return parser

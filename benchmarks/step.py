@@ -85,7 +85,7 @@ def wrapped_fit(clock: Clock) -> Iterator[None]:
         "update_frame_times": "frame times",
         "condition": "condition",
         "image_loss": "loss",
-        "backpropagate": "backpropagate",
+        "backpropagate": "pull back",
         "update_rows": "adam",
         "update_windows": "adam",
     }

@@ -452,6 +452,18 @@ class TestReproduce:
             changed = [field for field in vars(first) if getattr(first, field) != getattr(config, field)]
             assert len(changed) == 1
 
+    def test_cells_are_those_of_both_tables(self):
+        """20 cells: 15 of batches and degrees, 6 of Gaussians at the start, one of them in both."""
+        cells = {name: reproduce.config_of(name, (640, 1280), 30_000, 0) for name in reproduce.CELLS}
+        assert len({(one.num_gaussians, one.batch_size, one.degree) for one in cells.values()}) == 20
+        for name, (start, batch, degree) in list(reproduce.CELLS.items())[1:]:
+            assert name == f"{start:,}, batch {batch}, degree {degree}"
+            assert (cells[name].num_gaussians, cells[name].batch_size, cells[name].degree) == (start, batch, degree)
+        assert reproduce.published("100,000, batch 5, degree 3") == (37.94, 0.32)
+        assert reproduce.published("100,000, batch 3, degree 7") == (38.53, 0.62)
+        assert reproduce.published("as published") == (39.02, 0.65)
+        assert reproduce.published("degree 1") is None
+
     def test_a_smaller_fit_is_the_same_in_pixels(self):
         full, half = (reproduce.config_of("as published", size, 30_000, 0) for size in ((640, 1280), (320, 640)))
         assert half.num_gaussians == full.num_gaussians / 4

@@ -7,7 +7,7 @@ import sqlite3
 import numpy as np
 import pytest
 
-from benchmarks import defaults
+from benchmarks import defaults, step
 from benchmarks._clips import folder_sources, sample_sources
 from foldgauss.io import write_video
 from foldgauss.video import Economy, FitConfig
@@ -289,3 +289,17 @@ class TestTune:
         runs = [run for trial in kept["trials"] for run in trial["clips"].values()]
         assert len(runs) == 4
         assert all(run["psnr"] > 10 and run["gaussians"] == 80 and run["cpu_seconds"] < 2 for run in runs)
+
+
+class TestStep:
+    def test_every_part_is_timed(self):
+        """A function that the fit no longer calls would leave its part at zero."""
+        config = FitConfig(num_gaussians=200, degree=2, steps=40, quarter_fraction=0.0, half_fraction=0.0)
+        records, state, num_alive = step.measure(blob(), config, num_steps=3)
+        assert len(records) == 3
+        assert len(state.rows) == 200
+        assert 0 < num_alive <= 200
+        for record in records:
+            assert set(record) == {*step.PARTS, "total"}
+            assert all(seconds > 0 for part, seconds in record.items() if part != "other")
+        assert step.figures_of(records, naive=1.0, num_alive=num_alive)["total_ms"] > 0
