@@ -41,6 +41,13 @@ def test_one_image(folder):
     np.testing.assert_array_equal(read_masks(folder / "white.png"), labels(3) == 1)
 
 
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "LA"])
+def test_gray_levels_stored_otherwise(tmp_path, mode):
+    """As paint programs do; frame 77 of bear in DAVIS 2016 has a channel of alpha."""
+    Image.fromarray(np.where(labels(3) == 1, np.uint8(255), np.uint8(0))).convert(mode).save(tmp_path / "mask.png")
+    np.testing.assert_array_equal(read_masks(tmp_path / "mask.png"), labels(3) == 1)
+
+
 def test_a_video_is_cut_at_a_level(tmp_path):
     frames = [np.repeat(np.where(labels(k) == 1, 200, 30).astype(np.uint8)[..., None], 3, -1) for k in range(4)]
     path = write_video(tmp_path / "mask.mp4", frames, 25)

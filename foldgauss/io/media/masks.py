@@ -21,7 +21,7 @@ from foldgauss.render.splats import check_size
 MASK_LEVEL = 0.5  # fraction of white from which a pixel of a video belongs to the mask
 #: Pillow modes whose stored values are labels: palette, grayscale, and black and white.
 _LABEL_MODES = ("P", "L", "1")
-_COLOR_MODES = ("RGB", "RGBA")
+_COLOR_MODES = {"RGB": 3, "RGBA": 3, "LA": 1}  # channels besides alpha
 #: Other formats are not decoded, whatever the suffix: Pillow would pass some, such as PostScript, to other programs.
 _FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
 #: Limits on the pixels of a mask: 8K, or the largest ratio of deflate at 1 bit per pixel, whichever is larger.
@@ -111,9 +111,9 @@ def read_labels(paths: Sequence[Path]) -> np.ndarray:
     """Label images as uint8 (num_masks, height, width): 0 is the background, k the object k, 255 void.
 
     A palette image gives the *index* of each pixel, whatever its color (OpenCV gives the color, hence Pillow here); a
-    grayscale one its level, also where that is stored as three equal channels. Masks that are all black and white, as
-    those of DAVIS 2016, become 0 and 1. Raises ValueError for an image that does not decode, has colors instead of
-    labels, or differs in size.
+    grayscale one its level, also where that is stored as three equal channels or with alpha, which is ignored. Masks
+    that are all black and white, as those of DAVIS 2016, become 0 and 1. Raises ValueError for an image that does not
+    decode, has colors instead of labels, or differs in size.
     """
     masks, modes = [], set()
     for path in paths:
@@ -146,7 +146,8 @@ def _read_label_image(path: Path) -> tuple[np.ndarray, str]:
     except Exception as error:  # Pillow's decoders raise anything: SyntaxError, struct.error, zlib.error, IndexError
         got = f"{str(path)!r}, which does not"
         raise invalid("path", expected="masks that decode", got=got, cure="Copy it again.") from error
-    if mode in _COLOR_MODES and (pixels[..., :3] == pixels[..., :1]).all():  # grayscale as paint programs store it
+    channels = _COLOR_MODES.get(mode)  # grayscale as paint programs store it, and one mask of bear in DAVIS
+    if channels is not None and (pixels[..., :channels] == pixels[..., :1]).all():
         mode, pixels = "L", pixels[..., 0]
     if mode not in _LABEL_MODES:
         got = f"an image of mode {mode!r} in {str(path)!r}"
