@@ -3,7 +3,8 @@
     python -m benchmarks.moving_objects --clips FOLDER --masks FOLDER [--only NAME ...] [--sheets FOLDER] [--json FILE]
 
 Each subfolder of --clips holds the frames of a clip, and the subfolder of --masks of the same name its masks, as
-those of DAVIS; clips without masks are left out. Intersection over union is of each frame, its mean over all of them.
+`JPEGImages/480p` and `Annotations/480p` of DAVIS do; clips without masks are left out. Intersection over union is of
+each frame, its mean over all of them.
 """
 
 import argparse
@@ -79,6 +80,10 @@ def main(arguments: list[str] | None = None) -> None:
         )
         figures |= {f"overlap of {source.name}": overlap.mean(), f"CPU seconds per frame of {source.name}": seconds}
         frames[source.name] = [round(float(one), 3) for one in overlap]
+    mean = float(np.mean([np.mean(overlap) for overlap in frames.values()]))
+    table.add_section()
+    table.add_row("mean", "", f"{mean:.3f}")
+    figures["mean overlap"] = mean
     console.print(table)
     _common.finish(options.json, figures, _common.describe_machine(), overlap_of_frames=frames)
 

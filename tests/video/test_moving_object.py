@@ -19,7 +19,7 @@ from foldgauss.video import (
     select,
 )
 from foldgauss.video.motion.background_plate import Alignment, _median
-from foldgauss.video.motion.moving_object import nothing_moves
+from foldgauss.video.motion.moving_object import _assign_by_color, nothing_moves
 from foldgauss.video.selection import selectors
 
 SIZE, NUM_FRAMES, RADIUS = (90, 160), 6, 17.0
@@ -69,6 +69,28 @@ def test_a_disc_is_found(pan, speed):
     assert masks.dtype == bool
     assert overlap(masks, truth).mean() >= 0.85
     assert overlap(masks, truth).min() >= 0.75
+
+
+def test_pixels_near_the_object_are_assigned_by_color():
+    """Votes that miss a part of the object, or hold a part of what is around it; far from them no color counts."""
+    ground, skin = texture(0) * [0.4, 1.2, 0.4], texture(1) * [1.4, 0.4, 0.4]
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    truth = np.stack([np.hypot(x - 60 - 2 * k, y - 40) < 20 for k in range(8)])
+    twin = np.hypot(x - 140, y - 70) < 12  # of the object's color, elsewhere
+    frames = np.stack(
+        [np.where((mask | twin)[..., None], panned(skin, (5, 5)), panned(ground, (9, 9))) for mask in truth]
+    )
+    frames = np.clip(frames, 0, 255).round().astype(np.uint8)
+    votes = truth.astype(np.float32)
+    votes[2, 40:46, 55:70] = 0.2  # as where one frame of several misses it
+    votes[5, 58:63, 65:80] = 0.6
+    votes[7] = 0
+    masks = _assign_by_color(frames, votes)
+    assert overlap(votes > 0.5, truth)[[2, 5]].max() < 0.97
+    assert overlap(masks, truth)[:7].min() > 0.98
+    assert not masks[:, twin].any()
+    assert not masks[7].any()
+    assert not _assign_by_color(frames, np.zeros_like(votes)).any()
 
 
 def test_the_background_is_filled_in_from_other_frames():

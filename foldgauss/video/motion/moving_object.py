@@ -1,8 +1,8 @@
 """The moving object of a clip, as a mask of each frame, found by its motion against the background.
 
 Two cues are combined: flow that is left after the frames are aligned, and the difference from a plate of the background
-that the other frames show. GrabCut places the borders, the pieces are followed through the shot, and the masks vote
-along the flow.
+that the other frames show. GrabCut places the borders, the pieces are followed through the shot, the masks vote along
+the flow, and pixels near them are assigned by their color.
 """
 
 import cv2
@@ -49,6 +49,9 @@ SMALLEST, INSIDE, REFOUND, LOST, MERGED = 3e-4, 0.5, 0.4, 0.1, 2.0
 SEARCH, FARTHEST = 6, 0.125
 #: Objects are followed from every so many frames.
 SEED_SPACING = 5
+#: Colors are counted in so many bins of each channel, over the frames up to so many away, of the object and of what is
+#: within so many pixels of it. Log odds of a color and of a vote are at most so large. Objects grow by this radius.
+BINS, COLOR_REACH, SURROUNDINGS, COLOR_ODDS, VOTE_ODDS, GROWTH = 64, 10, 60, 6.0, 1.7, 4
 
 
 class NothingMoves(ValueError):
@@ -115,8 +118,7 @@ def _find_in_shot(frames: Frames, alignment: Alignment, shot: tuple[int, int], s
         return []
     if not shadow:
         masks = np.stack([_clean(_cut_shadow(mask, dark)) for mask, dark in zip(masks, strong, strict=True)])
-    votes = _vote(masks.astype(np.float32), alignment, first, MASK_VOTE)
-    return np.stack([_clean(one > 0.5) for one in votes])
+    return _assign_by_color(frames[first:stop], _vote(masks.astype(np.float32), alignment, first, MASK_VOTE))
 
 
 def _map(function, num: int) -> list:
@@ -263,6 +265,42 @@ def _agreement(there, back) -> Float32[np.ndarray, "rows columns"]:
 def _pull(image: Float32[np.ndarray, "rows columns"], flow) -> Float32[np.ndarray, "rows columns"]:
     """The image of the frame that the flow leads to, seen from here; 0 outside."""
     return cv2.remap(image, pixel_grid(*image.shape) + flow, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+
+
+def _assign_by_color(frames: Frames, votes: Float32[np.ndarray, "frames rows columns"]) -> Masks:
+    """Masks of the pixels whose colors, and votes, are rather those of the object than of its surroundings."""
+    inside, outside = [], []  # bins of colors
+    images = _map(lambda k: _quantize(frames[k]), len(frames))
+    for bins, vote in zip(images, votes, strict=True):
+        mask = vote > 0.5
+        outward, inward = (cv2.distanceTransform(np.uint8(one), cv2.DIST_L2, 3) for one in (~mask, mask))
+        inside.append(bins[inward > 1])
+        outside.append(bins[(outward > 2) & (outward < SURROUNDINGS)] if mask.any() else inside[-1])
+
+    def assign(k: int) -> Bool[np.ndarray, "rows columns"]:
+        window = slice(max(k - COLOR_REACH, 0), k + COLOR_REACH + 1)
+        own, other = (_count(np.concatenate(one[window])) for one in (inside, outside))
+        odds = np.float32(COLOR_ODDS * (own - other) / (own + other))[images[k]]
+        least = 1 / (1 + np.exp(VOTE_ODDS))
+        vote = np.clip(votes[k], least, 1 - least)
+        odds += np.log(vote / (1 - vote))
+        odds[~dilate(votes[k] > least, 2 * GROWTH + 1)] = -COLOR_ODDS
+        certain = cv2.ximgproc.guidedFilter(frames[k], np.float32(scipy.special.expit(odds)), GROWTH, 1e-4 * 255**2)
+        return _clean(certain > 0.5)
+
+    return np.stack(_map(assign, len(frames)))
+
+
+def _quantize(image: UInt8[np.ndarray, "rows columns 3"]) -> Int32[np.ndarray, "rows columns"]:
+    """The bin of each pixel's color, in Lab."""
+    channels = np.moveaxis(np.int32(cv2.cvtColor(image, cv2.COLOR_RGB2LAB)) * BINS // 256, -1, 0)
+    return np.ravel_multi_index(tuple(channels), (BINS,) * 3).astype(np.int32)
+
+
+def _count(bins: Int32[np.ndarray, " pixels"]) -> np.ndarray:
+    """How frequent each color is, as a fraction, smoothed over neighboring bins, and never zero."""
+    counts = np.bincount(bins, minlength=BINS**3) / max(len(bins), 1)
+    return scipy.ndimage.gaussian_filter(counts.reshape((BINS,) * 3), 1.0, truncate=3).ravel() + 1e-6
 
 
 def _track_best(pieces, evidence, alignment: Alignment, first: int) -> Masks | None:
