@@ -62,16 +62,6 @@ def _read(path: Path, setting: dict[str, Any]) -> dict[str, Run]:
     return runs
 
 
-def kept_setting(path: Path | None, name: str) -> Any:
-    """A setting of the runs in `path`; None where there is none."""
-    if path is None or not path.exists():
-        return None
-    try:
-        return json.loads(path.read_text())["setting"].get(name)
-    except (ValueError, KeyError, TypeError, AttributeError):
-        return None  # `Runs` says what is wrong
-
-
 def told(run: Run) -> str:
     """A run in one line."""
     shown = {

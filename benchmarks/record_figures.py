@@ -19,7 +19,7 @@ from matplotlib import pyplot as plt
 from matplotlib.lines import Line2D
 
 from benchmarks import _common
-from benchmarks.ablation import PAPER_STARTS
+from benchmarks.reproduce import PAPER_STARTS
 from foldgauss.io._atomic import atomic_path
 
 RECORDS = Path(__file__).parent / "records"

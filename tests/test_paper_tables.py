@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks import ablation, davis, folding_gain, frame_times, presets, reproduce
-from benchmarks._runs import Runs, kept_setting, scaled, scores, seconds_per_step
+from benchmarks import davis, folding_gain, frame_times, presets, reproduce
+from benchmarks._runs import Runs, scaled, scores, seconds_per_step
 from foldgauss.io import Clip, write_video
 from foldgauss.video import FitConfig, psnr, ssim
 
@@ -57,8 +57,6 @@ class TestRuns:
         assert set(kept["runs"]) == {"a", "b"}
         assert kept["runs"]["a"]["date"].count("-") == 2
         assert [path.name for path in tmp_path.iterdir()] == ["r.json"]
-        assert kept_setting(tmp_path / "r.json", "seed") == 0
-        assert kept_setting(tmp_path / "none.json", "seed") is None
 
     def test_runs_of_another_setting_are_refused(self, tmp_path):
         Runs(tmp_path / "r.json", {"seed": 0, "steps": 7}).get("a", dict)
@@ -71,7 +69,6 @@ class TestRuns:
         with pytest.raises(ValueError, match="--json: expected a file of finished runs"):
             Runs(tmp_path / "r.json", {})
         assert (tmp_path / "r.json").read_text() == text
-        assert kept_setting(tmp_path / "r.json", "steps") is None
 
     def test_nothing_is_kept_without_a_file(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
@@ -128,91 +125,6 @@ def fake_fits(monkeypatch, module, psnr_of=lambda config: 30.0, seconds=6.0):
 
     monkeypatch.setattr(module, "fitted", fitted)
     return configs
-
-
-class TestAblation:
-    def test_the_tables_have_one_fit_in_common(self):
-        cells = ablation.cells()
-        assert len(cells) == len({cell.name for cell in cells}) == 5 * 3 + 6 - 1
-        assert sum(cell.batch for cell in cells) == 60  # frames seen, in steps
-        assert {cell for cell in cells if cell.start != 0.1} == {
-            ablation.Cell(3, 7, start) for start in (0.2, 0.3, 0.4, 0.5, 0.6)
-        }
-
-    def test_a_cell_is_the_published_recipe_but_for_what_it_asks(self):
-        config = ablation.Cell(5, 9, 0.3).config("paper", (160, 320), 1200, 4)
-        own = {"num_gaussians": 18_750, "degree": 9, "batch_size": 5, "steps": 1200, "seed": 4}
-        assert config == FitConfig.preset("paper", **own)
-        assert config.growth is not None
-
-    def test_steps_fill_the_minutes(self):
-        pace = {1: 0.01, 3: 0.03, 5: 0.04}
-        steps = ablation.steps_within(10, pace)
-        seconds = steps * sum(pace[cell.batch] for cell in ablation.cells())
-        assert 0.75 * 600 < seconds <= 0.85 * 600
-        assert steps == 920
-        assert ablation.steps_within(1e-6, pace) == 1
-        assert ablation.steps_within(60, pace) == ablation.STEPS
-
-    def paper(self):
-        made = {
-            ablation.Cell(batch, degree, 0.1): {"psnr": row[0]}
-            for batch, cells in ablation.PAPER_GRID.items()
-            for degree, row in zip(ablation.DEGREES, cells, strict=True)
-        }
-        return made | {ablation.Cell(3, 7, start): {"psnr": row[0]} for start, row in ablation.PAPER_STARTS.items()}
-
-    def test_the_papers_own_figures_bear_it_out(self):
-        words = ablation.trend(self.paper())
-        assert [": holds. " in each for each in words] == [True] * 4
-        assert "Batch 3 is, by 0.41 dB over batch 5 and 1.10 dB over batch 1." in words[0]
-        assert "+0.11 dB with batch 1, +0.22 dB with batch 3, +0.01 dB with batch 5" in words[2]
-
-    def test_other_figures_do_not(self):
-        made = self.paper()
-        made[ablation.Cell(1, 9, 0.1)] = {"psnr": 45.0}
-        made[ablation.Cell(3, 7, 0.6)] = {"psnr": 39.5}
-        words = ablation.trend(made)
-        assert [": does not hold. " in each for each in words] == [True] * 4
-        assert "Batch 1 is, by 0.42 dB over batch 3" in words[0]
-        assert "Batch 1 with degree 9 is, by 6.47 dB over that." in words[1]
-        assert "0.6 M is, by 0.97 dB over 0.1 M (the paper: 0.49) and 0.48 over 0.5 M." in words[3]
-        made[ablation.Cell(1, 9, 0.1)] = {"psnr": 38.58}
-        assert "by 0.05 dB over that, which says nothing." in ablation.trend(made)[1]
-
-    def test_goes_on_with_the_same_steps(self, clip, tmp_path, monkeypatch, capsys):
-        timed, broken = [], [True]
-        monkeypatch.setattr(ablation, "seconds_per_step", lambda *given: timed.append(given[2]) or 0.05)
-
-        def psnr_of(config):
-            if broken[0] and config.degree == 9:
-                raise KeyboardInterrupt
-            return 30 + config.degree / 10
-
-        configs = fake_fits(monkeypatch, ablation, psnr_of)
-        command = ["--clip", str(clip), "--size", "24x32", "--minutes", "1.2", "--json", str(tmp_path / "a.json")]
-        with pytest.raises(KeyboardInterrupt):
-            ablation.main(command)
-        assert (len(configs), timed) == (5, [scaled(ablation.GROWN[batch], SIZE, (160, 320)) for batch in (1, 3, 5)])
-        broken[0] = False
-        ablation.main(command)
-        assert (len(configs), len(timed)) == (5 + 16, 3)
-        steps = {config.steps for config in configs}
-        assert steps == {61}
-        shown = printed(capsys)
-        assert "estimated minutes" in shown
-        assert "does not hold" in shown
-        assert "38.53 (0.62M)" in shown
-        kept = json.loads((tmp_path / "a.json").read_text())
-        assert len(kept["runs"]) == len(kept["figures"]) == 20
-        assert len(kept["trend"]) == 4
-        with pytest.raises(SystemExit):
-            ablation.main([*command, "--seed", "1"])
-        assert "seed 0 instead of 1" in capsys.readouterr().err
-
-    def test_tiny(self, clip, capsys):
-        ablation.main(["--clip", str(clip), "--size", "24x32", "--steps", "20"])
-        assert "What the paper finds" in capsys.readouterr().out
 
 
 class TestPresets:

@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("matplotlib", reason="the figures need the extra 'plot'").use("Agg")
 
 from benchmarks import record_figures  # noqa: E402
-from benchmarks.ablation import PAPER_STARTS  # noqa: E402
+from benchmarks.reproduce import PAPER_STARTS  # noqa: E402
 
 
 def _points(figure) -> set[tuple[float, float]]:
