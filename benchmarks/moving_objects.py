@@ -80,7 +80,7 @@ def main(arguments: list[str] | None = None) -> None:
         )
         figures |= {f"overlap of {source.name}": overlap.mean(), f"CPU seconds per frame of {source.name}": seconds}
         frames[source.name] = [round(float(one), 3) for one in overlap]
-    mean = float(np.mean([np.mean(overlap) for overlap in frames.values()]))
+    mean = float(np.mean([value for name, value in figures.items() if name.startswith("overlap")]))
     table.add_section()
     table.add_row("mean", "", f"{mean:.3f}")
     figures["mean overlap"] = mean

@@ -19,7 +19,7 @@ from foldgauss.video import (
     select,
 )
 from foldgauss.video.motion.background_plate import Alignment, _median
-from foldgauss.video.motion.moving_object import _assign_by_color, nothing_moves
+from foldgauss.video.motion.moving_object import _assign_by_color, _clean, nothing_moves
 from foldgauss.video.selection import selectors
 
 SIZE, NUM_FRAMES, RADIUS = (90, 160), 6, 17.0
@@ -71,26 +71,62 @@ def test_a_disc_is_found(pan, speed):
     assert overlap(masks, truth).min() >= 0.75
 
 
+def textured_clip(ground, skin, truth):
+    """Frames of an object of one texture before a ground of another; each a factor for the channels of noise."""
+    behind, front = (panned(texture(seed) * factor, (9, 9)) for seed, factor in enumerate((ground, skin)))
+    frames = [np.where(mask[..., None], front, behind) for mask in truth]
+    return np.clip(np.stack(frames), 0, 255).round().astype(np.uint8)
+
+
+GREEN, RED = [0.4, 1.2, 0.4], [1.4, 0.4, 0.4]
+ROWS, COLUMNS = np.mgrid[: SIZE[0], : SIZE[1]]
+
+
 def test_pixels_near_the_object_are_assigned_by_color():
-    """Votes that miss a part of the object, or hold a part of what is around it; far from them no color counts."""
-    ground, skin = texture(0) * [0.4, 1.2, 0.4], texture(1) * [1.4, 0.4, 0.4]
-    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
-    truth = np.stack([np.hypot(x - 60 - 2 * k, y - 40) < 20 for k in range(8)])
-    twin = np.hypot(x - 140, y - 70) < 12  # of the object's color, elsewhere
-    frames = np.stack(
-        [np.where((mask | twin)[..., None], panned(skin, (5, 5)), panned(ground, (9, 9))) for mask in truth]
-    )
-    frames = np.clip(frames, 0, 255).round().astype(np.uint8)
+    """Votes that miss a part of the border, or hold some of what is around it; far from them no color counts."""
+    truth = np.stack([np.hypot(COLUMNS - 60 - 2 * k, ROWS - 40) < 20 for k in range(26)])
+    twin = np.hypot(COLUMNS - 140, ROWS - 70) < 12  # of the object's color, elsewhere
+    frames = textured_clip(GREEN, RED, truth | twin)
     votes = truth.astype(np.float32)
-    votes[2, 40:46, 55:70] = 0.2  # as where one frame of several misses it
-    votes[5, 58:63, 65:80] = 0.6
-    votes[7] = 0
+    votes[2, 24:56, 72:] *= 0.3
+    votes[5, 45:70, 40:60] = 0.7
+    votes[25] = 0
+    plain = np.stack([_clean(vote > 0.5) for vote in votes])
+    assert overlap(plain, truth)[[2, 5]].max() < 0.9
     masks = _assign_by_color(frames, votes)
-    assert overlap(votes > 0.5, truth)[[2, 5]].max() < 0.97
-    assert overlap(masks, truth)[:7].min() > 0.98
+    assert overlap(masks, truth)[:25].min() > 0.97
     assert not masks[:, twin].any()
-    assert not masks[7].any()
+    assert not masks[25].any()
     assert not _assign_by_color(frames, np.zeros_like(votes)).any()
+
+
+def test_votes_count_where_colors_are_those_of_the_surroundings():
+    truth = np.repeat([(abs(COLUMNS - 70) < 25) & (abs(ROWS - 45) < 25)], 6, axis=0)
+    alike = truth & (ROWS > 55)  # a third
+    frames = textured_clip(GREEN, RED, truth & ~alike)
+    masks = _assign_by_color(frames, truth.astype(np.float32))
+    assert (masks & alike).sum() > 0.8 * alike.sum()
+    assert overlap(masks, truth).min() > 0.9
+
+
+def test_colors_are_those_of_frames_nearby():
+    """Object and ground exchange their colors in the middle; one frame's votes miss half of the object."""
+    truth = np.repeat([np.hypot(COLUMNS - 70, ROWS - 45) < 22], 40, axis=0)
+    frames = np.concatenate([textured_clip(GREEN, RED, truth[:20]), textured_clip(RED, GREEN, truth[20:])])
+    votes = truth.astype(np.float32)
+    votes[[2, 37], :, 70:] *= 0.3
+    assert overlap(_assign_by_color(frames, votes), truth)[[2, 37]].min() > 0.97
+
+
+def test_colors_that_votes_miss_in_one_frame_are_known_from_others():
+    truth = np.repeat([np.hypot(COLUMNS - 70, ROWS - 45) < 22], 6, axis=0)
+    left = truth & (COLUMNS < 70)
+    frames = textured_clip(GREEN, RED, left)
+    blue = textured_clip(GREEN, [0.3, 0.3, 1.5], truth & ~left)
+    frames = np.where((truth & ~left)[..., None], blue, frames)
+    votes = truth.astype(np.float32)
+    votes[3, :, 70:] *= 0.3
+    assert overlap(_assign_by_color(frames, votes), truth)[3] > 0.95
 
 
 def test_the_background_is_filled_in_from_other_frames():

@@ -50,8 +50,11 @@ SEARCH, FARTHEST = 6, 0.125
 #: Objects are followed from every so many frames.
 SEED_SPACING = 5
 #: Colors are counted in so many bins of each channel, over the frames up to so many away, of the object and of what is
-#: within so many pixels of it. Log odds of a color and of a vote are at most so large. Objects grow by this radius.
-BINS, COLOR_REACH, SURROUNDINGS, COLOR_ODDS, VOTE_ODDS, GROWTH = 64, 10, 60, 6.0, 1.7, 4
+#: within so many pixels of it.
+BINS, COLOR_REACH, SURROUNDINGS = 64, 10, 60
+#: A color counts from -COLOR_WEIGHT to COLOR_WEIGHT, by the difference of both frequencies over their sum, against log
+#: odds of the votes of at most VOTE_ODDS. An object reaches at most so many pixels beyond votes of -VOTE_ODDS.
+COLOR_WEIGHT, VOTE_ODDS, BEYOND = 4.0, 3.0, 4
 
 
 class NothingMoves(ValueError):
@@ -268,24 +271,22 @@ def _pull(image: Float32[np.ndarray, "rows columns"], flow) -> Float32[np.ndarra
 
 
 def _assign_by_color(frames: Frames, votes: Float32[np.ndarray, "frames rows columns"]) -> Masks:
-    """Masks of the pixels whose colors, and votes, are rather those of the object than of its surroundings."""
-    inside, outside = [], []  # bins of colors
-    images = _map(lambda k: _quantize(frames[k]), len(frames))
-    for bins, vote in zip(images, votes, strict=True):
-        mask = vote > 0.5
+    """Masks of the pixels whose votes and colors are rather those of the object than of its surroundings."""
+    inside, outside = [], []  # bins of the colors of each frame
+    for image, vote in zip(frames, votes, strict=True):
+        bins, mask = _quantize(image), vote > 0.5
         outward, inward = (cv2.distanceTransform(np.uint8(one), cv2.DIST_L2, 3) for one in (~mask, mask))
         inside.append(bins[inward > 1])
-        outside.append(bins[(outward > 2) & (outward < SURROUNDINGS)] if mask.any() else inside[-1])
+        outside.append(bins[mask.any() & (outward > 2) & (outward < SURROUNDINGS)])
 
     def assign(k: int) -> Bool[np.ndarray, "rows columns"]:
         window = slice(max(k - COLOR_REACH, 0), k + COLOR_REACH + 1)
         own, other = (_count(np.concatenate(one[window])) for one in (inside, outside))
-        odds = np.float32(COLOR_ODDS * (own - other) / (own + other))[images[k]]
-        least = 1 / (1 + np.exp(VOTE_ODDS))
-        vote = np.clip(votes[k], least, 1 - least)
-        odds += np.log(vote / (1 - vote))
-        odds[~dilate(votes[k] > least, 2 * GROWTH + 1)] = -COLOR_ODDS
-        certain = cv2.ximgproc.guidedFilter(frames[k], np.float32(scipy.special.expit(odds)), GROWTH, 1e-4 * 255**2)
+        color = np.float32(COLOR_WEIGHT * (own - other) / (own + other))[_quantize(frames[k])]
+        least = scipy.special.expit(-VOTE_ODDS)
+        odds = color + scipy.special.logit(np.clip(votes[k], least, 1 - least))
+        odds[~dilate(votes[k] > least, 2 * BEYOND + 1)] = -np.inf
+        certain = cv2.ximgproc.guidedFilter(frames[k], np.float32(scipy.special.expit(odds)), 4, 1e-4 * 255**2)
         return _clean(certain > 0.5)
 
     return np.stack(_map(assign, len(frames)))
