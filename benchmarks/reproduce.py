@@ -1,7 +1,7 @@
 """The paper's recipe to its end: preset `paper` with all its steps, and with one thing changed.
 
-    python -m benchmarks.reproduce --folder FOLDER [--tables] [--size HxW] [--frames A:B] [--steps N]
-                                   [--only NAME ...] [--seed S] [--engine E] [--json FILE]
+    python -m benchmarks.reproduce --folder FOLDER [--tables | --only NAME ...] [--size HxW] [--frames A:B] [--steps N]
+                                   [--seed S] [--engine E] [--json FILE]
 
 *Bunny*, by default all 132 frames of 640x1280, in the published 30,000 steps of 3 frames: hours on the CPU of a desktop
 machine; `--engine auto` uses a GPU where JAX sees one. A smaller `--size` has Gaussians at the start in proportion to
@@ -208,9 +208,10 @@ def _parser():
     parser.add_argument("--size", type=_common.size, metavar="HxW", default=FULL, help="[640x1280]")
     parser.add_argument("--frames", type=fit_clip._frames, metavar="A:B", help="frames A <= i < B [all]")
     parser.add_argument("--steps", type=_common.whole, default=PUBLISHED_STEPS, help=f"[{PUBLISHED_STEPS:,}]")
-    names = (*VARIANTS, *CELLS)
-    parser.add_argument("--tables", action="store_true", help="the cells of the paper's tables, not the variants")
-    parser.add_argument("--only", nargs="+", choices=names, metavar="NAME", help=f"these of {'; '.join(names)}")
+    names = tuple(VARIANTS | CELLS)
+    chosen = parser.add_mutually_exclusive_group()
+    chosen.add_argument("--tables", action="store_true", help="the cells of the paper's tables, not the variants")
+    chosen.add_argument("--only", nargs="+", choices=names, metavar="NAME", help=f"these of {'; '.join(names)}")
     parser.add_argument("--seed", type=int, default=0, help="[0]")
     parser.add_argument("--engine", choices=FIT_ENGINES, default="auto", help="that computes the steps [auto]")
     return parser

@@ -376,6 +376,40 @@ class TestReproduce:
         assert reproduce.published("as published") == (39.02, 0.65)
         assert reproduce.published("degree 1") is None
 
+    def test_the_paper_is_quoted(self):
+        """Sums of both tables, added up from the paper: table:bs-pol row by row, and table:init-gauss."""
+        rows = reproduce.PAPER_GRID.values()
+        assert [round(sum(psnr for psnr, _ in row), 2) for row in rows] == [186.12, 191.62, 189.59]
+        assert [round(sum(millions for _, millions in row), 2) for row in rows] == [8.31, 2.95, 1.59]
+        starts = reproduce.PAPER_STARTS.values()
+        assert [round(sum(column), 2) for column in list(zip(*starts, strict=True))[:2]] == [233.21, 3.81]
+
+    def test_tables_are_made_in_order_and_continued(self, tmp_path, monkeypatch, capsys):
+        made = []
+
+        def run(clip, name, config, folder):
+            if len(made) == 12:
+                raise KeyboardInterrupt
+            made.append(name)
+            return {"psnr": 30.0, "worst_psnr": 20.0, "ssim": 0.9, "gaussians": 7, "steps": 6, "cpu_hours": 0.1}
+
+        monkeypatch.setattr(reproduce, "run_to_end", run)
+        monkeypatch.setattr(reproduce, "bunny", lambda size, frames: Clip(blob(), 12.0, "blob", len(blob())))
+        folder, kept = tmp_path / "f", tmp_path / "t.json"
+        command = ["--folder", str(folder), "--tables", "--size", "24x32", "--json", str(kept)]
+        with pytest.raises(KeyboardInterrupt):
+            reproduce.main(command)
+        monkeypatch.setattr(reproduce, "run_to_end", lambda *given: made.append(given[1]) or run_of_others)
+        run_of_others = json.loads(kept.read_text())["runs"]["as published"]
+        reproduce.main(command)
+        assert made == list(reproduce.CELLS)
+        shown = printed(capsys)
+        assert "38.53 -0.49 0.62" in shown
+        assert "37.92 -1.10 0.31" in shown
+        with pytest.raises(SystemExit):
+            reproduce.main([*command, "--only", "batch 1"])
+        assert "not allowed with argument" in capsys.readouterr().err
+
     def test_a_smaller_fit_is_the_same_in_pixels(self):
         full, half = (reproduce.config_of("as published", size, 30_000, 0) for size in ((640, 1280), (320, 640)))
         assert half.num_gaussians == full.num_gaussians / 4
