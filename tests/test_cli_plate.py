@@ -70,8 +70,15 @@ def test_the_plate_and_its_masks_are_written(model, tmp_path, monkeypatch, capsy
     assert (filled[MASKS] != frames[MASKS]).any()
     assert run("plate", model) == 0
     assert read_video("m.plate.mp4").frames.shape == frames.shape
-    assert run("plate", model) == 2
-    assert "exists. Choose another path, or add --overwrite." in capsys.readouterr().err
+    capsys.readouterr()
+    for options in ([], ["--masks", "masks", "--out", "p.mp4"], ["--out", "images"]):
+        assert run("plate", model, *options) == 2
+        told = capsys.readouterr()
+        assert "exists. Choose another path, or add --overwrite." in told.err
+        assert "Searching" not in told.out
+    assert not (tmp_path / "p.mp4").exists()
+    (tmp_path / "empty").mkdir()
+    assert run("plate", model, "--masks", "masks", "--out", "empty", "--overwrite") == 0
 
 
 @pytest.mark.parametrize(

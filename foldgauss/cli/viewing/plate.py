@@ -49,10 +49,14 @@ def plate_command(
     if masks_path is not None and masks_path.suffix:
         raise wrong_use("--masks", expected="a folder, without extension", got=masks_path)
     for option, path in (("--out", out_path), ("--masks", masks_path)):
-        if path is not None and not path.is_dir():
+        if path is None:
+            continue
+        if not path.is_dir():
             refuse_input(path, "model", model_path, option)
             refuse_existing(path, overwrite, option)
             check_writable(path)
+        elif any(path.iterdir()):
+            refuse_existing(path, overwrite, option)
     model = load_video_model(model_path)
     image_size = image_size or model.size
     refuse_huge(image_size)

@@ -47,7 +47,8 @@ def read_masks(
     - A video: bool (num_frames, height, width), True where the brightest channel is at least `level` of white.
 
     `frames = (A, B)` keeps A <= i < B of a folder or video, None for an open end. `size` = (height, width) crops the
-    masks to that aspect around the center, as `read_video` crops frames: use the same value as for the fit.
+    masks to that aspect around the center, as `read_video` crops frames, without resizing them: use the same value as
+    for the fit.
 
     **Example:** `by_mask(model, read_masks("DAVIS/Annotations/480p/bear", label=1))`.
 

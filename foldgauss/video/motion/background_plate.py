@@ -99,7 +99,7 @@ def check_frames(frames: np.ndarray) -> None:
     """Raise ValueError unless these are three color frames at least."""
     shape, dtype = np.shape(frames), getattr(frames, "dtype", None)
     if len(shape) != 4 or shape[0] < 3 or shape[-1] != 3 or 0 in shape or dtype != np.uint8:
-        got = f"{dtype} {shape}"
+        got = f"{type(frames).__name__ if dtype is None else dtype} {shape}"
         raise invalid("frames", expected="uint8 (num_frames, height, width, 3) of 3 frames at least", got=got)
 
 
