@@ -30,6 +30,7 @@ from foldgauss.video.editing.edited_video import EditedVideo, Layer
 from foldgauss.video.editing.overlays import describe_overlay, restore_overlay
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.row_layout import columns, unpack
+from foldgauss.video.models.shared_paths import MAX_PATHS, SharedPaths
 from foldgauss.video.models.sparse_storage import from_stored, stored_counts, stored_skeleton, to_stored
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
@@ -152,6 +153,8 @@ def _describe_video(model: VideoModel) -> dict:
         "compositing": model.compositing,
         "scale_cutoff": model.scale_cutoff,
     }
+    if model.splats.paths is not None:
+        about["paths"] = list(model.splats.paths.times.shape)
     return about | {"stored": counts} if counts else about
 
 
@@ -167,10 +170,19 @@ def _video_skeleton(header: dict) -> VideoModel:
     if not is_within(header.get("scale_cutoff", 0.0), "[0, 1]"):
         raise ValueError("the cutoff of scales is out of range")
     row_width = columns(degree)["coefficients"].stop
+    num_paths, num_knots = header.get("paths", (0, 0))
+    if num_paths and not (is_integer(num_paths, 1) and num_paths <= MAX_PATHS and is_integer(num_knots, 1)):
+        raise ValueError("a number of paths or of their maps is out of range")
+
+    def build_paths() -> SharedPaths | None:
+        shape = num_paths, num_knots
+        return SharedPaths(jnp.zeros(shape, jnp.float32), jnp.zeros((*shape, 2, 3), jnp.float32)) if num_paths else None
 
     def build() -> VideoModel:
         return VideoModel(
-            splats=unpack(jnp.zeros((num, row_width), jnp.float32), degree, TimeLikelihood(np.float32(1))),
+            splats=unpack(
+                jnp.zeros((num, row_width), jnp.float32), degree, TimeLikelihood(np.float32(1)), build_paths()
+            ),
             frame_times=FrameTimes(jnp.zeros(num_frames - 1, jnp.float32)),
             size=(height, width),
             fps=float(header["fps"]),

@@ -69,4 +69,4 @@ def finetune_model(
                 near = window[done.alive]
                 apply_scale_cutoff(rows[done.alive], near, spec, model.scale_cutoff)
                 window[done.alive] = near
-    return eqx.tree_at(lambda m: m.splats, model, unpack(rows, model.degree, model.splats.envelope))
+    return eqx.tree_at(lambda m: m.splats, model, unpack(rows, model.degree, model.splats.envelope, model.splats.paths))

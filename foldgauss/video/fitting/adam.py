@@ -73,8 +73,9 @@ def adam_step(
 @kernel
 def _update(start, stop, touched, rows, grad, first, second, counts, kinds, bits, rates, units, at, corrections):
     beta1, beta2 = _f(BETA1), _f(BETA2)
-    width, own = _u(rows.shape[1]), rates.copy()
+    own = rates.copy()
     loc, scale, spread, time, opacity, fold = at
+    width = _u(fold + 2 * ((rows.shape[1] - fold) // 2))  # without the column of paths, which is not trained
     static_bit, opaque_bit, degrees = bits
     total = 0.0
     for k in range(start, stop):

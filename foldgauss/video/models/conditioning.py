@@ -2,7 +2,7 @@
 
 The fold equation is defined by `FoldedGaussian.condition_time` and repeated here for speed: these kernels touch only
 the Gaussians alive, whose number changes with every frame, unlike XLA's fixed shapes. A test checks that values and
-gradients agree. Only the polynomial fold and the time-likelihood envelope are supported.
+gradients agree. Only polynomial folds, shared paths and the time-likelihood envelope are supported.
 """
 
 import dataclasses
@@ -16,7 +16,8 @@ from foldgauss._numerics.simd import LANES, broadcast, cos_and_sin, exp, load, s
 from foldgauss._runtime.kernels import inline, kernel
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import pixels_per_unit
-from foldgauss.video.models.row_layout import columns
+from foldgauss.video.models.row_layout import columns, has_path_column
+from foldgauss.video.models.shared_paths import SharedPaths, from_pixel_gradient, to_pixel_maps
 from foldgauss.video.models.splats import SH_C0, TAU_MAX
 
 CHUNK = 4096  # Gaussians per task
@@ -215,6 +216,61 @@ def _pull_back(
     return d_time
 
 
+@kernel
+def _move(start, stop, alive, rows, maps, mean, factor):
+    """Move splats by the maps of their paths, in place."""
+    place = rows.shape[1] - 1
+    for k in range(start, stop):
+        path = _u(rows[alive[k], place])
+        if path == 0:
+            continue
+        m = maps[path]
+        x, y = mean[k, 0], mean[k, 1]
+        mean[k, 0] = m[0, 0] * x + m[0, 1] * y + m[0, 2]
+        mean[k, 1] = m[1, 0] * x + m[1, 1] * y + m[1, 2]
+        for c in range(2):
+            x, y = factor[k, 0, c], factor[k, 1, c]
+            factor[k, 0, c] = m[0, 0] * x + m[0, 1] * y
+            factor[k, 1, c] = m[1, 0] * x + m[1, 1] * y
+
+
+@kernel
+def _move_back(start, stop, alive, rows, maps, moved_mean, moved_factor, mean, factor, d_mean, d_factor, by_map):
+    """Gradients of splats before `_move`, and those by the maps; means and factors as they were before.
+
+    `d_mean` and `d_factor` come in as gradients of the moved splats, and are changed in place.
+    """
+    place = rows.shape[1] - 1
+    for k in range(start, stop):
+        for r in range(2):
+            mean[k, r] = moved_mean[k, r]
+            factor[k, r, 0], factor[k, r, 1] = moved_factor[k, r, 0], moved_factor[k, r, 1]
+        path = _u(rows[alive[k], place])
+        if path == 0:
+            continue
+        m, out = maps[path], by_map[path]
+        scale = _f(1.0) / (m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0])
+        x, y = moved_mean[k, 0] - m[0, 2], moved_mean[k, 1] - m[1, 2]
+        mean[k, 0] = scale * (m[1, 1] * x - m[0, 1] * y)
+        mean[k, 1] = scale * (m[0, 0] * y - m[1, 0] * x)
+        for c in range(2):
+            x, y = moved_factor[k, 0, c], moved_factor[k, 1, c]
+            factor[k, 0, c] = scale * (m[1, 1] * x - m[0, 1] * y)
+            factor[k, 1, c] = scale * (m[0, 0] * y - m[1, 0] * x)
+        gx, gy = d_mean[k, 0], d_mean[k, 1]
+        for r in range(2):
+            g = d_mean[k, r]
+            out[r, 0] += g * mean[k, 0] + d_factor[k, r, 0] * factor[k, 0, 0] + d_factor[k, r, 1] * factor[k, 0, 1]
+            out[r, 1] += g * mean[k, 1] + d_factor[k, r, 0] * factor[k, 1, 0] + d_factor[k, r, 1] * factor[k, 1, 1]
+            out[r, 2] += g
+        d_mean[k, 0] = m[0, 0] * gx + m[1, 0] * gy
+        d_mean[k, 1] = m[0, 1] * gx + m[1, 1] * gy
+        for c in range(2):
+            gx, gy = d_factor[k, 0, c], d_factor[k, 1, c]
+            d_factor[k, 0, c] = m[0, 0] * gx + m[1, 0] * gy
+            d_factor[k, 1, c] = m[0, 1] * gx + m[1, 1] * gy
+
+
 @dataclasses.dataclass(frozen=True)
 class ConditionedSplats:
     """Splats of one time, in pixels, of the Gaussians `alive` (indices, in array order)."""
@@ -227,13 +283,15 @@ class ConditionedSplats:
     opacity: np.ndarray
     color: np.ndarray
     kept: np.ndarray  # (num, 3), for the gradient: m_t, sigma_t and the angle in turns
+    maps: np.ndarray | None = None  # (paths + 1, 2, 3), by which those on a path were moved
 
 
 @dataclasses.dataclass(frozen=True)
 class ConditioningSpec:
     """Constants of conditioning: the fold's degree, the envelope's power and floor, and the image's size.
 
-    `aspect` is the model frame's height / width (default: the image's own), see `Splats2D.to_pixels`.
+    `aspect` is the model frame's height / width (default: the image's own), see `Splats2D.to_pixels`. `paths`: NumPy
+    arrays, for rows with a column of `path_index`.
     """
 
     degree: int
@@ -241,6 +299,7 @@ class ConditioningSpec:
     floor: float
     size: tuple[int, int]
     aspect: float | None = None
+    paths: SharedPaths | None = None
 
 
 def update_windows(rows: np.ndarray, indices: np.ndarray, window: np.ndarray) -> None:
@@ -283,14 +342,18 @@ def condition(
     mean, factor = np.empty((num, 2), np.float32), np.empty((num, 2, 2), np.float32)
     opacity, (color, kept) = np.empty(num, np.float32), np.empty((2, num, 3), np.float32)
     constants = np.float32([width / 2, height / 2, spec.power, spec.floor])
+    moves = spec.paths is not None and has_path_column(rows, spec.degree)
+    maps = to_pixel_maps(spec.paths.at(float(t)), float(unit), np.array([width / 2, height / 2])) if moves else None
 
     def work(start: int) -> None:
         stop = min(start + CHUNK, num)
         splats = (mean, factor, opacity, color, kept)
         _condition(_LAYOUT, start, stop, alive, rows, spec.degree, t, unit, *constants, *splats)
+        if maps is not None:
+            _move(start, stop, alive, rows, maps, mean, factor)
 
     run_tasks(work, range(0, num, CHUNK))
-    return ConditionedSplats(alive, t, unit, mean, factor, opacity, color, kept)
+    return ConditionedSplats(alive, t, unit, mean, factor, opacity, color, kept, maps)
 
 
 def backpropagate(
@@ -299,14 +362,28 @@ def backpropagate(
     gradients: tuple[np.ndarray, ...],
     spec: ConditioningSpec,
     grad: np.ndarray,
+    path_grad: np.ndarray | None = None,
 ) -> float:
-    """Add the gradients of mean, factor, opacity and colour, as gradients of rows, to `grad`; returns dL/dt."""
+    """Add the gradients of mean, factor, opacity and colour, as gradients of rows, to `grad`; returns dL/dt.
+
+    dL/dt is that with the maps of shared paths as they are at t. Gradients by these maps, in model space, are added to
+    `path_grad` (paths, 2, 3).
+    """
     num = len(done.alive)
     by_time = np.zeros(-(-num // CHUNK))
     power, floor = np.float32(spec.power), np.float32(spec.floor)
+    factor, (d_mean, d_factor, *others) = done.factor, gradients
+    if done.maps is not None:
+        own_mean, own_factor = np.empty_like(done.mean), np.empty_like(done.factor)
+        d_mean, d_factor = np.array(d_mean, np.float32), np.array(d_factor, np.float32)
+        by_map = np.zeros((len(by_time), *done.maps.shape))
+        factor = own_factor
 
     def work(start: int) -> None:
         stop = min(start + CHUNK, num)
+        if done.maps is not None:
+            own, by = (own_mean, own_factor, d_mean, d_factor), by_map[start // CHUNK]
+            _move_back(start, stop, done.alive, rows, done.maps, done.mean, done.factor, *own, by)
         by_time[start // CHUNK] = _pull_back(
             _LAYOUT,
             start,
@@ -318,13 +395,18 @@ def backpropagate(
             done.unit,
             power,
             floor,
-            done.factor,
+            factor,
             done.opacity,
             done.color,
             done.kept,
-            *gradients,
+            d_mean,
+            d_factor,
+            *others,
             grad,
         )
 
     run_tasks(work, range(0, num, CHUNK))
+    if done.maps is not None and path_grad is not None:
+        height, width = spec.size
+        path_grad += from_pixel_gradient(by_map.sum(0), float(done.unit), np.array([width / 2, height / 2]))
     return float(by_time.sum())

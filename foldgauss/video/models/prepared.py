@@ -2,6 +2,7 @@
 
 from typing import Protocol
 
+import jax
 import numpy as np
 
 from foldgauss._runtime.checks import invalid
@@ -17,6 +18,7 @@ from foldgauss.video.models.conditioning import (
 )
 from foldgauss.video.models.frame_times import FrameTimes, snap_to_shots
 from foldgauss.video.models.row_layout import pack
+from foldgauss.video.models.shared_paths import check_path_index
 from foldgauss.video.models.splats import FoldedSplats
 
 
@@ -47,7 +49,9 @@ class PreparedModel:
         _check_finite(self.rows)
         power, floor = (_common_value(model.splats.envelope, name) for name in ("power", "floor"))
         aspect = height / width if aspect is None else aspect
-        self.spec = ConditioningSpec(model.splats.degree, power, floor, tuple(size), aspect=aspect)
+        check_path_index(model.splats)
+        paths = jax.tree.map(np.asarray, model.splats.paths)
+        self.spec = ConditioningSpec(model.splats.degree, power, floor, tuple(size), aspect=aspect, paths=paths)
         self.window = np.empty((len(self.rows), 2), np.float32)
         update_windows(self.rows, np.arange(len(self.rows)), self.window)
         apply_scale_cutoff(self.rows, self.window, self.spec, model.scale_cutoff)

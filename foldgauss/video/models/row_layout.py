@@ -6,21 +6,26 @@ Gaussians alive.
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from foldgauss.envelope import TimeLikelihood
+from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.models.splats import FoldedSplats
+
+#: Fields of `FoldedSplats` that are not in `columns`.
+_OTHERS = ("envelope", "path_index", "paths")
 
 
 def _leaf_names() -> list[str]:
     """Trainable leaves, the fold last since its width varies with the degree."""
-    names = [field.name for field in dataclasses.fields(FoldedSplats) if field.name != "envelope"]
+    names = [field.name for field in dataclasses.fields(FoldedSplats) if field.name not in _OTHERS]
     return sorted(names, key=lambda name: name == "coefficients")
 
 
 def columns(degree: int) -> dict[str, slice]:
-    """The columns of each leaf of `FoldedSplats` in a row."""
+    """The columns of each trainable leaf of `FoldedSplats` in a row."""
     widths = {"loc": 2, "log_scale": 2, "color_dc": 3, "coefficients": 2 * degree}
     place, start = {}, 0
     for name in _leaf_names():
@@ -30,17 +35,27 @@ def columns(degree: int) -> dict[str, slice]:
 
 
 def pack(splats: FoldedSplats) -> np.ndarray:
-    """Leaves to rows, float32 (num, 11 + 2 degree)."""
+    """Leaves to rows, float32 (num, 11 + 2 degree); with shared paths the last column is `path_index`."""
     num = splats.num_gaussians
     leaves = [np.asarray(getattr(splats, name), np.float32).reshape(num, -1) for name in _leaf_names()]
+    if splats.paths is not None:
+        leaves.append(np.asarray(splats.path_index, np.float32)[:, None])
     return np.ascontiguousarray(np.concatenate(leaves, axis=1))
 
 
-def unpack(rows: np.ndarray, degree: int, envelope: TimeLikelihood) -> FoldedSplats:
-    """Rows to leaves (copies), the inverse of `pack`."""
+def has_path_column(rows: np.ndarray, degree: int) -> bool:
+    """Whether rows end with a column of `path_index`."""
+    return rows.shape[1] > columns(degree)["coefficients"].stop
+
+
+def unpack(rows: np.ndarray, degree: int, envelope: TimeLikelihood, paths: SharedPaths | None = None) -> FoldedSplats:
+    """Rows to leaves (copies), the inverse of `pack`; with `paths` where rows have a column of `path_index`."""
     num = len(rows)
     shapes = {"loc": (num, 2), "log_scale": (num, 2), "color_dc": (num, 3), "coefficients": (num, degree, 2)}
     leaves = {name: rows[:, place].reshape(shapes.get(name, (num,))).copy() for name, place in columns(degree).items()}
+    if paths is not None:
+        xp = np if isinstance(rows, np.ndarray) else jnp
+        leaves |= {"path_index": rows[:, -1].astype(xp.uint8), "paths": paths}
     return FoldedSplats(**leaves, envelope=envelope)
 
 

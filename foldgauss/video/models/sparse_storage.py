@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Float32, Int, UInt, UInt8
 from foldgauss._runtime.checks import invalid, is_integer, short_repr
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.models.row_layout import columns
+from foldgauss.video.models.shared_paths import SharedPaths, check_path_index
 from foldgauss.video.models.splats import OPAQUE_LOGIT, STATIC_LOG_TIME_SCALE, FoldedSplats
 
 #: Bits of a kind: static; opaque; and those of the degree.
@@ -114,6 +115,8 @@ class StoredSplats(eqx.Module):
     color_index: UInt[Array, " num"] | None
     shape_index: UInt[Array, " num"] | None
     degree: int = eqx.field(static=True)
+    path_index: UInt8[Array, " num"] | None = None
+    paths: SharedPaths | None = None
 
     @property
     def num_gaussians(self) -> int:
@@ -135,6 +138,7 @@ def from_stored(splats: FoldedSplats | StoredSplats) -> FoldedSplats:
 
     Raises ValueError for kinds and indices that do not fit the other leaves, whose shapes must be those of the class.
     """
+    check_path_index(splats)
     if isinstance(splats, FoldedSplats):
         return splats
     leaves = {name: getattr(splats, name) for name in _leaf_names()}

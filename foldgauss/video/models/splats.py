@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, UInt8
 
 from foldgauss._numerics.batch import concrete_value
 from foldgauss._runtime.checks import invalid
@@ -13,6 +13,7 @@ from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
 from foldgauss.fold import AbstractFold, PolynomialFold, ZeroFold
 from foldgauss.mixture import FoldedMixture
 from foldgauss.render import Splats2D
+from foldgauss.video.models.shared_paths import SharedPaths, move_splats
 
 #: Degree-0 spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 * color_dc, as in 3DGS.
 SH_C0 = 0.28209479177387814
@@ -44,6 +45,9 @@ class FoldedSplats(eqx.Module):
     | `coefficients` | (num, degree, 2) | the fold's c_k |
     | `opacity_logit` | (num,) | rho, by sigmoid |
     | `color_dc` | (num, 3) | 0.5 + 0.282 color_dc, not below 0 |
+    | `path_index` | (num,) or None | the path that moves the Gaussian, from 1; 0 for none |
+
+    `paths`: the motion that Gaussians share, by which those on a path are moved in addition; None without `path_index`.
 
     Source: VeGaS eq:vegas_equiv and "Implementation Details"; array order is depth order.
     """
@@ -57,6 +61,8 @@ class FoldedSplats(eqx.Module):
     opacity_logit: Float[Array, " num"]
     color_dc: Float[Array, "num 3"]
     envelope: TimeLikelihood
+    path_index: UInt8[Array, " num"] | None = None
+    paths: SharedPaths | None = None
 
     @property
     def num_gaussians(self) -> int:
@@ -83,7 +89,7 @@ class FoldedSplats(eqx.Module):
         return np.asarray(self.opacity_logit) == OPAQUE_LOGIT
 
     def gaussians(self) -> FoldedGaussian:
-        """The batch of Folded-Gaussians, batch shape (num,), event shape (3,)."""
+        """The batch of Folded-Gaussians, batch shape (num,), event shape (3,), before `paths` move them."""
         return FoldedGaussian(
             self.loc,
             rotated_scale_tril(jnp.exp(self.log_scale), 2 * jnp.pi * jax.nn.sigmoid(self.angle_logit)),
@@ -153,7 +159,8 @@ class FoldedSplats(eqx.Module):
             near &= self.log_scale.min(axis=-1) + log_a / 2 > float(np.log(scale_cutoff))
         opacity = jnp.where(near, jax.nn.sigmoid(self.opacity_logit), jnp.zeros_like(self.opacity_logit))
         color = jnp.maximum(0.5 + SH_C0 * self.color_dc, 0.0)
-        return Splats2D(conditional.loc, conditional.scale_tril, opacity, color)
+        splats = Splats2D(conditional.loc, conditional.scale_tril, opacity, color)
+        return splats if self.paths is None else move_splats(splats, self.path_index, self.paths.at(t))
 
 
 def _has_bits(leaf: Array) -> Bool[np.ndarray, "..."]:

@@ -1,0 +1,141 @@
+"""Paths that Gaussians share: maps in time, conditioning and its gradient, and files."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from foldgauss.io import load_video_model, save_video_model
+from foldgauss.render import RenderOptions
+from foldgauss.video import FrameTimes, VideoModel
+from foldgauss.video.models.conditioning import ConditioningSpec, backpropagate, condition, update_windows
+from foldgauss.video.models.renderer import VideoRenderer
+from foldgauss.video.models.row_layout import columns, pack, unpack
+from foldgauss.video.models.shared_paths import SharedPaths
+from foldgauss.video.models.splats import FoldedSplats
+from tests.video.test_conditioning import random_splats
+
+SIZE, T = (48, 80), np.float32(0.4)
+
+
+def random_paths(num_paths=2, num_knots=5, seed=3) -> SharedPaths:
+    rng = np.random.default_rng(seed)
+    times = np.sort(rng.random((num_paths, num_knots)), 1).astype(np.float32)
+    matrices = np.eye(2, 3) + 0.2 * rng.normal(size=(num_paths, num_knots, 2, 3))
+    return SharedPaths(times, matrices.astype(np.float32))
+
+
+def moving_splats(num=300, seed=0, **settings) -> FoldedSplats:
+    index = np.random.default_rng(seed).integers(0, 3, num).astype(np.uint8)
+    return dataclasses.replace(random_splats(num, seed=seed, **settings), path_index=index, paths=random_paths())
+
+
+def moving_model(splats=None) -> VideoModel:
+    splats = moving_splats() if splats is None else splats
+    return VideoModel(splats, FrameTimes.uniform(4), SIZE, 25.0, RenderOptions())
+
+
+def test_maps_are_those_at_the_knots_and_linear_between_them():
+    paths = random_paths()
+    for p in range(2):
+        for k in range(5):
+            np.testing.assert_array_equal(paths.at(paths.times[p, k])[p], paths.matrices[p, k])
+        middle = paths.times[p, 1] + 0.25 * (paths.times[p, 2] - paths.times[p, 1])
+        expected = 0.75 * paths.matrices[p, 1] + 0.25 * paths.matrices[p, 2]
+        np.testing.assert_allclose(paths.at(middle)[p], expected, atol=1e-5)
+        np.testing.assert_array_equal(paths.at(np.float32(-1))[p], paths.matrices[p, 0])
+        np.testing.assert_array_equal(paths.at(np.float32(2))[p], paths.matrices[p, -1])
+
+
+def test_jax_and_numpy_give_the_same_maps_also_at_repeated_times():
+    paths = random_paths()
+    paths = dataclasses.replace(paths, times=np.repeat(paths.times[:, :1], 5, 1))
+    for one in (paths, random_paths()):
+        for t in np.linspace(-0.1, 1.1, 13, dtype=np.float32):
+            own = jax.jit(lambda paths, t: paths.at(t))(jax.tree.map(jnp.asarray, one), t)
+            np.testing.assert_allclose(own, one.at(t), atol=1e-6)
+            assert np.isfinite(own).all()
+
+
+def test_a_path_with_one_knot_does_not_move():
+    paths = random_paths(num_knots=1)
+    np.testing.assert_array_equal(paths.at(np.float32(0.7)), paths.matrices[:, 0])
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_kernels_move_splats_as_at_does(degree):
+    splats = moving_splats(degree=degree)
+    home = jax.jit(lambda model, t: model.at(t))(moving_model(splats), T)
+    done = moving_model(splats).prepare(SIZE).at(float(T))
+    alive = np.flatnonzero(np.asarray(home.opacity) > 0)
+    np.testing.assert_array_equal(done.alive, alive)
+    assert len(np.unique(np.asarray(splats.path_index)[alive])) == 3
+    np.testing.assert_allclose(done.mean, home.mean[alive], rtol=1e-5, atol=5e-4)
+    cov = done.factor @ np.swapaxes(done.factor, 1, 2)
+    home_cov = np.asarray(home.factor @ jnp.swapaxes(home.factor, 1, 2))[alive]
+    np.testing.assert_allclose(cov, home_cov, rtol=2e-4, atol=1e-5 * np.abs(home_cov).max())
+
+
+def test_gradients_by_rows_and_by_maps_match_autodiff():
+    splats = moving_splats(degree=3, power=1.0)
+    rows, window = pack(splats), np.empty((splats.num_gaussians, 2), np.float32)
+    update_windows(rows, np.arange(len(rows)), window)
+    spec = ConditioningSpec(3, 1.0, 0.0, SIZE, paths=splats.paths)
+    done = condition(rows, window, T, spec)
+    rng = np.random.default_rng(1)
+    w_mean, w_cov = rng.normal(size=done.mean.shape), rng.normal(size=done.factor.shape) / 50
+    w_cov = w_cov + np.swapaxes(w_cov, 1, 2)
+
+    def loss(leaves, maps):
+        steady = SharedPaths(jnp.zeros((2, 1), maps.dtype), maps[:, None])
+        moved = dataclasses.replace(splats, **leaves, paths=steady)
+        home = moving_model(moved).at(jnp.asarray(T, maps.dtype))
+        cov = home.factor @ jnp.swapaxes(home.factor, 1, 2)
+        return jnp.sum(home.mean[done.alive] * w_mean) + jnp.sum(cov[done.alive] * w_cov)
+
+    with jax.enable_x64(True):
+        leaves = {name: jnp.asarray(getattr(splats, name), jnp.float64) for name in columns(3)}
+        maps = jnp.asarray(splats.paths.at(T), jnp.float64)
+        by_leaves, by_maps = jax.tree.map(np.asarray, jax.jit(jax.grad(loss, (0, 1)))(leaves, maps))
+    grad, path_grad = np.zeros_like(rows), np.zeros((2, 2, 3))
+    nothing = np.zeros(len(done.alive), np.float32), np.zeros((len(done.alive), 3), np.float32)
+    d_factor = (2 * w_cov @ done.factor).astype(np.float32)
+    backpropagate(rows, done, (w_mean.astype(np.float32), d_factor, *nothing), spec, grad, path_grad)
+    for name, place in columns(3).items():
+        truth = by_leaves[name].reshape(len(rows), -1)
+        largest = max(np.abs(truth).max(), 1e-3)
+        np.testing.assert_allclose(grad[:, place] / largest, truth / largest, atol=2e-5, err_msg=name)
+    np.testing.assert_array_equal(grad[:, -1], 0)
+    np.testing.assert_allclose(path_grad, by_maps, rtol=1e-4, atol=1e-5 * np.abs(by_maps).max())
+
+
+def test_rows_hold_the_path_and_come_back():
+    splats = moving_splats(50)
+    rows = pack(splats)
+    assert rows.shape == (50, 18)
+    again = unpack(rows, 3, splats.envelope, splats.paths)
+    assert jax.tree.structure(again) == jax.tree.structure(splats)
+    for one, other in zip(jax.tree.leaves(again), jax.tree.leaves(splats), strict=True):
+        assert one.dtype == other.dtype
+        np.testing.assert_array_equal(one, other)
+
+
+def test_files_hold_paths(tmp_path):
+    model = moving_model()
+    again = load_video_model(save_video_model(tmp_path / "m.safetensors", model))
+    for one, other in zip(jax.tree.leaves(again), jax.tree.leaves(model), strict=True):
+        np.testing.assert_array_equal(one, other)
+    for t in (0.2, 0.5):
+        np.testing.assert_array_equal(VideoRenderer(again).frame(t), VideoRenderer(model).frame(t))
+
+
+def test_a_number_of_a_path_that_is_not_there_is_an_error(tmp_path):
+    splats = moving_splats()
+    wrong = dataclasses.replace(splats, path_index=np.full(300, 3, np.uint8))
+    with pytest.raises(ValueError, match="path_index: expected paths from 0 to 2, got 3"):
+        moving_model(wrong).prepare(SIZE)
+    path = save_video_model(tmp_path / "m.safetensors", moving_model(wrong))
+    with pytest.raises(ValueError, match="paths from 0 to 2"):
+        load_video_model(path)
