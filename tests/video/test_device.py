@@ -34,7 +34,7 @@ from foldgauss.video import (
 )
 from foldgauss.video.fitting.loop import start
 from foldgauss.video.fitting.schedule import choose_views, plan_levels
-from foldgauss.video.fitting.state import FitState
+from foldgauss.video.fitting.state import FitState, paths_of
 from foldgauss.video.fitting.steppers import jax_stepper
 from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
 from foldgauss.video.fitting.steppers.engines import choose_engine
@@ -111,7 +111,7 @@ def compare_steps(config: FitConfig, progress: float, level: int = -1, outside: 
     own = stepper.step(there, progress, level)
     close(own, figures, share=1e-6)
     assert own[2] == figures[2]
-    for name in ("rows", "first", "second", "frame_errors", "time_logits"):
+    for name in ("rows", "first", "second", "frame_errors", "time_logits", "path_maps", "path_first", "path_second"):
         close(getattr(there, name), getattr(here, name))
     np.testing.assert_array_equal(there.counts, here.counts)
     np.testing.assert_array_equal(there.kinds, here.kinds)
@@ -269,13 +269,14 @@ def test_conditioning_matches_the_cpu(power, floor):
     update_windows(state.rows, np.arange(len(state.rows)), window)
 
     @jax.jit
-    def conditioned(rows, t):
+    def conditioned(rows, maps, t):
         alive = find_alive(program, rows, np.int32(150), t)
-        return alive, _splats(program, rows, t, alive, jnp.bool_(False))
+        return alive, _splats(program, rows, maps, t, alive, jnp.bool_(False))
 
+    paths = paths_of(state)
     for t in np.float32([0.0, 0.37, 1.0]):
-        alive, splats = conditioned(state.rows, t)
-        judge = condition(state.rows, window, t, ConditioningSpec(3, power, floor, program.size))
+        alive, splats = conditioned(state.rows, paths.at(t), t)
+        judge = condition(state.rows, window, t, ConditioningSpec(3, power, floor, program.size, paths=paths))
         np.testing.assert_array_equal(np.flatnonzero(alive), judge.alive)
         splats = jax.tree.map(lambda leaf, keep=judge.alive: np.asarray(leaf)[keep], splats)
         close(splats.mean, judge.mean)
@@ -307,7 +308,7 @@ def test_pallas_step_matches_xla():
             step.step(state, 0.1)
             state.step += 1
         own[engine] = state.land() or state
-    for name in ("rows", "first", "second", "frame_errors", "time_logits"):
+    for name in ("rows", "first", "second", "frame_errors", "time_logits", "path_maps", "path_first", "path_second"):
         close(getattr(own["pallas"], name), getattr(own["xla"], name), share=1e-4)
 
 
@@ -476,7 +477,7 @@ def test_four_devices_match_one(tmp_path):
     one, four = stepped(state), load_checkpoint(done, config=GROWING, source={})
     assert one.held.arrays.rows.sharding.num_devices == 1
     assert four.best_error == pytest.approx(one.best_error, rel=1e-6)
-    for name in ("rows", "first", "second", "frame_errors", "time_logits"):
+    for name in ("rows", "first", "second", "frame_errors", "time_logits", "path_maps", "path_first", "path_second"):
         close(getattr(four, name), getattr(one, name), share=1e-4)
     for own, other in zip(four.statistics, one.statistics, strict=True):
         close(own, other, share=1e-4)

@@ -352,7 +352,7 @@ def test_screen_gradient_is_in_units_of_half_the_image():
         step = stepper_of(state)
         moved = dataclasses.replace(state, rows=rows)
         options = {"squared": False, "mirrored": False, "seen": None, "fraction": None}
-        return step._differentiate(moved, k, np.float32(k), step.shapes[-1], **options)[0].value
+        return step._differentiate(moved, k, np.float32(k), step.shapes[-1], None, **options)[0].value
 
     small = 0.02
     slope = [(loss(small, 0) - loss(-small, 0)) / (2 * small), (loss(0, small) - loss(0, -small)) / (2 * small)]

@@ -157,7 +157,7 @@ def sparse_adam(
 def masked_adam(rows, grad, first, second, counts, touched, rates, *, kinds, units: RateUnits):
     """`sparse_adam` in JAX: rows, moments and counts after a step on the rows where `touched`, bool (num,), is true."""
     degree = (rows.shape[1] - columns(0)["coefficients"].start) // 2
-    grad = jnp.where(_has_parameter(kinds, degree), grad, jnp.zeros_like(grad))
+    grad = jnp.where(_has_parameter(kinds, degree, rows.shape[1]), grad, jnp.zeros_like(grad))
     counts = counts + touched.astype(counts.dtype)
     corrections = jnp.asarray(BIAS_CORRECTIONS)[jnp.minimum(counts, len(BIAS_CORRECTIONS) - 1)]
     beta1, beta2, one = np.float32(BETA1), np.float32(BETA2), np.float32(1)
@@ -169,11 +169,11 @@ def masked_adam(rows, grad, first, second, counts, touched, rates, *, kinds, uni
     return jnp.where(chosen, moved, rows), jnp.where(chosen, mean, first), jnp.where(chosen, square, second), counts
 
 
-def _has_parameter(kinds: UInt8[Array, " num"], degree: int) -> Bool[Array, "num width"]:
-    """Which parameters each Gaussian has."""
+def _has_parameter(kinds: UInt8[Array, " num"], degree: int, width: int) -> Bool[Array, "num width"]:
+    """Which parameters each Gaussian has; columns after the fold are none."""
     place = columns(degree)
     kinds = kinds.astype(jnp.int32)[:, None]
-    column = np.arange(place["coefficients"].stop, dtype=np.int32)[None, :]
+    column = np.arange(width, dtype=np.int32)[None, :]
     of_time = (column == place["time_loc_logit"].start) | (column == place["log_time_scale"].start)
     absent = of_time & ((kinds & STATIC_BIT) > 0)
     absent |= (column == place["opacity_logit"].start) & ((kinds & OPAQUE_BIT) > 0)

@@ -20,6 +20,8 @@ from foldgauss.video.fitting.growth import EXTENT, PUBLISHED_STEPS, PUBLISHED_UN
 class LearningRates:
     """Learning rates of Adam at the first step, by leaf, in model space (the frame's longer side is 1).
 
+    `frame_times` is that of the times of frames, `paths` that of the maps of shared paths.
+
     With `FitConfig.scale_rates_by_size` the unit of length is each Gaussian's own size s, the geometric mean of its
     standard deviations: the learning rates of m_s and c_k are `loc` and `coefficients` times s / UNIT_SIZE.
     With `FitConfig.scale_rates_by_duration` the unit of time is its own duration: the learning rate of c_k is
@@ -36,6 +38,7 @@ class LearningRates:
     time_loc_logit: float = 0.02
     log_time_scale: float = 0.05
     frame_times: float = 3e-3
+    paths: float = 1e-4
 
     def __post_init__(self) -> None:
         for name, value in dataclasses.asdict(self).items():
@@ -83,6 +86,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "ssim_fraction": 0.2,
         "initialization": "uniform",
         "follow_motion": False,
+        "follow_camera": False,
         "scale_rates_by_duration": False,
         "scale_rates_by_size": False,
         "quarter_fraction": 0.0,
@@ -225,6 +229,13 @@ class FitConfig:
     follow_motion: bool = field(
         default=True,
         metadata=setting("Initial paths follow the optical flow within each shot; otherwise they are static"),
+    )
+    follow_camera: bool = field(
+        default=True,
+        metadata=setting(
+            "Gaussians may follow the motion of the camera, which they share, each with a fold of its own in addition",
+            "A Gaussian does so where its track is then longer or its fold smaller. Not without `follow_motion`.",
+        ),
     )
     scale_rates_by_duration: bool = field(
         default=True,

@@ -7,13 +7,15 @@ import cv2
 import jax
 import numpy as np
 import scipy
-from jaxtyping import UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.envelope import TimeLikelihood
+from foldgauss.video.fitting.camera_coordinates import CameraCoordinates, prefers_camera
 from foldgauss.video.fitting.growth import PUBLISHED_UNIT
+from foldgauss.video.models.shared_paths import SharedPaths, leave_paths
 from foldgauss.video.models.splats import SH_C0, STATIC_LOG_TIME_SCALE, TAU_MAX, FoldedSplats
-from foldgauss.video.motion.optical_flow import Motion, fit_folds
+from foldgauss.video.motion.optical_flow import Motion, Tracks, fit_folds
 
 #: Logarithm of the ratio of the longer axis of a start on a straight edge to the geometric mean of both; the width, in
 #: pixels, of the window in which edges are measured.
@@ -63,6 +65,7 @@ def initialize(
     seed: int,
     times: np.ndarray | None = None,
     motion: Motion | None = None,
+    paths: SharedPaths | None = None,
     opacity: float = START_OPACITY,
     with_static: bool = False,
 ) -> FoldedSplats:
@@ -71,7 +74,8 @@ def initialize(
     Positions are drawn by image gradient within each frame, m_t is that frame's time, sizes follow from the local
     density of starts, colors from the pixel. With `motion`, folds follow the optical flow, and sigma_t is drawn as a
     fraction of the length of the track; without, folds are at rest and sigma_t is log-uniform. With `with_static`,
-    starts whose pixel never changes are static Gaussians, behind the others. `num_gaussians` may be a function of their
+    starts whose pixel never changes are static Gaussians, behind the others. Where the first of `paths`, that of the
+    camera, describes the motion better than a fold alone, starts follow it. `num_gaussians` may be a function of their
     mean lifetime in frames.
     """
     rng = np.random.default_rng([seed, 0])
@@ -79,7 +83,7 @@ def initialize(
     times = np.linspace(0, 1, num_frames) if times is None else np.asarray(times, np.float64)
     density_of = lambda k: measure_detail(frames[k])  # noqa: E731
     make = lambda home, position: make_splats(  # noqa: E731
-        frames, home, position, times, degree, envelope, motion, rng, opacity
+        frames, home, position, times, degree, envelope, motion, rng, opacity, paths
     )
     chance, lifetime = _try_starts(times, make, density_of, rng)
     if callable(num_gaussians):
@@ -99,18 +103,29 @@ def initialize(
     order = np.argsort(static, kind="stable")
     angle, coherence = sample_orientations(frames, home, position)
     log_scale = np.log(scale)[:, None] + ELONGATION * coherence[:, None] * [1, -1]
+    if paths is not None:
+        log_scale += splats.log_scale + np.log(max(frames.shape[1:3]))  # by the path's zoom
+        turned = CameraCoordinates.from_paths(paths, times, frames.shape[1:3]).turns(home)
+        angle = (angle + np.where(splats.path_index > 0, turned, 0) - np.pi / 2) % np.pi + np.pi / 2
     shape = {"log_scale": np.float32(log_scale), "angle_logit": np.float32(_logit(angle / (2 * np.pi)))}
     splats = dataclasses.replace(splats, **shape)
-    return jax.tree.map(lambda leaf: leaf[order] if leaf.ndim else leaf, splats)
+    ordered = jax.tree.map(lambda leaf: leaf[order] if leaf.ndim else leaf, dataclasses.replace(splats, paths=None))
+    return dataclasses.replace(ordered, paths=paths)
 
 
-def measure_lifetime(frames: UInt8[np.ndarray, "num_frames height width 3"], motion: Motion, degree: int) -> float:
+def measure_lifetime(
+    frames: UInt8[np.ndarray, "num_frames height width 3"],
+    motion: Motion,
+    degree: int,
+    camera: Float[np.ndarray, "num_frames 2 3"] | None = None,
+) -> float:
     """The mean number of frames in which the Gaussians of `initialize` are alive, if the frames are evenly spaced."""
     rng, times = np.random.default_rng(0), np.linspace(0, 1, len(frames))
+    paths = None if camera is None else SharedPaths(np.float32(times)[None], np.float32(camera)[None])
     envelope = TimeLikelihood(power=np.float32(1))
 
     def make(home: np.ndarray, position: np.ndarray) -> tuple[FoldedSplats, np.ndarray]:
-        return make_splats(frames, home, position, times, degree, envelope, motion, rng, START_OPACITY)
+        return make_splats(frames, home, position, times, degree, envelope, motion, rng, START_OPACITY, paths)
 
     return _try_starts(times, make, lambda k: measure_detail(frames[k]), rng)[1]
 
@@ -187,9 +202,12 @@ def make_splats(
     motion: Motion | None,
     rng: np.random.Generator,
     opacity: float,
+    paths: SharedPaths | None = None,
 ) -> tuple[FoldedSplats, np.ndarray]:
     """Splats at `position` in frames `home`, one pixel wide, with the colors of the frames; and their sigma_t."""
     num, (height, width) = len(home), frames.shape[1:3]
+    camera = None if paths is None else CameraCoordinates.from_paths(paths, times, (height, width))
+    follows = np.zeros(num, bool)
     interval = np.diff(times).min(initial=1.0)  # a single frame lasts the whole clip
     if motion is None:
         time = times[home] + rng.uniform(-0.5, 0.5, num) * interval
@@ -198,14 +216,18 @@ def make_splats(
         spread = np.exp(rng.uniform(np.log(shortest), np.log(max(TIME_SCALES[1], shortest)), num))
     else:
         time = times[home]
-        coefficients, spread = follow_tracks(motion, home, position, degree, rng)
+        coefficients, spread, follows = follow_tracks(motion, home, position, degree, rng, camera)
         coefficients /= np.float32(interval) ** np.arange(1, degree + 1)[:, None]
         spread = spread * interval
     column, row = np.floor(position).astype(np.int64).clip(0, [width - 1, height - 1]).T
     color, unit = frames[home, row, column] / np.float32(255), max(height, width)
+    log_scale = np.full(num, -np.log(unit))
+    if follows.any():
+        position = np.where(follows[:, None], camera.place(home, position), position)
+        log_scale += np.where(follows, camera.log_scales(home), 0)
     leaves = {
         "loc": (position - [width / 2, height / 2]) / unit,
-        "log_scale": np.full((num, 2), -np.log(unit)),
+        "log_scale": np.stack([log_scale, log_scale], 1),
         "angle_logit": _logit(rng.uniform(0.01, 0.99, num)),
         "time_loc_logit": _logit(np.clip(time, 1e-3, 1 - 1e-3)),
         "log_time_scale": np.log(spread),
@@ -213,7 +235,10 @@ def make_splats(
         "opacity_logit": _logit(np.full(num, opacity)),
         "color_dc": (color - 0.5) / SH_C0,
     }
-    return FoldedSplats(**{name: np.float32(leaf) for name, leaf in leaves.items()}, envelope=envelope), spread
+    splats = FoldedSplats(**{name: np.float32(leaf) for name, leaf in leaves.items()}, envelope=envelope)
+    return splats if paths is None else dataclasses.replace(
+        splats, path_index=follows.astype(np.uint8), paths=paths
+    ), spread
 
 
 def find_constant(frames: np.ndarray, home: np.ndarray, position: np.ndarray) -> np.ndarray:
@@ -229,6 +254,7 @@ def find_constant(frames: np.ndarray, home: np.ndarray, position: np.ndarray) ->
 
 def make_static(splats: FoldedSplats, which: np.ndarray) -> FoldedSplats:
     """The splats with those of `which` made static: at rest throughout the clip."""
+    splats = leave_paths(splats, which)
     return dataclasses.replace(
         splats,
         time_loc_logit=np.where(which, np.float32(0), splats.time_loc_logit),
@@ -238,29 +264,51 @@ def make_static(splats: FoldedSplats, which: np.ndarray) -> FoldedSplats:
 
 
 def follow_tracks(
-    motion: Motion, home: np.ndarray, position: np.ndarray, degree: int, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Folds (num, degree, 2), in pixels per frame^k, and sigma_t (num,) in frames, of points at `home`."""
+    motion: Motion,
+    home: np.ndarray,
+    position: np.ndarray,
+    degree: int,
+    rng: np.random.Generator,
+    camera: CameraCoordinates | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Folds (num, degree, 2), in pixels per frame^k, and sigma_t (num,) in frames, of points at `home`.
+
+    And which of them (num,) follow the `camera`: their folds are in its coordinates.
+    """
     coefficients, spread = np.empty((len(home), degree, 2), np.float32), np.empty(len(home))
+    follows = np.zeros(len(home), bool)
     fractions = np.exp(rng.uniform(*np.log(TRACK_FRACTIONS), len(home)))
 
     def follow(start: int) -> None:
         part = slice(start, start + CHUNK)
         tracks = motion.follow(home[part], position[part].astype(np.float32))
-        wide = np.maximum(fractions[part] * tracks.reach / 2, MIN_FRAMES)
-        wide[tracks.reach == 0] = UNTRACKED_FRAMES
-        folds, miss = fit_folds(tracks, wide, degree)
-        for _ in range(SHORTENINGS):
-            off = np.flatnonzero((miss > MISS) & (wide > MIN_FRAMES))
-            if not len(off):
-                break
-            wide[off] = np.maximum(wide[off] * SHORTENING, MIN_FRAMES)
-            folds[off], miss[off] = fit_folds(tracks[off], wide[off], degree)
+        folds, wide = _fit_tracks(tracks, fractions[part], degree)
+        if camera is not None:
+            placed = camera.place_tracks(tracks, home[part], position[part])
+            by_camera, camera_wide = _fit_tracks(placed, fractions[part], degree)
+            follows[part] = better = prefers_camera(folds, wide, by_camera, camera_wide)
+            folds[better], wide[better] = by_camera[better], camera_wide[better]
         coefficients[part], spread[part] = folds, wide
 
     for first in range(0, len(home), AT_ONCE):
         run_tasks(follow, range(first, min(first + AT_ONCE, len(home)), CHUNK))
-    return coefficients, spread
+    return coefficients, spread, follows
+
+
+def _fit_tracks(
+    tracks: Tracks, fractions: Float[np.ndarray, " num"], degree: int
+) -> tuple[Float32[np.ndarray, "num degree 2"], Float[np.ndarray, " num"]]:
+    """Folds and sigma_t of tracks, at most these `fractions` of half their length: less where the fold misses them."""
+    wide = np.maximum(fractions * tracks.reach / 2, MIN_FRAMES)
+    wide[tracks.reach == 0] = UNTRACKED_FRAMES
+    folds, miss = fit_folds(tracks, wide, degree)
+    for _ in range(SHORTENINGS):
+        off = np.flatnonzero((miss > MISS) & (wide > MIN_FRAMES))
+        if not len(off):
+            break
+        wide[off] = np.maximum(wide[off] * SHORTENING, MIN_FRAMES)
+        folds[off], miss[off] = fit_folds(tracks[off], wide[off], degree)
+    return folds, wide
 
 
 def measure_detail(frame: np.ndarray) -> np.ndarray:

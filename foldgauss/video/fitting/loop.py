@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from foldgauss._runtime import notebook_hooks
@@ -32,9 +33,11 @@ from foldgauss.video.fitting.steppers.engines import choose_engine, make_stepper
 from foldgauss.video.fitting.steppers.protocol import StepResult
 from foldgauss.video.models.frame_times import FrameTimes, make_time_logits
 from foldgauss.video.models.row_layout import pack
+from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.models.sparse_storage import find_initial_kinds, find_kinds
 from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.motion.camera_path import find_camera_maps
 from foldgauss.video.motion.optical_flow import Motion, motion_finder
 
 
@@ -198,6 +201,11 @@ def _warm_up(frames: np.ndarray, config: FitConfig, engine: str) -> None:
     state = start(corner, dataclasses.replace(tiny, follow_motion=False))
     for progress in (0.0, 1.0) if engine == "cpu" else ():  # with either loss
         make_stepper("cpu", corner, tiny, state, motion_finder(corner)).step(state, progress)
+    if engine == "cpu" and config.follow_camera:
+        rows = np.pad(state.rows, ((0, 0), (0, 1)), constant_values=1)
+        maps = np.tile(np.eye(2, 3, dtype=np.float32), (len(corner), 1, 1, 1))
+        state = FitState.create(rows, state.kinds, state.time_logits, path_maps=maps)
+        make_stepper("cpu", corner, tiny, state, motion_finder(corner)).step(state, 0.0)
     if evaluates:
         mean_psnr(state, tiny, corner)
 
@@ -223,11 +231,13 @@ def _start(
     if logits is None:
         logits = make_time_logits(num_frames, motion.find_cuts() if motion is not None else [])
     logits = np.array(logits, np.float32)
-    rows = pack(_initialize(frames, config, logits, motion))
+    splats = _initialize(frames, config, logits, motion)
+    rows = pack(splats)
     return FitState.create(
         rows,
         find_initial_kinds(rows, config.degree),
         logits,
+        **_path_fields(splats, logits),
         growing=config.growth is not None,
         plan=0 if config.minutes is not None else planned_steps(config, num_frames),
         seconds=clock() - begun,
@@ -251,7 +261,7 @@ def start_from(model: VideoModel, config: FitConfig, steps: int, progress: float
     rows, logits = pack(model.splats), np.array(model.frame_times.logits, np.float32)
     done = round(steps * progress / (1 - progress))
     kinds = find_kinds(rows, config.degree)
-    return FitState.create(rows, kinds, logits, step=done, plan=done + steps)
+    return FitState.create(rows, kinds, logits, step=done, plan=done + steps, **_path_fields(model.splats, logits))
 
 
 def _check_config(model: VideoModel, config: FitConfig) -> None:
@@ -282,7 +292,22 @@ def _initialize(frames: np.ndarray, config: FitConfig, logits: np.ndarray, motio
     times = np.asarray(FrameTimes(logits).times())
     opacity = SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY
     clip = {"times": times, "motion": motion, "opacity": opacity, "with_static": config.economy is not None}
+    clip["paths"] = _find_paths(motion, times) if config.follow_camera else None
     return initialize(frames, lambda life: choose_num(lifetime=life), envelope=envelope_of(config), **clip, **shape)
+
+
+def _find_paths(motion: Motion | None, times: np.ndarray) -> SharedPaths | None:
+    """The path of the camera, if it moves."""
+    maps = None if motion is None else find_camera_maps(motion)
+    return None if maps is None else SharedPaths(np.float32(times)[None], np.float32(maps)[None])
+
+
+def _path_fields(splats: FoldedSplats, logits: np.ndarray) -> dict[str, np.ndarray]:
+    """The fields of a state that hold shared paths, at its frame times."""
+    if splats.paths is None:
+        return {}
+    paths, times = jax.tree.map(np.asarray, splats.paths), np.asarray(FrameTimes(logits).times())
+    return {"path_maps": np.stack([paths.at(t) for t in times]).astype(np.float32)}
 
 
 # ------------------------------------------------------------------------------------------------ checks

@@ -90,15 +90,22 @@ class RateSchedule:
 
     def at(self, progress: float, backoffs: int) -> tuple[np.ndarray, np.float32]:
         """The rates of rows, float32 (width,), and of frame times, at a fraction of the plan and after back-offs."""
+        config, decay, slower = self.config, self._decay(progress), BACKOFF_FACTOR**-backoffs
+        rows = np.where(self.decayed, self.first * np.float32(decay), self.first) * np.float32(slower)
+        times = config.rates.frame_times * (decay if config.decayed == "all" else 1.0) * slower
+        return rows, np.float32(times)
+
+    def of_paths(self, progress: float, backoffs: int) -> np.float32:
+        """The rate of the maps of shared paths."""
+        return np.float32(self.config.rates.paths * self._decay(progress) * BACKOFF_FACTOR**-backoffs)
+
+    def _decay(self, progress: float) -> float:
         config = self.config
         decay = config.final_rate**progress if config.final_rate > 0 else max(1 - progress, 0.0)
         if max(1 - progress, 0.0) < config.cooldown_fraction:
             left = (1 - progress) / config.cooldown_fraction
             decay *= COLD + (1 - COLD) * left if left >= 0 else OVERTIME_FACTOR
-        slower = BACKOFF_FACTOR**-backoffs
-        rows = np.where(self.decayed, self.first * np.float32(decay), self.first) * np.float32(slower)
-        times = config.rates.frame_times * (decay if config.decayed == "all" else 1.0) * slower
-        return rows, np.float32(times)
+        return decay
 
 
 # ------------------------------------------------------------------------------------------ coarse to fine

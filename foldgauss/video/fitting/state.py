@@ -16,9 +16,10 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 import jax
 import numpy as np
 import optax
+from jaxtyping import Float, Int
 
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.video.fitting.adam import FRAME_TIME_ADAM, RateUnits, sparse_adam
+from foldgauss.video.fitting.adam import FRAME_TIME_ADAM, RateUnits, adam_step, sparse_adam
 from foldgauss.video.fitting.codebook import Codebook
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.growth import GradientStatistics
@@ -26,6 +27,7 @@ from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.metrics import psnr
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.row_layout import columns, unpack
+from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.models.video_model import VideoModel
 
 # ------------------------------------------------------------------------------------------------ metadata
@@ -40,6 +42,7 @@ class Sizes(NamedTuple):
     growing: bool = False  # whether there are gradient statistics
     colors: int = 0  # entries of the codebooks
     shapes: int = 0
+    paths: int = 0  # shared paths
 
 
 class StateArray(abc.ABC):
@@ -131,12 +134,21 @@ class Shared(StateArray):
 class PerFrame(StateArray):
     """One number for each frame, or for each interval between two frames; with Adam's moments of these, if asked."""
 
+    dtype: type = np.float32
     intervals: bool = False
     moments: bool = False
 
     def spec(self, sizes: Sizes) -> Any:
-        values = jax.ShapeDtypeStruct((sizes.num_frames - self.intervals,), np.float32)
+        values = jax.ShapeDtypeStruct((sizes.num_frames - self.intervals,), self.dtype)
         return jax.eval_shape(FRAME_TIME_ADAM.init, values) if self.moments else values
+
+
+@dataclasses.dataclass(frozen=True)
+class OfPaths(StateArray):
+    """The map of each shared path at each frame, (num_frames, paths, 2, 3), or a moment of these."""
+
+    def spec(self, sizes: Sizes) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((sizes.num_frames, sizes.paths, 2, 3), np.float32)
 
 
 def _stored(kind: StateArray) -> dict[str, Any]:
@@ -192,6 +204,10 @@ class FitState:
     frame_errors: np.ndarray = field(metadata=_stored(PerFrame()))  # mean squared error when last seen, 0 before
     time_logits: np.ndarray = field(metadata=_stored(PerFrame(intervals=True)))
     time_moments: optax.OptState = field(metadata=_stored(PerFrame(intervals=True, moments=True)))
+    path_maps: np.ndarray = field(metadata=_stored(OfPaths()))  # of each frame, in model space
+    path_first: np.ndarray = field(metadata=_stored(OfPaths()))  # their moments
+    path_second: np.ndarray = field(metadata=_stored(OfPaths()))
+    frame_counts: np.ndarray = field(metadata=_stored(PerFrame(np.int32)))  # steps that each frame's maps have taken
     statistics: GradientStatistics | None = field(metadata=_stored(OfGrowth()))  # None without densification to come
     step: int = field(default=0, metadata=_COUNT)
     plan: int = field(default=0, metadata=_COUNT)  # steps of the whole fit; 0 until minutes have been planned
@@ -222,7 +238,8 @@ class FitState:
         cls, rows: np.ndarray, kinds: np.ndarray, time_logits: np.ndarray, *, growing: bool = False, **fields: Any
     ) -> "FitState":
         """A state with these Gaussians and frame times; all other arrays as a fit starts with, but for `fields`."""
-        sizes = Sizes(*rows.shape, len(time_logits) + 1, growing)
+        paths = fields["path_maps"].shape[1] if "path_maps" in fields else 0
+        sizes = Sizes(*rows.shape, len(time_logits) + 1, growing, paths=paths)
         fields |= {"rows": rows, "kinds": kinds, "time_logits": time_logits}
         arrays = {name: kind.build(sizes) for name, kind in cls.array_fields().items() if name not in fields}
         return cls(**arrays, **fields)
@@ -246,7 +263,7 @@ class FitState:
     @property
     def sizes(self) -> Sizes:
         entries = len(self.colors.counts), len(self.shapes.counts)
-        return Sizes(*self.rows.shape, len(self.frame_errors), self.growing, *entries)
+        return Sizes(*self.rows.shape, len(self.frame_errors), self.growing, *entries, self.path_maps.shape[1])
 
     def is_finite(self, name: str) -> bool:
         """Whether all values of an array are finite, by their sum: a third of the time of testing each."""
@@ -318,13 +335,35 @@ DeviceArrays = collections.namedtuple(
 def to_model(state: FitState, config: FitConfig, size: tuple[int, int], fps: float) -> VideoModel:
     """The model as it stands in `state` (arrays are copied)."""
     return VideoModel(
-        splats=unpack(state.rows, config.degree, envelope_of(config)),
+        splats=unpack(state.rows, config.degree, envelope_of(config), paths_of(state)),
         frame_times=FrameTimes(state.time_logits.copy()),
         size=tuple(int(n) for n in size),
         fps=float(fps),
         options=config.options,
         compositing=config.compositing,
     )
+
+
+def paths_of(state: FitState) -> SharedPaths | None:
+    """The shared paths as they stand in `state` (copies); None where there are none."""
+    if not state.path_maps.shape[1]:
+        return None
+    times = np.tile(np.asarray(frame_times(state.time_logits)), (state.path_maps.shape[1], 1))
+    return SharedPaths(times, np.swapaxes(state.path_maps, 0, 1).copy())
+
+
+def update_paths(
+    state: FitState, grad: Float[np.ndarray, "frames paths 2 3"], frames: Int[np.ndarray, " n"], rate: float
+) -> None:
+    """A step of Adam on the maps of `frames`, which are distinct, in place."""
+    num = len(frames)
+    state.frame_counts[frames] += 1
+    arrays = (array[frames].reshape(num, -1) for array in (grad, state.path_first, state.path_second))
+    rates = np.full(grad[0].size, rate, np.float32)
+    move, first, second = adam_step(*arrays, state.frame_counts[frames], rates)
+    for array, value in ((state.path_first, first), (state.path_second, second)):
+        array[frames] = value.reshape(grad[frames].shape)
+    state.path_maps[frames] -= move.reshape(grad[frames].shape).astype(np.float32)
 
 
 def update_rows(

@@ -1,17 +1,19 @@
 """Paths that many Gaussians share, such as the motion of the camera: affine maps that depend on time."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt8
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from foldgauss._runtime.checks import invalid
 from foldgauss.render import Splats2D
 
 #: A Gaussian's path is a byte: 0 for none, else the number of the path, from 1.
 MAX_PATHS = 255
+FEW_PATHS = 4
 
 
 class SharedPaths(eqx.Module):
@@ -63,10 +65,35 @@ def all_maps(maps: Float[Array, "paths 2 3"]) -> Float[Array, "paths+1 2 3"]:
 
 def move_splats(splats: Splats2D, path_index: UInt8[Array, " num"], maps: Float[Array, "paths 2 3"]) -> Splats2D:
     """Splats in model space, each moved by the map of its path."""
-    own = all_maps(maps)[path_index]
+    if len(maps) > FEW_PATHS:
+        own = all_maps(maps)[path_index]
+    else:  # the gradient by a map is then a sum in a fixed order
+        own = jnp.broadcast_to(jnp.eye(2, 3, dtype=maps.dtype), (*path_index.shape, 2, 3))
+        for number, one in enumerate(maps, 1):
+            own = jnp.where((path_index == number)[:, None, None], one[None], own)
     linear, offset = own[..., :2], own[..., 2]
     mean = jnp.einsum("nij,nj->ni", linear, splats.mean) + offset
     return Splats2D(mean, linear @ splats.factor, splats.opacity, splats.color, splats.depth)
+
+
+def leave_paths(splats: Any, which: Bool[np.ndarray, " num"]) -> Any:
+    """`FoldedSplats` of NumPy arrays where those of `which` are on no path, at the position and size of their m_t.
+
+    They keep their angles and folds.
+    """
+    if splats.paths is None or not (which & (splats.path_index > 0)).any():
+        return splats
+    times = 1 / (1 + np.exp(-splats.time_loc_logit.astype(float)))
+    own = splats.paths.by_path(np.float32(times), np.maximum(splats.path_index, 1) - 1)
+    leaving = (which & (splats.path_index > 0))[:, None]
+    loc = np.einsum("nij,nj->ni", own[:, :, :2], splats.loc) + own[:, :, 2]
+    larger = 0.5 * np.log(np.linalg.det(own[:, :, :2].astype(float)))[:, None]
+    return dataclasses.replace(
+        splats,
+        loc=np.where(leaving, loc, splats.loc).astype(np.float32),
+        log_scale=np.where(leaving, splats.log_scale + larger, splats.log_scale).astype(np.float32),
+        path_index=np.where(leaving[:, 0], 0, splats.path_index).astype(np.uint8),
+    )
 
 
 def check_path_index(splats: Any) -> None:

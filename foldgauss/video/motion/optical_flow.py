@@ -145,16 +145,20 @@ class Motion:
 
     def measure_tracked(self) -> list[float]:
         """The fraction of points on a grid that can be tracked from each frame to the next."""
+        return [float(self.match_grid(k)[2].mean()) for k in range(len(self.there))]
+
+    def match_grid(
+        self, k: int, spacing: int = 8
+    ) -> tuple[Float32[np.ndarray, "num 2"], Float32[np.ndarray, "num 2"], Bool[np.ndarray, " num"]]:
+        """Points of frame k, on a grid of every `spacing`-th cell of the maps; their positions in frame k + 1; and
+        which of these are reliable. All in pixels, as for `follow`."""
         rows, columns = self.small.shape[1:3]
-        y, x = np.meshgrid(np.arange(4, rows, 8), np.arange(4, columns, 8), indexing="ij")
+        first = spacing // 2
+        y, x = np.meshgrid(np.arange(first, rows, spacing), np.arange(first, columns, spacing), indexing="ij")
         unit = np.float32([self.size[1] / columns, self.size[0] / rows])
         grid = ((np.stack([x.ravel(), y.ravel()], -1) + 0.5) * unit).astype(np.float32)
-        fractions = []
-        for k in range(len(self.there)):
-            home = np.full(len(grid), k)
-            _, known = self._step(home, grid, 1, self._color(home, grid))
-            fractions.append(float(known.mean()))
-        return fractions
+        home = np.full(len(grid), k)
+        return grid, *self._step(home, grid, 1, self._color(home, grid))
 
     def follow(
         self, home: Int[np.ndarray, " num"], position: Float32[np.ndarray, "num 2"], *, longest: int = LONGEST

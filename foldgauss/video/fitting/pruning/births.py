@@ -15,6 +15,7 @@ from foldgauss.video.fitting.schedule import to_planes
 from foldgauss.video.models.background import random_background
 from foldgauss.video.models.conditioning import ConditioningSpec, condition
 from foldgauss.video.models.row_layout import columns, pack
+from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.motion.optical_flow import Motion
 
 #: The size of newborns relative to that of evenly spread Gaussians: errors have finer detail than the present image.
@@ -32,6 +33,7 @@ def make_newborns(
     degree: int,
     envelope: TimeLikelihood,
     motion: Motion | None,
+    paths: SharedPaths | None,
     opacity: float,
     with_static: bool,
     seed: tuple[int, ...],
@@ -49,11 +51,12 @@ def make_newborns(
         return smooth / smooth.sum()
 
     position, _ = draw_positions(home, density_of, rng)
-    splats, _ = make_splats(frames, home, position, times, degree, envelope, motion, rng, opacity)
+    splats, _ = make_splats(frames, home, position, times, degree, envelope, motion, rng, opacity, paths)
     rows = pack(make_static(splats, find_constant(frames, home, position)) if with_static else splats)
     size = frames.shape[1:3]
     apart = math.sqrt(math.prod(size) / max(alive, 1.0)) / max(size)
-    rows[:, columns(degree)["log_scale"]] = np.log(SMALLER * SCALE_FACTOR * apart)
+    larger = 0.0 if paths is None else rows[:, columns(degree)["log_scale"]] + np.log(max(size))  # by the path's zoom
+    rows[:, columns(degree)["log_scale"]] = np.log(SMALLER * SCALE_FACTOR * apart) + larger
     return rows
 
 

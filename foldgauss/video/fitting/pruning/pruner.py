@@ -19,7 +19,7 @@ from foldgauss.video.fitting.pruning.description_length import (
     weigh_frames,
 )
 from foldgauss.video.fitting.pruning.scores import PruningScores, measure_scores
-from foldgauss.video.fitting.state import FitState, envelope_of, frame_times, mean_psnr
+from foldgauss.video.fitting.state import FitState, envelope_of, frame_times, mean_psnr, paths_of
 from foldgauss.video.models.conditioning import ConditioningSpec, update_windows
 from foldgauss.video.models.row_layout import columns
 from foldgauss.video.models.sparse_storage import clear_absent_moments, count_parameters, find_initial_kinds
@@ -152,17 +152,18 @@ class Pruner:
     def _add_newborns(self, state: FitState, scores: PruningScores, num: int) -> None:
         """Gaussians where errors are large, in depth anywhere between the others."""
         config, times = self._config, np.asarray(frame_times(state.time_logits))
-        window = _windows(state.rows)
+        window, spec = _windows(state.rows), dataclasses.replace(self._spec, paths=paths_of(state))
         new = make_newborns(
             num,
             np.ascontiguousarray(self._frames[..., :3]),
             times,
             scores.errors,
-            lambda k: measure_squares(state.rows, window, times[k], *self._target(k), self._spec, self._config),
+            lambda k: measure_squares(state.rows, window, times[k], *self._target(k), spec, self._config),
             float(np.mean([((window[:, 0] < t) & (t < window[:, 1])).sum() for t in times])),
             degree=config.degree,
             envelope=envelope_of(config),
             motion=self._find_motion() if config.follow_motion else None,
+            paths=paths_of(state),
             opacity=START_OPACITY,
             with_static=True,
             seed=(config.seed, 3, state.step),
@@ -194,7 +195,8 @@ class Pruner:
         times = np.asarray(frame_times(state.time_logits))
         weights = None if self._config.economy.psnr is None else weigh_frames(state.frame_errors)
         options = self._render_options() | {"seed": state.step, "weights": weights}
-        return measure_scores(state.rows, _windows(state.rows), times, self._spec, self._target, **options)
+        spec = dataclasses.replace(self._spec, paths=paths_of(state))
+        return measure_scores(state.rows, _windows(state.rows), times, spec, self._target, **options)
 
     def _psnr(self, state: FitState, scores: PruningScores) -> float:
         """The mean PSNR in dB, over black; scores of frames with alpha are measured over other colors."""

@@ -4,6 +4,8 @@ The number of Gaussians stays the same. Source: relocation of dead Gaussians in 
 (Kheradmand et al. 2024); the choice of Gaussians and their new parameters are ours.
 """
 
+import dataclasses
+
 import numpy as np
 import scipy
 from jaxtyping import Float, Float32, Int
@@ -14,7 +16,7 @@ from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.initialize import START_OPACITY, SUMMED_OPACITY
 from foldgauss.video.fitting.pruning.births import make_newborns, make_target, measure_squares
 from foldgauss.video.fitting.schedule import steps_per_pass
-from foldgauss.video.fitting.state import FitState, envelope_of, frame_times
+from foldgauss.video.fitting.state import FitState, envelope_of, frame_times, paths_of
 from foldgauss.video.models.conditioning import ConditioningSpec, update_windows
 from foldgauss.video.models.row_layout import columns
 from foldgauss.video.models.sparse_storage import find_initial_kinds, is_opaque, is_static
@@ -60,7 +62,7 @@ def relocate(
     num = round(config.relocated_fraction * np.isfinite(influence).sum())
     if num == 0:
         return
-    rows, stay = state.rows, np.ones(len(state.rows), bool)
+    rows, stay, spec = state.rows, np.ones(len(state.rows), bool), dataclasses.replace(spec, paths=paths_of(state))
     stay[np.argsort(influence, kind="stable")[:num]] = False
     new = make_newborns(
         num,
@@ -72,6 +74,7 @@ def relocate(
         degree=config.degree,
         envelope=envelope_of(config),
         motion=motion,
+        paths=paths_of(state),
         opacity=SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY,
         with_static=bool(is_static(state.kinds).any()),
         seed=(config.seed, 3, state.step),

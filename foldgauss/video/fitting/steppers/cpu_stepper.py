@@ -21,7 +21,7 @@ from foldgauss.video.fitting.schedule import (
     steps_per_pass,
     to_planes,
 )
-from foldgauss.video.fitting.state import FitState, frame_times, update_rows
+from foldgauss.video.fitting.state import FitState, frame_times, paths_of, update_paths, update_rows
 from foldgauss.video.fitting.steppers.interpolated_frames import make_interpolated
 from foldgauss.video.fitting.steppers.loss import ImageLoss, image_loss, squared_loss
 from foldgauss.video.fitting.steppers.protocol import StepResult
@@ -69,8 +69,9 @@ class CpuStepper:
         if self.frames.shape[3] == 4:
             self.background = random_background(config.seed, state.step)
         times = np.asarray(frame_times(state.time_logits))
-        by_time = np.zeros_like(times)
-        losses, alive = [], []
+        by_time, by_path = np.zeros_like(times), np.zeros(state.path_maps.shape)
+        shape = dataclasses.replace(self.shapes[level], paths=paths_of(state))
+        losses, alive, visited = [], [], set()
         squared = progress >= 1 - config.l2_fraction
         seen = None if state.statistics is None else []
         for view in choose_views(config, num_frames, state.step, state.frame_errors):
@@ -79,11 +80,12 @@ class CpuStepper:
             if self.interpolation is not None:
                 fraction = self.interpolation.choose(state.step, progress, k)
             t = times[k] if fraction is None else (1 - fraction) * times[k] + fraction * times[k + 1]
-            loss, done, d_time = self._differentiate(
-                state, k, t, self.shapes[level], squared=squared, mirrored=mirrored, seen=seen, fraction=fraction
-            )
+            settings = {"squared": squared, "mirrored": mirrored, "seen": seen, "fraction": fraction}
+            own_path = by_path[k] if fraction is None else None
+            loss, done, d_time = self._differentiate(state, k, t, shape, own_path, **settings)
             if fraction is None:
                 by_time[k] += d_time  # a batch may hold a frame twice
+                visited.add(k)
             losses.append(loss.value)
             alive.append(done.alive)
         if state.statistics is not None:
@@ -102,10 +104,12 @@ class CpuStepper:
         if config.learn_frame_times and num_frames > 2:
             updated = update_frame_times(state.time_logits, state.time_moments, by_time, time_rate)
             state.time_logits, state.time_moments = updated
+        if by_path.size and visited:
+            update_paths(state, by_path, np.array(sorted(visited)), self.rates.of_paths(progress, state.backoffs))
         return StepResult(float(np.mean(losses)), num_alive, finite)
 
     def measure_start(self, state: FitState) -> dict[int, float]:
-        shape, errors = self.shapes[-1], {}
+        shape, errors = dataclasses.replace(self.shapes[-1], paths=paths_of(state)), {}
         times = np.asarray(frame_times(state.time_logits))
         for k in choose_start_frames(self.num_frames):
             image = self._render(condition(state.rows, self.window, times[k], shape), shape).image
@@ -134,6 +138,7 @@ class CpuStepper:
         k: int,
         t: np.float32,
         shape: ConditioningSpec,
+        by_path: np.ndarray | None,
         *,
         squared: bool,
         mirrored: bool,
@@ -142,7 +147,8 @@ class CpuStepper:
     ) -> tuple[ImageLoss, ConditionedSplats, float]:
         """The loss of frame k, or of the image interpolated at `fraction` of the way to the next, and dL/dt.
 
-        Gradients by rows are added to `self.grad`. To the list `seen` is appended what `GradientStatistics.add` takes.
+        Gradients by rows are added to `self.grad`, those by the maps of paths to `by_path`. To the list `seen` is
+        appended what `GradientStatistics.add` takes.
         """
         if fraction is None:
             target = to_planes(shrink_frame(self.frames[k], shape.size), self.background)
@@ -169,7 +175,7 @@ class CpuStepper:
         if seen is not None:
             half = np.float32(shape.size[::-1]) / 2
             seen.append((done.alive[trace.visible], cpu.screen_gradient(d_mean[trace.visible] * half)))
-        return loss, done, backpropagate(rows, done, (d_mean, d_factor, *others), shape, self.grad)
+        return loss, done, backpropagate(rows, done, (d_mean, d_factor, *others), shape, self.grad, by_path)
 
     def _weight(self, errors: np.ndarray, k: int) -> float:
         """The weight of frame k's loss. For a mean PSNR, each dB of each frame counts the same."""

@@ -18,11 +18,12 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.render.tiles import find_visible
-from foldgauss.video.fitting.adam import RateUnits, masked_adam, update_frame_times
+from foldgauss.video.fitting.adam import BETA1, BETA2, EPSILON, RateUnits, masked_adam, update_frame_times
 from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.fitting.state import DeviceArrays, FitState, Sizes, frame_times
 from foldgauss.video.fitting.steppers.jax_loss import compute_losses
 from foldgauss.video.models.row_layout import columns, unpack
+from foldgauss.video.models.shared_paths import move_splats
 from foldgauss.video.models.splats import TAU_MAX
 
 #: The axis of the mesh that views are divided over.
@@ -37,6 +38,7 @@ class Control(NamedTuple):
     squared: Bool[Array, ""]  # which loss
     rates: Float[Array, " width"]
     time_rate: Float[Array, ""]
+    path_rate: Float[Array, ""]
     between: "Between | None" = None  # where the fit interpolates frames
 
 
@@ -80,11 +82,17 @@ class Program:
     grows: bool
     interpolates: bool
     num_devices: int
+    num_paths: int = 0  # that Gaussians share
+
+    @property
+    def num_trained(self) -> int:
+        """Columns of a row that learn."""
+        return columns(self.degree)["coefficients"].stop
 
     @property
     def width(self) -> int:
         """Of a row."""
-        return columns(self.degree)["coefficients"].stop
+        return self.num_trained + (self.num_paths > 0)
 
 
 def make_mesh(program: Program) -> Mesh | None:
@@ -122,13 +130,14 @@ def _specs(program: Program) -> tuple[DeviceArrays, jax.ShapeDtypeStruct, Contro
     def spec(*shape: int, dtype=np.float32) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct(shape, dtype)
 
-    sizes, kinds = Sizes(program.capacity, program.width, program.num_frames, program.grows), FitState.array_fields()
+    sizes = Sizes(program.capacity, program.width, program.num_frames, program.grows, paths=program.num_paths)
+    kinds = FitState.array_fields()
     arrays = DeviceArrays(*(kinds[name].spec(sizes) for name in DeviceArrays._fields))
     views, num = spec(program.batch_size, dtype=np.int32), spec(dtype=np.int32)
     between = None
     if program.interpolates:
         between = Between(spec(program.batch_size), spec(program.batch_size, *program.size, 3))
-    control = Control(views, num, spec(dtype=np.bool_), spec(program.width), spec(), between)
+    control = Control(views, num, spec(dtype=np.bool_), spec(program.num_trained), spec(), spec(), between)
     return arrays, spec(program.num_frames, *program.size, 3, dtype=np.uint8), control
 
 
@@ -138,7 +147,7 @@ def _specs(program: Program) -> tuple[DeviceArrays, jax.ShapeDtypeStruct, Contro
 def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames height width 3"], control: Control):
     """The arrays after a step, and its `Report`."""
     times = frame_times(arrays.time_logits)
-    seen = _distribute(program)(arrays.rows, times, frames, control)
+    seen = _distribute(program)(arrays.rows, arrays.path_maps, times, frames, control)
     statistics = arrays.statistics
     if statistics is not None:
         by_time = seen.by_rows[:, columns(program.degree)["time_loc_logit"].start]
@@ -146,13 +155,16 @@ def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames he
     used = jnp.arange(program.capacity, dtype=jnp.int32) < control.num
     touched = seen.alive if program.sparse_updates else used
     moments = arrays.first, arrays.second, arrays.counts
+    rates = jnp.pad(control.rates, (0, program.width - program.num_trained))
     rows, first, second, counts = masked_adam(
-        arrays.rows, seen.by_rows, *moments, touched, control.rates, kinds=arrays.kinds, units=program.rate_units
+        arrays.rows, seen.by_rows, *moments, touched, rates, kinds=arrays.kinds, units=program.rate_units
     )
     logits, time_moments = arrays.time_logits, arrays.time_moments
     if program.learns_times:
         logits, time_moments = update_frame_times(logits, time_moments, seen.by_times, control.time_rate)
     errors = jnp.where(seen.errors >= 0, seen.errors, arrays.frame_errors)
+    if program.num_paths:
+        arrays = _update_paths(arrays, seen, control.path_rate)
     report = Report(
         loss=seen.loss,
         num_alive=jnp.sum(seen.alive, dtype=jnp.int32),
@@ -165,11 +177,31 @@ def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames he
     return arrays._replace(frame_errors=errors, time_logits=logits, time_moments=time_moments), report
 
 
+def _update_paths(arrays: DeviceArrays, seen: "Gradients", rate: Float[Array, ""]) -> DeviceArrays:
+    """The twin of `state.update_paths`, for the frames of the batch."""
+    visited = seen.errors >= 0
+    counts = arrays.frame_counts + visited.astype(jnp.int32)
+    wide = jnp.maximum(counts, 1).astype(jnp.float32)[:, None, None, None]
+    beta1, beta2, one = np.float32(BETA1), np.float32(BETA2), np.float32(1)
+    first = beta1 * arrays.path_first + (one - beta1) * seen.by_paths
+    second = beta2 * arrays.path_second + (one - beta2) * seen.by_paths * seen.by_paths
+    square = second / (one - beta2**wide)
+    maps = arrays.path_maps - rate * (first / (one - beta1**wide)) / (jnp.sqrt(square) + np.float32(EPSILON))
+    chosen = visited[:, None, None, None]
+    return arrays._replace(
+        path_maps=jnp.where(chosen, maps, arrays.path_maps),
+        path_first=jnp.where(chosen, first, arrays.path_first),
+        path_second=jnp.where(chosen, second, arrays.path_second),
+        frame_counts=counts,
+    )
+
+
 class Gradients(NamedTuple):
     """The loss of a batch, its gradients, and which Gaussians it shows."""
 
     loss: Float[Array, ""]  # mean over the batch
     by_rows: Float[Array, "capacity width"]
+    by_paths: Float[Array, "num_frames paths 2 3"]
     by_times: Float[Array, " num_frames"]
     errors: Float[Array, " num_frames"]  # -1 of frames that are not in the batch
     alive: Bool[Array, " capacity"]
@@ -183,39 +215,46 @@ def _distribute(program: Program):
         return here
     whole, views = PartitionSpec(), PartitionSpec(VIEWS)
 
-    def on_each(rows, times, frames, control):
-        own = here(rows, times, frames, control)
+    def on_each(rows, path_maps, times, frames, control):
+        own = here(rows, path_maps, times, frames, control)
         total = functools.partial(jax.lax.psum, axis_name=VIEWS)
         largest = functools.partial(jax.lax.pmax, axis_name=VIEWS)
         return Gradients(
-            *map(total, (own.loss, own.by_rows, own.by_times)),
+            *map(total, (own.loss, own.by_rows, own.by_paths, own.by_times)),
             largest(own.errors),
             largest(own.alive.astype(jnp.int32)) > 0,
             largest(own.screen),
         )
 
     between = Between(views, views) if program.interpolates else None
-    own = Control(views=views, num=whole, squared=whole, rates=whole, time_rate=whole, between=between)
+    own = Control(views, num=whole, squared=whole, rates=whole, time_rate=whole, path_rate=whole, between=between)
     # The replication check does not support the loops inside.
-    return jax.shard_map(on_each, mesh=mesh, in_specs=(whole, whole, whole, own), out_specs=whole, check_vma=False)
+    return jax.shard_map(on_each, mesh=mesh, in_specs=(*4 * [whole], own), out_specs=whole, check_vma=False)
 
 
-def _differentiate(program: Program, rows, times, frames, control: Control) -> Gradients:
-    """Render the views and differentiate their losses by rows and times; sums over this device's part of the batch."""
+def _differentiate(program: Program, rows, path_maps, times, frames, control: Control) -> Gradients:
+    """Render the views and differentiate their losses by rows, the frames' maps of paths, and times.
+
+    All are sums over this device's part of the batch.
+    """
     k, mirrored = control.views % program.num_frames, control.views >= program.num_frames
     t, target, whole = times[k], frames[k].astype(jnp.float32) * np.float32(1 / 255), jnp.ones(len(k), bool)
+    maps = path_maps[k]
     if control.between is not None:
         fractions, targets = control.between
         whole = fractions < 0
-        t = jnp.where(whole, t, (1 - fractions) * t + fractions * times[jnp.minimum(k + 1, program.num_frames - 1)])
+        after = jnp.minimum(k + 1, program.num_frames - 1)
+        t = jnp.where(whole, t, (1 - fractions) * t + fractions * times[after])
+        share = jnp.where(whole, 0, fractions)[:, None, None, None]
+        maps = (1 - share) * maps + share * path_maps[after]
         target = jnp.where(whole[:, None, None, None], target, targets)
     alive = jax.vmap(lambda t: find_alive(program, rows, control.num, t))(t)
     target = jnp.where(mirrored[:, None, None, None], target[:, :, ::-1], target)
 
-    def condition(rows, t):
-        return jax.vmap(functools.partial(_splats, program, rows))(t, alive, mirrored)
+    def condition(rows, maps, t):
+        return jax.vmap(functools.partial(_splats, program, rows))(maps, t, alive, mirrored)
 
-    splats, to_rows = jax.vjp(condition, rows, t)
+    splats, to_rows = jax.vjp(condition, rows, maps, t)
     # One after another: `vmap` would compute both sides of the engine's branches, a third more time.
     images, to_splats = jax.vjp(functools.partial(jax.lax.map, functools.partial(_render, program)), splats)
 
@@ -225,10 +264,11 @@ def _differentiate(program: Program, rows, times, frames, control: Control) -> G
 
     (loss, errors), by_images = jax.value_and_grad(mean_loss, has_aux=True)(images)
     (by_splats,) = to_splats(by_images)
-    by_rows, by_t = to_rows(by_splats)
+    by_rows, by_maps, by_t = to_rows(by_splats)
     return Gradients(
         loss,
         by_rows,
+        jnp.zeros_like(path_maps).at[k].add(jnp.where(whole[:, None, None, None], by_maps, 0)),
         jnp.zeros_like(times).at[k].add(jnp.where(whole, by_t, 0)),  # a batch may hold a frame twice
         jnp.full_like(times, -1.0).at[k].max(jnp.where(whole, errors, -1)),
         jnp.any(alive, axis=0),
@@ -245,12 +285,15 @@ def find_alive(program: Program, rows, num, t) -> Bool[Array, " capacity"]:
     return used & (center - reach < t) & (t < center + reach)
 
 
-def _splats(program: Program, rows, t, alive, mirrored) -> Splats2D:
+def _splats(program: Program, rows, maps, t, alive, mirrored) -> Splats2D:
     """The Gaussians at time t in pixels, by `FoldedSplats.at`; those not alive have opacity 0."""
     # The rows of those are replaced, so that their underflow far away in time is in no gradient.
     rows = jnp.where(alive[:, None], rows, jnp.zeros_like(rows))
     envelope = TimeLikelihood(power=np.float32(program.power), floor=np.float32(program.floor))
-    splats = unpack(rows, program.degree, envelope).at(t).to_pixels(program.size, aspect=program.aspect)
+    splats = unpack(rows, program.degree, envelope).at(t)
+    if program.num_paths:
+        splats = move_splats(splats, rows[:, -1].astype(jnp.int32), maps)
+    splats = splats.to_pixels(program.size, aspect=program.aspect)
     # The opposite camera sees left for right.
     sign = jnp.where(mirrored, jnp.float32([-1, 1]), jnp.float32([1, 1]))
     offset = jnp.where(mirrored, jnp.float32([program.size[1], 0]), jnp.float32([0, 0]))
@@ -285,16 +328,19 @@ def _add(statistics: GradientStatistics, screen, by_time) -> GradientStatistics:
 
 @functools.lru_cache(maxsize=8)
 def compile_error(program: Program) -> jax.stages.Compiled:
-    """Compiled: called with `(rows, num, t, frame)`, the mean squared error of the image at time t against a frame."""
+    """Compiled: called with `(rows, maps, num, t, frame)`, the mean squared error of the image at t against a frame.
+
+    `maps` (paths, 2, 3) are those of the shared paths at t.
+    """
     place = replicated(program)
-    shapes = (program.capacity, program.width), (), (), (*program.size, 3)
-    dtypes = np.float32, np.int32, np.float32, np.uint8
+    shapes = (program.capacity, program.width), (program.num_paths, 2, 3), (), (), (*program.size, 3)
+    dtypes = np.float32, np.float32, np.int32, np.float32, np.uint8
     specs = (jax.ShapeDtypeStruct(*spec, sharding=place) for spec in zip(shapes, dtypes, strict=True))
     return jax.jit(functools.partial(_measure_error, program)).lower(*specs).compile()
 
 
-def _measure_error(program: Program, rows, num, t, frame: UInt8[Array, "height width 3"]) -> Float[Array, ""]:
+def _measure_error(program: Program, rows, maps, num, t, frame: UInt8[Array, "height width 3"]) -> Float[Array, ""]:
     alive = find_alive(program, rows, num, t)
-    image = _render(program, _splats(program, rows, t, alive, jnp.bool_(False)))
+    image = _render(program, _splats(program, rows, maps, t, alive, jnp.bool_(False)))
     difference = image - frame.astype(jnp.float32) * np.float32(1 / 255)
     return jnp.mean(jnp.mean(difference * difference, axis=1))

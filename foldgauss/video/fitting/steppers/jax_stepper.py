@@ -107,6 +107,7 @@ class JaxStepper:
     def adopt(self, state: FitState) -> None:
         """Move a state's arrays to the device, padded to the capacity."""
         growing, num, width = state.growing, *state.rows.shape
+        self.num_paths = state.path_maps.shape[1]
         capacity = self._choose_capacity(num)
         if capacity != self.capacity:
             self.capacity = capacity
@@ -143,6 +144,7 @@ class JaxStepper:
             squared=np.bool_(progress >= 1 - config.l2_fraction),
             rates=rates,
             time_rate=time_rate,
+            path_rate=self.rates.of_paths(progress, state.backoffs),
             between=self._interpolate(views, state.step, progress, self.levels[level].size),
         )
         self._prepare(state, progress, self.levels[level].size)
@@ -209,7 +211,7 @@ class JaxStepper:
         times = np.asarray(frame_times(state.time_logits))
         error = compile_error(self.programs[-1])
         chosen = choose_start_frames(self.num_frames)
-        return {int(k): float(error(arrays.rows, num, times[k], self.frames[k])) for k in chosen}
+        return {int(k): float(error(arrays.rows, arrays.path_maps[k], num, times[k], self.frames[k])) for k in chosen}
 
     def _choose_capacity(self, num: int) -> int:
         """Rows of the arrays: a function of the number of Gaussians, so that a resumed fit has the same."""
@@ -246,6 +248,7 @@ class JaxStepper:
             grows=config.growth is not None,
             interpolates=self.interpolation is not None,
             num_devices=max(divisors),
+            num_paths=self.num_paths,
         )
 
 

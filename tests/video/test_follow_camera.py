@@ -1,0 +1,182 @@
+"""Fits whose Gaussians follow the motion of the camera."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from foldgauss.io import load_video_model, save_video_model
+from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
+from foldgauss.video import FitConfig, evaluate, fit, fit_steps
+from foldgauss.video.fitting import loop
+from foldgauss.video.fitting.camera_coordinates import CameraCoordinates, prefers_camera
+from foldgauss.video.fitting.config import Economy
+from foldgauss.video.fitting.initialize import make_static
+from foldgauss.video.fitting.loop import start, start_from
+from foldgauss.video.fitting.state import paths_of, to_model
+from foldgauss.video.models.shared_paths import SharedPaths, leave_paths
+from foldgauss.video.motion.camera_path import FARTHEST, find_camera_maps
+from foldgauss.video.motion.optical_flow import Motion
+from tests.video.test_shared_paths import moving_splats
+from tests.video.test_stabilization import affine, scene
+
+CONFIG = FitConfig(num_gaussians=1500, steps=300, degree=2)
+TIMES = np.linspace(0, 1, 12)
+
+
+def shaken(maps, **settings) -> np.ndarray:
+    """Frames of a plane of Gaussians, seen by a camera that moves: `maps` (12, 3, 3) of each frame."""
+    model = scene(wide=3.0, scales=(0.01, 0.03), num=4000, **settings)
+    paths = SharedPaths(jnp.asarray(TIMES[None], jnp.float32), jnp.asarray(maps[None, :, :2], jnp.float32))
+    splats = dataclasses.replace(model.splats, path_index=np.ones(model.num_gaussians, np.uint8), paths=paths)
+    return np.stack(list(dataclasses.replace(model, splats=splats).frames()))
+
+
+def shake(seed=0, distance=0.02, turn=0.01) -> np.ndarray:
+    """The maps of a hand-held camera: every frame is somewhere else."""
+    rng = np.random.default_rng(seed)
+    return np.stack([affine(rng.normal() * turn, 1.0, rng.normal(size=2) * distance) for _ in TIMES])
+
+
+MAPS = shake()
+FRAMES = shaken(MAPS)
+
+
+def test_maps_are_found_to_a_fraction_of_a_pixel():
+    found = np.tile(np.eye(3), (12, 1, 1))
+    found[:, :2] = find_camera_maps(Motion.from_frames(FRAMES))
+    expected = MAPS @ np.linalg.inv(MAPS[5])  # the middle frame
+    corners = np.array([[x, y, 1] for x in (-0.5, 0.5) for y in (-0.3, 0.3)])
+    miss = np.einsum("kij,cj->kci", found - expected, corners)[..., :2] * FRAMES.shape[2]
+    assert np.sqrt((miss**2).sum(-1).mean()) < 0.3
+
+
+def test_a_camera_that_stands_still_has_no_maps():
+    assert find_camera_maps(Motion.from_frames(np.repeat(FRAMES[:1], 6, 0))) is None
+    assert start(np.repeat(FRAMES[:1], 6, 0), CONFIG).path_maps.shape == (6, 0, 2, 3)
+
+
+def test_maps_do_not_drift_away_where_the_camera_never_returns():
+    """A zoom by 15% in each frame, which adds up to 4.7 times."""
+    maps = np.stack([affine(zoom=1.15**k) for k in range(12)])
+    found = np.tile(np.eye(3), (12, 1, 1))
+    found[:, :2] = find_camera_maps(Motion.from_frames(shaken(maps)))
+    assert np.abs(np.log(np.linalg.svd(found[:, :2, :2], compute_uv=False))).max() < FARTHEST[0]
+    assert np.linalg.det(found[-1, :2, :2]) > 1.1  # but they follow
+
+
+def test_every_shot_has_coordinates_of_its_own():
+    both = np.concatenate([FRAMES, FRAMES[::-1, ::-1]])
+    found = find_camera_maps(Motion.from_frames(both))
+    for middle in (5, 17):
+        np.testing.assert_allclose(found[middle], np.eye(2, 3), atol=1e-12)
+
+
+def test_following_a_shaken_camera_is_worth_decibels():
+    alone = dataclasses.replace(CONFIG, follow_camera=False)
+    with_path, without = (fit(FRAMES, config).model for config in (CONFIG, alone))
+    assert without.splats.paths is None
+    assert np.asarray(with_path.splats.path_index).mean() > 0.5
+    assert evaluate(with_path, FRAMES).mean_psnr > evaluate(without, FRAMES).mean_psnr + 3
+
+
+def test_maps_are_learned(monkeypatch):
+    """From maps that are wrong by half a pixel."""
+    found = find_camera_maps(Motion.from_frames(FRAMES))
+    wrong = found + np.random.default_rng(0).normal(size=(12, 2, 3)) * [0, 0, 0.5 / 160]
+    monkeypatch.setattr(loop, "find_camera_maps", lambda motion: wrong)
+    held = dataclasses.replace(CONFIG, rates=dataclasses.replace(CONFIG.rates, paths=0.0))
+    learned, fixed = (fit(FRAMES, config).model for config in (CONFIG, held))
+    assert evaluate(learned, FRAMES).mean_psnr > evaluate(fixed, FRAMES).mean_psnr + 1
+    np.testing.assert_array_equal(fixed.splats.paths.matrices[0], np.float32(wrong))
+
+
+def test_an_object_that_stays_in_the_frame_does_not_follow():
+    frames = FRAMES.copy()
+    frames[:, 30:66, 60:100] = np.random.default_rng(1).integers(0, 255, (9, 10, 3)).repeat(4, 0).repeat(4, 1)
+    state = start(frames, CONFIG)
+    x, y = (state.rows[:, :2] * 160 + [80, 48]).T
+    inside = (x > 64) & (x < 96) & (y > 34) & (y < 62)
+    assert state.rows[inside, -1].mean() < 0.4
+    assert state.rows[~inside, -1].mean() > 0.6
+
+
+def test_starts_lie_where_the_frame_shows_them():
+    model = to_model(start(FRAMES, CONFIG), CONFIG, FRAMES.shape[1:3], 12.0)
+    still = dataclasses.replace(CONFIG, follow_camera=False)
+    plain = to_model(start(FRAMES, still), still, FRAMES.shape[1:3], 12.0)
+    ours, theirs = (evaluate(one, FRAMES).mean_psnr for one in (model, plain))
+    assert ours > theirs - 0.5
+
+
+def test_coordinates_of_positions_and_tracks_agree():
+    paths = SharedPaths(np.float32(TIMES)[None], np.float32(MAPS[None, :, :2]))
+    camera = CameraCoordinates.from_paths(paths, TIMES, (96, 160))
+    position, home = np.array([[20.0, 30.0], [100.0, 80.0]]), np.array([3, 7])
+    tracks = Motion.from_frames(FRAMES).follow(home, position.astype(np.float32))
+    placed = camera.place_tracks(tracks, home, position)
+    np.testing.assert_array_equal(placed.known, tracks.known)
+    for n in range(2):
+        for step in np.flatnonzero(tracks.known[n]):
+            frame = home[n] + step - 36
+            there = camera.place(np.array([frame]), position[[n]] + tracks.shift[n, step])[0]
+            own = camera.place(home[[n]], position[[n]])[0] + placed.shift[n, step]
+            np.testing.assert_allclose(own, there, atol=1e-3)
+    # The background stands still there, but for the error of the flow.
+    assert np.abs(placed.shift[tracks.known]).mean() < 0.2 * np.abs(tracks.shift[tracks.known]).mean()
+
+
+def test_the_longer_or_else_the_steadier_fold_is_preferred():
+    folds = np.array([[[1.0, 0.0]], [[1.0, 0.0]], [[1.0, 0.0]], [[0.1, 0.0]]])
+    by_camera = np.array([[[9.0, 0.0]], [[0.5, 0.0]], [[0.5, 0.0]], [[0.5, 0.0]]])
+    chosen = prefers_camera(folds, np.ones(4), by_camera, np.array([2.0, 0.5, 1.0, 1.0]))
+    assert chosen.tolist() == [True, False, True, False]
+
+
+def test_gaussians_that_leave_their_path_stay_where_they_are_at_their_time():
+    splats = moving_splats(60)
+    names = ("loc", "log_scale", "time_loc_logit", "log_time_scale", "coefficients")
+    numpy = dataclasses.replace(splats, **{name: np.asarray(getattr(splats, name)) for name in names})
+    left = leave_paths(numpy, np.arange(60) < 30)
+    np.testing.assert_array_equal(left.path_index[:30], 0)
+    np.testing.assert_array_equal(left.path_index[30:], numpy.path_index[30:])
+    times = 1 / (1 + np.exp(-numpy.time_loc_logit))
+    for n in range(60):
+        before, after = (one.at(jnp.float32(times[n])).mean[n] for one in (splats, left))
+        np.testing.assert_allclose(after, before, atol=1e-4)
+    still = make_static(numpy, np.arange(60) < 30)
+    np.testing.assert_array_equal(still.loc, left.loc)
+
+
+@pytest.mark.parametrize("engine", ["cpu", "xla"])
+def test_a_resumed_fit_has_the_same_bits(tmp_path, engine):
+    config = dataclasses.replace(CONFIG, num_gaussians=200, steps=24, engine=engine)
+    for state, info in fit_steps(FRAMES, config):
+        if info.step == 10:
+            save_checkpoint(tmp_path / "half.checkpoint", state, config=config, source={})
+    whole = to_model(state, config, FRAMES.shape[1:3], 12.0)
+    for state, _ in fit_steps(FRAMES, config, load_checkpoint(tmp_path / "half.checkpoint", config=config, source={})):
+        pass
+    resumed = to_model(state, config, FRAMES.shape[1:3], 12.0)
+    np.testing.assert_array_equal(resumed.splats.paths.matrices, whole.splats.paths.matrices)
+    np.testing.assert_array_equal(resumed.splats.loc, whole.splats.loc)
+
+
+def test_a_model_can_be_saved_loaded_and_fitted_further(tmp_path):
+    config = dataclasses.replace(CONFIG, num_gaussians=400, steps=60)
+    model = fit(FRAMES, config).model
+    again = load_video_model(save_video_model(tmp_path / "m.safetensors", model))
+    state = start_from(again, config, 10)
+    np.testing.assert_allclose(paths_of(state).matrices, model.splats.paths.matrices, atol=1e-6)
+    for after, _ in fit_steps(FRAMES, config, state):
+        pass
+    assert np.isfinite(after.path_maps).all()
+
+
+def test_an_economical_fit_follows_the_camera():
+    config = FitConfig(num_gaussians=600, steps=300, degree=2, economy=Economy())
+    model = fit(FRAMES, config).model
+    assert np.asarray(model.splats.path_index).mean() > 0.5
+    alone = fit(FRAMES, dataclasses.replace(config, follow_camera=False)).model
+    assert evaluate(model, FRAMES).mean_psnr > evaluate(alone, FRAMES).mean_psnr + 1
