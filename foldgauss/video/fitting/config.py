@@ -25,7 +25,8 @@ class LearningRates:
     With `FitConfig.scale_rates_by_size` the unit of length is each Gaussian's own size s, the geometric mean of its
     standard deviations: the learning rates of m_s and c_k are `loc` and `coefficients` times s / UNIT_SIZE.
     With `FitConfig.scale_rates_by_duration` the unit of time is its own duration: the learning rate of c_k is
-    `coefficients` times (UNIT_TIME / sigma_t)^k, that of m_t is `time_loc_logit` sigma_t / UNIT_TIME.
+    `coefficients` times (UNIT_TIME / sigma_t)^k, that of m_t is `time_loc_logit` sigma_t / UNIT_TIME. That of a path is
+    `paths` times s / UNIT_SIZE, with s the size of the Gaussians of the step, their geometric mean.
     A step then moves small and large, short and long Gaussians by the same fraction of their sizes and durations.
     """
 
@@ -38,7 +39,7 @@ class LearningRates:
     time_loc_logit: float = 0.02
     log_time_scale: float = 0.05
     frame_times: float = 3e-3
-    paths: float = 1e-4
+    paths: float = 7e-4
 
     def __post_init__(self) -> None:
         for name, value in dataclasses.asdict(self).items():

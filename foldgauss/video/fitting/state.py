@@ -16,7 +16,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 import jax
 import numpy as np
 import optax
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float32, Int
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.fitting.adam import FRAME_TIME_ADAM, RateUnits, adam_step, sparse_adam
@@ -364,6 +364,14 @@ def update_paths(
     for array, value in ((state.path_first, first), (state.path_second, second)):
         array[frames] = value.reshape(grad[frames].shape)
     state.path_maps[frames] -= move.reshape(grad[frames].shape).astype(np.float32)
+
+
+def measure_relative_size(rows: Float32[np.ndarray, "num width"], config: FitConfig) -> float:
+    """The size of Gaussians, in units of that at which the learning rate of paths is stated; 1 if that is absolute."""
+    unit = config.rate_units.size
+    if not unit or not len(rows):
+        return 1.0
+    return math.exp(float(rows[:, columns(config.degree)["log_scale"]].mean(dtype=np.float64))) / unit
 
 
 def update_rows(

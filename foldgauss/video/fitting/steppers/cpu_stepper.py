@@ -21,7 +21,14 @@ from foldgauss.video.fitting.schedule import (
     steps_per_pass,
     to_planes,
 )
-from foldgauss.video.fitting.state import FitState, frame_times, paths_of, update_paths, update_rows
+from foldgauss.video.fitting.state import (
+    FitState,
+    frame_times,
+    measure_relative_size,
+    paths_of,
+    update_paths,
+    update_rows,
+)
 from foldgauss.video.fitting.steppers.interpolated_frames import make_interpolated
 from foldgauss.video.fitting.steppers.loss import ImageLoss, image_loss, squared_loss
 from foldgauss.video.fitting.steppers.protocol import StepResult
@@ -98,6 +105,7 @@ class CpuStepper:
         num_alive = len(touched)
         if not config.sparse_updates:
             touched = np.arange(len(state.rows))
+        relative_size = measure_relative_size(state.rows[touched], config) if by_path.size else 1.0
         rates, time_rate = self.rates.at(progress, state.backoffs)
         finite = update_rows(state, self.grad, touched, rates, degree=config.degree, units=config.rate_units)
         update_windows(state.rows, touched, self.window)
@@ -105,7 +113,8 @@ class CpuStepper:
             updated = update_frame_times(state.time_logits, state.time_moments, by_time, time_rate)
             state.time_logits, state.time_moments = updated
         if by_path.size and visited:
-            update_paths(state, by_path, np.array(sorted(visited)), self.rates.of_paths(progress, state.backoffs))
+            path_rate = self.rates.of_paths(progress, state.backoffs)
+            update_paths(state, by_path, np.array(sorted(visited)), path_rate * relative_size)
         return StepResult(float(np.mean(losses)), num_alive, finite)
 
     def measure_start(self, state: FitState) -> dict[int, float]:

@@ -154,7 +154,7 @@ def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames he
         statistics = _add(statistics, seen.screen, by_time)
     used = jnp.arange(program.capacity, dtype=jnp.int32) < control.num
     touched = seen.alive if program.sparse_updates else used
-    moments = arrays.first, arrays.second, arrays.counts
+    moments, before = (arrays.first, arrays.second, arrays.counts), arrays.rows
     rates = jnp.pad(control.rates, (0, program.width - program.num_trained))
     rows, first, second, counts = masked_adam(
         arrays.rows, seen.by_rows, *moments, touched, rates, kinds=arrays.kinds, units=program.rate_units
@@ -164,7 +164,7 @@ def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames he
         logits, time_moments = update_frame_times(logits, time_moments, seen.by_times, control.time_rate)
     errors = jnp.where(seen.errors >= 0, seen.errors, arrays.frame_errors)
     if program.num_paths:
-        arrays = _update_paths(arrays, seen, control.path_rate)
+        arrays = _update_paths(arrays, seen, control.path_rate * _relative_size(program, before, touched))
     report = Report(
         loss=seen.loss,
         num_alive=jnp.sum(seen.alive, dtype=jnp.int32),
@@ -175,6 +175,15 @@ def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames he
     )
     arrays = arrays._replace(rows=rows, first=first, second=second, counts=counts, statistics=statistics)
     return arrays._replace(frame_errors=errors, time_logits=logits, time_moments=time_moments), report
+
+
+def _relative_size(program: Program, rows, touched) -> Float[Array, ""]:
+    """The twin of `state.measure_relative_size`, of the Gaussians `touched`."""
+    if not program.rate_units.size:
+        return jnp.float32(1)
+    sizes = jnp.mean(rows[:, columns(program.degree)["log_scale"]], axis=1)
+    mean = jnp.sum(jnp.where(touched, sizes, 0)) / jnp.maximum(jnp.sum(touched), 1).astype(jnp.float32)
+    return jnp.exp(mean) / np.float32(program.rate_units.size)
 
 
 def _update_paths(arrays: DeviceArrays, seen: "Gradients", rate: Float[Array, ""]) -> DeviceArrays:
