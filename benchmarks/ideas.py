@@ -43,6 +43,7 @@ def scaled_rates(factor: float) -> LearningRates:
 #: The fields of `FitConfig` that each row changes; `gaussians` is a factor on the number that the default chose.
 VARIANTS: dict[str, dict[str, Any]] = {
     "starts at rest": {"follow_motion": False},
+    "camera not followed": {"follow_camera": False},
     "rates not by duration": {"scale_rates_by_duration": False},
     "rates not by size": {"scale_rates_by_size": False},
     "frame times fixed": {"learn_frame_times": False},
