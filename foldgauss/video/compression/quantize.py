@@ -7,6 +7,9 @@ polynomials. A column's step follows from earlier columns by a rule stated in th
 hardly visible get coarse steps and need few bits. Absent parameters are stored in no column: powers above the path's
 own degree, times of static Gaussians, opacities of opaque ones; and shared colours are stored once.
 
+A model with shared paths (`SharedPaths`) has a column of their numbers; their maps are rounded in steps of model space
+too fine to be seen.
+
 Decoding uses only additions, multiplications, divisions and comparisons of float64, in a stated order. They are rounded
 alike everywhere, so every decoder returns the same bits. See docs/format.md.
 """
@@ -23,6 +26,7 @@ from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.row_layout import shift_path
+from foldgauss.video.models.shared_paths import SharedPaths, check_path_index
 from foldgauss.video.models.splats import OPAQUE_LOGIT, STATIC_LOG_TIME_SCALE, TAU_MAX, FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
 
@@ -33,8 +37,8 @@ LARGEST = 2**30 - 1
 #: Columns from which the steps of others may be computed.
 FEATURES = ("class", "size", "stretch", "duration", "opacity")
 #: Columns of plain integers: the cell of space and time, the class (how visible), absent parameters, the path's degree.
+#: So are `path`, the number of the shared path, and `shade`, that of the shared colour.
 INTEGER_COLUMNS = ("cell", "class", "without", "degree")
-_FIRST = (*INTEGER_COLUMNS, *FEATURES[1:], "time")
 COLORS = ("luma", "blue", "green")
 #: Columns that a bit of `without` makes absent: the bit, the value used instead, and the value used as a feature
 #: (sigma_t = 1, the clip's length; an opacity of 0.98).
@@ -59,16 +63,31 @@ TIME_STEP = 2.0**-10
 #: Least squared error, in steps, that the last power of a path must save: its two coefficients need some eight bits,
 #: and with fine steps a bit saves 2 ln 2 / 12.
 POWER_WORTH = 0.9
+#: Displacement by which rounding the maps of shared paths may move Gaussians, in pixels of the model's size; the most
+#: bits after the binary point that the maps then have; and the step of their times if those are not the frames'.
+PATH_ERROR, MAX_PATH_BITS, KNOT_STEP = 0.02, 28, 2.0**-24
+#: Fraction of Gaussians on either side that may be outside of the cells of a model with shared paths, and the least
+#: extent of these cells.
+_OUTSIDE, _MIN_SIDE = 0.005, 0.01
 #: Largest absolute exponent of sqrt(2) of a step.
 _MAX_EXPONENT = 120
 #: Largest steps; those of time and angle (turns) keep their logits finite.
 _MAX_STEP = {"time": 0.125, "angle": 0.125, "size": 0.35, "stretch": 0.5, "duration": 0.5, "opacity": 1.0}
 
 
-def column_names(degree: int, shared: int = 0) -> tuple[str, ...]:
+def column_names(degree: int, shared: int = 0, num_paths: int = 0) -> tuple[str, ...]:
     """The columns of a model in order; `shared` is the number of shared colours, 0 if they are not shared."""
     path = tuple(f"{axis}{k}" for k in range(degree + 1) for axis in "xy")
-    return (*_FIRST, *path, "angle", *(("shade",) if shared else ()), *COLORS)
+    return (
+        *INTEGER_COLUMNS,
+        *(("path",) if num_paths else ()),
+        *FEATURES[1:],
+        "time",
+        *path,
+        "angle",
+        *(("shade",) if shared else ()),
+        *COLORS,
+    )
 
 
 def path_power(name: str) -> int:
@@ -78,7 +97,7 @@ def path_power(name: str) -> int:
 
 def is_integral(name: str) -> bool:
     """Whether a column holds plain integers, without a rule."""
-    return name in INTEGER_COLUMNS or name == "shade"
+    return name in (*INTEGER_COLUMNS, "path", "shade")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,6 +128,22 @@ def compute_steps(halves: Int32[np.ndarray, " num"], name: str = "") -> Float[np
 
 
 @dataclasses.dataclass(frozen=True)
+class PathsInfo:
+    """Constants of shared paths, stored in the header.
+
+    `at_frames`: knots are at the times of the frames, and not stored. `bits`: maps are in steps of 2^-bits.
+    `middle`, `sides`: the rectangle that cells divide instead of the frame, since positions on a path may be outside.
+    """
+
+    num_paths: int
+    num_knots: int
+    at_frames: bool
+    bits: int
+    middle: tuple[float, float]
+    sides: tuple[float, float]
+
+
+@dataclasses.dataclass(frozen=True)
 class CompactInfo:
     """Constants of the model, stored in the header.
 
@@ -128,16 +163,26 @@ class CompactInfo:
     options: RenderOptions
     compositing: str
     scale_cutoff: float
+    paths: PathsInfo | None = None
+
+    @property
+    def column_names(self) -> tuple[str, ...]:
+        return column_names(self.degree, self.shared, 0 if self.paths is None else self.paths.num_paths)
 
 
 @dataclasses.dataclass(frozen=True)
 class Quantized:
-    """A model as integers: equal integers are equal models, to the bit."""
+    """A model as integers: equal integers are equal models, to the bit.
+
+    Of shared paths, `maps` and, unless they are at the frames, `knots`, the times of the maps.
+    """
 
     info: CompactInfo
     rules: dict[str, Rule]
     columns: dict[str, Int32[np.ndarray, " num"]]
     intervals: Int32[np.ndarray, " intervals"]
+    maps: Int32[np.ndarray, "paths knots 2 3"] | None = None
+    knots: Int32[np.ndarray, "paths knots"] | None = None
 
 
 # ------------------------------------------------------------------------------------------ decoding
@@ -192,7 +237,7 @@ class ColumnDecoder:
 def decode_values(quantized: Quantized) -> dict[str, Float[np.ndarray, " num"]]:
     """The values of all columns, for each Gaussian."""
     info, decoder = quantized.info, ColumnDecoder(quantized.rules, quantized.info)
-    for name in column_names(info.degree, info.shared):
+    for name in info.column_names:
         decoder.add(name, quantized.columns[name], decoder.half_exponents(name))
     values = decoder.values
     if info.shared:
@@ -203,20 +248,23 @@ def decode_values(quantized: Quantized) -> dict[str, Float[np.ndarray, " num"]]:
 # ------------------------------------------------------------------------------------------ cells
 
 
-def _sides(info: CompactInfo) -> tuple[float, float, float]:
-    """Extent of the image along x and y in model space, and of time."""
+def _extents(info: CompactInfo) -> tuple[tuple[float, float], ...]:
+    """Middle and side of what the cells divide along x, y and time: the image, or the rectangle of `PathsInfo`."""
     height, width = info.size
     longer = max(height, width)
-    return width / longer, height / longer, 1.0
+    middle, sides = (0.0, 0.0), (width / longer, height / longer)
+    if info.paths is not None:
+        middle, sides = info.paths.middle, info.paths.sides
+    return (*zip(middle, sides, strict=True), (0.5, 1.0))
 
 
 def locate_cells(
     x: Float[np.ndarray, " num"], y: Float[np.ndarray, " num"], time: Float[np.ndarray, " num"], info: CompactInfo
 ) -> Int32[np.ndarray, " num"]:
-    """Indices of the cells of these positions, clipped to the frame: bits of x, y, time in turns, lowest first."""
+    """Indices of the cells of these positions or of the nearest ones: bits of x, y, time in turns, lowest first."""
     out, place = np.zeros(len(x), np.int64), 0
     along = []
-    for value, middle, side, bits in zip((x, y, time), (0.0, 0.0, 0.5), _sides(info), info.cells, strict=True):
+    for value, (middle, side), bits in zip((x, y, time), _extents(info), info.cells, strict=True):
         index = np.floor(((value - middle) / side + 0.5) * 2**bits)
         along.append(np.clip(index, 0, 2**bits - 1).astype(np.int64))
     for k in range(max(info.cells)):
@@ -236,7 +284,7 @@ def cell_centers(cell: Int[np.ndarray, " num"], info: CompactInfo) -> list[Float
                 along[axis] |= ((cell >> place) & 1) << k
                 place += 1
     out = []
-    for index, middle, side, bits in zip(along, (0.0, 0.0, 0.5), _sides(info), info.cells, strict=True):
+    for index, (middle, side), bits in zip(along, _extents(info), info.cells, strict=True):
         out.append(middle + ((index + 0.5) / 2**bits - 0.5) * side)
     return out
 
@@ -269,6 +317,10 @@ def dequantize(quantized: Quantized) -> VideoModel:
         color_dc=single(color),
         envelope=TimeLikelihood(np.float32(info.power), np.float32(info.floor)),
     )
+    if info.paths is not None:
+        knots = quantized.knots * KNOT_STEP if quantized.knots is not None else _frame_knots(quantized)
+        paths = SharedPaths(single(knots), single(quantized.maps * 2.0**-info.paths.bits))
+        splats = dataclasses.replace(splats, path_index=quantized.columns["path"].astype(np.uint8), paths=paths)
     times = FrameTimes(single(quantized.intervals * TIME_STEP))
     shared = (info.size, info.fps, info.options, info.compositing, info.scale_cutoff)
     return VideoModel(splats, times, *shared)
@@ -285,6 +337,23 @@ def _log(x: Float[np.ndarray, " num"]) -> Float[np.ndarray, " num"]:
     for k in range(17, 0, -2):
         total = total * z + 1 / k
     return e * _LN2 + 2 * s * total
+
+
+def _exp(x: Float[np.ndarray, " num"]) -> Float[np.ndarray, " num"]:
+    """Exponential of numbers <= 0 by elementary operations only, to 1e-13 and not below e^-690."""
+    x = np.maximum(x, -690.0)
+    e = np.floor(x * (1 / _LN2) + 0.5)
+    rest, total = x - e * _LN2, np.ones_like(x)
+    for k in range(14, 0, -1):
+        total = 1 + total * rest / k
+    return np.ldexp(total, e.astype(np.int32))
+
+
+def _frame_knots(quantized: Quantized) -> Float[np.ndarray, "paths knots"]:
+    """The times of the frames (`FrameTimes.times`) for each path."""
+    logits = quantized.intervals.astype(np.float64)
+    summed = np.cumsum(_exp((logits - logits.max(initial=-np.inf)) * TIME_STEP))
+    return np.tile(np.concatenate([[0.0], summed / summed[-1:]]), (quantized.info.paths.num_paths, 1))
 
 
 def _logit(x: Float[np.ndarray, " num"]) -> Float[np.ndarray, " num"]:
@@ -356,6 +425,8 @@ class ExactColumns:
     values: dict[str, Float[np.ndarray, " num"]]
     place: Float[np.ndarray, "num degree+1 2"]
     logits: Float[np.ndarray, " intervals"]
+    path: Int32[np.ndarray, " num"] | None = None
+    paths: SharedPaths | None = None
 
     def has(self, name: str) -> Bool[np.ndarray, " num"]:
         """Which Gaussians have a value in a column other than the path's."""
@@ -386,7 +457,13 @@ def compute_columns(model: VideoModel) -> ExactColumns:
     values |= dict(zip(("luma", "blue", "green"), (leaf("color_dc") @ AXES.T).T, strict=True))
     place = np.concatenate([leaf("loc")[:, None], leaf("coefficients")], 1)
     own = swapped, turn, splats.static + 2 * splats.opaque.astype(np.int32), shade
-    return ExactColumns(info, *own, values, place, np.asarray(model.frame_times.logits, np.float64))
+    exact = ExactColumns(info, *own, values, place, np.asarray(model.frame_times.logits, np.float64))
+    if splats.paths is None:
+        return exact
+    check_path_index(splats)
+    paths = SharedPaths(*(np.asarray(own, np.float64) for own in (splats.paths.times, splats.paths.matrices)))
+    info = dataclasses.replace(info, paths=_make_paths_info(model, paths))
+    return dataclasses.replace(exact, info=info, path=np.asarray(splats.path_index, np.int32), paths=paths)
 
 
 def index_colors(model: VideoModel) -> Int32[np.ndarray, " num"] | None:
@@ -433,6 +510,18 @@ def _make_info(model: VideoModel) -> CompactInfo:
     )
 
 
+def _make_paths_info(model: VideoModel, paths: SharedPaths) -> PathsInfo:
+    low, high = np.quantile(np.asarray(model.splats.loc, np.float64), [_OUTSIDE, 1 - _OUTSIDE], axis=0)
+    middle, sides = ((low + high) / 2).round(4), np.maximum(high - low, _MIN_SIDE).round(4)
+    frames = np.asarray(model.frame_times.times(), np.float64)
+    at_frames = paths.num_knots == len(frames) and np.abs(paths.times - frames).max() <= 2.0**-20
+    # Half a step of all six numbers of a map moves (x, y) by so much of a step.
+    most = 0.5 * (1 + (np.abs(middle) + sides / 2).sum())
+    bits = math.ceil(math.log2(most * max(model.size) / PATH_ERROR))
+    extent = tuple(middle.tolist()), tuple(sides.tolist())
+    return PathsInfo(paths.num_paths, paths.num_knots, bool(at_frames), min(max(bits, 0), MAX_PATH_BITS), *extent)
+
+
 def choose_cell_bits(num_gaussians: int, size: tuple[int, int]) -> tuple[int, int, int]:
     """Bits of cells along x, y and time: about eight Gaussians per cell, a quarter of the bits for time."""
     total = min(max(round(math.log2(num_gaussians / 8)), 0), MAX_CELL_BITS)
@@ -468,20 +557,32 @@ def quantize(
     info = exact.info
     if cells is None:
         cells = find_cells(exact)
-    values = exact.values | {"class": classes, "cell": cells, "without": exact.without}
+    values = exact.values | {"class": classes, "cell": cells, "without": exact.without, "path": exact.path}
     if info.shared:
         first = np.unique(exact.shade, return_index=True)[1]
         values |= {name: values[name][first] for name in COLORS} | {"shade": exact.shade}
     # The path's degree is known only after rounding it.
-    names = column_names(info.degree, info.shared)
     whole = {"degree": np.full(info.num_gaussians, info.degree, np.int32)}
-    columns, saved = _round_columns(names, values | whole, exact, rules)
+    columns, saved = _round_columns(info.column_names, values | whole, exact, rules)
     columns["degree"] = degrees = _choose_degrees(saved)
     for k in range(1, info.degree + 1):
         for axis in "xy":
             columns[f"{axis}{k}"] = np.where(degrees >= k, columns[f"{axis}{k}"], 0).astype(np.int32)
     logits = exact.logits - exact.logits.max(initial=-np.inf)
-    return Quantized(info, rules, columns, np.rint(np.maximum(logits, -1e5) / TIME_STEP).astype(np.int32))
+    intervals = np.rint(np.maximum(logits, -1e5) / TIME_STEP).astype(np.int32)
+    return Quantized(info, rules, columns, intervals, **({} if info.paths is None else _round_paths(exact)))
+
+
+def _round_paths(exact: ExactColumns) -> dict[str, Int32[np.ndarray, "..."]]:
+    """The integers of the maps and, unless they are at the frames, of their times."""
+    about, scaled = exact.info.paths, {"maps": exact.paths.matrices * 2.0**exact.info.paths.bits}
+    if not about.at_frames:
+        scaled["knots"] = exact.paths.times / KNOT_STEP
+    for name, numbers in scaled.items():
+        if not (np.abs(numbers) <= LARGEST).all():
+            expected = f"shared paths whose {name} are within the range of their steps"
+            raise invalid("model", expected=expected, got="others", cure="Save it as .safetensors.")
+    return {name: np.rint(numbers).astype(np.int32) for name, numbers in scaled.items()}
 
 
 def find_cells(exact: ExactColumns) -> Int32[np.ndarray, " num"]:

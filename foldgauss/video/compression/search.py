@@ -294,8 +294,9 @@ def _take(model: VideoModel, which: Bool[np.ndarray, " num"] | Int[np.ndarray, "
     def index(leaf: np.ndarray) -> np.ndarray:
         return np.asarray(leaf)[which] if np.shape(leaf)[:1] == (num,) else leaf
 
-    splats = eqx.tree_at(lambda s: s.envelope, jax.tree.map(index, model.splats), model.splats.envelope)
-    return eqx.tree_at(lambda m: m.splats, model, splats)
+    splats, common = model.splats, {"envelope": model.splats.envelope, "paths": model.splats.paths}
+    own = jax.tree.map(index, dataclasses.replace(splats, **dict.fromkeys(common)))
+    return dataclasses.replace(model, splats=dataclasses.replace(own, **common))
 
 
 def _undo_rounding(quantized: Quantized, exact: ExactColumns, *, path: bool) -> VideoModel:
@@ -453,5 +454,6 @@ def _select_rows(exact: ExactColumns, kept: Bool[np.ndarray, " num"]) -> ExactCo
     if shade is not None:
         used, shade = np.unique(shade[kept], return_inverse=True)
         info, shade = dataclasses.replace(info, shared=len(used)), shade.ravel().astype(np.int32)
+    path = None if exact.path is None else exact.path[kept]
     own = exact.swapped[kept], exact.turn[kept], exact.without[kept], shade, values, exact.place[kept]
-    return ExactColumns(info, *own, exact.logits)
+    return ExactColumns(info, *own, exact.logits, path, exact.paths)
