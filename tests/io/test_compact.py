@@ -216,7 +216,8 @@ def test_kinds_save_bytes():
 
 @pytest.mark.parametrize("at_frames", [True, False])
 def test_shared_paths_are_kept(tmp_path, at_frames):
-    model = on_paths(soft_model(degree=3, options=RenderOptions()), at_frames=at_frames)
+    model, logits = soft_model(degree=3, options=RenderOptions()), np.float32([0, 0.1, -0.3, 0.2, -7.0, 2.5])
+    model = on_paths(eqx.tree_at(lambda m: m.frame_times.logits, model, logits), at_frames=at_frames)
     quantized = fine(model)
     assert quantized.info.paths.at_frames == at_frames
     path = save_compact(tmp_path / "m.fgz", quantized)
@@ -224,7 +225,9 @@ def test_shared_paths_are_kept(tmp_path, at_frames):
     same(again, dequantize(quantized))
     assert pack_compact(load_compact(path)) == path.read_bytes()
     np.testing.assert_array_equal(again.splats.path_index, model.splats.path_index)
-    np.testing.assert_allclose(again.splats.paths.times, model.splats.paths.times, atol=1e-6)
+    frames = np.tile(again.frame_times.times(), (2, 1))
+    times, atol = (frames, 2e-7) if at_frames else (model.splats.paths.times, 1e-7)
+    np.testing.assert_allclose(again.splats.paths.times, times, atol=atol)
     for t in (0.0, 0.37, 1.0):
         np.testing.assert_allclose(image(again, t), image(model, t), atol=1e-2)
 

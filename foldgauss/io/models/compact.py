@@ -33,15 +33,14 @@ from foldgauss.video.compression.quantize import (
     LARGEST,
     MAX_CELL_BITS,
     MAX_DEGREE,
-    MAX_PATH_BITS,
     MAX_SHARED,
     CompactInfo,
-    PathsInfo,
     Quantized,
     Rule,
     dequantize,
     is_integral,
 )
+from foldgauss.video.compression.quantized_paths import MAX_PATH_BITS, PathsInfo
 from foldgauss.video.models.shared_paths import MAX_PATHS
 from foldgauss.video.models.video_model import VideoModel
 

@@ -27,7 +27,6 @@ from foldgauss.io.models.selections import format_indices
 from foldgauss.io.models.video_model import load_video_model, read_origin
 from foldgauss.video.compression.quantize import (
     COLORS,
-    MAX_PATH_BITS,
     Quantized,
     Rule,
     column_names,
@@ -36,6 +35,7 @@ from foldgauss.video.compression.quantize import (
     is_integral,
     quantize,
 )
+from foldgauss.video.compression.quantized_paths import MAX_PATH_BITS
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.motion.moving_object import NothingMoves, nothing_moves

@@ -24,6 +24,7 @@ from jaxtyping import Bool, Float, Int, Int32
 from foldgauss._runtime.checks import invalid
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions
+from foldgauss.video.compression.quantized_paths import PathsInfo, decode_paths, describe_paths, round_paths
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.row_layout import shift_path
 from foldgauss.video.models.shared_paths import SharedPaths, check_path_index
@@ -63,12 +64,6 @@ TIME_STEP = 2.0**-10
 #: Least squared error, in steps, that the last power of a path must save: its two coefficients need some eight bits,
 #: and with fine steps a bit saves 2 ln 2 / 12.
 POWER_WORTH = 0.9
-#: Displacement by which rounding the maps of shared paths may move Gaussians, in pixels of the model's size; the most
-#: bits after the binary point that the maps then have; and the step of their times if those are not the frames'.
-PATH_ERROR, MAX_PATH_BITS, KNOT_STEP = 0.02, 28, 2.0**-24
-#: Fraction of Gaussians on either side that may be outside of the cells of a model with shared paths, and the least
-#: extent of these cells.
-_OUTSIDE, _MIN_SIDE = 0.005, 0.01
 #: Largest absolute exponent of sqrt(2) of a step.
 _MAX_EXPONENT = 120
 #: Largest steps; those of time and angle (turns) keep their logits finite.
@@ -125,22 +120,6 @@ def compute_steps(halves: Int32[np.ndarray, " num"], name: str = "") -> Float[np
     """2^(halves / 2), with at most one rounding, limited to the column's largest step."""
     steps = np.ldexp(np.where(halves % 2, _SQRT2, 1.0), halves // 2)
     return np.minimum(steps, _MAX_STEP[name]) if name in _MAX_STEP else steps
-
-
-@dataclasses.dataclass(frozen=True)
-class PathsInfo:
-    """Constants of shared paths, stored in the header.
-
-    `at_frames`: knots are at the times of the frames, and not stored. `bits`: maps are in steps of 2^-bits.
-    `middle`, `sides`: the rectangle that cells divide instead of the frame, since positions on a path may be outside.
-    """
-
-    num_paths: int
-    num_knots: int
-    at_frames: bool
-    bits: int
-    middle: tuple[float, float]
-    sides: tuple[float, float]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -318,9 +297,9 @@ def dequantize(quantized: Quantized) -> VideoModel:
         envelope=TimeLikelihood(np.float32(info.power), np.float32(info.floor)),
     )
     if info.paths is not None:
-        knots = quantized.knots * KNOT_STEP if quantized.knots is not None else _frame_knots(quantized)
-        paths = SharedPaths(single(knots), single(quantized.maps * 2.0**-info.paths.bits))
-        splats = dataclasses.replace(splats, path_index=quantized.columns["path"].astype(np.uint8), paths=paths)
+        knots, maps = decode_paths(info.paths, quantized.maps, quantized.knots, quantized.intervals * TIME_STEP)
+        index = quantized.columns["path"].astype(np.uint8)
+        splats = dataclasses.replace(splats, path_index=index, paths=SharedPaths(single(knots), single(maps)))
     times = FrameTimes(single(quantized.intervals * TIME_STEP))
     shared = (info.size, info.fps, info.options, info.compositing, info.scale_cutoff)
     return VideoModel(splats, times, *shared)
@@ -337,23 +316,6 @@ def _log(x: Float[np.ndarray, " num"]) -> Float[np.ndarray, " num"]:
     for k in range(17, 0, -2):
         total = total * z + 1 / k
     return e * _LN2 + 2 * s * total
-
-
-def _exp(x: Float[np.ndarray, " num"]) -> Float[np.ndarray, " num"]:
-    """Exponential of numbers <= 0 by elementary operations only, to 1e-13 and not below e^-690."""
-    x = np.maximum(x, -690.0)
-    e = np.floor(x * (1 / _LN2) + 0.5)
-    rest, total = x - e * _LN2, np.ones_like(x)
-    for k in range(14, 0, -1):
-        total = 1 + total * rest / k
-    return np.ldexp(total, e.astype(np.int32))
-
-
-def _frame_knots(quantized: Quantized) -> Float[np.ndarray, "paths knots"]:
-    """The times of the frames (`FrameTimes.times`) for each path."""
-    logits = quantized.intervals.astype(np.float64)
-    summed = np.cumsum(_exp((logits - logits.max(initial=-np.inf)) * TIME_STEP))
-    return np.tile(np.concatenate([[0.0], summed / summed[-1:]]), (quantized.info.paths.num_paths, 1))
 
 
 def _logit(x: Float[np.ndarray, " num"]) -> Float[np.ndarray, " num"]:
@@ -461,9 +423,8 @@ def compute_columns(model: VideoModel) -> ExactColumns:
     if splats.paths is None:
         return exact
     check_path_index(splats)
-    paths = SharedPaths(*(np.asarray(own, np.float64) for own in (splats.paths.times, splats.paths.matrices)))
-    info = dataclasses.replace(info, paths=_make_paths_info(model, paths))
-    return dataclasses.replace(exact, info=info, path=np.asarray(splats.path_index, np.int32), paths=paths)
+    info = dataclasses.replace(info, paths=describe_paths(model))
+    return dataclasses.replace(exact, info=info, path=np.asarray(splats.path_index, np.int32), paths=splats.paths)
 
 
 def index_colors(model: VideoModel) -> Int32[np.ndarray, " num"] | None:
@@ -508,18 +469,6 @@ def _make_info(model: VideoModel) -> CompactInfo:
         compositing=model.compositing,
         scale_cutoff=float(model.scale_cutoff),
     )
-
-
-def _make_paths_info(model: VideoModel, paths: SharedPaths) -> PathsInfo:
-    low, high = np.quantile(np.asarray(model.splats.loc, np.float64), [_OUTSIDE, 1 - _OUTSIDE], axis=0)
-    middle, sides = ((low + high) / 2).round(4), np.maximum(high - low, _MIN_SIDE).round(4)
-    frames = np.asarray(model.frame_times.times(), np.float64)
-    at_frames = paths.num_knots == len(frames) and np.abs(paths.times - frames).max() <= 2.0**-20
-    # Half a step of all six numbers of a map moves (x, y) by so much of a step.
-    most = 0.5 * (1 + (np.abs(middle) + sides / 2).sum())
-    bits = math.ceil(math.log2(most * max(model.size) / PATH_ERROR))
-    extent = tuple(middle.tolist()), tuple(sides.tolist())
-    return PathsInfo(paths.num_paths, paths.num_knots, bool(at_frames), min(max(bits, 0), MAX_PATH_BITS), *extent)
 
 
 def choose_cell_bits(num_gaussians: int, size: tuple[int, int]) -> tuple[int, int, int]:
@@ -570,19 +519,8 @@ def quantize(
             columns[f"{axis}{k}"] = np.where(degrees >= k, columns[f"{axis}{k}"], 0).astype(np.int32)
     logits = exact.logits - exact.logits.max(initial=-np.inf)
     intervals = np.rint(np.maximum(logits, -1e5) / TIME_STEP).astype(np.int32)
-    return Quantized(info, rules, columns, intervals, **({} if info.paths is None else _round_paths(exact)))
-
-
-def _round_paths(exact: ExactColumns) -> dict[str, Int32[np.ndarray, "..."]]:
-    """The integers of the maps and, unless they are at the frames, of their times."""
-    about, scaled = exact.info.paths, {"maps": exact.paths.matrices * 2.0**exact.info.paths.bits}
-    if not about.at_frames:
-        scaled["knots"] = exact.paths.times / KNOT_STEP
-    for name, numbers in scaled.items():
-        if not (np.abs(numbers) <= LARGEST).all():
-            expected = f"shared paths whose {name} are within the range of their steps"
-            raise invalid("model", expected=expected, got="others", cure="Save it as .safetensors.")
-    return {name: np.rint(numbers).astype(np.int32) for name, numbers in scaled.items()}
+    paths = {} if info.paths is None else round_paths(info.paths, exact.paths, LARGEST)
+    return Quantized(info, rules, columns, intervals, **paths)
 
 
 def find_cells(exact: ExactColumns) -> Int32[np.ndarray, " num"]:
