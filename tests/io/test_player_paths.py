@@ -31,6 +31,7 @@ CASES = {
     "over": {},
     "sum, other times": {"compositing": "sum", "degree": 0, "at_frames": False},
     "floor": {"degree": 2, "power": 1.0, "floor": 0.1},
+    "strong": {"reach": 8.0, "thin": 4.0},
 }
 FIELDS = ("mean", "factor", "opacity", "color")
 #: Colours are in the leaves alone.
@@ -41,8 +42,10 @@ PLACES["several"] = "\n[[edits]]\n".join(
 QUICK = ("transform", "freeze", "several")
 
 
-def make(at_frames=True, **how):
-    return on_paths(soft_model(options=RenderOptions(), **how), at_frames=at_frames)
+def make(at_frames=True, reach=1.0, thin=0.0, **how):
+    model = on_paths(soft_model(options=RenderOptions(), **how), at_frames=at_frames, reach=reach)
+    scale = model.splats.log_scale + np.float32([thin / 4, -thin])
+    return eqx.tree_at(lambda m: m.splats.log_scale, model, scale)
 
 
 @pytest.fixture(scope="module")
