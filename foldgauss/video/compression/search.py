@@ -115,8 +115,8 @@ def compress(
     `frames`: the clip, uint8 (num_frames, *model.size, 3), or with alpha (..., 4): the loss is measured against it.
     Without it, the loss is that against a clip at `psnr` dB (default: `ASSUMED_PSNR`) from the model's own images.
     Frames beyond `EXACT_PSNR`, 58.9 dB, count as that. Gaussians are reordered where that is hardly visible; absent
-    parameters (`FoldedSplats.degrees`, `static`, `opaque`) stay absent, and shared colours stay shared. Shared paths stay
-    as they are, to about a fiftieth of a pixel.
+    parameters (`FoldedSplats.degrees`, `static`, `opaque`) stay absent, and shared colours stay shared. Shared paths
+    stay as they are, to about a fiftieth of a pixel.
 
     With the clip, fine-tuning compensates for losses and allows coarser steps: all leaves for half of the `passes` each
     time Gaussians have been dropped, paths and colours for a quarter once geometry is rounded, colours for an eighth
