@@ -1,10 +1,13 @@
 """Small models made by hand: some tens of smooth Gaussians, an object among them."""
 
+import dataclasses
+
 import numpy as np
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions
 from foldgauss.video import FoldedSplats, FrameTimes, VideoModel
+from foldgauss.video.models.shared_paths import SharedPaths
 
 SIZE, NUM, NUM_FRAMES = (40, 64), 40, 7
 #: The object: the first dozen, which stand about (-0.15, 0); all others are background.
@@ -33,3 +36,18 @@ def soft_model(
     )
     options = RenderOptions.exact() if options is None else options
     return VideoModel(splats, FrameTimes.uniform(num_frames), size, 25.0, options, compositing)
+
+
+def on_paths(model, *, at_frames=True, reach=1.0, seed=7) -> VideoModel:
+    """The model with half of its Gaussians on a path, a quarter on another: they pan, turn and enlarge, unevenly."""
+    rng, splats = np.random.default_rng(seed), model.splats
+    times = np.asarray(model.frame_times.times())
+    if not at_frames:
+        times = np.sort(np.linspace(-0.1, 1.2, 5) + 0.05 * rng.normal(size=5)).astype(np.float32)
+    num = len(times)
+    steps = rng.normal(size=(2, num, 2, 3)) * np.array([0.02, 0.02, 0.05]) * reach
+    matrices = np.eye(2, 3) + np.cumsum(steps, 1)
+    index = np.array([1, 0, 1, 2])[np.arange(splats.num_gaussians) % 4]
+    paths = SharedPaths(np.tile(times, (2, 1)).astype(np.float32), matrices.astype(np.float32))
+    splats = dataclasses.replace(splats, path_index=index.astype(np.uint8), paths=paths)
+    return dataclasses.replace(model, splats=splats)

@@ -32,6 +32,7 @@ from foldgauss.video.fitting.codebook import Codebook
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.fitting.state import FitState
+from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.models.splats import OPAQUE_LOGIT, STATIC_LOG_TIME_SCALE
 from foldgauss.video.selection.selectors import Selection
 
@@ -334,6 +335,13 @@ SELECTION = Target(
 # ---------------------------------------------------------------------------------------------- compact
 
 
+def _on_paths(model: VideoModel, times: tuple[float, ...]) -> VideoModel:
+    matrices = np.eye(2, 3) + np.linspace(0, 0.1, 12 * len(times)).reshape(2, -1, 2, 3)
+    paths = SharedPaths(np.tile(np.float32(times), (2, 1)), matrices.astype(np.float32))
+    index = (np.arange(model.num_gaussians) % 3).astype(np.uint8)
+    return dataclasses.replace(model, splats=dataclasses.replace(model.splats, path_index=index, paths=paths))
+
+
 @functools.cache
 def _quantised() -> tuple:
     found = []
@@ -341,6 +349,8 @@ def _quantised() -> tuple:
         (tiny_model(), (0, 0, 0)),
         (tiny_model(16, 3, plain=False), (1, 1, 1)),
         (tiny_model(4, 0, frames=1), (1, 0, 1)),
+        (_on_paths(tiny_model(8, 1), (0.0, 0.5, 1.0)), (1, 0, 1)),
+        (_on_paths(tiny_model(8, 1), (-0.5, 2.0)), (1, 0, 1)),
     ):
         described = compute_columns(model)
         names = column_names(model.degree, described.info.shared)
@@ -394,6 +404,12 @@ def numbers_changed(data: bytes, random: Random) -> bytes:
     if len(intervals) and random.randrange(4) == 0:
         intervals[random.randrange(len(intervals))] = random.choice(values)
     changed = dataclasses.replace(quantized, columns=columns, rules=rules, intervals=intervals)
+    for name in ("maps", "knots"):
+        own = getattr(quantized, name)
+        if own is not None and random.randrange(3) == 0:
+            own = own.copy()
+            own.flat[random.randrange(own.size)] = random.choice(values)
+            changed = dataclasses.replace(changed, **{name: own})
     try:
         with np.errstate(all="ignore"):
             return compact.pack_compact(changed, {"clip": "a"})

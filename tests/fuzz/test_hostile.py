@@ -141,10 +141,13 @@ def _safetensors_header() -> bytes:
     return HUGE.to_bytes(8, "little") + TARGETS["model"].seeds()[0][8:]
 
 
-def _compact(**facts) -> bytes:
-    data = TARGETS["compact"].seeds()[0]
+def _compact(seed: int = 0, paths: dict | None = None, **facts) -> bytes:
+    data = TARGETS["compact"].seeds()[seed]
     length = int.from_bytes(data[12:16], "little")
-    header = json.dumps(json.loads(data[20 : 20 + length]) | facts).encode()
+    header = json.loads(data[20 : 20 + length]) | facts
+    if paths is not None:
+        header["paths"] |= paths
+    header = json.dumps(header).encode()
     fixed = data[:12] + len(header).to_bytes(4, "little") + bytes(4)
     return models.compact_resealed(fixed + header + data[20 + length :])
 
@@ -214,6 +217,10 @@ CLAIMS = {
     "compact: cells": ("compact", lambda: _compact(cells=[24, 24, 24])),
     "compact: degree": ("compact", lambda: _compact(degree=HUGE)),
     "compact: colours": ("compact", lambda: _compact(shared=HUGE)),
+    "compact: paths": ("compact", lambda: _compact(4, {"num_paths": HUGE})),
+    "compact: most paths": ("compact", lambda: _compact(4, {"num_paths": 255, "num_knots": 2**15})),
+    "compact: knots": ("compact", lambda: _compact(4, {"num_knots": HUGE})),
+    "compact: bits": ("compact", lambda: _compact(4, {"bits": HUGE})),
     "ply: rows": ("ply-vegas", lambda: _ply(0, b"vertex 3", b"vertex %d" % HUGE)),
     "ply: rows as text": ("ply-vegas", lambda: _ply(1, b"vertex 3", b"vertex %d" % HUGE)),
     "ply: lists": ("ply-vegas", lambda: _ply(3, b"face 2", b"face %d" % HUGE)),

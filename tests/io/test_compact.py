@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
-from soft_models import SIZE, soft_model
+from soft_models import SIZE, on_paths, soft_model
 
 import foldgauss.io.page
 from foldgauss.envelope import TimeLikelihood
@@ -39,6 +39,7 @@ from foldgauss.video.compression.quantize import (
 from foldgauss.video.models.metrics import evaluate
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.row_layout import shift_path
+from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.models.splats import OPAQUE_LOGIT, STATIC_LOG_TIME_SCALE
 
 
@@ -210,6 +211,158 @@ def test_kinds_save_bytes():
     assert len(pack_compact(fine(model))) < 0.8 * len(pack_compact(fine(plain)))
 
 
+# ------------------------------------------------------------------------------------ shared paths
+
+
+@pytest.mark.parametrize("at_frames", [True, False])
+def test_shared_paths_are_kept(tmp_path, at_frames):
+    model, logits = soft_model(degree=3, options=RenderOptions()), np.float32([0, 0.1, -0.3, 0.2, -7.0, 2.5])
+    model = on_paths(eqx.tree_at(lambda m: m.frame_times.logits, model, logits), at_frames=at_frames)
+    quantized = fine(model)
+    assert quantized.info.paths.at_frames == at_frames
+    path = save_compact(tmp_path / "m.fgz", quantized)
+    again = load_video_model(path)
+    same(again, dequantize(quantized))
+    assert pack_compact(load_compact(path)) == path.read_bytes()
+    np.testing.assert_array_equal(again.splats.path_index, model.splats.path_index)
+    frames = np.tile(again.frame_times.times(), (2, 1))
+    times, atol = (frames, 2e-7) if at_frames else (model.splats.paths.times, 1e-7)
+    np.testing.assert_allclose(again.splats.paths.times, times, atol=atol)
+    for t in (0.0, 0.37, 1.0):
+        np.testing.assert_allclose(image(again, t), image(model, t), atol=1e-2)
+
+
+@pytest.mark.parametrize("reach", [1.0, 30.0])
+def test_maps_are_displaced_by_less_than_a_fiftieth_of_a_pixel(reach):
+    """Also where the path leads far out of the frame."""
+    model = on_paths(soft_model(options=RenderOptions()), reach=reach)
+    loc = np.asarray(model.splats.loc) * reach
+    model = eqx.tree_at(lambda m: m.splats.loc, model, loc.astype(np.float32))
+    maps, decoded = (np.asarray(own.splats.paths.matrices, float) for own in (model, dequantize(fine(model))))
+    low, high = np.quantile(loc, [0.005, 0.995], axis=0)
+    corners = np.array([[x, y, 1] for x in (low[0], high[0]) for y in (low[1], high[1])])
+    moved = np.abs((decoded - maps) @ corners.T).max() * max(model.size)
+    assert 0.001 < moved < 0.02
+
+
+def test_cells_divide_the_positions_on_paths(tmp_path):
+    """Positions far out of the frame are in cells of their own, not all in those at its edge."""
+    model = on_paths(crowd(soft_model(options=RenderOptions()), 20))
+    where = np.asarray(model.splats.loc) * np.float32([6, 1]) + np.float32([3, 0])
+    model = eqx.tree_at(lambda m: m.splats.loc, model, where)
+    quantized = fine(model, -10.0)
+    assert quantized.info.cells[0] > 2
+    assert len(np.unique(quantized.columns["cell"])) > 0.4 * 2 ** sum(quantized.info.cells)
+    within = dataclasses.replace(quantized.info.paths, middle=(0.0, 0.0), sides=(1.0, 0.625))
+    exact = compute_columns(model)
+    exact = dataclasses.replace(exact, info=dataclasses.replace(exact.info, paths=within))
+    by_frame = quantize(exact, quantized.columns["class"], quantized.rules)
+    assert len(np.unique(by_frame.columns["cell"])) < 0.4 * 2 ** sum(quantized.info.cells)
+    np.testing.assert_allclose(dequantize(by_frame).splats.loc, where, atol=2e-3)
+    same(load_video_model(save_compact(tmp_path / "m.fgz", by_frame)), dequantize(by_frame))
+
+
+def test_shared_paths_need_few_bytes():
+    """Smooth motion over 90 frames, and a number of each Gaussian that its cell's others have as well."""
+    plain = crowd(soft_model(options=RenderOptions(), num_frames=90), 50)
+    t = np.asarray(plain.frame_times.times())[:, None, None]
+    motion = np.eye(2, 3) + np.sin(3 * t + np.arange(6).reshape(2, 3)) * np.array([0.05, 0.05, 0.2])
+    motion += 0.0005 * np.random.default_rng(0).normal(size=motion.shape)  # an unsteady hand
+    paths = SharedPaths(np.tile(t.ravel(), (2, 1)), np.stack([motion, motion[::-1]]).astype(np.float32))
+    index = np.where(np.asarray(plain.splats.loc)[:, 0] < 0.1, 1, 2).astype(np.uint8)
+    without = len(pack_compact(fine(plain, -10.0)))
+    on_one = dataclasses.replace(
+        plain.splats, path_index=np.ones_like(index), paths=jax.tree.map(lambda x: x[:1], paths)
+    )
+    one = len(pack_compact(fine(dataclasses.replace(plain, splats=on_one), -10.0)))
+    on_two = dataclasses.replace(plain.splats, path_index=index, paths=paths)
+    two = len(pack_compact(fine(dataclasses.replace(plain, splats=on_two), -10.0)))
+    assert one - without < 800
+    assert two - one < 800 + 0.5 * len(index) / 8
+
+
+@pytest.mark.parametrize("passes", [0, 2])
+def test_models_with_shared_paths_are_compressed(tmp_path, passes):
+    model = on_paths(soft_model(degree=3, options=RenderOptions()))
+    clip = clip_of(model)
+    made = compress(model, clip, passes=passes)
+    again = load_video_model(save_compact(tmp_path / "m.fgz", made.quantized))
+    same(again, made.model)
+    before, after = evaluate(model, clip).mean_psnr, evaluate(again, clip).mean_psnr
+    assert before - after == pytest.approx(made.loss_db, abs=1e-9)
+    assert made.loss_db <= 0.2
+
+
+def test_paths_are_shared_by_the_gaussians_that_are_left():
+    search = sys.modules["foldgauss.video.compression.search"]
+    model = on_paths(only(soft_model(options=RenderOptions()), np.array([3, 20])))  # as many Gaussians as paths
+    taken = search._take(model, np.array([1]))
+    np.testing.assert_array_equal(taken.splats.path_index, model.splats.path_index[1:])
+    same(taken.splats.paths, model.splats.paths)
+
+
+def test_sensitivity_is_that_to_parameters_before_the_path():
+    """A path that doubles all sizes makes positions matter more, by about the factor of the image's area."""
+    sensitivity = sys.modules["foldgauss.video.compression.sensitivity"]
+    search = sys.modules["foldgauss.video.compression.search"]
+    model = soft_model(degree=1, options=RenderOptions())
+    half = np.float32([[[[0.5, 0, 0], [0, 0.5, 0]]]])
+    splats = dataclasses.replace(
+        model.splats,
+        loc=model.splats.loc * 2,
+        log_scale=model.splats.log_scale + np.float32(np.log(2)),
+        coefficients=model.splats.coefficients * 2,
+        path_index=np.ones(model.num_gaussians, np.uint8),
+        paths=SharedPaths(np.zeros((1, 1), np.float32), half),
+    )
+    found = [
+        sensitivity.estimate_sensitivities(search.Contributions(one), compute_columns(one))[0]
+        for one in (model, dataclasses.replace(model, splats=splats))
+    ]
+    for name in found[0]:
+        by = 4 if name in ("x0", "y0", "x1", "y1") else 1
+        np.testing.assert_allclose(by * found[1][name], found[0][name], rtol=2e-2, atol=1e-3 * found[0][name].max())
+
+
+def test_paths_that_the_format_cannot_hold_are_rejected():
+    model = on_paths(soft_model())
+    for value in (1e9, np.nan):
+        matrices = np.where(np.arange(3) == 2, np.float32(value), model.splats.paths.matrices)
+        with pytest.raises(ValueError, match=r"shared paths whose maps are within the range"):
+            fine(eqx.tree_at(lambda m: m.splats.paths.matrices, model, matrices))
+    with pytest.raises(ValueError, match=r"shared paths whose knots are within the range"):
+        fine(eqx.tree_at(lambda m: m.splats.paths.times, model, model.splats.paths.times + np.float32(100)))
+    wrong = eqx.tree_at(lambda m: m.splats.path_index, model, np.full(model.num_gaussians, 3, np.uint8))
+    with pytest.raises(ValueError, match="path_index: expected paths from 0 to 2, got 3"):
+        compress(wrong)
+
+
+def with_paths(quantized, **changed):
+    """With another fact of its paths."""
+    paths = dataclasses.replace(quantized.info.paths, **changed)
+    return dataclasses.replace(quantized, info=dataclasses.replace(quantized.info, paths=paths))
+
+
+def test_wrong_paths_are_refused(tmp_path):
+    quantized, path = fine(on_paths(soft_model())), tmp_path / "m.fgz"
+    index, maps = np.full_like(quantized.columns["path"], 3), np.full_like(quantized.maps, 2**30)
+    maps[:, 0] = 2**29  # each step is within the range
+    files = {
+        "path: .* got numbers out of range": dataclasses.replace(
+            quantized, columns=quantized.columns | {"path": index}
+        ),
+        "maps: .* got numbers out of range": dataclasses.replace(quantized, maps=maps),
+        "bits": with_paths(quantized, bits=29),
+        "at_frames": with_paths(quantized, at_frames=1),
+        "middle": with_paths(quantized, middle=(0.0, 1e10)),
+        "sides": with_paths(quantized, sides=(1e-9, 1.0)),
+    }
+    for message, wrong in files.items():
+        save_compact(path, wrong)
+        with pytest.raises(ModelFileError, match=message):
+            load_compact(path)
+
+
 # ------------------------------------------------------------------------------------ stated loss
 
 
@@ -358,12 +511,27 @@ def test_paths_are_legendre_series_over_the_span():
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node, which runs the decoder for browsers")
 @pytest.mark.parametrize(
-    "how", [{"degree": 0}, {"degree": 3, "power": 1.0}, {"degree": 7}, {"num_frames": 1}, "crowd", "crowd of kinds"]
+    "how",
+    [
+        {"degree": 0},
+        {"degree": 3, "power": 1.0},
+        {"degree": 7},
+        {"num_frames": 1},
+        "crowd",
+        "crowd of kinds",
+        "paths",
+        "paths at other times",
+        "paths of a crowd",
+    ],
 )
 def test_the_decoder_for_browsers_gives_the_same_bits(tmp_path, how):
     model = soft_model(options=RenderOptions(), **({} if isinstance(how, str) else how))
-    if isinstance(how, str):
+    if isinstance(how, str) and "crowd" in how:
         model = crowd(model)
+    if isinstance(how, str) and "paths" in how:
+        if how != "paths":
+            model = eqx.tree_at(lambda m: m.frame_times.logits, model, np.float32([0, 0.1, -0.3, 0.2, -7.0, 2.5]))
+        model = on_paths(model, at_frames=how != "paths at other times")
     if how == "crowd of kinds":
         model = of_kinds(model)
     path = save_compact(tmp_path / "m.fgz", compress(model, passes=0).quantized)
@@ -381,10 +549,13 @@ def test_the_decoder_for_browsers_gives_the_same_bits(tmp_path, how):
     subprocess.run(["node", "run.mjs"], cwd=tmp_path, check=True, timeout=60)
     again = load_video_model(path)
     leaves = {field.name: getattr(again.splats, field.name) for field in dataclasses.fields(again.splats)}
-    leaves = {name: leaf for name, leaf in leaves.items() if name != "envelope"}
+    leaves = {name: leaf for name, leaf in leaves.items() if name not in ("envelope", "path_index", "paths")}
+    if again.splats.paths is not None:
+        paths = again.splats.paths
+        leaves |= {"path_index": again.splats.path_index, "path_times": paths.times, "path_matrices": paths.matrices}
     for name, leaf in (leaves | {"frame_times": again.frame_times.logits}).items():
-        by_browser = np.fromfile(tmp_path / name, np.float32)
-        np.testing.assert_array_equal(by_browser.view(np.int32), np.asarray(leaf).ravel().view(np.int32), err_msg=name)
+        leaf = np.asarray(leaf)
+        assert (tmp_path / name).read_bytes() == leaf.tobytes(), name
 
 
 # ------------------------------------------------------------------------------------ extremes

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from browser import Opened
-from soft_models import NUM, OBJECT, SIZE, soft_model
+from soft_models import NUM, OBJECT, SIZE, on_paths, soft_model
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import OutputError, export, html_page, load_video_model, save_compact, save_video_model, write_html
@@ -30,7 +30,7 @@ from foldgauss.video.models.renderer import VideoRenderer
 #: Indices of the selected Gaussians, as an expression in the page.
 PICKED = "Array.from(foldgauss.player.state.selected.keys()).filter((i) => foldgauss.player.state.selected[i])"
 #: What the brush is made of.
-MODULES = ("gaussians", "timeline")
+MODULES = ("gaussians", "paths", "timeline")
 
 
 class _Elements(HTMLParser):
@@ -765,11 +765,12 @@ def test_the_brush_acts_on_the_segment_seen(opened):
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node, which runs the brush's own conditioning")
-@pytest.mark.parametrize("how", [{}, {"degree": 0}, {"degree": 4, "power": 1.0, "floor": 0.1}])
+@pytest.mark.parametrize("how", [{}, {"degree": 0}, {"degree": 4, "power": 1.0, "floor": 0.1}, "paths"])
 def test_the_brush_conditions_as_the_distribution_does(tmp_path, how):
     """The fold equation stands once in Python; the brush has it again, and is held to that."""
     path = tmp_path / "m.fgz"
-    path.write_bytes(data_of(html_page(soft_model(options=RenderOptions(), **how))))
+    model = soft_model(options=RenderOptions(), **({} if how == "paths" else how))
+    path.write_bytes(data_of(html_page(on_paths(model) if how == "paths" else model)))
     for source in (player_page._DECODER, *(player_page._SOURCES / f"{name}.js" for name in MODULES)):
         (tmp_path / source.name).write_bytes(source.read_bytes())
     (tmp_path / "package.json").write_text('{"type": "module"}')

@@ -63,8 +63,11 @@ class ColumnContexts:
         if name == "y0":
             v = decoder.values
             middle, self._half = path_span(clamp_unit(v["time"]), v["duration"], info.reach)
-            bits = max(info.cells[:2]) + 1
-            self._nearest = find_nearest(v["x0"], v["y0"], TIME_WEIGHT * middle, bits)
+            at = v["x0"], v["y0"], TIME_WEIGHT * middle
+            if info.paths is not None:  # within the rectangle of the cells
+                (x, y), longer = info.paths.middle, max(info.paths.sides)
+                at = (at[0] - x) / longer, (at[1] - y) / longer, at[2] / longer
+            self._nearest = find_nearest(*at, max(info.cells[:2]) + 1)
 
     def _contexts(self, name: str, power: int, halves: np.ndarray) -> UInt8[np.ndarray, "num 2"]:
         """The first and the second context of each value."""

@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Int
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.io._atomic import atomic_path, check_path
@@ -29,16 +30,18 @@ from foldgauss.io.models.model_file import (
 from foldgauss.render import COMPOSITINGS, RenderOptions
 from foldgauss.video.compression.quantize import (
     FEATURES,
+    LARGEST,
     MAX_CELL_BITS,
     MAX_DEGREE,
     MAX_SHARED,
     CompactInfo,
     Quantized,
     Rule,
-    column_names,
     dequantize,
     is_integral,
 )
+from foldgauss.video.compression.quantized_paths import MAX_PATH_BITS, PathsInfo
+from foldgauss.video.models.shared_paths import MAX_PATHS
 from foldgauss.video.models.video_model import VideoModel
 
 COMPACT_SUFFIX = ".fgz"
@@ -77,7 +80,7 @@ def pack_compact(quantized: Quantized, metadata: dict | None = None) -> bytes:
     """The bytes of the file."""
     info, contexts = quantized.info, ColumnContexts(quantized.rules, quantized.info)
     streams, descriptions = [], []
-    for name in column_names(info.degree, info.shared):
+    for name in info.column_names:
         numbers = coded = quantized.columns[name]
         if name == "cell":  # from each to the next, around the end
             coded = np.diff(numbers, prepend=0) & _last_cell(info)
@@ -94,9 +97,15 @@ def pack_compact(quantized: Quantized, metadata: dict | None = None) -> bytes:
         "intervals": len(streams[-1]),
         "metadata": to_json_types(metadata or {}),
     }
+    num_values = info.num_gaussians * len(descriptions) + header["num_frames"] + _count_path_numbers(info)
+    if info.paths is None:
+        del header["paths"]
+    else:
+        parts = _pack_paths(quantized)
+        header["paths"] |= {name: len(part) for name, part in parts.items()}
+        streams.extend(parts.values())
     text = to_json("header", header).encode()
     data = b"".join(streams)
-    num_values = info.num_gaussians * len(descriptions) + header["num_frames"]
     text += b" " * (-(-num_values // _MOST_PER_BYTE) - len(text) - len(data))
     body = text + data
     numbers = (VERSION, len(text), zlib.crc32(body))
@@ -105,6 +114,36 @@ def pack_compact(quantized: Quantized, metadata: dict | None = None) -> bytes:
 
 def _last_cell(info: CompactInfo) -> int:
     return (1 << sum(info.cells)) - 1
+
+
+def _count_path_numbers(info: CompactInfo) -> int:
+    own = info.paths
+    return 0 if own is None else own.num_paths * own.num_knots * (6 if own.at_frames else 7)
+
+
+def _pack_paths(quantized: Quantized) -> dict[str, bytes]:
+    """The streams of knots, which is empty if they are at the frames, and maps: both as differences in time."""
+    knots, maps = b"", quantized.maps
+    if quantized.knots is not None:
+        coded = np.diff(quantized.knots, axis=1, prepend=0)
+        knots = range_coder.encode(coded.ravel(), range_coder.Column.without_contexts(coded.size))
+    coded = np.diff(maps, axis=1, prepend=_identities(quantized.info.paths))
+    return {"knots": knots, "maps": range_coder.encode(coded.ravel(), _describe_maps(quantized.info.paths))}
+
+
+def _identities(about: PathsInfo) -> Int[np.ndarray, "paths 1 2 3"]:
+    return np.tile(np.eye(2, 3, dtype=np.int64) << about.bits, (about.num_paths, 1, 1, 1))
+
+
+def _describe_maps(about: PathsInfo) -> range_coder.Column:
+    """Contexts: which of a map's six numbers it is, and the same number of the knot before."""
+    num = 6 * about.num_paths * about.num_knots
+    place = np.arange(num, dtype=np.int32)
+    near = np.where(place // 6 % about.num_knots > 0, place - 6, -1)
+    contexts = np.stack([place % 6, np.zeros_like(place)], 1).astype(np.uint8)
+    return dataclasses.replace(
+        range_coder.Column.without_contexts(num), contexts=contexts, near=near.astype(np.int32)[:, None]
+    )
 
 
 # ---------------------------------------------------------------------------------------------- reading
@@ -182,18 +221,21 @@ def _decode(header: dict, body: bytes, whole_length: int) -> Quantized:
     info = _parse_info(header)
     num, num_frames = info.num_gaussians, header["num_frames"]
     _check(is_integer(num_frames, 1), "num_frames", num_frames)
-    names = column_names(info.degree, info.shared)
+    names = info.column_names
     most = max(_MOST_PER_BYTE * whole_length, _ALWAYS_ALLOWED)
-    _check(num * len(names) + num_frames <= most, "num_gaussians", num)
+    _check(num * len(names) + num_frames + _count_path_numbers(info) <= most, "num_gaussians", num)
     descriptions = header["columns"]
     _check(isinstance(descriptions, list) and len(descriptions) == len(names), "columns", "others")
+    of_paths = [header["paths"][name] for name in ("knots", "maps")] if info.paths else [0, 0]
     lengths = [own[0] for own in descriptions] + [header["intervals"]]
-    _check(all(is_integer(own, 1) for own in lengths) and sum(lengths) == len(body), "bytes", "others")
+    right = all(is_integer(own, 1) for own in lengths) and all(is_integer(own, 0) for own in of_paths)
+    _check(right and sum(lengths + of_paths) == len(body), "bytes", "others")
     described = dict(zip(names, (own[1:] for own in descriptions), strict=True))
     rules = {name: _parse_rule(name, numbers) for name, numbers in described.items() if not is_integral(name)}
     _check(not any(described[name] for name in names if is_integral(name)), "rule", "none")
     contexts, columns, start = ColumnContexts(rules, info), {}, 0
     most = {"without": 3, "degree": info.degree, "shade": info.shared - 1}  # of the columns that are used as indices
+    most["path"] = info.paths.num_paths if info.paths else 0
     for name, length in zip(names, lengths[:-1], strict=True):
         numbers = range_coder.decode(body[start : start + length], contexts.describe_next(name))
         if name == "cell":
@@ -203,8 +245,25 @@ def _decode(header: dict, body: bytes, whole_length: int) -> Quantized:
         columns[name] = numbers
         contexts.add(name, numbers)
         start += length
-    intervals = range_coder.decode(body[start:], range_coder.Column.without_contexts(num_frames - 1))
-    return Quantized(info, rules, columns, intervals)
+    stop = start + lengths[-1]
+    intervals = range_coder.decode(body[start:stop], range_coder.Column.without_contexts(num_frames - 1))
+    paths = _decode_paths(info.paths, body[stop : stop + of_paths[0]], body[stop + of_paths[0] :]) if info.paths else {}
+    return Quantized(info, rules, columns, intervals, **paths)
+
+
+def _decode_paths(about: PathsInfo, knots: bytes, maps: bytes) -> dict[str, np.ndarray]:
+    shape = about.num_paths, about.num_knots
+    coded = range_coder.decode(maps, _describe_maps(about)).reshape(*shape, 2, 3)
+    made = {"maps": np.cumsum(coded, axis=1, dtype=np.int64) + _identities(about)}
+    if about.at_frames:
+        _check(not knots, "knots", "some")
+    else:
+        coded = range_coder.decode(knots, range_coder.Column.without_contexts(shape[0] * shape[1])).reshape(shape)
+        _check((coded[:, 1:] >= 0).all(), "knots", "times that decrease")
+        made["knots"] = np.cumsum(coded, axis=1, dtype=np.int64)
+    for name, numbers in made.items():
+        _check(np.abs(numbers).max() <= LARGEST, name, "numbers out of range")
+    return {name: numbers.astype(np.int32) for name, numbers in made.items()}
 
 
 def _parse_info(header: dict) -> CompactInfo:
@@ -220,9 +279,22 @@ def _parse_info(header: dict) -> CompactInfo:
     for name, interval in bounds.items():
         _check(is_within(header[name], interval), name, header[name])
     check_one_of("compositing", header["compositing"], COMPOSITINGS)
-    known = {field.name: header[field.name] for field in dataclasses.fields(CompactInfo)}
+    known = {field.name: header[field.name] for field in dataclasses.fields(CompactInfo) if field.name != "paths"}
     made = {"size": tuple(size), "cells": tuple(cells), "options": RenderOptions(**header["options"])}
+    made["paths"] = _parse_paths(header["paths"], header["num_frames"]) if "paths" in header else None
     return CompactInfo(**known | made)
+
+
+def _parse_paths(own: dict, num_frames: int) -> PathsInfo:
+    num_paths, num_knots, at_frames, bits = (own[name] for name in ("num_paths", "num_knots", "at_frames", "bits"))
+    _check(is_integer(num_paths, 1) and num_paths <= MAX_PATHS, "num_paths", num_paths)
+    _check(is_integer(num_knots, 1), "num_knots", num_knots)
+    _check(at_frames is False or (at_frames is True and num_knots == num_frames), "at_frames", at_frames)
+    _check(is_integer(bits, 0) and bits <= MAX_PATH_BITS, "bits", bits)
+    for name, interval in (("middle", "[-1e9, 1e9]"), ("sides", "[1e-6, 1e9]")):
+        right = isinstance(own[name], list) and len(own[name]) == 2 and all(is_within(x, interval) for x in own[name])
+        _check(right, name, own[name])
+    return PathsInfo(num_paths, num_knots, at_frames, bits, tuple(own["middle"]), tuple(own["sides"]))
 
 
 def _parse_rule(name: str, numbers: list) -> Rule:

@@ -3,7 +3,7 @@
 
 const FEATURES = ["class", "size", "stretch", "duration", "opacity"];
 const COLORS = ["luma", "blue", "green"];
-const WHOLE = ["cell", "class", "without", "degree", "shade"];
+const WHOLE = ["cell", "class", "without", "degree", "path", "shade"];
 const AXES = [
   [0.5773502691896258, 0.5773502691896258, 0.5773502691896258],
   [-0.7071067811865476, 0.0, 0.7071067811865476],
@@ -151,6 +151,13 @@ function log(x) {
   return e * LN2 + 2 * s * total;
 }
 const logit = (x) => log(x) - log(1 - x);
+/** Exponential of a number <= 0. */
+function exp(x) {
+  const held = Math.max(x, -690), e = Math.floor(held * (1 / LN2) + 0.5), rest = held - e * LN2;
+  let total = 1;
+  for (let k = 14; k > 0; k--) total = 1 + (total * rest) / k;
+  return total * power(2 * e);
+}
 const inClip = (x) => Math.min(Math.max(x, 2 ** -24), 1 - 2 ** -24);
 
 function legendre(degree) {
@@ -223,19 +230,19 @@ function findNearest(x, y, time, bits) {
 }
 
 /** The names of a file's columns in order. */
-function columnNames(degree, shared) {
+function columnNames({ degree, shared, paths }) {
   const path = Array.from({ length: 2 * degree + 2 }, (_, k) => "xy"[k % 2] + (k >> 1));
-  return [...WHOLE.slice(0, 4), ...FEATURES.slice(1), "time", ...path, "angle", ...(shared ? ["shade"] : []), ...COLORS];
+  return [...WHOLE.slice(0, paths ? 5 : 4), ...FEATURES.slice(1), "time", ...path, "angle", ...(shared ? ["shade"] : []), ...COLORS];
 }
 
 /** The values of all columns. */
 function decodeColumns(header, streamOf, onColumn) {
-  const num = header.num_gaussians, { degree, shared, cells } = header, q = {}, v = {}, features = [];
+  const num = header.num_gaussians, { shared, cells, paths } = header, q = {}, v = {}, features = [];
   const [height, width] = header.size, longer = Math.max(height, width);
-  const sides = [width / longer, height / longer, 1], middles = [0, 0, 0.5];
+  const sides = [...(paths?.sides ?? [width / longer, height / longer]), 1], middles = [...(paths?.middle ?? [0, 0]), 0.5];
   const half = new Float64Array(num), one = () => 1;
   let inCell, nearest;
-  const names = columnNames(degree, shared);
+  const names = columnNames(header);
   names.forEach((name, column) => {
     const [length, origin, exponent, ...slopes] = header.columns[column];
     const common = shared > 0 && COLORS.includes(name), rows = common ? shared : num;
@@ -292,15 +299,37 @@ function decodeColumns(header, streamOf, onColumn) {
     if (name === "y0") {
       const middle = new Float64Array(num);
       for (let i = 0; i < num; i++) [middle[i], half[i]] = spanOf(inClip(v.time[i]), v.duration[i], header.reach);
-      nearest = findNearest(v.x0, v.y0, middle.map((own) => TIME * own), Math.max(cells[0], cells[1]) + 1);
+      const side = paths ? Math.max(...paths.sides) : 1, across = (own, axis) => own.map((x) => (x - middles[axis]) / side);
+      nearest = findNearest(across(v.x0, 0), across(v.y0, 1), middle.map((own) => (TIME * own) / side), Math.max(cells[0], cells[1]) + 1);
     }
   });
   if (shared) for (const name of COLORS) v[name] = Float64Array.from(q.shade, (own) => v[name][own]);
   return v;
 }
 
+/** Shared paths: the times of their knots, and their maps. */
+function decodePaths({ paths }, stream, intervals) {
+  const { num_paths: num, num_knots: knots, bits } = paths, total = num * knots;
+  const times = new Float32Array(total), matrices = new Float32Array(6 * total);
+  const before = (i, width) => (Math.floor(i / width) % knots > 0 ? i - width : -1);
+  if (paths.at_frames) {
+    const largest = intervals.reduce((a, b) => Math.max(a, b), -Infinity), sums = [0];
+    for (const own of intervals) sums.push(sums.at(-1) + exp((own - largest) * 2 ** -10));
+    for (let i = 0; i < total; i++) times[i] = i % knots ? sums[i % knots] / sums.at(-1) : 0;
+  } else {
+    const numbers = Array.from(decodeColumn(stream(paths.knots), emptyColumn(total)));
+    for (let i = 0; i < total; i++) times[i] = (numbers[i] += numbers[before(i, 1)] ?? 0) * 2 ** -24;
+  }
+  const near = Int32Array.from({ length: 6 * total }, (_, i) => before(i, 6)), contexts = (i) => [i % 6, 0];
+  const numbers = Array.from(decodeColumn(stream(paths.maps), { ...emptyColumn(6 * total), contexts, near, width: 1 }));
+  for (let i = 0; i < 6 * total; i++)
+    matrices[i] = (numbers[i] += numbers[near[i]] ?? (i % 6 === 0 || i % 6 === 4 ? 2 ** bits : 0)) * 2 ** -bits;
+  return { path_times: times, path_matrices: matrices };
+}
+
 /**
- * {header, leaves}: the file's header, and Float32Arrays named and laid out as in FoldedSplats, and frame_times.
+ * {header, leaves}: the file's header, and Float32Arrays named and laid out as in FoldedSplats, and frame_times; with
+ * shared paths, `path_index` (Uint8Array), `path_times` and `path_matrices`, too.
  * `onColumn` is called with the fraction of columns decoded.
  */
 export function decode(buffer, onColumn = () => {}) {
@@ -319,6 +348,7 @@ export function decode(buffer, onColumn = () => {}) {
     coefficients: new Float32Array(2 * num * degree), opacity_logit: new Float32Array(num),
     color_dc: new Float32Array(3 * num), frame_times: Float32Array.from(intervals, (q) => q * 2 ** -10),
   };
+  if (header.paths) Object.assign(leaves, { path_index: Uint8Array.from(v.path) }, decodePaths(header, stream, intervals));
   const table = legendre(degree), powers = new Float64Array(degree + 1);
   for (let i = 0; i < num; i++) {
     const time = inClip(v.time[i]);

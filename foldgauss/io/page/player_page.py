@@ -35,6 +35,7 @@ from foldgauss.video.compression.quantize import (
     is_integral,
     quantize,
 )
+from foldgauss.video.compression.quantized_paths import MAX_PATH_BITS
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.motion.moving_object import NothingMoves, nothing_moves
@@ -55,6 +56,8 @@ _EXPORT = re.compile(r"^export (?:async )?(?:const|class|function) (\w+)", re.MU
 _SCRIPT_PLACE = "<!--edit script-->"
 #: Binary logarithm of equal steps, where steps in proportion are beyond the format.
 _EVEN = -18.0
+#: How many bits more the maps of shared paths have than in a compressed file.
+_MORE_PATH_BITS = 5
 _PER_E = 1.4427  # log2 e: slopes are those of natural logarithms
 
 Loaded = VideoModel | EditedVideo | SegmentedVideo | Quantized
@@ -233,6 +236,10 @@ def _flatten_segment(number: int, model: VideoModel | EditedVideo) -> VideoModel
 def quantize_finely(model: VideoModel) -> Quantized:
     """The model quantized in steps too fine to change the image, with its Gaussians in their order."""
     described = compute_columns(model)
+    if described.paths is not None:
+        paths = described.info.paths
+        paths = dataclasses.replace(paths, bits=min(paths.bits + _MORE_PATH_BITS, MAX_PATH_BITS))
+        described = dataclasses.replace(described, info=dataclasses.replace(described.info, paths=paths))
     classes = np.zeros(model.num_gaussians, np.int32)
     try:
         return quantize(described, classes, _fine_rules(model.degree))

@@ -7,6 +7,9 @@ polynomials. A column's step follows from earlier columns by a rule stated in th
 hardly visible get coarse steps and need few bits. Absent parameters are stored in no column: powers above the path's
 own degree, times of static Gaussians, opacities of opaque ones; and shared colours are stored once.
 
+A model with shared paths (`SharedPaths`) has a column of their numbers; their maps are rounded in steps of model space
+too fine to be seen.
+
 Decoding uses only additions, multiplications, divisions and comparisons of float64, in a stated order. They are rounded
 alike everywhere, so every decoder returns the same bits. See docs/format.md.
 """
@@ -21,8 +24,10 @@ from jaxtyping import Bool, Float, Int, Int32
 from foldgauss._runtime.checks import invalid
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions
+from foldgauss.video.compression.quantized_paths import PathsInfo, decode_paths, describe_paths, round_paths
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.row_layout import shift_path
+from foldgauss.video.models.shared_paths import SharedPaths, check_path_index
 from foldgauss.video.models.splats import OPAQUE_LOGIT, STATIC_LOG_TIME_SCALE, TAU_MAX, FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
 
@@ -33,8 +38,8 @@ LARGEST = 2**30 - 1
 #: Columns from which the steps of others may be computed.
 FEATURES = ("class", "size", "stretch", "duration", "opacity")
 #: Columns of plain integers: the cell of space and time, the class (how visible), absent parameters, the path's degree.
+#: So are `path`, the number of the shared path, and `shade`, that of the shared colour.
 INTEGER_COLUMNS = ("cell", "class", "without", "degree")
-_FIRST = (*INTEGER_COLUMNS, *FEATURES[1:], "time")
 COLORS = ("luma", "blue", "green")
 #: Columns that a bit of `without` makes absent: the bit, the value used instead, and the value used as a feature
 #: (sigma_t = 1, the clip's length; an opacity of 0.98).
@@ -65,10 +70,19 @@ _MAX_EXPONENT = 120
 _MAX_STEP = {"time": 0.125, "angle": 0.125, "size": 0.35, "stretch": 0.5, "duration": 0.5, "opacity": 1.0}
 
 
-def column_names(degree: int, shared: int = 0) -> tuple[str, ...]:
+def column_names(degree: int, shared: int = 0, num_paths: int = 0) -> tuple[str, ...]:
     """The columns of a model in order; `shared` is the number of shared colours, 0 if they are not shared."""
     path = tuple(f"{axis}{k}" for k in range(degree + 1) for axis in "xy")
-    return (*_FIRST, *path, "angle", *(("shade",) if shared else ()), *COLORS)
+    return (
+        *INTEGER_COLUMNS,
+        *(("path",) if num_paths else ()),
+        *FEATURES[1:],
+        "time",
+        *path,
+        "angle",
+        *(("shade",) if shared else ()),
+        *COLORS,
+    )
 
 
 def path_power(name: str) -> int:
@@ -78,7 +92,7 @@ def path_power(name: str) -> int:
 
 def is_integral(name: str) -> bool:
     """Whether a column holds plain integers, without a rule."""
-    return name in INTEGER_COLUMNS or name == "shade"
+    return name in (*INTEGER_COLUMNS, "path", "shade")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,16 +142,26 @@ class CompactInfo:
     options: RenderOptions
     compositing: str
     scale_cutoff: float
+    paths: PathsInfo | None = None
+
+    @property
+    def column_names(self) -> tuple[str, ...]:
+        return column_names(self.degree, self.shared, 0 if self.paths is None else self.paths.num_paths)
 
 
 @dataclasses.dataclass(frozen=True)
 class Quantized:
-    """A model as integers: equal integers are equal models, to the bit."""
+    """A model as integers: equal integers are equal models, to the bit.
+
+    Of shared paths, `maps` and, unless they are at the frames, `knots`, the times of the maps.
+    """
 
     info: CompactInfo
     rules: dict[str, Rule]
     columns: dict[str, Int32[np.ndarray, " num"]]
     intervals: Int32[np.ndarray, " intervals"]
+    maps: Int32[np.ndarray, "paths knots 2 3"] | None = None
+    knots: Int32[np.ndarray, "paths knots"] | None = None
 
 
 # ------------------------------------------------------------------------------------------ decoding
@@ -192,7 +216,7 @@ class ColumnDecoder:
 def decode_values(quantized: Quantized) -> dict[str, Float[np.ndarray, " num"]]:
     """The values of all columns, for each Gaussian."""
     info, decoder = quantized.info, ColumnDecoder(quantized.rules, quantized.info)
-    for name in column_names(info.degree, info.shared):
+    for name in info.column_names:
         decoder.add(name, quantized.columns[name], decoder.half_exponents(name))
     values = decoder.values
     if info.shared:
@@ -203,20 +227,23 @@ def decode_values(quantized: Quantized) -> dict[str, Float[np.ndarray, " num"]]:
 # ------------------------------------------------------------------------------------------ cells
 
 
-def _sides(info: CompactInfo) -> tuple[float, float, float]:
-    """Extent of the image along x and y in model space, and of time."""
+def _extents(info: CompactInfo) -> tuple[tuple[float, float], ...]:
+    """Middle and side of what the cells divide along x, y and time: the image, or the rectangle of `PathsInfo`."""
     height, width = info.size
     longer = max(height, width)
-    return width / longer, height / longer, 1.0
+    middle, sides = (0.0, 0.0), (width / longer, height / longer)
+    if info.paths is not None:
+        middle, sides = info.paths.middle, info.paths.sides
+    return (*zip(middle, sides, strict=True), (0.5, 1.0))
 
 
 def locate_cells(
     x: Float[np.ndarray, " num"], y: Float[np.ndarray, " num"], time: Float[np.ndarray, " num"], info: CompactInfo
 ) -> Int32[np.ndarray, " num"]:
-    """Indices of the cells of these positions, clipped to the frame: bits of x, y, time in turns, lowest first."""
+    """Indices of the cells of these positions or of the nearest ones: bits of x, y, time in turns, lowest first."""
     out, place = np.zeros(len(x), np.int64), 0
     along = []
-    for value, middle, side, bits in zip((x, y, time), (0.0, 0.0, 0.5), _sides(info), info.cells, strict=True):
+    for value, (middle, side), bits in zip((x, y, time), _extents(info), info.cells, strict=True):
         index = np.floor(((value - middle) / side + 0.5) * 2**bits)
         along.append(np.clip(index, 0, 2**bits - 1).astype(np.int64))
     for k in range(max(info.cells)):
@@ -236,7 +263,7 @@ def cell_centers(cell: Int[np.ndarray, " num"], info: CompactInfo) -> list[Float
                 along[axis] |= ((cell >> place) & 1) << k
                 place += 1
     out = []
-    for index, middle, side, bits in zip(along, (0.0, 0.0, 0.5), _sides(info), info.cells, strict=True):
+    for index, (middle, side), bits in zip(along, _extents(info), info.cells, strict=True):
         out.append(middle + ((index + 0.5) / 2**bits - 0.5) * side)
     return out
 
@@ -269,6 +296,10 @@ def dequantize(quantized: Quantized) -> VideoModel:
         color_dc=single(color),
         envelope=TimeLikelihood(np.float32(info.power), np.float32(info.floor)),
     )
+    if info.paths is not None:
+        knots, maps = decode_paths(info.paths, quantized.maps, quantized.knots, quantized.intervals * TIME_STEP)
+        index = quantized.columns["path"].astype(np.uint8)
+        splats = dataclasses.replace(splats, path_index=index, paths=SharedPaths(single(knots), single(maps)))
     times = FrameTimes(single(quantized.intervals * TIME_STEP))
     shared = (info.size, info.fps, info.options, info.compositing, info.scale_cutoff)
     return VideoModel(splats, times, *shared)
@@ -356,6 +387,8 @@ class ExactColumns:
     values: dict[str, Float[np.ndarray, " num"]]
     place: Float[np.ndarray, "num degree+1 2"]
     logits: Float[np.ndarray, " intervals"]
+    path: Int32[np.ndarray, " num"] | None = None
+    paths: SharedPaths | None = None
 
     def has(self, name: str) -> Bool[np.ndarray, " num"]:
         """Which Gaussians have a value in a column other than the path's."""
@@ -386,7 +419,12 @@ def compute_columns(model: VideoModel) -> ExactColumns:
     values |= dict(zip(("luma", "blue", "green"), (leaf("color_dc") @ AXES.T).T, strict=True))
     place = np.concatenate([leaf("loc")[:, None], leaf("coefficients")], 1)
     own = swapped, turn, splats.static + 2 * splats.opaque.astype(np.int32), shade
-    return ExactColumns(info, *own, values, place, np.asarray(model.frame_times.logits, np.float64))
+    exact = ExactColumns(info, *own, values, place, np.asarray(model.frame_times.logits, np.float64))
+    if splats.paths is None:
+        return exact
+    check_path_index(splats)
+    info = dataclasses.replace(info, paths=describe_paths(model))
+    return dataclasses.replace(exact, info=info, path=np.asarray(splats.path_index, np.int32), paths=splats.paths)
 
 
 def index_colors(model: VideoModel) -> Int32[np.ndarray, " num"] | None:
@@ -468,20 +506,21 @@ def quantize(
     info = exact.info
     if cells is None:
         cells = find_cells(exact)
-    values = exact.values | {"class": classes, "cell": cells, "without": exact.without}
+    values = exact.values | {"class": classes, "cell": cells, "without": exact.without, "path": exact.path}
     if info.shared:
         first = np.unique(exact.shade, return_index=True)[1]
         values |= {name: values[name][first] for name in COLORS} | {"shade": exact.shade}
     # The path's degree is known only after rounding it.
-    names = column_names(info.degree, info.shared)
     whole = {"degree": np.full(info.num_gaussians, info.degree, np.int32)}
-    columns, saved = _round_columns(names, values | whole, exact, rules)
+    columns, saved = _round_columns(info.column_names, values | whole, exact, rules)
     columns["degree"] = degrees = _choose_degrees(saved)
     for k in range(1, info.degree + 1):
         for axis in "xy":
             columns[f"{axis}{k}"] = np.where(degrees >= k, columns[f"{axis}{k}"], 0).astype(np.int32)
     logits = exact.logits - exact.logits.max(initial=-np.inf)
-    return Quantized(info, rules, columns, np.rint(np.maximum(logits, -1e5) / TIME_STEP).astype(np.int32))
+    intervals = np.rint(np.maximum(logits, -1e5) / TIME_STEP).astype(np.int32)
+    paths = {} if info.paths is None else round_paths(info.paths, exact.paths, LARGEST)
+    return Quantized(info, rules, columns, intervals, **paths)
 
 
 def find_cells(exact: ExactColumns) -> Int32[np.ndarray, " num"]:

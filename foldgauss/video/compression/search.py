@@ -115,7 +115,8 @@ def compress(
     `frames`: the clip, uint8 (num_frames, *model.size, 3), or with alpha (..., 4): the loss is measured against it.
     Without it, the loss is that against a clip at `psnr` dB (default: `ASSUMED_PSNR`) from the model's own images.
     Frames beyond `EXACT_PSNR`, 58.9 dB, count as that. Gaussians are reordered where that is hardly visible; absent
-    parameters (`FoldedSplats.degrees`, `static`, `opaque`) stay absent, and shared colours stay shared.
+    parameters (`FoldedSplats.degrees`, `static`, `opaque`) stay absent, and shared colours stay shared. Shared paths
+    stay as they are, to about a fiftieth of a pixel.
 
     With the clip, fine-tuning compensates for losses and allows coarser steps: all leaves for half of the `passes` each
     time Gaussians have been dropped, paths and colours for a quarter once geometry is rounded, colours for an eighth
@@ -294,8 +295,9 @@ def _take(model: VideoModel, which: Bool[np.ndarray, " num"] | Int[np.ndarray, "
     def index(leaf: np.ndarray) -> np.ndarray:
         return np.asarray(leaf)[which] if np.shape(leaf)[:1] == (num,) else leaf
 
-    splats = eqx.tree_at(lambda s: s.envelope, jax.tree.map(index, model.splats), model.splats.envelope)
-    return eqx.tree_at(lambda m: m.splats, model, splats)
+    splats, common = model.splats, {"envelope": model.splats.envelope, "paths": model.splats.paths}
+    own = jax.tree.map(index, dataclasses.replace(splats, **dict.fromkeys(common)))
+    return dataclasses.replace(model, splats=dataclasses.replace(own, **common))
 
 
 def _undo_rounding(quantized: Quantized, exact: ExactColumns, *, path: bool) -> VideoModel:
@@ -453,5 +455,6 @@ def _select_rows(exact: ExactColumns, kept: Bool[np.ndarray, " num"]) -> ExactCo
     if shade is not None:
         used, shade = np.unique(shade[kept], return_inverse=True)
         info, shade = dataclasses.replace(info, shared=len(used)), shade.ravel().astype(np.int32)
+    path = None if exact.path is None else exact.path[kept]
     own = exact.swapped[kept], exact.turn[kept], exact.without[kept], shade, values, exact.place[kept]
-    return ExactColumns(info, *own, exact.logits)
+    return ExactColumns(info, *own, exact.logits, path, exact.paths)

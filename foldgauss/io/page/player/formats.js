@@ -41,5 +41,6 @@ function checked({ header, leaves }) {
   for (const [name, leaf] of Object.entries(leaves))
     for (let k = 0; k < leaf.length; k++)
       if (!Number.isFinite(leaf[k])) throw new Error(`The file is damaged: ${name} has a value that is not finite. Copy or fit it again.`);
+  if (leaves.path_index?.some((path) => path > header.paths.num_paths)) throw new Error("The file is damaged: path_index has the number of a path that is not there. Copy or fit it again.");
   return { header, leaves };
 }

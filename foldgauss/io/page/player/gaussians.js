@@ -1,4 +1,5 @@
 // A model's Gaussians: their parameters, and what the shader reads of them, texels of four floats and windows of time.
+import { mapsAt, pathsOf } from "./paths.js";
 import { frameTimes } from "./timeline.js";
 
 export const TEXTURE_WIDTH = 2048;
@@ -9,10 +10,10 @@ export const STATIC = Math.fround(Math.log(1024));
 
 export const sigmoid = (x) => 1 / (1 + Math.exp(-x));
 
-/** Numbers per Gaussian of each leaf; `coefficients` has two per power. */
+/** Numbers per Gaussian of each leaf; `coefficients` has two per power; only a model with shared paths has `path_index`. */
 export const WIDTHS = {
   loc: () => 2, log_scale: () => 2, angle_logit: () => 1, time_loc: () => 1, log_time_scale: () => 1,
-  coefficients: (degree) => 2 * degree, opacity_logit: () => 1, color_dc: () => 3,
+  coefficients: (degree) => 2 * degree, opacity_logit: () => 1, color_dc: () => 3, path_index: () => 1,
 };
 
 /**
@@ -20,15 +21,18 @@ export const WIDTHS = {
  *
  * Its `leaves` hold m_t itself, `time_loc` in double precision, since an edit may move it out of the clip. Texels of a
  * Gaussian: 0: m_s, m_t, sigma_t; 1: two standard deviations, cosine and sine of the first one's angle;
- * 2: red, green, blue, opacity; 3 and on: the path's coefficients, two powers each.
+ * 2: red, green, blue, opacity; 3 and on: the path's coefficients, two powers each; in a model with shared paths a last
+ * one with the number of its shared path.
  */
-export function prepare({ header, leaves: { time_loc_logit: logits, frame_times: intervals, ...rest } }) {
-  const num = header.num_gaussians, { degree } = header, texels = 3 + Math.ceil(degree / 2);
-  const rows = Math.ceil((num * texels) / TEXTURE_WIDTH), leaves = { ...rest, time_loc: Float64Array.from(logits, sigmoid) };
+export function prepare({ header, leaves: { time_loc_logit: logits, frame_times: intervals, path_times, path_matrices, path_index, ...rest } }) {
+  const num = header.num_gaussians, { degree } = header, paths = pathsOf(header, { path_times, path_matrices });
+  const texels = 3 + Math.ceil(degree / 2) + (paths ? 1 : 0), rows = Math.ceil((num * texels) / TEXTURE_WIDTH);
+  const leaves = { ...rest, time_loc: Float64Array.from(logits, sigmoid) };
+  if (paths) leaves.path_index = Uint32Array.from(path_index);
   const values = new Float32Array(4 * TEXTURE_WIDTH * rows), times = frameTimes(intervals);
   for (let i = 0; i < num; i++) fillTexels(values, i, leaves, texels, degree);
   const windows = makeWindows(header, num, 4 * texels, values);
-  return { header, num, degree, texels, rows, values, times, windows, leaves, intervals, fingerprint: fingerprint(values, num) };
+  return { header, num, degree, texels, rows, values, times, windows, leaves, paths, intervals, fingerprint: fingerprint(values, num) };
 }
 
 /** Write the texels of Gaussian `i`. */
@@ -45,6 +49,7 @@ export function fillTexels(values, i, leaves, texels, degree) {
   for (let c = 0; c < 3; c++) values[at + 8 + c] = Math.max(0.5 + SH_C0 * leaves.color_dc[3 * i + c], 0);
   values[at + 11] = sigmoid(leaves.opacity_logit[i]);
   for (let k = 0; k < 2 * degree; k++) values[at + 12 + k] = leaves.coefficients[2 * degree * i + k];
+  if (leaves.path_index) values[at + 4 * texels - 4] = leaves.path_index[i];
 }
 
 /** Time windows in which Gaussians are rendered: near m_t, and above the file's scale cutoff. */
@@ -86,10 +91,25 @@ export function condition(model, i, time, lowPass) {
     x = u * (x + values[at + 12 + k]);
     y = u * (y + values[at + 13 + k]);
   }
-  return {
+  const own = {
     i, a, x: values[at] + x, y: values[at + 1] + y,
     first: values[at + 4] ** 2 * a + lowPass, second: values[at + 5] ** 2 * a + lowPass,
     cos: values[at + 6], sin: values[at + 7], opacity: values[at + 11],
+  };
+  const path = model.paths ? values[at + 4 * texels - 4] : 0;
+  return path ? moved(own, mapsAt(model.paths, time).subarray(6 * path, 6 * path + 6), lowPass) : own;
+}
+
+/** A conditioned Gaussian after the map (L | b) of its path. */
+function moved(one, [a, b, right, c, d, down], lowPass) {
+  const { x, y, cos, sin } = one, first = one.first - lowPass, second = one.second - lowPass;
+  const along = [a * cos + b * sin, c * cos + d * sin], across = [b * cos - a * sin, d * cos - c * sin]; // the axes, mapped
+  const xx = first * along[0] ** 2 + second * across[0] ** 2, yy = first * along[1] ** 2 + second * across[1] ** 2;
+  const xy = first * along[0] * along[1] + second * across[0] * across[1], angle = 0.5 * Math.atan2(2 * xy, xx - yy);
+  const longer = 0.5 * (xx + yy) + Math.hypot(0.5 * (xx - yy), xy), shorter = longer > 0 ? ((a * d - b * c) ** 2 * first * second) / longer : 0;
+  return {
+    ...one, x: a * x + b * y + right, y: c * x + d * y + down,
+    first: longer + lowPass, second: shorter + lowPass, cos: Math.cos(angle), sin: Math.sin(angle),
   };
 }
 

@@ -6,6 +6,7 @@ import { withTotals } from "./totals.js";
 const IDENTITY = [[1, 0], [0, 1]];
 const MOST_COPIES = 1000;
 const MOST_GAUSSIANS = 1_000_000; // after multiply: a few hundred bytes each, in each state that is kept
+const MOST_MAPS = 1_000_000; // of shared paths after multiply, 56 bytes each
 
 const isNumber = (own) => typeof own === "number" && Number.isFinite(own) && Math.abs(own) <= 1e9;
 const isList = (length, of = isNumber) => (own) => Array.isArray(own) && own.length === length && own.every(of);
@@ -55,6 +56,8 @@ export function checkTotal(total) {
 /** Copies, each just behind what it is a copy of; they are the selection then, with the originals if asked for. */
 function multiplied(state, { offsets, delays = 0, scale = 1, degrees = 0, about, originals = false }) {
   checkTotal(state.model.num + countOf(state) * offsets.length);
+  const { count, knots } = state.model.paths ?? { count: 0, knots: 0 };
+  if (count * knots * (offsets.length + 1) > MOST_MAPS) throw new Error(`offsets: expected fewer copies of ${count.toLocaleString("en")} shared paths with ${knots.toLocaleString("en")} maps each, got ${offsets.length}.`);
   const source = [], copy = [];
   for (let i = 0; i < state.model.num; i++)
     for (let k = 0; k <= (state.selected[i] ? offsets.length : 0); k++) {

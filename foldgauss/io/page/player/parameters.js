@@ -1,5 +1,6 @@
 // Edits as new parameters of the selected Gaussians: the twin of foldgauss.video.editing.bake, and of Recolor there.
 import { SH_C0, STATIC, condition, sigmoid } from "./gaussians.js";
+import { changedPaths, conjugated, mapsAt, retimed } from "./paths.js";
 import { gathered, indicesOf, withChanged } from "./state.js";
 
 const LUMINANCE = [0.2126, 0.7152, 0.0722];
@@ -9,10 +10,12 @@ const LARGEST_LOGIT = 16.6; // an opacity that float32 rounds to 1
 const logit = (x) => Math.log(x) - Math.log1p(-x);
 const dot = (one, other) => one.reduce((sum, own, k) => sum + own * other[k], 0);
 
-/** m -> c + A (m - c) + b, of rows A, c `about`, b `offset`. */
+/** m -> c + A (m - c) + b, of rows A, c `about`, b `offset`; shared paths go on in the frame that is moved. */
 export function applyAffine(state, [[a, b], [c, d]], about, offset) {
   const { degree } = state.model, identity = a === 1 && b === 0 && c === 0 && d === 1;
   const names = identity ? ["loc"] : ["loc", "coefficients", "log_scale", "angle_logit"];
+  const [right, down] = [offset[0] + (1 - a) * about[0] - b * about[1], offset[1] + (1 - d) * about[1] - c * about[0]];
+  const paths = changedPaths(state, (path) => conjugated(path, [a, b, c, d], [right, down]));
   return withChanged(state, names, (leaves, i) => {
     const { loc, coefficients } = leaves;
     const x = loc[2 * i] - about[0], y = loc[2 * i + 1] - about[1];
@@ -25,7 +28,7 @@ export function applyAffine(state, [[a, b], [c, d]], about, offset) {
       coefficients[k + 1] = c * along + d * across;
     }
     mapAxes(leaves, i, [a, b, c, d]);
-  });
+  }, paths);
 }
 
 /** Log standard deviations and angle of A R S: from the singular values of that matrix, two by two. */
@@ -94,7 +97,7 @@ export function withColor(states, color) {
   return (own) => color.map((one) => (one * dot(own, LUMINANCE) * total) / weighted);
 }
 
-/** Show time t at about + shift + stretch (t - about). Gaussians without a time of their own stay as they are. */
+/** Show time t at about + shift + stretch (t - about). Of Gaussians without a time of their own only the shared path has one. */
 export function applyRetiming(state, shift, stretch, about) {
   const { degree } = state.model, windows = state.model.windows.slice(), moved = (t) => about + shift + stretch * (t - about);
   const after = withChanged(state, ["time_loc", "log_time_scale", "coefficients"], (leaves, i) => {
@@ -104,7 +107,7 @@ export function applyRetiming(state, shift, stretch, about) {
     for (let k = 0; k < 2 * degree; k++) leaves.coefficients[2 * degree * i + k] /= stretch ** (1 + (k >> 1));
     const ends = [moved(windows[2 * i]), moved(windows[2 * i + 1])];
     [windows[2 * i], windows[2 * i + 1]] = stretch > 0 ? ends : ends.reverse();
-  });
+  }, changedPaths(state, (path) => retimed(path, moved)));
   return { ...after, model: { ...after.model, windows } };
 }
 
@@ -117,10 +120,16 @@ export function applyFreeze(state, time) {
     if (!state.selected[i] || (windows[2 * i] < t && t < windows[2 * i + 1])) kept.push(i);
   const held = gathered(state, kept, Uint8Array.from(kept, (i) => state.selected[i])), { model } = held;
   const still = model.windows, { degree } = model;
-  const after = withChanged(held, ["loc", "log_scale", "coefficients", "time_loc", "log_time_scale"], (leaves, i) => {
-    const { x, y, a } = condition(model, i, time, 0);
+  const names = ["loc", "log_scale", "coefficients", "time_loc", "log_time_scale", ...(model.paths ? ["angle_logit", "path_index"] : [])];
+  const after = withChanged(held, names, (leaves, i) => {
+    const { x, y, a } = condition(model, i, time, 0), path = model.paths ? leaves.path_index[i] : 0;
     [leaves.loc[2 * i], leaves.loc[2 * i + 1]] = [x, y];
     for (const k of [2 * i, 2 * i + 1]) leaves.log_scale[k] += 0.5 * Math.log(a);
+    if (path) {
+      const map = mapsAt(model.paths, time).subarray(6 * path, 6 * path + 6);
+      mapAxes(leaves, i, [map[0], map[1], map[3], map[4]]);
+      leaves.path_index[i] = 0;
+    }
     leaves.coefficients.fill(0, 2 * degree * i, 2 * degree * (i + 1));
     leaves.time_loc[i] = 0.5;
     leaves.log_time_scale[i] = STATIC;

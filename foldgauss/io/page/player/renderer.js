@@ -1,5 +1,6 @@
 // WebGL2: renders the Gaussians of one time into a texture of floats, and shows it on the screen.
 import { TEXTURE_WIDTH } from "./gaussians.js";
+import { mapsAt } from "./paths.js";
 import splatVertex from "./splat.vert.glsl";
 import splatFragment from "./splat.frag.glsl";
 import showVertex from "./show.vert.glsl";
@@ -94,6 +95,7 @@ export class Renderer {
     this.original = texture(gl, gl.LINEAR);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, 1, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, null);
     this.originalShown = null;
+    this.maps = texture(gl, gl.NEAREST);
     this.instances = gl.createBuffer();
     this.array = gl.createVertexArray();
     gl.bindVertexArray(this.array);
@@ -126,6 +128,16 @@ export class Renderer {
     if (!found) gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, ...size, 0, gl.RGBA, gl.FLOAT, values);
     held.set(values, made);
     return made;
+  }
+
+  /** Upload the maps of shared paths at a time, two texels each. */
+  takeMaps({ paths }, time) {
+    const { gl } = this, count = paths?.count ?? 0, rows = Math.max(Math.ceil((2 * count) / TEXTURE_WIDTH), 1);
+    const width = rows > 1 ? TEXTURE_WIDTH : Math.max(2 * count, 1), texels = new Float32Array(4 * width * rows);
+    if (paths) mapsAt(paths, time).subarray(6).forEach((own, k) => (texels[4 * Math.floor(k / 3) + (k % 3)] = own));
+    gl.activeTexture(gl.TEXTURE2);
+    gl.bindTexture(gl.TEXTURE_2D, this.maps);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, width, rows, 0, gl.RGBA, gl.FLOAT, texels);
   }
 
   /** Render parts, see `drawOne`, and sum them by their `weight`. */
@@ -177,7 +189,10 @@ export class Renderer {
     gl.bufferData(gl.ARRAY_BUFFER, instances, gl.STREAM_DRAW);
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, gaussians);
+    this.takeMaps(model, time);
     gl.uniform1i(at.gaussians, 0);
+    gl.uniform1i(at.maps, 2);
+    gl.uniform1i(at.hasPaths, model.paths ? 1 : 0);
     gl.uniform1i(at.texels, model.texels);
     gl.uniform1i(at.degree, model.degree);
     gl.uniform1f(at.time, time);

@@ -1,5 +1,6 @@
 // Model files of foldgauss, safetensors with a header of their own: see foldgauss.io.models.model_file and docs/format.md.
 import { STATIC } from "./gaussians.js";
+import { withoutUnused } from "./paths.js";
 
 const FORMAT = "foldgauss-model", VERSION = "1";
 const ARRAYS = { F32: Float32Array, U8: Uint8Array, U16: Uint16Array, U32: Uint32Array, F16: Uint16Array };
@@ -8,6 +9,7 @@ const STATIC_BIT = 128, OPAQUE_BIT = 64, DEGREE_MASK = 63;
 const ABSENT = {
   time_loc_logit: [STATIC_BIT, 0], log_time_scale: [STATIC_BIT, STATIC], opacity_logit: [OPAQUE_BIT, 8],
 };
+const MOST_PATHS = 255;
 const DAMAGED = "The file is damaged or cut short. Copy it again.";
 
 /** {header, leaves} of a video model. Throws an Error for display. */
@@ -25,10 +27,13 @@ export function readSafetensors(buffer) {
   if (colors !== undefined) leaves.color_dc = rows(leaves.color_dc, dense("color_index"), 3);
   if (shapes !== undefined) leaves.log_scale = rows(leaves.log_scale, dense("shape_index"), 2);
   leaves.frame_times = tensor("frame_times.logits");
-  const widths = { loc: 2, log_scale: 2, coefficients: 2 * degree, color_dc: 3 };
+  const widths = { loc: 2, log_scale: 2, coefficients: 2 * degree, color_dc: 3 }, [numPaths, knots] = header.paths ?? [0, 0];
+  if (numPaths) Object.assign(leaves, { path_index: dense("path_index"), path_times: dense("paths.times"), path_matrices: dense("paths.matrices") });
+  const lengths = { frame_times: header.num_frames - 1, path_times: numPaths * knots, path_matrices: 6 * numPaths * knots };
   for (const [name, leaf] of Object.entries(leaves))
-    if (leaf.length !== (name === "frame_times" ? header.num_frames - 1 : num * (widths[name] ?? 1))) throw new Error(DAMAGED);
-  return { header: { compositing: "over", scale_cutoff: 0, ...header, power: envelope("power"), floor: envelope("floor") }, leaves };
+    if (leaf.length !== (lengths[name] ?? num * (widths[name] ?? 1))) throw new Error(DAMAGED);
+  const paths = numPaths ? { num_paths: numPaths, num_knots: knots } : null;
+  return { header: { compositing: "over", scale_cutoff: 0, ...header, paths, power: envelope("power"), floor: envelope("floor") }, leaves };
 }
 
 /** The file's own header, and a function that gives a tensor's values by name. */
@@ -84,12 +89,14 @@ function rows(table, index, width) {
 }
 
 /** A model as a file that foldgauss opens: float32, all leaves dense. Throws an Error for display where none can hold it. */
-export function writeSafetensors({ header, num, degree, leaves, intervals }, metadata) {
+export function writeSafetensors(model, metadata) {
+  const { header, num, degree, leaves, intervals } = model, { paths, index } = withoutUnused(model);
   const outside = leaves.time_loc.filter((own) => !(own > 0 && own < 1));
   if (outside.length) {
     const frames = intervals.length * outside.reduce((most, own) => Math.max(most, own - 1, -own), 0);
     throw new Error(`${outside.length.toLocaleString("en")} Gaussians were moved in time beyond the clip, by up to ${frames.toFixed(1)} frames, where no model file holds them. Make Later, Speed or Delay that much less; or download the edit script, and render it: foldgauss edit MODEL SCRIPT --out edited.mp4.`);
   }
+  if (paths?.count > MOST_PATHS) throw new Error(`The edits give Gaussians ${paths.count} shared paths; a model file holds ${MOST_PATHS}. Make fewer copies; or download the edit script, and render it: foldgauss edit MODEL SCRIPT --out edited.mp4.`);
   const logits = Float32Array.from(leaves.time_loc, (own) => Math.log(own) - Math.log1p(-own));
   const tensors = {
     "frame_times.logits": [intervals, [intervals.length]], "splats.angle_logit": [leaves.angle_logit, [num]],
@@ -99,14 +106,20 @@ export function writeSafetensors({ header, num, degree, leaves, intervals }, met
     "splats.log_time_scale": [leaves.log_time_scale, [num]], "splats.opacity_logit": [leaves.opacity_logit, [num]],
     "splats.time_loc_logit": [logits, [num]],
   };
+  if (paths) {
+    tensors["splats.paths.matrices"] = [Float32Array.from(paths.matrices), [paths.count, paths.knots, 2, 3]];
+    tensors["splats.paths.times"] = [Float32Array.from(paths.times), [paths.count, paths.knots]];
+    tensors["splats.path_index"] = [Uint8Array.from(index), [num], "U8"];
+  }
   const own = {
     num_gaussians: num, degree, envelope: "TimeLikelihood", num_frames: intervals.length + 1, size: header.size, fps: header.fps,
     options: header.options, compositing: header.compositing, scale_cutoff: header.scale_cutoff,
+    ...(paths ? { paths: [paths.count, paths.knots] } : {}),
   };
   const about = { format: FORMAT, version: VERSION, kind: "video", header: JSON.stringify(own), metadata: JSON.stringify(metadata) };
   const entries = { __metadata__: about };
   let end = 0;
-  for (const [name, [values, shape]] of Object.entries(tensors)) entries[name] = { dtype: "F32", shape, data_offsets: [end, (end += values.byteLength)] };
+  for (const [name, [values, shape, dtype = "F32"]] of Object.entries(tensors)) entries[name] = { dtype, shape, data_offsets: [end, (end += values.byteLength)] };
   const text = new TextEncoder().encode(JSON.stringify(entries));
   const padded = new Uint8Array(8 * Math.ceil(text.length / 8)).fill(32);
   padded.set(text);

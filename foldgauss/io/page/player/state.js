@@ -43,17 +43,19 @@ export function originalsOf(state, num) {
 
 /**
  * The state with new values in the named leaves of the selected Gaussians, those that `change(leaves, i)` writes. All
- * other leaves are shared with the state before, so that undoing needs no memory.
+ * other leaves are shared with the state before, so that undoing needs no memory. `moved`: their new shared paths, of
+ * `changedPaths`.
  */
-export function withChanged(state, names, change) {
-  const { model } = state, leaves = { ...model.leaves };
-  for (const name of names) leaves[name] = leaves[name].slice();
+export function withChanged(state, names, change, moved = null) {
+  const { model } = state, leaves = { ...model.leaves }, { path_index: index } = leaves, paths = moved?.paths ?? model.paths;
+  for (const name of moved ? [...names, "path_index"] : names) leaves[name] = leaves[name].slice();
   const values = model.values.slice();
   for (const i of indicesOf(state)) {
     change(leaves, i);
+    if (moved) leaves.path_index[i] = moved.numbers[index[i]];
     fillTexels(values, i, leaves, model.texels, model.degree);
   }
-  return { ...state, model: { ...model, leaves, values } };
+  return { ...state, model: { ...model, leaves, values, paths } };
 }
 
 /** The state without the Gaussians that were moved in time so far beyond the clip that no image of it has them. */
@@ -71,7 +73,7 @@ export function gathered(state, source, selected) {
     return into;
   };
   const rows = Math.ceil((num * texels) / TEXTURE_WIDTH);
-  const leaves = Object.fromEntries(Object.entries(WIDTHS).map(([name, width]) => [name, take(model.leaves[name], width(degree))]));
+  const leaves = Object.fromEntries(Object.entries(WIDTHS).filter(([name]) => model.leaves[name]).map(([name, width]) => [name, take(model.leaves[name], width(degree))]));
   const values = take(model.values, 4 * texels, new Float32Array(4 * TEXTURE_WIDTH * rows));
   const changed = { ...model, num, rows, leaves, values, windows: take(model.windows, 2) };
   return { model: changed, selected, origin: take(state.origin, 1), totals: state.totals, rows: take(state.rows, 1) };

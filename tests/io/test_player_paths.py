@@ -1,0 +1,269 @@
+"""Models with shared paths in the player: their pictures, and those of edits, which move what the picture shows."""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from editor_page import (
+    EDITS,
+    IT,
+    LEVELS,
+    TIMES,
+    WORST,
+    assert_shows,
+    download,
+    drag,
+    drop,
+    picked,
+    read_script,
+    select,
+)
+from soft_models import NUM, OBJECT, SIZE, on_paths, soft_model
+
+from foldgauss.io import load_video_model, save_compact, save_video_model
+from foldgauss.io.page.player_page import quantize_finely
+from foldgauss.render import RenderOptions, Splats2D, render
+from foldgauss.video.models.renderer import VideoRenderer
+
+CASES = {
+    "over": {},
+    "sum, other times": {"compositing": "sum", "degree": 0, "at_frames": False},
+    "floor": {"degree": 2, "power": 1.0, "floor": 0.1},
+    "strong": {"reach": 8.0, "thin": 4.0},
+}
+FIELDS = ("mean", "factor", "opacity", "color")
+#: Colours are in the leaves alone.
+PLACES = {name: EDITS[name] for name in EDITS if name not in ("hue", "gain", "color", "matrix", "fainter", "denser")}
+PLACES["several"] = "\n[[edits]]\n".join(
+    EDITS[name] for name in ("later", "transform", "backwards", "copies", "rotate")
+)
+QUICK = ("transform", "freeze", "several")
+
+
+def make(at_frames=True, reach=1.0, thin=0.0, **how):
+    model = on_paths(soft_model(options=RenderOptions(), **how), at_frames=at_frames, reach=reach)
+    scale = model.splats.log_scale + np.float32([thin / 4, -thin])
+    return eqx.tree_at(lambda m: m.splats.log_scale, model, scale)
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory):
+    """The compact file of a model; every fifth Gaussian lasts."""
+    model, lasting = make(), np.arange(NUM) % 5 == 0
+    leaves = {"time_loc_logit": np.float32(0), "log_time_scale": np.log(np.float32(1024))}
+    leaves = {name: np.where(lasting, own, getattr(model.splats, name)) for name, own in leaves.items()}
+    leaves["coefficients"] = np.where(lasting[:, None, None], np.float32(0), model.splats.coefficients)
+    model = dataclasses.replace(model, splats=dataclasses.replace(model.splats, **leaves))
+    return save_compact(tmp_path_factory.mktemp("moving") / "clip.fgz", quantize_finely(model))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_pictures_are_those_of_the_engine(opened, tmp_path, name):
+    model = make(**CASES[name])
+    path = save_compact(tmp_path / "m.fgz", quantize_finely(model))
+    page = opened(path)
+    assert_shows(page, load_video_model(path))
+    far = np.abs(page.picture(0.3).astype(float) - VideoRenderer(model).frame(0.3))  # quantized finely
+    assert (far.mean() < 0.2) & (far.max() <= 3)
+    still = dataclasses.replace(model.splats, path_index=None, paths=None)
+    without = save_compact(tmp_path / "still.fgz", quantize_finely(dataclasses.replace(model, splats=still)))
+    assert np.abs(page.picture(0.9).astype(float) - opened(without).picture(0.9)).mean() > 1
+
+
+def test_any_file_is_opened(opened, moving, tmp_path):
+    bare = opened(None, fresh=True)
+    for name in ("over", "floor"):
+        model = make(**CASES[name])
+        drop(bare, save_video_model(tmp_path / f"{name}.safetensors", model))
+        bare.until(f"foldgauss.stats?.total === {NUM} && document.title === '{name}'").page.keyboard.press("k")
+        assert_shows(bare, model)
+    drop(bare, moving)
+    bare.until("document.title === 'clip'").page.keyboard.press("k")
+    assert_shows(bare, load_video_model(moving))
+
+
+@pytest.mark.parametrize("what", ["number", "lengths", "not finite"])
+def test_damaged_paths_are_told(opened, tmp_path, what):
+    model, bare = make(), opened(None, fresh=True)
+    if what == "number":
+        model = eqx.tree_at(lambda m: m.splats.path_index, model, np.full(NUM, 3, np.uint8))
+    if what == "not finite":
+        model = eqx.tree_at(lambda m: m.splats.paths.times, model, model.splats.paths.times * np.float32(np.nan))
+    path = save_video_model(tmp_path / "m.safetensors", model)
+    if what == "lengths":
+        path.write_bytes(path.read_bytes().replace(b'\\"paths\\": [2, 7]', b'\\"paths\\": [2, 6]'))
+    drop(bare, path)
+    bare.until("!document.getElementById('toast').hidden")
+    assert "damaged" in bare.page.locator("#toast").inner_text()
+
+
+# ----------------------------------------------------------------------------------------------- edits
+
+
+class Reference:
+    """A video as splats of each time, in model space, each edit exact in the frame."""
+
+    def __init__(self, model):
+        self.model, self.mask = model, np.arange(NUM) < 12
+        at = eqx.filter_jit(lambda splats, t: splats.at(t))
+        self.at = lambda t: [np.asarray(getattr(at(model.splats, jnp.float32(t)), name)) for name in FIELDS]
+
+    def edit(self, change):
+        """`change(at, t)` gives leaves; those of the selected Gaussians are taken."""
+        before, mask = self.at, self.mask
+
+        def at(t):
+            pairs = zip(change(before, t), before(t), strict=True)
+            return [np.where(mask.reshape(-1, *[1] * (old.ndim - 1)), new, old) for new, old in pairs]
+
+        self.at = at
+
+    def affine(self, matrix=((1, 0), (0, 1)), about=(0, 0), offset=(0, 0)):
+        matrix, about, offset = map(np.array, (matrix, about, offset))
+
+        def change(at, t):
+            mean, factor, *others = at(t)
+            return [(mean - about) @ matrix.T + about + offset, matrix @ factor, *others]
+
+        self.edit(change)
+
+    def gather(self, source, mask):
+        before = self.at
+        self.at, self.mask = lambda t: [own[source] for own in before(t)], mask
+
+    def apply(self, do, **keys):
+        if do == "move":
+            self.affine(offset=keys["offset"])
+        elif do == "scale":
+            self.affine(np.diag(np.broadcast_to(keys["factor"], 2)), keys["about"])
+        elif do == "rotate":
+            cos, sin = np.cos(np.radians(keys["degrees"])), np.sin(np.radians(keys["degrees"]))
+            self.affine(((cos, -sin), (sin, cos)), keys["about"])
+        elif do == "transform":
+            self.affine(keys["matrix"], keys["about"], keys.get("offset", (0, 0)))
+        elif do == "retime":
+            shift, stretch, about = (
+                keys.get(name, other) for name, other in (("shift", 0), ("stretch", 1), ("about", 0))
+            )
+            self.edit(lambda at, t: at(about + (t - about - shift) / stretch))
+        elif do == "freeze":
+            times = np.asarray(self.model.frame_times.times())
+            frozen = np.interp(keys["at"], np.arange(len(times)), times)
+            self.edit(lambda at, t: at(frozen))
+        elif do == "vanish":
+            self.gather(np.flatnonzero(~self.mask), np.zeros((~self.mask).sum(), bool))
+        elif do in ("to_front", "to_back"):
+            order = np.argsort(~self.mask if do == "to_front" else self.mask, kind="stable")
+            self.gather(order, self.mask[order])
+        elif do == "multiply":
+            self.multiply(**keys)
+        else:
+            assert do in ("recolor", "opacity")
+
+    def multiply(self, offsets, delays=0, scale=1, degrees=0, about=(0, 0), originals=False):
+        count = np.where(self.mask, len(offsets) + 1, 1)
+        copy = np.concatenate([np.arange(own) for own in count])
+        chosen = np.repeat(self.mask, count)
+        self.gather(np.repeat(np.arange(len(self.mask)), count), chosen)
+        for k, offset in enumerate(offsets):
+            self.mask = copy == k + 1
+            self.apply("scale", factor=scale, about=about)
+            self.apply("rotate", degrees=degrees, about=about)
+            self.apply("move", offset=offset)
+            self.apply("retime", shift=np.broadcast_to(delays, len(offsets))[k])
+        self.mask = chosen if originals else copy > 0
+
+    def picture(self, t):
+        splats = Splats2D(*(jnp.asarray(own, jnp.float32) for own in self.at(t))).to_pixels(SIZE)
+        how = {"compositing": self.model.compositing, "options": self.model.options, "engine": "cpu"}
+        return np.asarray(render(splats, SIZE, **how)) * 255
+
+    def assert_shown(self, page):
+        for t in TIMES:
+            far = np.abs(page.picture(t) - np.clip(self.picture(t), 0, 255))
+            assert (far.mean() < LEVELS + 0.3) & (far.max() <= WORST + 0.5), (t, far.mean(), far.max())
+
+
+def steps_of(page):
+    return [step for step in page.page.evaluate("foldgauss.player.editing.history.current") if "do" in step]
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in PLACES]
+)
+def test_an_edit_moves_what_is_seen(opened, moving, tmp_path, name):
+    page, reference = opened(moving), Reference(load_video_model(moving))
+    before = page.picture(0.9)
+    read_script(page, IT + PLACES[name])
+    for step in steps_of(page):
+        reference.apply(**step)
+    reference.assert_shown(page)
+    assert np.abs(page.picture(0.9).astype(float) - before).mean() > 0.3 or name in ("front", "back")
+    download(page, "#download-model", tmp_path / "own.safetensors")
+    again = load_video_model(tmp_path / "own.safetensors")
+    assert_shows(page, again)  # what is downloaded is what is seen
+    edited = page.picture(0.9)
+    page.page.keyboard.press("z")
+    np.testing.assert_array_equal(page.picture(0.9), before)
+    bare = opened(None, fresh=True)
+    drop(bare, tmp_path / "own.safetensors")
+    bare.until("document.title === 'own'").page.keyboard.press("k")
+    assert np.abs(bare.picture(0.9).astype(float) - edited).max() <= WORST
+
+
+def count_paths(page):
+    return page.page.evaluate("foldgauss.player.state.model.paths.count")
+
+
+def test_paths_are_made_where_they_are_needed(opened, tmp_path):
+    """One for each edit and path of the selection; it takes the place of one that is left without Gaussians."""
+    model = make()
+    shifts = np.array(model.splats.paths.matrices)
+    shifts[0, :, :, :2] = np.eye(2)
+    model = eqx.tree_at(lambda m: m.splats.paths.matrices, model, shifts)
+    page = opened(save_compact(tmp_path / "m.fgz", quantize_finely(model)))
+    read_script(page, IT + EDITS["move"])
+    assert count_paths(page) == 3  # the first path is a translation, too: the order does not matter
+    for name in ("rotate", "move", "later"):
+        read_script(page, IT + EDITS[name] + "\n[[edits]]\n" + EDITS["scale"])
+        assert count_paths(page) == 4, name  # those of steps between are used again
+    read_script(page, (IT + EDITS["rotate"]).replace("0-11", f"0-{NUM - 1}"))
+    assert count_paths(page) == 2
+    read_script(page, IT + EDITS["copies"] + "\n[[edits]]\n" + EDITS["rotate"])
+    assert count_paths(page) == 6
+    read_script(page, IT + EDITS["freeze"] + "\n[[edits]]\n" + EDITS["move"])
+    assert count_paths(page) == 2
+
+
+def test_tools_take_what_is_seen_there(opened, moving):
+    model, page = load_video_model(moving), opened(moving)
+    page.page.evaluate("foldgauss.seek(0.9)")
+    page.page.click("#edit")
+    page.page.click("[data-tool=rectangle]")
+    box = (-0.3, -0.2, 0.2, 0.25)
+    drag(page, [box[:2], box[2:]])
+    at = eqx.filter_jit(lambda own: own.splats.at(jnp.float32(0.9)))(model)
+    mean, alive = np.asarray(at.mean), np.asarray(at.opacity) > 0
+    inside = ((mean > box[:2]) & (mean < box[2:])).all(1) & alive
+    found = picked(page)
+    assert found <= set(np.flatnonzero(inside).tolist())
+    assert len(found) > 0.4 * inside.sum()
+    select(page, np.flatnonzero(OBJECT))
+    place = page.page.evaluate("foldgauss.controls.tools.picker.placeOf(foldgauss.player.state, 0.9)")
+    own = mean[OBJECT & alive]
+    np.testing.assert_allclose(place["box"], [*own.min(0), *own.max(0)], atol=1e-5)
+
+
+def test_copies_beyond_what_can_be_held_are_refused(opened, moving, tmp_path):
+    """A model file holds 255 paths; the page itself more."""
+    page = opened(moving)
+    offsets = [[round(0.001 * k, 3), 0.0] for k in range(150)]
+    read_script(page, IT + f'do = "multiply"\noffsets = {offsets}\n')
+    assert count_paths(page) == 300  # the first copy stays where it is
+    page.page.evaluate("foldgauss.files.downloadModel()")
+    assert "model file holds 255" in page.page.locator("#toast").inner_text()
+    page.page.evaluate("foldgauss.player.state.model.paths.knots = 1e6")
+    with pytest.raises(Exception, match="expected fewer copies of 300 shared paths"):
+        page.page.evaluate("foldgauss.player.editing.edit({ do: 'multiply', offsets: [[0, 0]] })")
