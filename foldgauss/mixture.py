@@ -552,8 +552,7 @@ def _sample_from(mixture: AbstractMixture, key, sample_shape, component: Array) 
     """One sample from each of the chosen components."""
     components, batch = mixture.components, mixture.batch_shape
     if isinstance(components, FoldedGaussian | Gaussian) and not _shares_parameters(components):
-        shares = isinstance(components, FoldedGaussian) and components.fold.shares_leaves
-        if not shares:
+        if isinstance(components, Gaussian) or not components.fold.shares_leaves:
             components = broadcast_leaves(components, (*batch, mixture.num_components))
         return _take_components(components, component, batch).sample(key)
     every = components.sample(key, sample_shape)
@@ -568,10 +567,7 @@ def _shares_parameters(components) -> bool:
 
 
 def _take_components(components, component: Array, batch: tuple[int, ...]):
-    """The components at the indices `component`, as one distribution of batch shape `component.shape`.
-
-    A leaf that all components share stays as it is.
-    """
+    """The components at the indices `component`, of batch shape `component.shape`; shared leaves stay as they are."""
     size, rank = math.prod(batch), len(batch)
     flat = component.reshape(-1, size)
     place = jnp.arange(size)[None]

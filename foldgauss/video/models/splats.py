@@ -152,7 +152,7 @@ class FoldedSplats(eqx.Module):
             raise invalid(
                 "mixture.components.time_loc", expected="times in (0, 1)", got=concrete_value(time_loc), cure=cure
             )
-        log_scale, angle = _axes(components.scale_tril)
+        log_scale, angle = find_axes(components.scale_tril)
         log_weights = mixture.log_weights
         log_opacity = log_weights - log_weights.max() + float(np.log(PEAK_OPACITY))
         return cls(
@@ -221,7 +221,7 @@ def _lower_factor(factor: Float[Array, "num 2 2"]) -> Float[Array, "num 2 2"]:
     return jnp.stack([rows[0], rows[1] / top[:, None]], -2)
 
 
-def _axes(tril: Float[Array, "num 2 2"]) -> tuple[Float[Array, "num 2"], Float[Array, " num"]]:
+def find_axes(tril: Float[Array, "num 2 2"]) -> tuple[Float[Array, "num 2"], Float[Array, " num"]]:
     """Logarithms of the two standard deviations, the greater first, and the angle: inverse of `rotated_scale_tril`.
 
     Closed-form singular values of [[p, 0], [q, r]]. The angle is in [pi/2, 3 pi/2]; it is unique modulo pi.
