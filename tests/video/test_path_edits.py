@@ -4,9 +4,19 @@ import dataclasses
 
 import numpy as np
 import pytest
+from commands import run
 from soft_models import NUM, OBJECT, SIZE, soft_model
 
-from foldgauss.io import load_selection, load_video_model, save_selection, save_video_model
+from foldgauss.io import (
+    frame_gaussians,
+    load_selection,
+    load_video_model,
+    read_pseudomesh,
+    save_selection,
+    save_video_model,
+    write_pseudomesh,
+)
+from foldgauss.render import Camera, project
 from foldgauss.video import EditedVideo, SegmentedVideo, Selection, VideoModel, edit, layers, select
 from foldgauss.video.editing.bake import gather_splats
 from foldgauss.video.models.renderer import VideoRenderer
@@ -145,3 +155,26 @@ def test_half_precision_keeps_paths(tmp_path):
     again = load_video_model(save_video_model(tmp_path / "half.safetensors", half)).splats
     np.testing.assert_array_equal(again.paths.matrices, MODEL.splats.paths.matrices)
     np.testing.assert_array_equal(again.path_index, INDEX)
+
+
+def test_frames_for_other_programs_are_those_of_the_model(tmp_path):
+    video = edit(MODEL).select(OBJECT).move((0.1, 0)).video()
+    mesh = read_pseudomesh(write_pseudomesh(tmp_path / "mesh", video, [0.3]))
+    np.testing.assert_allclose(mesh.frame(0), VideoRenderer(video).frame(0.3), atol=1)
+    seen = project(frame_gaussians(video, 0.3), Camera.front(SIZE[0] / SIZE[1]), SIZE)
+    np.testing.assert_allclose(seen.mean, VideoRenderer(video).splats(0.3).mean, atol=1e-3)
+
+
+def test_info_tells_who_follows_paths(tmp_path, capsys):
+    for model, text in (
+        (MODEL, "26 of 40 Gaussians follow 2 paths, 6 knots"),
+        (path_model(num_paths=1), "26 of 40 Gaussians follow the camera, 6 knots"),
+        (layers(soft_model(), MODEL), "26 of 80 Gaussians follow 2 paths, 6 knots"),
+    ):
+        index = np.minimum(INDEX, 1) if "camera" in text else INDEX
+        if isinstance(model, VideoModel):
+            model = dataclasses.replace(model, splats=dataclasses.replace(model.splats, path_index=index))
+        assert run("info", save_video_model(tmp_path / "m.safetensors", model)) == 0
+        assert text in capsys.readouterr().out
+    assert run("info", save_video_model(tmp_path / "m.safetensors", soft_model())) == 0
+    assert "Gaussians follow" not in capsys.readouterr().out

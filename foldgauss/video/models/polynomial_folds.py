@@ -102,7 +102,7 @@ class _Places:
         return coefficients / unit[:, None, None] ** np.arange(1, highest + 1)[:, None], error
 
     def _sample(self, which: Int[np.ndarray, " num"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """u = m_t - t, weight (num, times), 0 where a Gaussian is not shown, and the shift since m_t (num, times, 2)."""
+        """u = m_t - t, weight (num, times), 0 where a Gaussian is not shown, and the shift since m_t."""
         splats, index = self.splats, self.splats.path_index[which]
         time_loc = expit(splats.time_loc_logit[which].astype(np.float64))
         time_scale = np.exp(splats.log_time_scale[which].astype(np.float64))
