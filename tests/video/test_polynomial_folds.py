@@ -85,6 +85,13 @@ def test_short_lives_between_frames_and_whole_clips_are_fitted():
     assert error.max() < 0.01
 
 
+def test_gaussians_without_folds_of_their_own_get_one():
+    model = smooth_model(lambda t: np.stack([0.2 * t, -0.1 * t], -1), degree=0)
+    plain, error = without_paths(model)
+    assert plain.degree == 1
+    assert error.max() < 1e-3
+
+
 def test_what_cannot_be_converted():
     plain = soft_model()
     assert without_paths(plain)[0] is plain
