@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from foldgauss.envelope import CallableEnvelope, Constant, TimeLikelihood, plain_envelope
     from foldgauss.estimator import FoldedGaussianMixture as FoldedGaussianMixture
     from foldgauss.estimator import FoldedMixtureRegressor as FoldedMixtureRegressor
-    from foldgauss.fold import CallableFold, FourierFold, PolynomialFold, SplineFold, ZeroFold
+    from foldgauss.fold import CallableFold, FourierFold, PolynomialFold, SharedPathFold, SplineFold, ZeroFold
     from foldgauss.mixture import FoldedMixture, GaussianMixture
 
 for _kind, _location in {
@@ -40,6 +40,7 @@ __all__ = [
     "GaussianMixture",
     "Normal",
     "PolynomialFold",
+    "SharedPathFold",
     "SplineFold",
     "TimeLikelihood",
     "ZeroFold",
@@ -53,7 +54,7 @@ _HOMES = {
     "analysis.divergence": ("kl_divergence",),
     "envelope": ("CallableEnvelope", "Constant", "TimeLikelihood", "plain_envelope"),
     "estimator": ("FoldedGaussianMixture", "FoldedMixtureRegressor"),
-    "fold": ("CallableFold", "FourierFold", "PolynomialFold", "SplineFold", "ZeroFold"),
+    "fold": ("CallableFold", "FourierFold", "PolynomialFold", "SharedPathFold", "SplineFold", "ZeroFold"),
     "mixture": ("FoldedMixture", "GaussianMixture"),
 }
 

@@ -32,7 +32,7 @@ from foldgauss._runtime.threads import check_not_forked
 from foldgauss.analysis import interop, moments
 from foldgauss.analysis.conditional import TimeDensity, TimeMixture, conditional_gaussian, time_density, time_mixture
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood, as_envelope
-from foldgauss.fold import AbstractFold, CallableFold, ZeroFold, as_fold, evaluate_shift, restrict_fold
+from foldgauss.fold import AbstractFold, ZeroFold, as_fold, evaluate_shift, restrict_fold
 from foldgauss.gaussian import Gaussian, Normal
 
 __all__ = ["FoldedGaussian", "Gaussian", "Normal"]
@@ -115,7 +115,7 @@ class FoldedGaussian(BatchModule):
         self.loc, self.scale_tril, self.time_loc, self.time_scale = broadcast(parts, batch)
         self.envelope = broadcast_leaves(envelope, batch)
         # Parameters of a callable (say a network) are not copied per component: they keep axes of size 1.
-        self.fold = expand_leaves(fold, len(batch)) if isinstance(fold, CallableFold) else broadcast_leaves(fold, batch)
+        self.fold = expand_leaves(fold, len(batch)) if fold.shares_leaves else broadcast_leaves(fold, batch)
 
     @property
     def event_shape(self) -> tuple[int, ...]:

@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, ArrayLike, Float, PyTree
+from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
-from foldgauss._numerics.batch import BatchModule
+from foldgauss._numerics.batch import BatchModule, common_dtype, concrete_value, expand_leaves, ranked_leaves
+from foldgauss._numerics.piecewise import locate
 from foldgauss._numerics.pointwise import call_elementwise, split_parameters
 from foldgauss._numerics.triangular import join_columns, split_columns
 from foldgauss._runtime.checks import invalid
@@ -28,6 +29,7 @@ __all__ = [
     "CallableFold",
     "FourierFold",
     "PolynomialFold",
+    "SharedPathFold",
     "SplineFold",
     "ZeroFold",
     "as_fold",
@@ -46,6 +48,8 @@ class AbstractFold(BatchModule):
 
     #: Whether it depends on its leaves only; a user's function may also close over tracers.
     is_closed: ClassVar[bool] = False
+    #: Whether some leaves are the same for a whole batch, and then keep axes of size 1 instead of being copied.
+    shares_leaves: ClassVar[bool] = False
 
     @abstractmethod
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
@@ -239,6 +243,8 @@ class CallableFold(AbstractFold):
     # Set at construction, from the leaves of a single fold, so that the axes of a later vmap are known to be batch.
     parameter_ranks: tuple[int, ...] = eqx.field(static=True)
 
+    shares_leaves = True
+
     def __init__(self, function: Callable[[Float[Array, ""]], Float[Array, " d-1"]]):
         if not callable(function):
             raise invalid("function", expected="a callable u -> (d-1,)", got=repr(function))
@@ -250,6 +256,113 @@ class CallableFold(AbstractFold):
 
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
         return call_elementwise(self.parameters, self.static, self.parameter_ranks, u)
+
+
+class SharedPathFold(AbstractFold):
+    """A path that many Folded-Gaussians share, such as the motion of a camera, and a fold of each one's own.
+
+        f(u) = A(m_t - u) (q + g(u)) - A(m_t) q
+
+    A is the path, an affine map of space for each time: linear between the knots, constant before the first and after
+    the last. `anchor` is q, the place that the path moves, `time_loc` is m_t, and `fold` is g, with g(0) = 0. So
+    f(0) = 0, and with `loc` = A(m_t) q (`home`) the center at time t is A(t) (q + g(m_t - t)).
+
+    A fold moves centers only: that a path also turns and stretches the covariance is not represented. Moments are by
+    quadrature, with an error of some percent of a jump where two times of a path are equal.
+
+    **Shapes:** `times` (paths, knots), which do not decrease, and `matrices` (paths, knots, d-1, d), rows (linear part
+    | offset), usually without batch dimensions; `anchor` (*batch, d-1); `time_loc` (*batch,); `index` (*batch,), whole
+    numbers: the path of each element from 1, 0 for none, f = g; u (*batch,) -> (*batch, d-1), leading dimensions
+    broadcast. Paths are not copied for each element of a batch (as the parameters of a `CallableFold`), so `vmap` over
+    a batch of distributions needs `in_axes=None` for them, or a call within of the constructor.
+
+    **Units:** `anchor`, offsets and f are space, `times` and u time, linear parts have none.
+
+    **Example:** `SharedPathFold(ZeroFold(1), [2.0], time_loc=0.5, index=1, times=[[0.0, 1.0]], matrices=[[[[1.0, 0.0]],
+    [[3.0, 0.0]]]])(-0.5)  # from 2 * 2 to 3 * 2: [2.]`
+
+    **Source:** the "suitably chosen" f of eq:transform_s. **Raises:** ValueError for shapes that do not fit, times that
+    decrease, and for paths that there are not.
+    """
+
+    fold: AbstractFold
+    anchor: Float[Array, "*batch d-1"]
+    time_loc: Float[Array, "*batch"]
+    index: Int[Array, "*batch"]
+    times: Float[Array, "*batch paths knots"]
+    matrices: Float[Array, "*batch paths knots d-1 d"]
+
+    shares_leaves = True
+
+    def __init__(
+        self,
+        fold: AbstractFold | Callable,
+        anchor: ArrayLike,
+        *,
+        time_loc: ArrayLike,
+        index: ArrayLike,
+        times: ArrayLike,
+        matrices: ArrayLike,
+    ):
+        dtype = common_dtype(anchor, time_loc, times, matrices)
+        self.fold, self.index = as_fold(fold), jnp.asarray(index, jnp.int32)
+        self.anchor, self.time_loc, self.times, self.matrices = (
+            jnp.asarray(x, dtype) for x in (anchor, time_loc, times, matrices)
+        )
+        self._check(np.shape(self.anchor)[-1:])
+
+    def _check(self, space: tuple[int, ...]) -> None:
+        dims = (*space, *(n + 1 for n in space))
+        if self.times.ndim < 2 or not dims or self.matrices.shape[-4:] != (*self.times.shape[-2:], *dims):
+            expected, got = "times (paths, knots) and matrices (paths, knots, d-1, d)", f"{self.times.shape}"
+            raise invalid("times, matrices", expected=expected, got=f"{got} and {self.matrices.shape}")
+        times, index = concrete_value(self.times), concrete_value(self.index)
+        if times is not None and (np.diff(times) < 0).any():
+            raise invalid("times", expected="times that do not decrease", got=times.tolist())
+        most = self.times.shape[-2]
+        if index is not None and ((index < 0) | (index > most)).any():
+            raise invalid("index", expected=f"paths from 1 to {most}, or 0", got=index.tolist())
+
+    @property
+    def is_closed(self) -> bool:
+        return self.fold.is_closed
+
+    def maps(self, t: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1 d"]:
+        """The maps A(t) of the elements at times t; the identity for those on no path."""
+        t = jnp.asarray(t)
+        own, t = self._aligned(t)
+        path = jnp.maximum(own.index - 1, 0)
+        times = jnp.take_along_axis(own.times, path[..., None, None], axis=-2)[..., 0, :]
+        before, after, fraction = locate(times, t)
+        num_paths, num_knots, *dims = own.matrices.shape[-4:]
+        flat = own.matrices.reshape(*own.matrices.shape[:-4], num_paths * num_knots, *dims)
+
+        def pick(knot: Array) -> Array:
+            return jnp.take_along_axis(flat, (path * num_knots + knot)[..., None, None, None], axis=-3)[..., 0, :, :]
+
+        fraction = fraction[..., None, None]
+        maps = (1 - fraction) * pick(before) + fraction * pick(after)
+        return jnp.where((own.index > 0)[..., None, None], maps, jnp.eye(*dims, dtype=maps.dtype))
+
+    @property
+    def home(self) -> Float[Array, "*batch d-1"]:
+        """A(m_t) q, the `loc` of the Folded-Gaussian."""
+        return _apply_maps(self.maps(self.time_loc), self.anchor)
+
+    def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
+        own, u = self._aligned(jnp.asarray(u))
+        shift = own.fold(u)
+        moved = _apply_maps(own.maps(own.time_loc - u), own.anchor + shift) - own.home
+        return jnp.where((own.index > 0)[..., None], moved, shift)
+
+    def _aligned(self, u: Array) -> tuple["SharedPathFold", Array]:
+        """The fold and u, with equal batch ranks."""
+        rank = max(u.ndim, *(leaf.ndim - event for leaf, event in ranked_leaves(self)))
+        return expand_leaves(self, rank), _with_rank(u, rank)
+
+
+def _apply_maps(maps: Float[Array, "*#batch d-1 d"], place: Float[Array, "*#batch d-1"]) -> Float[Array, "*#batch d-1"]:
+    return (maps[..., :-1] * place[..., None, :]).sum(-1) + maps[..., -1]
 
 
 def as_fold(fold: AbstractFold | Callable) -> AbstractFold:
@@ -353,6 +466,10 @@ class RestrictedFold(AbstractFold):
     @property
     def is_closed(self) -> bool:
         return self.fold.is_closed
+
+    @property
+    def shares_leaves(self) -> bool:
+        return self.fold.shares_leaves
 
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch kept"]:
         return self.fold(u)[..., np.array(self.indices)]

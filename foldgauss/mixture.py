@@ -22,7 +22,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float, Int, Key
 
-from foldgauss._numerics.batch import align, as_value, broadcast_leaves, check_event
+from foldgauss._numerics.batch import align, as_value, broadcast_leaves, check_event, expand_leaves
 from foldgauss._numerics.factor import normalize_indices
 from foldgauss._runtime import notebook_hooks
 from foldgauss._runtime.checks import invalid
@@ -552,7 +552,8 @@ def _sample_from(mixture: AbstractMixture, key, sample_shape, component: Array) 
     """One sample from each of the chosen components."""
     components, batch = mixture.components, mixture.batch_shape
     if isinstance(components, FoldedGaussian | Gaussian) and not _shares_parameters(components):
-        components = broadcast_leaves(components, (*batch, mixture.num_components))
+        if isinstance(components, Gaussian) or not components.fold.shares_leaves:
+            components = broadcast_leaves(components, (*batch, mixture.num_components))
         return _take_components(components, component, batch).sample(key)
     every = components.sample(key, sample_shape)
     event = every.ndim - component.ndim - 1
@@ -566,16 +567,18 @@ def _shares_parameters(components) -> bool:
 
 
 def _take_components(components, component: Array, batch: tuple[int, ...]):
-    """The components at the indices `component`, as one distribution of batch shape `component.shape`."""
+    """The components at the indices `component`, of batch shape `component.shape`; shared leaves stay as they are."""
     size, rank = math.prod(batch), len(batch)
     flat = component.reshape(-1, size)
     place = jnp.arange(size)[None]
 
     def pick(leaf):
+        if set(leaf.shape[: rank + 1]) == {1}:
+            return leaf.reshape(*(1,) * component.ndim, *leaf.shape[rank + 1 :])
         rows = leaf.reshape(size, *leaf.shape[rank:])
         return rows[jnp.broadcast_to(place, flat.shape), flat].reshape(*component.shape, *leaf.shape[rank + 1 :])
 
-    return jax.tree.map(pick, components)
+    return jax.tree.map(pick, expand_leaves(components, rank + 1))
 
 
 # --- moments -------------------------------------------------------------------------------------------------

@@ -13,7 +13,17 @@ from jaxtyping import Array, Float
 from scipy.interpolate import BSpline
 
 from foldgauss.distribution import FoldedGaussian
-from foldgauss.fold import AbstractFold, CallableFold, FourierFold, PolynomialFold, SplineFold, ZeroFold, as_fold
+from foldgauss.fold import (
+    AbstractFold,
+    CallableFold,
+    FourierFold,
+    PolynomialFold,
+    SharedPathFold,
+    SplineFold,
+    ZeroFold,
+    as_fold,
+)
+from foldgauss.mixture import FoldedMixture
 
 #: Jitted once: called eagerly, each operation would be compiled alone.
 APPLY = eqx.filter_jit(lambda fold, u: fold(u))
@@ -31,6 +41,11 @@ class _Line(eqx.Module):
 
 
 KNOTS = [-1.0, -1.0, -1.0, -1.0, 0.2, 1.0, 1.0, 1.0, 1.0]
+PATHS = {
+    "times": np.array([[-0.5, 0.1, 0.6], [0.2, 0.2, 0.9]]),
+    "matrices": np.eye(2, 3) + 0.3 * np.random.default_rng(2).normal(size=(2, 3, 2, 3)),
+}
+MOVES = [[[[1.0, 0.0]], [[3.0, 0.0]]]]
 FOLDS = {
     "zero": lambda: ZeroFold(2),
     "degree 0": lambda: PolynomialFold(jnp.zeros((0, 2))),
@@ -38,6 +53,8 @@ FOLDS = {
     "spline": lambda: SplineFold(KNOTS, np.arange(10.0).reshape(5, 2) ** 1.5, degree=3),
     "steps": lambda: SplineFold([-1.0, 0.0, 0.5], [[1.0, 2.0], [3.0, -1.0]], degree=0),
     "fourier": lambda: FourierFold([[1.0, -2.0], [0.5, 0.25]], [[0.3, 1.0], [0.0, -1.0]], period=1.7),
+    "path": lambda: SharedPathFold(FOLDS["cubic"](), [0.3, -1.0], time_loc=0.25, index=2, **PATHS),
+    "no path": lambda: SharedPathFold(ZeroFold(2), [0.3, -1.0], time_loc=0.25, index=0, **PATHS),
     "function": lambda: CallableFold(_wave),
     "pytree": lambda: CallableFold(_Line(jnp.array([1.0, 2.0]))),
 }
@@ -195,6 +212,11 @@ def test_as_fold_wraps_only_what_is_no_fold():
         (lambda: FourierFold([[1.0]], [[1.0], [2.0]], period=1.0), "cosine"),
         (lambda: FourierFold([[1.0]], [[1.0]], period=0.0), "period"),
         (lambda: ZeroFold(1.5), "dim"),
+        (lambda: SharedPathFold(ZeroFold(2), 0.3, time_loc=0.0, index=1, **PATHS), "times, matrices"),
+        (lambda: SharedPathFold(ZeroFold(3), jnp.ones(3), time_loc=0.0, index=1, **PATHS), "times, matrices"),
+        (lambda: SharedPathFold(ZeroFold(2), jnp.ones(2), time_loc=0.0, index=3, **PATHS), "index"),
+        (lambda: SharedPathFold(ZeroFold(2), jnp.ones(2), time_loc=0.0, index=-1, **PATHS), "index"),
+        (lambda: SharedPathFold(ZeroFold(1), [1.0], time_loc=0, index=1, times=[[1, 0]], matrices=MOVES), "times"),
         (lambda: as_fold(3.0), "function"),
     ],
 )
@@ -235,3 +257,92 @@ def test_a_field_without_its_shape_is_an_error():
 
     with pytest.raises(ValueError, match=r"Own: expected annotated as Float.*field way without its shape"):
         FoldedGaussian(jnp.zeros(2), jnp.eye(2), time_loc=0.0, time_scale=1.0, fold=Own(jnp.ones(2)))
+
+
+def place_on_path(path, t):
+    """A(t) by NumPy: linear between the knots, constant beyond them."""
+    times, maps = PATHS["times"][path], PATHS["matrices"][path].reshape(3, 6)
+    return np.array([np.interp(t, times, column) for column in maps.T]).reshape(2, 3)
+
+
+def test_a_path_moves_the_anchor_with_its_own_fold():
+    rng, num = np.random.default_rng(4), 7
+    anchor, time_loc, u = rng.normal(size=(num, 2)), rng.uniform(-1, 1, num), rng.uniform(-1, 1, num)
+    index, own = np.array([0, 1, 2, 1, 2, 0, 1]), rng.normal(size=(num, 3, 2))
+    with jax.enable_x64(True):
+        fold = SharedPathFold(PolynomialFold(own), anchor, time_loc=time_loc, index=index, **PATHS)
+        got, home = APPLY(fold, u), fold.home
+        np.testing.assert_array_equal(APPLY(fold, np.zeros(num)), np.zeros((num, 2)))
+        along = APPLY(fold, jnp.asarray(u[:, None]))
+    for k in range(num):
+        g = sum(own[k, j] * u[k] ** (j + 1) for j in range(3))
+        expected, start = g, anchor[k]
+        if index[k]:
+            then, now = (place_on_path(index[k] - 1, t) for t in (time_loc[k] - u[k], time_loc[k]))
+            start = now[:, :2] @ anchor[k] + now[:, 2]
+            expected = then[:, :2] @ (anchor[k] + g) + then[:, 2] - start
+        np.testing.assert_allclose(got[k], expected, atol=1e-12)
+        np.testing.assert_allclose(along[k, k], expected, atol=1e-12)
+        np.testing.assert_allclose(home[k], start, atol=1e-12)
+
+
+def path_gaussians(num=5, dtype=np.float64, **changes) -> FoldedGaussian:
+    rng = np.random.default_rng(6)
+    time_loc, paths = rng.uniform(0, 0.8, num).astype(dtype), PATHS | changes
+    paths = {name: np.asarray(x, dtype) for name, x in paths.items()}
+    bends = PolynomialFold(rng.normal(size=(num, 2, 2)).astype(dtype))
+    anchor = rng.normal(size=(num, 2)).astype(dtype)
+    fold = SharedPathFold(bends, anchor, time_loc=time_loc, index=np.arange(num) % 3, **paths)
+    scale = rng.uniform(0.1, 0.3, (num, 2)).astype(dtype)
+    return FoldedGaussian(fold.home, scale=scale, time_loc=time_loc, time_scale=dtype(0.2), fold=fold)
+
+
+def test_distributions_on_paths():
+    with jax.enable_x64(True):
+        dist = path_gaussians()
+        assert (dist.batch_shape, dist.event_shape) == ((5,), (3,))
+        assert dist.fold.matrices.shape == (1, 2, 3, 2, 3)  # not copied for each of them
+        x = jnp.asarray(np.random.default_rng(7).uniform(-0.3, 0.8, (4, 1, 3)))
+        got = dist.log_prob(x)
+        u = np.asarray(dist.time_loc) - np.asarray(x[..., -1])
+        center = np.asarray(dist.loc) + np.asarray(dist.fold(u))
+        spread = np.diagonal(dist.scale_tril, axis1=1, axis2=2) * np.exp(-(u**2) / 0.16)[..., None]
+        z = (np.asarray(x[..., :2]) - center) / spread
+        expected = -0.5 * (z**2).sum(-1) - np.log(spread).sum(-1) - np.log(2 * np.pi)
+        expected += -0.5 * (u / 0.2) ** 2 - np.log(0.2) - 0.5 * np.log(2 * np.pi)
+        np.testing.assert_allclose(got, expected, rtol=1e-10)
+        # each alone, mapped over the constructor
+        alone = jax.vmap(lambda k: jax.tree.map(lambda leaf: leaf[k], dist).log_prob(x[0, 0]))(jnp.arange(5))
+        np.testing.assert_allclose(alone, got[0], rtol=1e-10)
+        kept = dist.marginal([1, -1])
+        np.testing.assert_allclose(kept.condition_time(0.3).loc, dist.condition_time(0.3).loc[:, 1:], rtol=1e-12)
+
+
+def test_samples_on_paths_have_their_moments():
+    dist = path_gaussians(dtype=np.float32, times=[[-0.5, 0.1, 0.6], [0.2, 0.5, 0.9]])
+    x = np.asarray(jax.jit(lambda dist, key: dist.sample(key, (200_000,)))(dist, jax.random.key(0)), np.float64)
+    mean, covariance = dist.moments()
+    for k in range(5):
+        own = np.cov(x[:, k].T)
+        np.testing.assert_allclose(x[:, k].mean(0), mean[k], atol=5 * np.sqrt(np.diag(own).max() / len(x)))
+        np.testing.assert_allclose(own, covariance[k], atol=0.02 * np.diag(own).max())
+    mixture = FoldedMixture(dist, weights=jnp.arange(1.0, 6.0))
+    draws = np.asarray(mixture.sample(jax.random.key(1), (200_000,)))
+    np.testing.assert_allclose(draws.mean(0), mixture.mean, atol=5 * np.sqrt(np.cov(draws.T).max() / len(draws)))
+    np.testing.assert_allclose(np.cov(draws.T), mixture.covariance_matrix, atol=0.02 * np.cov(draws.T).max())
+
+
+def test_gradients_reach_paths():
+    with jax.enable_x64(True):
+        dist, x = path_gaussians(), jnp.asarray(np.random.default_rng(8).uniform(0, 0.6, (6, 3)))
+        leaves, static = eqx.partition(dist, eqx.is_inexact_array)
+        mixture_loss = lambda one: FoldedMixture(eqx.combine(one, static), weights=jnp.ones(5)).log_prob(x).sum()  # noqa: E731
+        plain_loss = lambda one: eqx.combine(one, static).log_prob(x[:, None]).sum()  # noqa: E731
+        rng = np.random.default_rng(9)
+        way = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape) * np.not_equal(leaf, 0)), leaves)
+        for loss in (mixture_loss, plain_loss):
+            slope = jax.jit(jax.grad(loss))(leaves)
+            along = sum(jnp.sum(a * b) for a, b in zip(jax.tree.leaves(slope), jax.tree.leaves(way), strict=True))
+            step = lambda h: jax.jit(loss)(jax.tree.map(lambda a, b: a + h * b, leaves, way))  # noqa: B023, E731
+            np.testing.assert_allclose((step(1e-6) - step(-1e-6)) / 2e-6, along, rtol=1e-5)
+            assert jnp.abs(slope.fold.matrices).max() > 0

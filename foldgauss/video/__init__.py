@@ -26,6 +26,7 @@ from foldgauss.video.models.frame_times import (
     times_at,
 )
 from foldgauss.video.models.metrics import Evaluation, evaluate, psnr, ssim
+from foldgauss.video.models.polynomial_folds import without_paths
 from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.motion.background_plate import fill_background
@@ -114,4 +115,5 @@ __all__ = [
     "stabilize",
     "start_from",
     "times_at",
+    "without_paths",
 ]

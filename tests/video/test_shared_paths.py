@@ -9,7 +9,7 @@ import pytest
 
 from foldgauss.io import load_video_model, save_video_model
 from foldgauss.render import RenderOptions
-from foldgauss.video import FrameTimes, VideoModel
+from foldgauss.video import FrameTimes, VideoModel, density_image
 from foldgauss.video.models.conditioning import ConditioningSpec, backpropagate, condition, update_windows
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.row_layout import columns, pack, unpack
@@ -139,3 +139,42 @@ def test_a_number_of_a_path_that_is_not_there_is_an_error(tmp_path):
     path = save_video_model(tmp_path / "m.safetensors", moving_model(wrong))
     with pytest.raises(ValueError, match="paths from 0 to 2"):
         load_video_model(path)
+
+
+def test_folded_gaussians_are_those_of_the_frame():
+    with jax.enable_x64(True):
+        splats = jax.tree.map(
+            lambda leaf: jnp.asarray(leaf, float) if leaf.dtype != np.uint8 else leaf, moving_splats()
+        )
+        folded = jax.jit(lambda splats: splats.gaussians())(splats)
+        for t in (0.1, 0.4, 0.8):
+            there, at = splats.at(jnp.asarray(t)), folded.condition_time(t)
+            np.testing.assert_allclose(at.loc, there.mean, atol=1e-12)
+        one = jax.tree.map(jnp.asarray, splats.paths)
+        maps = one.by_index(folded.time_loc, splats.path_index)
+        own = maps[..., :2] @ splats._unmoved().scale_tril
+        covariance = folded.scale_tril @ folded.scale_tril.mT
+        np.testing.assert_allclose(covariance, own @ own.mT, rtol=1e-9, atol=1e-15)
+        np.testing.assert_array_equal(np.triu(folded.scale_tril, 1), 0)
+        # Paths without turn or stretch are represented exactly.
+        still = jnp.broadcast_to(jnp.eye(2), (*one.matrices.shape[:3], 2))
+        shifts = SharedPaths(one.times, jnp.concatenate([still, one.matrices[..., 2:]], -1))
+        moved = dataclasses.replace(splats, paths=shifts)
+        there, at = moved.at(jnp.asarray(0.4)), moved.gaussians().condition_time(0.4)
+        np.testing.assert_allclose(at.covariance_matrix, there.factor @ there.factor.mT, rtol=1e-9, atol=1e-15)
+
+
+def test_mixture_of_splats_on_paths_is_rendered_as_its_density():
+    mixture = moving_splats(40).to_mixture()
+    image = np.asarray(density_image(mixture, 0.4, SIZE))
+    height, width = SIZE
+    y, x = np.mgrid[0:height, 0:width] + 0.5
+    place = (np.stack([x, y], -1) - [width / 2, height / 2]) / max(SIZE)
+    grid = np.concatenate([place, np.full((*SIZE, 1), 0.4)], -1).astype(np.float32)
+    density = np.asarray(mixture.pdf(grid))
+    np.testing.assert_allclose(image, density, atol=1e-3 * density.max())
+    assert mixture.sample(jax.random.key(0), (1000,)).shape == (1000, 3)
+
+
+def test_models_without_paths_have_polynomial_folds():
+    assert type(random_splats(5).gaussians().fold).__name__ == "PolynomialFold"

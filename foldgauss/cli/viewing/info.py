@@ -34,6 +34,7 @@ def info(model_path: ModelFile) -> None:
         "frames": _describe_frames(model),
         "Gaussians": f"{model.num_gaussians:,}",
         "fold": f"polynomial of degree {model.degree}",
+        **_describe_paths(model),
         **_describe_savings(model),
         "envelope": f"time likelihood, power {' and '.join(powers)} (paper's text 1, its code 2)",
         "frame times": _describe_times(np.asarray(model.frame_times.times())),
@@ -85,6 +86,17 @@ def _print_segments(model_path: Path, model: SegmentedVideo, about: dict) -> Non
 
 def _describe_frames(model: Video) -> str:
     return f"{model.num_frames:,} of {model.size[0]}x{model.size[1]} (height x width), {model.fps:g} per second"
+
+
+def _describe_paths(model: VideoModel | EditedVideo) -> dict[str, str]:
+    """How many Gaussians follow shared paths; a single path is that of the camera."""
+    parts = [layer.model.splats for layer in as_edited(model).layers if layer.model.splats.paths is not None]
+    if not parts:
+        return {}
+    followers = sum(int((np.asarray(splats.path_index) > 0).sum()) for splats in parts)
+    num, knots = sum(splats.paths.num_paths for splats in parts), max(splats.paths.num_knots for splats in parts)
+    paths = "the camera" if num == 1 else f"{num:,} paths"
+    return {"paths": f"{followers:,} of {model.num_gaussians:,} Gaussians follow {paths}, {knots:,} knots"}
 
 
 def _describe_savings(model: VideoModel | EditedVideo) -> dict[str, str]:

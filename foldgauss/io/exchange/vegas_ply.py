@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import os
+import warnings
 from pathlib import Path
 
 import jax
@@ -18,6 +19,7 @@ from foldgauss.render import RenderOptions
 from foldgauss.render.camera import FIELD_OF_VIEW
 from foldgauss.render.splats import check_size
 from foldgauss.video.models.frame_times import FrameTimes
+from foldgauss.video.models.polynomial_folds import without_paths
 from foldgauss.video.models.splats import STATIC_LOG_TIME_SCALE, FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
@@ -98,9 +100,10 @@ def write_vegas_ply(path: str | os.PathLike, model: VideoModel) -> Path:
 
     $$ \sigma_t' = \sigma_t \sqrt{2 / p}, \quad \exp(-p\,u^2 / (2 \sigma_t^2)) = \exp(-2 u^2 / (2 \sigma_t'^2)) $$
 
-    Leaves are read back to float32 rounding. The published code renders with its own constants: a low pass of 0.3 px^2
-    (the presets' is 0.1), Gaussians up to 3.03 sigma_t' from m_t, and none whose scale, after the envelope, is below
-    1e-4 of its units (a fifth of a pixel at 1280 wide).
+    Leaves are read back to float32 rounding. The Gaussians of a model with shared paths get polynomial folds, see
+    `foldgauss.video.without_paths`, and a warning states the error. The published code renders with its own constants:
+    a low pass of 0.3 px^2 (the presets' is 0.1), Gaussians up to 3.03 sigma_t' from m_t, and none whose scale, after
+    the envelope, is below 1e-4 of its units (a fifth of a pixel at 1280 wide).
 
     **Raises:** ValueError for a model that the published code cannot render: an envelope of power 0, a floor,
     compositing "sum", one frame alone; `OutputError` where the path cannot be written.
@@ -110,6 +113,10 @@ def write_vegas_ply(path: str | os.PathLike, model: VideoModel) -> Path:
     **Source:** the layout of the published VeGaS code.
     """
     _check_writable_as_vegas(model)
+    if model.splats.paths is not None:
+        on_path = np.asarray(model.splats.path_index) > 0
+        model, error = without_paths(model)
+        _warn_of_error(error[on_path], model.degree)
     splats, unit = model.splats, _vegas_unit(model.size)
     plane = np.array([1.0, -1.0]) / unit
     loc = plane * np.asarray(splats.loc, np.float64)
@@ -130,6 +137,16 @@ def write_vegas_ply(path: str | os.PathLike, model: VideoModel) -> Path:
     if np.unique(powers).size == 1:
         note["power"] = float(np.unique(powers)[0])
     return write_ply(path, {"vertex": columns, "time": times}, comments=[NOTE + json.dumps(note)])
+
+
+def _warn_of_error(error: Float[np.ndarray, " num"], degree: int) -> None:
+    """Say how well polynomials of this degree follow shared paths, from the distances in pixels."""
+    if len(error):
+        rms, worst = np.sqrt(np.mean(error**2)), error.max()
+        text = f"the file has no shared paths: {len(error):,} Gaussians follow theirs by folds of degree {degree}"
+        warnings.warn(
+            f"model: {text}, with a root mean square error of {rms:.2g} pixels, {worst:.2g} at most.", stacklevel=3
+        )
 
 
 def _convert_time_scale(

@@ -5,12 +5,16 @@ those with m_s mapped, A f and A Sigma_s A^T; f is a polynomial, so its coeffici
 t -> t_0 + shift + r (t - t_0) maps m_t; sigma_t becomes abs(r) sigma_t, and the argument of the fold grows by r, so c_k
 becomes c_k / r^k. Source: VeGaS eq:cond_dens.
 
+Gaussians on a shared path A(t) are drawn at A(t) (q + f), and E A(t) (q + f) = (E A(t) E^-1) E (q + f): an affine map E
+is baked as above, and they get the path E A E^-1. With a change of time, the times of the path are mapped as m_t is.
+
 Computed in float64, then rounded to the parameters' dtype. A function returns None where no parameters represent the
 edit.
 """
 
 import dataclasses
 from collections.abc import Sequence
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +24,7 @@ from scipy.special import expit, logit
 
 from foldgauss._runtime.checks import invalid
 from foldgauss.video.editing.overlays import Affine, Recolor
+from foldgauss.video.models.shared_paths import PathChange, change_paths
 from foldgauss.video.models.splats import SH_C0, FoldedSplats
 
 Mask = Bool[np.ndarray, "num"]
@@ -35,14 +40,14 @@ def gather_splats(splats: FoldedSplats, source: Int[np.ndarray, " num_new"]) -> 
     def take(leaf):  # an envelope may have one parameter for all Gaussians
         return jnp.asarray(np.asarray(leaf)[source]) if np.ndim(leaf) and np.shape(leaf)[0] == num else leaf
 
-    return jax.tree.map(take, splats)
+    return dataclasses.replace(jax.tree.map(take, splats), paths=splats.paths)
 
 
 def apply_affine(splats: FoldedSplats, mask: Mask, map_: Affine) -> FoldedSplats | None:
     """Apply an affine map; None for one about the selection's own center, unless it is a translation."""
     loc, shift = _as_float64(splats.loc)[mask], np.array(map_.offset)
     if map_.is_translation:
-        return _replace_rows(splats, mask, loc=loc + shift)
+        return _replace_rows(splats, mask, partial(_map_path, np.eye(2), shift), loc=loc + shift)
     if map_.about is None:
         return None
     matrix, center = map_.matrix(), np.array(map_.about)
@@ -50,11 +55,21 @@ def apply_affine(splats: FoldedSplats, mask: Mask, map_: Affine) -> FoldedSplats
     return _replace_rows(
         splats,
         mask,
+        partial(_map_path, matrix, center + shift - matrix @ center),
         loc=(loc - center) @ matrix.T + (center + shift),
         coefficients=_as_float64(splats.coefficients)[mask] @ matrix.T,
         log_scale=log_scale,
         angle_logit=_angle_logit(angle),
     )
+
+
+def _map_path(
+    matrix: Float[np.ndarray, "2 2"], offset: Float[np.ndarray, "2"], times: np.ndarray, maps: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The path E A E^-1 with E(x) = `matrix` x + `offset`, which moves what is already mapped by E."""
+    linear = matrix @ maps[..., :2] @ np.linalg.inv(matrix)
+    moved = maps[..., 2] @ matrix.T + offset - linear @ offset
+    return times, np.concatenate([linear, moved[..., None]], -1)
 
 
 def _map_axes(splats: FoldedSplats, mask: Mask, matrix: Float[np.ndarray, "2 2"]) -> tuple[np.ndarray, np.ndarray]:
@@ -124,17 +139,28 @@ def apply_retiming(
     if not ((time_loc > 0) & (time_loc < 1)).all():
         return None
     power = np.arange(1, splats.degree + 1)[:, None]
+
+    def retime(times: np.ndarray, maps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        order = slice(None, None, -1 if stretch < 0 else 1)
+        return (about + shift + stretch * (times - about))[order], maps[order]
+
     return _replace_rows(
         splats,
         mask,
+        retime,
         time_loc_logit=logit(time_loc),
         log_time_scale=_as_float64(splats.log_time_scale)[mask] + np.log(abs(stretch)),
         coefficients=_as_float64(splats.coefficients)[mask] / np.float64(stretch) ** power,
     )
 
 
-def _replace_rows(splats: FoldedSplats, mask: Mask, **leaves: np.ndarray) -> FoldedSplats | None:
-    """Replace parameters of the selected Gaussians; None if a value is not finite in the parameters' dtype."""
+def _replace_rows(
+    splats: FoldedSplats, mask: Mask, path_change: PathChange | None = None, **leaves: np.ndarray
+) -> FoldedSplats | None:
+    """Replace parameters of the selected Gaussians, and their paths if these change, see `change_paths`.
+
+    None if a value is not finite in the parameters' dtype, and for too many paths.
+    """
     new = {}
     for name, values in leaves.items():
         leaf = np.array(getattr(splats, name))
@@ -143,7 +169,8 @@ def _replace_rows(splats: FoldedSplats, mask: Mask, **leaves: np.ndarray) -> Fol
         if not np.isfinite(leaf[mask]).all():
             return None
         new[name] = jnp.asarray(leaf)
-    return dataclasses.replace(splats, **new)
+    replaced = dataclasses.replace(splats, **new)
+    return replaced if path_change is None else change_paths(replaced, mask, path_change)
 
 
 def _as_float64(leaf) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Paths that many Gaussians share, such as the motion of the camera: affine maps that depend on time."""
 
 import dataclasses
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -8,12 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
+from foldgauss._numerics.piecewise import locate
 from foldgauss._runtime.checks import invalid
 from foldgauss.render import Splats2D
 
 #: A Gaussian's path is a byte: 0 for none, else the number of the path, from 1.
 MAX_PATHS = 255
+#: With so many paths at most, maps are chosen one by one, so that the gradient by each is a sum in a fixed order.
 FEW_PATHS = 4
+#: From the times (knots,) and matrices (knots, 2, 3) of a path to those of another.
+PathChange = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 class SharedPaths(eqx.Module):
@@ -48,13 +53,20 @@ class SharedPaths(eqx.Module):
     def by_path(self, t: Float[Array, "*batch"], path: Int[Array, "*batch"]) -> Float[Array, "*batch 2 3"]:
         """The maps of paths, numbered from 0, each at a time of its own."""
         xp = np if isinstance(self.matrices, np.ndarray) and isinstance(t, np.ndarray) else jnp
-        matrices, times = xp.asarray(self.matrices), xp.asarray(self.times)[path]
-        last = xp.clip((times <= t[..., None]).sum(-1) - 1, 0, max(self.num_knots - 2, 0))
-        after = xp.minimum(last + 1, self.num_knots - 1)
-        begun, ended = (xp.take_along_axis(times, k[..., None], -1)[..., 0] for k in (last, after))
-        span = ended - begun
-        fraction = xp.clip((t - begun) / xp.where(span > 0, span, 1), 0, 1)[..., None, None]
-        return (1 - fraction) * matrices[path, last] + fraction * matrices[path, after]
+        matrices, times = xp.asarray(self.matrices), xp.asarray(self.times)
+        before, after, fraction = locate(times[path], t)
+        fraction = fraction[..., None, None]
+        return (1 - fraction) * matrices[path, before] + fraction * matrices[path, after]
+
+    def by_index(self, t: Float[Array, "*batch"], index: UInt8[Array, "*batch"]) -> Float[Array, "*batch 2 3"]:
+        """The maps of Gaussians with this `path_index`, each at a time of its own; the identity for those on no path.
+
+        NumPy arrays if the leaves and t are.
+        """
+        xp = np if isinstance(self.matrices, np.ndarray) and isinstance(t, np.ndarray) else jnp
+        path = xp.asarray(index).astype(xp.int32)
+        maps = self.by_path(t, xp.maximum(path - 1, 0))
+        return xp.where((path > 0)[..., None, None], maps, xp.eye(2, 3, dtype=maps.dtype))
 
 
 def all_maps(maps: Float[Array, "paths 2 3"]) -> Float[Array, "paths+1 2 3"]:
@@ -67,7 +79,7 @@ def move_splats(splats: Splats2D, path_index: UInt8[Array, " num"], maps: Float[
     """Splats in model space, each moved by the map of its path."""
     if len(maps) > FEW_PATHS:
         own = all_maps(maps)[path_index]
-    else:  # the gradient by a map is then a sum in a fixed order
+    else:
         own = jnp.broadcast_to(jnp.eye(2, 3, dtype=maps.dtype), (*path_index.shape, 2, 3))
         for number, one in enumerate(maps, 1):
             own = jnp.where((path_index == number)[:, None, None], one[None], own)
@@ -84,15 +96,15 @@ def leave_paths(splats: Any, which: Bool[np.ndarray, " num"]) -> Any:
     if splats.paths is None or not (which & (splats.path_index > 0)).any():
         return splats
     times = 1 / (1 + np.exp(-splats.time_loc_logit.astype(float)))
-    own = splats.paths.by_path(np.float32(times), np.maximum(splats.path_index, 1) - 1)
-    leaving = (which & (splats.path_index > 0))[:, None]
-    loc = np.einsum("nij,nj->ni", own[:, :, :2], splats.loc) + own[:, :, 2]
-    larger = 0.5 * np.log(np.linalg.det(own[:, :, :2].astype(float)))[:, None]
+    leaving = np.where(which, splats.path_index, np.uint8(0))
+    maps = splats.paths.by_index(np.float32(times), leaving)
+    loc = np.einsum("nij,nj->ni", maps[:, :, :2], splats.loc) + maps[:, :, 2]
+    larger = 0.5 * np.log(np.abs(np.linalg.det(maps[:, :, :2].astype(float))))
     return dataclasses.replace(
         splats,
-        loc=np.where(leaving, loc, splats.loc).astype(np.float32),
-        log_scale=np.where(leaving, splats.log_scale + larger, splats.log_scale).astype(np.float32),
-        path_index=np.where(leaving[:, 0], 0, splats.path_index).astype(np.uint8),
+        loc=loc.astype(np.float32),
+        log_scale=(splats.log_scale + larger[:, None]).astype(np.float32),
+        path_index=np.where(which, np.uint8(0), splats.path_index),
     )
 
 
@@ -120,3 +132,60 @@ def from_pixel_gradient(
     """The gradient by maps of model space, from that by the maps of `to_pixel_maps`."""
     linear, offset = gradient[1:, :, :2], gradient[1:, :, 2:]
     return np.concatenate([linear - offset * center, unit * offset], 2)
+
+
+def change_paths(splats: Any, mask: Bool[np.ndarray, " num"], change: PathChange) -> Any | None:
+    """The splats, with the paths of the Gaussians of `mask` replaced by `change(times, matrices)` of them, float64.
+
+    A path that others follow stays as it is, and the changed one is added. None if there would be more than `MAX_PATHS`
+    or if a number is not finite.
+    """
+    if splats.paths is None:
+        return splats
+    index = np.array(splats.path_index)
+    leaves = splats.paths.times, splats.paths.matrices
+    times, matrices = (list(np.asarray(leaf, np.float64)) for leaf in leaves)
+    for path in set(index[mask].tolist()) - {0}:
+        on_path = index == path
+        changed = change(times[path - 1], matrices[path - 1])
+        if (on_path & ~mask).any():
+            times, matrices = [*times, changed[0]], [*matrices, changed[1]]
+            if len(times) > MAX_PATHS:
+                return None
+            index[on_path & mask] = len(times)
+        else:
+            times[path - 1], matrices[path - 1] = changed
+    with np.errstate(over="ignore"):
+        new = [np.asarray(parts, leaf.dtype) for parts, leaf in zip((times, matrices), leaves, strict=True)]
+    if not all(np.isfinite(leaf).all() for leaf in new):
+        return None
+    return dataclasses.replace(splats, path_index=jnp.asarray(index), paths=SharedPaths(*map(jnp.asarray, new)))
+
+
+def join_paths(parts: Sequence[Any]) -> tuple[UInt8[np.ndarray, " num"], SharedPaths] | tuple[None, None]:
+    """`path_index` and `paths` of the Gaussians of several splats, in turn; equal paths become one.
+
+    Paths with fewer knots repeat their last one. Raises ValueError for more than `MAX_PATHS`.
+    """
+    num_knots = max((part.paths.num_knots for part in parts if part.paths is not None), default=0)
+    if not num_knots:
+        return None, None
+    known, rows, index = {}, [], []
+    for part in parts:
+        numbers = [0]
+        if part.paths is not None:
+            after = num_knots - part.paths.num_knots
+            times = np.pad(np.asarray(part.paths.times), [(0, 0), (0, after)], mode="edge")
+            matrices = np.pad(np.asarray(part.paths.matrices), [(0, 0), (0, after), (0, 0), (0, 0)], mode="edge")
+            for row in zip(times, matrices, strict=True):
+                key = row[0].tobytes() + row[1].tobytes()
+                if key not in known:
+                    rows.append(row)
+                    known[key] = len(rows)
+                numbers.append(known[key])
+        own = np.zeros(part.num_gaussians, int) if part.paths is None else np.asarray(part.path_index)
+        index.append(np.array(numbers)[own])
+    if len(rows) > MAX_PATHS:
+        raise invalid("paths", expected=f"at most {MAX_PATHS} in all", got=len(rows))
+    times, matrices = map(np.stack, zip(*rows, strict=True))
+    return jnp.asarray(np.concatenate(index).astype(np.uint8)), SharedPaths(jnp.asarray(times), jnp.asarray(matrices))

@@ -10,7 +10,7 @@ from foldgauss._numerics.batch import concrete_value
 from foldgauss._runtime.checks import invalid
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
-from foldgauss.fold import AbstractFold, PolynomialFold, ZeroFold
+from foldgauss.fold import AbstractFold, PolynomialFold, SharedPathFold, ZeroFold
 from foldgauss.mixture import FoldedMixture
 from foldgauss.render import Splats2D
 from foldgauss.video.models.shared_paths import SharedPaths, move_splats
@@ -89,7 +89,36 @@ class FoldedSplats(eqx.Module):
         return np.asarray(self.opacity_logit) == OPAQUE_LOGIT
 
     def gaussians(self) -> FoldedGaussian:
-        """The batch of Folded-Gaussians, batch shape (num,), event shape (3,), before `paths` move them."""
+        """The batch of Folded-Gaussians in the frame, batch shape (num,), event shape (3,).
+
+        Those on a shared path have a `SharedPathFold`: their mean at each time is that of `at`. Their covariance is
+        that of `at` at their own time m_t, L(m_t) Sigma L(m_t)^T, times the envelope; how the linear part L of the path
+        changes while they are alive is left out.
+        """
+        unmoved = self._unmoved()
+        if self.paths is None:
+            return unmoved
+        index = jnp.asarray(self.path_index)
+        fold = SharedPathFold(
+            unmoved.fold,
+            self.loc,
+            time_loc=unmoved.time_loc,
+            index=index,
+            times=self.paths.times,
+            matrices=self.paths.matrices,
+        )
+        tril = _lower_factor(fold.maps(unmoved.time_loc)[..., :2] @ unmoved.scale_tril)
+        return FoldedGaussian(
+            fold.home,
+            jnp.where((index > 0)[:, None, None], tril, unmoved.scale_tril),
+            time_loc=unmoved.time_loc,
+            time_scale=unmoved.time_scale,
+            fold=fold,
+            envelope=self.envelope,
+        )
+
+    def _unmoved(self) -> FoldedGaussian:
+        """The Folded-Gaussians before `paths` move them."""
         return FoldedGaussian(
             self.loc,
             rotated_scale_tril(jnp.exp(self.log_scale), 2 * jnp.pi * jax.nn.sigmoid(self.angle_logit)),
@@ -103,8 +132,8 @@ class FoldedSplats(eqx.Module):
     def from_mixture(cls, mixture: FoldedMixture, *, color: ArrayLike) -> "FoldedSplats":
         """A mixture's components as splats, in their order: `gaussians()` is `mixture.components`.
 
-        Weights become opacities, `w_k / max w` times `PEAK_OPACITY`; `to_mixture` is the inverse. To render the
-        density itself, use `density_image`.
+        Weights become opacities, `w_k / max w` times `PEAK_OPACITY`; `to_mixture` is the inverse, for splats without
+        shared paths. To render the density itself, use `density_image`.
 
         Shapes: `mixture` of (x, y, t) without batch dimensions, in model space, m_t in (0, 1), with polynomial or zero
         folds and a time-likelihood or constant envelope; `color` (3,) or (num, 3), not below 0.
@@ -123,7 +152,7 @@ class FoldedSplats(eqx.Module):
             raise invalid(
                 "mixture.components.time_loc", expected="times in (0, 1)", got=concrete_value(time_loc), cure=cure
             )
-        log_scale, angle = _axes(components.scale_tril)
+        log_scale, angle = find_axes(components.scale_tril)
         log_weights = mixture.log_weights
         log_opacity = log_weights - log_weights.max() + float(np.log(PEAK_OPACITY))
         return cls(
@@ -139,7 +168,7 @@ class FoldedSplats(eqx.Module):
         )
 
     def to_mixture(self) -> FoldedMixture:
-        """The splats as a mixture, in model space: their Folded-Gaussians with weights in proportion to opacity.
+        """The splats as a mixture, in model space: `gaussians()` with weights in proportion to opacity.
 
         Colours are left out. Example: `model.splats.to_mixture().log_prob(jnp.array([0.0, 0.1, 0.5]))`.
         """
@@ -151,7 +180,7 @@ class FoldedSplats(eqx.Module):
         A Gaussian too far away in time (`TIME_CUTOFF`), or with a standard deviation not above `scale_cutoff` at t,
         gets opacity 0.
         """
-        folded = self.gaussians()
+        folded = self._unmoved()
         conditional = folded.condition_time(t)
         near = jnp.abs(t - folded.time_loc) < TAU_MAX * folded.time_scale
         if scale_cutoff > 0:
@@ -183,7 +212,16 @@ def rotated_scale_tril(scale: Float[Array, "num 2"], angle: Float[Array, " num"]
     return jnp.stack(rows, -2)
 
 
-def _axes(tril: Float[Array, "num 2 2"]) -> tuple[Float[Array, "num 2"], Float[Array, " num"]]:
+def _lower_factor(factor: Float[Array, "num 2 2"]) -> Float[Array, "num 2 2"]:
+    """The lower-triangular factor of F F^T, in closed form; the determinant is that of F."""
+    first, second = factor[:, 0], factor[:, 1]
+    top = jnp.hypot(first[:, 0], first[:, 1])
+    det = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+    rows = [jnp.stack([top, jnp.zeros_like(top)], -1), jnp.stack([(first * second).sum(-1), jnp.abs(det)], -1)]
+    return jnp.stack([rows[0], rows[1] / top[:, None]], -2)
+
+
+def find_axes(tril: Float[Array, "num 2 2"]) -> tuple[Float[Array, "num 2"], Float[Array, " num"]]:
     """Logarithms of the two standard deviations, the greater first, and the angle: inverse of `rotated_scale_tril`.
 
     Closed-form singular values of [[p, 0], [q, r]]. The angle is in [pi/2, 3 pi/2]; it is unique modulo pi.

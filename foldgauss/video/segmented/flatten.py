@@ -8,6 +8,7 @@ import numpy as np
 
 from foldgauss._runtime.checks import invalid
 from foldgauss.video.editing.edited_video import EditedVideo, Layer
+from foldgauss.video.models.shared_paths import join_paths
 from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import ONE_SEGMENT, VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
@@ -19,7 +20,8 @@ def flatten_video(video: VideoModel | EditedVideo | SegmentedVideo) -> VideoMode
     """The plain model that renders the same at all times: its array has the layers from front to back.
 
     Raises ValueError if no folded model represents the video, because of edits over a span, clocks, functions or a
-    camera; for layers of several envelopes or with cuts of their own, and for a video in segments.
+    camera; for layers of several envelopes, with cuts of their own or with too many shared paths, and for a video in
+    segments.
 
     Example: `flatten_video(layers(person, street))`.
     """
@@ -54,7 +56,7 @@ def _unique_values(leaf) -> tuple[float, ...]:
 
 
 def _concatenate(parts: list[FoldedSplats]) -> FoldedSplats:
-    """The Gaussians of all parts; folds of a lower degree are padded with zero coefficients."""
+    """The Gaussians of all parts; folds of a lower degree are padded with zero coefficients, see also `join_paths`."""
     degree = max(part.degree for part in parts)
 
     def gather(name: str) -> list:
@@ -63,5 +65,7 @@ def _concatenate(parts: list[FoldedSplats]) -> FoldedSplats:
             return [jnp.pad(leaf, ((0, 0), (0, degree - leaf.shape[1]), (0, 0))) for leaf in leaves]
         return leaves
 
-    names = [field.name for field in dataclasses.fields(FoldedSplats) if field.name != "envelope"]
-    return FoldedSplats(**{name: jnp.concatenate(gather(name)) for name in names}, envelope=parts[0].envelope)
+    path_index, paths = join_paths(parts)
+    shared = {"envelope": parts[0].envelope, "path_index": path_index, "paths": paths}
+    names = [field.name for field in dataclasses.fields(FoldedSplats) if field.name not in shared]
+    return FoldedSplats(**{name: jnp.concatenate(gather(name)) for name in names}, **shared)

@@ -59,8 +59,12 @@ class Contributions:
 
     def own_centers(self, indices: Int[np.ndarray, " num"]) -> Float[np.ndarray, "num 2"]:
         """Centres of these Gaussians at their own m_t, where the fold is 0, in pixels."""
-        height, width = self.size
-        return np.asarray(self.model.splats.loc, np.float64)[indices] * max(self.size) + [width / 2, height / 2]
+        (height, width), splats = self.size, self.model.splats
+        loc = np.asarray(splats.loc, np.float64)[indices]
+        if splats.paths is not None:
+            maps = self.prepared.spec.paths.by_index(self.own_times[indices], np.asarray(splats.path_index)[indices])
+            loc = np.einsum("nij,nj->ni", maps[..., :2], loc) + maps[..., 2]
+        return loc * max(self.size) + [width / 2, height / 2]
 
     @functools.cached_property
     def own_times(self) -> Float[np.ndarray, "num_gaussians"]:

@@ -1,0 +1,22 @@
+"""Piecewise linear functions of time, given by their values at knots."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+
+def locate(
+    times: Float[Array, "*batch knots"], t: Float[Array, "*batch"]
+) -> tuple[Int[Array, "*batch"], Int[Array, "*batch"], Float[Array, "*batch"]]:
+    """The knots before and after each t, and the fraction in [0, 1] of the way between them.
+
+    `times` do not decrease; where several are equal, t there is at the last. Outside of them the fraction is that of
+    the nearer end. NumPy arrays if both are.
+    """
+    xp = np if isinstance(times, np.ndarray) and isinstance(t, np.ndarray) else jnp
+    last = times.shape[-1] - 1
+    before = xp.clip((times <= t[..., None]).sum(-1, dtype=np.int32) - 1, 0, max(last - 1, 0))
+    after = xp.minimum(before + 1, last)
+    begun, ended = (xp.take_along_axis(times, k[..., None], -1)[..., 0] for k in (before, after))
+    span = ended - begun
+    return before, after, xp.clip((t - begun) / xp.where(span > 0, span, 1), 0, 1)
