@@ -47,7 +47,6 @@ from foldgauss.video.fitting.loop import FitInfo, fit_steps
 from foldgauss.video.fitting.state import FitState, to_model
 from foldgauss.video.models.metrics import Evaluation, evaluate
 from foldgauss.video.models.video_model import VideoModel
-from foldgauss.video.motion.camera_path import find_camera_maps
 from foldgauss.video.motion.optical_flow import Motion
 from foldgauss.video.tradeoff import (
     AXES,
@@ -184,9 +183,7 @@ class _Run:
         lifetime = TYPICAL_LIFETIME
         if wanted.num_gaussians is None and wanted.follow_motion:
             frames = np.ascontiguousarray(self.clip.frames[..., :3])
-            motion = self._find_motion()
-            camera = find_camera_maps(motion) if wanted.follow_camera else None
-            lifetime = measure_lifetime(frames, motion, wanted.degree, camera)
+            lifetime = measure_lifetime(frames, self._find_motion(), wanted.degree)
         return chosen_num_gaussians(wanted, self.clip.num_frames, *self.clip.size, lifetime=lifetime)
 
     def _print_plan(self, num_points: int, steps: int, expected: float) -> None:

@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float, Float32, Int
 from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.motion.optical_flow import LONGEST, Tracks
 
-#: A start follows the camera if sigma_t is longer by this factor than with a fold in coordinates of the frame; where
-#: both are alike, if its fold moves less.
+#: A start follows the camera if a fold follows its track for longer in these coordinates, by this factor, than in those
+#: of the frame; where both are alike, if it moves less.
 LONGER = 1.1
 
 

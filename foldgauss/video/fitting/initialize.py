@@ -113,19 +113,13 @@ def initialize(
     return dataclasses.replace(ordered, paths=paths)
 
 
-def measure_lifetime(
-    frames: UInt8[np.ndarray, "num_frames height width 3"],
-    motion: Motion,
-    degree: int,
-    camera: Float[np.ndarray, "num_frames 2 3"] | None = None,
-) -> float:
+def measure_lifetime(frames: UInt8[np.ndarray, "num_frames height width 3"], motion: Motion, degree: int) -> float:
     """The mean number of frames in which the Gaussians of `initialize` are alive, if the frames are evenly spaced."""
     rng, times = np.random.default_rng(0), np.linspace(0, 1, len(frames))
-    paths = None if camera is None else SharedPaths(np.float32(times)[None], np.float32(camera)[None])
     envelope = TimeLikelihood(power=np.float32(1))
 
     def make(home: np.ndarray, position: np.ndarray) -> tuple[FoldedSplats, np.ndarray]:
-        return make_splats(frames, home, position, times, degree, envelope, motion, rng, START_OPACITY, paths)
+        return make_splats(frames, home, position, times, degree, envelope, motion, rng, START_OPACITY)
 
     return _try_starts(times, make, lambda k: measure_detail(frames[k]), rng)[1]
 
@@ -273,7 +267,10 @@ def follow_tracks(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Folds (num, degree, 2), in pixels per frame^k, and sigma_t (num,) in frames, of points at `home`.
 
-    And which of them (num,) follow the `camera`: their folds are in its coordinates.
+    And which of them (num,) follow the `camera`: their folds are in its coordinates. sigma_t is in any case as long as
+    the track can be followed by a fold alone: Gaussians that live longer reproduce what differs from frame to frame,
+    such as motion blur, less well. (40 frames of 180x320, 60 s of one core, camera not followed, followed, and with
+    longer sigma_t: bus 40.0, 42.2, 39.9 dB; lady-running 41.7, 41.9, 40.6; car-shadow 38.1, 40.8, 40.5.)
     """
     coefficients, spread = np.empty((len(home), degree, 2), np.float32), np.empty(len(home))
     follows = np.zeros(len(home), bool)
@@ -287,7 +284,7 @@ def follow_tracks(
             placed = camera.place_tracks(tracks, home[part], position[part])
             by_camera, camera_wide = _fit_tracks(placed, fractions[part], degree)
             follows[part] = better = prefers_camera(folds, wide, by_camera, camera_wide)
-            folds[better], wide[better] = by_camera[better], camera_wide[better]
+            folds[better] = fit_folds(placed[better], wide[better], degree)[0]
         coefficients[part], spread[part] = folds, wide
 
     for first in range(0, len(home), AT_ONCE):
