@@ -40,6 +40,11 @@ MISS, SHORTENING, SHORTENINGS = 0.7, 0.6, 4
 #: A pixel is constant whose color changes by less than this (of 1, root mean square over the channels) in any of so
 #: many frames.
 CONSTANT, CONSTANT_FRAMES = 0.03, 64
+#: Gaussians alive in a frame, for each pixel, below which those that follow the camera live longer than a fold alone
+#: could follow their track. With more of them, they reproduce what differs from frame to frame, such as motion blur,
+#: less well. (40 frames of bus, 180x320, 800 steps, as long as possible and as a fold alone: 15,000 Gaussians 33.9 and
+#: 31.0 dB, 40,000 36.6 and 34.7, 100,000 38.5 and 38.0; 60 s of one core, 200,000: 39.9 and 42.2.)
+FEW_ALIVE = 0.35
 CHUNK = 12_000  # tracks held by a thread: some 3 kB each on the way
 AT_ONCE = 8 * CHUNK  # tracks held by all threads
 #: Trial starts per frame, from which follows how long starts are visible: so many sigma_t to either side. In long clips
@@ -83,11 +88,13 @@ def initialize(
     times = np.linspace(0, 1, num_frames) if times is None else np.asarray(times, np.float64)
     density_of = lambda k: measure_detail(frames[k])  # noqa: E731
     make = lambda home, position: make_splats(  # noqa: E731
-        frames, home, position, times, degree, envelope, motion, rng, opacity, paths
+        frames, home, position, times, degree, envelope, motion, rng, opacity, paths, longer
     )
+    longer = 1.0
     chance, lifetime = _try_starts(times, make, density_of, rng)
     if callable(num_gaussians):
         num_gaussians = num_gaussians(lifetime)
+    longer = max(FEW_ALIVE * frames[..., 0].size / max(num_gaussians * lifetime, 1), 1.0)
     if num_gaussians < FEW_STARTS * num_frames:  # random frames would leave out whole intervals
         home = _draw(chance, (np.arange(num_gaussians) + rng.random()) / num_gaussians)
     else:
@@ -197,8 +204,12 @@ def make_splats(
     rng: np.random.Generator,
     opacity: float,
     paths: SharedPaths | None = None,
+    longer: float = 1.0,
 ) -> tuple[FoldedSplats, np.ndarray]:
-    """Splats at `position` in frames `home`, one pixel wide, with the colors of the frames; and their sigma_t."""
+    """Splats at `position` in frames `home`, one pixel wide, with the colors of the frames; and their sigma_t.
+
+    `longer` is that of `follow_tracks`.
+    """
     num, (height, width) = len(home), frames.shape[1:3]
     camera = None if paths is None else CameraCoordinates.from_paths(paths, times, (height, width))
     follows = np.zeros(num, bool)
@@ -210,7 +221,7 @@ def make_splats(
         spread = np.exp(rng.uniform(np.log(shortest), np.log(max(TIME_SCALES[1], shortest)), num))
     else:
         time = times[home]
-        coefficients, spread, follows = follow_tracks(motion, home, position, degree, rng, camera)
+        coefficients, spread, follows = follow_tracks(motion, home, position, degree, rng, camera, longer)
         coefficients /= np.float32(interval) ** np.arange(1, degree + 1)[:, None]
         spread = spread * interval
     column, row = np.floor(position).astype(np.int64).clip(0, [width - 1, height - 1]).T
@@ -264,13 +275,12 @@ def follow_tracks(
     degree: int,
     rng: np.random.Generator,
     camera: CameraCoordinates | None = None,
+    longer: float = 1.0,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Folds (num, degree, 2), in pixels per frame^k, and sigma_t (num,) in frames, of points at `home`.
 
-    And which of them (num,) follow the `camera`: their folds are in its coordinates. sigma_t is in any case as long as
-    the track can be followed by a fold alone: Gaussians that live longer reproduce what differs from frame to frame,
-    such as motion blur, less well. (40 frames of 180x320, 60 s of one core, camera not followed, followed, and with
-    longer sigma_t: bus 40.0, 42.2, 39.9 dB; lady-running 41.7, 41.9, 40.6; car-shadow 38.1, 40.8, 40.5.)
+    And which of them (num,) follow the `camera`: their folds are in its coordinates. Their sigma_t is at most `longer`
+    times the one with which a fold alone follows the track.
     """
     coefficients, spread = np.empty((len(home), degree, 2), np.float32), np.empty(len(home))
     follows = np.zeros(len(home), bool)
@@ -284,6 +294,7 @@ def follow_tracks(
             placed = camera.place_tracks(tracks, home[part], position[part])
             by_camera, camera_wide = _fit_tracks(placed, fractions[part], degree)
             follows[part] = better = prefers_camera(folds, wide, by_camera, camera_wide)
+            wide[better] = np.minimum(np.maximum(camera_wide, wide), longer * wide)[better]
             folds[better] = fit_folds(placed[better], wide[better], degree)[0]
         coefficients[part], spread[part] = folds, wide
 
