@@ -26,7 +26,7 @@ class LearningRates:
     standard deviations: the learning rates of m_s and c_k are `loc` and `coefficients` times s / UNIT_SIZE.
     With `FitConfig.scale_rates_by_duration` the unit of time is its own duration: the learning rate of c_k is
     `coefficients` times (UNIT_TIME / sigma_t)^k, that of m_t is `time_loc_logit` sigma_t / UNIT_TIME. That of a path is
-    `paths` times s / UNIT_SIZE, with s the size of the Gaussians of the step, their geometric mean.
+    `paths` times s / UNIT_SIZE, with s the mean size of the Gaussians.
     A step then moves small and large, short and long Gaussians by the same fraction of their sizes and durations.
     """
 

@@ -30,6 +30,9 @@ from foldgauss.video.models.row_layout import columns, unpack
 from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.models.video_model import VideoModel
 
+#: Every so many Gaussians are looked at for their mean size.
+SIZE_STRIDE = 64
+
 # ------------------------------------------------------------------------------------------------ metadata
 
 
@@ -344,11 +347,13 @@ def to_model(state: FitState, config: FitConfig, size: tuple[int, int], fps: flo
     )
 
 
-def paths_of(state: FitState) -> SharedPaths | None:
-    """The shared paths as they stand in `state` (copies); None where there are none."""
+def paths_of(state: FitState, times: Float32[np.ndarray, " frames"] | None = None) -> SharedPaths | None:
+    """The shared paths as they stand in `state` (copies); None where there are none. `times`: its frame times."""
     if not state.path_maps.shape[1]:
         return None
-    times = np.tile(np.asarray(frame_times(state.time_logits)), (state.path_maps.shape[1], 1))
+    times = np.tile(
+        np.asarray(frame_times(state.time_logits)) if times is None else times, (state.path_maps.shape[1], 1)
+    )
     return SharedPaths(times, np.swapaxes(state.path_maps, 0, 1).copy())
 
 
@@ -366,12 +371,14 @@ def update_paths(
     state.path_maps[frames] -= move.reshape(grad[frames].shape).astype(np.float32)
 
 
-def measure_relative_size(rows: Float32[np.ndarray, "num width"], config: FitConfig) -> float:
-    """The size of Gaussians, in units of that at which the learning rate of paths is stated; 1 if that is absolute."""
+def measure_relative_size(state: FitState, config: FitConfig) -> float:
+    """The size of Gaussians, in units of that at which the learning rate of paths is stated; 1 if it is absolute.
+
+    Their geometric mean, of every `SIZE_STRIDE`-th.
+    """
     unit = config.rate_units.size
-    if not unit or not len(rows):
-        return 1.0
-    return math.exp(float(rows[:, columns(config.degree)["log_scale"]].mean(dtype=np.float64))) / unit
+    sizes = state.rows[::SIZE_STRIDE, columns(config.degree)["log_scale"]]
+    return math.exp(float(sizes.mean(dtype=np.float64))) / unit if unit else 1.0
 
 
 def update_rows(

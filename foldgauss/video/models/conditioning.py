@@ -17,7 +17,7 @@ from foldgauss._runtime.kernels import inline, kernel
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import pixels_per_unit
 from foldgauss.video.models.row_layout import columns, has_path_column
-from foldgauss.video.models.shared_paths import SharedPaths, from_pixel_gradient, to_pixel_maps
+from foldgauss.video.models.shared_paths import SharedPaths, from_pixel_gradient, invert_maps, to_pixel_maps
 from foldgauss.video.models.splats import SH_C0, TAU_MAX
 
 CHUNK = 4096  # Gaussians per task
@@ -235,40 +235,40 @@ def _move(start, stop, alive, rows, maps, mean, factor):
 
 
 @kernel
-def _move_back(start, stop, alive, rows, maps, moved_mean, moved_factor, mean, factor, d_mean, d_factor, by_map):
+def _move_back(
+    start, stop, alive, rows, maps, inverse, moved_mean, moved_factor, mean, factor, d_mean, d_factor, by_map
+):
     """Gradients of splats before `_move`, and those by the maps; means and factors as they were before.
 
     `d_mean` and `d_factor` come in as gradients of the moved splats, and are changed in place.
     """
-    place = rows.shape[1] - 1
+    place, summed = rows.shape[1] - 1, _u(0)
+    xx, xy, x1, yx, yy, y1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0  # by the map of the path `summed`
     for k in range(start, stop):
-        for r in range(2):
-            mean[k, r] = moved_mean[k, r]
-            factor[k, r, 0], factor[k, r, 1] = moved_factor[k, r, 0], moved_factor[k, r, 1]
         path = _u(rows[alive[k], place])
-        if path == 0:
-            continue
-        m, out = maps[path], by_map[path]
-        scale = _f(1.0) / (m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0])
-        x, y = moved_mean[k, 0] - m[0, 2], moved_mean[k, 1] - m[1, 2]
-        mean[k, 0] = scale * (m[1, 1] * x - m[0, 1] * y)
-        mean[k, 1] = scale * (m[0, 0] * y - m[1, 0] * x)
-        for c in range(2):
-            x, y = moved_factor[k, 0, c], moved_factor[k, 1, c]
-            factor[k, 0, c] = scale * (m[1, 1] * x - m[0, 1] * y)
-            factor[k, 1, c] = scale * (m[0, 0] * y - m[1, 0] * x)
         gx, gy = d_mean[k, 0], d_mean[k, 1]
-        for r in range(2):
-            g = d_mean[k, r]
-            out[r, 0] += g * mean[k, 0] + d_factor[k, r, 0] * factor[k, 0, 0] + d_factor[k, r, 1] * factor[k, 0, 1]
-            out[r, 1] += g * mean[k, 1] + d_factor[k, r, 0] * factor[k, 1, 0] + d_factor[k, r, 1] * factor[k, 1, 1]
-            out[r, 2] += g
-        d_mean[k, 0] = m[0, 0] * gx + m[1, 0] * gy
-        d_mean[k, 1] = m[0, 1] * gx + m[1, 1] * gy
-        for c in range(2):
-            gx, gy = d_factor[k, 0, c], d_factor[k, 1, c]
-            d_factor[k, 0, c] = m[0, 0] * gx + m[1, 0] * gy
-            d_factor[k, 1, c] = m[0, 1] * gx + m[1, 1] * gy
+        fxx, fxy, fyx, fyy = d_factor[k, 0, 0], d_factor[k, 0, 1], d_factor[k, 1, 0], d_factor[k, 1, 1]
+        m, w = maps[path], inverse[path]
+        x, y = moved_mean[k, 0], moved_mean[k, 1]
+        x, y = w[0, 0] * x + w[0, 1] * y + w[0, 2], w[1, 0] * x + w[1, 1] * y + w[1, 2]
+        a, b, c, d = moved_factor[k, 0, 0], moved_factor[k, 0, 1], moved_factor[k, 1, 0], moved_factor[k, 1, 1]
+        a, c = w[0, 0] * a + w[0, 1] * c, w[1, 0] * a + w[1, 1] * c
+        b, d = w[0, 0] * b + w[0, 1] * d, w[1, 0] * b + w[1, 1] * d
+        mean[k, 0], mean[k, 1] = x, y
+        factor[k, 0, 0], factor[k, 0, 1], factor[k, 1, 0], factor[k, 1, 1] = a, b, c, d
+        if path != summed:
+            out = by_map[summed]
+            out[0, 0], out[0, 1], out[0, 2] = out[0, 0] + xx, out[0, 1] + xy, out[0, 2] + x1
+            out[1, 0], out[1, 1], out[1, 2] = out[1, 0] + yx, out[1, 1] + yy, out[1, 2] + y1
+            xx, xy, x1, yx, yy, y1, summed = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, path
+        xx, xy, x1 = xx + gx * x + fxx * a + fxy * b, xy + gx * y + fxx * c + fxy * d, x1 + gx
+        yx, yy, y1 = yx + gy * x + fyx * a + fyy * b, yy + gy * y + fyx * c + fyy * d, y1 + gy
+        d_mean[k, 0], d_mean[k, 1] = m[0, 0] * gx + m[1, 0] * gy, m[0, 1] * gx + m[1, 1] * gy
+        d_factor[k, 0, 0], d_factor[k, 0, 1] = m[0, 0] * fxx + m[1, 0] * fyx, m[0, 0] * fxy + m[1, 0] * fyy
+        d_factor[k, 1, 0], d_factor[k, 1, 1] = m[0, 1] * fxx + m[1, 1] * fyx, m[0, 1] * fxy + m[1, 1] * fyy
+    out = by_map[summed]
+    out[0, 0], out[0, 1], out[0, 2] = out[0, 0] + xx, out[0, 1] + xy, out[0, 2] + x1
+    out[1, 0], out[1, 1], out[1, 2] = out[1, 0] + yx, out[1, 1] + yy, out[1, 2] + y1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -376,14 +376,14 @@ def backpropagate(
     if done.maps is not None:
         own_mean, own_factor = np.empty_like(done.mean), np.empty_like(done.factor)
         d_mean, d_factor = np.array(d_mean, np.float32), np.array(d_factor, np.float32)
-        by_map = np.zeros((len(by_time), *done.maps.shape))
+        by_map, inverse = np.zeros((len(by_time), *done.maps.shape)), invert_maps(done.maps)
         factor = own_factor
 
     def work(start: int) -> None:
         stop = min(start + CHUNK, num)
         if done.maps is not None:
             own, by = (own_mean, own_factor, d_mean, d_factor), by_map[start // CHUNK]
-            _move_back(start, stop, done.alive, rows, done.maps, done.mean, done.factor, *own, by)
+            _move_back(start, stop, done.alive, rows, done.maps, inverse, done.mean, done.factor, *own, by)
         by_time[start // CHUNK] = _pull_back(
             _LAYOUT,
             start,

@@ -126,6 +126,12 @@ def to_pixel_maps(
     return np.concatenate([maps[:, :, :2], offset[:, :, None]], 2).astype(np.float32)
 
 
+def invert_maps(maps: Float[np.ndarray, "*batch 2 3"]) -> Float[np.ndarray, "*batch 2 3"]:
+    """The maps back; float32."""
+    linear = np.linalg.inv(maps[..., :2].astype(np.float64))
+    return np.concatenate([linear, -linear @ maps[..., 2:]], -1).astype(np.float32)
+
+
 def from_pixel_gradient(
     gradient: Float[np.ndarray, "paths+1 2 3"], unit: float, center: Float[np.ndarray, "2"]
 ) -> Float[np.ndarray, "paths 2 3"]:

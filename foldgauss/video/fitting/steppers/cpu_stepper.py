@@ -77,7 +77,7 @@ class CpuStepper:
             self.background = random_background(config.seed, state.step)
         times = np.asarray(frame_times(state.time_logits))
         by_time, by_path = np.zeros_like(times), np.zeros(state.path_maps.shape)
-        shape = dataclasses.replace(self.shapes[level], paths=paths_of(state))
+        shape = dataclasses.replace(self.shapes[level], paths=paths_of(state, times))
         losses, alive, visited = [], [], set()
         squared = progress >= 1 - config.l2_fraction
         seen = None if state.statistics is None else []
@@ -105,7 +105,7 @@ class CpuStepper:
         num_alive = len(touched)
         if not config.sparse_updates:
             touched = np.arange(len(state.rows))
-        relative_size = measure_relative_size(state.rows[touched], config) if by_path.size else 1.0
+        relative_size = measure_relative_size(state, config) if by_path.size else 1.0
         rates, time_rate = self.rates.at(progress, state.backoffs)
         finite = update_rows(state, self.grad, touched, rates, degree=config.degree, units=config.rate_units)
         update_windows(state.rows, touched, self.window)

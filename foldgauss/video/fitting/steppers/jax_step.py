@@ -20,7 +20,7 @@ from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.render.tiles import find_visible
 from foldgauss.video.fitting.adam import BETA1, BETA2, EPSILON, RateUnits, masked_adam, update_frame_times
 from foldgauss.video.fitting.growth import GradientStatistics
-from foldgauss.video.fitting.state import DeviceArrays, FitState, Sizes, frame_times
+from foldgauss.video.fitting.state import SIZE_STRIDE, DeviceArrays, FitState, Sizes, frame_times
 from foldgauss.video.fitting.steppers.jax_loss import compute_losses
 from foldgauss.video.models.row_layout import columns, unpack
 from foldgauss.video.models.shared_paths import move_splats
@@ -164,7 +164,7 @@ def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames he
         logits, time_moments = update_frame_times(logits, time_moments, seen.by_times, control.time_rate)
     errors = jnp.where(seen.errors >= 0, seen.errors, arrays.frame_errors)
     if program.num_paths:
-        arrays = _update_paths(arrays, seen, control.path_rate * _relative_size(program, before, touched))
+        arrays = _update_paths(arrays, seen, control.path_rate * _relative_size(program, before, control.num))
     report = Report(
         loss=seen.loss,
         num_alive=jnp.sum(seen.alive, dtype=jnp.int32),
@@ -177,12 +177,13 @@ def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames he
     return arrays._replace(frame_errors=errors, time_logits=logits, time_moments=time_moments), report
 
 
-def _relative_size(program: Program, rows, touched) -> Float[Array, ""]:
-    """The twin of `state.measure_relative_size`, of the Gaussians `touched`."""
+def _relative_size(program: Program, rows, num) -> Float[Array, ""]:
+    """The twin of `state.measure_relative_size`."""
     if not program.rate_units.size:
         return jnp.float32(1)
-    sizes = jnp.mean(rows[:, columns(program.degree)["log_scale"]], axis=1)
-    mean = jnp.sum(jnp.where(touched, sizes, 0)) / jnp.maximum(jnp.sum(touched), 1).astype(jnp.float32)
+    sizes = jnp.mean(rows[::SIZE_STRIDE, columns(program.degree)["log_scale"]], axis=1)
+    used = jnp.arange(0, program.capacity, SIZE_STRIDE, dtype=jnp.int32) < num
+    mean = jnp.sum(jnp.where(used, sizes, 0)) / jnp.sum(used).astype(jnp.float32)
     return jnp.exp(mean) / np.float32(program.rate_units.size)
 
 
