@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from path_models import random_splats
 
-from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions
 from foldgauss.video import FrameTimes, VideoModel
 from foldgauss.video.models.conditioning import (
@@ -18,28 +18,8 @@ from foldgauss.video.models.conditioning import (
     update_windows,
 )
 from foldgauss.video.models.row_layout import columns, pack, unpack
-from foldgauss.video.models.splats import FoldedSplats
 
 SIZE, T = (48, 80), np.float32(0.4)
-
-
-def random_splats(num=300, degree=3, power=2.0, floor=0.0, seed=0) -> FoldedSplats:
-    rng = np.random.default_rng(seed)
-
-    def normal(*shape, scale=1.0):
-        return jnp.asarray(rng.normal(size=(num, *shape)) * scale, jnp.float32)
-
-    return FoldedSplats(
-        loc=normal(2, scale=0.3),
-        log_scale=normal(2, scale=0.5) - 3,
-        angle_logit=normal(),
-        time_loc_logit=normal(),
-        log_time_scale=normal(scale=0.7) - 1.5,
-        coefficients=normal(degree, 2),
-        opacity_logit=normal(),
-        color_dc=normal(3),
-        envelope=TimeLikelihood(power, floor),
-    )
 
 
 def twin(splats, power, floor):

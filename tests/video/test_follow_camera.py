@@ -5,6 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from path_models import affine, moving_splats, scene
 
 from foldgauss.io import load_video_model, save_video_model
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
@@ -18,8 +19,6 @@ from foldgauss.video.fitting.state import paths_of, to_model
 from foldgauss.video.models.shared_paths import SharedPaths, leave_paths
 from foldgauss.video.motion.camera_path import FARTHEST, find_camera_maps
 from foldgauss.video.motion.optical_flow import Motion
-from tests.video.test_shared_paths import moving_splats
-from tests.video.test_stabilization import affine, scene
 
 CONFIG = FitConfig(num_gaussians=1500, steps=300, degree=2)
 TIMES = np.linspace(0, 1, 12)

@@ -5,6 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 from commands import run
+from edit_cases import ALWAYS, BAKED, BETWEEN, apart
+from path_models import INDEX, path_model
 from soft_models import NUM, OBJECT, SIZE, soft_model
 
 from foldgauss.io import (
@@ -25,19 +27,6 @@ from foldgauss.video.segmented.flatten import flatten_video
 from foldgauss.video.segmented.segmented_video import Segment
 from foldgauss.video.selection.contributions import Contributions
 from foldgauss.video.tradeoff import to_half_precision
-from tests.video.test_edit import ALWAYS, BAKED, BETWEEN, apart
-
-#: A third of the Gaussians, of the object and of the background, on each of two paths, and a third on none.
-INDEX = (np.arange(NUM) % 3).astype(np.uint8)
-
-
-def path_model(num_paths=2, num_knots=6, seed=5, **settings) -> VideoModel:
-    rng, model = np.random.default_rng(seed), soft_model(**settings)
-    times = np.sort(rng.random((num_paths, num_knots)), 1).astype(np.float32)
-    matrices = np.eye(2, 3) + 0.08 * rng.normal(size=(num_paths, num_knots, 2, 3))
-    splats = dataclasses.replace(model.splats, path_index=INDEX, paths=SharedPaths(times, matrices.astype(np.float32)))
-    return dataclasses.replace(model, splats=splats)
-
 
 MODEL = path_model()
 

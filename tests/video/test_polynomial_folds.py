@@ -6,13 +6,13 @@ import warnings
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from path_models import INDEX, path_model
 from soft_models import NUM, OBJECT, soft_model
 
 from foldgauss.io import read_vegas_ply, write_vegas_ply
 from foldgauss.video import FrameTimes, without_paths
 from foldgauss.video.models.prepared import PreparedModel
 from foldgauss.video.models.shared_paths import SharedPaths
-from tests.video.test_path_edits import INDEX, path_model
 
 
 def smooth_model(place, *, num_knots=201, index=INDEX, **settings):

@@ -6,35 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from path_models import moving_model, moving_splats, random_paths, random_splats
 
 from foldgauss.io import load_video_model, save_video_model
-from foldgauss.render import RenderOptions
-from foldgauss.video import FrameTimes, VideoModel, density_image
+from foldgauss.video import density_image
 from foldgauss.video.models.conditioning import ConditioningSpec, backpropagate, condition, update_windows
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.row_layout import columns, pack, unpack
 from foldgauss.video.models.shared_paths import SharedPaths
-from foldgauss.video.models.splats import FoldedSplats
-from tests.video.test_conditioning import random_splats
 
 SIZE, T = (48, 80), np.float32(0.4)
-
-
-def random_paths(num_paths=2, num_knots=5, seed=3) -> SharedPaths:
-    rng = np.random.default_rng(seed)
-    times = np.sort(rng.random((num_paths, num_knots)), 1).astype(np.float32)
-    matrices = np.eye(2, 3) + 0.2 * rng.normal(size=(num_paths, num_knots, 2, 3))
-    return SharedPaths(times, matrices.astype(np.float32))
-
-
-def moving_splats(num=300, seed=0, **settings) -> FoldedSplats:
-    index = np.random.default_rng(seed).integers(0, 3, num).astype(np.uint8)
-    return dataclasses.replace(random_splats(num, seed=seed, **settings), path_index=index, paths=random_paths())
-
-
-def moving_model(splats=None) -> VideoModel:
-    splats = moving_splats() if splats is None else splats
-    return VideoModel(splats, FrameTimes.uniform(4), SIZE, 25.0, RenderOptions())
 
 
 def test_maps_are_those_at_the_knots_and_linear_between_them():

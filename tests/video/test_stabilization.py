@@ -2,59 +2,29 @@
 
 import itertools
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from path_models import SCENE_FRAMES as NUM_FRAMES
+from path_models import SCENE_SIZE as SIZE
+from path_models import affine, scene
 
-from foldgauss.envelope import TimeLikelihood
-from foldgauss.render import RenderOptions, Splats2D
+from foldgauss.render import Splats2D
 from foldgauss.video import (
     CameraPath,
-    FoldedSplats,
     FrameTimes,
     SegmentedVideo,
     StabilizedVideo,
-    VideoModel,
     edit,
     estimate_camera_path,
     psnr,
     stabilize,
 )
 from foldgauss.video.models.frame_times import make_time_logits
-from foldgauss.video.models.splats import STATIC_LOG_TIME_SCALE
-
-SIZE, NUM_FRAMES, FPS = (96, 160), 12, 12.0
-
-
-def scene(frame_times=None, num=1500, wide=2.0, scales=(0.01, 0.05), compositing="over"):
-    """Static Gaussians of random colors on a plane `wide` times the frame."""
-    rng = np.random.default_rng(3)
-    logit = lambda p: np.log(p / (1 - p))  # noqa: E731
-    leaves = {
-        "loc": rng.uniform(-wide / 2, wide / 2, (num, 2)) * [1, SIZE[0] / SIZE[1]],
-        "log_scale": np.log(rng.uniform(*scales, (num, 2))),
-        "angle_logit": rng.normal(size=num),
-        "time_loc_logit": np.zeros(num),
-        "log_time_scale": np.full(num, STATIC_LOG_TIME_SCALE),
-        "coefficients": np.zeros((num, 1, 2)),
-        "opacity_logit": np.full(num, logit(0.98)),
-        "color_dc": rng.normal(size=(num, 3)),
-    }
-    splats = FoldedSplats(
-        **{key: jnp.asarray(leaf, jnp.float32) for key, leaf in leaves.items()}, envelope=TimeLikelihood()
-    )
-    times = FrameTimes.uniform(NUM_FRAMES) if frame_times is None else frame_times
-    return VideoModel(splats, times, SIZE, FPS, RenderOptions(), compositing)
 
 
 def picture(video, k):
     """Frame k in 8 bits."""
     return next(video.frames(np.asarray(video.frame_times.times())[[k]]))
-
-
-def affine(turn=0.0, zoom=1.0, shift=(0.0, 0.0)):
-    cos, sin = zoom * np.cos(turn), zoom * np.sin(turn)
-    return np.array([[cos, -sin, shift[0]], [sin, cos, shift[1]], [0, 0, 1]])
 
 
 def standing(model):
