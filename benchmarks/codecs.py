@@ -3,7 +3,8 @@
     python -m benchmarks.codecs [--json FILE] [--clips FOLDER] [--minutes M] [--figure FILE]
 
 The sample clips and the subfolders of FOLDER, 50 frames each, at 160x284 (carphone: 144x176). `foldgauss`: fits of M
-minutes of one core with several numbers of Gaussians, compressed for at most 0.3 dB. Codecs: FFmpeg's encoders
+minutes of one core with several numbers of Gaussians, compressed for at most 0.3 dB, and the same where no Gaussian
+follows the camera. Codecs: FFmpeg's encoders
 through PyAV, 4:2:0, at several constant rate factors, presets *medium* and *slow* (SVT-AV1: 6 and 3), all tuned for
 PSNR, whole Matroska files. Images: one JPEG or WebP for each frame. PSNR and SSIM of the decoded RGB frames, means;
 bits per pixel; seconds of processor time to encode (to fit and compress) and to decode all frames (to render them).
@@ -41,6 +42,8 @@ from foldgauss.video import FitConfig, compress, psnr, ssim
 
 NUM_FRAMES, SIZE = 50, (160, 284)
 GAUSSIANS = (3_000, 12_000, 48_000)
+#: Whether Gaussians follow the camera.
+FITS = {"foldgauss": True, "foldgauss, camera not followed": False}
 LOSS_DB, MINUTES, REFERENCE = 0.3, 1.0, "x264 medium"
 #: Encoder, options, constant rate factors. SVT-AV1 is tuned for PSNR by default.
 CODECS = {
@@ -113,11 +116,11 @@ def run_images(frames: np.ndarray, name: str, quality: int) -> Run:
     return score(frames, decoded, sum(map(len, files)), encode_s, decode_s)
 
 
-def run_foldgauss(frames: np.ndarray, fps: float, num: int, minutes: float) -> Run:
+def run_foldgauss(frames: np.ndarray, fps: float, config: FitConfig) -> Run:
     with tempfile.TemporaryDirectory() as folder:
 
         def encode() -> Path:
-            model = fit_model(frames, FitConfig(num_gaussians=num, minutes=minutes), fps, cpu_time=True)
+            model = fit_model(frames, config, fps, cpu_time=True)
             made = compress(model, frames, max_loss_db=LOSS_DB)
             return save_compact(Path(folder) / "clip.fgz", made.quantized)
 
@@ -152,9 +155,11 @@ def measure(source: ClipSource, runs: Runs, minutes: float) -> dict[str, list[Ru
         for quality in qualities:
             key = f"{source.name}, {name}, {quality}"
             by_coder[name].append(runs.get(key, lambda n=name, q=quality: run_images(frames, n, q)))
-    for num in GAUSSIANS:
-        key = f"{source.name}, foldgauss, {num}"
-        by_coder["foldgauss"].append(runs.get(key, lambda n=num: run_foldgauss(frames, clip.fps, n, minutes)))
+    for name, follow in FITS.items():
+        for num in GAUSSIANS:
+            config = FitConfig(num_gaussians=num, minutes=minutes, follow_camera=follow)
+            key = f"{source.name}, {name}, {num}"
+            by_coder[name].append(runs.get(key, lambda config=config: run_foldgauss(frames, clip.fps, config)))
     return dict(by_coder)
 
 
@@ -163,7 +168,9 @@ def draw(results: dict[str, dict[str, list[Run]]], path: Path) -> None:
     for ax, (clip, by_coder) in zip(axes[0], results.items(), strict=True):
         for number, (name, made) in enumerate(by_coder.items()):
             points = sorted((run["bits_per_pixel"], run["psnr"]) for run in made)
-            style = {"lw": 2.5, "color": "black"} if name == "foldgauss" else {"lw": 1, "color": f"C{number}"}
+            style = (
+                {"lw": 2.5 if FITS[name] else 1, "color": "black"} if name in FITS else {"lw": 1, "color": f"C{number}"}
+            )
             ax.plot(*zip(*points, strict=True), marker="o", ms=3, label=name, **style)
         ax.set(title=clip, xscale="log", xlabel="bits per pixel")
         ax.grid(alpha=0.3)
