@@ -168,10 +168,8 @@ def draw(results: dict[str, dict[str, list[Run]]], path: Path) -> None:
     for ax, (clip, by_coder) in zip(axes[0], results.items(), strict=True):
         for number, (name, made) in enumerate(by_coder.items()):
             points = sorted((run["bits_per_pixel"], run["psnr"]) for run in made)
-            style = (
-                {"lw": 2.5 if FITS[name] else 1, "color": "black"} if name in FITS else {"lw": 1, "color": f"C{number}"}
-            )
-            ax.plot(*zip(*points, strict=True), marker="o", ms=3, label=name, **style)
+            color, width = ("black", 2.5 if FITS[name] else 1) if name in FITS else (f"C{number}", 1)
+            ax.plot(*zip(*points, strict=True), marker="o", ms=3, label=name, lw=width, color=color)
         ax.set(title=clip, xscale="log", xlabel="bits per pixel")
         ax.grid(alpha=0.3)
     axes[0, 0].set_ylabel("PSNR (dB)")
