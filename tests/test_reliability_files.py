@@ -144,6 +144,7 @@ def older(folder, name):
     return lambda: old.read_bytes() == OLDER and os.listdir(path) == [old.name]
 
 
+@pytest.mark.filterwarnings("ignore:model. the file has no shared paths")
 def test_a_full_disk_costs_no_older_output_and_leaves_nothing(work, disk, capsys):
     """All commands that write one file or one folder, each with an older one there."""
     for name in OUTPUTS:

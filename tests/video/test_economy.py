@@ -424,6 +424,9 @@ def test_count_of_parameters_is_that_of_the_file():
     alone = dataclasses.replace(model.splats, color_dc=distinct(model, 3), log_scale=distinct(model, 2))
     whole = dataclasses.replace(model, splats=alone)
     others = 2 + model.num_frames - 1  # of the envelope and the frame times
+    paths = whole.splats.paths
+    if paths is not None:
+        others += paths.times.size + paths.matrices.size + -(-len(kinds) // 4)
     assert whole.num_parameters == count_parameters(kinds) + -(-len(kinds) // 4) + others
 
 

@@ -374,11 +374,11 @@ def update_paths(
 def measure_relative_size(state: FitState, config: FitConfig) -> float:
     """The size of Gaussians, in units of that at which the learning rate of paths is stated; 1 if it is absolute.
 
-    Their geometric mean, of every `SIZE_STRIDE`-th.
+    Their geometric mean, of every `SIZE_STRIDE`-th, at most that of the frame.
     """
     unit = config.rate_units.size
-    sizes = state.rows[::SIZE_STRIDE, columns(config.degree)["log_scale"]]
-    return math.exp(float(sizes.mean(dtype=np.float64))) / unit if unit else 1.0
+    mean = float(state.rows[::SIZE_STRIDE, columns(config.degree)["log_scale"]].mean(dtype=np.float64))
+    return math.exp(min(mean, 0.0)) / unit if unit and math.isfinite(mean) else 1.0
 
 
 def update_rows(

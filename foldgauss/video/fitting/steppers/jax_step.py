@@ -184,7 +184,8 @@ def _relative_size(program: Program, rows, num) -> Float[Array, ""]:
     sizes = jnp.mean(rows[::SIZE_STRIDE, columns(program.degree)["log_scale"]], axis=1)
     used = jnp.arange(0, program.capacity, SIZE_STRIDE, dtype=jnp.int32) < num
     mean = jnp.sum(jnp.where(used, sizes, 0)) / jnp.sum(used).astype(jnp.float32)
-    return jnp.exp(mean) / np.float32(program.rate_units.size)
+    relative = jnp.exp(jnp.minimum(mean, 0)) / np.float32(program.rate_units.size)
+    return jnp.where(jnp.isfinite(mean), relative, 1)
 
 
 def _update_paths(arrays: DeviceArrays, seen: "Gradients", rate: Float[Array, ""]) -> DeviceArrays:
