@@ -155,7 +155,7 @@ def test_both_views_give_the_same_gradients():
     for mirrored in (False, True):
         step = CpuStepper(FRAMES, config, state)
         loss, _, by_time = step._differentiate(
-            state, 2, np.float32(0.6), step.shapes[-1], squared=False, mirrored=mirrored, seen=None, fraction=None
+            state, 2, np.float32(0.6), step.shapes[-1], None, squared=False, mirrored=mirrored, seen=None, fraction=None
         )
         gradients.append(np.append(step.grad, by_time))
         losses.append(loss.value)
