@@ -20,3 +20,19 @@ def locate(
     begun, ended = (xp.take_along_axis(times, k[..., None], -1)[..., 0] for k in (before, after))
     span = ended - begun
     return before, after, xp.clip((t - begun) / xp.where(span > 0, span, 1), 0, 1)
+
+
+def locate_in_rows(
+    times: Float[np.ndarray, "rows knots"], row: Int[np.ndarray, "*batch"], t: Float[np.ndarray, "*batch"]
+) -> tuple[Int[np.ndarray, "*batch"], Int[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
+    """`locate(times[row], t)`, without an array of (*batch, knots)."""
+    row, t = np.broadcast_arrays(row, t)
+    last, before = times.shape[-1] - 1, np.empty(t.shape, np.int32)
+    for number in np.unique(row):
+        here = row == number
+        before[here] = np.searchsorted(times[number], t[here], side="right") - 1
+    before = np.clip(before, 0, max(last - 1, 0))
+    after = np.minimum(before + 1, last)
+    begun, ended = times[row, before], times[row, after]
+    span = ended - begun
+    return before, after, np.clip((t - begun) / np.where(span > 0, span, 1), 0, 1)

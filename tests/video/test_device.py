@@ -412,7 +412,7 @@ def test_only_arrays_that_are_read_are_fetched(monkeypatch):
     fetched.clear()
     for _ in range(60):  # in which the guard remembers a state, on the device
         next(steps)
-    assert set(fetched) == {"frame_errors", "time_logits"}  # which every step tells
+    assert set(fetched) == {"frame_errors", "time_logits", "path_maps"}  # which every step tells, and the guard tests
     before = state.rows
     assert fetched[-1] == "rows"
     next(steps)

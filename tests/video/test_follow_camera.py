@@ -58,11 +58,28 @@ def test_a_camera_that_stands_still_has_no_maps():
 
 def test_maps_do_not_drift_away_where_the_camera_never_returns():
     """A zoom by 15% in each frame, which adds up to 4.7 times."""
-    maps = np.stack([affine(zoom=1.15**k) for k in range(12)])
+    maps = np.stack([affine(zoom=1.15**k) @ shaking for k, shaking in enumerate(MAPS)])
     found = np.tile(np.eye(3), (12, 1, 1))
     found[:, :2] = find_camera_maps(Motion.from_frames(shaken(maps)))
     assert np.abs(np.log(np.linalg.svd(found[:, :2, :2], compute_uv=False))).max() < FARTHEST[0]
     assert np.linalg.det(found[-1, :2, :2]) > 1.1  # but they follow
+
+
+def test_a_steady_pan_has_no_maps():
+    """Folds follow it, and frame times tell where frames are missing."""
+    maps = np.stack([affine(shift=(0.02 * k, 0.005 * k)) for k in range(12)])
+    frames = shaken(maps)
+    assert find_camera_maps(Motion.from_frames(frames)) is None
+    assert find_camera_maps(Motion.from_frames(np.delete(frames, 6, 0))) is None
+
+
+def test_an_object_before_a_flat_background_is_no_camera():
+    rng, y_x = np.random.default_rng(0), np.mgrid[:96, :160]
+    frames = np.full((12, 96, 160, 3), 120, np.uint8)
+    for frame, (x, y) in zip(frames, rng.uniform([40, 30], [120, 66], (12, 2)), strict=True):
+        inside = np.hypot(y_x[0] - y, y_x[1] - x) < 9
+        frame[inside] = rng.integers(0, 255, (inside.sum(), 3))
+    assert find_camera_maps(Motion.from_frames(frames)) is None
 
 
 def test_every_shot_has_coordinates_of_its_own():
@@ -107,6 +124,16 @@ def test_starts_lie_where_the_frame_shows_them():
     plain = to_model(start(FRAMES, still), still, FRAMES.shape[1:3], 12.0)
     ours, theirs = (evaluate(one, FRAMES).mean_psnr for one in (model, plain))
     assert ours > theirs - 0.5
+
+
+@pytest.mark.filterwarnings("ignore::foldgauss.video.DivergenceWarning")
+@pytest.mark.parametrize("value", [np.nan, 0.0])
+def test_maps_that_cannot_be_inverted_are_a_fault(value):
+    for state, info in fit_steps(FRAMES, dataclasses.replace(CONFIG, num_gaussians=200, steps=60)):
+        if info.step == 20:
+            state.path_maps[3, 0, :, :2] = value
+    assert state.backoffs == 1
+    assert (np.linalg.det(state.path_maps[..., :2]) > 0).all()
 
 
 def test_coordinates_of_positions_and_tracks_agree():

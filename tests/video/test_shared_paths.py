@@ -1,6 +1,7 @@
 """Paths that Gaussians share: maps in time, conditioning and its gradient, and files."""
 
 import dataclasses
+import tracemalloc
 
 import jax
 import jax.numpy as jnp
@@ -110,6 +111,38 @@ def test_files_hold_paths(tmp_path):
         np.testing.assert_array_equal(one, other)
     for t in (0.2, 0.5):
         np.testing.assert_array_equal(VideoRenderer(again).frame(t), VideoRenderer(model).frame(t))
+
+
+@pytest.mark.parametrize(
+    ("leaf", "value", "expected"),
+    [
+        ("matrices", np.nan, "finite times and matrices"),
+        ("times", np.inf, "finite times and matrices"),
+        ("times", -1.0, "times that do not decrease"),
+    ],
+)
+def test_paths_that_make_no_sense_are_errors(tmp_path, leaf, value, expected):
+    paths = random_paths()
+    changed = getattr(paths, leaf).copy()
+    changed[0, 3] = value
+    model = moving_model(dataclasses.replace(moving_splats(), paths=dataclasses.replace(paths, **{leaf: changed})))
+    with pytest.raises(ValueError, match=expected):
+        model.prepare(SIZE)
+    with pytest.raises(ValueError, match=expected):
+        load_video_model(save_video_model(tmp_path / "m.safetensors", model))
+
+
+def test_places_of_many_take_no_memory_for_every_knot():
+    rng = np.random.default_rng(0)
+    times = np.sort(rng.random((2, 2000)), 1).astype(np.float32)
+    paths = SharedPaths(times, rng.normal(size=(2, 2000, 2, 3)).astype(np.float32))
+    t, path = rng.random(20_000).astype(np.float32), rng.integers(0, 2, 20_000)
+    tracemalloc.start()
+    maps = paths.by_path(t, path)
+    assert tracemalloc.get_traced_memory()[1] < 2e7
+    tracemalloc.stop()
+    expected = jax.tree.map(jnp.asarray, paths).by_path(jnp.asarray(t[:50]), jnp.asarray(path[:50]))
+    np.testing.assert_allclose(maps[:50], expected, atol=1e-5)
 
 
 def test_a_number_of_a_path_that_is_not_there_is_an_error(tmp_path):

@@ -27,7 +27,7 @@ from foldgauss.render import RenderOptions
 from foldgauss.video.compression.quantized_paths import PathsInfo, decode_paths, describe_paths, round_paths
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.row_layout import shift_path
-from foldgauss.video.models.shared_paths import SharedPaths, check_path_index
+from foldgauss.video.models.shared_paths import SharedPaths, check_paths
 from foldgauss.video.models.splats import OPAQUE_LOGIT, STATIC_LOG_TIME_SCALE, TAU_MAX, FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
 
@@ -422,7 +422,7 @@ def compute_columns(model: VideoModel) -> ExactColumns:
     exact = ExactColumns(info, *own, values, place, np.asarray(model.frame_times.logits, np.float64))
     if splats.paths is None:
         return exact
-    check_path_index(splats)
+    check_paths(splats)
     info = dataclasses.replace(info, paths=describe_paths(model))
     return dataclasses.replace(exact, info=info, path=np.asarray(splats.path_index, np.int32), paths=splats.paths)
 

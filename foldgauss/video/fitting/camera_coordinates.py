@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from foldgauss.video.models.shared_paths import SharedPaths
+from foldgauss.video.models.shared_paths import SharedPaths, invert_maps
 from foldgauss.video.motion.optical_flow import LONGEST, Tracks
 
 #: A start follows the camera if a fold follows its track for longer in these coordinates, by this factor, than in those
@@ -29,8 +29,8 @@ class CameraCoordinates:
         maps[:, :2] = paths.by_path(np.asarray(times, np.float32), np.zeros(len(times), int))
         unit = max(size)
         to_pixels = np.array([[unit, 0, size[1] / 2], [0, unit, size[0] / 2], [0, 0, 1]])
-        inverse = to_pixels @ np.linalg.inv(maps) @ np.linalg.inv(to_pixels)
-        return cls(inverse[:, :2].astype(np.float32))
+        pixels = to_pixels @ maps @ np.linalg.inv(to_pixels)
+        return cls(invert_maps(pixels[:, :2]))
 
     def place(self, frame: Int[np.ndarray, " num"], position: Float[np.ndarray, "num 2"]) -> Float[np.ndarray, "num 2"]:
         """Positions in frames."""

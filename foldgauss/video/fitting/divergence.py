@@ -78,7 +78,7 @@ class Guard:
     def find_fault(self, state: FitState, result: StepResult) -> str:
         """A description of what is wrong after a step; empty if nothing is."""
         finite = math.isfinite(result.loss) and result.finite and state.is_finite("time_logits")
-        if not finite or (state.step % TEST_EVERY == 0 and not state.is_finite("rows")):
+        if not finite or (state.step % TEST_EVERY == 0 and not (state.is_finite("rows") and _has_valid_maps(state))):
             return _find_nonfinite(state, self.config) or f"a loss of {result.loss}"
         if state.backoffs >= MAX_BACKOFFS:
             return ""  # no back-off is left, and a bad fit is better than none
@@ -99,7 +99,7 @@ class Guard:
 
     def is_converging(self, state: FitState) -> bool:
         """Whether the fit has not diverged so far and its frames are better than at the start, as far as is known."""
-        if state.backoffs or not (state.is_finite("rows") and state.is_finite("second")):
+        if state.backoffs or not (state.is_finite("rows") and state.is_finite("second") and _has_valid_maps(state)):
             return False
         return not self.comparable or (self._error_ratio(state) <= MUCH_WORSE and self._start_ratio(state) < 1)
 
@@ -115,7 +115,7 @@ class Guard:
             return  # not all frames have been seen since the back-off
         most = 1 if state.backoffs else NOT_BETTER  # after a back-off, keep only states better than the start
         bad = self.comparable and (self._error_ratio(state) > MUCH_WORSE or self._start_ratio(state) > most)
-        if due and not bad and state.is_finite("rows") and state.is_finite("second"):
+        if due and not bad and state.is_finite("rows") and state.is_finite("second") and _has_valid_maps(state):
             state.last_finite = state.copy()
 
     def finish(self, state: FitState) -> None:
@@ -186,7 +186,17 @@ class Guard:
                 if at.stop > at.start
             }
         moved["frame times"] = _time_move(state)
+        maps = state.path_maps
+        if maps.size:
+            moved["paths"] = float(np.median(np.abs(maps - state.last_finite.path_maps))) / MIN_SCALE["loc"]
         return max(moved, key=moved.get)
+
+
+def _has_valid_maps(state: FitState) -> bool:
+    """Whether the maps of shared paths are finite and none mirrors or flattens the image."""
+    maps = state.path_maps
+    with np.errstate(invalid="ignore", over="ignore"):
+        return bool((np.isfinite(maps).all((-2, -1)) & (np.linalg.det(maps[..., :2]) > 0)).all())
 
 
 def _mean_without_worst(errors: np.ndarray) -> float:
@@ -207,6 +217,8 @@ def _find_nonfinite(state: FitState, config: FitConfig) -> str:
         bad = np.flatnonzero(~np.isfinite(rows[:, at]).all(1))
         if len(bad):
             found.append(f"no finite {name} in {len(bad):,} Gaussians, the first of them {bad[0]}")
+    if not _has_valid_maps(state):
+        found.append("no maps of shared paths that can be inverted")
     if not np.isfinite(state.time_logits).all():
         found.append("no finite frame times")
     return "; ".join(found)

@@ -359,8 +359,8 @@ def paths_of(state: FitState, times: Float32[np.ndarray, " frames"] | None = Non
 
 def update_paths(
     state: FitState, grad: Float[np.ndarray, "frames paths 2 3"], frames: Int[np.ndarray, " n"], rate: float
-) -> None:
-    """A step of Adam on the maps of `frames`, which are distinct, in place."""
+) -> bool:
+    """A step of Adam on the maps of `frames`, which are distinct, in place. Returns whether these can be inverted."""
     num = len(frames)
     state.frame_counts[frames] += 1
     arrays = (array[frames].reshape(num, -1) for array in (grad, state.path_first, state.path_second))
@@ -369,6 +369,8 @@ def update_paths(
     for array, value in ((state.path_first, first), (state.path_second, second)):
         array[frames] = value.reshape(grad[frames].shape)
     state.path_maps[frames] -= move.reshape(grad[frames].shape).astype(np.float32)
+    with np.errstate(invalid="ignore", over="ignore"):
+        return bool((np.linalg.det(state.path_maps[frames][..., :2]) > 0).all())
 
 
 def measure_relative_size(state: FitState, config: FitConfig) -> float:

@@ -18,7 +18,7 @@ from foldgauss.video.models.conditioning import (
 )
 from foldgauss.video.models.frame_times import FrameTimes, snap_to_shots
 from foldgauss.video.models.row_layout import pack
-from foldgauss.video.models.shared_paths import check_path_index
+from foldgauss.video.models.shared_paths import check_paths
 from foldgauss.video.models.splats import FoldedSplats
 
 
@@ -49,7 +49,7 @@ class PreparedModel:
         _check_finite(self.rows)
         power, floor = (_common_value(model.splats.envelope, name) for name in ("power", "floor"))
         aspect = height / width if aspect is None else aspect
-        check_path_index(model.splats)
+        check_paths(model.splats)
         paths = jax.tree.map(np.asarray, model.splats.paths)
         self.spec = ConditioningSpec(model.splats.degree, power, floor, tuple(size), aspect=aspect, paths=paths)
         self.window = np.empty((len(self.rows), 2), np.float32)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from foldgauss._numerics.piecewise import locate
+from foldgauss._numerics.piecewise import locate, locate_in_rows
 from foldgauss._runtime.checks import invalid
 from foldgauss.render import Splats2D
 
@@ -54,7 +54,10 @@ class SharedPaths(eqx.Module):
         """The maps of paths, numbered from 0, each at a time of its own."""
         xp = np if isinstance(self.matrices, np.ndarray) and isinstance(t, np.ndarray) else jnp
         matrices, times = xp.asarray(self.matrices), xp.asarray(self.times)
-        before, after, fraction = locate(times[path], t)
+        if xp is np:  # without the times of every Gaussian's path, of which there may be thousands
+            before, after, fraction = locate_in_rows(times, path, t)
+        else:
+            before, after, fraction = locate(times[path], t)
         fraction = fraction[..., None, None]
         return (1 - fraction) * matrices[path, before] + fraction * matrices[path, after]
 
@@ -108,10 +111,18 @@ def leave_paths(splats: Any, which: Bool[np.ndarray, " num"]) -> Any:
     )
 
 
-def check_path_index(splats: Any) -> None:
-    """Raise ValueError unless every Gaussian's path is one that there is; the splats must have known values."""
+def check_paths(splats: Any) -> None:
+    """Raise ValueError unless maps and times are finite, times do not decrease, and every Gaussian's path is there.
+
+    The splats must have known values.
+    """
     if splats.paths is None:
         return
+    times, matrices = np.asarray(splats.paths.times), np.asarray(splats.paths.matrices)
+    if not (np.isfinite(times).all() and np.isfinite(matrices).all()):
+        raise invalid("paths", expected="finite times and matrices", got="others", cure="Fit again.")
+    if (np.diff(times, axis=1) < 0).any():
+        raise invalid("paths.times", expected="times that do not decrease", got="others", cure="Sort the knots.")
     largest = int(np.asarray(splats.path_index).max(initial=0))
     if largest > splats.paths.num_paths:
         raise invalid("path_index", expected=f"paths from 0 to {splats.paths.num_paths}", got=largest)
@@ -127,9 +138,11 @@ def to_pixel_maps(
 
 
 def invert_maps(maps: Float[np.ndarray, "*batch 2 3"]) -> Float[np.ndarray, "*batch 2 3"]:
-    """The maps back; float32."""
-    linear = np.linalg.inv(maps[..., :2].astype(np.float64))
-    return np.concatenate([linear, -linear @ maps[..., 2:]], -1).astype(np.float32)
+    """The maps back, float32; not finite where there is none."""
+    (a, b), (c, d) = np.moveaxis(maps[..., :2].astype(np.float64), (-2, -1), (0, 1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        linear = np.moveaxis(np.array([[d, -b], [-c, a]]) / (a * d - b * c), (0, 1), (-2, -1))
+        return np.concatenate([linear, -linear @ maps[..., 2:]], -1).astype(np.float32)
 
 
 def from_pixel_gradient(

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Float32, Int, UInt, UInt8
 from foldgauss._runtime.checks import invalid, is_integer, short_repr
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.models.row_layout import columns
-from foldgauss.video.models.shared_paths import SharedPaths, check_path_index
+from foldgauss.video.models.shared_paths import SharedPaths, check_paths
 from foldgauss.video.models.splats import OPAQUE_LOGIT, STATIC_LOG_TIME_SCALE, FoldedSplats
 
 #: Bits of a kind: static; opaque; and those of the degree.
@@ -138,7 +138,7 @@ def from_stored(splats: FoldedSplats | StoredSplats) -> FoldedSplats:
 
     Raises ValueError for kinds and indices that do not fit the other leaves, whose shapes must be those of the class.
     """
-    check_path_index(splats)
+    check_paths(splats)
     if isinstance(splats, FoldedSplats):
         return splats
     leaves = {name: getattr(splats, name) for name in _leaf_names()}

@@ -160,6 +160,15 @@ class Motion:
         home = np.full(len(grid), k)
         return grid, *self._step(home, grid, 1, self._color(home, grid))
 
+    def find_texture(self, k: int, spacing: int = 8) -> Float32[np.ndarray, " num"]:
+        """The slope of frame k, in levels per cell of the maps, at the points of `match_grid`."""
+        gray, part = (
+            cv2.cvtColor(self.small[k], cv2.COLOR_RGB2GRAY).astype(np.float32),
+            slice(spacing // 2, None, spacing),
+        )
+        across, down = (cv2.Sobel(gray, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
+        return cv2.GaussianBlur(np.hypot(across, down), (0, 0), 1.0)[part, part].ravel()
+
     def follow(
         self, home: Int[np.ndarray, " num"], position: Float32[np.ndarray, "num 2"], *, longest: int = LONGEST
     ) -> Tracks:

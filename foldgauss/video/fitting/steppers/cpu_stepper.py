@@ -114,7 +114,7 @@ class CpuStepper:
             state.time_logits, state.time_moments = updated
         if by_path.size and visited:
             path_rate = self.rates.of_paths(progress, state.backoffs)
-            update_paths(state, by_path, np.array(sorted(visited)), path_rate * relative_size)
+            finite &= update_paths(state, by_path, np.array(sorted(visited)), path_rate * relative_size)
         return StepResult(float(np.mean(losses)), num_alive, finite)
 
     def measure_start(self, state: FitState) -> dict[int, float]:
