@@ -27,6 +27,7 @@ from foldgauss.video.models.frame_times import (
 )
 from foldgauss.video.models.metrics import Evaluation, evaluate, psnr, ssim
 from foldgauss.video.models.polynomial_folds import without_paths
+from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.motion.background_plate import fill_background
@@ -80,6 +81,7 @@ __all__ = [
     "SegmentedVideo",
     "SelectedGaussians",
     "Selection",
+    "SharedPaths",
     "Span",
     "StabilizedVideo",
     "VideoModel",

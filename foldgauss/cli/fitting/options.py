@@ -75,7 +75,8 @@ Threads = Annotated[
 def _fields(kind: type) -> dict[str, dataclasses.Field]:
     """The fields that have an option, by the option's name as a parameter."""
     fields = [field for field in dataclasses.fields(kind) if setting_of(field).option]
-    return {setting_of(field).option.removeprefix("--").replace("-", "_"): field for field in fields}
+    names = (setting_of(field).option.split("/")[0] for field in fields)
+    return {name.removeprefix("--").replace("-", "_"): field for name, field in zip(names, fields, strict=True)}
 
 
 #: Options of `FitConfig`, of which `--economy` is a flag, and of `Economy`.

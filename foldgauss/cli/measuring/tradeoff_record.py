@@ -183,8 +183,14 @@ def _changed(now: FitConfig | RenderOptions, before: FitConfig | RenderOptions, 
     """Options for all fields that differ."""
     names = [field.name for field in dataclasses.fields(now) if field.name != "options"]
     changed = [name for name in names if getattr(now, name) != getattr(before, name)]
-    words = [[FLAGS[name]] if name in FLAGS else [options[name], str(getattr(now, name))] for name in changed]
-    return list(itertools.chain.from_iterable(words))
+    return list(itertools.chain.from_iterable(_words(name, getattr(now, name), options) for name in changed))
+
+
+def _words(name: str, value: Any, options: dict[str, str]) -> list[str]:
+    if name in FLAGS:
+        return [FLAGS[name]]
+    on, _, off = options[name].partition("/")
+    return [on if value else off] if off else [on, str(value)]
 
 
 def changed_settings(point: Point, base: FitConfig) -> dict[str, Any]:

@@ -163,8 +163,8 @@ def _conditions(posterior: FrameTimePosterior, level: str) -> str:
     increments = posterior.log_prob.increments
     held = "durations, colors" if level == "splats" else "durations; their colors are integrated out"
     lines = [
-        f"- The splats, held as fitted: positions, folds, {held}. A smooth warp of time that the folds have absorbed "
-        "is not visible: intervals are those of times given the folds."
+        f"- The splats, held as fitted: positions, folds, {held}. A warp of time that the folds, or the maps of an "
+        "unsteady camera, have absorbed is not visible: intervals are those of times given these."
     ]
     if posterior.profiles is not None:
         lines.append(f"- The noise: {posterior.profiles.noise.describe()}.")

@@ -236,6 +236,8 @@ class FitConfig:
         metadata=setting(
             "Gaussians may follow the motion of the camera, which they share, each with a fold of its own in addition",
             "A Gaussian does so where its track is then longer or its fold smaller. Not without `follow_motion`.",
+            option="--follow-camera/--no-follow-camera",
+            group=MODEL,
         ),
     )
     scale_rates_by_duration: bool = field(
