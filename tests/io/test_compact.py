@@ -327,7 +327,7 @@ def test_sensitivity_is_that_to_parameters_before_the_path():
 def test_paths_that_the_format_cannot_hold_are_rejected():
     model = on_paths(soft_model())
     for value, expected in (
-        (1e9, "shared paths whose maps are within the range"),
+        (1e9, "paths whose maps are within the range"),
         (np.nan, "finite times and matrices"),
     ):
         matrices = np.where(np.arange(3) == 2, np.float32(value), model.splats.paths.matrices)

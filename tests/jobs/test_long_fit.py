@@ -12,7 +12,7 @@ from drifting import CONFIG, SIZE, drifting, write_drifting
 
 import foldgauss.jobs.runner as fitting
 import foldgauss.jobs.segments as long
-from foldgauss.io import VideoError, index_video, load_video_model, read_video
+from foldgauss.io import VideoError, index_video, load_video_model, read_video, save_video_model
 from foldgauss.io._atomic import OutputError
 from foldgauss.jobs import Outcome, Stopped, plan_long_fit, run_here, seam_drops, segments_folder
 from foldgauss.video import SegmentedVideo, VideoModel, evaluate
@@ -219,13 +219,15 @@ def test_a_plan_that_somebody_has_edited_is_made_again(clip, tmp_path, edit):
 
 
 def test_models_in_the_place_of_others_are_not_taken_for_them(whole, clip, tmp_path):
-    """Segments of one length have files of one size."""
+    """Also where the files have one size."""
     fit = plan_long_fit(clip, tmp_path / "long.safetensors", CONFIG, **ASKED)
     records = {outcome.job.name: outcome.record for outcome in done_here(fit)}
-    one, other = (Path(job.target) for job in fit.jobs[1:3])
-    assert one.stat().st_size == other.stat().st_size
-    one.write_bytes(other.read_bytes())
-    with pytest.raises(OutputError, match="expected segment 1 as it was written"):
+    one = Path(fit.jobs[0].target)
+    size, model, metadata = one.stat().st_size, load_video_model(one), read_metadata(one)
+    other = dataclasses.replace(model, splats=dataclasses.replace(model.splats, loc=model.splats.loc + 0.01))
+    save_video_model(one, other, metadata=metadata)
+    assert one.stat().st_size == size
+    with pytest.raises(OutputError, match="expected segment 0 as it was written"):
         fit.join(records)
     assert not fit.target.exists()
     assert joined(fit).path.read_bytes() == whole[1].path.read_bytes()
