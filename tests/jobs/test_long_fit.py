@@ -14,6 +14,7 @@ import foldgauss.jobs.runner as fitting
 import foldgauss.jobs.segments as long
 from foldgauss.io import VideoError, index_video, load_video_model, read_video, save_video_model
 from foldgauss.io._atomic import OutputError
+from foldgauss.io.models.video_model import read_metadata
 from foldgauss.jobs import Outcome, Stopped, plan_long_fit, run_here, seam_drops, segments_folder
 from foldgauss.video import SegmentedVideo, VideoModel, evaluate
 
