@@ -29,9 +29,10 @@ export function mapsAt(paths, time) {
 }
 
 /**
- * {paths, numbers} after an edit of a state's selected Gaussians: `change({times, matrices})` gives those of a new path
- * in place of each that they are on, and `numbers` its number by that of the old one. Paths that no other Gaussian is on
- * make room for new ones. Null if all stay the same.
+ * The paths after an edit of a state's selected Gaussians, or null if the edit changes no path. For each path that they
+ * follow, `change({times, matrices})` returns the knots of the path that replaces it for them. Returns {paths, numbers}:
+ * `numbers[n]` is the number of the path that replaces path n. A path that only selected Gaussians follow is overwritten;
+ * otherwise the new path is added.
  */
 export function changedPaths({ model: { paths, leaves }, selected }, change) {
   if (!paths) return null;
