@@ -87,10 +87,9 @@ def initialize(
     num_frames = len(frames)
     times = np.linspace(0, 1, num_frames) if times is None else np.asarray(times, np.float64)
     density_of = lambda k: measure_detail(frames[k])  # noqa: E731
-    make = lambda home, position: make_splats(  # noqa: E731
+    make = lambda home, position, longer=1.0: make_splats(  # noqa: E731
         frames, home, position, times, degree, envelope, motion, rng, opacity, paths, longer
     )
-    longer = 1.0
     chance, lifetime = _try_starts(times, make, density_of, rng)
     if callable(num_gaussians):
         num_gaussians = num_gaussians(lifetime)
@@ -100,7 +99,7 @@ def initialize(
     else:
         home = np.sort(rng.choice(num_frames, num_gaussians, p=chance))
     position, density = draw_positions(home, density_of, rng)
-    splats, spread = make(home, position)
+    splats, spread = make(home, position, longer)
     static = find_constant(frames, home, position) if with_static else np.zeros(num_gaussians, bool)
     splats, spread = make_static(splats, static), np.where(static, np.exp(STATIC_LOG_TIME_SCALE), spread)
     alive = count_alive(times[home], spread, times)[home]
