@@ -5,20 +5,21 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy
 from path_models import affine, moving_splats, scene
 
 from foldgauss.io import load_video_model, save_video_model
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.video import FitConfig, evaluate, fit, fit_steps
 from foldgauss.video.fitting import loop
-from foldgauss.video.fitting.camera_coordinates import CameraCoordinates, prefers_camera
 from foldgauss.video.fitting.config import Economy
 from foldgauss.video.fitting.initialize import make_static
 from foldgauss.video.fitting.loop import start, start_from
+from foldgauss.video.fitting.path_coordinates import PathCoordinates, prefers_path
 from foldgauss.video.fitting.state import paths_of, to_model
 from foldgauss.video.models.shared_paths import SharedPaths, leave_paths
-from foldgauss.video.motion.camera_path import FARTHEST, find_camera_maps
 from foldgauss.video.motion.optical_flow import Motion
+from foldgauss.video.motion.shared_motions import FARTHEST, find_shared_motions
 
 CONFIG = FitConfig(num_gaussians=1500, steps=300, degree=2)
 TIMES = np.linspace(0, 1, 12)
@@ -38,13 +39,18 @@ def shake(seed=0, distance=0.02, turn=0.01) -> np.ndarray:
     return np.stack([affine(rng.normal() * turn, 1.0, rng.normal(size=2) * distance) for _ in TIMES])
 
 
+def find_camera(motion: Motion) -> np.ndarray:
+    """The maps of the camera, (frames, 2, 3)."""
+    return find_shared_motions(motion)[0]
+
+
 MAPS = shake()
 FRAMES = shaken(MAPS)
 
 
 def test_maps_are_found_to_a_fraction_of_a_pixel():
     found = np.tile(np.eye(3), (12, 1, 1))
-    found[:, :2] = find_camera_maps(Motion.from_frames(FRAMES))
+    found[:, :2] = find_camera(Motion.from_frames(FRAMES))
     expected = MAPS @ np.linalg.inv(MAPS[5])  # the middle frame
     corners = np.array([[x, y, 1] for x in (-0.5, 0.5) for y in (-0.3, 0.3)])
     miss = np.einsum("kij,cj->kci", found - expected, corners)[..., :2] * FRAMES.shape[2]
@@ -52,7 +58,7 @@ def test_maps_are_found_to_a_fraction_of_a_pixel():
 
 
 def test_a_camera_that_stands_still_has_no_maps():
-    assert find_camera_maps(Motion.from_frames(np.repeat(FRAMES[:1], 6, 0))) is None
+    assert find_shared_motions(Motion.from_frames(np.repeat(FRAMES[:1], 6, 0))) is None
     assert start(np.repeat(FRAMES[:1], 6, 0), CONFIG).path_maps.shape == (6, 0, 2, 3)
 
 
@@ -60,7 +66,7 @@ def test_maps_do_not_drift_away_where_the_camera_never_returns():
     """A zoom by 15% in each frame, which adds up to 4.7 times."""
     maps = np.stack([affine(zoom=1.15**k) @ shaking for k, shaking in enumerate(MAPS)])
     found = np.tile(np.eye(3), (12, 1, 1))
-    found[:, :2] = find_camera_maps(Motion.from_frames(shaken(maps)))
+    found[:, :2] = find_camera(Motion.from_frames(shaken(maps)))
     assert np.abs(np.log(np.linalg.svd(found[:, :2, :2], compute_uv=False))).max() < FARTHEST[0]
     assert np.linalg.det(found[-1, :2, :2]) > 1.1  # but they follow
 
@@ -69,8 +75,8 @@ def test_a_steady_pan_has_no_maps():
     """Folds follow it, and frame times tell where frames are missing."""
     maps = np.stack([affine(shift=(0.02 * k, 0.005 * k)) for k in range(12)])
     frames = shaken(maps)
-    assert find_camera_maps(Motion.from_frames(frames)) is None
-    assert find_camera_maps(Motion.from_frames(np.delete(frames, 6, 0))) is None
+    assert find_shared_motions(Motion.from_frames(frames)) is None
+    assert find_shared_motions(Motion.from_frames(np.delete(frames, 6, 0))) is None
 
 
 def test_an_object_before_a_flat_background_is_no_camera():
@@ -79,12 +85,12 @@ def test_an_object_before_a_flat_background_is_no_camera():
     for frame, (x, y) in zip(frames, rng.uniform([40, 30], [120, 66], (12, 2)), strict=True):
         inside = np.hypot(y_x[0] - y, y_x[1] - x) < 9
         frame[inside] = rng.integers(0, 255, (inside.sum(), 3))
-    assert find_camera_maps(Motion.from_frames(frames)) is None
+    assert find_shared_motions(Motion.from_frames(frames)) is None
 
 
 def test_every_shot_has_coordinates_of_its_own():
     both = np.concatenate([FRAMES, FRAMES[::-1, ::-1]])
-    found = find_camera_maps(Motion.from_frames(both))
+    found = find_camera(Motion.from_frames(both))
     for middle in (5, 17):
         np.testing.assert_allclose(found[middle], np.eye(2, 3), atol=1e-12)
 
@@ -99,13 +105,13 @@ def test_following_a_shaken_camera_is_worth_decibels():
 
 def test_maps_are_learned(monkeypatch):
     """From maps that are wrong by half a pixel."""
-    found = find_camera_maps(Motion.from_frames(FRAMES))
+    found = find_shared_motions(Motion.from_frames(FRAMES))[:1]
     wrong = found + np.random.default_rng(0).normal(size=(12, 2, 3)) * [0, 0, 0.5 / 160]
-    monkeypatch.setattr(loop, "find_camera_maps", lambda motion: wrong)
+    monkeypatch.setattr(loop, "find_shared_motions", lambda motion: wrong)
     held = dataclasses.replace(CONFIG, rates=dataclasses.replace(CONFIG.rates, paths=0.0))
     learned, fixed = (fit(FRAMES, config).model for config in (CONFIG, held))
     assert evaluate(learned, FRAMES).mean_psnr > evaluate(fixed, FRAMES).mean_psnr + 1
-    np.testing.assert_array_equal(fixed.splats.paths.matrices[0], np.float32(wrong))
+    np.testing.assert_array_equal(fixed.splats.paths.matrices, np.float32(wrong))
 
 
 def test_an_object_that_stays_in_the_frame_does_not_follow():
@@ -116,6 +122,58 @@ def test_an_object_that_stays_in_the_frame_does_not_follow():
     inside = (x > 64) & (x < 96) & (y > 34) & (y < 62)
     assert state.rows[inside, -1].mean() < 0.4
     assert state.rows[~inside, -1].mean() > 0.6
+
+
+NOISE = scipy.ndimage.gaussian_filter(np.random.default_rng(2).normal(size=(40, 48, 3)), (2.5, 2.5, 0))
+PATCH = np.clip(128 + 400 * NOISE, 0, 255).astype(np.uint8)
+
+
+def with_object(frames: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """The frames, and `PATCH` before them: its upper left corner (x, y) in each, in pixels."""
+    frames, (rows, columns) = frames.copy(), PATCH.shape[:2]
+    for frame, (x, y) in zip(frames, corners, strict=True):
+        frame[y : y + rows, x : x + columns] = PATCH
+    return frames
+
+
+CORNERS = np.random.default_rng(3).integers([47, 22], [54, 29], (12, 2))
+WITH_OBJECT = with_object(FRAMES, CORNERS)
+
+
+def test_an_object_with_a_motion_of_its_own_is_found():
+    found = find_shared_motions(Motion.from_frames(WITH_OBJECT))
+    assert len(found) == 2
+    center = np.array([*((CORNERS[5] + np.array(PATCH.shape[1::-1]) / 2 - [80, 48]) / 160), 1])
+    moved = (found[1] @ center)[:, :2] * 160
+    np.testing.assert_allclose(moved - moved[5], CORNERS - CORNERS[5], atol=0.5)
+
+
+def test_gaussians_follow_the_object():
+    model = to_model(start(WITH_OBJECT, CONFIG), CONFIG, FRAMES.shape[1:3], 12.0)
+    on = np.asarray(model.splats.path_index) == 2
+    position = np.asarray(model.splats.loc)[on] * 160 + [80, 48] - CORNERS[5]  # of the middle frame
+    inside = ((position > -2) & (position < np.array(PATCH.shape[1::-1]) + 2)).all(1)
+    assert on.sum() > 50
+    assert inside.mean() > 0.8
+    alone = dataclasses.replace(CONFIG, follow_camera=False)
+    both, without = (evaluate(fit(WITH_OBJECT, config).model, WITH_OBJECT).mean_psnr for config in (CONFIG, alone))
+    assert both > without + 3
+
+
+def test_no_object_is_found_where_the_camera_alone_moves():
+    assert len(find_shared_motions(Motion.from_frames(FRAMES))) == 1
+
+
+def test_objects_in_several_shots():
+    both = np.concatenate([WITH_OBJECT, WITH_OBJECT[:, ::-1, ::-1]])
+    found = find_shared_motions(Motion.from_frames(both))
+    for middle in (5, 17):
+        np.testing.assert_allclose(found[:, middle], np.eye(2, 3)[None].repeat(2, 0), atol=1e-12)
+
+
+@pytest.mark.parametrize("num", [2, 3])
+def test_motions_of_few_frames(num):
+    assert find_shared_motions(Motion.from_frames(WITH_OBJECT[:num])) is None or num > 2
 
 
 def test_starts_lie_where_the_frame_shows_them():
@@ -138,7 +196,7 @@ def test_maps_that_cannot_be_inverted_are_a_fault(value):
 
 def test_coordinates_of_positions_and_tracks_agree():
     paths = SharedPaths(np.float32(TIMES)[None], np.float32(MAPS[None, :, :2]))
-    camera = CameraCoordinates.from_paths(paths, TIMES, (96, 160))
+    (camera,) = PathCoordinates.of_each(paths, TIMES, (96, 160))
     position, home = np.array([[20.0, 30.0], [100.0, 80.0]]), np.array([3, 7])
     tracks = Motion.from_frames(FRAMES).follow(home, position.astype(np.float32))
     placed = camera.place_tracks(tracks, home, position)
@@ -156,8 +214,11 @@ def test_coordinates_of_positions_and_tracks_agree():
 def test_the_longer_or_else_the_steadier_fold_is_preferred():
     folds = np.array([[[1.0, 0.0]], [[1.0, 0.0]], [[1.0, 0.0]], [[0.1, 0.0]]])
     by_camera = np.array([[[9.0, 0.0]], [[0.5, 0.0]], [[0.5, 0.0]], [[0.5, 0.0]]])
-    chosen = prefers_camera(folds, np.ones(4), by_camera, np.array([2.0, 0.5, 1.0, 1.0]))
+    chosen = prefers_path(folds, np.ones(4), by_camera, np.array([2.0, 0.5, 1.0, 1.0]), is_camera=True)
     assert chosen.tolist() == [True, False, True, False]
+    chosen = prefers_path(folds, np.ones(4), 0.9 * by_camera, np.array([2.0, 0.5, 1.0, 1.0]), is_camera=False)
+    assert chosen.tolist() == [True, False, True, False]
+    assert not prefers_path(folds, np.ones(4), 0.9 * folds, np.ones(4), is_camera=False).any()
 
 
 def test_gaussians_that_leave_their_path_stay_where_they_are_at_their_time():

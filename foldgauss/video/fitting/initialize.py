@@ -1,7 +1,7 @@
 """The initial Gaussians of a fit: drawn from the detail and the colors of the clip; or uniformly, as published."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import cv2
 import jax
@@ -11,8 +11,8 @@ from jaxtyping import Float, Float32, UInt8
 
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.video.fitting.camera_coordinates import CameraCoordinates, prefers_camera
 from foldgauss.video.fitting.growth import PUBLISHED_UNIT
+from foldgauss.video.fitting.path_coordinates import PathCoordinates, prefers_path
 from foldgauss.video.models.shared_paths import SharedPaths, leave_paths
 from foldgauss.video.models.splats import SH_C0, STATIC_LOG_TIME_SCALE, TAU_MAX, FoldedSplats
 from foldgauss.video.motion.optical_flow import Motion, Tracks, fit_folds
@@ -40,7 +40,7 @@ MISS, SHORTENING, SHORTENINGS = 0.7, 0.6, 4
 #: A pixel is constant whose color changes by less than this (of 1, root mean square over the channels) in any of so
 #: many frames.
 CONSTANT, CONSTANT_FRAMES = 0.03, 64
-#: Gaussians alive in a frame, for each pixel, below which those that follow the camera live longer than a fold alone
+#: Gaussians alive in a frame, for each pixel, below which those that follow a path live longer than a fold alone
 #: could follow their track. With more of them, they reproduce what differs from frame to frame, such as motion blur,
 #: less well. (40 frames of bus, 180x320, 800 steps, as long as possible and as a fold alone: 15,000 Gaussians 33.9 and
 #: 31.0 dB, 40,000 36.6 and 34.7, 100,000 38.5 and 38.0; 60 s of one core, 200,000: 39.9 and 42.2.)
@@ -79,9 +79,9 @@ def initialize(
     Positions are drawn by image gradient within each frame, m_t is that frame's time, sizes follow from the local
     density of starts, colors from the pixel. With `motion`, folds follow the optical flow, and sigma_t is drawn as a
     fraction of the length of the track; without, folds are at rest and sigma_t is log-uniform. With `with_static`,
-    starts whose pixel never changes are static Gaussians, behind the others. Where the first of `paths`, that of the
-    camera, describes the motion better than a fold alone, starts follow it. `num_gaussians` may be a function of their
-    mean lifetime in frames.
+    starts whose pixel never changes are static Gaussians, behind the others. Where one of `paths`, the camera's and
+    those of objects, describes the motion better than a fold alone, starts follow it. `num_gaussians` may be a function
+    of their mean lifetime in frames.
     """
     rng = np.random.default_rng([seed, 0])
     num_frames = len(frames)
@@ -111,8 +111,9 @@ def initialize(
     log_scale = np.log(scale)[:, None] + ELONGATION * coherence[:, None] * [1, -1]
     if paths is not None:
         log_scale += splats.log_scale + np.log(max(frames.shape[1:3]))  # by the path's zoom
-        turned = CameraCoordinates.from_paths(paths, times, frames.shape[1:3]).turns(home)
-        angle = (angle + np.where(splats.path_index > 0, turned, 0) - np.pi / 2) % np.pi + np.pi / 2
+        for number, coordinates in enumerate(PathCoordinates.of_each(paths, times, frames.shape[1:3]), 1):
+            angle += np.where(splats.path_index == number, coordinates.turns(home), 0)
+        angle = (angle - np.pi / 2) % np.pi + np.pi / 2
     shape = {"log_scale": np.float32(log_scale), "angle_logit": np.float32(_logit(angle / (2 * np.pi)))}
     splats = dataclasses.replace(splats, **shape)
     ordered = jax.tree.map(lambda leaf: leaf[order] if leaf.ndim else leaf, dataclasses.replace(splats, paths=None))
@@ -210,8 +211,8 @@ def make_splats(
     `longer` is that of `follow_tracks`.
     """
     num, (height, width) = len(home), frames.shape[1:3]
-    camera = None if paths is None else CameraCoordinates.from_paths(paths, times, (height, width))
-    follows = np.zeros(num, bool)
+    coordinates = PathCoordinates.of_each(paths, times, (height, width))
+    follows = np.zeros(num, np.uint8)
     interval = np.diff(times).min(initial=1.0)  # a single frame lasts the whole clip
     if motion is None:
         time = times[home] + rng.uniform(-0.5, 0.5, num) * interval
@@ -220,15 +221,16 @@ def make_splats(
         spread = np.exp(rng.uniform(np.log(shortest), np.log(max(TIME_SCALES[1], shortest)), num))
     else:
         time = times[home]
-        coefficients, spread, follows = follow_tracks(motion, home, position, degree, rng, camera, longer)
+        coefficients, spread, follows = follow_tracks(motion, home, position, degree, rng, coordinates, longer)
         coefficients /= np.float32(interval) ** np.arange(1, degree + 1)[:, None]
         spread = spread * interval
     column, row = np.floor(position).astype(np.int64).clip(0, [width - 1, height - 1]).T
     color, unit = frames[home, row, column] / np.float32(255), max(height, width)
     log_scale = np.full(num, -np.log(unit))
-    if follows.any():
-        position = np.where(follows[:, None], camera.place(home, position), position)
-        log_scale += np.where(follows, camera.log_scales(home), 0)
+    for number, own in enumerate(coordinates, 1):
+        here = follows == number
+        position = np.where(here[:, None], own.place(home, position), position)
+        log_scale += np.where(here, own.log_scales(home), 0)
     leaves = {
         "loc": (position - [width / 2, height / 2]) / unit,
         "log_scale": np.stack([log_scale, log_scale], 1),
@@ -240,9 +242,7 @@ def make_splats(
         "color_dc": (color - 0.5) / SH_C0,
     }
     splats = FoldedSplats(**{name: np.float32(leaf) for name, leaf in leaves.items()}, envelope=envelope)
-    return splats if paths is None else dataclasses.replace(
-        splats, path_index=follows.astype(np.uint8), paths=paths
-    ), spread
+    return splats if paths is None else dataclasses.replace(splats, path_index=follows, paths=paths), spread
 
 
 def find_constant(frames: np.ndarray, home: np.ndarray, position: np.ndarray) -> np.ndarray:
@@ -273,29 +273,33 @@ def follow_tracks(
     position: np.ndarray,
     degree: int,
     rng: np.random.Generator,
-    camera: CameraCoordinates | None = None,
+    coordinates: Sequence[PathCoordinates] = (),
     longer: float = 1.0,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Folds (num, degree, 2), in pixels per frame^k, and sigma_t (num,) in frames, of points at `home`.
 
-    And which of them (num,) follow the `camera`: their folds are in its coordinates. Their sigma_t is at most `longer`
-    times the one with which a fold alone follows the track.
+    And which path they follow, (num,), numbered from 1, 0 for none: their folds are in its `coordinates`. Their sigma_t
+    is at most `longer` times the one with which a fold alone follows the track.
     """
     coefficients, spread = np.empty((len(home), degree, 2), np.float32), np.empty(len(home))
-    follows = np.zeros(len(home), bool)
+    follows = np.zeros(len(home), np.uint8)
     fractions = np.exp(rng.uniform(*np.log(TRACK_FRACTIONS), len(home)))
 
     def follow(start: int) -> None:
         part = slice(start, start + CHUNK)
         tracks = motion.follow(home[part], position[part].astype(np.float32))
         folds, wide = _fit_tracks(tracks, fractions[part], degree)
-        if camera is not None:
-            placed = camera.place_tracks(tracks, home[part], position[part])
-            by_camera, camera_wide = _fit_tracks(placed, fractions[part], degree)
-            follows[part] = better = prefers_camera(folds, wide, by_camera, camera_wide)
-            wide[better] = np.minimum(np.maximum(camera_wide, wide), longer * wide)[better]
-            folds[better] = fit_folds(placed[better], wide[better], degree)[0]
-        coefficients[part], spread[part] = folds, wide
+        alone, number = wide.copy(), np.zeros(len(wide), np.uint8)
+        placed = [own.place_tracks(tracks, home[part], position[part]) for own in coordinates]
+        for path, moved in enumerate(placed, 1):
+            by_path, path_wide = _fit_tracks(moved, fractions[part], degree)
+            better = prefers_path(folds, wide, by_path, path_wide, is_camera=path == 1)
+            folds[better], wide[better], number[better] = by_path[better], path_wide[better], path
+        for path, moved in enumerate(placed, 1):
+            on = number == path
+            wide[on] = np.clip(wide, alone, longer * alone)[on]
+            folds[on] = fit_folds(moved[on], wide[on], degree)[0]
+        coefficients[part], spread[part], follows[part] = folds, wide, number
 
     for first in range(0, len(home), AT_ONCE):
         run_tasks(follow, range(first, min(first + AT_ONCE, len(home)), CHUNK))

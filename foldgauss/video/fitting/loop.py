@@ -37,8 +37,8 @@ from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.models.sparse_storage import find_initial_kinds, find_kinds
 from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
-from foldgauss.video.motion.camera_path import find_camera_maps
 from foldgauss.video.motion.optical_flow import Motion, motion_finder
+from foldgauss.video.motion.shared_motions import find_shared_motions
 
 
 class FitInfo(NamedTuple):
@@ -297,9 +297,9 @@ def _initialize(frames: np.ndarray, config: FitConfig, logits: np.ndarray, motio
 
 
 def _find_paths(motion: Motion | None, times: np.ndarray) -> SharedPaths | None:
-    """The path of the camera, if it moves."""
-    maps = None if motion is None else find_camera_maps(motion)
-    return None if maps is None else SharedPaths(np.float32(times)[None], np.float32(maps)[None])
+    """The path of the camera, if it moves, and those of objects."""
+    maps = None if motion is None else find_shared_motions(motion)
+    return None if maps is None else SharedPaths(np.tile(np.float32(times), (len(maps), 1)), np.float32(maps))
 
 
 def _path_fields(splats: FoldedSplats, logits: np.ndarray) -> dict[str, np.ndarray]:

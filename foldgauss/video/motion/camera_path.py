@@ -9,10 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from foldgauss._runtime.checks import invalid, is_within
-from foldgauss._runtime.threads import run_tasks
 from foldgauss.video.models.frame_times import is_cut
 from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer
-from foldgauss.video.motion.optical_flow import Motion, both_flows, pixel_grid, warp_image
+from foldgauss.video.motion.optical_flow import both_flows, pixel_grid, warp_image
 
 #: The longer side, in pixels, of the images that flow is computed on, and the distance of the points in them.
 SIDE, SPACING = 480, 6
@@ -23,21 +22,6 @@ INLIER, ITERATIONS = 0.7, 2000
 #: The camera's motion between two frames is unknown where less than this fraction of the points is tracked and agrees.
 #: (Between frames of two clips it was 0.02 at most; in a walk through a room, past people close by, 0.2 at least.)
 LEAST_INLIERS = 0.08
-#: Maps that a fit starts with are estimated from every so many cells of the flow's maps.
-FIT_SPACING = 4
-#: A point tells how the camera moves where the image has at least this slope, in levels of 255 per cell of the flow's
-#: maps: elsewhere flow is interpolated. At least this fraction of the points must.
-TEXTURE, LEAST_TEXTURED = 2.0, 0.1
-#: RANSAC, in pixels: flow is less exact than this in small frames.
-LEAST_INLIER = 0.3
-#: Gaussians follow a camera whose motion changes from frame to frame by this, in units of the frame's longer side (the
-#: median of second differences): folds follow steadier motion as well, without a map for each frame, which costs time
-#: and can make up for frame times. (Gains: carphone 4e-3, car-shadow 2e-3, bear 3e-4; none: Bunny 8e-5.)
-STEADY = 2.2e-4
-#: The largest zoom (as its logarithm) and the largest distance, in units of the frame's longer side, between a frame
-#: and the one in whose coordinates Gaussians are placed. Where the camera moves farther, its path is forgotten by these
-#: fractions in each frame; then Gaussians' own folds take over the slow part of the motion.
-FARTHEST, FORGOTTEN = (1.0, 4.0), (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
 #: Smoothing reaches so many standard deviations to either side.
 REACH = 3.0
 
@@ -126,7 +110,7 @@ def estimate_camera_path(video: RenderableVideo, *, on_frame: Callable[[], None]
     times = np.asarray(video.frame_times.times(), np.float64)
     cut = np.asarray(is_cut(times))
     matrices, inliers, starts = np.tile(np.eye(3), (len(times), 1, 1)), np.ones(len(times)), [0]
-    to_model = _pixels_to_model(size)
+    to_model = pixels_to_model(size)
     to_pixels = np.linalg.inv(to_model)
     before = None
     for k, image in enumerate(VideoRenderer(video, size).frames(times.astype(np.float32))):
@@ -157,10 +141,10 @@ def estimate_affine(
     returned = warp_image(back, target[None], cv2.INTER_LINEAR)[0]
     inside = ((target >= 0) & (target <= np.float32(one.shape[::-1]) - 1)).all(1)
     known = inside & (np.hypot(*(flow + returned).T) < MISS + MISS_FRACTION * np.hypot(*flow.T))
-    return _fit_affine(points, target, known, INLIER)
+    return fit_affine(points, target, known, INLIER)
 
 
-def _fit_affine(
+def fit_affine(
     points: Float[np.ndarray, "num 2"],
     target: Float[np.ndarray, "num 2"],
     known: Bool[np.ndarray, " num"],
@@ -181,68 +165,8 @@ def _fit_affine(
     return np.vstack([affine, [0, 0, 1]]), inliers
 
 
-def _pixels_to_model(size: tuple[int, int]) -> Float[np.ndarray, "3 3"]:
+def pixels_to_model(size: tuple[int, int]) -> Float[np.ndarray, "3 3"]:
     """The map of OpenCV's pixels, whose centers are whole numbers, to model space."""
     height, width = size
     unit = max(size)
     return np.array([[1, 0, 0.5 - width / 2], [0, 1, 0.5 - height / 2], [0, 0, unit]]) / unit
-
-
-def find_camera_maps(motion: Motion) -> Float[np.ndarray, "frames 2 3"] | None:
-    """The maps from coordinates that follow the camera to each frame, in model space; None where its motion is steady.
-
-    In the middle frame of each shot both are the same. Where the motion of the camera is unknown, it is taken to stand.
-    """
-    num, inlier = len(motion.small), max(INLIER * max(motion.size) / SIDE, LEAST_INLIER)
-    to_model = _pixels_to_model(motion.size)
-    to_model[:2, 2] -= 0.5 / max(motion.size)  # `Motion` has pixel centers at 0.5
-    to_pixels = np.linalg.inv(to_model)
-    steps = np.tile(np.eye(3), (num, 1, 1))
-
-    def estimate(k: int) -> None:
-        points, target, known = motion.match_grid(k, FIT_SPACING)
-        textured = motion.find_texture(k, FIT_SPACING) > TEXTURE
-        if textured.mean() < LEAST_TEXTURED:
-            return
-        found = _fit_affine(points[textured], target[textured], known[textured], inlier)
-        if found is not None:
-            steps[k + 1] = to_model @ found[0] @ to_pixels
-
-    cuts = [0, *motion.find_cuts(), num]
-    run_tasks(estimate, [k for k in range(num - 1) if k + 1 not in cuts])
-    shots = list(itertools.pairwise(cuts))
-    maps = next((found for found in (_chain(steps, shots, own) for own in FORGOTTEN) if _is_near(found)), None)
-    if maps is None:
-        return None
-    corners = 0.35 * np.array(list(itertools.product([-1, 1], [-1, 1]))) * motion.size[::-1] / max(motion.size)
-    return maps[:, :2] if _measure_unsteadiness(steps, shots, corners) > STEADY else None
-
-
-def _measure_unsteadiness(
-    steps: Float[np.ndarray, "frames 3 3"], shots: list[tuple[int, int]], points: Float[np.ndarray, "num 2"]
-) -> float:
-    """The median over frames of the second difference of the places of `points`: 0 for motion at constant velocity."""
-    points, changes = np.concatenate([points, np.ones((len(points), 1))], 1), [0.0]
-    for first, stop in shots:
-        for k in range(first + 1, stop - 1):
-            before, after = points @ np.linalg.inv(steps[k]).T, points @ steps[k + 1].T
-            change = (before - 2 * points + after)[:, :2]
-            changes.append(float(np.sqrt((change**2).sum(1).mean())))
-    return float(np.median(changes))
-
-
-def _chain(steps: Float[np.ndarray, "frames 3 3"], shots: list[tuple[int, int]], forgotten: float) -> np.ndarray:
-    """The maps to each frame from the middle frame of its shot; in each, a fraction of the path is `forgotten`."""
-    maps = np.tile(np.eye(3), (len(steps), 1, 1))
-    for first, stop in shots:
-        for k in range(first + 1, stop):
-            maps[k] = steps[k] @ ((1 - forgotten) * maps[k - 1] + forgotten * np.eye(3))
-        maps[first:stop] = maps[first:stop] @ np.linalg.inv(maps[(first + stop - 1) // 2])
-    return maps
-
-
-def _is_near(maps: Float[np.ndarray, "frames 3 3"]) -> bool:
-    """Whether no map zooms or moves by more than `FARTHEST`."""
-    both = np.concatenate([maps, np.linalg.inv(maps)])
-    zooms = np.log(np.linalg.svd(both[:, :2, :2], compute_uv=False))
-    return bool(np.abs(zooms).max() < FARTHEST[0] and np.abs(both[:, :2, 2]).max() < FARTHEST[1])

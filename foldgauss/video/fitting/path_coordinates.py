@@ -1,4 +1,4 @@
-"""Coordinates in which the background stands still while the camera moves, for the starts of a fit."""
+"""Coordinates in which what follows a shared path stands still, such as the background, for the starts of a fit."""
 
 import dataclasses
 
@@ -8,14 +8,15 @@ from jaxtyping import Bool, Float, Float32, Int
 from foldgauss.video.models.shared_paths import SharedPaths, invert_maps
 from foldgauss.video.motion.optical_flow import LONGEST, Tracks
 
-#: A start follows the camera if a fold follows its track for longer in these coordinates, by this factor, than in those
-#: of the frame; where both are alike, if it moves less.
-LONGER = 1.1
+#: A start follows a path if a fold follows its track for longer in these coordinates, by this factor, than in others;
+#: where both are alike, if it moves less: at all, in those of the camera, and by the second factor in those of objects.
+#: (Else the background would be divided among paths that are nearly the same.)
+LONGER, SMALLER = 1.1, 0.5
 
 
 @dataclasses.dataclass(frozen=True)
-class CameraCoordinates:
-    """Pixels of frames, (x, y) with centers at +0.5, in coordinates that follow the camera, also in pixels.
+class PathCoordinates:
+    """Pixels of frames, (x, y) with centers at +0.5, in coordinates that follow a shared path, also in pixels.
 
     `inverse` (frames, 2, 3) are the maps from each frame's pixels.
     """
@@ -23,14 +24,17 @@ class CameraCoordinates:
     inverse: Float32[np.ndarray, "frames 2 3"]
 
     @classmethod
-    def from_paths(cls, paths: SharedPaths, times: Float[np.ndarray, " frames"], size: tuple[int, int]):
-        """Those of the first of `paths`, for frames at `times` of `size` (height, width)."""
-        maps = np.tile(np.eye(3), (len(times), 1, 1))
-        maps[:, :2] = paths.by_path(np.asarray(times, np.float32), np.zeros(len(times), int))
-        unit = max(size)
+    def of_each(
+        cls, paths: SharedPaths | None, times: Float[np.ndarray, " frames"], size: tuple[int, int]
+    ) -> list["PathCoordinates"]:
+        """Those of each of `paths`, for frames at `times` of `size` (height, width)."""
+        unit, found = max(size), []
         to_pixels = np.array([[unit, 0, size[1] / 2], [0, unit, size[0] / 2], [0, 0, 1]])
-        pixels = to_pixels @ maps @ np.linalg.inv(to_pixels)
-        return cls(invert_maps(pixels[:, :2]))
+        for path in range(0 if paths is None else paths.num_paths):
+            maps = np.tile(np.eye(3), (len(times), 1, 1))
+            maps[:, :2] = paths.by_path(np.asarray(times, np.float32), np.full(len(times), path))
+            found.append(cls(invert_maps((to_pixels @ maps @ np.linalg.inv(to_pixels))[:, :2])))
+        return found
 
     def place(self, frame: Int[np.ndarray, " num"], position: Float[np.ndarray, "num 2"]) -> Float[np.ndarray, "num 2"]:
         """Positions in frames."""
@@ -55,17 +59,20 @@ class CameraCoordinates:
         return Tracks(np.where(tracks.known[..., None], moved, 0).astype(np.float32), tracks.known)
 
 
-def prefers_camera(
+def prefers_path(
     folds: Float[np.ndarray, "num degree 2"],
     spread: Float[np.ndarray, " num"],
-    by_camera: Float[np.ndarray, "num degree 2"],
-    camera_spread: Float[np.ndarray, " num"],
+    by_path: Float[np.ndarray, "num degree 2"],
+    path_spread: Float[np.ndarray, " num"],
+    *,
+    is_camera: bool,
 ) -> Bool[np.ndarray, " num"]:
-    """Which starts follow the camera: folds and sigma_t of the same tracks in either coordinates, see `LONGER`."""
+    """Which starts follow a path: folds and sigma_t of the same tracks in either coordinates, see `LONGER`."""
 
     def size(folds: np.ndarray, spread: np.ndarray) -> np.ndarray:
         powers = spread[:, None] ** np.arange(1, folds.shape[1] + 1)
         return (np.hypot(folds[..., 0], folds[..., 1]) * powers).sum(1)
 
-    longer, alike = camera_spread > LONGER * spread, camera_spread * LONGER > spread
-    return longer | (alike & (size(by_camera, camera_spread) < size(folds, spread)))
+    factor = 1.0 if is_camera else SMALLER
+    longer, alike = path_spread > LONGER * spread, path_spread * LONGER > spread
+    return longer | (alike & (size(by_path, path_spread) < factor * size(folds, spread)))
