@@ -115,7 +115,7 @@ def test_spans_are_what_decoding_from_the_start_gives(tmp_path, name):
     assert clip.num_frames == 120
     assert (clip.times is not None) == (name == "uneven.mp4")
     _described(index, clip)
-    assert index.cuts == Motion.from_frames(clip.frames).find_cuts()
+    assert index.cuts == Motion.from_frames(clip.frames).cuts
     _as_read(index, path)
     _as_read(index, path, SPANS[1:2], size=(20, 30))
     np.testing.assert_array_equal(LazyFrames(index, run=7)[:], clip.frames)
@@ -192,7 +192,7 @@ def test_sample_clips(name):
     path, stop = sample_clip(name), 33 if name == "bikes" else 12
     clip, index = read_video(path, frames=(0, stop)), index_video(path, frames=(0, stop))
     _described(index, clip)
-    assert index.cuts == Motion.from_frames(clip.frames).find_cuts() == ([30] if name == "bikes" else [])
+    assert index.cuts == Motion.from_frames(clip.frames).cuts == ([30] if name == "bikes" else [])
     _as_read(index, path, [(stop - 3, stop)], size=(60, 100))
 
 
@@ -205,7 +205,7 @@ def test_cuts_of_a_stream_are_those_of_the_clip():
         finder = CutFinder()
         for frame in frames:
             finder.add(frame)
-        assert finder.found == Motion.from_frames(frames).find_cuts()
+        assert finder.found == Motion.from_frames(frames).cuts
         assert finder.found
 
 
@@ -704,4 +704,4 @@ def test_cuts_of_a_long_clip():
         finder.add(frame)
     motion = Motion.from_frames(frames)
     assert motion.small.shape[2] < 320
-    assert finder.found == motion.find_cuts()
+    assert finder.found == motion.cuts

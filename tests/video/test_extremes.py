@@ -220,7 +220,7 @@ def test_one_frame_tells_no_times(still):
 def test_slide_show_has_no_gaps():
     """Most intervals are cuts: gaps there would be the usual interval, and what is shown within them nothing."""
     frames = alternating("AABAABAAB", np.maximum(pictures_of(2), 100))
-    assert len(Motion.from_frames(frames).find_cuts()) == 5
+    assert len(Motion.from_frames(frames).cuts) == 5
     model = fit(frames, FitConfig(num_gaussians=600, steps=150)).model
     shown = np.stack(list(model.frames(interpolated_times(np.asarray(model.frame_times.times()), 4))))
     assert shown.mean((1, 2, 3)).min() > 0.5 * frames.mean((1, 2, 3)).min()

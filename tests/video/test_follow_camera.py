@@ -18,6 +18,7 @@ from foldgauss.video.fitting.loop import start, start_from
 from foldgauss.video.fitting.path_coordinates import PathCoordinates, prefers_path
 from foldgauss.video.fitting.state import paths_of, to_model
 from foldgauss.video.models.shared_paths import SharedPaths, leave_paths
+from foldgauss.video.motion.camera_path import fit_affine
 from foldgauss.video.motion.optical_flow import Motion
 from foldgauss.video.motion.shared_motions import FARTHEST, find_shared_motions
 
@@ -140,12 +141,30 @@ CORNERS = np.random.default_rng(3).integers([47, 22], [54, 29], (12, 2))
 WITH_OBJECT = with_object(FRAMES, CORNERS)
 
 
+def check_object(maps: np.ndarray, corners: np.ndarray) -> None:
+    """Whether the maps (12, 2, 3) move the center of the object as `corners` do."""
+    center = np.array([*((corners[5] + np.array(PATCH.shape[1::-1]) / 2 - [80, 48]) / 160), 1])
+    np.testing.assert_allclose((maps @ center) * 160 - (maps[5] @ center) * 160, corners - corners[5], atol=0.5)
+
+
 def test_an_object_with_a_motion_of_its_own_is_found():
     found = find_shared_motions(Motion.from_frames(WITH_OBJECT))
     assert len(found) == 2
-    center = np.array([*((CORNERS[5] + np.array(PATCH.shape[1::-1]) / 2 - [80, 48]) / 160), 1])
-    moved = (found[1] @ center)[:, :2] * 160
-    np.testing.assert_allclose(moved - moved[5], CORNERS - CORNERS[5], atol=0.5)
+    check_object(found[1], CORNERS)
+
+
+def test_an_object_before_a_camera_that_stands_still_is_found():
+    frames = with_object(FRAMES[:1].repeat(12, 0), CORNERS)
+    (found,) = find_shared_motions(Motion.from_frames(frames))
+    check_object(found, CORNERS)
+    alone = dataclasses.replace(CONFIG, follow_camera=False)
+    both, without = (evaluate(fit(frames, config).model, frames).mean_psnr for config in (CONFIG, alone))
+    assert both > without + 2
+
+
+def test_an_object_that_moves_steadily_has_no_maps():
+    corners = np.array([[30 + 3 * k, 20 + k] for k in range(12)])
+    assert find_shared_motions(Motion.from_frames(with_object(FRAMES[:1].repeat(12, 0), corners))) is None
 
 
 def test_gaussians_follow_the_object():
@@ -167,13 +186,41 @@ def test_no_object_is_found_where_the_camera_alone_moves():
 def test_objects_in_several_shots():
     both = np.concatenate([WITH_OBJECT, WITH_OBJECT[:, ::-1, ::-1]])
     found = find_shared_motions(Motion.from_frames(both))
-    for middle in (5, 17):
-        np.testing.assert_allclose(found[:, middle], np.eye(2, 3)[None].repeat(2, 0), atol=1e-12)
+    check_object(found[1, :12], CORNERS)
+    check_object(found[1, 12:], [160, 96] - CORNERS - PATCH.shape[1::-1])
 
 
 @pytest.mark.parametrize("num", [2, 3])
 def test_motions_of_few_frames(num):
-    assert find_shared_motions(Motion.from_frames(WITH_OBJECT[:num])) is None or num > 2
+    found = find_shared_motions(Motion.from_frames(WITH_OBJECT[:num]))
+    assert found is None if num == 2 else len(found) == 1
+
+
+def test_points_on_a_line_tell_no_map():
+    line = np.float32([[2, 2], [6, 2], [10, 2]])
+    assert fit_affine(line, line + 1, 0.5, 3) is None
+    frames = np.random.default_rng(0).integers(0, 255, (5, 12, 20, 3)).astype(np.uint8)
+    find_shared_motions(Motion.from_frames(frames))
+
+
+def test_maps_that_mirror_or_zoom_very_much_are_not_believed():
+    points = np.random.default_rng(0).uniform(0, 100, (30, 2)).astype(np.float32)
+    assert fit_affine(points, points * 1.5, 0.5, 6)[1] == 30
+    assert fit_affine(points, points * 2.5, 0.5, 6) is None
+    assert fit_affine(points, points * [1, -1], 0.5, 6) is None
+
+
+def test_a_resumed_fit_with_an_object_has_the_same_bits(tmp_path):
+    config = dataclasses.replace(CONFIG, num_gaussians=300, steps=24)
+    for state, info in fit_steps(WITH_OBJECT, config):
+        if info.step == 10:
+            save_checkpoint(tmp_path / "half.checkpoint", state, config=config, source={})
+    half = load_checkpoint(tmp_path / "half.checkpoint", config=config, source={})
+    for resumed, _ in fit_steps(WITH_OBJECT, config, half):
+        pass
+    assert state.path_maps.shape == (12, 2, 2, 3)
+    np.testing.assert_array_equal(resumed.path_maps, state.path_maps)
+    np.testing.assert_array_equal(resumed.rows, state.rows)
 
 
 def test_starts_lie_where_the_frame_shows_them():
@@ -214,11 +261,11 @@ def test_coordinates_of_positions_and_tracks_agree():
 def test_the_longer_or_else_the_steadier_fold_is_preferred():
     folds = np.array([[[1.0, 0.0]], [[1.0, 0.0]], [[1.0, 0.0]], [[0.1, 0.0]]])
     by_camera = np.array([[[9.0, 0.0]], [[0.5, 0.0]], [[0.5, 0.0]], [[0.5, 0.0]]])
-    chosen = prefers_path(folds, np.ones(4), by_camera, np.array([2.0, 0.5, 1.0, 1.0]), is_camera=True)
+    chosen = prefers_path(folds, np.ones(4), by_camera, np.array([2.0, 0.5, 1.0, 1.0]), is_first=True)
     assert chosen.tolist() == [True, False, True, False]
-    chosen = prefers_path(folds, np.ones(4), 0.9 * by_camera, np.array([2.0, 0.5, 1.0, 1.0]), is_camera=False)
+    chosen = prefers_path(folds, np.ones(4), 0.9 * by_camera, np.array([2.0, 0.5, 1.0, 1.0]), is_first=False)
     assert chosen.tolist() == [True, False, True, False]
-    assert not prefers_path(folds, np.ones(4), 0.9 * folds, np.ones(4), is_camera=False).any()
+    assert not prefers_path(folds, np.ones(4), 0.9 * folds, np.ones(4), is_first=False).any()
 
 
 def test_gaussians_that_leave_their_path_stay_where_they_are_at_their_time():

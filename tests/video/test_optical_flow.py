@@ -137,10 +137,10 @@ def plainly_warped(one, other, share: float):
 
 def test_cuts_are_found():
     one, other, third = panning(7, (2, 0)), panning(5, (0, 0), seed=5), panning(4, (0, -1), seed=9)
-    assert Motion.from_frames(np.concatenate([one, other, third])).find_cuts() == [7, 12]
-    assert Motion.from_frames(one).find_cuts() == []
-    assert Motion.from_frames(moving_blobs()).find_cuts() == []
-    assert Motion.from_frames(np.full((3, 20, 30, 3), 7, np.uint8)).find_cuts() == []
+    assert Motion.from_frames(np.concatenate([one, other, third])).cuts == [7, 12]
+    assert Motion.from_frames(one).cuts == []
+    assert Motion.from_frames(moving_blobs()).cuts == []
+    assert Motion.from_frames(np.full((3, 20, 30, 3), 7, np.uint8)).cuts == []
 
 
 def test_tracks_end_at_a_cut():

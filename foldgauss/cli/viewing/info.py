@@ -89,14 +89,14 @@ def _describe_frames(model: Video) -> str:
 
 
 def _describe_paths(model: VideoModel | EditedVideo) -> dict[str, str]:
-    """How many Gaussians follow shared paths; a single path is that of the camera."""
+    """How many Gaussians follow shared paths."""
     parts = [layer.model.splats for layer in as_edited(model).layers if layer.model.splats.paths is not None]
     if not parts:
         return {}
     followers = sum(int((np.asarray(splats.path_index) > 0).sum()) for splats in parts)
     num, knots = sum(splats.paths.num_paths for splats in parts), max(splats.paths.num_knots for splats in parts)
-    paths = "the camera" if num == 1 else f"{num:,} paths"
-    return {"paths": f"{followers:,} of {model.num_gaussians:,} Gaussians follow {paths}, {knots:,} knots"}
+    paths = "a shared path" if num == 1 else f"{num:,} shared paths"
+    return {"paths": f"{followers:,} of {model.num_gaussians:,} Gaussians follow {paths} of {knots:,} knots"}
 
 
 def _describe_savings(model: VideoModel | EditedVideo) -> dict[str, str]:

@@ -180,7 +180,7 @@ def index_video(
 
     `path`, `fps` and `deinterlace` as in `read_video`, with the same errors. `frames = (A, B)` restricts the clip to
     A <= i < B; the index counts from A. `on_frame()` is called after each frame that is kept. `find_cuts`: search for
-    frames that begin a new shot, as `foldgauss.video.motion.optical_flow.Motion.find_cuts` does.
+    frames that begin a new shot, as `foldgauss.video.motion.optical_flow.Motion.cuts` does.
 
     Raises `FileNotFoundError` for a missing path, `VideoError` for everything else that cannot be read.
     """

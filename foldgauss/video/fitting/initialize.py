@@ -293,7 +293,7 @@ def follow_tracks(
         placed = [own.place_tracks(tracks, home[part], position[part]) for own in coordinates]
         for path, moved in enumerate(placed, 1):
             by_path, path_wide = _fit_tracks(moved, fractions[part], degree)
-            better = prefers_path(folds, wide, by_path, path_wide, is_camera=path == 1)
+            better = prefers_path(folds, wide, by_path, path_wide, is_first=path == 1)
             folds[better], wide[better], number[better] = by_path[better], path_wide[better], path
         for path, moved in enumerate(placed, 1):
             on = number == path

@@ -229,7 +229,7 @@ def _start(
     begun, num_frames = clock(), len(frames)
     motion = find_motion() if config.follow_motion else None
     if logits is None:
-        logits = make_time_logits(num_frames, motion.find_cuts() if motion is not None else [])
+        logits = make_time_logits(num_frames, motion.cuts if motion is not None else [])
     logits = np.array(logits, np.float32)
     splats = _initialize(frames, config, logits, motion)
     rows = pack(splats)
@@ -297,7 +297,7 @@ def _initialize(frames: np.ndarray, config: FitConfig, logits: np.ndarray, motio
 
 
 def _find_paths(motion: Motion | None, times: np.ndarray) -> SharedPaths | None:
-    """The path of the camera, if it moves, and those of objects."""
+    """The path of the camera and that of an object, unless they move steadily."""
     maps = None if motion is None else find_shared_motions(motion)
     return None if maps is None else SharedPaths(np.tile(np.float32(times), (len(maps), 1)), np.float32(maps))
 

@@ -9,8 +9,8 @@ from foldgauss.video.models.shared_paths import SharedPaths, invert_maps
 from foldgauss.video.motion.optical_flow import LONGEST, Tracks
 
 #: A start follows a path if a fold follows its track for longer in these coordinates, by this factor, than in others;
-#: where both are alike, if it moves less: at all, in those of the camera, and by the second factor in those of objects.
-#: (Else the background would be divided among paths that are nearly the same.)
+#: where both are alike, if it moves less: at all, in those of the first path, and by the second factor in those of
+#: others. (Else the background would be divided among paths that are nearly the same.)
 LONGER, SMALLER = 1.1, 0.5
 
 
@@ -65,7 +65,7 @@ def prefers_path(
     by_path: Float[np.ndarray, "num degree 2"],
     path_spread: Float[np.ndarray, " num"],
     *,
-    is_camera: bool,
+    is_first: bool,
 ) -> Bool[np.ndarray, " num"]:
     """Which starts follow a path: folds and sigma_t of the same tracks in either coordinates, see `LONGER`."""
 
@@ -73,6 +73,6 @@ def prefers_path(
         powers = spread[:, None] ** np.arange(1, folds.shape[1] + 1)
         return (np.hypot(folds[..., 0], folds[..., 1]) * powers).sum(1)
 
-    factor = 1.0 if is_camera else SMALLER
+    factor = 1.0 if is_first else SMALLER
     longer, alike = path_spread > LONGER * spread, path_spread * LONGER > spread
     return longer | (alike & (size(by_path, path_spread) < factor * size(folds, spread)))

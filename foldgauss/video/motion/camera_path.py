@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 
 from foldgauss._runtime.checks import invalid, is_within
 from foldgauss.video.models.frame_times import is_cut
@@ -19,6 +19,8 @@ SIDE, SPACING = 480, 6
 MISS, MISS_FRACTION = 0.3, 0.05
 #: RANSAC: a point follows the camera within this many pixels; iterations at most.
 INLIER, ITERATIONS = 0.7, 2000
+#: The largest zoom from one frame to the next, and its inverse.
+MOST_ZOOM = 2.0
 #: The camera's motion between two frames is unknown where less than this fraction of the points is tracked and agrees.
 #: (Between frames of two clips it was 0.02 at most; in a walk through a room, past people close by, 0.2 at least.)
 LEAST_INLIERS = 0.08
@@ -141,28 +143,28 @@ def estimate_affine(
     returned = warp_image(back, target[None], cv2.INTER_LINEAR)[0]
     inside = ((target >= 0) & (target <= np.float32(one.shape[::-1]) - 1)).all(1)
     known = inside & (np.hypot(*(flow + returned).T) < MISS + MISS_FRACTION * np.hypot(*flow.T))
-    return fit_affine(points, target, known, INLIER)
+    found = fit_affine(points[known], target[known], INLIER, LEAST_INLIERS * len(points))
+    return None if found is None else (found[0], found[1] / len(points))
 
 
 def fit_affine(
-    points: Float[np.ndarray, "num 2"],
-    target: Float[np.ndarray, "num 2"],
-    known: Bool[np.ndarray, " num"],
-    inlier: float,
-) -> tuple[Float[np.ndarray, "3 3"], float] | None:
-    """The affine map that most of the points `known` follow within a distance of `inlier`, and their fraction of all.
+    points: Float[np.ndarray, "num 2"], target: Float[np.ndarray, "num 2"], inlier: float, least: float
+) -> tuple[Float[np.ndarray, "3 3"], int] | None:
+    """The affine map that most points follow to `target` within a distance of `inlier`, and how many do.
 
-    None where it is less than `LEAST_INLIERS`.
+    None if fewer than `least` do, or if the map mirrors or zooms by more than `MOST_ZOOM`.
     """
-    if known.sum() < max(3, LEAST_INLIERS * len(points)):
+    if len(points) < max(least, 3):
         return None
     affine, used = cv2.estimateAffine2D(
-        points[known], target[known], ransacReprojThreshold=inlier, maxIters=ITERATIONS, confidence=0.9999
+        points, target, ransacReprojThreshold=inlier, maxIters=ITERATIONS, confidence=0.9999
     )
-    inliers = float(used.sum() / len(points))
-    if affine is None or inliers < LEAST_INLIERS or np.linalg.det(affine[:, :2]) <= 0:
+    if affine is None or not np.isfinite(affine).all() or used.sum() < least:  # NaN: all points on a line
         return None
-    return np.vstack([affine, [0, 0, 1]]), inliers
+    zooms = np.linalg.svd(affine[:, :2], compute_uv=False)
+    if np.linalg.det(affine[:, :2]) <= 0 or zooms.max() > MOST_ZOOM or zooms.min() < 1 / MOST_ZOOM:
+        return None
+    return np.vstack([affine, [0, 0, 1]]), int(used.sum())
 
 
 def pixels_to_model(size: tuple[int, int]) -> Float[np.ndarray, "3 3"]:

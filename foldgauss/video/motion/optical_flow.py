@@ -131,13 +131,10 @@ class Motion:
         there, back = [pair.there for pair in pairs], [pair.back for pair in pairs]
         return cls(pairs[0].size, *map(np.concatenate, (small, there, back)), pairs[0].miss)
 
-    def find_cuts(self) -> list[int]:
+    @functools.cached_property
+    def cuts(self) -> list[int]:
         """The frames, in order, that begin a new shot."""
         return [k + 1 for k, known in enumerate(self.measure_tracked()) if known < CUT_FRACTION]
-
-    @functools.cached_property
-    def _cuts(self) -> list[int]:
-        return self.find_cuts()
 
     def find_still(self) -> list[int]:
         """The intervals, k for that between frames k and k + 1, in which nothing moves by `STILL` pixels."""
@@ -147,16 +144,19 @@ class Motion:
         """The fraction of points on a grid that can be tracked from each frame to the next."""
         return [float(self.match_grid(k)[2].mean()) for k in range(len(self.there))]
 
-    def match_grid(
-        self, k: int, spacing: int = 8
-    ) -> tuple[Float32[np.ndarray, "num 2"], Float32[np.ndarray, "num 2"], Bool[np.ndarray, " num"]]:
-        """Points of frame k, on a grid of every `spacing`-th cell of the maps; their positions in frame k + 1; and
-        which of these are reliable. All in pixels, as for `follow`."""
+    def grid(self, spacing: int) -> Float32[np.ndarray, "num 2"]:
+        """Points on a grid of every `spacing`-th cell of the maps, in pixels, as for `follow`."""
         rows, columns = self.small.shape[1:3]
         first = spacing // 2
         y, x = np.meshgrid(np.arange(first, rows, spacing), np.arange(first, columns, spacing), indexing="ij")
         unit = np.float32([self.size[1] / columns, self.size[0] / rows])
-        grid = ((np.stack([x.ravel(), y.ravel()], -1) + 0.5) * unit).astype(np.float32)
+        return ((np.stack([x.ravel(), y.ravel()], -1) + 0.5) * unit).astype(np.float32)
+
+    def match_grid(
+        self, k: int, spacing: int = 8
+    ) -> tuple[Float32[np.ndarray, "num 2"], Float32[np.ndarray, "num 2"], Bool[np.ndarray, " num"]]:
+        """The points of `grid` in frame k, their positions in frame k + 1, and which of these are reliable."""
+        grid = self.grid(spacing)
         home = np.full(len(grid), k)
         return grid, *self._step(home, grid, 1, self._color(home, grid))
 
@@ -236,7 +236,7 @@ class Motion:
         # The cubic through a point's places in four frames differs from the line through the inner two by -fraction
         # (1 - fraction) / 2 times the mean of both second differences, of weights 2 - fraction and 1 + fraction.
         for near, sign, origin in ((k - 1, -1, grid - past * flow), (k + 1, 1, grid + ahead * flow)):
-            if not 0 <= near < len(self.there) or near + 1 in self._cuts:
+            if not 0 <= near < len(self.there) or near + 1 in self.cuts:
                 continue
             out, home = (self.there, self.back) if sign > 0 else (self.back, self.there)
             step = warp_image(_resize_flow(out[near], self.size, (rows, columns)), origin, cv2.INTER_LINEAR)
@@ -291,7 +291,7 @@ class Motion:
 
 
 class CutFinder:
-    """`Motion.find_cuts` for a clip that is given frame by frame; two frames are kept.
+    """`Motion.cuts` for a clip that is given frame by frame; two frames are kept.
 
     For most pairs a fast flow between small images rules out a cut. Any other pair is tested as a clip of its own, on
     maps as large as those of a short clip; those of a long one, for which `Motion` saves memory, may be smaller.
@@ -308,7 +308,7 @@ class CutFinder:
         if self._before is not None:
             large, small = zip(self._before, now, strict=True)
             (known,) = Motion.from_frames(np.stack(small), cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).measure_tracked()
-            if known < SURE_FRACTION and Motion.from_frames(np.stack(large)).find_cuts():
+            if known < SURE_FRACTION and Motion.from_frames(np.stack(large)).cuts:
                 self.found.append(self._num)
         self._before, self._num = now, self._num + 1
 

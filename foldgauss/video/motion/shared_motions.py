@@ -2,14 +2,12 @@
 
 import dataclasses
 import itertools
-from collections.abc import Callable
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from foldgauss._runtime.threads import run_tasks
-from foldgauss.video.motion.camera_path import INLIER, ITERATIONS, SIDE, fit_affine, pixels_to_model
+from foldgauss.video.motion.camera_path import INLIER, LEAST_INLIERS, SIDE, fit_affine, pixels_to_model
 from foldgauss.video.motion.optical_flow import Motion
 
 #: The camera's maps are estimated from every so many cells of the flow's maps.
@@ -23,6 +21,9 @@ LEAST_INLIER = 0.3
 #: median of second differences): folds follow steadier motion as well, without a map for each frame, which costs time
 #: and can make up for frame times. (Gains: carphone 4e-3, car-shadow 2e-3, bear 3e-4; none: Bunny 8e-5.)
 STEADY = 2.2e-4
+#: Likewise for an object, in units of `STEADY`, where the camera's motion is steady: a step with any path takes a tenth
+#: longer. (Bunny's, 1.2: as good as without at equal steps. carphone's: 15, 0.5 dB.)
+STEADY_ALONE = 5.0
 #: The largest zoom (as its logarithm) and the largest distance, in units of the frame's longer side, between a frame
 #: and the one in whose coordinates Gaussians are placed. Where the motion goes farther, it is forgotten by these
 #: fractions in each frame; then Gaussians' own folds take over its slow part.
@@ -32,13 +33,14 @@ FARTHEST, FORGOTTEN = (1.0, 4.0), (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
 TRACK_SPACING, TRACK_GAP, TRACK_REACH, MAX_TRACKS = 6, 4, 12, 20_000
 #: Motions besides that of the camera.
 MAX_OBJECTS = 1
-#: At least this fraction of the tracks must be followed better than by the motions known so far.
+#: An object's path follows at least this fraction of all tracks, of those that the paths before it do not.
 LEAST_FOLLOWED = 0.02
-#: A track is followed if it strays from its mean by less than this, in units of RANSAC's threshold.
+#: A path follows a track that strays from its mean by less than this, in units of RANSAC's threshold. Distances are
+#: those of the coordinates that follow the path: pixels in the middle of each shot.
 STRAY = 1.5
-#: An object's motion is estimated from the tracks that none of the others follows, then from those that it follows
-#: itself within these multiples of `STRAY`.
-ROUNDS = (3.0, 3.0, 3.0, 1.5, 1.5, 1.5)
+#: An object's motion is estimated from the tracks that no path follows yet, and then again and again from those that
+#: are nearer to it than to the others, within these multiples of `STRAY`.
+ROUNDS = (3.0, 3.0, 3.0, 1.5)
 #: The fewest tracks that tell an object's motion between two frames, and those of them that must agree.
 FEWEST, AGREEING = 8, 6
 
@@ -46,7 +48,7 @@ FEWEST, AGREEING = 8, 6
 def find_shared_motions(motion: Motion, max_objects: int = MAX_OBJECTS) -> Float[np.ndarray, "paths frames 2 3"] | None:
     """The maps from coordinates that follow the camera to each frame, then those of objects, in model space.
 
-    None where the camera's motion is steady or unknown. In the middle frame of each shot coordinates are the frame's.
+    Those that move steadily are left out; None if all do. In the middle frame of each shot coordinates are the frame's.
     Where a motion is unknown between two frames, it is taken to be the camera's, and that of the camera to be none. An
     object is what moves as a whole, in another way than the camera: also a background that is nearer or farther.
 
@@ -54,10 +56,10 @@ def find_shared_motions(motion: Motion, max_objects: int = MAX_OBJECTS) -> Float
     """
     clip = _Clip.of(motion)
     camera = clip.find_camera_steps()
-    path = clip.chain_within_limits(camera)
-    if path is None or clip.measure_unsteadiness(camera) <= STEADY:
-        return None
-    return np.stack([path, *_find_objects(clip, camera, max_objects)])[:, :, :2]
+    path = clip.chain_within_limits(camera) if clip.measure_unsteadiness(camera, clip.corners) > STEADY else None
+    found = [] if path is None else [path]
+    found += _find_objects(clip, camera, max_objects, steady=STEADY if found else STEADY_ALONE * STEADY)
+    return np.stack(found)[:, :, :2] if found else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +75,7 @@ class _Clip:
     def of(cls, motion: Motion) -> "_Clip":
         to_model = pixels_to_model(motion.size)
         to_model[:2, 2] -= 0.5 / max(motion.size)  # `Motion` has pixel centers at 0.5
-        shots = list(itertools.pairwise([0, *motion.find_cuts(), len(motion.small)]))
+        shots = list(itertools.pairwise([0, *motion.cuts, len(motion.small)]))
         return cls(motion, shots, max(INLIER * max(motion.size) / SIDE, LEAST_INLIER), to_model)
 
     @property
@@ -98,7 +100,8 @@ class _Clip:
             textured = self.find_textured(k, SPACING)
             if textured.mean() < LEAST_TEXTURED:
                 return
-            found = fit_affine(points[textured], target[textured], known[textured], self.inlier)
+            known &= textured
+            found = fit_affine(points[known], target[known], self.inlier, LEAST_INLIERS * textured.sum())
             if found is not None:
                 steps[k + 1] = self.in_model(found[0])
 
@@ -118,17 +121,28 @@ class _Clip:
         """The maps of which as little is forgotten as `FARTHEST` allows; None if all had to be."""
         return next((maps for maps in (self.chain(steps, own) for own in FORGOTTEN) if _is_near(maps)), None)
 
-    def measure_unsteadiness(self, steps: Float[np.ndarray, "frames 3 3"]) -> float:
-        """The median over frames of the second difference of the places of four points: 0 at constant velocity."""
+    @property
+    def corners(self) -> Float[np.ndarray, "frames 4 2"]:
+        """Four points of every frame, in model space."""
         height, width = np.array(self.motion.size) / max(self.motion.size)
-        points = np.array([[0.35 * x * width, 0.35 * y * height, 1] for x in (-1, 1) for y in (-1, 1)])
-        changes = [0.0]
+        points = [[0.35 * x * width, 0.35 * y * height] for x in (-1, 1) for y in (-1, 1)]
+        return np.tile(points, (len(self.motion.small), 1, 1))
+
+    def measure_unsteadiness(
+        self, steps: Float[np.ndarray, "frames 3 3"], places: Float[np.ndarray, "frames num 2"]
+    ) -> float:
+        """The median over frames of the second difference of points at `places`: 0 at constant velocity.
+
+        Where steps or places are NaN, they are unknown.
+        """
+        changes = []
         for first, stop in self.shots:
             for k in range(first + 1, stop - 1):
-                before, after = points @ np.linalg.inv(steps[k]).T, points @ steps[k + 1].T
-                change = (before - 2 * points + after)[:, :2]
-                changes.append(float(np.sqrt((change**2).sum(1).mean())))
-        return float(np.median(changes))
+                points = np.concatenate([places[k], np.ones((len(places[k]), 1))], 1)
+                change = (points @ np.linalg.inv(steps[k]).T - 2 * points + points @ steps[k + 1].T)[:, :2]
+                changes.append(np.sqrt((change**2).sum(1).mean()))
+        changes = np.array(changes)
+        return float(np.median(changes[~np.isnan(changes)])) if not np.isnan(changes).all() else 0.0
 
 
 def _is_near(maps: Float[np.ndarray, "frames 3 3"]) -> bool:
@@ -141,20 +155,30 @@ def _is_near(maps: Float[np.ndarray, "frames 3 3"]) -> bool:
 # ------------------------------------------------------------------------------------------------------- objects
 
 
-def _find_objects(clip: _Clip, camera: Float[np.ndarray, "frames 3 3"], max_objects: int) -> list[np.ndarray]:
-    """Maps to each frame, (frames, 3, 3), of up to `max_objects`: one after another, what moves otherwise."""
+def _find_objects(
+    clip: _Clip, camera: Float[np.ndarray, "frames 3 3"], max_objects: int, steady: float
+) -> list[np.ndarray]:
+    """Maps to each frame, (frames, 3, 3), of up to `max_objects`: one after another, what moves otherwise.
+
+    The search ends at one whose unsteadiness is at most `steady`.
+    """
     points, limit = _Points.of(clip), STRAY * clip.inlier
     best, found = points.measure_stray(clip.chain(camera)), []
     for _ in range(max_objects):
         followed = left = best > limit
         for wide in ROUNDS:
-            if followed.sum() < max(LEAST_FOLLOWED * len(followed), FEWEST):
+            if not points.are_enough(followed):
                 return found
-            steps = points.estimate_steps(followed, camera)
-            own = points.measure_stray(clip.chain(steps))
+            steps = points.estimate_steps(followed)
+            known = np.where(np.isnan(steps), camera, steps)
+            own = points.measure_stray(clip.chain(known))
             followed = left & (own < best) & (own < wide * limit)
-        maps = clip.chain_within_limits(steps)
-        if maps is None or (left & (own < limit)).mean() < LEAST_FOLLOWED:
+        maps = clip.chain_within_limits(known)
+        if maps is None:
+            return found
+        own = points.measure_stray(maps)
+        followed = left & (own < limit)
+        if not points.are_enough(followed) or clip.measure_unsteadiness(steps, points.find_middle(followed)) <= steady:
             return found
         found.append(maps)
         best = np.minimum(best, own)
@@ -173,8 +197,10 @@ class _Points:
     @classmethod
     def of(cls, clip: _Clip) -> "_Points":
         homes = clip.pairs[::TRACK_GAP]
-        grids = [clip.motion.match_grid(k, TRACK_SPACING)[0][clip.find_textured(k, TRACK_SPACING)] for k in homes]
-        home, position = np.repeat(homes, [len(grid) for grid in grids]), np.concatenate([np.zeros((0, 2)), *grids])
+        grid = clip.motion.grid(TRACK_SPACING)
+        textured = [clip.find_textured(k, TRACK_SPACING) for k in homes]
+        home = np.repeat(homes, [which.sum() for which in textured])
+        position = np.concatenate([np.zeros((0, 2)), *(grid[which] for which in textured)])
         if len(home) > MAX_TRACKS:
             drawn = np.sort(np.random.default_rng(0).choice(len(home), MAX_TRACKS, replace=False))
             home, position = home[drawn], position[drawn]
@@ -192,35 +218,34 @@ class _Points:
         mean = place.mean(1, keepdims=True, where=known)
         return np.sqrt(((place - mean) ** 2).sum(2).mean(1, where=self.known))
 
-    def estimate_steps(
-        self, which: Bool[np.ndarray, " num"], otherwise: Float[np.ndarray, "frames 3 3"]
-    ) -> Float[np.ndarray, "frames 3 3"]:
-        """The map from the frame before to each frame that most of the tracks `which` follow, or else the other's."""
-        steps, by_frame = otherwise.copy(), self._pairs_of(which)
-        for k in self.clip.pairs:
-            one, other = by_frame(k)
-            if len(one) < FEWEST:
-                continue
-            affine, used = cv2.estimateAffine2D(
-                one, other, ransacReprojThreshold=self.clip.inlier, maxIters=ITERATIONS // 4, confidence=0.999
-            )
-            if affine is not None and used.sum() >= AGREEING and np.linalg.det(affine[:, :2]) > 0.1:
-                steps[k + 1] = self.clip.in_model(np.vstack([affine, [0, 0, 1]]))
-        return steps
+    def are_enough(self, which: Bool[np.ndarray, " num"]) -> bool:
+        """Whether these tracks are an object."""
+        return which.sum() >= max(LEAST_FOLLOWED * len(which), FEWEST)
 
-    def _pairs_of(self, which: Bool[np.ndarray, " num"]) -> Callable[[int], tuple[np.ndarray, np.ndarray]]:
-        """From a frame to the places of tracks `which` in it and in the next one."""
+    def find_middle(self, which: Bool[np.ndarray, " num"]) -> Float[np.ndarray, "frames 1 2"]:
+        """The mean place of these tracks in each frame, in model space; NaN where there are none."""
+        known = which[:, None] & self.known
+        frame, place, num = self.frame[known], self.place[known], len(self.clip.motion.small)
+        count = np.bincount(frame, minlength=num)
+        summed = np.stack([np.bincount(frame, axis, num) for axis in place.T], 1)
+        middle = np.full((num, 2), np.nan)
+        middle[count > 0] = summed[count > 0] / count[count > 0, None]
+        return (middle @ self.clip.to_model[:2, :2].T + self.clip.to_model[:2, 2])[:, None]
+
+    def estimate_steps(self, which: Bool[np.ndarray, " num"]) -> Float[np.ndarray, "frames 3 3"]:
+        """The map from the frame before to each frame that most of these tracks agree on; NaN if unknown."""
         row, step = np.nonzero(which[:, None] & self.known[:, :-1] & self.known[:, 1:])
-        frame = self.frame[row, step]
-        order = np.argsort(frame, kind="stable")
-        row, step, ends = (
-            row[order],
-            step[order],
-            np.searchsorted(frame[order], np.arange(len(self.clip.motion.small) + 1)),
-        )
+        order = np.argsort(self.frame[row, step], kind="stable")
+        row, step = row[order], step[order]
+        ends = np.searchsorted(self.frame[row, step], np.arange(len(self.clip.motion.small) + 1))
+        steps = np.full((len(self.clip.motion.small), 3, 3), np.nan)
 
-        def places(k: int) -> tuple[np.ndarray, np.ndarray]:
-            part = slice(ends[k], ends[k + 1])
-            return self.place[row[part], step[part]], self.place[row[part], step[part] + 1]
+        def estimate(k: int) -> None:
+            on, at = (index[ends[k] : ends[k + 1]] for index in (row, step))
+            if len(on) >= FEWEST:
+                found = fit_affine(self.place[on, at], self.place[on, at + 1], self.clip.inlier, AGREEING)
+                if found is not None:
+                    steps[k + 1] = self.clip.in_model(found[0])
 
-        return places
+        run_tasks(estimate, self.clip.pairs)
+        return steps

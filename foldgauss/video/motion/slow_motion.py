@@ -66,7 +66,7 @@ class _Window:
         pairs = {k: self.frames[n : n + 2] for n, k in enumerate(around[:-1])}
         self.flows = {k: flows[k] if k in flows else Motion.from_frames(pair) for k, pair in pairs.items()}
         self.motion = Motion.join(list(self.flows.values()))
-        self.is_cut = self.inner + 1 in self.motion.find_cuts()
+        self.is_cut = self.inner + 1 in self.motion.cuts
 
     def average(self, image: np.ndarray, fraction: float) -> UInt8[np.ndarray, "height width 3"]:
         """The weighted average of the video's own image and the prediction, at a fraction of the interval."""

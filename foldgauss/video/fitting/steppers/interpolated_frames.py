@@ -24,7 +24,7 @@ class InterpolatedFrames:
 
     def __init__(self, frames: np.ndarray, config: FitConfig, chance: float, motion: Motion):
         self.frames, self.config, self.chance, self.motion = frames, config, chance, motion
-        self.left_out = {*(k - 1 for k in motion.find_cuts()), *motion.find_still(), len(frames) - 1}
+        self.left_out = {*(k - 1 for k in motion.cuts), *motion.find_still(), len(frames) - 1}
 
     def choose(self, step: int, progress: float, k: int) -> float | None:
         """At which fraction of the way from frame k to the next the time of a step lies; None for the frame itself."""
