@@ -1,6 +1,7 @@
 """The command `compress`."""
 
 import math
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
@@ -33,6 +34,8 @@ from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.tradeoff import to_half_precision
 
 Score = Callable[[VideoModel], Evaluation]
+#: Passes over the frames in all, in units of --passes.
+USUAL_PASSES = 4
 #: Fine-tuning that is better than the model by more dB than this causes a warning.
 MAX_GAIN_DB = 0.5
 
@@ -141,14 +144,19 @@ def _write_compressed(
     columns = SpinnerColumn(), TimeElapsedColumn(), TextColumn("{task.description}")
     with Progress(*columns, console=err, disable=not err.is_terminal, transient=True) as bar:
         task = bar.add_task("Compressing", total=None)  # the number of trials is unknown
-
-        gain = 0.0
+        usual = 0 if clip is None else USUAL_PASSES * passes
+        gain, done, stage, started = 0.0, 0, "", time.monotonic()
 
         def show(what: str, loss: float) -> None:
-            nonlocal gain
+            nonlocal gain, done, stage
             gain = gain if math.isnan(loss) else max(gain, -loss)
-            text = f"Compressing: {what}" + ("" if math.isnan(loss) else f", {loss:.3f} dB lost")
-            bar.update(task, description=text)
+            done += what.startswith("fine-tuning")
+            text = what if math.isnan(loss) else f"{what}, {loss:.3f} dB lost"
+            text += f" (pass {done:,} of about {max(usual, done):,.0f})" if done else ""
+            bar.update(task, description=f"Compressing: {text}")
+            if not err.is_terminal and (what != stage or not math.isnan(loss)):
+                err.print(f"{time.monotonic() - started:7.1f} s  {text}", soft_wrap=True)
+            stage = what
 
         given = None if clip is None else clip.frames
         made = compress(model, given, max_loss_db=max_loss_db, psnr=known_psnr, passes=passes, on_step=show)
