@@ -196,6 +196,12 @@ def test_motions_of_few_frames(num):
     assert found is None if num == 2 else len(found) == 1
 
 
+def test_clips_whose_frames_are_all_shots_or_flat():
+    noise = np.random.default_rng(0).integers(0, 255, (5, 96, 160, 3)).astype(np.uint8)
+    for frames in (noise, np.full((5, 96, 160, 3), 120, np.uint8), noise[:2], noise[:1]):
+        assert find_shared_motions(Motion.from_frames(frames)) is None
+
+
 def test_points_on_a_line_tell_no_map():
     line = np.float32([[2, 2], [6, 2], [10, 2]])
     assert fit_affine(line, line + 1, 0.5, 3) is None

@@ -196,7 +196,7 @@ class _Points:
 
     @classmethod
     def of(cls, clip: _Clip) -> "_Points":
-        homes = clip.pairs[::TRACK_GAP]
+        homes = np.array(clip.pairs[::TRACK_GAP], int)
         grid = clip.motion.grid(TRACK_SPACING)
         textured = [clip.find_textured(k, TRACK_SPACING) for k in homes]
         home = np.repeat(homes, [which.sum() for which in textured])
