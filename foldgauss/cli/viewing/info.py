@@ -19,6 +19,8 @@ from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
 #: Number of segments that are listed.
 MAX_SEGMENTS = 100
+#: Number of shared paths whose Gaussians are counted one by one.
+MAX_PATHS = 3
 
 
 @app.command()
@@ -42,9 +44,7 @@ def info(model_path: ModelFile) -> None:
         "file": _describe_size(model_path, model),
     }
     if isinstance(model, EditedVideo):
-        figures["edits"] = ", ".join(
-            f"{len(one.overlays) + len(one.clocks)} on {one.num_gaussians:,} Gaussians" for one in model.layers
-        )
+        figures["edits"] = _describe_edits(model)
     _print_facts(model_path, figures, about)
 
 
@@ -93,10 +93,29 @@ def _describe_paths(model: VideoModel | EditedVideo) -> dict[str, str]:
     parts = [layer.model.splats for layer in as_edited(model).layers if layer.model.splats.paths is not None]
     if not parts:
         return {}
-    followers = sum(int((np.asarray(splats.path_index) > 0).sum()) for splats in parts)
-    num, knots = sum(splats.paths.num_paths for splats in parts), max(splats.paths.num_knots for splats in parts)
+    followers = np.concatenate(
+        [np.bincount(np.asarray(splats.path_index), minlength=splats.paths.num_paths + 1)[1:] for splats in parts]
+    )
+    num, knots = len(followers), {splats.paths.num_knots for splats in parts}
     paths = "a shared path" if num == 1 else f"{num:,} shared paths"
-    return {"paths": f"{followers:,} of {model.num_gaussians:,} Gaussians follow {paths} of {knots:,} knots"}
+    each = f"{'' if len(knots) == 1 else 'up to '}{max(knots):,} knots"
+    text = f"{followers.sum():,} of {model.num_gaussians:,} Gaussians follow {paths} of {each}"
+    if 1 < num <= MAX_PATHS:
+        text += ": " + ", ".join(f"{count:,} path {number}" for number, count in enumerate(followers, 1))
+    return {"paths": text}
+
+
+def _describe_edits(model: EditedVideo) -> str:
+    """The edits of each layer that are not baked into its parameters, and how many Gaussians they are of."""
+    layers = []
+    for layer in model.layers:
+        edits = (*layer.overlays, *layer.clocks)
+        count = np.logical_or.reduce([np.asarray(one.mask) for one in edits]).sum() if edits else 0
+        on = f" on {count:,} of {layer.num_gaussians:,} Gaussians" if edits else ""
+        layers.append(f"{len(edits) or 'none'}{on}")
+    if len(layers) > 1:
+        layers = [f"layer {number}: {text}" for number, text in enumerate(layers)]
+    return ", ".join(layers) + "; those baked into the parameters are not counted"
 
 
 def _describe_savings(model: VideoModel | EditedVideo) -> dict[str, str]:
