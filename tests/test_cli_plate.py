@@ -38,7 +38,10 @@ def test_scripts_select_what_moves(model, tmp_path, capsys):
     assert parse_edit_script(SCRIPT).apply(MODEL).num_gaussians == wanted.num_gaussians < MODEL.num_gaussians
     (tmp_path / "edits.toml").write_text(SCRIPT)
     assert run("edit", model, tmp_path / "edits.toml", "--out", tmp_path / "gone.safetensors") == 0
-    assert f"{wanted.num_gaussians} Gaussians" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert f"{wanted.num_gaussians} Gaussians" in told
+    assert told.startswith("Searching for what moves against the background ...\n")
+    assert f"The moving object has {MODEL.num_gaussians - wanted.num_gaussians} of 40 Gaussians." in told
     assert load_video_model(tmp_path / "gone.safetensors").num_gaussians == wanted.num_gaussians
 
 
@@ -55,8 +58,33 @@ def test_scripts_say_where_nothing_moves(model, tmp_path, monkeypatch, capsys):
     with pytest.raises(NothingMoves):
         edit(MODEL).select(moving=True)
     assert run("plate", model, "--out", tmp_path / "images") == 1
-    assert "moving: expected an object that moves against the background, got none." in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "moving: expected an object that moves against the background, got none." in told
+    assert "Remove an object by foldgauss edit, selected by a mask, a box or a click" in told
     assert not list(tmp_path.iterdir())
+
+
+def test_too_few_frames_are_refused_before_the_search(tmp_path, capsys):
+    save_video_model(tmp_path / "m.safetensors", soft_model(num_frames=2))
+    assert run("plate", tmp_path / "m.safetensors", "--out", tmp_path / "images") == 1
+    told = capsys.readouterr()
+    assert "moving: expected a video of 3 frames at least, got 2. Fit more frames" in told.err
+    assert "Searching" not in told.out
+    with pytest.raises(NothingMoves, match=r"moving: expected a video of 3 frames at least, got 2\. Select by a mask"):
+        edit(soft_model(num_frames=2)).select(moving=True)
+
+
+def test_an_object_without_gaussians_is_told(monkeypatch):
+    few = np.zeros_like(MASKS)
+    few[2, 0, :3] = True
+    monkeypatch.setattr(selectors, "find_moving_object", lambda frames: few)
+    with pytest.raises(EditScriptError) as error:
+        parse_edit_script(SCRIPT).apply(MODEL)
+    told = str(error.value)
+    assert (
+        "line 2, [selections.it]: moving: expected an object that has Gaussians of its own, got one that" in told
+    )
+    assert "covers up to 3 of 2,560 pixels of a frame, but to which no Gaussian belongs. Lower the threshold, 0.5, or" in told
 
 
 @pytest.mark.usefixtures("searched")

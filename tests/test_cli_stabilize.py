@@ -41,6 +41,8 @@ def test_options_reach_the_video(model, tmp_path, monkeypatch, capsys):
     assert "exists. Choose another path, or add --overwrite." in capsys.readouterr().err
     assert run("stabilize", model, "--overwrite", "--smoothing", "0.2") == 0
     assert "Enlarged by 1.0" in capsys.readouterr().out
+    assert run("stabilize", model, "--overwrite", "--smoothing", "0.001") == 0
+    assert "Enlarged" not in capsys.readouterr().out  # by 1.00
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,15 @@
 """The moving object of a clip, found without input, and the background behind it."""
 
+import logging
+import re
+
 import cv2
 import numpy as np
 import pytest
+from commands import run
 from object_clips import BACKGROUND, DISC, named_model, square
 
+from foldgauss.io import save_video_model
 from foldgauss.video import (
     NothingMoves,
     SegmentedVideo,
@@ -19,7 +24,7 @@ from foldgauss.video import (
     select,
 )
 from foldgauss.video.motion.background_plate import Alignment, _median
-from foldgauss.video.motion.moving_object import _assign_by_color, _clean, nothing_moves
+from foldgauss.video.motion.moving_object import LISTED_SHOTS, _assign_by_color, _clean, _log_missing, nothing_moves
 from foldgauss.video.selection import selectors
 
 SIZE, NUM_FRAMES, RADIUS = (90, 160), 6, 17.0
@@ -129,7 +134,7 @@ def test_colors_that_votes_miss_in_one_frame_are_known_from_others():
     assert overlap(_assign_by_color(frames, votes), truth)[3] > 0.95
 
 
-def test_the_background_is_filled_in_from_other_frames():
+def test_the_background_is_filled_in_from_other_frames(caplog):
     frames, empty, truth = disc_clip(pan=4.0, speed=1.0, num_frames=10)
     alignment = Alignment.from_frames(frames)
     assert alignment.shots == [(0, 10)]
@@ -139,7 +144,9 @@ def test_the_background_is_filled_in_from_other_frames():
     assert psnr(filled, empty) > 35 > 25 > psnr(frames, empty)
     # Without other frames to fill it from, the hole is filled from its surroundings.
     everywhere = np.broadcast_to(truth.any(0), truth.shape)
-    assert 30 > psnr(fill_background(frames[:3], everywhere[:3]), empty[:3]) > psnr(frames[:3], empty[:3])
+    with caplog.at_level(logging.INFO):
+        assert 30 > psnr(fill_background(frames[:3], everywhere[:3]), empty[:3]) > psnr(frames[:3], empty[:3])
+    assert re.fullmatch(r"\d\d% of the removed area is shown by no frame .*", caplog.messages[0])
 
 
 def test_the_kernel_takes_the_lower_median_of_what_is_known():
@@ -165,14 +172,32 @@ def test_where_nothing_moves_this_is_an_error(pan, noise):
         find_moving_object(noisy)
 
 
-def test_each_shot_has_its_own_object_or_none():
+def test_each_shot_has_its_own_object_or_none(caplog):
     one, _, truth = disc_clip(num_frames=5)
     other, _, other_truth = disc_clip(pan=0.0, speed=-2.0, seed=5, num_frames=5)
     still, _, _ = disc_clip(pan=0.0, seed=9, disc=False, num_frames=3)
-    masks = find_moving_object(np.concatenate([one, other[:, ::-1], still]))
+    with caplog.at_level(logging.INFO):
+        masks = find_moving_object(np.concatenate([one, other[:, ::-1], still]))
     assert overlap(masks[:5], truth).mean() >= 0.85
     assert overlap(masks[5:10], other_truth[:, ::-1]).mean() >= 0.85
     assert not masks[10:].any()
+    assert caplog.messages == ["No moving object was found in the shot of frames 10:13."]
+    caplog.clear()
+    with caplog.at_level(logging.INFO):
+        _log_missing([(k, k + 1) for k in range(LISTED_SHOTS + 2)])
+    assert caplog.messages[0].endswith("frames 0:1, which has fewer than 3.")
+    assert caplog.messages[LISTED_SHOTS:] == ["Nor in 2 more shots."]
+
+
+def test_plate_tells_of_shots_and_of_what_no_frame_shows(tmp_path, capsys):
+    one, other = (named_model(num_frames=num)[0] for num in (6, 4))
+    still = edit(other).freeze(2).transform([[0, 1], [-1, 0]], about=(0, 0)).video()
+    save_video_model(tmp_path / "m.safetensors", SegmentedVideo.from_models([(0, one), (6, still)]))
+    assert run("plate", tmp_path / "m.safetensors", "--out", tmp_path / "images") == 0
+    told = capsys.readouterr()
+    assert "2 shots, each on its own; they begin at frames 0, 6." in told.err
+    assert "No moving object was found in the shot of frames 6:10." in told.out
+    assert re.search(r"\n\d+% of the removed area is shown by no frame and filled from its surroundings\.", told.out)
 
 
 @pytest.mark.parametrize(
@@ -228,7 +253,7 @@ def test_select_combines_motion_with_other_criteria(moving, searched):
     assert len(select(model, moving=True, threshold=0.99)) < len(searched)
 
 
-def test_segments_are_searched_one_by_one(moving, searched, monkeypatch):
+def test_segments_are_searched_one_by_one(moving, searched, monkeypatch, caplog):
     model, _, _ = moving
     num, calls = model.num_frames, []
     video = SegmentedVideo.from_models([(0, model), (num, model)])
@@ -242,7 +267,17 @@ def test_segments_are_searched_one_by_one(moving, searched, monkeypatch):
 
     monkeypatch.setattr(selectors, "find_moving_object", search)
     search.still = False
-    assert list(map(len, edit(video).select(moving=True).selection.parts)) == [0, len(searched)]
+    with caplog.at_level(logging.INFO):
+        assert list(map(len, edit(video).select(moving=True).selection.parts)) == [0, len(searched)]
+    searching = "Searching for what moves against the background ..."
+    assert caplog.messages == [
+        "Segment 0, whose first frame, 0, is frame 0 of the clip:",
+        searching,
+        "moving: expected an object, got none. Select by a mask, a box or a click.",
+        f"Segment 1, whose first frame, 0, is frame {num} of the clip:",
+        searching,
+        f"The moving object has {len(searched)} of {model.num_gaussians:,} Gaussians.",
+    ]
     search.still = True
     with pytest.raises(NothingMoves):
         edit(video).select(moving=True)

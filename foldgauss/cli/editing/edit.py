@@ -10,6 +10,7 @@ import typer
 from foldgauss.cli.app.application import WrongUse, app, out, wrong_use
 from foldgauss.cli.app.completion import complete_files
 from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, parse_size
+from foldgauss.cli.shared.log_lines import print_log
 from foldgauss.cli.shared.outputs import check_image_path, name_after, refuse_existing, refuse_huge, refuse_input
 from foldgauss.cli.shared.rendering import render_to_file
 from foldgauss.io._atomic import check_writable
@@ -68,7 +69,8 @@ def edit_command(
     model = load_video_model(model_path)
     if not as_model:
         refuse_huge(image_size or model.size)
-    edited = script.apply(model)
+    with print_log():
+        edited = script.apply(model)
     if as_model:
         about = read_origin(model_path)
         about = {key: about[key] for key in ("clip", "frames") if key in about} | {"edited_by": script_path.name}

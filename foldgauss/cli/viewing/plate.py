@@ -8,6 +8,7 @@ import typer
 
 from foldgauss.cli.app.application import app, out, wrong_use
 from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, parse_size
+from foldgauss.cli.shared.log_lines import print_log, print_shots
 from foldgauss.cli.shared.outputs import check_image_path, name_after, refuse_existing, refuse_huge, refuse_input
 from foldgauss.cli.shared.rendering import (
     CodecName,
@@ -22,7 +23,10 @@ from foldgauss.io._atomic import check_writable
 from foldgauss.io.media.video_writing import VIDEO_SUFFIXES
 from foldgauss.io.models.video_model import load_video_model
 from foldgauss.video.motion.background_plate import Alignment, fill_background
-from foldgauss.video.motion.moving_object import find_moving_object
+from foldgauss.video.motion.moving_object import LEAST_FRAMES, NothingMoves, find_moving_object, nothing_moves
+
+#: What can be done where the search finds nothing, or the wrong thing.
+_CURE = "Remove an object by foldgauss edit, selected by a mask, a box or a click; see docs/editing.md."
 
 
 @app.command("plate")
@@ -58,6 +62,9 @@ def plate_command(
         elif any(path.iterdir()):
             refuse_existing(path, overwrite, option)
     model = load_video_model(model_path)
+    if model.num_frames < LEAST_FRAMES:
+        cure = "Fit more frames: a plate is what other frames show behind the object."
+        raise nothing_moves(f"a video of {LEAST_FRAMES} frames at least", model.num_frames, cure)
     image_size = image_size or model.size
     refuse_huge(image_size)
     frames = np.empty((model.num_frames, *image_size, 3), np.uint8)
@@ -67,8 +74,14 @@ def plate_command(
             advance()
     out.print("Searching for what moves against the background ...")
     alignment = Alignment.from_frames(frames)
-    masks = find_moving_object(frames, shadow=True, alignment=alignment)
-    plate, options = fill_background(frames, masks, alignment=alignment), VideoOptions(codec, crf, pixel_format)
+    print_shots(alignment.starts)
+    with print_log():
+        try:
+            masks = find_moving_object(frames, shadow=True, alignment=alignment)
+        except NothingMoves as error:
+            raise nothing_moves("an object that moves against the background", "none", _CURE) from error
+        plate = fill_background(frames, masks, alignment=alignment)
+    options = VideoOptions(codec, crf, pixel_format)
     write_images(out_path, plate, len(plate), model.fps, overwrite=overwrite, options=options)
     if masks_path is not None:
         images = (np.repeat(np.uint8(255 * mask)[..., None], 3, -1) for mask in masks)

@@ -6,9 +6,10 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from foldgauss.cli.app.application import WrongUse, app, err, name_option, out, wrong_use
+from foldgauss.cli.app.application import WrongUse, app, name_option, out, wrong_use
 from foldgauss.cli.app.completion import complete_choice
 from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, parse_color, parse_size
+from foldgauss.cli.shared.log_lines import print_shots
 from foldgauss.cli.shared.outputs import check_image_path, name_after, refuse_existing, refuse_huge, refuse_input
 from foldgauss.cli.shared.rendering import (
     CodecName,
@@ -78,13 +79,12 @@ def stabilize_command(
     shown, rate = timeline.times(np.asarray(model.frame_times.times()), model.fps), timeline.rate(model.fps)
     with progress_bar("Estimating the camera's path", model.num_frames) as advance:
         path = estimate_camera_path(model, on_frame=advance)
-    if len(path.starts) > 1:
-        err.print(f"{len(path.starts)} shots, each on its own; they begin at frames {_list(path.starts)}.")
+    print_shots(path.starts)
     try:
         video = stabilize(model, smoothing=smoothing, fixed=fixed, border=border, path=path)
     except ValueError as error:
         raise WrongUse(name_option(str(error))) from error
-    if border == "crop":
+    if border == "crop" and f"{video.zoom:.2f}" != "1.00":
         out.print(f"Enlarged by {video.zoom:.2f} to hide the borders.")
     render_to_file(
         model=video,
@@ -97,7 +97,3 @@ def stabilize_command(
         options=options,
         flow=flow,
     )
-
-
-def _list(numbers: tuple[int, ...], most: int = 8) -> str:
-    return ", ".join(map(str, numbers[:most])) + (", ..." if len(numbers) > most else "")

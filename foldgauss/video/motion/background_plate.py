@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import logging
 
 import cv2
 import numba as nb
@@ -12,6 +13,8 @@ from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.video.motion.optical_flow import both_flows, pixel_grid, warp_image
+
+_LOG = logging.getLogger(__name__)
 
 #: The longer side, in pixels, of the images that flow is computed on, and the distance of the points in them.
 SIDE, SPACING = 480, 6
@@ -107,8 +110,8 @@ def fill_background(frames: Frames, masks: Masks, *, alignment: Alignment | None
     """The frames without what the masks cover: other frames, moved as the background, show what is behind it.
 
     A pixel is the median of the frames that show it, up to `PLATE_REACH` frames away within its shot. One that no
-    frame shows is interpolated from its surroundings. Pixels away from the masks stay as they are. `alignment` is
-    that of the frames (default: estimated here).
+    frame shows is interpolated from its surroundings; the fraction of these is logged, at level INFO. Pixels away from
+    the masks stay as they are. `alignment` is that of the frames (default: estimated here).
 
     Raises ValueError for frames of another type, and masks of another size.
     Example: `fill_background(frames, find_moving_object(frames, shadow=True))`.
@@ -122,7 +125,7 @@ def fill_background(frames: Frames, masks: Masks, *, alignment: Alignment | None
     side = max(frames.shape[1:3])
     margin, edge = 2 * round(MARGIN * side) + 1, max(SOFT_EDGE * side, 0.5)
     covered = np.stack([dilate(mask, margin) for mask in masks])
-    filled = frames.copy()
+    filled, num_unknown = frames.copy(), np.zeros(len(frames), int)
 
     def fill(item: tuple[int, tuple[int, int]]) -> None:
         k, shot = item
@@ -131,13 +134,24 @@ def fill_background(frames: Frames, masks: Masks, *, alignment: Alignment | None
         window = bounding_box(covered[k])
         plate, count = render_plate(frames, covered, alignment, k, shot, box=window)
         unknown = np.uint8(count == 0)
+        num_unknown[k] = (unknown & covered[k][window]).sum()
         plate = cv2.inpaint(plate, unknown, 3, cv2.INPAINT_TELEA) if unknown.any() else plate
         # From 0 at the border of what is replaced, where the blurred mask is a half, to 1.
         weight = np.clip(2 * cv2.GaussianBlur(covered[k][window].astype(np.float32), (0, 0), edge) - 1, 0, 1)[..., None]
         filled[k][window] = (weight * plate + (1 - weight) * frames[k][window]).round()
 
     run_tasks(fill, [(k, shot) for shot in alignment.shots for k in range(*shot)])
+    _log_unknown(int(num_unknown.sum()), int(covered.sum()))
     return filled
+
+
+def _log_unknown(unknown: int, removed: int) -> None:
+    """Log how many of the removed pixels no frame shows."""
+    if unknown:
+        percent = f"{100 * unknown / removed:.0f}%" if 100 * unknown >= removed else "Less than 1%"
+        _LOG.info("%s of the removed area is shown by no frame and filled from its surroundings.", percent)
+    elif removed:
+        _LOG.info("All of the removed area is shown by other frames.")
 
 
 def render_plate(

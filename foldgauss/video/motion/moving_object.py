@@ -5,6 +5,8 @@ that the other frames show. GrabCut places the borders, the pieces are followed 
 the flow, and pixels near them are assigned by their color.
 """
 
+import logging
+
 import cv2
 import numpy as np
 import scipy
@@ -23,6 +25,8 @@ from foldgauss.video.motion.background_plate import (
     warp_by,
 )
 from foldgauss.video.motion.optical_flow import both_flows, pixel_grid
+
+_LOG = logging.getLogger(__name__)
 
 #: Motion is measured over so many frames: slow objects need more, fast ones are not found again after many.
 GAPS = (1, 2, 4)
@@ -55,6 +59,12 @@ BINS, COLOR_REACH, SURROUNDINGS = 64, 10, 60
 #: A color counts from -COLOR_WEIGHT to COLOR_WEIGHT, by the difference of both frequencies over their sum, against log
 #: odds of the votes of at most VOTE_ODDS. An object reaches at most so many pixels beyond votes of -VOTE_ODDS.
 COLOR_WEIGHT, VOTE_ODDS, BEYOND = 4.0, 3.0, 4
+#: A motion cannot be told from a camera's in fewer frames.
+LEAST_FRAMES = 3
+#: So many shots without an object are logged one by one.
+LISTED_SHOTS = 8
+#: The cure of errors of selections, which can be made otherwise.
+SELECT_OTHERWISE = "Select by a mask, a box or a click."
 
 
 class NothingMoves(ValueError):
@@ -67,7 +77,7 @@ def find_moving_object(frames: Frames, *, shadow: bool = False, alignment: Align
     `frames` are uint8 (num_frames, height, width, 3), in which the background fills most of the image and moves as a
     plane does, about: a camera that turns, zooms, or passes a distant scene. Each shot has an object of its own, and
     objects that touch count as one. Masks are empty where it is hidden. `shadow`: with the shadow that it casts.
-    `alignment` is that of the frames (default: estimated here).
+    `alignment` is that of the frames (default: estimated here). Shots in which none is found are logged, at level INFO.
 
     It costs about half a second of processor time for each frame, of any size.
 
@@ -85,19 +95,29 @@ def find_moving_object(frames: Frames, *, shadow: bool = False, alignment: Align
             masks[k] = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
     if not masks.any():
         raise nothing_moves("an object that moves against the background", "none")
+    _log_missing([shot for shot in alignment.shots if not masks[slice(*shot)].any()])
     return masks
 
 
-def nothing_moves(expected: str, got: object) -> NothingMoves:
+def nothing_moves(expected: str, got: object, cure: str = SELECT_OTHERWISE) -> NothingMoves:
     """The error, to be raised."""
-    return NothingMoves(str(invalid("moving", expected=expected, got=got, cure="Select by a mask, a box or a click.")))
+    return NothingMoves(str(invalid("moving", expected=expected, got=got, cure=cure)))
+
+
+def _log_missing(shots: list[tuple[int, int]]) -> None:
+    """Log the shots in which no object was found."""
+    for first, stop in shots[:LISTED_SHOTS]:
+        why = f", which has fewer than {LEAST_FRAMES}" if stop - first < LEAST_FRAMES else ""
+        _LOG.info("No moving object was found in the shot of frames %d:%d%s.", first, stop, why)
+    if len(shots) > LISTED_SHOTS:
+        _LOG.info("Nor in %d more shots.", len(shots) - LISTED_SHOTS)
 
 
 def _find_in_shot(frames: Frames, alignment: Alignment, shot: tuple[int, int], shadow: bool) -> Masks | list:
     """The masks of one shot at the size of the alignment's images; none if nothing moves."""
     first, stop = shot
     num = stop - first
-    if num < 3:
+    if num < LEAST_FRAMES:
         return []
     moved = np.stack(_map(lambda k: _measure_motion(alignment, first + k, shot), num))
     moved = _vote(moved, alignment, first, MOTION_VOTE)

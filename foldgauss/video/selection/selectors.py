@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import logging
 from collections.abc import Callable
 from typing import Any
 
@@ -12,7 +13,7 @@ from foldgauss._runtime.checks import invalid, is_integer
 from foldgauss.video.models.splats import SH_C0
 from foldgauss.video.models.video_model import VideoModel, check_model, check_time
 from foldgauss.video.motion.background_plate import SIDE
-from foldgauss.video.motion.moving_object import find_moving_object, nothing_moves
+from foldgauss.video.motion.moving_object import LEAST_FRAMES, find_moving_object, nothing_moves
 from foldgauss.video.selection.contributions import (
     Contributions,
     average_seen_colors,
@@ -41,6 +42,8 @@ from foldgauss.video.selection.tracking import (
     settle_labels,
     to_lab,
 )
+
+_LOG = logging.getLogger(__name__)
 
 #: Fraction of a Gaussian's contribution that must lie inside a mask.
 THRESHOLD = 0.5
@@ -326,17 +329,27 @@ def by_motion(model: VideoModel, *, threshold: float = THRESHOLD) -> Selection:
     """The Gaussians of the moving object: those whose rendered contribution lies inside the masks that
     `find_moving_object` finds in the model's own images, to at least `threshold`.
 
-    It is the largest object that moves against the background, in each shot. It takes about a second per frame.
+    It is the largest object that moves against the background, in each shot. It takes about a second per frame. Shots
+    without one, and the number of Gaussians, are logged at level INFO.
 
-    **Example:** `edit(model).select(moving=True).vanish()`. **Raises:** ValueError if nothing moves, and as `by_mask`.
+    **Example:** `edit(model).select(moving=True).vanish()`. **Raises:** `NothingMoves`, a ValueError, if nothing moves,
+    or no Gaussian belongs to what does; and as `by_mask`.
     """
     check_model(model)
-    if model.num_frames < 3:
-        raise nothing_moves("a video of 3 frames at least", model.num_frames)
+    if model.num_frames < LEAST_FRAMES:
+        raise nothing_moves(f"a video of {LEAST_FRAMES} frames at least", model.num_frames)
+    _LOG.info("Searching for what moves against the background ...")
     scale = min(1.0, SIDE / max(model.size))
     size = tuple(max(1, round(side * scale)) for side in model.size)
     masks = find_moving_object(np.stack(list(model.frames(size=size))))
-    return by_mask(model, masks, threshold=threshold)
+    found = by_mask(model, masks, threshold=threshold)
+    if not len(found):
+        area = int(masks.sum((1, 2)).max())
+        got = f"one that covers up to {area:,} of {masks[0].size:,} pixels of a frame, but to which no Gaussian belongs"
+        cure = f"Lower the threshold, {threshold:g}, or select by a mask, a box or a click."
+        raise nothing_moves("an object that has Gaussians of its own", got, cure)
+    _LOG.info("The moving object has %s of %s Gaussians.", f"{len(found):,}", f"{model.splats.num_gaussians:,}")
+    return found
 
 
 def by_color(
