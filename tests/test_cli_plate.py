@@ -81,10 +81,8 @@ def test_an_object_without_gaussians_is_told(monkeypatch):
     with pytest.raises(EditScriptError) as error:
         parse_edit_script(SCRIPT).apply(MODEL)
     told = str(error.value)
-    assert (
-        "line 2, [selections.it]: moving: expected an object that has Gaussians of its own, got one that" in told
-    )
-    assert "covers up to 3 of 2,560 pixels of a frame, but to which no Gaussian belongs. Lower the threshold, 0.5, or" in told
+    assert "line 2, [selections.it]: moving: expected an object that has Gaussians of its own, got one that" in told
+    assert "covers up to 3 of 2,560 pixels of a frame, but to which no Gaussian belongs. Lower the threshold" in told
 
 
 @pytest.mark.usefixtures("searched")

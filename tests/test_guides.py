@@ -93,10 +93,17 @@ def _editing(names, folder):
     # The script, as it stands there.
     (folder / "masks").mkdir()
     Image.fromarray(255 * names["masks"][0].astype(np.uint8)).save(folder / "masks" / "ball.png")
-    (script,) = [block.text for block in guides.blocks("docs/editing.md") if block.language == "toml"]
+    script, on_plate = [block.text for block in guides.blocks("docs/editing.md") if block.language == "toml"]
     edited = parse_edit_script(script, folder=folder).apply(names["model"])
     assert edited.num_gaussians > names["model"].num_gaussians
     assert isinstance(edited, EditedVideo)
+    (folder / "object").rename(folder / "searched")
+    (folder / "object").mkdir()
+    for k, mask in enumerate(names["masks"]):
+        Image.fromarray(255 * mask.astype(np.uint8)).save(folder / "object" / f"{k}.png")
+    on_plate = parse_edit_script(on_plate, folder=folder).apply(names["model"])
+    assert [layer.num_gaussians for layer in on_plate.layers] == [len(names["ball"]), 600]
+    assert np.abs(on_plate.render(0.4) - load_video_model(folder / "plate.safetensors").render(0.4)).max() > 0.02
 
 
 def _estimator(names, folder):
