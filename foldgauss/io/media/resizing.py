@@ -93,12 +93,6 @@ def convert_channels(frame: np.ndarray, channels: int) -> np.ndarray:
     return cv2.cvtColor(frame, cv2.COLOR_RGB2RGBA) if channels == 4 else frame[..., :3]
 
 
-def unify_channels(frames: list[np.ndarray]) -> list[np.ndarray]:
-    """All frames with alpha where any is transparent anywhere, otherwise all without."""
-    transparent = any(frame.shape[2] == 4 and frame[..., 3].min() < 255 for frame in frames)
-    return [convert_channels(frame, 4 if transparent else 3) for frame in frames]
-
-
 def copy_to_blocks(frames: Iterable[np.ndarray]) -> list[np.ndarray]:
     """Copies of the frames in large blocks, each of which is returned to the system when its last frame is freed.
 
@@ -116,9 +110,13 @@ def copy_to_blocks(frames: Iterable[np.ndarray]) -> list[np.ndarray]:
 
 
 def stack_frames(frames: list[np.ndarray]) -> np.ndarray:
-    """`np.stack` that empties the list as it goes, so that the peak is one copy of the clip and not two."""
-    clip = np.empty((len(frames), *frames[0].shape), np.uint8)
+    """All frames in one array: with alpha where any is transparent anywhere, otherwise without.
+
+    The list is emptied as it goes, so that the peak is one copy of the clip and not two.
+    """
+    channels = 4 if any(frame.shape[2] == 4 and frame[..., 3].min() < 255 for frame in frames) else 3
+    clip = np.empty((len(frames), *frames[0].shape[:2], channels), np.uint8)
     for number in range(len(frames)):
-        clip[number] = frames[number]
+        clip[number] = convert_channels(frames[number], channels)
         frames[number] = None
     return clip

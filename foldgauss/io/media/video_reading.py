@@ -19,7 +19,7 @@ from foldgauss.io.media.clip import (
 from foldgauss.io.media.format_detection import may_be_animation
 from foldgauss.io.media.frame_rate import FrameRate, describe_rate
 from foldgauss.io.media.image_files import is_image_file, read_animation, read_folder, read_image_file
-from foldgauss.io.media.resizing import describe_crop, make_resizer, stack_frames, unify_channels
+from foldgauss.io.media.resizing import describe_crop, make_resizer, stack_frames
 from foldgauss.io.media.video_decoding import read_video_file
 
 
@@ -73,7 +73,6 @@ def read_video(
     notes += describe_rate(rate)
     if size is not None and center_crop is None:
         notes += describe_crop(sizes, size)
-    kept = unify_channels(kept)
     return Clip(stack_frames(kept), float(rate.fps), str(path), num_declared, rate.times, notes)
 
 
