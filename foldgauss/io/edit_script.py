@@ -270,7 +270,7 @@ class EditScript:
                 raise invalid("select", expected="a selection of at least one Gaussian", got=got)
         given = {key: value for key, value in _convert_spans(table).items() if key not in ("do", "select")}
         if "degrees" in given:
-            given[ACTIONS[table["do"]].angle] = _to_radians(given.pop("degrees"))
+            given[ACTIONS[table["do"]].angle] = np.radians(given.pop("degrees")).tolist()
         return getattr(edits, table["do"])(**given)
 
     def _add_layers(self, video: Video) -> Video:
@@ -520,8 +520,3 @@ def _convert_spans(table: dict[str, Any]) -> dict[str, Any]:
 def _convert_span(value: list[float] | str) -> tuple[float | None, ...]:
     ends = value.split(":") if isinstance(value, str) else value
     return tuple((int(end) if end else None) if isinstance(end, str) else end for end in ends)
-
-
-def _to_radians(degrees: float | list[float]) -> float | list[float]:
-    """Convert one angle or a list of them."""
-    return [math.radians(one) for one in degrees] if isinstance(degrees, list) else math.radians(degrees)

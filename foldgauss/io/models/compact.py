@@ -173,9 +173,8 @@ def load_compact(path: str | os.PathLike) -> Quantized:
         raise _unreadable(path, got) from error
 
 
-def load_compact_model(path: str | os.PathLike) -> VideoModel:
+def load_compact_model(path: Path) -> VideoModel:
     """The model in a compact file. Raises as `load_compact`, also for values beyond float32."""
-    path = check_path(path)
     with np.errstate(over="ignore", invalid="ignore"):
         model = dequantize(load_compact(path))
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model)):
@@ -183,9 +182,8 @@ def load_compact_model(path: str | os.PathLike) -> VideoModel:
     return model
 
 
-def compact_metadata(path: str | os.PathLike) -> dict:
+def compact_metadata(path: Path) -> dict:
     """The `metadata` that `save_compact` stored. Raises as `load_compact`."""
-    path = check_path(path)
     return _read_header(path, path.read_bytes())[0]["metadata"]
 
 

@@ -99,10 +99,6 @@ def read_origin(path: str | os.PathLike) -> dict:
     return {name: value for name, value in read_metadata(path).items() if name not in _NOTES or _NOTES[name](value)}
 
 
-def _is_text(value: object) -> bool:
-    return isinstance(value, str)
-
-
 def _is_range(value: object) -> bool:
     """Whether these are frames A up to, not including, B, as `read_video` takes them."""
     if not isinstance(value, list) or len(value) != 2:
@@ -114,9 +110,7 @@ def _is_range(value: object) -> bool:
 
 #: Metadata that `fit` and `compress` write and later commands read, with their checks.
 _NOTES: dict[str, Callable[[object], bool]] = {
-    "clip": _is_text,
-    "frames_digest": _is_text,
-    "clip_digest": _is_text,
+    **dict.fromkeys(("clip", "frames_digest", "clip_digest"), lambda value: isinstance(value, str)),
     "frames": _is_range,
     "seed": lambda value: is_integer(value, 0),
     "mean_psnr": lambda value: is_within(value, "(0, 100]"),
@@ -174,15 +168,11 @@ def _video_skeleton(header: dict) -> VideoModel:
     if num_paths and not (is_integer(num_paths, 1) and num_paths <= MAX_PATHS and is_integer(num_knots, 1)):
         raise ValueError("a number of paths or of their maps is out of range")
 
-    def build_paths() -> SharedPaths | None:
-        shape = num_paths, num_knots
-        return SharedPaths(jnp.zeros(shape, jnp.float32), jnp.zeros((*shape, 2, 3), jnp.float32)) if num_paths else None
-
     def build() -> VideoModel:
+        times, maps = (jnp.zeros((num_paths, num_knots, *shape), jnp.float32) for shape in ((), (2, 3)))
+        rows, paths = jnp.zeros((num, row_width), jnp.float32), SharedPaths(times, maps) if num_paths else None
         return VideoModel(
-            splats=unpack(
-                jnp.zeros((num, row_width), jnp.float32), degree, TimeLikelihood(np.float32(1)), build_paths()
-            ),
+            splats=unpack(rows, degree, TimeLikelihood(np.float32(1)), paths),
             frame_times=FrameTimes(jnp.zeros(num_frames - 1, jnp.float32)),
             size=(height, width),
             fps=float(header["fps"]),

@@ -201,7 +201,12 @@ def _encode_model(model: Model, loaded: Loaded) -> Iterator[str]:
         spans = [{name: int(getattr(segment, name)) for name in names} for segment in loaded.segments]
         yield f'<script type="application/json" id="segments">{json.dumps(spans)}</script>'
         for number, segment in enumerate(loaded.segments):
-            yield _block(f"model-{number}", pack_compact(quantize_finely(_flatten_segment(number, segment.model))))
+            edited = segment.model
+            try:
+                plain = flatten_video(edited)
+            except ValueError as error:
+                raise ValueError(f"segment {number}: {error}") from error
+            yield _block(f"model-{number}", pack_compact(quantize_finely(plain)))
     elif isinstance(model, Quantized):
         yield _block("model", pack_compact(model))
     elif loaded is not model and is_compact(model):
@@ -224,13 +229,6 @@ def _encode_moving(model: Loaded) -> str:
     if not found:
         raise missing or nothing_moves("an object that has Gaussians of its own", "none")
     return f'<script type="application/json" id="moving">{json.dumps(found)}</script>'
-
-
-def _flatten_segment(number: int, model: VideoModel | EditedVideo) -> VideoModel:
-    try:
-        return flatten_video(model)
-    except ValueError as error:
-        raise ValueError(f"segment {number}: {error}") from error
 
 
 def quantize_finely(model: VideoModel) -> Quantized:
