@@ -12,7 +12,7 @@ import scipy
 from jaxtyping import Float
 from scipy.special import expit, logit
 
-from foldgauss._runtime.checks import check_one_of, invalid, is_within, short_repr
+from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_within, short_repr
 from foldgauss.io._atomic import atomic_folder
 from foldgauss.io.exchange.ply_file import NOTE, read_ply, write_ply
 from foldgauss.render import Camera, Gaussians3D, pixels_per_unit
@@ -51,8 +51,7 @@ def frame_gaussians(model: RenderableVideo | VideoRenderer, t: float, *, depth_s
 
     **Source:** VeGaS eq:mirage (flat Gaussians), eq:vegas_equiv_cond (of one time).
     """
-    if not is_within(depth_step, "[0, 1]"):
-        raise invalid("depth_step", expected="a depth in [0, 1] of the frame's longer side", got=repr(depth_step))
+    check_within("depth_step", depth_step, "[0, 1]", "a depth in [0, 1] of the frame's longer side")
     if not is_within(float(t), "[0, 1]"):
         raise invalid("t", expected="a time in [0, 1]", got=repr(t))
     renderer = model if isinstance(model, VideoRenderer) else VideoRenderer(model)

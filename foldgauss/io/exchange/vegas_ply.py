@@ -11,10 +11,11 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from foldgauss._runtime.checks import invalid, is_within
+from foldgauss._runtime.checks import check_within, invalid
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io.exchange.ply_file import NOTE, Ply, facts_error, read_ply, write_ply
-from foldgauss.io.media.frame_rate import DEFAULT_FPS, MAX_FPS, MIN_FPS
+from foldgauss.io.media.clip import check_fps
+from foldgauss.io.media.frame_rate import DEFAULT_FPS
 from foldgauss.render import RenderOptions
 from foldgauss.render.camera import FIELD_OF_VIEW
 from foldgauss.render.splats import check_size
@@ -205,13 +206,10 @@ def _fill_in(
         fps = note.get("fps", DEFAULT_FPS) if fps is None else fps
         check_size(size)
         cutoff = note.get("scale_cutoff", VEGAS_SCALE_CUTOFF * _vegas_unit(size))
-        if not is_within(cutoff, "[0, 1]"):
-            raise invalid("scale_cutoff", expected="a number in [0, 1]", got=repr(cutoff))
+        check_within("scale_cutoff", cutoff, "[0, 1]", "a number in [0, 1]")
         power = note.get("power", VEGAS_POWER)
-        if not is_within(power, "(0, 1e30]"):
-            raise invalid("power", expected="a number in (0, 1e30]", got=repr(power))
-        if not is_within(fps, f"[{MIN_FPS}, {MAX_FPS}]"):
-            raise invalid("fps", expected=f"a rate in [{MIN_FPS:g}, {MAX_FPS:g}]", got=repr(fps), cure="Try 25.")
+        check_within("power", power, "(0, 1e30]", "a number in (0, 1e30]")
+        check_fps(fps)
     except (TypeError, ValueError) as error:
         raise facts_error(ply.path, error) from error
     return (int(size[0]), int(size[1])), float(fps), options, float(cutoff), float(power)
