@@ -31,7 +31,6 @@ from foldgauss.video.compression.quantize import (
     Rule,
     column_names,
     compute_columns,
-    dequantize,
     is_integral,
     quantize,
 )
@@ -60,7 +59,7 @@ _EVEN = -18.0
 _MORE_PATH_BITS = 5
 _PER_E = 1.4427  # log2 e: slopes are those of natural logarithms
 
-Loaded = VideoModel | EditedVideo | SegmentedVideo | Quantized
+Loaded = VideoModel | EditedVideo | SegmentedVideo
 Model = Loaded | str | os.PathLike
 Frames = Clip | UInt8[np.ndarray, "num_frames height width channels"]
 
@@ -207,8 +206,6 @@ def _encode_model(model: Model, loaded: Loaded) -> Iterator[str]:
             except ValueError as error:
                 raise ValueError(f"segment {number}: {error}") from error
             yield _block(f"model-{number}", pack_compact(quantize_finely(plain)))
-    elif isinstance(model, Quantized):
-        yield _block("model", pack_compact(model))
     elif loaded is not model and is_compact(model):
         yield _block("model", Path(model).read_bytes())
     else:
@@ -217,8 +214,7 @@ def _encode_model(model: Model, loaded: Loaded) -> Iterator[str]:
 
 def _encode_moving(model: Loaded) -> str:
     """The Gaussians of the moving object, by segment, as the page writes selections."""
-    whole = dequantize(model) if isinstance(model, Quantized) else model
-    models = (one.model for one in whole.segments) if isinstance(whole, SegmentedVideo) else [whole]
+    models = (one.model for one in model.segments) if isinstance(model, SegmentedVideo) else [model]
     found, missing = {}, None
     for number, one in enumerate(models):
         try:
@@ -265,14 +261,9 @@ def _fine_rules(degree: int) -> dict[str, Rule]:
 def _encode_original(original: Frames, model: Loaded, quality: int) -> list[bytes]:
     """The original's frames as WebP."""
     frames = original.frames if isinstance(original, Clip) else original
-    if isinstance(model, Quantized):
-        size, num = tuple(model.info.size), len(model.intervals) + 1
-    else:
-        size, num = tuple(model.size), model.num_frames
-    shape, dtype = np.shape(frames), getattr(frames, "dtype", None)
-    if len(shape) != 4 or shape[:3] != (num, *size) or shape[3] not in (3, 4) or dtype != np.uint8:
-        expected = f"frames uint8 ({num}, {size[0]}, {size[1]}, 3), those of the model"
-        cure = "Read them with read_video(path, size=model.size)."
+    shape, dtype, own = np.shape(frames), getattr(frames, "dtype", None), (model.num_frames, *model.size, 3)
+    if len(shape) != 4 or shape[:3] != own[:3] or shape[3] not in (3, 4) or dtype != np.uint8:
+        expected, cure = f"frames uint8 {own}, those of the model", "Read them with read_video(path, size=model.size)."
         raise invalid("original", expected=expected, got=f"{dtype} {shape}", cure=cure)
     pictures = []
     for frame in frames:
