@@ -27,7 +27,7 @@ from foldgauss.io.media.clip import (
 )
 from foldgauss.io.media.frame_rate import describe_rate, make_increasing
 from foldgauss.io.media.image_files import image_paths, read_folder
-from foldgauss.io.media.video_decoding import DecodeReport, decode_file, describe_span, read_video_file
+from foldgauss.io.media.video_decoding import DecodeReport, decode_file, read_video_file
 from foldgauss.io.media.video_reading import choose_reader
 from foldgauss.video.motion.optical_flow import CutFinder
 
@@ -108,7 +108,8 @@ class FrameIndex:
         about = self._about
         time_base, notes = about["time_base"], tuple(about["shape_notes"])
         seconds = make_increasing((self.stamps * time_base).tolist(), about["rate"])
-        return DecodeReport(about["rate"], about["num_total"], notes, seconds, time_base, about["threads"])
+        arrays = self.places, self.stamps, seconds
+        return DecodeReport(about["rate"], about["num_total"], notes, *arrays, time_base, about["threads"])
 
     def span(self, first: int, stop: int) -> tuple[int, int]:
         """The range, for `read_indexed`, of the frames `first` up to `stop` of those that decode: the same numbers
@@ -203,17 +204,12 @@ def index_video(
     with translate_os_errors(path):
         reader = choose_reader(path)
         if reader is read_video_file:
-            kept, passed, report = decode_file(
-                path, start, stop, lambda decoded: list(map(record, decoded)), deinterlace=deinterlace
-            )
+            found, report = decode_file(path, start, stop, lambda decoded: list(map(record, decoded)), deinterlace)
         else:
-            kept, num_declared, rate, notes = reader(path, start, stop, record)
-            passed = [(start + k, 0) for k in range(len(kept))]
+            found = reader(path, start, stop, record)
             if reader is read_folder:
                 names = [entry.name for entry in image_paths(path)[start:stop]]
-    places, stamps = np.array(passed, np.int64).T.copy()
-    if report is not None:
-        num_declared, rate, notes = describe_span(report, stamps, places.tolist(), len(kept), start, stop)
+    kept, num_declared, rate, notes = found
     if fps is None:
         notes += describe_rate(rate)
     about = {
@@ -236,8 +232,8 @@ def index_video(
         "shape_notes": list(report.notes) if report else [],
     }
     arrays = {
-        "stamps": stamps,
-        "places": places,
+        "stamps": report.stamps if report else np.zeros(len(kept), np.int64),
+        "places": report.positions if report else np.arange(start, start + len(kept)),
         "digests": np.frombuffer(bytes(digests), np.uint8).reshape(-1, DIGEST_BYTES),
         "transparent": np.frombuffer(transparent, np.uint8).astype(bool),
     }

@@ -21,7 +21,6 @@ from foldgauss.io.media.frame_index import FrameIndex, digest_frame
 from foldgauss.io.media.frame_rate import FrameRate, describe_rate
 from foldgauss.io.media.image_files import read_images
 from foldgauss.io.media.resizing import convert_channels, describe_crop, make_resizer
-from foldgauss.io.media.video_decoding import describe_span
 from foldgauss.io.media.video_reading import choose_reader
 
 #: Frames before the wanted one at which a seek aims, in turn: after a seek into the middle of a stream, frames may show
@@ -55,10 +54,8 @@ def read_indexed(index: FrameIndex, first: int, stop: int | None, *, size: tuple
     with translate_os_errors(path), closing(IndexedReader(index)) as reader:
         frames, num_declared, rate, notes = reader.read(low, high, size)
     if index.kind == "video":
-        last = index.num_before + high
-        end = index.start + (index.num_declared if stop is None else stop)
-        stamps, places = index.stamps[:last], index.places[:last].tolist()
-        num_declared, rate, notes = describe_span(index.report, stamps, places, high - low, index.start + first, end)
+        before, end = index.num_before, index.start + (index.num_declared if stop is None else stop)
+        num_declared, rate, notes = index.report.describe_span(before + low, before + high, index.start + first, end)
     elif stop is None:
         num_declared = index.num_declared - first
     crop = () if size is None else describe_crop([index.size], size)
