@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.io.models.model_file import load_part, register_model, save_model
+from foldgauss.io.models.model_file import Kind, load_part, register_model, save_model
 from foldgauss.io.models.video_model import read_header_of_kind
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.state import FitState, Sizes
@@ -62,4 +62,4 @@ def _make_skeleton(header: dict) -> FitState:
     return FitState(**arrays, **counters, last_finite=last_finite)
 
 
-register_model(CHECKPOINT, FitState, to_header=_describe, from_header=_make_skeleton)
+register_model(Kind(CHECKPOINT, FitState, to_header=_describe, from_header=_make_skeleton))

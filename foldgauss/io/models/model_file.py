@@ -46,28 +46,8 @@ class ModelFileError(ValueError):
 
 
 @dataclass(frozen=True)
-class _Kind:
-    name: str
-    model_type: type
-    to_header: Callable[[Any], dict]
-    from_header: Callable[[dict], Any]
-    to_stored: Callable[[Any], Any]
-    from_stored: Callable[[Any], Any]
-
-
-_KINDS: dict[str, _Kind] = {}
-
-
-def register_model(
-    kind: str,
-    model_type: type,
-    *,
-    to_header: Callable[[Any], dict],
-    from_header: Callable[[dict], Any],
-    to_stored: Callable[[Any], Any] = lambda model: model,
-    from_stored: Callable[[Any], Any] = lambda model: model,
-) -> None:
-    """Register `model_type` for saving and loading under the name `kind`.
+class Kind:
+    """A type of models that files can hold, under the name `name`.
 
     `to_header(model)` returns the static fields as a JSON-compatible dict. `from_header(dict)` returns the skeleton:
     the same pytree with a `jax.ShapeDtypeStruct` for every array leaf. The dict is not trusted, so `from_header` must
@@ -75,13 +55,25 @@ def register_model(
 
     `to_stored` converts a model to the pytree that is stored and described by the header; `from_stored` is its inverse
     and raises ValueError for leaves whose values are inconsistent.
-
-    Raises `ValueError` if `kind` already names another type.
     """
-    known = _KINDS.get(kind)
-    if known is not None and known.model_type is not model_type:
-        raise invalid("kind", expected="a free name", got=f"{kind!r}, taken by {known.model_type.__name__}")
-    _KINDS[kind] = _Kind(kind, model_type, to_header, from_header, to_stored, from_stored)
+
+    name: str
+    model_type: type
+    to_header: Callable[[Any], dict]
+    from_header: Callable[[dict], Any]
+    to_stored: Callable[[Any], Any] = lambda model: model
+    from_stored: Callable[[Any], Any] = lambda model: model
+
+
+_KINDS: dict[str, Kind] = {}
+
+
+def register_model(kind: Kind) -> None:
+    """Register a kind for saving and loading. Raises `ValueError` if its name is already that of another type."""
+    known = _KINDS.setdefault(kind.name, kind)
+    if known.model_type is not kind.model_type:
+        raise invalid("kind", expected="a free name", got=f"{kind.name!r}, taken by {known.model_type.__name__}")
+    _KINDS[kind.name] = kind
 
 
 # ----------------------------------------------------------------------------------------------- saving
@@ -177,7 +169,7 @@ def _to_numpy(key: str, leaf: Any) -> np.ndarray:
     return array  # tobytes gives C order whatever the strides
 
 
-def _check_described(kind: _Kind, model: Any, header: str) -> None:
+def _check_described(kind: Kind, model: Any, header: str) -> None:
     """Raise unless the header alone gives back the model's tree, static fields, shapes and types."""
     skeleton = kind.from_header(json.loads(header))
     _check_tensors(_get_specs(_array_leaves(model)), _get_specs(_array_leaves(skeleton)), "model")
@@ -247,7 +239,7 @@ def load_part(path: Path, about: dict, prefix: str = "") -> Any:
         raise model_file_error("path", expected="tensors that fit each other", got=got) from error
 
 
-def match_kind(path: Path, about: dict) -> tuple[_Kind, Any]:
+def match_kind(path: Path, about: dict) -> tuple[Kind, Any]:
     """The kind of model, and the skeleton made from the header, checked against the tensors, of which none is read."""
     kind = _KINDS.get(about["kind"])
     if kind is None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from foldgauss._runtime.checks import invalid
 from foldgauss.io._atomic import check_path
-from foldgauss.io.models.model_file import load_model, model_file_error, read_header, register_model, save_model
+from foldgauss.io.models.model_file import Kind, load_model, model_file_error, read_header, register_model, save_model
 from foldgauss.video.models.video_model import ONE_SEGMENT, VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 from foldgauss.video.selection.selectors import Selection
@@ -127,9 +127,8 @@ def _make_skeleton(header: dict) -> _SelectionRecord:
     return _SelectionRecord(jax.ShapeDtypeStruct((header["num_gaussians"],), np.bool_), header["digest"])
 
 
-register_model(
-    SELECTION,
-    _SelectionRecord,
-    to_header=lambda record: {"num_gaussians": len(record.mask), "digest": record.digest},
-    from_header=_make_skeleton,
-)
+def _describe(record: _SelectionRecord) -> dict:
+    return {"num_gaussians": len(record.mask), "digest": record.digest}
+
+
+register_model(Kind(SELECTION, _SelectionRecord, to_header=_describe, from_header=_make_skeleton))

@@ -16,6 +16,7 @@ from foldgauss.envelope import TimeLikelihood
 from foldgauss.io._atomic import check_path
 from foldgauss.io.models.compact import COMPACT_SUFFIX, compact_metadata, is_compact, load_compact_model
 from foldgauss.io.models.model_file import (
+    Kind,
     ModelFileError,
     load_part,
     model_file_error,
@@ -236,5 +237,5 @@ _FORMS = {
     "to_stored": partial(_with_splats, change=to_stored),
     "from_stored": partial(_with_splats, change=from_stored),
 }
-register_model(VIDEO, VideoModel, to_header=_describe_video, from_header=_video_skeleton, **_FORMS)
-register_model(EDITED, EditedVideo, to_header=_describe_edited, from_header=_edited_skeleton, **_FORMS)
+register_model(Kind(VIDEO, VideoModel, to_header=_describe_video, from_header=_video_skeleton, **_FORMS))
+register_model(Kind(EDITED, EditedVideo, to_header=_describe_edited, from_header=_edited_skeleton, **_FORMS))
