@@ -5,6 +5,7 @@ against the size of the file, and invalid content raises only `ModelFileError`.
 """
 
 import dataclasses
+import io
 import json
 import os
 import zlib
@@ -231,22 +232,19 @@ def _decode(header: dict, body: bytes, whole_length: int) -> Quantized:
     described = dict(zip(names, (own[1:] for own in descriptions), strict=True))
     rules = {name: _parse_rule(name, numbers) for name, numbers in described.items() if not is_integral(name)}
     _check(not any(described[name] for name in names if is_integral(name)), "rule", "none")
-    contexts, columns, start = ColumnContexts(rules, info), {}, 0
+    contexts, streams = ColumnContexts(rules, info), io.BytesIO(body)
     most = {"without": 3, "degree": info.degree, "shade": info.shared - 1}  # of the columns that are used as indices
     most["path"] = info.paths.num_paths if info.paths else 0
     for name, length in zip(names, lengths[:-1], strict=True):
-        numbers = range_coder.decode(body[start : start + length], contexts.describe_next(name))
+        numbers = range_coder.decode(streams.read(length), contexts.describe_next(name))
         if name == "cell":
             numbers = (np.cumsum(numbers, dtype=np.int64) & _last_cell(info)).astype(np.int32)
         if name in most:
             _check(numbers.min() >= 0 and numbers.max() <= most[name], name, "numbers out of range")
-        columns[name] = numbers
         contexts.add(name, numbers)
-        start += length
-    stop = start + lengths[-1]
-    intervals = range_coder.decode(body[start:stop], range_coder.Column.without_contexts(num_frames - 1))
-    paths = _decode_paths(info.paths, body[stop : stop + of_paths[0]], body[stop + of_paths[0] :]) if info.paths else {}
-    return Quantized(info, rules, columns, intervals, **paths)
+    intervals = range_coder.decode(streams.read(lengths[-1]), range_coder.Column.without_contexts(num_frames - 1))
+    paths = _decode_paths(info.paths, *map(streams.read, of_paths)) if info.paths else {}
+    return Quantized(info, rules, contexts.columns, intervals, **paths)
 
 
 def _decode_paths(about: PathsInfo, knots: bytes, maps: bytes) -> dict[str, np.ndarray]:

@@ -337,8 +337,7 @@ def _check_tensors(kept: dict[str, dict], described: dict[str, dict], where: str
     for key in sorted(kept.keys() | described.keys()):
         have, want = kept.get(key), described.get(key)
         if have != want and not (want and want["dtype"] == "F32" and have == want | {"dtype": "F16"}):
-            expected, got = _spec_text(want), _spec_text(have)
-            raise model_file_error(f"tensor {key!r} of {where!r}", expected=expected, got=got)
+            raise model_file_error(f"tensor {key!r} of {where!r}", expected=_spec_text(want), got=_spec_text(have))
 
 
 def _read_leaves(skeleton: Any, path: Path, prefix: str) -> Any:
