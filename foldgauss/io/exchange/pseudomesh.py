@@ -16,9 +16,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from foldgauss._runtime.checks import check_one_of, invalid
-from foldgauss.io._atomic import atomic_folder, missing_error
+from foldgauss.io._atomic import PathLike, atomic_folder, missing_error
 from foldgauss.io.exchange.gaussians_ply import check_times, frame_gaussians, read_3dgs_ply, write_gaussians_ply
 from foldgauss.io.exchange.ply_file import facts_error, format_error, read_bytes
+from foldgauss.io.media.clip import Size
 from foldgauss.io.media.frame_rate import DEFAULT_FPS
 from foldgauss.io.media.image_files import natural_sort_key
 from foldgauss.render import COMPOSITINGS, Camera, Gaussians3D, RenderOptions, Splats2D, Triangles, cpu, project
@@ -50,7 +51,7 @@ class Pseudomesh:
 
     triangles: tuple[Triangles, ...]
     times: Float[np.ndarray, "num_frames"]
-    size: tuple[int, int]
+    size: Size
     fps: float
     options: RenderOptions
     compositing: str = "over"
@@ -64,7 +65,7 @@ class Pseudomesh:
         faces = self.triangles[number]
         return np.concatenate([faces.origin[:, None], faces.origin[:, None] + faces.edges], axis=1)
 
-    def splats(self, number: int, size: tuple[int, int] | None = None) -> Splats2D:
+    def splats(self, number: int, size: Size | None = None) -> Splats2D:
         """The conditioned Gaussians of a frame, in pixels of an image of `size` (default: the video's own).
 
         Frames whose vertices lie in the plane are rendered directly, others through the front camera, in array order.
@@ -81,7 +82,7 @@ class Pseudomesh:
         return Splats2D(mean, factor, faces.opacity, faces.color)
 
     def frame(
-        self, number: int, size: tuple[int, int] | None = None, *, background: tuple[float, float, float] = BLACK
+        self, number: int, size: Size | None = None, *, background: tuple[float, float, float] = BLACK
     ) -> UInt8[np.ndarray, "height width 3"]:
         """The image of a frame over `background`. Raises ValueError for an invalid size or background."""
         size = self.size if size is None else tuple(size)
@@ -91,7 +92,7 @@ class Pseudomesh:
         return to_bytes(cpu.forward(*leaves, behind, size, **drawn).image)
 
     def frames(
-        self, size: tuple[int, int] | None = None, *, background: tuple[float, float, float] = BLACK
+        self, size: Size | None = None, *, background: tuple[float, float, float] = BLACK
     ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
         """The images of all frames one by one."""
         for number in range(self.num_frames):
@@ -110,7 +111,7 @@ def _flat_factor(edges: Float[np.ndarray, "num 2 3"]) -> Float[np.ndarray, "num 
 
 
 def write_pseudomesh(
-    folder: str | os.PathLike,
+    folder: PathLike,
     model: RenderableVideo,
     times: Sequence[float] | None = None,
     *,
@@ -180,7 +181,7 @@ def _axes(factor: Float[np.ndarray, "num 2 2"]) -> Float[np.ndarray, "num 2 2"]:
 
 
 def read_pseudomesh(
-    folder: str | os.PathLike, *, size: tuple[int, int] | None = None, fps: float | None = None, axes: str = "y-up"
+    folder: PathLike, *, size: Size | None = None, fps: float | None = None, axes: str = "y-up"
 ) -> Pseudomesh:
     """Read frames as triangles, after editing in a mesh tool or straight from `write_pseudomesh`.
 
@@ -274,7 +275,7 @@ def _check_area(path: Path, edges: Float[np.ndarray, "num 2 3"]) -> None:
         raise format_error(path, expected="faces of nonzero area", got=got, cure=cure)
 
 
-def read_obj(path: str | os.PathLike) -> Float[np.ndarray, "faces 3 3"]:
+def read_obj(path: PathLike) -> Float[np.ndarray, "faces 3 3"]:
     """The vertices of a triangle soup in an `.obj` file, (x, y, z) as they stand there, float64.
 
     Face k must have vertices 3k + 1, 3k + 2, 3k + 3 of the file, in this order: its first vertex is the Gaussian's

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-import os
 import warnings
 from pathlib import Path
 
@@ -13,8 +12,9 @@ from jaxtyping import Float
 
 from foldgauss._runtime.checks import check_within, invalid
 from foldgauss.envelope import TimeLikelihood
+from foldgauss.io._atomic import PathLike
 from foldgauss.io.exchange.ply_file import NOTE, Ply, facts_error, read_ply, write_ply
-from foldgauss.io.media.clip import check_fps
+from foldgauss.io.media.clip import Size, check_fps
 from foldgauss.io.media.frame_rate import DEFAULT_FPS
 from foldgauss.render import RenderOptions
 from foldgauss.render.camera import FIELD_OF_VIEW
@@ -33,9 +33,7 @@ VEGAS_SCALE_CUTOFF = 1e-4
 _VEGAS_ACROSS = math.log(1e-8)
 
 
-def read_vegas_ply(
-    path: str | os.PathLike, *, size: tuple[int, int] | None = None, fps: float | None = None
-) -> VideoModel:
+def read_vegas_ply(path: PathLike, *, size: Size | None = None, fps: float | None = None) -> VideoModel:
     r"""A video from the PLY file of the published VeGaS code, rendered as its formulas define.
 
     **Shapes:** element `vertex` with x, z, f_dc_0..2, opacity, scale_0, scale_2, rot_0, m_0, sigma_0 and
@@ -94,7 +92,7 @@ def read_vegas_ply(
     return VideoModel(splats, FrameTimes(_time_logits(ply)), size, fps, options, scale_cutoff=scale_cutoff)
 
 
-def write_vegas_ply(path: str | os.PathLike, model: VideoModel) -> Path:
+def write_vegas_ply(path: PathLike, model: VideoModel) -> Path:
     r"""Write a video in the format of the published VeGaS code; returns the path. See `read_vegas_ply` for the layout.
 
     The envelope has power 2 there. That of another power p > 0 is the same function of time with
@@ -158,7 +156,7 @@ def _convert_time_scale(
     return np.where(log_time_scale == STATIC_LOG_TIME_SCALE, log_time_scale, other_scale)
 
 
-def _vegas_unit(size: tuple[int, int]) -> float:
+def _vegas_unit(size: Size) -> float:
     """One unit of the published space in model units."""
     height, width = size
     return min(1.0, width / height) / (2 * math.tan(FIELD_OF_VIEW / 2))
@@ -192,9 +190,7 @@ def _time_logits(ply: Ply) -> Float[np.ndarray, " intervals"]:
     return weights.astype(np.float32).ravel()
 
 
-def _fill_in(
-    ply: Ply, size: tuple[int, int] | None, fps: float | None
-) -> tuple[tuple[int, int], float, RenderOptions, float, float]:
+def _fill_in(ply: Ply, size: Size | None, fps: float | None) -> tuple[Size, float, RenderOptions, float, float]:
     """Size, rate, options, cutoff and power: as given, else as recorded in the file, else the published defaults."""
     note = _read_note(ply)
     if size is None and "size" not in note:

@@ -17,7 +17,8 @@ from av.filter import Graph
 from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc, VideoReformatter
 
 from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_integer, is_within
-from foldgauss.io.media.clip import PathLike, VideoError, check_readable, video_error
+from foldgauss.io._atomic import PathLike
+from foldgauss.io.media.clip import VideoError, check_readable, video_error
 from foldgauss.io.media.decoder import CONVERSION, VideoDecoder, filter_frame, open_container
 from foldgauss.io.media.format_detection import SOUND_DEMUXERS
 

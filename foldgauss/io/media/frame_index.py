@@ -13,10 +13,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from foldgauss.io._atomic import atomic_path, check_path
+from foldgauss.io._atomic import PathLike, atomic_path, check_path
 from foldgauss.io.media.clip import (
-    PathLike,
     Range,
+    Size,
     VideoError,
     check_fps,
     check_range,
@@ -77,7 +77,7 @@ class FrameIndex:
         self.deinterlace: bool = about["deinterlace"]
         self.fixed_fps: float | None = about["fixed_fps"]
         self.fps: float = about["fps"]
-        self.size: tuple[int, int] = tuple(about["size"])
+        self.size: Size = tuple(about["size"])
         self.num_declared: int = about["num_declared"]
         self.notes: tuple[str, ...] = tuple(about["notes"])
         self.cuts: list[int] = list(about["cuts"])
@@ -85,7 +85,7 @@ class FrameIndex:
         self.has_alpha = bool(self.transparent.any())
         self.num_before = len(self.places) - self.num_frames  # frames decoded before the first one indexed
         self.positions = self.places[self.num_before :] - self.start
-        self.alpha_at_size: dict[tuple[int, int], bool] = {}  # found by the reader
+        self.alpha_at_size: dict[Size, bool] = {}  # found by the reader
         self.last_margin = 0  # of the reader's last seek, in frames
 
     def __repr__(self) -> str:
@@ -192,7 +192,7 @@ def index_video(
     digests, transparent, finder = bytearray(), bytearray(), CutFinder() if find_cuts else None
     report, names = None, []
 
-    def record(image: np.ndarray) -> tuple[int, int]:
+    def record(image: np.ndarray) -> Size:
         """Record what the index needs of a frame; its size."""
         digests.extend(digest_frame(image))
         transparent.append(int(image.shape[2] == 4 and image[..., 3].min() < 255))

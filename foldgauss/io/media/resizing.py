@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 import cv2
 import numpy as np
 
-from foldgauss.io.media.clip import format_size, video_error
+from foldgauss.io.media.clip import Size, format_size, video_error
 
 BLOCK_BYTES = 64 << 20
 #: Fraction of a frame, above which a crop to another aspect is reported: 16:9 to 2:1, a ninth, is not.
@@ -21,9 +21,7 @@ def memory_limit() -> int:
         return 8 << 30
 
 
-def make_resizer(
-    size: tuple[int, int] | None, crop: tuple[int, int] | None = None
-) -> Callable[[np.ndarray], np.ndarray]:
+def make_resizer(size: Size | None, crop: Size | None = None) -> Callable[[np.ndarray], np.ndarray]:
     """A function from BGR frames to RGB frames: crop the central window `crop`, then the aspect of `size`, then resize.
 
     It raises `VideoError` once its outputs add up to more than `memory_limit()`.
@@ -51,7 +49,7 @@ def make_resizer(
     return prepare
 
 
-def aspect_window(have: tuple[int, int], want: tuple[int, int]) -> tuple[slice, slice]:
+def aspect_window(have: Size, want: Size) -> tuple[slice, slice]:
     """The largest central window of `have` with the aspect of `want`, to whole pixels."""
     height, width = have
     if width * want[0] > height * want[1]:
@@ -61,7 +59,7 @@ def aspect_window(have: tuple[int, int], want: tuple[int, int]) -> tuple[slice, 
     return center_window(have, window)
 
 
-def describe_crop(sizes: Iterable[tuple[int, int]], want: tuple[int, int]) -> tuple[str, ...]:
+def describe_crop(sizes: Iterable[Size], want: Size) -> tuple[str, ...]:
     """A note if the aspect of `want` keeps little of frames of these `sizes`; otherwise nothing."""
     for height, width in sizes:
         rows, columns = aspect_window((height, width), want)
@@ -73,7 +71,7 @@ def describe_crop(sizes: Iterable[tuple[int, int]], want: tuple[int, int]) -> tu
     return ()
 
 
-def center_window(have: tuple[int, int], window: tuple[int, int]) -> tuple[slice, slice]:
+def center_window(have: Size, window: Size) -> tuple[slice, slice]:
     """Rows and columns of the central (height, width) `window`. Raises `VideoError` where it does not fit."""
     if window[0] > have[0] or window[1] > have[1]:
         raise video_error(

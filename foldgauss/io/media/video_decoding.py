@@ -8,12 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from foldgauss.io.media.clip import ReadResult, check_range_within, no_frames_error, video_error
+from foldgauss.io.media.clip import RangeFacts, ReadResult, check_range_within, no_frames_error, video_error
 from foldgauss.io.media.decoder import MAX_FRAMES, DecodedFrame, VideoDecoder
 from foldgauss.io.media.frame_rate import (
     DEFAULT_FPS,
     MAX_FPS,
-    FrameRate,
     estimate_num_frames,
     estimate_rate,
     make_increasing,
@@ -45,9 +44,7 @@ class DecodeReport(NamedTuple):
     time_base: float
     threads: int
 
-    def describe_span(
-        self, first: int, end: int, start: int, stop: int | None
-    ) -> tuple[int, FrameRate, tuple[str, ...]]:
+    def describe_span(self, first: int, end: int, start: int, stop: int | None) -> RangeFacts:
         """Number of frames declared from position `start` up to `stop`, their rate, and notes.
 
         Those that decode are the numbers `first` up to `end` of all frames decoded.

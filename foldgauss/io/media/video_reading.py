@@ -4,11 +4,12 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+from foldgauss.io._atomic import PathLike
 from foldgauss.io.media.clip import (
     Clip,
-    PathLike,
     Range,
     ReadResult,
+    Size,
     check_fps,
     check_frame_size,
     check_range,
@@ -27,9 +28,9 @@ def read_video(
     path: PathLike,
     *,
     frames: Range | None = None,
-    size: tuple[int, int] | None = None,
+    size: Size | None = None,
     fps: float | None = None,
-    center_crop: tuple[int, int] | None = None,
+    center_crop: Size | None = None,
     deinterlace: bool = True,
 ) -> Clip:
     """Read a video file, a folder of images in natural order (img2 before img10), or one image as a clip of one frame.

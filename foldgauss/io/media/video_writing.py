@@ -11,8 +11,8 @@ import numpy as np
 from PIL import Image
 
 from foldgauss._runtime.checks import check_one_of
-from foldgauss.io._atomic import atomic_folder, atomic_path, check_path, output_error
-from foldgauss.io.media.clip import PathLike, check_fps, format_size, video_error
+from foldgauss.io._atomic import PathLike, atomic_folder, atomic_path, check_path, output_error
+from foldgauss.io.media.clip import check_fps, format_size, video_error
 from foldgauss.io.media.encoder import VIDEO_SUFFIXES, Sound, check_sound, choose_encoding, encode_video, straighten
 
 ANIMATION_SUFFIXES = (".gif", ".webp")

@@ -7,7 +7,6 @@ against the size of the file, and invalid content raises only `ModelFileError`.
 import dataclasses
 import io
 import json
-import os
 import zlib
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ import numpy as np
 from jaxtyping import Int
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
-from foldgauss.io._atomic import atomic_path, check_path
+from foldgauss.io._atomic import PathLike, atomic_path, check_path
 from foldgauss.io.models import range_coder
 from foldgauss.io.models.column_contexts import ColumnContexts
 from foldgauss.io.models.model_file import (
@@ -58,7 +57,7 @@ _ALWAYS_ALLOWED = 1 << 18
 _SIDE = 1 << 20  # largest side of an image: a decoder holds it in memory
 
 
-def save_compact(path: str | os.PathLike, quantized: Quantized, *, metadata: dict | None = None) -> Path:
+def save_compact(path: PathLike, quantized: Quantized, *, metadata: dict | None = None) -> Path:
     """Write a quantized model whole or not at all; equal ones give equal bytes. See `foldgauss.video.compress`.
 
     Raises ValueError for a name that does not end in .fgz, `OutputError` where it cannot be written.
@@ -150,7 +149,7 @@ def _describe_maps(about: PathsInfo) -> range_coder.Column:
 # ---------------------------------------------------------------------------------------------- reading
 
 
-def is_compact(path: str | os.PathLike) -> bool:
+def is_compact(path: PathLike) -> bool:
     """Whether a file starts with the magic bytes of compact files; False for one that cannot be read."""
     try:
         with open(path, "rb") as file:
@@ -159,7 +158,7 @@ def is_compact(path: str | os.PathLike) -> bool:
         return False
 
 
-def load_compact(path: str | os.PathLike) -> Quantized:
+def load_compact(path: PathLike) -> Quantized:
     """The quantized model in a compact file, for `foldgauss.video.compression.quantize.dequantize`.
 
     Raises `ModelFileError` for a file that is damaged, cut off, of a later version or of another kind.

@@ -15,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 
 from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.threads import check_not_forked
-from foldgauss.io._atomic import atomic_path, missing_error
+from foldgauss.io._atomic import PathLike, atomic_path, missing_error
 
 FORMAT = "foldgauss-model"
 VERSION = "1"  # increased when older programs cannot read the file
@@ -79,7 +79,7 @@ def register_model(kind: Kind) -> None:
 # ----------------------------------------------------------------------------------------------- saving
 
 
-def save_model(path: str | os.PathLike, model: Any, *, metadata: dict | None = None) -> Path:
+def save_model(path: PathLike, model: Any, *, metadata: dict | None = None) -> Path:
     """Write `model` whole or not at all; returns the path. Equal models and metadata give equal bytes.
 
     Every array leaf of the pytree, JAX or NumPy, is stored under its path in the tree ("splats.loc"). `metadata` is
@@ -211,7 +211,7 @@ def to_json_types(value: Any) -> Any:
 # ---------------------------------------------------------------------------------------------- loading
 
 
-def load_model(path: str | os.PathLike) -> Any:
+def load_model(path: PathLike) -> Any:
     """Read the model that `save_model` wrote, equal to the bit. Nothing in the file is executed.
 
     Leaves are JAX arrays, except 64-bit ones without JAX's x64 mode, which stay NumPy arrays; those stored in half
@@ -264,7 +264,7 @@ def translate_header_errors(path: Path, kind: str) -> Iterator[None]:
         raise model_file_error("path", expected=f"the header of a model of kind {kind!r}", got=got) from error
 
 
-def read_header(path: str | os.PathLike) -> dict:
+def read_header(path: PathLike) -> dict:
     """The header of a file, without reading its tensors.
 
     Keys: `format`, `version`, `kind` (strings), `header` and `metadata` (dicts), and `tensors`, which maps

@@ -2,7 +2,6 @@
 
 import dataclasses
 import hashlib
-import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,7 +10,7 @@ import jax
 import numpy as np
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.io._atomic import check_path
+from foldgauss.io._atomic import PathLike, check_path
 from foldgauss.io.models.model_file import Kind, load_model, model_file_error, read_header, register_model, save_model
 from foldgauss.video.models.video_model import ONE_SEGMENT, VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
@@ -29,7 +28,7 @@ class _SelectionRecord:
     digest: str = dataclasses.field(metadata={"static": True})
 
 
-def save_selection(path: str | os.PathLike, selection: Selection, model: VideoModel) -> Path:
+def save_selection(path: PathLike, selection: Selection, model: VideoModel) -> Path:
     """Write a selection of `model`'s Gaussians, whole or not at all: a safetensors file, a byte per Gaussian.
 
     **Raises:** ValueError for a selection of another number of Gaussians, `OutputError` as `save_video_model`.
@@ -47,7 +46,7 @@ def save_selection(path: str | os.PathLike, selection: Selection, model: VideoMo
     return save_model(path, _SelectionRecord(selection.mask, compute_digest(model)))
 
 
-def load_selection(path: str | os.PathLike, model: VideoModel) -> Selection:
+def load_selection(path: PathLike, model: VideoModel) -> Selection:
     """Read a selection of `model`'s Gaussians.
 
     **Raises:** ValueError for a selection of another model, or of this one before it was changed; `FileNotFoundError`;

@@ -1,7 +1,6 @@
 """How fitted and edited videos are described in a model file's header, and which arrays of them are stored."""
 
 import dataclasses
-import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.io._atomic import check_path
+from foldgauss.io._atomic import PathLike, check_path
 from foldgauss.io.models.compact import COMPACT_SUFFIX, compact_metadata, is_compact, load_compact_model
 from foldgauss.io.models.model_file import (
     Kind,
@@ -41,7 +40,7 @@ VIDEO, EDITED = PARTS
 
 
 def save_video_model(
-    path: str | os.PathLike, model: VideoModel | EditedVideo | SegmentedVideo, *, metadata: dict | None = None
+    path: PathLike, model: VideoModel | EditedVideo | SegmentedVideo, *, metadata: dict | None = None
 ) -> Path:
     """Write a fitted, an edited or a segmented video; `metadata` is free: where it came from, how good it is.
 
@@ -62,7 +61,7 @@ def save_video_model(
     return save_model(path, model, metadata=metadata)
 
 
-def check_model_name(path: str | os.PathLike, parameter: str = "path") -> None:
+def check_model_name(path: PathLike, parameter: str = "path") -> None:
     """Raise ValueError for a name with an extension that is another format's."""
     path = Path(path)
     if path.suffix and path.suffix.lower() != MODEL_SUFFIX:
@@ -73,7 +72,7 @@ def check_model_name(path: str | os.PathLike, parameter: str = "path") -> None:
         raise invalid(parameter, expected=expected, got=repr(str(path)), cure=cure)
 
 
-def load_video_model(path: str | os.PathLike) -> VideoModel | EditedVideo | SegmentedVideo:
+def load_video_model(path: PathLike) -> VideoModel | EditedVideo | SegmentedVideo:
     """Read a fitted, an edited or a segmented video, or a compact file (detected from its first bytes).
 
     Of segments no more than the header is read: see `SegmentedVideo`, which loads them on access.
@@ -89,13 +88,13 @@ def load_video_model(path: str | os.PathLike) -> VideoModel | EditedVideo | Segm
     return load_part(path, about)
 
 
-def read_metadata(path: str | os.PathLike) -> dict:
+def read_metadata(path: PathLike) -> dict:
     """The metadata of a model file, compact or not. Raises as `load_video_model`."""
     path = check_path(path)
     return compact_metadata(path) if is_compact(path) else read_header(path)["metadata"]
 
 
-def read_origin(path: str | os.PathLike) -> dict:
+def read_origin(path: PathLike) -> dict:
     """`read_metadata`, which is not trusted, without those of `fit`'s entries that have another type than it writes."""
     return {name: value for name, value in read_metadata(path).items() if name not in _NOTES or _NOTES[name](value)}
 
@@ -118,7 +117,7 @@ _NOTES: dict[str, Callable[[object], bool]] = {
 }
 
 
-def read_header_of_kind(path: str | os.PathLike, *kinds: str) -> dict:
+def read_header_of_kind(path: PathLike, *kinds: str) -> dict:
     """The header of a file of one of these kinds; raises `ModelFileError` for another kind."""
     about = read_header(path)
     if about["kind"] not in kinds:

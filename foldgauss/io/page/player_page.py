@@ -9,7 +9,6 @@ import dataclasses
 import hashlib
 import html
 import json
-import os
 import re
 import warnings
 from collections.abc import Iterable, Iterator
@@ -20,7 +19,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from foldgauss._runtime.checks import invalid, is_integer, short_repr
-from foldgauss.io._atomic import atomic_path, check_path
+from foldgauss.io._atomic import PathLike, atomic_path, check_path
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.compact import is_compact, pack_compact
 from foldgauss.io.models.selections import format_indices
@@ -60,12 +59,12 @@ _MORE_PATH_BITS = 5
 _PER_E = 1.4427  # log2 e: slopes are those of natural logarithms
 
 Loaded = VideoModel | EditedVideo | SegmentedVideo
-Model = Loaded | str | os.PathLike
+Model = Loaded | PathLike
 Frames = Clip | UInt8[np.ndarray, "num_frames height width channels"]
 
 
 def write_html(
-    path: str | os.PathLike,
+    path: PathLike,
     model: Model,
     *,
     original: Frames | None = None,
@@ -183,7 +182,7 @@ def make_notebook_iframe(model: VideoModel | EditedVideo | SegmentedVideo) -> st
 
 def _load(model: Model) -> tuple[Loaded, str]:
     """The model, and a name for it."""
-    if isinstance(model, str | os.PathLike):
+    if isinstance(model, PathLike):
         path = check_path(model, "model")
         name = read_origin(path).get("clip", path.stem)
         return load_video_model(path), name
