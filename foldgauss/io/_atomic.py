@@ -27,8 +27,7 @@ class OutputError(OSError):
 def check_path(path: object, order: str = "") -> Path:
     """`path` as a Path. Raises ValueError for another type, with `order`, the order of the arguments, as a hint."""
     if not isinstance(path, PathLike):
-        cure = f"The order is ({order})." if order else ""
-        raise invalid("path", expected="a path", got=short_repr(path), cure=cure)
+        raise invalid("path", expected="a path", got=short_repr(path), cure=f"The order is ({order})." if order else "")
     return Path(path)
 
 

@@ -66,8 +66,7 @@ def export(
     unknown = [*(of_scenes if format != "ply3dgs" else ()), *(of_pages if format != "html" else ())]
     unknown += ["times"] if format in ("ply", "html") and times is not None else []
     if unknown:
-        got = f"it for {format!r}"
-        raise invalid(unknown[0], expected="an option of this format", got=got, cure="Leave it out.")
+        raise invalid(unknown[0], expected="an option of this format", got=f"it for {format!r}", cure="Leave it out.")
     if format == "ply" and isinstance(model, SegmentedVideo):
         return _write_vegas_segments(out, model, overwrite)
     if format == "ply":

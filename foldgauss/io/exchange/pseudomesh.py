@@ -5,7 +5,6 @@ The `.obj` contains the shape, one triangle per Gaussian; the `.ply`, an ordinar
 
 import dataclasses
 import json
-import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from foldgauss._runtime.checks import check_one_of, invalid
+from foldgauss._runtime.checks import check_one_of, check_within, invalid
 from foldgauss.io._atomic import PathLike, atomic_folder, missing_error
 from foldgauss.io.exchange.gaussians_ply import check_times, frame_gaussians, read_3dgs_ply, write_gaussians_ply
 from foldgauss.io.exchange.ply_file import facts_error, format_error, read_bytes
@@ -205,8 +204,7 @@ def read_pseudomesh(
     if not paths:
         cure = "Give the folder that write_pseudomesh or `foldgauss export --format obj` made."
         raise format_error(folder, expected="a folder with .obj files", got="none", cure=cure)
-    given = {"size": size, "fps": fps}
-    given = {name: value for name, value in given.items() if value is not None}
+    given = {name: value for name, value in (("size", size), ("fps", fps)) if value is not None}
     facts = _check_notes(folder, _read_notes(folder, len(paths)) | given, len(paths))
     return Pseudomesh(tuple(_read_frame(path, axes) for path in paths), **facts)
 
@@ -236,8 +234,7 @@ def _check_notes(folder: Path, notes: dict, num_frames: int) -> dict:
         options = RenderOptions(**notes["options"])
         check_one_of("compositing", notes["compositing"], COMPOSITINGS)
         check_size(size)
-        if not 0 < fps < math.inf:
-            raise invalid("fps", expected="a positive rate", got=fps)
+        check_within("fps", fps, "(0, inf)", "a positive rate")
         if times.shape != (num_frames,) or not ((times >= 0) & (times <= 1)).all():
             expected = f"{num_frames} numbers in [0, 1], one for each .obj"
             cure = "A frame was added or removed: correct the list too, or remove the file and give size."

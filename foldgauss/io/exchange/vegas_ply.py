@@ -70,8 +70,7 @@ def read_vegas_ply(path: PathLike, *, size: Size | None = None, fps: float | Non
     size, fps, options, scale_cutoff, power = _fill_in(ply, size, fps)
     num_weights = sum(name.startswith("w1_") for name in ply.names("vertex"))
     if num_weights % 2:
-        expected = "an even number of w1 columns, pairs (x, z)"
-        raise ply.error(expected=expected, got=str(num_weights), cure="The file is damaged.")
+        raise ply.error("an even number of w1 columns, pairs (x, z)", str(num_weights), "The file is damaged.")
     names = ["x", "z", "scale_0", "scale_2", "rot_0", "m_0", "sigma_0", "opacity", "f_dc_0", "f_dc_1", "f_dc_2"]
     columns = ply.columns("vertex", [*names, *(f"w1_{k}" for k in range(num_weights))])
     unit = _vegas_unit(size)
@@ -182,11 +181,9 @@ def _time_logits(ply: Ply) -> Float[np.ndarray, " intervals"]:
     names = sorted(ply.names("time"), key=lambda name: (len(name), name))
     weights = ply.columns("time", names)
     if 1 not in weights.shape or weights.size == 0:
-        got = f"{weights.shape[0]} rows of {weights.shape[1]}"
-        raise ply.error(expected="one row of weights in element 'time'", got=got)
+        raise ply.error("one row of weights in element 'time'", f"{weights.shape[0]} rows of {weights.shape[1]}")
     if weights.shape[0] == 1 and names != [f"time_func_{k}" for k in range(len(names))]:
-        got = ", ".join(names[:9])
-        raise ply.error(expected="time_func_0, time_func_1, ... in element 'time'", got=got)
+        raise ply.error("time_func_0, time_func_1, ... in element 'time'", ", ".join(names[:9]))
     return weights.astype(np.float32).ravel()
 
 
@@ -229,20 +226,18 @@ def _check_writable_as_vegas(model: VideoModel) -> None:
         if isinstance(model, SegmentedVideo):
             cure = "export(model, 'ply', FOLDER) writes one for each segment."
         raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
-    envelope = model.splats.envelope
-    facts = {
-        "floor": (np.unique(envelope.floor), 0.0, "Fit it without a floor."),
-        "compositing": (np.array([model.compositing]), "over", "Fit it with --compositing over."),
-    }
     if model.num_frames < 2:
         expected = "at least 2 frames, as a VeGaS file stores the intervals between frames"
         raise invalid("model", expected=expected, got="1", cure="Write the picture as a still scene, ply3dgs.")
-    for name, (found, known, cure) in facts.items():
-        if not (found == known).all():
-            got, expected = ", ".join(map(str, found[:3])), f"{known}, the only one in a VeGaS file"
-            raise invalid(f"model's {name}", expected=expected, got=got, cure=cure)
+    floors = np.unique(model.splats.envelope.floor)
+    if not (floors == 0).all():
+        got, expected = ", ".join(map(str, floors[:3])), "0.0, the only one in a VeGaS file"
+        raise invalid("model's floor", expected=expected, got=got, cure="Fit it without a floor.")
+    if model.compositing != "over":
+        expected, cure = "over, the only one in a VeGaS file", "Fit it with --compositing over."
+        raise invalid("model's compositing", expected=expected, got=model.compositing, cure=cure)
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model)):
         raise invalid("model", expected="finite numbers", got="NaN or infinities", cure="The fit diverged: fit again.")
-    if not (np.asarray(envelope.power) > 0).all():
+    if not (np.asarray(model.splats.envelope.power) > 0).all():
         cure = "Fit it with another --power."
         raise invalid("model's power", expected="above 0, as VeGaS files require", got="0", cure=cure)

@@ -275,11 +275,9 @@ def _choose_stream(container: av.container.InputContainer, path: Path) -> av.Vid
         got, cure = f"an unknown one in {str(path)!r}", "Convert it with ffmpeg."
         raise video_error("path", expected="a video whose codec is known here", got=got, cure=cure)
     streams = [one for one in known if not one.disposition & Disposition.attached_pic]
-    best = container.streams.best("video")
-    if best in streams:
-        return best
     if streams:
-        return streams[0]
+        best = container.streams.best("video")
+        return best if best in streams else streams[0]
     if container.streams.video:
         got = f"audio with a cover image, {str(path)!r}"
         raise video_error("path", expected="a video", got=got, cure="Give a file with moving images.")

@@ -53,8 +53,7 @@ def save_video_model(
         raise invalid("model", expected="a video", got="a chain of edits", cure="End it with .video().")
     check_path(path, "path, model")
     if not isinstance(model, VideoModel | EditedVideo | SegmentedVideo):
-        expected = "a VideoModel, an EditedVideo or a SegmentedVideo"
-        raise invalid("model", expected=expected, got=type(model).__name__)
+        raise invalid("model", expected="a VideoModel, an EditedVideo or a SegmentedVideo", got=type(model).__name__)
     check_model_name(path)
     if isinstance(model, SegmentedVideo):
         return save_segmented(Path(path), model, metadata)
