@@ -10,13 +10,7 @@ import numpy as np
 
 from foldgauss.io.media.clip import RangeFacts, ReadResult, check_range_within, no_frames_error, video_error
 from foldgauss.io.media.decoder import MAX_FRAMES, DecodedFrame, VideoDecoder
-from foldgauss.io.media.frame_rate import (
-    DEFAULT_FPS,
-    MAX_FPS,
-    estimate_num_frames,
-    estimate_rate,
-    make_increasing,
-)
+from foldgauss.io.media.frame_rate import DEFAULT_FPS, MAX_FPS, estimate_num_frames, estimate_rate, make_increasing
 from foldgauss.io.media.resizing import copy_to_blocks
 
 

@@ -27,7 +27,10 @@ _MAGNITUDE_BOUNDS = np.array([0.5, 1.5] + [3.0 * 2**k for k in range(13)])
 
 
 class ColumnContexts:
-    """The contexts of a file's columns in turn: `describe_next` gives a column's, then `add` takes its values."""
+    """The contexts of a file's columns in turn: `describe_next` gives a column's, then `add` takes its values.
+
+    `columns` has the values of those that were added.
+    """
 
     def __init__(self, rules: dict[str, Rule], info: CompactInfo):
         self._info, self._decoder = info, ColumnDecoder(rules, info)

@@ -98,32 +98,27 @@ def save_model(path: PathLike, model: Any, *, metadata: dict | None = None) -> P
     header = kind.to_header(model)
     _check_described(kind, model, to_json("header", header))
     about = {"kind": kind.name, "header": header, "metadata": metadata or {}}
-    return write_tensors(Path(path), _get_specs(arrays), lambda keys: (arrays[key] for key in keys), **about)
+    return write_tensors(Path(path), _get_specs(arrays), lambda keys: (arrays[key] for key in keys), about)
 
 
 def write_tensors(
-    path: Path,
-    specs: Mapping[str, dict],
-    tensors: Callable[[list[str]], Iterable[np.ndarray]],
-    *,
-    kind: str,
-    header: dict,
-    metadata: dict,
+    path: Path, specs: Mapping[str, dict], tensors: Callable[[list[str]], Iterable[np.ndarray]], about: dict
 ) -> Path:
     """Write a model file, whole or not at all: tensors with `specs` as in `read_header`; returns the path.
 
-    `tensors(keys)` yields them in that order, little-endian. Raises as `save_model`.
+    `tensors(keys)` yields them in that order, little-endian. `about` has `kind`, `header` and `metadata`, likewise.
+    Raises as `save_model`.
     """
-    about = {
+    strings = {
         "format": FORMAT,
         "version": VERSION,
-        "kind": kind,
-        "header": to_json("header", header),
-        "metadata": to_json("metadata", to_json_types(metadata)),
+        "kind": about["kind"],
+        "header": to_json("header", about["header"]),
+        "metadata": to_json("metadata", to_json_types(about["metadata"])),
     }
     # Not written by the library, whose header has a random order: equal models must give equal bytes.
     order = sorted(specs, key=lambda key: (-_ITEM_BYTES[specs[key]["dtype"]], key))  # so every tensor is aligned
-    entries: dict[str, Any] = {_RESERVED: about}
+    entries: dict[str, Any] = {_RESERVED: strings}
     end = 0
     for key in order:
         start, end = end, end + math.prod(specs[key]["shape"]) * _ITEM_BYTES[specs[key]["dtype"]]
@@ -159,14 +154,11 @@ def _array_leaves(tree: Any) -> dict[str, Any]:
 
 def _to_numpy(key: str, leaf: Any) -> np.ndarray:
     """Little-endian, of a type that the format holds; nothing is converted but the byte order."""
-    if not hasattr(leaf, "dtype") or leaf.dtype.name not in _DTYPES:
-        got = f"dtype {getattr(leaf, 'dtype', type(leaf).__name__)}"
-        cure = "Store complex numbers as two arrays and PRNG keys by jax.random.key_data."
+    if leaf.dtype.name not in _DTYPES:
+        got, cure = f"dtype {leaf.dtype}", "Store complex numbers as two arrays and PRNG keys by jax.random.key_data."
         raise model_file_error(key, expected="a real, integer or boolean array", got=got, cure=cure)
-    array = np.asarray(leaf)
-    if array.dtype.byteorder == ">":
-        array = array.astype(array.dtype.newbyteorder("<"))
-    return array  # tobytes gives C order whatever the strides
+    # In any strides: tobytes gives C order.
+    return np.asarray(leaf).astype(leaf.dtype.newbyteorder("<"), copy=False)
 
 
 def _check_described(kind: Kind, model: Any, header: str) -> None:

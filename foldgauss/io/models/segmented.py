@@ -78,7 +78,8 @@ def join_segments(path: PathLike, sources: Sequence[tuple[int, PathLike]], *, me
                         raise _unfit(files[number], "one that has changed meanwhile", "Join them again.")
                     yield array
 
-    return write_tensors(path, specs, tensors, kind=SEGMENTED, header={"segments": entries}, metadata=metadata or {})
+    about = {"kind": SEGMENTED, "header": {"segments": entries}, "metadata": metadata or {}}
+    return write_tensors(path, specs, tensors, about)
 
 
 def save_segmented(path: Path, video: SegmentedVideo, metadata: dict | None) -> Path:
