@@ -74,12 +74,9 @@ def describe_crop(sizes: Iterable[Size], want: Size) -> tuple[str, ...]:
 def center_window(have: Size, window: Size) -> tuple[slice, slice]:
     """Rows and columns of the central (height, width) `window`. Raises `VideoError` where it does not fit."""
     if window[0] > have[0] or window[1] > have[1]:
-        raise video_error(
-            "center_crop",
-            expected=f"at most the frame's {format_size(have)}",
-            got=f"{window[0]}x{window[1]}",
-            cure="Crop a smaller window, or enlarge with size=(height, width) instead.",
-        )
+        expected, got = f"at most the frame's {format_size(have)}", f"{window[0]}x{window[1]}"
+        cure = "Crop a smaller window, or enlarge with size=(height, width) instead."
+        raise video_error("center_crop", expected=expected, got=got, cure=cure)
     top, left = (have[0] - window[0]) // 2, (have[1] - window[1]) // 2
     return slice(top, top + window[0]), slice(left, left + window[1])
 
