@@ -11,7 +11,7 @@ import html
 import json
 import re
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -148,14 +148,14 @@ def html_page(
     if not (is_integer(quality, 1) and quality <= 100):
         raise invalid("quality", expected="a whole number from 1 to 100", got=quality)
     plain, name = _load(model)
-    pictures = [] if original is None else _encode_original(original, plain, quality)
-    blocks = [*_encode_model(model, plain), *([_encode_moving(plain)] if moving else [])]
-    return _assemble(blocks, pictures, name if title is None else title, save_to)
+    pictures = [] if original is None else list(_encode_original(original, plain, quality))
+    blocks = [*_encode_model(model, plain), *([_encode_moving(plain)] if moving else []), *pictures]
+    return _assemble(blocks, name if title is None else title, save_to)
 
 
 def empty_page() -> str:
     """The page without a model: it opens model files from the computer that it is shown on."""
-    return _assemble([], [], "foldgauss player")
+    return _assemble([], "foldgauss player")
 
 
 def make_notebook_iframe(model: VideoModel | EditedVideo | SegmentedVideo) -> str | None:
@@ -168,7 +168,7 @@ def make_notebook_iframe(model: VideoModel | EditedVideo | SegmentedVideo) -> st
                 return None
     except (ValueError, OSError):  # the file of a video in segments may be gone
         return None
-    page = _assemble(blocks, [], "foldgauss")
+    page = _assemble(blocks, "foldgauss")
     if len(page) > LARGEST_IN_NOTEBOOK:
         return None
     height, width = model.size
@@ -257,35 +257,31 @@ def _fine_rules(degree: int) -> dict[str, Rule]:
 # -------------------------------------------------------------------------------------------- the original
 
 
-def _encode_original(original: Frames, model: Loaded, quality: int) -> list[bytes]:
-    """The original's frames as WebP."""
+def _encode_original(original: Frames, model: Loaded, quality: int) -> Iterator[str]:
+    """The page's data blocks of the original's frames, as WebP."""
     frames = original.frames if isinstance(original, Clip) else original
     shape, dtype, own = np.shape(frames), getattr(frames, "dtype", None), (model.num_frames, *model.size, 3)
     if len(shape) != 4 or shape[:3] != own[:3] or shape[3] not in (3, 4) or dtype != np.uint8:
         expected, cure = f"frames uint8 {own}, those of the model", "Read them with read_video(path, size=model.size)."
         raise invalid("original", expected=expected, got=f"{dtype} {shape}", cure=cure)
-    pictures = []
-    for frame in frames:
+    for number, frame in enumerate(frames):
         bgr = frame[..., 2::-1]  # premultiplied colors without their alpha are the image over black
         done, data = cv2.imencode(".webp", bgr, [cv2.IMWRITE_WEBP_QUALITY, quality])
         if not done:
             raise invalid("original", expected="frames that WebP can hold, up to 16,383 pixels a side", got=frame.shape)
-        pictures.append(data.tobytes())
-    return pictures
+        yield _block(f"frame-{number}", data.tobytes())
 
 
 # ------------------------------------------------------------------------------------------------ the page
 
 
-def _assemble(models: Iterable[str], pictures: Iterable[bytes], title: str, save_to: SaveTarget | None = None) -> str:
+def _assemble(blocks: list[str], title: str, save_to: SaveTarget | None = None) -> str:
     script, style = bundle_script("main.js"), (_SOURCES / "player.css").read_text(encoding="utf-8")
-    blocks = [*models, *(_block(f"frame-{k}", picture) for k, picture in enumerate(pictures))]
-    blocks += [] if save_to is None else save_to.blocks()
     parts = {
         "policy": _policy(script, style, connects=save_to is not None),
         "title": html.escape(title.encode("utf-8", "replace").decode()),  # names of files need not be UTF-8
         "style": style,
-        "data": "\n".join(blocks),
+        "data": "\n".join([*blocks, *(save_to.blocks() if save_to else ())]),
         "script": script,
     }
     page = (_SOURCES / "page.html").read_text(encoding="utf-8")
