@@ -35,6 +35,12 @@ def is_within(value: object, bounds: str) -> bool:
     )
 
 
+def check_within(parameter: str, value: object, bounds: str, expected: str) -> None:
+    """Raise unless `is_within(value, bounds)`; `expected` describes what is."""
+    if not is_within(value, bounds):
+        raise invalid(parameter, expected=expected, got=repr(value))
+
+
 def _is_finite(value: Real) -> bool:
     try:
         return math.isfinite(value)

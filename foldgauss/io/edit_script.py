@@ -33,6 +33,7 @@ from typing import Any
 import numpy as np
 
 from foldgauss._runtime.checks import invalid
+from foldgauss.io._atomic import PathLike
 from foldgauss.io._toml_lines import key_lines
 from foldgauss.io.media.masks import read_masks
 from foldgauss.io.models.selections import load_selection, parse_indices, parse_ranges
@@ -270,7 +271,7 @@ class EditScript:
                 raise invalid("select", expected="a selection of at least one Gaussian", got=got)
         given = {key: value for key, value in _convert_spans(table).items() if key not in ("do", "select")}
         if "degrees" in given:
-            given[ACTIONS[table["do"]].angle] = _to_radians(given.pop("degrees"))
+            given[ACTIONS[table["do"]].angle] = np.radians(given.pop("degrees")).tolist()
         return getattr(edits, table["do"])(**given)
 
     def _add_layers(self, video: Video) -> Video:
@@ -301,7 +302,7 @@ class EditScript:
         return _TableContext(self.source, self.text, table, named)
 
 
-def read_edit_script(path: str | os.PathLike) -> EditScript:
+def read_edit_script(path: PathLike) -> EditScript:
     """Read a script and check tables, keys, names and types of values. `EditScript.apply` checks the values.
 
     **Raises:** `FileNotFoundError`; `EditScriptError` with line and key for all other errors.
@@ -327,7 +328,7 @@ def read_edit_script(path: str | os.PathLike) -> EditScript:
     return dataclasses.replace(script, _includes=(path.resolve(),))
 
 
-def parse_edit_script(text: str, *, source: str = "script", folder: str | os.PathLike = ".") -> EditScript:
+def parse_edit_script(text: str, *, source: str = "script", folder: PathLike = ".") -> EditScript:
     """As `read_edit_script`, for the text of a script; paths in it are relative to `folder`."""
     if _DEEP_KEY.search(text):
         raise EditScriptError(f"{source}: expected keys of a few parts, got one of more than {MAX_PARTS}.")
@@ -520,8 +521,3 @@ def _convert_spans(table: dict[str, Any]) -> dict[str, Any]:
 def _convert_span(value: list[float] | str) -> tuple[float | None, ...]:
     ends = value.split(":") if isinstance(value, str) else value
     return tuple((int(end) if end else None) if isinstance(end, str) else end for end in ends)
-
-
-def _to_radians(degrees: float | list[float]) -> float | list[float]:
-    """Convert one angle or a list of them."""
-    return [math.radians(one) for one in degrees] if isinstance(degrees, list) else math.radians(degrees)

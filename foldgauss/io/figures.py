@@ -1,17 +1,16 @@
 """Figures of `foldgauss.analysis.plot` as files."""
 
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from foldgauss.analysis.plot import Panel, plot_tradeoff
-from foldgauss.io._atomic import atomic_path
+from foldgauss.io._atomic import PathLike, atomic_path
 
 DPI = 110
 
 
-def write_figure(path: str | os.PathLike, draw: Callable[[Any], object], size: tuple[float, float]) -> Path:
+def write_figure(path: PathLike, draw: Callable[[Any], object], size: tuple[float, float]) -> Path:
     """Write what `draw(figure)` plots as a PNG of `size` inches, whole or not at all.
 
     Raises ImportError without matplotlib (`foldgauss[plot]`).
@@ -28,7 +27,7 @@ def write_figure(path: str | os.PathLike, draw: Callable[[Any], object], size: t
 
 
 def write_tradeoff(
-    path: str | os.PathLike, panels: Sequence[Panel], quality: Sequence[float], names: Sequence[tuple[str, str]]
+    path: PathLike, panels: Sequence[Panel], quality: Sequence[float], names: Sequence[tuple[str, str]]
 ) -> Path:
     """`plot_tradeoff` as a PNG, whole or not at all. Raises ImportError without matplotlib (`foldgauss[plot]`)."""
 

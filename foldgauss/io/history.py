@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any, Self
 
 from foldgauss._runtime.checks import invalid, is_integer
 from foldgauss.analysis.plot import plot_history
-from foldgauss.io._atomic import atomic_path, translate_output_errors
+from foldgauss.io._atomic import PathLike, atomic_path, translate_output_errors
 from foldgauss.io.figures import write_figure
 from foldgauss.video.fitting.loop import FitInfo, FitState
 
@@ -33,7 +32,7 @@ class HistoryFile:
     Example: `with HistoryFile("fit.jsonl") as history: fit(frames, observers=[history])`.
     """
 
-    def __init__(self, path: str | os.PathLike, resumed_at: int | None = None, psnr: float | None = None):
+    def __init__(self, path: PathLike, resumed_at: int | None = None, psnr: float | None = None):
         self.path, self._file, self._last, self._append = Path(path), None, 0, False
         if resumed_at is not None and self.path.exists():
             self._append, kept = True, [line for line in _read_lines(self.path) if line["step"] <= resumed_at]
@@ -70,13 +69,13 @@ def info_line(info: FitInfo) -> dict[str, Any]:
     return {name: _to_json(value) for name, value in info._asdict().items()}
 
 
-def read_history(path: str | os.PathLike) -> list[FitInfo]:
+def read_history(path: PathLike) -> list[FitInfo]:
     """The steps of a history file, which may belong to a running fit. Raises ValueError for another file."""
     lines = [{name: value for name, value in line.items() if value is not None} for line in _read_lines(Path(path))]
     return [FitInfo(*(line.get(name, _NULL.get(name)) for name in FitInfo._fields)) for line in lines]
 
 
-def write_curves(path: str | os.PathLike, history: Iterable[FitInfo]) -> Path:
+def write_curves(path: PathLike, history: Iterable[FitInfo]) -> Path:
     """`plot_history` as a PNG, whole or not at all. Raises ImportError without matplotlib (`foldgauss[plot]`)."""
 
     def draw(figure: Any) -> None:

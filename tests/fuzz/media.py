@@ -139,8 +139,7 @@ _READ = {
     for module, names in {
         "clip": (ONLY, "check_range_within", "check_num_pixels"),
         "resizing": (
-            ONLY, "make_resizer", "convert_channels", "unify_channels", "copy_to_blocks",
-            "stack_frames",
+            ONLY, "make_resizer", "convert_channels", "copy_to_blocks", "stack_frames",
         ),
         "decoder": (),
         "image_files": ("natural_sort_key", "_is_jpeg_sequence"),

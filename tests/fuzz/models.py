@@ -287,7 +287,7 @@ CHECKPOINT = Target(
     | {
         "foldgauss.io.models.video_model": (
             "save_video_model", "check_model_name", "load_video_model", "read_metadata", "read_origin",
-            "_is_text", "_is_range", "_with_splats", "_describe_video", "_video_skeleton", "_describe_edited",
+            "_is_range", "_with_splats", "_describe_video", "_video_skeleton", "_describe_edited",
             "_describe_layer", "_describe_camera", "_edited_skeleton", "_layer_skeleton", "_camera_skeleton",
         ),
         "foldgauss.io.models.checkpoint": ("save_checkpoint", "_describe"),
@@ -451,7 +451,6 @@ COMPACT = Target(
             "load_video_model",
             "read_metadata",
             "read_origin",
-            "_is_text",
             "_is_range",
         ),
         "foldgauss.io.models.range_coder": ("encode",),

@@ -17,7 +17,7 @@ from hypothesis.extra import numpy as hnp
 from safetensors.numpy import load_file, save_file
 
 from foldgauss.io._atomic import OutputError, atomic_path
-from foldgauss.io.models.model_file import ModelFileError, load_model, read_header, register_model, save_model
+from foldgauss.io.models.model_file import Kind, ModelFileError, load_model, read_header, register_model, save_model
 
 
 class Inner(eqx.Module):
@@ -65,7 +65,7 @@ def _from_header(header):
     )
 
 
-register_model("test-toy", Toy, to_header=_to_header, from_header=_from_header)
+register_model(Kind("test-toy", Toy, to_header=_to_header, from_header=_from_header))
 
 
 def _toy(weight=None, parts=None, layers=(), fps=25.0):
@@ -213,7 +213,7 @@ def test_a_header_that_forgets_a_field_is_refused(tmp_path):
     def skeleton(header):
         return Forgetful(jax.ShapeDtypeStruct((2,), jnp.float32), header.get("extra"), 3)
 
-    register_model("test-forgetful", Forgetful, to_header=lambda _: {}, from_header=skeleton)
+    register_model(Kind("test-forgetful", Forgetful, to_header=lambda _: {}, from_header=skeleton))
     with pytest.raises(ModelFileError, match="structure"):
         save_model(tmp_path / "m", Forgetful(jnp.zeros(2), None, 4))
     with pytest.raises(ModelFileError, match="extra"):
@@ -222,9 +222,9 @@ def test_a_header_that_forgets_a_field_is_refused(tmp_path):
 
 
 def test_one_name_names_one_type():
-    register_model("test-toy", Toy, to_header=_to_header, from_header=_from_header)
+    register_model(Kind("test-toy", Toy, to_header=_to_header, from_header=_from_header))
     with pytest.raises(ValueError, match="test-toy"):
-        register_model("test-toy", Inner, to_header=_to_header, from_header=_from_header)
+        register_model(Kind("test-toy", Inner, to_header=_to_header, from_header=_from_header))
 
 
 # -------------------------------------------------------------------------------------------- bad files

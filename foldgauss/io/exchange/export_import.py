@@ -1,17 +1,17 @@
 """Export and import of models, with the format chosen by name."""
 
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid
-from foldgauss.io._atomic import OutputError, atomic_folder, check_path, check_writable
+from foldgauss.io._atomic import OutputError, PathLike, atomic_folder, check_path, check_writable
 from foldgauss.io.exchange.gaussians_ply import write_3dgs_frames, write_3dgs_ply
 from foldgauss.io.exchange.ply_file import format_error
 from foldgauss.io.exchange.pseudomesh import write_pseudomesh
 from foldgauss.io.exchange.vegas_ply import read_vegas_ply, write_vegas_ply
+from foldgauss.io.media.clip import Size
 from foldgauss.io.page.player_page import HTML_SUFFIX, Frames, write_html
 from foldgauss.video.editing.chain import Edit
 from foldgauss.video.editing.edited_video import EditedVideo
@@ -26,7 +26,7 @@ FORMATS = ("ply", "ply3dgs", "obj", "html")
 def export(
     model: VideoModel | EditedVideo | SegmentedVideo,
     format: str,
-    out: str | os.PathLike,
+    out: PathLike,
     *,
     times: Sequence[float] | None = None,
     depth_step: float | None = None,
@@ -66,8 +66,7 @@ def export(
     unknown = [*(of_scenes if format != "ply3dgs" else ()), *(of_pages if format != "html" else ())]
     unknown += ["times"] if format in ("ply", "html") and times is not None else []
     if unknown:
-        got = f"it for {format!r}"
-        raise invalid(unknown[0], expected="an option of this format", got=got, cure="Leave it out.")
+        raise invalid(unknown[0], expected="an option of this format", got=f"it for {format!r}", cure="Leave it out.")
     if format == "ply" and isinstance(model, SegmentedVideo):
         return _write_vegas_segments(out, model, overwrite)
     if format == "ply":
@@ -113,9 +112,7 @@ def _check_new(path: Path, overwrite: bool) -> None:
         raise OutputError(f"{text} Choose another path, or allow overwriting.")
 
 
-def import_model(
-    path: str | os.PathLike, *, size: tuple[int, int] | None = None, fps: float | None = None
-) -> VideoModel:
+def import_model(path: PathLike, *, size: Size | None = None, fps: float | None = None) -> VideoModel:
     """The model in a file of another program: a published VeGaS video. See `read_vegas_ply` for `size` and `fps`.
 
     **Raises:** `FileNotFoundError`; `FormatError` for a file that is damaged or holds no video. Static 3DGS

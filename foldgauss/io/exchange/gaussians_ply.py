@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -12,8 +11,8 @@ import scipy
 from jaxtyping import Float
 from scipy.special import expit, logit
 
-from foldgauss._runtime.checks import check_one_of, invalid, is_within, short_repr
-from foldgauss.io._atomic import atomic_folder
+from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_within, short_repr
+from foldgauss.io._atomic import PathLike, atomic_folder
 from foldgauss.io.exchange.ply_file import NOTE, read_ply, write_ply
 from foldgauss.render import Camera, Gaussians3D, pixels_per_unit
 from foldgauss.render.camera import THICKNESS
@@ -51,8 +50,7 @@ def frame_gaussians(model: RenderableVideo | VideoRenderer, t: float, *, depth_s
 
     **Source:** VeGaS eq:mirage (flat Gaussians), eq:vegas_equiv_cond (of one time).
     """
-    if not is_within(depth_step, "[0, 1]"):
-        raise invalid("depth_step", expected="a depth in [0, 1] of the frame's longer side", got=repr(depth_step))
+    check_within("depth_step", depth_step, "[0, 1]", "a depth in [0, 1] of the frame's longer side")
     if not is_within(float(t), "[0, 1]"):
         raise invalid("t", expected="a time in [0, 1]", got=repr(t))
     renderer = model if isinstance(model, VideoRenderer) else VideoRenderer(model)
@@ -71,9 +69,7 @@ def frame_gaussians(model: RenderableVideo | VideoRenderer, t: float, *, depth_s
     return Gaussians3D(*(leaf.astype(np.float32) for leaf in (mean, flat, opacity, color)))
 
 
-def write_gaussians_ply(
-    path: str | os.PathLike, gaussians: Gaussians3D, *, axes: str = "y-down", sh_degree: int = 3
-) -> Path:
+def write_gaussians_ply(path: PathLike, gaussians: Gaussians3D, *, axes: str = "y-down", sh_degree: int = 3) -> Path:
     """Write Gaussians in space as a 3DGS PLY file, which ordinary viewers open; returns the path.
 
     The layout is that of the published 3DGS: x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3, all
@@ -114,7 +110,7 @@ def _columns(gaussians: Gaussians3D, axes: str, sh_degree: int) -> dict[str, np.
 
 
 def write_3dgs_ply(
-    path: str | os.PathLike,
+    path: PathLike,
     model: RenderableVideo | VideoRenderer,
     t: float,
     *,
@@ -142,7 +138,7 @@ def write_3dgs_ply(
 
 
 def write_3dgs_frames(
-    folder: str | os.PathLike,
+    folder: PathLike,
     model: RenderableVideo,
     times: Sequence[float] | None = None,
     *,
@@ -180,7 +176,7 @@ def check_times(model: RenderableVideo, times: Sequence[float] | None) -> Float[
     return found
 
 
-def read_3dgs_ply(path: str | os.PathLike, *, axes: str = "y-down") -> Gaussians3D:
+def read_3dgs_ply(path: PathLike, *, axes: str = "y-down") -> Gaussians3D:
     """The Gaussians of a 3DGS PLY file, in model space if the file has the `axes` given; NumPy leaves.
 
     **Shapes:** see `Gaussians3D`; factor = R diag(scales), columns in the file's order. The color is that of degree 0,

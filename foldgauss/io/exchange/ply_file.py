@@ -6,7 +6,6 @@ content raises only `FormatError`.
 Source of the layout: G. Turk, "The PLY Polygon File Format" (1994).
 """
 
-import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.io._atomic import atomic_path, missing_error
+from foldgauss.io._atomic import PathLike, atomic_path, missing_error
 
 _SIZES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
@@ -118,7 +117,7 @@ class Ply:
 # ---------------------------------------------------------------------------------------------- reading
 
 
-def read_ply(path: str | os.PathLike, wanted: Iterable[str]) -> Ply:
+def read_ply(path: PathLike, wanted: Iterable[str]) -> Ply:
     """Read the `wanted` elements of a PLY file, those of them that it has: text or binary, of either byte order.
 
     Other elements, lists among them, are skipped. Raises `FileNotFoundError` for a missing path and `FormatError` for
@@ -292,7 +291,7 @@ def _is_number(word: bytes) -> bool:
 
 
 def write_ply(
-    path: str | os.PathLike, elements: Mapping[str, Mapping[str, np.ndarray]], *, comments: Sequence[str] = ()
+    path: PathLike, elements: Mapping[str, Mapping[str, np.ndarray]], *, comments: Sequence[str] = ()
 ) -> Path:
     """Write columns of numbers, float32, binary and little-endian as viewers expect; whole or not at all.
 

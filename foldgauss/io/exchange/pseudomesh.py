@@ -5,7 +5,6 @@ The `.obj` contains the shape, one triangle per Gaussian; the `.ply`, an ordinar
 
 import dataclasses
 import json
-import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -15,10 +14,11 @@ import jax
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from foldgauss._runtime.checks import check_one_of, invalid
-from foldgauss.io._atomic import atomic_folder, missing_error
+from foldgauss._runtime.checks import check_one_of, check_within, invalid
+from foldgauss.io._atomic import PathLike, atomic_folder, missing_error
 from foldgauss.io.exchange.gaussians_ply import check_times, frame_gaussians, read_3dgs_ply, write_gaussians_ply
 from foldgauss.io.exchange.ply_file import facts_error, format_error, read_bytes
+from foldgauss.io.media.clip import Size
 from foldgauss.io.media.frame_rate import DEFAULT_FPS
 from foldgauss.io.media.image_files import natural_sort_key
 from foldgauss.render import COMPOSITINGS, Camera, Gaussians3D, RenderOptions, Splats2D, Triangles, cpu, project
@@ -50,7 +50,7 @@ class Pseudomesh:
 
     triangles: tuple[Triangles, ...]
     times: Float[np.ndarray, "num_frames"]
-    size: tuple[int, int]
+    size: Size
     fps: float
     options: RenderOptions
     compositing: str = "over"
@@ -64,7 +64,7 @@ class Pseudomesh:
         faces = self.triangles[number]
         return np.concatenate([faces.origin[:, None], faces.origin[:, None] + faces.edges], axis=1)
 
-    def splats(self, number: int, size: tuple[int, int] | None = None) -> Splats2D:
+    def splats(self, number: int, size: Size | None = None) -> Splats2D:
         """The conditioned Gaussians of a frame, in pixels of an image of `size` (default: the video's own).
 
         Frames whose vertices lie in the plane are rendered directly, others through the front camera, in array order.
@@ -81,7 +81,7 @@ class Pseudomesh:
         return Splats2D(mean, factor, faces.opacity, faces.color)
 
     def frame(
-        self, number: int, size: tuple[int, int] | None = None, *, background: tuple[float, float, float] = BLACK
+        self, number: int, size: Size | None = None, *, background: tuple[float, float, float] = BLACK
     ) -> UInt8[np.ndarray, "height width 3"]:
         """The image of a frame over `background`. Raises ValueError for an invalid size or background."""
         size = self.size if size is None else tuple(size)
@@ -91,7 +91,7 @@ class Pseudomesh:
         return to_bytes(cpu.forward(*leaves, behind, size, **drawn).image)
 
     def frames(
-        self, size: tuple[int, int] | None = None, *, background: tuple[float, float, float] = BLACK
+        self, size: Size | None = None, *, background: tuple[float, float, float] = BLACK
     ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
         """The images of all frames one by one."""
         for number in range(self.num_frames):
@@ -110,7 +110,7 @@ def _flat_factor(edges: Float[np.ndarray, "num 2 3"]) -> Float[np.ndarray, "num 
 
 
 def write_pseudomesh(
-    folder: str | os.PathLike,
+    folder: PathLike,
     model: RenderableVideo,
     times: Sequence[float] | None = None,
     *,
@@ -180,7 +180,7 @@ def _axes(factor: Float[np.ndarray, "num 2 2"]) -> Float[np.ndarray, "num 2 2"]:
 
 
 def read_pseudomesh(
-    folder: str | os.PathLike, *, size: tuple[int, int] | None = None, fps: float | None = None, axes: str = "y-up"
+    folder: PathLike, *, size: Size | None = None, fps: float | None = None, axes: str = "y-up"
 ) -> Pseudomesh:
     """Read frames as triangles, after editing in a mesh tool or straight from `write_pseudomesh`.
 
@@ -204,8 +204,7 @@ def read_pseudomesh(
     if not paths:
         cure = "Give the folder that write_pseudomesh or `foldgauss export --format obj` made."
         raise format_error(folder, expected="a folder with .obj files", got="none", cure=cure)
-    given = {"size": size, "fps": fps}
-    given = {name: value for name, value in given.items() if value is not None}
+    given = {name: value for name, value in (("size", size), ("fps", fps)) if value is not None}
     facts = _check_notes(folder, _read_notes(folder, len(paths)) | given, len(paths))
     return Pseudomesh(tuple(_read_frame(path, axes) for path in paths), **facts)
 
@@ -235,8 +234,7 @@ def _check_notes(folder: Path, notes: dict, num_frames: int) -> dict:
         options = RenderOptions(**notes["options"])
         check_one_of("compositing", notes["compositing"], COMPOSITINGS)
         check_size(size)
-        if not 0 < fps < math.inf:
-            raise invalid("fps", expected="a positive rate", got=fps)
+        check_within("fps", fps, "(0, inf)", "a positive rate")
         if times.shape != (num_frames,) or not ((times >= 0) & (times <= 1)).all():
             expected = f"{num_frames} numbers in [0, 1], one for each .obj"
             cure = "A frame was added or removed: correct the list too, or remove the file and give size."
@@ -274,7 +272,7 @@ def _check_area(path: Path, edges: Float[np.ndarray, "num 2 3"]) -> None:
         raise format_error(path, expected="faces of nonzero area", got=got, cure=cure)
 
 
-def read_obj(path: str | os.PathLike) -> Float[np.ndarray, "faces 3 3"]:
+def read_obj(path: PathLike) -> Float[np.ndarray, "faces 3 3"]:
     """The vertices of a triangle soup in an `.obj` file, (x, y, z) as they stand there, float64.
 
     Face k must have vertices 3k + 1, 3k + 2, 3k + 3 of the file, in this order: its first vertex is the Gaussian's

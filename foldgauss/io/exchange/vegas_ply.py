@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-import os
 import warnings
 from pathlib import Path
 
@@ -11,10 +10,12 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from foldgauss._runtime.checks import invalid, is_within
+from foldgauss._runtime.checks import check_within, invalid
 from foldgauss.envelope import TimeLikelihood
+from foldgauss.io._atomic import PathLike
 from foldgauss.io.exchange.ply_file import NOTE, Ply, facts_error, read_ply, write_ply
-from foldgauss.io.media.frame_rate import DEFAULT_FPS, MAX_FPS, MIN_FPS
+from foldgauss.io.media.clip import Size, check_fps
+from foldgauss.io.media.frame_rate import DEFAULT_FPS
 from foldgauss.render import RenderOptions
 from foldgauss.render.camera import FIELD_OF_VIEW
 from foldgauss.render.splats import check_size
@@ -32,9 +33,7 @@ VEGAS_SCALE_CUTOFF = 1e-4
 _VEGAS_ACROSS = math.log(1e-8)
 
 
-def read_vegas_ply(
-    path: str | os.PathLike, *, size: tuple[int, int] | None = None, fps: float | None = None
-) -> VideoModel:
+def read_vegas_ply(path: PathLike, *, size: Size | None = None, fps: float | None = None) -> VideoModel:
     r"""A video from the PLY file of the published VeGaS code, rendered as its formulas define.
 
     **Shapes:** element `vertex` with x, z, f_dc_0..2, opacity, scale_0, scale_2, rot_0, m_0, sigma_0 and
@@ -71,8 +70,7 @@ def read_vegas_ply(
     size, fps, options, scale_cutoff, power = _fill_in(ply, size, fps)
     num_weights = sum(name.startswith("w1_") for name in ply.names("vertex"))
     if num_weights % 2:
-        expected = "an even number of w1 columns, pairs (x, z)"
-        raise ply.error(expected=expected, got=str(num_weights), cure="The file is damaged.")
+        raise ply.error("an even number of w1 columns, pairs (x, z)", str(num_weights), "The file is damaged.")
     names = ["x", "z", "scale_0", "scale_2", "rot_0", "m_0", "sigma_0", "opacity", "f_dc_0", "f_dc_1", "f_dc_2"]
     columns = ply.columns("vertex", [*names, *(f"w1_{k}" for k in range(num_weights))])
     unit = _vegas_unit(size)
@@ -93,7 +91,7 @@ def read_vegas_ply(
     return VideoModel(splats, FrameTimes(_time_logits(ply)), size, fps, options, scale_cutoff=scale_cutoff)
 
 
-def write_vegas_ply(path: str | os.PathLike, model: VideoModel) -> Path:
+def write_vegas_ply(path: PathLike, model: VideoModel) -> Path:
     r"""Write a video in the format of the published VeGaS code; returns the path. See `read_vegas_ply` for the layout.
 
     The envelope has power 2 there. That of another power p > 0 is the same function of time with
@@ -157,7 +155,7 @@ def _convert_time_scale(
     return np.where(log_time_scale == STATIC_LOG_TIME_SCALE, log_time_scale, other_scale)
 
 
-def _vegas_unit(size: tuple[int, int]) -> float:
+def _vegas_unit(size: Size) -> float:
     """One unit of the published space in model units."""
     height, width = size
     return min(1.0, width / height) / (2 * math.tan(FIELD_OF_VIEW / 2))
@@ -183,17 +181,13 @@ def _time_logits(ply: Ply) -> Float[np.ndarray, " intervals"]:
     names = sorted(ply.names("time"), key=lambda name: (len(name), name))
     weights = ply.columns("time", names)
     if 1 not in weights.shape or weights.size == 0:
-        got = f"{weights.shape[0]} rows of {weights.shape[1]}"
-        raise ply.error(expected="one row of weights in element 'time'", got=got)
+        raise ply.error("one row of weights in element 'time'", f"{weights.shape[0]} rows of {weights.shape[1]}")
     if weights.shape[0] == 1 and names != [f"time_func_{k}" for k in range(len(names))]:
-        got = ", ".join(names[:9])
-        raise ply.error(expected="time_func_0, time_func_1, ... in element 'time'", got=got)
+        raise ply.error("time_func_0, time_func_1, ... in element 'time'", ", ".join(names[:9]))
     return weights.astype(np.float32).ravel()
 
 
-def _fill_in(
-    ply: Ply, size: tuple[int, int] | None, fps: float | None
-) -> tuple[tuple[int, int], float, RenderOptions, float, float]:
+def _fill_in(ply: Ply, size: Size | None, fps: float | None) -> tuple[Size, float, RenderOptions, float, float]:
     """Size, rate, options, cutoff and power: as given, else as recorded in the file, else the published defaults."""
     note = _read_note(ply)
     if size is None and "size" not in note:
@@ -205,13 +199,10 @@ def _fill_in(
         fps = note.get("fps", DEFAULT_FPS) if fps is None else fps
         check_size(size)
         cutoff = note.get("scale_cutoff", VEGAS_SCALE_CUTOFF * _vegas_unit(size))
-        if not is_within(cutoff, "[0, 1]"):
-            raise invalid("scale_cutoff", expected="a number in [0, 1]", got=repr(cutoff))
+        check_within("scale_cutoff", cutoff, "[0, 1]", "a number in [0, 1]")
         power = note.get("power", VEGAS_POWER)
-        if not is_within(power, "(0, 1e30]"):
-            raise invalid("power", expected="a number in (0, 1e30]", got=repr(power))
-        if not is_within(fps, f"[{MIN_FPS}, {MAX_FPS}]"):
-            raise invalid("fps", expected=f"a rate in [{MIN_FPS:g}, {MAX_FPS:g}]", got=repr(fps), cure="Try 25.")
+        check_within("power", power, "(0, 1e30]", "a number in (0, 1e30]")
+        check_fps(fps)
     except (TypeError, ValueError) as error:
         raise facts_error(ply.path, error) from error
     return (int(size[0]), int(size[1])), float(fps), options, float(cutoff), float(power)
@@ -235,20 +226,18 @@ def _check_writable_as_vegas(model: VideoModel) -> None:
         if isinstance(model, SegmentedVideo):
             cure = "export(model, 'ply', FOLDER) writes one for each segment."
         raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
-    envelope = model.splats.envelope
-    facts = {
-        "floor": (np.unique(envelope.floor), 0.0, "Fit it without a floor."),
-        "compositing": (np.array([model.compositing]), "over", "Fit it with --compositing over."),
-    }
     if model.num_frames < 2:
         expected = "at least 2 frames, as a VeGaS file stores the intervals between frames"
         raise invalid("model", expected=expected, got="1", cure="Write the picture as a still scene, ply3dgs.")
-    for name, (found, known, cure) in facts.items():
-        if not (found == known).all():
-            got, expected = ", ".join(map(str, found[:3])), f"{known}, the only one in a VeGaS file"
-            raise invalid(f"model's {name}", expected=expected, got=got, cure=cure)
+    floors = np.unique(model.splats.envelope.floor)
+    if not (floors == 0).all():
+        got, expected = ", ".join(map(str, floors[:3])), "0.0, the only one in a VeGaS file"
+        raise invalid("model's floor", expected=expected, got=got, cure="Fit it without a floor.")
+    if model.compositing != "over":
+        expected, cure = "over, the only one in a VeGaS file", "Fit it with --compositing over."
+        raise invalid("model's compositing", expected=expected, got=model.compositing, cure=cure)
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model)):
         raise invalid("model", expected="finite numbers", got="NaN or infinities", cure="The fit diverged: fit again.")
-    if not (np.asarray(envelope.power) > 0).all():
+    if not (np.asarray(model.splats.envelope.power) > 0).all():
         cure = "Fit it with another --power."
         raise invalid("model's power", expected="above 0, as VeGaS files require", got="0", cure=cure)

@@ -10,16 +10,18 @@ from pathlib import Path
 import numpy as np
 
 from foldgauss._runtime.checks import invalid, is_within
-from foldgauss.io._atomic import check_path, missing_error
+from foldgauss.io._atomic import PathLike, check_path, missing_error
 from foldgauss.io.media.format_detection import HEAD_BYTES
 from foldgauss.io.media.frame_rate import MAX_FPS, MIN_FPS, FrameRate
 
 MAX_PIXELS = 1 << 28  # of one image, 16384x16384: a header may claim any size
 VIDEO = "a video file or a folder of images"
 Range = tuple[int | None, int | None]
-PathLike = str | os.PathLike
-#: (prepared frames, frames declared within the range, frame rate, notes)
-ReadResult = tuple[list[np.ndarray], int, FrameRate, tuple[str, ...]]
+Size = tuple[int, int]  # (height, width)
+#: (frames declared within a range, frame rate, notes)
+RangeFacts = tuple[int, FrameRate, tuple[str, ...]]
+#: (prepared frames, and the facts)
+ReadResult = tuple[list[np.ndarray], *RangeFacts]
 
 
 class VideoError(ValueError):
@@ -60,7 +62,7 @@ class Clip:
         return self.frames.shape[0]
 
     @property
-    def size(self) -> tuple[int, int]:
+    def size(self) -> Size:
         """(height, width) in pixels."""
         return self.frames.shape[1], self.frames.shape[2]
 
@@ -123,7 +125,7 @@ def check_range_within(start: int, stop: int | None, num_total: int, path: Path)
         raise video_error("frames", expected=expected, got=format_range(start, stop), cure=cure)
 
 
-def check_frame_size(size: tuple[int, int] | None, parameter: str = "size") -> tuple[int, int] | None:
+def check_frame_size(size: Size | None, parameter: str = "size") -> Size | None:
     if size is None:
         return None
     sides = tuple(size) if isinstance(size, tuple | list | np.ndarray) else ()
@@ -139,7 +141,7 @@ def check_fps(fps: float) -> None:
         raise video_error("fps", expected=f"a rate in [{MIN_FPS:g}, {MAX_FPS:g}]", got=repr(fps), cure="Try 25.")
 
 
-def check_num_pixels(path: Path, size: tuple[int, int] | None) -> None:
+def check_num_pixels(path: Path, size: Size | None) -> None:
     """Raise where a header claims more than `MAX_PIXELS`, before memory is allocated for them."""
     if size is not None and size[0] * size[1] > MAX_PIXELS:
         expected = f"images of at most {MAX_PIXELS:,} pixels"

@@ -14,7 +14,7 @@ from av.filter import Graph
 from av.stream import Disposition
 from av.video.reformatter import Interpolation, VideoReformatter
 
-from foldgauss.io.media.clip import VIDEO, VideoError, check_num_pixels, format_num_bytes, read_head, video_error
+from foldgauss.io.media.clip import VIDEO, Size, VideoError, check_num_pixels, format_num_bytes, read_head, video_error
 from foldgauss.io.media.format_detection import DEMUXERS, LIST, describe_kind
 from foldgauss.io.media.frame_rate import DEFAULT_FPS
 from foldgauss.io.media.image_files import premultiply
@@ -47,7 +47,7 @@ class DecodedFrame:
     position: int
     stamp: int
     decoded: av.VideoFrame
-    size: tuple[int, int]
+    size: Size
     matrix: tuple[int, int, int, int] = (1 << 16, 0, 0, 1 << 16)
     converter: VideoReformatter = field(default_factory=VideoReformatter)
 
@@ -275,11 +275,9 @@ def _choose_stream(container: av.container.InputContainer, path: Path) -> av.Vid
         got, cure = f"an unknown one in {str(path)!r}", "Convert it with ffmpeg."
         raise video_error("path", expected="a video whose codec is known here", got=got, cure=cure)
     streams = [one for one in known if not one.disposition & Disposition.attached_pic]
-    best = container.streams.best("video")
-    if best in streams:
-        return best
     if streams:
-        return streams[0]
+        best = container.streams.best("video")
+        return best if best in streams else streams[0]
     if container.streams.video:
         got = f"audio with a cover image, {str(path)!r}"
         raise video_error("path", expected="a video", got=got, cure="Give a file with moving images.")

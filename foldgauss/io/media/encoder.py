@@ -16,8 +16,9 @@ import numpy as np
 from av.filter import Graph
 from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc, VideoReformatter
 
-from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
-from foldgauss.io.media.clip import PathLike, VideoError, check_readable, video_error
+from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_integer, is_within
+from foldgauss.io._atomic import PathLike
+from foldgauss.io.media.clip import VideoError, check_readable, video_error
 from foldgauss.io.media.decoder import CONVERSION, VideoDecoder, filter_frame, open_container
 from foldgauss.io.media.format_detection import SOUND_DEMUXERS
 
@@ -237,8 +238,7 @@ def check_sound(sound: Sound) -> None:
     if not isinstance(sound, Sound):
         cure = "Write Sound('clip.mp4')."
         raise invalid("sound", expected="a foldgauss.io.Sound", got=type(sound).__name__, cure=cure)
-    if not is_within(sound.start, "[0, 1e9]"):
-        raise invalid("sound.start", expected="seconds from 0 to 1e9", got=repr(sound.start))
+    check_within("sound.start", sound.start, "[0, 1e9]", "seconds from 0 to 1e9")
     if not is_within(sound.speed, "[0.01, 100]"):
         expected, cure = "a speed from 0.01 to 100", "Leave sound out."
         raise invalid("sound.speed", expected=expected, got=f"{sound.speed:g}", cure=cure)

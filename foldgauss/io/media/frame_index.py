@@ -13,10 +13,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from foldgauss.io._atomic import atomic_path, check_path
+from foldgauss.io._atomic import PathLike, atomic_path, check_path
 from foldgauss.io.media.clip import (
-    PathLike,
     Range,
+    Size,
     VideoError,
     check_fps,
     check_range,
@@ -27,7 +27,7 @@ from foldgauss.io.media.clip import (
 )
 from foldgauss.io.media.frame_rate import describe_rate, make_increasing
 from foldgauss.io.media.image_files import image_paths, read_folder
-from foldgauss.io.media.video_decoding import DecodeReport, decode_file, describe_span, read_video_file
+from foldgauss.io.media.video_decoding import DecodeReport, decode_file, read_video_file
 from foldgauss.io.media.video_reading import choose_reader
 from foldgauss.video.motion.optical_flow import CutFinder
 
@@ -77,7 +77,7 @@ class FrameIndex:
         self.deinterlace: bool = about["deinterlace"]
         self.fixed_fps: float | None = about["fixed_fps"]
         self.fps: float = about["fps"]
-        self.size: tuple[int, int] = tuple(about["size"])
+        self.size: Size = tuple(about["size"])
         self.num_declared: int = about["num_declared"]
         self.notes: tuple[str, ...] = tuple(about["notes"])
         self.cuts: list[int] = list(about["cuts"])
@@ -85,7 +85,7 @@ class FrameIndex:
         self.has_alpha = bool(self.transparent.any())
         self.num_before = len(self.places) - self.num_frames  # frames decoded before the first one indexed
         self.positions = self.places[self.num_before :] - self.start
-        self.alpha_at_size: dict[tuple[int, int], bool] = {}  # found by the reader
+        self.alpha_at_size: dict[Size, bool] = {}  # found by the reader
         self.last_margin = 0  # of the reader's last seek, in frames
 
     def __repr__(self) -> str:
@@ -108,7 +108,8 @@ class FrameIndex:
         about = self._about
         time_base, notes = about["time_base"], tuple(about["shape_notes"])
         seconds = make_increasing((self.stamps * time_base).tolist(), about["rate"])
-        return DecodeReport(about["rate"], about["num_total"], notes, seconds, time_base, about["threads"])
+        arrays = self.places, self.stamps, seconds
+        return DecodeReport(about["rate"], about["num_total"], notes, *arrays, time_base, about["threads"])
 
     def span(self, first: int, stop: int) -> tuple[int, int]:
         """The range, for `read_indexed`, of the frames `first` up to `stop` of those that decode: the same numbers
@@ -191,7 +192,7 @@ def index_video(
     digests, transparent, finder = bytearray(), bytearray(), CutFinder() if find_cuts else None
     report, names = None, []
 
-    def record(image: np.ndarray) -> tuple[int, int]:
+    def record(image: np.ndarray) -> Size:
         """Record what the index needs of a frame; its size."""
         digests.extend(digest_frame(image))
         transparent.append(int(image.shape[2] == 4 and image[..., 3].min() < 255))
@@ -203,17 +204,12 @@ def index_video(
     with translate_os_errors(path):
         reader = choose_reader(path)
         if reader is read_video_file:
-            kept, passed, report = decode_file(
-                path, start, stop, lambda decoded: list(map(record, decoded)), deinterlace=deinterlace
-            )
+            found, report = decode_file(path, start, stop, lambda decoded: list(map(record, decoded)), deinterlace)
         else:
-            kept, num_declared, rate, notes = reader(path, start, stop, record)
-            passed = [(start + k, 0) for k in range(len(kept))]
+            found = reader(path, start, stop, record)
             if reader is read_folder:
                 names = [entry.name for entry in image_paths(path)[start:stop]]
-    places, stamps = np.array(passed, np.int64).T.copy()
-    if report is not None:
-        num_declared, rate, notes = describe_span(report, stamps, places.tolist(), len(kept), start, stop)
+    kept, num_declared, rate, notes = found
     if fps is None:
         notes += describe_rate(rate)
     about = {
@@ -236,8 +232,8 @@ def index_video(
         "shape_notes": list(report.notes) if report else [],
     }
     arrays = {
-        "stamps": stamps,
-        "places": places,
+        "stamps": report.stamps if report else np.zeros(len(kept), np.int64),
+        "places": report.positions if report else np.arange(start, start + len(kept)),
         "digests": np.frombuffer(bytes(digests), np.uint8).reshape(-1, DIGEST_BYTES),
         "transparent": np.frombuffer(transparent, np.uint8).astype(bool),
     }

@@ -8,6 +8,8 @@ import numpy as np
 
 from foldgauss.io.media.clip import (
     Clip,
+    RangeFacts,
+    Size,
     VideoError,
     check_frame_size,
     check_range,
@@ -21,7 +23,6 @@ from foldgauss.io.media.frame_index import FrameIndex, digest_frame
 from foldgauss.io.media.frame_rate import FrameRate, describe_rate
 from foldgauss.io.media.image_files import read_images
 from foldgauss.io.media.resizing import convert_channels, describe_crop, make_resizer
-from foldgauss.io.media.video_decoding import describe_span
 from foldgauss.io.media.video_reading import choose_reader
 
 #: Frames before the wanted one at which a seek aims, in turn: after a seek into the middle of a stream, frames may show
@@ -31,7 +32,7 @@ MARGINS = (0, 16, 64, 256, 1024, 4096, 16384)
 NEAR = 64
 
 
-def read_indexed(index: FrameIndex, first: int, stop: int | None, *, size: tuple[int, int] | None = None) -> Clip:
+def read_indexed(index: FrameIndex, first: int, stop: int | None, *, size: Size | None = None) -> Clip:
     """Frames `first` up to `stop` of an indexed clip, without decoding from the start: equal to the bit to
     `read_video(path, frames=(first, stop), size=size)`.
 
@@ -55,10 +56,8 @@ def read_indexed(index: FrameIndex, first: int, stop: int | None, *, size: tuple
     with translate_os_errors(path), closing(IndexedReader(index)) as reader:
         frames, num_declared, rate, notes = reader.read(low, high, size)
     if index.kind == "video":
-        last = index.num_before + high
-        end = index.start + (index.num_declared if stop is None else stop)
-        stamps, places = index.stamps[:last], index.places[:last].tolist()
-        num_declared, rate, notes = describe_span(index.report, stamps, places, high - low, index.start + first, end)
+        before, end = index.num_before, index.start + (index.num_declared if stop is None else stop)
+        num_declared, rate, notes = index.report.describe_span(before + low, before + high, index.start + first, end)
     elif stop is None:
         num_declared = index.num_declared - first
     crop = () if size is None else describe_crop([index.size], size)
@@ -81,9 +80,7 @@ class IndexedReader:
             self._decoder.close()
         self._decoder, self._last = None, None
 
-    def read(
-        self, first: int, stop: int, size: tuple[int, int] | None
-    ) -> tuple[np.ndarray, int, FrameRate, tuple[str, ...]]:
+    def read(self, first: int, stop: int, size: Size | None) -> tuple[np.ndarray, *RangeFacts]:
         """Frames `first` up to `stop` of those that decode, as `Clip.frames`, and the rest of a `ReadResult`."""
         channels, prepare = 4 if self.has_alpha(size) else 3, make_resizer(size)
         frames = np.empty((stop - first, *(size or self.index.size), channels), np.uint8)
@@ -94,7 +91,7 @@ class IndexedReader:
 
         return frames, *self._read_each(first, stop, take)
 
-    def has_alpha(self, size: tuple[int, int] | None) -> bool:
+    def has_alpha(self, size: Size | None) -> bool:
         """Whether any frame of the whole clip is transparent anywhere within the crop to `size`."""
         index = self.index
         if size is None or not index.has_alpha:
@@ -104,14 +101,12 @@ class IndexedReader:
             index.alpha_at_size[size] = any(self._is_transparent(number, size) for number in candidates)
         return index.alpha_at_size[size]
 
-    def _is_transparent(self, number: int, size: tuple[int, int]) -> bool:
+    def _is_transparent(self, number: int, size: Size) -> bool:
         found, prepare = [], make_resizer(size)
         self._read_each(number, number + 1, lambda image: found.append(prepare(image)[..., 3].min() < 255))
         return bool(found[0])
 
-    def _read_each(
-        self, first: int, stop: int, take: Callable[[np.ndarray], object]
-    ) -> tuple[int, FrameRate, tuple[str, ...]]:
+    def _read_each(self, first: int, stop: int, take: Callable[[np.ndarray], object]) -> RangeFacts:
         """Pass the frames as stored to `take`, one by one; returns the rest of a `ReadResult`."""
         index = self.index
         if index.kind == "video":

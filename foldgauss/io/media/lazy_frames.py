@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from foldgauss._runtime.checks import short_repr
-from foldgauss.io.media.clip import check_frame_size, check_readable, translate_os_errors, video_error
+from foldgauss.io.media.clip import Size, check_frame_size, check_readable, translate_os_errors, video_error
 from foldgauss.io.media.frame_index import DIGEST_BYTES, FrameIndex
 from foldgauss.io.media.indexed_reader import IndexedReader
 
@@ -40,7 +40,7 @@ class LazyFrames:
     def __init__(
         self,
         index: FrameIndex,
-        size: tuple[int, int] | None = None,
+        size: Size | None = None,
         first: int = 0,
         stop: int | None = None,
         run: int = RUN,

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Bool
 from PIL import Image
 
-from foldgauss._runtime.checks import invalid, is_integer, is_within
-from foldgauss.io._atomic import check_path, missing_error
-from foldgauss.io.media.clip import Range, format_size
+from foldgauss._runtime.checks import check_within, invalid, is_integer
+from foldgauss.io._atomic import PathLike, check_path, missing_error
+from foldgauss.io.media.clip import Range, Size, format_size
 from foldgauss.io.media.image_files import IMAGE_SUFFIXES, image_paths
 from foldgauss.io.media.resizing import aspect_window
 from foldgauss.io.media.video_reading import read_video
@@ -32,11 +32,11 @@ VOID = 255
 
 
 def read_masks(
-    path: str | os.PathLike,
+    path: PathLike,
     *,
     label: int | None = None,
     frames: Range | None = None,
-    size: tuple[int, int] | None = None,
+    size: Size | None = None,
     level: float = MASK_LEVEL,
 ) -> Bool[np.ndarray, "height width"] | Bool[np.ndarray, "num_frames height width"]:
     """The masks of an object, as `foldgauss.video.by_mask` takes them.
@@ -80,8 +80,7 @@ def _read(path: Path, label: int | None, frames: Range | None, level: float) -> 
     if label is not None:
         cure = "Leave label out, or give a folder of PNGs."
         raise invalid("label", expected="images with labels", got=f"the video {str(path)!r}", cure=cure)
-    if not is_within(level, "(0, 1]"):
-        raise invalid("level", expected="a fraction of white in (0, 1]", got=repr(level))
+    check_within("level", level, "(0, 1]", "a fraction of white in (0, 1]")
     return read_video(path, frames=frames).over_black.max(-1) >= 255 * level
 
 

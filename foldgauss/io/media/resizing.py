@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 import cv2
 import numpy as np
 
-from foldgauss.io.media.clip import format_size, video_error
+from foldgauss.io.media.clip import Size, format_size, video_error
 
 BLOCK_BYTES = 64 << 20
 #: Fraction of a frame, above which a crop to another aspect is reported: 16:9 to 2:1, a ninth, is not.
@@ -21,9 +21,7 @@ def memory_limit() -> int:
         return 8 << 30
 
 
-def make_resizer(
-    size: tuple[int, int] | None, crop: tuple[int, int] | None = None
-) -> Callable[[np.ndarray], np.ndarray]:
+def make_resizer(size: Size | None, crop: Size | None = None) -> Callable[[np.ndarray], np.ndarray]:
     """A function from BGR frames to RGB frames: crop the central window `crop`, then the aspect of `size`, then resize.
 
     It raises `VideoError` once its outputs add up to more than `memory_limit()`.
@@ -51,7 +49,7 @@ def make_resizer(
     return prepare
 
 
-def aspect_window(have: tuple[int, int], want: tuple[int, int]) -> tuple[slice, slice]:
+def aspect_window(have: Size, want: Size) -> tuple[slice, slice]:
     """The largest central window of `have` with the aspect of `want`, to whole pixels."""
     height, width = have
     if width * want[0] > height * want[1]:
@@ -61,7 +59,7 @@ def aspect_window(have: tuple[int, int], want: tuple[int, int]) -> tuple[slice, 
     return center_window(have, window)
 
 
-def describe_crop(sizes: Iterable[tuple[int, int]], want: tuple[int, int]) -> tuple[str, ...]:
+def describe_crop(sizes: Iterable[Size], want: Size) -> tuple[str, ...]:
     """A note if the aspect of `want` keeps little of frames of these `sizes`; otherwise nothing."""
     for height, width in sizes:
         rows, columns = aspect_window((height, width), want)
@@ -73,15 +71,12 @@ def describe_crop(sizes: Iterable[tuple[int, int]], want: tuple[int, int]) -> tu
     return ()
 
 
-def center_window(have: tuple[int, int], window: tuple[int, int]) -> tuple[slice, slice]:
+def center_window(have: Size, window: Size) -> tuple[slice, slice]:
     """Rows and columns of the central (height, width) `window`. Raises `VideoError` where it does not fit."""
     if window[0] > have[0] or window[1] > have[1]:
-        raise video_error(
-            "center_crop",
-            expected=f"at most the frame's {format_size(have)}",
-            got=f"{window[0]}x{window[1]}",
-            cure="Crop a smaller window, or enlarge with size=(height, width) instead.",
-        )
+        expected, got = f"at most the frame's {format_size(have)}", f"{window[0]}x{window[1]}"
+        cure = "Crop a smaller window, or enlarge with size=(height, width) instead."
+        raise video_error("center_crop", expected=expected, got=got, cure=cure)
     top, left = (have[0] - window[0]) // 2, (have[1] - window[1]) // 2
     return slice(top, top + window[0]), slice(left, left + window[1])
 
@@ -91,12 +86,6 @@ def convert_channels(frame: np.ndarray, channels: int) -> np.ndarray:
     if frame.shape[2] == channels:
         return frame
     return cv2.cvtColor(frame, cv2.COLOR_RGB2RGBA) if channels == 4 else frame[..., :3]
-
-
-def unify_channels(frames: list[np.ndarray]) -> list[np.ndarray]:
-    """All frames with alpha where any is transparent anywhere, otherwise all without."""
-    transparent = any(frame.shape[2] == 4 and frame[..., 3].min() < 255 for frame in frames)
-    return [convert_channels(frame, 4 if transparent else 3) for frame in frames]
 
 
 def copy_to_blocks(frames: Iterable[np.ndarray]) -> list[np.ndarray]:
@@ -116,9 +105,13 @@ def copy_to_blocks(frames: Iterable[np.ndarray]) -> list[np.ndarray]:
 
 
 def stack_frames(frames: list[np.ndarray]) -> np.ndarray:
-    """`np.stack` that empties the list as it goes, so that the peak is one copy of the clip and not two."""
-    clip = np.empty((len(frames), *frames[0].shape), np.uint8)
+    """All frames in one array: with alpha where any is transparent anywhere, otherwise without.
+
+    The list is emptied as it goes, so that the peak is one copy of the clip and not two.
+    """
+    channels = 4 if any(frame.shape[2] == 4 and frame[..., 3].min() < 255 for frame in frames) else 3
+    clip = np.empty((len(frames), *frames[0].shape[:2], channels), np.uint8)
     for number in range(len(frames)):
-        clip[number] = frames[number]
+        clip[number] = convert_channels(frames[number], channels)
         frames[number] = None
     return clip

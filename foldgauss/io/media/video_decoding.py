@@ -1,6 +1,6 @@
 """One pass through a video file: its frames, and what the container reports about them."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
@@ -8,16 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from foldgauss.io.media.clip import ReadResult, check_range_within, no_frames_error, video_error
+from foldgauss.io.media.clip import RangeFacts, ReadResult, check_range_within, no_frames_error, video_error
 from foldgauss.io.media.decoder import MAX_FRAMES, DecodedFrame, VideoDecoder
-from foldgauss.io.media.frame_rate import (
-    DEFAULT_FPS,
-    MAX_FPS,
-    FrameRate,
-    estimate_num_frames,
-    estimate_rate,
-    make_increasing,
-)
+from foldgauss.io.media.frame_rate import DEFAULT_FPS, MAX_FPS, estimate_num_frames, estimate_rate, make_increasing
 from foldgauss.io.media.resizing import copy_to_blocks
 
 
@@ -25,39 +18,44 @@ def read_video_file(
     path: Path, start: int, stop: int | None, prepare: Callable, *, deinterlace: bool = True
 ) -> ReadResult:
     """The frames of a video file."""
-    kept, passed, report = decode_file(
-        path, start, stop, lambda frames: copy_to_blocks(map(prepare, frames)), deinterlace=deinterlace
-    )
-    positions, stamps = zip(*passed, strict=True)
-    return kept, *describe_span(report, stamps, positions, len(kept), start, stop)
+    return decode_file(path, start, stop, lambda frames: copy_to_blocks(map(prepare, frames)), deinterlace)[0]
 
 
 class DecodeReport(NamedTuple):
     """What a pass through a video file finds besides its frames.
 
     `fps`: the container's rate, or the default in its place. `num_total`: number of frames, missing ones included.
-    `notes`: about the shape of pixels and interlacing. `seconds`: increasing times of all frames decoded. `time_base`:
-    the unit of time stamps, in seconds. `threads`: of the decoder.
+    `notes`: about the shape of pixels and interlacing. Of all frames decoded `positions`, `stamps` in units of
+    `time_base` seconds, and increasing times in `seconds`. `threads`: of the decoder.
     """
 
     fps: float
     num_total: int
     notes: tuple[str, ...]
+    positions: np.ndarray
+    stamps: np.ndarray
     seconds: np.ndarray
     time_base: float
     threads: int
 
+    def describe_span(self, first: int, end: int, start: int, stop: int | None) -> RangeFacts:
+        """Number of frames declared from position `start` up to `stop`, their rate, and notes.
+
+        Those that decode are the numbers `first` up to `end` of all frames decoded.
+        """
+        rate = estimate_rate(self.seconds[first:end], self.fps)
+        if np.ptp(self.stamps[:end]) == 0 and end > 1:  # a raw stream: the rate is FFmpeg's guess
+            rate = rate._replace(guessed=True)
+        gaps = _describe_gaps([start - 1, *self.positions[first:end].tolist()])
+        return (self.num_total if stop is None else stop) - start, rate, self.notes + gaps
+
 
 def decode_file(
-    path: Path,
-    start: int,
-    stop: int | None,
-    keep: Callable[[Iterator[np.ndarray]], list],
-    *,
-    deinterlace: bool = True,
-) -> tuple[list, list[tuple[int, int]], DecodeReport]:
-    """Decode a video file once. Returns what `keep` makes of its BGR or BGRA frames from `start` up to `stop`, the
-    positions and time stamps of all frames decoded, and a report. Raises `VideoError` for a file that cannot be read.
+    path: Path, start: int, stop: int | None, keep: Callable[[Iterator[np.ndarray]], list], deinterlace: bool
+) -> tuple[ReadResult, DecodeReport]:
+    """Decode a video file once; `keep` makes the list of its BGR or BGRA frames from `start` up to `stop`.
+
+    Raises `VideoError` for a file that cannot be read.
     """
     passed: list[tuple[int, int]] = []
     with closing(VideoDecoder(path, deinterlace=deinterlace)) as decoder:
@@ -67,8 +65,9 @@ def decode_file(
             cure = "The file is damaged or its codec is unknown here; convert it with ffmpeg."
             got = f"none in {str(path)!r}"
             raise video_error("path", expected="a video with frames that decode", got=got, cure=cure)
-        time_base = float(decoder.time_base)
-        seconds, num_reached = make_increasing([stamp * time_base for _, stamp in passed], fps), passed[-1][0] + 1
+        positions, stamps = np.array(passed, np.int64).T.copy()
+        time_base, num_reached = float(decoder.time_base), passed[-1][0] + 1
+        seconds = make_increasing((stamps * time_base).tolist(), fps)
         num_total = max(_count_declared(decoder, seconds, fps, num_reached), num_reached)
         notes, aspect, threads = (), decoder.pixel_aspect, decoder.threads
         if abs(aspect - 1) > 0.01:
@@ -79,7 +78,8 @@ def decode_file(
     check_range_within(start, stop, num_total, path)
     if not kept:
         raise no_frames_error(start, stop, len(passed), num_total, path)
-    return kept, passed, DecodeReport(fps, num_total, notes, seconds, time_base, threads)
+    report = DecodeReport(fps, num_total, notes, positions, stamps, seconds, time_base, threads)
+    return (kept, *report.describe_span(len(passed) - len(kept), len(passed), start, stop)), report
 
 
 def select_frames(
@@ -113,29 +113,6 @@ def _count_declared(decoder: VideoDecoder, seconds: np.ndarray, fps: float, num_
     if estimated >= MAX_FRAMES:  # a damaged header
         return num_reached
     return min(num_declared, estimated) if num_declared else estimated
-
-
-# ------------------------------------------------------------------------------------------------ notes
-
-
-def describe_span(
-    report: DecodeReport,
-    stamps: Sequence[int],
-    positions: Sequence[int],
-    num_kept: int,
-    start: int,
-    stop: int | None,
-) -> tuple[int, FrameRate, tuple[str, ...]]:
-    """Number of frames declared from `start` up to `stop`, their rate, and notes.
-
-    `stamps` and `positions` are those of all frames decoded up to `stop`, of which the last `num_kept` are kept.
-    """
-    num_passed = len(positions)
-    rate = estimate_rate(report.seconds[num_passed - num_kept : num_passed], report.fps)
-    if np.ptp(stamps) == 0 and num_passed > 1:  # a raw stream: the rate is FFmpeg's guess
-        rate = rate._replace(guessed=True)
-    gaps = _describe_gaps([start - 1, *positions[num_passed - num_kept :]])
-    return (report.num_total if stop is None else stop) - start, rate, report.notes + gaps
 
 
 def _describe_gaps(positions: list[int]) -> tuple[str, ...]:

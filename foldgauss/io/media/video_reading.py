@@ -4,11 +4,12 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+from foldgauss.io._atomic import PathLike
 from foldgauss.io.media.clip import (
     Clip,
-    PathLike,
     Range,
     ReadResult,
+    Size,
     check_fps,
     check_frame_size,
     check_range,
@@ -19,7 +20,7 @@ from foldgauss.io.media.clip import (
 from foldgauss.io.media.format_detection import may_be_animation
 from foldgauss.io.media.frame_rate import FrameRate, describe_rate
 from foldgauss.io.media.image_files import is_image_file, read_animation, read_folder, read_image_file
-from foldgauss.io.media.resizing import describe_crop, make_resizer, stack_frames, unify_channels
+from foldgauss.io.media.resizing import describe_crop, make_resizer, stack_frames
 from foldgauss.io.media.video_decoding import read_video_file
 
 
@@ -27,9 +28,9 @@ def read_video(
     path: PathLike,
     *,
     frames: Range | None = None,
-    size: tuple[int, int] | None = None,
+    size: Size | None = None,
     fps: float | None = None,
-    center_crop: tuple[int, int] | None = None,
+    center_crop: Size | None = None,
     deinterlace: bool = True,
 ) -> Clip:
     """Read a video file, a folder of images in natural order (img2 before img10), or one image as a clip of one frame.
@@ -73,7 +74,6 @@ def read_video(
     notes += describe_rate(rate)
     if size is not None and center_crop is None:
         notes += describe_crop(sizes, size)
-    kept = unify_channels(kept)
     return Clip(stack_frames(kept), float(rate.fps), str(path), num_declared, rate.times, notes)
 
 

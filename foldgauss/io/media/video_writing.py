@@ -11,8 +11,8 @@ import numpy as np
 from PIL import Image
 
 from foldgauss._runtime.checks import check_one_of
-from foldgauss.io._atomic import atomic_folder, atomic_path, check_path, output_error
-from foldgauss.io.media.clip import PathLike, check_fps, format_size, video_error
+from foldgauss.io._atomic import PathLike, atomic_folder, atomic_path, check_path, output_error
+from foldgauss.io.media.clip import check_fps, format_size, video_error
 from foldgauss.io.media.encoder import VIDEO_SUFFIXES, Sound, check_sound, choose_encoding, encode_video, straighten
 
 ANIMATION_SUFFIXES = (".gif", ".webp")
@@ -113,10 +113,10 @@ def write_frames(
     ValueError for an unknown `image_format`.
     """
     check_one_of("image_format", image_format, IMAGE_FORMATS)
-    folder, encode = Path(folder), _encode_png if image_format == "png" else _encode_webp
+    folder = Path(folder)
     with atomic_folder(folder, overwrite, pattern=r"[0-9]{5,}\.(png|webp)") as temporary:
         for number, frame in enumerate(_check_frames(frames)):
-            (temporary / f"{number:05d}.{image_format}").write_bytes(encode(frame))
+            (temporary / f"{number:05d}.{image_format}").write_bytes(_encode_image(frame, image_format))
     return folder
 
 
@@ -130,7 +130,7 @@ def write_image(path: PathLike, image: np.ndarray) -> Path:
     path = Path(path)
     if path.suffix.lower() != ".png":
         raise video_error("path", expected="a name ending in .png", got=repr(path.name), cure="Rename the output.")
-    data = _encode_png(_check_frame(image, None, "image"))
+    data = _encode_image(_check_frame(image, None, "image"))
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
     return path
@@ -169,23 +169,15 @@ def _check_frame(frame: np.ndarray, shape: tuple | None, parameter: str, channel
     return np.ascontiguousarray(frame)
 
 
-def _encode_png(frame: np.ndarray) -> bytes:
-    return cv2.imencode(".png", _to_opencv(frame))[1].tobytes()
-
-
-def _to_opencv(frame: np.ndarray) -> np.ndarray:
-    """BGR, or BGRA with straight alpha."""
-    if frame.shape[2] == 3:
-        return cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
-    return cv2.cvtColor(straighten(frame), cv2.COLOR_RGBA2BGRA)
-
-
-def _encode_webp(frame: np.ndarray) -> bytes:
-    quality = [cv2.IMWRITE_WEBP_QUALITY, 101]  # above 100: lossless
-    if max(frame.shape[:2]) > MAX_WEBP_SIDE:
+def _encode_image(frame: np.ndarray, image_format: str = "png") -> bytes:
+    """Without loss; with alpha, colors become straight."""
+    if image_format == "webp" and max(frame.shape[:2]) > MAX_WEBP_SIDE:
         got = format_size(frame.shape)
         raise video_error("frames", expected=f"sides of at most {MAX_WEBP_SIDE:,} for WebP", got=got, cure="Take PNG.")
-    return cv2.imencode(".webp", _to_opencv(frame), quality)[1].tobytes()
+    rgba = frame.shape[2] == 4
+    image = cv2.cvtColor(straighten(frame), cv2.COLOR_RGBA2BGRA) if rgba else cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
+    quality = [cv2.IMWRITE_WEBP_QUALITY, 101] if image_format == "webp" else []  # above 100: lossless
+    return cv2.imencode(f".{image_format}", image, quality)[1].tobytes()
 
 
 # ------------------------------------------------------------------------------------------- animations

@@ -1,14 +1,14 @@
 """Checkpoints: a running fit in a file, with the settings and the frames that it must be resumed with."""
 
 import dataclasses
-import os
 from pathlib import Path
 
 import jax
 import numpy as np
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.io.models.model_file import load_part, register_model, save_model
+from foldgauss.io._atomic import PathLike
+from foldgauss.io.models.model_file import Kind, load_part, register_model, save_model
 from foldgauss.io.models.video_model import read_header_of_kind
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.state import FitState, Sizes
@@ -18,12 +18,12 @@ CHECKPOINT = "fit-checkpoint"
 FREE = "on_divergence"
 
 
-def save_checkpoint(path: str | os.PathLike, state: FitState, *, config: FitConfig, source: dict) -> Path:
+def save_checkpoint(path: PathLike, state: FitState, *, config: FitConfig, source: dict) -> Path:
     """Write a running fit with what it must be resumed with: its settings and its frames."""
     return save_model(path, state, metadata={"config": dataclasses.asdict(config), "source": source})
 
 
-def load_checkpoint(path: str | os.PathLike, *, config: FitConfig, source: dict) -> FitState:
+def load_checkpoint(path: PathLike, *, config: FitConfig, source: dict) -> FitState:
     """Read a running fit. Raises ValueError if it was started with other settings or other frames."""
     about = read_header_of_kind(path, CHECKPOINT)
     kept = about["metadata"]
@@ -62,4 +62,4 @@ def _make_skeleton(header: dict) -> FitState:
     return FitState(**arrays, **counters, last_finite=last_finite)
 
 
-register_model(CHECKPOINT, FitState, to_header=_describe, from_header=_make_skeleton)
+register_model(Kind(CHECKPOINT, FitState, to_header=_describe, from_header=_make_skeleton))

@@ -27,11 +27,14 @@ _MAGNITUDE_BOUNDS = np.array([0.5, 1.5] + [3.0 * 2**k for k in range(13)])
 
 
 class ColumnContexts:
-    """The contexts of a file's columns in turn: `describe_next` gives a column's, then `add` takes its values."""
+    """The contexts of a file's columns in turn: `describe_next` gives a column's, then `add` takes its values.
+
+    `columns` has the values of those that were added.
+    """
 
     def __init__(self, rules: dict[str, Rule], info: CompactInfo):
         self._info, self._decoder = info, ColumnDecoder(rules, info)
-        self._values: dict[str, np.ndarray] = {}
+        self.columns: dict[str, np.ndarray] = {}
         self._in_cell = self._nearest = np.zeros((info.num_gaussians, 0), np.int32)
         self._half = np.ones(info.num_gaussians)
 
@@ -56,7 +59,7 @@ class ColumnContexts:
     def add(self, name: str, numbers: Int32[np.ndarray, " rows"]) -> None:
         """Record the column's values."""
         decoder, info = self._decoder, self._info
-        self._values[name] = numbers
+        self.columns[name] = numbers
         decoder.add(name, numbers, decoder.half_exponents(name))
         if name == "cell":
             self._in_cell = find_latest_in_cell(numbers, 1 << sum(info.cells))
@@ -71,7 +74,7 @@ class ColumnContexts:
 
     def _contexts(self, name: str, power: int, halves: np.ndarray) -> UInt8[np.ndarray, "num 2"]:
         """The first and the second context of each value."""
-        q, first = self._values, (halves >> 1) & 31
+        q, first = self.columns, (halves >> 1) & 31
         if name == "class":
             second = 0
         elif name == "without":

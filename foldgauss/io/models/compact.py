@@ -5,8 +5,8 @@ against the size of the file, and invalid content raises only `ModelFileError`.
 """
 
 import dataclasses
+import io
 import json
-import os
 import zlib
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Int
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
-from foldgauss.io._atomic import atomic_path, check_path
+from foldgauss.io._atomic import PathLike, atomic_path, check_path
 from foldgauss.io.models import range_coder
 from foldgauss.io.models.column_contexts import ColumnContexts
 from foldgauss.io.models.model_file import (
@@ -57,7 +57,7 @@ _ALWAYS_ALLOWED = 1 << 18
 _SIDE = 1 << 20  # largest side of an image: a decoder holds it in memory
 
 
-def save_compact(path: str | os.PathLike, quantized: Quantized, *, metadata: dict | None = None) -> Path:
+def save_compact(path: PathLike, quantized: Quantized, *, metadata: dict | None = None) -> Path:
     """Write a quantized model whole or not at all; equal ones give equal bytes. See `foldgauss.video.compress`.
 
     Raises ValueError for a name that does not end in .fgz, `OutputError` where it cannot be written.
@@ -149,7 +149,7 @@ def _describe_maps(about: PathsInfo) -> range_coder.Column:
 # ---------------------------------------------------------------------------------------------- reading
 
 
-def is_compact(path: str | os.PathLike) -> bool:
+def is_compact(path: PathLike) -> bool:
     """Whether a file starts with the magic bytes of compact files; False for one that cannot be read."""
     try:
         with open(path, "rb") as file:
@@ -158,7 +158,7 @@ def is_compact(path: str | os.PathLike) -> bool:
         return False
 
 
-def load_compact(path: str | os.PathLike) -> Quantized:
+def load_compact(path: PathLike) -> Quantized:
     """The quantized model in a compact file, for `foldgauss.video.compression.quantize.dequantize`.
 
     Raises `ModelFileError` for a file that is damaged, cut off, of a later version or of another kind.
@@ -173,9 +173,8 @@ def load_compact(path: str | os.PathLike) -> Quantized:
         raise _unreadable(path, got) from error
 
 
-def load_compact_model(path: str | os.PathLike) -> VideoModel:
+def load_compact_model(path: Path) -> VideoModel:
     """The model in a compact file. Raises as `load_compact`, also for values beyond float32."""
-    path = check_path(path)
     with np.errstate(over="ignore", invalid="ignore"):
         model = dequantize(load_compact(path))
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model)):
@@ -183,9 +182,8 @@ def load_compact_model(path: str | os.PathLike) -> VideoModel:
     return model
 
 
-def compact_metadata(path: str | os.PathLike) -> dict:
+def compact_metadata(path: Path) -> dict:
     """The `metadata` that `save_compact` stored. Raises as `load_compact`."""
-    path = check_path(path)
     return _read_header(path, path.read_bytes())[0]["metadata"]
 
 
@@ -233,22 +231,19 @@ def _decode(header: dict, body: bytes, whole_length: int) -> Quantized:
     described = dict(zip(names, (own[1:] for own in descriptions), strict=True))
     rules = {name: _parse_rule(name, numbers) for name, numbers in described.items() if not is_integral(name)}
     _check(not any(described[name] for name in names if is_integral(name)), "rule", "none")
-    contexts, columns, start = ColumnContexts(rules, info), {}, 0
+    contexts, streams = ColumnContexts(rules, info), io.BytesIO(body)
     most = {"without": 3, "degree": info.degree, "shade": info.shared - 1}  # of the columns that are used as indices
     most["path"] = info.paths.num_paths if info.paths else 0
     for name, length in zip(names, lengths[:-1], strict=True):
-        numbers = range_coder.decode(body[start : start + length], contexts.describe_next(name))
+        numbers = range_coder.decode(streams.read(length), contexts.describe_next(name))
         if name == "cell":
             numbers = (np.cumsum(numbers, dtype=np.int64) & _last_cell(info)).astype(np.int32)
         if name in most:
             _check(numbers.min() >= 0 and numbers.max() <= most[name], name, "numbers out of range")
-        columns[name] = numbers
         contexts.add(name, numbers)
-        start += length
-    stop = start + lengths[-1]
-    intervals = range_coder.decode(body[start:stop], range_coder.Column.without_contexts(num_frames - 1))
-    paths = _decode_paths(info.paths, body[stop : stop + of_paths[0]], body[stop + of_paths[0] :]) if info.paths else {}
-    return Quantized(info, rules, columns, intervals, **paths)
+    intervals = range_coder.decode(streams.read(lengths[-1]), range_coder.Column.without_contexts(num_frames - 1))
+    paths = _decode_paths(info.paths, *map(streams.read, of_paths)) if info.paths else {}
+    return Quantized(info, rules, contexts.columns, intervals, **paths)
 
 
 def _decode_paths(about: PathsInfo, knots: bytes, maps: bytes) -> dict[str, np.ndarray]:

@@ -15,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 
 from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.threads import check_not_forked
-from foldgauss.io._atomic import atomic_path, missing_error
+from foldgauss.io._atomic import PathLike, atomic_path, missing_error
 
 FORMAT = "foldgauss-model"
 VERSION = "1"  # increased when older programs cannot read the file
@@ -46,28 +46,8 @@ class ModelFileError(ValueError):
 
 
 @dataclass(frozen=True)
-class _Kind:
-    name: str
-    model_type: type
-    to_header: Callable[[Any], dict]
-    from_header: Callable[[dict], Any]
-    to_stored: Callable[[Any], Any]
-    from_stored: Callable[[Any], Any]
-
-
-_KINDS: dict[str, _Kind] = {}
-
-
-def register_model(
-    kind: str,
-    model_type: type,
-    *,
-    to_header: Callable[[Any], dict],
-    from_header: Callable[[dict], Any],
-    to_stored: Callable[[Any], Any] = lambda model: model,
-    from_stored: Callable[[Any], Any] = lambda model: model,
-) -> None:
-    """Register `model_type` for saving and loading under the name `kind`.
+class Kind:
+    """A type of models that files can hold, under the name `name`.
 
     `to_header(model)` returns the static fields as a JSON-compatible dict. `from_header(dict)` returns the skeleton:
     the same pytree with a `jax.ShapeDtypeStruct` for every array leaf. The dict is not trusted, so `from_header` must
@@ -75,19 +55,31 @@ def register_model(
 
     `to_stored` converts a model to the pytree that is stored and described by the header; `from_stored` is its inverse
     and raises ValueError for leaves whose values are inconsistent.
-
-    Raises `ValueError` if `kind` already names another type.
     """
-    known = _KINDS.get(kind)
-    if known is not None and known.model_type is not model_type:
-        raise invalid("kind", expected="a free name", got=f"{kind!r}, taken by {known.model_type.__name__}")
-    _KINDS[kind] = _Kind(kind, model_type, to_header, from_header, to_stored, from_stored)
+
+    name: str
+    model_type: type
+    to_header: Callable[[Any], dict]
+    from_header: Callable[[dict], Any]
+    to_stored: Callable[[Any], Any] = lambda model: model
+    from_stored: Callable[[Any], Any] = lambda model: model
+
+
+_KINDS: dict[str, Kind] = {}
+
+
+def register_model(kind: Kind) -> None:
+    """Register a kind for saving and loading. Raises `ValueError` if its name is already that of another type."""
+    known = _KINDS.setdefault(kind.name, kind)
+    if known.model_type is not kind.model_type:
+        raise invalid("kind", expected="a free name", got=f"{kind.name!r}, taken by {known.model_type.__name__}")
+    _KINDS[kind.name] = kind
 
 
 # ----------------------------------------------------------------------------------------------- saving
 
 
-def save_model(path: str | os.PathLike, model: Any, *, metadata: dict | None = None) -> Path:
+def save_model(path: PathLike, model: Any, *, metadata: dict | None = None) -> Path:
     """Write `model` whole or not at all; returns the path. Equal models and metadata give equal bytes.
 
     Every array leaf of the pytree, JAX or NumPy, is stored under its path in the tree ("splats.loc"). `metadata` is
@@ -106,32 +98,27 @@ def save_model(path: str | os.PathLike, model: Any, *, metadata: dict | None = N
     header = kind.to_header(model)
     _check_described(kind, model, to_json("header", header))
     about = {"kind": kind.name, "header": header, "metadata": metadata or {}}
-    return write_tensors(Path(path), _get_specs(arrays), lambda keys: (arrays[key] for key in keys), **about)
+    return write_tensors(Path(path), _get_specs(arrays), lambda keys: (arrays[key] for key in keys), about)
 
 
 def write_tensors(
-    path: Path,
-    specs: Mapping[str, dict],
-    tensors: Callable[[list[str]], Iterable[np.ndarray]],
-    *,
-    kind: str,
-    header: dict,
-    metadata: dict,
+    path: Path, specs: Mapping[str, dict], tensors: Callable[[list[str]], Iterable[np.ndarray]], about: dict
 ) -> Path:
     """Write a model file, whole or not at all: tensors with `specs` as in `read_header`; returns the path.
 
-    `tensors(keys)` yields them in that order, little-endian. Raises as `save_model`.
+    `tensors(keys)` yields them in that order, little-endian. `about` has `kind`, `header` and `metadata`, likewise.
+    Raises as `save_model`.
     """
-    about = {
+    strings = {
         "format": FORMAT,
         "version": VERSION,
-        "kind": kind,
-        "header": to_json("header", header),
-        "metadata": to_json("metadata", to_json_types(metadata)),
+        "kind": about["kind"],
+        "header": to_json("header", about["header"]),
+        "metadata": to_json("metadata", to_json_types(about["metadata"])),
     }
     # Not written by the library, whose header has a random order: equal models must give equal bytes.
     order = sorted(specs, key=lambda key: (-_ITEM_BYTES[specs[key]["dtype"]], key))  # so every tensor is aligned
-    entries: dict[str, Any] = {_RESERVED: about}
+    entries: dict[str, Any] = {_RESERVED: strings}
     end = 0
     for key in order:
         start, end = end, end + math.prod(specs[key]["shape"]) * _ITEM_BYTES[specs[key]["dtype"]]
@@ -167,17 +154,14 @@ def _array_leaves(tree: Any) -> dict[str, Any]:
 
 def _to_numpy(key: str, leaf: Any) -> np.ndarray:
     """Little-endian, of a type that the format holds; nothing is converted but the byte order."""
-    if not hasattr(leaf, "dtype") or leaf.dtype.name not in _DTYPES:
-        got = f"dtype {getattr(leaf, 'dtype', type(leaf).__name__)}"
-        cure = "Store complex numbers as two arrays and PRNG keys by jax.random.key_data."
+    if leaf.dtype.name not in _DTYPES:
+        got, cure = f"dtype {leaf.dtype}", "Store complex numbers as two arrays and PRNG keys by jax.random.key_data."
         raise model_file_error(key, expected="a real, integer or boolean array", got=got, cure=cure)
-    array = np.asarray(leaf)
-    if array.dtype.byteorder == ">":
-        array = array.astype(array.dtype.newbyteorder("<"))
-    return array  # tobytes gives C order whatever the strides
+    # In any strides: tobytes gives C order.
+    return np.asarray(leaf).astype(leaf.dtype.newbyteorder("<"), copy=False)
 
 
-def _check_described(kind: _Kind, model: Any, header: str) -> None:
+def _check_described(kind: Kind, model: Any, header: str) -> None:
     """Raise unless the header alone gives back the model's tree, static fields, shapes and types."""
     skeleton = kind.from_header(json.loads(header))
     _check_tensors(_get_specs(_array_leaves(model)), _get_specs(_array_leaves(skeleton)), "model")
@@ -219,7 +203,7 @@ def to_json_types(value: Any) -> Any:
 # ---------------------------------------------------------------------------------------------- loading
 
 
-def load_model(path: str | os.PathLike) -> Any:
+def load_model(path: PathLike) -> Any:
     """Read the model that `save_model` wrote, equal to the bit. Nothing in the file is executed.
 
     Leaves are JAX arrays, except 64-bit ones without JAX's x64 mode, which stay NumPy arrays; those stored in half
@@ -247,7 +231,7 @@ def load_part(path: Path, about: dict, prefix: str = "") -> Any:
         raise model_file_error("path", expected="tensors that fit each other", got=got) from error
 
 
-def match_kind(path: Path, about: dict) -> tuple[_Kind, Any]:
+def match_kind(path: Path, about: dict) -> tuple[Kind, Any]:
     """The kind of model, and the skeleton made from the header, checked against the tensors, of which none is read."""
     kind = _KINDS.get(about["kind"])
     if kind is None:
@@ -272,7 +256,7 @@ def translate_header_errors(path: Path, kind: str) -> Iterator[None]:
         raise model_file_error("path", expected=f"the header of a model of kind {kind!r}", got=got) from error
 
 
-def read_header(path: str | os.PathLike) -> dict:
+def read_header(path: PathLike) -> dict:
     """The header of a file, without reading its tensors.
 
     Keys: `format`, `version`, `kind` (strings), `header` and `metadata` (dicts), and `tensors`, which maps
@@ -345,8 +329,7 @@ def _check_tensors(kept: dict[str, dict], described: dict[str, dict], where: str
     for key in sorted(kept.keys() | described.keys()):
         have, want = kept.get(key), described.get(key)
         if have != want and not (want and want["dtype"] == "F32" and have == want | {"dtype": "F16"}):
-            expected, got = _spec_text(want), _spec_text(have)
-            raise model_file_error(f"tensor {key!r} of {where!r}", expected=expected, got=got)
+            raise model_file_error(f"tensor {key!r} of {where!r}", expected=_spec_text(want), got=_spec_text(have))
 
 
 def _read_leaves(skeleton: Any, path: Path, prefix: str) -> Any:

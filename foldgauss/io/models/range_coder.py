@@ -75,7 +75,7 @@ class Column:
         return self.present, np.ascontiguousarray(self.contexts, np.uint8), *floats, near
 
 
-# ------------------------------------------------------------------------------------------ adaptive model
+# ------------------------------------------------------------------------------------------ coding
 
 
 @exact_kernel
@@ -94,35 +94,6 @@ def _predict_context(i, near, seen, origin, step, scale):
         level += 1
         bound = 1.5 if level == 1 else 2 * bound
     return 16 + level if ratio >= 0 else 16 - level
-
-
-@exact_kernel
-def _mix(node, own, chances, weights, logits, logistic, logit):
-    """The probability of a one at a node, times 65536, given the contexts `own`."""
-    total = 0
-    for m in range(MODELS):
-        logits[m] = logit[chances[m, own[m], node, 0] >> 4]
-        total += logits[m] * weights[node, m]
-    p = logistic[min(max(total >> 16, -2047), 2047) + 2048]
-    return min(max(p, MARGIN), 65536 - MARGIN)
-
-
-@exact_kernel
-def _update(node, own, chances, weights, logits, p, bit):
-    """Update weights and `chances`, which are (probability of a one times 65536, bits seen + 2)."""
-    error = (65536 if bit else 0) - p
-    for m in range(MODELS):
-        weights[node, m] += (logits[m] * error * RATE) >> 18
-        chance = chances[m, own[m], node]
-        if bit:
-            chance[0] += (65536 - chance[0]) // chance[1]
-        else:
-            chance[0] -= chance[0] // chance[1]
-        if chance[1] < MEMORY:
-            chance[1] += 1
-
-
-# ------------------------------------------------------------------------------------------ coding
 
 
 @exact_kernel
@@ -150,10 +121,24 @@ def _code_bit(data, interval, decodes, p, bit):
 
 @exact_kernel
 def _code_adaptive(data, interval, decodes, state, node, bit):
+    """Code a bit with the probability that its node's contexts `own` mix, and adapt these to the bit; returns it."""
     own, chances, weights, logits, logistic, logit = state
-    p = _mix(node, own, chances, weights, logits, logistic, logit)
+    total = 0
+    for m in range(MODELS):
+        logits[m] = logit[chances[m, own[m], node, 0] >> 4]
+        total += logits[m] * weights[node, m]
+    p = min(max(logistic[min(max(total >> 16, -2047), 2047) + 2048], MARGIN), 65536 - MARGIN)
     bit = _code_bit(data, interval, decodes, p, bit)
-    _update(node, own, chances, weights, logits, p, bit)
+    error = (65536 if bit else 0) - p
+    for m in range(MODELS):
+        weights[node, m] += (logits[m] * error * RATE) >> 18
+        chance = chances[m, own[m], node]
+        if bit:
+            chance[0] += (65536 - chance[0]) // chance[1]
+        else:
+            chance[0] -= chance[0] // chance[1]
+        if chance[1] < MEMORY:
+            chance[1] += 1
     return bit
 
 
@@ -219,6 +204,7 @@ def decode(data: bytes, column: Column) -> Int32[np.ndarray, " num"]:
 
 
 def _initial_state() -> tuple[np.ndarray, ...]:
+    """The state of `_code_adaptive`; chances are (probability of a one times 65536, bits seen + 2)."""
     chances = np.empty((MODELS, CONTEXTS, NODES, 2), np.int64)
     chances[..., 0], chances[..., 1] = 32768, 2
     weights = np.full((NODES, MODELS), WEIGHT, np.int64)

@@ -1,7 +1,6 @@
 """Models of a clip's segments in one file, each loaded on access. The layout is in docs/formats.md."""
 
 import math
-import os
 import re
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within, short_repr
-from foldgauss.io._atomic import check_path, check_writable
+from foldgauss.io._atomic import PathLike, check_path, check_writable
 from foldgauss.io.models.compact import is_compact
 from foldgauss.io.models.model_file import (
     ModelFileError,
@@ -40,9 +39,7 @@ _KEY = re.compile(r"segments\.(0|[1-9][0-9]{0,8})\.(.+)", re.DOTALL)
 _MAX_DEGREE = 1 << 20
 
 
-def join_segments(
-    path: str | os.PathLike, sources: Sequence[tuple[int, str | os.PathLike]], *, metadata: dict | None = None
-) -> Path:
+def join_segments(path: PathLike, sources: Sequence[tuple[int, PathLike]], *, metadata: dict | None = None) -> Path:
     """Write the models of a clip's segments into one file, whole or not at all; returns the path.
 
     `sources` has (number of its first frame in the whole clip, model file) of each segment, in order. Their tensors are
@@ -81,7 +78,8 @@ def join_segments(
                         raise _unfit(files[number], "one that has changed meanwhile", "Join them again.")
                     yield array
 
-    return write_tensors(path, specs, tensors, kind=SEGMENTED, header={"segments": entries}, metadata=metadata or {})
+    about = {"kind": SEGMENTED, "header": {"segments": entries}, "metadata": metadata or {}}
+    return write_tensors(path, specs, tensors, about)
 
 
 def save_segmented(path: Path, video: SegmentedVideo, metadata: dict | None) -> Path:
@@ -120,7 +118,7 @@ def _unfit(file: Path, got: str, cure: str) -> ModelFileError:
 # ---------------------------------------------------------------------------------------------- loading
 
 
-def is_segmented(path: str | os.PathLike) -> bool:
+def is_segmented(path: PathLike) -> bool:
     """Whether a file holds a video in segments; no tensor is read. Raises as `load_video_model`."""
     path = check_path(path)
     return not is_compact(path) and read_header(path)["kind"] == SEGMENTED

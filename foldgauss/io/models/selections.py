@@ -2,7 +2,6 @@
 
 import dataclasses
 import hashlib
-import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,8 +10,8 @@ import jax
 import numpy as np
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.io._atomic import check_path
-from foldgauss.io.models.model_file import load_model, model_file_error, read_header, register_model, save_model
+from foldgauss.io._atomic import PathLike, check_path
+from foldgauss.io.models.model_file import Kind, load_model, model_file_error, read_header, register_model, save_model
 from foldgauss.video.models.video_model import ONE_SEGMENT, VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 from foldgauss.video.selection.selectors import Selection
@@ -29,7 +28,7 @@ class _SelectionRecord:
     digest: str = dataclasses.field(metadata={"static": True})
 
 
-def save_selection(path: str | os.PathLike, selection: Selection, model: VideoModel) -> Path:
+def save_selection(path: PathLike, selection: Selection, model: VideoModel) -> Path:
     """Write a selection of `model`'s Gaussians, whole or not at all: a safetensors file, a byte per Gaussian.
 
     **Raises:** ValueError for a selection of another number of Gaussians, `OutputError` as `save_video_model`.
@@ -47,7 +46,7 @@ def save_selection(path: str | os.PathLike, selection: Selection, model: VideoMo
     return save_model(path, _SelectionRecord(selection.mask, compute_digest(model)))
 
 
-def load_selection(path: str | os.PathLike, model: VideoModel) -> Selection:
+def load_selection(path: PathLike, model: VideoModel) -> Selection:
     """Read a selection of `model`'s Gaussians.
 
     **Raises:** ValueError for a selection of another model, or of this one before it was changed; `FileNotFoundError`;
@@ -127,9 +126,8 @@ def _make_skeleton(header: dict) -> _SelectionRecord:
     return _SelectionRecord(jax.ShapeDtypeStruct((header["num_gaussians"],), np.bool_), header["digest"])
 
 
-register_model(
-    SELECTION,
-    _SelectionRecord,
-    to_header=lambda record: {"num_gaussians": len(record.mask), "digest": record.digest},
-    from_header=_make_skeleton,
-)
+def _describe(record: _SelectionRecord) -> dict:
+    return {"num_gaussians": len(record.mask), "digest": record.digest}
+
+
+register_model(Kind(SELECTION, _SelectionRecord, to_header=_describe, from_header=_make_skeleton))

@@ -1,7 +1,6 @@
 """How fitted and edited videos are described in a model file's header, and which arrays of them are stored."""
 
 import dataclasses
-import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -13,9 +12,10 @@ import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.io._atomic import check_path
+from foldgauss.io._atomic import PathLike, check_path
 from foldgauss.io.models.compact import COMPACT_SUFFIX, compact_metadata, is_compact, load_compact_model
 from foldgauss.io.models.model_file import (
+    Kind,
     ModelFileError,
     load_part,
     model_file_error,
@@ -40,7 +40,7 @@ VIDEO, EDITED = PARTS
 
 
 def save_video_model(
-    path: str | os.PathLike, model: VideoModel | EditedVideo | SegmentedVideo, *, metadata: dict | None = None
+    path: PathLike, model: VideoModel | EditedVideo | SegmentedVideo, *, metadata: dict | None = None
 ) -> Path:
     """Write a fitted, an edited or a segmented video; `metadata` is free: where it came from, how good it is.
 
@@ -53,15 +53,14 @@ def save_video_model(
         raise invalid("model", expected="a video", got="a chain of edits", cure="End it with .video().")
     check_path(path, "path, model")
     if not isinstance(model, VideoModel | EditedVideo | SegmentedVideo):
-        expected = "a VideoModel, an EditedVideo or a SegmentedVideo"
-        raise invalid("model", expected=expected, got=type(model).__name__)
+        raise invalid("model", expected="a VideoModel, an EditedVideo or a SegmentedVideo", got=type(model).__name__)
     check_model_name(path)
     if isinstance(model, SegmentedVideo):
         return save_segmented(Path(path), model, metadata)
     return save_model(path, model, metadata=metadata)
 
 
-def check_model_name(path: str | os.PathLike, parameter: str = "path") -> None:
+def check_model_name(path: PathLike, parameter: str = "path") -> None:
     """Raise ValueError for a name with an extension that is another format's."""
     path = Path(path)
     if path.suffix and path.suffix.lower() != MODEL_SUFFIX:
@@ -72,7 +71,7 @@ def check_model_name(path: str | os.PathLike, parameter: str = "path") -> None:
         raise invalid(parameter, expected=expected, got=repr(str(path)), cure=cure)
 
 
-def load_video_model(path: str | os.PathLike) -> VideoModel | EditedVideo | SegmentedVideo:
+def load_video_model(path: PathLike) -> VideoModel | EditedVideo | SegmentedVideo:
     """Read a fitted, an edited or a segmented video, or a compact file (detected from its first bytes).
 
     Of segments no more than the header is read: see `SegmentedVideo`, which loads them on access.
@@ -88,19 +87,15 @@ def load_video_model(path: str | os.PathLike) -> VideoModel | EditedVideo | Segm
     return load_part(path, about)
 
 
-def read_metadata(path: str | os.PathLike) -> dict:
+def read_metadata(path: PathLike) -> dict:
     """The metadata of a model file, compact or not. Raises as `load_video_model`."""
     path = check_path(path)
     return compact_metadata(path) if is_compact(path) else read_header(path)["metadata"]
 
 
-def read_origin(path: str | os.PathLike) -> dict:
+def read_origin(path: PathLike) -> dict:
     """`read_metadata`, which is not trusted, without those of `fit`'s entries that have another type than it writes."""
     return {name: value for name, value in read_metadata(path).items() if name not in _NOTES or _NOTES[name](value)}
-
-
-def _is_text(value: object) -> bool:
-    return isinstance(value, str)
 
 
 def _is_range(value: object) -> bool:
@@ -114,16 +109,14 @@ def _is_range(value: object) -> bool:
 
 #: Metadata that `fit` and `compress` write and later commands read, with their checks.
 _NOTES: dict[str, Callable[[object], bool]] = {
-    "clip": _is_text,
-    "frames_digest": _is_text,
-    "clip_digest": _is_text,
+    **dict.fromkeys(("clip", "frames_digest", "clip_digest"), lambda value: isinstance(value, str)),
     "frames": _is_range,
     "seed": lambda value: is_integer(value, 0),
     "mean_psnr": lambda value: is_within(value, "(0, 100]"),
 }
 
 
-def read_header_of_kind(path: str | os.PathLike, *kinds: str) -> dict:
+def read_header_of_kind(path: PathLike, *kinds: str) -> dict:
     """The header of a file of one of these kinds; raises `ModelFileError` for another kind."""
     about = read_header(path)
     if about["kind"] not in kinds:
@@ -174,15 +167,11 @@ def _video_skeleton(header: dict) -> VideoModel:
     if num_paths and not (is_integer(num_paths, 1) and num_paths <= MAX_PATHS and is_integer(num_knots, 1)):
         raise ValueError("a number of paths or of their maps is out of range")
 
-    def build_paths() -> SharedPaths | None:
-        shape = num_paths, num_knots
-        return SharedPaths(jnp.zeros(shape, jnp.float32), jnp.zeros((*shape, 2, 3), jnp.float32)) if num_paths else None
-
     def build() -> VideoModel:
+        times, maps = (jnp.zeros((num_paths, num_knots, *shape), jnp.float32) for shape in ((), (2, 3)))
+        rows, paths = jnp.zeros((num, row_width), jnp.float32), SharedPaths(times, maps) if num_paths else None
         return VideoModel(
-            splats=unpack(
-                jnp.zeros((num, row_width), jnp.float32), degree, TimeLikelihood(np.float32(1)), build_paths()
-            ),
+            splats=unpack(rows, degree, TimeLikelihood(np.float32(1)), paths),
             frame_times=FrameTimes(jnp.zeros(num_frames - 1, jnp.float32)),
             size=(height, width),
             fps=float(header["fps"]),
@@ -246,5 +235,5 @@ _FORMS = {
     "to_stored": partial(_with_splats, change=to_stored),
     "from_stored": partial(_with_splats, change=from_stored),
 }
-register_model(VIDEO, VideoModel, to_header=_describe_video, from_header=_video_skeleton, **_FORMS)
-register_model(EDITED, EditedVideo, to_header=_describe_edited, from_header=_edited_skeleton, **_FORMS)
+register_model(Kind(VIDEO, VideoModel, to_header=_describe_video, from_header=_video_skeleton, **_FORMS))
+register_model(Kind(EDITED, EditedVideo, to_header=_describe_edited, from_header=_edited_skeleton, **_FORMS))

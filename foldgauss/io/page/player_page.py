@@ -9,10 +9,9 @@ import dataclasses
 import hashlib
 import html
 import json
-import os
 import re
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -20,7 +19,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from foldgauss._runtime.checks import invalid, is_integer, short_repr
-from foldgauss.io._atomic import atomic_path, check_path
+from foldgauss.io._atomic import PathLike, atomic_path, check_path
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.compact import is_compact, pack_compact
 from foldgauss.io.models.selections import format_indices
@@ -31,7 +30,6 @@ from foldgauss.video.compression.quantize import (
     Rule,
     column_names,
     compute_columns,
-    dequantize,
     is_integral,
     quantize,
 )
@@ -60,13 +58,13 @@ _EVEN = -18.0
 _MORE_PATH_BITS = 5
 _PER_E = 1.4427  # log2 e: slopes are those of natural logarithms
 
-Loaded = VideoModel | EditedVideo | SegmentedVideo | Quantized
-Model = Loaded | str | os.PathLike
+Loaded = VideoModel | EditedVideo | SegmentedVideo
+Model = Loaded | PathLike
 Frames = Clip | UInt8[np.ndarray, "num_frames height width channels"]
 
 
 def write_html(
-    path: str | os.PathLike,
+    path: PathLike,
     model: Model,
     *,
     original: Frames | None = None,
@@ -150,14 +148,14 @@ def html_page(
     if not (is_integer(quality, 1) and quality <= 100):
         raise invalid("quality", expected="a whole number from 1 to 100", got=quality)
     plain, name = _load(model)
-    pictures = [] if original is None else _encode_original(original, plain, quality)
-    blocks = [*_encode_model(model, plain), *([_encode_moving(plain)] if moving else [])]
-    return _assemble(blocks, pictures, name if title is None else title, save_to)
+    pictures = [] if original is None else list(_encode_original(original, plain, quality))
+    blocks = [*_encode_model(model, plain), *([_encode_moving(plain)] if moving else []), *pictures]
+    return _assemble(blocks, name if title is None else title, save_to)
 
 
 def empty_page() -> str:
     """The page without a model: it opens model files from the computer that it is shown on."""
-    return _assemble([], [], "foldgauss player")
+    return _assemble([], "foldgauss player")
 
 
 def make_notebook_iframe(model: VideoModel | EditedVideo | SegmentedVideo) -> str | None:
@@ -170,7 +168,7 @@ def make_notebook_iframe(model: VideoModel | EditedVideo | SegmentedVideo) -> st
                 return None
     except (ValueError, OSError):  # the file of a video in segments may be gone
         return None
-    page = _assemble(blocks, [], "foldgauss")
+    page = _assemble(blocks, "foldgauss")
     if len(page) > LARGEST_IN_NOTEBOOK:
         return None
     height, width = model.size
@@ -184,7 +182,7 @@ def make_notebook_iframe(model: VideoModel | EditedVideo | SegmentedVideo) -> st
 
 def _load(model: Model) -> tuple[Loaded, str]:
     """The model, and a name for it."""
-    if isinstance(model, str | os.PathLike):
+    if isinstance(model, PathLike):
         path = check_path(model, "model")
         name = read_origin(path).get("clip", path.stem)
         return load_video_model(path), name
@@ -201,9 +199,12 @@ def _encode_model(model: Model, loaded: Loaded) -> Iterator[str]:
         spans = [{name: int(getattr(segment, name)) for name in names} for segment in loaded.segments]
         yield f'<script type="application/json" id="segments">{json.dumps(spans)}</script>'
         for number, segment in enumerate(loaded.segments):
-            yield _block(f"model-{number}", pack_compact(quantize_finely(_flatten_segment(number, segment.model))))
-    elif isinstance(model, Quantized):
-        yield _block("model", pack_compact(model))
+            edited = segment.model
+            try:
+                plain = flatten_video(edited)
+            except ValueError as error:
+                raise ValueError(f"segment {number}: {error}") from error
+            yield _block(f"model-{number}", pack_compact(quantize_finely(plain)))
     elif loaded is not model and is_compact(model):
         yield _block("model", Path(model).read_bytes())
     else:
@@ -212,8 +213,7 @@ def _encode_model(model: Model, loaded: Loaded) -> Iterator[str]:
 
 def _encode_moving(model: Loaded) -> str:
     """The Gaussians of the moving object, by segment, as the page writes selections."""
-    whole = dequantize(model) if isinstance(model, Quantized) else model
-    models = (one.model for one in whole.segments) if isinstance(whole, SegmentedVideo) else [whole]
+    models = (one.model for one in model.segments) if isinstance(model, SegmentedVideo) else [model]
     found, missing = {}, None
     for number, one in enumerate(models):
         try:
@@ -224,13 +224,6 @@ def _encode_moving(model: Loaded) -> str:
     if not found:
         raise missing or nothing_moves("an object that has Gaussians of its own", "none")
     return f'<script type="application/json" id="moving">{json.dumps(found)}</script>'
-
-
-def _flatten_segment(number: int, model: VideoModel | EditedVideo) -> VideoModel:
-    try:
-        return flatten_video(model)
-    except ValueError as error:
-        raise ValueError(f"segment {number}: {error}") from error
 
 
 def quantize_finely(model: VideoModel) -> Quantized:
@@ -264,40 +257,31 @@ def _fine_rules(degree: int) -> dict[str, Rule]:
 # -------------------------------------------------------------------------------------------- the original
 
 
-def _encode_original(original: Frames, model: Loaded, quality: int) -> list[bytes]:
-    """The original's frames as WebP."""
+def _encode_original(original: Frames, model: Loaded, quality: int) -> Iterator[str]:
+    """The page's data blocks of the original's frames, as WebP."""
     frames = original.frames if isinstance(original, Clip) else original
-    if isinstance(model, Quantized):
-        size, num = tuple(model.info.size), len(model.intervals) + 1
-    else:
-        size, num = tuple(model.size), model.num_frames
-    shape, dtype = np.shape(frames), getattr(frames, "dtype", None)
-    if len(shape) != 4 or shape[:3] != (num, *size) or shape[3] not in (3, 4) or dtype != np.uint8:
-        expected = f"frames uint8 ({num}, {size[0]}, {size[1]}, 3), those of the model"
-        cure = "Read them with read_video(path, size=model.size)."
+    shape, dtype, own = np.shape(frames), getattr(frames, "dtype", None), (model.num_frames, *model.size, 3)
+    if len(shape) != 4 or shape[:3] != own[:3] or shape[3] not in (3, 4) or dtype != np.uint8:
+        expected, cure = f"frames uint8 {own}, those of the model", "Read them with read_video(path, size=model.size)."
         raise invalid("original", expected=expected, got=f"{dtype} {shape}", cure=cure)
-    pictures = []
-    for frame in frames:
+    for number, frame in enumerate(frames):
         bgr = frame[..., 2::-1]  # premultiplied colors without their alpha are the image over black
         done, data = cv2.imencode(".webp", bgr, [cv2.IMWRITE_WEBP_QUALITY, quality])
         if not done:
             raise invalid("original", expected="frames that WebP can hold, up to 16,383 pixels a side", got=frame.shape)
-        pictures.append(data.tobytes())
-    return pictures
+        yield _block(f"frame-{number}", data.tobytes())
 
 
 # ------------------------------------------------------------------------------------------------ the page
 
 
-def _assemble(models: Iterable[str], pictures: Iterable[bytes], title: str, save_to: SaveTarget | None = None) -> str:
+def _assemble(blocks: list[str], title: str, save_to: SaveTarget | None = None) -> str:
     script, style = bundle_script("main.js"), (_SOURCES / "player.css").read_text(encoding="utf-8")
-    blocks = [*models, *(_block(f"frame-{k}", picture) for k, picture in enumerate(pictures))]
-    blocks += [] if save_to is None else save_to.blocks()
     parts = {
         "policy": _policy(script, style, connects=save_to is not None),
         "title": html.escape(title.encode("utf-8", "replace").decode()),  # names of files need not be UTF-8
         "style": style,
-        "data": "\n".join(blocks),
+        "data": "\n".join([*blocks, *(save_to.blocks() if save_to else ())]),
         "script": script,
     }
     page = (_SOURCES / "page.html").read_text(encoding="utf-8")
