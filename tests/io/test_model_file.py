@@ -277,7 +277,7 @@ def test_files_of_another_kind(tmp_path, content, word):
 
 
 def test_a_folder_and_a_foreign_safetensors(tmp_path):
-    _refused(tmp_path, "not a plain file")
+    _refused(tmp_path, "a folder")
     save_file({"a": np.zeros(2)}, tmp_path / "foreign.safetensors")
     _refused(tmp_path / "foreign.safetensors", "format 'unknown'")
 

@@ -281,7 +281,7 @@ def _check_container(path: Path) -> None:
     if not os.path.exists(path):
         raise missing_error(path, "a model file")
     if not path.is_file():
-        raise _unreadable_error(path, "not a plain file")
+        raise _unreadable_error(path, "a folder" if path.is_dir() else "a device or a pipe")
     size = path.stat().st_size
     with open(path, "rb") as file:
         first = file.read(_PREFIX + 1)
