@@ -21,9 +21,10 @@ LEAST_INLIER = 0.3
 #: median of second differences): folds follow steadier motion as well, without a map for each frame, which costs time
 #: and can make up for frame times. (Gains: carphone 4e-3, car-shadow 2e-3, bear 3e-4; none: Bunny 8e-5.)
 STEADY = 2.2e-4
-#: Likewise for an object, in units of `STEADY`, where the camera's motion is steady: a step with any path takes a tenth
-#: longer. (Bunny's, 1.2: as good as without at equal steps. carphone's: 15, 0.5 dB.)
-STEADY_ALONE = 5.0
+#: Where they do not follow the camera, they follow an object whose fourth differences are larger than this, in units of
+#: that of noise whose second differences are 1: a step with any path takes a tenth longer, and cubic folds follow
+#: smooth curves. (Bunny: 1.9e-4, as good as without at equal steps. carphone: 2.3e-3, 0.5 dB.)
+SMOOTH = 1.1e-3
 #: The largest zoom (as its logarithm) and the largest distance, in units of the frame's longer side, between a frame
 #: and the one in whose coordinates Gaussians are placed. Where the motion goes farther, it is forgotten by these
 #: fractions in each frame; then Gaussians' own folds take over its slow part.
@@ -38,9 +39,9 @@ LEAST_FOLLOWED = 0.02
 #: A path follows a track that strays from its mean by less than this, in units of RANSAC's threshold. Distances are
 #: those of the coordinates that follow the path: pixels in the middle of each shot.
 STRAY = 1.5
-#: An object's motion is estimated from the tracks that no path follows yet, and then again and again from those that
-#: are nearer to it than to the others, within these multiples of `STRAY`.
-ROUNDS = (3.0, 3.0, 3.0, 1.5)
+#: An object's motion is estimated so many times: from the tracks that no path follows yet, and then from those of them
+#: that stray less from it than from the others, and by at most this multiple of `STRAY`.
+ROUNDS, WIDER = 4, 3.0
 #: The fewest tracks that tell an object's motion between two frames, and those of them that must agree.
 FEWEST, AGREEING = 8, 6
 
@@ -56,9 +57,9 @@ def find_shared_motions(motion: Motion, max_objects: int = MAX_OBJECTS) -> Float
     """
     clip = _Clip.of(motion)
     camera = clip.find_camera_steps()
-    path = clip.chain_within_limits(camera) if clip.measure_unsteadiness(camera, clip.corners) > STEADY else None
+    path = clip.chain_within_limits(camera) if clip.measure_unsteadiness(camera, clip.corners, 2) > STEADY else None
     found = [] if path is None else [path]
-    found += _find_objects(clip, camera, max_objects, steady=STEADY if found else STEADY_ALONE * STEADY)
+    found += _find_objects(clip, camera, max_objects, smooth=-np.inf if found else SMOOTH)
     return np.stack(found)[:, :, :2] if found else None
 
 
@@ -129,20 +130,24 @@ class _Clip:
         return np.tile(points, (len(self.motion.small), 1, 1))
 
     def measure_unsteadiness(
-        self, steps: Float[np.ndarray, "frames 3 3"], places: Float[np.ndarray, "frames num 2"]
+        self, steps: Float[np.ndarray, "frames 3 3"], places: Float[np.ndarray, "frames num 2"], order: int
     ) -> float:
-        """The median over frames of the second difference of points at `places`: 0 at constant velocity.
+        """The median over frames of the differences, of an even `order`, of points at `places`.
 
-        Where steps or places are NaN, they are unknown.
+        In units of those of noise whose second differences are 1. Where steps or places are NaN, they are unknown.
         """
-        changes = []
+        weights, half, changes = np.diff(np.eye(order + 1), order, axis=0)[0], order // 2, []
         for first, stop in self.shots:
-            for k in range(first + 1, stop - 1):
+            for k in range(first + half, stop - half):
                 points = np.concatenate([places[k], np.ones((len(places[k]), 1))], 1)
-                change = (points @ np.linalg.inv(steps[k]).T - 2 * points + points @ steps[k + 1].T)[:, :2]
+                before, after = [points], [points]
+                for j in range(half):
+                    before.append(before[-1] @ np.linalg.inv(steps[k - j]).T)
+                    after.append(after[-1] @ steps[k + j + 1].T)
+                change = np.einsum("i,inj->nj", weights, [*before[:0:-1], *after])[:, :2]
                 changes.append(np.sqrt((change**2).sum(1).mean()))
-        changes = np.array(changes)
-        return float(np.median(changes[~np.isnan(changes)])) if not np.isnan(changes).all() else 0.0
+        changes = np.array(changes)[~np.isnan(changes)] * np.sqrt(6 / (weights**2).sum())
+        return float(np.median(changes)) if len(changes) else 0.0
 
 
 def _is_near(maps: Float[np.ndarray, "frames 3 3"]) -> bool:
@@ -156,29 +161,30 @@ def _is_near(maps: Float[np.ndarray, "frames 3 3"]) -> bool:
 
 
 def _find_objects(
-    clip: _Clip, camera: Float[np.ndarray, "frames 3 3"], max_objects: int, steady: float
+    clip: _Clip, camera: Float[np.ndarray, "frames 3 3"], max_objects: int, smooth: float
 ) -> list[np.ndarray]:
     """Maps to each frame, (frames, 3, 3), of up to `max_objects`: one after another, what moves otherwise.
 
-    The search ends at one whose unsteadiness is at most `steady`.
+    The search ends at one whose fourth differences are at most `smooth`.
     """
     points, limit = _Points.of(clip), STRAY * clip.inlier
     best, found = points.measure_stray(clip.chain(camera)), []
     for _ in range(max_objects):
         followed = left = best > limit
-        for wide in ROUNDS:
+        for _ in range(ROUNDS):
             if not points.are_enough(followed):
                 return found
             steps = points.estimate_steps(followed)
             known = np.where(np.isnan(steps), camera, steps)
             own = points.measure_stray(clip.chain(known))
-            followed = left & (own < best) & (own < wide * limit)
+            followed = left & (own < best) & (own < WIDER * limit)
         maps = clip.chain_within_limits(known)
         if maps is None:
             return found
         own = points.measure_stray(maps)
         followed = left & (own < limit)
-        if not points.are_enough(followed) or clip.measure_unsteadiness(steps, points.find_middle(followed)) <= steady:
+        unsteadiness = clip.measure_unsteadiness(steps, points.find_middle(followed), 4)
+        if not points.are_enough(followed) or unsteadiness <= smooth:
             return found
         found.append(maps)
         best = np.minimum(best, own)
