@@ -20,7 +20,7 @@ from foldgauss.video.fitting.state import paths_of, to_model
 from foldgauss.video.models.shared_paths import SharedPaths, leave_paths
 from foldgauss.video.motion.camera_path import fit_affine
 from foldgauss.video.motion.optical_flow import Motion
-from foldgauss.video.motion.shared_motions import FARTHEST, find_shared_motions
+from foldgauss.video.motion.shared_motions import FARTHEST, _Clip, find_shared_motions
 
 CONFIG = FitConfig(num_gaussians=1500, steps=300, degree=2)
 TIMES = np.linspace(0, 1, 12)
@@ -165,6 +165,32 @@ def test_an_object_before_a_camera_that_stands_still_is_found():
 def test_an_object_that_moves_steadily_has_no_maps():
     corners = np.array([[30 + 3 * k, 20 + k] for k in range(12)])
     assert find_shared_motions(Motion.from_frames(with_object(FRAMES[:1].repeat(12, 0), corners))) is None
+
+
+@pytest.mark.parametrize("order", [2, 4])
+def test_unsteadiness_is_that_of_the_path(order):
+    """Zero for polynomials of a lower degree; alike for noise, whatever the order; by numpy's differences otherwise."""
+    clip = _Clip.of(Motion.from_frames(FRAMES[:1].repeat(12, 0)))
+    rng = np.random.default_rng(0)
+    curve = np.stack([np.polyval(rng.normal(size=order), TIMES) for _ in range(2)], 1)
+    noise = rng.normal(size=(12, 2))
+    measured = []
+    for path in (curve, noise):
+        steps = np.tile(np.eye(3), (12, 1, 1))
+        steps[1:, :2, 2] = np.diff(path, axis=0)
+        measured.append(clip.measure_unsteadiness(steps, path[:, None], order))
+    unit = np.sqrt(6 / (np.diff(np.eye(order + 1), order, axis=0) ** 2).sum())
+    expected = np.median(np.linalg.norm(np.diff(noise, order, axis=0), axis=1)) * unit
+    assert measured[0] < 1e-12
+    np.testing.assert_allclose(measured[1], expected)
+
+
+def test_unknown_places_and_steps_do_not_count():
+    clip = _Clip.of(Motion.from_frames(FRAMES[:1].repeat(12, 0)))
+    steps, places = np.tile(np.eye(3), (12, 1, 1)), np.zeros((12, 1, 2))
+    steps[3], places[7] = np.nan, np.nan
+    assert clip.measure_unsteadiness(steps, places, 2) == 0
+    assert clip.measure_unsteadiness(np.full_like(steps, np.nan), places, 2) == 0
 
 
 def test_gaussians_follow_the_object():

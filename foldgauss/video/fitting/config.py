@@ -234,9 +234,10 @@ class FitConfig:
     follow_camera: bool = field(
         default=True,
         metadata=setting(
-            "Where the camera moves, Gaussians may follow its motion, or that of the largest moving object, each with "
-            "a fold of its own in addition",
-            "A Gaussian does so where its track is then longer or its fold smaller. Not without `follow_motion`.",
+            "Gaussians may follow the motion of the camera, or that of the largest moving object, each with a fold of "
+            "its own in addition",
+            "A Gaussian does so where its track is then longer or its fold smaller. None does where these move "
+            "steadily, nor without `follow_motion`.",
             option="--follow-camera/--no-follow-camera",
             group=MODEL,
         ),
