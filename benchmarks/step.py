@@ -79,6 +79,7 @@ def wrapped_fit(clock: Clock) -> Iterator[None]:
     kernels = types.SimpleNamespace(
         forward=clock.timed("raster forward", cpu.forward),
         backward=clock.timed("raster backward", cpu.backward),
+        screen_gradient=cpu.screen_gradient,
     )
     parts = {
         "frame_times": "frame times",

@@ -65,3 +65,14 @@ def test_what_float32_cannot_hold():
     assert y[7] == 1
     _, y = apply(_vectors.sigmoid, x)
     np.testing.assert_allclose(y[:8], [0, 0, 0, 1, 1, 1, np.nan, 0.5], atol=1e-37)
+
+
+def test_window_of_two_vectors():
+    @nb.njit
+    def work(x, y):
+        before, after = load(x, np.uint64(0)), load(x, np.uint64(LANES))
+        store(y, np.uint64(0), _vectors.window(before, after, 5))
+
+    x, y = np.arange(2 * LANES, dtype=np.float32), np.zeros(LANES, np.float32)
+    work(x, y)
+    np.testing.assert_array_equal(y, x[5 : 5 + LANES])

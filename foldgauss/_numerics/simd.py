@@ -286,6 +286,17 @@ def _shuffled(builder, a, b, picks):
     return builder.shuffle_vector(a, b, ir.Constant(_INTS, picks))
 
 
+@intrinsic(prefer_literal=True)
+def window(typing_context, a, b, start):
+    """Of the 32 lanes of a and b one after another, the 16 from the constant `start` on."""
+    first = start.literal_value
+
+    def generate(context, builder, signature, args):
+        return _shuffled(builder, *args[:2], [*range(first, first + LANES)])
+
+    return VECTOR(VECTOR, VECTOR, start), generate
+
+
 @intrinsic
 def gather_columns(typing_context, array, indices, start):
     """The 8 columns of 16 rows of a contiguous float32 array (num, 8): of rows indices[start : start + 16], int32."""

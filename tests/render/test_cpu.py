@@ -144,7 +144,8 @@ def test_transmittance_is_the_weight_of_the_background():
 
 def test_screen_gradient():
     d_mean = np.float32([[3, 4], [0, 0], [-5, 12]])
-    np.testing.assert_array_equal(cpu.screen_gradient(d_mean), np.float32([5, 0, 13]))
+    np.testing.assert_array_equal(cpu.screen_gradient(d_mean, (2, 2)), np.float32([5, 0, 13]))
+    np.testing.assert_array_equal(cpu.screen_gradient(d_mean, (6, 8)), np.float32([np.sqrt(288), 0, np.sqrt(1696)]))
 
 
 def results(leaves, size, weights, **how):

@@ -86,13 +86,16 @@ def test_too_high_rates_are_lowered_until_the_fit_converges(begun, leaf):
     assert evaluate(model, CLIP).mean_psnr > begun
 
 
-def test_exploding_folds_are_named(usual):
+def test_exploding_folds_are_named_and_undone():
     def explode(state):
         state.rows[:, columns(CONFIG.degree)["coefficients"]] *= 1e6
 
+    def slow_down(state):  # the same rates from here on, without the explosion
+        state.backoffs += 1
+
     with pytest.warns(DivergenceWarning, match="dB worse than they were; coefficients moved most"):
-        got = _fit_with(explode, dataclasses.replace(CONFIG, quarter_fraction=0, half_fraction=0))
-    assert got > usual - 3
+        got = _fit_with(explode)
+    assert got > _fit_with(slow_down) - 1.5  # over seeds 0.9 to 1.1 dB less: steps are lost
 
 
 def test_a_single_frame_that_is_worse_for_a_while_raises_no_warning():

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 
 from foldgauss.render import cpu
@@ -167,7 +168,8 @@ class CpuStepper:
         done = condition(rows, self.window, t, shape)
         mean, factor = done.mean, done.factor
         if mirrored:
-            target = np.ascontiguousarray(target[:, :, ::-1])
+            for plane in target:
+                cv2.flip(plane, 1, dst=plane)
             mean, factor = mirror(mean, factor, shape.size[1])
         trace = self._render(dataclasses.replace(done, mean=mean, factor=factor), shape)
         if squared:
@@ -178,12 +180,14 @@ class CpuStepper:
         if fraction is None:
             state.frame_errors[k] = loss.mean_squared_error
             weight = self._weight(state.frame_errors, k)
-        d_mean, d_factor, *others, _ = cpu.backward(trace, loss.gradient * np.float32(weight / self.config.batch_size))
+        gradient = loss.gradient
+        gradient *= np.float32(weight / self.config.batch_size)
+        d_mean, d_factor, *others, _ = cpu.backward(trace, gradient)
         if mirrored:
             d_mean, d_factor = mirror(d_mean, d_factor, 0)
         if seen is not None:
-            half = np.float32(shape.size[::-1]) / 2
-            seen.append((done.alive[trace.visible], cpu.screen_gradient(d_mean[trace.visible] * half)))
+            visible = np.flatnonzero(trace.visible)
+            seen.append((done.alive[visible], cpu.screen_gradient(d_mean, shape.size)[visible]))
         return loss, done, backpropagate(rows, done, (d_mean, d_factor, *others), shape, self.grad, by_path)
 
     def _weight(self, errors: np.ndarray, k: int) -> float:
@@ -206,5 +210,8 @@ class CpuStepper:
 
 def mirror(mean: np.ndarray, factor: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
     """Splats in pixels as the opposite camera sees them, left for right; with width 0 the transpose, for gradients."""
-    sign = np.float32([-1, 1])
-    return mean * sign + np.float32([width, 0]), factor * sign[:, None]
+    mean, factor = mean.copy(), factor.copy()
+    np.subtract(width, mean[:, 0], out=mean[:, 0])
+    for column in factor[:, 0].T:  # one by one: NumPy is slow along an axis of 2
+        column *= -1
+    return mean, factor

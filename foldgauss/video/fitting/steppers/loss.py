@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
+from foldgauss._numerics.simd import LANES, broadcast, load, select, store, window
 from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.kernels import inline, kernel
 from foldgauss._runtime.threads import run_tasks
@@ -20,12 +21,13 @@ RADIUS = 5  # 11 taps
 SIGMA = 1.5
 C1, C2 = 0.01**2, 0.03**2  # Wang et al. 2004: (K1 L)^2 and (K2 L)^2 with L = 1
 #: Rows per task: enough that the 5 rows of halo above and below cost little, few enough to stay in the cache.
-STRIP = 40
+STRIP = 54
 
 _taps = [math.exp(-0.5 * (k / SIGMA) ** 2) for k in range(RADIUS + 1)]
 #: Weights of the tap in the middle and of those 1 to RADIUS pixels away.
 TAPS = tuple(np.float32(tap / (2 * sum(_taps) - _taps[0])) for tap in _taps)
 _W0, _W1, _W2, _W3, _W4, _W5 = TAPS
+_ALL_TAPS = np.array((*TAPS[:0:-1], *TAPS))
 
 _f, _u = nb.float32, nb.uint64
 
@@ -40,87 +42,86 @@ class ImageLoss(NamedTuple):
 
 
 @inline
-def _blur(row, x):
-    """The 11 taps around x of a row that carries RADIUS entries of padding on either side."""
-    c = _u(x + _u(RADIUS))
+def _blur(numbers, at, apart):
+    """The 11 taps of 16 numbers, from `at` on, down the columns: rows are `apart`."""
     return (
-        _W0 * row[c]
-        + _W1 * (row[c - _u(1)] + row[c + _u(1)])
-        + _W2 * (row[c - _u(2)] + row[c + _u(2)])
-        + _W3 * (row[c - _u(3)] + row[c + _u(3)])
-        + _W4 * (row[c - _u(4)] + row[c + _u(4)])
-        + _W5 * (row[c - _u(5)] + row[c + _u(5)])
+        broadcast(_W0) * load(numbers, at)
+        + broadcast(_W1) * (load(numbers, at - apart) + load(numbers, at + apart))
+        + broadcast(_W2) * (load(numbers, at - _u(2) * apart) + load(numbers, at + _u(2) * apart))
+        + broadcast(_W3) * (load(numbers, at - _u(3) * apart) + load(numbers, at + _u(3) * apart))
+        + broadcast(_W4) * (load(numbers, at - _u(4) * apart) + load(numbers, at + _u(4) * apart))
+        + broadcast(_W5) * (load(numbers, at - _u(5) * apart) + load(numbers, at + _u(5) * apart))
+    )
+
+
+@inline
+def _blur_along(row, at):
+    """The 11 taps of 16 numbers of a row, from `at` on. Neighbors are shuffled: loads across cache lines are slow."""
+    before, here, after = load(row, at - _u(LANES)), load(row, at), load(row, at + _u(LANES))
+    return (
+        broadcast(_W0) * here
+        + broadcast(_W1) * (window(before, here, 15) + window(here, after, 1))
+        + broadcast(_W2) * (window(before, here, 14) + window(here, after, 2))
+        + broadcast(_W3) * (window(before, here, 13) + window(here, after, 3))
+        + broadcast(_W4) * (window(before, here, 12) + window(here, after, 4))
+        + broadcast(_W5) * (window(before, here, 11) + window(here, after, 5))
     )
 
 
 @kernel
-def _vertical_moments(x, y, row, moments):
-    """Blur x, y, x^2, y^2, x y down the columns at one row, into the padded rows of `moments` (5, ...)."""
-    height, width = x.shape
-    m_x, m_y, m_xx, m_yy, m_xy = moments[0], moments[1], moments[2], moments[3], moments[4]
-    moments[:] = 0.0
-    for k in range(max(-RADIUS, -row), min(RADIUS, height - 1 - row) + 1):
-        tap, x_row, y_row = TAPS[abs(k)], x[row + k], y[row + k]
-        for c in range(_u(width)):
-            p = c + _u(RADIUS)
-            a, b = x_row[c], y_row[c]
-            m_x[p] += tap * a
-            m_y[p] += tap * b
-            m_xx[p] += tap * a * a
-            m_yy[p] += tap * b * b
-            m_xy[p] += tap * a * b
+def _blur_moments(x, y, at, wide, taps, moments, pitch):
+    """Blur x, y, x^2, y^2 and x y down the columns at the row that begins at `at`, into padded rows, `pitch` apart."""
+    none, pitch = broadcast(_f(0)), _u(pitch)
+    for c in range(_u(0), _u(wide), _u(LANES)):
+        m_x, m_y, m_xx, m_yy, m_xy = none, none, none, none, none
+        place = _u(at) + c - _u(RADIUS) * _u(wide)
+        for k in range(_u(2 * RADIUS + 1)):
+            a, b = load(x, place), load(y, place)
+            by_a, by_b = broadcast(taps[k]) * a, broadcast(taps[k]) * b
+            m_x, m_y = m_x + by_a, m_y + by_b
+            m_xx, m_yy, m_xy = m_xx + by_a * a, m_yy + by_b * b, m_xy + by_a * b
+            place += _u(wide)
+        out = _u(LANES) + c
+        store(moments, out, m_x)
+        store(moments, out + pitch, m_y)
+        store(moments, out + _u(2) * pitch, m_xx)
+        store(moments, out + _u(3) * pitch, m_yy)
+        store(moments, out + _u(4) * pitch, m_xy)
 
 
 @kernel
-def _similarity_row(moments, ssim, d_mean, d_square, d_product):
-    """SSIM along one row, and its derivatives by the blurs of x, x^2 and x y (into padded rows)."""
-    b_x, b_y, b_xx, b_yy, b_xy = moments[0], moments[1], moments[2], moments[3], moments[4]
-    c1, c2 = _f(C1), _f(C2)
-    for c in range(_u(len(ssim))):
-        mean_x, mean_y = _blur(b_x, c), _blur(b_y, c)
-        var_x = _blur(b_xx, c) - mean_x * mean_x
-        var_y = _blur(b_yy, c) - mean_y * mean_y
-        cov = _blur(b_xy, c) - mean_x * mean_y
-        top_mean, top_cov = _f(2) * mean_x * mean_y + c1, _f(2) * cov + c2
+def _similarity_row(moments, wide, pitch, ssim, derivatives):
+    """SSIM along one row, and its derivatives by the blurs of x, x^2 and x y (three padded rows, `pitch` apart)."""
+    pitch, two, c1, c2 = _u(pitch), broadcast(_f(2)), broadcast(_f(C1)), broadcast(_f(C2))
+    for c in range(_u(0), _u(wide), _u(LANES)):
+        at = c + _u(LANES)
+        mean_x, mean_y = _blur_along(moments, at), _blur_along(moments, at + pitch)
+        var_x = _blur_along(moments, at + _u(2) * pitch) - mean_x * mean_x
+        var_y = _blur_along(moments, at + _u(3) * pitch) - mean_y * mean_y
+        cov = _blur_along(moments, at + _u(4) * pitch) - mean_x * mean_y
+        top_mean, top_cov = two * mean_x * mean_y + c1, two * cov + c2
         low_mean, low_var = mean_x * mean_x + mean_y * mean_y + c1, var_x + var_y + c2
-        inverse = _f(1) / (low_mean * low_var)
+        inverse = broadcast(_f(1)) / (low_mean * low_var)
         value = top_mean * top_cov * inverse
-        ssim[c] = value
-        p = c + _u(RADIUS)
-        by_square = -value * low_mean * inverse
-        d_square[p] = by_square
-        d_product[p] = _f(2) * top_mean * inverse
-        d_mean[p] = (
-            _f(2) * mean_y * (top_cov - top_mean) * inverse
-            - _f(2) * mean_x * value * low_var * inverse
-            - _f(2) * mean_x * by_square
-        )
+        by_square = broadcast(_f(0)) - value * low_mean * inverse
+        by_mean = two * mean_y * (top_cov - top_mean) * inverse
+        store(ssim, c, value)
+        store(derivatives, at, by_mean - two * mean_x * value * low_var * inverse - two * mean_x * by_square)
+        store(derivatives, at + pitch, by_square)
+        store(derivatives, at + _u(2) * pitch, two * top_mean * inverse)
 
 
 @kernel
-def _blur_row(padded, out):
-    for c in range(_u(len(out))):
-        out[c] = _blur(padded, c)
-
-
-@kernel
-def _finish_row(x, y, row, top, blurred, scratch, scale_l1, scale_ssim, gradient):
-    """Blur the derivatives down the columns and combine the gradient of one row."""
-    height, width = x.shape
-    s_mean, s_square, s_product = scratch[0], scratch[1], scratch[2]
-    scratch[:] = 0.0
-    for k in range(max(-RADIUS, -row), min(RADIUS, height - 1 - row) + 1):
-        tap, slot = TAPS[abs(k)], row + k - top
-        by_mean, by_square, by_product = blurred[0, slot], blurred[1, slot], blurred[2, slot]
-        for c in range(_u(width)):
-            s_mean[c] += tap * by_mean[c]
-            s_square[c] += tap * by_square[c]
-            s_product[c] += tap * by_product[c]
-    for c in range(_u(width)):
-        a, b = x[row, c], y[row, c]
-        sign = _f(1) if a > b else (_f(-1) if a < b else _f(0))
-        by_ssim = s_mean[c] + _f(2) * a * s_square[c] + b * s_product[c]
-        gradient[row, c] = scale_l1 * sign - scale_ssim * by_ssim
+def _finish_row(x, y, at, blurred, here, wide, scale_l1, scale_ssim, out):
+    """Blur the derivatives down the columns and combine the gradient of one row, which begins at `at` of x and y."""
+    none, two, line = broadcast(_f(0)), broadcast(_f(2)), _u(3) * _u(wide)
+    positive, by_similarity = broadcast(scale_l1), broadcast(scale_ssim)
+    for c in range(_u(0), _u(wide), _u(LANES)):
+        a, b, place = load(x, _u(at) + c), load(y, _u(at) + c), _u(here) + c
+        by_mean, by_square = _blur(blurred, place, line), _blur(blurred, place + _u(wide), line)
+        by_product = _blur(blurred, place + _u(2) * _u(wide), line)
+        by_l1 = select(a > b, positive, select(a < b, none - positive, none))
+        store(out, c, by_l1 - by_similarity * (by_mean + two * a * by_square + b * by_product))
 
 
 @kernel
@@ -139,24 +140,41 @@ def _errors(x, y, start, stop):
 
 
 @kernel
-def _strip(x, y, start, stop, scale_l1, scale_ssim, gradient):
-    """Gradient of rows start..stop of one plane; returns their sums of |x - y|, (x - y)^2 and SSIM."""
+def _strip(x, y, start, stop, taps, scale_l1, scale_ssim, gradient, similarity):
+    """Gradient of rows start..stop of one plane; returns their sums of |x - y|, (x - y)^2 and SSIM.
+
+    `similarity`: None, or an output for the SSIM of every pixel, (height, width).
+    """
     height, width = x.shape
-    top, bottom = max(0, start - RADIUS), min(height, stop + RADIUS)
-    moments = np.empty((5, width + 2 * RADIUS), np.float32)
-    padded = np.zeros((3, width + 2 * RADIUS), np.float32)
-    blurred = np.empty((3, bottom - top, width), np.float32)
-    ssim, scratch = np.empty(width, np.float32), np.empty((3, width), np.float32)
-    total = 0.0
-    for row in range(top, bottom):
-        _vertical_moments(x, y, row, moments)
-        _similarity_row(moments, ssim, padded[0], padded[1], padded[2])
-        for k in range(3):
-            _blur_row(padded[k], blurred[k, row - top])
+    wide = (width + LANES - 1) // LANES * LANES
+    pitch, total = wide + 2 * LANES, 0.0
+    # Rows around the strip, and columns up to whole vectors, with zeros outside the image.
+    first, num = start - 2 * RADIUS, stop - start + 4 * RADIUS
+    own_x, own_y = np.zeros((num, wide), np.float32), np.zeros((num, wide), np.float32)
+    for row in range(max(first, 0), min(first + num, height)):
+        own_x[row - first, :width], own_y[row - first, :width] = x[row], y[row]
+    flat_x, flat_y = own_x.reshape(-1), own_y.reshape(-1)
+    moments, derivatives = np.zeros(5 * pitch, np.float32), np.zeros(3 * pitch, np.float32)
+    blurred, ssim = np.zeros((num - 2 * RADIUS) * 3 * wide, np.float32), np.empty(wide, np.float32)
+    for k in range(num - 2 * RADIUS):
+        row = start - RADIUS + k
+        if not 0 <= row < height:
+            continue
+        _blur_moments(flat_x, flat_y, (k + RADIUS) * wide, wide, taps, moments, pitch)
+        _similarity_row(moments, wide, pitch, ssim, derivatives)
+        for j in range(3):
+            derivatives[j * pitch + LANES + width : (j + 1) * pitch] = 0.0
+            for c in range(_u(0), _u(wide), _u(LANES)):
+                out = _u(3 * k + j) * _u(wide) + c
+                store(blurred, out, _blur_along(derivatives, _u(j) * _u(pitch) + _u(LANES) + c))
         if start <= row < stop:
-            total += ssim.sum()
+            total += ssim[:width].sum()
+            if similarity is not None:
+                similarity[row] = ssim[:width]
     for row in range(start, stop):
-        _finish_row(x, y, row, top, blurred, scratch, scale_l1, scale_ssim, gradient)
+        at = row - first
+        _finish_row(flat_x, flat_y, at * wide, blurred, (at - RADIUS) * 3 * wide, wide, scale_l1, scale_ssim, ssim)
+        gradient[row] = ssim[:width]
     absolute, squared = _errors(x, y, start, stop)
     return absolute, squared, total
 
@@ -195,7 +213,7 @@ def image_loss(rendered: np.ndarray, target: np.ndarray, *, ssim_fraction: float
         c, start, stop = strips[k]
         planes = rendered[c], target[c], start, stop
         if ssim_fraction > 0:
-            sums[k] = _strip(*planes, by_l1, by_ssim, gradient[c])
+            sums[k] = _strip(*planes, _ALL_TAPS, by_l1, by_ssim, gradient[c], None)
         else:
             sums[k] = _strip_l1(*planes, by_l1, gradient[c])
 
@@ -207,15 +225,8 @@ def image_loss(rendered: np.ndarray, target: np.ndarray, *, ssim_fraction: float
 
 def ssim_map(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """SSIM at every pixel of two float32 planes (height, width), zero padding: what the loss averages."""
-    height, width = x.shape
-    out = np.empty((height, width), np.float32)
-    moments, padded = (
-        np.empty((5, width + 2 * RADIUS), np.float32),
-        np.zeros((3, width + 2 * RADIUS), np.float32),
-    )
-    for row in range(height):
-        _vertical_moments(x, y, row, moments)
-        _similarity_row(moments, out[row], padded[0], padded[1], padded[2])
+    out, gradient = np.empty_like(x), np.empty_like(x)
+    _strip(x, y, 0, len(x), _ALL_TAPS, np.float32(1), np.float32(1), gradient, out)
     return out
 
 
