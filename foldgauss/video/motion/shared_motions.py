@@ -17,13 +17,14 @@ SPACING = 4
 TEXTURE, LEAST_TEXTURED = 2.0, 0.1
 #: RANSAC, in pixels: flow is less exact than this in small frames.
 LEAST_INLIER = 0.3
-#: Gaussians follow a camera whose motion changes from frame to frame by this, in units of the frame's longer side (the
-#: median of second differences): folds follow steadier motion as well, without a map for each frame, which costs time
-#: and can make up for frame times. (Gains: carphone 4e-3, car-shadow 2e-3, bear 3e-4; none: Bunny 8e-5.)
-STEADY = 2.2e-4
-#: Where they do not follow the camera, they follow an object whose fourth differences are larger than this, in units of
-#: that of noise whose second differences are 1: a step with any path takes a tenth longer, and cubic folds follow
-#: smooth curves. (Bunny: 1.9e-4, as good as without at equal steps. carphone: 2.3e-3, 0.5 dB.)
+#: Gaussians follow the camera in shots in which it is unsteadier than this: the mean of the fourth differences of its
+#: path, which are 0 for cubics, in units of the frame's longer side and of those of noise whose second differences are
+#: 1. Folds follow steadier motion as well, without a map for each frame, which costs time. (Unsteady: carphone 3.1e-3,
+#: bear 2.9e-4; steady: Bunny 8e-5, a rotation by 40 degrees in a second 7e-5. A camera that shakes for a while counts,
+#: and so do missing frames: one of 30 in a pan costs 4 dB without a path, more than learned frame times make up for.)
+STEADY = 1.6e-4
+#: Where they do not follow the camera, they follow an object that is unsteadier than this: a step with any path takes a
+#: tenth longer. (Bunny: 2.9e-4, as good as without at equal steps.)
 SMOOTH = 1.1e-3
 #: The largest zoom (as its logarithm) and the largest distance, in units of the frame's longer side, between a frame
 #: and the one in whose coordinates Gaussians are placed. Where the motion goes farther, it is forgotten by these
@@ -49,17 +50,18 @@ FEWEST, AGREEING = 8, 6
 def find_shared_motions(motion: Motion, max_objects: int = MAX_OBJECTS) -> Float[np.ndarray, "paths frames 2 3"] | None:
     """The maps from coordinates that follow the camera to each frame, then those of objects, in model space.
 
-    Those that move steadily are left out; None if all do. In the middle frame of each shot coordinates are the frame's.
-    Where a motion is unknown between two frames, it is taken to be the camera's, and that of the camera to be none. An
-    object is what moves as a whole, in another way than the camera: also a background that is nearer or farther.
+    Those that move steadily are left out; None if all do. In the middle frame of each shot coordinates are the frame's,
+    and so they are in shots whose camera moves steadily. Where a motion is unknown between two frames, it is taken to
+    be the camera's, and that of the camera to be none. An object is what moves as a whole, in another way than the
+    camera: also a background that is nearer or farther.
 
     Source: Fischler and Bolles 1981 (RANSAC), one motion after another; tracks decide which points belong to which.
     """
     clip = _Clip.of(motion)
     camera = clip.find_camera_steps()
-    path = clip.chain_within_limits(camera) if clip.measure_unsteadiness(camera, clip.corners, 2) > STEADY else None
-    found = [] if path is None else [path]
-    found += _find_objects(clip, camera, max_objects, smooth=-np.inf if found else SMOOTH)
+    path = clip.chain_within_limits(clip.keep_unsteady(camera))
+    found = [path] if path is not None and (path != np.eye(3)).any() else []
+    found += _find_objects(clip, camera, max_objects, smooth=None if found else SMOOTH)
     return np.stack(found)[:, :, :2] if found else None
 
 
@@ -129,25 +131,37 @@ class _Clip:
         points = [[0.35 * x * width, 0.35 * y * height] for x in (-1, 1) for y in (-1, 1)]
         return np.tile(points, (len(self.motion.small), 1, 1))
 
-    def measure_unsteadiness(
-        self, steps: Float[np.ndarray, "frames 3 3"], places: Float[np.ndarray, "frames num 2"], order: int
-    ) -> float:
-        """The median over frames of the differences, of an even `order`, of points at `places`.
-
-        In units of those of noise whose second differences are 1. Where steps or places are NaN, they are unknown.
-        """
-        weights, half, changes = np.diff(np.eye(order + 1), order, axis=0)[0], order // 2, []
+    def keep_unsteady(self, steps: Float[np.ndarray, "frames 3 3"]) -> Float[np.ndarray, "frames 3 3"]:
+        """The camera's steps, with the identity in shots whose unsteadiness is at most `STEADY`."""
+        kept, changes = steps.copy(), self.measure_changes(steps, self.corners)
         for first, stop in self.shots:
-            for k in range(first + half, stop - half):
+            if not _are_larger(changes[first:stop], STEADY):
+                kept[first:stop] = np.eye(3)
+        return kept
+
+    def measure_changes(
+        self, steps: Float[np.ndarray, "frames 3 3"], places: Float[np.ndarray, "frames num 2"]
+    ) -> Float[np.ndarray, " frames"]:
+        """The fourth differences of points at `places` in each frame, as of `STEADY`, rms over the points.
+
+        NaN in frames less than two from the ends of a shot, and where steps or places are NaN, which is unknown.
+        """
+        weights, changes = np.array([1, -4, 6, -4, 1]), np.full(len(steps), np.nan)
+        for first, stop in self.shots:
+            for k in range(first + 2, stop - 2):
                 points = np.concatenate([places[k], np.ones((len(places[k]), 1))], 1)
-                before, after = [points], [points]
-                for j in range(half):
-                    before.append(before[-1] @ np.linalg.inv(steps[k - j]).T)
-                    after.append(after[-1] @ steps[k + j + 1].T)
-                change = np.einsum("i,inj->nj", weights, [*before[:0:-1], *after])[:, :2]
-                changes.append(np.sqrt((change**2).sum(1).mean()))
-        changes = np.array(changes)[~np.isnan(changes)] * np.sqrt(6 / (weights**2).sum())
-        return float(np.median(changes)) if len(changes) else 0.0
+                before = points @ np.linalg.inv(steps[k]).T
+                after = points @ steps[k + 1].T
+                path = [before @ np.linalg.inv(steps[k - 1]).T, before, points, after, after @ steps[k + 2].T]
+                change = np.einsum("i,inj->nj", weights, path)[:, :2]
+                changes[k] = np.sqrt((change**2).sum(1).mean())
+        return changes * np.sqrt(6 / 70)  # the sums of the squared weights of second and of fourth differences
+
+
+def _are_larger(changes: Float[np.ndarray, " frames"], least: float) -> bool:
+    """Whether the mean of those that are known is larger."""
+    known = changes[~np.isnan(changes)]
+    return len(known) > 0 and bool(known.mean() > least)
 
 
 def _is_near(maps: Float[np.ndarray, "frames 3 3"]) -> bool:
@@ -161,11 +175,11 @@ def _is_near(maps: Float[np.ndarray, "frames 3 3"]) -> bool:
 
 
 def _find_objects(
-    clip: _Clip, camera: Float[np.ndarray, "frames 3 3"], max_objects: int, smooth: float
+    clip: _Clip, camera: Float[np.ndarray, "frames 3 3"], max_objects: int, smooth: float | None
 ) -> list[np.ndarray]:
     """Maps to each frame, (frames, 3, 3), of up to `max_objects`: one after another, what moves otherwise.
 
-    The search ends at one whose fourth differences are at most `smooth`.
+    The search ends at one that is not unsteadier than `smooth`, if given.
     """
     points, limit = _Points.of(clip), STRAY * clip.inlier
     best, found = points.measure_stray(clip.chain(camera)), []
@@ -183,8 +197,9 @@ def _find_objects(
             return found
         own = points.measure_stray(maps)
         followed = left & (own < limit)
-        unsteadiness = clip.measure_unsteadiness(steps, points.find_middle(followed), 4)
-        if not points.are_enough(followed) or unsteadiness <= smooth:
+        if not points.are_enough(followed):
+            return found
+        if smooth is not None and not _are_larger(clip.measure_changes(steps, points.find_middle(followed)), smooth):
             return found
         found.append(maps)
         best = np.minimum(best, own)
