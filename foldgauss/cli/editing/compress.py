@@ -55,7 +55,10 @@ def compress_command(
         Path | None, typer.Option("--out", help=f"FILE{COMPACT_SUFFIX} [default: the model's name in this folder].")
     ] = None,
     passes: Annotated[
-        int, typer.Option(help="Passes over VIDEO that reduce the loss by rounding; 0: only round.", min=0)
+        int,
+        typer.Option(
+            help=f"Passes over VIDEO of a fine-tuning, about {USUAL_PASSES} times as many in all; 0: only round.", min=0
+        ),
     ] = 48,
     frames: Annotated[
         str | None, typer.Option(metavar="A:B", help="Frames of VIDEO [default: those that it was fitted to].")

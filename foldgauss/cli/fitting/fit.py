@@ -66,7 +66,7 @@ def fit(
         Path | None,
         typer.Option(
             metavar="FILE.jsonl",
-            help="Write the figures of every step here, and their curves to FILE.png.",
+            help="Write the loss, PSNR and times of every step here, and curves of them to FILE.png (extra `plot`).",
             rich_help_panel=PROGRESS,
         ),
     ] = None,

@@ -60,7 +60,7 @@ Scheduler = Annotated[
     str | None,
     typer.Option(
         metavar="ADDRESS",
-        help="A running dask scheduler, as tcp://host:8786, whose workers see the same folders.",
+        help="A running dask scheduler, such as tcp://host:8786, whose workers see the same folders.",
         rich_help_panel=WORKERS,
     ),
 ]

@@ -27,7 +27,7 @@ NewClip = Annotated[
     typer.Argument(help="Video file, folder of images in natural order, or one image.", autocompletion=complete_clips),
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing outputs.")]
-Size = Annotated[str | None, typer.Option(metavar="HxW", help="Height x width in pixels, as 160x320.")]
+Size = Annotated[str | None, typer.Option(metavar="HxW", help="Height x width in pixels, such as 160x320.")]
 Frames = Annotated[
     str | None, typer.Option(metavar="A:B", help="Frames A up to, not including, B; either may be omitted.")
 ]

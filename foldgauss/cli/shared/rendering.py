@@ -35,13 +35,13 @@ Crf = Annotated[
     int | None, typer.Option(help="Constant rate factor: smaller makes better and larger files [default: h264 16].")
 ]
 PixelFormat = Annotated[
-    str | None, typer.Option(metavar="NAME", help="FFmpeg's pixel format, as yuv444p or yuv420p10le.")
+    str | None, typer.Option(metavar="NAME", help="FFmpeg's name of the pixel format, such as yuv444p or yuv420p10le.")
 ]
 SoundFile = Annotated[
     Path | None,
     typer.Option(
         "--sound",
-        help="File whose sound the video gets, usually the fitted clip; stretched in slow motion, at its pitch.",
+        help="File whose sound the video gets, usually the fitted clip; stretched in slow motion, with its pitch kept.",
     ),
 ]
 

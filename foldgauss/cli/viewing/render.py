@@ -73,7 +73,7 @@ def render(
         str,
         typer.Option(
             metavar="RRGGBB",
-            help="Background color of a model of a clip with alpha, as ffffff; none: images with alpha.",
+            help="Background color of a model of a clip with alpha, such as ffffff; none: images with alpha.",
         ),
     ] = "000000",
     image_format: Annotated[

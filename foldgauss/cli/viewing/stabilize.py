@@ -53,7 +53,7 @@ def stabilize_command(
     fps: Fps = None,
     speed: Speed = None,
     background: Annotated[
-        str, typer.Option(metavar="RRGGBB", help="Background color, as ffffff; none: with alpha.")
+        str, typer.Option(metavar="RRGGBB", help="Background color, such as ffffff; none: with alpha.")
     ] = "000000",
     codec: CodecName = None,
     crf: Crf = None,

@@ -278,10 +278,10 @@ class FitConfig:
     interpolation_fraction: float | None = field(
         default=None,
         metadata=setting(
-            "Fraction of the first steps that fit frames interpolated by optical flow, for slow motion",
-            "Improves the times between frames. First steps are those before `interpolation_end`.",
+            "Of the steps before interpolation ends, the fraction that fits frames interpolated by optical flow",
+            "Improves the times between frames, for slow motion. Interpolation ends at `interpolation_end`.",
             bounds="[0, 1)",
-            unset=f"{INTERPOLATION_FRACTION:g}; 0 with an economy or alpha, or without follow_motion",
+            unset=f"{INTERPOLATION_FRACTION:g}; 0 with an economy, alpha or no optical flow",
             option="--interpolation-fraction",
             group=OPTIMIZATION,
         ),
@@ -323,12 +323,14 @@ class FitConfig:
     rates: LearningRates = field(default=LearningRates(), metadata=setting("Learning rates at the first step"))
     final_rate: float = field(
         default=0.2,
-        metadata=setting("Learning rates decay exponentially to this fraction of themselves", bounds="[0, 1]"),
+        metadata=setting(
+            "Learning rates decay exponentially to this fraction of their initial values", bounds="[0, 1]"
+        ),
     )
     cooldown_fraction: float = field(
         default=0.2,
         metadata=setting(
-            "Fraction of the steps, at the end, in which learning rates also fall linearly, to almost 0",
+            "Fraction of the steps, at the end, in which learning rates also decrease linearly, to 2%",
             "Averages out the noise of single frames in the gradients.",
             bounds="[0, 1]",
         ),
@@ -409,10 +411,11 @@ class FitConfig:
         * "standard": `FitConfig()`.
         * "draft": a first impression in a fraction of the time: 10,000 Gaussians of degree 2, 800 steps.
         * "paper": the published configuration. 500,000 Gaussians, initialized uniformly, that grow (`Growth`), degree
-          7, batches of 3, 30,000 steps, L1 + 0.2 D-SSIM, two opposite cameras, the published learning rates, of which
-          only that of positions decays (to 1/100), Adam updates of all Gaussians, the published rasterizer's constants.
-          Other numbers of steps scale the growth schedule in proportion, but not the learning rates, so fits of a few
-          thousand steps stop early. Not reproduced: the published code skips Gaussians thinner than 1e-4 of its units.
+          7, batches of 3, 30,000 steps, 0.8 L1 + 0.2 D-SSIM, two opposite cameras, the published learning rates, of
+          which only that of positions decays (to 1/100), Adam updates of all Gaussians, the published rasterizer's
+          constants. Other numbers of steps scale the growth schedule in proportion, but not the learning rates, so fits
+          of a few thousand steps stop early. Not reproduced: the published code skips Gaussians thinner than 1e-4 of
+          its units.
           Source: VeGaS, "Implementation Details", and constants of its published code.
 
         Raises ValueError for an unknown name or change. Example: `FitConfig.preset("paper", steps=3000)`.
