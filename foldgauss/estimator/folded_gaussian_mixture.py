@@ -59,7 +59,7 @@ _CURES = {
 #: With "auto", the initial number of components is at most the number of points divided by this.
 _POINTS_PER_COMPONENT = 8
 #: The highest degree fitted in float32. Beyond, with times far from normal, a curve's normal equations lose more digits
-#: than float32 has: up to 1 nat a point at degree 10 (docs/estimator.md).
+#: than float32 has: up to 1 nat a point at degree 10.
 _MAX_SINGLE_DEGREE = 6
 #: Spacings of floating-point times up to this fraction of a component's spread are harmless.
 _MAX_SPACING = 0.01
