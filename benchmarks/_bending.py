@@ -77,8 +77,8 @@ def feature_tracks(seed: int = 0) -> Split:
 
     frames = np.asarray(datasets.bikes(frames=FRAMES).frames)
     home, width = HOME - FRAMES[0], frames.shape[2]
-    grey = cv2.cvtColor(frames[home], cv2.COLOR_RGB2GRAY)
-    corners = cv2.goodFeaturesToTrack(grey, CORNERS, QUALITY, DISTANCE).reshape(-1, 2) + np.float32(0.5)
+    gray = cv2.cvtColor(frames[home], cv2.COLOR_RGB2GRAY)
+    corners = cv2.goodFeaturesToTrack(gray, CORNERS, QUALITY, DISTANCE).reshape(-1, 2) + np.float32(0.5)
     reach = min(home, len(frames) - 1 - home)
     tracks = Motion.from_frames(frames).follow(np.full(len(corners), home), corners, longest=reach)
     rng = np.random.default_rng(seed)

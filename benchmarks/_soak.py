@@ -130,8 +130,8 @@ def by_cycle(samples: list[Sample], cycles: list[tuple[float, float]], field: st
 def trend(points: list[tuple[float, float]], warm_up: float = WARM_UP) -> Trend:
     """A least-squares line through `points` (hours, MiB), but for the first share `warm_up` of the time.
 
-    Neighbours are alike, so they tell less than as many independent ones: the error is that of
-    n (1 - r) / (1 + r) points, r being the correlation of neighbouring residuals where that is above 0.
+    Neighbors are alike, so they tell less than as many independent ones: the error is that of
+    n (1 - r) / (1 + r) points, r being the correlation of neighboring residuals where that is above 0.
     """
     hours, mib = np.array([point for point in points if point[0] >= warm_up * points[-1][0]]).T
     line = stats.linregress(hours, mib)

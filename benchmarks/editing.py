@@ -4,7 +4,7 @@
                                  [--models FOLDER]
 
 *rider*: 25 frames of *bikes* at 160x384, a man who rides past cars. His masks are made here, by a rough outline on five
-frames and by colour (GrabCut) on all. *shapes*: 24 frames of 128x256 made here, a striped disc and a chequered box over
+frames and by color (GrabCut) on all. *shapes*: 24 frames of 128x256 made here, a striped disc and a chequered box over
 a textured ground; masks and the picture behind the disc are known.
 
 Each is fitted, its object selected by its masks and then deleted, copied, made smaller or larger, and changed in one
@@ -155,7 +155,7 @@ def _outline(k: int) -> np.ndarray:
 
 
 def _cut_out(frame: np.ndarray, outline: np.ndarray) -> np.ndarray:
-    """What a rough outline means, by colour: bool (height, width)."""
+    """What a rough outline means, by color: bool (height, width)."""
     drawn = np.zeros(frame.shape[:2], np.uint8)
     if len(outline):
         cv2.fillPoly(drawn, [outline.round().astype(np.int32)], 1)

@@ -67,13 +67,13 @@ def density() -> plt.Figure:
     ax.set(xlabel="time t", ylabel="space s")
     note = {"arrowprops": {"arrowstyle": "->", "color": GREY, "lw": 0.8}, "color": GREY, "fontsize": 9}
     low, high = ax.get_ylim()
-    ax.annotate("centre $m_s + f(m_t - t)$", (0.36, float(_centre(0.36))), (0.3, high - 0.1 * (high - low)), **note)
-    ax.annotate("$s\\,|\\,t$ is a Gaussian with\nvariance $a(t)\\,\\Sigma$", (0.77, float(_centre(0.75))),
+    ax.annotate("center $m_s + f(m_t - t)$", (0.36, float(_center(0.36))), (0.3, high - 0.1 * (high - low)), **note)
+    ax.annotate("$s\\,|\\,t$ is a Gaussian with\nvariance $a(t)\\,\\Sigma$", (0.77, float(_center(0.75))),
                 (0.72, low + 0.75 * (high - low)), **note)  # fmt: skip
     return fig
 
 
-def _centre(t: float) -> np.ndarray:
+def _center(t: float) -> np.ndarray:
     return np.asarray(bent().condition_time(t).loc)[0]
 
 
@@ -136,7 +136,7 @@ def pipeline(scene: Scene, model: VideoModel) -> plt.Figure:
     fig, axes = plt.subplots(2, 2, figsize=(9.6, 4.7))
     panels = {
         "1  frames, and what moves in them": _bright(scene.frames[k]),
-        "2  Gaussians start along the flow (colour: direction)": _flow(scene.frames[k], scene.frames[k + 1]),
+        "2  Gaussians start along the flow (color: direction)": _flow(scene.frames[k], scene.frames[k + 1]),
         f"3  fitted, conditioned on t (one in {EVERY} drawn)": np.full_like(scene.frames[k], 255),
         "4  blended front to back: a picture, at any t": _bright(next(model.frames(np.array([t])))),
     }
@@ -153,9 +153,9 @@ def _bright(picture: np.ndarray) -> np.ndarray:
 
 
 def _flow(frame: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Optical flow as colour: hue is direction, paleness is rest."""
-    grey = [cv2.cvtColor(one, cv2.COLOR_RGB2GRAY) for one in (frame, after)]
-    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(*grey, None)
+    """Optical flow as color: hue is direction, paleness is rest."""
+    gray = [cv2.cvtColor(one, cv2.COLOR_RGB2GRAY) for one in (frame, after)]
+    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(*gray, None)
     length, angle = cv2.cartToPolar(flow[..., 0], flow[..., 1])
     saturation = np.clip(length / np.quantile(length, 0.98), 0, 1)
     hsv = np.stack([angle * 90 / np.pi, 255 * saturation, np.full_like(length, 255)], -1)
@@ -163,7 +163,7 @@ def _flow(frame: np.ndarray, after: np.ndarray) -> np.ndarray:
 
 
 def _outlines(ax: plt.Axes, model: VideoModel, t: float) -> None:
-    """Two-sigma ellipses of some of the Gaussians alive at t, in their colours."""
+    """Two-sigma ellipses of some of the Gaussians alive at t, in their colors."""
     splats = model.at(t)
     alive = np.flatnonzero(np.asarray(splats.opacity) > 0.05)[::EVERY][::-1]  # the front ones are drawn last
     factor = np.asarray(splats.factor)[alive]

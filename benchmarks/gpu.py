@@ -45,7 +45,7 @@ LOOKS = 10  # of a fit, evenly spaced in time; each renders all frames on the CP
 #: Peak float32 operations and exponentials a second, and bytes a second, by the device's name. NVIDIA's data sheets;
 #: exponentials: 16 a cycle on each of 132 multiprocessors at 1.83 GHz.
 PEAKS = {"H100": (67e12, 3.9e12, 3.35e12), "H200": (67e12, 3.9e12, 4.8e12)}
-#: Float32 operations of a pair: offsets 2, whitened ones 5, exponent 4, comparisons 4, light 2, three colours 6; with
+#: Float32 operations of a pair: offsets 2, whitened ones 5, exponent 4, comparisons 4, light 2, three colors 6; with
 #: gradients the same once more, and of the way back gain 7, slope 5, nine products and sums over pixels 18.
 OPERATIONS = {"forward": 23, "both": 23 + 23 + 30}
 EXPONENTIALS = {"forward": 1, "both": 2}

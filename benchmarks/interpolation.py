@@ -5,12 +5,12 @@
                                        [--seed S] [--set NAME=VALUE ...] [--sheet FILE] [--cost] [--weight W ...]
 
 Without options: *bunny* and *bikes* at 160x320, 5 minutes each, with as many Gaussians as the fit chooses. Frames 0, 2,
-4, ... are fitted, and frames 1, 3, 5, ... drawn half way between the learned times of their neighbours, as `foldgauss
-render` does (`interpolate_frames`) and by the Gaussians alone. Beside them, of the same neighbours:
+4, ... are fitted, and frames 1, 3, 5, ... drawn half way between the learned times of their neighbors, as `foldgauss
+render` does (`interpolate_frames`) and by the Gaussians alone. Beside them, of the same neighbors:
 
 - their mean, and their mean after warping each half way by OpenCV's DIS flow between the two;
 - what the fit learns from between frames, `Motion.interpolate`;
-- the first two again, of the model's own pictures of the neighbours: then all start from the same quality;
+- the first two again, of the model's own pictures of the neighbors: then all start from the same quality;
 - with `--weight`, `interpolate_frames` with other weights of the prediction by optical flow, the same everywhere.
 
 PSNR and SSIM of 8-bit pictures, means over the frames; "without cuts" leaves out frames between two shots, which
@@ -57,11 +57,11 @@ def mean_of_two(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 def warped_half_way(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Each picture moved half of its flow to the other, then their mean."""
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    grey = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (one, other)]
+    gray = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (one, other)]
     rows, columns = one.shape[:2]
     grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).astype(np.float32)
     moved = []
-    for picture, pair in ((one, grey), (other, grey[::-1])):
+    for picture, pair in ((one, gray), (other, gray[::-1])):
         flow = search.calc(*pair, None)
         moved.append(cv2.remap(picture, grid - flow / 2, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
     return mean_of_two(*moved)

@@ -9,7 +9,7 @@ and definitions of types are not mutated.
 
 With --json each mutant that is done is kept there, and the same command continues after it; remove a run from the file
 to try it again. Survivors are listed with their lines: each is either equivalent, or shows what no test checks. Those
-that were found to be equivalent (no test of behaviour can see them) are in `REVIEWED` with the reason, by their lines.
+that were found to be equivalent (no test of behavior can see them) are in `REVIEWED` with the reason, by their lines.
 """
 
 import argparse

@@ -37,7 +37,7 @@ BOUND = 8.0
 class Case(NamedTuple):
     """One row of the table; `condition` is that of Sigma, `offset` is added to space and to time (times its scale).
 
-    `centred` puts loc and time_loc at 0: there residuals as small as 1e-30 are seen, which drown beside a loc of 1.
+    `centered` puts loc and time_loc at 0: there residuals as small as 1e-30 are seen, which drown beside a loc of 1.
     `resting` makes all coefficients 0, so that this is so for a fold too: slopes by coefficients remain.
     """
 
@@ -47,7 +47,7 @@ class Case(NamedTuple):
     time_scale: float = 0.3
     condition: float = 10.0
     offset: float = 0.0
-    centred: bool = False
+    centered: bool = False
     resting: bool = False
 
 
@@ -66,11 +66,11 @@ def cases(dtype) -> list[Case]:
         Case("d 10", dim=10),
         Case("d 64", dim=64),
         Case("d 64, condition", dim=64, condition=condition),
-        Case("centred", degree=0, centred=True),
-        Case("centred, resting fold", centred=True, resting=True),
-        Case("centred, resting fold, time_scale 1e-3", centred=True, resting=True, time_scale=1e-3),
-        Case("centred, resting fold, time_scale 1e6", centred=True, resting=True, time_scale=1e6),
-        Case("centred, condition, time_scale 1e-12", degree=0, centred=True, condition=condition, time_scale=1e-12),
+        Case("centered", degree=0, centered=True),
+        Case("centered, resting fold", centered=True, resting=True),
+        Case("centered, resting fold, time_scale 1e-3", centered=True, resting=True, time_scale=1e-3),
+        Case("centered, resting fold, time_scale 1e6", centered=True, resting=True, time_scale=1e6),
+        Case("centered, condition, time_scale 1e-12", degree=0, centered=True, condition=condition, time_scale=1e-12),
         # Not degree 12: XLA on the CPU takes coefficients below the smallest normal number for 0.
         Case("condition, time_scale 1e6, degree 5", condition=condition, time_scale=1e6, degree=5),
         Case("condition, offset, time_scale 1e-12", condition=condition, offset=offset, time_scale=1e-12),
@@ -90,9 +90,9 @@ def build(case: Case, dtype) -> tuple[FoldedGaussian, np.ndarray]:
         (not case.resting) * rng.normal(size=(case.degree, dim)) / scale ** np.arange(1, case.degree + 1)[:, None] / 4
     )
     dist = FoldedGaussian(
-        np.zeros(dim, dtype) if case.centred else (rng.normal(size=dim) + case.offset).astype(dtype),
+        np.zeros(dim, dtype) if case.centered else (rng.normal(size=dim) + case.offset).astype(dtype),
         tril,
-        time_loc=np.asarray((0.0 if case.centred else 0.4) + case.offset * scale, dtype),
+        time_loc=np.asarray((0.0 if case.centered else 0.4) + case.offset * scale, dtype),
         time_scale=np.asarray(scale, dtype),
         fold=PolynomialFold(rows.astype(dtype)),
         envelope=TimeLikelihood(power.astype(dtype)),

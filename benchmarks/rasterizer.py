@@ -9,7 +9,7 @@ unit), the table gives both.
 
 Timed: wall seconds of a whole call from float32 NumPy (cpu) or device (xla) arrays to finished results, median over
 rounds that run all engines in turn, listing included. XLA uses all cores and is told its lists' capacity, `cpu` is
-timed with one thread and with two. Backward is the gradient of <image, g> by mean, factor, opacity, colour and
+timed with one thread and with two. Backward is the gradient of <image, g> by mean, factor, opacity, color and
 background, the forward pass included. The reference is dense, so it draws only as many splats as make about 1e7
 pairs of its own, pixels times splats.
 

@@ -42,7 +42,7 @@ BUNNY = {
     "160x320": (GREEN, ("bunny-160-1", "bunny-160")),
     "640x1280": (BLUE, ("bunny-640-5", "bunny-640", "bunny-640-60")),
 }
-#: Coders of `codecs.json` in the figure of bytes: marker, colour, label.
+#: Coders of `codecs.json` in the figure of bytes: marker, color, label.
 CODERS = {
     "SVT-AV1 6": ("v", GREY, "AV1"),
     "x265 medium": ("^", GREY, "H.265"),

@@ -12,7 +12,7 @@ error is the largest difference to float64, relative to 1 + |value|; `benchmarks
 *whitening*, as this package computes it, makes L^-1 of the residual of every pair of point and component; *matrix
 product* multiplies the monomials of a point (10 for d = 3) by the coefficients of every component, once for all. The
 error is that of the log-likelihood of a point, the largest, against whitening in float64; with points as they are, and
-moved away from the origin by so many of their deviations, as data that nobody centred are.
+moved away from the origin by so many of their deviations, as data that nobody centered are.
 
 Tasks take turns; times are medians.
 """

@@ -10,7 +10,7 @@
   is each frame found where the whole clip has it? Its pictures and its splats are the same, so this tells only that
   frames are found wherever they are.
 - unseen: every second frame of the clip is fitted, and the frames between are looked for: are they half way between
-  the times of their neighbours, if the clip's playback speed is regular?
+  the times of their neighbors, if the clip's playback speed is regular?
 - calibration: ranks of true times in simulated videos of a small synthetic scene, with right noise, noise assumed 1.5
   times too great and too small, frames of 8 bits, and smoothed noise; coverage of 50% and 90% intervals; `--plot`
   draws the ranks.
@@ -321,7 +321,7 @@ def clip_part(options: argparse.Namespace, figures: dict[str, float]) -> None:
 
 
 def unseen_part(options: argparse.Namespace, figures: dict[str, float]) -> None:
-    """Frames between those that were fitted: their times against the middle of their neighbours' learned times."""
+    """Frames between those that were fitted: their times against the middle of their neighbors' learned times."""
     path = Path(options.clip) if Path(options.clip).exists() else sample_clip(options.clip)
     frames = read_video(path, size=SIZE).frames
     frames = frames[: len(frames) - (len(frames) + 1) % 2]  # the first and the last are fitted

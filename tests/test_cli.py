@@ -332,7 +332,7 @@ def broken_inputs(tmp_path, work):
         "another version": (["info", later], 1, "version"),
         "missing model": (["render", tmp_path / "none", "--out", tmp_path / "v.mp4"], 2, "none"),
         "unknown container": (["render", model, "--out", tmp_path / "v.avi"], 2, "mp4"),
-        "no colour": (["render", model, "--out", tmp_path / "f", "--background", "red"], 2, "--background: .*RRGGBB"),
+        "no color": (["render", model, "--out", tmp_path / "f", "--background", "red"], 2, "--background: .*RRGGBB"),
         "upsample zero": (["render", model, "--out", tmp_path / "v.mp4", "--upsample", "0"], 2, "upsample"),
         "render size zero": (["render", model, "--out", tmp_path / "v.mp4", "--size", "0x0"], 2, "HxW"),
         "evaluate another clip": (["evaluate", model, clip, "--frames", "0:3"], 2, "6 frames"),

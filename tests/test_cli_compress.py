@@ -170,9 +170,9 @@ def test_the_wrong_clip_is_refused(work, tmp_path, capsys, monkeypatch):
     model, frames = load_video_model(work / "model.safetensors"), read_video(work / "clip").frames
     about = {"clip": "clip", "mean_psnr": 33.3, "frames": [0, FRAMES], "frames_digest": "another's"}
     save_video_model("m.safetensors", model, metadata=about)
-    write_video("grey", np.full_like(frames, 90), 12.0)
+    write_video("gray", np.full_like(frames, 90), 12.0)
     write_video("short", frames[:3], 12.0)
-    assert run("compress", "m.safetensors", "grey") == 2
+    assert run("compress", "m.safetensors", "gray") == 2
     assert "VIDEO: expected the clip that the model was fitted to" in " ".join(capsys.readouterr().err.split())
     assert run("compress", "m.safetensors", "short") == 2
     assert "frames 0:5 of clip, got 'short', which has fewer" in " ".join(capsys.readouterr().err.split())

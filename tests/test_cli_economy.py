@@ -11,7 +11,7 @@ from foldgauss.io import load_video_model, write_video
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory):
-    """Eight frames of a disc that moves over one colour, as PNG."""
+    """Eight frames of a disc that moves over one color, as PNG."""
     folder = tmp_path_factory.mktemp("clip") / "disc"
     y, x = np.mgrid[0:40, 0:64]
     disc = np.stack([np.hypot(x - 12 - 5 * k, y - 20) < 8 for k in range(8)])[..., None]

@@ -332,7 +332,7 @@ def test_names_hold_no_pictures(capsys):
 
 
 def test_names_are_shown_as_they_are(monkeypatch):
-    """In a bar, too, brackets are no commands for a colour."""
+    """In a bar, too, brackets are no commands for a color."""
     console = Console(file=io.StringIO(), force_terminal=True, width=120)
     monkeypatch.setattr(_jobs_view, "err", console)
     with _jobs_view._open_view("clips", 2, "bar") as view:

@@ -144,12 +144,12 @@ def test_a_killed_run_goes_on_to_the_same_draws(work, done, tmp_path, capsys, no
     assert {path.name for path in target.iterdir()} == FILES
 
 
-def test_without_colours_less_is_known(work, done, tmp_path, no_pictures):
+def test_without_colors_less_is_known(work, done, tmp_path, no_pictures):
     target = tmp_path / "results"
     assert run(*arguments(work, target, *SHORT, "--steps", "60", "--level", "colors")) == 0
     told = (target / "summary.md").read_text()
     assert "their colors are integrated out" in told
-    assert "their colours" not in (done / "summary.md").read_text()
+    assert "their colors" not in (done / "summary.md").read_text()
     wider = [float(one["exact_std"]) / float(other["exact_std"]) for one, other in zip(
         table_of(target)[5:9], table_of(done)[5:9], strict=True)]  # fmt: skip
     assert min(wider) > 0.9

@@ -91,7 +91,7 @@ def test_arguments_of_synthetic_clips_are_checked(options, name):
 
 
 HEIGHT, WIDTH = 40, 60
-#: DAVIS' own first colours: an OpenCV reader sees 128s where the labels are 1 and 2.
+#: DAVIS' own first colors: an OpenCV reader sees 128s where the labels are 1 and 2.
 PALETTE = [0, 0, 0, 128, 0, 0, 0, 128, 0, 128, 128, 0]
 
 
@@ -151,7 +151,7 @@ def test_davis_without_masks_says_why(root):
 
 
 def test_black_and_white_masks_are_one_object(root):
-    """As DAVIS 2016 has them, in one bit or in grey."""
+    """As DAVIS 2016 has them, in one bit or in gray."""
     for k in range(4):
         mask = np.where(labels(k) == 1, np.uint8(255), np.uint8(0))
         write_mask(root / "Annotations" / "480p" / "bear" / f"{k:05d}.png", mask > 0 if k % 2 else mask, None)
@@ -159,7 +159,7 @@ def test_black_and_white_masks_are_one_object(root):
 
 
 def test_a_palette_with_void_alone_has_no_object(root):
-    """255 of a palette is void; only of grey masks it is the object."""
+    """255 of a palette is void; only of gray masks it is the object."""
     for k in range(4):
         write_mask(root / "Annotations" / "480p" / "bear" / f"{k:05d}.png", labels(k) // 255 * 255)
     found = datasets.davis(root, "bear")
@@ -185,9 +185,9 @@ def test_davis_names_what_is_there(root, tmp_path):
 
 def test_davis_refuses_masks_that_do_not_fit(root):
     place = root / "Annotations" / "480p" / "bear"
-    colours = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    colours[0, 0] = 1, 2, 3
-    write_image(place / "00002.png", colours)
+    colors = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    colors[0, 0] = 1, 2, 3
+    write_image(place / "00002.png", colors)
     _fails(ValueError, "masks with a label per pixel.*'RGB'.*00002.png", root, "bear")
     (place / "00002.png").write_text("cut off")
     _fails(ValueError, "masks that decode, got .*00002.png", root, "bear")

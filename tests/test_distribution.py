@@ -126,9 +126,9 @@ def test_density_integrates_to_one():
     t, time_weights = 0.4 + 0.3 * 7 * nodes, 0.3 * 7 * weights
     # Space is integrated around the ridge with the ridge's own width: far out it is narrower than any grid.
     u = (0.4 - t)[:, None]
-    centre = 0.1 + BEND[0][0] * u + BEND[1][0] * u**2
+    center = 0.1 + BEND[0][0] * u + BEND[1][0] * u**2
     width = 8 * 0.3 * np.sqrt(floor + (1 - floor) * np.exp(-power * (u / 0.3) ** 2 / 2))
-    s = centre + width * nodes[:, None, None]
+    s = center + width * nodes[:, None, None]
     x = np.stack([s, np.broadcast_to(t[:, None], s.shape)], axis=-1)
     total = np.einsum("t,tb,s,stb->b", time_weights, width, weights, PDF(dist, x))
     np.testing.assert_allclose(total, 1, atol=1e-8)

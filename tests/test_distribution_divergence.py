@@ -124,7 +124,7 @@ def test_where_it_is_infinite(p, q, finite):
 
 
 def test_same_curve_written_about_another_time_is_the_same_curve():
-    # loc + c (m_t - t) with m_t moved by 0.2: the centres agree up to rounding, so only the covariance counts.
+    # loc + c (m_t - t) with m_t moved by 0.2: the centers agree up to rounding, so only the covariance counts.
     line = BEND * np.array([[1], [0]])
     p = _dist(1.0, bend=line)
     q = _dist(1.0, time_loc=0.6, bend=line, loc=np.array([0.1, -0.4]) - 0.2 * BEND[0])

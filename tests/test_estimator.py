@@ -131,8 +131,8 @@ def test_covariances_are_of_their_kind_and_precisions_their_inverses(kind, degre
     np.testing.assert_array_equal(np.tril(fitted.precisions_cholesky_, -1), 0)
     # Whatever their kind, their sizes are those of the residuals, as far as EM has converged.
     powers = (fitted.time_means_ - x[:, 1:2])[:, :, None] ** np.arange(1, degree + 1)
-    centres = fitted.locs_ + np.einsum("nkj,kjd->nkd", powers, fitted.fold_coefficients_)
-    squares = ((x[:, None, [0, 2]] - centres) ** 2).sum(-1)
+    centers = fitted.locs_ + np.einsum("nkj,kjd->nkd", powers, fitted.fold_coefficients_)
+    squares = ((x[:, None, [0, 2]] - centers) ** 2).sum(-1)
     sizes = np.trace(fitted.space_covariances_, axis1=1, axis2=2)
     assert (fitted.predict_proba(x) * squares).sum(1).mean() == pytest.approx(fitted.weights_ @ sizes, rel=0.02)
     given = _quiet(mixture.set_params(means_init=np.stack([x[k::K].mean(0) for k in range(K)])), x).space_covariances_
@@ -231,9 +231,9 @@ def test_crossing_tracks_are_found():
     t = np.linspace(0.2, 0.8, 5)
     u = fitted.time_means_[:, None] - t
     powers = u[:, :, None] ** np.arange(1, 4)
-    centre = fitted.locs_[:, :1] + np.einsum("ktj,kj->kt", powers, fitted.fold_coefficients_[:, :, 0])
+    center = fitted.locs_[:, :1] + np.einsum("ktj,kj->kt", powers, fitted.fold_coefficients_[:, :, 0])
     truth = CURVES @ (t[None] ** np.arange(4)[:, None])
-    nearest = np.abs(centre[:, None] - truth[None]).max(-1)
+    nearest = np.abs(center[:, None] - truth[None]).max(-1)
     assert (nearest.min(0) < 0.03).all()  # 0.03 is the noise of one point
     assert sorted(nearest.argmin(1)) == [0, 1, 2]
     np.testing.assert_allclose(np.sqrt(fitted.space_covariances_.ravel()), 0.03, rtol=0.3)
@@ -242,7 +242,7 @@ def test_crossing_tracks_are_found():
 @pytest.mark.slow
 @pytest.mark.parametrize("start", ["kmeans", "random_from_data"])
 def test_annealing_finds_the_best_optimum(start):
-    """Groups of neighbours, where tracks cross: from heat on, every start ends at the same best."""
+    """Groups of neighbors, where tracks cross: from heat on, every start ends at the same best."""
     x, labels = _tracks()
     plain, heated = (
         [

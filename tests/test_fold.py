@@ -116,12 +116,12 @@ def test_spline_equals_scipy_and_is_held_outside(knots, degree):
         assert np.isnan(nan).all()
 
 
-def test_centred_spline_differs_by_a_constant():
+def test_centered_spline_differs_by_a_constant():
     fold = FOLDS["spline"]()
     u = np.linspace(-1.5, 1.5, 7, dtype=np.float32)  # its middle is 0
-    ours, centred = (np.asarray(APPLY(f, u)) for f in (fold, fold.centered()))
-    np.testing.assert_allclose(centred, ours - ours[3], atol=1e-4)
-    np.testing.assert_allclose(centred[3], np.zeros(2), atol=1e-5)
+    ours, centered = (np.asarray(APPLY(f, u)) for f in (fold, fold.centered()))
+    np.testing.assert_allclose(centered, ours - ours[3], atol=1e-4)
+    np.testing.assert_allclose(centered[3], np.zeros(2), atol=1e-5)
     assert np.abs(ours[3]).max() > 1
 
 

@@ -228,10 +228,10 @@ def test_draws_have_the_moments_and_the_weights(drawn):
     one_hot = component[:, None] == np.arange(3)
     assert _deviations(one_hot, WEIGHTS) < ALARM
     assert _deviations(x, mixture.mean) < ALARM
-    centred = x - np.asarray(mixture.mean)
-    products = centred[:, :, None] * centred[:, None, :]
+    centered = x - np.asarray(mixture.mean)
+    products = centered[:, :, None] * centered[:, None, :]
     assert _deviations(products, mixture.covariance_matrix) < ALARM
-    # Power: without the centres' own spread the covariance is seen to be wrong, without weights the mean.
+    # Power: without the centers' own spread the covariance is seen to be wrong, without weights the mean.
     within = np.tensordot(WEIGHTS, mixture.components.covariance_matrix, 1)
     assert _deviations(products, within) > ALARM
     assert _deviations(x, np.asarray(mixture.components.mean).mean(0)) > ALARM
@@ -250,8 +250,8 @@ def test_draws_at_a_time_have_the_regression(drawn):
     at = mixture.condition_time(t)
     assert _deviations(one_hot, at.weights) < ALARM
     assert _deviations(s, mixture.expected_space(t)) < ALARM
-    centred = s - np.asarray(mixture.expected_space(t))
-    products = centred[:, :, None] * centred[:, None, :]
+    centered = s - np.asarray(mixture.expected_space(t))
+    products = centered[:, :, None] * centered[:, None, :]
     assert _deviations(products, mixture.space_covariance(t)) < ALARM
     assert _deviations(one_hot, WEIGHTS) > ALARM  # power: the weights that do not follow time
     unweighted = np.asarray(WEIGHTS) @ np.asarray(mixture.components.condition_time(jnp.asarray([t])).loc)

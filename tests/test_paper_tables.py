@@ -21,8 +21,8 @@ SIZE, NUM_FRAMES = (24, 32), 6
 def blob(num_frames=NUM_FRAMES, size=SIZE):
     """A blob that moves to the right, at the same pace throughout."""
     y, x = np.mgrid[0 : size[0], 0 : size[1]]
-    centre = np.linspace(0.2, 0.7, num_frames)[:, None, None] * size[1]
-    light = np.exp(-((x - centre) ** 2 + (y - size[0] / 2) ** 2) / 20)
+    center = np.linspace(0.2, 0.7, num_frames)[:, None, None] * size[1]
+    light = np.exp(-((x - center) ** 2 + (y - size[0] / 2) ** 2) / 20)
     return np.stack([255 * light, 128 + 0 * light, 255 - 200 * light], -1).astype(np.uint8)
 
 

@@ -44,11 +44,11 @@ def test_slices_stand_on_the_conditional_gaussians(ax, bend):
     bells = [line for line in _red(ax) if len(line.get_xdata()) > 2]
     assert len(dots) == len(bells) == 3
     for t, dot, bell in zip(times, dots, bells, strict=True):
-        centre = 0.2 + sum(c * (0.5 - t) ** (k + 1) for k, (c,) in enumerate(bend))  # u = time_loc - t
+        center = 0.2 + sum(c * (0.5 - t) ** (k + 1) for k, (c,) in enumerate(bend))  # u = time_loc - t
         scale = 0.4 * np.exp(-0.25 * ((t - 0.5) / 0.3) ** 2)
-        np.testing.assert_allclose([dot.get_xdata()[0], dot.get_ydata()[0]], [t, centre], atol=1e-6)
+        np.testing.assert_allclose([dot.get_xdata()[0], dot.get_ydata()[0]], [t, center], atol=1e-6)
         foot, s = bell.get_xdata() - t, bell.get_ydata()
-        np.testing.assert_allclose(foot / foot.max(), np.exp(-0.5 * ((s - centre) / scale) ** 2), atol=1e-3)
+        np.testing.assert_allclose(foot / foot.max(), np.exp(-0.5 * ((s - center) / scale) ** 2), atol=1e-3)
 
 
 def test_limits_labels_and_axes(ax):

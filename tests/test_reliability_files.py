@@ -531,7 +531,7 @@ def test_texts_of_a_file_command_no_terminal(work, tmp_path, capsys):
 
 
 def test_a_trend_is_seen_and_none_is_not():
-    """Of the soak's line: noise of 20 MiB whose neighbours are alike, an hour of it; 60 MiB an hour are seen, 0 not."""
+    """Of the soak's line: noise of 20 MiB whose neighbors are alike, an hour of it; 60 MiB an hour are seen, 0 not."""
     found = {0.0: 0, 60.0: 0}
     for slope in found:
         for seed in range(20):

@@ -21,8 +21,8 @@ from foldgauss.video.fitting.loop import start, start_from, to_model
 def moving_disc(num_frames=6, size=(48, 64)):
     """uint8 (num_frames, *size, 3): a disc over a slope."""
     y, x = np.mgrid[: size[0], : size[1]]
-    centres = np.linspace(0.2, 0.8, num_frames) * size[1]
-    light = np.stack([np.exp(-((x - at) ** 2 + (y - size[0] / 2) ** 2) / 40) for at in centres])[..., None]
+    centers = np.linspace(0.2, 0.8, num_frames) * size[1]
+    light = np.stack([np.exp(-((x - at) ** 2 + (y - size[0] / 2) ** 2) / 40) for at in centers])[..., None]
     slope = np.stack([x / size[1], y / size[0], 0 * x + 0.3], -1) * 0.6
     return np.rint(255 * (slope * (1 - light) + light * np.array([1, 0.2, 0.1]))).astype(np.uint8)
 
@@ -211,8 +211,8 @@ def _extreme():
     """Leaves of some Gaussians at the ends of what is finite; the others are as they were."""
     far = np.float32(3e38)
     return {
-        "centres far away": {"loc": [1e30, -1e30]},
-        "centres at the largest number": {"loc": [far, -far]},
+        "centers far away": {"loc": [1e30, -1e30]},
+        "centers at the largest number": {"loc": [far, -far]},
         "scales of 1e-30": {"log_scale": [math.log(1e-30)] * 2},
         "scales of 1e-45 and 1e30": {"log_scale": [-103.0, 69.0]},
         "scales that overflow": {"log_scale": [1e30, 1e30]},
@@ -224,13 +224,13 @@ def _extreme():
         "times at the end": {"time_loc_logit": 1e30},
         "folds of 1e6": {"coefficients": 1e6},
         "folds of the largest number": {"coefficients": far},
-        "colours below black": {"color_dc": -far},
+        "colors below black": {"color_dc": -far},
     }
 
 
 @pytest.mark.parametrize("name", _extreme())
 def test_engines_agree_on_extreme_models(name):
-    """Degree 7; a Gaussian in three is far from usual. Colours of the others stay below white."""
+    """Degree 7; a Gaussian in three is far from usual. Colors of the others stay below white."""
     model = soft_model(degree=7)
     changed = {}
     for leaf, value in _extreme()[name].items():

@@ -118,8 +118,8 @@ def test_first_calls_that_compile_at_once():
 def moving_disc(num_frames=5, size=(48, 64)):
     """uint8 (num_frames, *size, 3)."""
     y, x = np.mgrid[: size[0], : size[1]]
-    centres = np.linspace(0.3, 0.7, num_frames) * size[1]
-    light = np.stack([np.exp(-((x - at) ** 2 + (y - size[0] / 2) ** 2) / 60) for at in centres])
+    centers = np.linspace(0.3, 0.7, num_frames) * size[1]
+    light = np.stack([np.exp(-((x - at) ** 2 + (y - size[0] / 2) ** 2) / 60) for at in centers])
     return np.rint(255 * light[..., None] * np.array([0.9, 0.5, 0.2])).astype(np.uint8)
 
 

@@ -15,7 +15,7 @@ def model_of_12() -> VideoModel:
 
 
 def clip_of(model: VideoModel, times=None, noise=4.0, seed=0) -> np.ndarray:
-    """What the model shows at `times`, with noise (grey levels); by default frame TWICE + 1 is TWICE again."""
+    """What the model shows at `times`, with noise (gray levels); by default frame TWICE + 1 is TWICE again."""
     if times is None:
         times = np.linspace(0, 1, NUM_FRAMES)
         times[TWICE + 1] = times[TWICE]

@@ -68,7 +68,7 @@ def carphone(*, frames: Range | None = None, size: Size | None = None) -> Clip:
 
 
 def waves(num_frames: int = 6, *, size: Size = (48, 80), fps: float = 24.0) -> Clip:
-    """A synthetic clip without noise: a grey pattern of waves that moves to the left by 2 pixels a frame.
+    """A synthetic clip without noise: a gray pattern of waves that moves to the left by 2 pixels a frame.
 
     `size` is (height, width) in pixels. The clip needs no extra and takes no time to make; examples and tests use it.
 
@@ -78,8 +78,8 @@ def waves(num_frames: int = 6, *, size: Size = (48, 80), fps: float = 24.0) -> C
     """
     x, y = _pixel_indices(num_frames, size, fps)
     k = np.arange(num_frames)[:, None, None]
-    grey = 128 + 100 * np.sin(0.15 * x + 0.3 * k) * np.cos(0.1 * y)
-    return _synthetic("waves", np.repeat(grey[..., None], 3, axis=-1), fps)
+    gray = 128 + 100 * np.sin(0.15 * x + 0.3 * k) * np.cos(0.1 * y)
+    return _synthetic("waves", np.repeat(gray[..., None], 3, axis=-1), fps)
 
 
 def ball(
@@ -88,7 +88,7 @@ def ball(
     """A synthetic clip with masks: an orange ball crosses a textured ground from left to right at constant speed.
 
     The masks are 1 on the ball and 0 elsewhere. `noise` is the standard deviation of independent normal noise on every
-    value, in grey levels (0 to 255), drawn with `seed`. The clip needs no extra; examples and tests use it.
+    value, in gray levels (0 to 255), drawn with `seed`. The clip needs no extra; examples and tests use it.
 
     Raises ValueError unless `num_frames` and both sides are positive integers, `fps` is positive and `noise` is not
     negative.
@@ -96,7 +96,7 @@ def ball(
     Example: `sample = ball(16); by_mask(model, sample.masks == 1)`.
     """
     x, y = _pixel_indices(num_frames, size, fps)
-    check_within("noise", noise, "[0, inf)", "a standard deviation in grey levels, 0 or more")
+    check_within("noise", noise, "[0, inf)", "a standard deviation in gray levels, 0 or more")
     height, width = size
     center = width * np.linspace(0.15, 0.8, num_frames)[:, None, None]
     inside = np.hypot(x + 0.5 - center, y + 0.5 - height / 2) < height / 5

@@ -181,7 +181,7 @@ def _level(log, least):
 
 @kernel
 def _load_geometry(geometry, num, which, left, top, block):
-    """The geometry of splats which[:num], column after column, their centres relative to (left, top).
+    """The geometry of splats which[:num], column after column, their centers relative to (left, top).
 
     `which` has length BLOCK: up to a multiple of 16 it is padded with the last splat.
     """
@@ -203,7 +203,7 @@ def _load_geometry(geometry, num, which, left, top, block):
 def _find_tiles(num, block, upper, lower, width, first, end):
     """Exact ellipse-tile test: tiles first <= k < end of a band that the block's splats reach.
 
-    `upper` and `lower`: the y of the band's first and last pixel centres.
+    `upper` and `lower`: the y of the band's first and last pixel centers.
     """
     for e in range(_u(num)):
         x, y = block[_u(_X * BLOCK) + e], block[_u(_Y * BLOCK) + e]
@@ -258,7 +258,7 @@ def _bucket_tiles(geometry, row_start, entries, begin, end, height, width):
 def _find_cells(num, block, first, end):
     """Cells first <= k < end of every band of cells that the block's splats reach, band after band.
 
-    Exact for the rectangle of a cell's pixel centres.
+    Exact for the rectangle of a cell's pixel centers.
     """
     for band in range(_u(CELLS)):
         upper, at = _f(_i(band) * _i(CELL)), band * _u(BLOCK)
@@ -289,7 +289,7 @@ def _aligned_empty(size):
 def _load_block(geometry, color, background, entries, listed, left, top, block, first, end):
     """The parameters of up to BLOCK splats of a tile, one after another, and the cells that each one reaches.
 
-    Centres are relative to the centre of the tile's first pixel.
+    Centers are relative to the center of the tile's first pixel.
     """
     which = end  # reused: `end` is written last
     for e in range(_u(len(listed))):

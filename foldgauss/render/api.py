@@ -43,7 +43,7 @@ def render(
 
     $$ C = \sum_i c_i \alpha_i T_i + T_{end}\, c_{bg}, \qquad T_i = \prod_{j<i} (1 - \alpha_j) $$
 
-    - `splats`: in pixels (x right, y down, centres at +0.5), front to back in array order.
+    - `splats`: in pixels (x right, y down, centers at +0.5), front to back in array order.
     - `size`: (height, width) in pixels.
     - `background`: one color, (channels,); None is black.
     - `compositing`: "over", as 3DGS and VeGaS; or "sum", the accumulated blend of GaussianImage, where all

@@ -44,7 +44,7 @@ from .target import CONSTANT, Target, chance
 def tiny_model(
     num: int = 3, degree: int = 1, *, plain: bool = True, shared: bool = False, frames: int = 3, seed: int = 0
 ) -> VideoModel:
-    """Some Gaussians; not `plain`: with all that the stored form leaves out or shares; `shared`: of one colour."""
+    """Some Gaussians; not `plain`: with all that the stored form leaves out or shares; `shared`: of one color."""
     rng = np.random.default_rng(seed)
 
     def normal(*shape: int) -> np.ndarray:

@@ -216,7 +216,7 @@ CLAIMS = {
     "compact: frames": ("compact", lambda: _compact(num_frames=HUGE)),
     "compact: cells": ("compact", lambda: _compact(cells=[24, 24, 24])),
     "compact: degree": ("compact", lambda: _compact(degree=HUGE)),
-    "compact: colours": ("compact", lambda: _compact(shared=HUGE)),
+    "compact: colors": ("compact", lambda: _compact(shared=HUGE)),
     "compact: paths": ("compact", lambda: _compact(4, {"num_paths": HUGE})),
     "compact: most paths": ("compact", lambda: _compact(4, {"num_paths": 255, "num_knots": 2**15})),
     "compact: knots": ("compact", lambda: _compact(4, {"num_knots": HUGE})),
@@ -419,7 +419,7 @@ def test_a_mask_too_large_for_its_file_is_called_so(side, tmp_path):
         read_masks(tmp_path / "m.png")
 
 
-def test_good_neighbours_are_still_read(tmp_path):
+def test_good_neighbors_are_still_read(tmp_path):
     """Large and plain pictures are no bombs: the limit is far from them."""
     plain = np.zeros((4320, 7680), np.uint8)
     plain[:10] = 1

@@ -110,7 +110,7 @@ def test_frame_times_and_cut_are_kept():
 
 
 def of_kinds(model, seed=0):
-    """Paths of several degrees, a third of the Gaussians lasting, half solid, and colours that four share."""
+    """Paths of several degrees, a third of the Gaussians lasting, half solid, and colors that four share."""
     rng, splats = np.random.default_rng(seed), model.splats
     num, degree = model.num_gaussians, model.degree
     lasting = np.arange(num) % 3 == 0

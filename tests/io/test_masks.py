@@ -80,8 +80,8 @@ def test_refused(folder, tmp_path):
     fails("size: expected", folder, size=(0, 5))
     (folder / "empty").mkdir()
     fails("path: expected a folder with images", folder / "empty")
-    write_image(folder / "colours.png", np.full((*SIZE, 3), (1, 2, 3), np.uint8))
-    fails("label per pixel.*'RGB'", folder / "colours.png")
+    write_image(folder / "colors.png", np.full((*SIZE, 3), (1, 2, 3), np.uint8))
+    fails("label per pixel.*'RGB'", folder / "colors.png")
     video = write_video(tmp_path / "v.mp4", [np.zeros((*SIZE, 3), np.uint8)] * 2, 25)
     fails("label: expected images with labels, got the video", video, label=1)
     for level in (0, 1.5, None):

@@ -88,7 +88,7 @@ def test_axes_of_any_factor():
 
 
 def edited(path, change):
-    """The file with its vertices changed, as a tool writes it: no colours, no comments, other index forms."""
+    """The file with its vertices changed, as a tool writes it: no colors, no comments, other index forms."""
     faces = change(read_obj(path))
     lines = ["mtllib none.mtl", "o soup", *("v " + " ".join(map(repr, row)) for row in faces.reshape(-1, 3).tolist())]
     lines += ["vn 0 0 1", "s off"]
@@ -125,13 +125,13 @@ def test_scaled_and_mirrored_faces(folder, model):
 
 
 def test_depth_is_seen_by_the_front_camera(folder, model):
-    """Moved towards the viewer by half the camera's distance all is twice as large, about the frame's centre."""
+    """Moved towards the viewer by half the camera's distance all is twice as large, about the frame's center."""
     before = read_pseudomesh(folder).splats(1)
     distance = 0.5 / math.tan(0.6911112 / 2)
     edited(folder / "frame_0001.obj", lambda faces: faces + np.array([0, 0, distance / 2]))
     after = read_pseudomesh(folder).splats(1)
-    centre = np.array([40.0, 24.0], np.float32)
-    np.testing.assert_allclose(after.mean - centre, 2 * (before.mean - centre), rtol=1e-4, atol=1e-3)
+    center = np.array([40.0, 24.0], np.float32)
+    np.testing.assert_allclose(after.mean - center, 2 * (before.mean - center), rtol=1e-4, atol=1e-3)
     covariance = lambda factor: np.asarray(factor) @ np.asarray(factor).mT  # noqa: E731
     np.testing.assert_allclose(covariance(after.factor), 4 * covariance(before.factor), rtol=1e-3, atol=1e-2)
     assert read_pseudomesh(folder).frame(1).shape == (*SIZE, 3)

@@ -41,7 +41,7 @@ from foldgauss.video.models.renderer import VideoRenderer
 
 
 def thinned():
-    """A model whose file leaves out parameters: static and opaque Gaussians, shared colours, several degrees."""
+    """A model whose file leaves out parameters: static and opaque Gaussians, shared colors, several degrees."""
     model = soft_model(options=RenderOptions())
     leaves = {
         name: np.array(getattr(model.splats, name)) for name in ("time_loc_logit", "log_time_scale", "opacity_logit")

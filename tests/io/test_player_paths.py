@@ -34,7 +34,7 @@ CASES = {
     "strong": {"reach": 8.0, "thin": 4.0},
 }
 FIELDS = ("mean", "factor", "opacity", "color")
-#: Colours are in the leaves alone.
+#: Colors are in the leaves alone.
 PLACES = {name: EDITS[name] for name in EDITS if name not in ("hue", "gain", "color", "matrix", "fainter", "denser")}
 PLACES["several"] = "\n[[edits]]\n".join(
     EDITS[name] for name in ("later", "transform", "backwards", "copies", "rotate")

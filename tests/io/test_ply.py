@@ -483,9 +483,9 @@ def test_wrong_arguments(tmp_path, arguments):
 
 def test_what_gaussians_cannot_be_written(tmp_path):
     good = frame_gaussians(random_model(), 0.5)
-    grey = eqx.tree_at(lambda g: g.color, good, good.color[:, :1])
+    gray = eqx.tree_at(lambda g: g.color, good, good.color[:, :1])
     broken = eqx.tree_at(lambda g: g.mean, good, good.mean * np.float32(np.nan))
-    for gaussians, text in ((grey, "channels"), (broken, "finite")):
+    for gaussians, text in ((gray, "channels"), (broken, "finite")):
         with pytest.raises(ValueError, match=text):
             write_gaussians_ply(tmp_path / "g.ply", gaussians)
     assert list(tmp_path.iterdir()) == []
@@ -583,7 +583,7 @@ def test_frame_weights_are_needed(tmp_path):
 
 @pytest.mark.parametrize(
     "note", ['{"size": [1, "a"]}', "[1]", "{", '{"options": 3}', '{"size": [4, 4], "options": {"low_pass": -1}}',
-             '{"size": [4, 4], "options": {"colour": 1}}', '{"size": [4, 4], "fps": "many"}', "[" * 100_000,
+             '{"size": [4, 4], "options": {"color": 1}}', '{"size": [4, 4], "fps": "many"}', "[" * 100_000,
              '{"size": [4, 4], "power": 0}', '{"size": [4, 4], "power": "two"}', '{"size": [4, 4], "power": 1e300}']
 )  # fmt: skip
 def test_notes_that_are_none(tmp_path, note):

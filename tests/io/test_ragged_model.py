@@ -19,14 +19,14 @@ from foldgauss.video.models.row_layout import unpack
 from foldgauss.video.models.splats import OPAQUE_LOGIT, STATIC_LOG_TIME_SCALE
 
 NUM, NUM_FRAMES = 50, 5
-#: Bytes of a Gaussian besides coefficients, times, colour and shape; those of frame times and envelope.
+#: Bytes of a Gaussian besides coefficients, times, color and shape; those of frame times and envelope.
 PLAIN, SHARED = 4 * 4, 4 * (NUM_FRAMES - 1 + 2)
 
 
 def ragged_model(
     degrees, lasting=False, num_colors=None, num_shapes=None, *, solid=False, degree=None, seed=0
 ) -> VideoModel:
-    """Random Gaussians of these `degrees` (num,), of which those of `lasting` last, in so many colours and shapes.
+    """Random Gaussians of these `degrees` (num,), of which those of `lasting` last, in so many colors and shapes.
 
     No light comes through those of `solid`.
     """
@@ -65,11 +65,11 @@ def mixed(num: int, degree: int, *, seed: int = 1) -> tuple[np.ndarray, np.ndarr
 
 
 ALTERNATING, SEVENTEEN = np.arange(NUM) % 2 == 0, np.arange(NUM) % 17
-# Name: degrees, who lasts, colours, shapes; stored bytes of coefficients, times, colours, shapes, kinds with indices.
+# Name: degrees, who lasts, colors, shapes; stored bytes of coefficients, times, colors, shapes, kinds with indices.
 CASES = {
     "all whole": (np.full(NUM, 3), False, None, None, (24 * NUM, 8 * NUM, 12 * NUM, 8 * NUM, 0)),
     "degree 0, all timed": (np.zeros(NUM, int), False, None, None, (0, 8 * NUM, 12 * NUM, 8 * NUM, 0)),
-    "none moves, all last, one colour": (np.zeros(NUM, int), True, 1, None, (0, 0, 12, 8 * NUM, 2 * NUM)),
+    "none moves, all last, one color": (np.zeros(NUM, int), True, 1, None, (0, 0, 12, 8 * NUM, 2 * NUM)),
     "all last": (np.full(NUM, 3), True, None, None, (24 * NUM, 0, 12 * NUM, 8 * NUM, NUM)),
     "half last": (np.full(NUM, 2), ALTERNATING, None, None, (16 * NUM, 4 * NUM, 12 * NUM, 8 * NUM, NUM)),
     "half stand still": (2 * ALTERNATING, False, None, None, (8 * NUM, 8 * NUM, 12 * NUM, 8 * NUM, NUM)),
@@ -80,10 +80,10 @@ CASES = {
         None,
         (24 * NUM, 8 * NUM, 12 * NUM, 8 * NUM, 0),
     ),
-    "few colours": (np.full(NUM, 1), False, 6, None, (8 * NUM, 8 * NUM, 12 * 6, 8 * NUM, NUM)),
-    "too many colours": (np.full(NUM, 1), False, NUM - 1, None, (8 * NUM, 8 * NUM, 12 * NUM, 8 * NUM, 0)),
-    "256 colours": (np.ones(600, int), False, 256, None, (8 * 600, 8 * 600, 12 * 256, 8 * 600, 600)),
-    "257 colours": (np.ones(600, int), False, 257, None, (8 * 600, 8 * 600, 12 * 257, 8 * 600, 2 * 600)),
+    "few colors": (np.full(NUM, 1), False, 6, None, (8 * NUM, 8 * NUM, 12 * 6, 8 * NUM, NUM)),
+    "too many colors": (np.full(NUM, 1), False, NUM - 1, None, (8 * NUM, 8 * NUM, 12 * NUM, 8 * NUM, 0)),
+    "256 colors": (np.ones(600, int), False, 256, None, (8 * 600, 8 * 600, 12 * 256, 8 * 600, 600)),
+    "257 colors": (np.ones(600, int), False, 257, None, (8 * 600, 8 * 600, 12 * 257, 8 * 600, 2 * 600)),
     "one Gaussian": ([0], True, None, None, (0, 0, 12, 8, 1)),
     "highest degree": (SEVENTEEN, ALTERNATING, 5, None, (8 * SEVENTEEN.sum(), 4 * NUM, 12 * 5, 8 * NUM, 2 * NUM)),
     "few shapes": (np.full(NUM, 1), False, None, 6, (8 * NUM, 8 * NUM, 12 * NUM, 8 * 6, NUM)),
@@ -177,7 +177,7 @@ def test_no_kinds_beyond_their_room(tmp_path):
 
 
 def test_the_largest_index(tmp_path):
-    """More than 65,536 colours: four bytes for each."""
+    """More than 65,536 colors: four bytes for each."""
     num, num_colors = 110_000, 65_537
     model = ragged_model(np.zeros(num, int), False, num_colors)
     path = save_video_model(tmp_path / "m", model)
@@ -290,11 +290,11 @@ HEADERS = {
     "no clear": lambda header: header["stored"].pop("clear"),
     "no powers": lambda header: header["stored"].pop("powers"),
     "no timed": lambda header: header["stored"].pop("timed"),
-    "no colours": put(colors=0),
-    "other colours": put(colors=7),
-    "colours beyond all": put(colors=NUM + 1),
-    "colours that are no number": put(colors="many"),
-    "colours beyond any index": lambda h: h.update(num_gaussians=10**13, stored={"colors": 10**12}),
+    "no colors": put(colors=0),
+    "other colors": put(colors=7),
+    "colors beyond all": put(colors=NUM + 1),
+    "colors that are no number": put(colors="many"),
+    "colors beyond any index": lambda h: h.update(num_gaussians=10**13, stored={"colors": 10**12}),
     "no shapes": put(shapes=0),
     "other shapes": put(shapes=5),
     "shapes beyond all": put(shapes=NUM + 1),
@@ -314,7 +314,7 @@ HEADERS = {
 
 @pytest.fixture
 def hostile(tmp_path):
-    """A good file, to be made a bad one: 50 Gaussians, 60 powers, 25 timed, 40 clear, 6 colours, 4 shapes."""
+    """A good file, to be made a bad one: 50 Gaussians, 60 powers, 25 timed, 40 clear, 6 colors, 4 shapes."""
     degrees = np.where(np.arange(NUM) < 20, 3, 0)
     path = save_video_model(tmp_path / "m", ragged_model(degrees, ALTERNATING, 6, 4, solid=np.arange(NUM) < 10))
     assert read_header(path)["header"]["stored"] == {"powers": 60, "timed": 25, "clear": 40, "colors": 6, "shapes": 4}
@@ -396,7 +396,7 @@ def test_info_tells_what_gaussians_do_without(tmp_path, capsys):
     assert f"{path.stat().st_size:,} bytes" in told
     run("info", save_video_model(tmp_path / "whole.safetensors", ragged_model(np.full(NUM, 3))))
     told = capsys.readouterr().out
-    assert not any(name in told for name in ("degrees", "static", "colours", "shapes", "opaque"))
+    assert not any(name in told for name in ("degrees", "static", "colors", "shapes", "opaque"))
 
 
 def test_no_shape_of_a_ragged_model_is_compiled_for(tmp_path, caplog):

@@ -35,7 +35,7 @@ FIRSTS, LENGTHS = (0, 4, 13), (7, 9, 5)
 
 
 def ragged(model):
-    """With kinds, shared colours and shapes: stored in another form than it has in memory."""
+    """With kinds, shared colors and shapes: stored in another form than it has in memory."""
     splats, lasting = model.splats, np.arange(NUM) % 2 == 0
     leaves = {name: np.array(getattr(splats, name)) for name in ("time_loc_logit", "log_time_scale", "coefficients")}
     leaves["time_loc_logit"][lasting], leaves["log_time_scale"][lasting] = 0, STATIC_LOG_TIME_SCALE

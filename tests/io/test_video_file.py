@@ -25,7 +25,7 @@ def _psnr(a, b):
 
 
 def _moving(num_frames=8, height=48, width=64):
-    """Smooth colour waves that move: VP9 and 4:2:0 keep them well, so frames are told apart."""
+    """Smooth color waves that move: VP9 and 4:2:0 keep them well, so frames are told apart."""
     y, x = np.mgrid[:height, :width]
     waves = [
         np.stack(
@@ -49,7 +49,7 @@ def clip_file(tmp_path_factory):
 
 @pytest.fixture
 def folder(tmp_path):
-    """Five frames, one grey level each, named so that only natural order is the right one."""
+    """Five frames, one gray level each, named so that only natural order is the right one."""
     place = tmp_path / "frames"
     place.mkdir()
     for number in (1, 2, 9, 10, 11):
@@ -93,7 +93,7 @@ def test_sample_clip_is_cut_as_in_the_paper():
     assert np.abs(small.frames - blocks).max() <= 0.5 + 1e-6
 
 
-def test_colours_are_rgb(tmp_path):
+def test_colors_are_rgb(tmp_path):
     red = np.zeros((4, 32, 32, 3), np.uint8)
     red[..., 0] = 200
     for name in ("red.mp4", "red.webm", "red"):
@@ -138,7 +138,7 @@ def test_a_size_that_crops_much_is_reported(clip_file):
     assert abs(whole[0] / whole[1] - height / width) < 0.05
 
 
-def test_enlarging_is_cubic_and_centred(clip_file):
+def test_enlarging_is_cubic_and_centered(clip_file):
     whole = read_video(clip_file).frames[0]
     large = read_video(clip_file, size=(96, 128)).frames[0]
     np.testing.assert_array_equal(large, cv2.resize(whole, (128, 96), interpolation=cv2.INTER_CUBIC))
@@ -205,7 +205,7 @@ def test_folder_is_sorted_naturally(folder):
     assert read_video(folder, frames=(1, 3)).frames[:, 0, 0, 0].tolist() == [20, 90]
 
 
-def test_grey_and_16_bit_images(tmp_path):
+def test_gray_and_16_bit_images(tmp_path):
     levels = np.arange(65536, dtype=np.uint16).reshape(256, 256)
     cv2.imwrite(str(tmp_path / "0.png"), levels)
     cv2.imwrite(str(tmp_path / "1.png"), np.repeat(levels[..., None], 3, 2))
@@ -541,7 +541,7 @@ def test_encodings_that_do_not_fit_are_refused(tmp_path, name, options, words):
 
 
 def _rgba(num_frames=3):
-    """RGB and alpha; hidden colours where alpha is 0."""
+    """RGB and alpha; hidden colors where alpha is 0."""
     alpha = np.zeros((num_frames, 48, 64, 1), np.uint8)
     alpha[:, :24], alpha[:, 24:36] = 255, 51
     return np.concatenate([_moving(num_frames), alpha], -1)
@@ -564,7 +564,7 @@ def test_alpha_of_images_is_kept_and_premultiplied(tmp_path, depth):
     np.testing.assert_array_equal(clip.frames[..., 3], _rgba()[..., 3])
     np.testing.assert_array_equal(clip.over_black[:, :24], _moving(3)[:, :24])
     np.testing.assert_allclose(clip.over_black[:, 24:36], _moving(3)[:, 24:36] * 0.2, atol=0.51)
-    assert not clip.frames[:, 36:].any()  # hidden colours are gone
+    assert not clip.frames[:, 36:].any()  # hidden colors are gone
 
 
 @pytest.mark.parametrize(("mode", "associated"), [("RGBA", 0), ("RGBA", 1), ("LA", 0), ("LA", 1)])
@@ -592,7 +592,7 @@ def test_a_gray_png_of_16_bits_with_a_transparent_level_keeps_its_levels(tmp_pat
     assert read_video(tmp_path / "a.png").frames[0, 0].tolist() == [[0] * 3, [39] * 3, [233] * 3]
 
 
-def test_alpha_is_resized_with_the_colour_it_weighs(tmp_path):
+def test_alpha_is_resized_with_the_color_it_weighs(tmp_path):
     """A red pixel beside a hidden green one: half of the light, all of it red."""
     image = np.zeros((32, 32, 4), np.uint8)
     image[:, ::2], image[:, 1::2] = (255, 0, 0, 255), (0, 255, 0, 0)
@@ -792,12 +792,12 @@ def test_webm_says_that_it_is_webm(clip_file):
     assert b"matroska" not in head
 
 
-def test_colour_error_of_the_encoder_is_centred(tmp_path):
+def test_color_error_of_the_encoder_is_centered(tmp_path):
     """FFmpeg's default conversion rounds down, which costs each channel about a level both in writing and reading."""
-    grey = np.repeat(np.arange(40, 216, 11, dtype=np.uint8), 4)
-    frames = np.repeat(np.repeat(grey[None, None, :, None], 32, 1), 3, 3)
+    gray = np.repeat(np.arange(40, 216, 11, dtype=np.uint8), 4)
+    frames = np.repeat(np.repeat(gray[None, None, :, None], 32, 1), 3, 3)
     frames = np.repeat(frames, 3, 0)
-    error = read_video(write_video(tmp_path / "grey.mp4", frames, 25)).frames.astype(int) - frames
+    error = read_video(write_video(tmp_path / "gray.mp4", frames, 25)).frames.astype(int) - frames
     assert np.abs(error.mean((0, 1, 2))).max() < 0.3
 
 
@@ -912,7 +912,7 @@ def test_failure_leaves_nothing_new(tmp_path):
 _BAD_FRAMES = {
     "none": [],
     "floats": [np.zeros((32, 32, 3))],
-    "grey": [np.zeros((32, 32), np.uint8)],
+    "gray": [np.zeros((32, 32), np.uint8)],
     "alpha": [np.zeros((32, 32, 4), np.uint8)],
     "sizes": [np.zeros((32, 32, 3), np.uint8), np.zeros((32, 34, 3), np.uint8)],
 }

@@ -290,16 +290,16 @@ def test_pixels_that_are_not_square_are_told(tmp_path):
     assert "1.07 times as wide" in clip.notes[0]
 
 
-# --------------------------------------------------------------------------------------- grey, alpha, depth
+# --------------------------------------------------------------------------------------- gray, alpha, depth
 
 
 @pytest.mark.parametrize(("suffix", "fourcc"), [(".png", b"MPNG"), (".jpg", b"MJPG")])
-def test_grey(tmp_path, suffix, fourcc):
-    grey = _waves(4)[..., 0]
-    packets = [cv2.imencode(suffix, frame, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes() for frame in grey]
-    (tmp_path / "grey.avi").write_bytes(_avi(packets, 48, 64, fourcc=fourcc))
-    frames = read_video(tmp_path / "grey.avi").frames
-    assert np.abs(frames.astype(int) - grey[..., None]).max() <= (0 if suffix == ".png" else 2)
+def test_gray(tmp_path, suffix, fourcc):
+    gray = _waves(4)[..., 0]
+    packets = [cv2.imencode(suffix, frame, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes() for frame in gray]
+    (tmp_path / "gray.avi").write_bytes(_avi(packets, 48, 64, fourcc=fourcc))
+    frames = read_video(tmp_path / "gray.avi").frames
+    assert np.abs(frames.astype(int) - gray[..., None]).max() <= (0 if suffix == ".png" else 2)
 
 
 @pytest.mark.parametrize(
@@ -320,7 +320,7 @@ def test_grey(tmp_path, suffix, fourcc):
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else str(value),
 )
 def test_levels_of_depths_and_ranges(tmp_path, name, options, near):
-    """Ten bits are not clipped, a full range not stretched; colours are those of their matrix."""
+    """Ten bits are not clipped, a full range not stretched; colors are those of their matrix."""
     frames = np.repeat(np.repeat(np.repeat(FLAT[None, None], 48, 1), 16, 2), 2, 0)
     _ffmpeg(*options, tmp_path / name, frames=frames)
     found = read_video(tmp_path / name).frames[1]
@@ -329,10 +329,10 @@ def test_levels_of_depths_and_ranges(tmp_path, name, options, near):
         assert np.abs(patch - color).max() <= (3 if near is None else near)
 
 
-def test_ten_bits_of_grey(tmp_path):
-    grey = np.repeat(np.arange(0, 256, 4, dtype=np.uint8)[None, None, :, None], 3, -1).repeat(48, 1).repeat(2, 0)
-    _ffmpeg("-c:v", "ffv1", "-pix_fmt", "gray10le", tmp_path / "a.mkv", frames=grey)
-    assert np.abs(read_video(tmp_path / "a.mkv").frames.astype(int) - grey).max() <= 2
+def test_ten_bits_of_gray(tmp_path):
+    gray = np.repeat(np.arange(0, 256, 4, dtype=np.uint8)[None, None, :, None], 3, -1).repeat(48, 1).repeat(2, 0)
+    _ffmpeg("-c:v", "ffv1", "-pix_fmt", "gray10le", tmp_path / "a.mkv", frames=gray)
+    assert np.abs(read_video(tmp_path / "a.mkv").frames.astype(int) - gray).max() <= 2
 
 
 def test_high_dynamic_range_is_read(tmp_path):
@@ -869,7 +869,7 @@ def test_images_with_more_pixels_than_their_bytes_can_hold(tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
-def test_images_of_one_colour_are_not_taken_for_them(tmp_path, suffix):
+def test_images_of_one_color_are_not_taken_for_them(tmp_path, suffix):
     assert cv2.imwrite(str(tmp_path / f"a{suffix}"), np.zeros((3000, 3000, 3), np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 1])
     assert read_video(tmp_path / f"a{suffix}", size=(10, 10)).num_frames == 1
 

@@ -312,7 +312,7 @@ def test_depth_order_and_array_order():
 
 
 def test_flat_image_at_a_slant_needs_array_order():
-    """One splat covers another of its plane from everywhere in front; by depth of centres it does not."""
+    """One splat covers another of its plane from everywhere in front; by depth of centers it does not."""
     disc = (jnp.asarray([[0.0, 0.0], [0.05, 0.0]]), jnp.full((2, 2), 0.1), jnp.zeros(2), jnp.ones(2))
     gaussians = from_scale_angle(*disc, jnp.asarray([[1.0, 0, 0], [0, 0, 1]]))
     camera = orbit(Camera.front(0.5), 0.01)  # the second is nearer by 5e-4

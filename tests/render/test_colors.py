@@ -1,4 +1,4 @@
-"""Colours by least squares: against the dense solution, and against descended colours on a real frame."""
+"""Colors by least squares: against the dense solution, and against descended colors on a real frame."""
 
 import cv2
 import jax
@@ -19,7 +19,7 @@ def recolored(splats, colors):
 
 
 def weights(splats, size, **how):
-    """The map from one channel of the colours to the pixels, as a matrix (pixels, num)."""
+    """The map from one channel of the colors to the pixels, as a matrix (pixels, num)."""
     one_hot = recolored(splats, jnp.eye(len(splats.mean), dtype=splats.mean.dtype))
     return np.asarray(draw(one_hot, size, engine="reference", **how), np.float64).reshape(-1, len(splats.mean))
 
@@ -29,7 +29,7 @@ def weights(splats, size, **how):
     [("over", "cpu"), ("sum", "cpu"), *(pytest.param(how, "xla", marks=pytest.mark.slow) for how in ("over", "sum"))],
 )
 def test_equals_the_dense_solution(compositing, engine):
-    """Two frames, of two sizes, that share their colours; the matrix is made from pictures of single splats."""
+    """Two frames, of two sizes, that share their colors; the matrix is made from pictures of single splats."""
     splats, size = scene("plain")
     splats = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[:40]), splats)
     frames = [splats, Splats2D(splats.mean[::-1] + 2, splats.factor, splats.opacity, splats.color)]

@@ -57,7 +57,7 @@ def test_any_ceiling(kind, ceiling, compositing):
 
 
 def opaque(leaves):
-    """Splats of opacity 1, some with their centre on a pixel's: there alpha is 1 to the bit."""
+    """Splats of opacity 1, some with their center on a pixel's: there alpha is 1 to the bit."""
     leaves[2][:] = 1
     leaves[0][::2] = np.floor(leaves[0][::2]) + 0.5
 

@@ -255,7 +255,7 @@ def test_degenerate_splats_give_finite_images(engine):
 
 
 def center_of_one(engine, factor):
-    """Of a splat on a pixel's centre, where a thin splat's alpha does not vanish; with no low pass to save it.
+    """Of a splat on a pixel's center, where a thin splat's alpha does not vanish; with no low pass to save it.
 
     That the picture and all gradients are finite is checked.
     """
@@ -381,7 +381,7 @@ def test_support_radius(engine):
 
 @pytest.mark.parametrize("engine", SLOW_XLA)
 def test_gradient_at_alpha_one(engine):
-    """An opaque splat's centre on a pixel's, no ceiling: what lies behind has no light, but alpha has its gradient."""
+    """An opaque splat's center on a pixel's, no ceiling: what lies behind has no light, but alpha has its gradient."""
     with jax.enable_x64(True):
         color = jnp.asarray([[1.0, 0.5, 0.0], [0.0, 0.0, 1.0]], jnp.float64)
         mean, factor = jnp.full((2, 2), 2.5, jnp.float64), jnp.stack([2 * jnp.eye(2, dtype=jnp.float64)] * 2)

@@ -187,7 +187,7 @@ def test_long_needles(compositing):
 
 @pytest.mark.parametrize("scale", [1e-6, 1e6, *(pytest.param(scale, marks=pytest.mark.slow) for scale in (1e-3, 1e3))])
 def test_sizes(scale):
-    """On pixels' centres, so that the smallest are seen at all."""
+    """On pixels' centers, so that the smallest are seen at all."""
     rng, num, size = np.random.default_rng(0), 50, (30, 30)
     mean = rng.integers(0, 30, (num, 2)) + 0.5
     factor = scale * rng.normal(size=(num, 2, 2))

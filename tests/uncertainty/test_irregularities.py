@@ -156,7 +156,7 @@ def test_summary_names_frames_that_are_not_identified():
     assert "Not identified: frame 5.**" in text
     assert "None of 9 intervals shows a duplicated or dropped frame" in text
     assert "2 others were not assessed" in text
-    assert "20" not in text.split("grey")[0].rsplit("residuals", 1)[1]
+    assert "20" not in text.split("gray")[0].rsplit("residuals", 1)[1]
     unsure = dataclasses.replace(posterior, converged=False, message="Not converged after 9 steps.")
     assert summary(unsure).startswith("Not converged")
     table = frame_table(posterior, times)

@@ -58,11 +58,11 @@ def _by_hand(equations, k, t, prior_scale=PRIOR):
             precision += a.T @ a / equations.variance[j]
             rhs += a.T @ (frames[j] - a @ equations.color) / equations.variance[j]
     covariance = np.linalg.inv(precision)
-    colour, a = equations.color + covariance @ rhs, equations.weights(t).toarray()
+    color, a = equations.color + covariance @ rhs, equations.weights(t).toarray()
     pixels = equations.variance[k] * np.eye(len(a)) + a @ covariance @ a.T
     pixels = scipy.stats.Covariance.from_cholesky(np.linalg.cholesky(pixels))  # one factorization for all channels
     logpdf = scipy.stats.multivariate_normal.logpdf
-    return sum(logpdf(x, mean, pixels) for x, mean in zip(frames[k].T, (a @ colour).T, strict=True))
+    return sum(logpdf(x, mean, pixels) for x, mean in zip(frames[k].T, (a @ color).T, strict=True))
 
 
 def _times(equations, k):

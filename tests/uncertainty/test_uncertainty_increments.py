@@ -72,7 +72,7 @@ def test_log_prior_is_what_draws_of_it_follow():
     assert scipy.stats.kstest(times[:, 1], scipy.stats.beta(2.5, 7.5).cdf).pvalue < 1e-3
 
 
-def test_logits_are_centred_and_give_the_times_back():
+def test_logits_are_centered_and_give_the_times_back():
     increments = free_times(6)
     times = increments.times(np.random.default_rng(0).normal(size=(7, 4)))
     logits = increments.logits(times)

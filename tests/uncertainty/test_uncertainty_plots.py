@@ -82,7 +82,7 @@ def test_trace_has_a_line_for_each_ensemble(posterior):
 def test_correlation_title_states_the_effective_number(posterior):
     ax = plots.plot_correlation(posterior.profiles)
     np.testing.assert_allclose(ax.lines[0].get_ydata(), 0.7 ** np.arange(12))
-    assert ax.get_title() == "Residuals of 5.1 grey levels, one value in 10 counts"
+    assert ax.get_title() == "Residuals of 5.1 gray levels, one value in 10 counts"
 
 
 def test_cuts_are_left_out():

@@ -17,7 +17,7 @@ HELD = LearningRates(0, 0, 0, 0, 0, 0, 0, 0, frame_times=4e-3)
 
 
 def passing(num_frames=7, height=24, width=40, noise=3.0):
-    """A bright spot that crosses the frame: uint8 (num_frames, height, width, 3), noise in grey levels."""
+    """A bright spot that crosses the frame: uint8 (num_frames, height, width, 3), noise in gray levels."""
     y, x = np.mgrid[0:height, 0:width]
     place = np.linspace(0.2, 0.8, num_frames)[:, None, None] * width
     spot = np.exp(-((x - place) ** 2 + (y - height / 2) ** 2) / 30)

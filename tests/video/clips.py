@@ -1,4 +1,4 @@
-"""Small synthetic clips: soft coloured blobs that move over a gradient."""
+"""Small synthetic clips: soft colored blobs that move over a gradient."""
 
 import numpy as np
 
@@ -8,10 +8,10 @@ def moving_blobs(num_frames: int = 6, height: int = 48, width: int = 64) -> np.n
     y, x = np.mgrid[0:height, 0:width].astype(np.float64)
     t = np.linspace(0, 1, num_frames)[:, None, None]
     frames = np.stack([x / width + 0 * t, y / height + 0 * t, 0.3 + 0 * (x + t)], axis=-1) * 0.6
-    for centre_x, centre_y, color in (
+    for center_x, center_y, color in (
         (0.2 + 0.5 * t, 0.5, (1, 0.2, 0.1)),
         (0.7, 0.2 + 0.5 * t**2, (0.1, 0.4, 1)),
     ):
-        blob = np.exp(-((x - centre_x * width) ** 2 + (y - centre_y * height) ** 2) / 40)[..., None]
+        blob = np.exp(-((x - center_x * width) ** 2 + (y - center_y * height) ** 2) / 40)[..., None]
         frames = frames * (1 - blob) + blob * np.array(color)
     return (frames * 255).round().astype(np.uint8)

@@ -92,10 +92,10 @@ def _bricks(apart: float, half_height: float) -> np.ndarray:
 
 
 def square(model: VideoModel, name: int, k: int) -> np.ndarray:
-    """Where an object of `named_model` is in frame k: bool (height, width), its Gaussians' centres' square."""
+    """Where an object of `named_model` is in frame k: bool (height, width), its Gaussians' centers' square."""
     height, width = model.size
     t = k / (model.num_frames - 1)
     x, y = np.arange(width) + 0.5 - width / 2, np.arange(height)[:, None] + 0.5 - height / 2
-    centre = max(model.size) * (START[name] + t * SPEED[name])
+    center = max(model.size) * (START[name] + t * SPEED[name])
     half = max(model.size) * (HALF_SIDE + 0.02)  # and what they reach beyond
-    return (np.abs(x - centre[0]) < half) & (np.abs(y - centre[1]) < half)
+    return (np.abs(x - center[0]) < half) & (np.abs(y - center[1]) < half)

@@ -54,7 +54,7 @@ def test_kernel_values_match_condition_time(degree, power, floor):
 @pytest.mark.parametrize(("power", "floor"), [(1.0, 0.0), (2.0, 0.0), (2.0, 0.05)])
 @pytest.mark.parametrize("degree", [0, 3])
 def test_kernel_gradients_match_autodiff(degree, power, floor):
-    """Of a loss that looks at mean, covariance, opacity and colour with random weights; and of time."""
+    """Of a loss that looks at mean, covariance, opacity and color with random weights; and of time."""
     splats = random_splats(degree=degree, power=power, floor=floor)
     rows, shape, done = twin(splats, power, floor)
     rng = np.random.default_rng(1)
@@ -94,9 +94,9 @@ def test_scale_cutoff_keeps_the_times_when_both_scales_exceed_it(power, floor):
     cut = window.copy()
     apply_scale_cutoff(rows, cut, spec, cutoff)
     at = columns(spec.degree)
-    centre, spread = 1 / (1 + np.exp(-rows[:, at["time_loc_logit"]])), np.exp(rows[:, at["log_time_scale"]])
+    center, spread = 1 / (1 + np.exp(-rows[:, at["time_loc_logit"]])), np.exp(rows[:, at["log_time_scale"]])
     t = np.linspace(window.min(1), window.max(1), 102, axis=1)[:, 1:-1]
-    a = floor + (1 - floor) * np.exp(-0.5 * power * ((t - centre) / spread) ** 2)
+    a = floor + (1 - floor) * np.exp(-0.5 * power * ((t - center) / spread) ** 2)
     smaller = np.exp(rows[:, at["log_scale"]].min(1, keepdims=True)) * np.sqrt(a)
     kept = (cut[:, :1] < t) & (t < cut[:, 1:])
     np.testing.assert_array_equal(kept, smaller > cutoff)

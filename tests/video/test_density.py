@@ -30,7 +30,7 @@ def _mixture(num=5, **changes):
 
 
 def _grid(size, t):
-    """Pixel centres in model space, and t."""
+    """Pixel centers in model space, and t."""
     height, width = size
     x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
     scale = pixels_per_unit(size)
@@ -118,7 +118,7 @@ def test_round_covariances_and_dead_components_become_splats():
     np.testing.assert_allclose(back.components.scale_tril, mixture.components.scale_tril, rtol=1e-5, atol=1e-7)
 
 
-def test_invalid_mixtures_and_colours_are_rejected():
+def test_invalid_mixtures_and_colors_are_rejected():
     def from_mixture(**parts):
         return FoldedSplats.from_mixture(_mixture(**parts), color=[1.0, 1.0, 1.0])
 

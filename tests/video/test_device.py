@@ -47,7 +47,7 @@ from foldgauss.video.models.conditioning import ConditioningSpec, condition, upd
 from foldgauss.video.models.row_layout import columns
 from foldgauss.video.motion.optical_flow import motion_finder
 
-#: Nothing in it is black: at a colour of 0 the slope is one thing or another by rounding.
+#: Nothing in it is black: at a color of 0 the slope is one thing or another by rounding.
 FRAMES = moving_blobs(height=32, width=40) // 2 + 40
 CONFIG = FitConfig(num_gaussians=150, steps=100, engine="xla", interpolation_fraction=0.0)
 #: As the paper's: batches, both cameras, Adam for all, growth, here within few steps.

@@ -265,7 +265,7 @@ def test_correlated_errors_count_once(scene):
     assert rough.effective_samples > 0.9 * rough.num_samples
 
 
-# ---------------------------------------------------------------------------------------------- kinds, colours
+# ---------------------------------------------------------------------------------------------- kinds, colors
 
 
 def test_kinds_match_the_stored_model():
@@ -606,7 +606,7 @@ def test_a_round_that_falls_far_below_is_tried_again_with_less(monkeypatch):
 
 
 def test_psnr_of_alpha_is_over_black():
-    """Frames with alpha are measured over other colours than they are held to: half of them are seen through."""
+    """Frames with alpha are measured over other colors than they are held to: half of them are seen through."""
     shape = disc(lambda s: (15 + 50 * s, 24), num_frames=8)
     alpha = np.where(np.abs(shape.astype(int) - shape[0, 0, 0]).max(-1, keepdims=True) > 20, 255, 0).astype(np.uint8)
     frames = np.concatenate([shape * (alpha > 0), alpha], -1)

@@ -51,10 +51,10 @@ def test_affine_edits_commute_with_rendering(name, when):
     """The picture of the edited model is the edited picture: sampled where A^-1 takes each pixel."""
     edited = MAPS[name](edit(MODEL), **when).video()
     assert isinstance(edited, EditedVideo if when else VideoModel)
-    matrix, centre, offset = MATRICES[name]
+    matrix, center, offset = MATRICES[name]
     y, x = np.mgrid[0 : SIZE[0], 0 : SIZE[1]] + 0.5
     point = (np.stack([x, y], -1) - np.array(SIZE[::-1]) / 2) / max(SIZE)
-    source = (point - centre - offset) @ np.linalg.inv(matrix).T + centre
+    source = (point - center - offset) @ np.linalg.inv(matrix).T + center
     at = (source * max(SIZE) + 1.5 * np.array(SIZE[::-1])) * FINER - 0.5
     inside = ((at > 4) & (at < np.array(SIZE[::-1]) * 3 * FINER - 5)).all(-1)
     assert inside.mean() > 0.95
@@ -223,7 +223,7 @@ def test_no_way_through_nothing(matrix, progress):
 
 def test_edits_act_in_their_order():
     """An affine edit after an overlay of the same Gaussians must not slip in under it."""
-    turned = edit(MODEL).select(OBJECT).rotate(0.8)  # about its own centre: an overlay
+    turned = edit(MODEL).select(OBJECT).rotate(0.8)  # about its own center: an overlay
     wide = np.diag([2.0, 0.5])
     both = turned.move((0.1, 0)).transform(wide, about=(0, 0)).video().at(0.31)
     before, middle = turned.video().at(0.31), np.array(SIZE[::-1]) / 2
@@ -272,7 +272,7 @@ def test_a_single_frame_and_no_other(name):
     if name == "recolor":
         assert quality(before[3], clip, inside) - quality(after[3], clip, inside) > 5
     assert (before[3] != after[3])[inside].any()
-    # Half way to the neighbours it is seen, beyond it is not.
+    # Half way to the neighbors it is seen, beyond it is not.
     near, far = (np.interp(k, np.arange(NUM_FRAMES), TIMES) for k in (3.4, 3.6))
     assert apart(chain.video(), model, near) > 0.01
     assert apart(chain.video(), model, far) == 0
@@ -319,17 +319,17 @@ def test_a_turn_of_more_than_a_turn_is_one():
     assert apart(eased, MODEL, TIMES[1]) > 0.1
 
 
-# ------------------------------------------------------------------------------------------- own centres, copies
+# ------------------------------------------------------------------------------------------- own centers, copies
 
 
-def test_about_its_own_centre_it_stays_where_it_is():
+def test_about_its_own_center_it_stays_where_it_is():
     for make in (lambda e: e.scale(1.7), lambda e: e.rotate(1.0), lambda e: e.transform([[1, 0.5], [0, -1]])):
         video = make(edit(MODEL).select(OBJECT)).video()
         # Weighted by opacity and area, which an affine map scales alike.
-        np.testing.assert_allclose(own_centre(video), own_centre(MODEL), atol=1e-5)
+        np.testing.assert_allclose(own_center(video), own_center(MODEL), atol=1e-5)
 
 
-def test_the_own_centre_is_where_most_of_it_is():
+def test_the_own_center_is_where_most_of_it_is():
     """Weighted by opacity and area: by hand, of two."""
     ones = np.ones((2, 3), np.float32)
     factor = np.float32([[[2, 1], [0, 1]], [[1, 0], [3, 1]]])  # areas 2 and 1
@@ -342,7 +342,7 @@ def test_the_own_centre_is_where_most_of_it_is():
 
 
 def test_what_is_left_stays_where_it_was():
-    """Half of an object deleted does not move the centre about which the other half was scaled."""
+    """Half of an object deleted does not move the center about which the other half was scaled."""
     some = np.arange(NUM) < 5
     whole = edit(MODEL).select(OBJECT).scale(1.5)
     left = whole.select(some).vanish()
@@ -354,7 +354,7 @@ def test_what_is_left_stays_where_it_was():
     assert gone.splats.num_gaussians == NUM - OBJECT.sum()
 
 
-def own_centre(video):
+def own_center(video):
     found = []
     edit(video).select(OBJECT).apply(lambda g, t: found.append(g.center) or g).video().at(0.31)
     return found[0]
@@ -383,7 +383,7 @@ def test_an_envelope_of_each_ones_own_goes_with_it():
 
 
 def test_copies_have_their_own_edits_and_times():
-    """What was done to the original, about its own centre, is done to each copy about its own."""
+    """What was done to the original, about its own center, is done to each copy about its own."""
     grown = edit(MODEL).select(OBJECT).scale(1.5)
     copies = grown.multiply([(0.2, 0.0), (0.0, 0.2)], delays=(0.0, 0.1), scale=(1, 0.5), angle=0.2)
     each = [grown.scale(1).rotate(0.2).move((0.2, 0)), grown.scale(0.5).rotate(0.2).move((0, 0.2)).retime(shift=0.1)]
@@ -456,10 +456,10 @@ def test_shots():
     assert apart(one_frame, model, float(times[3] + 0.4)) == 0
 
 
-# ----------------------------------------------------------------------------------------------------------- colours
+# ----------------------------------------------------------------------------------------------------------- colors
 
 
-def test_recolouring_keeps_the_shading():
+def test_recoloring_keeps_the_shading():
     light = np.array([0.2126, 0.7152, 0.0722])
     base = edit(MODEL).apply(lambda g, t: g).video().at(0.5)
     red = edit(MODEL).select(OBJECT).recolor((0.8, 0.1, 0.1)).video()
@@ -616,12 +616,12 @@ WRONG = {
     "size of copies": (lambda: E.multiply([(0, 0)], scale=0), "scale: expected numbers > 0"),
     "originals": (lambda: E.multiply([(0, 0)], originals="yes"), "originals: expected True or False"),
     "delays": (lambda: E.multiply([(0, 0)], delays=(1, 2)), "delays: expected one number or 1"),
-    "colour": (lambda: E.recolor((1, 2)), "color: expected 3 finite"),
-    "dark colour": (lambda: E.recolor((1, 2, -1)), "color: expected red, green and blue in"),
+    "color": (lambda: E.recolor((1, 2)), "color: expected 3 finite"),
+    "dark color": (lambda: E.recolor((1, 2, -1)), "color: expected red, green and blue in"),
     "no way": (lambda: E.recolor(), "color, hue, gain: expected color, hue, or gain"),
     "two ways": (lambda: E.recolor((1, 0, 0), hue=0.1), "color, hue, gain: expected color, hue, or gain"),
     "gains": (lambda: E.recolor(gain=(1, 2)), "gain: expected one number or 3"),
-    "colour matrix": (lambda: E.recolor(matrix=np.eye(2)), r"matrix: expected finite numbers of shape \(3, 3\)"),
+    "color matrix": (lambda: E.recolor(matrix=np.eye(2)), r"matrix: expected finite numbers of shape \(3, 3\)"),
     "black object": (lambda: E.recolor(gain=0).recolor((1, 0, 0)), "color: expected an object that is not black"),
     "standing still": (lambda: E.retime(stretch=0), "stretch: expected a number other than 0"),
     "two clocks": (lambda: E.retime(shift=1, clock=Clock.frozen(0)), "clock: expected a clock, or"),
@@ -776,7 +776,7 @@ def test_to_the_front_and_to_the_back():
 
 
 def test_a_part_of_an_edit_as_a_whole_is_not_retimed():
-    """The centre of the rest would go elsewhere: what is not selected keeps its bits."""
+    """The center of the rest would go elsewhere: what is not selected keeps its bits."""
     some = OBJECT.copy()
     some[np.flatnonzero(OBJECT)[::2]] = False
     turned = edit(MODEL).select(OBJECT).rotate(1.0)

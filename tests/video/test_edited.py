@@ -205,7 +205,7 @@ def test_turns_in_space():
     mirrored = chain.transform([[-1, 0], [0, 1]], about=(-0.15, 0)).video()
     around = chain.place(rotate=(0, np.pi, 0), about=(-0.15, 0)).video()
     np.testing.assert_allclose(np.sort(around.at(0.31).mean, 0), np.sort(mirrored.at(0.31).mean, 0), atol=1e-3)
-    # About its own centre, that stays: and on the way it is narrower.
+    # About its own center, that stays: and on the way it is narrower.
     spun = chain.place(rotate=(0, np.pi / 2, 0)).video().at(0.31)
     width = lambda splats: np.sqrt(np.median((splats.factor[..., 0, :] ** 2).sum(-1)))  # noqa: E731
     only = edit(MODEL).select(~OBJECT).vanish().select().place(rotate=(0, 1.4, 0)).video().at(0.31)
@@ -215,7 +215,7 @@ def test_turns_in_space():
 
 
 def test_edits_go_on_in_space():
-    """Placed first, then moved, recoloured, and given to a function that sees three coordinates."""
+    """Placed first, then moved, recolored, and given to a function that sees three coordinates."""
     dims = []
     chain = edit(MODEL).select(OBJECT).place(depth=-0.3).move((0.1, 0)).recolor((1, 0, 0)).rotate(0.3)
     video = chain.apply(lambda g, t: dims.append(g.mean.shape[1]) or g).video()
@@ -238,7 +238,7 @@ KEPT = {
     "affine": lambda e: e.rotate(0.3).transform([[1, 0.2], [0.1, -2]], (0.1, 0), about=(0, 0), **SPAN),
     "opacity": lambda e: e.vanish(**SPAN).opacity(3),
     "copies": lambda e: e.multiply([(0.1, 0), (0.2, 0)], delays=0.3, **SPAN),
-    "colours": lambda e: e.recolor(hue=0.2, frame=2).recolor((1, 0, 0), times=(0.2, 0.4)),
+    "colors": lambda e: e.recolor(hue=0.2, frame=2).recolor((1, 0, 0), times=(0.2, 0.4)),
     "time": lambda e: e.retime(shift=0.5).retime(clock=Clock((0, 0.3, 1), (0.2, 0.9, 0)), **SPAN).freeze(2),
     "space": lambda e: e.place(depth=0.3, rotate=(0.1, 0.2, 0.3), about=(0, 0), **SPAN).place(depth=1),
     "camera": lambda e: e.seen_from(Camera.front(ASPECT).orbit(0.3)),

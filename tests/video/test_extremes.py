@@ -45,7 +45,7 @@ def one_bright_pixel():
 
 
 def pictures_of(num, size=SIZE):
-    """Pictures that have nothing in common: plain, but of a colour and with a disc each."""
+    """Pictures that have nothing in common: plain, but of a color and with a disc each."""
     rng, (y, x) = np.random.default_rng(4), np.mgrid[: size[0], : size[1]]
     made = []
     for _ in range(num):

@@ -87,7 +87,7 @@ def test_odd_clips(shape):
 
 
 def test_flat_clip():
-    """No gradient anywhere: starts are spread evenly, and one colour is all there is to learn."""
+    """No gradient anywhere: starts are spread evenly, and one color is all there is to learn."""
     frames = np.full((2, 32, 32, 3), 128, np.uint8)
     assert evaluate(fit(frames, CONFIG).model, frames).mean_psnr > 30
 

@@ -119,7 +119,7 @@ def passing(num_frames: int, before: tuple[float, float], behind: tuple[float, f
 
 
 def plainly_warped(one, other, share: float):
-    grey = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (one, other)]
+    gray = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (one, other)]
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     grid = np.stack(np.meshgrid(np.arange(160), np.arange(96)), -1).astype(np.float32)
     moved = [
@@ -130,7 +130,7 @@ def plainly_warped(one, other, share: float):
             cv2.INTER_CUBIC,
             borderMode=cv2.BORDER_REPLICATE,
         )
-        for picture, pair, way in ((one, grey, share), (other, grey[::-1], 1 - share))
+        for picture, pair, way in ((one, gray, share), (other, gray[::-1], 1 - share))
     ]
     return (1 - share) * moved[0] + share * moved[1]
 

@@ -33,7 +33,7 @@ from foldgauss.video import (
 )
 from foldgauss.video.segmented.segmented_video import MAX_PREPARED
 
-#: Three segments of a dozen frames, three of which are shared with each neighbour.
+#: Three segments of a dozen frames, three of which are shared with each neighbor.
 FIRSTS, LENGTH, NUM_FRAMES = (0, 9, 18), 12, 30
 SHARED = (9, 10, 11, 18, 19, 20)
 
@@ -105,9 +105,9 @@ def orbit(t):
 
 CHAINS = {
     "move": lambda e: e.move((0.2, 0.1)),
-    "about its centre": lambda e: e.rotate(0.4).scale(1.3),
-    "a colour, eased": lambda e: e.recolor((0.9, 0.2, 0.1), frames=(2, 6), ease=1, curve="smooth"),
-    "a colour": lambda e: e.recolor((0.9, 0.2, 0.1)),
+    "about its center": lambda e: e.rotate(0.4).scale(1.3),
+    "a color, eased": lambda e: e.recolor((0.9, 0.2, 0.1), frames=(2, 6), ease=1, curve="smooth"),
+    "a color": lambda e: e.recolor((0.9, 0.2, 0.1)),
     "hue, at times": lambda e: e.recolor(hue=0.3, times=(0.2, 0.61), ease=(0.5, 1)),
     "copies": lambda e: e.multiply([(0.1, 0.0), (0.2, 0.1)], delays=[0.05, 0.2], scale=0.8).to_front(),
     "copies over a span": lambda e: e.multiply([(0.1, 0.0)], delays=0.1, originals=True, frames=(1, 4)).opacity(0.5),
@@ -207,7 +207,7 @@ def test_a_click_is_carried():
 
 
 def test_what_is_told_of_both_ends_is_told_between():
-    """The middle segment hears from both neighbours: a disc that the last one denies ends in it."""
+    """The middle segment hears from both neighbors: a disc that the last one denies ends in it."""
     video = scene()[0]
     nothing = np.zeros((40, 60), bool)
     nothing[0, 0] = True
@@ -247,7 +247,7 @@ def test_nothing_is_carried_over_a_cut_or_without_follow():
     assert len(found.parts[2])
 
 
-def test_colours_and_times_are_asked_of_every_segment():
+def test_colors_and_times_are_asked_of_every_segment():
     video, labels = scene()
     red = edit(video).select(color=(0.9, 0.3, 0.1), tolerance=25).selection
     assert red.parts == tuple(by_color(segment.model, (0.9, 0.3, 0.1), tolerance=25) for segment in video.segments)
@@ -404,7 +404,7 @@ def test_what_a_span_does_not_reach_is_the_same_segment():
     assert both.segments[2] is not video.segments[2]
 
 
-def test_one_colour_for_the_object_in_all_segments():
+def test_one_color_for_the_object_in_all_segments():
     """By the mean lightness over all, so that it does not jump where one segment follows another."""
     video = soft_video()
     models = [segment.model for segment in video.segments]

@@ -241,7 +241,7 @@ def test_gaussians_between_frames_are_decided_by_position():
     hidden = between[LABEL[between] != BACKGROUND]
     assert len(hidden) > 40
     assert (found.mask[hidden] == (LABEL[hidden] == DISC)).mean() > 0.98  # some stand in the disc's rim
-    one = by_mask(model, object_masks(DISC)[0], frame=0)  # followed: by their neighbours' place
+    one = by_mask(model, object_masks(DISC)[0], frame=0)  # followed: by their neighbors' place
     assert (one.mask[hidden] == (LABEL[hidden] == DISC)).mean() > 0.9
     alone = by_mask(model, object_masks(DISC)[0], frame=0, follow=False)
     early = MODEL.splats.gaussians().time_loc[hidden] < 0.5 / 11
@@ -296,7 +296,7 @@ def test_bad_masks(mask, options, match):
     assert "\n" not in str(caught.value)
 
 
-# ------------------------------------------------------------------------------------- boxes, colours, times
+# ------------------------------------------------------------------------------------- boxes, colors, times
 
 
 def test_boxes_and_polygons_are_masks():
@@ -304,7 +304,7 @@ def test_boxes_and_polygons_are_masks():
     mask[10:30, 5:25] = True
     wanted = by_mask(MODEL, mask, frame=3)
     assert by_box(MODEL, (5, 10, 25, 30), frame=3) == wanted
-    assert by_box(MODEL, (4.6, 9.6, 25.4, 30.4), frame=3) == wanted  # by centres
+    assert by_box(MODEL, (4.6, 9.6, 25.4, 30.4), frame=3) == wanted  # by centers
     assert by_polygon(MODEL, [(5, 10), (25, 10), (25, 30), (5, 30)], frame=3) == wanted
     assert by_box(MODEL, (5, 10, 25, 30)) == by_mask(MODEL, mask, frames=(0, 12))
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
@@ -329,7 +329,7 @@ def test_colors(name):
 
 
 def test_seen_color_is_that_of_the_image():
-    """Two of opposite tints, one on the other, look grey."""
+    """Two of opposite tints, one on the other, look gray."""
     color = np.asarray(MODEL.splats.color_dc).copy()
     disc = truth(DISC).indices
     color[disc[::2]], color[disc[1::2]] = (2.0, -2.0, 0.0), (-2.0, 2.0, 0.0)
@@ -369,23 +369,23 @@ def test_times():
 # ----------------------------------------------------------------------------------------------------- clicks
 
 
-def centre(name, k):
+def center(name, k):
     return tuple(np.array([WIDTH, HEIGHT]) / 2 + WIDTH * (START[name] + TIMES[k] * SPEED[name]))
 
 
 @pytest.mark.parametrize("name", [DISC, BOX])
 @pytest.mark.parametrize("k", [0, 6, 10])
 def test_a_click_grows_to_the_object(name, k):
-    missed, wrong = errors(by_click(MODEL, centre(name, k), frame=k, tolerance=25), truth(name))
+    missed, wrong = errors(by_click(MODEL, center(name, k), frame=k, tolerance=25), truth(name))
     assert missed < 0.05
     assert wrong < 0.02
 
 
 def test_click_stops_at_a_motion_boundary():
-    """Disc and wall of one colour."""
+    """Disc and wall of one color."""
     color = np.broadcast_to(np.float32([0.5, 0.2, 0.1]), (len(LABEL), 3))
     model = eqx.tree_at(lambda m: m.splats.color_dc, MODEL, color)
-    found = by_click(model, centre(DISC, 6), frame=6)
+    found = by_click(model, center(DISC, 6), frame=6)
     missed, wrong = errors(found, truth(DISC))
     assert missed < 0.05
     assert wrong < 0.05
@@ -412,7 +412,7 @@ def test_criteria_are_intersected():
     )
     assert select(MODEL, frames=(2, 5), alive=True) == by_time(MODEL, frames=(2, 5), alive=True)
     assert select(MODEL, mask=object_masks(DISC)) == truth(DISC)
-    assert select(MODEL, click=centre(DISC, 6), frame=6) == by_click(MODEL, centre(DISC, 6), frame=6)
+    assert select(MODEL, click=center(DISC, 6), frame=6) == by_click(MODEL, center(DISC, 6), frame=6)
     assert select(MODEL, polygon=[(0, 0), (9, 0), (9, 9)], frame=0, follow=False) == by_polygon(
         MODEL, [(0, 0), (9, 0), (9, 9)], frame=0, follow=False
     )

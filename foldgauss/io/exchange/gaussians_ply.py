@@ -73,13 +73,13 @@ def write_gaussians_ply(path: PathLike, gaussians: Gaussians3D, *, axes: str = "
     """Write Gaussians in space as a 3DGS PLY file, which ordinary viewers open; returns the path.
 
     The layout is that of the published 3DGS: x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3, all
-    float32, little-endian, the quaternion as w x y z. Colours do not depend on the view, so f_rest is 0. Some viewers
+    float32, little-endian, the quaternion as w x y z. Colors do not depend on the view, so f_rest is 0. Some viewers
     (SIBR, 3DGS.cpp) read nothing without it; all others take files of `sh_degree=0` too, a quarter as large.
 
     **Units:** model units; `axes` is "y-down" as in trained scenes (COLMAP: x right, y down, z away), which viewers of
     such scenes show upright, or "y-up" (x right, y up, z towards the viewer) for programs that take a file as it is.
 
-    **Raises:** ValueError for other axes or degrees, for numbers that are not finite and for colours that are not RGB;
+    **Raises:** ValueError for other axes or degrees, for numbers that are not finite and for colors that are not RGB;
     `OutputError` where the path cannot be written.
 
     **Example:** `write_gaussians_ply("scene.ply", frame_gaussians(model, 0.5), axes="y-up")`

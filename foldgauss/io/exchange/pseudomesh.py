@@ -40,7 +40,7 @@ _AXES_SLANT = 1e-6  # cosine up to which two columns of a factor are its axes: r
 
 @dataclass(frozen=True, eq=False)
 class Pseudomesh:
-    """Frames as triangles with opacity and colour: what a folder of `.obj` and `.ply` files holds.
+    """Frames as triangles with opacity and color: what a folder of `.obj` and `.ply` files holds.
 
     **Shapes:** `triangles` one `Triangles` (NumPy leaves, front first) for each frame, of its own number of faces;
     `times` (num_frames,), those of the frames in [0, 1]. **Units:** model space.
@@ -76,8 +76,8 @@ class Pseudomesh:
         if faces.origin[:, 2].any() or faces.edges[..., 2].any():
             return jax.tree.map(np.asarray, project(faces.to_gaussians(), Camera.front(aspect), size, order="array"))
         unit = pixels_per_unit(size, aspect=aspect)
-        centre = np.array([size[1] / 2, size[0] / 2], np.float32)
-        mean, factor = faces.origin[:, :2] * np.float32(unit) + centre, _flat_factor(faces.edges) * np.float32(unit)
+        center = np.array([size[1] / 2, size[0] / 2], np.float32)
+        mean, factor = faces.origin[:, :2] * np.float32(unit) + center, _flat_factor(faces.edges) * np.float32(unit)
         return Splats2D(mean, factor, faces.opacity, faces.color)
 
     def frame(
@@ -121,7 +121,7 @@ def write_pseudomesh(
 
     Face k of an `.obj` is Gaussian k of the frame, front first, with three vertices of its own: m, m + s1 r1 and
     m + s2 r2, the covariance's axes to one standard deviation; x is right, y up, z towards the viewer, the frame's
-    centre the origin and its longer side 1. The `.ply` beside it is the frame as a 3DGS file, y down. After editing,
+    center the origin and its longer side 1. The `.ply` beside it is the frame as a 3DGS file, y down. After editing,
     with vertices kept in number and order, `read_pseudomesh` takes the shape from the `.obj`, the rest from the `.ply`.
 
     `times` (default: the model's frame times), in [0, 1]. The folder appears whole or not at all; one that holds files
@@ -184,7 +184,7 @@ def read_pseudomesh(
 ) -> Pseudomesh:
     """Read frames as triangles, after editing in a mesh tool or straight from `write_pseudomesh`.
 
-    Every `NAME.obj` of the folder, in natural order, with `NAME.ply` beside it: shape from the one, opacity and colour
+    Every `NAME.obj` of the folder, in natural order, with `NAME.ply` beside it: shape from the one, opacity and color
     from the other, face k being Gaussian k. `size` = (height, width), `fps` and the times come from pseudomesh.json;
     without that file `size` must be given, the rate is 25 and the frames are evenly spaced. `axes` are those of the
     `.obj`: "y-up" as written, or "y-down" for a tool that turned it.
@@ -248,7 +248,7 @@ def _read_frame(path: Path, axes: str) -> Triangles:
     beside = path.with_suffix(".ply")
     if not beside.exists():
         got = f"{path.name!r} without {beside.name!r}"
-        raise format_error(path.parent, expected="a .ply with opacity and colour beside every .obj", got=got)
+        raise format_error(path.parent, expected="a .ply with opacity and color beside every .obj", got=got)
     look, vertices = read_3dgs_ply(beside), read_obj(path)  # both are empty where no Gaussian was visible
     if len(vertices) != len(look.opacity):
         cure = "Faces were added or removed: keep them all, and hide Gaussians by opacity instead."
@@ -276,8 +276,8 @@ def read_obj(path: PathLike) -> Float[np.ndarray, "faces 3 3"]:
     """The vertices of a triangle soup in an `.obj` file, (x, y, z) as they stand there, float64.
 
     Face k must have vertices 3k + 1, 3k + 2, 3k + 3 of the file, in this order: its first vertex is the Gaussian's
-    centre, and a tool that merges or reorders vertices destroys that. Everything but `v` and `f` lines is skipped, and
-    so is what follows x, y and z in a `v` line (a colour) or the vertex in an `f` line (`1/2/3`). Indices may be
+    center, and a tool that merges or reorders vertices destroys that. Everything but `v` and `f` lines is skipped, and
+    so is what follows x, y and z in a `v` line (a color) or the vertex in an `f` line (`1/2/3`). Indices may be
     negative.
 
     **Raises:** `FileNotFoundError`; `FormatError` with the line.

@@ -57,7 +57,7 @@ def read_vegas_ply(path: PathLike, *, size: Size | None = None, fps: float | Non
     pass 0.3 px^2, alpha up to 0.99 and from 1/255 on, exp(-tau^2 / 2) > 0.01, and standard deviations above 1e-4 of its
     units (`VideoModel.scale_cutoff`). Files written by foldgauss record the model's own values instead.
 
-    **Raises:** `FileNotFoundError`, and `FormatError` for a file that is damaged, of another kind, with colours that
+    **Raises:** `FileNotFoundError`, and `FormatError` for a file that is damaged, of another kind, with colors that
     depend on the view, or without a size.
 
     **Example:** `model = read_vegas_ply("point_cloud.ply", size=(480, 854), fps=24)`
@@ -173,7 +173,7 @@ def _check_is_vegas(ply: Ply) -> None:
         raise ply.error(expected="Gaussians", got="none")
     rest = [name for name in ply.names("vertex") if name.startswith("f_rest_")]
     if rest and np.any(ply.columns("vertex", rest)):
-        raise ply.error(expected="colours of degree 0, as VeGaS has them", got="f_rest columns that are not 0")
+        raise ply.error(expected="colors of degree 0, as VeGaS has them", got="f_rest columns that are not 0")
 
 
 def _time_logits(ply: Ply) -> Float[np.ndarray, " intervals"]:

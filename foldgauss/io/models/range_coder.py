@@ -61,7 +61,7 @@ class Column:
     origin: Float[np.ndarray, " num"]
     step: Float[np.ndarray, " num"]
     scale: Float[np.ndarray, " num"]
-    near: Int32[np.ndarray, "num neighbours"]
+    near: Int32[np.ndarray, "num neighbors"]
 
     @classmethod
     def without_contexts(cls, num: int) -> "Column":

@@ -41,7 +41,7 @@ class IncrementIntervals:
 
 @dataclasses.dataclass(frozen=True)
 class Irregularity:
-    """An interval between two frames that is far shorter or longer than its neighbours.
+    """An interval between two frames that is far shorter or longer than its neighbors.
 
     `frames`: the two frames. `kind`: "duplicated", the second repeats the first, or "dropped", frames between them are
     missing, about `size` - 1. `probability`: fraction of the draws in which this holds. `size`: mean increment in units

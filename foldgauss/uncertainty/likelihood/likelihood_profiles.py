@@ -298,7 +298,7 @@ def _check_identified(curves: ProfileCurves) -> None:
     rises = np.nanmax(curves.values, axis=1) - np.nanmin(curves.values, axis=1)
     if (rises[1:-1] < FLAT).all():
         got = f"log-likelihoods that change by at most {rises[1:-1].max():.2g} over all times"
-        cure = "The times are not identified: nothing changes, or the noise is too great (5 grey levels: 5 / 255)."
+        cure = "The times are not identified: nothing changes, or the noise is too great (5 gray levels: 5 / 255)."
         raise invalid("video", expected="frames that identify their times", got=got, cure=cure)
 
 

@@ -39,7 +39,7 @@ class FrameNoise:
 
     def __post_init__(self):
         limits = {
-            "scale": (np.inf, "numbers > 0", "5 grey levels are 5 / 255."),
+            "scale": (np.inf, "numbers > 0", "5 gray levels are 5 / 255."),
             "fraction": (1.0, "numbers in (0, 1]", "1 counts every value, 1/30 one value in 30."),
         }
         for name, (limit, expected, cure) in limits.items():
@@ -63,7 +63,7 @@ class FrameNoise:
         )
         counted = "all values count" if middle == "1" else f"one value in {middle} counts"
         between = "" if low == high else f" (frames: one in {low} to {high})"
-        return f"residuals of {255 * np.median(self.scale):.2g} grey levels, {counted}{between}"
+        return f"residuals of {255 * np.median(self.scale):.2g} gray levels, {counted}{between}"
 
     @property
     def weight(self) -> Float64[np.ndarray, " num_frames"]:

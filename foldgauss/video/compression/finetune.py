@@ -20,7 +20,7 @@ from foldgauss.video.models.video_model import VideoModel
 FIRST_RATE, LAST_RATE = 0.4, 0.12
 PATH_AND_COLOR, COLOR = ("loc", "coefficients", "color_dc"), ("color_dc",)
 
-#: The planes (3, height, width) that frame k should match in a step, and the background colour (3,).
+#: The planes (3, height, width) that frame k should match in a step, and the background color (3,).
 Target = Callable[[int, int], tuple[Float32[np.ndarray, "3 height width"], Float32[np.ndarray, "3"]]]
 
 
@@ -37,7 +37,7 @@ def finetune_model(
     """The model after `passes` over its frames in random order, by least squares and the fit's Adam.
 
     Only the leaves `free` change (None: all); frame times do not. `target(k, step)` returns what frame k is compared
-    with. `shared`: each Gaussian's colour index; Gaussians with the same index keep the same colour. Deterministic.
+    with. `shared`: each Gaussian's color index; Gaussians with the same index keep the same color. Deterministic.
     """
     prepared = PreparedModel(model, model.size)
     rows, window, spec = prepared.rows, prepared.window, prepared.spec

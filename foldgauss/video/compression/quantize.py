@@ -2,10 +2,10 @@
 
 Each Gaussian is described by *columns*, parameters whose errors affect the image independently: size and stretch (mean
 and half difference of the logarithms of its standard deviations, the longer axis first), duration, opacity, time, angle
-modulo half a turn, colour along fixed axes, and its path over the span of time in which it is visible, as Legendre
+modulo half a turn, color along fixed axes, and its path over the span of time in which it is visible, as Legendre
 polynomials. A column's step follows from earlier columns by a rule stated in the file, so that Gaussians that are
 hardly visible get coarse steps and need few bits. Absent parameters are stored in no column: powers above the path's
-own degree, times of static Gaussians, opacities of opaque ones; and shared colours are stored once.
+own degree, times of static Gaussians, opacities of opaque ones; and shared colors are stored once.
 
 A model with shared paths (`SharedPaths`) has a column of their numbers; their maps are rounded in steps of model space
 too fine to be seen.
@@ -38,7 +38,7 @@ LARGEST = 2**30 - 1
 #: Columns from which the steps of others may be computed.
 FEATURES = ("class", "size", "stretch", "duration", "opacity")
 #: Columns of plain integers: the cell of space and time, the class (how visible), absent parameters, the path's degree.
-#: So are `path`, the number of the shared path, and `shade`, that of the shared colour.
+#: So are `path`, the number of the shared path, and `shade`, that of the shared color.
 INTEGER_COLUMNS = ("cell", "class", "without", "degree")
 COLORS = ("luma", "blue", "green")
 #: Columns that a bit of `without` makes absent: the bit, the value used instead, and the value used as a feature
@@ -48,9 +48,9 @@ ABSENT = {
     "time": (1, 0.5, 0.0),
     "opacity": (2, float(OPAQUE_LOGIT), 4.0),
 }
-#: Most colours that are stored as shared, and most bits of a cell.
+#: Most colors that are stored as shared, and most bits of a cell.
 MAX_SHARED, MAX_CELL_BITS = 4096, 24
-#: Orthonormal colour axes, as rows: brightness, blue against red, green against both.
+#: Orthonormal color axes, as rows: brightness, blue against red, green against both.
 AXES = np.array(
     [
         [0.5773502691896258, 0.5773502691896258, 0.5773502691896258],
@@ -71,7 +71,7 @@ _MAX_STEP = {"time": 0.125, "angle": 0.125, "size": 0.35, "stretch": 0.5, "durat
 
 
 def column_names(degree: int, shared: int = 0, num_paths: int = 0) -> tuple[str, ...]:
-    """The columns of a model in order; `shared` is the number of shared colours, 0 if they are not shared."""
+    """The columns of a model in order; `shared` is the number of shared colors, 0 if they are not shared."""
     path = tuple(f"{axis}{k}" for k in range(degree + 1) for axis in "xy")
     return (
         *INTEGER_COLUMNS,
@@ -126,7 +126,7 @@ def compute_steps(halves: Int32[np.ndarray, " num"], name: str = "") -> Float[np
 class CompactInfo:
     """Constants of the model, stored in the header.
 
-    `cells`: binary logarithms of the numbers of cells along x, y and time. `shared`: the number of shared colours; 0 if
+    `cells`: binary logarithms of the numbers of cells along x, y and time. `shared`: the number of shared colors; 0 if
     each Gaussian has its own. `reach`: half-width of a path's span of time, in sigma_t.
     """
 
@@ -194,7 +194,7 @@ class ColumnDecoder:
         return self._rules[name].half_exponents(features, self.rows(name))
 
     def origin(self, name: str) -> Float[np.ndarray, "rows"]:
-        """Values of integer 0 in the next column: the cell's centre, if cells divide that axis."""
+        """Values of integer 0 in the next column: the cell's center, if cells divide that axis."""
         axis = {"x0": 0, "y0": 1, "time": 2}.get(name)
         if axis is not None and self._info.cells[axis]:
             return cell_centers(self.values["cell"].astype(np.int64), self._info)[axis]
@@ -255,7 +255,7 @@ def locate_cells(
 
 
 def cell_centers(cell: Int[np.ndarray, " num"], info: CompactInfo) -> list[Float[np.ndarray, " num"]]:
-    """The centres of cells along x, y and time."""
+    """The centers of cells along x, y and time."""
     along, place = [np.zeros(len(cell), np.int64) for _ in range(3)], 0
     for k in range(max(info.cells)):
         for axis, bits in enumerate(info.cells):
@@ -428,7 +428,7 @@ def compute_columns(model: VideoModel) -> ExactColumns:
 
 
 def index_colors(model: VideoModel) -> Int32[np.ndarray, " num"] | None:
-    """Each Gaussian's index among the distinct colours, dark ones first; None if few Gaussians share one."""
+    """Each Gaussian's index among the distinct colors, dark ones first; None if few Gaussians share one."""
     color = np.asarray(model.splats.color_dc, np.float64)
     found, index = np.unique(color, axis=0, return_inverse=True)
     if 2 * len(found) > len(color) or len(found) > MAX_SHARED:
@@ -501,7 +501,7 @@ def quantize(
 ) -> Quantized:
     """Round every column by its rule; errors of earlier columns are corrected by later ones.
 
-    `cells`: the cells whose centres positions are relative to (default: those that they are in).
+    `cells`: the cells whose centers positions are relative to (default: those that they are in).
     """
     info = exact.info
     if cells is None:

@@ -115,11 +115,11 @@ def compress(
     `frames`: the clip, uint8 (num_frames, *model.size, 3), or with alpha (..., 4): the loss is measured against it.
     Without it, the loss is that against a clip at `psnr` dB (default: `ASSUMED_PSNR`) from the model's own images.
     Frames beyond `EXACT_PSNR`, 58.9 dB, count as that. Gaussians are reordered where that is hardly visible; absent
-    parameters (`FoldedSplats.degrees`, `static`, `opaque`) stay absent, and shared colours stay shared. Shared paths
+    parameters (`FoldedSplats.degrees`, `static`, `opaque`) stay absent, and shared colors stay shared. Shared paths
     stay as they are, to about a fiftieth of a pixel.
 
     With the clip, fine-tuning compensates for losses and allows coarser steps: all leaves for half of the `passes` each
-    time Gaussians have been dropped, paths and colours for a quarter once geometry is rounded, colours for an eighth
+    time Gaussians have been dropped, paths and colors for a quarter once geometry is rounded, colors for an eighth
     once paths are. More passes make smaller files. With 0 passes every parameter is the model's own, rounded.
     `on_step(what, loss_db)` is called now and then, with NaN before anything has been measured.
 
@@ -210,7 +210,7 @@ def _search_finetuned(
     best, tried = None, {}
     for _ in range(_TRIES):
         quantized, exact = plan.quantize(factor), plan.exact
-        for what, free, fraction in (("paths and colours", PATH_AND_COLOR, 0.25), ("colours", COLOR, 0.125)):
+        for what, free, fraction in (("paths and colors", PATH_AND_COLOR, 0.25), ("colors", COLOR, 0.125)):
             with_path = free is PATH_AND_COLOR
             start = _undo_rounding(quantized, exact, path=with_path)
             tuned = finetune(start, fraction, f"fine-tuning {what}", free=free, seed=1, shared=exact.shade)
@@ -301,7 +301,7 @@ def _take(model: VideoModel, which: Bool[np.ndarray, " num"] | Int[np.ndarray, "
 
 
 def _undo_rounding(quantized: Quantized, exact: ExactColumns, *, path: bool) -> VideoModel:
-    """The decoded model with exact colours and, if `path`, exact paths."""
+    """The decoded model with exact colors and, if `path`, exact paths."""
     model = dequantize(quantized)
     color = np.stack([exact.values[name] for name in COLORS], 1) @ AXES
     splats = eqx.tree_at(lambda s: s.color_dc, model.splats, color.astype(np.float32))
@@ -342,7 +342,7 @@ class _Loss:
 
     @property
     def error(self) -> float:
-        """The model's squared error at `psnr`, colours in [0, 1], summed over frames, pixels and channels."""
+        """The model's squared error at `psnr`, colors in [0, 1], summed over frames, pixels and channels."""
         return self._targets[0].size * self.num_frames * 10 ** (-self.psnr / 10)
 
     def __call__(self, model: VideoModel, which: Int[np.ndarray, " some"]) -> float:
@@ -417,7 +417,7 @@ class _Plan:
             predicted = np.clip((design @ fit + self._classes)[seen], -30, 30)
             fit[0] += 0.5 * np.log2(np.mean(sensitivity[name][seen] * 4.0**-predicted) + 1e-30)
         if self.exact.info.shared:
-            for name in COLORS:  # a shared colour is as sensitive as all of its Gaussians together
+            for name in COLORS:  # a shared color is as sensitive as all of its Gaussians together
                 summed = np.bincount(self.exact.shade, sensitivity[name])
                 self._fits[name] = np.array([0.5 * np.log2(np.mean(summed) + 1e-30)])
 

@@ -32,7 +32,7 @@ Overlaps = tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"], Float[np.
 def sort_by_cell(cell: Int32[np.ndarray, " num"], overlaps: Overlaps, budget: float) -> Int[np.ndarray, " num"]:
     """Indices of the Gaussians in a new order, in sweeps through the cells; `overlaps` is from `find_overlaps`.
 
-    `budget`: the squared error allowed if all pairs whose order is given up were swapped; colours in [0, 1], summed
+    `budget`: the squared error allowed if all pairs whose order is given up were swapped; colors in [0, 1], summed
     over frames, pixels and channels.
     """
     front, back, cost = overlaps
@@ -70,7 +70,7 @@ def sort_constrained(
 def find_overlaps(contributions: Contributions) -> Overlaps:
     """Overlapping pairs of Gaussians, the front one first, and the squared error of swapping them.
 
-    A pixel where two neighbours in the order have alphas a, b and colours that differ by d changes by a b d times the
+    A pixel where two neighbors in the order have alphas a, b and colors that differ by d changes by a b d times the
     transmittance in front of them.
     """
     num, (height, width) = contributions.num_gaussians, contributions.size

@@ -1,4 +1,4 @@
-"""Checks of the arguments of edits: numbers, lists of numbers, matrices and colours."""
+"""Checks of the arguments of edits: numbers, lists of numbers, matrices and colors."""
 
 import math
 import warnings

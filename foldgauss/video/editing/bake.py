@@ -105,7 +105,7 @@ def scale_opacity(splats: FoldedSplats, mask: Mask, factor: float) -> FoldedSpla
 
 
 def apply_recolor(splats: FoldedSplats, mask: Mask, recolor: Recolor) -> FoldedSplats | None:
-    """Map the colours."""
+    """Map the colors."""
     color = recolor.map_colors(opacities_and_colors(splats, mask)[1])
     return _replace_rows(splats, mask, color_dc=(color - 0.5) / SH_C0)
 
@@ -113,7 +113,7 @@ def apply_recolor(splats: FoldedSplats, mask: Mask, recolor: Recolor) -> FoldedS
 def opacities_and_colors(
     splats: FoldedSplats, mask: Mask
 ) -> tuple[Float[np.ndarray, " num"], Float[np.ndarray, "num 3"]]:
-    """Opacities and colours of the selected Gaussians."""
+    """Opacities and colors of the selected Gaussians."""
     color = 0.5 + SH_C0 * _as_float64(splats.color_dc)[mask]
     return expit(_as_float64(splats.opacity_logit)[mask]), np.maximum(color, 0.0)
 

@@ -83,7 +83,7 @@ class Edit:
 
     Edits apply in the order of the calls, each to the result of those before. An edit that a folded model represents
     exactly at all times is **baked** into its parameters: translations; affine maps about a fixed point; opacities that
-    stay below 1; colours; deletion and copies; retiming whose time locations stay within (0, 1). All others are kept as
+    stay below 1; colors; deletion and copies; retiming whose time locations stay within (0, 1). All others are kept as
     **overlays**, applied to the conditioned Gaussians at each time: edits over a span, edits about the selection's own
     center, clocks, functions, depth. `video()` is a plain `VideoModel` if all edits could be baked. Gaussians that are
     not selected stay the same to the bit, and an edit that changes nothing (a factor 1, an angle 0) is skipped.
@@ -236,7 +236,7 @@ class Edit:
         identity = make(mask=np.zeros(0, bool), span=None).is_identity
         return self._apply(make, when, lambda splats, mask: apply_affine(splats, mask, make(mask, None)), skip=identity)
 
-    # ------------------------------------------------------------------- copies, order, opacity and colour
+    # ------------------------------------------------------------------- copies, order, opacity and color
 
     def multiply(
         self,
@@ -340,11 +340,11 @@ class Edit:
         matrix: ArrayLike | None = None,
         **when: Unpack[When],
     ) -> "Edit":
-        """Change the colours in one of three ways, clipped at 0 from below. Baked without a span.
+        """Change the colors in one of three ways, clipped at 0 from below. Baked without a span.
 
-        - `color` (3,): the object takes this colour and keeps its shading: `color` times each Gaussian's lightness over
+        - `color` (3,): the object takes this color and keeps its shading: `color` times each Gaussian's lightness over
           the mean lightness of the selection, weighted by opacity.
-        - `hue` in turns, 0 red, 1/3 green, 2/3 blue: lightness and distance from grey are kept.
+        - `hue` in turns, 0 red, 1/3 green, 2/3 blue: lightness and distance from gray are kept.
         - c' = gain * (M c) + offset with `matrix` M (3, 3); `gain`, `offset` one number or (3,).
 
         **Units:** red, green and blue about [0, 1].

@@ -35,7 +35,7 @@ class SelectedGaussians:
     (num, dim, 2), any F with covariance F F^T; `opacity` (num,) in [0, 1]; `color` (num, 3), >= 0. dim is 2, or 3 once
     an edit has moved Gaussians of the model into 3D space. NumPy arrays.
 
-    **Units:** the frame's centre is the origin and its longer side 1.
+    **Units:** the frame's center is the origin and its longer side 1.
 
     **Example:** `dataclasses.replace(gaussians, mean=gaussians.mean + [0.1, 0.0])`.
     """
@@ -204,10 +204,10 @@ def is_active(overlay: AbstractOverlay, progress: float) -> bool:
 
 
 class Recolor(AbstractOverlay):
-    """A linear map of colours c' = max(M c + b, 0), applied as c + s (c' - c) at progress s, or a new hue.
+    """A linear map of colors c' = max(M c + b, 0), applied as c + s (c' - c) at progress s, or a new hue.
 
     `hue` is in turns (0 red, 1/3 green, 2/3 blue); it is set before the linear map. Lightness (Rec. 709) and the
-    distance from grey are kept.
+    distance from gray are kept.
     """
 
     mask: Bool[np.ndarray, " num_gaussians"]
@@ -225,7 +225,7 @@ class Recolor(AbstractOverlay):
             check_number("hue", self.hue)
 
     def map_colors(self, color: Float[np.ndarray, "num 3"]) -> Float[np.ndarray, "num 3"]:
-        """The colours at progress 1, float64."""
+        """The colors at progress 1, float64."""
         color = np.asarray(color, np.float64)
         if self.hue is not None:
             color = _with_hue(color, self.hue)
@@ -237,10 +237,10 @@ class Recolor(AbstractOverlay):
 
 
 def _with_hue(color: Float[np.ndarray, "num 3"], hue: float) -> Float[np.ndarray, "num 3"]:
-    grey = (color @ LUMINANCE_WEIGHTS)[:, None]
+    gray = (color @ LUMINANCE_WEIGHTS)[:, None]
     pure = np.clip(np.abs((hue + np.array([0, 2 / 3, 1 / 3])) % 1 * 6 - 3) - 1, 0, 1)
     direction = pure - pure @ LUMINANCE_WEIGHTS
-    return grey + np.linalg.norm(color - grey, axis=1, keepdims=True) * direction / np.linalg.norm(direction)
+    return gray + np.linalg.norm(color - gray, axis=1, keepdims=True) * direction / np.linalg.norm(direction)
 
 
 class Place(AbstractOverlay):

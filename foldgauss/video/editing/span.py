@@ -114,7 +114,7 @@ def make_frame_span(
 ) -> FrameSpan | None:
     """The span of one frame, of frames (first, stop) or of times (start, stop); None for always.
 
-    A frame reaches half way to its neighbours: frame k covers |position - k| < 0.5, where `position` is the frame
+    A frame reaches half way to its neighbors: frame k covers |position - k| < 0.5, where `position` is the frame
     number interpolated between the frame times. So the span contains its frames, every other frame stays the same to
     the bit, and frames that are interpolated near it show the edit. `frames` includes first and excludes stop. None,
     the first or the last frame as an end means that the span has no end there.

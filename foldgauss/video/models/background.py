@@ -1,4 +1,4 @@
-"""Frames with alpha over a background. Colours are premultiplied by alpha.
+"""Frames with alpha over a background. Colors are premultiplied by alpha.
 
 $$ C = c\\,\\alpha + (1 - \\alpha)\\, b $$
 
@@ -18,7 +18,7 @@ _STREAM = 3  # random stream of the seed: others are the starts, the order of fr
 
 
 def random_background(seed: int, step: int) -> Float[np.ndarray, "3"]:
-    """The background colour of a step: it depends on nothing else, so that a resumed fit repeats it."""
+    """The background color of a step: it depends on nothing else, so that a resumed fit repeats it."""
     return np.random.default_rng([seed, _STREAM, step]).random(3, np.float32)
 
 

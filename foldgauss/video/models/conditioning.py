@@ -23,7 +23,7 @@ from foldgauss.video.models.splats import SH_C0, TAU_MAX
 CHUNK = 4096  # Gaussians per task
 
 _f, _u = nb.float32, nb.uint64
-#: Outputs of conditioning for each Gaussian: mean 2, factor 4, opacity, colour 3, kept 3.
+#: Outputs of conditioning for each Gaussian: mean 2, factor 4, opacity, color 3, kept 3.
 _NUM_OUT = 13
 
 
@@ -67,9 +67,9 @@ def _windows(at, start, stop, indices, rows, window):
     """The time windows in which these Gaussians are rendered."""
     for k in range(start, stop):
         i = indices[k]
-        centre, reach = _sigmoid(rows[i, at.time]), at.tau_max * math.exp(rows[i, at.spread])
-        window[i, 0] = centre - reach
-        window[i, 1] = centre + reach
+        center, reach = _sigmoid(rows[i, at.time]), at.tau_max * math.exp(rows[i, at.spread])
+        window[i, 0] = center - reach
+        window[i, 1] = center + reach
 
 
 @kernel
@@ -120,8 +120,8 @@ def _column(columns, c):
 @kernel
 def _condition_vectors(at, columns, degree, t, unit, cx, cy, power, floor, out):
     none, scale = broadcast(_f(0.0)), broadcast(unit)
-    centre, spread = sigmoid(_column(columns, at.time)), exp(_column(columns, at.spread))
-    u = centre - broadcast(t)
+    center, spread = sigmoid(_column(columns, at.time)), exp(_column(columns, at.spread))
+    u = center - broadcast(t)
     x, y = none, none
     for j in range(degree - 1, -1, -1):  # Horner
         x = u * (x + _column(columns, at.fold + 2 * j))
@@ -146,7 +146,7 @@ def _condition_vectors(at, columns, degree, t, unit, cx, cy, power, floor, out):
     for c in range(_u(3)):
         value = broadcast(_f(0.5)) + broadcast(at.sh_c0) * _column(columns, at.color + c)
         store(out, (_u(7) + c) * _u(LANES), select(value < none, none, value))
-    store(out, _u(10 * LANES), centre)
+    store(out, _u(10 * LANES), center)
     store(out, _u(11 * LANES), spread)
     store(out, _u(12 * LANES), turn)
 
@@ -181,8 +181,8 @@ def _pull_back(
         gx, gy = d_mean[k, 0] * unit, d_mean[k, 1] * unit
         out[at.loc] += gx
         out[at.loc + 1] += gy
-        centre, spread, turn = kept[k, 0], kept[k, 1], kept[k, 2]
-        u = centre - t
+        center, spread, turn = kept[k, 0], kept[k, 1], kept[k, 2]
+        u = center - t
         # Fold: dL/dc_j = g u^j, and dL/du by the derivative of the polynomial.
         d_u, u_power = _f(0.0), _f(1.0)
         for j in range(degree):
@@ -207,7 +207,7 @@ def _pull_back(
         by_exponent = (by_first + by_second) * slope
         out[at.spread] += by_exponent * square
         d_u -= by_exponent * tau / spread
-        out[at.time] += d_u * centre * (_f(1.0) - centre)
+        out[at.time] += d_u * center * (_f(1.0) - center)
         d_time -= d_u
         out[at.opacity] += d_opacity[k] * opacity[k] * (_f(1.0) - opacity[k])
         for c in range(3):
@@ -318,7 +318,7 @@ def apply_scale_cutoff(rows: np.ndarray, window: np.ndarray, spec: ConditioningS
     if scale_cutoff <= 0:
         return
     places = columns(spec.degree)
-    centre, spread = (rows[:, places[name].start].astype(float) for name in ("time_loc_logit", "log_time_scale"))
+    center, spread = (rows[:, places[name].start].astype(float) for name in ("time_loc_logit", "log_time_scale"))
     smaller = rows[:, places["log_scale"]].min(axis=1).astype(float)
     needed = np.exp(2 * (math.log(scale_cutoff) - smaller)) - spec.floor
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -326,7 +326,7 @@ def apply_scale_cutoff(rows: np.ndarray, window: np.ndarray, spec: ConditioningS
     never, always = needed >= 1 - spec.floor, needed <= 0
     reach = np.where(always, np.inf, np.sqrt(np.where(never | always, 0, square)))
     reach = np.minimum(reach, TAU_MAX) * np.exp(spread)
-    middle = 1 / (1 + np.exp(-centre))
+    middle = 1 / (1 + np.exp(-center))
     window[:, 0], window[:, 1] = np.maximum(window[:, 0], middle - reach), np.minimum(window[:, 1], middle + reach)
 
 
@@ -364,7 +364,7 @@ def backpropagate(
     grad: np.ndarray,
     path_grad: np.ndarray | None = None,
 ) -> float:
-    """Add the gradients of mean, factor, opacity and colour, as gradients of rows, to `grad`; returns dL/dt.
+    """Add the gradients of mean, factor, opacity and color, as gradients of rows, to `grad`; returns dL/dt.
 
     dL/dt is that with the maps of shared paths as they are at t. Gradients by these maps, in model space, are added to
     `path_grad` (paths, 2, 3).

@@ -16,18 +16,18 @@ _LOG_2PI = float(np.log(2 * np.pi))
 def density_image(
     mixture: FoldedMixture, t: ArrayLike, size: tuple[int, int], *, aspect: float | None = None, engine: str = "auto"
 ) -> Float[Array, "height width"]:
-    """p(x, y, t) at the centre of every pixel: `mixture.pdf` on the grid, but rendered.
+    """p(x, y, t) at the center of every pixel: `mixture.pdf` on the grid, but rendered.
 
         sum_k  w_k N(t; m_t, sigma_t^2) / (2 pi sqrt(det a Sigma_s))  exp(-q_k(x, y) / 2)
 
-    The components at t are splats whose colour is their peak, added up without low-pass filter, ceiling or stop. Left
+    The components at t are splats whose color is their peak, added up without low-pass filter, ceiling or stop. Left
     out are values below 1e-8 of a component's *own* peak (6 deviations), and components much thinner than a pixel, see
     `RenderOptions.exact`. Differentiable in the mixture's parameters.
 
     Shapes: `mixture` of (x, y, t) without batch dimensions; t a number; `size` (height, width) -> (height, width).
 
     Units: density per unit of model space squared and of time, *not* per pixel: model space has its origin at the
-    image's centre, x right, y down, and the longer side of the frame is 1 (`aspect`: height / width of the frame,
+    image's center, x right, y down, and the longer side of the frame is 1 (`aspect`: height / width of the frame,
     default the image's own). Divide by `pixels_per_unit(size)` squared for pixels, and by `p(t)` for space given t.
 
     Example: `density_image(mixture, 0.5, (90, 160))`.
@@ -45,8 +45,8 @@ def density_image(
     at = components.condition_time(t)
     log_det = jnp.log(jnp.diagonal(at.base_tril, axis1=-2, axis2=-1)).sum(-1) + 2 * at.log_scale
     log_peak = mixture.log_weights + components.time_marginal.log_prob(t) - log_det - _LOG_2PI
-    # Peaks of any size are colours: opacities cannot exceed 1.
-    highest = float(np.log(jnp.finfo(dtype).max)) - 1  # an infinite colour would not be rendered
+    # Peaks of any size are colors: opacities cannot exceed 1.
+    highest = float(np.log(jnp.finfo(dtype).max)) - 1  # an infinite color would not be rendered
     peak = jnp.exp(jnp.minimum(log_peak, highest))
     num = mixture.num_components
     factor = jnp.broadcast_to(jnp.tril(at.scale_tril), (num, 2, 2))  # no gradient above the diagonal

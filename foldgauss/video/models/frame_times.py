@@ -18,7 +18,7 @@ from foldgauss._runtime.threads import check_not_forked
 #: middle of a shot has vanished in the next one for sigma_t up to 1.15 shots, whose envelope shrinks it by at most a
 #: tenth at the ends of its own shot.
 GAP, GAP_SHOTS = 8.0, 3.0
-#: An interval longer than the median one by this factor is a cut. Learned times move neighbours less than that.
+#: An interval longer than the median one by this factor is a cut. Learned times move neighbors less than that.
 CUT_RATIO = 6.0
 
 
@@ -48,7 +48,7 @@ class FrameTimes(eqx.Module):
     def times(self) -> Float[Array, "num_frames"]:
         """The times t_k: 0 at the first frame, exactly 1 at the last, never decreasing.
 
-        Neighbours are equal only where a weight is too small for the dtype.
+        Neighbors are equal only where a weight is too small for the dtype.
         """
         check_not_forked()
         summed = jnp.cumsum(jax.nn.softmax(jnp.asarray(self.logits)))

@@ -22,7 +22,7 @@ def psnr(target: np.ndarray, image: np.ndarray) -> float:
     return float(skimage.metrics.peak_signal_noise_ratio(target, image, data_range=255))
 
 
-#: Side of SSIM's window in pixels, and the distance from its centre to its edge.
+#: Side of SSIM's window in pixels, and the distance from its center to its edge.
 SSIM_WINDOW, SSIM_REACH = 11, 5
 
 

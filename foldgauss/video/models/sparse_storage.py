@@ -1,7 +1,7 @@
 """Which parameters each Gaussian has, and the lossless form in which a model file stores them.
 
 A Gaussian's *kind* is a byte: its degree, and a bit for each of two groups of parameters that it does without. A static
-Gaussian has no m_t and sigma_t, an opaque one no opacity. Colours and sizes that many Gaussians share are stored once.
+Gaussian has no m_t and sigma_t, an opaque one no opacity. Colors and sizes that many Gaussians share are stored once.
 """
 
 import dataclasses
@@ -96,7 +96,7 @@ class StoredSplats(eqx.Module):
     | `time_loc_logit`, `log_time_scale` | (timed,) | those of the Gaussians that are not static |
     | `opacity_logit` | (clear,) | those of the Gaussians that are not opaque |
     | `color_index` | (num,) or None | each Gaussian's row of `color_dc`; None: rows are not shared |
-    | `color_dc` | (colors, 3) | the distinct colours |
+    | `color_dc` | (colors, 3) | the distinct colors |
     | `shape_index`, `log_scale` | likewise, (shapes, 2) | the distinct pairs of standard deviations |
 
     `degree` is that of the dense leaf; no Gaussian need reach it.

@@ -1,4 +1,4 @@
-"""Folded splats: Folded-Gaussians with opacity and colour, the trainable parameters of a video."""
+"""Folded splats: Folded-Gaussians with opacity and color, the trainable parameters of a video."""
 
 import equinox as eqx
 import jax
@@ -15,7 +15,7 @@ from foldgauss.mixture import FoldedMixture
 from foldgauss.render import Splats2D
 from foldgauss.video.models.shared_paths import SharedPaths, move_splats
 
-#: Degree-0 spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 * color_dc, as in 3DGS.
+#: Degree-0 spherical harmonic, 1 / (2 sqrt(pi)): color = 0.5 + SH_C0 * color_dc, as in 3DGS.
 SH_C0 = 0.28209479177387814
 #: A Gaussian is rendered only where exp(-tau^2 / 2) exceeds this, as in the published VeGaS.
 TIME_CUTOFF = 0.01
@@ -31,9 +31,9 @@ PEAK_OPACITY = 0.99
 
 
 class FoldedSplats(eqx.Module):
-    """Folded Gaussians with opacity and colour: raw leaves, before activation, in model space.
+    """Folded Gaussians with opacity and color: raw leaves, before activation, in model space.
 
-    Model space has its origin at the frame's centre, x right, y down, and the frame's longer side is 1; time is [0, 1].
+    Model space has its origin at the frame's center, x right, y down, and the frame's longer side is 1; time is [0, 1].
 
     | leaf | shape | becomes |
     |---|---|---|
@@ -137,7 +137,7 @@ class FoldedSplats(eqx.Module):
 
         Shapes: `mixture` of (x, y, t) without batch dimensions, in model space, m_t in (0, 1), with polynomial or zero
         folds and a time-likelihood or constant envelope; `color` (3,) or (num, 3), not below 0.
-        Raises ValueError for any other mixture or colour.
+        Raises ValueError for any other mixture or color.
 
         Example: `FoldedSplats.from_mixture(mixture, color=[1.0, 0.5, 0.0]).at(0.5)`.
         """
@@ -170,7 +170,7 @@ class FoldedSplats(eqx.Module):
     def to_mixture(self) -> FoldedMixture:
         """The splats as a mixture, in model space: `gaussians()` with weights in proportion to opacity.
 
-        Colours are left out. Example: `model.splats.to_mixture().log_prob(jnp.array([0.0, 0.1, 0.5]))`.
+        Colors are left out. Example: `model.splats.to_mixture().log_prob(jnp.array([0.0, 0.1, 0.5]))`.
         """
         return FoldedMixture(self.gaussians(), logits=jax.nn.log_sigmoid(self.opacity_logit))
 

@@ -152,7 +152,7 @@ class _RegionCriterion:
             make, name = regions[function]
             self._region = make(context.stand_in, arguments[name], **where)
             self._frames = self._region.frames
-        #: By segment and layer: masks of what the neighbours show, by frames of the clip.
+        #: By segment and layer: masks of what the neighbors show, by frames of the clip.
         self._masks: dict[int, list[dict[int, _Image]]] = {}
 
     def evaluate(self) -> SegmentedSelection:
@@ -164,10 +164,10 @@ class _RegionCriterion:
             number = waiting.popleft()
             one = self._context.replay(number)
             found[number] = self._evaluate_named(one, number) if number in named else self._propagate(one, number)
-            for other in self._neighbours(number):
+            for other in self._neighbors(number):
                 if other in found or other in named or not self._arguments.get("follow", True):
                     continue
-                if len(found[number]) or number in named:  # an empty selection is information for the neighbour, too
+                if len(found[number]) or number in named:  # an empty selection is information for the neighbor, too
                     self._render_masks(one, found[number], number, other)
                 if len(found[number]) and other not in reached:
                     reached.add(other)
@@ -180,7 +180,7 @@ class _RegionCriterion:
         segment = self._segments[number]
         return [k for k in self._frames if segment.first <= k < segment.stop]
 
-    def _neighbours(self, number: int) -> Iterable[int]:
+    def _neighbors(self, number: int) -> Iterable[int]:
         return (other for other in (number - 1, number + 1) if 0 <= other < len(self._segments))
 
     def _evaluate_named(self, one: Edit, number: int) -> Selection:
@@ -198,7 +198,7 @@ class _RegionCriterion:
         return self._context.evaluate_segment(one, lambda model, _: self._function(model, **own))
 
     def _render_masks(self, one: Edit, found: Selection, number: int, other: int) -> None:
-        """Render the selection of a segment as masks of the frames that it shares with a neighbour."""
+        """Render the selection of a segment as masks of the frames that it shares with a neighbor."""
         here, there = self._segments[number], self._segments[other]
         layers, selected = one._video.layers, dataclasses.replace(one, selection=found)._masks()
         by_layer = self._masks.setdefault(other, [{} for _ in layers])
@@ -212,10 +212,10 @@ class _RegionCriterion:
                     images[k] = render_matte(contributions, mask, own_time) >= _MIN_CONTRIBUTION
 
     def _propagate(self, one: Edit, number: int) -> Selection:
-        """In a segment with none of the frames named: by the masks that its neighbours show."""
+        """In a segment with none of the frames named: by the masks that its neighbors show."""
         first, by_layer = self._segments[number].first, self._masks[number]
         if len(by_layer) != len(one._video.layers):
-            expected = f"{len(by_layer)} layers, as its neighbour has"
+            expected = f"{len(by_layer)} layers, as its neighbor has"
             raise invalid(f"segments[{number}]", expected=expected, got=len(one._video.layers))
         threshold = self._arguments.get("threshold", THRESHOLD)
 

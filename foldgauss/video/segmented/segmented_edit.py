@@ -66,7 +66,7 @@ class SegmentedEdit:
       has the same progress in both segments.
     - Regions (`mask=`, `box=`, `polygon=`, `click=`) are evaluated on the segments that have the frames named, and
       propagated from segment to segment: where the selection contributes at least half of a pixel of a shared frame,
-      that pixel is in the neighbour's mask. There is no propagation across a cut, where no frame is shared, nor with
+      that pixel is in the neighbor's mask. There is no propagation across a cut, where no frame is shared, nor with
       `follow=False`. `color=`, `moving=` and times are evaluated on every segment.
     - Clocks (`retime`, `freeze`, `delays=`) work within one segment only: a clock that would show frames of another
       segment raises ValueError.
@@ -265,7 +265,7 @@ def _deselect_all(one: Edit) -> Edit:
 
 @edit.register
 def _(video: SegmentedVideo) -> SegmentedEdit:
-    """Start with a stand-in of one grey Gaussian that is always alive."""
+    """Start with a stand-in of one gray Gaussian that is always alive."""
     shapes = {
         "loc": (1, 2),
         "log_scale": (1, 2),

@@ -107,9 +107,9 @@ class SegmentedVideo(RenderedVideo):
     """The models of a clip's segments as one video; it is rendered, played and saved as a `VideoModel` is.
 
     Each segment keeps its own frame times and cuts: times between frames k and k + 1 of the clip are interpolated
-    between those of the segment. Where neighbours share frames, a to b - 1, they are cross-faded: at frame position p
+    between those of the segment. Where neighbors share frames, a to b - 1, they are cross-faded: at frame position p
     the later one has weight (p - a + 1) / (b - a + 1), which rises from 0 at frame a - 1 to 1 at frame b. Before its
-    first frame and after its last a model shows that frame. Neighbours that share no frame meet at a cut, and between
+    first frame and after its last a model shows that frame. Neighbors that share no frame meet at a cut, and between
     the two frames the nearer one is shown.
 
     Models are loaded when they are rendered, and at most `MAX_PREPARED` of them are kept.
@@ -276,7 +276,7 @@ def _check_segments(segments: tuple[Segment, ...]) -> None:
         cure = "Count frames from that of the first segment."
         raise invalid("segments", expected="the first one to begin at frame 0", got=segments[0].first, cure=cure)
     for number, (one, other) in enumerate(pairwise(segments)):
-        _check_neighbours(number, one, other)
+        _check_neighbors(number, one, other)
         _check_alike(number + 1, segments[0], other)
     for number, (one, other) in enumerate(zip(segments, segments[2:], strict=False)):
         if other.first < one.stop:
@@ -285,7 +285,7 @@ def _check_segments(segments: tuple[Segment, ...]) -> None:
             raise invalid("segments", expected=expected, got=f"frame {other.first}", cure=cure)
 
 
-def _check_neighbours(number: int, one: Segment, other: Segment) -> None:
+def _check_neighbors(number: int, one: Segment, other: Segment) -> None:
     if not (one.first < other.first and one.stop < other.stop):
         expected = f"segment {number + 1} to begin and to end after segment {number}, {one.first}:{one.stop}"
         cure = "Give them in the order of the clip, none within another."

@@ -1,6 +1,6 @@
 """Contribution of each Gaussian to a rendered image: the weights w_i(p) = alpha_i(p) times the transmittance at i.
 
-An image is A c: linear in the colours, with A the weights. The renderer's two passes therefore apply A and its
+An image is A c: linear in the colors, with A the weights. The renderer's two passes therefore apply A and its
 transpose: the forward pass renders any three values per Gaussian, the backward pass sums any image times the weights
 over pixels. There are always three channels, the number for which the fit has compiled its kernels.
 """
@@ -53,12 +53,12 @@ class Contributions:
         return FrameContributions(self, self.prepared.at(float(snap_to_shots(t, self.times))))
 
     def centers_at(self, indices: Int[np.ndarray, " num"], t: float) -> Float32[np.ndarray, "num 2"]:
-        """Centres of these Gaussians at time t, in pixels, alive or not."""
+        """Centers of these Gaussians at time t, in pixels, alive or not."""
         always = np.broadcast_to(np.float32([-math.inf, math.inf]), (len(indices), 2))
         return condition(self.prepared.rows[indices], always, t, self.prepared.spec).mean
 
     def own_centers(self, indices: Int[np.ndarray, " num"]) -> Float[np.ndarray, "num 2"]:
-        """Centres of these Gaussians at their own m_t, where the fold is 0, in pixels."""
+        """Centers of these Gaussians at their own m_t, where the fold is 0, in pixels."""
         (height, width), splats = self.size, self.model.splats
         loc = np.asarray(splats.loc, np.float64)[indices]
         if splats.paths is not None:
@@ -103,7 +103,7 @@ class FrameContributions:
         return self.gather(np.ones((1, *self.source.size), np.float32))[:, 0]
 
     def render(self, values: Float[np.ndarray, "num_alive channels"]) -> Float32[np.ndarray, "channels height width"]:
-        """A v: the image of up to three values per Gaussian in place of its colour."""
+        """A v: the image of up to three values per Gaussian in place of its color."""
         return self._forward(_pad_to_three(values, 1)).image[: values.shape[1]]
 
     def gather(self, images: Float[np.ndarray, "channels height width"]) -> Float32[np.ndarray, "num_alive channels"]:
@@ -154,7 +154,7 @@ def update_best(
 def average_seen_colors(
     contributions: Contributions,
 ) -> tuple[Float[np.ndarray, "num_gaussians 3"], Bool[np.ndarray, " num_gaussians"]]:
-    """The rendered colour where each Gaussian is visible, averaged over all frames; and which are visible at all."""
+    """The rendered color where each Gaussian is visible, averaged over all frames; and which are visible at all."""
 
     def observations():
         for k in range(len(contributions.times)):

@@ -59,7 +59,7 @@ def region_from_mask(model: VideoModel, mask: Masks, frame: int | None, frames: 
 def region_from_box(
     model: VideoModel, box: tuple[float, float, float, float], frame: int | None, frames: tuple[int, int] | None
 ) -> Region:
-    """The pixels whose centres lie in x0 <= x < x1, y0 <= y < y1."""
+    """The pixels whose centers lie in x0 <= x < x1, y0 <= y < y1."""
     check_model(model)
     edges = _as_array(box)
     if edges.shape != (4,) or edges.dtype.kind not in "fiu" or not np.isfinite(edges).all():
@@ -74,13 +74,13 @@ def region_from_box(
 def region_from_polygon(
     model: VideoModel, polygon: Float[ArrayLike, "corners 2"], frame: int | None, frames: tuple[int, int] | None
 ) -> Region:
-    """The pixels whose centres lie in a polygon of corners (x, y), even-odd."""
+    """The pixels whose centers lie in a polygon of corners (x, y), even-odd."""
     check_model(model)
     corners = _as_array(polygon)
     bad = corners.ndim != 2 or corners.shape[1:] != (2,) or len(corners) < 3 or corners.dtype.kind not in "fiu"
     if bad or not np.isfinite(corners).all():
         raise invalid("polygon", expected="at least 3 corners (x, y) in pixels", got=_short_repr(polygon))
-    # scikit-image has pixel centres at integers, and rows first.
+    # scikit-image has pixel centers at integers, and rows first.
     return _constant_region(
         "polygon", model, skimage.draw.polygon2mask(model.size, corners[:, ::-1] - 0.5), frame, frames
     )
@@ -149,7 +149,7 @@ def _check_mask(model: VideoModel, mask: np.ndarray, ndim: int) -> np.ndarray:
     """A mask or a stack of masks of the model's aspect; bool, or float in [0, 1]."""
     mask = np.asarray(mask)
     if mask.ndim != ndim or mask.size == 0 or mask.dtype.kind not in "bf":
-        cure = "From labels take those of one object: mask=(labels == 1); from grey levels, mask=(levels > 127)."
+        cure = "From labels take those of one object: mask=(labels == 1); from gray levels, mask=(levels > 127)."
         raise invalid("mask", expected="bool (height, width)", got=f"{mask.dtype} {mask.shape}", cure=cure)
     if mask.dtype.kind == "f" and not ((mask >= 0) & (mask <= 1)).all():
         raise invalid("mask", expected="bool, or fractions in [0, 1]", got="other values")

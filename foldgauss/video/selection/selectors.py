@@ -1,4 +1,4 @@
-"""Selections: sets of Gaussians, and functions that select them by region, colour, time or a click."""
+"""Selections: sets of Gaussians, and functions that select them by region, color, time or a click."""
 
 import dataclasses
 import functools
@@ -47,7 +47,7 @@ _LOG = logging.getLogger(__name__)
 
 #: Fraction of a Gaussian's contribution that must lie inside a mask.
 THRESHOLD = 0.5
-#: Defaults in Delta E: a shade; and more for clicks, where links between neighbours limit the set, too.
+#: Defaults in Delta E: a shade; and more for clicks, where links between neighbors limit the set, too.
 COLOR_TOLERANCE, CLICK_TOLERANCE = 10.0, 15.0
 
 
@@ -170,7 +170,7 @@ def select(
     - `moving`: `by_motion`, from all frames. `alive`: of `by_time`.
     - `threshold`: of mask, box, polygon and `moving`. `follow`: of mask, box and polygon.
 
-    **Units:** pixels of the model's own size, x right, y down; times in [0, 1]; colours in [0, 1].
+    **Units:** pixels of the model's own size, x right, y down; times in [0, 1]; colors in [0, 1].
 
     **Example:** `select(model, box=(200, 80, 420, 260), frame=0, color=(0.8, 0.1, 0.1), tolerance=25)`.
 
@@ -275,10 +275,10 @@ def by_mask(
     - `mask`: bool (height, width) for `frame`, or for each of `frames`; (num_frames, height, width), one for each of
       `frames` (default: all); or {frame: mask}. Any size of the model's aspect; values in [0, 1] are fractions.
     - `follow`: Gaussians that the masked frames hardly show are labeled where they are visible, frame by frame outwards
-      within the shot, as their neighbours of similar motion and colour. False: only Gaussians visible in the masked
+      within the shot, as their neighbors of similar motion and color. False: only Gaussians visible in the masked
       frames are selected.
     - Gaussians visible in no frame are labeled by their position at their own m_t in the nearest frame: by its mask, or
-      with `follow` by their labeled neighbours.
+      with `follow` by their labeled neighbors.
 
     One mask selects a whole object; a few masks are better, and one for each frame is best.
 
@@ -300,7 +300,7 @@ def by_box(
 ) -> Selection:
     """The Gaussians inside the box (x0, y0, x1, y1) of `frame`, or of each of `frames` (default: all): see `by_mask`.
 
-    **Units:** pixels of the model's own size, x right, y down; a pixel is inside if its centre (at +0.5) is.
+    **Units:** pixels of the model's own size, x right, y down; a pixel is inside if its center (at +0.5) is.
 
     **Example:** `by_box(model, (200, 80, 420, 260), frame=0)`. **Raises:** ValueError for a box without pixels.
     """
@@ -357,12 +357,12 @@ def by_color(
 ) -> Selection:
     """The Gaussians that look like `color`, red, green and blue in [0, 1], to within `tolerance`.
 
-    With `seen`, a Gaussian's colour is the image's where it is visible, averaged over frames by its weights: where many
-    overlap, its own colour may be anything. Its own is used without `seen`, and for Gaussians that are never visible.
+    With `seen`, a Gaussian's color is the image's where it is visible, averaged over frames by its weights: where many
+    overlap, its own color may be anything. Its own is used without `seen`, and for Gaussians that are never visible.
 
-    **Units:** tolerance in CIELAB Delta E (CIEDE2000): 1 is just noticeable, 10 a shade, 30 another colour.
+    **Units:** tolerance in CIELAB Delta E (CIEDE2000): 1 is just noticeable, 10 a shade, 30 another color.
 
-    **Example:** `by_color(model, (0.9, 0.2, 0.1), tolerance=25)`. **Raises:** ValueError for an invalid colour.
+    **Example:** `by_color(model, (0.9, 0.2, 0.1), tolerance=25)`. **Raises:** ValueError for an invalid color.
     """
     wanted = np.asarray(color)
     if wanted.shape != (3,) or wanted.dtype.kind not in "fiu" or not ((wanted >= 0) & (wanted <= 1)).all():
@@ -410,8 +410,8 @@ def by_click(
     """The object at a click: grown from the greatest contributor at the pixel (x, y) of `frame`, along its motion.
 
     A Gaussian is included if it *looks* like the pixel, to within `tolerance`, and is linked to it by a chain of such
-    neighbours, which touch and move alike in most of the frames in which they touch, up to the cuts of the shot. A
-    static background of one colour has no boundary: intersect with a box. At most 48 frames are examined.
+    neighbors, which touch and move alike in most of the frames in which they touch, up to the cuts of the shot. A
+    static background of one color has no boundary: intersect with a box. At most 48 frames are examined.
 
     **Units:** `click` in pixels of the model's own size, x right, y down; tolerance in CIELAB Delta E, as `by_color`.
 
@@ -483,7 +483,7 @@ def _select_region(model: VideoModel, region: Region, threshold: float, follow: 
 def _label_by_position(
     contributions: Contributions, region: Region, label: Int8[np.ndarray, " num_gaussians"]
 ) -> Int8[np.ndarray, " num_gaussians"]:
-    """Decide the unknown by their centres at their own m_t, if the nearest frame has a mask."""
+    """Decide the unknown by their centers at their own m_t, if the nearest frame has a mask."""
     label, unknown = label.copy(), np.flatnonzero(label == UNKNOWN)
     nearest = contributions.nearest_frame(unknown)
     for k in set(region.frames) & set(nearest.tolist()):

@@ -1,4 +1,4 @@
-"""Tracking by motion and colour: carries labels of Gaussians to other frames, and grows a set from a single pixel."""
+"""Tracking by motion and color: carries labels of Gaussians to other frames, and grows a set from a single pixel."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -14,14 +14,14 @@ from foldgauss.video.selection.contributions import Contributions, FrameContribu
 #: A frame is ignored for a Gaussian whose weights there sum to less than this fraction of the sum in its best frame: it
 #: is occluded, or about to appear or vanish.
 CLEAR = 0.5
-#: Neighbours that vote on a label, and neighbours that may be linked.
+#: Neighbors that vote on a label, and neighbors that may be linked.
 VOTERS, NEIGHBORS = 16, 8
-#: One unit of difference: of position and of motion per frame, in longer sides of the frame; of colour, in Delta E.
+#: One unit of difference: of position and of motion per frame, in longer sides of the frame; of color, in Delta E.
 PLACE, MOTION, COLOR = 0.03, 0.004, 10.0
-#: Neighbours touch if their centres are within this many times the sum of their standard deviations, plus a pixel.
+#: Neighbors touch if their centers are within this many times the sum of their standard deviations, plus a pixel.
 #: Those at the start of a fit are 0.4 such sums apart.
 REACH = 1.5
-#: Neighbours move alike if their motions differ by at most `MOTION` plus this fraction of the motion.
+#: Neighbors move alike if their motions differ by at most `MOTION` plus this fraction of the motion.
 MOTION_FRACTION = 0.1
 #: Most frames that a set is grown through; a Gaussian lives for several frames, and links them.
 GROWN_FRAMES = 48
@@ -31,7 +31,7 @@ UNKNOWN, OUT, IN = -1, 0, 1
 class Observations(NamedTuple):
     """The Gaussians visible in a frame, and the features that tell them apart.
 
-    Colours and motions are those *seen* where the Gaussian is: the image's, averaged by its weights. The Gaussian's own
+    Colors and motions are those *seen* where the Gaussian is: the image's, averaged by its weights. The Gaussian's own
     values may be anything where many overlap. A large spread of the motion seen means a motion boundary.
     """
 
@@ -66,7 +66,7 @@ def observe(contributions: Contributions, k: int) -> Observations:
 
 
 def _motion(contributions: Contributions, k: int, frame: FrameContributions) -> Float32[np.ndarray, "num_alive 2"]:
-    """Displacement of each Gaussian's centre within one frame interval, in pixels."""
+    """Displacement of each Gaussian's center within one frame interval, in pixels."""
     intervals = np.diff(contributions.times)
     half = intervals[max(k - 1, 0) : k + 1].min(initial=1.0) / 2  # the shorter interval: the other may be a cut
     t = float(contributions.times[k])
@@ -79,7 +79,7 @@ def to_lab(color: Float[np.ndarray, "num 3"]) -> Float32[np.ndarray, "num 3"]:
 
 
 def color_difference(one: Float[np.ndarray, "num 3"], other: Float[np.ndarray, "3"]) -> Float[np.ndarray, " num"]:
-    """Delta E of CIELAB colours. Source: CIEDE2000."""
+    """Delta E of CIELAB colors. Source: CIEDE2000."""
     return skimage.color.deltaE_ciede2000(one, np.broadcast_to(other, one.shape))
 
 
@@ -95,7 +95,7 @@ def propagate_labels(
     """Carry labels from `frames` to the other frames of their shots, nearest frames first.
 
     In the first frame that shows it clearly, an unlabelled Gaussian takes the label of the labelled ones nearest to it
-    in position, motion and colour. `best`: the sum of each Gaussian's weights in its best frame.
+    in position, motion and color. `best`: the sum of each Gaussian's weights in its best frame.
     """
     label = label.copy()
     for k in _frames_outward(contributions, sorted(frames)):
@@ -160,7 +160,7 @@ def _shot_numbers(contributions: Contributions) -> Int[np.ndarray, " num_frames"
 def grow_from_pixel(
     contributions: Contributions, pixel: tuple[int, int], k: int, tolerance: float
 ) -> Bool[np.ndarray, " num_gaussians"] | None:
-    """The Gaussians of a pixel's colour, linked to it (row, column, in frame k) through neighbours that move alike.
+    """The Gaussians of a pixel's color, linked to it (row, column, in frame k) through neighbors that move alike.
 
     None if nothing is rendered at the pixel.
     """
@@ -192,7 +192,7 @@ def _sample_frames(contributions: Contributions, k: int) -> list[int]:
 
 
 class _Pairs(NamedTuple):
-    """Indices of neighbours that touch, in both orders, of all frames in turn."""
+    """Indices of neighbors that touch, in both orders, of all frames in turn."""
 
     one: Int[np.ndarray, " num"]
     other: Int[np.ndarray, " num"]
@@ -220,7 +220,7 @@ def _find_linked(num: int, pairs: _Pairs, seed: int) -> Bool[np.ndarray, " num_g
 def _assign_boundary(
     num: int, pairs: _Pairs, inside: Bool[np.ndarray, " num_gaussians"]
 ) -> Bool[np.ndarray, " num_gaussians"]:
-    """Gaussians always at motion boundaries whose own motion is nearer to their neighbours' inside than outside."""
+    """Gaussians always at motion boundaries whose own motion is nearer to their neighbors' inside than outside."""
     free = np.ones(num, bool)
     free[pairs.one[pairs.firm]] = False
     gaps = []
@@ -246,7 +246,7 @@ def _find_pairs(
 
 def _find_touching(seen: Observations, motion: float) -> _Pairs:
     """The pairs of one frame."""
-    num = min(NEIGHBORS + 1, len(seen.index))  # each point is its own nearest neighbour
+    num = min(NEIGHBORS + 1, len(seen.index))  # each point is its own nearest neighbor
     radius = np.abs(np.linalg.det(seen.frame.splats.factor[seen.which])) ** 0.5
     distance, other = scipy.spatial.cKDTree(seen.position).query(seen.position, list(range(1, num + 1)))
     one = np.broadcast_to(np.arange(len(other))[:, None], other.shape)

@@ -81,7 +81,7 @@ function fingerprint(values, num) {
   return [sum, other].map((own) => (own >>> 0).toString(16).padStart(8, "0")).join("");
 }
 
-/** A Gaussian conditioned on a time: centre, variances along its axes with the low-pass filter's added, axes. Model units. */
+/** A Gaussian conditioned on a time: center, variances along its axes with the low-pass filter's added, axes. Model units. */
 export function condition(model, i, time, lowPass) {
   const { values, texels, degree, header } = model, at = 4 * texels * i;
   const u = values[at + 2] - time, tau = u / values[at + 3];

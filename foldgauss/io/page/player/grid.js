@@ -1,7 +1,7 @@
 // Gaussians conditioned on one time, in a grid of cells by where they reach: which cover a point, and which can be seen.
 import { alphaAt } from "./gaussians.js";
 
-const SEEN = 0.01; // least opacity times transmittance at its centre for a Gaussian to be seen
+const SEEN = 0.01; // least opacity times transmittance at its center for a Gaussian to be seen
 const FAR = 3.4; // standard deviations: beyond, no alpha exceeds 1 / 255
 const MOST_CELLS = 48; // along a side
 
@@ -36,7 +36,7 @@ export class Grid {
     return this.cells[row * this.side + column];
   }
 
-  /** Whether the Gaussian at a place can be seen at its centre. */
+  /** Whether the Gaussian at a place can be seen at its center. */
   isSeen(place) {
     const { x, y, opacity } = this.list[place];
     let left = opacity;

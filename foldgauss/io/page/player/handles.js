@@ -1,4 +1,4 @@
-// Handles on the selection: a frame that moves it, a corner that scales and a knob that rotates it about its centre.
+// Handles on the selection: a frame that moves it, a corner that scales and a knob that rotates it about its center.
 import { element } from "./elements.js";
 
 const LEAST = 44; // CSS pixels: the frame's smallest side, so that fingers hit it

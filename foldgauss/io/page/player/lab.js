@@ -1,4 +1,4 @@
-// CIELAB of sRGB, D65, and the distance of two colours: 1 is just noticeable, 10 a shade, 30 another colour.
+// CIELAB of sRGB, D65, and the distance of two colors: 1 is just noticeable, 10 a shade, 30 another color.
 
 const WHITE = [0.95047, 1, 1.08883];
 const TO_XYZ = [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.072175], [0.0193339, 0.119192, 0.9503041]];

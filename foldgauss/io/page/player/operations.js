@@ -33,7 +33,7 @@ function scaled(state, factor, about) {
   return affine(state, [[x, 0], [0, y]], about);
 }
 
-/** The colour map of a `recolor`, which may depend on the selections of all `states` together. */
+/** The color map of a `recolor`, which may depend on the selections of all `states` together. */
 function colorMap({ color, hue, gain, offset, matrix }, states) {
   if (color !== undefined) return withColor(states, color);
   if (hue !== undefined) return withHue(hue);

@@ -65,7 +65,7 @@ export function applyOpacity(state, factor) {
   });
 }
 
-/** Map the colours, red, green and blue, by a function. */
+/** Map the colors, red, green and blue, by a function. */
 export function applyColors(state, map) {
   return withChanged(state, ["color_dc"], ({ color_dc: raw }, i) => {
     const color = map([0, 1, 2].map((c) => Math.max(0.5 + SH_C0 * raw[3 * i + c], 0)));
@@ -73,18 +73,18 @@ export function applyColors(state, map) {
   });
 }
 
-/** A colour with another hue, in turns; its lightness and distance from grey are kept. */
+/** A color with another hue, in turns; its lightness and distance from gray are kept. */
 export function withHue(hue) {
   const wrapped = (x) => x - Math.floor(x);
   const pure = [0, 2 / 3, 1 / 3].map((own) => Math.min(Math.max(Math.abs(wrapped(hue + own) * 6 - 3) - 1, 0), 1));
   const direction = pure.map((own) => own - dot(pure, LUMINANCE)), length = Math.hypot(...direction);
   return (color) => {
-    const grey = dot(color, LUMINANCE), away = Math.hypot(...color.map((own) => own - grey));
-    return direction.map((own) => grey + (away * own) / length);
+    const gray = dot(color, LUMINANCE), away = Math.hypot(...color.map((own) => own - gray));
+    return direction.map((own) => gray + (away * own) / length);
   };
 }
 
-/** `color` times a colour's lightness over the mean of the selections of several states, weighted by opacity. */
+/** `color` times a color's lightness over the mean of the selections of several states, weighted by opacity. */
 export function withColor(states, color) {
   let weighted = 0, total = 0;
   for (const state of states)

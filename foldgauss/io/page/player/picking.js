@@ -1,4 +1,4 @@
-// Which Gaussians a brush, an outline or a colour means, and which are next to those selected. Indices of a state's model.
+// Which Gaussians a brush, an outline or a color means, and which are next to those selected. Indices of a state's model.
 import { Grid, extent } from "./grid.js";
 import { alive, condition, lowPassOf } from "./gaussians.js";
 import { deltaE, toLab } from "./lab.js";
@@ -20,7 +20,7 @@ export class Picker {
     return found;
   }
 
-  /** Those that are seen and whose centres are `inside(x, y)`, which lies within a box. */
+  /** Those that are seen and whose centers are `inside(x, y)`, which lies within a box. */
   seenIn(state, time, inside, [left, top, right, bottom]) {
     const near = this.at(state, time, (one) => {
       const reach = extent(one);
@@ -53,7 +53,7 @@ export class Picker {
     return this.seenIn(state, time, inside, [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)]);
   }
 
-  /** The colour of the picture at a point, red, green, blue. */
+  /** The color of the picture at a point, red, green, blue. */
   colorAt(state, time, x, y) {
     const color = [0, 0, 0], { values, texels } = state.model;
     for (const [one, weight] of this.grid(this.at(state, time), state).shown(x, y))
@@ -61,7 +61,7 @@ export class Picker {
     return color.map((own) => Math.min(own, 1));
   }
 
-  /** Of this colour to a tolerance in CIELAB, at whatever time. */
+  /** Of this color to a tolerance in CIELAB, at whatever time. */
   ofColor({ model: { num, values, texels } }, color, tolerance) {
     const wanted = toLab(color), found = [];
     for (let i = 0; i < num; i++) {
@@ -73,16 +73,16 @@ export class Picker {
 
   /** Seen at this time, not selected, and no farther than `distance` from one selected: what growing adds. */
   around(state, time, distance) {
-    return this.neighbours(state, time, distance, (i) => !state.selected[i]);
+    return this.neighbors(state, time, distance, (i) => !state.selected[i]);
   }
 
   /** Selected, and no farther than `distance` from one seen that is not: what shrinking removes. */
   border(state, time, distance) {
-    return this.neighbours(state, time, distance, (i) => state.selected[i]);
+    return this.neighbors(state, time, distance, (i) => state.selected[i]);
   }
 
   /** Seen Gaussians that are `wanted`, next to seen ones that are not. */
-  neighbours(state, time, distance, wanted) {
+  neighbors(state, time, distance, wanted) {
     const all = this.at(state, time), grid = this.grid(all, state), seen = all.filter((one, place) => grid.isSeen(place) || state.selected[one.i]);
     const square = (one) => [Math.floor(one.x / distance), Math.floor(one.y / distance)], buckets = new Map();
     for (const one of seen) {
@@ -101,7 +101,7 @@ export class Picker {
     return seen.filter((one) => wanted(one.i) && isNear(one)).map((one) => one.i);
   }
 
-  /** The selection's centre at a time, by opacity and area, and its box of centres; null if none of it is alive. */
+  /** The selection's center at a time, by opacity and area, and its box of centers; null if none of it is alive. */
   placeOf(state, time) {
     const own = this.at(state, time, (one) => state.selected[one.i]);
     if (!own.length) return null;

@@ -200,7 +200,7 @@ export class Player {
     return [0, 0, (visible.width * k) / size[0], (visible.height * k) / size[1]];
   }
 
-  /** Whether the selection is tinted: not after an edit of its colour, which the tint would hide, until the next step. */
+  /** Whether the selection is tinted: not after an edit of its color, which the tint would hide, until the next step. */
   get isTinted() {
     const { draft, history } = this.editing;
     return this.highlighting && (draft !== null || !COLORING.includes(history.last?.do));

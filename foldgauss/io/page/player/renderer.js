@@ -8,7 +8,7 @@ import showFragment from "./show.frag.glsl";
 import mixFragment from "./mix.frag.glsl";
 
 export const WHAT = { model: 0, original: 1, difference: 2 };
-/** Colour of selected Gaussians, and the bit of an instance that marks them. */
+/** Color of selected Gaussians, and the bit of an instance that marks them. */
 const TINT = [1, 0.58, 0.2];
 export const SELECTED = 2 ** 31;
 const NO_BOUND = 1e30;
@@ -173,7 +173,7 @@ export class Renderer {
 
   /**
    * Render the listed Gaussians of a model, front to back, at a time, into width x height pixels. Of the target: `unit`,
-   * pixels per unit of model space; `origin`, the frame's centre; `lowPass` in px^2; `isExact`: in single precision.
+   * pixels per unit of model space; `origin`, the frame's center; `lowPass` in px^2; `isExact`: in single precision.
    */
   drawOne({ model, instances, time, highlight }, { width, height, unit, origin, lowPass, isExact }) {
     const { gl, splat: { made, at } } = this, { header } = model, { options } = header;
@@ -208,7 +208,7 @@ export class Renderer {
     gl.uniform1f(at.highlight, highlight);
     gl.uniform3fv(at.tint, TINT);
     gl.enable(gl.BLEND);
-    // Front to back: colours are weighted by the transmittance, which each Gaussian reduces, except in sums.
+    // Front to back: colors are weighted by the transmittance, which each Gaussian reduces, except in sums.
     if (header.compositing === "sum") gl.blendFuncSeparate(gl.ONE, gl.ONE, gl.ZERO, gl.ONE);
     else gl.blendFuncSeparate(gl.DST_ALPHA, gl.ONE, gl.ZERO, gl.ONE_MINUS_SRC_ALPHA);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, instances.length);

@@ -1,7 +1,7 @@
 // The clip's segments: their weights at each position, and their models, decoded on demand. A single model is one segment.
 import { Timeline } from "./timeline.js";
 
-/** Most Gaussians held decoded, some two hundred bytes each, besides the visible segments and their neighbours. */
+/** Most Gaussians held decoded, some two hundred bytes each, besides the visible segments and their neighbors. */
 const MOST_HELD = 2e6;
 const CLOSE = 1e-6; // frames: a position closer to a frame is that frame
 

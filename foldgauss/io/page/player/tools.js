@@ -71,7 +71,7 @@ export class Tools {
     if (this.name === "rectangle" || this.name === "lasso") this.finish();
   }
 
-  /** A key in place of the pointer: a dab, a colour, or a corner; the second corner ends a rectangle. */
+  /** A key in place of the pointer: a dab, a color, or a corner; the second corner ends a rectangle. */
   tap(point, event) {
     if (this.name === "rectangle" && this.points.length) {
       this.points = [this.points[0], point];

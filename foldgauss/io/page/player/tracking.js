@@ -1,10 +1,10 @@
-// Following a selection through the clip: a new Gaussian takes the label of those of its colour that cover its centre.
+// Following a selection through the clip: a new Gaussian takes the label of those of its color that cover its center.
 import { alphaAt } from "./gaussians.js";
 
-const SAME_COLOR = 0.02; // variance of colour differences
+const SAME_COLOR = 0.02; // variance of color differences
 const SELECTED = 1, OTHER = 2;
 
-/** Similarity of the colours of two Gaussians, 0 to 1. */
+/** Similarity of the colors of two Gaussians, 0 to 1. */
 function colorSimilarity({ values, texels }, i, j) {
   const at = 4 * texels * i + 8, other = 4 * texels * j + 8;
   let square = 0;
