@@ -2,10 +2,11 @@
 
 Clips, images and masks (`read_video`, `write_video`, `index_video`, `read_masks`), models (`save_video_model`,
 `load_video_model`, `save_compact`), formats of other programs (`export`, `import_model`), the HTML player
-(`write_html`), and the history of a fit. `foldgauss.io.datasets` holds sample clips.
+(`write_html`), scripts of edits (`read_edit_script`), and the history of a fit. Sample clips: `foldgauss.io.datasets`.
 """
 
 from foldgauss.io._atomic import OutputError
+from foldgauss.io.edit_script import EditScript, EditScriptError, read_edit_script
 from foldgauss.io.exchange.export_import import export, import_model
 from foldgauss.io.exchange.gaussians_ply import (
     frame_gaussians,
@@ -35,6 +36,8 @@ from foldgauss.io.page.player_page import html_page, write_html
 
 __all__ = [
     "Clip",
+    "EditScript",
+    "EditScriptError",
     "FormatError",
     "FrameIndex",
     "HistoryFile",
@@ -54,6 +57,7 @@ __all__ = [
     "load_selection",
     "load_video_model",
     "read_3dgs_ply",
+    "read_edit_script",
     "read_history",
     "read_indexed",
     "read_masks",

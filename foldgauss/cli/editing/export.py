@@ -136,7 +136,7 @@ def import_command(
         ),
     ] = None,
     size: Size = None,
-    fps: Annotated[float | None, typer.Option(help="Frames per second [default: as in the file, or 25].")] = None,
+    fps: Annotated[float | None, typer.Option(help="Frames per second [default: the file's, or 25].")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Read a model of another program, see docs/formats.md.

@@ -58,7 +58,8 @@ def export(
     """
     if not isinstance(model, VideoModel | EditedVideo | SegmentedVideo):
         cure = "End the chain with .video()." if isinstance(model, Edit) else "The order is (model, format, out)."
-        raise invalid("model", expected="a VideoModel or an EditedVideo", got=type(model).__name__, cure=cure)
+        expected = "a VideoModel, an EditedVideo or a SegmentedVideo"
+        raise invalid("model", expected=expected, got=type(model).__name__, cure=cure)
     check_one_of("format", format, FORMATS)
     out = check_path(out, "model, format, out")
     of_scenes = _without_none(depth_step=depth_step, axes=axes, sh_degree=sh_degree)

@@ -29,9 +29,9 @@ def interpolate_frames(
 ) -> Iterator[UInt8[np.ndarray, "height width channels"]]:
     """As `video.frames`, but coherent between frames: slow motion.
 
-    An image between two frames is a weighted average of the video's own and of one that `Motion.interpolate` makes of
-    its images at the four frames around. The latter has weight 3/4, and less where the two images beside it, moved to
-    it, differ. At frames, at cuts, for images with alpha (`background=None`) and with sides of `MAX_SIDE` pixels or
+    An image between two frames is a weighted average of the video's own and of one that is predicted by optical flow
+    from its images at the four frames around. The latter has weight 3/4, and less where the two images beside it, moved
+    to it, differ. At frames, at cuts, for images with alpha (`background=None`) and with sides of `MAX_SIDE` pixels or
     more, the image is the video's own. Images between the same two frames should follow each other: the images and the
     flow of an interval and of those beside it are kept.
 
