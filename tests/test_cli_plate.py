@@ -114,11 +114,29 @@ def test_the_plate_and_its_masks_are_written(model, tmp_path, monkeypatch, capsy
         (["--size", "0x3"], "--size: expected HxW"),
         (["--masks", "x.png"], "--masks: expected a folder, without extension, got x.png"),
         (["--codec", "divx"], "--codec: expected"),
+        (["--crf", "99"], "--crf: expected a whole number from 0 to 51 for h264, got 99."),
+        (["--codec", "av1"], "frames: expected at least 64x64 for av1"),
+        (["--out", "x", "--masks", "./x"], "--masks: expected another folder than --out, got x."),
     ],
 )
 @pytest.mark.usefixtures("searched")
 def test_mistakes_are_told_and_nothing_is_written(model, tmp_path, monkeypatch, capsys, options, message):
     monkeypatch.chdir(tmp_path)
     assert run("plate", model, *options) == 2
-    assert message in " ".join(capsys.readouterr().err.split())
+    told = capsys.readouterr()
+    assert message in " ".join(told.err.split())
+    assert "Searching" not in told.out
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.usefixtures("searched")
+@pytest.mark.parametrize("options", [["--masks", "mine"], ["--masks", "masks", "--out", "mine"]])
+def test_folders_of_other_files_are_refused_before_the_search(model, tmp_path, monkeypatch, capsys, options):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("mine")
+    assert run("plate", model, *options, "--overwrite") == 1
+    told = capsys.readouterr()
+    assert "expected an empty folder or one of numbered frames, got 'mine' with 'notes.txt' in it" in told.err
+    assert "Searching" not in told.out
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]

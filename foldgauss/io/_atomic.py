@@ -148,7 +148,7 @@ def atomic_folder(folder: PathLike, overwrite: bool = False, *, pattern: str, wh
     Raises `OutputError` if the folder is refused, or its parent is missing or not writable.
     """
     given, folder = Path(folder), Path(folder).resolve()
-    _check_replaceable(given, overwrite, pattern, what)
+    check_replaceable(given, overwrite, pattern=pattern, what=what)
     _check_target(folder)
     temporary, aside = temporary_name(folder, ""), temporary_name(folder, "")
     with translate_output_errors(folder):
@@ -157,7 +157,7 @@ def atomic_folder(folder: PathLike, overwrite: bool = False, *, pattern: str, wh
         with _name_output(folder, temporary):
             yield temporary
         try:
-            _check_replaceable(given, overwrite, pattern, what)
+            check_replaceable(given, overwrite, pattern=pattern, what=what)
             if folder.exists():
                 os.replace(folder, aside)
             os.replace(temporary, folder)
@@ -170,7 +170,7 @@ def atomic_folder(folder: PathLike, overwrite: bool = False, *, pattern: str, wh
         shutil.rmtree(aside, ignore_errors=True)
 
 
-def _check_replaceable(folder: Path, overwrite: bool, pattern: str, what: str) -> None:
+def check_replaceable(folder: Path, overwrite: bool, *, pattern: str, what: str = "frames") -> None:
     """Raise `OutputError` unless `atomic_folder` may replace `folder`."""
     if not os.path.exists(folder):
         return

@@ -15,10 +15,10 @@ from foldgauss.cli.shared.clips import Video
 from foldgauss.cli.shared.outputs import IMAGE_SUFFIX
 from foldgauss.cli.shared.tables import format_count
 from foldgauss.cli.shared.timeline import Timeline
-from foldgauss.io.media.encoder import CODECS, Sound
+from foldgauss.io.media.encoder import CODECS, Sound, choose_encoding
 from foldgauss.io.media.frame_rate import MAX_FPS
 from foldgauss.io.media.lazy_frames import LazyFrames
-from foldgauss.io.media.video_writing import MAX_GIF_FPS, write_image, write_video
+from foldgauss.io.media.video_writing import MAX_GIF_FPS, VIDEO_SUFFIXES, write_image, write_video
 from foldgauss.video.models.background import BLACK, Background
 from foldgauss.video.models.metrics import Evaluation, evaluate
 from foldgauss.video.motion.slow_motion import interpolate_frames
@@ -66,6 +66,17 @@ class VideoOptions(NamedTuple):
     crf: int | None = None
     pixel_format: str | None = None
     sound: Sound | None = None
+
+
+def check_video_options(path: Path, size: tuple[int, int], options: VideoOptions) -> None:
+    """Refuse options that do not fit the video file `path` with RGB frames of this size, before they are computed."""
+    suffix = path.suffix.lower()
+    if suffix not in VIDEO_SUFFIXES or path.is_dir():
+        return  # refused by `write_video`, which has no options for other kinds of files
+    try:
+        choose_encoding(suffix, options.codec, options.crf, options.pixel_format, (*size, 3))
+    except ValueError as error:
+        raise WrongUse(name_option(str(error)) if str(error).startswith(options._fields) else str(error)) from error
 
 
 def choose_sound(path: Path | None, timeline: Timeline, about: dict[str, Any], fps: float) -> Sound | None:

@@ -15,12 +15,13 @@ from foldgauss.cli.shared.rendering import (
     Crf,
     PixelFormat,
     VideoOptions,
+    check_video_options,
     progress_bar,
     video_option,
     write_images,
 )
-from foldgauss.io._atomic import check_writable
-from foldgauss.io.media.video_writing import VIDEO_SUFFIXES
+from foldgauss.io._atomic import check_replaceable, check_writable
+from foldgauss.io.media.video_writing import FRAME_NAMES, VIDEO_SUFFIXES
 from foldgauss.io.models.video_model import load_video_model
 from foldgauss.video.motion.background_plate import Alignment, fill_background
 from foldgauss.video.motion.moving_object import LEAST_FRAMES, NothingMoves, find_moving_object, nothing_moves
@@ -61,12 +62,17 @@ def plate_command(
             check_writable(path)
         elif any(path.iterdir()):
             refuse_existing(path, overwrite, option)
+            check_replaceable(path, overwrite, pattern=FRAME_NAMES)
+    if masks_path is not None and masks_path.resolve() == out_path.resolve():
+        raise wrong_use("--masks", expected="another folder than --out", got=masks_path)
     model = load_video_model(model_path)
     if model.num_frames < LEAST_FRAMES:
         cure = "Fit more frames: a plate is what other frames show behind the object."
         raise nothing_moves(f"a video of {LEAST_FRAMES} frames at least", model.num_frames, cure)
     image_size = image_size or model.size
     refuse_huge(image_size)
+    options = VideoOptions(codec, crf, pixel_format)
+    check_video_options(out_path, image_size, options)
     frames = np.empty((model.num_frames, *image_size, 3), np.uint8)
     with progress_bar("Rendering", model.num_frames) as advance:
         for k, frame in enumerate(model.frames(size=image_size)):
@@ -81,7 +87,6 @@ def plate_command(
         except NothingMoves as error:
             raise nothing_moves("an object that moves against the background", "none", _CURE) from error
         plate = fill_background(frames, masks, alignment=alignment)
-    options = VideoOptions(codec, crf, pixel_format)
     write_images(out_path, plate, len(plate), model.fps, overwrite=overwrite, options=options)
     if masks_path is not None:
         images = (np.repeat(np.uint8(255 * mask)[..., None], 3, -1) for mask in masks)

@@ -17,6 +17,8 @@ from foldgauss.io.media.encoder import VIDEO_SUFFIXES, Sound, check_sound, choos
 
 ANIMATION_SUFFIXES = (".gif", ".webp")
 IMAGE_FORMATS = ("png", "webp")  # of folders of frames; both lossless
+#: Pattern of the names of the files in them.
+FRAME_NAMES = r"[0-9]{5,}\.(png|webp)"
 MAX_WEBP_SIDE = 16_383
 MAX_GIF_FPS = 50.0  # browsers show frames of less than 2 hundredths of a second for 10
 WEBP_QUALITY = 90  # of an animated WebP, in its encoder's own measure
@@ -114,7 +116,7 @@ def write_frames(
     """
     check_one_of("image_format", image_format, IMAGE_FORMATS)
     folder = Path(folder)
-    with atomic_folder(folder, overwrite, pattern=r"[0-9]{5,}\.(png|webp)") as temporary:
+    with atomic_folder(folder, overwrite, pattern=FRAME_NAMES) as temporary:
         for number, frame in enumerate(_check_frames(frames)):
             (temporary / f"{number:05d}.{image_format}").write_bytes(_encode_image(frame, image_format))
     return folder
