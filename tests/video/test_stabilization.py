@@ -216,6 +216,7 @@ def test_mistakes_are_told():
     for options, message in [
         ({"smoothing": 0.0}, "smoothing: expected seconds > 0, got 0.0"),
         ({"smoothing": float("nan")}, "smoothing: expected seconds > 0"),
+        ({"smoothing": 1e9}, r"smoothing: expected at most [0-9.e+]+ seconds \(100,000 frames\), got 1000000000.0"),
         ({"border": "blur"}, "border: expected one of"),
         ({"path": standing(scene(FrameTimes.uniform(3)))}, "path: expected that of 12 frames, got 3"),
         ({"path": far, "fixed": True}, r"border: expected a path that a zoom of 2 suffices for.*Fill or keep"),

@@ -19,6 +19,8 @@ Border = Literal["crop", "fill", "keep"]
 BORDERS = ("crop", "fill", "keep")
 #: Standard deviation of the smoothed path, in seconds.
 SMOOTHING = 1.0
+#: Largest standard deviation, in frames: the memory of the filter grows with it.
+MAX_SMOOTHING = 100_000
 #: Largest zoom of a cropped video.
 MAX_ZOOM = 2.0
 #: Beyond the border frames at these distances are shown, the nearest in front; they begin inside the border by this
@@ -57,6 +59,9 @@ def stabilize(
         raise invalid("video", expected="a model or another video of it", got=type(video).__name__, cure=cure)
     if not is_within(smoothing, "(0, inf)"):
         raise invalid("smoothing", expected="seconds > 0", got=short_repr(smoothing))
+    if not fixed and smoothing * video.fps > MAX_SMOOTHING:
+        expected = f"at most {MAX_SMOOTHING / video.fps:g} seconds ({MAX_SMOOTHING:,} frames)"
+        raise invalid("smoothing", expected=expected, got=short_repr(smoothing), cure="For a still camera: fixed.")
     if border not in BORDERS:
         raise invalid("border", expected=f"one of {BORDERS}", got=short_repr(border))
     if border == "fill" and video.compositing == "sum":
