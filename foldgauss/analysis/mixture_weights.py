@@ -54,6 +54,10 @@ def _check_weights(name: str, given: Array) -> None:
         raise invalid(name, expected=expected, got=given.tolist(), cure=cure)
     if not (given > least).any(-1).all():
         raise invalid(name, expected="a positive weight", got="none", cure="Weights are relative: all equal means 1/k.")
+    normal = float(np.finfo(given.dtype).tiny)
+    if name == "weights" and not (given >= normal).any(-1).all():  # JAX computes with those below as with 0
+        cure = "Weights are relative: divide by the largest."
+        raise invalid(name, expected=f"a weight of at least {normal:g}", got=given.tolist(), cure=cure)
 
 
 def _log_weights(weights: Array) -> Array:
