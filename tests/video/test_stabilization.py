@@ -77,13 +77,22 @@ def test_shots_are_separate():
     assert estimate_camera_path(joined).starts == (0, NUM_FRAMES)
 
 
-@pytest.mark.parametrize("step", [affine(shift=(0.03, -0.02)), affine(0.05, 1.01)])
-def test_constant_speed_is_left_as_it_is(step):
+@pytest.mark.parametrize("frames", [0.5, 24.0, 1000.0])
+@pytest.mark.parametrize("step", [affine(shift=(0.03, -0.02)), affine(0.05, 1.01, (0.01, 0.02)), affine(zoom=1.1)])
+def test_constant_speed_is_left_as_it_is(step, frames):
     matrices = np.stack([np.linalg.matrix_power(step, k) for k in range(20)])
     path = CameraPath(matrices, np.ones(20), np.linspace(0, 1, 20))
-    # Exactly so for translations; rotations and zooms are averaged as matrices, which shortens them a little.
-    exact = step[0, 1] == 0
-    np.testing.assert_allclose(path.smoothed(0.5), np.tile(np.eye(3), (20, 1, 1)), atol=1e-12 if exact else 2e-3)
+    np.testing.assert_allclose(path.smoothed(frames), np.tile(np.eye(3), (20, 1, 1)), atol=1e-10)
+
+
+def test_a_steady_turn_is_kept_and_its_shake_is_not():
+    rng, num = np.random.default_rng(0), 120
+    turn = np.stack([affine(0.03 * k) for k in range(num)])
+    shake = np.stack([affine(shift=rng.normal(size=2) * 0.01) for _ in range(num)])
+    smooth = CameraPath(shake @ turn, np.ones(num), np.linspace(0, 1, num)).smoothed(8.0) @ shake @ turn
+    left = (smooth @ np.linalg.inv(turn))[20:-20]
+    np.testing.assert_allclose(left[:, :2, :2], np.tile(np.eye(2), (len(left), 1, 1)), atol=1e-3)
+    assert left[:, :2, 2].std(0).max() < 0.4 * 0.01
 
 
 def test_smoothing_is_that_of_a_gaussian():

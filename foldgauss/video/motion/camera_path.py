@@ -6,6 +6,8 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
+import scipy.linalg
+import scipy.ndimage
 from jaxtyping import Float, UInt8
 
 from foldgauss._runtime.checks import invalid, is_within
@@ -68,9 +70,10 @@ class CameraPath:
     def smoothed(self, frames: float) -> Float[np.ndarray, "frames 3 3"]:
         """The maps of each frame to where a smoother path would show it.
 
-        The path is convolved with a Gaussian of `frames` standard deviation, and continued beyond the ends of a shot by
-        point reflection, so that a camera at constant speed is left as it is. Raises ValueError unless `frames` > 0.
-        Source: Liu et al. 2013, Bundled Camera Paths (without their mesh).
+        The logarithms of the maps from frame to frame are summed, and convolved with a Gaussian of `frames` standard
+        deviation. Beyond the ends of a shot they are continued by point reflection: a camera that moves, turns and
+        zooms at constant speed is left as it is. Raises ValueError unless `frames` > 0.
+        Source: Liu et al. 2013, Bundled Camera Paths, without their mesh.
         """
         if not is_within(frames, "(0, inf)"):
             raise invalid("frames", expected="a number > 0", got=frames)
@@ -79,21 +82,17 @@ class CameraPath:
         weights /= weights.sum()
         maps = np.empty_like(self.matrices)
         for first, stop in self.shots:
-            path = _extend(self.matrices[first:stop], reach)
-            for k in range(stop - first):
-                near = np.einsum("i,ijk->jk", weights, path[k : k + 2 * reach + 1])
-                maps[first + k] = near @ np.linalg.inv(path[k + reach])
+            steps = [np.zeros((3, 3)), *(_logarithm(self.between(k - 1, k)) for k in range(first + 1, stop))]
+            path = np.cumsum(steps, axis=0)
+            longer = np.pad(path, ((reach, reach), (0, 0), (0, 0)), mode="reflect", reflect_type="odd")
+            smooth = scipy.ndimage.convolve1d(longer, weights, axis=0)[reach:-reach]
+            maps[first:stop] = scipy.linalg.expm(smooth - path)
         return maps
 
 
-def _extend(path: Float[np.ndarray, "frames 3 3"], reach: int) -> Float[np.ndarray, "longer 3 3"]:
-    """The path with `reach` more frames at either end, reflected about the end frames, again and again if need be."""
-    while reach > 0 and len(path) > 1:
-        more = min(reach, len(path) - 1)
-        ahead = [path[-1] @ np.linalg.inv(path[-1 - j]) @ path[-1] for j in range(1, more + 1)]
-        behind = [path[0] @ np.linalg.inv(path[j]) @ path[0] for j in range(more, 0, -1)]
-        path, reach = np.stack([*behind, *path, *ahead]), reach - more
-    return np.concatenate([path[:1].repeat(reach, 0), path, path[-1:].repeat(reach, 0)])
+def _logarithm(affine: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """The motion, held for one frame, that leads to this map."""
+    return np.real(scipy.linalg.logm(affine))
 
 
 def estimate_camera_path(video: RenderableVideo, *, on_frame: Callable[[], None] = lambda: None) -> CameraPath:
