@@ -81,7 +81,7 @@ class TimeLikelihood(AbstractEnvelope):
 
     **Example:** `TimeLikelihood(power=2).log_a(1.5, time_loc=0.5, time_scale=0.5)  # -2 * 2^2 / 2 = -4.`
 
-    **Source:** eq:a_func_2d. **Raises:** ValueError if `power` is negative or `floor` is outside [0, 1).
+    **Source:** eq:a_func_2d. **Raises:** ValueError if `power` is negative or infinite, or `floor` is outside [0, 1).
     """
 
     power: Float[Array, "*#batch"]
@@ -91,8 +91,9 @@ class TimeLikelihood(AbstractEnvelope):
 
     def __init__(self, power: ArrayLike = 1.0, floor: ArrayLike = 0.0):
         self.power, self.floor = _float_array(power), _float_array(floor)
-        if _any(self.power, lambda x: x < 0):
-            raise invalid("power", expected="a number >= 0", got=power, cure="The paper's text has 1, its code 2.")
+        if _any(self.power, lambda x: (x < 0) | np.isinf(x)):
+            cure = "The paper's text has 1, its code 2."
+            raise invalid("power", expected="a finite number >= 0", got=power, cure=cure)
         if _any(self.floor, lambda x: (x < 0) | (x >= 1)):
             raise invalid("floor", expected="a number in [0, 1)", got=floor, cure="For a = 1 use Constant().")
 

@@ -50,6 +50,8 @@ def test_options_reach_the_video(model, tmp_path, monkeypatch, capsys):
     [
         (["--border", "blur"], "--border: expected one of crop, fill, keep, got blur"),
         (["--smoothing", "0"], "--smoothing: expected seconds > 0, got 0.0"),
+        (["--fixed", "--smoothing", "0.5"], "--fixed: expected no --smoothing, got both"),
+        (["--crf", "99"], "--crf: expected"),
         (["--out", "x.png"], "--out: expected"),
         (["--size", "0x3"], "--size: expected HxW"),
     ],

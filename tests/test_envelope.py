@@ -129,6 +129,7 @@ def test_power_and_floor_may_be_batched():
     ("arguments", "name"),
     [
         ({"power": -1.0}, "power"),
+        ({"power": np.inf}, "power"),
         ({"floor": -0.1}, "floor"),
         ({"floor": 1.0}, "floor"),
         ({"floor": [0.5, 2]}, "floor"),

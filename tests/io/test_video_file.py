@@ -57,6 +57,24 @@ def folder(tmp_path):
     return place
 
 
+@pytest.mark.parametrize(
+    ("numbers", "note"),
+    [
+        ((1, 2, 3), None),
+        ((10, 20, 30, 40), None),
+        ((1, 7, 11, 90), None),  # no sequence
+        ((1, 2, 4, 5, 6), "1 number is missing in the names, the first after img2.png"),
+        ((8, 9, 10, 13, 14, 17), "4 numbers are missing in the names, the first after img10.png"),
+        ((10, 20, 40, 50), "1 number is missing in the names, the first after img20.png"),
+    ],
+)
+def test_missing_images_of_a_sequence_are_reported(tmp_path, numbers, note):
+    for number in numbers:
+        write_image(tmp_path / f"img{number}.png", np.full((4, 5, 3), number, np.uint8))
+    notes = read_video(tmp_path).notes
+    assert notes == (() if note is None else (f"{note}; frames are taken to be evenly spaced.",))
+
+
 def test_center_crop_cuts_first_and_resizes_then(clip_file):
     whole = read_video(clip_file).frames
     np.testing.assert_array_equal(read_video(clip_file, center_crop=(21, 32)).frames, whole[:, 13:34, 16:48])

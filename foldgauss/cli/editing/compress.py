@@ -33,6 +33,7 @@ from foldgauss.video.models.metrics import Evaluation, evaluate
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.tradeoff import to_half_precision
 
+MAX_LOSS_DB, PASSES = 0.2, 48
 Score = Callable[[VideoModel], Evaluation]
 #: Passes over the frames in all, in units of --passes.
 USUAL_PASSES = 4
@@ -50,7 +51,7 @@ def compress_command(
             autocompletion=complete_clips,
         ),
     ] = None,
-    max_loss_db: Annotated[float, typer.Option(help="Largest loss of mean PSNR, in dB.")] = 0.2,
+    max_loss_db: Annotated[float, typer.Option(help="Largest loss of mean PSNR, in dB.")] = MAX_LOSS_DB,
     out_path: Annotated[
         Path | None, typer.Option("--out", help=f"FILE{COMPACT_SUFFIX} [default: the model's name in this folder].")
     ] = None,
@@ -59,7 +60,7 @@ def compress_command(
         typer.Option(
             help=f"Passes over VIDEO of a fine-tuning, about {USUAL_PASSES} times as many in all; 0: only round.", min=0
         ),
-    ] = 48,
+    ] = PASSES,
     frames: Annotated[
         str | None, typer.Option(metavar="A:B", help="Frames of VIDEO [default: those that it was fitted to].")
     ] = None,
@@ -82,6 +83,9 @@ def compress_command(
         raise WrongUse(str(error)) from error
     if not is_within(max_loss_db, "(0, 60]"):
         raise wrong_use("--max-loss-db", expected="a loss in (0, 60] dB", got=max_loss_db)
+    if float16 and (passes != PASSES or max_loss_db != MAX_LOSS_DB):
+        name = "--passes" if passes != PASSES else "--max-loss-db"
+        raise wrong_use("--float16", expected=f"no {name}", got="both; parameters are only rounded")
     if frames is not None and video is None:
         raise wrong_use("--frames", expected="a VIDEO to take them from", got="none")
     refuse_input(target, "model", model_path)

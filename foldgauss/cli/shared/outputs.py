@@ -5,9 +5,9 @@ from collections.abc import Collection
 from pathlib import Path
 
 from foldgauss.cli.app.application import WrongUse, wrong_use
-from foldgauss.io._atomic import OutputError, check_writable
+from foldgauss.io._atomic import OutputError, check_replaceable, check_writable
 from foldgauss.io.media.resizing import memory_limit
-from foldgauss.io.media.video_writing import ANIMATION_SUFFIXES, VIDEO_SUFFIXES
+from foldgauss.io.media.video_writing import ANIMATION_SUFFIXES, FRAME_NAMES, VIDEO_SUFFIXES
 
 IMAGE_SUFFIX = ".png"
 
@@ -36,6 +36,17 @@ def refuse_input(path: Path, what: str, source: Path, option: str = "--out") -> 
     # os.path: a name that is too long does not exist here; creating the file reports it.
     if os.path.exists(path) and os.path.exists(source) and path.samefile(source):
         raise WrongUse(f"{option}: expected another file than the {what}, got {path}.")
+
+
+def check_images_output(path: Path, source: Path, overwrite: bool, option: str = "--out") -> None:
+    """Refuse a video, an image or a folder of frames made from the model `source` that could not be written."""
+    if not path.is_dir():
+        refuse_input(path, "model", source, option)
+        refuse_existing(path, overwrite, option)
+        check_writable(path)
+    elif any(path.iterdir()):
+        refuse_existing(path, overwrite, option)
+        check_replaceable(path, overwrite, pattern=FRAME_NAMES)
 
 
 def refuse_foreign(

@@ -9,7 +9,7 @@ import typer
 from foldgauss.cli.app.application import app, out, wrong_use
 from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, parse_size
 from foldgauss.cli.shared.log_lines import print_log, print_shots
-from foldgauss.cli.shared.outputs import check_image_path, name_after, refuse_existing, refuse_huge, refuse_input
+from foldgauss.cli.shared.outputs import check_image_path, check_images_output, name_after, refuse_huge
 from foldgauss.cli.shared.rendering import (
     CodecName,
     Crf,
@@ -20,8 +20,7 @@ from foldgauss.cli.shared.rendering import (
     video_option,
     write_images,
 )
-from foldgauss.io._atomic import check_replaceable, check_writable
-from foldgauss.io.media.video_writing import FRAME_NAMES, VIDEO_SUFFIXES
+from foldgauss.io.media.video_writing import VIDEO_SUFFIXES
 from foldgauss.io.models.video_model import load_video_model
 from foldgauss.video.motion.background_plate import Alignment, fill_background
 from foldgauss.video.motion.moving_object import LEAST_FRAMES, NothingMoves, find_moving_object, nothing_moves
@@ -54,15 +53,8 @@ def plate_command(
     if masks_path is not None and masks_path.suffix:
         raise wrong_use("--masks", expected="a folder, without extension", got=masks_path)
     for option, path in (("--out", out_path), ("--masks", masks_path)):
-        if path is None:
-            continue
-        if not path.is_dir():
-            refuse_input(path, "model", model_path, option)
-            refuse_existing(path, overwrite, option)
-            check_writable(path)
-        elif any(path.iterdir()):
-            refuse_existing(path, overwrite, option)
-            check_replaceable(path, overwrite, pattern=FRAME_NAMES)
+        if path is not None:
+            check_images_output(path, model_path, overwrite, option)
     if masks_path is not None and masks_path.resolve() == out_path.resolve():
         raise wrong_use("--masks", expected="another folder than --out", got=masks_path)
     model = load_video_model(model_path)

@@ -23,10 +23,9 @@ from foldgauss.cli.shared.arguments import (
 from foldgauss.cli.shared.outputs import (
     IMAGE_SUFFIX,
     check_image_path,
+    check_images_output,
     name_after,
-    refuse_existing,
     refuse_huge,
-    refuse_input,
 )
 from foldgauss.cli.shared.rendering import (
     CodecName,
@@ -39,7 +38,6 @@ from foldgauss.cli.shared.rendering import (
     render_to_file,
 )
 from foldgauss.cli.shared.timeline import Fps, Speed, Timeline, Upsample, parse_remap
-from foldgauss.io._atomic import check_writable
 from foldgauss.io.media.video_writing import IMAGE_FORMATS, VIDEO_SUFFIXES
 from foldgauss.io.models.video_model import load_video_model, read_origin
 
@@ -104,10 +102,7 @@ def render(
         raise wrong_use("--format", expected="a folder as --out", got=out_path)
     if image_format is not None and image_format not in IMAGE_FORMATS:
         raise wrong_use("--format", expected="one of " + ", ".join(IMAGE_FORMATS), got=image_format)
-    if not out_path.is_dir():
-        refuse_input(out_path, "model", model_path)
-        refuse_existing(out_path, overwrite)
-        check_writable(out_path)
+    check_images_output(out_path, model_path, overwrite)
     model = load_video_model(model_path)
     constants = override_constants(model.options, alpha_cutoff, support_radius, transmittance_stop)
     model = model.with_options(constants)

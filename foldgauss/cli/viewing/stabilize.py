@@ -10,7 +10,7 @@ from foldgauss.cli.app.application import WrongUse, app, name_option, out, wrong
 from foldgauss.cli.app.completion import complete_choice
 from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, parse_color, parse_size
 from foldgauss.cli.shared.log_lines import print_shots
-from foldgauss.cli.shared.outputs import check_image_path, name_after, refuse_existing, refuse_huge, refuse_input
+from foldgauss.cli.shared.outputs import check_image_path, check_images_output, name_after, refuse_huge
 from foldgauss.cli.shared.rendering import (
     CodecName,
     Crf,
@@ -18,13 +18,13 @@ from foldgauss.cli.shared.rendering import (
     PixelFormat,
     SoundFile,
     VideoOptions,
+    check_video_options,
     choose_sound,
     progress_bar,
     render_to_file,
     video_option,
 )
 from foldgauss.cli.shared.timeline import Fps, Speed, Timeline, Upsample
-from foldgauss.io._atomic import check_writable
 from foldgauss.io.media.video_writing import VIDEO_SUFFIXES
 from foldgauss.io.models.video_model import load_video_model, read_origin
 from foldgauss.video.motion.camera_path import estimate_camera_path
@@ -69,13 +69,13 @@ def stabilize_command(
     if out_path is None:
         out_path = name_after(model_path, f".stable{VIDEO_SUFFIXES[0]}")
     check_image_path(out_path)
-    if not out_path.is_dir():
-        refuse_input(out_path, "model", model_path)
-        refuse_existing(out_path, overwrite)
-        check_writable(out_path)
+    check_images_output(out_path, model_path, overwrite)
+    if fixed and smoothing != SMOOTHING:
+        raise wrong_use("--fixed", expected="no --smoothing", got="both; the camera stands still")
     model = load_video_model(model_path)
     refuse_huge(image_size or model.size)
     options = VideoOptions(codec, crf, pixel_format, choose_sound(sound, timeline, read_origin(model_path), model.fps))
+    check_video_options(out_path, image_size or model.size, options)
     shown, rate = timeline.times(np.asarray(model.frame_times.times()), model.fps), timeline.rate(model.fps)
     with progress_bar("Estimating the camera's path", model.num_frames) as advance:
         path = estimate_camera_path(model, on_frame=advance)

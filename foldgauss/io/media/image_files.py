@@ -70,7 +70,8 @@ def read_folder(folder: Path, start: int, stop: int | None, prepare: Callable) -
         got, cure = f"{str(folder)!r} without any", "Give the folder that holds the frames, or a video file."
         raise video_error("path", expected=expected, got=got, cure=cure)
     check_range_within(start, stop, len(images), folder)
-    return read_images(images[start:stop], prepare)
+    frames, num, rate, notes = read_images(images[start:stop], prepare)
+    return frames, num, rate, notes + describe_missing(images[start:stop])
 
 
 def image_paths(folder: Path) -> list[Path]:
@@ -78,6 +79,23 @@ def image_paths(folder: Path) -> list[Path]:
     visible = (entry for entry in folder.iterdir() if not entry.name.startswith("."))
     images = (entry for entry in visible if entry.suffix.lower() in IMAGE_SUFFIXES and entry.is_file())
     return sorted(images, key=lambda entry: natural_sort_key(entry.name))
+
+
+def describe_missing(images: list[Path]) -> tuple[str, ...]:
+    """A note if numbers are missing in the names of a sequence, such as f7.png, f8.png, f10.png."""
+    numbers = [re.findall(r"[0-9]+", image.stem)[-1:] for image in images]
+    if len(images) < 3 or not all(numbers):
+        return ()
+    steps = np.diff([int(number) for (number,) in numbers])
+    usual = min(steps)
+    if usual < 1 or (steps == usual).sum() < len(steps) / 2 or (steps % usual).any():
+        return ()  # not a sequence
+    first, num = int(np.argmax(steps > usual)), int((steps // usual - 1).sum())
+    if not num:
+        return ()
+    what = "1 number is" if num == 1 else f"{num:,} numbers are"
+    where = f"the first after {images[first].name}"
+    return (f"{what} missing in the names, {where}; frames are taken to be evenly spaced.",)
 
 
 def natural_sort_key(name: str) -> tuple:

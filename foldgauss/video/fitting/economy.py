@@ -30,7 +30,7 @@ class Economy:
     psnr: float | None = field(
         default=None,
         metadata=setting(
-            "Fit the smallest model whose mean PSNR is this, in dB; takes longer",
+            "Fit the smallest model whose mean PSNR is this, in dB; takes up to half as many steps more than given",
             bounds="(0, 100]",
             option="--smallest-at-psnr",
             group="model",
