@@ -701,3 +701,11 @@ def test_weights_that_jax_takes_for_zero_are_refused():
     with pytest.raises(ValueError, match=r"weights: expected a weight of at least 1\.17549e-38, got .*divide by"):
         FoldedMixture(components, weights=[1e-40, 1e-42])
     assert jnp.isfinite(FoldedMixture(components, weights=[1e-30, 1e-42]).log_prob([0.5, 0.5]))
+
+
+@pytest.mark.parametrize("dtype", [jnp.float16, jnp.bfloat16])
+def test_weights_of_half_precision_need_not_be_normal_numbers(dtype):
+    """JAX computes with them in float32."""
+    components = Gaussian(jnp.zeros((2, 1), dtype), jnp.ones((2, 1, 1), dtype))
+    small = GaussianMixture(components, weights=jnp.array([1e-5, 2e-5], dtype))
+    assert float(small.log_prob(jnp.zeros(1, dtype))) == pytest.approx(-0.92, abs=0.02)

@@ -54,8 +54,9 @@ def _check_weights(name: str, given: Array) -> None:
         raise invalid(name, expected=expected, got=given.tolist(), cure=cure)
     if not (given > least).any(-1).all():
         raise invalid(name, expected="a positive weight", got="none", cure="Weights are relative: all equal means 1/k.")
-    normal = float(np.finfo(given.dtype).tiny)
-    if name == "weights" and not (given >= normal).any(-1).all():  # JAX computes with those below as with 0
+    # JAX computes with those below as with 0; with float16 and bfloat16 it computes in float32.
+    normal = float(min(jnp.finfo(given.dtype).tiny, jnp.finfo(jnp.float32).tiny))
+    if name == "weights" and not (given >= normal).any(-1).all():
         cure = "Weights are relative: divide by the largest."
         raise invalid(name, expected=f"a weight of at least {normal:g}", got=given.tolist(), cure=cure)
 
