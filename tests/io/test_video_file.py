@@ -7,6 +7,7 @@ import sys
 import wave
 import zlib
 from fractions import Fraction
+from pathlib import Path
 
 import av
 import cv2
@@ -18,6 +19,7 @@ from foldgauss.io import Clip, Sound, VideoError, read_video, write_frames, writ
 from foldgauss.io._atomic import OutputError
 from foldgauss.io.datasets import sample_clip
 from foldgauss.io.media import resizing
+from foldgauss.io.media.image_files import describe_missing
 
 
 def _psnr(a, b):
@@ -73,6 +75,19 @@ def test_missing_images_of_a_sequence_are_reported(tmp_path, numbers, note):
         write_image(tmp_path / f"img{number}.png", np.full((4, 5, 3), number, np.uint8))
     notes = read_video(tmp_path).notes
     assert notes == (() if note is None else (f"{note}; frames are taken to be evenly spaced.",))
+
+
+@pytest.mark.parametrize(
+    "names", [("a1", "a2", "a3", "b9", "b10"), ("1_1", "1_2", "1_3", "2_8", "2_9"), ("1", "2", "3", "x4", "x5", "x7")]
+)
+def test_names_of_several_sequences_are_not_missing(names):
+    assert describe_missing([Path(f"{name}.png") for name in names]) == ()
+
+
+@pytest.mark.parametrize("first", [2**63 - 2, 2**64 - 2, 10**30])
+def test_missing_images_of_a_sequence_with_huge_numbers(first):
+    names = [Path(f"{first + k}.png") for k in (0, 1, 2, 4)]
+    assert describe_missing(names)[0].startswith(f"1 number is missing in the names, the first after {first + 2}.png")
 
 
 def test_center_crop_cuts_first_and_resizes_then(clip_file):

@@ -82,11 +82,14 @@ def image_paths(folder: Path) -> list[Path]:
 
 
 def describe_missing(images: list[Path]) -> tuple[str, ...]:
-    """A note if numbers are missing in the names of a sequence, such as f7.png, f8.png, f10.png."""
-    numbers = [re.findall(r"[0-9]+", image.stem)[-1:] for image in images]
-    if len(images) < 3 or not all(numbers):
+    """A note if numbers are missing in the names of a sequence, such as f7.png, f8.png, f10.png.
+
+    Names of a sequence differ in their last number only.
+    """
+    parts = [re.fullmatch(r"(.*?)([0-9]+)([^0-9]*)", image.stem, re.DOTALL) for image in images]
+    if len(images) < 3 or not all(parts) or len({part.group(1, 3) for part in parts}) > 1:
         return ()
-    steps = np.diff([int(number) for (number,) in numbers])
+    steps = np.diff(np.array([int(part[2]) for part in parts], object))  # of any size
     usual = min(steps)
     if usual < 1 or (steps == usual).sum() < len(steps) / 2 or (steps % usual).any():
         return ()  # not a sequence
