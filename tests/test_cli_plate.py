@@ -115,6 +115,8 @@ def test_the_plate_and_its_masks_are_written(model, tmp_path, monkeypatch, capsy
         (["--masks", "x.png"], "--masks: expected a folder, without extension, got x.png"),
         (["--codec", "divx"], "--codec: expected"),
         (["--crf", "99"], "--crf: expected a whole number from 0 to 51 for h264, got 99."),
+        (["--crf", "20", "--out", "x.gif"], "--crf: expected a video file for it, got 'x.gif'."),
+        (["--codec", "h264", "--out", "images"], "--codec: expected a video file for it, got 'images'."),
         (["--codec", "av1"], "frames: expected at least 64x64 for av1"),
         (["--out", "x", "--masks", "./x"], "--masks: expected another folder than --out, got x."),
     ],
@@ -140,3 +142,14 @@ def test_folders_of_other_files_are_refused_before_the_search(model, tmp_path, m
     assert "expected an empty folder or one of numbered frames, got 'mine' with 'notes.txt' in it" in told.err
     assert "Searching" not in told.out
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+
+
+@pytest.mark.usefixtures("searched")
+def test_a_file_in_place_of_a_folder_is_refused_before_the_search(model, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine").write_text("mine")
+    assert run("plate", model, "--out", "mine", "--overwrite") == 1
+    told = capsys.readouterr()
+    assert "expected a folder for frames, got the file 'mine'" in told.err
+    assert "Searching" not in told.out
+    assert (tmp_path / "mine").read_text() == "mine"

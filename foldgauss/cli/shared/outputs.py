@@ -43,6 +43,8 @@ def check_images_output(path: Path, source: Path, overwrite: bool, option: str =
     if not path.is_dir():
         refuse_input(path, "model", source, option)
         refuse_existing(path, overwrite, option)
+        if not path.suffix:
+            check_replaceable(path, overwrite, pattern=FRAME_NAMES)
         check_writable(path)
     elif any(path.iterdir()):
         refuse_existing(path, overwrite, option)

@@ -69,14 +69,23 @@ class VideoOptions(NamedTuple):
 
 
 def check_video_options(path: Path, size: tuple[int, int], options: VideoOptions) -> None:
-    """Refuse options that do not fit the video file `path` with RGB frames of this size, before they are computed."""
+    """Refuse options that do not fit the output `path` with RGB frames of this size, before they are computed."""
     suffix = path.suffix.lower()
+    if suffix not in VIDEO_SUFFIXES:
+        _refuse_options(path, options)
     if suffix not in VIDEO_SUFFIXES or path.is_dir():
-        return  # refused by `write_video`, which has no options for other kinds of files
+        return
     try:
         choose_encoding(suffix, options.codec, options.crf, options.pixel_format, (*size, 3))
     except ValueError as error:
         raise WrongUse(name_option(str(error)) if str(error).startswith(options._fields) else str(error)) from error
+
+
+def _refuse_options(path: Path, options: VideoOptions) -> None:
+    """Refuse options of video files for another kind of output."""
+    given = [name for name, value in options._asdict().items() if value is not None]
+    if given:
+        raise wrong_use(f"--{given[0].replace('_', '-')}", expected="a video file for it", got=repr(path.name))
 
 
 def choose_sound(path: Path | None, timeline: Timeline, about: dict[str, Any], fps: float) -> Sound | None:
@@ -154,10 +163,7 @@ def render_to_file(
         if len(times) != 1:
             cure = "Choose it by --times T, or write to a folder (a name without extension)."
             raise wrong_use("--out", expected="one image for a .png", got=f"{len(times):,} images", cure=cure)
-        given = [name for name, value in options._asdict().items() if value is not None]
-        if given:
-            name = f"--{given[0].replace('_', '-')}"
-            raise wrong_use(name, expected="a video file for it", got=repr(path.name))
+        _refuse_options(path, options)
         write_image(path, next(images))
         out.print(f"{path}: the image at time {times[0]:g}", soft_wrap=True)
         return
