@@ -104,6 +104,13 @@ def test_smoothing_is_that_of_a_gaussian():
     np.testing.assert_allclose(smooth[20:-20], kept * x[20:-20], atol=4e-3)  # the filter ends after 3 deviations
 
 
+def test_the_time_of_smoothing_does_not_grow_with_its_square():
+    """Nearly an hour otherwise."""
+    matrices = np.stack([affine(shift=(0.01 * k, 0)) for k in range(4)])
+    smooth = CameraPath(matrices, np.ones(4), np.linspace(0, 1, 4)).smoothed(100_000.0)
+    np.testing.assert_allclose(smooth, np.tile(np.eye(3), (4, 1, 1)), atol=1e-6)
+
+
 def test_one_frame_and_short_shots():
     path = CameraPath(np.tile(np.eye(3), (3, 1, 1)), np.ones(3), np.array([0, 0.5, 1]), (0, 1))
     np.testing.assert_allclose(path.smoothed(10.0), path.matrices, atol=1e-12)

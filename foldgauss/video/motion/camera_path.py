@@ -7,7 +7,6 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 import scipy.linalg
-import scipy.ndimage
 from jaxtyping import Float, UInt8
 
 from foldgauss._runtime.checks import invalid, is_within
@@ -85,7 +84,7 @@ class CameraPath:
             steps = [np.zeros((3, 3)), *(_logarithm(self.between(k - 1, k)) for k in range(first + 1, stop))]
             path = np.cumsum(steps, axis=0)
             longer = np.pad(path, ((reach, reach), (0, 0), (0, 0)), mode="reflect", reflect_type="odd")
-            smooth = scipy.ndimage.convolve1d(longer, weights, axis=0)[reach:-reach]
+            smooth = np.stack([np.tensordot(weights, longer[k : k + len(weights)], 1) for k in range(len(path))])
             maps[first:stop] = scipy.linalg.expm(smooth - path)
         return maps
 
