@@ -78,6 +78,13 @@ def test_a_steady_pan_has_no_maps():
     assert find_shared_motions(Motion.from_frames(PAN)) is None
 
 
+def test_an_unknown_step_of_a_pan_is_no_jump(monkeypatch):
+    """Unknown where the image has no texture."""
+    own = _Clip.find_textured
+    monkeypatch.setattr(_Clip, "find_textured", lambda clip, k, spacing: own(clip, k, spacing) & (k != 5))
+    assert find_shared_motions(Motion.from_frames(PAN)) is None
+
+
 def test_a_pan_with_a_missing_frame_is_followed():
     """Folds do not jump, and learned frame times take longer to make up for it."""
     frames = np.delete(PAN, 6, 0)

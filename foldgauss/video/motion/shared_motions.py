@@ -58,8 +58,9 @@ def find_shared_motions(motion: Motion, max_objects: int = MAX_OBJECTS) -> Float
     Source: Fischler and Bolles 1981 (RANSAC), one motion after another; tracks decide which points belong to which.
     """
     clip = _Clip.of(motion)
-    camera = clip.find_camera_steps()
-    path = clip.chain_within_limits(clip.keep_unsteady(camera))
+    steps = clip.find_camera_steps()
+    camera = _fill_unknown(steps)
+    path = clip.chain_within_limits(clip.keep_unsteady(steps))
     found = [path] if path is not None and (path != np.eye(3)).any() else []
     found += _find_objects(clip, camera, max_objects, smooth=None if found else SMOOTH)
     return np.stack(found)[:, :, :2] if found else None
@@ -95,8 +96,8 @@ class _Clip:
         return self.motion.find_texture(k, spacing) > TEXTURE
 
     def find_camera_steps(self) -> Float[np.ndarray, "frames 3 3"]:
-        """The map from the frame before to each frame that most of the image follows; the identity if unknown."""
-        steps = np.tile(np.eye(3), (len(self.motion.small), 1, 1))
+        """The map from the frame before to each frame that most of the image follows; NaN if unknown."""
+        steps = np.full((len(self.motion.small), 3, 3), np.nan)
 
         def estimate(k: int) -> None:
             points, target, known = self.motion.match_grid(k, SPACING)
@@ -132,8 +133,8 @@ class _Clip:
         return np.tile(points, (len(self.motion.small), 1, 1))
 
     def keep_unsteady(self, steps: Float[np.ndarray, "frames 3 3"]) -> Float[np.ndarray, "frames 3 3"]:
-        """The camera's steps, with the identity in shots whose unsteadiness is at most `STEADY`."""
-        kept, changes = steps.copy(), self.measure_changes(steps, self.corners)
+        """The camera's steps, with the identity where unknown and in shots whose unsteadiness is at most `STEADY`."""
+        kept, changes = _fill_unknown(steps), self.measure_changes(steps, self.corners)
         for first, stop in self.shots:
             if not _are_larger(changes[first:stop], STEADY):
                 kept[first:stop] = np.eye(3)
@@ -156,6 +157,11 @@ class _Clip:
                 change = np.einsum("i,inj->nj", weights, path)[:, :2]
                 changes[k] = np.sqrt((change**2).sum(1).mean())
         return changes * np.sqrt(6 / 70)  # the sums of the squared weights of second and of fourth differences
+
+
+def _fill_unknown(steps: Float[np.ndarray, "frames 3 3"]) -> Float[np.ndarray, "frames 3 3"]:
+    """The camera's steps: none where they are NaN, which is unknown."""
+    return np.where(np.isnan(steps), np.eye(3), steps)
 
 
 def _are_larger(changes: Float[np.ndarray, " frames"], least: float) -> bool:
