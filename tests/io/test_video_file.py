@@ -68,6 +68,7 @@ def folder(tmp_path):
         ((1, 2, 4, 5, 6), "1 number is missing in the names, the first after img2.png"),
         ((8, 9, 10, 13, 14, 17), "4 numbers are missing in the names, the first after img10.png"),
         ((10, 20, 40, 50), "1 number is missing in the names, the first after img20.png"),
+        ((20240130, 20240131, 20240201, 20240202), None),  # dates
     ],
 )
 def test_missing_images_of_a_sequence_are_reported(tmp_path, numbers, note):

@@ -94,7 +94,7 @@ def describe_missing(images: list[Path]) -> tuple[str, ...]:
     if usual < 1 or (steps == usual).sum() < len(steps) / 2 or (steps % usual).any():
         return ()  # not a sequence
     first, num = int(np.argmax(steps > usual)), int((steps // usual - 1).sum())
-    if not num:
+    if not 0 < num <= len(images):  # with more, the numbers are dates, or images were picked
         return ()
     what = "1 number is" if num == 1 else f"{num:,} numbers are"
     where = f"the first after {images[first].name}"

@@ -20,7 +20,7 @@ const KNOTS = [
 // Columns that a bit of `without` makes absent: the bit, the value used instead, and the value used as a feature.
 const ABSENT = { duration: [1, Math.fround(6.931471824645996), 0], time: [1, 0.5, 0], opacity: [2, 8, 4] };
 const LN2 = 0.6931471805599453, SQRT2 = 1.4142135623730951;
-const NEIGHBOURS = 4, CANDIDATES = 16, TIME = 0.3;
+const NEIGHBORS = 4, CANDIDATES = 16, TIME = 0.3;
 
 const LOGISTIC = Int32Array.from({ length: 4096 }, (_, place) => {
   const k = place >> 7, part = place & 127;
@@ -191,11 +191,11 @@ function along(cell, cells, axis) {
 /** The latest Gaussians before each in its cell, else the one before it: rows of four indices, -1 for none. */
 function findLatestInCell(cell, numCells) {
   const last = new Int32Array(numCells).fill(-1), before = new Int32Array(cell.length);
-  const out = new Int32Array(NEIGHBOURS * cell.length).fill(-1);
+  const out = new Int32Array(NEIGHBORS * cell.length).fill(-1);
   for (let i = 0; i < cell.length; i++) {
     let j = (before[i] = last[cell[i]]), count = 0;
-    for (; j >= 0 && count < NEIGHBOURS; j = before[j]) out[NEIGHBOURS * i + count++] = j;
-    if (count === 0) out[NEIGHBOURS * i] = i - 1;
+    for (; j >= 0 && count < NEIGHBORS; j = before[j]) out[NEIGHBORS * i + count++] = j;
+    if (count === 0) out[NEIGHBORS * i] = i - 1;
     last[cell[i]] = i;
   }
   return out;
@@ -205,7 +205,7 @@ function findLatestInCell(cell, numCells) {
 function findNearest(x, y, time, bits) {
   const side = 2 ** bits, num = x.length, square = (v) => clip(Math.floor((v + 0.5) * side), 0, side - 1);
   const last = new Int32Array(side * side).fill(-1), before = new Int32Array(num);
-  const out = new Int32Array(NEIGHBOURS * num).fill(-1), best = new Float64Array(NEIGHBOURS);
+  const out = new Int32Array(NEIGHBORS * num).fill(-1), best = new Float64Array(NEIGHBORS);
   for (let i = 0; i < num; i++) {
     const column = square(x[i]), row = square(y[i]);
     best.fill(Infinity);
@@ -213,15 +213,15 @@ function findNearest(x, y, time, bits) {
       for (let r = Math.max(row - 1, 0); r < Math.min(row + 2, side); r++)
         for (let j = last[c * side + r], count = 0; j >= 0 && count < CANDIDATES; j = before[j], count++) {
           const dx = x[i] - x[j], dy = y[i] - y[j], dt = time[i] - time[j], far = dx * dx + dy * dy + dt * dt;
-          let place = NEIGHBOURS;
+          let place = NEIGHBORS;
           while (place > 0 && far < best[place - 1]) place--;
-          if (place === NEIGHBOURS) continue;
-          for (let k = NEIGHBOURS - 1; k > place; k--) {
+          if (place === NEIGHBORS) continue;
+          for (let k = NEIGHBORS - 1; k > place; k--) {
             best[k] = best[k - 1];
-            out[NEIGHBOURS * i + k] = out[NEIGHBOURS * i + k - 1];
+            out[NEIGHBORS * i + k] = out[NEIGHBORS * i + k - 1];
           }
           best[place] = far;
-          out[NEIGHBOURS * i + place] = j;
+          out[NEIGHBORS * i + place] = j;
         }
     before[i] = last[column * side + row];
     last[column * side + row] = i;
@@ -281,7 +281,7 @@ function decodeColumns(header, streamOf, onColumn) {
     else if (name !== "cell") {
       const near = k > 0 || ["angle", "shade", ...COLORS].includes(name) ? nearest : inCell;
       const scale = k > 0 ? (i) => { let s = half[i]; for (let n = 1; n < k; n++) s = s * half[i]; return s; } : one;
-      known = { ...known, has, contexts, scale, near, width: NEIGHBOURS };
+      known = { ...known, has, contexts, scale, near, width: NEIGHBORS };
     }
     const numbers = decodeColumn(streamOf(length), known);
     onColumn((column + 1) / names.length);

@@ -25,10 +25,10 @@ from foldgauss.uncertainty.posterior.result import FrameTimePosterior
 
 __all__ = ["plot_correlation", "plot_increments", "plot_pairs", "plot_times", "plot_trace"]
 
-_BLUE, _RED, _GREY, _ORANGE, _GREEN = "#1f4e79", "#d1242f", "#57606a", "#bc4c00", "#1a7f37"
+_BLUE, _RED, _GRAY, _ORANGE, _GREEN = "#1f4e79", "#d1242f", "#57606a", "#bc4c00", "#1a7f37"
 _FLAG = {"duplicated": (_RED, "v"), "dropped": (_ORANGE, "^")}
 _MOST_PAIRS, _POINTS, _STEPS_SHOWN = 6, 2000, 1000
-_COLORS = (_BLUE, _ORANGE, _GREEN, _RED, "#8250df", _GREY)
+_COLORS = (_BLUE, _ORANGE, _GREEN, _RED, "#8250df", _GRAY)
 
 
 def plot_times(
@@ -67,12 +67,12 @@ def plot_times(
     upper.plot(frames, mean, color=_BLUE, linewidth=1.2, label="posterior mean")
     if fitted is not None:
         shown = (np.asarray(fitted, np.float64) - even) / unit
-        upper.plot(frames, shown, ":", color=_GREY, linewidth=1.4, label="as fitted")
+        upper.plot(frames, shown, ":", color=_GRAY, linewidth=1.4, label="as fitted")
     for kind, (color, marker) in _FLAG.items():
         at = np.array([one.frames for one in flagged if one.kind == kind])
         if len(at):
             upper.plot(at.mean(1), mean[at].mean(1), marker, color=color, markersize=6, label=kind, zorder=5)
-    upper.axhline(0, color=_GREY, linewidth=0.6)
+    upper.axhline(0, color=_GRAY, linewidth=0.6)
     upper.set_ylabel("time less even spacing\n(frames)")
     upper.set_title("Frame times, given the splats")
     upper.legend(ncols=6, fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.02), frameon=False)
@@ -119,7 +119,7 @@ def plot_increments(
     found = increment_intervals(posterior, level)
     shown = np.flatnonzero(~find_cuts(posterior))
     at = shown + 0.5
-    ax.axhline(1, color=_GREY, linewidth=0.6)
+    ax.axhline(1, color=_GRAY, linewidth=0.6)
     ax.vlines(at, found.low[shown], found.high[shown], color=_BLUE, alpha=0.45, linewidth=_bar_width(len(found.mean)))
     ax.plot(at, found.mean[shown], "o", color=_BLUE, markersize=2.5, label=f"mean and central {100 * level:.3g}%")
     for kind, (color, marker) in _FLAG.items():
@@ -260,7 +260,7 @@ def plot_correlation(profiles: LikelihoodProfiles, ax: Any = None) -> Any:
     reach = int(below[0]) if below.size else len(correlation) - 1
     last = min(len(correlation), max(3 * reach, 12) + 1)
     ax.plot(np.arange(last), correlation[:last], "o-", color=_BLUE, markersize=3.5, linewidth=1.2)
-    ax.axhline(0, color=_GREY, linewidth=0.6)
+    ax.axhline(0, color=_GRAY, linewidth=0.6)
     ax.axhline(LAST_CORRELATION, color=_RED, linewidth=0.8, linestyle="--")
     ax.text(last - 1, LAST_CORRELATION, f"{LAST_CORRELATION:g}: cutoff", color=_RED, fontsize="small",
             ha="right", va="bottom")  # fmt: skip

@@ -1,5 +1,5 @@
 #version 300 es
-// The weighted contribution of one rendered image to a fade: colour and transmittance.
+// The weighted contribution of one rendered image to a fade: color and transmittance.
 precision highp float;
 
 uniform sampler2D rendered;

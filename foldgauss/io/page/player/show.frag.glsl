@@ -11,7 +11,7 @@ in vec2 atPicture, atTarget;
 out vec4 result;
 
 void main() {
-  vec4 model = texture(rendered, atTarget); // colour and transmittance
+  vec4 model = texture(rendered, atTarget); // color and transmittance
   vec3 color = clamp(model.rgb + model.a * background, 0.0, 1.0);
   vec3 other = texture(original, atPicture).rgb;
   if (what == 1) color = other;

@@ -1,18 +1,18 @@
 #version 300 es
-// A pixel of a Gaussian: alpha, limited as in the engines, and the colour times alpha.
+// A pixel of a Gaussian: alpha, limited as in the engines, and the color times alpha.
 precision highp float;
 
 uniform float cutoff, ceiling, support;
 uniform vec3 tint;
 
-flat in vec2 centre;
+flat in vec2 center;
 flat in vec4 axes;
 flat in vec4 paint;
 flat in float tinted;
 out vec4 result;
 
 void main() {
-  vec2 away = gl_FragCoord.xy - centre;
+  vec2 away = gl_FragCoord.xy - center;
   vec2 deviations = vec2(dot(axes.xy, away), dot(axes.zw, away));
   float square = dot(deviations, deviations);
   float alpha = paint.a * exp(-0.5 * square);

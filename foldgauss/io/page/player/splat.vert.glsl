@@ -10,15 +10,15 @@ uniform int texels, degree;
 uniform bool hasPaths; // then the last texel of a Gaussian has the number of its shared path, from 1
 uniform float time, envelopePower, envelopeFloor;
 uniform float unit; // pixels of the target per unit of model space
-uniform vec2 origin, target; // the frame's centre and the target's size, pixels
+uniform vec2 origin, target; // the frame's center and the target's size, pixels
 uniform float lowPass, cutoff, support; // px^2; alpha; squared deviations
-uniform float highlight; // of selected Gaussians: how much of their colour is the tint's
+uniform float highlight; // of selected Gaussians: how much of their color is the tint's
 
 in uint instance; // index; highest bit: selected
 
-flat out vec2 centre;
+flat out vec2 center;
 flat out vec4 axes; // rows that map an offset in pixels to standard deviations
-flat out vec4 paint; // colour and opacity
+flat out vec4 paint; // color and opacity
 flat out float tinted;
 
 vec4 texel(int index, int k) {
@@ -73,10 +73,10 @@ void main() {
 
   // In the frame of its own axes the covariance is diagonal, and so is the low pass: nothing cancels.
   vec2 second = vec2(-first.y, first.x), roots = sqrt(variances);
-  centre = mean * unit + origin;
+  center = mean * unit + origin;
   axes = vec4(first / roots.x, second / roots.y);
   float reach = min(2.0 * log(paint.a / cutoff), support) * 1.001 + 0.001; // slightly too far: alpha decides in the fragment shader
   vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
   vec2 away = corner * sqrt(reach) * roots;
-  gl_Position = vec4(2.0 * (centre + away.x * first + away.y * second) / target - 1.0, 0.0, 1.0);
+  gl_Position = vec4(2.0 * (center + away.x * first + away.y * second) / target - 1.0, 0.0, 1.0);
 }
