@@ -9,7 +9,8 @@ from numba.core.caching import FunctionCache
 # Not "fast": NaN and infinity keep their meaning; sums may be reordered, which vectorized sums need.
 _OPTIONS = {"error_model": "numpy", "fastmath": {"nsz", "contract", "reassoc", "arcp"}}
 
-#: For small functions used inside kernels.
+#: For functions used inside kernels. (A kernel that calls another has a copy of it, which LLVM optimizes in its place:
+#: which copy runs, and with it the last bits of sums, depends on whether kernels are compiled or loaded.)
 inline = nb.njit(inline="always", **_OPTIONS)
 
 

@@ -1,5 +1,9 @@
 """The fused loss against scikit-image (map) and JAX (value and gradient)."""
 
+import os
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -83,6 +87,22 @@ def test_bits_do_not_depend_on_threads():
         _threads.set_num_threads(None)
     assert one.value == three.value
     np.testing.assert_array_equal(one.gradient, three.gradient)
+
+
+def test_kernels_from_the_cache_have_the_bits_of_those_compiled_anew(tmp_path):
+    """So functions that kernels call are inlined, see `_runtime.kernels.inline`."""
+    code = (
+        "import hashlib, numpy as np; from foldgauss.video.fitting.steppers.loss import image_loss\n"
+        "x, y = np.random.default_rng(0).random((2, 3, 40, 50), np.float32); loss = image_loss(x, y)\n"
+        "print(hashlib.sha256(loss.gradient.tobytes()).hexdigest(), loss.value, loss.mean_squared_error)"
+    )
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    runs = [
+        subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True).stdout
+        for _ in range(2)
+    ]
+    assert list(tmp_path.rglob("*.nbc"))
+    assert runs[0] == runs[1]
 
 
 def test_shapes_are_checked():

@@ -68,7 +68,7 @@ def _blur_along(row, at):
     )
 
 
-@kernel
+@inline
 def _blur_moments(x, y, at, wide, taps, moments, pitch):
     """Blur x, y, x^2, y^2 and x y down the columns at the row that begins at `at`, into padded rows, `pitch` apart."""
     none, pitch = broadcast(_f(0)), _u(pitch)
@@ -89,7 +89,7 @@ def _blur_moments(x, y, at, wide, taps, moments, pitch):
         store(moments, out + _u(4) * pitch, m_xy)
 
 
-@kernel
+@inline
 def _similarity_row(moments, wide, pitch, ssim, derivatives):
     """SSIM along one row, and its derivatives by the blurs of x, x^2 and x y (three padded rows, `pitch` apart)."""
     pitch, two, c1, c2 = _u(pitch), broadcast(_f(2)), broadcast(_f(C1)), broadcast(_f(C2))
@@ -111,7 +111,7 @@ def _similarity_row(moments, wide, pitch, ssim, derivatives):
         store(derivatives, at + _u(2) * pitch, two * top_mean * inverse)
 
 
-@kernel
+@inline
 def _finish_row(x, y, at, blurred, here, wide, scale_l1, scale_ssim, out):
     """Blur the derivatives down the columns and combine the gradient of one row, which begins at `at` of x and y."""
     none, two, line = broadcast(_f(0)), broadcast(_f(2)), _u(3) * _u(wide)
@@ -124,7 +124,7 @@ def _finish_row(x, y, at, blurred, here, wide, scale_l1, scale_ssim, out):
         store(out, c, by_l1 - by_similarity * (by_mean + two * a * by_square + b * by_product))
 
 
-@kernel
+@inline
 def _errors(x, y, start, stop):
     """Sums of |x - y| and (x - y)^2 over rows start..stop."""
     absolute, squared = 0.0, 0.0
