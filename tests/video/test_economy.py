@@ -94,10 +94,14 @@ def test_degree_is_that_of_the_motion(name, degree):
 
 
 def test_static_background_is_static():
-    _, model, _, _ = fitted("line")
-    still_ones = np.asarray(model.splats.color_dc)[:, 0] < 0
-    seen = weights(model).sum(0)
-    assert seen[still_ones & model.splats.static].sum() > 0.5 * seen[still_ones].sum()
+    """Of single fits, by the last bits of rounding, half of it to nearly all."""
+    shares = []
+    for seed in range(3):
+        _, model, _, _ = fitted("line", seed=seed)
+        still_ones = np.asarray(model.splats.color_dc)[:, 0] < 0
+        seen = weights(model).sum(0)
+        shares.append(seen[still_ones & model.splats.static].sum() / seen[still_ones].sum())
+    assert np.mean(shares) > 0.6
 
 
 def test_gaussians_end_at_a_cut():
