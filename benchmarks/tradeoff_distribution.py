@@ -11,8 +11,9 @@ error is the largest difference to float64, relative to 1 + |value|; `benchmarks
 **E-step**: responsibilities of a mixture with linear folds and a = 1, whose density is a quadratic form of (s, t).
 *whitening*, as this package computes it, makes L^-1 of the residual of every pair of point and component; *matrix
 product* multiplies the monomials of a point (10 for d = 3) by the coefficients of every component, once for all. The
-error is that of the log-likelihood of a point, the largest, against whitening in float64; with points as they are, and
-moved away from the origin by so many of their deviations, as data that nobody centered are.
+error is the largest one of the log-likelihood of a point, against whitening in float64. It is measured for the points
+as they are, and for points shifted from the origin by a multiple of their standard deviation, as in data that have not
+been centered.
 
 Tasks take turns; times are medians.
 """

@@ -27,7 +27,7 @@ def _psnr(a, b):
 
 
 def _moving(num_frames=8, height=48, width=64):
-    """Smooth color waves that move: VP9 and 4:2:0 keep them well, so frames are told apart."""
+    """A smooth, moving color pattern, whose frames can still be identified after lossy compression (VP9, 4:2:0)."""
     y, x = np.mgrid[:height, :width]
     waves = [
         np.stack(
