@@ -79,7 +79,7 @@ def wrapped_fit(clock: Clock) -> Iterator[None]:
     kernels = types.SimpleNamespace(
         forward=clock.timed("raster forward", cpu.forward),
         backward=clock.timed("raster backward", cpu.backward),
-        screen_gradient=cpu.screen_gradient,
+        raise_screen_gradients=cpu.raise_screen_gradients,
     )
     parts = {
         "frame_times": "frame times",

@@ -24,7 +24,7 @@ from foldgauss._numerics.simd import (
     store,
     transpose_cells,
 )
-from foldgauss._runtime.kernels import inline, kernel
+from foldgauss._runtime.kernels import exact_kernel, inline, kernel
 
 TILE = 16
 PIXELS = TILE * TILE
@@ -132,39 +132,45 @@ def project(start, stop, mean, factor, opacity, color, height, width, low_pass, 
 
 
 @kernel
-def bucket_rows(span, num_rows):
-    """Counting pass: the splats of every row in array order, and the positions of each splat's entries."""
-    num = len(span)
-    start = np.zeros(num_rows + 1, np.int64)
-    first_slot = np.zeros(num + 1, np.int64)
-    for i in range(num):
-        first_slot[i + 1] = first_slot[i] + span[i, 1] - span[i, 0]
+def count_rows(start, stop, span, count):
+    """Add to `count`, one number for each row, the splats of start..stop that reach it."""
+    for i in range(start, stop):
         for row in range(span[i, 0], span[i, 1]):
-            start[row + 1] += 1
-    for row in range(num_rows):
-        start[row + 1] += start[row]
-    fill = start.copy()
-    entries = np.empty(start[num_rows], np.int32)
-    slot_position = np.empty(start[num_rows], np.int64)
-    for i in range(num):
-        slot = first_slot[i]
+            count[row] += 1
+
+
+@kernel
+def fill_rows(start, stop, span, slot, fill, entries, first_slot, slot_position):
+    """List splats start..stop in the rows that they reach, in array order, and the positions of each one's entries.
+
+    `slot`: the first one of these splats; `fill`: the position in `entries` of the first in each row, overwritten.
+    """
+    for i in range(start, stop):
+        first_slot[i] = slot
         for row in range(span[i, 0], span[i, 1]):
             position = fill[row]
             entries[position] = i
             slot_position[slot] = position
             slot += 1
             fill[row] = position + 1
-    return start, entries, first_slot, slot_position
+    first_slot[stop] = slot
 
 
 @kernel
 def project_and_bucket(
     num_rows, mean, factor, opacity, color, height, width, low_pass, cutoff, support, geometry, span
 ):
-    """`project` of all splats, then `bucket_rows`: for few splats, calls from Python would dominate the time."""
+    """`project` of all splats, then their rows: for few splats, calls from Python would dominate the time."""
     num = len(opacity)
     project(0, num, mean, factor, opacity, color, height, width, low_pass, cutoff, support, geometry, span)
-    return bucket_rows(span, num_rows)
+    row_start = np.zeros(num_rows + 1, np.int64)
+    count_rows(0, num, span, row_start[1:])
+    for row in range(num_rows):
+        row_start[row + 1] += row_start[row]
+    entries, slot_position = np.empty(row_start[-1], np.int32), np.empty(row_start[-1], np.int64)
+    first_slot = np.empty(num + 1, np.int64)
+    fill_rows(0, num, span, 0, row_start[:-1].copy(), entries, first_slot, slot_position)
+    return row_start, entries, first_slot, slot_position
 
 
 @inline
@@ -801,3 +807,12 @@ def gather_visibility(start, stop, first_slot, slot_position, visibility, contri
             total += visibility[slot_position[s], 0]
             most = max(most, visibility[slot_position[s], 1])
         contribution[i], largest_alpha[i] = total, most
+
+
+@exact_kernel
+def raise_screen_gradients(start, stop, d_mean, half_width, half_height, first_slot, indices, largest):
+    """`cpu.raise_screen_gradients` for splats start..stop."""
+    for i in range(start, stop):
+        if first_slot[i] < first_slot[i + 1]:
+            x, y = half_width * d_mean[i, 0], half_height * d_mean[i, 1]
+            largest[indices[i]] = max(largest[indices[i]], math.sqrt(x * x + y * y))

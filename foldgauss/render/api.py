@@ -196,7 +196,9 @@ def _render_cpu_bwd(size, compositing, options, leaves, grad_image):
 
     def differentiate(gradients, grad_image, *leaves):
         trace = cpu.forward(*leaves, size, compositing=compositing, options=options)
-        for out, gradient in zip(gradients, cpu.backward(trace, _split_channels(grad_image)), strict=True):
+        grad_image = _split_channels(grad_image)
+        by_leaf = *cpu.backward(trace, grad_image), cpu.background_gradient(trace, grad_image)
+        for out, gradient in zip(gradients, by_leaf, strict=True):
             out[...] = gradient
 
     shapes = tuple(jax.ShapeDtypeStruct(leaf.shape, jnp.float32) for leaf in leaves)

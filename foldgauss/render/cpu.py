@@ -58,11 +58,6 @@ class Trace:
     block_transmittances: list[np.ndarray]  # per part: the transmittance at the start of each block
     constants: tuple  # background, over, ceiling, stop
 
-    @property
-    def visible(self) -> np.ndarray:
-        """Which splats reach the image: (num,), bool."""
-        return np.diff(self.buckets[2]) > 0
-
 
 def check_options(options: RenderOptions) -> None:
     """Raise ValueError for options that this engine does not support."""
@@ -112,8 +107,10 @@ def forward_frames(
     for frame in frames:
         _check_leaves(*frame)
     passes = [_ForwardPass(frame, size, compositing, options, visibility) for frame in frames]
-    run_tasks(_call, [(one.project, start) for one in passes if len(one.chunks) > 1 for start in one.chunks])
+    large = [(one, start) for one in passes if len(one.chunks) > 1 for start in one.chunks]
+    run_tasks(_call, [(one.project, start) for one, start in large])
     run_tasks(_ForwardPass.bucket, passes)
+    run_tasks(_call, [(one.fill, start) for one, start in large])
     small = sum(one.work for one in passes) < SINGLE_TASK_NS
     run_tasks(_call, [(one.composite, part) for one in passes for part in one.split(whole=small)], serial=small)
     if visibility:
@@ -148,7 +145,7 @@ def _read_only(array: np.ndarray) -> np.ndarray:
 
 
 class _ForwardPass:
-    """The forward pass of one frame. Methods run in order; `project`, `composite` and `gather` in parallel parts."""
+    """The forward pass of one frame. Methods run in order; all but `bucket` and `split` in parallel parts."""
 
     def __init__(self, frame, size, compositing, options, visibility) -> None:
         self.mean, self.factor, self.opacity, self.color, background = map(_read_only, frame)
@@ -156,6 +153,7 @@ class _ForwardPass:
         num, channels, over = len(self.opacity), len(background), compositing == "over"
         self.chunks = range(0, num, SPLATS_PER_TASK)
         self.num_rows = -(-size[0] // TILE)
+        self.counts = np.zeros((len(self.chunks), self.num_rows), np.int64)  # entries by chunk and row of tiles
         self.geometry, self.span = np.empty((num, 8), np.float32), np.empty((num, 2), np.int32)
         self.image, self.transmittance = np.empty((channels, *size), np.float32), np.empty(size, np.float32)
         self.visibility = SplatVisibility(*np.empty((2, num), np.float32)) if visibility else None
@@ -167,7 +165,9 @@ class _ForwardPass:
         )
 
     def project(self, start: int) -> None:
-        kernels.project(start, min(start + SPLATS_PER_TASK, len(self.opacity)), *self._projection_arguments())
+        stop = min(start + SPLATS_PER_TASK, len(self.opacity))
+        kernels.project(start, stop, *self._projection_arguments())
+        kernels.count_rows(start, stop, self.span, self.counts[start // SPLATS_PER_TASK])
 
     def _projection_arguments(self) -> tuple:
         radius = self.options.support_radius
@@ -177,12 +177,23 @@ class _ForwardPass:
         return *splats, *self.size, low_pass, cutoff, support, self.geometry, self.span
 
     def bucket(self) -> None:
-        """List the splats of every row; those of a single chunk are projected here as well."""
-        if len(self.chunks) == 1:
+        """Make room for the entries of every row; those of a single chunk are projected and listed here as well."""
+        if len(self.chunks) <= 1:
             self.buckets = kernels.project_and_bucket(self.num_rows, *self._projection_arguments())
         else:
-            self.buckets = kernels.bucket_rows(self.span, self.num_rows)
+            # Entries are ordered by row, then by chunk; slots by chunk.
+            position = np.append(0, np.cumsum(self.counts.T))
+            self.fill_from = np.ascontiguousarray(position[:-1].reshape(self.counts.T.shape).T)
+            self.slot_from = np.append(0, np.cumsum(self.counts.sum(1)))
+            entries, slot_position = np.empty(position[-1], np.int32), np.empty(position[-1], np.int64)
+            first_slot = np.empty(len(self.opacity) + 1, np.int64)
+            row_start = np.ascontiguousarray(position[:: len(self.chunks)])
+            self.buckets = row_start, entries, first_slot, slot_position
         self.entry_visibility = None if self.visibility is None else np.empty((len(self.buckets[1]), 2), np.float32)
+
+    def fill(self, start: int) -> None:
+        chunk, stop = start // SPLATS_PER_TASK, min(start + SPLATS_PER_TASK, len(self.opacity))
+        kernels.fill_rows(start, stop, self.span, self.slot_from[chunk], self.fill_from[chunk], *self.buckets[1:])
 
     @property
     def work(self) -> float:
@@ -226,9 +237,9 @@ class _ForwardPass:
 
 
 def backward(trace: Trace, grad_image: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Gradients of mean, factor, opacity, color and background, given dL/dimage, planar (channels, height, width).
+    """Gradients of mean, factor, opacity and color, given dL/dimage, planar (channels, height, width).
 
-    Raises ValueError if `grad_image` does not have the image's shape.
+    That of the background is `background_gradient`. Raises ValueError if `grad_image` does not have the image's shape.
     """
     return backward_frames([trace], [grad_image])[0]
 
@@ -253,10 +264,12 @@ def backward_frames(traces: Sequence[Trace], grad_images: Sequence[np.ndarray]) 
 
     run_tasks(sum_rows, [(job, part) for job in jobs for part in range(len(job[0].parts))])
     run_tasks(gather, [(job, start) for job in jobs for start in range(0, len(job[0].geometry), SPLATS_PER_TASK)])
-    return [
-        (*grads, np.einsum("chw,hw->c", grad_image, trace.transmittance, dtype=np.float32))
-        for trace, grad_image, _, grads in jobs
-    ]
+    return [grads for *_, grads in jobs]
+
+
+def background_gradient(trace: Trace, grad_image: np.ndarray) -> np.ndarray:
+    """The gradient of the background, (channels,), given dL/dimage as for `backward`."""
+    return np.einsum("chw,hw->c", grad_image, trace.transmittance, dtype=np.float32)
 
 
 def _empty_sums(trace: Trace) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
@@ -266,13 +279,20 @@ def _empty_sums(trace: Trace) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
     return slots, tuple(np.empty(shape, np.float32) for shape in ((num, 2), (num, 2, 2), (num,), (num, channels)))
 
 
-def screen_gradient(d_mean: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """The positional gradient that densification uses: |dL/dmean|, (num,), with means in units of half the image.
+def raise_screen_gradients(largest: np.ndarray, trace: Trace, d_mean: np.ndarray, indices: np.ndarray) -> None:
+    """Raise `largest`, float32, where the positional gradient that densification uses is larger, in place.
 
-    `d_mean` is dL/dmean in pixels, (num, 2), of an image of `size`, (height, width). The published densification
-    splits and clones where the mean over views exceeds a threshold.
+    That is |dL/dmean|, with means in units of half the image. `d_mean` is dL/dmean in pixels, (num, 2); splat i is that
+    of `largest[indices[i]]`, each at most once. Splats that do not reach the image are left out. The published
+    densification splits and clones where the mean over views exceeds a threshold.
 
     Source: Kerbl et al. 2023, 3D Gaussian Splatting, section 5.2.
     """
-    height, width = np.float32(size) / 2
-    return np.sqrt(np.square(width * d_mean[:, 0]) + np.square(height * d_mean[:, 1]))  # `hypot` is slow
+    half_height, half_width = np.float32(trace.image.shape[1:]) / 2
+    num, first_slot = len(d_mean), trace.buckets[2]
+
+    def work(start: int) -> None:
+        stop = min(start + SPLATS_PER_TASK, num)
+        kernels.raise_screen_gradients(start, stop, d_mean, half_width, half_height, first_slot, indices, largest)
+
+    run_tasks(work, range(0, num, SPLATS_PER_TASK))

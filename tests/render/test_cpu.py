@@ -38,7 +38,8 @@ def assert_agrees(leaves, size, compositing="over", options=None):
     trace = cpu.forward(*leaves, size, compositing=compositing, options=options)
     difference = np.abs(np.moveaxis(trace.image, 0, -1) - truth)[~avoid]
     assert difference.max(initial=0) <= 1e-5 * max(1.0, np.abs(truth).max())
-    for name, one, other in zip(NAMES, cpu.backward(trace, weights), true_grads, strict=True):
+    grads = *cpu.backward(trace, weights), cpu.background_gradient(trace, weights)
+    for name, one, other in zip(NAMES, grads, true_grads, strict=True):
         scale = max(1.0, np.abs(other).max(initial=0))
         np.testing.assert_allclose(one / scale, other / scale, atol=2e-5, err_msg=name)
 
@@ -142,15 +143,23 @@ def test_transmittance_is_the_weight_of_the_background():
     assert white.transmittance.min() < 0.5 < white.transmittance.max()
 
 
-def test_screen_gradient():
-    d_mean = np.float32([[3, 4], [0, 0], [-5, 12]])
-    np.testing.assert_array_equal(cpu.screen_gradient(d_mean, (2, 2)), np.float32([5, 0, 13]))
-    np.testing.assert_array_equal(cpu.screen_gradient(d_mean, (6, 8)), np.float32([np.sqrt(288), 0, np.sqrt(1696)]))
+@pytest.mark.parametrize(("size", "expected"), [((2, 2), [5, 0, 13]), ((6, 8), [np.sqrt(288), 0, np.sqrt(1696)])])
+def test_screen_gradients(size, expected):
+    """In units of half the image; splat 2 does not reach it, and what was larger stays."""
+    mean = np.float32([[1, 1], [1, 1], [1e6, 1], [1, 1], [1, 1]])
+    shapes, color = np.broadcast_to(np.eye(2, dtype=np.float32), (5, 2, 2)), np.ones((5, 3), np.float32)
+    trace = cpu.forward(mean, shapes, np.full(5, 0.5, np.float32), color, np.zeros(3, np.float32), size)
+    d_mean = np.float32([[3, 4], [0, 0], [7, 7], [-5, 12], [3, 4]])
+    largest = np.float32([-1, -1, 40, -1, -1, -1])
+    cpu.raise_screen_gradients(largest, trace, d_mean, np.array([5, 1, 0, 3, 2]))
+    np.testing.assert_array_equal(largest[[5, 1, 3]], np.float32(expected))
+    np.testing.assert_array_equal(largest[[0, 2, 4]], np.float32([-1, 40, -1]))
 
 
 def results(leaves, size, weights, **how):
     trace = cpu.forward(*leaves, size, visibility=True, **how)
-    return [trace.image, trace.transmittance, *trace.visibility, *cpu.backward(trace, weights)]
+    grads = *cpu.backward(trace, weights), cpu.background_gradient(trace, weights)
+    return [trace.image, trace.transmittance, *trace.visibility, *grads]
 
 
 @pytest.mark.parametrize("channels", [3, 6])
@@ -179,7 +188,7 @@ def test_several_frames_equal_single_frames(compositing):
     traces = cpu.forward_frames(frames, size, compositing=compositing, visibility=True)
     grads = cpu.backward_frames(traces, weights)
     for frame, weight, trace, grad in zip(frames, weights, traces, grads, strict=True):
-        alone = results(frame, size, weight, compositing=compositing)
+        alone = results(frame, size, weight, compositing=compositing)[:-1]
         for one, two in zip(alone, [trace.image, trace.transmittance, *trace.visibility, *grad], strict=True):
             np.testing.assert_array_equal(one, two)
 
@@ -200,7 +209,7 @@ def test_trimmed_lists_keep_the_gradient():
     assert not seen[3][-1].any()
     first = sum(seen[3].any(axis=1))
     short = cpu.backward(cpu.forward(*(leaf[: 2 * first] for leaf in leaves[:4]), leaves[4], size), weights)
-    for one, other in zip(seen[:4], short[:4], strict=True):
+    for one, other in zip(seen, short, strict=True):
         np.testing.assert_array_equal(one[:first], other[:first])
 
 

@@ -108,9 +108,9 @@ def test_halves_are_drawn_from_their_parent():
 def test_gradients_are_averaged_over_steps_in_which_it_was_seen():
     sums = OfGrowth().build(Sizes(3, 0, 0, growing=True))
     by_time = np.float32([-4e-4, 4e-4, 0])
-    sums.add([(np.array([0]), np.float32([3e-4]))], by_time)
-    sums.add([(np.array([0, 2]), np.float32([1e-4, 5e-4])), (np.array([2]), np.float32([7e-4]))], -by_time)
-    np.testing.assert_allclose(sums.screen, [4e-4, 0, 7e-4], rtol=1e-5)  # the largest of a batch
+    sums.add(np.float32([3e-4, -1, -1]), by_time)
+    sums.add(np.float32([1e-4, -1, 7e-4]), -by_time)
+    np.testing.assert_allclose(sums.screen, [4e-4, 0, 7e-4], rtol=1e-5)
     np.testing.assert_allclose(sums.time, [8e-4, 0, 0], rtol=1e-5)  # signs do not cancel; unseen, nothing counts
     assert sums.seen.tolist() == [2, 0, 1]
     _, born = change(gaussians(3), sums)
@@ -351,7 +351,7 @@ def test_screen_gradient_is_in_units_of_half_the_image():
         rows[0, PLACE["loc"]] += np.float32([dx * 20 / unit, dy * 12 / unit])
         step = stepper_of(state)
         moved = dataclasses.replace(state, rows=rows)
-        options = {"squared": False, "mirrored": False, "seen": None, "fraction": None}
+        options = {"squared": False, "mirrored": False, "screen": None, "fraction": None}
         return step._differentiate(moved, k, np.float32(k), step.shapes[-1], None, **options)[0].value
 
     small = 0.02

@@ -16,7 +16,8 @@ from foldgauss.video.fitting.growth import Growth
 from foldgauss.video.fitting.initialize import initialize_uniform
 from foldgauss.video.fitting.loop import start, to_model
 from foldgauss.video.fitting.schedule import choose_views
-from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper, mirror
+from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
+from foldgauss.video.models.conditioning import mirror
 from foldgauss.video.models.row_layout import columns
 from foldgauss.video.models.splats import SH_C0
 
@@ -135,7 +136,8 @@ def test_opposite_camera_sees_the_mirrored_image():
     size = (24, 40)
     mean, factor, *others = splats_in_pixels(size)
     front = cpu.forward(mean, factor, *others, np.zeros(3, np.float32), size)
-    seen = mirror(mean, factor, 40)
+    seen = np.empty_like(mean), np.empty_like(factor)
+    mirror(mean, factor, 40, out=seen)
     back = cpu.forward(*seen, *others, np.zeros(3, np.float32), size)
     np.testing.assert_allclose(back.image, front.image[:, :, ::-1], atol=2e-6)
     model = Splats2D((mean - [20, 12]).astype(np.float32) / 40, factor / 40, *others)
@@ -155,7 +157,15 @@ def test_both_views_give_the_same_gradients():
     for mirrored in (False, True):
         step = CpuStepper(FRAMES, config, state)
         loss, _, by_time = step._differentiate(
-            state, 2, np.float32(0.6), step.shapes[-1], None, squared=False, mirrored=mirrored, seen=None, fraction=None
+            state,
+            2,
+            np.float32(0.6),
+            step.shapes[-1],
+            None,
+            squared=False,
+            mirrored=mirrored,
+            screen=None,
+            fraction=None,
         )
         gradients.append(np.append(step.grad, by_time))
         losses.append(loss.value)

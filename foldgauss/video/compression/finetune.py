@@ -60,7 +60,7 @@ def finetune_model(
         leaves = done.mean, done.factor, done.opacity, done.color, background
         trace = cpu.forward(*leaves, model.size, compositing=model.compositing, options=model.options)
         by_image = (trace.image - wanted) * np.float32(2 / wanted.size)
-        backpropagate(rows, done, cpu.backward(trace, by_image)[:4], spec, grad)
+        backpropagate(rows, done, cpu.backward(trace, by_image), spec, grad)
         rate = np.float32(FIRST_RATE * (LAST_RATE / FIRST_RATE) ** (step / steps))
         update_rows(state, grad, done.alive, rates * rate, degree=model.degree, units=config.rate_units)
         if free is None:

@@ -36,7 +36,7 @@ def estimate_sensitivities(
         if len(frame.alive):
             signs = rng.integers(0, 2, shape, dtype=np.int8) * np.float32(2 * LEVELS) - np.float32(LEVELS)
             rows = np.zeros((num, 11 + 2 * degree), np.float32)
-            backpropagate(prepared.rows, frame.splats, cpu.backward(frame.trace, signs)[:4], prepared.spec, rows)
+            backpropagate(prepared.rows, frame.splats, cpu.backward(frame.trace, signs), prepared.spec, rows)
             for name, gradient in to_columns(rows[frame.alive].astype(np.float64), frame.alive).items():
                 total[name][frame.alive] += gradient**2
             best[frame.alive] = np.maximum(best[frame.alive], frame.total)

@@ -2,14 +2,15 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from dataclasses import field
 from typing import NamedTuple
 
 import numpy as np
 
 from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.kernels import exact_kernel
 from foldgauss._runtime.settings import check_settings, setting
+from foldgauss._runtime.threads import run_tasks
 from foldgauss.render.camera import FIELD_OF_VIEW
 
 #: One unit of the published geometry in ours: there the image's half width is tan(FIELD_OF_VIEW / 2), here the longer
@@ -22,6 +23,7 @@ PUBLISHED_STEPS = 30_000
 #: In plans however short, gradients are averaged over at least so many steps; and between resets opacities have the
 #: time to recover: at the published rate, 0.025 a step, the logit of 0.01 needs 184 steps to that of 0.5.
 MIN_EVERY, MIN_RESET_EVERY = 10, 200
+CHUNK = 1 << 16  # Gaussians per task
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,15 +125,19 @@ class GradientStatistics(NamedTuple):
     time: np.ndarray  #: float32: of time gradients
     seen: np.ndarray  #: int32: steps in which the Gaussian was seen
 
-    def add(self, views: Sequence[tuple[np.ndarray, np.ndarray]], by_time: np.ndarray) -> None:
-        """Add a step: for each of its views, the Gaussians seen in it (each once) and their screen gradients.
+    def add(self, screen: np.ndarray, by_time: np.ndarray) -> None:
+        """Add a step: the largest screen gradient over its views, and dL/dm_t by the raw m_t over all; (num,) each.
 
-        `by_time` (num,) is dL/dm_t by the raw m_t, over all views.
+        `screen` is negative for Gaussians that no view shows.
         """
-        largest = np.full(len(self.screen), -1, np.float32)
-        for indices, screen in views:
-            largest[indices] = np.maximum(largest[indices], screen)
-        seen = np.flatnonzero(largest >= 0)
-        self.screen[seen] += largest[seen]
-        self.time[seen] += np.abs(by_time[seen])
-        self.seen[seen] += 1
+        num = len(screen)
+        run_tasks(lambda start: _add(start, min(start + CHUNK, num), screen, by_time, *self), range(0, num, CHUNK))
+
+
+@exact_kernel
+def _add(start, stop, screen, by_time, screen_sum, time_sum, seen):
+    for i in range(start, stop):
+        if screen[i] >= 0:
+            screen_sum[i] += screen[i]
+            time_sum[i] += abs(by_time[i])
+            seen[i] += 1

@@ -197,7 +197,7 @@ def measure_scores(
         weight = weights[k] / samples
         for _ in range(samples):
             signs = rng.integers(0, 2, signs_shape, dtype=np.int8) * np.float32(2) - np.float32(1)
-            d_mean, d_factor, d_opacity, d_color, _ = cpu.backward(trace, signs)
+            d_mean, d_factor, d_opacity, d_color = cpu.backward(trace, signs)
             second_order[alive] += weight * (done.opacity * d_opacity).astype(float) ** 2
             by_path[alive] += weight * powers[:, :, None] * _outer(d_mean.astype(float))[:, None]
             by_scale = (done.factor * d_factor).sum(1).astype(float)  # by the logarithms

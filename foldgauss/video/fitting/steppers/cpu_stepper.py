@@ -39,6 +39,7 @@ from foldgauss.video.models.conditioning import (
     ConditioningSpec,
     backpropagate,
     condition,
+    mirror,
     update_windows,
 )
 from foldgauss.video.models.row_layout import columns
@@ -81,14 +82,14 @@ class CpuStepper:
         shape = dataclasses.replace(self.shapes[level], paths=paths_of(state, times))
         losses, alive, visited = [], [], set()
         squared = progress >= 1 - config.l2_fraction
-        seen = None if state.statistics is None else []
+        screen = None if state.statistics is None else np.full(len(state.rows), -1, np.float32)
         for view in choose_views(config, num_frames, state.step, state.frame_errors):
             k, mirrored = int(view) % num_frames, int(view) >= num_frames
             fraction = None
             if self.interpolation is not None:
                 fraction = self.interpolation.choose(state.step, progress, k)
             t = times[k] if fraction is None else (1 - fraction) * times[k] + fraction * times[k + 1]
-            settings = {"squared": squared, "mirrored": mirrored, "seen": seen, "fraction": fraction}
+            settings = {"squared": squared, "mirrored": mirrored, "screen": screen, "fraction": fraction}
             own_path = by_path[k] if fraction is None else None
             loss, done, d_time = self._differentiate(state, k, t, shape, own_path, **settings)
             if fraction is None:
@@ -97,7 +98,7 @@ class CpuStepper:
             losses.append(loss.value)
             alive.append(done.alive)
         if state.statistics is not None:
-            state.statistics.add(seen, self.grad[:, columns(config.degree)["time_loc_logit"]][:, 0])
+            state.statistics.add(screen, self.grad[:, columns(config.degree)["time_loc_logit"]][:, 0])
         touched = alive[0]
         if len(alive) > 1:  # np.unique sorts: a tenth of a step
             marked = np.zeros(len(state.rows), bool)
@@ -152,13 +153,13 @@ class CpuStepper:
         *,
         squared: bool,
         mirrored: bool,
-        seen: list[tuple[np.ndarray, np.ndarray]] | None,
+        screen: np.ndarray | None,
         fraction: float | None,
     ) -> tuple[ImageLoss, ConditionedSplats, float]:
         """The loss of frame k, or of the image interpolated at `fraction` of the way to the next, and dL/dt.
 
-        Gradients by rows are added to `self.grad`, those by the maps of paths to `by_path`. To the list `seen` is
-        appended what `GradientStatistics.add` takes.
+        Gradients by rows are added to `self.grad`, those by the maps of paths to `by_path`; `screen`, the largest
+        screen gradients of this step, is raised.
         """
         if fraction is None:
             target = to_planes(shrink_frame(self.frames[k], shape.size), self.background)
@@ -170,7 +171,8 @@ class CpuStepper:
         if mirrored:
             for plane in target:
                 cv2.flip(plane, 1, dst=plane)
-            mean, factor = mirror(mean, factor, shape.size[1])
+            mean, factor = np.empty_like(mean), np.empty_like(factor)
+            mirror(done.mean, done.factor, shape.size[1], out=(mean, factor))
         trace = self._render(dataclasses.replace(done, mean=mean, factor=factor), shape)
         if squared:
             loss = squared_loss(trace.image, target)
@@ -182,13 +184,12 @@ class CpuStepper:
             weight = self._weight(state.frame_errors, k)
         gradient = loss.gradient
         gradient *= np.float32(weight / self.config.batch_size)
-        d_mean, d_factor, *others, _ = cpu.backward(trace, gradient)
+        gradients = cpu.backward(trace, gradient)
         if mirrored:
-            d_mean, d_factor = mirror(d_mean, d_factor, 0)
-        if seen is not None:
-            visible = np.flatnonzero(trace.visible)
-            seen.append((done.alive[visible], cpu.screen_gradient(d_mean, shape.size)[visible]))
-        return loss, done, backpropagate(rows, done, (d_mean, d_factor, *others), shape, self.grad, by_path)
+            mirror(*gradients[:2], 0, out=gradients[:2])
+        if screen is not None:
+            cpu.raise_screen_gradients(screen, trace, gradients[0], done.alive)
+        return loss, done, backpropagate(rows, done, gradients, shape, self.grad, by_path)
 
     def _weight(self, errors: np.ndarray, k: int) -> float:
         """The weight of frame k's loss. For a mean PSNR, each dB of each frame counts the same."""
@@ -206,12 +207,3 @@ class CpuStepper:
             compositing=self.config.compositing,
             options=self.config.options,
         )
-
-
-def mirror(mean: np.ndarray, factor: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Splats in pixels as the opposite camera sees them, left for right; with width 0 the transpose, for gradients."""
-    mean, factor = mean.copy(), factor.copy()
-    np.subtract(width, mean[:, 0], out=mean[:, 0])
-    for column in factor[:, 0].T:  # one by one: NumPy is slow along an axis of 2
-        column *= -1
-    return mean, factor
