@@ -52,12 +52,16 @@ def test_options_reach_the_video(model, tmp_path, monkeypatch, capsys):
         (["--smoothing", "0"], "--smoothing: expected seconds > 0, got 0.0"),
         (["--fixed", "--smoothing", "0.5"], "--fixed: expected no --smoothing, got both"),
         (["--crf", "99"], "--crf: expected"),
+        (["--background", "none"], "frames: expected RGB for h264 in .mp4"),
+        (["--background", "none", "--out", "x.gif"], "--background: expected a color for .gif, got none"),
+        (["--fps", "60", "--out", "x.gif"], "--fps: expected at most 50 frames per second, got 60"),
         (["--out", "x.png"], "--out: expected"),
         (["--size", "0x3"], "--size: expected HxW"),
     ],
 )
 def test_mistakes_are_told_and_nothing_is_written(model, tmp_path, monkeypatch, capsys, options, message):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("foldgauss.video.motion.stabilization.estimate_camera_path", None)  # mistakes are told before
     assert run("stabilize", model, *options) == 2
     assert message in " ".join(capsys.readouterr().err.split())
     assert not list(tmp_path.iterdir())

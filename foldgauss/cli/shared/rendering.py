@@ -18,7 +18,7 @@ from foldgauss.cli.shared.timeline import Timeline
 from foldgauss.io.media.encoder import CODECS, Sound, choose_encoding
 from foldgauss.io.media.frame_rate import MAX_FPS
 from foldgauss.io.media.lazy_frames import LazyFrames
-from foldgauss.io.media.video_writing import MAX_GIF_FPS, VIDEO_SUFFIXES, write_image, write_video
+from foldgauss.io.media.video_writing import ANIMATION_SUFFIXES, MAX_GIF_FPS, VIDEO_SUFFIXES, write_image, write_video
 from foldgauss.video.models.background import BLACK, Background
 from foldgauss.video.models.metrics import Evaluation, evaluate
 from foldgauss.video.motion.slow_motion import interpolate_frames
@@ -68,17 +68,32 @@ class VideoOptions(NamedTuple):
     sound: Sound | None = None
 
 
-def check_video_options(path: Path, size: tuple[int, int], options: VideoOptions) -> None:
-    """Refuse options that do not fit the output `path` with RGB frames of this size, before they are computed."""
+def check_video_options(
+    path: Path, size: tuple[int, int], fps: float, options: VideoOptions, background: Background = BLACK
+) -> None:
+    """Refuse options that do not fit the output `path` for such frames, before they are computed."""
     suffix = path.suffix.lower()
+    _check_rate(path, fps)
+    if background is None and suffix in ANIMATION_SUFFIXES and not path.is_dir():
+        expected, cure = f"a color for {suffix}", "Take .webm, .mov, .mkv or a folder."
+        raise wrong_use("--background", expected=expected, got="none", cure=cure)
     if suffix not in VIDEO_SUFFIXES:
         _refuse_options(path, options)
     if suffix not in VIDEO_SUFFIXES or path.is_dir():
         return
     try:
-        choose_encoding(suffix, options.codec, options.crf, options.pixel_format, (*size, 3))
+        choose_encoding(
+            suffix, options.codec, options.crf, options.pixel_format, (*size, 4 if background is None else 3)
+        )
     except ValueError as error:
         raise WrongUse(name_option(str(error)) if str(error).startswith(options._fields) else str(error)) from error
+
+
+def _check_rate(path: Path, fps: float) -> None:
+    most = MAX_GIF_FPS if path.suffix.lower() == ".gif" else MAX_FPS
+    if path.suffix and not path.is_dir() and fps > most:
+        expected, cure = f"at most {most:g} frames per second", "Give a lower rate, or write to a folder."
+        raise wrong_use("--fps", expected=expected, got=f"{fps:g}", cure=cure)
 
 
 def _refuse_options(path: Path, options: VideoOptions) -> None:
@@ -181,10 +196,7 @@ def write_images(
     options: VideoOptions = VideoOptions(),  # noqa: B008
 ) -> None:
     """Write `num` images as a video or to a folder."""
-    most = MAX_GIF_FPS if path.suffix.lower() == ".gif" else MAX_FPS
-    if path.suffix and not path.is_dir() and fps > most:
-        expected, cure = f"at most {most:g} frames per second", "Give a lower rate, or write to a folder."
-        raise wrong_use("--fps", expected=expected, got=f"{fps:g}", cure=cure)
+    _check_rate(path, fps)
     with progress_bar("Rendering", num) as advance:
         try:
             write_video(

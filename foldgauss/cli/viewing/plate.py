@@ -64,7 +64,7 @@ def plate_command(
     image_size = image_size or model.size
     refuse_huge(image_size)
     options = VideoOptions(codec, crf, pixel_format)
-    check_video_options(out_path, image_size, options)
+    check_video_options(out_path, image_size, model.fps, options)
     frames = np.empty((model.num_frames, *image_size, 3), np.uint8)
     with progress_bar("Rendering", model.num_frames) as advance:
         for k, frame in enumerate(model.frames(size=image_size)):

@@ -27,7 +27,6 @@ from foldgauss.cli.shared.rendering import (
 from foldgauss.cli.shared.timeline import Fps, Speed, Timeline, Upsample
 from foldgauss.io.media.video_writing import VIDEO_SUFFIXES
 from foldgauss.io.models.video_model import load_video_model, read_origin
-from foldgauss.video.motion.camera_path import estimate_camera_path
 from foldgauss.video.motion.stabilization import BORDERS, MAX_ZOOM, SMOOTHING, stabilize
 
 
@@ -75,15 +74,14 @@ def stabilize_command(
     model = load_video_model(model_path)
     refuse_huge(image_size or model.size)
     options = VideoOptions(codec, crf, pixel_format, choose_sound(sound, timeline, read_origin(model_path), model.fps))
-    check_video_options(out_path, image_size or model.size, options)
     shown, rate = timeline.times(np.asarray(model.frame_times.times()), model.fps), timeline.rate(model.fps)
+    check_video_options(out_path, image_size or model.size, rate, options, background_color)
     with progress_bar("Estimating the camera's path", model.num_frames) as advance:
-        path = estimate_camera_path(model, on_frame=advance)
-    print_shots(path.starts)
-    try:
-        video = stabilize(model, smoothing=smoothing, fixed=fixed, border=border, path=path)
-    except ValueError as error:
-        raise WrongUse(name_option(str(error))) from error
+        try:
+            video = stabilize(model, smoothing=smoothing, fixed=fixed, border=border, on_frame=advance)
+        except ValueError as error:
+            raise WrongUse(name_option(str(error))) from error
+    print_shots(video.path.starts)
     if border == "crop" and f"{video.zoom:.2f}" != "1.00":
         out.print(f"Enlarged by {video.zoom:.2f} to hide the borders.")
     render_to_file(

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -38,6 +39,7 @@ def stabilize(
     fixed: bool = False,
     border: Border = "crop",
     path: CameraPath | None = None,
+    on_frame: Callable[[], None] = lambda: None,
 ) -> "StabilizedVideo":
     """A video as a steadier camera would show it: its Gaussians move against the motion of the camera.
 
@@ -48,7 +50,8 @@ def stabilize(
     - `"fill"`: what other frames of the shot show there, the nearest in time in front.
     - `"keep"`: the background.
 
-    `path` is that of `estimate_camera_path(video)`, which takes a rendering of every frame (default: estimated here).
+    `path` is that of `estimate_camera_path(video)`, which takes a rendering of every frame (default: estimated here,
+    with a call of `on_frame()` after each).
 
     Raises ValueError for anything but a video, smoothing that is not above 0, an unknown border, a path of another
     number of frames, a path that a crop by `MAX_ZOOM` does not suffice for, and a filled border with compositing "sum".
@@ -67,7 +70,7 @@ def stabilize(
     if border == "fill" and video.compositing == "sum":
         cure = "Choose crop or keep: sums of several frames have no order in depth."
         raise invalid("border", expected='"crop" or "keep" with compositing "sum"', got=border, cure=cure)
-    path = estimate_camera_path(video) if path is None else path
+    path = estimate_camera_path(video, on_frame=on_frame) if path is None else path
     if path.num_frames != video.num_frames:
         raise invalid("path", expected=f"that of {video.num_frames} frames", got=path.num_frames)
     maps = path.held() if fixed else path.smoothed(smoothing * video.fps)
