@@ -498,6 +498,17 @@ def test_any_function_of_the_conditioned_gaussians():
     assert apart(half, expected, quarter) < 1e-5
 
 
+def test_arrays_that_a_function_returns_as_they_were_keep_their_bits():
+    model = soft_model(size=(60, 100))  # the unit is no power of two: conversion to model space and back rounds
+    before = model.prepare(model.size).splats(0.5)
+    moved = edit(model).select(OBJECT).apply(lambda g, t: dataclasses.replace(g, mean=g.mean + 0.1)).video().at(0.5)
+    np.testing.assert_array_equal(moved.factor, before.factor)
+    larger = (
+        edit(model).select(OBJECT).apply(lambda g, t: dataclasses.replace(g, factor=1.5 * g.factor)).video().at(0.5)
+    )
+    np.testing.assert_array_equal(larger.mean, before.mean)
+
+
 def test_functions_of_triangles():
     """A shift, a turn and a mirror of vertices are those edits."""
     chain = edit(MODEL).select(OBJECT)
@@ -683,8 +694,9 @@ OTHER_UNITS = {
 @pytest.mark.parametrize("name", OTHER_UNITS)
 def test_numbers_of_other_units_are_warned_of(name):
     call, message = OTHER_UNITS[name]
-    with pytest.warns(UserWarning, match=f"^{message}"):
+    with pytest.warns(UserWarning, match=f"^{message}") as caught:
         assert call().video() is not None
+    assert {warning.filename for warning in caught} == {__file__}
 
 
 def test_turns_shifts_and_ways_that_are_meant():

@@ -387,8 +387,9 @@ def test_numpy_scalars_are_accepted():
 
 
 def test_every_must_be_positive():
-    with pytest.raises(ValueError, match="every"):
-        fit(moving_blobs(), CONFIG, every=0)
+    for wrong in (0, 2.5):
+        with pytest.raises(ValueError, match="every"):
+            fit(moving_blobs(), CONFIG, every=wrong)
 
 
 def test_bad_rates():

@@ -84,8 +84,9 @@ def test_times_snap_to_shots_at_a_cut():
 def test_invalid_input_is_rejected():
     with pytest.raises(ValueError, match="num_frames"):
         FrameTimes.uniform(0)
-    with pytest.raises(ValueError, match="upsample"):
-        interpolated_times(np.array([0.0, 1.0]), 0)
+    for wrong in (0, 2.5, "2"):
+        with pytest.raises(ValueError, match="upsample: expected a whole number"):
+            interpolated_times(np.array([0.0, 1.0]), wrong)
 
 
 def test_positions_become_times():
@@ -113,3 +114,6 @@ def test_remapped_time():
     for wrong in ([[0, 0]], [[0, 0], [0, 1]], [[1, 0], [2, 1]], [[0, 0], [1, -1]], [[0, 0], [1, np.nan]], [0, 1]):
         with pytest.raises(ValueError, match="remap: expected"):
             remapped_positions(wrong, fps=2)
+    for wrong in (0, -25.0, np.nan):
+        with pytest.raises(ValueError, match="fps: expected a number > 0"):
+            remapped_positions([[0, 0], [1, 1]], fps=wrong)

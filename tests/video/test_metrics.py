@@ -31,6 +31,8 @@ def test_evaluate_compares_frame_by_frame():
     assert evaluate(model, frames[::-1].copy()).psnr[0] < 50
     with pytest.raises(ValueError, match="frames"):
         evaluate(model, frames[:2])
+    with pytest.raises(ValueError, match=r"^frames: expected uint8 .*got list\."):
+        evaluate(model, list(frames))
 
 
 def test_frames_at_other_times_and_sizes():

@@ -91,6 +91,8 @@ def test_errors(name):
             video.render(seconds=seconds)
     with pytest.raises(ValueError, match=r"^time: expected a time in \[0, 1\], got 5.*render\(frame=k\)"):
         video.render(5)
+    with pytest.raises(ValueError, match=r"^time: expected one time in \[0, 1\], got \[0.1, 0.2\]"):
+        video.render([0.1, 0.2])
 
 
 @pytest.mark.parametrize("moment", [{"frame": 2}, {"seconds": 0.3}])

@@ -313,6 +313,8 @@ def test_boxes_and_polygons_are_masks():
     for box in ((5, 10, 5, 30), (25, 10, 5, 30), (0, 0, np.nan, 3), (1, 2, 3), "box"):
         with pytest.raises(ValueError, match=r"^box"):
             by_box(MODEL, box)
+    with pytest.raises(ValueError, match=r"^box: expected \(x0, y0, x1, y1\) in pixels, got ndarray\.$"):
+        by_box(MODEL, np.arange(100.0).reshape(10, 10))
     with pytest.raises(ValueError, match=r"^box: expected pixels of a 48x72 frame in it, got none"):
         by_box(MODEL, (80, 0, 90, 10))
     for polygon in ([(0, 0), (1, 1)], [(0, 0, 0)] * 3, [(0, 0), (1, np.inf), (3, 3)], 7):
@@ -423,6 +425,7 @@ def test_bad_criteria():
         ({}, "^select: expected at least one criterion"),
         ({"tolerance": 5.0, "frame": 1}, "^tolerance: expected color or click"),
         ({"click": (5, 5)}, "^frame: expected the frame that was clicked in"),
+        ({"click": (5, 5), "frames": (0, 2)}, r"^frames: expected none with a click, got \(0, 2\)\. Give frame=k"),
     ):
         with pytest.raises(ValueError, match=match):
             select(MODEL, **options)
@@ -438,8 +441,12 @@ def test_bad_models():
         by_color(mixed, (0, 0, 0))
     with pytest.raises(ValueError, match=r"^model: expected a VideoModel, got FoldedSplats"):
         matte(MODEL.splats, truth(DISC), 0.5)
+    with pytest.raises(ValueError, match=r"^model: expected a VideoModel, got str"):
+        by_click("model.safetensors", (1, 1), frame=0)
     with pytest.raises(ValueError, match=r"^selection"):
         matte(MODEL, Selection(np.zeros(3, bool)), 0.5)
+    with pytest.raises(ValueError, match=r"^t: expected one time in \[0, 1\], got \[0\.1, 0\.2\]"):
+        matte(MODEL, truth(DISC), [0.1, 0.2])
 
 
 # ------------------------------------------------------------------------------------------------- a real fit

@@ -225,6 +225,13 @@ def test_between_shots_the_nearer_one_is_shown():
     assert [video.map_at(float(t))[0, 2] for t in (times[5] + 0.01, times[6] - 0.01)] == [0, 0.1]
 
 
+def test_half_way_between_segments_image_and_map_are_those_of_one_frame():
+    clip = SegmentedVideo.from_models([(0, scene(FrameTimes.uniform(3))), (3, scene(FrameTimes.uniform(2), num=1400))])
+    path = CameraPath(np.tile(np.eye(3), (5, 1, 1)), np.ones(5), clip.frame_times.times(), (0, 3))
+    video = StabilizedVideo(clip, np.stack([affine(shift=(0.2 * (k < 3), 0)) for k in range(5)]), path)
+    np.testing.assert_allclose(video.render(2.5 / 4), clip.render(2.5 / 4), atol=1e-4)
+
+
 def test_mistakes_are_told():
     model = scene()
     path = standing(model)

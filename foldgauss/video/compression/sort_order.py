@@ -160,7 +160,7 @@ def _add_costs(count, index, layer, color, num, keys, costs, row, column, used):
                 if layer[r, q, i, 0] * layer[r, q, i, 1] < _FAINT:
                     continue
                 for j in range(i + 1, count[r, q]):
-                    # The transmittance in front of the back one without the other, not below a minimum: see there.
+                    # The transmittance in front of the back one without the other, at least `_MIN_TRANSMITTANCE`.
                     behind = max(layer[r, q, j, 1], _MIN_TRANSMITTANCE) / max(1 - layer[r, q, i, 0], np.float32(0.01))
                     passed = min(behind, layer[r, q, i, 1])
                     both = layer[r, q, i, 0] * layer[r, q, j, 0] * passed

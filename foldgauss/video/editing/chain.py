@@ -257,7 +257,8 @@ class Edit:
 
         Copies have the edits of their originals, each about its own center, even if the edit was of a larger selection.
         """
-        shifts = [self._point("offsets", offset) for offset in check_pairs("offsets", offsets)]
+        # By `map`: a list comprehension is a frame of its own in Python 3.11, at which warnings would point.
+        shifts = list(map(partial(self._point, "offsets"), check_pairs("offsets", offsets)))
         about = self._fixed_point(about)
         named = (("delays", delays), ("scale", scale), ("angle", angle))
         delays, sizes, angles = (broadcast_numbers(name, values, len(shifts)) for name, values in named)
@@ -297,7 +298,10 @@ class Edit:
         return self._gather(sources, copies), [copy == k for k in range(1, num + 1)]
 
     def vanish(self, **when: Unpack[When]) -> "Edit":
-        """Remove the selection. Baked without a span: the Gaussians are deleted, and the selection is empty."""
+        """Remove the selection. Without a span the Gaussians are deleted, and the selection is empty.
+
+        An overlay hides them instead where they are all of a layer, or only a part of those of an earlier overlay.
+        """
         if self._span(when) is not None:
             return self.opacity(0.0, **when)
         self._check_selected()

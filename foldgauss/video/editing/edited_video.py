@@ -352,8 +352,10 @@ class _ConditionedLayer:
         if after.mean is before.mean and after.factor is before.factor:
             return
         if not self.in_space and after.mean.shape[1] == 2:
-            self.mean[selected] = after.mean * self._unit + self._middle
-            self.factor[selected] = after.factor * self._unit
+            if after.mean is not before.mean:
+                self.mean[selected] = after.mean * self._unit + self._middle
+            if after.factor is not before.factor:
+                self.factor[selected] = after.factor * self._unit
             return
         after = after.in_space()
         self._make_space()

@@ -97,8 +97,8 @@ def fit(
     """
     config = FitConfig() if config is None else config
     observers, history = list(observers), []
-    if every < 1:
-        raise invalid("every", expected="a whole number >= 1", got=every)
+    if not is_integer(every, 1):
+        raise invalid("every", expected="a whole number >= 1", got=repr(every))
     for state, info in fit_steps(frames, config):
         for observe in observers:
             observe(state, info)

@@ -81,9 +81,9 @@ def independent_frames(
 
     `config` is that of each frame's fit: starts, loss, coarse levels, rates (see `RATE_FACTOR`), compositing. Its
     `steps` are of each frame (default `DEFAULT_STEPS`); its `minutes` are for all, divided evenly by measured speed.
-    Settings about time (`degree`, `power`, `floor`, `learn_frame_times`, `follow_motion`, `scale_rates_by_duration`,
-    `scale_rates_by_size`) have no meaning here and are ignored. `on_frame` is called with number and model of each
-    frame that is done.
+    Settings about time (`degree`, `power`, `floor`, `learn_frame_times`, `follow_motion`, `follow_camera`,
+    `scale_rates_by_duration`, `scale_rates_by_size`) have no meaning here and are ignored. `on_frame` is called with
+    number and model of each frame that is done.
 
     **Raises** ValueError for frames that cannot be fitted, for fewer parameters than a Gaussian in each frame has, and
     for settings that would change the numbers of Gaussians, or that need other frames.

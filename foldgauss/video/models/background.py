@@ -22,7 +22,9 @@ def random_background(seed: int, step: int) -> Float[np.ndarray, "3"]:
     return np.random.default_rng([seed, _STREAM, step]).random(3, np.float32)
 
 
-def composite(frame: UInt8[np.ndarray, "height width 4"], background: Float[np.ndarray, "3"]) -> UInt8[np.ndarray, ""]:
+def composite(
+    frame: UInt8[np.ndarray, "height width 4"], background: Float[np.ndarray, "3"]
+) -> UInt8[np.ndarray, "height width 3"]:
     """One frame over `background`, with values in [0, 1]: uint8 (height, width, 3), rounded."""
     transmittance = 1 - frame[..., 3:] * np.float32(1 / 255)
     behind = 255 * np.asarray(background, np.float32)

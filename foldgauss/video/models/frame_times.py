@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Float32
 
-from foldgauss._runtime.checks import invalid, is_integer, short_repr
+from foldgauss._runtime.checks import invalid, is_integer, is_within, short_repr
 from foldgauss._runtime.threads import check_not_forked
 
 #: Length of the gap between two shots, in frames: `GAP` plus `GAP_SHOTS` times the longer shot. A Gaussian in the
@@ -105,8 +105,8 @@ def interpolated_times(times: np.ndarray, upsample: int) -> np.ndarray:
     At a cut the first half of the new frames repeats the frame before it, the second half the frame after it.
     Shape ((n - 1) * upsample + 1,). Source: VeGaS, the sentence after eq:frame_fitting.
     """
-    if upsample < 1:
-        raise invalid("upsample", expected="a whole number >= 1", got=upsample)
+    if not is_integer(upsample, 1):
+        raise invalid("upsample", expected="a whole number >= 1", got=short_repr(upsample))
     return times_at(times, np.arange((len(times) - 1) * upsample + 1) / upsample)
 
 
@@ -129,7 +129,7 @@ def played_positions(num_frames: int, rate: float, *, speed: float = 1.0) -> Flo
     `rate` is the output's frame rate over the clip's, `speed` the playback speed: 0.25 is slow motion. The last frame
     is included only if a step lands on it. Raises ValueError unless rate > 0 and speed is finite and not 0.
     """
-    _check_rate(rate)
+    _check_rate("rate", rate)
     if not (np.isfinite(speed) and speed != 0):
         raise invalid("speed", expected="a number other than 0", got=speed, cure="0.25 is slow motion, -1 backwards.")
     step = abs(speed) / rate
@@ -146,7 +146,8 @@ def remapped_positions(
     `rate` as in `played_positions`. Raises ValueError for anything else.
     Example: `remapped_positions([[0, 0], [1, 1], [3, 1], [4, 2]], fps=25)` holds second 1 for two seconds.
     """
-    _check_rate(rate)
+    _check_rate("fps", fps)
+    _check_rate("rate", rate)
     points = np.asarray(remap, np.float64)
     if points.ndim != 2 or points.shape[1:] != (2,) or len(points) < 2 or not np.isfinite(points).all():
         expected = "at least two rows (second shown, second of the clip)"
@@ -160,6 +161,6 @@ def remapped_positions(
     return np.interp(seconds, shown, of_clip) * fps
 
 
-def _check_rate(rate: float) -> None:
-    if not (np.isfinite(rate) and rate > 0):
-        raise invalid("rate", expected="a number > 0", got=rate)
+def _check_rate(name: str, rate: float) -> None:
+    if not is_within(rate, "(0, inf)"):
+        raise invalid(name, expected="a number > 0", got=short_repr(rate))

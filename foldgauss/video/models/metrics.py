@@ -91,6 +91,7 @@ def evaluate(
 def check_frames(model: RenderableVideo, frames: np.ndarray) -> None:
     """Raise unless `frames` are uint8 frames of the model's number and size, with or without alpha."""
     expected = (model.num_frames, *model.size)
-    if frames.ndim != 4 or frames.shape[:-1] != expected or frames.shape[-1] not in (3, 4) or frames.dtype != np.uint8:
+    shape, dtype = getattr(frames, "shape", None), getattr(frames, "dtype", None)
+    if shape is None or tuple(shape[:-1]) != expected or shape[-1] not in (3, 4) or dtype != np.uint8:
         wanted = f"uint8 {(*expected, 3)}, or 4 with alpha"
-        raise invalid("frames", expected=wanted, got=f"{frames.dtype} {frames.shape}")
+        raise invalid("frames", expected=wanted, got=type(frames).__name__ if shape is None else f"{dtype} {shape}")

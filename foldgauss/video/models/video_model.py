@@ -28,13 +28,16 @@ ONE_SEGMENT = "Take one segment's own: video.segments[k].model."
 
 
 def check_time(t: float, name: str = "t", cure: str = "Frame k is at frame_times.times()[k].") -> None:
-    """Raise unless t is a time in [0, 1], if its value is known."""
+    """Raise ValueError unless t is one time, in [0, 1] if its value is known."""
     check_not_forked()
     try:
-        value = concrete_value(jnp.asarray(t))
+        time = jnp.asarray(t)
+        value = concrete_value(time)
     except (TypeError, ValueError):
         raise invalid(name, expected="a time in [0, 1]", got=short_repr(t)) from None
-    if value is not None and not ((value >= 0) & (value <= 1)).all():
+    if time.ndim:
+        raise invalid(name, expected="one time in [0, 1]", got=short_repr(t))
+    if value is not None and not 0 <= value <= 1:
         raise invalid(name, expected="a time in [0, 1]", got=value, cure=cure)
 
 

@@ -57,8 +57,9 @@ FAST_SIDE, SURE_FRACTION = 160, 0.5
 class Tracks:
     """Tracks of points, relative to their starts.
 
-    Shapes: `shift` (num, 2 LONGEST + 1, 2) in pixels, x right and y down, 0 at the middle column, which is the frame of
-    the start; `known` (num, 2 LONGEST + 1), true along the track: one interval around the middle.
+    Shapes: `shift` (num, 2 longest + 1, 2) in pixels, x right and y down, 0 at the middle column, which is the frame of
+    the start; `known` (num, 2 longest + 1), true along the track: one interval around the middle. `longest` is that of
+    `Motion.follow`.
     """
 
     shift: Float32[np.ndarray, "num steps 2"]
@@ -172,7 +173,10 @@ class Motion:
     def follow(
         self, home: Int[np.ndarray, " num"], position: Float32[np.ndarray, "num 2"], *, longest: int = LONGEST
     ) -> Tracks:
-        """Track points, at `position` (x, y in pixels, centers at +0.5) in frame `home`, forward and backward."""
+        """Track points, at `position` (x, y in pixels, centers at +0.5) in frame `home`, forward and backward.
+
+        A track has at most `longest` frames to either side.
+        """
         num, position = len(home), position.astype(np.float32)
         shift = np.zeros((num, 2 * longest + 1, 2), np.float32)
         known = np.zeros((num, 2 * longest + 1), bool)

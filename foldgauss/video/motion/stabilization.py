@@ -169,7 +169,7 @@ class StabilizedVideo(RenderedVideo):
         k = int(np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2))
         fraction = float(np.clip((t - times[k]) / max(times[k + 1] - times[k], 1e-30), 0, 1))
         if k + 1 in self.path.starts:
-            return k + round(fraction), 0.0
+            return k + (fraction >= 0.5), 0.0  # half way the later one, as `snap_to_shots`
         return (k + 1, 0.0) if fraction == 1 else (k, fraction)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import skimage
 from jaxtyping import ArrayLike, Bool, Float, Float32
 
-from foldgauss._runtime.checks import invalid, is_integer, is_within
+from foldgauss._runtime.checks import invalid, is_integer, is_within, short_repr
 from foldgauss.video.models.video_model import VideoModel, check_model
 
 Mask = Bool[np.ndarray, "height width"] | Float[np.ndarray, "height width"]
@@ -63,7 +63,7 @@ def region_from_box(
     check_model(model)
     edges = _as_array(box)
     if edges.shape != (4,) or edges.dtype.kind not in "fiu" or not np.isfinite(edges).all():
-        raise invalid("box", expected="(x0, y0, x1, y1) in pixels", got=_short_repr(box))
+        raise invalid("box", expected="(x0, y0, x1, y1) in pixels", got=short_repr(box))
     if not (edges[0] < edges[2] and edges[1] < edges[3]):
         raise invalid("box", expected="x0 < x1 and y0 < y1", got=box, cure="x is right, y is down.")
     (height, width), (x0, y0, x1, y1) = model.size, edges
@@ -79,7 +79,7 @@ def region_from_polygon(
     corners = _as_array(polygon)
     bad = corners.ndim != 2 or corners.shape[1:] != (2,) or len(corners) < 3 or corners.dtype.kind not in "fiu"
     if bad or not np.isfinite(corners).all():
-        raise invalid("polygon", expected="at least 3 corners (x, y) in pixels", got=_short_repr(polygon))
+        raise invalid("polygon", expected="at least 3 corners (x, y) in pixels", got=short_repr(polygon))
     # scikit-image has pixel centers at integers, and rows first.
     return _constant_region(
         "polygon", model, skimage.draw.polygon2mask(model.size, corners[:, ::-1] - 0.5), frame, frames
@@ -92,11 +92,6 @@ def _as_array(given: object) -> np.ndarray:
         return np.asarray(given)
     except ValueError:
         return np.zeros(0)
-
-
-def _short_repr(given: object) -> str:
-    """For an error message of one line: the value if it is short, else its type."""
-    return repr(given) if isinstance(given, list | tuple | np.ndarray | str | float | int) else type(given).__name__
 
 
 def resolve_frames(model: VideoModel, frame: int | None, frames: tuple[int, int] | None) -> range:

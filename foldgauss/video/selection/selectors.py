@@ -220,10 +220,11 @@ def list_criteria(
         ("threshold", threshold != THRESHOLD and not (regional or moving), "a mask, box, polygon or moving with it"),
         ("follow", not follow and not regional, "a mask, box or polygon with it"),
         ("alive", alive and not timed, "times or frames with it"),
-        ("frames", click is not None and frames is not None, "frame, the one that was clicked in"),
     ):
         if misplaced:
             raise invalid(name, expected=wanted, got="none")
+    if click is not None and frames is not None:
+        raise invalid("frames", expected="none with a click", got=repr(frames), cure="Give frame=k, that of the click.")
     if tolerance is not None and color is None and click is None:
         raise invalid("tolerance", expected="color or click with it", got="neither")
     if color is not None:
@@ -419,6 +420,7 @@ def by_click(
 
     **Raises:** ValueError for a click outside the frame, or where nothing is rendered.
     """
+    check_model(model)
     point, (height, width) = np.asarray(click), model.size
     if point.shape != (2,) or point.dtype.kind not in "fiu" or not ((point >= 0) & (point < [width, height])).all():
         raise invalid("click", expected=f"(x, y) in pixels of a {height}x{width} frame", got=click)
