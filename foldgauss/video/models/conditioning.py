@@ -310,6 +310,13 @@ def update_windows(rows: np.ndarray, indices: np.ndarray, window: np.ndarray) ->
     )
 
 
+def find_windows(rows: np.ndarray) -> np.ndarray:
+    """The time windows of all rows, float32 (num, 2)."""
+    window = np.empty((len(rows), 2), np.float32)
+    update_windows(rows, np.arange(len(rows)), window)
+    return window
+
+
 def apply_scale_cutoff(rows: np.ndarray, window: np.ndarray, spec: ConditioningSpec, scale_cutoff: float) -> None:
     """Narrow `window` (num, 2) to the times when both standard deviations exceed `scale_cutoff`, in model units.
 

@@ -14,7 +14,7 @@ from foldgauss.video.models.conditioning import (
     ConditioningSpec,
     apply_scale_cutoff,
     condition,
-    update_windows,
+    find_windows,
 )
 from foldgauss.video.models.frame_times import FrameTimes, snap_to_shots
 from foldgauss.video.models.row_layout import pack
@@ -52,8 +52,7 @@ class PreparedModel:
         check_paths(model.splats)
         paths = jax.tree.map(np.asarray, model.splats.paths)
         self.spec = ConditioningSpec(model.splats.degree, power, floor, tuple(size), aspect=aspect, paths=paths)
-        self.window = np.empty((len(self.rows), 2), np.float32)
-        update_windows(self.rows, np.arange(len(self.rows)), self.window)
+        self.window = find_windows(self.rows)
         apply_scale_cutoff(self.rows, self.window, self.spec, model.scale_cutoff)
         self._times = np.asarray(model.frame_times.times())
 

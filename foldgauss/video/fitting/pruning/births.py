@@ -1,21 +1,28 @@
 """Gaussians born where a running fit has the largest errors, drawn and moved like those of the start."""
 
+import dataclasses
 import math
-from collections.abc import Callable
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
-from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import cpu
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.initialize import SCALE_FACTOR, draw_positions, find_constant, make_splats, make_static
+from foldgauss.video.fitting.initialize import (
+    SCALE_FACTOR,
+    START_OPACITY,
+    SUMMED_OPACITY,
+    draw_positions,
+    find_constant,
+    make_splats,
+    make_static,
+)
 from foldgauss.video.fitting.schedule import to_planes
+from foldgauss.video.fitting.state import FitState, envelope_of, frame_times, paths_of
 from foldgauss.video.models.background import random_background
-from foldgauss.video.models.conditioning import ConditioningSpec, condition
+from foldgauss.video.models.conditioning import ConditioningSpec, condition, find_windows
 from foldgauss.video.models.row_layout import columns, pack
-from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.motion.optical_flow import Motion
 
 #: The size of newborns relative to that of evenly spread Gaussians: errors have finer detail than the present image.
@@ -24,39 +31,40 @@ SMALLER = 0.6
 
 def make_newborns(
     num: int,
-    frames: UInt8[np.ndarray, "num_frames height width 3"],
-    times: Float[np.ndarray, " num_frames"],
+    state: FitState,
+    frames: UInt8[np.ndarray, "num_frames height width channels"],
     errors: Float[np.ndarray, " num_frames"],
-    measure_squares: Callable[[int], Float32[np.ndarray, "height width"]],
-    alive: float,
-    *,
-    degree: int,
-    envelope: TimeLikelihood,
+    config: FitConfig,
+    spec: ConditioningSpec,
     motion: Motion | None,
-    paths: SharedPaths | None,
-    opacity: float,
+    *,
     with_static: bool,
-    seed: tuple[int, ...],
 ) -> Float32[np.ndarray, "num width"]:
     """Packed rows of `num` Gaussians, at frames and positions drawn by squared error, with the colors of the clip.
 
-    `errors` are those of the frames, `measure_squares(k)` gives those of the pixels of frame k; `alive` is the mean
-    number of Gaussians alive in a frame. With `with_static`, those whose pixel never changes are static.
+    `errors` are the squared errors of the frames, up to a common factor; `spec` is that of whole frames. With
+    `with_static`, Gaussians whose pixel never changes are static.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng([config.seed, 3, state.step])
+    times, window, paths = np.asarray(frame_times(state.time_logits)), find_windows(state.rows), paths_of(state)
+    spec, colors = dataclasses.replace(spec, paths=paths), np.ascontiguousarray(frames[..., :3])
     home = np.sort(rng.choice(len(frames), num, p=errors / errors.sum()))
 
     def density_of(k: int) -> np.ndarray:
-        smooth = cv2.GaussianBlur(measure_squares(k).astype(np.float64), (0, 0), 1.0) + 1e-12
+        squares = _measure_squares(state.rows, window, times[k], *make_target(frames, k, config), spec, config)
+        smooth = cv2.GaussianBlur(squares.astype(np.float64), (0, 0), 1.0) + 1e-12
         return smooth / smooth.sum()
 
     position, _ = draw_positions(home, density_of, rng)
-    splats, _ = make_splats(frames, home, position, times, degree, envelope, motion, rng, opacity, paths)
-    rows = pack(make_static(splats, find_constant(frames, home, position)) if with_static else splats)
-    size = frames.shape[1:3]
+    opacity = SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY
+    shape = config.degree, envelope_of(config)
+    splats, _ = make_splats(colors, home, position, times, *shape, motion, rng, opacity, paths)
+    rows = pack(make_static(splats, find_constant(colors, home, position)) if with_static else splats)
+    alive = float(np.mean([((window[:, 0] < t) & (t < window[:, 1])).sum() for t in times]))  # in a frame
+    size, at = frames.shape[1:3], columns(config.degree)["log_scale"]
     apart = math.sqrt(math.prod(size) / max(alive, 1.0)) / max(size)
-    larger = 0.0 if paths is None else rows[:, columns(degree)["log_scale"]] + np.log(max(size))  # by the path's zoom
-    rows[:, columns(degree)["log_scale"]] = np.log(SMALLER * SCALE_FACTOR * apart) + larger
+    larger = 0.0 if paths is None else rows[:, at] + np.log(max(size))  # by the path's zoom
+    rows[:, at] = np.log(SMALLER * SCALE_FACTOR * apart) + larger
     return rows
 
 
@@ -68,7 +76,7 @@ def make_target(
     return to_planes(frames[k], background), background
 
 
-def measure_squares(
+def _measure_squares(
     rows: Float32[np.ndarray, "num width"],
     window: Float32[np.ndarray, "num 2"],
     t: float,

@@ -4,13 +4,11 @@ import dataclasses
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float, Float32
 
 from foldgauss.render import pixels_per_unit
 from foldgauss.video.fitting.codebook import Codebook, average_clusters, find_clusters
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, most_gaussians
-from foldgauss.video.fitting.initialize import START_OPACITY
-from foldgauss.video.fitting.pruning.births import make_newborns, make_target, measure_squares, shuffle_into
+from foldgauss.video.fitting.pruning.births import make_newborns, make_target, shuffle_into
 from foldgauss.video.fitting.pruning.description_length import (
     PrunedRows,
     allowed_error,
@@ -19,8 +17,8 @@ from foldgauss.video.fitting.pruning.description_length import (
     weigh_frames,
 )
 from foldgauss.video.fitting.pruning.scores import PruningScores, measure_scores
-from foldgauss.video.fitting.state import FitState, envelope_of, frame_times, mean_psnr, paths_of
-from foldgauss.video.models.conditioning import ConditioningSpec, update_windows
+from foldgauss.video.fitting.state import FitState, frame_times, mean_psnr, paths_of
+from foldgauss.video.models.conditioning import ConditioningSpec, find_windows
 from foldgauss.video.models.row_layout import columns
 from foldgauss.video.models.sparse_storage import clear_absent_moments, count_parameters, find_initial_kinds
 from foldgauss.video.motion.optical_flow import Motion
@@ -151,23 +149,9 @@ class Pruner:
 
     def _add_newborns(self, state: FitState, scores: PruningScores, num: int) -> None:
         """Gaussians where errors are large, in depth anywhere between the others."""
-        config, times = self._config, np.asarray(frame_times(state.time_logits))
-        window, spec = _windows(state.rows), dataclasses.replace(self._spec, paths=paths_of(state))
-        new = make_newborns(
-            num,
-            np.ascontiguousarray(self._frames[..., :3]),
-            times,
-            scores.errors,
-            lambda k: measure_squares(state.rows, window, times[k], *self._target(k), spec, self._config),
-            float(np.mean([((window[:, 0] < t) & (t < window[:, 1])).sum() for t in times])),
-            degree=config.degree,
-            envelope=envelope_of(config),
-            motion=self._find_motion() if config.follow_motion else None,
-            paths=paths_of(state),
-            opacity=START_OPACITY,
-            with_static=True,
-            seed=(config.seed, 3, state.step),
-        )
+        config = self._config
+        motion = self._find_motion() if config.follow_motion else None
+        new = make_newborns(num, state, self._frames, scores.errors, config, self._spec, motion, with_static=True)
         order = shuffle_into(len(state.rows), num, np.random.default_rng([config.seed, 6, state.step]))
         state.extend(new, find_initial_kinds(new, config.degree), newborn=np.ones(num, bool))
         state.keep(order)
@@ -194,26 +178,22 @@ class Pruner:
     def _measure(self, state: FitState) -> PruningScores:
         times = np.asarray(frame_times(state.time_logits))
         weights = None if self._config.economy.psnr is None else weigh_frames(state.frame_errors)
-        options = self._render_options() | {"seed": state.step, "weights": weights}
-        spec = dataclasses.replace(self._spec, paths=paths_of(state))
-        return measure_scores(state.rows, _windows(state.rows), times, spec, self._target, **options)
+        return measure_scores(
+            state.rows,
+            find_windows(state.rows),
+            times,
+            dataclasses.replace(self._spec, paths=paths_of(state)),
+            lambda k: make_target(self._frames, k, self._config),
+            compositing=self._config.compositing,
+            options=self._config.options,
+            weights=weights,
+            seed=state.step,
+        )
 
     def _psnr(self, state: FitState, scores: PruningScores) -> float:
         """The mean PSNR in dB, over black; scores of frames with alpha are measured over other colors."""
         alpha = self._frames.shape[3] == 4 and self._config.economy.psnr is not None
         return mean_psnr(state, self._config, self._frames) if alpha else scores.psnr
-
-    def _target(self, k: int) -> tuple[Float32[np.ndarray, "3 height width"], Float[np.ndarray, "3"]]:
-        return make_target(self._frames, k, self._config)
-
-    def _render_options(self) -> dict:
-        return {"compositing": self._config.compositing, "options": self._config.options}
-
-
-def _windows(rows: np.ndarray) -> Float32[np.ndarray, "num 2"]:
-    window = np.empty((len(rows), 2), np.float32)
-    update_windows(rows, np.arange(len(rows)), window)
-    return window
 
 
 def _keep(state: FitState, pruned: PrunedRows, degree: int) -> None:

@@ -4,8 +4,6 @@ The number of Gaussians stays the same. Source: relocation of dead Gaussians in 
 (Kheradmand et al. 2024); the choice of Gaussians and their new parameters are ours.
 """
 
-import dataclasses
-
 import numpy as np
 import scipy
 from jaxtyping import Float, Float32, Int
@@ -13,11 +11,10 @@ from jaxtyping import Float, Float32, Int
 from foldgauss.video.fitting.adam import BETA2
 from foldgauss.video.fitting.budget import measure_progress
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.initialize import START_OPACITY, SUMMED_OPACITY
-from foldgauss.video.fitting.pruning.births import make_newborns, make_target, measure_squares
+from foldgauss.video.fitting.pruning.births import make_newborns
 from foldgauss.video.fitting.schedule import steps_per_pass
-from foldgauss.video.fitting.state import FitState, envelope_of, frame_times, paths_of
-from foldgauss.video.models.conditioning import ConditioningSpec, update_windows
+from foldgauss.video.fitting.state import FitState, frame_times
+from foldgauss.video.models.conditioning import ConditioningSpec, find_windows
 from foldgauss.video.models.row_layout import columns
 from foldgauss.video.models.sparse_storage import find_initial_kinds, is_opaque, is_static
 from foldgauss.video.motion.optical_flow import Motion
@@ -56,29 +53,14 @@ def relocate(
     static Gaussians, new ones at constant pixels are static too. `spec` is that of whole frames.
     """
     times = np.asarray(frame_times(state.time_logits))
-    window = np.empty((len(state.rows), 2), np.float32)
-    update_windows(state.rows, np.arange(len(state.rows)), window)
-    influence = measure_influence(state, window, times, config.degree)
+    influence = measure_influence(state, find_windows(state.rows), times, config.degree)
     num = round(config.relocated_fraction * np.isfinite(influence).sum())
     if num == 0:
         return
-    rows, stay, spec = state.rows, np.ones(len(state.rows), bool), dataclasses.replace(spec, paths=paths_of(state))
+    stay = np.ones(len(state.rows), bool)
     stay[np.argsort(influence, kind="stable")[:num]] = False
-    new = make_newborns(
-        num,
-        np.ascontiguousarray(frames[..., :3]),
-        times,
-        state.frame_errors.astype(float),
-        lambda k: measure_squares(rows, window, times[k], *make_target(frames, k, config), spec, config),
-        float(np.mean([((window[:, 0] < t) & (t < window[:, 1])).sum() for t in times])),
-        degree=config.degree,
-        envelope=envelope_of(config),
-        motion=motion,
-        paths=paths_of(state),
-        opacity=SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY,
-        with_static=bool(is_static(state.kinds).any()),
-        seed=(config.seed, 3, state.step),
-    )
+    errors, with_static = state.frame_errors.astype(float), bool(is_static(state.kinds).any())
+    new = make_newborns(num, state, frames, errors, config, spec, motion, with_static=with_static)
     kinds = find_initial_kinds(new, config.degree)
     state.keep(np.flatnonzero(stay))
     place = _find_places(state, new, kinds, config)

@@ -39,6 +39,7 @@ from foldgauss.video.models.conditioning import (
     ConditioningSpec,
     backpropagate,
     condition,
+    find_windows,
     mirror,
     update_windows,
 )
@@ -70,8 +71,7 @@ class CpuStepper:
 
     def adopt(self, state: FitState) -> None:
         self.grad = np.zeros_like(state.rows)
-        self.window = np.empty((len(state.rows), 2), np.float32)
-        update_windows(state.rows, np.arange(len(state.rows)), self.window)
+        self.window = find_windows(state.rows)
 
     def step(self, state: FitState, progress: float, level: int = -1) -> StepResult:
         config, num_frames = self.config, self.num_frames
