@@ -241,9 +241,7 @@ def test_lower_degree_path_is_optimal(degree):
     span = 0.7
     moments = ((u / span)[:, None, None] ** np.arange(7)[:, None] * parts[:, None]).sum(0)
     none = np.zeros(1)
-    scores = PruningScores(
-        none, none, 1, SIZE, none, none, none, moments[None], np.array([span]), none, none, none, none
-    )
+    scores = PruningScores(none, none, 1, none, none, none, moments[None], np.array([span]), none, none, none, none)
     added, lower = scores.lower_degree(path[None], degree, np.array([0]))
     powers = u[:, None] ** np.arange(4)
     # sum over frames of |F^T (powers (path - lower))|^2

@@ -1,7 +1,5 @@
 """Sensitivity of the rendered images to each parameter of a model."""
 
-from collections.abc import Callable
-
 import numpy as np
 from jaxtyping import Float
 
@@ -17,7 +15,7 @@ LEVELS = 255.0
 
 
 def estimate_sensitivities(
-    contributions: Contributions, exact: ExactColumns, on_frame: Callable[[], None] = lambda: None
+    contributions: Contributions, exact: ExactColumns
 ) -> tuple[dict[str, Float[np.ndarray, " num"]], Float[np.ndarray, " num"]]:
     """Squared change of the images per squared change of each parameter, and contributions to the best frames.
 
@@ -40,7 +38,6 @@ def estimate_sensitivities(
             for name, gradient in to_columns(rows[frame.alive].astype(np.float64), frame.alive).items():
                 total[name][frame.alive] += gradient**2
             best[frame.alive] = np.maximum(best[frame.alive], frame.total)
-        on_frame()
     return total, best
 
 

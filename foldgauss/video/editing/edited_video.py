@@ -78,8 +78,7 @@ class EditedVideo(RenderedVideo, eqx.Module):
     def __check_init__(self) -> None:
         if not self.layers:
             raise invalid("layers", expected="at least one", got="none")
-        if not _is_index(self.timeline, len(self.layers)):
-            raise invalid("timeline", expected=f"the number of one of {len(self.layers)} layers", got=self.timeline)
+        check_timeline(self.timeline, len(self.layers), "layers")
         _check_compatible([layer.model for layer in self.layers])
 
     @property
@@ -144,8 +143,7 @@ def stack_layers(*videos: VideoModel | EditedVideo, timeline: int = -1) -> Edite
     parts = [as_edited(video) for video in videos]
     if not parts:
         raise invalid("videos", expected="at least one", got="none")
-    if not _is_index(timeline, len(parts)):
-        raise invalid("timeline", expected=f"the number of one of {len(parts)} videos", got=timeline)
+    check_timeline(timeline, len(parts), "videos")
     for part in parts:
         if part.camera is not None:
             cure = "Stack the layers first, then call edit(...).seen_from(camera)."
@@ -174,9 +172,10 @@ def as_edited(video: VideoModel | EditedVideo) -> EditedVideo:
     return EditedVideo((Layer(video),), timeline=0)
 
 
-def _is_index(number: object, num: int) -> bool:
-    """Whether `number` is an index into `num` items; below 0 it counts from the end."""
-    return is_integer(number, -num) and number < num
+def check_timeline(timeline: object, num: int, items: str) -> None:
+    """Raise ValueError unless it is an index into `num` items; below 0 it counts from the end."""
+    if not (is_integer(timeline, -num) and timeline < num):
+        raise invalid("timeline", expected=f"the number of one of {num} {items}", got=timeline)
 
 
 def _check_compatible(models: list[VideoModel]) -> None:

@@ -24,7 +24,7 @@ from foldgauss.video.motion.background_plate import (
     resize_frames,
     warp_by,
 )
-from foldgauss.video.motion.optical_flow import both_flows, pixel_grid
+from foldgauss.video.motion.optical_flow import both_flows, pixel_grid, warp_image
 
 _LOG = logging.getLogger(__name__)
 
@@ -280,7 +280,7 @@ def _agreement(there, back) -> Float32[np.ndarray, "rows columns"]:
     """1 where the flow back leads home again, to 0 where it misses by more than `VOTE_MISS` pixels, or out of sight."""
     rows, columns = there.shape[:2]
     target = pixel_grid(rows, columns) + there
-    miss = there + cv2.remap(back, target, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    miss = there + warp_image(back, target, cv2.INTER_LINEAR)
     inside = ((target >= 0) & (target <= np.float32([columns - 1, rows - 1]))).all(-1)
     return inside * np.exp(-(miss**2).sum(-1) / VOTE_MISS**2)
 

@@ -161,7 +161,7 @@ class Motion:
         home = np.full(len(grid), k)
         return grid, *self._step(home, grid, 1, self._color(home, grid))
 
-    def find_texture(self, k: int, spacing: int = 8) -> Float32[np.ndarray, " num"]:
+    def find_texture(self, k: int, spacing: int) -> Float32[np.ndarray, " num"]:
         """The slope of frame k, in levels per cell of the maps, at the points of `match_grid`."""
         gray, part = (
             cv2.cvtColor(self.small[k], cv2.COLOR_RGB2GRAY).astype(np.float32),

@@ -49,7 +49,7 @@ ROUNDS, WIDER = 4, 3.0
 FEWEST, AGREEING = 8, 6
 
 
-def find_shared_motions(motion: Motion, max_objects: int = MAX_OBJECTS) -> Float[np.ndarray, "paths frames 2 3"] | None:
+def find_shared_motions(motion: Motion) -> Float[np.ndarray, "paths frames 2 3"] | None:
     """The maps from coordinates that follow the camera to each frame, then those of objects, in model space.
 
     Those that move steadily are left out; None if all do. In the middle frame of each shot coordinates are the frame's,
@@ -64,7 +64,7 @@ def find_shared_motions(motion: Motion, max_objects: int = MAX_OBJECTS) -> Float
     camera = _fill_unknown(steps)
     path = clip.chain_within_limits(clip.keep_unsteady(steps))
     found = [path] if path is not None and (path != np.eye(3)).any() else []
-    found += _find_objects(clip, camera, max_objects, smooth=None if found else SMOOTH)
+    found += _find_objects(clip, camera, smooth=None if found else SMOOTH)
     return np.stack(found)[:, :, :2] if found else None
 
 
@@ -182,16 +182,14 @@ def _is_near(maps: Float[np.ndarray, "frames 3 3"]) -> bool:
 # ------------------------------------------------------------------------------------------------------- objects
 
 
-def _find_objects(
-    clip: _Clip, camera: Float[np.ndarray, "frames 3 3"], max_objects: int, smooth: float | None
-) -> list[np.ndarray]:
-    """Maps to each frame, (frames, 3, 3), of up to `max_objects`: one after another, what moves otherwise.
+def _find_objects(clip: _Clip, camera: Float[np.ndarray, "frames 3 3"], smooth: float | None) -> list[np.ndarray]:
+    """Maps to each frame, (frames, 3, 3), of up to `MAX_OBJECTS`: one after another, what moves otherwise.
 
     The search ends at one that is not unsteadier than `smooth`, if given.
     """
     points, limit = _Points.of(clip), STRAY * clip.inlier
     best, found = points.measure_stray(clip.chain(camera)), []
-    for _ in range(max_objects):
+    for _ in range(MAX_OBJECTS):
         followed = left = best > limit
         for _ in range(ROUNDS):
             if not points.are_enough(followed):

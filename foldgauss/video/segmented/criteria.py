@@ -17,7 +17,13 @@ from foldgauss.video.motion.moving_object import NothingMoves
 from foldgauss.video.segmented.segmented_selection import SegmentedSelection
 from foldgauss.video.segmented.segmented_video import Segment
 from foldgauss.video.selection.contributions import Contributions, render_matte
-from foldgauss.video.selection.regions import region_from_box, region_from_mask, region_from_polygon, resolve_frames
+from foldgauss.video.selection.regions import (
+    check_times,
+    region_from_box,
+    region_from_mask,
+    region_from_polygon,
+    resolve_frames,
+)
 from foldgauss.video.selection.selectors import (
     THRESHOLD,
     Selection,
@@ -110,10 +116,7 @@ class CriteriaEvaluator:
         """First and last frame position for `times`, else the range of frames."""
         if times is None:
             return resolve_frames(self.stand_in, frame, frames)
-        pair = np.asarray(times)
-        if pair.shape != (2,) or pair.dtype.kind not in "fiu" or not 0 <= pair[0] <= pair[1] <= 1:
-            raise invalid("times", expected="(start, stop) with 0 <= start <= stop <= 1", got=times)
-        return tuple(float(t) * (self.stand_in.num_frames - 1) for t in pair)
+        return tuple(t * (self.stand_in.num_frames - 1) for t in check_times(times))
 
 
 def _overlaps(positions: range | tuple[float, float], segment: Segment) -> bool:

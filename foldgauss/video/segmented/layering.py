@@ -6,10 +6,10 @@ import functools
 import numpy as np
 from jaxtyping import Float64
 
-from foldgauss._runtime.checks import invalid, is_integer
+from foldgauss._runtime.checks import invalid
 from foldgauss.video.editing.clip_window import FunctionOfTime
 from foldgauss.video.editing.clock import Clock
-from foldgauss.video.editing.edited_video import EditedVideo, Layer, as_edited, stack_layers
+from foldgauss.video.editing.edited_video import EditedVideo, Layer, as_edited, check_timeline, stack_layers
 from foldgauss.video.editing.layer_edits import gather_layer
 from foldgauss.video.editing.overlays import AbstractOverlay, GaussianFunction, Retiming, TriangleFunction, is_active
 from foldgauss.video.editing.span import NEVER, Span, distinct_knots
@@ -43,8 +43,7 @@ def layers(*videos: Video, timeline: int = -1) -> EditedVideo | SegmentedVideo:
     """
     if not any(isinstance(video, SegmentedVideo) for video in videos):
         return stack_layers(*videos, timeline=timeline)
-    if not (is_integer(timeline, -len(videos)) and timeline < len(videos)):
-        raise invalid("timeline", expected=f"the number of one of {len(videos)} videos", got=timeline)
+    check_timeline(timeline, len(videos), "videos")
     timeline %= len(videos)
     lead = videos[timeline]
     if not isinstance(lead, SegmentedVideo):

@@ -4,14 +4,13 @@ import dataclasses
 import math
 import os
 from collections.abc import Callable, Mapping
-from numbers import Integral
 
 import cv2
 import numpy as np
 import skimage
 from jaxtyping import ArrayLike, Bool, Float, Float32
 
-from foldgauss._runtime.checks import invalid, is_integer, is_within, short_repr
+from foldgauss._runtime.checks import check_within, invalid, is_integer, short_repr
 from foldgauss.video.models.video_model import VideoModel, check_model
 
 Mask = Bool[np.ndarray, "height width"] | Float[np.ndarray, "height width"]
@@ -108,9 +107,16 @@ def resolve_frames(model: VideoModel, frame: int | None, frames: tuple[int, int]
 
 def check_number(name: str, value: object, bounds: str) -> float:
     """As float. Raises ValueError unless it is a number within the bounds."""
-    if not is_within(value, bounds):
-        raise invalid(name, expected=f"a number in {bounds}", got=repr(value))
+    check_within(name, value, bounds, f"a number in {bounds}")
     return float(value)
+
+
+def check_times(times: object) -> tuple[float, float]:
+    """As floats (start, stop). Raises ValueError unless 0 <= start <= stop <= 1."""
+    pair = _as_array(times)
+    if pair.shape != (2,) or pair.dtype.kind not in "fiu" or not 0 <= pair[0] <= pair[1] <= 1:
+        raise invalid("times", expected="(start, stop) with 0 <= start <= stop <= 1", got=times)
+    return float(pair[0]), float(pair[1])
 
 
 def _constant_region(name, model, inside: Bool[np.ndarray, "height width"], frame, frames) -> Region:
@@ -124,7 +130,7 @@ def _constant_region(name, model, inside: Bool[np.ndarray, "height width"], fram
 
 
 def _check_frame(model: VideoModel, k: object) -> int:
-    if not isinstance(k, Integral) or isinstance(k, bool) or not 0 <= k < model.num_frames:
+    if not (is_integer(k, 0) and k < model.num_frames):
         raise invalid("frame", expected=f"a frame's number in [0, {model.num_frames})", got=repr(k))
     return int(k)
 

@@ -26,6 +26,7 @@ from foldgauss.video.selection.regions import (
     Masks,
     Region,
     check_number,
+    check_times,
     region_from_box,
     region_from_mask,
     region_from_polygon,
@@ -513,7 +514,4 @@ def _resolve_span(
             return 0.0, 1.0  # a single frame covers all times
         ends = np.array([chosen[0], chosen[-1]]) + (np.array([-0.5, 0.5]) if widen else 0)
         return tuple(np.interp(ends, np.arange(num_frames), contributions.times))
-    pair = np.asarray(times)
-    if pair.shape != (2,) or pair.dtype.kind not in "fiu" or not 0 <= pair[0] <= pair[1] <= 1:
-        raise invalid("times", expected="(start, stop) with 0 <= start <= stop <= 1", got=times)
-    return float(pair[0]), float(pair[1])
+    return check_times(times)

@@ -105,7 +105,7 @@ class PrunedRows(NamedTuple):
     price: float
 
 
-def compute_price(scores: PruningScores, bits: float, progress: float = 1.0) -> float:
+def compute_price(scores: PruningScores, bits: float, progress: float) -> float:
     """The squared error that a parameter has to save: its bits, at d(n / 2 log2 e) / de = n / (2 e ln 2).
 
     The error is that expected at the end of the fit, `progress` being the fraction of the plan that is done.

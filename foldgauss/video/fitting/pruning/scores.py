@@ -47,7 +47,6 @@ class PruningScores:
     errors: Float[np.ndarray, " num_frames"]
     weights: Float[np.ndarray, " num_frames"]
     num_samples: int
-    size: tuple[int, int]
     correlation: Float[np.ndarray, "3"]
     first_order: Float[np.ndarray, " num"]
     second_order: Float[np.ndarray, " num"]
@@ -157,7 +156,6 @@ def measure_scores(
     options: RenderOptions,
     weights: Float[np.ndarray, " num_frames"] | None = None,
     seed: int = 0,
-    on_frame: Callable[[], None] = lambda: None,
 ) -> PruningScores:
     """The scores of packed rows against frames with `weights`; None: all 1.
 
@@ -185,7 +183,6 @@ def measure_scores(
         errors[k] = np.vdot(residual, residual)
         products += _products(residual, before)
         before = residual
-        on_frame()
         if not len(alive):
             continue
         first_order[alive] -= 2 * weights[k] * done.opacity * cpu.backward(trace, residual)[2]
@@ -207,7 +204,7 @@ def measure_scores(
     num_samples = len(times) * 3 * math.prod(shape.size)
     lines = np.array([len(times), *shape.size])
     correlation = products * lines / np.maximum(lines - 1, 1) / max(errors.sum(), np.finfo(float).tiny)
-    of_frames = errors, weights, num_samples, shape.size, correlation
+    of_frames = errors, weights, num_samples, correlation
     orders = first_order, second_order
     return PruningScores(*of_frames, *orders, by_path, span, by_color, by_axes, by_size, misses)
 
