@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Float16, Float32, Int, UInt8
 from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
-from foldgauss.video.motion.optical_flow import both_flows, pixel_grid, warp_image
+from foldgauss.video.motion.optical_flow import both_flows, match_points
 
 _LOG = logging.getLogger(__name__)
 
@@ -232,17 +232,10 @@ def _align(one, other, start: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarra
 
 def find_homography(there, back, inside=None) -> tuple[Float[np.ndarray, "3 3"], float] | None:
     """The homography that most points follow, and their fraction; None if the flow is that of two different scenes."""
-    rows, columns = there.shape[:2]
-    part = slice(SPACING // 2, None, SPACING)
-    points, flow = pixel_grid(rows, columns)[part, part].reshape(-1, 2), there[part, part].reshape(-1, 2)
+    points, target, known = match_points(there, back, SPACING, MISS, MISS_FRACTION)
     if inside is not None:
-        points, flow = points[inside[part, part].ravel()], flow[inside[part, part].ravel()]
-    if len(points) < LEAST_POINTS:
-        return None
-    target = points + flow
-    returned = warp_image(back, target[None], cv2.INTER_LINEAR)[0]
-    known = ((target >= 0) & (target <= np.float32([columns - 1, rows - 1]))).all(1)
-    known &= np.hypot(*(flow + returned).T) < MISS + MISS_FRACTION * np.hypot(*flow.T)
+        part = slice(SPACING // 2, None, SPACING)
+        points, target, known = (leaf[inside[part, part].ravel()] for leaf in (points, target, known))
     if known.sum() < max(LEAST_POINTS, LEAST_KNOWN * len(points)):
         return None
     cv2.setRNGSeed(0)

@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 from foldgauss._runtime.checks import invalid, is_within
 from foldgauss.video.models.frame_times import is_cut
 from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer
-from foldgauss.video.motion.optical_flow import both_flows, pixel_grid, warp_image
+from foldgauss.video.motion.optical_flow import both_flows, match_points
 
 #: The longer side, in pixels, of the images that flow is computed on, and the distance of the points in them.
 SIDE, SPACING = 480, 6
@@ -134,13 +134,7 @@ def estimate_affine(
 
     None where it is less than `LEAST_INLIERS`.
     """
-    there, back = both_flows(one, other)
-    part = slice(SPACING // 2, None, SPACING)
-    points, flow = (map[part, part].reshape(-1, 2) for map in (pixel_grid(*one.shape), there))
-    target = points + flow
-    returned = warp_image(back, target[None], cv2.INTER_LINEAR)[0]
-    inside = ((target >= 0) & (target <= np.float32(one.shape[::-1]) - 1)).all(1)
-    known = inside & (np.hypot(*(flow + returned).T) < MISS + MISS_FRACTION * np.hypot(*flow.T))
+    points, target, known = match_points(*both_flows(one, other), SPACING, MISS, MISS_FRACTION)
     found = fit_affine(points[known], target[known], INLIER, LEAST_INLIERS * len(points))
     return None if found is None else (found[0], found[1] / len(points))
 

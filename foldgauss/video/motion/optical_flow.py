@@ -346,6 +346,21 @@ def both_flows(
     return search.calc(one, other, None), search.calc(other, one, None)
 
 
+def match_points(there, back, spacing: int, miss: float, miss_fraction: float) -> tuple[np.ndarray, ...]:
+    """Every `spacing`-th pixel of an image (num, 2), where flow leads it in the other one, and which are reliable.
+
+    Those are whose target is inside, and from there the flow back misses by less than `miss` pixels plus this fraction
+    of the distance.
+    """
+    rows, columns = there.shape[:2]
+    part = slice(spacing // 2, None, spacing)
+    points, flow = (of_pixels[part, part].reshape(-1, 2) for of_pixels in (pixel_grid(rows, columns), there))
+    target = points + flow
+    returned = warp_image(back, target[None], cv2.INTER_LINEAR)[0]
+    inside = ((target >= 0) & (target <= np.float32([columns - 1, rows - 1]))).all(1)
+    return points, target, inside & (np.hypot(*(flow + returned).T) < miss + miss_fraction * np.hypot(*flow.T))
+
+
 @functools.lru_cache(maxsize=4)
 def pixel_grid(rows: int, columns: int) -> Float32[np.ndarray, "rows columns 2"]:
     """(x, y) of every pixel, centers at whole numbers, as in OpenCV; the array is shared and read-only."""
