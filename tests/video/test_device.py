@@ -307,7 +307,7 @@ def test_pallas_step_matches_xla():
         for _ in range(2):
             step.step(state, 0.1)
             state.step += 1
-        own[engine] = state.land() or state
+        own[engine] = state.fetch_all() or state
     for name in ("rows", "first", "second", "frame_errors", "time_logits", "path_maps", "path_first", "path_second"):
         close(getattr(own["pallas"], name), getattr(own["xla"], name), share=1e-4)
 

@@ -161,7 +161,7 @@ def test_a_device_gives_every_array_back(monkeypatch, growing):
     copy = state.copy()
     state.rows = state.rows + 1
     assert state.changed
-    state.land()
+    state.fetch_all()
     np.testing.assert_array_equal(state.rows, before.rows + 1)
     np.testing.assert_array_equal(copy.rows, before.rows)
     assert all(name in vars(state) for name in ARRAYS)

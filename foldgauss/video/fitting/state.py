@@ -312,7 +312,7 @@ class FitState:
             self.__dict__.pop(name, None)
         self.held = held
 
-    def land(self) -> None:
+    def fetch_all(self) -> None:
         """Fetch all arrays that were not assigned meanwhile, and hold none any more."""
         if self.held is not None:
             arrays = {name: getattr(self, name) for name in ARRAYS}

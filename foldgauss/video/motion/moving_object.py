@@ -43,11 +43,12 @@ MAYBE, PROBABLY, CERTAINLY, TOP, FAINTEST, LEAST_EVIDENCE = 0.3, 0.5, 0.8, 99.8,
 #: Votes are passed on to the next frame at this rate: of motion, and of masks. Flow must agree with the flow back
 #: within about so many pixels.
 MOTION_VOTE, MASK_VOTE, VOTE_MISS = 0.6, 0.8, 1.5
-#: A shadow darkens all channels alike, to this difference of logarithms. It may be slight where borders are sought;
-#: it is cut off below an object where it is strong.
+#: A shadow darkens all channels alike: logarithms of ratios differ by less than `HUE`. Their mean is below `SLIGHT`
+#: where borders are sought, below `STRONG` where shadow is cut off below an object, and always above `DARKEST`.
 HUE, SLIGHT, STRONG, DARKEST = 0.12, -0.1, -0.6, -2.2
-#: The smallest piece, a fraction of the image. A piece follows if this fraction of it, or so much of what is expected,
-#: is where it is expected; the frame has lost the object below a tenth of its usual area.
+#: The smallest piece, a fraction of the image. A piece follows if the fraction `INSIDE` of it is where the object is
+#: expected, or if it covers the fraction `REFOUND` of that. The object is lost in a frame where its area is below the
+#: fraction `LOST` of the usual one; where it is above `MERGED` times that, it touches another object.
 SMALLEST, INSIDE, REFOUND, LOST, MERGED = 3e-4, 0.5, 0.4, 0.1, 2.0
 #: A lost object is sought this many pixels further in each frame, at most this fraction of the longer side away.
 SEARCH, FARTHEST = 6, 0.125

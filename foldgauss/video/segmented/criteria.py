@@ -91,7 +91,7 @@ class CriteriaEvaluator:
         Raises `NothingMoves` if nothing moves in any of them.
         """
         positions = self._positions(**arguments) if function is by_time else None
-        parts, still = [], []
+        parts, motionless = [], []
         for number, segment in enumerate(self.segments):
             if within is not None and not len(within.parts[number]):
                 parts.append(within.parts[number])
@@ -105,11 +105,11 @@ class CriteriaEvaluator:
                 try:
                     parts.append(self.evaluate_segment(one, lambda model, _, own=own: function(model, **own)))
                 except NothingMoves as error:
-                    still.append(error)
+                    motionless.append(error)
                     _LOG.info("%s", error)
                     parts.append(self.select_none(number))
-        if still and len(still) == len(parts):
-            raise still[0]
+        if motionless and len(motionless) == len(parts):
+            raise motionless[0]
         return SegmentedSelection(tuple(parts))
 
     def _positions(self, times: Any = None, frame: Any = None, frames: Any = None, alive: bool = False) -> Any:

@@ -39,10 +39,10 @@ class Control(NamedTuple):
     rates: Float[Array, " width"]
     time_rate: Float[Array, ""]
     path_rate: Float[Array, ""]
-    between: "Between | None" = None  # where the fit interpolates frames
+    interpolated: "InterpolatedViews | None" = None  # where the fit interpolates frames
 
 
-class Between(NamedTuple):
+class InterpolatedViews(NamedTuple):
     """The views of a step whose targets are interpolated, see `interpolated_frames`."""
 
     fractions: Float[Array, " batch"]  # of the way from frame k to the next; negative: the view is the frame itself
@@ -134,10 +134,10 @@ def _specs(program: Program) -> tuple[DeviceArrays, jax.ShapeDtypeStruct, Contro
     kinds = FitState.array_fields()
     arrays = DeviceArrays(*(kinds[name].spec(sizes) for name in DeviceArrays._fields))
     views, num = spec(program.batch_size, dtype=np.int32), spec(dtype=np.int32)
-    between = None
+    interpolated = None
     if program.interpolates:
-        between = Between(spec(program.batch_size), spec(program.batch_size, *program.size, 3))
-    control = Control(views, num, spec(dtype=np.bool_), spec(program.num_trained), spec(), spec(), between)
+        interpolated = InterpolatedViews(spec(program.batch_size), spec(program.batch_size, *program.size, 3))
+    control = Control(views, num, spec(dtype=np.bool_), spec(program.num_trained), spec(), spec(), interpolated)
     return arrays, spec(program.num_frames, *program.size, 3, dtype=np.uint8), control
 
 
@@ -237,8 +237,8 @@ def _distribute(program: Program):
             largest(own.screen),
         )
 
-    between = Between(views, views) if program.interpolates else None
-    own = Control(views, num=whole, squared=whole, rates=whole, time_rate=whole, path_rate=whole, between=between)
+    interpolated = InterpolatedViews(views, views) if program.interpolates else None
+    own = Control(views, *5 * [whole], interpolated)
     # The replication check does not support the loops inside.
     return jax.shard_map(on_each, mesh=mesh, in_specs=(*4 * [whole], own), out_specs=whole, check_vma=False)
 
@@ -251,8 +251,8 @@ def _differentiate(program: Program, rows, path_maps, times, frames, control: Co
     k, mirrored = control.views % program.num_frames, control.views >= program.num_frames
     t, target, whole = times[k], frames[k].astype(jnp.float32) * np.float32(1 / 255), jnp.ones(len(k), bool)
     maps = path_maps[k]
-    if control.between is not None:
-        fractions, targets = control.between
+    if control.interpolated is not None:
+        fractions, targets = control.interpolated
         whole = fractions < 0
         after = jnp.minimum(k + 1, program.num_frames - 1)
         t = jnp.where(whole, t, (1 - fractions) * t + fractions * times[after])

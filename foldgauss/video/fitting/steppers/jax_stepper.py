@@ -25,8 +25,8 @@ from foldgauss.video.fitting.schedule import (
 from foldgauss.video.fitting.state import DeviceArrays, FitState, Sizes, frame_times
 from foldgauss.video.fitting.steppers.interpolated_frames import Prefetcher, make_interpolated
 from foldgauss.video.fitting.steppers.jax_step import (
-    Between,
     Control,
+    InterpolatedViews,
     Program,
     Report,
     compile_error,
@@ -133,7 +133,7 @@ class JaxStepper:
 
     def step(self, state: FitState, progress: float, level: int = -1) -> StepResult:
         if state.changed:  # by an observer of the fit
-            state.land()
+            state.fetch_all()
             self.adopt(state)
         held, config = state.held, self.config
         rates, time_rate = self.rates.at(progress, state.backoffs)
@@ -145,7 +145,7 @@ class JaxStepper:
             rates=rates,
             time_rate=time_rate,
             path_rate=self.rates.of_paths(progress, state.backoffs),
-            between=self._interpolate(views, state.step, progress, self.levels[level].size),
+            interpolated=self._interpolate(views, state.step, progress, self.levels[level].size),
         )
         self._prepare(state, progress, self.levels[level].size)
         arrays, report = compile_step(self.programs[level])(held.arrays, self.images[level], control)
@@ -153,7 +153,9 @@ class JaxStepper:
         state.hold(HeldArrays(arrays, held.num, held.growing, report))
         return StepResult(float(report.loss), int(report.num_alive), state.is_finite("rows"))
 
-    def _interpolate(self, views: np.ndarray, step: int, progress: float, size: tuple[int, int]) -> Between | None:
+    def _interpolate(
+        self, views: np.ndarray, step: int, progress: float, size: tuple[int, int]
+    ) -> InterpolatedViews | None:
         """The interpolated targets of a step, of `size`; None if the fit has none at all."""
         if self.interpolation is None:
             return None
@@ -167,7 +169,7 @@ class JaxStepper:
             if size not in self._no_targets:
                 self._no_targets[size] = jax.device_put(targets, replicated(self.programs[-1]))
             targets = self._no_targets[size]
-        return Between(fractions, targets)
+        return InterpolatedViews(fractions, targets)
 
     def _prepare(self, state: FitState, progress: float, size: tuple[int, int]) -> None:
         """Have the interpolated frames of the next steps prepared, which are chosen by the errors as they are now."""
@@ -186,7 +188,7 @@ class JaxStepper:
         """Densification on the host, where any is due."""
         growth = self.config.growth.for_plan(state.plan)
         if growth.changes_at(state.step):
-            state.land()
+            state.fetch_all()
             grow(state, self.config, self.size)
             self.adopt(state)
         elif state.step + 1 >= growth.until_step:
@@ -196,7 +198,7 @@ class JaxStepper:
         """On the host."""
         config, (height, width) = self.config, self.size
         spec = ConditioningSpec(config.degree, config.power, config.floor, (height, width))
-        state.land()
+        state.fetch_all()
         relocate(state, self.frames, config, spec, self.find_motion() if config.follow_motion else None)
         self.adopt(state)
 
