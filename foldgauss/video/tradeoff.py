@@ -219,19 +219,19 @@ def _costs(points: Sequence[Point], throughput: Throughput, num_frames: int) -> 
     )
 
 
-def pareto_front(cost: Sequence[float], quality: Sequence[float]) -> list[int]:
-    """Indices of the Pareto front, the cheapest first: each is better by more than `LEAST_GAIN` than all cheaper ones.
+def pareto_front(cost: Sequence[float], quality: Sequence[float], least_gain: float = LEAST_GAIN) -> list[int]:
+    """Indices of the Pareto front, the cheapest first: each is better by more than `least_gain` than all cheaper ones.
 
     **Shapes:** one cost and one quality per point. Points with NaN or infinities are left out; of points with the same
-    cost and qualities within `LEAST_GAIN`, the first one is taken.
+    cost and qualities within `least_gain`, the first one is taken.
 
     **Example:** `pareto_front([1, 2, 3], [30, 29, 33]) == [0, 2]`.
     """
     finite = [k for k in range(len(cost)) if math.isfinite(cost[k]) and math.isfinite(quality[k])]
     chosen, best = [], -math.inf
     for k in sorted(finite, key=lambda k: (cost[k], -quality[k])):
-        if quality[k] > best + LEAST_GAIN:
-            least = max(quality[k] - LEAST_GAIN, best + LEAST_GAIN)
+        if quality[k] > best + least_gain:
+            least = max(quality[k] - least_gain, best + least_gain)
             chosen.append(next(j for j in finite if cost[j] == cost[k] and quality[j] >= least))
             best = quality[k]
     return chosen
