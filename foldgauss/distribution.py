@@ -33,7 +33,7 @@ from foldgauss.analysis import interop, moments
 from foldgauss.analysis.conditional import TimeDensity, TimeMixture, conditional_gaussian, time_density, time_mixture
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood, as_envelope
 from foldgauss.fold import AbstractFold, ZeroFold, as_fold, evaluate_shift, restrict_fold
-from foldgauss.gaussian import Gaussian, Normal
+from foldgauss.gaussian import Gaussian, Normal, times_exp
 
 __all__ = ["FoldedGaussian", "Gaussian", "Normal"]
 
@@ -445,14 +445,13 @@ class FoldedGaussian(BatchModule):
 def _whiten(at: Gaussian, s: Array) -> tuple[Array, Array]:
     """Standard normal coordinates of s, and log |dz/ds|."""
     y = join_columns(solve_lower(at.base_tril, split_columns(s - at.loc)))
-    half = jnp.exp(-0.5 * at.log_scale)[..., None]  # twice: the product may fit where exp(-log_scale) does not
-    return y * half * half, -_log_det(at)
+    return times_exp(y, -at.log_scale[..., None]), -_log_det(at)
 
 
 def _unwhiten(at: Gaussian, z: Array) -> tuple[Array, Array]:
     """The inverse of `_whiten`: s, and log |ds/dz|."""
-    half = jnp.exp(0.5 * at.log_scale)[..., None]
-    return at.loc + join_columns(multiply_lower(at.base_tril, split_columns(z))) * half * half, _log_det(at)
+    y = join_columns(multiply_lower(at.base_tril, split_columns(z)))
+    return at.loc + times_exp(y, at.log_scale[..., None]), _log_det(at)
 
 
 def _log_det(at: Gaussian) -> Array:

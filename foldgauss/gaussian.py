@@ -201,7 +201,10 @@ class Gaussian(BatchModule):
     @property
     def stddev(self) -> Float[Array, "*batch dim"]:
         """Standard deviations of the coordinates, which do not underflow where `variance` does."""
-        by_row = jnp.exp(self.log_scale)[..., None] * jnp.sqrt((self.base_tril**2).sum(-1))
+        unit = lax.stop_gradient(jnp.abs(self.base_tril).max(-1))  # squares may be out of the dtype's range
+        unit = jnp.where((unit > 0) & jnp.isfinite(unit), unit, 1)
+        length = unit * jnp.sqrt(((self.base_tril / unit[..., None]) ** 2).sum(-1))
+        by_row = jnp.exp(self.log_scale)[..., None] * length
         return jnp.broadcast_to(by_row, (*self.batch_shape, *self.event_shape))
 
     def entropy(self) -> Float[Array, "*batch"]:
@@ -301,7 +304,7 @@ def _scaled_log_prob(root: Array | None, value: Array, loc: Array, tril: Array, 
 def _half_mahalanobis(value, loc, tril, log_scale, root):
     """root^2 |L^-1 (value - loc)|^2 exp(-2 log_scale) / 2; inf wherever it is inf for root = 1."""
     residual = split_columns(value - loc)
-    z = [_times_exp(y, -log_scale[..., None]) for y in solve_lower(tril, residual)]
+    z = [times_exp(y, -log_scale[..., None]) for y in solve_lower(tril, residual)]
     # A residual that is infinite in one coordinate would give 0 * inf with zeros of L.
     beyond = _any([jnp.isinf(r) for r in residual])
     half = _sum([0.5 * y * y for y in z])
@@ -319,9 +322,9 @@ def _half_mahalanobis_jvp(primals, tangents):
     half = _half_mahalanobis(value, loc, tril, log_scale, root)
     unreachable, c = jnp.isposinf(half)[..., None], -log_scale[..., None]
     residual = [jnp.where(unreachable, 0, r) for r in split_columns(value - loc)]
-    z = [_times_exp(jnp.where(unreachable, 0, y), c, root) for y in solve_lower(tril, residual)]
+    z = [times_exp(jnp.where(unreachable, 0, y), c, root) for y in solve_lower(tril, residual)]
     w = solve_upper(tril, z)
-    by_residual = [_times_exp(y, c, root) for y in w]
+    by_residual = [times_exp(y, c, root) for y in w]
     # The barrier separates the gradients of single coordinates from their concatenation. XLA on the CPU would fuse the
     # two and then select the coordinate again for every element: many times slower.
     residual_dot = lax.optimization_barrier(split_columns(value_dot - loc_dot))
@@ -341,18 +344,18 @@ def _any(flags: Columns) -> Bool[Array, "*#batch"]:
 
 
 @jax.custom_jvp
-def _times_exp(y: Float[Array, "*#batch"], c: Float[Array, "*#batch"], root: Array | None = None):
+def times_exp(y: Float[Array, "*#batch"], c: Float[Array, "*#batch"], root: Array | None = None):
     """root y exp(c), infinite only where the product is, not where exp(c) is."""
     largest = _log_largest(y.dtype)
     half = jnp.exp(0.5 * jnp.clip(c, -2 * largest, 2 * largest))
     return y * (half if root is None else half * root) * half
 
 
-@_times_exp.defjvp
+@times_exp.defjvp
 def _times_exp_jvp(primals, tangents):
     (y, c, root), (y_dot, c_dot, _) = primals, tangents
-    product = _times_exp(y, c, root)
-    return product, _times_exp(y_dot, c, root) + product * c_dot
+    product = times_exp(y, c, root)
+    return product, times_exp(y_dot, c, root) + product * c_dot
 
 
 def _times_square(x: Array, root: Array | None) -> Array:

@@ -509,7 +509,8 @@ def _as_normal(components: Gaussian) -> Normal:
     if components.event_shape != (1,):
         got = f"event_shape {components.event_shape}"
         raise invalid("mixture", expected="a single coordinate", got=got, cure="Take marginal([i]) first.")
-    return Normal(components.loc[..., 0], components.stddev[..., 0], validate_args=False)
+    stddev = components.stddev[..., 0]  # 0 where it underflows, far from a component's time
+    return Normal(components.loc[..., 0], jnp.maximum(stddev, float(jnp.finfo(stddev.dtype).tiny)), validate_args=False)
 
 
 @eqx.filter_jit
@@ -520,7 +521,7 @@ def _cdf(weights: Array, components: Normal | TimeDensity, t: Array) -> Array:
 @eqx.filter_jit
 def _icdf(weights: Array, components: Normal | TimeDensity, q: Array) -> Array:
     """Bisection between the least and the greatest of the components' quantiles."""
-    quantiles, _ = lax.stop_gradient((components.icdf(q[..., None]), q))
+    quantiles = lax.stop_gradient(components.icdf(q[..., None]))
     (aligned,) = align([(weights, 0)], quantiles.ndim)
     low = jnp.where(aligned > 0, quantiles, jnp.inf).min(-1)
     high = jnp.where(aligned > 0, quantiles, -jnp.inf).max(-1)

@@ -189,6 +189,14 @@ def test_batches_in_float32_agree_with_a_loop_in_float64(floors):
     np.testing.assert_allclose(divergence[finite], expected[finite], rtol=1e-4, atol=1e-5)
 
 
+def test_gaussians_far_from_time_loc():
+    """1 / a is out of range: centers that are equal must not make it NaN."""
+    far = _dist().condition_time(0.4 + 60 * 0.3)
+    assert kl_divergence(far, far) == 0
+    moved = Gaussian(far.loc + 1, far.base_tril, log_scale=far.log_scale)
+    assert np.isposinf(kl_divergence(far, moved))
+
+
 def test_bad_pairs_are_refused():
     with pytest.raises(ValueError, match=r"^p, q: expected two distributions of one class and dimension, got "):
         kl_divergence(_dist(), Normal(0.0, 1.0))

@@ -45,6 +45,16 @@ def _dist(power=1.0, floor=0.0, **changes):
     return FoldedGaussian(**(parameters | {"envelope": TimeLikelihood(power, floor)} | changes))
 
 
+def test_whitening_on_the_ridge_far_from_time_loc():
+    """The center there is whitened to 0, although 1 / sqrt(a) is out of range."""
+    dist = _dist(fold=ZeroFold(2))
+    t = dist.time_loc + 80 * dist.time_scale
+    center = dist.condition_time(t).loc
+    z, _ = WHITEN(dist, jnp.concatenate([center, t[None]]))
+    np.testing.assert_array_equal(z[:2], 0)
+    np.testing.assert_allclose(z[2], 80, rtol=1e-12)
+
+
 def _book_moments(power, floor, coefficients=BEND, scale=0.3):
     """The laws of total mean and covariance, integrated by Gauss-Hermite in NumPy."""
     tau, weights = np.polynomial.hermite_e.hermegauss(80)

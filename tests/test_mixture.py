@@ -377,6 +377,14 @@ def test_time_posterior(x64):
 # --- weights of zero, and points far away ---------------------------------------------------------------------
 
 
+def test_cdf_where_standard_deviations_underflow():
+    """A step at the center: one half there, not 0 / 0."""
+    components = FoldedGaussian([[0.5]], [[0.2]], time_loc=[0.0], time_scale=1.0)
+    far = FoldedMixture(components, weights=[1.0]).condition_time(20.0)
+    assert (far.components.stddev == 0).all()
+    np.testing.assert_array_equal(far.cdf(jnp.array([[0.4], [0.5], [0.6]])), [0, 0.5, 1])
+
+
 def test_cdf_and_quantiles_of_a_gaussian_mixture(x64):
     weights, loc, scale = (
         np.array([0.3, 0.0, 0.7]),

@@ -11,7 +11,7 @@ from foldgauss._runtime.checks import invalid
 from foldgauss.analysis.moments import mean_log_envelope
 from foldgauss.analysis.quadrature import SEARCH_GRID, adaptive_panels, diverges, find_peaks, gauss_hermite, normal_rule
 from foldgauss.envelope import Constant, TimeLikelihood
-from foldgauss.gaussian import Gaussian, Normal
+from foldgauss.gaussian import Gaussian, Normal, times_exp
 
 __all__ = ["kl_divergence"]
 
@@ -83,8 +83,8 @@ def _kl_normal(loc_p, scale_p, loc_q, scale_q):
 def _kl_gaussian(p: Gaussian, q: Gaussian):
     dim, log_ratio = p.loc.shape[-1], q.log_scale - p.log_scale
     trace, log_det = _trace_and_log_det(p.base_tril, q.base_tril)
-    distance = (_solve(q.base_tril, (p.loc - q.loc)[..., None]) ** 2).sum((-2, -1)) * jnp.exp(-2 * q.log_scale)
-    return 0.5 * (trace * jnp.exp(-2 * log_ratio) - dim + log_det + distance) + dim * log_ratio
+    whitened = times_exp(_solve(q.base_tril, (p.loc - q.loc)[..., None]), -q.log_scale[..., None, None])
+    return 0.5 * (trace * jnp.exp(-2 * log_ratio) - dim + log_det + (whitened**2).sum((-2, -1))) + dim * log_ratio
 
 
 def _trace_and_log_det(tril_p, tril_q):
