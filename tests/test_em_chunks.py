@@ -90,6 +90,13 @@ class _Files:
         return (part.copy() for part in self.parts)
 
 
+class _Lists(_Files):
+    """Chunks that are lists of rows, as text files give them."""
+
+    def __iter__(self):
+        return (part.tolist() for part in self.parts)
+
+
 class _Changing:
     """Other rows in each pass."""
 
@@ -429,6 +436,15 @@ def test_invalid_dask_arrays_raise():
     ]:
         with pytest.raises(ValueError, match=match):
             _fit(data, weights)
+
+
+def test_chunks_may_be_lists_of_rows():
+    x = _tracks()
+    parts = np.split(x, (1, 90, 350))
+    fitted = _fit(_Lists(parts))
+    np.testing.assert_array_equal(np.concatenate(list(fitted.predict(_Lists(parts)))), fitted.predict(x))
+    scores = np.concatenate(list(fitted.score_samples(_Lists(parts))))
+    np.testing.assert_allclose(scores, fitted.score_samples(x), rtol=1e-12)
 
 
 def test_prediction_checks_chunks():

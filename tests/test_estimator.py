@@ -83,6 +83,14 @@ def test_passes_quick_checks(check):
         getattr(estimator_checks, check)("FoldedGaussianMixture", estimator)
 
 
+def test_an_initial_weight_may_be_0():
+    """Without a warning of NumPy's, which is an error here; the component is reset."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        fitted = FoldedGaussianMixture(2, degree=1, weights_init=[1.0, 0.0], random_state=0).fit(_blobs())
+    assert (fitted.weights_ > 0).all()
+
+
 @pytest.mark.parametrize(("kind", "degree"), [("full", 1), pytest.param("diag", 0, marks=pytest.mark.slow)])
 def test_linear_folds_match_scikit_learn(kind, degree):
     """A linear fold is a full covariance, no fold a diagonal one: the same start, the same iterations."""

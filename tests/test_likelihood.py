@@ -280,6 +280,12 @@ def test_bootstrap_agrees_with_fresh_data(x64):
         np.testing.assert_allclose(errors[name], getattr(fresh, name).std(0), rtol=0.15)
 
 
+@pytest.mark.parametrize("number", [-1, 1, 2.5])
+def test_the_number_of_replicates_is_checked(number):
+    with pytest.raises(ValueError, match=r"^num_replicates: expected a whole number >= 2, got "):
+        bootstrap(None, jax.random.key(0), number)
+
+
 def test_bootstrap_of_a_failed_fit_raises(x64):
     failed = fit(np.zeros((60, 3)), degree=2)
     with pytest.raises(ValueError, match="SINGULAR_TIME"):

@@ -318,7 +318,7 @@ def _check_chunk(number: int, x, width: int | None):
 def _split_pieces(chunks: Iterable[tuple], width: int | None) -> Iterator[Piece]:
     """Split chunks to checked pieces; `width` None means that of the first chunk."""
     for number, x, weights in chunks:
-        _check_chunk(number, x, width)
+        x = _check_chunk(number, x, width)
         width = x.shape[1]
         for row in range(0, len(x), _PIECE_ROWS):
             rows = slice(row, row + _PIECE_ROWS)

@@ -18,7 +18,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key
 from foldgauss._numerics.batch import cast
 from foldgauss._numerics.regression import hermite, hermite_to_powers
 from foldgauss._numerics.triangular import solve_upper_matrix
-from foldgauss._runtime.checks import check_one_of, invalid
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer
 from foldgauss._runtime.threads import check_not_forked
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood
@@ -437,7 +437,7 @@ def bootstrap(result: Fit, key: Key[Array, ""], num_replicates: int = 200, *, ba
     **Source:** Efron and Tibshirani, An Introduction to the Bootstrap, section 6.5.
     **Raises:** ValueError if the fit failed, or `num_replicates` is below 2.
     """
-    if _check_degree("num_replicates", num_replicates) < 2:
+    if not is_integer(num_replicates, 2):
         raise invalid("num_replicates", expected="a whole number >= 2", got=num_replicates, cure="200 is usual.")
     if int(result.status) not in (FitStatus.OK, FitStatus.NOT_CONVERGED):
         result.check()
@@ -571,7 +571,7 @@ def _check_bounded(envelope: AbstractEnvelope, dim: int) -> None:
 
 
 def _check_degree(name: str, value) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
+    if not is_integer(value, 0):
         raise invalid(name, expected="a whole number >= 0", got=repr(value))
     return int(value)
 

@@ -87,7 +87,9 @@ def params_from_gaussians(weights, means, covariances, degree: int, dtype) -> Pa
     curve[:, 0] = means[:, :-1]
     if degree:
         curve[:, 1] = -slope * np.sqrt(variance)[:, None]  # v decreases with time
-    parts = (np.log(weights), means[:, -1], np.sqrt(variance), curve, np.linalg.cholesky(conditional))
+    with np.errstate(divide="ignore"):  # of a weight of 0
+        log_weights = np.log(weights)
+    parts = (log_weights, means[:, -1], np.sqrt(variance), curve, np.linalg.cholesky(conditional))
     return Parameters(*(jnp.asarray(z, dtype) for z in parts))
 
 
