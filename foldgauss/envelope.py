@@ -99,7 +99,9 @@ class TimeLikelihood(AbstractEnvelope):
 
     def log_a(self, t, *, time_loc, time_scale):
         t, time_loc, time_scale, power, floor = jnp.broadcast_arrays(t, time_loc, time_scale, self.power, self.floor)
-        tau = _bounded_tau(t - time_loc, time_scale)
+        offset = t - time_loc
+        offset = offset if jnp.issubdtype(offset.dtype, jnp.floating) else offset.astype(self.power.dtype)
+        tau = _bounded_tau(offset, time_scale)
         return _log_floored(0.5 * power * tau * tau, floor)
 
 

@@ -17,11 +17,18 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
-from foldgauss._numerics.batch import BatchModule, common_dtype, concrete_value, expand_leaves, ranked_leaves
+from foldgauss._numerics.batch import (
+    BatchModule,
+    as_value,
+    common_dtype,
+    concrete_value,
+    expand_leaves,
+    ranked_leaves,
+)
 from foldgauss._numerics.piecewise import locate
 from foldgauss._numerics.pointwise import call_elementwise, split_parameters
 from foldgauss._numerics.triangular import join_columns, split_columns
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import invalid, is_integer
 from foldgauss._runtime.threads import check_not_forked
 
 __all__ = [
@@ -71,9 +78,9 @@ class ZeroFold(AbstractFold):
     is_closed = True
 
     def __init__(self, dim: int):
-        if not isinstance(dim, int) or dim < 1:
+        if not is_integer(dim, 1):
             raise invalid("dim", expected="an integer >= 1", got=repr(dim), cure="It is d - 1.")
-        self.dim = dim
+        self.dim = int(dim)
 
     def __call__(self, u: Float[Array, "*batch"]) -> Float[Array, "*batch d-1"]:
         check_not_forked()
@@ -149,9 +156,9 @@ class SplineFold(AbstractFold):
 
     def __init__(self, knots: ArrayLike, coefficients: ArrayLike, *, degree: int = 3):
         self.coefficients = _coefficient_rows("coefficients", coefficients, "n", "Row i holds c_i")
-        if not isinstance(degree, int) or degree < 0:
+        if not is_integer(degree, 0):
             raise invalid("degree", expected="an integer >= 0", got=repr(degree), cure="3 is a cubic spline.")
-        self.knots, self.degree = _check_knots(knots, self.coefficients.shape[-2], degree), degree
+        self.knots, self.degree = _check_knots(knots, self.coefficients.shape[-2], degree), int(degree)
 
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
         check_not_forked()
@@ -209,8 +216,7 @@ class FourierFold(AbstractFold):
         return self.sine.shape[-2]
 
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
-        check_not_forked()
-        u = jnp.asarray(u)
+        u = as_value(u, self.sine.dtype)
         rank = max(u.ndim, self.period.ndim, self.sine.ndim - 2)
         sine, cosine = (_with_rank(x, rank + 2) for x in (self.sine, self.cosine))
         u, period = (_with_rank(x, rank)[..., None] for x in (u, self.period))

@@ -636,7 +636,10 @@ def test_gradients_go_through_the_integral():
 
 @pytest.mark.parametrize(
     ("indices", "expected"),
-    [([], "whole"), ([0.5], "whole"), ("s", "whole"), ([3], "numbers from"), ([0, 0], "each"), ([2, -1], "each")],
+    [
+        *(([], "whole"), ([0.5], "whole"), ([np.inf], "whole"), ("s", "whole")),
+        *(([3], "numbers from"), ([0, 0], "each"), ([2, -1], "each")),
+    ],
 )
 def test_indices_are_checked(indices, expected):
     for call in (lambda: _dist().marginal(indices), lambda: _dist().condition(indices, [0.0] * len(indices))):

@@ -144,6 +144,7 @@ def test_integers_and_weak_types_become_floats():
     envelope = TimeLikelihood(np.array([1, 2]), 0)
     assert (envelope.power.dtype, envelope.floor.dtype) == (jnp.float32, jnp.float32)
     assert not envelope.floor.weak_type  # jitted code is compiled once for numbers and arrays
+    np.testing.assert_allclose(TimeLikelihood(power=2).log_a(3, time_loc=1, time_scale=1), -4)
 
 
 def test_nan_propagates():

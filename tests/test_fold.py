@@ -227,6 +227,14 @@ def test_bad_input_names_the_parameter(make, name):
 
 def test_integers_become_floats():
     assert PolynomialFold([[1], [2]]).coefficients.dtype == jnp.float32
+    wave = FourierFold([[1.0]], [[0.5]], period=4.0)
+    np.testing.assert_array_equal(wave(1), wave(1.0))
+
+
+def test_numpy_integers_are_integers():
+    assert ZeroFold(np.int64(2)).dim == 2
+    knots, coefficients = [-1, -1, 0, 1, 1], [[2.0], [0.0], [1.0]]
+    assert SplineFold(knots, coefficients, degree=np.int64(1)).degree == 1
 
 
 def test_ranks_of_leaves_follow_from_annotations():

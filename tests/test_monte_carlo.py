@@ -66,6 +66,9 @@ def test_a_weight_of_zero_counts_nothing():
     components = FoldedGaussian(jnp.array([[0.0], [1.0]]), [[0.3]], time_loc=0.5, time_scale=0.1)
     lower, upper = entropy_bounds(FoldedMixture(components, weights=[0.0, 1.0]))
     np.testing.assert_allclose(lower, upper)
+    logits = jnp.array([-jnp.inf, 0.0])
+    slopes = jax.grad(lambda logits: entropy_bounds(FoldedMixture(components, logits=logits))[1])(logits)
+    np.testing.assert_array_equal(slopes, 0)
 
 
 def test_bad_arguments():

@@ -23,6 +23,12 @@ def test_every_item_once(count, num_items):
     assert sorted(done) == list(range(num_items))
 
 
+@pytest.mark.parametrize("count", [0, -1, 2.5])
+def test_counts_are_whole_numbers(count):
+    with pytest.raises(ValueError, match=r"^count: expected a whole number >= 1, or None, got "):
+        _threads.set_num_threads(count)
+
+
 @pytest.mark.parametrize("count", [1, 3])
 def test_an_error_reaches_the_caller_and_the_pool_lives_on(count):
     _threads.set_num_threads(count)

@@ -106,7 +106,7 @@ def normalize_indices(indices, dim: int) -> tuple[int, ...]:
     cure = f"The coordinates are 0 to {dim - 1}, time is {dim - 1} (or -1)."
     try:
         given = [int(i) for i in np.atleast_1d(np.asarray(indices)) if i == int(i)]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         given = None
     if given is None or len(given) != np.size(indices) or not given:
         raise invalid("indices", expected="whole numbers, at least one", got=repr(indices), cure=cure)

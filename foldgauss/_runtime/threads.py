@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import invalid, is_integer
 
 _lock = threading.Lock()
 _pool: ThreadPoolExecutor | None = None
@@ -44,7 +44,7 @@ def num_threads() -> int:
 def set_num_threads(count: int | None) -> None:
     """Fix the number of kernel threads; None returns to the default."""
     global _pool, _num_threads
-    if count is not None and count < 1:
+    if count is not None and not is_integer(count, 1):
         raise invalid("count", expected="a whole number >= 1, or None", got=count)
     with _lock:
         _num_threads, _pool = count, None

@@ -57,7 +57,7 @@ def entropy_bounds(mixture) -> tuple[Float[Array, "*batch"], Float[Array, "*batc
     """
     weights, components = mixture.weights, mixture.components
     lower = (weights * components.entropy()).sum(-1)
-    return lower, lower - jnp.where(weights > 0, weights * mixture.log_weights, 0).sum(-1)
+    return lower, lower - (weights * jnp.where(weights > 0, mixture.log_weights, 0)).sum(-1)
 
 
 def _mean_of(values: Float[Array, "num_samples ..."]) -> Estimate:
