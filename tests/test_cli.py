@@ -17,9 +17,11 @@ import pytest
 from commands import run
 
 from foldgauss import cli
+from foldgauss.cli.app.application import WrongUse
 from foldgauss.cli.fitting import demo as demonstration
 from foldgauss.cli.fitting import fit as fitting
 from foldgauss.cli.shared import rendering as _shared
+from foldgauss.cli.shared.timeline import Timeline
 from foldgauss.cli.viewing import info as drawing
 from foldgauss.io import load_video_model, read_video, save_video_model, write_image, write_video
 from foldgauss.io.models.model_file import read_header
@@ -266,6 +268,13 @@ def test_clip_with_alpha(tmp_path, capsys):
     white, black = (cv2.imread(str(tmp_path / name / "00000.png")) for name in ("white", "black"))
     assert white[:4].mean() > 225
     assert black[:4].mean() < 30
+
+
+def test_too_many_images_are_refused_by_the_option_that_asks_for_them():
+    times = np.linspace(0, 1, 2002)
+    for timeline, option in ((Timeline(fps=1e3), "fps"), (Timeline(speed=1e-4), "speed"), (Timeline(600), "upsample")):
+        with pytest.raises(WrongUse, match=f"^--{option}: expected at most 1,000,000 images, got "):
+            timeline.times(times, 1.0)
 
 
 def broken_inputs(tmp_path, work):

@@ -87,14 +87,14 @@ def test_missing_extras_are_told_with_their_cure(well, monkeypatch, capsys):
     known = importlib.metadata.version
 
     def version(name):
-        if name in ("matplotlib", "emcee", "numpyro", "scikit-learn", "sk-video"):
+        if name in ("matplotlib", "emcee", "numpyro", "scikit-learn", "sk-video", "distributed"):
             raise importlib.metadata.PackageNotFoundError(name)
         return known(name)
 
     monkeypatch.setattr(importlib.metadata, "version", version)
     assert run("doctor") == 0  # extras are optional
     told = " ".join(capsys.readouterr().out.split())  # however wide the terminal was
-    for extra in ("plot", "uncertainty", "numpyro", "sklearn", "samples"):
+    for extra in ("plot", "uncertainty", "numpyro", "sklearn", "samples", "distributed"):
         assert f"pip install 'foldgauss[{extra}]'" in told
     assert "no emcee" in told
     assert run("doctor", "--json") == 0

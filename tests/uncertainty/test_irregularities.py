@@ -104,7 +104,15 @@ def test_intervals_cover():
 
 @pytest.mark.parametrize(
     ("setting", "value"),
-    [("duplicate", 0), ("duplicate", 1.0), ("dropped", 1.0), ("dropped", np.nan), ("probability", 0), ("reach", 0)],
+    [
+        ("duplicate", 0),
+        ("duplicate", 1.0),
+        ("dropped", 1.0),
+        ("dropped", np.nan),
+        ("probability", 0),
+        ("reach", 0),
+        ("reach", 1.5),
+    ],
 )
 def test_settings_out_of_range(setting, value):
     posterior = posterior_about(np.linspace(0, 1, 6))

@@ -182,6 +182,12 @@ def test_increments_of_draws_follow_the_prior(concentration, known):
             assert marginal is None or scipy.stats.kstest(draws[:, k + 1], marginal.cdf).pvalue > 1e-3
 
 
+def test_levels_are_checked():
+    found = exact_posterior(parabolas(np.array([0.5]), np.array([0.1])), free_times(3, 1.0))
+    with pytest.raises(ValueError, match=r"^level: expected a number in \[0, 1\], got 1.5"):
+        found.interval(1.5)
+
+
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 10_000), concentration=st.sampled_from([0.5, 1.0, 3.0]))
 def test_densities_integrate_to_one_and_means_increase(seed, concentration):

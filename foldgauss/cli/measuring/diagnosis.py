@@ -30,6 +30,15 @@ NAME = "foldgauss"
 NUM_SPLATS, SIZE, MAX_DIFFERENCE = 60, (48, 64), 5e-3
 TINY = FitConfig(num_gaussians=150, degree=2, steps=40)
 MIN_PSNR = 20.0
+#: The extras that are reported, by what they are for.
+EXTRAS = {
+    "samples": "sample clips",
+    "plot": "plots of densities and fits",
+    "uncertainty": "uncertainty of frame times",
+    "sklearn": "the estimator",
+    "numpyro": "to_numpyro",
+    "distributed": "fits with several processes or a cluster",
+}
 
 
 class Trial(NamedTuple):
@@ -80,7 +89,7 @@ def find_extras() -> dict[str, dict[str, str | None]]:
     """The packages of each optional extra with their versions; None: missing."""
     found: dict[str, dict[str, str | None]] = {}
     for name, extra in _requirements():
-        if extra in ("samples", "plot", "uncertainty", "numpyro", "sklearn"):
+        if extra in EXTRAS:
             found.setdefault(extra, {})[name] = find_version(name)
     return found
 

@@ -8,16 +8,9 @@ from rich.table import Table
 from rich.text import Text
 
 from foldgauss.cli.app.application import app, err, out
-from foldgauss.cli.measuring.diagnosis import NAME, Trial, collect_facts, run_trials
+from foldgauss.cli.measuring.diagnosis import EXTRAS, NAME, Trial, collect_facts, run_trials
 
 GREEN, RED, YELLOW = "green", "red", "yellow"
-_FOR = {
-    "samples": "sample clips",
-    "plot": "plots of densities and fits",
-    "uncertainty": "uncertainty of frame times",
-    "sklearn": "the estimator",
-    "numpyro": "to_numpyro",
-}
 
 
 @app.command()
@@ -98,7 +91,7 @@ def _extra_rows(found: dict[str, Any]) -> list[Row]:
         missing = [one for one, version in packages.items() if version is None]
         cure = f"no {', '.join(missing)}: pip install '{NAME}[{name}]'" if missing else ""
         text = "; ".join(part for part in (there, cure) if part)
-        rows.append((YELLOW if missing else GREEN, name, f"{_FOR.get(name, '')}: {text}".removeprefix(": ")))
+        rows.append((YELLOW if missing else GREEN, name, f"{EXTRAS.get(name, '')}: {text}".removeprefix(": ")))
     return rows
 
 

@@ -83,7 +83,7 @@ class Timeline:
             return times_at(frame_times, remapped_positions(self.remap, fps, rate))
         speed = self.speed or 1.0
         if self.speed is not None or self.fps is not None:  # otherwise it has as many frames as the clip
-            self._refuse_long("--speed", (len(frame_times) - 1) * rate / abs(speed))
+            self._refuse_long("--fps" if self.speed is None else "--speed", (len(frame_times) - 1) * rate / abs(speed))
         return times_at(frame_times, played_positions(len(frame_times), rate, speed=speed))
 
     def warn_of_end(self, num_frames: int, fps: float) -> None:

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
-from foldgauss._runtime.checks import invalid, is_within
+from foldgauss._runtime.checks import invalid, is_integer, is_within
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles, likelihood_profiles
 from foldgauss.uncertainty.likelihood.noise import FrameNoise
 from foldgauss.uncertainty.posterior.exact import exact_posterior
@@ -100,7 +100,7 @@ def irregularities(
         raise invalid("dropped", expected="a number > 1", got=dropped)
     if not is_within(probability, "(0, 1]"):
         raise invalid("probability", expected="a number in (0, 1]", got=probability)
-    if reach < 1:
+    if not is_integer(reach, 1):
         raise invalid("reach", expected="a whole number >= 1", got=reach)
     steps, assessable, found = np.diff(_thin_draws(posterior), axis=1), is_assessable(posterior), []
     for k, near in _neighbors(find_cuts(posterior), reach):

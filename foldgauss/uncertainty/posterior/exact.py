@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.special import gammaln
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import invalid, is_within
 from foldgauss._runtime.kernels import inline, kernel
 from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves
 from foldgauss.uncertainty.posterior.increments import Increments
@@ -78,6 +78,8 @@ class ExactPosterior:
 
     def interval(self, level: float = 0.95) -> tuple[Float64[np.ndarray, " num_frames"], ...]:
         """(low, high) of the central intervals that contain the probability `level`."""
+        if not is_within(level, "[0, 1]"):
+            raise invalid("level", expected="a number in [0, 1]", got=level)
         return self.quantile((1 - level) / 2), self.quantile((1 + level) / 2)
 
     def sample(self, num: int, seed: int = 0) -> Float64[np.ndarray, "num num_frames"]:
