@@ -23,7 +23,7 @@ from foldgauss._numerics.batch import (
     expand_leaves,
     ranked_leaves,
 )
-from foldgauss._numerics.factor import check_loc, marginal_tril, normalize_indices, resolve_scale_tril
+from foldgauss._numerics.factor import check_loc, check_rest, marginal_tril, normalize_indices, resolve_scale_tril
 from foldgauss._numerics.safe_grad import evaluate_with_safe_grad
 from foldgauss._numerics.triangular import join_columns, multiply_lower, solve_lower, split_columns
 from foldgauss._runtime import notebook_hooks
@@ -397,13 +397,7 @@ class FoldedGaussian(BatchModule):
         rest = tuple(i for i in range(self._time_index) if i not in indices)
         if self._time_index not in indices:
             return time_mixture(self, rest, indices, values, keeps_time=True)
-        if not rest:
-            raise invalid(
-                "indices",
-                expected="at least one coordinate that is not given",
-                got="all",
-                cure="For the density use log_prob.",
-            )
+        check_rest(rest)
         where = indices.index(self._time_index)
         given = tuple(i for i in indices if i != self._time_index)
         ordered = self.marginal((*given, *rest, self._time_index))

@@ -25,7 +25,7 @@ from foldgauss._numerics.batch import (
     common_dtype,
     ranked_leaves,
 )
-from foldgauss._numerics.factor import check_loc, check_matrix, check_tril, marginal_tril, normalize_indices
+from foldgauss._numerics.factor import check_loc, check_matrix, check_rest, check_tril, marginal_tril, normalize_indices
 from foldgauss._numerics.safe_grad import evaluate_with_safe_grad
 from foldgauss._numerics.triangular import (
     UNROLLED_SIZE,
@@ -36,7 +36,6 @@ from foldgauss._numerics.triangular import (
     solve_upper,
     split_columns,
 )
-from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.threads import check_not_forked
 
 __all__ = ["Gaussian", "Normal"]
@@ -259,13 +258,7 @@ class Gaussian(BatchModule):
         """
         indices = normalize_indices(indices, self.event_shape[0])
         rest = tuple(i for i in range(self.event_shape[0]) if i not in indices)
-        if not rest:
-            raise invalid(
-                "indices",
-                expected="at least one coordinate that is not given",
-                got="all",
-                cure="For the density use log_prob.",
-            )
+        check_rest(rest)
         values = as_value(values, self.loc.dtype)
         check_event("values", values, (len(indices),))
         return condition_on_first(self.marginal((*indices, *rest)), values)

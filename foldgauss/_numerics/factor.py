@@ -116,3 +116,10 @@ def normalize_indices(indices, dim: int) -> tuple[int, ...]:
     if len(set(result)) != len(result):
         raise invalid("indices", expected="each coordinate once", got=repr(indices), cure=cure)
     return result
+
+
+def check_rest(rest: tuple[int, ...]) -> None:
+    """Raise unless some coordinates are left once others are given."""
+    if not rest:
+        expected, cure = "at least one coordinate that is not given", "For the density use log_prob."
+        raise invalid("indices", expected=expected, got="all", cure=cure)

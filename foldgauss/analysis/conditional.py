@@ -12,7 +12,7 @@ from jax.scipy.special import log_ndtr, logsumexp
 from jaxtyping import Array, Float, Key
 
 from foldgauss._numerics.batch import as_value, batch_shape_of, check_event, map_over_batch, ranked_leaves
-from foldgauss._numerics.factor import normalize_indices
+from foldgauss._numerics.factor import check_rest, normalize_indices
 from foldgauss._runtime.checks import invalid
 from foldgauss.analysis.narrow_crossings import ROUNDING, crossing_modes, crossing_panels, gaussian_at
 from foldgauss.analysis.quadrature import (
@@ -244,13 +244,7 @@ class TimeMixture(eqx.Module):
         if self.keeps_time:
             return self.parent.condition(given, both)
         kept = tuple(i for i in range(offset + self._space_dim) if i not in given)
-        if not kept:
-            raise invalid(
-                "indices",
-                expected="at least one coordinate that is not given",
-                got="all",
-                cure="For the density use log_prob.",
-            )
+        check_rest(kept)
         return time_mixture(self.parent, kept, given, both, keeps_time=False)
 
     @property

@@ -12,8 +12,8 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from foldgauss._runtime.checks import is_within
 from foldgauss.cli.app.application import WrongUse, app, err, warn, wrong_use
 from foldgauss.cli.app.completion import complete_clips
-from foldgauss.cli.shared.arguments import ModelFile, Overwrite
-from foldgauss.cli.shared.clips import is_other_clip, read_fitted_clip, refuse_segments
+from foldgauss.cli.shared.arguments import FittedFrames, ModelFile, Overwrite
+from foldgauss.cli.shared.clips import is_other_clip, keep_origin, read_fitted_clip, refuse_segments
 from foldgauss.cli.shared.outputs import refuse_existing, refuse_input
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import print_figures
@@ -61,9 +61,7 @@ def compress_command(
             help=f"Passes over VIDEO of a fine-tuning, about {USUAL_PASSES} times as many in all; 0: only round.", min=0
         ),
     ] = PASSES,
-    frames: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Frames of VIDEO [default: those that it was fitted to].")
-    ] = None,
+    frames: FittedFrames = None,
     float16: Annotated[
         bool,
         typer.Option("--float16", help=f"Only round to 16 bits, into a {MODEL_SUFFIX} file of about half the size."),
@@ -117,7 +115,7 @@ def compress_command(
 
 def save_compressed(target: Path, made: Compressed, about: dict[str, Any], *, known: bool = True) -> None:
     """Write a compact file with the metadata `about`, and its PSNR if that is `known`."""
-    about = {name: about[name] for name in ("clip", "frames", "frames_digest", "seed") if name in about}
+    about = keep_origin(about, "clip", "frames", "frames_digest", "seed")
     about |= {"mean_psnr": round(made.psnr - made.loss_db, 3)} if known else {}
     save_compact(target, made.quantized, metadata=about | {"loss_db": round(made.loss_db, 4)})
 

@@ -10,6 +10,7 @@ import typer
 from foldgauss.cli.app.application import WrongUse, app, out, wrong_use
 from foldgauss.cli.app.completion import complete_files
 from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, parse_size
+from foldgauss.cli.shared.clips import keep_origin
 from foldgauss.cli.shared.log_lines import print_log
 from foldgauss.cli.shared.outputs import check_image_path, name_after, refuse_existing, refuse_huge, refuse_input
 from foldgauss.cli.shared.rendering import render_to_file
@@ -73,7 +74,7 @@ def edit_command(
         edited = script.apply(model)
     if as_model:
         about = read_origin(model_path)
-        about = {key: about[key] for key in ("clip", "frames") if key in about} | {"edited_by": script_path.name}
+        about = keep_origin(about, "clip", "frames") | {"edited_by": script_path.name}
         if isinstance(edited, SegmentedVideo):
             edited = _drop_scores(model, edited)
         save_video_model(out_path, edited, metadata=about)
@@ -93,8 +94,7 @@ def _drop_scores(model: SegmentedVideo, edited: SegmentedVideo) -> SegmentedVide
     segments = []
     for segment in edited.segments:
         if id(segment) not in before:
-            kept = {name: value for name, value in segment.metadata.items() if name in ("clip", "frames")}
-            segment = dataclasses.replace(segment, metadata=kept)
+            segment = dataclasses.replace(segment, metadata=keep_origin(segment.metadata, "clip", "frames"))
         segments.append(segment)
     return SegmentedVideo(segments)
 
@@ -130,8 +130,8 @@ def segment_command(
         raise wrong_use("NUMBER", expected=expected, got=number)
     segment = video.segments[number]
     begins = (about.get("frames") or [0])[0] or 0
-    whole = {"clip": about["clip"]} if "clip" in about else {}
-    known = whole | {"frames": [begins + segment.first, begins + segment.stop]} | dict(segment.metadata)
+    whole = keep_origin(about, "clip") | {"frames": [begins + segment.first, begins + segment.stop]}
+    known = whole | dict(segment.metadata)
     save_video_model(out_path, segment.model, metadata=known)
     text = f"segment {number}, frames {segment.first:,}:{segment.stop:,}, {segment.num_gaussians:,} Gaussians"
     out.print(f"{out_path}: {text}", soft_wrap=True)

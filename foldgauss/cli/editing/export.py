@@ -13,6 +13,7 @@ from foldgauss.cli.shared.arguments import (
     OriginalQuality,
     Overwrite,
     Size,
+    Times,
     parse_size,
     parse_times,
 )
@@ -54,12 +55,7 @@ def export_command(
             "of a model in segments [default: by the model's name].",
         ),
     ] = None,
-    times: Annotated[
-        str | None,
-        typer.Option(
-            metavar="T,T,..|A:B:N", help="Times in [0, 1]; or N times from A to B [default: those of the frames]."
-        ),
-    ] = None,
+    times: Times = None,
     original: Original = None,
     original_quality: OriginalQuality = QUALITY,
     overwrite: Overwrite = False,

@@ -10,14 +10,12 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 
 from foldgauss.cli.app.application import Stopped, err
 from foldgauss.cli.app.signals import note_signals
-from foldgauss.cli.fitting.progress import Display, print_json
+from foldgauss.cli.fitting.progress import FIRST_LINE_SECONDS, LINE_SECONDS, Display, print_json
 from foldgauss.cli.shared.rendering import TIME_LEFT
 from foldgauss.jobs import FitJob, Outcome, WorkerPool, run_here, run_on
 from foldgauss.jobs import Progress as JobProgress
 from foldgauss.jobs import Stopped as JobsStopped
 
-#: Seconds before the first line of a log, which is early since options may be mistyped, and between two lines.
-FIRST_LINE_SECONDS, LINE_SECONDS = 10.0, 30.0
 #: Up to so many jobs, each has a line in a log.
 MAX_LINES = 20
 

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from foldgauss.cli.app.application import Stopped, WrongUse, err, name_option, out, warn
-from foldgauss.cli.fitting.job_progress import LINE_SECONDS, emit_json, run_jobs
-from foldgauss.cli.fitting.progress import Display
+from foldgauss.cli.fitting.job_progress import emit_json, run_jobs
+from foldgauss.cli.fitting.progress import LINE_SECONDS, Display
 from foldgauss.cli.fitting.workers import WorkerOptions
 from foldgauss.cli.shared.rendering import progress_bar
 from foldgauss.cli.shared.tables import format_count, print_figures

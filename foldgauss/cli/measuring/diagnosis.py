@@ -156,15 +156,15 @@ def find_engines() -> dict[str, Any]:
         "engines": [name for name in ENGINES if name != "auto"],
         "jax_devices": sorted(set(devices)),
         "auto": choose_engine(RenderOptions(), np.dtype(np.float32)),
-        "gpu": any(device.platform not in ("cpu",) for device in jax.devices()),
+        "gpu": any(device.platform != "cpu" for device in jax.devices()),
     }
 
 
-def moving_blob(num_frames: int = 6) -> np.ndarray:
-    """Frames of a bright spot that moves across the image, uint8 RGB."""
+def moving_blob() -> np.ndarray:
+    """Six frames of a bright spot that moves across the image, uint8 RGB."""
     height, width = SIZE
     y, x = np.mgrid[0:height, 0:width]
-    t = np.linspace(0.25, 0.75, num_frames)[:, None, None]
+    t = np.linspace(0.25, 0.75, 6)[:, None, None]
     blob = np.exp(-((x - t * width) ** 2 + (y - height / 2) ** 2) / 60)
     return np.stack([255 * blob, 90 + 0 * blob, 200 - 150 * blob], -1).astype(np.uint8)
 

@@ -281,12 +281,11 @@ def _bars() -> Iterator[Callable[[str, int, int], None]]:
 
 def _sample(path: Path, overwrite: bool, bars, **arguments: Any) -> FrameTimePosterior:
     """Sample, from the draws of a stopped run if there are any; with `overwrite`, draws of another run are replaced."""
-    existed, course = path.exists(), []
+    existed, sampled = path.exists(), False
 
     def show(what: str, done: int, total: int) -> None:
-        course[1:] = [done]
-        if not course:
-            course.append(done)
+        nonlocal sampled
+        sampled = True
         bars(what, done, total)
 
     def sample() -> FrameTimePosterior:
@@ -313,7 +312,7 @@ def _sample(path: Path, overwrite: bool, bars, **arguments: Any) -> FrameTimePos
         again = f" The same command continues from {path}." if path.exists() else ""
         raise OutputError(f"{output_error(path, error)}{again}") from error
     if existed:
-        text = "was complete: nothing was sampled" if not course else "was continued"
+        text = "was complete: nothing was sampled" if not sampled else "was continued"
         out.print(f"{path}: {text}", soft_wrap=True)
     return posterior
 

@@ -1,6 +1,6 @@
 """Models and the clips that they were fitted to."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +83,6 @@ def is_other_clip(model_path: Path, clip: Clip, measure_psnr: Callable[[], float
     return fitted is not None and has_other_frames(about, clip) and measure_psnr() < fitted - OTHER_CLIP_DB
 
 
-def keep_origin(about: dict[str, Any], *names: str) -> dict[str, Any]:
+def keep_origin(about: Mapping[str, Any], *names: str) -> dict[str, Any]:
     """The entries of a model's metadata with these names."""
     return {name: about[name] for name in names if name in about}

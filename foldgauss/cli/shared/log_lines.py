@@ -18,9 +18,9 @@ class _Printer(logging.Handler):
 
 
 @contextlib.contextmanager
-def print_log(name: str = "foldgauss") -> Iterator[None]:
-    """Print what the logger of this name, and those below it, log at level INFO or above."""
-    logger, handler = logging.getLogger(name), _Printer()
+def print_log() -> Iterator[None]:
+    """Print what the package logs at level INFO or above."""
+    logger, handler = logging.getLogger("foldgauss"), _Printer()
     before = logger.level
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import typer
 
-from foldgauss.cli.app.application import WrongUse, app, out, warn, wrong_use
+from foldgauss.cli.app.application import app, out, warn, wrong_use
 from foldgauss.cli.app.help import App
-from foldgauss.cli.shared.arguments import FittedClip, ModelFile, Overwrite
+from foldgauss.cli.shared.arguments import FittedClip, FittedFrames, ModelFile, Overwrite
 from foldgauss.cli.shared.clips import Video, read_fitted_clip
 from foldgauss.cli.shared.outputs import IMAGE_SUFFIX, name_after, refuse_existing, refuse_huge
 from foldgauss.cli.shared.rendering import Flow
@@ -80,9 +80,7 @@ def reconstruction(
         typer.Option(metavar="K,K,..", help=f"Frames of the model, from 0 [default: {DEFAULT_FRAMES}, evenly spaced]."),
     ] = None,
     width: Width = None,
-    frames: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Frames of VIDEO [default: those that it was fitted to].")
-    ] = None,
+    frames: FittedFrames = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Show original frames, their reconstruction, and the difference, magnified.
@@ -124,10 +122,7 @@ def _size(model: Video, width: int | None) -> tuple[int, int]:
     if width < MIN_WIDTH:
         raise wrong_use("--width", expected=f"at least {MIN_WIDTH}", got=width)
     size = max(round(width * model.size[0] / model.size[1]), 1), width
-    try:
-        refuse_huge(size)
-    except WrongUse as error:
-        raise WrongUse(str(error).replace("--size", "--width")) from error
+    refuse_huge(size, "--width")
     return size
 
 

@@ -137,8 +137,8 @@ class _Curve:
 
     def evaluate(self, t: float) -> None:
         if t not in self.times:
+            point = self.point(self.equations.at(self.k, t))
             place = bisect.bisect(self.times, t)
-            point = self.point(self.equations.at(self.k, t), place)
             self.times.insert(place, t)
             self.points.insert(place, point)
 
@@ -151,7 +151,7 @@ class _Curve:
 class _Dense(_Curve):
     """Exact, by a Cholesky factorization at every time."""
 
-    def point(self, at: FrameAt, place: int) -> float:
+    def point(self, at: FrameAt) -> float:
         factor = scipy.linalg.cholesky(at.dense(), lower=True, overwrite_a=True, check_finite=False)
         whitened = scipy.linalg.solve_triangular(factor, at.rhs, lower=True, check_finite=False)
         left = (at.residual**2).sum() / at.variance - (whitened**2).sum()
@@ -174,11 +174,11 @@ class _Estimated(_Curve):
         super().__init__(equations, k)
         self.signs = signs
 
-    def point(self, at: FrameAt, place: int) -> _Point:
+    def point(self, at: FrameAt) -> _Point:
         projected = at.weights.T @ self.signs / np.sqrt(at.variance)
         rhs = np.concatenate([at.rhs, projected], axis=1)
         tolerance = np.where(np.arange(rhs.shape[1]) < at.rhs.shape[1], TOLERANCE, TRACE_TOLERANCE)
-        start = self._guess(at.t, place, rhs)
+        start = self._guess(at.t, rhs)
         found = solve_conjugate_gradient(at.__matmul__, self.equations.precondition, rhs, start, tolerance)
         colors = found[:, : at.rhs.shape[1]]
         # A lower bound whose error is second order in that of the solution, independent of the start.
@@ -186,7 +186,7 @@ class _Estimated(_Curve):
         left = (at.residual**2).sum() / at.variance - explained
         return _Point(-left / 2, found, projected)
 
-    def _guess(self, t: float, place: int, rhs: np.ndarray) -> np.ndarray:
+    def _guess(self, t: float, rhs: np.ndarray) -> np.ndarray:
         """Linear extrapolation from the two solutions nearest in time."""
         if not self.points:
             own = self.equations.solution
@@ -200,14 +200,14 @@ class _Estimated(_Curve):
 
     def values(self) -> np.ndarray:
         # d log det H = tr(H^-1 dH), dH = (dA^T A + A^T dA) / s^2, E z z^T = I.
-        skip = self.points[0].solution.shape[1] - self.signs.shape[1]
+        channels = self.points[0].solution.shape[1] - self.signs.shape[1]  # the other columns are those of the probes
         rises = [
-            ((after.projected - before.projected) * (after.solution + before.solution)[:, skip:]).sum()
+            ((after.projected - before.projected) * (after.solution + before.solution)[:, channels:]).sum()
             / self.signs.shape[1]
             for before, after in zip(self.points[:-1], self.points[1:], strict=True)
         ]
         log_det = np.concatenate([[0.0], np.cumsum(rises)])
-        return np.array([each.log_likelihood for each in self.points]) - skip * log_det / 2
+        return np.array([each.log_likelihood for each in self.points]) - channels * log_det / 2
 
 
 def _refine(curve: _Curve, base_nodes: np.ndarray, base_values: np.ndarray, low: float, high: float) -> None:
