@@ -15,10 +15,10 @@ from foldgauss.analysis.plot import plot_density, plot_history
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: The largest number of components plotted; of space coordinates; points of the grid along each axis.
-_MOST, _SPACES, _GRID = 48, 3, 120
-#: Range of time in time_scales to either side, of space in standard deviations, and of paths in time_scales.
-_REACH, _WIDE, _BOLD = 2.6, 3.0, 1.5
+#: The largest numbers of components and of space coordinates plotted; points of the grid along each axis.
+_MAX_COMPONENTS, _MAX_SPACES, _GRID = 48, 3, 120
+#: Half ranges: of time in time_scales, of space in standard deviations, and of paths in time_scales.
+_TIME_RANGE, _SPACE_RANGE, _PATH_RANGE = 2.6, 3.0, 1.5
 _DPI, _WIDTH, _HEIGHT = 80, 3.6, 2.8
 _RED = "#d1242f"
 
@@ -57,7 +57,7 @@ def distribution_png(dist) -> "Figure":
         plot_density(dist, figure.subplots()).set_title(_name(dist), fontsize=9)
         return figure
     size = int(np.prod(dist.batch_shape))
-    chosen = np.unique(np.linspace(0, size - 1, min(size, _MOST)).round().astype(int))
+    chosen = np.unique(np.linspace(0, size - 1, min(size, _MAX_COMPONENTS)).round().astype(int))
     note = "" if len(chosen) == size else f", {len(chosen)} of them drawn"
     batch = f", batch {dist.batch_shape}{note}" if dist.batch_shape else ""
     return _drawn(_part(dist, dist.batch_shape, chosen), np.full(len(chosen), 1 / len(chosen)), _name(dist) + batch)
@@ -68,7 +68,7 @@ def mixture_png(mixture: Any) -> "Figure":
     """As of one distribution; of many components the heaviest, of a batch of mixtures the first."""
     weights = np.asarray(mixture.weights, float)
     first = weights.reshape(-1, weights.shape[-1])[0]
-    chosen = np.sort(np.argsort(-first, kind="stable")[:_MOST])
+    chosen = np.sort(np.argsort(-first, kind="stable")[:_MAX_COMPONENTS])
     text = f"{_name(mixture)}, {len(first):,} components"
     if len(chosen) < len(first):
         text += f", the {len(chosen)} heaviest: {first[chosen].sum():.0%}"
@@ -110,21 +110,21 @@ def _part(dist, batch: tuple[int, ...], chosen: np.ndarray):
 def _drawn(dist, weights: np.ndarray, title: str) -> "Figure":
     bells = _bells(dist, weights)
     spaces = bells.center.shape[-1]
-    panels = min(spaces, _SPACES) + (spaces > 1)
+    panels = min(spaces, _MAX_SPACES) + (spaces > 1)
     figure = _figure(panels)
     axes = np.atleast_1d(figure.subplots(1, panels))
-    for j, ax in zip(range(min(spaces, _SPACES)), axes, strict=False):
+    for j, ax in zip(range(min(spaces, _MAX_SPACES)), axes, strict=False):
         _draw_time(bells, j, ax)
     if spaces > 1:
         _draw_paths(bells, axes[-1])
-    left = f" (the first {_SPACES} of {spaces} space coordinates)" if spaces > _SPACES else ""
+    left = f" (the first {_MAX_SPACES} of {spaces} space coordinates)" if spaces > _MAX_SPACES else ""
     figure.suptitle(title + left, fontsize=9)
     return figure
 
 
 def _bells(dist, weights: np.ndarray) -> _Bells:
     loc, scale = np.asarray(dist.time_loc, float), np.asarray(dist.time_scale, float)
-    t = np.linspace((loc - _REACH * scale).min(), (loc + _REACH * scale).max(), _GRID)
+    t = np.linspace((loc - _TIME_RANGE * scale).min(), (loc + _TIME_RANGE * scale).max(), _GRID)
     given = _given(dist, jnp.asarray(t[:, None], dist.loc.dtype))
     return _Bells(weights, loc, scale, t, *(np.asarray(part, float) for part in given))
 
@@ -143,7 +143,7 @@ def _alive(bells: _Bells, reach: float) -> np.ndarray:
 
 def _limits(bells: _Bells, j: int) -> tuple[float, float]:
     alive = _alive(bells, 2.0)
-    low, high = (bells.center[..., j] + side * _WIDE * bells.scale[..., j] for side in (-1, 1))
+    low, high = (bells.center[..., j] + side * _SPACE_RANGE * bells.scale[..., j] for side in (-1, 1))
     return low[alive].min(), high[alive].max()
 
 
@@ -156,7 +156,7 @@ def _draw_time(bells: _Bells, j: int, ax: Any) -> None:
         density += weight * of_time * _normal(s[:, None], bells.center[:, k, j], bells.scale[:, k, j])
     shade = np.sqrt(density / max(density.max(), 1e-300))
     ax.pcolormesh(bells.t, s, shade, cmap="Blues", vmin=0, vmax=1.3, shading="gouraud", rasterized=True)
-    path = np.where(_alive(bells, _BOLD), bells.center[..., j], np.nan)
+    path = np.where(_alive(bells, _PATH_RANGE), bells.center[..., j], np.nan)
     ax.plot(bells.t, path, color=_RED, linewidth=0.9, alpha=0.7)
     name = "space s" if bells.center.shape[-1] == 1 else f"space s[{j}]"
     ax.set(xlabel="time t", ylabel=name, ylim=(low, high), xlim=(bells.t[0], bells.t[-1]))
@@ -165,7 +165,7 @@ def _draw_time(bells: _Bells, j: int, ax: Any) -> None:
 def _draw_paths(bells: _Bells, ax: Any) -> None:
     """Centers in the plane of the first two space coordinates, darker as time goes by; crosses: one deviation."""
     for k in range(len(bells.weight)):
-        alive = _alive(bells, _BOLD)[:, k]
+        alive = _alive(bells, _PATH_RANGE)[:, k]
         x, y = bells.center[alive, k, 0], bells.center[alive, k, 1]
         if not len(x):  # shorter than the grid is fine
             continue

@@ -216,9 +216,9 @@ class _Run:
         begun = time.perf_counter()
         evaluate(model, self.clip.frames)
         measure_frame_rate(model)
-        look = time.perf_counter() - begun
+        evaluation = time.perf_counter() - begun
         step = (last.seconds - first.seconds) / max(last.step - first.step, 1)
-        return Throughput(max(first.seconds - step, 0.0), step, look)
+        return Throughput(max(first.seconds - step, 0.0), step, evaluation)
 
     def _fit(self, config: FitConfig, show: Callable[[FitInfo], None]) -> Iterator[tuple[FitState, FitInfo]]:
         for state, info in fit_steps(self.clip.frames, config, motion=self._find_motion()):
@@ -369,7 +369,7 @@ class _Spent(NamedTuple):
 def _temporary_file(folder: Path, point: Point) -> Iterator[Path]:
     """A path for a file that is written to measure its size, and removed afterwards."""
     suffix = ".fgz" if point.stored in PASSES else ".safetensors"
-    path = folder / f".weighed{suffix}"
+    path = folder / f".measured{suffix}"
     try:
         yield path
     finally:

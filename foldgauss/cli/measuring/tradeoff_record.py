@@ -220,8 +220,8 @@ def report(record: Record, made: list[Point], skipped: list[Skipped], clock: str
         costs = [1 / amount if more_is_better else amount for amount in amounts]
         quality = [row["psnr"] for row in rows]
         chosen = pareto_front(costs, quality)
-        bend = knee([costs[k] for k in chosen], [quality[k] for k in chosen])
-        at = None if bend is None else chosen[bend]
+        place = knee([costs[k] for k in chosen], [quality[k] for k in chosen])  # on the front
+        at = None if place is None else chosen[place]
         text = label.replace("(s)", "(CPU seconds)") if columns[cost] == "cpu_seconds" else label
         panels.append(Panel(text, amounts, chosen, at))
         record.fronts[cost] = {
@@ -275,15 +275,15 @@ def _print_fronts(rows: list[dict[str, Any]], names: list[str], fronts: dict[str
     units = {"seconds": "{:.1f} s", "cpu_seconds": "{:.1f} CPU seconds", "bytes": "{:,} bytes"}
     units |= {"frames_per_second": "{:.0f} frames per second"}
     for cost, (what, *_) in COSTS.items():
-        bend, column = fronts[cost]["knee"], fronts[cost]["column"]
-        if bend is None:
+        name, column = fronts[cost]["knee"], fronts[cost]["column"]
+        if name is None:
             out.print(
                 f"PSNR against {what}: no knee; the Pareto front is {'; '.join(fronts[cost]['front'])}", soft_wrap=True
             )
             continue
-        row = rows[names.index(bend)]
+        row = rows[names.index(name)]
         figure = units[column].format(row[column])
-        out.print(f"PSNR against {what}: the knee is {bend}, {row['psnr']:.2f} dB with {figure}", soft_wrap=True)
+        out.print(f"PSNR against {what}: the knee is {name}, {row['psnr']:.2f} dB with {figure}", soft_wrap=True)
     on = {name for cost in COSTS for name in fronts[cost]["front"]}
     out.print("Commands of the points on the Pareto fronts:")
     for name, row in zip(names, rows, strict=True):

@@ -150,22 +150,22 @@ def solve_conjugate_gradient(
     Norms are those of the preconditioner. Raises ValueError without convergence. Source: Hestenes and Stiefel 1952.
     """
     x, goal = start.copy(), np.maximum(tolerance**2 * (rhs * precondition(rhs)).sum(0), np.finfo(float).tiny)
-    left = rhs - product(x)
-    turned = precondition(left)
-    direction, size = turned.copy(), (left * turned).sum(0)
+    residual = rhs - product(x)
+    preconditioned = precondition(residual)
+    direction, norm = preconditioned.copy(), (residual * preconditioned).sum(0)  # squared norms, as `goal`
     for _ in range(MAX_ITERATIONS):
-        if (size <= goal).all():
+        if (norm <= goal).all():
             break
-        across = product(direction)
-        bend = (direction * across).sum(0)
-        step = np.divide(size, bend, out=np.zeros_like(size), where=bend > 0)
+        change = product(direction)
+        curvature = (direction * change).sum(0)
+        step = np.divide(norm, curvature, out=np.zeros_like(norm), where=curvature > 0)
         x += step * direction
-        left -= step * across
-        turned = precondition(left)
-        size, before = (left * turned).sum(0), size
-        direction = turned + np.divide(size, before, out=np.zeros_like(size), where=before > 0) * direction
+        residual -= step * change
+        preconditioned = precondition(residual)
+        norm, before = (residual * preconditioned).sum(0), norm
+        direction = preconditioned + np.divide(norm, before, out=np.zeros_like(norm), where=before > 0) * direction
     else:
-        got = f"{np.sqrt((size / goal).max()):.2g} times that after {MAX_ITERATIONS}"
+        got = f"{np.sqrt((norm / goal).max()):.2g} times that after {MAX_ITERATIONS}"
         cure = "A smaller prior_scale converges faster."
         raise invalid("prior_scale", expected=f"colors solved to {np.max(tolerance):g}", got=got, cure=cure)
     return x
