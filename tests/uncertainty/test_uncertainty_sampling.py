@@ -376,6 +376,11 @@ def test_what_is_refused(change, word):
         frame_time_posterior(**{"log_prob": toy(*NEAR), "progress": False, **change})
 
 
+def test_a_default_as_a_whole_number_is_none_beside_log_prob():
+    with pytest.raises(ValueError, match=r"^walkers: "):  # not the concentration
+        frame_time_posterior(log_prob=toy(*NEAR), progress=False, concentration=1, walkers=4)
+
+
 @pytest.fixture(scope="module")
 def profiles():
     """Profiles of another clip."""

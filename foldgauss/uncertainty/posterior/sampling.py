@@ -125,7 +125,7 @@ def _check_arguments(
         raise invalid("log_prob", expected="the result of `frame_time_log_prob`", got=short_repr(log_prob))
     defaults = {"noise": (noise, DEFAULT_NOISE), "level": (level, "splats"), "concentration": (concentration, 1.0)}
     beside = [name for name, value in given.items() if value is not None]
-    beside += [name for name, (value, usual) in defaults.items() if type(value) is not type(usual) or value != usual]
+    beside += [name for name, (value, usual) in defaults.items() if not (np.isscalar(value) and value == usual)]
     if beside:
         cure = "Give them to `frame_time_log_prob`, or leave `log_prob` out."
         expected = "nothing beside `log_prob`, which has its own"
