@@ -9,12 +9,11 @@ Without options: the first 48 frames of Bunny and bikes at 160x320, each fitted 
 """
 
 import argparse
+import dataclasses
 import tempfile
 import time
 from pathlib import Path
 
-import equinox as eqx
-import jax
 import numpy as np
 
 from benchmarks import _common
@@ -23,6 +22,7 @@ from foldgauss.io import Clip, read_video, save_compact, save_video_model
 from foldgauss.io.datasets import sample_clip
 from foldgauss.io.models.video_model import load_video_model
 from foldgauss.video import FitConfig, VideoModel, compress, evaluate, fit
+from foldgauss.video.editing.bake import gather_splats
 from foldgauss.video.selection.contributions import Contributions, sum_contributions
 from foldgauss.video.selection.regions import Region
 
@@ -35,7 +35,7 @@ def pruned(model: VideoModel, clip: Clip) -> VideoModel:
     everywhere = np.ones(model.size, np.float32)
     order = np.argsort(sum_contributions(lit, Region(tuple(range(model.num_frames)), lambda k: everywhere))[1])
     before, least, most = evaluate(model, clip.frames).mean_psnr, 0, model.num_gaussians - 1
-    while most - least > model.num_gaussians // 200:
+    while most - least > max(model.num_gaussians // 200, 1):
         middle = (least + most) // 2
         lost = before - evaluate(kept(model, np.sort(order[middle:])), clip.frames).mean_psnr
         least, most = (middle, most) if lost <= PRUNED_DB else (least, middle)
@@ -43,10 +43,7 @@ def pruned(model: VideoModel, clip: Clip) -> VideoModel:
 
 
 def kept(model: VideoModel, indices: np.ndarray) -> VideoModel:
-    def cut(leaf: np.ndarray) -> np.ndarray:
-        return np.asarray(leaf)[indices] if np.ndim(leaf) else leaf
-
-    return eqx.tree_at(lambda m: m.splats, model, jax.tree.map(cut, model.splats))
+    return dataclasses.replace(model, splats=gather_splats(model.splats, indices))
 
 
 def measure(name: str, model: VideoModel, clip: Clip, options: argparse.Namespace, figures: dict) -> None:
