@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, Bool, Float, Key
 
 from foldgauss._numerics.batch import (
@@ -344,11 +345,12 @@ def times_exp(y: Float[Array, "*#batch"], c: Float[Array, "*#batch"], root: Arra
     return y * (half if root is None else half * root) * half
 
 
-@times_exp.defjvp
+@functools.partial(times_exp.defjvp, symbolic_zeros=True)
 def _times_exp_jvp(primals, tangents):
     (y, c, root), (y_dot, c_dot, _) = primals, tangents
     product = times_exp(y, c, root)
-    return product, times_exp(y_dot, c, root) + product * c_dot
+    tangent = jnp.zeros_like(product) if isinstance(y_dot, SymbolicZero) else times_exp(y_dot, c, root)
+    return product, tangent if isinstance(c_dot, SymbolicZero) else tangent + product * c_dot  # 0 inf would be NaN
 
 
 def _times_square(x: Array, root: Array | None) -> Array:

@@ -61,7 +61,9 @@ def test_options_reach_the_video(model, tmp_path, monkeypatch, capsys):
 )
 def test_mistakes_are_told_and_nothing_is_written(model, tmp_path, monkeypatch, capsys, options, message):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("foldgauss.video.motion.stabilization.estimate_camera_path", None)  # mistakes are told before
+    monkeypatch.setattr(
+        "foldgauss.video.motion.stabilization.estimate_camera_path", None
+    )  # errors are raised before it is called
     assert run("stabilize", model, *options) == 2
     assert message in " ".join(capsys.readouterr().err.split())
     assert not list(tmp_path.iterdir())

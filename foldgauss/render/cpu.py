@@ -177,7 +177,7 @@ class _ForwardPass:
         return *splats, *self.size, low_pass, cutoff, support, self.geometry, self.span
 
     def bucket(self) -> None:
-        """Make room for the entries of every row; those of a single chunk are projected and listed here as well."""
+        """Allocate the lists of the splats of each row; those of a single chunk are projected and listed here, too."""
         if len(self.chunks) <= 1:
             self.buckets = kernels.project_and_bucket(self.num_rows, *self._projection_arguments())
         else:
