@@ -22,7 +22,6 @@ from foldgauss.io import Clip, read_video, save_compact, save_video_model
 from foldgauss.io.datasets import sample_clip
 from foldgauss.io.models.video_model import load_video_model
 from foldgauss.video import FitConfig, VideoModel, compress, evaluate, fit
-from foldgauss.video.editing.bake import gather_splats
 from foldgauss.video.selection.contributions import Contributions, sum_contributions
 from foldgauss.video.selection.regions import Region
 
@@ -43,7 +42,7 @@ def pruned(model: VideoModel, clip: Clip) -> VideoModel:
 
 
 def kept(model: VideoModel, indices: np.ndarray) -> VideoModel:
-    return dataclasses.replace(model, splats=gather_splats(model.splats, indices))
+    return dataclasses.replace(model, splats=model.splats.take(indices))
 
 
 def measure(name: str, model: VideoModel, clip: Clip, options: argparse.Namespace, figures: dict) -> None:

@@ -1,11 +1,13 @@
 """The paper's recipe to its end: preset `paper` with all its steps, and with one thing changed.
 
-    python -m benchmarks.reproduce --folder FOLDER [--tables | --only NAME ...] [--size HxW] [--frames A:B] [--steps N]
-                                   [--seed S] [--engine E] [--json FILE]
+    python -m benchmarks.reproduce --folder FOLDER [--tables | --only NAME ...] [--size HxW | --crop HxW] [--frames A:B]
+                                   [--steps N] [--seed S] [--engine E] [--json FILE]
 
 *Bunny*, by default all 132 frames of 640x1280, in the published 30,000 steps of 3 frames: hours on the CPU of a desktop
 machine; `--engine auto` uses a GPU where JAX sees one. A smaller `--size` has Gaussians at the start in proportion to
 its pixels, and lengths, rates of positions and thresholds of gradients that are the same in pixels (`config_of`).
+Smaller frames show more detail per pixel; `--crop` instead fits the central window of the frames, with as much detail
+as they have.
 `VARIANTS` lists the fits: "as published", the power of the paper's text instead of its code's, other batches and
 degrees, and what the paper does not state or we chose. With --tables they are the `CELLS` of the paper's tables of
 batches and degrees (table:bs-pol) and of Gaussians at the start (table:init-gauss), the most telling first. The former
@@ -17,6 +19,7 @@ and number of Gaussians against steps. The same command continues a fit after it
 fits that are done. `cpu_hours` are of the process, over all its runs.
 """
 
+import argparse
 import csv
 import dataclasses
 import time
@@ -26,9 +29,9 @@ from typing import Any
 from benchmarks import _common, fit_clip
 from benchmarks._common import console
 from benchmarks._runs import Run, Runs, scaled, scores
-from foldgauss.io import Clip
+from foldgauss.io import Clip, read_video
 from foldgauss.io._atomic import atomic_path
-from foldgauss.io.datasets import bunny
+from foldgauss.io.datasets import bunny, sample_clip
 from foldgauss.io.provenance import fingerprint
 from foldgauss.jobs.runner import Checkpoint, run_steps
 from foldgauss.video import FitConfig, Growth, LearningRates, fit_steps
@@ -181,11 +184,19 @@ def show(runs: dict[str, Run], title: str) -> None:
     console.print(table)
 
 
+def read_clip(options: argparse.Namespace) -> Clip:
+    if options.crop:
+        return read_video(sample_clip("bunny"), frames=options.frames, center_crop=options.crop)
+    return bunny(size=options.size, frames=options.frames)
+
+
 def main(arguments: list[str] | None = None) -> None:
     parser = _parser()
     options = _common.parse(parser, arguments)
-    clip = bunny(size=options.size, frames=options.frames)
+    clip = read_clip(options)
     setting = {"size": clip.size, "frames": clip.num_frames, "steps": options.steps, "seed": options.seed}
+    if options.crop:
+        setting["cropped"] = True
     try:
         options.folder.mkdir(parents=True, exist_ok=True)
         runs = Runs(options.json, setting)
@@ -196,7 +207,8 @@ def main(arguments: list[str] | None = None) -> None:
         config = config_of(name, clip.size, options.steps, options.seed)
         config = dataclasses.replace(config, engine=options.engine)
         done[name] = runs.get(name, lambda name=name, config=config: run_to_end(clip, name, config, options.folder))
-    show(done, f"Bunny, {clip.num_frames} frames of {clip.size[0]}x{clip.size[1]}, {options.steps:,} steps")
+    title = f"Bunny, {clip.num_frames} frames of {clip.size[0]}x{clip.size[1]}, {options.steps:,} steps"
+    show(done, title + (", not resized" if options.crop else ""))
     figures = {f"psnr, {name}": run["psnr"] for name, run in done.items()}
     _common.finish(None, figures, _common.describe_machine())
     runs.write(figures=figures)
@@ -205,7 +217,9 @@ def main(arguments: list[str] | None = None) -> None:
 def _parser():
     parser = _common.parser(__doc__)
     parser.add_argument("--folder", type=Path, required=True, help="of checkpoints and curves")
-    parser.add_argument("--size", type=_common.size, metavar="HxW", default=FULL, help="[640x1280]")
+    shown = parser.add_mutually_exclusive_group()
+    shown.add_argument("--size", type=_common.size, metavar="HxW", default=FULL, help="[640x1280]")
+    shown.add_argument("--crop", type=_common.size, metavar="HxW", help="the central window, not resized")
     parser.add_argument("--frames", type=fit_clip._frames, metavar="A:B", help="frames A <= i < B [all]")
     parser.add_argument("--steps", type=_common.whole, default=PUBLISHED_STEPS, help=f"[{PUBLISHED_STEPS:,}]")
     names = tuple(VARIANTS | CELLS)

@@ -410,6 +410,24 @@ class TestReproduce:
             reproduce.main([*command, "--only", "batch 1"])
         assert "not allowed with argument" in capsys.readouterr().err
 
+    def test_a_crop_is_not_resized(self, tmp_path, monkeypatch, capsys):
+        made = []
+
+        def run(clip, name, config, folder):
+            made.append((clip, config))
+            return {"psnr": 30.0, "worst_psnr": 20.0, "ssim": 0.9, "gaussians": 7, "steps": 6, "cpu_hours": 0.1}
+
+        monkeypatch.setattr(reproduce, "run_to_end", run)
+        kept = tmp_path / "t.json"
+        command = ["--folder", str(tmp_path), "--only", "as published", "--frames", "0:2", "--json", str(kept)]
+        reproduce.main([*command, "--crop", "160x320"])
+        ((clip, config),) = made
+        np.testing.assert_array_equal(clip.frames, reproduce.bunny(frames=(0, 2)).frames[:, 240:400, 480:800])
+        assert config == reproduce.config_of("as published", (160, 320), 30_000, 0)
+        with pytest.raises(SystemExit):  # runs of resized frames do not continue it
+            reproduce.main([*command, "--size", "160x320"])
+        assert "cropped" in capsys.readouterr().err
+
     def test_a_smaller_fit_is_the_same_in_pixels(self):
         full, half = (reproduce.config_of("as published", size, 30_000, 0) for size in ((640, 1280), (320, 640)))
         assert half.num_gaussians == full.num_gaussians / 4

@@ -12,7 +12,17 @@ from test_optical_flow import panning
 
 from foldgauss._runtime import threads as _threads
 from foldgauss.render import RenderOptions
-from foldgauss.video import Economy, FitConfig, LearningRates, evaluate, fit, fit_steps, interpolated_times, psnr
+from foldgauss.video import (
+    Economy,
+    FitConfig,
+    LearningRates,
+    evaluate,
+    fit,
+    fit_steps,
+    independent_frames,
+    interpolated_times,
+    psnr,
+)
 from foldgauss.video.fitting import loop as fit_module
 from foldgauss.video.fitting.config import (
     MOST_PER_PIXEL,
@@ -392,9 +402,18 @@ def test_every_must_be_positive():
             fit(moving_blobs(), CONFIG, every=wrong)
 
 
-def test_bad_rates():
+@pytest.mark.parametrize("rate", [-1.0, "fast", None])
+def test_bad_rates(rate):
     with pytest.raises(ValueError, match=r"rates\.loc"):
-        LearningRates(loc=-1.0)
+        LearningRates(loc=rate)
+
+
+@pytest.mark.parametrize("fps", [0, -25.0, np.nan, np.inf, "25"])
+def test_a_frame_rate_is_checked_before_the_fit(fps):
+    with pytest.raises(ValueError, match="fps"):
+        fit(moving_blobs(), CONFIG, fps=fps, observers=[lambda state, info: pytest.fail("a step was taken")])
+    with pytest.raises(ValueError, match="fps"):
+        independent_frames(moving_blobs(), 1000, CONFIG, fps=fps)
 
 
 @pytest.mark.parametrize(

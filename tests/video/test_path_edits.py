@@ -20,7 +20,6 @@ from foldgauss.io import (
 )
 from foldgauss.render import Camera, project
 from foldgauss.video import EditedVideo, SegmentedVideo, Selection, VideoModel, edit, layers, select
-from foldgauss.video.editing.bake import gather_splats
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.shared_paths import MAX_PATHS, SharedPaths
 from foldgauss.video.segmented.flatten import flatten_video
@@ -81,11 +80,9 @@ def distinct_paths(num):
 
 
 def test_gathered_gaussians_keep_their_paths_also_where_these_are_as_many():
-    splats = gather_splats(MODEL.splats, np.arange(6))
-    again = gather_splats(
-        dataclasses.replace(splats, paths=distinct_paths(6), path_index=np.arange(1, 7).astype(np.uint8)),
-        np.array([4, 1]),
-    )
+    splats = MODEL.splats.take(np.arange(6))
+    splats = dataclasses.replace(splats, paths=distinct_paths(6), path_index=np.arange(1, 7).astype(np.uint8))
+    again = splats.take(np.array([4, 1]))
     assert again.paths.num_paths == 6
     np.testing.assert_array_equal(again.path_index, [5, 2])
 

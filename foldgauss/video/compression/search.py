@@ -13,7 +13,6 @@ import warnings
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
@@ -289,15 +288,7 @@ class _Sorting:
 
 
 def _take(model: VideoModel, which: Bool[np.ndarray, " num"] | Int[np.ndarray, " some"]) -> VideoModel:
-    """The model with only the Gaussians of a mask or of these indices."""
-    num = model.num_gaussians
-
-    def index(leaf: np.ndarray) -> np.ndarray:
-        return np.asarray(leaf)[which] if np.shape(leaf)[:1] == (num,) else leaf
-
-    splats, common = model.splats, {"envelope": model.splats.envelope, "paths": model.splats.paths}
-    own = jax.tree.map(index, dataclasses.replace(splats, **dict.fromkeys(common)))
-    return dataclasses.replace(model, splats=dataclasses.replace(own, **common))
+    return dataclasses.replace(model, splats=model.splats.take(which))
 
 
 def _undo_rounding(quantized: Quantized, exact: ExactColumns, *, path: bool) -> VideoModel:

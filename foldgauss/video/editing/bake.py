@@ -16,10 +16,9 @@ import dataclasses
 from collections.abc import Sequence
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.special import expit, logit
 
 from foldgauss._runtime.checks import invalid
@@ -31,16 +30,6 @@ Mask = Bool[np.ndarray, "num"]
 
 #: With a mean lightness below this, the lightness of the Gaussians does not tell the shading of an object.
 MIN_LIGHTNESS = 1e-4
-
-
-def gather_splats(splats: FoldedSplats, source: Int[np.ndarray, " num_new"]) -> FoldedSplats:
-    """The Gaussians at the indices `source`, in that order; indices may be missing or repeated."""
-    num = splats.num_gaussians
-
-    def take(leaf):  # an envelope may have one parameter for all Gaussians
-        return jnp.asarray(np.asarray(leaf)[source]) if np.ndim(leaf) and np.shape(leaf)[0] == num else leaf
-
-    return dataclasses.replace(jax.tree.map(take, splats), paths=splats.paths)
 
 
 def apply_affine(splats: FoldedSplats, mask: Mask, map_: Affine) -> FoldedSplats | None:

@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Int
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.video.editing.bake import gather_splats
 from foldgauss.video.editing.edited_video import Layer
 from foldgauss.video.editing.origins import Mask
 from foldgauss.video.editing.overlays import (
@@ -60,7 +59,7 @@ def gather_layer(
         masks = [mask[source] if k is None else mask[source] & (copy == k) for k in numbers]
         overlays += [dataclasses.replace(overlay, mask=one) for one in masks if one.any()]
     clocks = [dataclasses.replace(clock, mask=np.asarray(clock.mask)[source]) for clock in layer.clocks]
-    model = dataclasses.replace(layer.model, splats=gather_splats(layer.model.splats, source))
+    model = dataclasses.replace(layer.model, splats=layer.model.splats.take(source))
     return Layer(model, tuple(overlays), tuple(clock for clock in clocks if clock.mask.any()))
 
 

@@ -7,7 +7,7 @@ from dataclasses import field
 from types import MappingProxyType
 from typing import Any
 
-from foldgauss._runtime.checks import check_one_of, invalid
+from foldgauss._runtime.checks import check_one_of, invalid, is_within
 from foldgauss._runtime.settings import check_settings, setting
 from foldgauss._runtime.threads import num_threads
 from foldgauss.render import COMPOSITINGS, RenderOptions
@@ -43,7 +43,7 @@ class LearningRates:
 
     def __post_init__(self) -> None:
         for name, value in dataclasses.asdict(self).items():
-            if not (math.isfinite(value) and value >= 0):
+            if not is_within(value, "[0, inf)"):
                 raise invalid(f"rates.{name}", expected="a finite number >= 0", got=value)
 
 

@@ -31,7 +31,7 @@ from foldgauss.video.fitting.pruning.relocation import is_relocation_due, reloca
 from foldgauss.video.fitting.state import FitState, envelope_of, mean_psnr, running_psnr, to_model
 from foldgauss.video.fitting.steppers.engines import choose_engine, make_stepper
 from foldgauss.video.fitting.steppers.protocol import StepResult
-from foldgauss.video.models.frame_times import FrameTimes, make_time_logits
+from foldgauss.video.models.frame_times import FrameTimes, check_rate, make_time_logits
 from foldgauss.video.models.row_layout import pack
 from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.models.sparse_storage import find_initial_kinds, find_kinds
@@ -99,6 +99,7 @@ def fit(
     observers, history = list(observers), []
     if not is_integer(every, 1):
         raise invalid("every", expected="a whole number >= 1", got=repr(every))
+    check_rate("fps", fps)
     for state, info in fit_steps(frames, config):
         for observe in observers:
             observe(state, info)

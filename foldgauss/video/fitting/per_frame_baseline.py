@@ -13,7 +13,7 @@ from foldgauss.video.fitting.config import FitConfig, LearningRates
 from foldgauss.video.fitting.initialize import START_OPACITY, SUMMED_OPACITY, initialize, make_static
 from foldgauss.video.fitting.loop import check_frames, fit_steps, start_from, to_model
 from foldgauss.video.models.background import BLACK
-from foldgauss.video.models.frame_times import FrameTimes
+from foldgauss.video.models.frame_times import FrameTimes, check_rate
 from foldgauss.video.models.video_model import VideoModel
 
 #: Parameters of a Gaussian without time: position 2, scales 2, angle, opacity, color 3.
@@ -93,6 +93,7 @@ def independent_frames(
     **Source:** VeGaS, eq:miragevideo: the family that folds are to improve on.
     """
     check_frames(frames)
+    check_rate("fps", fps)
     config = FitConfig() if config is None else config
     _check_config(config)
     num_frames, least = len(frames), PARAMETERS * len(frames)

@@ -129,7 +129,7 @@ def played_positions(num_frames: int, rate: float, *, speed: float = 1.0) -> Flo
     `rate` is the output's frame rate over the clip's, `speed` the playback speed: 0.25 is slow motion. The last frame
     is included only if a step lands on it. Raises ValueError unless rate > 0 and speed is finite and not 0.
     """
-    _check_rate("rate", rate)
+    check_rate("rate", rate)
     if not (np.isfinite(speed) and speed != 0):
         raise invalid("speed", expected="a number other than 0", got=speed, cure="0.25 is slow motion, -1 backwards.")
     step = abs(speed) / rate
@@ -146,8 +146,8 @@ def remapped_positions(
     `rate` as in `played_positions`. Raises ValueError for anything else.
     Example: `remapped_positions([[0, 0], [1, 1], [3, 1], [4, 2]], fps=25)` holds second 1 for two seconds.
     """
-    _check_rate("fps", fps)
-    _check_rate("rate", rate)
+    check_rate("fps", fps)
+    check_rate("rate", rate)
     points = np.asarray(remap, np.float64)
     if points.ndim != 2 or points.shape[1:] != (2,) or len(points) < 2 or not np.isfinite(points).all():
         expected = "at least two rows (second shown, second of the clip)"
@@ -161,6 +161,7 @@ def remapped_positions(
     return np.interp(seconds, shown, of_clip) * fps
 
 
-def _check_rate(name: str, rate: float) -> None:
+def check_rate(name: str, rate: float) -> None:
+    """Raise ValueError unless a number of frames a second, or a ratio of two, is positive and finite."""
     if not is_within(rate, "(0, inf)"):
         raise invalid(name, expected="a number > 0", got=short_repr(rate))

@@ -1,5 +1,7 @@
 """Folded splats: Folded-Gaussians with opacity and color, the trainable parameters of a video."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -77,6 +79,15 @@ class FoldedSplats(eqx.Module):
         """Each Gaussian's last power whose coefficients are not both +0: higher powers are not stored."""
         kept = _has_bits(self.coefficients).any(axis=2)
         return (kept * np.arange(1, self.degree + 1)).max(axis=1, initial=0)
+
+    def take(self, which: Bool[np.ndarray, " num"] | Int[np.ndarray, " num_new"]) -> "FoldedSplats":
+        """The Gaussians of a mask or at these indices, in their order; all paths stay. Indices may repeat."""
+        num = self.num_gaussians
+
+        def index(leaf: Array) -> Array:  # an envelope may have one parameter for all Gaussians
+            return jnp.asarray(np.asarray(leaf)[which]) if np.shape(leaf)[:1] == (num,) else leaf
+
+        return dataclasses.replace(jax.tree.map(index, dataclasses.replace(self, paths=None)), paths=self.paths)
 
     @property
     def static(self) -> Bool[np.ndarray, " num"]:
