@@ -1,7 +1,7 @@
 """The paper's recipe to its end: preset `paper` with all its steps, and with one thing changed.
 
     python -m benchmarks.reproduce --folder FOLDER [--tables | --only NAME ...] [--size HxW | --crop HxW] [--frames A:B]
-                                   [--steps N] [--seed S] [--engine E] [--json FILE]
+                                   [--steps N] [--seed S] [--engine E] [--json FILE] [--plot FILE]
 
 *Bunny*, by default all 132 frames of 640x1280, in the published 30,000 steps of 3 frames: hours on the CPU of a desktop
 machine; `--engine auto` uses a GPU where JAX sees one. A smaller `--size` has Gaussians at the start in proportion to
@@ -23,6 +23,7 @@ import argparse
 import csv
 import dataclasses
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -132,10 +133,7 @@ class Curve:
         self.path = path
         self.points: list[tuple[float, ...]] = []
         if state is not None and path.exists():
-            with path.open(newline="") as file:
-                rows = [[row[name] for name in self.COLUMNS] for row in csv.DictReader(file)]
-            points = [(int(step), float(psnr), int(num), float(cpu)) for step, psnr, num, cpu in rows]
-            self.points = [point for point in points if point[0] <= state.step]
+            self.points = [point for point in read_curve(path) if point[0] <= state.step]
         self.before = self.points[-1][-1] if self.points else 0.0
         self.begun = time.process_time()
 
@@ -148,12 +146,45 @@ class Curve:
             csv.writer(file).writerows([self.COLUMNS, *self.points])
 
 
+def read_curve(path: Path) -> list[tuple[float, ...]]:
+    with path.open(newline="") as file:
+        rows = [[row[name] for name in Curve.COLUMNS] for row in csv.DictReader(file)]
+    return [(int(step), float(psnr), int(num), float(cpu)) for step, psnr, num, cpu in rows]
+
+
+def curve_path(folder: Path, name: str) -> Path:
+    return folder / f"{name.replace(' ', '-').replace(',', '').replace('.', '_')}.csv"
+
+
+def plot_curves(folder: Path, names: Iterable[str], path: Path) -> None:
+    """PSNR and number of Gaussians against steps, of the fits whose curves `folder` holds."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
+    for name in names:
+        if curve_path(folder, name).exists():
+            steps, psnr, num, _ = zip(*read_curve(curve_path(folder, name)), strict=True)
+            thousands = [step / 1000 for step in steps]
+            axes[0].plot(thousands, psnr, label=name, lw=1)
+            axes[1].plot(thousands, [one / 1e6 for one in num], label=name, lw=1)
+    axes[0].set(xlabel="thousands of steps", ylabel="PSNR of the frames seen last (dB)")
+    axes[1].set(xlabel="thousands of steps", ylabel="millions of Gaussians", ylim=(0, None))
+    for ax in axes:
+        ax.grid(alpha=0.3)
+    axes[1].legend(fontsize=7)
+    figure.savefig(path, dpi=150)
+    pyplot.close(figure)
+
+
 def run_to_end(clip: Clip, name: str, config: FitConfig, folder: Path) -> Run:
     """A fit, continued after its checkpoint. Raises ValueError for a checkpoint of other settings or frames."""
-    stem = name.replace(" ", "-").replace(",", "").replace(".", "_")
-    checkpoint = Checkpoint(folder / f"{stem}.checkpoint", config, fingerprint(clip))
+    curve_file = curve_path(folder, name)
+    checkpoint = Checkpoint(curve_file.with_suffix(".checkpoint"), config, fingerprint(clip))
     state = checkpoint.load(required=True) if checkpoint.path.exists() else None
-    curve = Curve(folder / f"{stem}.csv", state)
+    curve = Curve(curve_file, state)
     where = "" if state is None else f" continues after step {state.step:,}"
     console.print(f"{name}{where}", style="dim", soft_wrap=True)
 
@@ -209,6 +240,8 @@ def main(arguments: list[str] | None = None) -> None:
         done[name] = runs.get(name, lambda name=name, config=config: run_to_end(clip, name, config, options.folder))
     title = f"Bunny, {clip.num_frames} frames of {clip.size[0]}x{clip.size[1]}, {options.steps:,} steps"
     show(done, title + (", not resized" if options.crop else ""))
+    if options.plot:
+        plot_curves(options.folder, done, options.plot)
     figures = {f"psnr, {name}": run["psnr"] for name, run in done.items()}
     _common.finish(None, figures, _common.describe_machine())
     runs.write(figures=figures)
@@ -228,6 +261,7 @@ def _parser():
     chosen.add_argument("--only", nargs="+", choices=names, metavar="NAME", help=f"these of {'; '.join(names)}")
     parser.add_argument("--seed", type=int, default=0, help="[0]")
     parser.add_argument("--engine", choices=FIT_ENGINES, default="auto", help="that computes the steps [auto]")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the curves here (PNG)")
     return parser
 
 

@@ -466,3 +466,12 @@ class TestReproduce:
         assert [row[0] for row in rows] == ["step", "2", "4", "6"]
         assert rows == [line.split(",")[:3] for line in (tmp_path / "whole.csv").read_text().splitlines()]
         assert not (tmp_path / "parts.checkpoint").exists()
+        assert [point[0] for point in reproduce.read_curve(tmp_path / "parts.csv")] == [2, 4, 6]
+
+    def test_curves_are_drawn(self, tmp_path):
+        """Also where a fit is kept in the record, but its curve is gone."""
+        pytest.importorskip("matplotlib", reason="matplotlib is an optional extra")
+        text = "step,psnr,gaussians,cpu_seconds\n100,20.5,500,1.5\n200,25.0,600,3.0\n"
+        reproduce.curve_path(tmp_path, "batch 1").write_text(text)
+        reproduce.plot_curves(tmp_path, ["batch 1", "degree 1"], tmp_path / "curves.png")
+        assert min(cv2.imread(str(tmp_path / "curves.png")).shape[:2]) > 300
