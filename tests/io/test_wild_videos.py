@@ -290,6 +290,18 @@ def test_pixels_that_are_not_square_are_told(tmp_path):
     assert "1.07 times as wide" in clip.notes[0]
 
 
+@pytest.mark.parametrize(("transfer", "name"), [(16, "PQ"), (18, "HLG"), (1, None)])
+def test_hdr_is_told(tmp_path, transfer, name):
+    with av.open(tmp_path / "a.mp4", "w") as out:
+        stream = out.add_stream("libx264", rate=10, width=64, height=48, pix_fmt="yuv420p10le")
+        stream.codec_context.color_trc = transfer
+        for frame in _waves():
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(frame)))
+        out.mux(stream.encode(None))
+    notes = read_video(tmp_path / "a.mp4").notes
+    assert notes == () if name is None else f"HDR ({name})" in notes[0]
+
+
 # --------------------------------------------------------------------------------------- gray, alpha, depth
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from av.codec.context import Flags
 from av.filter import Graph
 from av.stream import Disposition
-from av.video.reformatter import Interpolation, VideoReformatter
+from av.video.reformatter import ColorTrc, Interpolation, VideoReformatter
 
 from foldgauss.io.media.clip import VIDEO, Size, VideoError, check_num_pixels, format_num_bytes, read_head, video_error
 from foldgauss.io.media.format_detection import DEMUXERS, LIST, describe_kind
@@ -32,6 +32,8 @@ CONVERSION = (
     | Interpolation.FULL_CHR_H_INP
     | Interpolation.BITEXACT
 )
+#: Transfer functions of HDR.
+_HDR = {ColorTrc.SMPTE2084: "PQ", ColorTrc.ARIB_STD_B67: "HLG"}
 #: FFmpeg's decoders of VP8 and VP9 drop alpha; these are the ones that keep it.
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 
@@ -111,6 +113,11 @@ class VideoDecoder:
     @property
     def threads(self) -> int:
         return self._codec.thread_count
+
+    @property
+    def hdr(self) -> str | None:
+        """The transfer function of a video in HDR, "PQ" or "HLG"; None for other videos."""
+        return _HDR.get(self._stream.codec_context.color_trc)
 
     @property
     def num_declared(self) -> int:

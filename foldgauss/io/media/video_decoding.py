@@ -25,7 +25,7 @@ class DecodeReport(NamedTuple):
     """What a pass through a video file finds besides its frames.
 
     `fps`: the container's rate, or the default in its place. `num_total`: number of frames, missing ones included.
-    `notes`: about the shape of pixels and interlacing. Of all frames decoded `positions`, `stamps` in units of
+    `notes`: about the shape of pixels, HDR and interlacing. Of all frames decoded `positions`, `stamps` in units of
     `time_base` seconds, and increasing times in `seconds`. `threads`: of the decoder.
     """
 
@@ -69,9 +69,11 @@ def decode_file(
         time_base, num_reached = float(decoder.time_base), passed[-1][0] + 1
         seconds = make_increasing((stamps * time_base).tolist(), fps)
         num_total = max(_count_declared(decoder, seconds, fps, num_reached), num_reached)
-        notes, aspect, threads = (), decoder.pixel_aspect, decoder.threads
+        notes, aspect, hdr, threads = (), decoder.pixel_aspect, decoder.hdr, decoder.threads
         if abs(aspect - 1) > 0.01:
             notes += (f"pixels are {aspect:.3g} times as wide as high; frames are kept as stored, not stretched.",)
+        if hdr is not None:
+            notes += (f"colors are HDR ({hdr}) and are not tone-mapped: they look pale unless converted before.",)
         if decoder.has_converted:
             notes += ("interlaced frames are converted to progressive ones.",)
     # The container's count may be an estimate, so the range is checked against the decoded frames as well.
