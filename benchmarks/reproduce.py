@@ -60,6 +60,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "opacity 0.005 pruned": {"growth": {"prune_opacity": 0.005}},
     "radius above 20 px pruned": {"growth": {"prune_radius": 20.0}},
     "wide Gaussians kept": {"growth": {"prune_scale": 1e9}},
+    "thin Gaussians drawn": {"scale_cutoff": 0.0},
     "no resets": {"growth": {"reset_every": 10**9}},
     "rates x2": {"rates": 2.0},
     "positions learn to the end": {"final_rate": 1.0},
@@ -120,6 +121,7 @@ def config_of(name: str, size: tuple[int, int], steps: int, seed: int) -> FitCon
     factors = {"loc": factor * zoom, "coefficients": factor * zoom}
     rates = dataclasses.asdict(preset["rates"])
     changes["rates"] = LearningRates(**{rate: factors.get(rate, factor) * value for rate, value in rates.items()})
+    changes["scale_cutoff"] = zoom * changes.get("scale_cutoff", preset["scale_cutoff"])
     changes["num_gaussians"] = scaled(changes.get("num_gaussians", preset["num_gaussians"]), size)
     return FitConfig.preset("paper", **changes, steps=steps, seed=seed)
 

@@ -437,6 +437,7 @@ class TestReproduce:
             assert getattr(half.growth, length) == 2 * getattr(full.growth, length)
         assert (half.rates.loc, half.rates.coefficients) == (2 * full.rates.loc, 2 * full.rates.coefficients)
         assert half.rates.log_scale == full.rates.log_scale
+        assert half.scale_cutoff == 2 * full.scale_cutoff
 
     def test_an_interrupted_fit_continues(self, tmp_path, monkeypatch):
         """Stopped between checkpoints, it goes on from the last one: model and curve are those of a whole run."""

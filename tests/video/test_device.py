@@ -43,7 +43,7 @@ from foldgauss.video.fitting.steppers.jax_loss import compute_losses, ssim
 from foldgauss.video.fitting.steppers.jax_step import _splats, find_alive, lower_step
 from foldgauss.video.fitting.steppers.jax_stepper import HeldArrays, JaxStepper
 from foldgauss.video.fitting.steppers.loss import image_loss, squared_loss, ssim_map
-from foldgauss.video.models.conditioning import ConditioningSpec, condition, update_windows
+from foldgauss.video.models.conditioning import ConditioningSpec, condition, find_windows
 from foldgauss.video.models.row_layout import columns
 from foldgauss.video.motion.optical_flow import motion_finder
 
@@ -67,6 +67,7 @@ GROWING = FitConfig(
     batch_size=4,
     power=2.0,
     two_cameras=True,
+    scale_cutoff=0.004,
     sparse_updates=False,
     growth=GROWTH,
     scale_rates_by_size=False,
@@ -258,25 +259,25 @@ def test_ssim_matches_the_cpu():
     close(own[..., 0], ssim_map(rendered, target))
 
 
-@pytest.mark.parametrize(("power", "floor"), [(1.0, 0.0), (2.0, 0.1)])
-def test_conditioning_matches_the_cpu(power, floor):
+@pytest.mark.parametrize(("power", "floor", "cutoff"), [(1.0, 0.0, 0.0), (2.0, 0.1, 0.0), (2.0, 0.0, 0.02)])
+def test_conditioning_matches_the_cpu(power, floor, cutoff):
     """The fold equation's home, `FoldedGaussian.condition_time`, as the step calls it, against the fused twin."""
     config = dataclasses.replace(CONFIG, power=power, floor=floor)
     state = warm_state(config, steps=5)
     step = JaxStepper(FRAMES, CONFIG, copy.deepcopy(state), "xla")  # of whose program only the sizes count
-    program = dataclasses.replace(step.programs[-1], power=power, floor=floor)
-    window = np.empty((len(state.rows), 2), np.float32)
-    update_windows(state.rows, np.arange(len(state.rows)), window)
+    program = dataclasses.replace(step.programs[-1], power=power, floor=floor, scale_cutoff=cutoff)
+    paths = paths_of(state)
+    spec = ConditioningSpec(3, power, floor, program.size, paths=paths, scale_cutoff=cutoff)
+    window = find_windows(state.rows, spec)
 
     @jax.jit
     def conditioned(rows, maps, t):
         alive = find_alive(program, rows, np.int32(150), t)
         return alive, _splats(program, rows, maps, t, alive, jnp.bool_(False))
 
-    paths = paths_of(state)
     for t in np.float32([0.0, 0.37, 1.0]):
         alive, splats = conditioned(state.rows, paths.at(t), t)
-        judge = condition(state.rows, window, t, ConditioningSpec(3, power, floor, program.size, paths=paths))
+        judge = condition(state.rows, window, t, spec)
         np.testing.assert_array_equal(np.flatnonzero(alive), judge.alive)
         splats = jax.tree.map(lambda leaf, keep=judge.alive: np.asarray(leaf)[keep], splats)
         close(splats.mean, judge.mean)

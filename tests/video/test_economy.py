@@ -21,7 +21,7 @@ from foldgauss.video.fitting.pruning.description_length import MAX_OPAQUE_FRACTI
 from foldgauss.video.fitting.pruning.pruner import _long_axis_first
 from foldgauss.video.fitting.pruning.scores import PruningScores, measure_scores
 from foldgauss.video.fitting.schedule import plan_levels
-from foldgauss.video.models.conditioning import ConditioningSpec, condition, update_windows
+from foldgauss.video.models.conditioning import ConditioningSpec, condition, find_windows
 from foldgauss.video.models.row_layout import columns, pack
 from foldgauss.video.models.sparse_storage import (
     OPAQUE_BIT,
@@ -152,8 +152,7 @@ def _target(frames):
 
 def _pictures(rows, shape, times, drawn) -> list[np.ndarray]:
     """Planes (3, height, width), float32."""
-    window = np.empty((len(rows), 2), np.float32)
-    update_windows(rows, np.arange(len(rows)), window)
+    window = find_windows(rows, shape)
     pictures = []
     for t in times:
         done = condition(rows, window, t, shape)
@@ -168,8 +167,7 @@ def _error(rows, frames, shape, times, drawn) -> float:
 
 
 def _measured(rows, frames, shape, times, drawn, **how):
-    window = np.empty((len(rows), 2), np.float32)
-    update_windows(rows, np.arange(len(rows)), window)
+    window = find_windows(rows, shape)
     return measure_scores(rows, window, times, shape, _target(frames), **drawn, **how)
 
 
@@ -409,9 +407,8 @@ def test_cost_of_another_shape_is_as_predicted(scene, own):
 def test_one_gaussian_always_stays():
     _, model, state, _ = fitted("noise", steps=700)
     rows = state.rows[:3]
-    window = np.empty((3, 2), np.float32)
-    update_windows(rows, np.arange(3), window)
     shape = ConditioningSpec(3, 1.0, 0.0, SIZE)
+    window = find_windows(rows, shape)
     times = np.asarray(model.frame_times.times())
     scores = measure_scores(rows, window, times, shape, _target(noise(24)), compositing="over", options=model.options)
     dear = Economy(bits=1e12, most_dropped=1.0)

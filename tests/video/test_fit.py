@@ -35,6 +35,7 @@ from foldgauss.video.fitting.loop import check_frames, start, start_from, to_mod
 from foldgauss.video.fitting.schedule import steps_per_pass
 from foldgauss.video.fitting.steppers import cpu_stepper
 from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
+from foldgauss.video.models.prepared import PreparedModel
 
 CONFIG = FitConfig(num_gaussians=800, steps=60)
 
@@ -513,5 +514,19 @@ def test_start_from_refuses_arguments_out_of_range(fitted):
     for steps, progress in ((0, 0.5), (1.5, 0.5), (10, 1.0), (10, -0.1), (10, np.nan)):
         with pytest.raises(ValueError, match="expected"):
             start_from(fitted[1], CONFIG, steps, progress)
-    with pytest.raises(ValueError, match="scale_cutoff"):
+    with pytest.raises(ValueError, match=r"config\.scale_cutoff: expected the model's, 0\.0001, got 0"):
         start_from(dataclasses.replace(fitted[1], scale_cutoff=1e-4), CONFIG, 10)
+
+
+def test_gaussians_below_the_cutoff_of_scales_are_not_drawn():
+    """In the fit as in the model that comes of it, which keeps the cutoff."""
+    config, frames = dataclasses.replace(CONFIG, power=2.0, scale_cutoff=0.03, steps=30), moving_blobs()
+    result, whole = (fit(frames, one, every=1) for one in (config, dataclasses.replace(config, scale_cutoff=0.0)))
+    model = result.model
+    assert (model.scale_cutoff, whole.model.scale_cutoff) == (0.03, 0)
+    assert max(info.num_alive for info in result.history) < 0.8 * min(info.num_alive for info in whole.history)
+    again = start_from(model, config, 10)
+    assert again.rows.shape[0] == model.num_gaussians
+    time = float(model.frame_times.times()[1])
+    drawn = np.asarray(model.splats.at(time, scale_cutoff=0.03).opacity) > 0
+    assert len(PreparedModel(model, model.size).at(time).alive) == drawn.sum() < model.num_gaussians

@@ -11,7 +11,7 @@ from path_models import moving_model, moving_splats, random_paths, random_splats
 
 from foldgauss.io import load_video_model, save_video_model
 from foldgauss.video import density_image
-from foldgauss.video.models.conditioning import ConditioningSpec, backpropagate, condition, update_windows
+from foldgauss.video.models.conditioning import ConditioningSpec, backpropagate, condition, find_windows
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.row_layout import columns, pack, unpack
 from foldgauss.video.models.shared_paths import SharedPaths
@@ -62,10 +62,8 @@ def test_kernels_move_splats_as_at_does(degree):
 
 def test_gradients_by_rows_and_by_maps_match_autodiff():
     splats = moving_splats(degree=3, power=1.0)
-    rows, window = pack(splats), np.empty((splats.num_gaussians, 2), np.float32)
-    update_windows(rows, np.arange(len(rows)), window)
-    spec = ConditioningSpec(3, 1.0, 0.0, SIZE, paths=splats.paths)
-    done = condition(rows, window, T, spec)
+    rows, spec = pack(splats), ConditioningSpec(3, 1.0, 0.0, SIZE, paths=splats.paths)
+    done = condition(rows, find_windows(rows, spec), T, spec)
     rng = np.random.default_rng(1)
     w_mean, w_cov = rng.normal(size=done.mean.shape), rng.normal(size=done.factor.shape) / 50
     w_cov = w_cov + np.swapaxes(w_cov, 1, 2)

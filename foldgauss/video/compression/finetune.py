@@ -10,7 +10,7 @@ from foldgauss.render import cpu
 from foldgauss.video.fitting.codebook import Codebook
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.state import FitState, update_rows
-from foldgauss.video.models.conditioning import apply_scale_cutoff, backpropagate, condition, update_windows
+from foldgauss.video.models.conditioning import backpropagate, condition, update_windows
 from foldgauss.video.models.prepared import PreparedModel
 from foldgauss.video.models.row_layout import columns, unpack
 from foldgauss.video.models.sparse_storage import find_kinds
@@ -64,9 +64,5 @@ def finetune_model(
         rate = np.float32(FIRST_RATE * (LAST_RATE / FIRST_RATE) ** (step / steps))
         update_rows(state, grad, done.alive, rates * rate, degree=model.degree, units=config.rate_units)
         if free is None:
-            update_windows(rows, done.alive, window)
-            if model.scale_cutoff > 0:
-                near = window[done.alive]
-                apply_scale_cutoff(rows[done.alive], near, spec, model.scale_cutoff)
-                window[done.alive] = near
+            update_windows(rows, done.alive, window, spec)
     return eqx.tree_at(lambda m: m.splats, model, unpack(rows, model.degree, model.splats.envelope, model.splats.paths))

@@ -74,6 +74,8 @@ PUBLISHED_RATES = LearningRates(
     log_time_scale=1e-3,
     frame_times=1e-3,
 )
+#: The standard deviation above which the published code draws a Gaussian, in our unit of length.
+PUBLISHED_SCALE_CUTOFF = 1e-4 * PUBLISHED_UNIT
 #: The fields that each preset changes, see `FitConfig.preset`.
 PRESETS: dict[str, dict[str, Any]] = {
     "standard": {},
@@ -103,6 +105,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "interpolation_fraction": 0.0,
         "two_cameras": True,
         "growth": Growth(),
+        "scale_cutoff": PUBLISHED_SCALE_CUTOFF,
         "options": RenderOptions.standard(),
     },
 }
@@ -202,6 +205,15 @@ class FitConfig:
         ),
     )
     floor: float = field(default=0.0, metadata=setting("Floor of the envelope a(t)", bounds="[0, 1)", group=MODEL))
+    scale_cutoff: float = field(
+        default=0.0,
+        metadata=setting(
+            "Gaussians are drawn only where both standard deviations exceed this, in model units",
+            "These are shrunk by the envelope. The published code has 1e-4 of its units, 0.18 px of 640x1280.",
+            bounds="[0, 1)",
+            group=MODEL,
+        ),
+    )
     ssim_fraction: float = field(
         default=0.2,
         metadata=setting(

@@ -274,14 +274,12 @@ def _check_config(model: VideoModel, config: FitConfig) -> None:
         "floor": (np.float32(config.floor), np.float32(envelope.floor)),
         "compositing": (config.compositing, model.compositing),
         "options": (config.options, model.options),
+        "scale_cutoff": (config.scale_cutoff, model.scale_cutoff),
     }
     for name, (got, expected) in pairs.items():
         if not np.all(got == expected):
             cure = "Give the config that the model was fitted with."
             raise invalid(f"config.{name}", expected=f"the model's, {expected}", got=got, cure=cure)
-    if model.scale_cutoff != 0:
-        cure = "Imported videos with a cutoff of scales cannot be fitted further."
-        raise invalid("model.scale_cutoff", expected="0", got=model.scale_cutoff, cure=cure)
 
 
 def _initialize(frames: np.ndarray, config: FitConfig, logits: np.ndarray, motion: Motion | None) -> FoldedSplats:

@@ -344,6 +344,7 @@ def to_model(state: FitState, config: FitConfig, size: tuple[int, int], fps: flo
         fps=float(fps),
         options=config.options,
         compositing=config.compositing,
+        scale_cutoff=config.scale_cutoff,
     )
 
 

@@ -63,13 +63,34 @@ def _sigmoid(x):
 
 
 @kernel
-def _windows(at, start, stop, indices, rows, window):
-    """The time windows in which these Gaussians are rendered."""
+def _windows(at, start, stop, indices, rows, power, floor, cuts, log_cutoff, window):
+    """The time windows in which these Gaussians are rendered; `cuts`: those below the cutoff of scales are left out."""
     for k in range(start, stop):
-        i = indices[k]
-        center, reach = _sigmoid(rows[i, at.time]), at.tau_max * math.exp(rows[i, at.spread])
+        i, tau = indices[k], at.tau_max
+        if cuts:
+            tau = min(tau, _longest(min(rows[i, at.scale], rows[i, at.scale + 1]) - log_cutoff, power, floor, tau))
+        center, reach = _sigmoid(rows[i, at.time]), tau * math.exp(rows[i, at.spread])
         window[i, 0] = center - reach
         window[i, 1] = center + reach
+
+
+@inline
+def _longest(margin, power, floor, most):
+    """The largest |tau|, up to `most`, with log a(tau) > -2 margin; 0 if there is none.
+
+    That is (1 - floor) exp(-power tau^2 / 2) > exp(-2 margin) - floor.
+    """
+    if margin <= 0:
+        return _f(0)
+    square = 2 * margin
+    if floor > 0:
+        needed = math.exp(-2 * margin) - floor
+        if needed <= 0:
+            return most
+        square = math.log((1 - floor) / needed)
+    if 2 * square >= power * most * most:
+        return most
+    return _f(math.sqrt(2 * square / power))
 
 
 @kernel
@@ -291,7 +312,8 @@ class ConditioningSpec:
     """Constants of conditioning: the fold's degree, the envelope's power and floor, and the image's size.
 
     `aspect` is the model frame's height / width (default: the image's own), see `Splats2D.to_pixels`. `paths`: NumPy
-    arrays, for rows with a column of `path_index`.
+    arrays, for rows with a column of `path_index`. `scale_cutoff`: Gaussians are alive only where both standard
+    deviations, shrunk by the envelope, exceed it, in model units.
     """
 
     degree: int
@@ -300,41 +322,24 @@ class ConditioningSpec:
     size: tuple[int, int]
     aspect: float | None = None
     paths: SharedPaths | None = None
+    scale_cutoff: float = 0.0
 
 
-def update_windows(rows: np.ndarray, indices: np.ndarray, window: np.ndarray) -> None:
+def update_windows(rows: np.ndarray, indices: np.ndarray, window: np.ndarray, spec: ConditioningSpec) -> None:
     """Write the time windows of the rows `indices` into `window` (num, 2)."""
-    num = len(indices)
+    num, cuts = len(indices), spec.scale_cutoff > 0
+    own = spec.power, spec.floor, cuts, math.log(spec.scale_cutoff) if cuts else 0.0
     run_tasks(
-        lambda start: _windows(_LAYOUT, start, min(start + CHUNK, num), indices, rows, window), range(0, num, CHUNK)
+        lambda start: _windows(_LAYOUT, start, min(start + CHUNK, num), indices, rows, *own, window),
+        range(0, num, CHUNK),
     )
 
 
-def find_windows(rows: np.ndarray) -> np.ndarray:
+def find_windows(rows: np.ndarray, spec: ConditioningSpec) -> np.ndarray:
     """The time windows of all rows, float32 (num, 2)."""
     window = np.empty((len(rows), 2), np.float32)
-    update_windows(rows, np.arange(len(rows)), window)
+    update_windows(rows, np.arange(len(rows)), window, spec)
     return window
-
-
-def apply_scale_cutoff(rows: np.ndarray, window: np.ndarray, spec: ConditioningSpec, scale_cutoff: float) -> None:
-    """Narrow `window` (num, 2) to the times when both standard deviations exceed `scale_cutoff`, in model units.
-
-    With s the smaller one: s^2 a > cutoff^2, that is (1 - floor) exp(-power tau^2 / 2) > (cutoff / s)^2 - floor.
-    """
-    if scale_cutoff <= 0:
-        return
-    places = columns(spec.degree)
-    center, spread = (rows[:, places[name].start].astype(float) for name in ("time_loc_logit", "log_time_scale"))
-    smaller = rows[:, places["log_scale"]].min(axis=1).astype(float)
-    needed = np.exp(2 * (math.log(scale_cutoff) - smaller)) - spec.floor
-    with np.errstate(divide="ignore", invalid="ignore"):
-        square = 2 * (math.log1p(-spec.floor) - np.log(needed)) / spec.power  # tau^2 where both sides are equal
-    never, always = needed >= 1 - spec.floor, needed <= 0
-    reach = np.where(always, np.inf, np.sqrt(np.where(never | always, 0, square)))
-    reach = np.minimum(reach, TAU_MAX) * np.exp(spread)
-    middle = 1 / (1 + np.exp(-center))
-    window[:, 0], window[:, 1] = np.maximum(window[:, 0], middle - reach), np.minimum(window[:, 1], middle + reach)
 
 
 def condition(

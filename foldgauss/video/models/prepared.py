@@ -12,7 +12,6 @@ from foldgauss.render.splats import check_size
 from foldgauss.video.models.conditioning import (
     ConditionedSplats,
     ConditioningSpec,
-    apply_scale_cutoff,
     condition,
     find_windows,
 )
@@ -51,9 +50,9 @@ class PreparedModel:
         aspect = height / width if aspect is None else aspect
         check_paths(model.splats)
         paths = jax.tree.map(np.asarray, model.splats.paths)
-        self.spec = ConditioningSpec(model.splats.degree, power, floor, tuple(size), aspect=aspect, paths=paths)
-        self.window = find_windows(self.rows)
-        apply_scale_cutoff(self.rows, self.window, self.spec, model.scale_cutoff)
+        own = {"aspect": aspect, "paths": paths, "scale_cutoff": model.scale_cutoff}
+        self.spec = ConditioningSpec(model.splats.degree, power, floor, tuple(size), **own)
+        self.window = find_windows(self.rows, self.spec)
         self._times = np.asarray(model.frame_times.times())
 
     def at(self, t: float, members: np.ndarray | None = None) -> ConditionedSplats:

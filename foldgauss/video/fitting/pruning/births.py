@@ -46,7 +46,7 @@ def make_newborns(
     `with_static`, Gaussians whose pixel never changes are static.
     """
     rng = np.random.default_rng([config.seed, 3, state.step])
-    times, window, paths = np.asarray(frame_times(state.time_logits)), find_windows(state.rows), paths_of(state)
+    times, window, paths = np.asarray(frame_times(state.time_logits)), find_windows(state.rows, spec), paths_of(state)
     spec, colors = dataclasses.replace(spec, paths=paths), np.ascontiguousarray(frames[..., :3])
     home = np.sort(rng.choice(len(frames), num, p=errors / errors.sum()))
 

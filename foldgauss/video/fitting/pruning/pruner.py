@@ -180,7 +180,7 @@ class Pruner:
         weights = None if self._config.economy.psnr is None else weigh_frames(state.frame_errors)
         return measure_scores(
             state.rows,
-            find_windows(state.rows),
+            find_windows(state.rows, self._spec),
             times,
             dataclasses.replace(self._spec, paths=paths_of(state)),
             lambda k: make_target(self._frames, k, self._config),

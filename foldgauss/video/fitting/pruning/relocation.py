@@ -53,7 +53,7 @@ def relocate(
     static Gaussians, new ones at constant pixels are static too. `spec` is that of whole frames.
     """
     times = np.asarray(frame_times(state.time_logits))
-    influence = measure_influence(state, find_windows(state.rows), times, config.degree)
+    influence = measure_influence(state, find_windows(state.rows, spec), times, config.degree)
     num = round(config.relocated_fraction * np.isfinite(influence).sum())
     if num == 0:
         return

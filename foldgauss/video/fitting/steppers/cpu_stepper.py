@@ -60,9 +60,11 @@ class CpuStepper:
         self.num_frames, height, width, _ = frames.shape
         self.levels, self.rates = plan_levels(config, (height, width)), RateSchedule(config)
         self.steps_per_pass = steps_per_pass(config, self.num_frames)
-        own = config.degree, config.power, config.floor
-        self.shapes = [ConditioningSpec(*own, level.size, aspect=height / width) for level in self.levels[:-1]]
-        self.shapes.append(ConditioningSpec(*own, (height, width)))
+        whole = ConditioningSpec(
+            config.degree, config.power, config.floor, (height, width), scale_cutoff=config.scale_cutoff
+        )
+        smaller = (dataclasses.replace(whole, size=level.size, aspect=height / width) for level in self.levels[:-1])
+        self.shapes = [*smaller, whole]
         self.interpolation = make_interpolated(frames, config, find_motion)
         if config.economy is not None:
             coarse = 1 - self.levels[-1].fraction
@@ -71,7 +73,7 @@ class CpuStepper:
 
     def adopt(self, state: FitState) -> None:
         self.grad = np.zeros_like(state.rows)
-        self.window = find_windows(state.rows)
+        self.window = find_windows(state.rows, self.shapes[-1])
 
     def step(self, state: FitState, progress: float, level: int = -1) -> StepResult:
         config, num_frames = self.config, self.num_frames
@@ -110,7 +112,7 @@ class CpuStepper:
         relative_size = measure_relative_size(state, config) if by_path.size else 1.0
         rates, time_rate = self.rates.at(progress, state.backoffs)
         finite = update_rows(state, self.grad, touched, rates, degree=config.degree, units=config.rate_units)
-        update_windows(state.rows, touched, self.window)
+        update_windows(state.rows, touched, self.window, shape)
         if config.learn_frame_times and num_frames > 2:
             updated = update_frame_times(state.time_logits, state.time_moments, by_time, time_rate)
             state.time_logits, state.time_moments = updated

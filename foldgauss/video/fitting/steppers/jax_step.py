@@ -7,6 +7,7 @@ The frames of a batch are divided over the devices of a mesh, each of which has 
 
 import dataclasses
 import functools
+import math
 from typing import NamedTuple
 
 import jax
@@ -71,6 +72,7 @@ class Program:
     degree: int
     power: float
     floor: float
+    scale_cutoff: float
     compositing: str
     options: RenderOptions
     engine: str
@@ -292,16 +294,23 @@ def find_alive(program: Program, rows, num, t) -> Bool[Array, " capacity"]:
     place = columns(program.degree)
     center = jax.nn.sigmoid(rows[:, place["time_loc_logit"].start])
     reach = np.float32(TAU_MAX) * jnp.exp(rows[:, place["log_time_scale"].start])
-    used = jnp.arange(program.capacity, dtype=jnp.int32) < num
-    return used & (center - reach < t) & (t < center + reach)
+    alive = (jnp.arange(program.capacity, dtype=jnp.int32) < num) & (center - reach < t) & (t < center + reach)
+    if program.scale_cutoff > 0:
+        spread = jnp.exp(rows[:, place["log_time_scale"].start])
+        log_a = _envelope(program).log_a(t, time_loc=center, time_scale=spread)
+        alive &= rows[:, place["log_scale"]].min(axis=1) + log_a / 2 > math.log(program.scale_cutoff)
+    return alive
+
+
+def _envelope(program: Program) -> TimeLikelihood:
+    return TimeLikelihood(power=np.float32(program.power), floor=np.float32(program.floor))
 
 
 def _splats(program: Program, rows, maps, t, alive, mirrored) -> Splats2D:
     """The Gaussians at time t in pixels, by `FoldedSplats.at`; those not alive have opacity 0."""
     # The rows of those are replaced, so that their underflow far away in time is in no gradient.
     rows = jnp.where(alive[:, None], rows, jnp.zeros_like(rows))
-    envelope = TimeLikelihood(power=np.float32(program.power), floor=np.float32(program.floor))
-    splats = unpack(rows, program.degree, envelope).at(t)
+    splats = unpack(rows, program.degree, _envelope(program)).at(t)
     if program.num_paths:
         splats = move_splats(splats, rows[:, -1].astype(jnp.int32), maps)
     splats = splats.to_pixels(program.size, aspect=program.aspect)

@@ -239,6 +239,7 @@ class JaxStepper:
             degree=config.degree,
             power=config.power,
             floor=config.floor,
+            scale_cutoff=config.scale_cutoff,
             compositing=config.compositing,
             options=config.options,
             engine=self.engine,
