@@ -90,6 +90,7 @@ LATER = (
     "relocated_fraction",
     "interpolation_end",
     "follow_camera",
+    "scale_cutoff",
 )
 
 
