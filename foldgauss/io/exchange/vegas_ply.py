@@ -19,6 +19,7 @@ from foldgauss.io.media.frame_rate import DEFAULT_FPS
 from foldgauss.render import RenderOptions
 from foldgauss.render.camera import FIELD_OF_VIEW
 from foldgauss.render.splats import check_size
+from foldgauss.video.fitting.config import PUBLISHED_SCALE_CUTOFF
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.polynomial_folds import without_paths
 from foldgauss.video.models.splats import STATIC_LOG_TIME_SCALE, FoldedSplats
@@ -27,8 +28,6 @@ from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
 #: The envelope's power of the published code, which scales standard deviations by exp(-tau^2 / 2).
 VEGAS_POWER = 2.0
-#: Standard deviations, in its units, above which the published code renders a Gaussian.
-VEGAS_SCALE_CUTOFF = 1e-4
 #: `scale_1`, across the plane, has no effect on the image; this eps is written.
 _VEGAS_ACROSS = math.log(1e-8)
 
@@ -198,7 +197,7 @@ def _fill_in(ply: Ply, size: Size | None, fps: float | None) -> tuple[Size, floa
         size = note["size"] if size is None else size
         fps = note.get("fps", DEFAULT_FPS) if fps is None else fps
         check_size(size)
-        cutoff = note.get("scale_cutoff", VEGAS_SCALE_CUTOFF * _vegas_unit(size))
+        cutoff = note.get("scale_cutoff", PUBLISHED_SCALE_CUTOFF * _vegas_unit(size))
         check_within("scale_cutoff", cutoff, "[0, 1]", "a number in [0, 1]")
         power = note.get("power", VEGAS_POWER)
         check_within("power", power, "(0, 1e30]", "a number in (0, 1e30]")

@@ -74,8 +74,8 @@ PUBLISHED_RATES = LearningRates(
     log_time_scale=1e-3,
     frame_times=1e-3,
 )
-#: The standard deviation above which the published code draws a Gaussian, in our unit of length.
-PUBLISHED_SCALE_CUTOFF = 1e-4 * PUBLISHED_UNIT
+#: Standard deviations, in its units, above which the published code draws a Gaussian.
+PUBLISHED_SCALE_CUTOFF = 1e-4
 #: The fields that each preset changes, see `FitConfig.preset`.
 PRESETS: dict[str, dict[str, Any]] = {
     "standard": {},
@@ -105,7 +105,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "interpolation_fraction": 0.0,
         "two_cameras": True,
         "growth": Growth(),
-        "scale_cutoff": PUBLISHED_SCALE_CUTOFF,
+        "scale_cutoff": PUBLISHED_SCALE_CUTOFF * PUBLISHED_UNIT,
         "options": RenderOptions.standard(),
     },
 }
