@@ -39,7 +39,7 @@ from foldgauss.video.motion.optical_flow import Motion, motion_finder
 
 #: A fit whose growth has no limit that it could reach has capacity for so many times the Gaussians of its start; where
 #: that is not enough it doubles, and steps are compiled anew.
-CAPACITY_FACTOR = 4
+CAPACITY_FACTOR = 2
 #: Interpolated frames are prepared so many steps ahead: one takes some tenths of a second, a step on a GPU some ms.
 STEPS_AHEAD = 64
 _FIELDS = FitState.array_fields()
@@ -59,7 +59,7 @@ class HeldArrays:
         if self.report is not None and name in Report._fields:
             return np.array(getattr(self.report, name))
         if kind.per_gaussian:
-            return jax.tree.map(lambda leaf: np.array(leaf)[: self.num].copy(), getattr(self.arrays, name))
+            return jax.tree.map(lambda leaf: np.asarray(leaf)[: self.num].copy(), getattr(self.arrays, name))
         if name not in self._fetched:
             self._fetched[name] = jax.tree.map(np.array, getattr(self.arrays, name))
         return jax.tree.map(np.array, self._fetched[name])
