@@ -25,8 +25,10 @@ def test_evaluate_compares_frame_by_frame():
     model = VideoModel(random_splats(), FrameTimes.uniform(3), SIZE, 25.0, RenderOptions())
     frames = np.stack(list(model.frames()))
     assert frames.dtype == np.uint8
-    scores = evaluate(model, frames)
+    seen = []
+    scores = evaluate(model, frames, seen.append)
     assert scores.psnr == (100, 100, 100)
+    np.testing.assert_array_equal(seen, frames)
     assert evaluate(model, frames[::-1].copy()).psnr[1] == 100
     assert evaluate(model, frames[::-1].copy()).psnr[0] < 50
     with pytest.raises(ValueError, match="frames"):

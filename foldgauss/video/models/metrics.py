@@ -1,12 +1,15 @@
 """Image quality: PSNR and SSIM of frames, by scikit-image."""
 
 import dataclasses
+import itertools
+import math
 from collections.abc import Callable
 
 import numpy as np
 import skimage
 
 from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.threads import num_threads, run_tasks
 from foldgauss.video.models.background import BLACK, check_background, composite
 from foldgauss.video.models.renderer import RenderableVideo
 
@@ -24,6 +27,8 @@ def psnr(target: np.ndarray, image: np.ndarray) -> float:
 
 #: Side of SSIM's window in pixels, and the distance from its center to its edge.
 SSIM_WINDOW, SSIM_REACH = 11, 5
+#: Pixels of the images that are compared at the same time: SSIM takes 130 bytes for each.
+PIXELS_AT_ONCE = 5_000_000
 
 
 def ssim(target: np.ndarray, image: np.ndarray) -> float:
@@ -78,14 +83,24 @@ def evaluate(
     Example: `evaluate(model, clip.frames).mean_psnr`.
     """
     check_frames(model, frames)
-    scores = []
-    for k, image in enumerate(model.frames(background=background)):
-        target = np.asarray(frames[k])
-        target = target if target.shape[-1] == 3 else composite(target, check_background(background))
-        scores.append((psnr(target, image), ssim(target, image)))
+    scores = np.zeros((model.num_frames, 2))
+
+    def score(k: int) -> None:
+        scores[k] = psnr(*pairs[k]), ssim(*pairs[k])
+
+    images = enumerate(model.frames(background=background))
+    at_once = min(num_threads(), max(PIXELS_AT_ONCE // math.prod(model.size), 1))
+    while pairs := {k: (_target(frames[k], background), image) for k, image in itertools.islice(images, at_once)}:
+        run_tasks(score, pairs)
         if on_frame is not None:
-            on_frame(image)
-    return Evaluation(*map(tuple, zip(*scores, strict=True)))
+            for _, image in pairs.values():
+                on_frame(image)
+    return Evaluation(*map(tuple, scores.T.tolist()))
+
+
+def _target(frame: np.ndarray, background: tuple[float, float, float]) -> np.ndarray:
+    frame = np.asarray(frame)
+    return frame if frame.shape[-1] == 3 else composite(frame, check_background(background))
 
 
 def check_frames(model: RenderableVideo, frames: np.ndarray) -> None:
