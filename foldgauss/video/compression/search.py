@@ -62,9 +62,12 @@ _FINEST, _COARSEST, _CLOSE = -8.0, 9.0, 0.05
 _WORTH = 40.0
 #: How much coarser, in powers of two, the first try with fine-tuning is; and the loss per power of two, dB.
 _COARSER, _SLOPE = 1.7, 0.7
-#: Gaussians are dropped in stages, each of passes / 2 passes: first as many as lose so many dB before the others are
-#: fine-tuned, and half as many after each stage that lost more than this fraction of the allowed loss.
-_STAGES, _STAGES_OF_PASSES, _FIRST_DROPPED, _DROPPING = 5, 2, 4.0, 0.4
+#: Gaussians are dropped in stages, each with passes / 2 passes of fine-tuning, after which the model should have lost
+#: this fraction of the allowed loss.
+_STAGES, _STAGES_OF_PASSES, _DROPPING = 5, 2, 0.75
+#: How many dB a stage drops, at most `_MOST_DROPPED`: as many as fine-tuning is expected to make up for. It leaves the
+#: fraction `_LEFT` of what was dropped, and gains by itself `_FADING` times as much as in the stage before.
+_FIRST_GAINED, _FADING, _LEFT, _MOST_DROPPED = 0.35, 0.8, 0.13, 6.0
 #: How much coarser, in powers of two, the steps may be at which a Gaussian that is dropped is not worth its bits.
 _MAX_COARSER = 24.0
 #: Tries with fine-tuning, each of passes / 4 + passes / 8 passes; and the fraction of the allowed loss that ends them.
@@ -194,17 +197,19 @@ def _search_finetuned(
             model, loss.target, math.ceil(fraction * passes), on_pass=lambda: on_step(what, math.nan), **how
         )
 
-    kept, plan, so_far, dropped = model, complete, 0.0, _FIRST_DROPPED
+    kept, current, plan, so_far, gained = model, model, complete, 0.0, _FIRST_GAINED
     for stage in range(_STAGES):
-        trial = _Sorting(_drop(kept, plan, loss, least, max(so_far, 0.0) + dropped))(_FIRST_ORDERING * loss.error)
+        dropped = min(max((_DROPPING * max_loss - so_far + _FADING * gained) / _LEFT, 0.0), _MOST_DROPPED)
+        if dropped:
+            current = _drop(current, plan, loss, least, so_far + dropped)
+        current = _Sorting(current)(_FIRST_ORDERING * loss.error)
         what = "fine-tuning after dropping Gaussians"
-        trial = finetune(trial, 1 / _STAGES_OF_PASSES, what, seed=stage, shared=index_colors(trial))
-        measured = loss(trial, loss.all_frames)
-        on_step("dropped", measured)
-        if measured <= _DROPPING * max_loss:
-            kept, plan, so_far = trial, _Plan(trial), measured
-        else:
-            dropped /= 2  # too many to compensate for
+        current = finetune(current, 1 / _STAGES_OF_PASSES, what, seed=stage, shared=index_colors(current))
+        before, so_far, plan = so_far, loss(current, loss.all_frames), _Plan(current)
+        on_step("dropped", so_far)
+        gained = _LEFT * dropped + before - so_far
+        if so_far <= max_loss:
+            kept = current
     plan, factor = _Plan(_reorder(kept, loss, max_loss)), least + _COARSER
     best, tried = None, {}
     for _ in range(_TRIES):
