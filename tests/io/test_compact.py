@@ -16,11 +16,11 @@ from soft_models import SIZE, on_paths, soft_model
 
 import foldgauss.io.page
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.io import ModelFileError, load_compact, load_video_model, save_compact, save_video_model
+from foldgauss.io import ModelFileError, datasets, load_compact, load_video_model, save_compact, save_video_model
 from foldgauss.io.models.compact import MAGIC, VERSION, is_compact, pack_compact
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.render import RenderOptions
-from foldgauss.video import compress, layers
+from foldgauss.video import FitConfig, compress, fit, layers
 from foldgauss.video.compression.quantize import (
     AXES,
     Rule,
@@ -410,6 +410,24 @@ def test_fine_tuning_makes_smaller_files(how):
     lost = evaluate(model, clip).mean_psnr - evaluate(mended.model, clip).mean_psnr
     assert lost == pytest.approx(mended.loss_db, abs=1e-9)
     assert lost <= 0.2
+
+
+def test_gaussians_that_few_passes_cannot_make_up_for_are_not_dropped():
+    """A stage of pruning that loses more than the following ones could gain is undone."""
+    frames, losses = datasets.ball(24).clip.frames, []
+    model = fit(frames, FitConfig(num_gaussians=200, steps=300, seed=1)).model
+
+    def note(what: str, loss_db: float) -> None:
+        if what == "dropped":
+            losses.append(loss_db)
+
+    made = compress(model, frames, max_loss_db=0.5, passes=8, on_step=note)
+    worst = int(np.argmax(losses))
+    assert losses[worst] > 0.5
+    assert worst < len(losses) - 1
+    assert max(losses[worst + 1 :]) <= 0.5
+    assert made.loss_db <= 0.5
+    assert made.num_dropped > 120
 
 
 def test_a_greater_loss_makes_a_smaller_file():

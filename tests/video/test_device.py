@@ -585,7 +585,7 @@ def test_capacity_doubles_where_it_is_not_enough():
     config = dataclasses.replace(GROWING, max_gaussians=None)
     stepper = JaxStepper.__new__(JaxStepper)
     stepper.config, stepper.num_frames, stepper.size = config, 6, (32, 40)
-    assert [stepper._choose_capacity(num) for num in (240, 241, 480, 900)] == [240, 480, 480, 960]
+    assert [stepper._choose_capacity(num) for num in (60, 121, 240, 241, 900)] == [120, 240, 240, 480, 960]
     stepper.config = GROWING
     assert stepper._choose_capacity(60) == 250
     stepper.config = CONFIG

@@ -65,13 +65,14 @@ _COARSER, _SLOPE = 1.7, 0.7
 #: Gaussians are dropped in stages, each with passes / 2 passes of fine-tuning, after which the model should have lost
 #: this fraction of the allowed loss.
 _STAGES, _STAGES_OF_PASSES, _DROPPING = 5, 2, 0.75
-#: How many dB a stage drops, at most `_MOST_DROPPED`: as many as fine-tuning is expected to make up for. It leaves the
-#: fraction `_LEFT` of what was dropped, and gains by itself `_FADING` times as much as in the stage before.
+#: How many dB a stage drops, at most `_MOST_DROPPED`: as many as fine-tuning is expected to make up for. Fine-tuning
+#: leaves the fraction `_LEFT` of what was dropped; beside that it gains some dB, at first about `_FIRST_GAINED`, and in
+#: each stage `_FADING` times as many as in the one before.
 _FIRST_GAINED, _FADING, _LEFT, _MOST_DROPPED = 0.35, 0.8, 0.13, 6.0
-#: How much coarser, in powers of two, the steps may be at which a Gaussian that is dropped is not worth its bits.
-_MAX_COARSER = 24.0
+#: How much coarser or finer, in powers of two, the steps may be at which a dropped Gaussian is not worth its bits.
+_DROPPED_RANGE = 24.0
 #: Tries with fine-tuning, each of passes / 4 + passes / 8 passes; and the fraction of the allowed loss that ends them.
-_TRIES, _ENOUGH = 6, 0.9
+_TRIES, _ENOUGH = 6, 0.85
 #: Most powers of two by which a try may extrapolate.
 _MAX_EXTRAPOLATION = 2.0
 #: Fraction of the allowed squared error that reordering may add if all pairs whose order is given up are swapped; and
@@ -197,21 +198,49 @@ def _search_finetuned(
             model, loss.target, math.ceil(fraction * passes), on_pass=lambda: on_step(what, math.nan), **how
         )
 
-    kept, current, plan, so_far, gained = model, model, complete, 0.0, _FIRST_GAINED
-    for stage in range(_STAGES):
-        dropped = min(max((_DROPPING * max_loss - so_far + _FADING * gained) / _LEFT, 0.0), _MOST_DROPPED)
+    smaller = _drop_in_stages(model, complete, least, loss, max_loss, finetune, on_step)
+    # Where the last stage leaves too little of the loss for rounding, the one before.
+    tries = (
+        _search_factor(_Plan(_reorder(one, loss, max_loss)), least, loss, max_loss, finetune, on_step)
+        for one in reversed(smaller)
+    )
+    return next(filter(None, tries), None)
+
+
+def _drop_in_stages(
+    model: VideoModel,
+    plan: "_Plan",
+    least: float,
+    loss: "_Loss",
+    max_loss: float,
+    finetune: Callable,
+    on_step: Callable,
+) -> list[VideoModel]:
+    """The model, then models with ever fewer Gaussians, fine-tuned, that lose at most `max_loss`."""
+    kept, current, so_far, gained, most = [(model, 0.0)], model, 0.0, _FIRST_GAINED, _MOST_DROPPED
+    for stages_left in reversed(range(_STAGES)):
+        dropped = min(max((_DROPPING * max_loss - so_far + _FADING * gained) / _LEFT, 0.0), most)
         if dropped:
             current = _drop(current, plan, loss, least, so_far + dropped)
         current = _Sorting(current)(_FIRST_ORDERING * loss.error)
-        what = "fine-tuning after dropping Gaussians"
-        current = finetune(current, 1 / _STAGES_OF_PASSES, what, seed=stage, shared=index_colors(current))
-        before, so_far, plan = so_far, loss(current, loss.all_frames), _Plan(current)
+        what, seed = "fine-tuning after dropping Gaussians", _STAGES - 1 - stages_left
+        current = finetune(current, 1 / _STAGES_OF_PASSES, what, seed=seed, shared=index_colors(current))
+        before, so_far = so_far, loss(current, loss.all_frames)
         on_step("dropped", so_far)
         gained = _LEFT * dropped + before - so_far
         if so_far <= max_loss:
-            kept = current
-    plan, factor = _Plan(_reorder(kept, loss, max_loss)), least + _COARSER
-    best, tried = None, {}
+            kept.append((current, so_far))
+        elif so_far - stages_left * _FADING * gained > max_loss:  # too many to make up for
+            (current, so_far), most = kept[-1], most / 2
+        plan = _Plan(current)
+    return [model for model, _ in kept]
+
+
+def _search_factor(
+    plan: "_Plan", least: float, loss: "_Loss", max_loss: float, finetune: Callable, on_step: Callable
+) -> _Try | None:
+    """As `_search_finetuned`, without dropping Gaussians."""
+    best, tried, factor = None, {}, least + _COARSER
     for _ in range(_TRIES):
         quantized, exact = plan.quantize(factor), plan.exact
         for what, free, fraction in (("paths and colors", PATH_AND_COLOR, 0.25), ("colors", COLOR, 0.125)):
@@ -260,7 +289,7 @@ def _next_factor(tried: dict[float, float], max_loss: float, least: float) -> fl
 
 def _drop(model: VideoModel, plan: "_Plan", loss: "_Loss", least: float, most: float) -> VideoModel:
     """The model without as many of the Gaussians that matter least as costs at most `most` dB."""
-    fine, coarse = least, least + _MAX_COARSER
+    fine, coarse = least - _DROPPED_RANGE, least + _DROPPED_RANGE
     while coarse - fine > 2 * _CLOSE:
         middle = (fine + coarse) / 2
         lost = loss(_take(model, plan.keep(middle)), loss.sampled_frames)

@@ -1,7 +1,6 @@
 """Image quality: PSNR and SSIM of frames, by scikit-image."""
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Callable
 
@@ -88,19 +87,18 @@ def evaluate(
     def score(k: int) -> None:
         scores[k] = psnr(*pairs[k]), ssim(*pairs[k])
 
-    images = enumerate(model.frames(background=background))
+    pairs = {}
     at_once = min(num_threads(), max(PIXELS_AT_ONCE // math.prod(model.size), 1))
-    while pairs := {k: (_target(frames[k], background), image) for k, image in itertools.islice(images, at_once)}:
-        run_tasks(score, pairs)
+    for k, image in enumerate(model.frames(background=background)):
+        target = np.asarray(frames[k])
+        target = target if target.shape[-1] == 3 else composite(target, check_background(background))
+        pairs[k] = target, image
         if on_frame is not None:
-            for _, image in pairs.values():
-                on_frame(image)
+            on_frame(image)
+        if len(pairs) == at_once or k == model.num_frames - 1:
+            run_tasks(score, pairs)
+            pairs.clear()
     return Evaluation(*map(tuple, scores.T.tolist()))
-
-
-def _target(frame: np.ndarray, background: tuple[float, float, float]) -> np.ndarray:
-    frame = np.asarray(frame)
-    return frame if frame.shape[-1] == 3 else composite(frame, check_background(background))
 
 
 def check_frames(model: RenderableVideo, frames: np.ndarray) -> None:
