@@ -14,9 +14,9 @@ batches and degrees (table:bs-pol) and of Gaussians at the start (table:init-gau
 start with 100,000: their 38.53 dB for batch 3 and degree 7 is the first row of the other table. PSNR and SSIM are of
 8-bit images, the mean over all frames, beside the published PSNR.
 
-FOLDER keeps a checkpoint of the fit under way and, for each fit, the curve NAME.csv of PSNR (of the frames seen last)
-and number of Gaussians against steps. The same command continues a fit after its checkpoint; with --json also after the
-fits that are done. `cpu_hours` are of the process, over all its runs.
+FOLDER keeps a checkpoint of the fit under way and, for each fit, the curve NAME.csv of running PSNR (of all frames,
+each with the error it had when a step last rendered it) and number of Gaussians against steps. The same command
+continues a fit after its checkpoint; with --json also after the fits that are done. `cpu_hours` are of the process, over all its runs.
 """
 
 import argparse
@@ -172,7 +172,7 @@ def plot_curves(folder: Path, names: Iterable[str], path: Path) -> None:
             thousands = [step / 1000 for step in steps]
             axes[0].plot(thousands, psnr, label=name, lw=1)
             axes[1].plot(thousands, [one / 1e6 for one in num], label=name, lw=1)
-    axes[0].set(xlabel="thousands of steps", ylabel="PSNR of the frames seen last (dB)")
+    axes[0].set(xlabel="thousands of steps", ylabel="running PSNR (dB)")
     axes[1].set(xlabel="thousands of steps", ylabel="millions of Gaussians", ylim=(0, None))
     for ax in axes:
         ax.grid(alpha=0.3)
