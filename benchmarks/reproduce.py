@@ -16,7 +16,8 @@ start with 100,000: their 38.53 dB for batch 3 and degree 7 is the first row of 
 
 FOLDER keeps a checkpoint of the fit under way and, for each fit, the curve NAME.csv of running PSNR (of all frames,
 each with the error it had when a step last rendered it) and number of Gaussians against steps. The same command
-continues a fit after its checkpoint; with --json also after the fits that are done. `cpu_hours` are of the process, over all its runs.
+continues a fit after its checkpoint; with --json also after the fits that are done. `cpu_hours` are of the process,
+over all its runs.
 """
 
 import argparse
