@@ -5,6 +5,7 @@ import pytest
 from clips import moving_blobs
 from test_conditioning import SIZE, random_splats
 
+from foldgauss._runtime.threads import set_num_threads
 from foldgauss.render import RenderOptions
 from foldgauss.video import FrameTimes, VideoModel, evaluate, psnr, ssim
 
@@ -35,6 +36,20 @@ def test_evaluate_compares_frame_by_frame():
         evaluate(model, frames[:2])
     with pytest.raises(ValueError, match=r"^frames: expected uint8 .*got list\."):
         evaluate(model, list(frames))
+
+
+@pytest.mark.parametrize("threads", [1, 2, 4])
+def test_frames_that_are_compared_at_once_have_their_own_scores(threads):
+    model = VideoModel(random_splats(), FrameTimes.uniform(5), SIZE, 25.0, RenderOptions())
+    frames = np.stack(list(model.frames()))[::-1].copy()
+    set_num_threads(threads)
+    try:
+        scores = evaluate(model, frames)
+    finally:
+        set_num_threads(None)
+    pairs = list(zip(frames, model.frames(), strict=True))
+    assert scores.psnr == tuple(psnr(*pair) for pair in pairs)
+    assert scores.ssim == tuple(ssim(*pair) for pair in pairs)
 
 
 def test_frames_at_other_times_and_sizes():

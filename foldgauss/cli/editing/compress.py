@@ -58,7 +58,7 @@ def compress_command(
     passes: Annotated[
         int,
         typer.Option(
-            help=f"Passes over VIDEO of a fine-tuning, about {USUAL_PASSES} times as many in all; 0: only round.", min=0
+            help=f"Passes over VIDEO of a fine-tuning, about {USUAL_PASSES} times as many in all; 0: none.", min=0
         ),
     ] = PASSES,
     frames: FittedFrames = None,
