@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 import threading
+import weakref
 from functools import partial
 
 import numpy as np
@@ -631,6 +632,15 @@ def test_frames_as_an_array(long, long_index):
     assert again.digest() == lazy.digest() == hashlib.blake2b(whole, digest_size=16).hexdigest()
     lazy.close()
     np.testing.assert_array_equal(lazy[2], whole[2])
+
+
+def test_a_closed_array_keeps_no_decoder(long_index):
+    lazy = LazyFrames(long_index)
+    first = lazy[0]
+    held = weakref.ref(lazy._reader._decoder)
+    lazy.close()
+    assert held() is None
+    assert (lazy[0] == first).all()
 
 
 def test_what_arrays_refuse_is_refused(long_index):

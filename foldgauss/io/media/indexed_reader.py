@@ -78,7 +78,7 @@ class IndexedReader:
     def close(self) -> None:
         if self._decoder is not None:
             self._decoder.close()
-        self._decoder, self._last = None, None
+        self._decoder, self._frames, self._last = None, iter(()), None  # the frames hold the decoder and its threads
 
     def read(self, first: int, stop: int, size: Size | None) -> tuple[np.ndarray, *RangeFacts]:
         """Frames `first` up to `stop` of those that decode, as `Clip.frames`, and the rest of a `ReadResult`."""
