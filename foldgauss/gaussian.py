@@ -42,6 +42,8 @@ from foldgauss._runtime.threads import check_not_forked
 __all__ = ["Gaussian", "Normal"]
 
 _LOG_2PI = float(np.log(2 * np.pi))
+#: Standard deviations from the mean beyond which the cdf is 0 or 1 in float64.
+_FAR = 40.0
 
 
 class Normal(BatchModule):
@@ -94,7 +96,9 @@ class Normal(BatchModule):
     def cdf(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
         """P(t <= value)."""
         value, loc, scale = self._aligned(value)
-        return jax.scipy.special.ndtr((value - loc) / scale)
+        far = jnp.abs(value - loc) > _FAR * scale  # there quotients overflow, whose derivatives would be NaN
+        z = jnp.where(far, jnp.sign(value - loc) * _FAR, (value - loc) / jnp.where(far, 1, scale))
+        return jax.scipy.special.ndtr(z)
 
     def icdf(self, q: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
         """The quantile t with P(t <= quantile) = q; NaN for q outside [0, 1]."""

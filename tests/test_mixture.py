@@ -378,11 +378,17 @@ def test_time_posterior(x64):
 
 
 def test_cdf_where_standard_deviations_underflow():
-    """A step at the center: one half there, not 0 / 0."""
-    components = FoldedGaussian([[0.5]], [[0.2]], time_loc=[0.0], time_scale=1.0)
-    far = FoldedMixture(components, weights=[1.0]).condition_time(20.0)
-    assert (far.components.stddev == 0).all()
-    np.testing.assert_array_equal(far.cdf(jnp.array([[0.4], [0.5], [0.6]])), [0, 0.5, 1])
+    """A step at the center: one half there, not 0 / 0; flat elsewhere."""
+
+    def far(log_scale):
+        components = FoldedGaussian([[0.5]], [jnp.exp(log_scale)], time_loc=[0.0], time_scale=1.0, validate_args=False)
+        return FoldedMixture(components, weights=[1.0], validate_args=False).condition_time(20.0)
+
+    log_scale = jnp.log(jnp.array([0.2]))
+    assert (far(log_scale).components.stddev == 0).all()
+    np.testing.assert_array_equal(far(log_scale).cdf(jnp.array([[0.4], [0.5], [0.6]])), [0, 0.5, 1])
+    slope = jax.jacobian(lambda log_scale: far(log_scale).cdf(jnp.array([[0.4], [0.6]])))(log_scale)
+    np.testing.assert_array_equal(slope, np.zeros((2, 1)))
 
 
 def test_cdf_and_quantiles_of_a_gaussian_mixture(x64):
