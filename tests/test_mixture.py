@@ -391,6 +391,13 @@ def test_cdf_where_standard_deviations_underflow():
     np.testing.assert_array_equal(slope, np.zeros((2, 1)))
 
 
+def test_the_mean_is_infinite_where_a_fold_overflows():
+    """At t = 1e20 the widest component has all the weight; its fold, of degree 3, exceeds float32."""
+    components = _components(fold=PolynomialFold(np.ones((3, 3, 2), np.float32)))
+    mean = FoldedMixture(components, weights=WEIGHTS).expected_space(jnp.array([-1e20, 1e20], jnp.float32))
+    np.testing.assert_array_equal(mean, [[np.inf, np.inf], [-np.inf, -np.inf]])
+
+
 def test_cdf_and_quantiles_of_a_gaussian_mixture(x64):
     weights, loc, scale = (
         np.array([0.3, 0.0, 0.7]),

@@ -104,7 +104,8 @@ def mixture_moments(weights: Array, means: Array, covariances: Array) -> tuple[A
     """Mean and covariance by the laws of total mean and covariance, from those of the components."""
     mean = weighted_sum(weights, means, 1)
     # A second pass on centered means: otherwise the rounding error of the weights is multiplied by the offset.
-    mean = mean + weighted_sum(weights, means - mean[..., None, :], 1)
+    error = weighted_sum(weights, means - mean[..., None, :], 1)
+    mean = jnp.where(jnp.isfinite(mean), mean + error, mean)  # where a fold overflows it stays infinite
     centered = means - mean[..., None, :]
     return mean, weighted_sum(weights, covariances + centered[..., :, None] * centered[..., None, :], 2)
 
