@@ -46,6 +46,18 @@ _LOG_2PI = float(np.log(2 * np.pi))
 _FAR = 40.0
 
 
+@jax.custom_jvp
+def _divide(x: Array, scale: Array) -> Array:
+    """x / scale, whose derivative does not divide by scale^2, which underflows."""
+    return x / scale
+
+
+@_divide.defjvp
+def _divide_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    quotient = _divide(*primals)
+    return quotient, _divide(tangents[0] - quotient * tangents[1], primals[1])
+
+
 class Normal(BatchModule):
     """A normal distribution on the real line: the time marginal of a Folded-Gaussian.
 
@@ -96,8 +108,8 @@ class Normal(BatchModule):
     def cdf(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
         """P(t <= value)."""
         value, loc, scale = self._aligned(value)
-        far = jnp.abs(value - loc) > _FAR * scale  # there quotients overflow, whose derivatives would be NaN
-        z = jnp.where(far, jnp.sign(value - loc) * _FAR, (value - loc) / jnp.where(far, 1, scale))
+        far = jnp.abs(value - loc) / _FAR > scale  # there quotients overflow, whose derivatives would be NaN
+        z = jnp.where(far, jnp.sign(value - loc) * _FAR, _divide(value - loc, jnp.where(far, 1, scale)))
         return jax.scipy.special.ndtr(z)
 
     def icdf(self, q: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:

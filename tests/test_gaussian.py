@@ -46,13 +46,18 @@ def test_normal_at_the_ends():
     np.testing.assert_allclose(density, stats.norm(0.5, 2.0).pdf([-3.0, 0.5]), rtol=1e-12)
 
 
-def test_the_cdf_is_flat_far_from_narrow_normals():
+def test_derivatives_of_the_cdf_of_narrow_and_wide_normals():
     with jax.enable_x64(False):
         values = np.array([-1.0, 1.0, np.inf], np.float32)
         cdf = jax.value_and_grad(lambda scale, value: Normal(0.0, scale, validate_args=False).cdf(value), (0, 1))
         found = jax.vmap(cdf, (None, 0))(jnp.float32(1e-30), values)
+        near = jax.vmap(cdf, (None, 0))(jnp.float32(1e-22), np.array([0, 1e-22], np.float32))
+        wide = jax.grad(lambda scale: Normal(0.0, scale, validate_args=False).cdf(np.inf))(jnp.float32(1e38))
     np.testing.assert_array_equal(found[0], [0, 1, 1])
     np.testing.assert_array_equal(found[1], np.zeros((2, 3)))
+    density = stats.norm.pdf([0, 1]) / 1e-22
+    np.testing.assert_allclose(near[1], [[0, -density[1]], density], rtol=1e-5)
+    assert wide == 0
 
 
 @pytest.mark.parametrize("log_scale", [0.0, -1.5])

@@ -391,6 +391,12 @@ def test_cdf_where_standard_deviations_underflow():
     np.testing.assert_array_equal(slope, np.zeros((2, 1)))
 
 
+def test_a_mean_whose_components_are_too_far_apart():
+    """Their difference exceeds float32."""
+    apart = GaussianMixture(Gaussian([[3e38], [-3e38]], np.ones((2, 1, 1), np.float32)), weights=[0.9, 0.1])
+    np.testing.assert_allclose(apart.mean, [2.4e38], rtol=1e-6)
+
+
 def test_the_mean_is_infinite_where_a_fold_overflows():
     """At t = 1e20 the widest component has all the weight; its fold, of degree 3, exceeds float32."""
     components = _components(fold=PolynomialFold(np.ones((3, 3, 2), np.float32)))

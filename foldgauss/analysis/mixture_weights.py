@@ -105,7 +105,7 @@ def mixture_moments(weights: Array, means: Array, covariances: Array) -> tuple[A
     mean = weighted_sum(weights, means, 1)
     # A second pass on centered means: otherwise the rounding error of the weights is multiplied by the offset.
     error = weighted_sum(weights, means - mean[..., None, :], 1)
-    mean = jnp.where(jnp.isfinite(mean), mean + error, mean)  # where a fold overflows it stays infinite
+    mean = jnp.where(jnp.isfinite(error), mean + error, mean)  # not where differences overflow
     centered = means - mean[..., None, :]
     return mean, weighted_sum(weights, covariances + centered[..., :, None] * centered[..., None, :], 2)
 

@@ -643,6 +643,14 @@ def test_a_closed_array_keeps_no_decoder(long_index):
     assert (lazy[0] == first).all()
 
 
+def test_a_decoder_may_be_closed_while_it_is_read(long):
+    video = decoder.VideoDecoder(long)
+    frames = video.frames()
+    next(frames)
+    video.close()
+    assert list(frames) == []  # FFmpeg would read memory that is freed
+
+
 def test_what_arrays_refuse_is_refused(long_index):
     lazy = LazyFrames(long_index, first=600)
     for which in (20, -21):

@@ -100,6 +100,7 @@ class VideoDecoder:
         #: Whether an edit list may hide frames that the container counts.
         self.hides_frames = self._container.format.name.startswith("mov")
         self.has_converted = False  # whether any frame was interlaced
+        self._closed = False
         self._size = self._codec.height, self._codec.width
         self._converter = VideoReformatter()
         self._angle: int | None = None  # of the display matrix
@@ -108,6 +109,8 @@ class VideoDecoder:
         self._damaged = False  # since then
 
     def close(self) -> None:
+        """Close the file; `frames` that are being read end."""
+        self._closed = True
         self._container.close()
 
     @property
@@ -169,6 +172,8 @@ class VideoDecoder:
             self._size = self._size if all(self._size) else (frame.height, frame.width)
             matrix = self._find_matrix(frame)
             yield DecodedFrame(self._last, stamp or 0, frame, self._size, matrix, self._converter)
+            if self._closed:  # FFmpeg would read on in memory that is freed
+                return
 
     def _find_matrix(self, frame: av.VideoFrame) -> tuple[int, int, int, int]:
         """The display matrix of the frame, read anew where its angle is another: to read it keeps the frame in memory
