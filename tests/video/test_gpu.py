@@ -12,7 +12,12 @@ from foldgauss import FoldedGaussian, FoldedMixture, PolynomialFold
 from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.video import FitConfig, evaluate, fit
 
-pytestmark = [pytest.mark.gpu, pytest.mark.usefixtures("optimized")]
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.usefixtures("optimized"),
+    # Pallas's compiler for GPUs that `pallas` uses, from JAX 0.11 on; docs/gpu.md says so.
+    pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning"),
+]
 CPU = jax.devices("cpu")[0]
 SIZE = (120, 200)
 
