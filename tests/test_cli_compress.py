@@ -86,6 +86,10 @@ ODD = [
     {"frames": 5},
     {"frames_digest": ["another's"]},
     {"clip": {"a": 1}, "seed": "0"},
+    {"frame_seconds": [0, 0.2, 0.2]},
+    {"frame_seconds": [0.1, 0.2]},
+    {"frame_seconds": {"0": 0}},
+    {"frame_seconds": [0, "1"]},
 ]
 
 

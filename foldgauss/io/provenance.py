@@ -5,6 +5,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.media.lazy_frames import LazyFrames
 
@@ -18,6 +20,11 @@ def fingerprint(clip: Clip) -> dict[str, Any]:
 def describe_source(clip: Clip, seed: int) -> dict[str, Any]:
     """The metadata about the clip and the seed in a model file."""
     return {"clip": Path(clip.source).name, "seed": seed, "frames_digest": fingerprint(clip)["frames_digest"]}
+
+
+def describe_times(times: np.ndarray | None) -> dict[str, Any]:
+    """The metadata about the times at which the frames of a clip are shown: none where they are evenly spaced."""
+    return {} if times is None else {"frame_seconds": np.round(times, 6).tolist()}
 
 
 def has_other_frames(about: Mapping[str, Any], clip: Clip) -> bool:

@@ -24,7 +24,7 @@ from foldgauss.io.media.indexed_reader import read_indexed
 from foldgauss.io.media.video_reading import read_video
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.io.models.video_model import save_video_model
-from foldgauss.io.provenance import describe_source, fingerprint
+from foldgauss.io.provenance import describe_source, describe_times, fingerprint
 from foldgauss.jobs.job import FitJob, file_digest, read_record
 from foldgauss.jobs.warning_capture import WarningCapture
 from foldgauss.video.fitting.config import FitConfig
@@ -182,8 +182,8 @@ def read_clip(job: FitJob) -> Clip:
 
 
 def fit_metadata(clip: Clip, seed: int, frames: tuple[int | None, int | None] | None) -> dict[str, Any]:
-    """Metadata of a fitted model: its clip, the range of frames, and the seed."""
-    return describe_source(clip, seed) | {"frames": frames}
+    """Metadata of a fitted model: its clip, the range of frames, the seed, and times of frames as `describe_times`."""
+    return describe_source(clip, seed) | {"frames": frames} | describe_times(clip.times)
 
 
 def mean_scores(scores: Evaluation) -> dict[str, float]:

@@ -20,6 +20,7 @@ from foldgauss.io.media.frame_index import FrameIndex, index_video
 from foldgauss.io.media.indexed_reader import read_indexed
 from foldgauss.io.models.segmented import join_segments
 from foldgauss.io.models.video_model import load_video_model
+from foldgauss.io.provenance import describe_times
 from foldgauss.jobs.job import FitJob, file_digest
 from foldgauss.video.fitting.config import FitConfig, rename_settings
 from foldgauss.video.models.metrics import psnr, ssim
@@ -214,6 +215,7 @@ def plan_long_fit(
     with atomic_path(folder / _PLAN) as temporary:
         temporary.write_text(json.dumps(kept) + "\n")
     metadata = {"clip": clip.name, "seed": config.seed, "frames": frames, "clip_digest": index.digest}
+    metadata |= describe_times(index.times)
     jobs = _make_jobs(
         clip, folder, config, index, spans, size, checkpoint_seconds, 0 if frames is None else frames[0] or 0
     )

@@ -15,10 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from browser import Opened
+from editor_page import drop
 from soft_models import NUM, OBJECT, SIZE, on_paths, soft_model
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import OutputError, export, html_page, load_video_model, save_compact, save_video_model, write_html
+from foldgauss.io.models.video_model import read_origin
 from foldgauss.io.page import player_page
 from foldgauss.io.page.player_page import bundle_script, quantize_finely
 from foldgauss.render import RenderOptions
@@ -553,7 +555,7 @@ def test_segments_that_no_page_holds_are_told(monkeypatch):
     video, made = segmented(), []
     (frame,) = [one for tag, one in _Elements(video._repr_html_()).tags if tag == "iframe"]
     assert frame["srcdoc"] == html_page(video, title="foldgauss")
-    monkeypatch.setattr(player_page, "pack_compact", lambda model: made.append(model) or bytes(1000))
+    monkeypatch.setattr(player_page, "pack_compact", lambda model, metadata: made.append(model) or bytes(1000))
     monkeypatch.setattr(player_page, "LARGEST_IN_NOTEBOOK", 3000)
     assert video._repr_html_() is None
     assert len(made) == 2  # more have no room
@@ -596,6 +598,43 @@ def test_few_segments_are_held_whatever_the_length(opened):
         page.until(f"foldgauss.stats.decoded.join() === '{','.join(map(str, held))}'")
         assert page.stats["textures"] <= 4
         assert page.stats["total"] == 9 * NUM
+
+
+def test_a_variable_frame_rate_is_kept(opened, tmp_path):
+    """Frames are shown at the clip's own times, of a model and of one in segments; a model saved has them, too."""
+    for name, video in (("model.safetensors", soft_model()), ("segments.safetensors", segmented())):
+        num = video.num_frames
+        seconds = np.cumsum([0, *np.where(np.arange(num - 1) % 3, 0.04, 0.4)]).tolist()
+        path = save_video_model(tmp_path / name, video, metadata={"frame_seconds": seconds})
+        page = opened(path, fresh=True)
+        timeline = page.page.evaluate("foldgauss.player.timeline.seconds")
+        assert timeline == pytest.approx(seconds)
+        end = seconds[-1]
+        assert page.page.locator("#whole").inner_text() == f"/ 0:{end:05.2f}"
+        positions = [0, 0.5, 1, 1.25, num - 1, num, -0.5]
+        ask = "(all) => all.map((one) => foldgauss.player.timeline.{}(one))"
+        shown = page.page.evaluate(ask.format("secondOf"), positions)
+        mean = 1 / video.fps
+        assert shown == pytest.approx([0, 0.2, 0.4, 0.41, end, end + mean, -0.5 * mean])
+        assert page.page.evaluate(ask.format("positionAt"), shown) == pytest.approx(positions)
+        advanced = page.page.evaluate(
+            """() => {
+              const { player } = foldgauss, { advance } = Object.getPrototypeOf(player);
+              player.seekPosition(0);
+              player.before = 1000;
+              advance.call(player, 1200);
+              return player.position;
+            }"""
+        )
+        assert advanced == pytest.approx(0.5)
+    page = opened(tmp_path / "model.safetensors", fresh=True)
+    with page.page.expect_download() as saved:
+        page.page.evaluate("foldgauss.files.downloadModel()")
+    saved.value.save_as(tmp_path / "saved.safetensors")
+    own, other = (read_origin(tmp_path / name)["frame_seconds"] for name in ("model.safetensors", "saved.safetensors"))
+    assert own == other
+    drop(page, tmp_path / "saved.safetensors")
+    page.until("foldgauss.player.timeline.seconds?.length === " + str(len(own)))
 
 
 def test_controls_work_on_the_whole_clip(opened):

@@ -183,6 +183,45 @@ def test_rate_can_be_given(clip_file):
     assert read_video(clip_file, fps=30).fps == 30.0
 
 
+#: Seconds at which frames of a clip with an uneven rate are shown.
+UNEVEN = np.array([0, 0.1, 0.16, 0.4, 0.5, 0.53, 0.8, 0.9])
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "tolerance"),
+    [
+        ("a.mp4", None, 1e-5),
+        ("a.mp4", "h265", 1e-5),
+        ("a.mp4", "av1", 1e-5),
+        ("a.webm", None, 6e-4),  # milliseconds
+        ("a.mov", None, 1e-5),
+        ("a.mkv", None, 6e-4),
+        ("a.gif", None, 6e-3),  # hundredths of a second
+        ("a.webp", None, 6e-4),
+    ],
+)
+def test_frames_are_shown_at_their_times(tmp_path, name, codec, tolerance):
+    write_video(tmp_path / name, _moving(8, 64, 64), 7 / 0.9, times=UNEVEN, codec=codec)
+    clip = read_video(tmp_path / name)
+    assert clip.num_frames == 8
+    np.testing.assert_allclose(clip.times, UNEVEN, atol=tolerance)
+    assert clip.fps == pytest.approx(7 / 0.9, rel=2e-3)
+
+
+def test_times_too_near_for_the_clock_stay_in_order(tmp_path):
+    times = np.array([0, 1e-7, 2e-7, 0.1, 0.2, 0.5, 0.6, 0.7])
+    write_video(tmp_path / "a.mp4", _moving(), 10, times=times)
+    np.testing.assert_allclose(read_video(tmp_path / "a.mp4").times, times, atol=5e-5)
+
+
+@pytest.mark.parametrize("times", [UNEVEN[1:], UNEVEN[:-1], [*UNEVEN, 1.0], UNEVEN[::-1], [[0.0]], [], [0, np.nan]])
+@pytest.mark.parametrize("name", ["a.mp4", "a.webp", "folder"])
+def test_times_that_do_not_fit_are_refused(tmp_path, times, name):
+    with pytest.raises(VideoError, match=r"times: expected seconds that rise from 0|frames: expected \d, as many"):
+        write_video(tmp_path / name, _moving(), 10, times=times)
+    assert not list(tmp_path.iterdir())
+
+
 def test_truncated_video_yields_the_frames_that_decode(tmp_path, clip_file):
     data = clip_file.read_bytes()
     whole = read_video(clip_file)

@@ -13,7 +13,7 @@ from foldgauss._runtime.checks import is_within
 from foldgauss.cli.app.application import WrongUse, app, err, warn, wrong_use
 from foldgauss.cli.app.completion import complete_clips
 from foldgauss.cli.shared.arguments import FittedFrames, ModelFile, Overwrite
-from foldgauss.cli.shared.clips import is_other_clip, keep_origin, read_fitted_clip, refuse_segments
+from foldgauss.cli.shared.clips import is_other_clip, read_fitted_clip, refuse_segments
 from foldgauss.cli.shared.outputs import refuse_existing, refuse_input
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import print_figures
@@ -23,6 +23,7 @@ from foldgauss.io.models.compact import COMPACT_SUFFIX, check_compact_name, save
 from foldgauss.io.models.video_model import (
     MODEL_SUFFIX,
     check_model_name,
+    keep_origin,
     load_video_model,
     read_origin,
     save_video_model,
@@ -115,7 +116,7 @@ def compress_command(
 
 def save_compressed(target: Path, made: Compressed, about: dict[str, Any], *, known: bool = True) -> None:
     """Write a compact file with the metadata `about`, and its PSNR if that is `known`."""
-    about = keep_origin(about, "clip", "frames", "frames_digest", "seed")
+    about = keep_origin(about, "clip", "frames", "frame_seconds", "frames_digest", "seed")
     about |= {"mean_psnr": round(made.psnr - made.loss_db, 3)} if known else {}
     save_compact(target, made.quantized, metadata=about | {"loss_db": round(made.loss_db, 4)})
 

@@ -10,7 +10,6 @@ import typer
 from foldgauss.cli.app.application import WrongUse, app, out, wrong_use
 from foldgauss.cli.app.completion import complete_files
 from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, parse_size
-from foldgauss.cli.shared.clips import keep_origin
 from foldgauss.cli.shared.log_lines import print_log
 from foldgauss.cli.shared.outputs import check_image_path, name_after, refuse_existing, refuse_huge, refuse_input
 from foldgauss.cli.shared.rendering import render_to_file
@@ -19,7 +18,9 @@ from foldgauss.io.edit_script import read_edit_script
 from foldgauss.io.models.video_model import (
     MODEL_SUFFIX,
     check_model_name,
+    keep_origin,
     load_video_model,
+    read_frame_seconds,
     read_origin,
     save_video_model,
 )
@@ -74,7 +75,7 @@ def edit_command(
         edited = script.apply(model)
     if as_model:
         about = read_origin(model_path)
-        about = keep_origin(about, "clip", "frames") | {"edited_by": script_path.name}
+        about = keep_origin(about, "clip", "frames", "frame_seconds") | {"edited_by": script_path.name}
         if isinstance(edited, SegmentedVideo):
             edited = _drop_scores(model, edited)
         save_video_model(out_path, edited, metadata=about)
@@ -83,18 +84,18 @@ def edit_command(
             kind = f"a model in {len(edited.segments)} segments"
         out.print(f"{out_path}: {kind}, {edited.num_gaussians:,} Gaussians", soft_wrap=True)
         return
-    render_to_file(
-        edited, out_path, np.asarray(edited.frame_times.times()), edited.fps, size=image_size, overwrite=overwrite
-    )
+    seconds = read_frame_seconds(read_origin(model_path), edited.num_frames)
+    times = np.asarray(edited.frame_times.times())
+    render_to_file(edited, out_path, times, edited.fps, size=image_size, overwrite=overwrite, stamps=seconds)
 
 
 def _drop_scores(model: SegmentedVideo, edited: SegmentedVideo) -> SegmentedVideo:
     """Remove the recorded scores of edited segments, which were measured before the edit."""
-    before = set(map(id, model.segments))
+    before, kept = set(map(id, model.segments)), ("clip", "frames", "frame_seconds")
     segments = []
     for segment in edited.segments:
         if id(segment) not in before:
-            segment = dataclasses.replace(segment, metadata=keep_origin(segment.metadata, "clip", "frames"))
+            segment = dataclasses.replace(segment, metadata=keep_origin(segment.metadata, *kept))
         segments.append(segment)
     return SegmentedVideo(segments)
 

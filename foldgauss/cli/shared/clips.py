@@ -1,8 +1,7 @@
 """Models and the clips that they were fitted to."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from foldgauss.cli.app.application import WrongUse, err, warn, wrong_use
 from foldgauss.cli.shared.arguments import parse_frames
@@ -81,8 +80,3 @@ def is_other_clip(model_path: Path, clip: Clip, measure_psnr: Callable[[], float
     about = read_origin(model_path)
     fitted = about.get("mean_psnr")
     return fitted is not None and has_other_frames(about, clip) and measure_psnr() < fitted - OTHER_CLIP_DB
-
-
-def keep_origin(about: Mapping[str, Any], *names: str) -> dict[str, Any]:
-    """The entries of a model's metadata with these names."""
-    return {name: about[name] for name in names if name in about}

@@ -165,10 +165,12 @@ def render_to_file(
     overwrite: bool = False,
     options: VideoOptions = VideoOptions(),  # noqa: B008
     flow: bool = True,
+    stamps: np.ndarray | None = None,
 ) -> None:
     """Write the images at `times` as a video or to a folder, or a single image to a .png.
 
-    `flow`: between frames, averages with predictions by optical flow, see `interpolate_frames`.
+    `flow`: between frames, averages with predictions by optical flow, see `interpolate_frames`. `stamps`: seconds at
+    which the images are shown; None where they are evenly spaced at `fps`.
     """
     if flow:
         images = interpolate_frames(model, times, size, background=background)
@@ -182,7 +184,8 @@ def render_to_file(
         write_image(path, next(images))
         out.print(f"{path}: the image at time {times[0]:g}", soft_wrap=True)
         return
-    write_images(path, images, len(times), fps, image_format=image_format, overwrite=overwrite, options=options)
+    how = {"image_format": image_format, "overwrite": overwrite, "options": options, "stamps": stamps}
+    write_images(path, images, len(times), fps, **how)
 
 
 def write_images(
@@ -194,8 +197,9 @@ def write_images(
     image_format: str = "png",
     overwrite: bool = False,
     options: VideoOptions = VideoOptions(),  # noqa: B008
+    stamps: np.ndarray | None = None,
 ) -> None:
-    """Write `num` images as a video or to a folder."""
+    """Write `num` images as a video or to a folder. `stamps`: as in `render_to_file`."""
     _check_rate(path, fps)
     with progress_bar("Rendering", num) as advance:
         try:
@@ -205,10 +209,12 @@ def write_images(
                 min(fps, MAX_FPS),
                 overwrite=overwrite,
                 image_format=image_format,
+                times=stamps,
                 **options._asdict(),
             )
         except ValueError as error:
             if not str(error).startswith(VideoOptions._fields):
                 raise
             raise WrongUse(name_option(str(error))) from error
-    out.print(f"{path}: {format_count(num, 'frame')} at {fps:g} frames per second", soft_wrap=True)
+    rate = f"{fps:g} frames per second" if stamps is None else f"the times of the clip, {fps:.4g} per second on average"
+    out.print(f"{path}: {format_count(num, 'frame')} at {rate}", soft_wrap=True)

@@ -23,7 +23,11 @@ Speed = Annotated[float | None, typer.Option(help="Playback speed: 0.25 is slow 
 
 @dataclasses.dataclass(frozen=True)
 class Timeline:
-    """Chooses the rendered times and the frame rate; all but `fps` exclude each other."""
+    """Chooses the rendered times and the frame rate; all but `fps` exclude each other.
+
+    In the methods `fps` is the clip's rate. `seconds` are the times at which its frames are shown where they are not
+    evenly spaced, and `fps` is their mean rate then.
+    """
 
     upsample: int | None = None
     fps: float | None = None
@@ -58,14 +62,26 @@ class Timeline:
         return self.frame is not None or (self.chosen is not None and len(self.chosen) == 1)
 
     def rate(self, fps: float) -> float:
-        """Frames per second of the output, given those of the clip."""
+        """Frames per second of the output."""
         return fps * (self.upsample or 1) if self.fps is None else self.fps
 
     def playing_speed(self, fps: float) -> float:
         """How many times as fast as the clip the output plays, where that is constant."""
         return self.rate(fps) / (fps * self.upsample) if self.upsample else self.speed or 1.0
 
-    def times(self, frame_times: np.ndarray, fps: float) -> np.ndarray:
+    def stamps(self, fps: float, seconds: np.ndarray | None) -> np.ndarray | None:
+        """Seconds at which the output's images are shown; None where they are evenly spaced.
+
+        Those of the clip's own frames, and what `upsample` puts between them, keep the clip's rhythm.
+        """
+        others = self.speed, self.remap, self.chosen, self.frame, None if self.upsample else self.fps
+        if seconds is None or any(other is not None for other in others):
+            return None
+        numbers, upsample = np.arange(len(seconds)), self.upsample or 1
+        shown = np.interp(np.arange((len(seconds) - 1) * upsample + 1) / upsample, numbers, seconds)
+        return shown / self.playing_speed(fps)
+
+    def times(self, frame_times: np.ndarray, fps: float, seconds: np.ndarray | None = None) -> np.ndarray:
         """The model times to render, in order."""
         if self.chosen is not None:
             return self.chosen
@@ -77,14 +93,16 @@ class Timeline:
         if self.upsample is not None:
             self._refuse_long("--upsample", (len(frame_times) - 1) * self.upsample)
             return interpolated_times(frame_times, self.upsample)
+        if self.stamps(fps, seconds) is not None:
+            return frame_times
         rate = self.rate(fps) / fps
         if self.remap is not None:
             self._refuse_long("--remap", self.remap[-1][0] * fps * rate)
-            return times_at(frame_times, remapped_positions(self.remap, fps, rate))
-        speed = self.speed or 1.0
+            return times_at(frame_times, _uneven(remapped_positions(self.remap, fps, rate), fps, seconds))
+        speed, num = self.speed or 1.0, len(frame_times) if seconds is None else seconds[-1] * fps + 1
         if self.speed is not None or self.fps is not None:  # otherwise it has as many frames as the clip
-            self._refuse_long("--fps" if self.speed is None else "--speed", (len(frame_times) - 1) * rate / abs(speed))
-        return times_at(frame_times, played_positions(len(frame_times), rate, speed=speed))
+            self._refuse_long("--fps" if self.speed is None else "--speed", (num - 1) * rate / abs(speed))
+        return times_at(frame_times, _uneven(played_positions(num, rate, speed=speed), fps, seconds))
 
     def warn_of_end(self, num_frames: int, fps: float) -> None:
         """Warn if `remap` exceeds the clip, whose last frame ends at num_frames / fps."""
@@ -99,6 +117,11 @@ class Timeline:
         if num_images > MAX_IMAGES:
             expected = f"at most {MAX_IMAGES:,} images"
             raise wrong_use(option, expected=expected, got=f"{num_images:,.0f}")
+
+
+def _uneven(positions: np.ndarray, fps: float, seconds: np.ndarray | None) -> np.ndarray:
+    """Positions among frames shown at `seconds`, from those among evenly spaced ones."""
+    return positions if seconds is None else np.interp(positions / fps, seconds, np.arange(len(seconds)))
 
 
 def parse_remap(text: str | None) -> list[tuple[float, float]] | None:

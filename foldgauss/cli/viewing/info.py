@@ -33,7 +33,7 @@ def info(model_path: ModelFile) -> None:
         return
     powers = sorted({f"{float(one.model.splats.envelope.power):g}" for one in as_edited(model).layers})
     figures = {
-        "frames": _describe_frames(model),
+        "frames": _describe_frames(model, about),
         "Gaussians": f"{model.num_gaussians:,}",
         "fold": f"polynomial of degree {model.degree}",
         **_describe_paths(model),
@@ -62,7 +62,7 @@ def _print_segments(model_path: Path, model: SegmentedVideo, about: dict) -> Non
     cuts, fades = len(model.cuts), len(model.segments) - 1 - len(model.cuts)
     joints = f"; begin at a cut: {cuts:,}; fade in: {fades:,}" if len(model.segments) > 1 else ""
     figures = {
-        "frames": _describe_frames(model),
+        "frames": _describe_frames(model, about),
         "segments": f"{len(model.segments):,}{joints}",
         "Gaussians": f"{model.num_gaussians:,} in all",
         "fold": f"polynomial of degree {model.degree}",
@@ -84,8 +84,9 @@ def _print_segments(model_path: Path, model: SegmentedVideo, about: dict) -> Non
         out.print(f"and {len(model.segments) - MAX_SEGMENTS:,} more segments")
 
 
-def _describe_frames(model: Video) -> str:
-    return f"{model.num_frames:,} of {model.size[0]}x{model.size[1]} (height x width), {model.fps:g} per second"
+def _describe_frames(model: Video, about: dict) -> str:
+    rate = f"{model.fps:.4g} per second on average" if "frame_seconds" in about else f"{model.fps:g} per second"
+    return f"{model.num_frames:,} of {model.size[0]}x{model.size[1]} (height x width), {rate}"
 
 
 def _describe_paths(model: VideoModel | EditedVideo) -> dict[str, str]:

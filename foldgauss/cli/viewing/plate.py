@@ -21,7 +21,7 @@ from foldgauss.cli.shared.rendering import (
     write_images,
 )
 from foldgauss.io.media.video_writing import VIDEO_SUFFIXES
-from foldgauss.io.models.video_model import load_video_model
+from foldgauss.io.models.video_model import load_video_model, read_frame_seconds, read_origin
 from foldgauss.video.motion.background_plate import Alignment, fill_background
 from foldgauss.video.motion.moving_object import LEAST_FRAMES, NothingMoves, find_moving_object, nothing_moves
 
@@ -79,7 +79,8 @@ def plate_command(
         except NothingMoves as error:
             raise nothing_moves("an object that moves against the background", "none", _CURE) from error
         plate = fill_background(frames, masks, alignment=alignment)
-    write_images(out_path, plate, len(plate), model.fps, overwrite=overwrite, options=options)
+    stamps = read_frame_seconds(read_origin(model_path), model.num_frames)
+    write_images(out_path, plate, len(plate), model.fps, overwrite=overwrite, options=options, stamps=stamps)
     if masks_path is not None:
         images = (np.repeat(np.uint8(255 * mask)[..., None], 3, -1) for mask in masks)
-        write_images(masks_path, images, len(masks), model.fps, overwrite=overwrite)
+        write_images(masks_path, images, len(masks), model.fps, overwrite=overwrite, stamps=stamps)

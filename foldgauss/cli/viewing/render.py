@@ -39,7 +39,7 @@ from foldgauss.cli.shared.rendering import (
 )
 from foldgauss.cli.shared.timeline import Fps, Speed, Timeline, Upsample, parse_remap
 from foldgauss.io.media.video_writing import IMAGE_FORMATS, VIDEO_SUFFIXES
-from foldgauss.io.models.video_model import load_video_model, read_origin
+from foldgauss.io.models.video_model import load_video_model, read_frame_seconds, read_origin
 
 
 @app.command()
@@ -107,8 +107,10 @@ def render(
     constants = override_constants(model.options, alpha_cutoff, support_radius, transmittance_stop)
     model = model.with_options(constants)
     refuse_huge(image_size or model.size)
-    options = VideoOptions(codec, crf, pixel_format, choose_sound(sound, timeline, read_origin(model_path), model.fps))
-    shown, rate = timeline.times(np.asarray(model.frame_times.times()), model.fps), timeline.rate(model.fps)
+    about, rate = read_origin(model_path), timeline.rate(model.fps)
+    options = VideoOptions(codec, crf, pixel_format, choose_sound(sound, timeline, about, model.fps))
+    seconds = read_frame_seconds(about, model.num_frames)
+    shown = timeline.times(np.asarray(model.frame_times.times()), model.fps, seconds)
     timeline.warn_of_end(model.num_frames, model.fps)
     render_to_file(
         model,
@@ -121,6 +123,7 @@ def render(
         overwrite=overwrite,
         options=options,
         flow=flow,
+        stamps=timeline.stamps(model.fps, seconds),
     )
 
 

@@ -26,7 +26,7 @@ from foldgauss.cli.shared.rendering import (
 )
 from foldgauss.cli.shared.timeline import Fps, Speed, Timeline, Upsample
 from foldgauss.io.media.video_writing import VIDEO_SUFFIXES
-from foldgauss.io.models.video_model import load_video_model, read_origin
+from foldgauss.io.models.video_model import load_video_model, read_frame_seconds, read_origin
 from foldgauss.video.motion.stabilization import BORDERS, MAX_ZOOM, SMOOTHING, stabilize
 
 
@@ -73,8 +73,10 @@ def stabilize_command(
         raise wrong_use("--fixed", expected="no --smoothing", got="both; the camera stands still")
     model = load_video_model(model_path)
     refuse_huge(image_size or model.size)
-    options = VideoOptions(codec, crf, pixel_format, choose_sound(sound, timeline, read_origin(model_path), model.fps))
-    shown, rate = timeline.times(np.asarray(model.frame_times.times()), model.fps), timeline.rate(model.fps)
+    about, rate = read_origin(model_path), timeline.rate(model.fps)
+    options = VideoOptions(codec, crf, pixel_format, choose_sound(sound, timeline, about, model.fps))
+    seconds = read_frame_seconds(about, model.num_frames)
+    shown = timeline.times(np.asarray(model.frame_times.times()), model.fps, seconds)
     check_video_options(out_path, image_size or model.size, rate, options, background_color)
     with progress_bar("Estimating the camera's path", model.num_frames) as advance:
         try:
@@ -94,4 +96,5 @@ def stabilize_command(
         overwrite=overwrite,
         options=options,
         flow=flow,
+        stamps=timeline.stamps(model.fps, seconds),
     )

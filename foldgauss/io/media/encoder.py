@@ -69,6 +69,8 @@ CODECS = {
 #: The codec of each extension unless one is given.
 DEFAULT_CODECS = {".mp4": "h264", ".webm": "vp9", ".mov": "prores", ".mkv": "ffv1"}
 SAMPLE_RATE = 48_000
+#: Units of the time stamps of unevenly spaced frames.
+CLOCK = Fraction(1, 90_000)
 #: Seconds of the source by which atempo is early, measured below speed 1: clicks by 12 +- 8 ms, noise 15, tones 7.
 TEMPO_LEAD = 0.012
 VIDEO_SUFFIXES = tuple(DEFAULT_CODECS)
@@ -131,14 +133,22 @@ def choose_encoding(
 
 
 def encode_video(
-    path: Path, frames: Iterator[np.ndarray], fps: float, encoding: Encoding, sound: Sound | None = None
+    path: Path,
+    frames: Iterator[np.ndarray],
+    fps: float,
+    encoding: Encoding,
+    sound: Sound | None = None,
+    times: np.ndarray | None = None,
 ) -> None:
     """Encode RGB frames, or premultiplied RGBA ones, which are stored with straight alpha.
 
+    `times`: seconds at which the frames are shown; None where they are evenly spaced.
     Colors are converted by BT.709 in limited range, and the file says so. An odd height or width is padded by repeating
     the last row or column where the pixel format has half the color resolution.
     """
     rate = Fraction(fps).limit_denominator(100_000)
+    clock = 1 / rate if times is None else CLOCK
+    ticks = None if times is None else _count_ticks(times, 1 / fps)
     options = dict(encoding.codec.options) | ({} if encoding.crf is None else {"crf": str(encoding.crf)})
     pixel_format = av.VideoFormat(encoding.pixel_format, 64, 64)
     matrix = None if pixel_format.is_rgb else Colorspace.ITU709
@@ -162,15 +172,24 @@ def encode_video(
                     context = stream.codec_context
                     context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
                     context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
+                stream.codec_context.time_base = clock
                 open_with_own_priority(stream.codec_context)
             given = av.VideoFrame.from_ndarray(image, format="rgba" if image.shape[2] == 4 else "rgb24")
             given = converter.reformat(given, format=pixel_format.name, dst_colorspace=matrix, interpolation=CONVERSION)
-            given.pts, given.time_base = number, 1 / rate
+            begin, end = (number, number + 1) if ticks is None else ticks[number : number + 2]
+            given.pts, given.duration, given.time_base = begin, end - begin, clock
             container.mux(stream.encode(given))
-            while (waiting := waiting or next(packets, None)) and waiting.pts * waiting.time_base < (number + 1) / rate:
+            while (waiting := waiting or next(packets, None)) and waiting.pts * waiting.time_base < end * clock:
                 container.mux(waiting)
                 waiting = None
         container.mux(stream.encode())
+
+
+def _count_ticks(times: np.ndarray, last_duration: float) -> list[int]:
+    """Time stamps of the frames and of the end in units of `CLOCK`, each later than the one before."""
+    ticks = np.rint(np.append(times, times[-1] + last_duration) / float(CLOCK)).astype(np.int64)
+    apart = np.arange(len(ticks))
+    return (np.maximum.accumulate(ticks - apart) + apart).tolist()
 
 
 def _encode_sound(stream: av.AudioStream, sound: Sound) -> Iterator[av.Packet]:

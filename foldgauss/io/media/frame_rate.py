@@ -51,8 +51,8 @@ def describe_rate(rate: FrameRate) -> tuple[str, ...]:
         return ()
     intervals = np.diff(rate.times)
     return (
-        f"frames are {intervals.min():.3g} to {intervals.max():.3g} s apart; all are kept, and treated as evenly "
-        f"spaced at their mean rate of {rate.fps:.4g} per second.",
+        f"frames are {intervals.min():.3g} to {intervals.max():.3g} s apart, {rate.fps:.4g} per second on average; all "
+        "are kept, with the times at which they are shown.",
     )
 
 

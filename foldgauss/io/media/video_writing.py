@@ -1,7 +1,7 @@
 """Writing clips: videos, animations, folders of images and single images."""
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from foldgauss._runtime.checks import check_one_of
+from foldgauss._runtime.checks import check_one_of, short_repr
 from foldgauss.io._atomic import PathLike, atomic_folder, atomic_path, check_path, output_error
 from foldgauss.io.media.clip import check_fps, format_size, video_error
 from foldgauss.io.media.encoder import VIDEO_SUFFIXES, Sound, check_sound, choose_encoding, encode_video, straighten
@@ -35,6 +35,7 @@ def write_video(
     crf: int | None = None,
     pixel_format: str | None = None,
     sound: Sound | None = None,
+    times: Sequence[float] | None = None,
 ) -> Path:
     """Write frames, uint8 RGB of shape (height, width, 3), and return the path. No partial file is left on errors.
 
@@ -44,6 +45,9 @@ def write_video(
     `pixel_format` is FFmpeg's name; by default "yuv420p" (half the color resolution) except for ProRes and FFV1. An odd
     height or width is then padded by repeating its last row or column. Colors are those of BT.709, and the file says
     so. An MP4 can be played while it is loaded (faststart).
+
+    `times`: seconds at which the frames are shown, rising from 0, such as `Clip.times`; by default they are evenly
+    spaced at `fps`. The last frame is shown for 1 / fps. A folder of images holds no times.
 
     `sound`: that of another file, as `Sound("clip.mp4", start=2.0, speed=0.5)`; stored as AAC, in .webm as Opus.
 
@@ -66,6 +70,9 @@ def write_video(
         cure = "For a model: model.frames()."
         raise video_error("frames", expected="an iterable of images", got=type(frames).__name__, cure=cure)
     check_one_of("image_format", image_format, IMAGE_FORMATS)
+    if times is not None:
+        times = _check_times(times)
+        frames = _match_times(frames, len(times))
     suffix = path.suffix.lower()
     options = {"codec": codec, "crf": crf, "pixel_format": pixel_format, "sound": sound}
     given = [name for name, value in options.items() if value is not None]
@@ -75,7 +82,7 @@ def write_video(
     if os.path.isdir(path) or not path.suffix:  # not Path's, which raises for a name that is too long
         return write_frames(path, frames, overwrite=overwrite, image_format=image_format)
     if suffix in ANIMATION_SUFFIXES:
-        return _write_animation(path, suffix, frames, float(fps))
+        return _write_animation(path, suffix, frames, float(fps), times)
     if suffix not in VIDEO_SUFFIXES:
         expected = "a name ending in .mp4, .webm, .mov, .mkv, .gif or .webp, or a folder (no extension) for images"
         cure = "For one image: write_image." if suffix == ".png" else "Rename the output."
@@ -88,7 +95,7 @@ def write_video(
         check_sound(sound)
     with atomic_path(path) as temporary:
         try:
-            encode_video(temporary, chain([first], frames), float(fps), encoding, sound)
+            encode_video(temporary, chain([first], frames), float(fps), encoding, sound, times)
         except OSError as error:
             if error in failures:
                 raise
@@ -138,6 +145,27 @@ def write_image(path: PathLike, image: np.ndarray) -> Path:
     return path
 
 
+def _check_times(times: Sequence[float]) -> np.ndarray:
+    times = np.asarray(times, np.float64)
+    rising = times.ndim == 1 and len(times) and times[0] == 0 and (np.diff(times) > 0).all()
+    if not rising or not np.isfinite(times).all():
+        raise video_error("times", expected="seconds that rise from 0, one for each frame", got=short_repr(times))
+    return times
+
+
+def _match_times(frames: Iterable[np.ndarray], num: int) -> Iterator[np.ndarray]:
+    """The frames. Raises `VideoError` unless there are `num`."""
+    count = 0
+    for frame in frames:
+        count += 1
+        if count > num:
+            break
+        yield frame
+    if count != num:
+        got = f"more than {num}" if count > num else f"{count}"
+        raise video_error("frames", expected=f"{num}, as many as times", got=got)
+
+
 def _noting_failures(frames: Iterable[np.ndarray], failures: list[OSError]) -> Iterator[np.ndarray]:
     """The frames; an OSError of making them is added to `failures`, to be told from those of writing."""
     try:
@@ -185,7 +213,9 @@ def _encode_image(frame: np.ndarray, image_format: str = "png") -> bytes:
 # ------------------------------------------------------------------------------------------- animations
 
 
-def _write_animation(path: Path, suffix: str, frames: Iterable[np.ndarray], fps: float) -> Path:
+def _write_animation(
+    path: Path, suffix: str, frames: Iterable[np.ndarray], fps: float, times: np.ndarray | None
+) -> Path:
     """Write an animated GIF or WebP that repeats forever."""
     if suffix == ".gif" and fps > MAX_GIF_FPS:
         expected, cure = f"at most {MAX_GIF_FPS:g} for a GIF", "Take fewer frames, or a .webp or .webm."
@@ -194,14 +224,15 @@ def _write_animation(path: Path, suffix: str, frames: Iterable[np.ndarray], fps:
         images = map(Image.fromarray, _check_frames(frames, channels=(3,)))
         first, *rest = (image.quantize(256) for image in images) if suffix == ".gif" else images
         shared = {"save_all": True, "append_images": rest, "loop": 0}
+        ends = np.arange(len(rest) + 2) / fps if times is None else np.append(times, times[-1] + 1 / fps)
         try:
             if suffix == ".gif":
                 # Milliseconds, in whole hundredths of a second, whose sums are the true times rounded.
-                ends = np.rint(100 * np.arange(len(rest) + 2) / fps).astype(int)
-                durations = [10 * int(duration) for duration in np.diff(ends)]
+                durations = [10 * int(duration) for duration in np.diff(np.rint(100 * ends).astype(int))]
                 first.save(temporary, "GIF", duration=durations, optimize=False, **shared)
             else:
-                first.save(temporary, "WEBP", duration=1000 / fps, quality=WEBP_QUALITY, **shared)
+                durations = 1000 / fps if times is None else np.diff(np.rint(1000 * ends)).astype(int).tolist()
+                first.save(temporary, "WEBP", duration=durations, quality=WEBP_QUALITY, **shared)
         except OSError as error:
             raise output_error(path, error) from error
         except (OverflowError, RuntimeError, ValueError) as error:

@@ -1,8 +1,9 @@
 """How fitted and edited videos are described in a model file's header, and which arrays of them are stored."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -98,6 +99,24 @@ def read_origin(path: PathLike) -> dict:
     return {name: value for name, value in read_metadata(path).items() if name not in _NOTES or _NOTES[name](value)}
 
 
+def keep_origin(about: Mapping[str, Any], *names: str) -> dict[str, Any]:
+    """The entries of a model's metadata with these names."""
+    return {name: about[name] for name in names if name in about}
+
+
+def read_frame_seconds(about: dict, num_frames: int) -> np.ndarray | None:
+    """Seconds at which the frames of a fitted clip are shown, from `read_origin`; None if they are evenly spaced."""
+    seconds = about.get("frame_seconds")
+    return None if seconds is None or len(seconds) != num_frames else np.array(seconds, np.float64)
+
+
+def _is_rising(value: object) -> bool:
+    """Whether these are seconds that rise from 0."""
+    if not isinstance(value, list) or not all(is_within(one, "[0, inf)") for one in value):
+        return False
+    return len(value) > 1 and value[0] == 0 and all(one < other for one, other in pairwise(value))
+
+
 def _is_range(value: object) -> bool:
     """Whether these are frames A up to, not including, B, as `read_video` takes them."""
     if not isinstance(value, list) or len(value) != 2:
@@ -111,6 +130,7 @@ def _is_range(value: object) -> bool:
 _NOTES: dict[str, Callable[[object], bool]] = {
     **dict.fromkeys(("clip", "frames_digest", "clip_digest"), lambda value: isinstance(value, str)),
     "frames": _is_range,
+    "frame_seconds": _is_rising,
     "seed": lambda value: is_integer(value, 0),
     "mean_psnr": lambda value: is_within(value, "(0, 100]"),
 }

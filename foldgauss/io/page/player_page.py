@@ -23,7 +23,7 @@ from foldgauss.io._atomic import PathLike, atomic_path, check_path
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.compact import is_compact, pack_compact
 from foldgauss.io.models.selections import format_indices
-from foldgauss.io.models.video_model import load_video_model, read_origin
+from foldgauss.io.models.video_model import keep_origin, load_video_model, read_origin
 from foldgauss.video.compression.quantize import (
     COLORS,
     Quantized,
@@ -147,9 +147,9 @@ def html_page(
     """
     if not (is_integer(quality, 1) and quality <= 100):
         raise invalid("quality", expected="a whole number from 1 to 100", got=quality)
-    plain, name = _load(model)
+    plain, name, metadata = _load(model)
     pictures = [] if original is None else list(_encode_original(original, plain, quality))
-    blocks = [*_encode_model(model, plain), *([_encode_moving(plain)] if moving else []), *pictures]
+    blocks = [*_encode_model(model, plain, metadata), *([_encode_moving(plain)] if moving else []), *pictures]
     return _assemble(blocks, name if title is None else title, save_to)
 
 
@@ -162,7 +162,7 @@ def make_notebook_iframe(model: VideoModel | EditedVideo | SegmentedVideo) -> st
     """The page as an iframe for notebooks; None where it is too large or the model cannot be shown."""
     blocks: list[str] = []
     try:
-        for block in _encode_model(model, model):
+        for block in _encode_model(model, model, {}):
             blocks.append(block)
             if sum(map(len, blocks)) > LARGEST_IN_NOTEBOOK:
                 return None
@@ -180,20 +180,23 @@ def make_notebook_iframe(model: VideoModel | EditedVideo | SegmentedVideo) -> st
 # ----------------------------------------------------------------------------------------------- the model
 
 
-def _load(model: Model) -> tuple[Loaded, str]:
-    """The model, and a name for it."""
+def _load(model: Model) -> tuple[Loaded, str, dict]:
+    """The model, a name for it, and the metadata that the page needs."""
     if isinstance(model, PathLike):
         path = check_path(model, "model")
-        name = read_origin(path).get("clip", path.stem)
-        return load_video_model(path), name
+        about = read_origin(path)
+        return load_video_model(path), about.get("clip", path.stem), keep_origin(about, "frame_seconds")
     if not isinstance(model, Loaded):
         cure = "End the chain with .video()." if type(model).__name__ == "Edit" else "The model comes first."
         raise invalid("model", expected="a VideoModel or an EditedVideo", got=short_repr(model), cure=cure)
-    return model, "foldgauss"
+    return model, "foldgauss", {}
 
 
-def _encode_model(model: Model, loaded: Loaded) -> Iterator[str]:
-    """The page's data blocks of the model, one by one; a compact file is embedded unchanged."""
+def _encode_model(model: Model, loaded: Loaded, metadata: dict) -> Iterator[str]:
+    """The page's data blocks of the model, one by one; a compact file is embedded unchanged.
+
+    `metadata` of the whole video goes into the first block.
+    """
     if isinstance(loaded, SegmentedVideo):
         names = ("first", "num_frames", "num_gaussians")
         spans = [{name: int(getattr(segment, name)) for name in names} for segment in loaded.segments]
@@ -204,11 +207,11 @@ def _encode_model(model: Model, loaded: Loaded) -> Iterator[str]:
                 plain = flatten_video(edited)
             except ValueError as error:
                 raise ValueError(f"segment {number}: {error}") from error
-            yield _block(f"model-{number}", pack_compact(quantize_finely(plain)))
+            yield _block(f"model-{number}", pack_compact(quantize_finely(plain), {} if number else metadata))
     elif loaded is not model and is_compact(model):
         yield _block("model", Path(model).read_bytes())
     else:
-        yield _block("model", pack_compact(quantize_finely(flatten_video(loaded))))
+        yield _block("model", pack_compact(quantize_finely(flatten_video(loaded)), metadata))
 
 
 def _encode_moving(model: Loaded) -> str:

@@ -167,9 +167,10 @@ export class Files {
   }
 
   downloadModel() {
-    const { player: { state }, title, stem } = this;
+    const { player: { state, timeline: { seconds } }, title, stem } = this;
     try {
-      download(writeSafetensors(withoutUnseen(state).model, { clip: title, edited: "foldgauss player" }), `${stem}.edited.safetensors`);
+      const metadata = { clip: title, edited: "foldgauss player", ...(seconds ? { frame_seconds: seconds } : {}) };
+      download(writeSafetensors(withoutUnseen(state).model, metadata), `${stem}.edited.safetensors`);
     } catch (error) {
       toast(error.message, LONG);
     }

@@ -105,7 +105,7 @@ export class Player {
     this.before = now;
     this.adapt(passed);
     if (this.segments.missing !== undefined) return; // wait until it is decoded
-    const next = this.position + passed * this.timeline.fps * this.speed, rest = this.rest ?? 0;
+    const { timeline } = this, next = timeline.positionAt(timeline.secondOf(this.position) + passed * this.speed), rest = this.rest ?? 0;
     let to = next;
     this.rest = 0;
     if (next > last && !this.loop) {

@@ -75,7 +75,8 @@ export class Recording {
   async run() {
     const { player } = this, canvas = this.canvas(), [width, height] = [canvas.width, canvas.height], context = canvas.getContext("2d");
     const { first, last, speed } = this.range, rate = player.timeline.fps * speed, before = player.position, parts = [];
-    const tick = 1000 / Math.min(Math.max(rate, 24), 60), length = (last - first + 1) / rate;
+    const { timeline } = player, begin = timeline.secondOf(first), length = (timeline.secondOf(last) - begin) / speed + 1 / rate;
+    const tick = 1000 / Math.min(Math.max(rate, 24), 60);
     player.pause();
     const stream = canvas.captureStream(0), [track] = stream.getVideoTracks(), pixels = width * height * (1000 / tick);
     const source = track.requestFrame ? track : stream; // in Firefox it is the stream's
@@ -94,7 +95,8 @@ export class Recording {
       const begun = performance.now();
       for (let seconds = 0; seconds < length && !this.stopped; seconds = (performance.now() - begun) / 1000) {
         const now = performance.now();
-        await at(Math.min(first + Math.floor(seconds * rate + 1e-6) + (rate < 24 ? (seconds * rate) % 1 : 0), last)); // slow motion has times between frames
+        const position = timeline.positionAt(begin + seconds * speed);
+        await at(Math.min(rate < 24 ? position : Math.floor(position + 1e-6), last)); // slow motion has times between frames
         put("record", `Recording ${Math.round((100 * seconds) / length)} % — stop`);
         await pause(Math.max(tick - (performance.now() - now), LEAST_PAUSE));
       }

@@ -33,7 +33,16 @@ export function readSafetensors(buffer) {
   for (const [name, leaf] of Object.entries(leaves))
     if (leaf.length !== (lengths[name] ?? num * (widths[name] ?? 1))) throw new Error(DAMAGED);
   const paths = numPaths ? { num_paths: numPaths, num_knots: knots } : null;
-  return { header: { compositing: "over", scale_cutoff: 0, ...header, paths, power: envelope("power"), floor: envelope("floor") }, leaves };
+  return { header: { compositing: "over", scale_cutoff: 0, ...header, metadata: readMetadata(about), paths, power: envelope("power"), floor: envelope("floor") }, leaves };
+}
+
+/** The free part of a file's header; null where it is no JSON. */
+function readMetadata({ metadata }) {
+  try {
+    return JSON.parse(metadata);
+  } catch {
+    return null;
+  }
 }
 
 /** The file's own header, and a function that gives a tensor's values by name. */

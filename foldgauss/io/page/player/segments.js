@@ -41,7 +41,7 @@ export class Segments {
     this.onReady = this.onError = () => {};
     const own = this.hold(0, lead), numFrames = this.spans.at(-1).first + this.spans.at(-1).num_frames;
     const times = () => Array.from({ length: numFrames }, (_, k) => k / Math.max(numFrames - 1, 1));
-    this.timeline = spans ? new Timeline(times(), lead.header.fps) : own.timeline;
+    this.timeline = spans ? new Timeline(times(), lead.header.fps, lead.header.metadata?.frame_seconds) : own.timeline;
     this.begun = false;
     this.goTo(0);
   }
@@ -53,7 +53,7 @@ export class Segments {
   }
 
   hold(number, model) {
-    const own = { base: model, timeline: new Timeline(model.times, model.header.fps) };
+    const own = { base: model, timeline: new Timeline(model.times, model.header.fps, model.header.metadata?.frame_seconds) };
     this.held.set(number, own);
     return own;
   }

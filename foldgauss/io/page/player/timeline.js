@@ -18,17 +18,32 @@ function median(values) {
 
 /** Times of a clip's frame positions: 2.5 is half way from frame 2 to frame 3. */
 export class Timeline {
-  constructor(times, fps) {
+  /** `seconds`: when the frames are shown, where they are not evenly spaced at `fps`; ignored unless they rise from 0, one for each frame. */
+  constructor(times, fps, seconds) {
     this.times = times;
     this.fps = fps;
     this.last = times.length - 1;
+    const fits = Array.isArray(seconds) && seconds.length === times.length && seconds[0] === 0 && seconds.every((own, k) => k === 0 || own > seconds[k - 1]);
+    this.seconds = fits ? seconds : null;
     const intervals = times.slice(1).map((own, k) => own - times[k]);
     const bound = intervals.length ? CUT_RATIO * median(intervals) : 0;
     this.isCut = intervals.map((own) => own > bound);
   }
 
-  get duration() {
-    return this.times.length / this.fps;
+  /** The second at which a position is shown; beyond the last frame it goes on at `fps`. */
+  secondOf(position) {
+    const { seconds, fps, last } = this, k = Math.min(Math.floor(position), last - 1);
+    if (!seconds || position < 0 || last === 0) return position / fps;
+    if (position > last) return seconds[last] + (position - last) / fps;
+    return seconds[k] + (position - k) * (seconds[k + 1] - seconds[k]);
+  }
+
+  /** The position shown at a second, the inverse of `secondOf`. */
+  positionAt(second) {
+    const { seconds, fps, last } = this;
+    if (!seconds || second < 0 || last === 0) return second * fps;
+    if (second > seconds[last]) return last + (second - seconds[last]) * fps;
+    return place(seconds, second);
   }
 
   /** The model's time of a position; in the gap of a cut that of the nearer frame. */
@@ -41,13 +56,17 @@ export class Timeline {
 
   /** The position of a time of the model. */
   positionOf(time) {
-    if (this.last === 0) return 0;
-    let low = 0, high = this.last;
-    while (high - low > 1) {
-      const middle = (low + high) >> 1;
-      if (this.times[middle] <= time) low = middle; else high = middle;
-    }
-    const span = this.times[high] - this.times[low];
-    return low + (span > 0 ? Math.min(Math.max((time - this.times[low]) / span, 0), 1) : 0);
+    return this.last === 0 ? 0 : place(this.times, time);
   }
+}
+
+/** The position of a value among rising ones, two at least: 2.5 is half way from number 2 to number 3. */
+function place(rising, value) {
+  let low = 0, high = rising.length - 1;
+  while (high - low > 1) {
+    const middle = (low + high) >> 1;
+    if (rising[middle] <= value) low = middle; else high = middle;
+  }
+  const span = rising[high] - rising[low];
+  return low + (span > 0 ? Math.min(Math.max((value - rising[low]) / span, 0), 1) : 0);
 }

@@ -49,14 +49,14 @@ export class Transport {
 
   /** Half a second on or back; `finely`: a tenth of a frame. */
   skip(way, finely) {
-    const { player } = this;
-    player.seekPosition(player.position + way * (finely ? 0.1 : player.timeline.fps / 2));
+    const { player } = this, { timeline, position } = player;
+    player.seekPosition(finely ? position + 0.1 * way : timeline.positionAt(timeline.secondOf(position) + 0.5 * way));
   }
 
   update() {
-    const { player } = this, { timeline: { last, fps }, position, playing } = player;
-    put("now", clock(position / fps));
-    put("whole", `/ ${clock(last / fps)}`);
+    const { player } = this, { timeline, timeline: { last }, position, playing } = player;
+    put("now", clock(timeline.secondOf(position)));
+    put("whole", `/ ${clock(timeline.secondOf(last))}`);
     put("frame", `frame ${playing || Number.isInteger(position) ? Math.round(position) : position.toFixed(2)} of ${last}`);
     fill(element("scrub"), position);
     element("scrub").setAttribute("aria-valuetext", `frame ${position.toFixed(1)} of ${last}`);
