@@ -18,6 +18,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+from av.video.reformatter import VideoReformatter
 from commands import run
 from PIL import Image
 
@@ -299,7 +300,64 @@ def test_hdr_is_told(tmp_path, transfer, name):
             out.mux(stream.encode(av.VideoFrame.from_ndarray(frame)))
         out.mux(stream.encode(None))
     notes = read_video(tmp_path / "a.mp4").notes
-    assert notes == () if name is None else f"HDR ({name})" in notes[0]
+    assert notes == () if name is None else f"HDR ({name}), and are tone-mapped" in notes[0]
+
+
+def _pq(light):
+    power = (light / 10_000) ** (2610 / 16384)
+    return ((3424 / 4096 + 2413 / 4096 * 32 * power) / (1 + 2392 / 4096 * 32 * power)) ** (2523 / 4096 * 128)
+
+
+def _on_a_display(light):
+    """8-bit signals of BT.709 of light in cd/m2 of BT.2020, in plain float64: BT.2087, BT.2390, BT.1886."""
+    to_709 = [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]]
+    light = light @ np.transpose(to_709)
+    highest = np.maximum(light.max(-1, keepdims=True), 1e-6)
+    grid = 1000 * np.linspace(0, 1, 200_001) ** 4  # the curve is inverted by looking it up
+    most = _pq(203) / _pq(1000)
+    knee = 1.5 * most - 0.5
+    t = (np.minimum(_pq(highest) / _pq(1000), 1) - knee) / (1 - knee)
+    spline = (2 * t**3 - 3 * t**2 + 1) * knee + (t**3 - 2 * t**2 + t) * (1 - knee) + (3 * t**2 - 2 * t**3) * most
+    lowered = np.interp(np.where(t > 0, spline, knee + t * (1 - knee)) * _pq(1000), _pq(grid), grid)
+    return 255 * np.clip(light * lowered / highest / 203, 0, 1) ** (1 / 2.4)
+
+
+@pytest.mark.parametrize("transfer", ["PQ", "HLG"])
+@pytest.mark.parametrize("kind", ["gbrp16le", "gbrap16le", "yuv444p10le"])
+def test_hdr_is_tone_mapped(tmp_path, transfer, kind):
+    """Patches of color, among them grays and the most saturated ones of BT.2020."""
+    rng = np.random.default_rng(0)
+    signal = rng.uniform(0, 1, (6, 8, 3))
+    signal[0] = np.linspace(0, 1, 8)[:, None]
+    signal[1, :3] = 0.7 * np.eye(3)
+    if transfer == "PQ":
+        grid = 10_000 * np.linspace(0, 1, 200_001) ** 4
+        light = np.minimum(np.interp(signal, _pq(grid), grid), 1000)
+    else:
+        scene = np.where(signal < 0.5, signal**2 / 3, (np.exp((signal - 0.55991073) / 0.17883277) + 0.28466892) / 12)
+        light = 1000 * scene * (scene @ [0.2627, 0.6780, 0.0593])[..., None] ** 0.2
+    expected = _on_a_display(light)
+    pixels = np.rint(65535 * signal).astype(np.uint16).repeat(8, 0).repeat(8, 1)
+    if kind == "gbrap16le":
+        pixels = np.concatenate([pixels, np.full((*pixels.shape[:2], 1), 65535, np.uint16)], -1)
+    with av.open(tmp_path / "a.mkv", "w") as out:
+        stream = out.add_stream("ffv1", rate=10, width=64, height=48, pix_fmt=kind)
+        context = stream.codec_context
+        context.color_trc, context.color_primaries = 16 if transfer == "PQ" else 18, 9
+        frame = av.VideoFrame.from_ndarray(pixels, format="rgba64le" if kind == "gbrap16le" else "rgb48le")
+        if kind == "yuv444p10le":
+            context.colorspace, context.color_range = 9, 1
+            frame = VideoReformatter().reformat(frame, format=kind, dst_colorspace=9, dst_color_range=1)
+        out.mux(stream.encode(frame))
+        out.mux(stream.encode(None))
+    clip = read_video(tmp_path / "a.mkv")
+    assert clip.frames.shape == (1, 48, 64, 3)
+    error = np.abs(clip.frames[0, 4::8, 4::8] - expected)
+    if kind != "yuv444p10le":
+        assert error.max() < 0.6  # half a level is rounding
+    assert np.median(error) < 0.6
+    assert error.mean() < 1.5
+    np.testing.assert_allclose(clip.frames[0, 4, 4::8], expected[0], atol=1.6)  # grays
 
 
 # --------------------------------------------------------------------------------------- gray, alpha, depth

@@ -12,12 +12,13 @@ import numpy as np
 from av.codec.context import Flags
 from av.filter import Graph
 from av.stream import Disposition
-from av.video.reformatter import ColorTrc, Interpolation, VideoReformatter
+from av.video.reformatter import Interpolation, VideoReformatter
 
 from foldgauss.io.media.clip import VIDEO, Size, VideoError, check_num_pixels, format_num_bytes, read_head, video_error
 from foldgauss.io.media.format_detection import DEMUXERS, LIST, describe_kind
 from foldgauss.io.media.frame_rate import DEFAULT_FPS
 from foldgauss.io.media.image_files import premultiply
+from foldgauss.io.media.tone_mapping import HDR, map_tones
 
 MAX_ERRORS = 1000  # packets in a row that cannot be read after which a video has ended
 MAX_FRAMES = 1 << 31  # a container that declares more is damaged
@@ -32,8 +33,6 @@ CONVERSION = (
     | Interpolation.FULL_CHR_H_INP
     | Interpolation.BITEXACT
 )
-#: Transfer functions of HDR.
-_HDR = {ColorTrc.SMPTE2084: "PQ", ColorTrc.ARIB_STD_B67: "HLG"}
 #: FFmpeg's decoders of VP8 and VP9 drop alpha; these are the ones that keep it.
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 
@@ -44,7 +43,7 @@ class DecodedFrame:
     `VideoDecoder.time_base`; 0 for a stream without time stamps. `size`: (height, width) of the video as stored, to
     which a frame of another size is stretched. `matrix`: (a, b, c, d), right is shown along (a, b), down along (c, d),
     in units of 2^-16. `converter`: one for all frames, since FFmpeg takes longer to prepare it than to convert
-    a small frame."""
+    a small frame. `hdr`: as of `VideoDecoder`."""
 
     position: int
     stamp: int
@@ -52,14 +51,16 @@ class DecodedFrame:
     size: Size
     matrix: tuple[int, int, int, int] = (1 << 16, 0, 0, 1 << 16)
     converter: VideoReformatter = field(default_factory=VideoReformatter)
+    hdr: str | None = None
 
     def to_array(self) -> np.ndarray:
         """Upright and uint8: BGR of shape (height, width, 3), or premultiplied BGRA of shape (height, width, 4).
 
-        Raises `VideoError` for what FFmpeg cannot convert, such as the extreme sizes of a damaged file.
+        HDR is tone-mapped. Raises `VideoError` for what FFmpeg cannot convert, as the extreme sizes of a damaged file.
         """
         has_alpha = any(part.is_alpha for part in self.decoded.format.components)
-        (height, width), kind = self.size, "bgra" if has_alpha else "bgr24"
+        (height, width), kinds = self.size, ("bgra", "bgr24") if self.hdr is None else ("bgra64le", "bgr48le")
+        kind = kinds[0 if has_alpha else 1]
         try:
             image = self.converter.reformat(self.decoded, width, height, kind, interpolation=CONVERSION).to_ndarray()
         except av.FFmpegError as error:
@@ -67,6 +68,8 @@ class DecodedFrame:
             got = f"one that it cannot ({given}, to be shown at {height}x{width})"
             cure = "The file is damaged, or convert it with ffmpeg."
             raise video_error("path", expected="frames that FFmpeg converts to RGB", got=got, cure=cure) from error
+        if self.hdr is not None:
+            image = map_tones(image, self.hdr, self.decoded.color_primaries)
         if has_alpha:
             opaque = image[..., 3].min() == 255
             image = np.ascontiguousarray(image[..., :3]) if opaque else premultiply(image)
@@ -120,7 +123,7 @@ class VideoDecoder:
     @property
     def hdr(self) -> str | None:
         """The transfer function of a video in HDR, "PQ" or "HLG"; None for other videos."""
-        return _HDR.get(self._stream.codec_context.color_trc)
+        return HDR.get(self._stream.codec_context.color_trc)
 
     @property
     def num_declared(self) -> int:
@@ -171,7 +174,7 @@ class VideoDecoder:
             self._last = self._find_position(stamp)
             self._size = self._size if all(self._size) else (frame.height, frame.width)
             matrix = self._find_matrix(frame)
-            yield DecodedFrame(self._last, stamp or 0, frame, self._size, matrix, self._converter)
+            yield DecodedFrame(self._last, stamp or 0, frame, self._size, matrix, self._converter, self.hdr)
             if self._closed:  # FFmpeg would read on in memory that is freed
                 return
 

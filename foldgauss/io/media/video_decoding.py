@@ -73,7 +73,7 @@ def decode_file(
         if abs(aspect - 1) > 0.01:
             notes += (f"pixels are {aspect:.3g} times as wide as high; frames are kept as stored, not stretched.",)
         if hdr is not None:
-            notes += (f"colors are HDR ({hdr}) and are not tone-mapped: they look pale unless converted before.",)
+            notes += (f"colors are HDR ({hdr}), and are tone-mapped to those of ordinary video.",)
         if decoder.has_converted:
             notes += ("interlaced frames are converted to progressive ones.",)
     # The container's count may be an estimate, so the range is checked against the decoded frames as well.

@@ -1,0 +1,119 @@
+"""Tone mapping: HDR video, of the transfer functions PQ and HLG, as video for ordinary displays.
+
+Signals become light of an HDR display of 1,000 cd/m2 (ITU-R BT.2100), its colors those of BT.709. The curve of ITU-R
+BT.2390 then lowers the highest of the three channels to at most 203 cd/m2, the white of ordinary video (BT.2408), and
+the others by the same factor, which keeps the hue. The result is the signal of a display with gamma 2.4 (BT.1886).
+"""
+
+import functools
+
+import numpy as np
+from av.video.reformatter import ColorPrimaries, ColorTrc
+from jaxtyping import Float, UInt8, UInt16
+
+from foldgauss._runtime.kernels import exact_kernel, inline
+
+#: Transfer functions of HDR.
+HDR = {ColorTrc.SMPTE2084: "PQ", ColorTrc.ARIB_STD_B67: "HLG"}
+#: cd/m2 of the brightest color of the HDR display, and of white in the result.
+PEAK, WHITE = 1000.0, 203.0
+GAMMA, HLG_GAMMA = 2.4, 1.2
+#: Luminance of red, green and blue of BT.2020.
+_LUMINANCE = 0.2627, 0.6780, 0.0593
+#: Linear red, green and blue to those of BT.709, by the primaries of the video; without an entry they are kept.
+_TO_BT709 = {
+    ColorPrimaries.BT2020: [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]],
+    ColorPrimaries.SMPTE432: [[1.2249, -0.2247, 0.0], [-0.0420, 1.0419, 0.0], [-0.0197, -0.0786, 1.0979]],
+}
+#: Tables have this many entries, at equal steps of the square root of light, up to `_BRIGHTEST` times `PEAK`: colors
+#: outside BT.709 have channels above 1.
+_ENTRIES, _BRIGHTEST = 4096, 2.0
+
+
+def pq_signal(light: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """The PQ signal, from 0 to 1, of light in cd/m2. Source: BT.2100, table 4."""
+    power = np.power(light / 10_000, 2610 / 16384)
+    return np.power((3424 / 4096 + 2413 / 128 * power) / (1 + 2392 / 128 * power), 2523 / 32)
+
+
+def pq_light(signal: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """The inverse of `pq_signal`."""
+    power = np.power(signal, 32 / 2523)
+    return 10_000 * np.power(np.maximum(power - 3424 / 4096, 0) / (2413 / 128 - 2392 / 128 * power), 16384 / 2610)
+
+
+def hlg_scene_light(signal: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Light of the scene, from 0 to 1, of an HLG signal. Source: BT.2100, table 5."""
+    a = 0.17883277
+    b, c = 1 - 4 * a, 0.5 - a * np.log(4 * a)
+    return np.where(signal <= 0.5, signal**2 / 3, (np.exp((signal - c) / a) + b) / 12)
+
+
+def lower_highlights(light: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Light of at most `PEAK` cd/m2 lowered to at most `WHITE`; dark light is kept. Source: BT.2390, section 5.4.1."""
+    whole = pq_signal(np.float64(PEAK))
+    value, most = pq_signal(np.minimum(light, PEAK)) / whole, pq_signal(np.float64(WHITE)) / whole
+    knee = 1.5 * most - 0.5
+    t = np.maximum(value - knee, 0) / (1 - knee)
+    spline = (2 * t**3 - 3 * t**2 + 1) * knee + (t**3 - 2 * t**2 + t) * (1 - knee) + (3 * t**2 - 2 * t**3) * most
+    return pq_light(np.where(value < knee, value, spline) * whole)
+
+
+def map_tones(
+    image: UInt16[np.ndarray, "height width channels"], transfer: str, primaries: int
+) -> UInt8[np.ndarray, "height width channels"]:
+    """The image with 8 bits for ordinary displays.
+
+    Its channels are blue, green and red, and alpha if there are four; `transfer` is "PQ" or "HLG", and `primaries` one
+    of FFmpeg's `ColorPrimaries`.
+    """
+    matrix = np.array(_TO_BT709.get(primaries, np.eye(3)))
+    out = np.empty(image.shape, np.uint8)
+    _map_tones(image, out, *_tables(transfer), matrix, np.array(_LUMINANCE), np.sqrt(_BRIGHTEST))
+    return out
+
+
+@functools.cache
+def _tables(transfer: str) -> tuple[Float[np.ndarray, " entries"], ...]:
+    """Light of each signal of 16 bits, of the display for PQ and of the scene for HLG, in units of `PEAK`.
+
+    And three tables by the square root of light: the factor from that light to the display's, the factor of tone
+    mapping to light in units of `WHITE`, and the 8-bit signal of such light.
+    """
+    signals, roots = np.linspace(0, 1, 1 << 16), np.linspace(0, 1, _ENTRIES)
+    light = np.maximum((_BRIGHTEST * roots**2), 1e-9)
+    if transfer == "PQ":
+        shown, factor = np.minimum(pq_light(signals) / PEAK, 1), np.ones(_ENTRIES)
+    else:
+        shown, factor = hlg_scene_light(signals), light ** (HLG_GAMMA - 1)
+    return shown, factor, lower_highlights(PEAK * light) / (WHITE * light), 255 * roots ** (2 / GAMMA)
+
+
+@inline
+def _look_up(table, root):
+    """The value of a table at `root` from 0 to 1, linear between entries."""
+    place = root * (len(table) - 1)
+    k = min(int(place), len(table) - 2)
+    return table[k] + (place - k) * (table[k + 1] - table[k])
+
+
+@exact_kernel
+def _map_tones(image, out, shown, factor, lowered, codes, matrix, luminance, brightest):
+    for y in range(image.shape[0]):
+        for x in range(image.shape[1]):
+            blue, green, red = shown[image[y, x, 0]], shown[image[y, x, 1]], shown[image[y, x, 2]]
+            light = luminance[0] * red + luminance[1] * green + luminance[2] * blue
+            scale = _look_up(factor, np.sqrt(light) / brightest)
+            most = 1e-9
+            own = (
+                scale * (matrix[0, 0] * red + matrix[0, 1] * green + matrix[0, 2] * blue),
+                scale * (matrix[1, 0] * red + matrix[1, 1] * green + matrix[1, 2] * blue),
+                scale * (matrix[2, 0] * red + matrix[2, 1] * green + matrix[2, 2] * blue),
+            )
+            for c in range(3):
+                most = max(most, own[c])
+            gain = _look_up(lowered, min(np.sqrt(most) / brightest, 1.0))
+            for c in range(3):
+                out[y, x, 2 - c] = int(_look_up(codes, np.sqrt(min(max(own[c] * gain, 0.0), 1.0))) + 0.5)
+            if image.shape[2] == 4:
+                out[y, x, 3] = (image[y, x, 3] + 128) // 257
