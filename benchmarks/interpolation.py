@@ -32,9 +32,9 @@ import numpy as np
 from benchmarks import _common, fit_clip
 from benchmarks._common import console
 from foldgauss._runtime.threads import set_num_threads
+from foldgauss.cli.shared.contact_sheet import make_comparison_sheet
 from foldgauss.io import Clip, read_video, write_image
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.contact_sheet import make_comparison_sheet
 from foldgauss.video import interpolate_frames, interpolated_times
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.loop import fit_steps, to_model

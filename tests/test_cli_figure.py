@@ -9,8 +9,8 @@ from commands import run
 from soft_models import SIZE
 from tiny_clips import NUM_FRAMES, clip_of, model_of_12, write_both
 
+from foldgauss.cli.shared.contact_sheet import ERROR_GAIN
 from foldgauss.io import load_video_model, save_video_model
-from foldgauss.io.media.contact_sheet import ERROR_GAIN
 from foldgauss.video import FrameTimes, VideoModel, interpolate_frames, layers
 from foldgauss.video.models.frame_times import make_time_logits, times_at
 

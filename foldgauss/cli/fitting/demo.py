@@ -12,11 +12,11 @@ from foldgauss.cli.app.application import app, err, out
 from foldgauss.cli.fitting.fit import stop_on_signals, summarize_fit
 from foldgauss.cli.fitting.options import choose_display
 from foldgauss.cli.fitting.progress import display_progress
+from foldgauss.cli.shared.contact_sheet import make_comparison_sheet
 from foldgauss.cli.shared.outputs import make_folder, refuse_foreign
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import print_figures, summarize_scores, write_json
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.contact_sheet import make_comparison_sheet
 from foldgauss.io.media.video_reading import read_video
 from foldgauss.io.media.video_writing import write_image, write_video
 from foldgauss.io.models.video_model import save_video_model

@@ -11,9 +11,9 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
 
+from foldgauss.cli.shared.contact_sheet import make_comparison_sheet
 from foldgauss.io.history import HistoryFile, info_line
 from foldgauss.io.media.clip import Clip
-from foldgauss.io.media.contact_sheet import make_comparison_sheet
 from foldgauss.io.media.video_writing import write_image
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.loop import FitInfo

@@ -12,10 +12,10 @@ from foldgauss.cli.app.application import app, out, warn, wrong_use
 from foldgauss.cli.app.help import App
 from foldgauss.cli.shared.arguments import FittedClip, FittedFrames, ModelFile, Overwrite
 from foldgauss.cli.shared.clips import Video, read_fitted_clip
+from foldgauss.cli.shared.contact_sheet import make_comparison_sheet, make_contact_sheet
 from foldgauss.cli.shared.outputs import IMAGE_SUFFIX, name_after, refuse_existing, refuse_huge
 from foldgauss.cli.shared.rendering import Flow
 from foldgauss.io._atomic import check_writable
-from foldgauss.io.media.contact_sheet import make_comparison_sheet, make_contact_sheet
 from foldgauss.io.media.video_writing import write_image
 from foldgauss.io.models.video_model import load_video_model
 from foldgauss.video.models.frame_times import times_at

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from foldgauss.io.media.contact_sheet import ERROR_GAIN, make_comparison_sheet
+from foldgauss.cli.shared.contact_sheet import ERROR_GAIN, make_comparison_sheet
 
 
 def test_layout_and_error():
