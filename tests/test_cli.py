@@ -185,6 +185,27 @@ def test_a_variable_frame_rate_is_kept(tmp_path, capsys):
     assert np.abs(read["held"].frames.astype(int) - fitted[3]).mean() < 2
 
 
+def test_sound_of_a_range_begins_with_it(tmp_path):
+    """Frame 3 is shown at 0.5 s, which no rate tells; a click is heard there."""
+    times, model = np.array([0, 0.1, 0.2, 0.5, 0.6, 1.0]), tmp_path / "m.safetensors"
+    write_video(tmp_path / "clip.mp4", blobs(), 5.0, times=times)
+    samples = np.zeros(16_000, np.int16)
+    samples[4000:4400] = 20_000 * np.sin(np.arange(400))
+    with wave.open(str(tmp_path / "click.wav"), "wb") as sound:
+        sound.setparams((1, 2, 8000, 0, "NONE", ""))
+        sound.writeframes(samples.tobytes())
+    assert run("fit", tmp_path / "clip.mp4", "--frames", "3:6", "--out", model, *QUICK) == 0
+    assert (
+        run("render", model, "--sound", tmp_path / "click.wav", "--out", tmp_path / "out.mov", "--codec", "h264") == 0
+    )
+    np.testing.assert_allclose(read_video(tmp_path / "out.mov").times, times[3:] - 0.5, atol=1e-4)
+    with av.open(str(tmp_path / "out.mov")) as container:
+        heard = np.concatenate([frame.to_ndarray()[0] for frame in container.decode(audio=0)])
+    loud = np.flatnonzero(np.abs(heard) > 0.2) / 48_000
+    assert loud[0] < 0.02
+    assert 0.03 < loud[-1] < 0.08
+
+
 def test_one_picture(work, tmp_path, capsys):
     """A .png takes one time, and no more."""
     model, target = work / "model.safetensors", tmp_path / "one.png"

@@ -90,6 +90,7 @@ ODD = [
     {"frame_seconds": [0.1, 0.2]},
     {"frame_seconds": {"0": 0}},
     {"frame_seconds": [0, "1"]},
+    {"first_second": -1},
 ]
 
 

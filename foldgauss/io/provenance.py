@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from foldgauss.io.media.clip import Clip
+from foldgauss.io.media.frame_index import FrameIndex
 from foldgauss.io.media.lazy_frames import LazyFrames
 
 
@@ -22,9 +23,10 @@ def describe_source(clip: Clip, seed: int) -> dict[str, Any]:
     return {"clip": Path(clip.source).name, "seed": seed, "frames_digest": fingerprint(clip)["frames_digest"]}
 
 
-def describe_times(times: np.ndarray | None) -> dict[str, Any]:
-    """The metadata about the times at which the frames of a clip are shown: none where they are evenly spaced."""
-    return {} if times is None else {"frame_seconds": np.round(times, 6).tolist()}
+def describe_times(clip: Clip | FrameIndex) -> dict[str, Any]:
+    """The metadata about when frames are shown: `frame_seconds`, unless they are evenly spaced, and `first_second`."""
+    about: dict[str, Any] = {} if clip.times is None else {"frame_seconds": np.round(clip.times, 6).tolist()}
+    return about | ({"first_second": round(clip.first_second, 6)} if clip.first_second else {})
 
 
 def has_other_frames(about: Mapping[str, Any], clip: Clip) -> bool:

@@ -183,7 +183,7 @@ def read_clip(job: FitJob) -> Clip:
 
 def fit_metadata(clip: Clip, seed: int, frames: tuple[int | None, int | None] | None) -> dict[str, Any]:
     """Metadata of a fitted model: its clip, the range of frames, the seed, and times of frames as `describe_times`."""
-    return describe_source(clip, seed) | {"frames": frames} | describe_times(clip.times)
+    return describe_source(clip, seed) | {"frames": frames} | describe_times(clip)
 
 
 def mean_scores(scores: Evaluation) -> dict[str, float]:

@@ -215,7 +215,7 @@ def plan_long_fit(
     with atomic_path(folder / _PLAN) as temporary:
         temporary.write_text(json.dumps(kept) + "\n")
     metadata = {"clip": clip.name, "seed": config.seed, "frames": frames, "clip_digest": index.digest}
-    metadata |= describe_times(index.times)
+    metadata |= describe_times(index)
     jobs = _make_jobs(
         clip, folder, config, index, spans, size, checkpoint_seconds, 0 if frames is None else frames[0] or 0
     )

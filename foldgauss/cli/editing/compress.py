@@ -21,6 +21,7 @@ from foldgauss.io._atomic import check_writable
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.compact import COMPACT_SUFFIX, check_compact_name, save_compact
 from foldgauss.io.models.video_model import (
+    CLIP_NOTES,
     MODEL_SUFFIX,
     check_model_name,
     keep_origin,
@@ -116,7 +117,7 @@ def compress_command(
 
 def save_compressed(target: Path, made: Compressed, about: dict[str, Any], *, known: bool = True) -> None:
     """Write a compact file with the metadata `about`, and its PSNR if that is `known`."""
-    about = keep_origin(about, "clip", "frames", "frame_seconds", "frames_digest", "seed")
+    about = keep_origin(about, *CLIP_NOTES, "frames_digest", "seed")
     about |= {"mean_psnr": round(made.psnr - made.loss_db, 3)} if known else {}
     save_compact(target, made.quantized, metadata=about | {"loss_db": round(made.loss_db, 4)})
 

@@ -16,6 +16,7 @@ from foldgauss.cli.shared.rendering import render_to_file
 from foldgauss.io._atomic import check_writable
 from foldgauss.io.edit_script import read_edit_script
 from foldgauss.io.models.video_model import (
+    CLIP_NOTES,
     MODEL_SUFFIX,
     check_model_name,
     keep_origin,
@@ -75,7 +76,7 @@ def edit_command(
         edited = script.apply(model)
     if as_model:
         about = read_origin(model_path)
-        about = keep_origin(about, "clip", "frames", "frame_seconds") | {"edited_by": script_path.name}
+        about = keep_origin(about, *CLIP_NOTES) | {"edited_by": script_path.name}
         if isinstance(edited, SegmentedVideo):
             edited = _drop_scores(model, edited)
         save_video_model(out_path, edited, metadata=about)
@@ -91,11 +92,11 @@ def edit_command(
 
 def _drop_scores(model: SegmentedVideo, edited: SegmentedVideo) -> SegmentedVideo:
     """Remove the recorded scores of edited segments, which were measured before the edit."""
-    before, kept = set(map(id, model.segments)), ("clip", "frames", "frame_seconds")
+    before = set(map(id, model.segments))
     segments = []
     for segment in edited.segments:
         if id(segment) not in before:
-            segment = dataclasses.replace(segment, metadata=keep_origin(segment.metadata, *kept))
+            segment = dataclasses.replace(segment, metadata=keep_origin(segment.metadata, *CLIP_NOTES))
         segments.append(segment)
     return SegmentedVideo(segments)
 

@@ -112,7 +112,7 @@ def choose_sound(path: Path | None, timeline: Timeline, about: dict[str, Any], f
     if not path.is_file():
         raise wrong_use("--sound", expected="a file", got=f"{str(path)!r}, which is missing")
     first = (about.get("frames") or (0,))[0] or 0
-    return Sound(path, first / fps, timeline.playing_speed(fps))
+    return Sound(path, about.get("first_second", first / fps), timeline.playing_speed(fps))
 
 
 #: Columns of a progress bar after the elapsed time.

@@ -38,7 +38,8 @@ class Clip:
     second. `source`: the path as given. `num_declared`: number of frames that the container declares within the
     requested range; larger than `num_frames` where a damaged file is truncated. `times`: display times of the frames,
     float64 (num_frames,), in seconds from the first one; None where frames are evenly spaced at `fps`, otherwise `fps`
-    is their mean rate. `notes`: remarks on how the file was read, one line each.
+    is their mean rate. `notes`: remarks on how the file was read, one line each. `first_second`: when the first frame
+    of a range is shown, in seconds from the first frame of the video file; 0 of images, and where `fps` was given.
     """
 
     frames: np.ndarray
@@ -47,6 +48,7 @@ class Clip:
     num_declared: int
     times: np.ndarray | None = None
     notes: tuple[str, ...] = ()
+    first_second: float = 0.0
 
     @property
     def has_alpha(self) -> bool:

@@ -77,6 +77,7 @@ class FrameIndex:
         self.deinterlace: bool = about["deinterlace"]
         self.fixed_fps: float | None = about["fixed_fps"]
         self.fps: float = about["fps"]
+        self.first_second: float = about.get("first_second", 0.0)
         self.size: Size = tuple(about["size"])
         self.num_declared: int = about["num_declared"]
         self.notes: tuple[str, ...] = tuple(about["notes"])
@@ -219,6 +220,7 @@ def index_video(
         "start": start,
         "fixed_fps": None if fps is None else float(fps),
         "fps": float(rate.fps if fps is None else fps),
+        "first_second": rate.first_second if fps is None else 0.0,
         "size": [int(side) for side in kept[-1]],
         "num_declared": int(num_declared),
         "notes": list(notes),

@@ -18,12 +18,13 @@ MAX_LAST_DURATION = 1.5
 class FrameRate(NamedTuple):
     """The rate of a clip; where its frames are not evenly spaced, their `times` in seconds and `fps` as the mean rate.
 
-    `guessed`: the file records no usable rate.
+    `guessed`: the file records no usable rate. `first_second`: as of `Clip`.
     """
 
     fps: float
     times: Float[np.ndarray, " num_frames"] | None = None
     guessed: bool = False
+    first_second: float = 0.0
 
 
 def estimate_rate(seconds: Float[np.ndarray, " num_frames"], fps: float) -> FrameRate:

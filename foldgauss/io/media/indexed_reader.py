@@ -63,7 +63,8 @@ def read_indexed(index: FrameIndex, first: int, stop: int | None, *, size: Size 
     crop = () if size is None else describe_crop([index.size], size)
     if index.fixed_fps is not None:
         rate = FrameRate(index.fixed_fps)
-    return Clip(frames, float(rate.fps), index.source, num_declared, rate.times, notes + describe_rate(rate) + crop)
+    notes += describe_rate(rate) + crop
+    return Clip(frames, float(rate.fps), index.source, num_declared, rate.times, notes, rate.first_second)
 
 
 class IndexedReader:

@@ -44,6 +44,7 @@ class DecodeReport(NamedTuple):
         Those that decode are the numbers `first` up to `end` of all frames decoded.
         """
         rate = estimate_rate(self.seconds[first:end], self.fps)
+        rate = rate._replace(first_second=float(self.seconds[first] - self.seconds[0]))
         if np.ptp(self.stamps[:end]) == 0 and end > 1:  # a raw stream: the rate is FFmpeg's guess
             rate = rate._replace(guessed=True)
         gaps = _describe_gaps([start - 1, *self.positions[first:end].tolist()])

@@ -42,12 +42,13 @@ def read_video(
     and to the right). Frames are decoded one by one: memory is that of the output plus two source frames, and a clip
     that would take over a third of the machine's memory is refused. `Clip.notes` reports a `size` that crops much.
 
-    Images of 16 bits are scaled to 8, and so are videos of 10 or more; gray ones get three equal channels. Colors of
-    videos are converted by the matrix and the range that the file declares (BT.601 and limited where it does not), with
-    interpolated chroma. Where any frame is transparent anywhere, the clip has alpha (see `Clip`), and opaque frames get
-    an alpha of 255. Interlaced frames are converted to progressive ones (FFmpeg's bwdif, one for each), or refused
-    without `deinterlace`. Videos are rotated upright. A damaged one yields the frames that decode; see
-    `Clip.num_declared`. Unevenly spaced frames are all kept; see `Clip.times`.
+    Images of 16 bits are scaled to 8, and so are videos of 10 or more; gray ones get three equal channels. HDR videos
+    (PQ, HLG) are tone-mapped (ITU-R BT.2390) to colors of BT.709, white at 203 cd/m2. Colors of videos are converted by
+    the matrix and the range that the file declares (BT.601 and limited where it does not), with interpolated chroma.
+    Where any frame is transparent anywhere, the clip has alpha (see `Clip`), and opaque frames get an alpha of 255.
+    Interlaced frames are converted to progressive ones (FFmpeg's bwdif, one for each), or refused without
+    `deinterlace`. Videos are rotated upright. A damaged one yields the frames that decode; see `Clip.num_declared`.
+    Unevenly spaced frames are all kept; see `Clip.times`.
 
     The format is detected from the first bytes, not from the name. No file or address that `path` refers to is opened,
     such as the entries of a playlist. Images of more than 16384x16384 pixels are refused by their header.
@@ -74,7 +75,8 @@ def read_video(
     notes += describe_rate(rate)
     if size is not None and center_crop is None:
         notes += describe_crop(sizes, size)
-    return Clip(stack_frames(kept), float(rate.fps), str(path), num_declared, rate.times, notes)
+    about = float(rate.fps), str(path), num_declared, rate.times, notes, rate.first_second
+    return Clip(stack_frames(kept), *about)
 
 
 def choose_reader(path: Path) -> Callable[..., ReadResult]:

@@ -37,6 +37,8 @@ from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
 MODEL_SUFFIX = ".safetensors"
+#: Metadata of which frames of which clip a model shows, and when the clip shows them.
+CLIP_NOTES = ("clip", "frames", "frame_seconds", "first_second")
 VIDEO, EDITED = PARTS
 
 
@@ -131,6 +133,7 @@ _NOTES: dict[str, Callable[[object], bool]] = {
     **dict.fromkeys(("clip", "frames_digest", "clip_digest"), lambda value: isinstance(value, str)),
     "frames": _is_range,
     "frame_seconds": _is_rising,
+    "first_second": lambda value: is_within(value, "[0, inf)"),
     "seed": lambda value: is_integer(value, 0),
     "mean_psnr": lambda value: is_within(value, "(0, 100]"),
 }
