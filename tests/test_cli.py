@@ -154,12 +154,14 @@ def test_other_rates_speeds_and_times(work, tmp_path, capsys):
 
 def test_a_variable_frame_rate_is_kept(tmp_path, capsys):
     """Frames are shown at the times of the clip's; at another speed or rate, its seconds are divided evenly."""
-    times, model = np.array([0, 0.1, 0.2, 0.5, 0.6, 1.0]), tmp_path / "m.safetensors"
-    write_video(tmp_path / "clip.mp4", blobs(), 5.0, times=times)
+    times, end, model = np.array([0, 3, 6, 14, 17, 31]) / 30, 41 / 30, tmp_path / "m.safetensors"
+    write_video(tmp_path / "clip.mp4", blobs(), 5.0, times=[*times, end])
     assert run("fit", tmp_path / "clip.mp4", "--out", model, *QUICK) == 0
-    assert "0.1 to 0.4 s apart, 5 per second on average" in capsys.readouterr().err
+    assert "0.1 to 0.467 s apart, 4.839 per second on average" in capsys.readouterr().err
     assert run("info", model) == 0
-    assert "5 per second on average" in capsys.readouterr().out.replace("\n", " ")
+    told = capsys.readouterr().out.replace("\n", " ")
+    assert "4.39 per second on average" in told
+    assert "frame_seconds" not in told
     assert run("compress", model, "--out", tmp_path / "m.fgz") == 0
     read = {}
     for name, own, *options in (
@@ -167,21 +169,24 @@ def test_a_variable_frame_rate_is_kept(tmp_path, capsys):
         ("compact", tmp_path / "m.fgz"),
         ("twice", model, "--upsample", 2),
         ("slow", model, "--upsample", 2, "--fps", 5),
-        ("even", model, "--fps", 10),
-        ("half", model, "--speed", 0.5, "--fps", 10),
-        ("held", model, "--remap", "0=0.5,1=0.5"),
+        ("even", model, "--fps", 30),
+        ("half", model, "--speed", 0.5, "--fps", 15),
+        ("back", model, "--speed", -1, "--fps", 30),
+        ("held", model, "--remap", f"0={14 / 30},1={14 / 30}"),
     ):
         assert run("render", own, "--out", tmp_path / f"{name}.mp4", *options) == 0
         read[name] = read_video(tmp_path / f"{name}.mp4")
-    between = np.interp(np.arange(11) / 2, np.arange(6), times)
-    for name, expected in (("as-fitted", times), ("compact", times), ("twice", between), ("slow", 2 * between)):
+    between, slower = np.interp(np.arange(11) / 2, np.arange(6), times), 2 * 5 / times[-1] / 5  # at 5 a second
+    for name, expected in (("as-fitted", times), ("compact", times), ("twice", between), ("slow", slower * between)):
         np.testing.assert_allclose(read[name].times, expected, atol=1e-4)
-    for name, frames in (("even", 11), ("half", 21), ("held", 6)):
+        assert read[name].duration == pytest.approx(slower * end if name == "slow" else end, abs=1e-4)
+    for name, frames in (("even", 41), ("half", 41), ("back", 32), ("held", 5)):
         assert (read[name].times, read[name].num_frames) == (None, frames)
     fitted = read["as-fitted"].frames.astype(int)
-    for shown, frame in ((0, 0), (1, 1), (2, 2), (5, 3), (6, 4), (10, 5)):  # at these tenths of a second
+    for shown, frame in ((0, 0), (3, 1), (6, 2), (14, 3), (17, 4), (31, 5), (40, 5)):  # the last one is held
         assert np.abs(read["even"].frames[shown].astype(int) - fitted[frame]).mean() < 2
-        assert np.abs(read["half"].frames[2 * shown].astype(int) - fitted[frame]).mean() < 2
+        assert np.abs(read["half"].frames[shown].astype(int) - fitted[frame]).mean() < 2
+        assert np.abs(read["back"].frames[31 - min(shown, 31)].astype(int) - fitted[frame]).mean() < 2
     assert np.abs(read["held"].frames.astype(int) - fitted[3]).mean() < 2
 
 

@@ -5,8 +5,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.media.frame_index import FrameIndex
 from foldgauss.io.media.lazy_frames import LazyFrames
@@ -24,9 +22,10 @@ def describe_source(clip: Clip, seed: int) -> dict[str, Any]:
 
 
 def describe_times(clip: Clip | FrameIndex) -> dict[str, Any]:
-    """The metadata about when frames are shown: `frame_seconds`, unless they are evenly spaced, and `first_second`."""
-    about: dict[str, Any] = {} if clip.times is None else {"frame_seconds": np.round(clip.times, 6).tolist()}
-    return about | ({"first_second": round(clip.first_second, 6)} if clip.first_second else {})
+    """The metadata about when frames are shown: `frame_seconds`, with the end, where they are not evenly spaced, and
+    `first_second`, as of `Clip`."""
+    about: dict[str, Any] = {} if clip.times is None else {"frame_seconds": [*clip.times.tolist(), clip.duration]}
+    return about | ({"first_second": clip.first_second} if clip.first_second else {})
 
 
 def has_other_frames(about: Mapping[str, Any], clip: Clip) -> bool:

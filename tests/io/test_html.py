@@ -604,18 +604,20 @@ def test_a_variable_frame_rate_is_kept(opened, tmp_path):
     """Frames are shown at the clip's own times, of a model and of one in segments; a model saved has them, too."""
     for name, video in (("model.safetensors", soft_model()), ("segments.safetensors", segmented())):
         num = video.num_frames
-        seconds = np.cumsum([0, *np.where(np.arange(num - 1) % 3, 0.04, 0.4)]).tolist()
+        seconds = np.cumsum([0, *np.where(np.arange(num - 1) % 3, 0.04, 0.4), 0.7]).tolist()
         path = save_video_model(tmp_path / name, video, metadata={"frame_seconds": seconds})
         page = opened(path, fresh=True)
         timeline = page.page.evaluate("foldgauss.player.timeline.seconds")
         assert timeline == pytest.approx(seconds)
-        end = seconds[-1]
-        assert page.page.locator("#whole").inner_text() == f"/ 0:{end:05.2f}"
-        positions = [0, 0.5, 1, 1.25, num - 1, num, -0.5]
+        last = seconds[-2]
+        assert page.page.locator("#whole").inner_text() == f"/ 0:{last:05.2f}"
+        positions = [0, 0.5, 1, 1.25, num - 1, num - 0.5, num, num + 1, -0.5]
         ask = "(all) => all.map((one) => foldgauss.player.timeline.{}(one))"
         shown = page.page.evaluate(ask.format("secondOf"), positions)
         mean = 1 / video.fps
-        assert shown == pytest.approx([0, 0.2, 0.4, 0.41, end, end + mean, -0.5 * mean])
+        assert shown == pytest.approx(
+            [0, 0.2, 0.4, 0.41, last, last + 0.35, last + 0.7, last + 0.7 + mean, -0.5 * mean]
+        )
         assert page.page.evaluate(ask.format("positionAt"), shown) == pytest.approx(positions)
         advanced = page.page.evaluate(
             """() => {

@@ -183,8 +183,8 @@ def test_rate_can_be_given(clip_file):
     assert read_video(clip_file, fps=30).fps == 30.0
 
 
-#: Seconds at which frames of a clip with an uneven rate are shown.
-UNEVEN = np.array([0, 0.1, 0.16, 0.4, 0.5, 0.53, 0.8, 0.9])
+#: Seconds at which 8 frames of a clip with an uneven rate are shown, and the end.
+UNEVEN = np.array([0, 0.1, 0.1634, 0.4, 0.5, 0.5334, 0.8, 0.9, 1.3])
 
 
 @pytest.mark.parametrize(
@@ -204,21 +204,53 @@ def test_frames_are_shown_at_their_times(tmp_path, name, codec, tolerance):
     write_video(tmp_path / name, _moving(8, 64, 64), 7 / 0.9, times=UNEVEN, codec=codec)
     clip = read_video(tmp_path / name)
     assert clip.num_frames == 8
-    np.testing.assert_allclose(clip.times, UNEVEN, atol=tolerance)
-    assert clip.fps == pytest.approx(7 / 0.9, rel=2e-3)
+    np.testing.assert_allclose(clip.times, UNEVEN[:-1], atol=tolerance)
+    assert clip.duration == pytest.approx(UNEVEN[-1], abs=tolerance)
+    if not name.endswith((".gif", ".webp")):  # whose rate is that of the durations
+        assert clip.fps == pytest.approx(7 / 0.9, rel=1e-3)
 
 
-def test_times_too_near_for_the_clock_stay_in_order(tmp_path):
+@pytest.mark.parametrize(("name", "tolerance"), [("a.mp4", 5e-5), ("a.mkv", 3e-3), ("a.webm", 3e-3)])
+def test_times_too_near_for_the_clock_stay_in_order(tmp_path, name, tolerance):
     times = np.array([0, 1e-7, 2e-7, 0.1, 0.2, 0.5, 0.6, 0.7])
-    write_video(tmp_path / "a.mp4", _moving(), 10, times=times)
-    np.testing.assert_allclose(read_video(tmp_path / "a.mp4").times, times, atol=5e-5)
+    write_video(tmp_path / name, _moving(), 10, times=times)
+    np.testing.assert_allclose(read_video(tmp_path / name).times, times, atol=tolerance)
 
 
-@pytest.mark.parametrize("times", [UNEVEN[1:], UNEVEN[:-1], [*UNEVEN, 1.0], UNEVEN[::-1], [[0.0]], [], [0, np.nan]])
+@pytest.mark.parametrize("name", ["a.mp4", "a.webm", "a.mov", "a.mkv", "a.gif", "a.webp"])
+@pytest.mark.parametrize("hold", [0.1, 1.0])
+def test_a_last_frame_that_is_held_is_held(tmp_path, hold, name):
+    """Frames are evenly spaced up to the last one, which is shown for as long as another or ten times as long."""
+    times = [*(0.1 * np.arange(8)), 0.7 + hold]
+    write_video(tmp_path / name, _moving(), 10, times=times)
+    clip = read_video(tmp_path / name)
+    assert (clip.num_frames, clip.num_declared) == (8, 8)
+    assert clip.duration == (None if hold == 0.1 else pytest.approx(1.7))
+    part = read_video(tmp_path / name, frames=(2, 5))
+    assert (part.times, part.duration) == (None, None)
+    if not name.endswith((".gif", ".webp")):
+        assert clip.fps == pytest.approx(10)
+        assert part.first_second == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(
+    "times",
+    [UNEVEN[1:], UNEVEN[:-2], [*UNEVEN, 2.0], UNEVEN[::-1], [[0.0]], [], [0, np.nan], [0, 1e9], "abc", [0, [1]], 3],
+    ids=str,
+)
 @pytest.mark.parametrize("name", ["a.mp4", "a.webp", "folder"])
 def test_times_that_do_not_fit_are_refused(tmp_path, times, name):
-    with pytest.raises(VideoError, match=r"times: expected seconds that rise from 0|frames: expected \d, as many"):
+    with pytest.raises(VideoError, match=r"times: expected seconds that rise from 0|frames: expected \d+, as many"):
         write_video(tmp_path / name, _moving(), 10, times=times)
+    assert not list(tmp_path.iterdir())
+
+
+def test_animations_that_browsers_slow_down_are_refused(tmp_path):
+    times = [*(np.arange(7) / 60), 2.0]  # the mean rate is low
+    with pytest.raises(VideoError, match=r"times: expected at most 50 frames per second for a .gif, got 60"):
+        write_video(tmp_path / "a.gif", _moving(), 4, times=times)
+    with pytest.raises(VideoError, match=r"times: expected at most 1000 frames per second for a .webp"):
+        write_video(tmp_path / "a.webp", _moving(), 4, times=np.array(times) / 20)
     assert not list(tmp_path.iterdir())
 
 

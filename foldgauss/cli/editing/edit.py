@@ -134,6 +134,11 @@ def segment_command(
     begins = (about.get("frames") or [0])[0] or 0
     whole = keep_origin(about, "clip") | {"frames": [begins + segment.first, begins + segment.stop]}
     known = whole | dict(segment.metadata)
+    seconds = read_frame_seconds(about, video.num_frames)
+    if seconds is not None:  # the segment's own frames may be evenly spaced, at another rate than the whole clip's
+        own = seconds[segment.first : segment.stop + 1]
+        first = about.get("first_second", 0.0) + float(own[0])
+        known |= {"frame_seconds": (own - own[0]).tolist(), "first_second": first}
     save_video_model(out_path, segment.model, metadata=known)
     text = f"segment {number}, frames {segment.first:,}:{segment.stop:,}, {segment.num_gaussians:,} Gaussians"
     out.print(f"{out_path}: {text}", soft_wrap=True)

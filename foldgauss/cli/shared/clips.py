@@ -69,7 +69,8 @@ def _read_lazily(video: Path, *, frames: tuple[int | None, int | None] | None, s
     with err.status(f"Indexing {video.name}"):
         index = index_video(video, frames=frames, find_cuts=False)
     lazy = LazyFrames(index, size)
-    return Clip(lazy, index.fps, index.source, index.num_declared, index.times, index.notes, index.first_second)
+    about = index.source, index.num_declared, index.times, index.notes, index.first_second, index.duration
+    return Clip(lazy, index.fps, *about)
 
 
 def is_other_clip(model_path: Path, clip: Clip, measure_psnr: Callable[[], float]) -> bool:

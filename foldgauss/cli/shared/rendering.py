@@ -18,7 +18,13 @@ from foldgauss.cli.shared.timeline import Timeline
 from foldgauss.io.media.encoder import CODECS, Sound, choose_encoding
 from foldgauss.io.media.frame_rate import MAX_FPS
 from foldgauss.io.media.lazy_frames import LazyFrames
-from foldgauss.io.media.video_writing import ANIMATION_SUFFIXES, MAX_GIF_FPS, VIDEO_SUFFIXES, write_image, write_video
+from foldgauss.io.media.video_writing import (
+    ANIMATION_SUFFIXES,
+    MAX_ANIMATION_FPS,
+    VIDEO_SUFFIXES,
+    write_image,
+    write_video,
+)
 from foldgauss.video.models.background import BLACK, Background
 from foldgauss.video.models.metrics import Evaluation, evaluate
 from foldgauss.video.motion.slow_motion import interpolate_frames
@@ -89,8 +95,11 @@ def check_video_options(
         raise WrongUse(name_option(str(error)) if str(error).startswith(options._fields) else str(error)) from error
 
 
-def _check_rate(path: Path, fps: float) -> None:
-    most = MAX_GIF_FPS if path.suffix.lower() == ".gif" else MAX_FPS
+def _check_rate(path: Path, fps: float, stamps: np.ndarray | None = None) -> None:
+    suffix = path.suffix.lower()
+    most = MAX_ANIMATION_FPS.get(suffix, MAX_FPS)
+    if stamps is not None and len(stamps) > 1 and suffix in ANIMATION_SUFFIXES:
+        fps = 1 / np.diff(stamps).min() / (1 + 1e-6)
     if path.suffix and not path.is_dir() and fps > most:
         expected, cure = f"at most {most:g} frames per second", "Give a lower rate, or write to a folder."
         raise wrong_use("--fps", expected=expected, got=f"{fps:g}", cure=cure)
@@ -200,7 +209,7 @@ def write_images(
     stamps: np.ndarray | None = None,
 ) -> None:
     """Write `num` images as a video or to a folder. `stamps`: as in `render_to_file`."""
-    _check_rate(path, fps)
+    _check_rate(path, fps, stamps)
     with progress_bar("Rendering", num) as advance:
         try:
             write_video(
@@ -216,5 +225,7 @@ def write_images(
             if not str(error).startswith(VideoOptions._fields):
                 raise
             raise WrongUse(name_option(str(error))) from error
-    rate = f"{fps:g} frames per second" if stamps is None else f"the times of the clip, {fps:.4g} per second on average"
-    out.print(f"{path}: {format_count(num, 'frame')} at {rate}", soft_wrap=True)
+    rate = f"at {fps:g} frames per second"
+    if stamps is not None and path.suffix and not path.is_dir():
+        rate = f"unevenly spaced as in the clip, {fps:.4g} per second on average"
+    out.print(f"{path}: {format_count(num, 'frame')} {rate}", soft_wrap=True)

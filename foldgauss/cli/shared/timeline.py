@@ -25,8 +25,8 @@ Speed = Annotated[float | None, typer.Option(help="Playback speed: 0.25 is slow 
 class Timeline:
     """Chooses the rendered times and the frame rate; all but `fps` exclude each other.
 
-    In the methods `fps` is the clip's rate. `seconds` are the times at which its frames are shown where they are not
-    evenly spaced, and `fps` is their mean rate then.
+    In the methods `fps` is the clip's rate. `seconds`, (num_frames + 1,), are the times at which its frames are shown,
+    and the end, where they are not evenly spaced; `fps` is their mean rate then.
     """
 
     upsample: int | None = None
@@ -70,7 +70,7 @@ class Timeline:
         return self.rate(fps) / (fps * self.upsample) if self.upsample else self.speed or 1.0
 
     def stamps(self, fps: float, seconds: np.ndarray | None) -> np.ndarray | None:
-        """Seconds at which the output's images are shown; None where they are evenly spaced.
+        """Seconds at which the output's images are shown, and the end; None where they are evenly spaced.
 
         Those of the clip's own frames, and what `upsample` puts between them, keep the clip's rhythm.
         """
@@ -78,8 +78,8 @@ class Timeline:
         if seconds is None or any(other is not None for other in others):
             return None
         numbers, upsample = np.arange(len(seconds)), self.upsample or 1
-        shown = np.interp(np.arange((len(seconds) - 1) * upsample + 1) / upsample, numbers, seconds)
-        return shown / self.playing_speed(fps)
+        shown = np.interp(np.arange((len(seconds) - 2) * upsample + 1) / upsample, numbers, seconds)
+        return np.append(shown, seconds[-1]) / self.playing_speed(fps)
 
     def times(self, frame_times: np.ndarray, fps: float, seconds: np.ndarray | None = None) -> np.ndarray:
         """The model times to render, in order."""
@@ -98,18 +98,23 @@ class Timeline:
         rate = self.rate(fps) / fps
         if self.remap is not None:
             self._refuse_long("--remap", self.remap[-1][0] * fps * rate)
-            return times_at(frame_times, _uneven(remapped_positions(self.remap, fps, rate), fps, seconds))
-        speed, num = self.speed or 1.0, len(frame_times) if seconds is None else seconds[-1] * fps + 1
+            positions = remapped_positions(self.remap, fps, rate)
+            return times_at(frame_times, positions if seconds is None else _place(positions / fps, seconds))
+        speed, length = self.speed or 1.0, len(frame_times) - 1 if seconds is None else seconds[-1] * fps
         if self.speed is not None or self.fps is not None:  # otherwise it has as many frames as the clip
-            self._refuse_long("--fps" if self.speed is None else "--speed", (num - 1) * rate / abs(speed))
-        return times_at(frame_times, _uneven(played_positions(num, rate, speed=speed), fps, seconds))
+            self._refuse_long("--fps" if self.speed is None else "--speed", length * rate / abs(speed))
+        if seconds is not None:
+            return times_at(frame_times, _place(_seconds_played(seconds, fps * rate, speed), seconds))
+        return times_at(frame_times, played_positions(len(frame_times), rate, speed=speed))
 
-    def warn_of_end(self, num_frames: int, fps: float) -> None:
-        """Warn if `remap` exceeds the clip, whose last frame ends at num_frames / fps."""
-        last = 0.0 if self.remap is None else max(of_clip for _, of_clip in self.remap)
-        if last > num_frames / fps * (1 + 1e-6):
+    def warn_of_end(self, num_frames: int, fps: float, seconds: np.ndarray | None) -> None:
+        """Warn if `remap` exceeds the clip."""
+        last, end = 0.0, num_frames / fps if seconds is None else seconds[-1]
+        if self.remap is not None:
+            last = max(of_clip for _, of_clip in self.remap)
+        if last > end * (1 + 1e-6):
             warn(
-                f"--remap: expected seconds up to the end of the clip, {num_frames / fps:.4g}, got {last:.4g}. "
+                f"--remap: expected seconds up to the end of the clip, {end:.4g}, got {last:.4g}. "
                 "Its last frame is held from there on."
             )
 
@@ -119,9 +124,17 @@ class Timeline:
             raise wrong_use(option, expected=expected, got=f"{num_images:,.0f}")
 
 
-def _uneven(positions: np.ndarray, fps: float, seconds: np.ndarray | None) -> np.ndarray:
-    """Positions among frames shown at `seconds`, from those among evenly spaced ones."""
-    return positions if seconds is None else np.interp(positions / fps, seconds, np.arange(len(seconds)))
+def _seconds_played(seconds: np.ndarray, rate: float, speed: float) -> np.ndarray:
+    """Evenly spaced seconds of the clip, until its end; backwards from its last frame on."""
+    step = abs(speed) / rate
+    if speed > 0:
+        return np.arange(max(int(np.ceil(seconds[-1] / step - 1e-6)), 1)) * step
+    return seconds[-2] - np.arange(int(seconds[-2] / step + 1e-6) + 1) * step
+
+
+def _place(shown: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """The frame positions at seconds of the clip."""
+    return np.interp(shown, seconds[:-1], np.arange(len(seconds) - 1))
 
 
 def parse_remap(text: str | None) -> list[tuple[float, float]] | None:

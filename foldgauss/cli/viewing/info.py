@@ -11,7 +11,7 @@ from foldgauss.cli.app.application import app, out
 from foldgauss.cli.shared.arguments import ModelFile
 from foldgauss.cli.shared.clips import Video
 from foldgauss.io.models.compact import is_compact
-from foldgauss.io.models.video_model import load_video_model, read_metadata
+from foldgauss.io.models.video_model import load_video_model, read_frame_seconds, read_origin
 from foldgauss.video.editing.edited_video import EditedVideo, as_edited
 from foldgauss.video.models.sparse_storage import stored_counts, to_stored
 from foldgauss.video.models.video_model import VideoModel
@@ -27,7 +27,7 @@ MAX_PATHS = 3
 def info(model_path: ModelFile) -> None:
     """Show what a model file contains."""
     model = load_video_model(model_path)
-    about = read_metadata(model_path)
+    about = read_origin(model_path)
     if isinstance(model, SegmentedVideo):
         _print_segments(model_path, model, about)
         return
@@ -51,7 +51,11 @@ def info(model_path: ModelFile) -> None:
 def _print_facts(model_path: Path, figures: dict[str, str], about: dict) -> None:
     table = Table(title=str(model_path), show_header=False)
     # Metadata of the fitted clip may have the name of a figure of the model.
-    metadata = {f"{k} of the clip" if k in figures else k: _shorten(v) for k, v in about.items() if v is not None}
+    metadata = {
+        f"{k} of the clip" if k in figures else k: _shorten(v)
+        for k, v in about.items()
+        if v is not None and k != "frame_seconds"
+    }
     for name, value in (figures | metadata).items():
         table.add_row(name, value)
     out.print(table)
@@ -85,7 +89,10 @@ def _print_segments(model_path: Path, model: SegmentedVideo, about: dict) -> Non
 
 
 def _describe_frames(model: Video, about: dict) -> str:
-    rate = f"{model.fps:.4g} per second on average" if "frame_seconds" in about else f"{model.fps:g} per second"
+    seconds = read_frame_seconds(about, model.num_frames)
+    rate = f"{model.fps:g} per second"
+    if seconds is not None:
+        rate = f"{model.num_frames / seconds[-1]:.4g} per second on average"
     return f"{model.num_frames:,} of {model.size[0]}x{model.size[1]} (height x width), {rate}"
 
 

@@ -111,7 +111,7 @@ def render(
     options = VideoOptions(codec, crf, pixel_format, choose_sound(sound, timeline, about, model.fps))
     seconds = read_frame_seconds(about, model.num_frames)
     shown = timeline.times(np.asarray(model.frame_times.times()), model.fps, seconds)
-    timeline.warn_of_end(model.num_frames, model.fps)
+    timeline.warn_of_end(model.num_frames, model.fps, seconds)
     render_to_file(
         model,
         out_path,

@@ -34,12 +34,13 @@ class Clip:
     """Frames in memory.
 
     `frames`: uint8 RGB, shape (num_frames, height, width, 3), C-contiguous; for images with alpha RGBA, shape
-    (num_frames, height, width, 4), with colors premultiplied by alpha (the image over black). `fps`: frames per
-    second. `source`: the path as given. `num_declared`: number of frames that the container declares within the
-    requested range; larger than `num_frames` where a damaged file is truncated. `times`: display times of the frames,
-    float64 (num_frames,), in seconds from the first one; None where frames are evenly spaced at `fps`, otherwise `fps`
-    is their mean rate. `notes`: remarks on how the file was read, one line each. `first_second`: when the first frame
-    of a range is shown, in seconds from the first frame of the video file; 0 of images, and where `fps` was given.
+    (num_frames, height, width, 4), with colors premultiplied by alpha (the image over black). `fps`: frames per second.
+    `source`: the path as given. `num_declared`: number of frames that the container declares within the requested
+    range; larger than `num_frames` where a damaged file is truncated. `times`: display times of the frames, float64
+    (num_frames,), in seconds from the first one; None where frames are evenly spaced at `fps`, otherwise `fps` is their
+    mean rate. `duration`: seconds to the end of the last one, where there are `times`. `notes`: remarks on how the file
+    was read, one line each. `first_second`: when the first frame of a range is shown, in seconds from the first frame
+    of the video file; 0 of images, and where `fps` was given.
     """
 
     frames: np.ndarray
@@ -49,6 +50,7 @@ class Clip:
     times: np.ndarray | None = None
     notes: tuple[str, ...] = ()
     first_second: float = 0.0
+    duration: float | None = None
 
     @property
     def has_alpha(self) -> bool:

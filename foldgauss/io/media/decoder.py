@@ -12,7 +12,7 @@ import numpy as np
 from av.codec.context import Flags
 from av.filter import Graph
 from av.stream import Disposition
-from av.video.reformatter import Interpolation, VideoReformatter
+from av.video.reformatter import Colorspace, Interpolation, VideoReformatter
 
 from foldgauss.io.media.clip import VIDEO, Size, VideoError, check_num_pixels, format_num_bytes, read_head, video_error
 from foldgauss.io.media.format_detection import DEMUXERS, LIST, describe_kind
@@ -33,6 +33,8 @@ CONVERSION = (
     | Interpolation.FULL_CHR_H_INP
     | Interpolation.BITEXACT
 )
+#: FFmpeg's numbers of matrices: not declared, and those that its conversion does not know.
+_UNSPECIFIED, _UNKNOWN_MATRICES = 2, {10: "BT.2020 with constant luminance", 14: "ICtCp"}
 #: FFmpeg's decoders of VP8 and VP9 drop alpha; these are the ones that keep it.
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 
@@ -56,20 +58,26 @@ class DecodedFrame:
     def to_array(self) -> np.ndarray:
         """Upright and uint8: BGR of shape (height, width, 3), or premultiplied BGRA of shape (height, width, 4).
 
-        HDR is tone-mapped. Raises `VideoError` for what FFmpeg cannot convert, as the extreme sizes of a damaged file.
+        HDR is tone-mapped. Raises `VideoError` for what FFmpeg cannot convert, such as the extreme
+        sizes of a damaged file.
         """
         has_alpha = any(part.is_alpha for part in self.decoded.format.components)
-        (height, width), kinds = self.size, ("bgra", "bgr24") if self.hdr is None else ("bgra64le", "bgr48le")
-        kind = kinds[0 if has_alpha else 1]
+        (height, width), kind, matrix = self.size, "bgra" if has_alpha else "bgr24", None
+        if self.hdr is not None:  # FFmpeg 8 converts 4:2:0 to packed 16 bits wrongly, but not to planar ones
+            kind = "gbrap16le" if has_alpha else "gbrp16le"
+            matrix = Colorspace.BT2020 if self.decoded.colorspace == _UNSPECIFIED else None
         try:
-            image = self.converter.reformat(self.decoded, width, height, kind, interpolation=CONVERSION).to_ndarray()
+            how = {"src_colorspace": matrix, "interpolation": CONVERSION}
+            image = self.converter.reformat(self.decoded, width, height, kind, **how).to_ndarray()
         except av.FFmpegError as error:
             given = f"{self.decoded.format.name}, {self.decoded.height}x{self.decoded.width}"
+            if self.decoded.colorspace in _UNKNOWN_MATRICES:
+                given += f", {_UNKNOWN_MATRICES[self.decoded.colorspace]}"
             got = f"one that it cannot ({given}, to be shown at {height}x{width})"
             cure = "The file is damaged, or convert it with ffmpeg."
             raise video_error("path", expected="frames that FFmpeg converts to RGB", got=got, cure=cure) from error
         if self.hdr is not None:
-            image = map_tones(image, self.hdr, self.decoded.color_primaries)
+            image = map_tones(self.decoded, image, self.hdr)
         if has_alpha:
             opaque = image[..., 3].min() == 255
             image = np.ascontiguousarray(image[..., :3]) if opaque else premultiply(image)

@@ -3,6 +3,7 @@
 import math
 import os
 import sys
+from bisect import bisect_left
 from collections.abc import Iterator, Mapping
 from contextlib import closing, suppress
 from fractions import Fraction
@@ -69,8 +70,13 @@ CODECS = {
 #: The codec of each extension unless one is given.
 DEFAULT_CODECS = {".mp4": "h264", ".webm": "vp9", ".mov": "prores", ".mkv": "ffv1"}
 SAMPLE_RATE = 48_000
-#: Units of the time stamps of unevenly spaced frames.
-CLOCK = Fraction(1, 90_000)
+#: Units of the time stamps of unevenly spaced frames, in seconds; Matroska counts milliseconds.
+CLOCKS = {
+    ".mp4": Fraction(1, 90_000),
+    ".mov": Fraction(1, 90_000),
+    ".mkv": Fraction(1, 1000),
+    ".webm": Fraction(1, 1000),
+}
 #: Seconds of the source by which atempo is early, measured below speed 1: clicks by 12 +- 8 ms, noise 15, tones 7.
 TEMPO_LEAD = 0.012
 VIDEO_SUFFIXES = tuple(DEFAULT_CODECS)
@@ -142,18 +148,18 @@ def encode_video(
 ) -> None:
     """Encode RGB frames, or premultiplied RGBA ones, which are stored with straight alpha.
 
-    `times`: seconds at which the frames are shown; None where they are evenly spaced.
+    `times`: seconds at which the frames are shown, and the end if there is one more; None where they are evenly spaced.
     Colors are converted by BT.709 in limited range, and the file says so. An odd height or width is padded by repeating
     the last row or column where the pixel format has half the color resolution.
     """
     rate = Fraction(fps).limit_denominator(100_000)
-    clock = 1 / rate if times is None else CLOCK
-    ticks = None if times is None else _count_ticks(times, 1 / fps)
+    suffix = path.suffix.lower()
+    clock = 1 / rate if times is None else CLOCKS[suffix]
+    ticks = None if times is None else _count_ticks(np.append(times, times[-1] + 1 / fps), clock)
     options = dict(encoding.codec.options) | ({} if encoding.crf is None else {"crf": str(encoding.crf)})
     pixel_format = av.VideoFormat(encoding.pixel_format, 64, 64)
     matrix = None if pixel_format.is_rgb else Colorspace.ITU709
     steps = 64 // pixel_format.chroma_height(), 64 // pixel_format.chroma_width()
-    suffix = path.suffix.lower()
     container = av.open(f"file:{path}", "w", options={"movflags": "+faststart"} if suffix in (".mp4", ".mov") else {})
     with container:
         stream = container.add_stream(encoding.codec.encoder, rate=rate, options=options)
@@ -173,22 +179,32 @@ def encode_video(
                     context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
                     context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
                 stream.codec_context.time_base = clock
+                if ticks is not None:  # with B-frames, an MP4 does not say for how long the last frame is shown
+                    stream.codec_context.max_b_frames = 0
                 open_with_own_priority(stream.codec_context)
             given = av.VideoFrame.from_ndarray(image, format="rgba" if image.shape[2] == 4 else "rgb24")
             given = converter.reformat(given, format=pixel_format.name, dst_colorspace=matrix, interpolation=CONVERSION)
             begin, end = (number, number + 1) if ticks is None else ticks[number : number + 2]
-            given.pts, given.duration, given.time_base = begin, end - begin, clock
-            container.mux(stream.encode(given))
+            given.pts, given.time_base = begin, clock
+            container.mux(_set_durations(stream.encode(given), ticks))
             while (waiting := waiting or next(packets, None)) and waiting.pts * waiting.time_base < end * clock:
                 container.mux(waiting)
                 waiting = None
-        container.mux(stream.encode())
+        container.mux(_set_durations(stream.encode(), ticks))
 
 
-def _count_ticks(times: np.ndarray, last_duration: float) -> list[int]:
-    """Time stamps of the frames and of the end in units of `CLOCK`, each later than the one before."""
-    ticks = np.rint(np.append(times, times[-1] + last_duration) / float(CLOCK)).astype(np.int64)
-    apart = np.arange(len(ticks))
+def _set_durations(packets: list[av.Packet], ticks: list[int] | None) -> list[av.Packet]:
+    """The packets; those of unevenly spaced frames with the durations that follow from their time stamps."""
+    if ticks is not None:
+        for packet in packets:
+            place = bisect_left(ticks, packet.pts)
+            packet.duration = ticks[place + 1] - ticks[place]
+    return packets
+
+
+def _count_ticks(seconds: np.ndarray, clock: Fraction) -> list[int]:
+    """Time stamps in units of `clock`, each later than the one before."""
+    ticks, apart = np.rint(seconds / float(clock)).astype(np.int64), np.arange(len(seconds))
     return (np.maximum.accumulate(ticks - apart) + apart).tolist()
 
 

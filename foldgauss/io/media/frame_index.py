@@ -78,6 +78,7 @@ class FrameIndex:
         self.fixed_fps: float | None = about["fixed_fps"]
         self.fps: float = about["fps"]
         self.first_second: float = about.get("first_second", 0.0)
+        self.duration: float | None = about.get("duration")
         self.size: Size = tuple(about["size"])
         self.num_declared: int = about["num_declared"]
         self.notes: tuple[str, ...] = tuple(about["notes"])
@@ -110,7 +111,8 @@ class FrameIndex:
         time_base, notes = about["time_base"], tuple(about["shape_notes"])
         seconds = make_increasing((self.stamps * time_base).tolist(), about["rate"])
         arrays = self.places, self.stamps, seconds
-        return DecodeReport(about["rate"], about["num_total"], notes, *arrays, time_base, about["threads"])
+        last = about.get("last_duration", 0.0)
+        return DecodeReport(about["rate"], about["num_total"], notes, *arrays, time_base, about["threads"], last)
 
     def span(self, first: int, stop: int) -> tuple[int, int]:
         """The range, for `read_indexed`, of the frames `first` up to `stop` of those that decode: the same numbers
@@ -221,6 +223,8 @@ def index_video(
         "fixed_fps": None if fps is None else float(fps),
         "fps": float(rate.fps if fps is None else fps),
         "first_second": rate.first_second if fps is None else 0.0,
+        "duration": rate.duration if fps is None else None,
+        "last_duration": report.last_duration if report else 0.0,
         "size": [int(side) for side in kept[-1]],
         "num_declared": int(num_declared),
         "notes": list(notes),

@@ -276,7 +276,7 @@ def read_animation(path: Path, start: int, stop: int | None, prepare: Callable) 
     shown = np.array(delays[start:])
     rate = estimate_rate(np.concatenate([[0], np.cumsum(shown)]) / 1000, 1000 * len(shown) / shown.sum())
     if rate.times is not None:
-        rate = rate._replace(times=rate.times[:-1])
+        rate = rate._replace(times=rate.times[:-1], duration=float(rate.times[-1]))
     return kept, (num_total if stop is None else stop) - start, rate, ()
 
 

@@ -64,7 +64,8 @@ def read_indexed(index: FrameIndex, first: int, stop: int | None, *, size: Size 
     if index.fixed_fps is not None:
         rate = FrameRate(index.fixed_fps)
     notes += describe_rate(rate) + crop
-    return Clip(frames, float(rate.fps), index.source, num_declared, rate.times, notes, rate.first_second)
+    about = index.source, num_declared, rate.times, notes, rate.first_second, rate.duration
+    return Clip(frames, float(rate.fps), *about)
 
 
 class IndexedReader:

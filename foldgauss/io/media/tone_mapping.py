@@ -1,33 +1,49 @@
-"""Tone mapping: HDR video, of the transfer functions PQ and HLG, as video for ordinary displays.
+"""Tone mapping: HDR video, of the transfer functions PQ and HLG, as SDR video.
 
-Signals become light of an HDR display of 1,000 cd/m2 (ITU-R BT.2100), its colors those of BT.709. The curve of ITU-R
-BT.2390 then lowers the highest of the three channels to at most 203 cd/m2, the white of ordinary video (BT.2408), and
-the others by the same factor, which keeps the hue. The result is the signal of a display with gamma 2.4 (BT.1886).
+Signals become light of an HDR display (ITU-R BT.2100; for HLG one of 1,000 cd/m2), in the primaries of BT.709. The
+curve of ITU-R BT.2390 lowers the highest of the three channels from at most 1,000 cd/m2 to at most 203, which is white
+in the result, and the others by the same factor, which keeps the hue. HDR reference white, 203 cd/m2 (BT.2408), becomes
+90% of the signal. The result is the signal of a display with gamma 2.4 (BT.1886).
 """
 
 import functools
 
+import av
 import numpy as np
-from av.video.reformatter import ColorPrimaries, ColorTrc
+from av.video.reformatter import ColorPrimaries, ColorRange, ColorTrc
 from jaxtyping import Float, UInt8, UInt16
 
 from foldgauss._runtime.kernels import exact_kernel, inline
 
 #: Transfer functions of HDR.
 HDR = {ColorTrc.SMPTE2084: "PQ", ColorTrc.ARIB_STD_B67: "HLG"}
-#: cd/m2 of the brightest color of the HDR display, and of white in the result.
+#: cd/m2 that become white, and of white in the result.
 PEAK, WHITE = 1000.0, 203.0
 GAMMA, HLG_GAMMA = 2.4, 1.2
 #: Luminance of red, green and blue of BT.2020.
 _LUMINANCE = 0.2627, 0.6780, 0.0593
-#: Linear red, green and blue to those of BT.709, by the primaries of the video; without an entry they are kept.
+#: Linear red, green and blue to those of BT.709, from BT.2020 and from P3 with the white of D65.
+_FROM_BT2020 = [
+    [1.6604910021, -0.5876411388, -0.0728498633],
+    [-0.1245504745, 1.1328998971, -0.0083494226],
+    [-0.0181507634, -0.1005788980, 1.1187296614],
+]
+_FROM_P3 = [
+    [1.2249401763, -0.2249401763, 0.0],
+    [-0.0420569547, 1.0420569547, 0.0],
+    [-0.0196375546, -0.0786360454, 1.0982736000],
+]
+#: By the primaries of the video; without an entry they are kept. BT.2100 defines PQ and HLG with those of BT.2020.
 _TO_BT709 = {
-    ColorPrimaries.BT2020: [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]],
-    ColorPrimaries.SMPTE432: [[1.2249, -0.2247, 0.0], [-0.0420, 1.0419, 0.0], [-0.0197, -0.0786, 1.0979]],
+    ColorPrimaries.BT2020: _FROM_BT2020,
+    ColorPrimaries.UNSPECIFIED: _FROM_BT2020,
+    ColorPrimaries.SMPTE432: _FROM_P3,
 }
-#: Tables have this many entries, at equal steps of the square root of light, up to `_BRIGHTEST` times `PEAK`: colors
-#: outside BT.709 have channels above 1.
-_ENTRIES, _BRIGHTEST = 4096, 2.0
+#: Signal of white that FFmpeg makes of YUV of limited range, in 16 bits.
+_LIMITED_WHITE = 65283
+#: Tables have this many entries, at equal steps of the square root of light, up to `_BRIGHTEST` times `PEAK`: PQ has up
+#: to 10,000 cd/m2, and colors outside BT.709 have higher channels than that.
+_ENTRIES, _BRIGHTEST = 8192, 20.0
 
 
 def pq_signal(light: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
@@ -60,30 +76,32 @@ def lower_highlights(light: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."
 
 
 def map_tones(
-    image: UInt16[np.ndarray, "height width channels"], transfer: str, primaries: int
-) -> UInt8[np.ndarray, "height width channels"]:
-    """The image with 8 bits for ordinary displays.
+    frame: av.VideoFrame, image: UInt16[np.ndarray, "height width rgb"], transfer: str
+) -> UInt8[np.ndarray, "height width bgr"]:
+    """A frame of the transfer function "PQ" or "HLG" as SDR.
 
-    Its channels are blue, green and red, and alpha if there are four; `transfer` is "PQ" or "HLG", and `primaries` one
-    of FFmpeg's `ColorPrimaries`.
+    `image`: its red, green and blue, and alpha if there are four channels, as FFmpeg converts them to 16 bits. The
+    result has blue first, as OpenCV has it.
     """
-    matrix = np.array(_TO_BT709.get(primaries, np.eye(3)))
+    limited, bits = not frame.format.is_rgb and frame.color_range != ColorRange.JPEG, frame.format.components[0].bits
+    white = _LIMITED_WHITE if limited else ((1 << bits) - 1) << (16 - bits)
+    matrix = np.array(_TO_BT709.get(frame.color_primaries, np.eye(3)))
     out = np.empty(image.shape, np.uint8)
-    _map_tones(image, out, *_tables(transfer), matrix, np.array(_LUMINANCE), np.sqrt(_BRIGHTEST))
+    _map_tones(image, out, *_tables(transfer, white), matrix, np.array(_LUMINANCE), np.sqrt(_BRIGHTEST))
     return out
 
 
 @functools.cache
-def _tables(transfer: str) -> tuple[Float[np.ndarray, " entries"], ...]:
+def _tables(transfer: str, white: int) -> tuple[Float[np.ndarray, " entries"], ...]:
     """Light of each signal of 16 bits, of the display for PQ and of the scene for HLG, in units of `PEAK`.
 
     And three tables by the square root of light: the factor from that light to the display's, the factor of tone
-    mapping to light in units of `WHITE`, and the 8-bit signal of such light.
+    mapping to light in units of `WHITE`, and the 8-bit signal of such light. `white`: the largest signal.
     """
-    signals, roots = np.linspace(0, 1, 1 << 16), np.linspace(0, 1, _ENTRIES)
-    light = np.maximum((_BRIGHTEST * roots**2), 1e-9)
+    signals, roots = np.minimum(np.arange(1 << 16) / white, 1), np.linspace(0, 1, _ENTRIES)
+    light = np.maximum(_BRIGHTEST * roots**2, 1e-9)
     if transfer == "PQ":
-        shown, factor = np.minimum(pq_light(signals) / PEAK, 1), np.ones(_ENTRIES)
+        shown, factor = pq_light(signals) / PEAK, np.ones(_ENTRIES)
     else:
         shown, factor = hlg_scene_light(signals), light ** (HLG_GAMMA - 1)
     return shown, factor, lower_highlights(PEAK * light) / (WHITE * light), 255 * roots ** (2 / GAMMA)
@@ -101,7 +119,7 @@ def _look_up(table, root):
 def _map_tones(image, out, shown, factor, lowered, codes, matrix, luminance, brightest):
     for y in range(image.shape[0]):
         for x in range(image.shape[1]):
-            blue, green, red = shown[image[y, x, 0]], shown[image[y, x, 1]], shown[image[y, x, 2]]
+            red, green, blue = shown[image[y, x, 0]], shown[image[y, x, 1]], shown[image[y, x, 2]]
             light = luminance[0] * red + luminance[1] * green + luminance[2] * blue
             scale = _look_up(factor, np.sqrt(light) / brightest)
             most = 1e-9

@@ -26,7 +26,8 @@ class DecodeReport(NamedTuple):
 
     `fps`: the container's rate, or the default in its place. `num_total`: number of frames, missing ones included.
     `notes`: about the shape of pixels, HDR and interlacing. Of all frames decoded `positions`, `stamps` in units of
-    `time_base` seconds, and increasing times in `seconds`. `threads`: of the decoder.
+    `time_base` seconds, and increasing times in `seconds`. `threads`: of the decoder. `last_duration`: seconds for
+    which the last of these is shown; 0 where that is unknown.
     """
 
     fps: float
@@ -37,13 +38,15 @@ class DecodeReport(NamedTuple):
     seconds: np.ndarray
     time_base: float
     threads: int
+    last_duration: float
 
     def describe_span(self, first: int, end: int, start: int, stop: int | None) -> RangeFacts:
         """Number of frames declared from position `start` up to `stop`, their rate, and notes.
 
         Those that decode are the numbers `first` up to `end` of all frames decoded.
         """
-        rate = estimate_rate(self.seconds[first:end], self.fps)
+        last = self.seconds[-1] + self.last_duration if end == len(self.seconds) else self.seconds[end]
+        rate = estimate_rate(self.seconds[first:end], self.fps, float(last))
         rate = rate._replace(first_second=float(self.seconds[first] - self.seconds[0]))
         if np.ptp(self.stamps[:end]) == 0 and end > 1:  # a raw stream: the rate is FFmpeg's guess
             rate = rate._replace(guessed=True)
@@ -58,7 +61,7 @@ def decode_file(
 
     Raises `VideoError` for a file that cannot be read.
     """
-    passed: list[tuple[int, int]] = []
+    passed: list[tuple[int, int, int]] = []
     with closing(VideoDecoder(path, deinterlace=deinterlace)) as decoder:
         fps = decoder.fps if 0 < decoder.fps <= MAX_FPS else DEFAULT_FPS
         kept = keep(select_frames(decoder.frames(), start, stop, passed))
@@ -66,44 +69,47 @@ def decode_file(
             cure = "The file is damaged or its codec is unknown here; convert it with ffmpeg."
             got = f"none in {str(path)!r}"
             raise video_error("path", expected="a video with frames that decode", got=got, cure=cure)
-        positions, stamps = np.array(passed, np.int64).T.copy()
+        positions, stamps, durations = np.array(passed, np.int64).T.copy()
         time_base, num_reached = float(decoder.time_base), passed[-1][0] + 1
         seconds = make_increasing((stamps * time_base).tolist(), fps)
-        num_total = max(_count_declared(decoder, seconds, fps, num_reached), num_reached)
+        last = max(int(durations[-1]), 0) * time_base
+        num_total = max(_count_declared(decoder, seconds, fps, num_reached, last), num_reached)
+        if decoder.hides_frames and num_total == num_reached and decoder.declared_seconds:  # an MP4, whose frames have
+            last = max(decoder.declared_seconds - (seconds[-1] - seconds[0]), 0.0)  # the durations of others
         notes, aspect, hdr, threads = (), decoder.pixel_aspect, decoder.hdr, decoder.threads
         if abs(aspect - 1) > 0.01:
             notes += (f"pixels are {aspect:.3g} times as wide as high; frames are kept as stored, not stretched.",)
         if hdr is not None:
-            notes += (f"colors are HDR ({hdr}), and are tone-mapped to those of ordinary video.",)
+            notes += (f"colors are HDR ({hdr}), and are tone-mapped to SDR.",)
         if decoder.has_converted:
             notes += ("interlaced frames are converted to progressive ones.",)
     # The container's count may be an estimate, so the range is checked against the decoded frames as well.
     check_range_within(start, stop, num_total, path)
     if not kept:
         raise no_frames_error(start, stop, len(passed), num_total, path)
-    report = DecodeReport(fps, num_total, notes, positions, stamps, seconds, time_base, threads)
+    report = DecodeReport(fps, num_total, notes, positions, stamps, seconds, time_base, threads, last)
     return (kept, *report.describe_span(len(passed) - len(kept), len(passed), start, stop)), report
 
 
 def select_frames(
-    frames: Iterable[DecodedFrame], start: int, stop: int | None, passed: list[tuple[int, int]]
+    frames: Iterable[DecodedFrame], start: int, stop: int | None, passed: list[tuple[int, int, int]]
 ) -> Iterator[np.ndarray]:
-    """The frames from `start` up to `stop`; position and stamp of each decoded on the way are added to `passed`.
+    """The frames from `start` up to `stop`; of each decoded on the way position, stamp and duration go to `passed`.
 
     Frames before `start` are decoded and dropped: seeking stops at key frames.
     """
     for frame in frames:
         if stop is not None and frame.position >= stop:
             return
-        passed.append((frame.position, frame.stamp))
+        passed.append((frame.position, frame.stamp, frame.decoded.duration or 0))
         if frame.position >= start:
             yield frame.to_array()
         if stop is not None and frame.position == stop - 1:
             return
 
 
-def _count_declared(decoder: VideoDecoder, seconds: np.ndarray, fps: float, num_reached: int) -> int:
-    """The number of frames that the container declares, where frame `num_reached` is shown at seconds[-1].
+def _count_declared(decoder: VideoDecoder, seconds: np.ndarray, fps: float, num_reached: int, last: float) -> int:
+    """The number of frames that the container declares, where frame `num_reached` is shown at seconds[-1] for `last`.
 
     Its own count includes frames that an edit list hides, as in an MP4 that was cut without encoding.
     """
@@ -112,7 +118,7 @@ def _count_declared(decoder: VideoDecoder, seconds: np.ndarray, fps: float, num_
         return num_declared
     if shown is None:
         return num_declared or num_reached
-    estimated = estimate_num_frames(seconds - seconds[0], shown, fps, num_reached)
+    estimated = estimate_num_frames(seconds - seconds[0], shown, fps, num_reached, last)
     if estimated >= MAX_FRAMES:  # a damaged header
         return num_reached
     return min(num_declared, estimated) if num_declared else estimated

@@ -43,7 +43,7 @@ def read_video(
     that would take over a third of the machine's memory is refused. `Clip.notes` reports a `size` that crops much.
 
     Images of 16 bits are scaled to 8, and so are videos of 10 or more; gray ones get three equal channels. HDR videos
-    (PQ, HLG) are tone-mapped (ITU-R BT.2390) to colors of BT.709, white at 203 cd/m2. Colors of videos are converted by
+    (PQ, HLG) are tone-mapped to SDR (ITU-R BT.2390). Colors of videos are converted by
     the matrix and the range that the file declares (BT.601 and limited where it does not), with interpolated chroma.
     Where any frame is transparent anywhere, the clip has alpha (see `Clip`), and opaque frames get an alpha of 255.
     Interlaced frames are converted to progressive ones (FFmpeg's bwdif, one for each), or refused without
@@ -75,7 +75,7 @@ def read_video(
     notes += describe_rate(rate)
     if size is not None and center_crop is None:
         notes += describe_crop(sizes, size)
-    about = float(rate.fps), str(path), num_declared, rate.times, notes, rate.first_second
+    about = float(rate.fps), str(path), num_declared, rate.times, notes, rate.first_second, rate.duration
     return Clip(stack_frames(kept), *about)
 
 

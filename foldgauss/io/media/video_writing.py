@@ -14,13 +14,15 @@ from foldgauss._runtime.checks import check_one_of, short_repr
 from foldgauss.io._atomic import PathLike, atomic_folder, atomic_path, check_path, output_error
 from foldgauss.io.media.clip import check_fps, format_size, video_error
 from foldgauss.io.media.encoder import VIDEO_SUFFIXES, Sound, check_sound, choose_encoding, encode_video, straighten
+from foldgauss.io.media.frame_rate import MAX_SECONDS, are_rising_seconds
 
 ANIMATION_SUFFIXES = (".gif", ".webp")
 IMAGE_FORMATS = ("png", "webp")  # of folders of frames; both lossless
 #: Pattern of the names of the files in them.
 FRAME_NAMES = r"[0-9]{5,}\.(png|webp)"
 MAX_WEBP_SIDE = 16_383
-MAX_GIF_FPS = 50.0  # browsers show frames of less than 2 hundredths of a second for 10
+#: A GIF has hundredths of a second, and browsers show frames of less than 2 for 10; an animated WebP has milliseconds.
+MAX_ANIMATION_FPS = {".gif": 50.0, ".webp": 1000.0}
 WEBP_QUALITY = 90  # of an animated WebP, in its encoder's own measure
 
 
@@ -46,8 +48,9 @@ def write_video(
     height or width is then padded by repeating its last row or column. Colors are those of BT.709, and the file says
     so. An MP4 can be played while it is loaded (faststart).
 
-    `times`: seconds at which the frames are shown, rising from 0, such as `Clip.times`; by default they are evenly
-    spaced at `fps`. The last frame is shown for 1 / fps. A folder of images holds no times.
+    `times`: seconds at which the frames are shown, rising from 0, such as `Clip.times`, and if there is one more, the
+    end, such as `Clip.duration`; otherwise the last frame is shown for 1 / fps. By default frames are evenly spaced. A
+    folder of images holds no times.
 
     `sound`: that of another file, as `Sound("clip.mp4", start=2.0, speed=0.5)`; stored as AAC, in .webm as Opus.
 
@@ -146,24 +149,23 @@ def write_image(path: PathLike, image: np.ndarray) -> Path:
 
 
 def _check_times(times: Sequence[float]) -> np.ndarray:
-    times = np.asarray(times, np.float64)
-    rising = times.ndim == 1 and len(times) and times[0] == 0 and (np.diff(times) > 0).all()
-    if not rising or not np.isfinite(times).all():
-        raise video_error("times", expected="seconds that rise from 0, one for each frame", got=short_repr(times))
-    return times
+    if not are_rising_seconds(times):
+        expected = f"seconds that rise from 0 to at most {MAX_SECONDS:,.0f}, one for each frame"
+        raise video_error("times", expected=expected, got=short_repr(times))
+    return np.array(times, np.float64)
 
 
 def _match_times(frames: Iterable[np.ndarray], num: int) -> Iterator[np.ndarray]:
-    """The frames. Raises `VideoError` unless there are `num`."""
+    """The frames. Raises `VideoError` unless there are as many as times, `num`, or one fewer: the last is the end."""
     count = 0
     for frame in frames:
         count += 1
         if count > num:
             break
         yield frame
-    if count != num:
+    if not num - 1 <= count <= num:
         got = f"more than {num}" if count > num else f"{count}"
-        raise video_error("frames", expected=f"{num}, as many as times", got=got)
+        raise video_error("frames", expected=f"{num}, as many as times, or one fewer", got=got)
 
 
 def _noting_failures(frames: Iterable[np.ndarray], failures: list[OSError]) -> Iterator[np.ndarray]:
@@ -217,14 +219,17 @@ def _write_animation(
     path: Path, suffix: str, frames: Iterable[np.ndarray], fps: float, times: np.ndarray | None
 ) -> Path:
     """Write an animated GIF or WebP that repeats forever."""
-    if suffix == ".gif" and fps > MAX_GIF_FPS:
-        expected, cure = f"at most {MAX_GIF_FPS:g} for a GIF", "Take fewer frames, or a .webp or .webm."
-        raise video_error("fps", expected=expected, got=f"{fps:g}", cure=cure)
+    highest, most = fps if times is None or len(times) < 2 else 1 / np.diff(times).min(), MAX_ANIMATION_FPS[suffix]
+    if highest > most * (1 + 1e-6):
+        expected, cure = f"at most {most:g} frames per second for a {suffix}", "Take fewer frames, or a .webm."
+        raise video_error("fps" if times is None else "times", expected=expected, got=f"{highest:g}", cure=cure)
     with atomic_path(path) as temporary:
         images = map(Image.fromarray, _check_frames(frames, channels=(3,)))
         first, *rest = (image.quantize(256) for image in images) if suffix == ".gif" else images
         shared = {"save_all": True, "append_images": rest, "loop": 0}
-        ends = np.arange(len(rest) + 2) / fps if times is None else np.append(times, times[-1] + 1 / fps)
+        ends = np.arange(len(rest) + 2) / fps
+        if times is not None:
+            ends = np.append(times, times[-1] + 1 / fps)[: len(ends)]
         try:
             if suffix == ".gif":
                 # Milliseconds, in whole hundredths of a second, whose sums are the true times rounded.
@@ -236,6 +241,7 @@ def _write_animation(
         except OSError as error:
             raise output_error(path, error) from error
         except (OverflowError, RuntimeError, ValueError) as error:
-            expected, got = f"a size and a rate that {suffix} can hold", f"{first.height}x{first.width} at {fps:g} fps"
+            longest, expected = np.diff(ends).max(), f"a size and times that {suffix} can hold"
+            got = f"{first.height}x{first.width}, shown for up to {longest:g} s"
             raise video_error("frames", expected=expected, got=got, cure="Take an .mp4 or .webm.") from error
     return path

@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Callable, Mapping
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import numpy as np
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io._atomic import PathLike, check_path
+from foldgauss.io.media.frame_rate import are_rising_seconds
 from foldgauss.io.models.compact import COMPACT_SUFFIX, compact_metadata, is_compact, load_compact_model
 from foldgauss.io.models.model_file import (
     Kind,
@@ -107,16 +107,12 @@ def keep_origin(about: Mapping[str, Any], *names: str) -> dict[str, Any]:
 
 
 def read_frame_seconds(about: dict, num_frames: int) -> np.ndarray | None:
-    """Seconds at which the frames of a fitted clip are shown, from `read_origin`; None if they are evenly spaced."""
+    """Seconds at which the frames of a fitted clip are shown, and the end, (num_frames + 1,), from `read_origin`.
+
+    None where they are evenly spaced.
+    """
     seconds = about.get("frame_seconds")
-    return None if seconds is None or len(seconds) != num_frames else np.array(seconds, np.float64)
-
-
-def _is_rising(value: object) -> bool:
-    """Whether these are seconds that rise from 0."""
-    if not isinstance(value, list) or not all(is_within(one, "[0, inf)") for one in value):
-        return False
-    return len(value) > 1 and value[0] == 0 and all(one < other for one, other in pairwise(value))
+    return None if seconds is None or len(seconds) != num_frames + 1 else np.array(seconds, np.float64)
 
 
 def _is_range(value: object) -> bool:
@@ -132,7 +128,7 @@ def _is_range(value: object) -> bool:
 _NOTES: dict[str, Callable[[object], bool]] = {
     **dict.fromkeys(("clip", "frames_digest", "clip_digest"), lambda value: isinstance(value, str)),
     "frames": _is_range,
-    "frame_seconds": _is_rising,
+    "frame_seconds": lambda value: all(is_within(one, "[0, inf)") for one in value) and are_rising_seconds(value),
     "first_second": lambda value: is_within(value, "[0, inf)"),
     "seed": lambda value: is_integer(value, 0),
     "mean_psnr": lambda value: is_within(value, "(0, 100]"),

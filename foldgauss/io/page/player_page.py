@@ -23,7 +23,7 @@ from foldgauss.io._atomic import PathLike, atomic_path, check_path
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.compact import is_compact, pack_compact
 from foldgauss.io.models.selections import format_indices
-from foldgauss.io.models.video_model import keep_origin, load_video_model, read_origin
+from foldgauss.io.models.video_model import keep_origin, load_video_model, read_frame_seconds, read_origin
 from foldgauss.video.compression.quantize import (
     COLORS,
     Quantized,
@@ -184,8 +184,9 @@ def _load(model: Model) -> tuple[Loaded, str, dict]:
     """The model, a name for it, and the metadata that the page needs."""
     if isinstance(model, PathLike):
         path = check_path(model, "model")
-        about = read_origin(path)
-        return load_video_model(path), about.get("clip", path.stem), keep_origin(about, "frame_seconds")
+        about, loaded = read_origin(path), load_video_model(path)
+        uneven = read_frame_seconds(about, loaded.num_frames) is not None
+        return loaded, about.get("clip", path.stem), keep_origin(about, "frame_seconds") if uneven else {}
     if not isinstance(model, Loaded):
         cure = "End the chain with .video()." if type(model).__name__ == "Edit" else "The model comes first."
         raise invalid("model", expected="a VideoModel or an EditedVideo", got=short_repr(model), cure=cure)

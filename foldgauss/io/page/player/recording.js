@@ -75,8 +75,8 @@ export class Recording {
   async run() {
     const { player } = this, canvas = this.canvas(), [width, height] = [canvas.width, canvas.height], context = canvas.getContext("2d");
     const { first, last, speed } = this.range, rate = player.timeline.fps * speed, before = player.position, parts = [];
-    const { timeline } = player, begin = timeline.secondOf(first), length = (timeline.secondOf(last) - begin) / speed + 1 / rate;
-    const tick = 1000 / Math.min(Math.max(rate, 24), 60);
+    const { timeline } = player, begin = timeline.secondOf(first), length = (timeline.secondOf(last + 1) - begin) / speed;
+    const tick = 1000 / (timeline.seconds ? 60 : Math.min(Math.max(rate, 24), 60)); // with own times, frames may follow each other quickly
     player.pause();
     const stream = canvas.captureStream(0), [track] = stream.getVideoTracks(), pixels = width * height * (1000 / tick);
     const source = track.requestFrame ? track : stream; // in Firefox it is the stream's

@@ -18,32 +18,31 @@ function median(values) {
 
 /** Times of a clip's frame positions: 2.5 is half way from frame 2 to frame 3. */
 export class Timeline {
-  /** `seconds`: when the frames are shown, where they are not evenly spaced at `fps`; ignored unless they rise from 0, one for each frame. */
+  /** `seconds`: when the frames are shown, and the end, where they are not evenly spaced at `fps`; ignored unless they fit and rise from 0. */
   constructor(times, fps, seconds) {
     this.times = times;
     this.fps = fps;
     this.last = times.length - 1;
-    const fits = Array.isArray(seconds) && seconds.length === times.length && seconds[0] === 0 && seconds.every((own, k) => k === 0 || own > seconds[k - 1]);
+    const fits = Array.isArray(seconds) && seconds.length === times.length + 1 && seconds[0] === 0 && seconds.every((own, k) => Number.isFinite(own) && (k === 0 || own > seconds[k - 1]));
     this.seconds = fits ? seconds : null;
     const intervals = times.slice(1).map((own, k) => own - times[k]);
     const bound = intervals.length ? CUT_RATIO * median(intervals) : 0;
     this.isCut = intervals.map((own) => own > bound);
   }
 
-  /** The second at which a position is shown; beyond the last frame it goes on at `fps`. */
+  /** The second at which a position is shown; the last frame ends at `last` + 1. */
   secondOf(position) {
-    const { seconds, fps, last } = this, k = Math.min(Math.floor(position), last - 1);
-    if (!seconds || position < 0 || last === 0) return position / fps;
-    if (position > last) return seconds[last] + (position - last) / fps;
+    const { seconds, fps, last } = this, end = last + 1, k = Math.min(Math.floor(position), last);
+    if (!seconds || position < 0) return position / fps;
+    if (position > end) return seconds[end] + (position - end) / fps;
     return seconds[k] + (position - k) * (seconds[k + 1] - seconds[k]);
   }
 
   /** The position shown at a second, the inverse of `secondOf`. */
   positionAt(second) {
-    const { seconds, fps, last } = this;
-    if (!seconds || second < 0 || last === 0) return second * fps;
-    if (second > seconds[last]) return last + (second - seconds[last]) * fps;
-    return place(seconds, second);
+    const { seconds, fps, last } = this, end = last + 1;
+    if (!seconds || second < 0) return second * fps;
+    return second > seconds[end] ? end + (second - seconds[end]) * fps : place(seconds, second);
   }
 
   /** The model's time of a position; in the gap of a cut that of the nearer frame. */
