@@ -89,7 +89,9 @@ def test_an_object_without_gaussians_is_told(monkeypatch):
 def test_the_plate_and_its_masks_are_written(model, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert run("plate", model, "--masks", "masks", "--out", "images") == 0
-    assert "7 frames at 25 frames per second" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "An object was found in 7 of 7 frames, where it covers " in told
+    assert "7 frames at 25 frames per second" in told
     np.testing.assert_array_equal(read_masks("masks"), MASKS)
     filled, frames = read_video("images").frames, np.stack(list(MODEL.frames()))
     np.testing.assert_array_equal(filled[:, :5], frames[:, :5])

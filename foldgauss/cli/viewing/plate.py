@@ -78,6 +78,10 @@ def plate_command(
             masks = find_moving_object(frames, shadow=True, alignment=alignment)
         except NothingMoves as error:
             raise nothing_moves("an object that moves against the background", "none", _CURE) from error
+        covered = masks.mean((1, 2))[masks.any((1, 2))]
+        if len(covered):
+            found, size = f"in {len(covered)} of {len(masks)} frames", f"{covered.min():.1%} to {covered.max():.1%}"
+            out.print(f"An object was found {found}, where it covers {size} of the image.")
         plate = fill_background(frames, masks, alignment=alignment)
     stamps = read_frame_seconds(read_origin(model_path), model.num_frames)
     write_images(out_path, plate, len(plate), model.fps, overwrite=overwrite, options=options, stamps=stamps)
