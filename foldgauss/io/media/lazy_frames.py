@@ -6,6 +6,7 @@ import hashlib
 import operator
 import os
 import threading
+import weakref
 from functools import cached_property
 
 import numpy as np
@@ -16,11 +17,19 @@ from foldgauss.io.media.frame_index import DIGEST_BYTES, FrameIndex
 from foldgauss.io.media.indexed_reader import IndexedReader
 
 RUN = 32
+_ALIVE: weakref.WeakSet["LazyFrames"] = weakref.WeakSet()
+
+
+def _begin_child() -> None:
+    """In a forked process never free the parent's decoders, which would wait for threads that a fork does not copy."""
+    gc.freeze()
+    for frames in list(_ALIVE):
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(frames._reader))
+        frames._open()
 
 
 if hasattr(os, "register_at_fork"):
-    # In a forked process the parent's decoders are never freed: that would wait for threads that a fork does not copy.
-    os.register_at_fork(after_in_child=gc.freeze)
+    os.register_at_fork(after_in_child=_begin_child)
 
 
 class LazyFrames:
@@ -52,19 +61,11 @@ class LazyFrames:
         self.index, self._size = index, check_frame_size(size)
         self._first, self._stop, self._run = first, stop, run
         self._open()
+        _ALIVE.add(self)
 
     def _open(self) -> None:
         self._reader, self._cache, self._cache_start = IndexedReader(self.index), None, 0
-        self._own_lock, self._process = threading.RLock(), os.getpid()
-
-    @property
-    def _lock(self) -> threading.RLock:
-        """One decoder has one position in the file. A forked process opens its own decoder, with its own lock."""
-        if self._process != os.getpid():
-            # The parent's is never freed: that would wait for threads of the decoder, which a fork does not copy.
-            ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._reader))
-            self._open()
-        return self._own_lock
+        self._lock = threading.RLock()  # one decoder has one position in the file
 
     def __reduce__(self) -> tuple:
         return LazyFrames, (self.index, self._size, self._first, self._stop, self._run)
