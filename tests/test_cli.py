@@ -157,7 +157,7 @@ def test_a_variable_frame_rate_is_kept(tmp_path, capsys):
     times, end, model = np.array([0, 3, 6, 14, 17, 31]) / 30, 41 / 30, tmp_path / "m.safetensors"
     write_video(tmp_path / "clip.mp4", blobs(), 5.0, times=[*times, end])
     assert run("fit", tmp_path / "clip.mp4", "--out", model, *QUICK) == 0
-    assert "0.1 to 0.467 s apart, 4.839 per second on average" in capsys.readouterr().err
+    assert "shown for 0.1 to 0.467 s, 4.839 per second on average" in capsys.readouterr().err
     assert run("info", model) == 0
     told = capsys.readouterr().out.replace("\n", " ")
     assert "4.39 per second on average" in told

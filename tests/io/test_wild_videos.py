@@ -173,7 +173,7 @@ def test_uneven_times_are_told_and_no_frame_is_lost(tmp_path, mp4, uneven_mp4):
     assert uneven.fps == pytest.approx(7 / 1.6)
     assert uneven.num_declared == 8
     assert len(uneven.notes) == 1
-    assert "0.1 to 0.4 s apart" in uneven.notes[0]
+    assert "shown for 0.1 to 0.4 s" in uneven.notes[0]
     assert "4.375" in uneven.notes[0]
     late = read_video(tmp_path / "uneven.mp4", frames=(3, 6))
     np.testing.assert_allclose(late.times, [0, 0.1, 0.5], atol=1e-3)
@@ -213,7 +213,7 @@ def test_animations_have_times_of_their_own(tmp_path):
         clip = read_video(tmp_path / name)
         np.testing.assert_allclose(clip.times, [0, 0.1, 0.2, 0.6])
         assert clip.fps == pytest.approx(4 / 0.8)
-        assert "apart" in clip.notes[0]
+        assert "shown for" in clip.notes[0]
 
 
 # ---------------------------------------------------------------------------------------- sizes and turns
@@ -1005,7 +1005,7 @@ FEW = ("--steps", 2, "--gaussians", 20, "--size", "16x16")
 def test_fit_tells_of_uneven_times_and_keeps_the_duration(tmp_path, capsys, uneven_mp4):
     (tmp_path / "clip.mp4").write_bytes(uneven_mp4)
     assert run("fit", tmp_path / "clip.mp4", "--out", tmp_path / "a.safetensors", *FEW) == 0
-    told = [line for line in capsys.readouterr().err.splitlines() if "apart" in line]
+    told = [line for line in capsys.readouterr().err.splitlines() if "shown for" in line]
     assert len(told) == 1
     assert told[0].startswith("warning: ")
     model = load_video_model(tmp_path / "a.safetensors")

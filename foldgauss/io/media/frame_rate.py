@@ -52,7 +52,7 @@ def estimate_rate(seconds: Float[np.ndarray, " num_frames"], fps: float, end: fl
     if len(seconds) < 2:
         return FrameRate(fps)
     times = seconds - seconds[0]
-    last = 0.0 if end is None else end - seconds[-1]
+    last = 0.0 if end is None or end - seconds[0] > MAX_SECONDS else end - seconds[-1]
     mean = (len(times) - 1) / times[-1]
     grid, rates = np.arange(len(times)), (fps, mean)
     even = [FrameRate(rate) for rate in rates if np.abs(times - grid / rate).max() <= OFF_GRID / rate]
@@ -70,10 +70,10 @@ def describe_rate(rate: FrameRate) -> tuple[str, ...]:
         )
     if rate.times is None:
         return ()
-    intervals = np.diff(rate.times)
+    intervals = np.diff([*rate.times, rate.duration])
     return (
-        f"frames are {intervals.min():.3g} to {intervals.max():.3g} s apart, {rate.fps:.4g} per second on average; all "
-        "are kept, with the times at which they are shown.",
+        f"frames are shown for {intervals.min():.3g} to {intervals.max():.3g} s, {rate.fps:.4g} per second on average; "
+        "all are kept, with their times.",
     )
 
 
