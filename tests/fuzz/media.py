@@ -171,6 +171,8 @@ _ENCODED = (
     (".mkv", "ffv1", "yuva420p", {}), (".webm", "libvpx-vp9", "yuva420p", {}), (".mov", "prores_ks", "yuv422p10le", {}),
     (".mkv", "libx264", "yuv420p", {"flags": "+ilme+ildct", "bf": "2"}), (".wmv", "wmv2", "yuv420p", {}),
     (".flv", "flv", "yuv420p", {}), (".mp4", "libx264", "yuv420p", {"movflags": "frag_keyframe+empty_moov"}),
+    (".mp4", "libx264", "yuv420p10le", {"color_trc": "arib-std-b67"}),
+    (".mkv", "ffv1", "yuva420p10le", {"color_trc": "smpte2084"}),
 )  # fmt: skip
 
 
@@ -191,6 +193,8 @@ def _clips() -> tuple[bytes, ...]:
     found = [written(lambda path: write_video(path, frames, 10), suffix) for suffix in (".mp4", ".webm", ".gif")]
     for suffix, *encoding in _ENCODED:
         found.append(written(lambda path, how=encoding: _encode(path, frames, *how), suffix))
+    uneven = [0, 0.1, 0.3, 0.32, 0.5, 1.5]
+    found += [written(lambda path: write_video(path, frames, 10, times=uneven), suffix) for suffix in (".mp4", ".mkv")]
     return (*found, _with_edits(found[4]))
 
 
