@@ -90,6 +90,8 @@ ODD = [
     {"frame_seconds": [0.1, 0.2]},
     {"frame_seconds": {"0": 0}},
     {"frame_seconds": [0, "1"]},
+    {"frame_seconds": 5},
+    {"frame_seconds": True},
     {"first_second": -1},
 ]
 

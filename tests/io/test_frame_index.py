@@ -12,8 +12,10 @@ import subprocess
 import sys
 import threading
 import weakref
+from fractions import Fraction
 from functools import partial
 
+import av
 import numpy as np
 import pytest
 from PIL import Image
@@ -441,6 +443,36 @@ def test_threads_take_turns(long, long_index, monkeypatch):
     np.testing.assert_array_equal(lazy[20], read_video(long, frames=(20, 21)).frames[0])
     waits[0].join(timeout=60)
     np.testing.assert_array_equal(found, read_video(long, frames=(500, 501)).frames)
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "b.mp4", "a.mkv", "a.ts"])
+def test_ranges_of_an_uneven_clip_end_where_the_next_frame_begins(tmp_path, name):
+    """Of 40 frames, 30 a second, one is held for 10 s; with B-frames ("b.mp4"), which come in another order, too."""
+    ticks = np.arange(40) + 300 * (np.arange(40) >= 20)
+    with av.open(str(tmp_path / name), "w") as out:
+        stream = out.add_stream("libx264", rate=30, width=64, height=48, pix_fmt="yuv420p")
+        stream.codec_context.max_b_frames = 2 if name[0] == "b" else 0
+        for tick, image in zip(ticks, _moving(40), strict=True):
+            frame = av.VideoFrame.from_ndarray(image)
+            frame.pts, frame.time_base = int(tick), Fraction(1, 30)
+            out.mux(stream.encode(frame))
+        out.mux(stream.encode())
+    index = index_video(tmp_path / name)
+    for first, stop, end in [(25, 35, None), (0, 20, 320), (5, 19, None), (5, 30, 330), (0, 40, 340), (20, 40, None)]:
+        clip = read_video(tmp_path / name, frames=(first, stop))
+        part = index_video(tmp_path / name, frames=(first, stop))
+        assert clip.first_second == pytest.approx(ticks[first] / 30, abs=2e-3)
+        if end is None:
+            assert (clip.times, clip.duration) == (None, None)
+        else:
+            np.testing.assert_allclose(clip.times, (ticks[first:stop] - ticks[first]) / 30, atol=2e-3)
+            # The end of the last frame of all is not told by every container.
+            assert clip.duration == pytest.approx((end - ticks[first]) / 30, abs=2e-3 if stop < 40 else 0.4)
+        for other in (part, read_indexed(index, first, stop), read_indexed(part, 0, stop - first)):
+            assert (other.fps, other.notes) == (clip.fps, clip.notes)
+            assert other.duration == clip.duration
+            np.testing.assert_array_equal(other.times, clip.times)
+            assert other.first_second == pytest.approx(clip.first_second, abs=1e-9)
 
 
 FORKING = """

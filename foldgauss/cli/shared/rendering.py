@@ -20,7 +20,7 @@ from foldgauss.io.media.frame_rate import MAX_FPS
 from foldgauss.io.media.lazy_frames import LazyFrames
 from foldgauss.io.media.video_writing import (
     ANIMATION_SUFFIXES,
-    MAX_ANIMATION_FPS,
+    MAX_GIF_FPS,
     VIDEO_SUFFIXES,
     write_image,
     write_video,
@@ -95,11 +95,8 @@ def check_video_options(
         raise WrongUse(name_option(str(error)) if str(error).startswith(options._fields) else str(error)) from error
 
 
-def _check_rate(path: Path, fps: float, stamps: np.ndarray | None = None) -> None:
-    suffix = path.suffix.lower()
-    most = MAX_ANIMATION_FPS.get(suffix, MAX_FPS)
-    if stamps is not None and len(stamps) > 1 and suffix in ANIMATION_SUFFIXES:
-        fps = 1 / np.diff(stamps).min() / (1 + 1e-6)
+def _check_rate(path: Path, fps: float) -> None:
+    most = MAX_GIF_FPS if path.suffix.lower() == ".gif" else MAX_FPS
     if path.suffix and not path.is_dir() and fps > most:
         expected, cure = f"at most {most:g} frames per second", "Give a lower rate, or write to a folder."
         raise wrong_use("--fps", expected=expected, got=f"{fps:g}", cure=cure)
@@ -209,7 +206,7 @@ def write_images(
     stamps: np.ndarray | None = None,
 ) -> None:
     """Write `num` images as a video or to a folder. `stamps`: as in `render_to_file`."""
-    _check_rate(path, fps, stamps)
+    _check_rate(path, fps)
     with progress_bar("Rendering", num) as advance:
         try:
             write_video(
@@ -227,5 +224,5 @@ def write_images(
             raise WrongUse(name_option(str(error))) from error
     rate = f"at {fps:g} frames per second"
     if stamps is not None and path.suffix and not path.is_dir():
-        rate = f"unevenly spaced as in the clip, {fps:.4g} per second on average"
+        rate = f"unevenly spaced as in the clip, {num / stamps[-1]:.4g} per second on average"
     out.print(f"{path}: {format_count(num, 'frame')} {rate}", soft_wrap=True)

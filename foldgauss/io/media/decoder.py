@@ -45,7 +45,7 @@ class DecodedFrame:
     `VideoDecoder.time_base`; 0 for a stream without time stamps. `size`: (height, width) of the video as stored, to
     which a frame of another size is stretched. `matrix`: (a, b, c, d), right is shown along (a, b), down along (c, d),
     in units of 2^-16. `converter`: one for all frames, since FFmpeg takes longer to prepare it than to convert
-    a small frame. `hdr`: as of `VideoDecoder`."""
+    a small frame."""
 
     position: int
     stamp: int
@@ -53,7 +53,11 @@ class DecodedFrame:
     size: Size
     matrix: tuple[int, int, int, int] = (1 << 16, 0, 0, 1 << 16)
     converter: VideoReformatter = field(default_factory=VideoReformatter)
-    hdr: str | None = None
+
+    @property
+    def hdr(self) -> str | None:
+        """The transfer function of a frame in HDR, "PQ" or "HLG"; None for others."""
+        return HDR.get(self.decoded.color_trc)
 
     def to_array(self) -> np.ndarray:
         """Upright and uint8: BGR of shape (height, width, 3), or premultiplied BGRA of shape (height, width, 4).
@@ -129,11 +133,6 @@ class VideoDecoder:
         return self._codec.thread_count
 
     @property
-    def hdr(self) -> str | None:
-        """The transfer function of a video in HDR, "PQ" or "HLG"; None for other videos."""
-        return HDR.get(self._stream.codec_context.color_trc)
-
-    @property
     def num_declared(self) -> int:
         """The number of frames that the container counts, including those that an edit list hides; 0 where it does not
         count them."""
@@ -167,6 +166,21 @@ class VideoDecoder:
         except (ValueError, OverflowError):
             return None
 
+    def find_last_duration(self, duration: int, elapsed: float, num_frames: int) -> float:
+        """Seconds for which the last of `num_frames`, `elapsed` seconds after the first, is shown; 0 if it is unknown.
+
+        `duration` is that of the decoder, in units of `time_base`: in an MP4 that of another frame where frames are
+        stored in another order, in Matroska often a default.
+        """
+        if self.hides_frames:
+            is_known = self.declared_seconds is not None and self.num_declared in (0, num_frames)
+            return max(self.declared_seconds - elapsed, 0.0) if is_known else 0.0
+        if "matroska" not in self._container.format.name:
+            return 0.0
+        seconds, rates = duration * self.time_base, (self._stream.average_rate, self._stream.guessed_rate)
+        is_default = any(abs(seconds - 1 / rate) <= 1.5 * self.time_base for rate in rates if rate)
+        return 0.0 if is_default else float(max(seconds, 0))
+
     def seek(self, stamp: int) -> None:
         """Continue at the last key frame up to `stamp`; positions are counted from there."""
         with suppress(av.FFmpegError):  # a damaged index: continue where the decoder is
@@ -182,7 +196,7 @@ class VideoDecoder:
             self._last = self._find_position(stamp)
             self._size = self._size if all(self._size) else (frame.height, frame.width)
             matrix = self._find_matrix(frame)
-            yield DecodedFrame(self._last, stamp or 0, frame, self._size, matrix, self._converter, self.hdr)
+            yield DecodedFrame(self._last, stamp or 0, frame, self._size, matrix, self._converter)
             if self._closed:  # FFmpeg would read on in memory that is freed
                 return
 

@@ -32,7 +32,7 @@ from foldgauss.io.media.video_reading import choose_reader
 from foldgauss.video.motion.optical_flow import CutFinder
 
 DIGEST_BYTES = 16
-_FORMAT = 2
+_FORMAT = 3
 #: What NumPy raises for other files, and our own checks for other arrays.
 _LOAD_ERRORS = (
     OSError,
@@ -51,11 +51,11 @@ class FrameIndex:
     """The index of a clip; made by `index_video`.
 
     `source`: the path as given. `kind`: "video", "folder" or "pictures" (an animation, or one image). `num_frames`,
-    `fps`, `times`, `num_declared`, `notes`: as in `Clip`. `size`: (height, width) of the frames as stored.
-    `has_alpha`: whether any frame is transparent anywhere. `cuts`: the frames, in order, that begin a new shot; empty
-    where they were not searched for. `digest`: of all frames as stored, in hexadecimal; it shows whether a file is
-    still the one that was indexed. `positions`: int64 (num_frames,), the position of each frame in the range: k for
-    frame k, except in a clip that lost frames to damage.
+    `fps`, `times`, `duration`, `first_second`, `num_declared`, `notes`: as in `Clip`. `size`: (height, width) of the
+    frames as stored. `has_alpha`: whether any frame is transparent anywhere. `cuts`: the frames, in order, that begin a
+    new shot; empty where they were not searched for. `digest`: of all frames as stored, in hexadecimal; it shows
+    whether a file is still the one that was indexed. `positions`: int64 (num_frames,), the position of each frame in
+    the range: k for frame k, except in a clip that lost frames to damage.
 
     About 40 bytes per frame. It can be pickled, and saved with `save`.
     """
@@ -77,8 +77,8 @@ class FrameIndex:
         self.deinterlace: bool = about["deinterlace"]
         self.fixed_fps: float | None = about["fixed_fps"]
         self.fps: float = about["fps"]
-        self.first_second: float = about.get("first_second", 0.0)
-        self.duration: float | None = about.get("duration")
+        self.first_second: float = about["first_second"]
+        self.duration: float | None = about["duration"]
         self.size: Size = tuple(about["size"])
         self.num_declared: int = about["num_declared"]
         self.notes: tuple[str, ...] = tuple(about["notes"])
@@ -111,8 +111,9 @@ class FrameIndex:
         time_base, notes = about["time_base"], tuple(about["shape_notes"])
         seconds = make_increasing((self.stamps * time_base).tolist(), about["rate"])
         arrays = self.places, self.stamps, seconds
-        last = about.get("last_duration", 0.0)
-        return DecodeReport(about["rate"], about["num_total"], notes, *arrays, time_base, about["threads"], last)
+        return DecodeReport(
+            about["rate"], about["num_total"], notes, *arrays, time_base, about["threads"], about["end"]
+        )
 
     def span(self, first: int, stop: int) -> tuple[int, int]:
         """The range, for `read_indexed`, of the frames `first` up to `stop` of those that decode: the same numbers
@@ -224,7 +225,7 @@ def index_video(
         "fps": float(rate.fps if fps is None else fps),
         "first_second": rate.first_second if fps is None else 0.0,
         "duration": rate.duration if fps is None else None,
-        "last_duration": report.last_duration if report else 0.0,
+        "end": report.end if report else 0.0,
         "size": [int(side) for side in kept[-1]],
         "num_declared": int(num_declared),
         "notes": list(notes),

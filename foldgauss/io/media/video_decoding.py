@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -26,8 +27,8 @@ class DecodeReport(NamedTuple):
 
     `fps`: the container's rate, or the default in its place. `num_total`: number of frames, missing ones included.
     `notes`: about the shape of pixels, HDR and interlacing. Of all frames decoded `positions`, `stamps` in units of
-    `time_base` seconds, and increasing times in `seconds`. `threads`: of the decoder. `last_duration`: seconds for
-    which the last of these is shown; 0 where that is unknown.
+    `time_base` seconds, and increasing times in `seconds`. `threads`: of the decoder. `end`: when the last
+    of these ends, in seconds as well; 0 where that is unknown.
     """
 
     fps: float
@@ -38,15 +39,17 @@ class DecodeReport(NamedTuple):
     seconds: np.ndarray
     time_base: float
     threads: int
-    last_duration: float
+    end: float
 
     def describe_span(self, first: int, end: int, start: int, stop: int | None) -> RangeFacts:
         """Number of frames declared from position `start` up to `stop`, their rate, and notes.
 
         Those that decode are the numbers `first` up to `end` of all frames decoded.
         """
-        last = self.seconds[-1] + self.last_duration if end == len(self.seconds) else self.seconds[end]
-        rate = estimate_rate(self.seconds[first:end], self.fps, float(last))
+        last = self.end
+        if end < len(self.seconds):  # until the next one is shown, unless others were lost before it
+            last = float(self.seconds[end]) if self.positions[end] == self.positions[end - 1] + 1 else 0.0
+        rate = estimate_rate(self.seconds[first:end], self.fps, last)
         rate = rate._replace(first_second=float(self.seconds[first] - self.seconds[0]))
         if np.ptp(self.stamps[:end]) == 0 and end > 1:  # a raw stream: the rate is FFmpeg's guess
             rate = rate._replace(guessed=True)
@@ -61,51 +64,66 @@ def decode_file(
 
     Raises `VideoError` for a file that cannot be read.
     """
-    passed: list[tuple[int, int, int]] = []
+    passed = Passed()
     with closing(VideoDecoder(path, deinterlace=deinterlace)) as decoder:
         fps = decoder.fps if 0 < decoder.fps <= MAX_FPS else DEFAULT_FPS
         kept = keep(select_frames(decoder.frames(), start, stop, passed))
-        if not passed:
+        if not passed.positions:
             cure = "The file is damaged or its codec is unknown here; convert it with ffmpeg."
             got = f"none in {str(path)!r}"
             raise video_error("path", expected="a video with frames that decode", got=got, cure=cure)
-        positions, stamps, durations = np.array(passed, np.int64).T.copy()
-        time_base, num_reached = float(decoder.time_base), passed[-1][0] + 1
-        seconds = make_increasing((stamps * time_base).tolist(), fps)
-        last = max(int(durations[-1]), 0) * time_base
+        positions, stamps = np.array(passed.positions, np.int64), np.array(passed.stamps, np.int64)
+        time_base, num_reached = float(decoder.time_base), passed.positions[-1] + 1
+        seconds = make_increasing((np.append(stamps, passed.following) * time_base).tolist(), fps)
+        seconds, end = seconds[: len(stamps)], float(seconds[-1])
+        if not passed.following:
+            last = decoder.find_last_duration(passed.duration, seconds[-1] - seconds[0], num_reached)
+            end = float(seconds[-1] + last) if last else 0.0
+        last = max(end - seconds[-1], 0.0)
         num_total = max(_count_declared(decoder, seconds, fps, num_reached, last), num_reached)
-        if decoder.hides_frames and num_total == num_reached and decoder.declared_seconds:  # an MP4, whose frames have
-            last = max(decoder.declared_seconds - (seconds[-1] - seconds[0]), 0.0)  # the durations of others
-        notes, aspect, hdr, threads = (), decoder.pixel_aspect, decoder.hdr, decoder.threads
+        notes, aspect, threads = (), decoder.pixel_aspect, decoder.threads
         if abs(aspect - 1) > 0.01:
             notes += (f"pixels are {aspect:.3g} times as wide as high; frames are kept as stored, not stretched.",)
-        if hdr is not None:
-            notes += (f"colors are HDR ({hdr}), and are tone-mapped to SDR.",)
+        if passed.hdr:
+            notes += (f"colors are HDR ({' and '.join(sorted(passed.hdr))}), and are tone-mapped to SDR.",)
         if decoder.has_converted:
             notes += ("interlaced frames are converted to progressive ones.",)
     # The container's count may be an estimate, so the range is checked against the decoded frames as well.
     check_range_within(start, stop, num_total, path)
     if not kept:
-        raise no_frames_error(start, stop, len(passed), num_total, path)
-    report = DecodeReport(fps, num_total, notes, positions, stamps, seconds, time_base, threads, last)
-    return (kept, *report.describe_span(len(passed) - len(kept), len(passed), start, stop)), report
+        raise no_frames_error(start, stop, len(stamps), num_total, path)
+    report = DecodeReport(fps, num_total, notes, positions, stamps, seconds, time_base, threads, end)
+    return (kept, *report.describe_span(len(stamps) - len(kept), len(stamps), start, stop)), report
 
 
-def select_frames(
-    frames: Iterable[DecodedFrame], start: int, stop: int | None, passed: list[tuple[int, int, int]]
-) -> Iterator[np.ndarray]:
-    """The frames from `start` up to `stop`; of each decoded on the way position, stamp and duration go to `passed`.
+@dataclass
+class Passed:
+    """The frames that were decoded: their positions and stamps, the transfer functions of those in HDR, the duration of
+    the last one by the decoder, and the stamp of the one after it, in a list, if that was decoded, too."""
+
+    positions: list[int] = field(default_factory=list)
+    stamps: list[int] = field(default_factory=list)
+    hdr: set[str] = field(default_factory=set)
+    duration: int = 0
+    following: list[int] = field(default_factory=list)
+
+
+def select_frames(frames: Iterable[DecodedFrame], start: int, stop: int | None, passed: Passed) -> Iterator[np.ndarray]:
+    """The frames from `start` up to `stop`; each decoded on the way is noted in `passed`, and so is the next one.
 
     Frames before `start` are decoded and dropped: seeking stops at key frames.
     """
     for frame in frames:
         if stop is not None and frame.position >= stop:
+            if passed.positions and frame.position == passed.positions[-1] + 1:
+                passed.following.append(frame.stamp)
             return
-        passed.append((frame.position, frame.stamp, frame.decoded.duration or 0))
+        passed.positions.append(frame.position)
+        passed.stamps.append(frame.stamp)
+        passed.duration = frame.decoded.duration or 0
         if frame.position >= start:
+            passed.hdr |= {frame.hdr} - {None}
             yield frame.to_array()
-        if stop is not None and frame.position == stop - 1:
-            return
 
 
 def _count_declared(decoder: VideoDecoder, seconds: np.ndarray, fps: float, num_reached: int, last: float) -> int:

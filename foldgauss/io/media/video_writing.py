@@ -21,8 +21,7 @@ IMAGE_FORMATS = ("png", "webp")  # of folders of frames; both lossless
 #: Pattern of the names of the files in them.
 FRAME_NAMES = r"[0-9]{5,}\.(png|webp)"
 MAX_WEBP_SIDE = 16_383
-#: A GIF has hundredths of a second, and browsers show frames of less than 2 for 10; an animated WebP has milliseconds.
-MAX_ANIMATION_FPS = {".gif": 50.0, ".webp": 1000.0}
+MAX_GIF_FPS = 50.0  # browsers show frames of less than 2 hundredths of a second for 10
 WEBP_QUALITY = 90  # of an animated WebP, in its encoder's own measure
 
 
@@ -215,14 +214,19 @@ def _encode_image(frame: np.ndarray, image_format: str = "png") -> bytes:
 # ------------------------------------------------------------------------------------------- animations
 
 
+def _durations(ends: np.ndarray, least: int) -> list[int]:
+    """Whole durations between these times, at least `least`: where frames come more quickly, they are moved apart."""
+    ends, apart = np.rint(ends).astype(int), least * np.arange(len(ends))
+    return np.diff(np.maximum.accumulate(ends - apart) + apart).tolist()
+
+
 def _write_animation(
     path: Path, suffix: str, frames: Iterable[np.ndarray], fps: float, times: np.ndarray | None
 ) -> Path:
     """Write an animated GIF or WebP that repeats forever."""
-    highest, most = fps if times is None or len(times) < 2 else 1 / np.diff(times).min(), MAX_ANIMATION_FPS[suffix]
-    if highest > most * (1 + 1e-6):
-        expected, cure = f"at most {most:g} frames per second for a {suffix}", "Take fewer frames, or a .webm."
-        raise video_error("fps" if times is None else "times", expected=expected, got=f"{highest:g}", cure=cure)
+    if suffix == ".gif" and fps > MAX_GIF_FPS:
+        expected, cure = f"at most {MAX_GIF_FPS:g} for a GIF", "Take fewer frames, or a .webp or .webm."
+        raise video_error("fps", expected=expected, got=f"{fps:g}", cure=cure)
     with atomic_path(path) as temporary:
         images = map(Image.fromarray, _check_frames(frames, channels=(3,)))
         first, *rest = (image.quantize(256) for image in images) if suffix == ".gif" else images
@@ -233,10 +237,10 @@ def _write_animation(
         try:
             if suffix == ".gif":
                 # Milliseconds, in whole hundredths of a second, whose sums are the true times rounded.
-                durations = [10 * int(duration) for duration in np.diff(np.rint(100 * ends).astype(int))]
+                durations = [10 * duration for duration in _durations(100 * ends, least=2)]
                 first.save(temporary, "GIF", duration=durations, optimize=False, **shared)
             else:
-                durations = 1000 / fps if times is None else np.diff(np.rint(1000 * ends)).astype(int).tolist()
+                durations = 1000 / fps if times is None else _durations(1000 * ends, least=1)
                 first.save(temporary, "WEBP", duration=durations, quality=WEBP_QUALITY, **shared)
         except OSError as error:
             raise output_error(path, error) from error

@@ -115,6 +115,10 @@ def read_frame_seconds(about: dict, num_frames: int) -> np.ndarray | None:
     return None if seconds is None or len(seconds) != num_frames + 1 else np.array(seconds, np.float64)
 
 
+def _are_numbers(values: list) -> bool:
+    return all(is_within(one, "[0, inf)") for one in values)
+
+
 def _is_range(value: object) -> bool:
     """Whether these are frames A up to, not including, B, as `read_video` takes them."""
     if not isinstance(value, list) or len(value) != 2:
@@ -128,7 +132,7 @@ def _is_range(value: object) -> bool:
 _NOTES: dict[str, Callable[[object], bool]] = {
     **dict.fromkeys(("clip", "frames_digest", "clip_digest"), lambda value: isinstance(value, str)),
     "frames": _is_range,
-    "frame_seconds": lambda value: all(is_within(one, "[0, inf)") for one in value) and are_rising_seconds(value),
+    "frame_seconds": lambda value: isinstance(value, list) and _are_numbers(value) and are_rising_seconds(value),
     "first_second": lambda value: is_within(value, "[0, inf)"),
     "seed": lambda value: is_integer(value, 0),
     "mean_psnr": lambda value: is_within(value, "(0, 100]"),

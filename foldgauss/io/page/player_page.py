@@ -185,8 +185,10 @@ def _load(model: Model) -> tuple[Loaded, str, dict]:
     if isinstance(model, PathLike):
         path = check_path(model, "model")
         about, loaded = read_origin(path), load_video_model(path)
-        uneven = read_frame_seconds(about, loaded.num_frames) is not None
-        return loaded, about.get("clip", path.stem), keep_origin(about, "frame_seconds") if uneven else {}
+        kept = keep_origin(about, "frames", "first_second")
+        if read_frame_seconds(about, loaded.num_frames) is not None:
+            kept |= keep_origin(about, "frame_seconds")
+        return loaded, about.get("clip", path.stem), kept
     if not isinstance(model, Loaded):
         cure = "End the chain with .video()." if type(model).__name__ == "Edit" else "The model comes first."
         raise invalid("model", expected="a VideoModel or an EditedVideo", got=short_repr(model), cure=cure)

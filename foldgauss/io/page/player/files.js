@@ -167,9 +167,10 @@ export class Files {
   }
 
   downloadModel() {
-    const { player: { state, timeline: { seconds } }, title, stem } = this;
+    const { player: { state, base }, title, stem } = this;
     try {
-      const metadata = { clip: title, edited: "foldgauss player", ...(seconds ? { frame_seconds: seconds } : {}) };
+      const kept = Object.entries(base.header.metadata ?? {}).filter(([name]) => ["frames", "frame_seconds", "first_second"].includes(name));
+      const metadata = { clip: title, edited: "foldgauss player", ...Object.fromEntries(kept) };
       download(writeSafetensors(withoutUnseen(state).model, metadata), `${stem}.edited.safetensors`);
     } catch (error) {
       toast(error.message, LONG);
