@@ -72,7 +72,7 @@ class Timeline:
     def stamps(self, fps: float, seconds: np.ndarray | None) -> np.ndarray | None:
         """Seconds at which the output's images are shown, and the end; None where they are evenly spaced.
 
-        Those of the clip's own frames, and what `upsample` puts between them, keep the clip's rhythm.
+        The clip's own frames, and those that `upsample` puts between them, stay unevenly spaced.
         """
         others = self.speed, self.remap, self.chosen, self.frame, None if self.upsample else self.fps
         if seconds is None or any(other is not None for other in others):
