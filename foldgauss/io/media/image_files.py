@@ -273,10 +273,8 @@ def read_animation(path: Path, start: int, stop: int | None, prepare: Callable) 
     check_range_within(start, stop, num_total, path)
     if not kept:
         raise no_frames_error(start, stop, len(delays), num_total, path)
-    shown = np.array(delays[start:])
-    rate = estimate_rate(np.concatenate([[0], np.cumsum(shown)]) / 1000, 1000 * len(shown) / shown.sum())
-    if rate.times is not None:
-        rate = rate._replace(times=rate.times[:-1], duration=float(rate.times[-1]))
+    shown = np.cumsum([0, *delays[start:]]) / 1000
+    rate = estimate_rate(shown[:-1], (len(shown) - 1) / shown[-1], float(shown[-1]))
     return kept, (num_total if stop is None else stop) - start, rate, ()
 
 
