@@ -216,12 +216,12 @@ def test_animations_have_times_of_their_own(tmp_path):
         assert "shown for" in clip.notes[0]
 
 
-@pytest.mark.parametrize("rate", [15, 24000 / 1001, 30])
+@pytest.mark.parametrize("rate", [20, 24000 / 1001, 30])
 def test_delays_rounded_to_hundredths_are_even(tmp_path, rate):
     """As FFmpeg writes them, whose last one may be longer than the others."""
     frames = [Image.fromarray(frame) for frame in _waves(20)]
     delays = np.diff(np.rint(100 * np.arange(21) / rate)) * 10
-    delays[-1] = np.ceil(100 / rate) * 10
+    delays[-1] += 20
     frames[0].save(tmp_path / "a.gif", save_all=True, append_images=frames[1:], duration=delays.astype(int).tolist())
     clip = read_video(tmp_path / "a.gif")
     assert (clip.num_frames, clip.times, clip.duration, clip.notes) == (20, None, None, ())
