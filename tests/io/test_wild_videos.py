@@ -430,6 +430,20 @@ def test_gray(tmp_path, suffix, fourcc):
     assert np.abs(frames.astype(int) - gray[..., None]).max() <= (0 if suffix == ".png" else 2)
 
 
+@pytest.mark.parametrize(("kind", "scale"), [("gray", 1), ("gray10le", 4)])
+@pytest.mark.parametrize("limited", [True, False])
+def test_gray_of_limited_range(tmp_path, kind, scale, limited):
+    with av.open(tmp_path / "a.mkv", "w") as out:
+        stream = out.add_stream("ffv1", rate=10, width=64, height=48, pix_fmt=kind)
+        stream.codec_context.color_range = 1 if limited else 2
+        luma = np.tile(np.linspace(16, 235, 64).round(), (48, 1))
+        kinds = np.uint8 if scale == 1 else np.uint16
+        out.mux(stream.encode(av.VideoFrame.from_ndarray((scale * luma).astype(kinds), format=kind)))
+        out.mux(stream.encode(None))
+    expected = (luma - 16) * 255 / 219 if limited else luma
+    assert np.abs(read_video(tmp_path / "a.mkv").frames[0] - expected[..., None]).max() <= 1
+
+
 @pytest.mark.parametrize(
     ("name", "options", "near"),
     [

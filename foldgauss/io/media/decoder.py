@@ -12,7 +12,7 @@ import numpy as np
 from av.codec.context import Flags
 from av.filter import Graph
 from av.stream import Disposition
-from av.video.reformatter import Colorspace, Interpolation, VideoReformatter
+from av.video.reformatter import ColorRange, Colorspace, Interpolation, VideoReformatter
 
 from foldgauss.io.media.clip import VIDEO, Size, VideoError, check_num_pixels, format_num_bytes, read_head, video_error
 from foldgauss.io.media.format_detection import DEMUXERS, LIST, describe_kind
@@ -33,6 +33,8 @@ CONVERSION = (
     | Interpolation.FULL_CHR_H_INP
     | Interpolation.BITEXACT
 )
+#: Luma of limited range as that of full range: FFmpeg's conversion takes all gray video for full range.
+_EXPANDED = np.rint(np.clip((np.arange(256) - 16) * (255 / 219), 0, 255)).astype(np.uint8)
 #: FFmpeg's numbers of matrices: not declared, and those that its conversion does not know.
 _UNSPECIFIED, _UNKNOWN_MATRICES = 2, {10: "BT.2020 with constant luminance", 14: "ICtCp"}
 #: FFmpeg's decoders of VP8 and VP9 drop alpha; these are the ones that keep it.
@@ -82,6 +84,8 @@ class DecodedFrame:
             raise video_error("path", expected="frames that FFmpeg converts to RGB", got=got, cure=cure) from error
         if self.hdr is not None:
             image = map_tones(self.decoded, image, self.hdr)
+        elif self.decoded.format.name.startswith("gray") and self.decoded.color_range == ColorRange.MPEG:
+            image = _EXPANDED[image]
         if has_alpha:
             opaque = image[..., 3].min() == 255
             image = np.ascontiguousarray(image[..., :3]) if opaque else premultiply(image)
