@@ -252,3 +252,23 @@ def test_what_was_noted_of_quality_is_not_that_of_edited_segments(here, tmp_path
     first, *others = load_video_model(tmp_path / "dark.safetensors").segments
     assert first.metadata == {"clip": "clip"}
     assert all(segment.metadata == {"clip": "clip", "mean_psnr": 30.0} for segment in others)
+
+
+def test_segments_and_edits_keep_uneven_times(tmp_path):
+    """A segment is shown as its part of the clip, and an edited model as the clip."""
+    whole, seconds = video(), np.cumsum([0, *np.where(np.arange(NUM_FRAMES) % 4, 0.04, 0.3)])
+    about = {"frames": [2, 2 + NUM_FRAMES], "frame_seconds": seconds.tolist(), "first_second": 0.5}
+    path, script = save_video_model(tmp_path / "long.safetensors", whole, metadata=about), tmp_path / "e.toml"
+    assert run("segment", path, 1, "--out", tmp_path / "one.safetensors") == 0
+    span = whole.segments[1]
+    own = seconds[span.first : span.stop + 1]
+    found = read_metadata(tmp_path / "one.safetensors")
+    np.testing.assert_allclose(found["frame_seconds"], own - own[0])
+    assert found["first_second"] == pytest.approx(0.5 + own[0])
+    script.write_text('[[edits]]\ndo = "recolor"\ngain = 0.5\n')
+    for name, expected in (("one", own - own[0]), ("long", seconds)):
+        assert run("edit", tmp_path / f"{name}.safetensors", script, "--out", tmp_path / f"{name}.mp4") == 0
+        shown = read_video(tmp_path / f"{name}.mp4")
+        np.testing.assert_allclose([*shown.times, shown.duration], expected, atol=1e-4)
+        assert run("edit", tmp_path / f"{name}.safetensors", script, "--out", tmp_path / f"{name}-e.safetensors") == 0
+        np.testing.assert_allclose(read_metadata(tmp_path / f"{name}-e.safetensors")["frame_seconds"], expected)
