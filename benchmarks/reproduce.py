@@ -23,10 +23,13 @@ over all its runs.
 import argparse
 import csv
 import dataclasses
+import math
 import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from benchmarks import _common, fit_clip
 from benchmarks._common import console
@@ -39,13 +42,17 @@ from foldgauss.jobs.runner import Checkpoint, run_steps
 from foldgauss.video import FitConfig, Growth, LearningRates, fit_steps
 from foldgauss.video.fitting.config import FIT_ENGINES, PRESETS
 from foldgauss.video.fitting.growth import PUBLISHED_STEPS
+from foldgauss.video.fitting.loop import start
 from foldgauss.video.fitting.state import FitState, to_model
+from foldgauss.video.models.row_layout import columns
 
 FULL = (640, 1280)
 #: Steps between two points of a curve, and seconds between two checkpoints.
 EVERY, CHECKPOINT_SECONDS = 100, 120.0
 
-#: What each fit changes in the preset, or in its `Growth`; the largest questions first.
+#: What each fit changes in the preset, or in its `Growth`; the largest questions first. `rates` is a factor of all
+#: learning rates, `extent` one of what is in units of the scene's extent (the learning rate of positions and two
+#: lengths of `Growth`), `box` one of positions and sizes at the start.
 VARIANTS: dict[str, dict[str, Any]] = {
     "as published": {},
     "power of the text": {"power": 1.0},
@@ -54,6 +61,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "degree 3": {"degree": 3},
     "one camera": {"two_cameras": False},
     "start from the clip": {"initialization": "clip"},
+    "start in a box of 1.1 frames": {"box": 1.1},
+    "extent of 1 unit": {"extent": 1 / 1.1},
     "time gradient not used": {"growth": {"time_gradient": 1e9}},
     "time gradient x0.25": {"growth": {"time_gradient": 5e-5}},
     "time gradient splits": {"growth": {"clone_below_time": 1e-9}},
@@ -113,13 +122,15 @@ def config_of(name: str, size: tuple[int, int], steps: int, seed: int) -> FitCon
     if name in CELLS:
         changes = dict(zip(("num_gaussians", "batch_size", "degree"), CELLS[name], strict=True))
     else:
-        changes = dict(VARIANTS[name])
+        changes = {setting: value for setting, value in VARIANTS[name].items() if setting != "box"}
     preset = PRESETS["paper"]
     growth = dataclasses.replace(Growth(), **changes.pop("growth", {}))
     lengths = "screen_gradient", "time_gradient", "clone_below", "prune_scale"
-    changes["growth"] = dataclasses.replace(growth, **{length: zoom * getattr(growth, length) for length in lengths})
+    extent = changes.pop("extent", 1.0)
+    zooms = dict.fromkeys(lengths, zoom) | dict.fromkeys(("clone_below", "prune_scale"), extent * zoom)
+    changes["growth"] = dataclasses.replace(growth, **{name: by * getattr(growth, name) for name, by in zooms.items()})
     factor = changes.pop("rates", 1.0)
-    factors = {"loc": factor * zoom, "coefficients": factor * zoom}
+    factors = {"loc": extent * factor * zoom, "coefficients": factor * zoom}
     rates = dataclasses.asdict(preset["rates"])
     changes["rates"] = LearningRates(**{rate: factors.get(rate, factor) * value for rate, value in rates.items()})
     changes["scale_cutoff"] = zoom * changes.get("scale_cutoff", preset["scale_cutoff"])
@@ -182,6 +193,14 @@ def plot_curves(folder: Path, names: Iterable[str], path: Path) -> None:
     pyplot.close(figure)
 
 
+def start_in_box(clip: Clip, config: FitConfig, factor: float) -> FitState:
+    """The state before the first step, with distances between the Gaussians and their sizes `factor` times as large."""
+    state, place = start(clip.frames, config), columns(config.degree)
+    state.rows[:, place["loc"]] *= np.float32(factor)
+    state.rows[:, place["log_scale"]] += np.float32(math.log(factor))
+    return state
+
+
 def run_to_end(clip: Clip, name: str, config: FitConfig, folder: Path) -> Run:
     """A fit, continued after its checkpoint. Raises ValueError for a checkpoint of other settings or frames."""
     curve_file = curve_path(folder, name)
@@ -189,6 +208,8 @@ def run_to_end(clip: Clip, name: str, config: FitConfig, folder: Path) -> Run:
     state = checkpoint.load(required=True) if checkpoint.path.exists() else None
     curve = Curve(curve_file, state)
     where = "" if state is None else f" continues after step {state.step:,}"
+    if state is None and (box := VARIANTS.get(name, {}).get("box")):
+        state = start_in_box(clip, config, box)
     console.print(f"{name}{where}", style="dim", soft_wrap=True)
 
     def observe(state: FitState, info) -> None:

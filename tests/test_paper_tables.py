@@ -12,8 +12,11 @@ import pytest
 
 from benchmarks import davis, folding_gain, frame_times, presets, reproduce
 from benchmarks._runs import Runs, scaled, scores, seconds_per_step
+from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import Clip, write_video
-from foldgauss.video import FitConfig, psnr, ssim
+from foldgauss.video import FitConfig, fit_steps, psnr, ssim
+from foldgauss.video.fitting.loop import start
+from foldgauss.video.models.row_layout import unpack
 
 SIZE, NUM_FRAMES = (24, 32), 6
 
@@ -358,19 +361,56 @@ class TestReproduce:
 
     def test_each_fit_differs_from_the_preset_in_one_thing(self):
         made = {name: reproduce.config_of(name, (640, 1280), 30_000, 0) for name in reproduce.VARIANTS}
-        first, *others = made.values()
+        first = made["as published"]
         assert first == FitConfig.preset("paper", seed=0)
-        for config in others:
-            changed = [field for field in vars(first) if getattr(first, field) != getattr(config, field)]
-            assert len(changed) == 1
+        changed = {
+            name: {field for field in vars(first) if getattr(first, field) != getattr(config, field)}
+            for name, config in made.items()
+        }
+        assert changed.pop("as published") == changed.pop("start in a box of 1.1 frames") == set()
+        assert changed.pop("extent of 1 unit") == {"rates", "growth"}
+        assert all(len(fields) == 1 for fields in changed.values())
+
+    def test_a_smaller_extent_changes_what_is_in_its_units(self):
+        first, smaller = (
+            reproduce.config_of(name, (640, 1280), 30_000, 0) for name in ("as published", "extent of 1 unit")
+        )
+        for whole, part, names in (
+            (first.rates, smaller.rates, {"loc"}),
+            (first.growth, smaller.growth, {"clone_below", "prune_scale"}),
+        ):
+            ratios = {name: getattr(part, name) / value for name, value in vars(whole).items() if value}
+            assert {name for name, ratio in ratios.items() if ratio != 1} == names
+            np.testing.assert_allclose([ratios[name] for name in names], 1 / 1.1, rtol=1e-12)
+
+    def test_a_start_in_a_larger_box(self, tmp_path, monkeypatch):
+        """Positions and sizes of the first state; the fit begins with it, others do not."""
+        clip = Clip(blob(), 12.0, "blob", len(blob()))
+        name = "start in a box of 1.1 frames"
+        config = dataclasses.replace(reproduce.config_of(name, SIZE, 4, 0), num_gaussians=50)
+        begun = []
+
+        def steps(frames, config, state):
+            begun.append(None if state is None else (state.step, unpack(state.rows, config.degree, TimeLikelihood())))
+            yield from fit_steps(frames, config, state)
+
+        monkeypatch.setattr(reproduce, "fit_steps", steps)
+        reproduce.run_to_end(clip, name, config, tmp_path)
+        reproduce.run_to_end(clip, "as published", config, tmp_path)
+        plain = unpack(start(clip.frames, config).rows, config.degree, TimeLikelihood())
+        (step, splats), other = begun
+        assert (step, other) == (0, None)
+        np.testing.assert_allclose(splats.loc, 1.1 * plain.loc, rtol=1e-6)
+        np.testing.assert_allclose(np.exp(splats.log_scale), 1.1 * np.exp(plain.log_scale), rtol=1e-5)
+        np.testing.assert_array_equal(splats.coefficients, plain.coefficients)
 
     def test_cells_are_those_of_both_tables(self):
         """20 cells: 15 of batches and degrees, 6 of Gaussians at the start, one of them in both."""
         cells = {name: reproduce.config_of(name, (640, 1280), 30_000, 0) for name in reproduce.CELLS}
         assert len({(one.num_gaussians, one.batch_size, one.degree) for one in cells.values()}) == 20
-        for name, (start, batch, degree) in list(reproduce.CELLS.items())[1:]:
-            assert name == f"{start:,}, batch {batch}, degree {degree}"
-            assert (cells[name].num_gaussians, cells[name].batch_size, cells[name].degree) == (start, batch, degree)
+        for name, (num, batch, degree) in list(reproduce.CELLS.items())[1:]:
+            assert name == f"{num:,}, batch {batch}, degree {degree}"
+            assert (cells[name].num_gaussians, cells[name].batch_size, cells[name].degree) == (num, batch, degree)
         assert reproduce.published("100,000, batch 5, degree 3") == (37.94, 0.32)
         assert reproduce.published("100,000, batch 3, degree 7") == (38.53, 0.62)
         assert reproduce.published("as published") == (39.02, 0.65)
