@@ -47,7 +47,7 @@ def test_compress_and_use(work, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert run("compress", work / "model.safetensors", work / "clip", "--max-loss-db", 0.3, "--passes", 1) == 0
     shown, progress = capsys.readouterr()
-    assert re.search(r"^ +\d+\.\d s  fine-tuning .* \(pass 1 of about 4\)$", progress, re.MULTILINE)
+    assert re.search(r"^ +\d+\.\d s  fine-tuning .* \(pass 1 of about 5\)$", progress, re.MULTILINE)
     assert re.search(r"compression factor\s*│ \d+\.\d\d", shown)
     about = read_metadata("model.fgz")
     assert about["clip"] == "clip"

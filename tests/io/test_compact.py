@@ -21,6 +21,7 @@ from foldgauss.io.models.compact import MAGIC, VERSION, is_compact, pack_compact
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, compress, fit, layers
+from foldgauss.video.compression.finetune import finetune_model
 from foldgauss.video.compression.quantize import (
     AXES,
     Rule,
@@ -466,6 +467,62 @@ def test_order_found_before_fine_tuning_shortens_the_column_of_cells():
     ]
     assert back[0] > 0.4
     assert back[1] < 0.15
+
+
+@pytest.mark.parametrize("change", [lambda model: model, of_kinds, on_paths])
+def test_what_is_rounded_stays_while_the_rest_is_fitted(monkeypatch, change):
+    """From the step of rounding on that fixes them, integers do not change; others do."""
+    module = sys.modules["foldgauss.video.compression.search"]
+    model = change(crowd(soft_model(degree=3, options=RenderOptions())))
+    plan, loss = module._Plan(model), module._Loss(model, clip_of(model), None)
+    made, fixed = [], []
+
+    def recorded(*given):
+        made.append(quantize(*given))
+        return made[-1]
+
+    def finetune(model, fraction, what, **how):
+        fixed.append(how["fixed"])
+        return finetune_model(model, loss.target, 1, **how)
+
+    monkeypatch.setattr(module, "quantize", recorded)
+    done = module._round_in_steps(plan, 1.0, finetune)
+    assert done is made[-1]
+    assert len(fixed) == len(made) - 1 == len(module._ROUNDING)
+    groups = {
+        "log_scale": ("size", "stretch", "duration", "opacity", "time", "angle"),
+        "loc": ("cell", "degree", *(f"{axis}{k}" for axis in "xy" for k in range(4))),
+        "color_dc": ("luma", "blue", "green"),
+    }
+    for leaf, names in groups.items():
+        for name in names:
+            moves = 0
+            for before, after, step in zip(made[:-1], made[1:], fixed, strict=True):
+                was, now = (one.columns[name] for one in (before, after))
+                if leaf == "color_dc" and done.info.shared:
+                    was, now = was[before.columns["shade"]], now[after.columns["shade"]]
+                np.testing.assert_array_equal(now[step[leaf]], was[step[leaf]])
+                moves += int((now != was).sum())
+            assert moves or name in ("cell", "degree")
+
+
+def test_rounding_in_steps_loses_less(monkeypatch):
+    """Than rounding all shapes, then all paths, then all colors; and that less than rounding at once."""
+    module = sys.modules["foldgauss.video.compression.search"]
+    model = crowd(soft_model(degree=3, options=RenderOptions()))
+    loss, plan = module._Loss(model, clip_of(model), None), module._Plan(model)
+
+    def finetune(model, fraction, what, **how):
+        return finetune_model(model, loss.target, round(40 * fraction), **how)
+
+    def measure():
+        return loss(dequantize(module._round_in_steps(plan, 4.0, finetune)), loss.all_frames)
+
+    by_shares = measure()
+    monkeypatch.setattr(module, "_ROUNDING", ((module.SHAPE, 1.0, 0.4), (module.PATH, 1.0, 0.225)))
+    by_groups = measure()
+    at_once = loss(dequantize(plan.quantize(4.0)), loss.all_frames)
+    assert by_shares < by_groups < at_once
 
 
 def test_loss_out_of_reach(monkeypatch):

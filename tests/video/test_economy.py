@@ -498,6 +498,23 @@ def test_finetuning_keeps_the_kinds():
     assert evaluate(again, frames).mean_psnr > 45
 
 
+def test_finetuning_leaves_what_is_fixed():
+    """To the bit, and the others come closer to the frames."""
+    frames, model, _, _ = fitted("line")
+    darker = np.asarray(model.splats.color_dc) * np.float32(0.8)
+    worse = dataclasses.replace(model, splats=dataclasses.replace(model.splats, color_dc=darker))
+    which = np.arange(model.num_gaussians) % 2 == 0
+    fixed = {name: ~which if name == "loc" else which for name in columns(model.degree)}
+    again = finetune_model(worse, lambda k, _: _target(frames)(k), 4, fixed=fixed)
+    for name, same in fixed.items():
+        before, after = (np.asarray(getattr(one.splats, name)) for one in (worse, again))
+        np.testing.assert_array_equal(after[same], before[same])
+    for name in ("loc", "color_dc", "log_scale"):
+        before, after = (np.asarray(getattr(one.splats, name)) for one in (worse, again))
+        assert (after[~fixed[name]] != before[~fixed[name]]).any()
+    assert evaluate(again, frames).mean_psnr > evaluate(worse, frames).mean_psnr + 1
+
+
 # ---------------------------------------------------------------------------------------------- settings
 
 

@@ -38,7 +38,7 @@ from foldgauss.video.tradeoff import to_half_precision
 MAX_LOSS_DB, PASSES = 0.2, 48
 Score = Callable[[VideoModel], Evaluation]
 #: Passes over the frames in all, in units of --passes.
-USUAL_PASSES = 4
+USUAL_PASSES = 5
 #: Fine-tuning that is better than the model by more dB than this causes a warning.
 MAX_GAIN_DB = 0.5
 

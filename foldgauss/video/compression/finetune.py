@@ -1,10 +1,10 @@
-"""Fine-tuning: fits some leaves of a model again, so that they compensate for the rounding of the others."""
+"""Fine-tuning: fits a model again where it is not rounded, to compensate for what is."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float32, Int32
+from jaxtyping import Bool, Float32, Int32
 
 from foldgauss.render import cpu
 from foldgauss.video.fitting.codebook import Codebook
@@ -18,7 +18,6 @@ from foldgauss.video.models.video_model import VideoModel
 
 #: Learning rates decay exponentially between these fractions of a fit's first ones: the model is near its optimum.
 FIRST_RATE, LAST_RATE = 0.4, 0.12
-PATH_AND_COLOR, COLOR = ("loc", "coefficients", "color_dc"), ("color_dc",)
 
 #: The planes (3, height, width) that frame k should match in a step, and the background color (3,).
 Target = Callable[[int, int], tuple[Float32[np.ndarray, "3 height width"], Float32[np.ndarray, "3"]]]
@@ -29,21 +28,25 @@ def finetune_model(
     target: Target,
     passes: int,
     *,
-    free: Collection[str] | None = None,
+    fixed: dict[str, Bool[np.ndarray, " num"]] | None = None,
     shared: Int32[np.ndarray, " num"] | None = None,
     seed: int = 0,
     on_pass: Callable[[], None] = lambda: None,
 ) -> VideoModel:
     """The model after `passes` over its frames in random order, by least squares and the fit's Adam.
 
-    Only the leaves `free` change (None: all); frame times do not. `target(k, step)` returns what frame k is compared
-    with. `shared`: each Gaussian's color index; Gaussians with the same index keep the same color. Deterministic.
+    Frame times do not change, nor do the Gaussians that `fixed` gives for a leaf of `FoldedSplats`. `target(k, step)`
+    returns what frame k is compared with. `shared`: each Gaussian's color index; Gaussians with the same index keep the
+    same color. Deterministic.
     """
     prepared = PreparedModel(model, model.size)
     rows, window, spec = prepared.rows, prepared.window, prepared.spec
     rates, config = np.zeros(rows.shape[1], np.float32), FitConfig()
+    free = np.ones(rows.shape, np.float32)
     for name, place in columns(model.degree).items():
-        rates[place] = getattr(config.rates, name) if free is None or name in free else 0.0
+        rates[place] = getattr(config.rates, name)
+        if fixed:
+            free[:, place] = ~fixed[name][:, None]
     kinds, codebook = find_kinds(rows, model.degree), Codebook.create(shared, 3)
     state = FitState.create(rows, kinds, model.frame_times.logits, colors=codebook)
     grad, times = np.zeros_like(rows), np.asarray(model.frame_times.times())
@@ -61,8 +64,9 @@ def finetune_model(
         trace = cpu.forward(*leaves, model.size, compositing=model.compositing, options=model.options)
         by_image = (trace.image - wanted) * np.float32(2 / wanted.size)
         backpropagate(rows, done, cpu.backward(trace, by_image), spec, grad)
+        if fixed:
+            grad[done.alive] *= free[done.alive]  # Adam does not move what never had a gradient
         rate = np.float32(FIRST_RATE * (LAST_RATE / FIRST_RATE) ** (step / steps))
         update_rows(state, grad, done.alive, rates * rate, degree=model.degree, units=config.rate_units)
-        if free is None:
-            update_windows(rows, done.alive, window, spec)
+        update_windows(rows, done.alive, window, spec)
     return eqx.tree_at(lambda m: m.splats, model, unpack(rows, model.degree, model.splats.envelope, model.splats.paths))

@@ -12,12 +12,12 @@ import math
 import warnings
 from collections.abc import Callable
 
-import equinox as eqx
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float, Float32, Int
 
 from foldgauss._runtime.checks import invalid, is_integer, is_within
-from foldgauss.video.compression.finetune import COLOR, PATH_AND_COLOR, finetune_model
+from foldgauss.video.compression.finetune import finetune_model
 from foldgauss.video.compression.quantize import (
     ABSENT,
     AXES,
@@ -44,6 +44,7 @@ from foldgauss.video.models.background import BLACK, composite, random_backgroun
 from foldgauss.video.models.metrics import check_frames
 from foldgauss.video.models.metrics import psnr as psnr_of
 from foldgauss.video.models.renderer import VideoRenderer
+from foldgauss.video.models.row_layout import shift_path
 from foldgauss.video.models.splats import SH_C0
 from foldgauss.video.models.video_model import VideoModel, check_model
 from foldgauss.video.selection.contributions import Contributions
@@ -71,8 +72,19 @@ _STAGES, _STAGES_OF_PASSES, _DROPPING = 5, 2, 0.75
 _FIRST_GAINED, _FADING, _LEFT, _MOST_DROPPED = 0.35, 0.8, 0.13, 6.0
 #: How much coarser or finer, in powers of two, the steps may be at which a dropped Gaussian is not worth its bits.
 _DROPPED_RANGE = 24.0
-#: Tries with fine-tuning, each of passes / 4 + passes / 8 passes; and the fraction of the allowed loss that ends them.
-_TRIES, _ENOUGH = 6, 0.85
+#: Leaves of `FoldedSplats` that are rounded together. Steps of rounding: the group, the share of the Gaussians whose
+#: leaves of it are rounded then or earlier, and the passes of fine-tuning all that is not, as a fraction of `passes`.
+SHAPE = ("log_scale", "angle_logit", "time_loc_logit", "log_time_scale", "opacity_logit")
+PATH, COLOR = ("loc", "coefficients"), ("color_dc",)
+_GROUPS = SHAPE, PATH, COLOR
+_ROUNDING = (
+    *((SHAPE, 0.4, 0.15), (SHAPE, 0.75, 0.15), (SHAPE, 1.0, 0.1)),
+    *((PATH, 0.5, 0.1), (PATH, 1.0, 0.075)),
+    (COLOR, 0.5, 0.05),
+)
+_SEED = 0
+#: Tries with fine-tuning; the fraction of the allowed loss that they aim at, and the one that ends them.
+_TRIES, _AIM, _ENOUGH = 6, 0.97, 0.94
 #: Most powers of two by which a try may extrapolate.
 _MAX_EXTRAPOLATION = 2.0
 #: Fraction of the allowed squared error that reordering may add if all pairs whose order is given up are swapped; and
@@ -80,7 +92,7 @@ _MAX_EXTRAPOLATION = 2.0
 _ORDERING = 0.3
 #: Squared error that reordering may add before fine-tuning, which compensates for most of it, as a fraction of the
 #: model's own.
-_FIRST_ORDERING = 0.05
+_FIRST_ORDERING = 1.0
 #: Least number of Gaussians from which steps are regressed on features.
 _FEW = 100
 _MIN_SENSITIVITY = 1e-4  # below, a Gaussian is not visible
@@ -122,8 +134,8 @@ def compress(
     stay as they are, to about a fiftieth of a pixel.
 
     With the clip, fine-tuning compensates for losses and allows coarser steps: all leaves for half of the `passes` each
-    time Gaussians have been dropped, paths and colors for a quarter once geometry is rounded, colors for an eighth
-    once paths are. More passes make smaller files. With 0 passes every parameter is the model's own, rounded.
+    time Gaussians have been dropped; and in each try of such steps for 5/8 of them, while ever more leaves of ever more
+    Gaussians are rounded. More passes make smaller files. With 0 passes every parameter is the model's own, rounded.
     `on_step(what, loss_db)` is called now and then, with NaN before anything has been measured.
 
     Raises ValueError for anything but a `VideoModel` (bake edits first), for NaN or infinities, several envelopes, a
@@ -242,14 +254,7 @@ def _search_factor(
     """As `_search_finetuned`, without dropping Gaussians."""
     best, tried, factor = None, {}, least + _COARSER
     for _ in range(_TRIES):
-        quantized, exact = plan.quantize(factor), plan.exact
-        for what, free, fraction in (("paths and colors", PATH_AND_COLOR, 0.25), ("colors", COLOR, 0.125)):
-            with_path = free is PATH_AND_COLOR
-            start = _undo_rounding(quantized, exact, path=with_path)
-            tuned = finetune(start, fraction, f"fine-tuning {what}", free=free, seed=1, shared=exact.shade)
-            exact = _fix_rounded(quantized, tuned, path=with_path, before=exact)
-            columns = quantized.columns
-            quantized = quantize(exact, columns["class"], quantized.rules, columns["cell"])
+        quantized = _round_in_steps(plan, factor, finetune)
         decoded = dequantize(quantized)
         tried[factor] = measured = loss(decoded, loss.all_frames)
         on_step("fine-tuned", measured)
@@ -268,7 +273,7 @@ def _next_factor(tried: dict[float, float], max_loss: float, least: float) -> fl
 
     The squared error is modelled as a constant plus that of rounding, which grows as 4^factor.
     """
-    aim = 0.95 * max_loss
+    aim = _AIM * max_loss
     below = max((factor for factor, loss in tried.items() if loss <= max_loss), default=None)
     above = min((factor for factor, loss in tried.items() if loss > max_loss), default=None)
     if below is not None and above is not None:
@@ -325,25 +330,63 @@ def _take(model: VideoModel, which: Bool[np.ndarray, " num"] | Int[np.ndarray, "
     return dataclasses.replace(model, splats=model.splats.take(which))
 
 
-def _undo_rounding(quantized: Quantized, exact: ExactColumns, *, path: bool) -> VideoModel:
-    """The decoded model with exact colors and, if `path`, exact paths."""
-    model = dequantize(quantized)
-    color = np.stack([exact.values[name] for name in COLORS], 1) @ AXES
-    splats = eqx.tree_at(lambda s: s.color_dc, model.splats, color.astype(np.float32))
-    if path:
-        place = unrounded_paths(quantized, exact).astype(np.float32)
-        splats = eqx.tree_at(lambda s: (s.loc, s.coefficients), splats, (place[:, 0], place[:, 1:]))
-    return eqx.tree_at(lambda m: m.splats, model, splats)
+#: By the name of a group, which Gaussians' leaves of it are rounded for good.
+_Fixed = dict[tuple[str, ...], Bool[np.ndarray, " num"]]
 
 
-def _fix_rounded(quantized: Quantized, tuned: VideoModel, *, path: bool, before: ExactColumns) -> ExactColumns:
-    """The columns to quantize next: decoded values where they are rounded already, and `tuned`'s for the others."""
-    now, values = compute_columns(tuned), decode_values(quantized)
-    values = {name: values[name] for name in before.values} | {name: now.values[name] for name in COLORS}
-    values["time"] = clamp_unit(values["time"])
+def _round_in_steps(plan: "_Plan", factor: float, finetune: Callable) -> Quantized:
+    """The model quantized with steps times 2^factor, in the steps `_ROUNDING`."""
+    quantized, exact = plan.quantize(factor), plan.exact
+    num, rng = exact.info.num_gaussians, np.random.default_rng(_SEED)
+    ranks = dict.fromkeys(_GROUPS, rng.permutation(num) / num)
+    if exact.shade is not None:  # Gaussians that share a color are rounded together
+        ranks[COLOR] = (rng.permutation(exact.info.shared) / exact.info.shared)[exact.shade]
+    fixed = dict.fromkeys(_GROUPS, np.zeros(num, bool))
+    for group, share, fraction in _ROUNDING:
+        fixed[group] = ranks[group] < share
+        start = _round_fixed(quantized, exact, fixed)
+        frozen = {name: which for group, which in fixed.items() for name in group}
+        tuned = finetune(start, fraction, "fine-tuning the rest", fixed=frozen, seed=1, shared=exact.shade)
+        exact = _keep_fixed(quantized, exact, tuned, fixed)
+        columns = quantized.columns
+        cells = np.where(fixed[SHAPE], columns["cell"], find_cells(exact))
+        quantized = quantize(exact, columns["class"], quantized.rules, cells)
+    return quantized
+
+
+def _round_fixed(quantized: Quantized, exact: ExactColumns, fixed: _Fixed) -> VideoModel:
+    """The model whose leaves are decoded where they are `fixed`, and exact elsewhere."""
+    model, decoded = dequantize(quantized), decode_values(quantized)
+    v = {name: np.where(fixed[SHAPE], decoded[name], value) for name, value in exact.values.items()}
+    time = clamp_unit(v["time"])
+    moved = shift_path(exact.place, time - exact.values["time"])
+    place = np.where(fixed[SHAPE][:, None, None], unrounded_paths(quantized, exact), moved)
+    leaves = {
+        "log_scale": np.stack([v["size"] + v["stretch"], v["size"] - v["stretch"]], 1),
+        "angle_logit": scipy.special.logit(clamp_unit(v["angle"])),
+        "time_loc_logit": scipy.special.logit(time),
+        "log_time_scale": v["duration"],
+        "opacity_logit": v["opacity"],
+        "loc": place[:, 0],
+        "coefficients": place[:, 1:],
+        "color_dc": np.stack([exact.values[name] for name in COLORS], 1) @ AXES,
+    }
+    for group, which in fixed.items():
+        for name in group:
+            own = np.asarray(getattr(model.splats, name))
+            leaves[name] = np.where(which.reshape(-1, *[1] * (own.ndim - 1)), own, leaves[name])
+    splats = dataclasses.replace(model.splats, **{name: np.float32(leaf) for name, leaf in leaves.items()})
+    return dataclasses.replace(model, splats=splats)
+
+
+def _keep_fixed(quantized: Quantized, exact: ExactColumns, tuned: VideoModel, fixed: _Fixed) -> ExactColumns:
+    """The columns to quantize next: decoded values where they are `fixed`, and `tuned`'s for the others."""
+    now, decoded = compute_columns(tuned), decode_values(quantized)
+    of = {name: fixed[COLOR if name in COLORS else SHAPE] for name in now.values}
+    values = {name: np.where(of[name], decoded[name], now.values[name]) for name in now.values}
     # Rounded paths are rounded again from the same exact ones, hence to the same integers.
-    place, time = (now.place, values["time"]) if path else (before.place, before.values["time"])
-    return dataclasses.replace(before, values=values | {"time": time}, place=place)
+    place = np.where(fixed[PATH][:, None, None], exact.place, now.place)
+    return dataclasses.replace(exact, values=values | {"time": clamp_unit(values["time"])}, place=place)
 
 
 class _Loss:
