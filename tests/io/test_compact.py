@@ -1,6 +1,7 @@
 """Compact files: within the loss they state, the same bits everywhere, and nothing breaks on bad ones."""
 
 import dataclasses
+import itertools
 import json
 import shutil
 import subprocess
@@ -471,7 +472,7 @@ def test_order_found_before_fine_tuning_shortens_the_column_of_cells():
 
 @pytest.mark.parametrize("change", [lambda model: model, of_kinds, on_paths])
 def test_what_is_rounded_stays_while_the_rest_is_fitted(monkeypatch, change):
-    """From the step of rounding on that fixes them, integers do not change; others do."""
+    """From the stage of rounding on that fixes them, integers do not change; others do."""
     module = sys.modules["foldgauss.video.compression.search"]
     model = change(crowd(soft_model(degree=3, options=RenderOptions())))
     plan, loss = module._Plan(model), module._Loss(model, clip_of(model), None)
@@ -486,7 +487,7 @@ def test_what_is_rounded_stays_while_the_rest_is_fitted(monkeypatch, change):
         return finetune_model(model, loss.target, 1, **how)
 
     monkeypatch.setattr(module, "quantize", recorded)
-    done = module._round_in_steps(plan, 1.0, finetune)
+    done = module._round_in_stages(plan, 1.0, finetune)
     assert done is made[-1]
     assert len(fixed) == len(made) - 1 == len(module._ROUNDING)
     groups = {
@@ -495,6 +496,9 @@ def test_what_is_rounded_stays_while_the_rest_is_fitted(monkeypatch, change):
         "color_dc": ("luma", "blue", "green"),
     }
     for leaf, names in groups.items():
+        shares = [step[leaf].mean() for step in fixed]
+        assert all((after[leaf] >= before[leaf]).all() for before, after in itertools.pairwise(fixed))
+        assert 0.3 < shares[-1] < 0.7 if leaf == "color_dc" else shares[-1] == 1
         for name in names:
             moves = 0
             for before, after, step in zip(made[:-1], made[1:], fixed, strict=True):
@@ -506,7 +510,7 @@ def test_what_is_rounded_stays_while_the_rest_is_fitted(monkeypatch, change):
             assert moves or name in ("cell", "degree")
 
 
-def test_rounding_in_steps_loses_less(monkeypatch):
+def test_rounding_in_stages_loses_less(monkeypatch):
     """Than rounding all shapes, then all paths, then all colors; and that less than rounding at once."""
     module = sys.modules["foldgauss.video.compression.search"]
     model = crowd(soft_model(degree=3, options=RenderOptions()))
@@ -516,13 +520,22 @@ def test_rounding_in_steps_loses_less(monkeypatch):
         return finetune_model(model, loss.target, round(40 * fraction), **how)
 
     def measure():
-        return loss(dequantize(module._round_in_steps(plan, 4.0, finetune)), loss.all_frames)
+        return loss(dequantize(module._round_in_stages(plan, 4.0, finetune)), loss.all_frames)
 
     by_shares = measure()
     monkeypatch.setattr(module, "_ROUNDING", ((module.SHAPE, 1.0, 0.4), (module.PATH, 1.0, 0.225)))
     by_groups = measure()
     at_once = loss(dequantize(plan.quantize(4.0)), loss.all_frames)
     assert by_shares < by_groups < at_once
+
+
+@pytest.mark.parametrize(("passes", "max_loss"), [(4, 0.2), (16, 0.2), (48, 0.05)])
+def test_few_passes_and_small_losses_make_smaller_files_too(passes, max_loss):
+    """Than rounding alone: reordering costs no more than such a fine-tuning compensates for."""
+    model = crowd(soft_model(degree=3, options=RenderOptions()))
+    clip = clip_of(model, 20.0)
+    alone, made = (compress(model, clip, max_loss_db=max_loss, passes=number) for number in (0, passes))
+    assert len(pack_compact(made.quantized)) < 0.75 * len(pack_compact(alone.quantized))
 
 
 def test_loss_out_of_reach(monkeypatch):

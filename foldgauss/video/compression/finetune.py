@@ -35,9 +35,9 @@ def finetune_model(
 ) -> VideoModel:
     """The model after `passes` over its frames in random order, by least squares and the fit's Adam.
 
-    Frame times do not change, nor do the Gaussians that `fixed` gives for a leaf of `FoldedSplats`. `target(k, step)`
-    returns what frame k is compared with. `shared`: each Gaussian's color index; Gaussians with the same index keep the
-    same color. Deterministic.
+    Frame times do not change, nor do those leaves of `FoldedSplats` of the Gaussians that `fixed` marks.
+    `target(k, step)` returns what frame k is compared with. `shared`: each Gaussian's color index; Gaussians with the
+    same index keep the same color. Deterministic.
     """
     prepared = PreparedModel(model, model.size)
     rows, window, spec = prepared.rows, prepared.window, prepared.spec

@@ -72,8 +72,8 @@ _STAGES, _STAGES_OF_PASSES, _DROPPING = 5, 2, 0.75
 _FIRST_GAINED, _FADING, _LEFT, _MOST_DROPPED = 0.35, 0.8, 0.13, 6.0
 #: How much coarser or finer, in powers of two, the steps may be at which a dropped Gaussian is not worth its bits.
 _DROPPED_RANGE = 24.0
-#: Leaves of `FoldedSplats` that are rounded together. Steps of rounding: the group, the share of the Gaussians whose
-#: leaves of it are rounded then or earlier, and the passes of fine-tuning all that is not, as a fraction of `passes`.
+#: Leaves of `FoldedSplats` that are rounded together. Stages of rounding: the group, the share of the Gaussians whose
+#: leaves of it are rounded then or earlier, and the passes that fine-tune everything else, as a fraction of `passes`.
 SHAPE = ("log_scale", "angle_logit", "time_loc_logit", "log_time_scale", "opacity_logit")
 PATH, COLOR = ("loc", "coefficients"), ("color_dc",)
 _GROUPS = SHAPE, PATH, COLOR
@@ -90,9 +90,10 @@ _MAX_EXTRAPOLATION = 2.0
 #: Fraction of the allowed squared error that reordering may add if all pairs whose order is given up are swapped; and
 #: fraction of the allowed loss that it may cost.
 _ORDERING = 0.3
-#: Squared error that reordering may add before fine-tuning, which compensates for most of it, as a fraction of the
-#: model's own.
-_FIRST_ORDERING = 1.0
+#: Squared error that reordering may add before the fine-tuning of a stage, as a fraction of the model's own: with so
+#: many passes and so large a loss allowed, and with more; in proportion to fewer passes, which compensate for less of
+#: it, and to the square of a smaller loss. It is divided by so much where a stage loses too much.
+_FIRST_ORDERING, _WITH_PASSES, _WITH_LOSS, _LESS_ORDERING = 1.0, 48, 0.2, 20
 #: Least number of Gaussians from which steps are regressed on features.
 _FEW = 100
 _MIN_SENSITIVITY = 1e-4  # below, a Gaussian is not visible
@@ -129,13 +130,14 @@ def compress(
 
     `frames`: the clip, uint8 (num_frames, *model.size, 3), or with alpha (..., 4): the loss is measured against it.
     Without it, the loss is that against a clip at `psnr` dB (default: `ASSUMED_PSNR`) from the model's own images.
-    Frames beyond `EXACT_PSNR`, 58.9 dB, count as that. Gaussians are reordered where that is hardly visible; absent
+    Frames beyond `EXACT_PSNR`, 58.9 dB, count as that. Gaussians are reordered; absent
     parameters (`FoldedSplats.degrees`, `static`, `opaque`) stay absent, and shared colors stay shared. Shared paths
     stay as they are, to about a fiftieth of a pixel.
 
     With the clip, fine-tuning compensates for losses and allows coarser steps: all leaves for half of the `passes` each
-    time Gaussians have been dropped; and in each try of such steps for 5/8 of them, while ever more leaves of ever more
-    Gaussians are rounded. More passes make smaller files. With 0 passes every parameter is the model's own, rounded.
+    time Gaussians have been dropped; and in each try of a factor of the steps for about 5/8 of them, at least six,
+    while ever more leaves of ever more Gaussians are rounded. More passes make smaller files. With 0 passes every
+    parameter is the model's own, rounded.
     `on_step(what, loss_db)` is called now and then, with NaN before anything has been measured.
 
     Raises ValueError for anything but a `VideoModel` (bake edits first), for NaN or infinities, several envelopes, a
@@ -210,7 +212,8 @@ def _search_finetuned(
             model, loss.target, math.ceil(fraction * passes), on_pass=lambda: on_step(what, math.nan), **how
         )
 
-    smaller = _drop_in_stages(model, complete, least, loss, max_loss, finetune, on_step)
+    ordering = _FIRST_ORDERING * min(passes / _WITH_PASSES, 1) * min(max_loss / _WITH_LOSS, 1) ** 2
+    smaller = _drop_in_stages(model, complete, least, loss, max_loss, ordering, finetune, on_step)
     # Where the last stage leaves too little of the loss for rounding, the one before.
     tries = (
         _search_factor(_Plan(_reorder(one, loss, max_loss)), least, loss, max_loss, finetune, on_step)
@@ -225,16 +228,20 @@ def _drop_in_stages(
     least: float,
     loss: "_Loss",
     max_loss: float,
+    ordering: float,
     finetune: Callable,
     on_step: Callable,
 ) -> list[VideoModel]:
-    """The model, then models with ever fewer Gaussians, fine-tuned, that lose at most `max_loss`."""
+    """The model, then models with ever fewer Gaussians, fine-tuned, that lose at most `max_loss`.
+
+    `ordering`: what reordering may add to the squared error before fine-tuning, as a fraction of the model's own.
+    """
     kept, current, so_far, gained, most = [(model, 0.0)], model, 0.0, _FIRST_GAINED, _MOST_DROPPED
     for stages_left in reversed(range(_STAGES)):
         dropped = min(max((_DROPPING * max_loss - so_far + _FADING * gained) / _LEFT, 0.0), most)
         if dropped:
             current = _drop(current, plan, loss, least, so_far + dropped)
-        current = _Sorting(current)(_FIRST_ORDERING * loss.error)
+        current = _Sorting(current)(ordering * loss.error)
         what, seed = "fine-tuning after dropping Gaussians", _STAGES - 1 - stages_left
         current = finetune(current, 1 / _STAGES_OF_PASSES, what, seed=seed, shared=index_colors(current))
         before, so_far = so_far, loss(current, loss.all_frames)
@@ -243,7 +250,7 @@ def _drop_in_stages(
         if so_far <= max_loss:
             kept.append((current, so_far))
         elif so_far - stages_left * _FADING * gained > max_loss:  # too many to make up for
-            (current, so_far), most = kept[-1], most / 2
+            (current, so_far), most, ordering = kept[-1], most / 2, ordering / _LESS_ORDERING
         plan = _Plan(current)
     return [model for model, _ in kept]
 
@@ -254,7 +261,7 @@ def _search_factor(
     """As `_search_finetuned`, without dropping Gaussians."""
     best, tried, factor = None, {}, least + _COARSER
     for _ in range(_TRIES):
-        quantized = _round_in_steps(plan, factor, finetune)
+        quantized = _round_in_stages(plan, factor, finetune)
         decoded = dequantize(quantized)
         tried[factor] = measured = loss(decoded, loss.all_frames)
         on_step("fine-tuned", measured)
@@ -334,14 +341,14 @@ def _take(model: VideoModel, which: Bool[np.ndarray, " num"] | Int[np.ndarray, "
 _Fixed = dict[tuple[str, ...], Bool[np.ndarray, " num"]]
 
 
-def _round_in_steps(plan: "_Plan", factor: float, finetune: Callable) -> Quantized:
-    """The model quantized with steps times 2^factor, in the steps `_ROUNDING`."""
+def _round_in_stages(plan: "_Plan", factor: float, finetune: Callable) -> Quantized:
+    """The model quantized with steps times 2^factor, in the stages `_ROUNDING`."""
     quantized, exact = plan.quantize(factor), plan.exact
     num, rng = exact.info.num_gaussians, np.random.default_rng(_SEED)
     ranks = dict.fromkeys(_GROUPS, rng.permutation(num) / num)
     if exact.shade is not None:  # Gaussians that share a color are rounded together
         ranks[COLOR] = (rng.permutation(exact.info.shared) / exact.info.shared)[exact.shade]
-    fixed = dict.fromkeys(_GROUPS, np.zeros(num, bool))
+    fixed = {group: np.zeros(num, bool) for group in _GROUPS}
     for group, share, fraction in _ROUNDING:
         fixed[group] = ranks[group] < share
         start = _round_fixed(quantized, exact, fixed)
