@@ -487,7 +487,7 @@ def test_what_is_rounded_stays_while_the_rest_is_fitted(monkeypatch, change):
         return finetune_model(model, loss.target, 1, **how)
 
     monkeypatch.setattr(module, "quantize", recorded)
-    done = module._round_in_stages(plan, 1.0, finetune)
+    done = module._round_in_stages(plan, 1.0, finetune, module._ROUNDING)
     assert done is made[-1]
     assert len(fixed) == len(made) - 1 == len(module._ROUNDING)
     groups = {
@@ -510,7 +510,7 @@ def test_what_is_rounded_stays_while_the_rest_is_fitted(monkeypatch, change):
             assert moves or name in ("cell", "degree")
 
 
-def test_rounding_in_stages_loses_less(monkeypatch):
+def test_rounding_in_stages_loses_less():
     """Than rounding all shapes, then all paths, then all colors; and that less than rounding at once."""
     module = sys.modules["foldgauss.video.compression.search"]
     model = crowd(soft_model(degree=3, options=RenderOptions()))
@@ -519,12 +519,11 @@ def test_rounding_in_stages_loses_less(monkeypatch):
     def finetune(model, fraction, what, **how):
         return finetune_model(model, loss.target, round(40 * fraction), **how)
 
-    def measure():
-        return loss(dequantize(module._round_in_stages(plan, 4.0, finetune)), loss.all_frames)
+    def measure(stages):
+        return loss(dequantize(module._round_in_stages(plan, 4.0, finetune, stages)), loss.all_frames)
 
-    by_shares = measure()
-    monkeypatch.setattr(module, "_ROUNDING", ((module.SHAPE, 1.0, 0.4), (module.PATH, 1.0, 0.225)))
-    by_groups = measure()
+    by_shares = measure(module._ROUNDING)
+    by_groups = measure(((module.SHAPE, 1.0, 0.4), (module.PATH, 1.0, 0.225)))
     at_once = loss(dequantize(plan.quantize(4.0)), loss.all_frames)
     assert by_shares < by_groups < at_once
 

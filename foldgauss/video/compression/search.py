@@ -77,11 +77,14 @@ _DROPPED_RANGE = 24.0
 SHAPE = ("log_scale", "angle_logit", "time_loc_logit", "log_time_scale", "opacity_logit")
 PATH, COLOR = ("loc", "coefficients"), ("color_dc",)
 _GROUPS = SHAPE, PATH, COLOR
-_ROUNDING = (
+_RoundingStages = tuple[tuple[tuple[str, ...], float, float], ...]
+_ROUNDING: _RoundingStages = (
     *((SHAPE, 0.4, 0.15), (SHAPE, 0.75, 0.15), (SHAPE, 1.0, 0.1)),
     *((PATH, 0.5, 0.1), (PATH, 1.0, 0.075)),
     (COLOR, 0.5, 0.05),
 )
+#: The same with fewer than so many passes, of which each of those stages would have one or two.
+_ROUNDING_SHORT, _FEW_PASSES = ((SHAPE, 1.0, 0.25), (PATH, 1.0, 0.125)), 24
 _SEED = 0
 #: Tries with fine-tuning; the fraction of the allowed loss that they aim at, and the one that ends them.
 _TRIES, _AIM, _ENOUGH = 6, 0.97, 0.94
@@ -135,8 +138,8 @@ def compress(
     stay as they are, to about a fiftieth of a pixel.
 
     With the clip, fine-tuning compensates for losses and allows coarser steps: all leaves for half of the `passes` each
-    time Gaussians have been dropped; and in each try of a factor of the steps for about 5/8 of them, at least six,
-    while ever more leaves of ever more Gaussians are rounded. More passes make smaller files. With 0 passes every
+    time Gaussians have been dropped; and in each try of a factor of the steps for about 5/8 of them (3/8 of fewer than
+    24), while ever more leaves of ever more Gaussians are rounded. More passes make smaller files. With 0 passes every
     parameter is the model's own, rounded.
     `on_step(what, loss_db)` is called now and then, with NaN before anything has been measured.
 
@@ -214,9 +217,10 @@ def _search_finetuned(
 
     ordering = _FIRST_ORDERING * min(passes / _WITH_PASSES, 1) * min(max_loss / _WITH_LOSS, 1) ** 2
     smaller = _drop_in_stages(model, complete, least, loss, max_loss, ordering, finetune, on_step)
+    rounding = _ROUNDING if passes >= _FEW_PASSES else _ROUNDING_SHORT
     # Where the last stage leaves too little of the loss for rounding, the one before.
     tries = (
-        _search_factor(_Plan(_reorder(one, loss, max_loss)), least, loss, max_loss, finetune, on_step)
+        _search_factor(_Plan(_reorder(one, loss, max_loss)), least, loss, max_loss, rounding, finetune, on_step)
         for one in reversed(smaller)
     )
     return next(filter(None, tries), None)
@@ -256,12 +260,18 @@ def _drop_in_stages(
 
 
 def _search_factor(
-    plan: "_Plan", least: float, loss: "_Loss", max_loss: float, finetune: Callable, on_step: Callable
+    plan: "_Plan",
+    least: float,
+    loss: "_Loss",
+    max_loss: float,
+    stages: _RoundingStages,
+    finetune: Callable,
+    on_step: Callable,
 ) -> _Try | None:
-    """As `_search_finetuned`, without dropping Gaussians."""
+    """As `_search_finetuned`, without dropping Gaussians; `stages` of rounding as `_ROUNDING`."""
     best, tried, factor = None, {}, least + _COARSER
     for _ in range(_TRIES):
-        quantized = _round_in_stages(plan, factor, finetune)
+        quantized = _round_in_stages(plan, factor, finetune, stages)
         decoded = dequantize(quantized)
         tried[factor] = measured = loss(decoded, loss.all_frames)
         on_step("fine-tuned", measured)
@@ -341,15 +351,15 @@ def _take(model: VideoModel, which: Bool[np.ndarray, " num"] | Int[np.ndarray, "
 _Fixed = dict[tuple[str, ...], Bool[np.ndarray, " num"]]
 
 
-def _round_in_stages(plan: "_Plan", factor: float, finetune: Callable) -> Quantized:
-    """The model quantized with steps times 2^factor, in the stages `_ROUNDING`."""
+def _round_in_stages(plan: "_Plan", factor: float, finetune: Callable, stages: _RoundingStages) -> Quantized:
+    """The model quantized with steps times 2^factor, in `stages` as those of `_ROUNDING`."""
     quantized, exact = plan.quantize(factor), plan.exact
     num, rng = exact.info.num_gaussians, np.random.default_rng(_SEED)
     ranks = dict.fromkeys(_GROUPS, rng.permutation(num) / num)
     if exact.shade is not None:  # Gaussians that share a color are rounded together
         ranks[COLOR] = (rng.permutation(exact.info.shared) / exact.info.shared)[exact.shade]
     fixed = {group: np.zeros(num, bool) for group in _GROUPS}
-    for group, share, fraction in _ROUNDING:
+    for group, share, fraction in stages:
         fixed[group] = ranks[group] < share
         start = _round_fixed(quantized, exact, fixed)
         frozen = {name: which for group, which in fixed.items() for name in group}
