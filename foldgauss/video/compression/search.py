@@ -133,9 +133,9 @@ def compress(
 
     `frames`: the clip, uint8 (num_frames, *model.size, 3), or with alpha (..., 4): the loss is measured against it.
     Without it, the loss is that against a clip at `psnr` dB (default: `ASSUMED_PSNR`) from the model's own images.
-    Frames beyond `EXACT_PSNR`, 58.9 dB, count as that. Gaussians are reordered; absent
-    parameters (`FoldedSplats.degrees`, `static`, `opaque`) stay absent, and shared colors stay shared. Shared paths
-    stay as they are, to about a fiftieth of a pixel.
+    Frames beyond `EXACT_PSNR`, 58.9 dB, count as that. Gaussians are reordered; absent parameters
+    (`FoldedSplats.degrees`, `static`, `opaque`) stay absent, and shared colors stay shared. Shared paths stay as they
+    are, to about a fiftieth of a pixel.
 
     With the clip, fine-tuning compensates for losses and allows coarser steps: all leaves for half of the `passes` each
     time Gaussians have been dropped; and in each try of a factor of the steps for about 5/8 of them (3/8 of fewer than
@@ -373,10 +373,9 @@ def _round_in_stages(plan: "_Plan", factor: float, finetune: Callable, stages: _
 
 def _round_fixed(quantized: Quantized, exact: ExactColumns, fixed: _Fixed) -> VideoModel:
     """The model whose leaves are decoded where they are `fixed`, and exact elsewhere."""
-    model, decoded = dequantize(quantized), decode_values(quantized)
-    v = {name: np.where(fixed[SHAPE], decoded[name], value) for name, value in exact.values.items()}
-    time = clamp_unit(v["time"])
-    moved = shift_path(exact.place, time - exact.values["time"])
+    model, v = dequantize(quantized), exact.values
+    time = clamp_unit(np.where(fixed[SHAPE], decode_values(quantized)["time"], v["time"]))
+    moved = shift_path(exact.place, time - v["time"])
     place = np.where(fixed[SHAPE][:, None, None], unrounded_paths(quantized, exact), moved)
     leaves = {
         "log_scale": np.stack([v["size"] + v["stretch"], v["size"] - v["stretch"]], 1),
@@ -386,7 +385,7 @@ def _round_fixed(quantized: Quantized, exact: ExactColumns, fixed: _Fixed) -> Vi
         "opacity_logit": v["opacity"],
         "loc": place[:, 0],
         "coefficients": place[:, 1:],
-        "color_dc": np.stack([exact.values[name] for name in COLORS], 1) @ AXES,
+        "color_dc": np.stack([v[name] for name in COLORS], 1) @ AXES,
     }
     for group, which in fixed.items():
         for name in group:
