@@ -5,7 +5,7 @@ import json
 import cv2
 import numpy as np
 import pytest
-from commands import run
+from commands import run, seconds_heard, write_tone
 from PIL import Image
 from soft_models import NUM, SIZE, soft_model
 
@@ -72,6 +72,9 @@ def test_pictures_of_an_edit(work, tmp_path, capsys):
         assert (clip.num_frames, clip.size) == (FRAMES, (20, 32) if size else SIZE)
     edited = edit(soft_model()).select(box=(12, 10, 32, 30), frame=3).move((0.2, 0)).video()
     np.testing.assert_array_equal(read_video(tmp_path / "edited").frames, np.stack(list(edited.frames(size=(20, 32)))))
+    sound = ("--sound", write_tone(tmp_path / "tone.wav", 1.0), "--out", tmp_path / "heard.mp4")
+    assert run("edit", work / "model.safetensors", work / "baked.toml", *sound) == 0
+    assert seconds_heard(tmp_path / "heard.mp4") == pytest.approx(FRAMES / 25, abs=0.03)
 
 
 @pytest.mark.parametrize("name", ["out.gif", "out.webp", "pngs", "webps"])
@@ -126,6 +129,17 @@ def test_what_edit_refuses(work, tmp_path, capsys):
     code, told = refused(model, baked, "--out", target, "--size", "20x32")
     assert code == 2
     assert "--size" in told
+    tone = write_tone(tmp_path / "tone.wav", 1.0)
+    code, told = refused(model, baked, "--out", target, "--sound", tone)
+    assert code == 2
+    assert "--sound: expected a video or a folder as --out" in told
+    code, told = refused(model, baked, "--out", tmp_path / "images", "--sound", tone)
+    assert code == 2
+    assert "--sound: expected a video file for it, got 'images'" in told
+    code, told = refused(model, baked, "--out", tmp_path / "silent.mp4", "--sound", tmp_path / "none.wav")
+    assert code == 2
+    assert "which is missing" in told
+    assert not (tmp_path / "silent.mp4").exists()
     code, told = refused(model, baked, "--out", tmp_path / "out.png")
     assert code == 2
     assert ".safetensors" in told

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from commands import run
+from commands import run, seconds_heard, write_tone
 from soft_models import soft_model
 
 from foldgauss.cli.viewing import plate
@@ -96,8 +96,9 @@ def test_the_plate_and_its_masks_are_written(model, tmp_path, monkeypatch, capsy
     filled, frames = read_video("images").frames, np.stack(list(MODEL.frames()))
     np.testing.assert_array_equal(filled[:, :5], frames[:, :5])
     assert (filled[MASKS] != frames[MASKS]).any()
-    assert run("plate", model) == 0
+    assert run("plate", model, "--sound", write_tone(tmp_path / "tone.wav", 1.0)) == 0
     assert read_video("m.plate.mp4").frames.shape == frames.shape
+    assert seconds_heard("m.plate.mp4") == pytest.approx(len(frames) / 25, abs=0.03)
     capsys.readouterr()
     for options in ([], ["--masks", "masks", "--out", "p.mp4"], ["--out", "images"]):
         assert run("plate", model, *options) == 2
@@ -119,6 +120,7 @@ def test_the_plate_and_its_masks_are_written(model, tmp_path, monkeypatch, capsy
         (["--crf", "99"], "--crf: expected a whole number from 0 to 51 for h264, got 99."),
         (["--crf", "20", "--out", "x.gif"], "--crf: expected a video file for it, got 'x.gif'."),
         (["--codec", "h264", "--out", "images"], "--codec: expected a video file for it, got 'images'."),
+        (["--sound", "none.wav"], "--sound: expected a file, got 'none.wav', which is missing"),
         (["--codec", "av1"], "frames: expected at least 64x64 for av1"),
         (["--out", "x", "--masks", "./x"], "--masks: expected another folder than --out, got x."),
     ],

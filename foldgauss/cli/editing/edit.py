@@ -12,7 +12,14 @@ from foldgauss.cli.app.completion import complete_files
 from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, parse_size
 from foldgauss.cli.shared.log_lines import print_log
 from foldgauss.cli.shared.outputs import check_image_path, name_after, refuse_existing, refuse_huge, refuse_input
-from foldgauss.cli.shared.rendering import render_to_file
+from foldgauss.cli.shared.rendering import (
+    SoundFile,
+    VideoOptions,
+    check_video_options,
+    choose_sound,
+    render_to_file,
+)
+from foldgauss.cli.shared.timeline import Timeline
 from foldgauss.io._atomic import check_writable
 from foldgauss.io.edit_script import read_edit_script
 from foldgauss.io.models.video_model import (
@@ -49,6 +56,7 @@ def edit_command(
         ),
     ] = None,
     size: Size = None,
+    sound: SoundFile = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Edit objects or single frames of a model by a script.
@@ -61,21 +69,23 @@ def edit_command(
     script = read_edit_script(script_path)
     as_model = out_path.suffix.lower() == MODEL_SUFFIX
     image_size = parse_size(size)
-    if as_model and image_size is not None:
-        raise wrong_use("--size", expected="a video or a folder as --out", got=out_path)
+    for option, given in (("--size", image_size), ("--sound", sound)):
+        if as_model and given is not None:
+            raise wrong_use(option, expected="a video or a folder as --out", got=out_path)
     if not as_model:
         check_image_path(out_path, others=MODEL_SUFFIX)
         refuse_huge(image_size)
     if not out_path.is_dir():
         refuse_existing(out_path, overwrite)
         check_writable(out_path)
-    model = load_video_model(model_path)
+    model, about = load_video_model(model_path), read_origin(model_path)
     if not as_model:
         refuse_huge(image_size or model.size)
+        options = VideoOptions(sound=choose_sound(sound, Timeline(), about, model.fps))
+        check_video_options(out_path, image_size or model.size, model.fps, options)
     with print_log():
         edited = script.apply(model)
     if as_model:
-        about = read_origin(model_path)
         about = keep_origin(about, *CLIP_NOTES) | {"edited_by": script_path.name}
         if isinstance(edited, SegmentedVideo):
             edited = _drop_scores(model, edited)
@@ -85,9 +95,9 @@ def edit_command(
             kind = f"a model in {len(edited.segments)} segments"
         out.print(f"{out_path}: {kind}, {edited.num_gaussians:,} Gaussians", soft_wrap=True)
         return
-    seconds = read_frame_seconds(read_origin(model_path), edited.num_frames)
-    times = np.asarray(edited.frame_times.times())
-    render_to_file(edited, out_path, times, edited.fps, size=image_size, overwrite=overwrite, stamps=seconds)
+    how = {"size": image_size, "overwrite": overwrite, "options": options}
+    seconds = read_frame_seconds(about, edited.num_frames)
+    render_to_file(edited, out_path, np.asarray(edited.frame_times.times()), edited.fps, stamps=seconds, **how)
 
 
 def _drop_scores(model: SegmentedVideo, edited: SegmentedVideo) -> SegmentedVideo:

@@ -14,12 +14,15 @@ from foldgauss.cli.shared.rendering import (
     CodecName,
     Crf,
     PixelFormat,
+    SoundFile,
     VideoOptions,
     check_video_options,
+    choose_sound,
     progress_bar,
     video_option,
     write_images,
 )
+from foldgauss.cli.shared.timeline import Timeline
 from foldgauss.io.media.video_writing import VIDEO_SUFFIXES
 from foldgauss.io.models.video_model import load_video_model, read_frame_seconds, read_origin
 from foldgauss.video.motion.background_plate import Alignment, fill_background
@@ -43,6 +46,7 @@ def plate_command(
     codec: CodecName = None,
     crf: Crf = None,
     pixel_format: PixelFormat = None,
+    sound: SoundFile = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Render a model without its moving object, with what other frames show behind it."""
@@ -63,7 +67,8 @@ def plate_command(
         raise nothing_moves(f"a video of {LEAST_FRAMES} frames at least", model.num_frames, cure)
     image_size = image_size or model.size
     refuse_huge(image_size)
-    options = VideoOptions(codec, crf, pixel_format)
+    about = read_origin(model_path)
+    options = VideoOptions(codec, crf, pixel_format, choose_sound(sound, Timeline(), about, model.fps))
     check_video_options(out_path, image_size, model.fps, options)
     frames = np.empty((model.num_frames, *image_size, 3), np.uint8)
     with progress_bar("Rendering", model.num_frames) as advance:
@@ -83,7 +88,7 @@ def plate_command(
             found, size = f"in {len(covered)} of {len(masks)} frames", f"{covered.min():.1%} to {covered.max():.1%}"
             out.print(f"An object was found {found}, where it covers {size} of the image.")
         plate = fill_background(frames, masks, alignment=alignment)
-    stamps = read_frame_seconds(read_origin(model_path), model.num_frames)
+    stamps = read_frame_seconds(about, model.num_frames)
     write_images(out_path, plate, len(plate), model.fps, overwrite=overwrite, options=options, stamps=stamps)
     if masks_path is not None:
         images = (np.repeat(np.uint8(255 * mask)[..., None], 3, -1) for mask in masks)
