@@ -1,6 +1,7 @@
 """The Folded-Gaussian distribution FN(m, Sigma, a, f) of the VeGaS paper.
 
 It is not the |X| "folded normal" of scipy and numpyro: here the *center* of a Gaussian moves along a curve in time.
+Labels such as eq:foldgauss are those of the LaTeX source of the paper, arXiv:2411.11024.
 """
 
 import jax
@@ -145,7 +146,8 @@ class FoldedGaussian(BatchModule):
 
         **Example:** `dist.condition_time(0.25).sample(key)`
 
-        **Source:** eq:cond_dens, eq:cond_proof. Far from `time_loc` only `scale_tril` underflows.
+        **Source:** eq:cond_dens, eq:cond_proof. Far from `time_loc`, `scale_tril` may underflow to 0; the density does
+        not use it, but `log_scale`.
         """
         t = as_value(t, self.loc.dtype)
         dist = expand_leaves(self, t.ndim)
@@ -325,9 +327,10 @@ class FoldedGaussian(BatchModule):
 
     @property
     def mode(self) -> Float[Array, "*batch d"]:
-        """The maximum of the density, (loc, time_loc), if it is unique: `power (d-1) < 2`.
+        """The maximum of the density, (loc, time_loc), if it is unique.
 
-        On the ridge s = loc + f(u) the density is proportional to exp(tau^2 (power (d-1) - 2) / 4).
+        It is if `power (d-1) (1 - floor) < 2`, or, with a floor, `<= 2`. On the ridge s = loc + f(u) the density is
+        proportional to exp(tau^2 (power (d-1) - 2) / 4), for `floor=0`.
 
         **Source:** eq:foldgauss at s = loc + f(u). **Raises:** ValueError if the density has a ridge of modes, two
         modes (a floor) or none (unbounded); under tracing the result is NaN instead.

@@ -1,7 +1,8 @@
 """Mixtures of Folded-Gaussians, and their conditional and marginal distributions.
 
 At a time t a mixture of Folded-Gaussians is a mixture of Gaussians whose weights depend on t. Without time, or given
-space but not time, it is a mixture of integrals over time. All classes share the methods of `AbstractMixture`:
+space but not time, it is a mixture of integrals over time. Labels such as eq:foldgauss are those of the LaTeX source
+of the paper, arXiv:2411.11024. All classes share the methods of `AbstractMixture`:
 
 | | `FoldedMixture` | `GaussianMixture` | `IntegratedMixture` |
 |---|---|---|---|
@@ -61,7 +62,7 @@ class AbstractMixture(eqx.Module):
     components: eqx.AbstractVar[eqx.Module]
     logits: eqx.AbstractVar[Float[Array, "*batch k"]]
 
-    has_rsample = False  #: draws jump from component to component
+    has_rsample = False  #: the choice of a component is not reparameterized
 
     @property
     def event_shape(self) -> tuple[int, ...]:
@@ -73,7 +74,7 @@ class AbstractMixture(eqx.Module):
 
     @property
     def num_components(self) -> int:
-        """K."""
+        """Number of components."""
         return self.logits.shape[-1]
 
     @property
@@ -105,7 +106,7 @@ class AbstractMixture(eqx.Module):
         return jnp.exp(self.log_prob(value))
 
     def component_log_prob(self, value: Float[Array, "*#batch d"]) -> Float[Array, "*#batch k"]:
-        """log p_k(x) of each component, without its weight.
+        """log p_k(x) of each component, without its weight. **Raises:** as `log_prob`.
 
         **Shapes:** value (*sample, *batch, d) -> (*sample, *batch, k).
         """
@@ -289,7 +290,7 @@ class FoldedMixture(_WeightedMixture):
         **Source:** eq:cond_dens and Bayes' rule. **Raises:** ValueError on invalid indices, all indices, or a wrong
         shape of values.
         """
-        return _conditioned(self, indices, values)
+        return _condition(self, indices, values)
 
     def time_given_space(self, s: Float[Array, "*#batch d-1"]) -> "TimePosterior":
         """The density of time given space, p(t | s), by quadrature.
@@ -327,7 +328,7 @@ class GaussianMixture(_WeightedMixture):
 
     def condition(self, indices, values: ArrayLike) -> "GaussianMixture":
         """The other coordinates, in ascending order, given these; exact. As `FoldedMixture.condition`."""
-        return _conditioned(self, indices, values)
+        return _condition(self, indices, values)
 
     def cdf(self, x: Float[Array, "*#batch 1"]) -> Float[Array, "*#batch"]:
         """P(coordinate <= x), for a single coordinate. **Raises:** ValueError if there are several."""
@@ -355,7 +356,7 @@ class IntegratedMixture(AbstractMixture):
     logits: Float[Array, "*batch k"]
 
     def cdf(self, value: Float[Array, "*#batch 1"]) -> Float[Array, "*#batch"]:
-        """P(coordinate <= x | given), for a single coordinate."""
+        """P(coordinate <= x | given), for a single coordinate. **Raises:** ValueError if there are several."""
         return weighted_sum(self.weights, self.components.cdf(_add_component_axis(self, self._checked(value))))
 
     def error_estimate(self, x: Float[Array, "*#batch n"]) -> Float[Array, "*#batch"]:
@@ -369,7 +370,7 @@ class IntegratedMixture(AbstractMixture):
 
     def condition(self, indices, values: ArrayLike) -> "IntegratedMixture | GaussianMixture":
         """The other coordinates given these, as `FoldedMixture.condition`; exact if time is given."""
-        return _conditioned(self, indices, values)
+        return _condition(self, indices, values)
 
 
 class TimePosterior(AbstractMixture):
@@ -483,7 +484,7 @@ def _at_time(mixture: FoldedMixture, t: Array) -> GaussianMixture:
     return GaussianMixture(mixture.components.condition_time(t), logits=logits, validate_args=False)
 
 
-def _conditioned(mixture: AbstractMixture, indices, values: ArrayLike):
+def _condition(mixture: AbstractMixture, indices, values: ArrayLike):
     indices = normalize_indices(indices, mixture.event_shape[0])
     values = as_value(values, mixture.logits.dtype)
     check_event("values", values, (len(indices),))

@@ -29,7 +29,7 @@ def test_the_trials_go_well_here(tried):
     assert [one.name for one in tried if not one.ok] == []
     assert len(tried) == 4
     assert all(one.seconds < 10 for one in tried)
-    decibels = [float(found[1]) for one in tried if (found := re.search(r"([\d.]+) dB", one.told))]
+    decibels = [float(found[1]) for one in tried if (found := re.search(r"([\d.]+) dB", one.message))]
     assert len(decibels) == 1
     assert min(decibels) > 30
 
@@ -60,7 +60,7 @@ def test_a_wrong_picture_is_seen(monkeypatch):
     ):
         trial = spoiled(how)
         assert not trial.ok
-        assert told in trial.told
+        assert told in trial.message
         assert "Reinstall" in trial.cure
 
 

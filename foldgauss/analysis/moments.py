@@ -71,8 +71,9 @@ def mode(dist) -> Float[Array, "*batch d"]:
         return _ridge(dist, _highest_time(dist))
     filled = broadcast_leaves(dist, batch)
     envelope, dim = filled.envelope, dist.loc.shape[-1]
-    slope = envelope.power * dim * (1 - envelope.floor)  # of the ridge at its own time, in tau^2 / 4, plus 2
-    unique = jnp.where(envelope.floor > 0, slope <= 2, slope < 2)
+    # On the ridge the log density is about tau^2 (growth - 2) / 4 near tau = 0: the envelope narrows, the time decays.
+    growth = envelope.power * dim * (1 - envelope.floor)
+    unique = jnp.where(envelope.floor > 0, growth <= 2, growth < 2)
     _refuse_no_mode(unique, envelope, dim)
     return jnp.where(unique[..., None], _ridge(filled, filled.time_loc), jnp.nan)
 

@@ -33,10 +33,10 @@ from foldgauss.video.compression.quantize import (
     dequantize,
     is_integral,
     legendre,
-    path_matrix,
-    path_span,
     quantize,
-    unrounded_paths,
+    trajectory_matrix,
+    trajectory_span,
+    unrounded_trajectories,
 )
 from foldgauss.video.models.metrics import evaluate
 from foldgauss.video.models.renderer import VideoRenderer
@@ -203,7 +203,7 @@ def test_power_that_saves_little_is_dropped():
     degrees = dequantize(coarse).splats.degrees
     np.testing.assert_array_equal(degrees, coarse.columns["degree"])
     assert 0 < (degrees < 3).sum() < len(degrees)
-    place = unrounded_paths(coarse, compute_columns(model))
+    place = unrounded_trajectories(coarse, compute_columns(model))
     np.testing.assert_array_equal((place[:, 1:] != 0).any(2), np.arange(3) < degrees[:, None])
 
 
@@ -452,8 +452,8 @@ def test_invisible_gaussians_are_dropped():
 def test_dropping_uses_the_loss_that_it_may_cost():
     search = sys.modules["foldgauss.video.compression.search"]
     model = crowd(soft_model(options=RenderOptions()))
-    loss, plan = search._Loss(model, clip_of(model), None), search._Plan(model)
-    kept = [search._drop(model, plan, loss, -8.0, most) for most in (0.1, 1.0, 5.0)]
+    loss, quantizer = search._Loss(model, clip_of(model), None), search._Quantizer(model)
+    kept = [search._drop(model, quantizer, loss, -8.0, most) for most in (0.1, 1.0, 5.0)]
     lost = [loss(one, loss.all_frames) for one in kept]
     assert lost[0] <= 0.1
     assert 0.1 < lost[1] <= 1.0 < lost[2] <= 5.0
@@ -475,7 +475,7 @@ def test_what_is_rounded_stays_while_the_rest_is_fitted(monkeypatch, change):
     """From the stage of rounding on that fixes them, integers do not change; others do."""
     module = sys.modules["foldgauss.video.compression.search"]
     model = change(crowd(soft_model(degree=3, options=RenderOptions())))
-    plan, loss = module._Plan(model), module._Loss(model, clip_of(model), None)
+    quantizer, loss = module._Quantizer(model), module._Loss(model, clip_of(model), None)
     made, fixed = [], []
 
     def recorded(*given):
@@ -487,7 +487,7 @@ def test_what_is_rounded_stays_while_the_rest_is_fitted(monkeypatch, change):
         return finetune_model(model, loss.target, 1, **how)
 
     monkeypatch.setattr(module, "quantize", recorded)
-    done = module._round_in_stages(plan, 1.0, finetune, module._ROUNDING)
+    done = module._round_in_stages(quantizer, 1.0, finetune, module._ROUNDING)
     assert done is made[-1]
     assert len(fixed) == len(made) - 1 == len(module._ROUNDING)
     groups = {
@@ -496,9 +496,9 @@ def test_what_is_rounded_stays_while_the_rest_is_fitted(monkeypatch, change):
         "color_dc": ("luma", "blue", "green"),
     }
     for leaf, names in groups.items():
-        shares = [step[leaf].mean() for step in fixed]
+        fractions = [step[leaf].mean() for step in fixed]
         assert all((after[leaf] >= before[leaf]).all() for before, after in itertools.pairwise(fixed))
-        assert 0.3 < shares[-1] < 0.7 if leaf == "color_dc" else shares[-1] == 1
+        assert 0.3 < fractions[-1] < 0.7 if leaf == "color_dc" else fractions[-1] == 1
         for name in names:
             moves = 0
             for before, after, step in zip(made[:-1], made[1:], fixed, strict=True):
@@ -514,7 +514,7 @@ def test_rounding_in_stages_loses_less():
     """Than rounding all shapes, then all paths, then all colors; and that less than rounding at once."""
     module = sys.modules["foldgauss.video.compression.search"]
     model = crowd(soft_model(degree=3, options=RenderOptions()))
-    loss, plan = module._Loss(model, clip_of(model), None), module._Plan(model)
+    loss, plan = module._Loss(model, clip_of(model), None), module._Quantizer(model)
 
     def finetune(model, fraction, what, **how):
         return finetune_model(model, loss.target, round(40 * fraction), **how)
@@ -523,7 +523,7 @@ def test_rounding_in_stages_loses_less():
         return loss(dequantize(module._round_in_stages(plan, 4.0, finetune, stages)), loss.all_frames)
 
     by_shares = measure(module._ROUNDING)
-    by_groups = measure(((module.SHAPE, 1.0, 0.4), (module.PATH, 1.0, 0.225)))
+    by_groups = measure(((module.SHAPE, 1.0, 0.4), (module.TRAJECTORY, 1.0, 0.225)))
     at_once = loss(dequantize(plan.quantize(4.0)), loss.all_frames)
     assert by_shares < by_groups < at_once
 
@@ -590,8 +590,8 @@ def test_a_path_is_the_same_from_another_time():
 def test_paths_are_legendre_series_over_the_span():
     model = soft_model(degree=3)
     info, v = compute_columns(model).info, compute_columns(model).values
-    matrix = path_matrix(v["time"], v["duration"], info)
-    middle, half = path_span(v["time"], v["duration"], info.reach)
+    matrix = trajectory_matrix(v["time"], v["duration"], info)
+    middle, half = trajectory_span(v["time"], v["duration"], info.reach)
     for w in (-1.0, 0.2, 1.0):
         u = v["time"] - (middle + half * w)
         by_matrix = (matrix * (u[:, None] ** np.arange(4))[:, :, None]).sum(1)

@@ -11,11 +11,11 @@ from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.video import FitConfig
 from foldgauss.video.fitting.state import (
     ARRAYS,
+    CodebookArray,
     DeviceArrays,
     FitState,
     PerFrame,
     PerGaussian,
-    Shared,
     Sizes,
     StateArray,
 )
@@ -98,7 +98,7 @@ def test_keep_cuts_every_per_gaussian_array():
         now, then = getattr(state, name), getattr(before, name)
         if isinstance(kind, PerGaussian):
             np.testing.assert_array_equal(now, then[index])
-        elif isinstance(kind, Shared):
+        elif isinstance(kind, CodebookArray):
             np.testing.assert_array_equal(now.index, then.index[index])
             np.testing.assert_array_equal(now.first, then.first)
         elif isinstance(kind, PerFrame):

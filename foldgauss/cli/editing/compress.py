@@ -60,7 +60,8 @@ def compress_command(
     passes: Annotated[
         int,
         typer.Option(
-            help=f"Passes over VIDEO of a fine-tuning, about {USUAL_PASSES} times as many in all; 0: none.", min=0
+            help=f"Passes over VIDEO of fine-tuning, about {USUAL_PASSES} times as many in all stages; 0: none.",
+            min=0,
         ),
     ] = PASSES,
     frames: FittedFrames = None,
@@ -98,7 +99,7 @@ def compress_command(
         raise wrong_use("MODEL", expected="a plain model", got="one with edits", cure=cure)
     clip = None if video is None else read_fitted_clip(model, model_path, video, frames)
     if clip is not None and is_other_clip(model_path, clip, lambda: evaluate(model, clip.frames).mean_psnr):
-        cure = "Give that clip, or none: parameters are then only rounded."
+        cure = "Give that clip, or none: there is no fine-tuning then."
         got = f"{str(video)!r}, another clip"
         raise wrong_use("VIDEO", expected="the clip that the model was fitted to", got=got, cure=cure)
     if float16:
@@ -170,7 +171,7 @@ def _write_compressed(
     if passes and gain > MAX_GAIN_DB:
         warn(
             f"fine-tuning came {gain:.1f} dB closer to the clip than the model. Either its fit had not converged, or "
-            "it was edited, and the passes have undone the edits. --passes 0 only rounds."
+            "it was edited, and the passes have undone the edits. --passes 0 does without fine-tuning."
         )
     save_compressed(target, made, about, known=clip is not None or known_psnr is not None)
     if clip is None:

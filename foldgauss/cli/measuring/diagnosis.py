@@ -42,13 +42,13 @@ EXTRAS = {
 
 
 class Trial(NamedTuple):
-    """The result of a trial, as text in `told`, and its duration; compilation took `first_seconds` more."""
+    """The result of a trial, as text in `message`, and its duration; compilation took `first_seconds` more."""
 
     name: str
     ok: bool
     seconds: float
     first_seconds: float
-    told: str
+    message: str
     cure: str = ""
 
 
@@ -184,11 +184,11 @@ def _run_trial(name: str, attempt: Callable[[], str]) -> Trial:
     try:
         attempt()
         again = time.perf_counter()
-        told = attempt()
+        message = attempt()
         seconds = time.perf_counter() - again
-        return Trial(name, True, round(seconds, 3), round(max(again - begun - seconds, 0.0), 3), told)
+        return Trial(name, True, round(seconds, 3), round(max(again - begun - seconds, 0.0), 3), message)
     except _Failed as failed:
-        return Trial(name, False, round(time.perf_counter() - begun, 3), 0.0, failed.told, failed.cure)
+        return Trial(name, False, round(time.perf_counter() - begun, 3), 0.0, failed.message, failed.cure)
     except Exception as error:
         return Trial(name, False, round(time.perf_counter() - begun, 3), 0.0, _short(error), _REINSTALL)
 
@@ -199,9 +199,9 @@ _REINSTALL = (
 
 
 class _Failed(Exception):
-    def __init__(self, told: str, cure: str):
-        super().__init__(told)
-        self.told, self.cure = told, cure
+    def __init__(self, message: str, cure: str):
+        super().__init__(message)
+        self.message, self.cure = message, cure
 
 
 def _scene() -> Splats2D:

@@ -45,7 +45,7 @@ def doctor(
 
 def _problems(found: dict[str, Any], done: list[Trial]) -> list[str]:
     """Problems of this installation, with remedies. A missing extra is not a problem."""
-    problems = [f"{one.name}: {one.told}. {one.cure}" for one in done if not one.ok]
+    problems = [f"{one.name}: {one.message}. {one.cure}" for one in done if not one.ok]
     missing = [name for name, version in found["versions"].items() if version is None]
     if missing:
         problems.append(f"missing: {', '.join(missing)}. pip install --upgrade {NAME}")
@@ -128,7 +128,7 @@ def _print_trial(trial: Trial) -> None:
     compiled = f", {trial.first_seconds:.1f} s more the first time" if trial.first_seconds > 0.5 else ""
     line = Text.assemble(
         ("ok  " if trial.ok else "no  ", GREEN if trial.ok else RED),
-        f"{trial.name:<34}{trial.told} ({trial.seconds:.2f} s{compiled})",
+        f"{trial.name:<34}{trial.message} ({trial.seconds:.2f} s{compiled})",
     )
     out.print(line, soft_wrap=True)
 

@@ -18,7 +18,7 @@ from foldgauss._runtime.checks import invalid
 from foldgauss.cli.app.application import Stopped, WrongUse, app, err, out, warn, wrong_use
 from foldgauss.cli.app.completion import complete_choice
 from foldgauss.cli.measuring.profiles_file import is_profiles_file, load_profiles, save_profiles
-from foldgauss.cli.shared.arguments import FittedClip, ModelFile, Overwrite
+from foldgauss.cli.shared.arguments import FittedClip, FittedFrames, ModelFile, Overwrite
 from foldgauss.cli.shared.clips import read_fitted_clip, refuse_segments
 from foldgauss.cli.shared.outputs import name_after
 from foldgauss.cli.shared.rendering import TIME_LEFT
@@ -61,12 +61,7 @@ def uncertainty_command(
             help="Folder for tables, plots and draws [default: MODEL-uncertainty in this folder].",
         ),
     ] = None,
-    frames: Annotated[
-        str | None,
-        typer.Option(
-            metavar="A:B", help="Frames A up to, not including, B of the clip [default: those that it was fitted to]."
-        ),
-    ] = None,
+    frames: FittedFrames = None,
     only: Annotated[
         str | None,
         typer.Option(

@@ -33,7 +33,11 @@ Frames = Annotated[
 ]
 FittedFrames = Annotated[
     str | None,
-    typer.Option(metavar="A:B", help="Frames of VIDEO [default: those that the model was fitted to]."),
+    typer.Option(
+        metavar="A:B",
+        help="Frames A up to, not including, B of the clip, as many as the model has "
+        "[default: those that it was fitted to].",
+    ),
 ]
 Times = Annotated[
     str | None,

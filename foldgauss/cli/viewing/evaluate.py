@@ -11,6 +11,7 @@ from foldgauss.cli.app.application import app, out
 from foldgauss.cli.shared.arguments import (
     AlphaCutoff,
     FittedClip,
+    FittedFrames,
     ModelFile,
     Overwrite,
     SupportRadius,
@@ -35,14 +36,7 @@ def evaluate_command(
     json_path: Annotated[
         Path | None, typer.Option("--json", metavar="FILE.json", help="Also write the figures here.")
     ] = None,
-    frames: Annotated[
-        str | None,
-        typer.Option(
-            metavar="A:B",
-            help="Frames A up to, not including, B of the clip, as many as the model has "
-            "[default: those that it was fitted to].",
-        ),
-    ] = None,
+    frames: FittedFrames = None,
     alpha_cutoff: AlphaCutoff = None,
     support_radius: SupportRadius = None,
     transmittance_stop: TransmittanceStop = None,

@@ -31,10 +31,11 @@ class VideoError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Clip:
-    """Frames in memory.
+    """Frames and when they are shown.
 
     `frames`: uint8 RGB, shape (num_frames, height, width, 3), C-contiguous; for images with alpha RGBA, shape
-    (num_frames, height, width, 4), with colors premultiplied by alpha (the image over black). `fps`: frames per second.
+    (num_frames, height, width, 4), with colors premultiplied by alpha (the image over black). Commands also use
+    `LazyFrames`, of these shapes, which cannot be taken `over_black`. `fps`: frames per second.
     `source`: the path as given. `num_declared`: number of frames that the container declares within the requested
     range; larger than `num_frames` where a damaged file is truncated. `times`: display times of the frames, float64
     (num_frames,), in seconds from the first one; None where frames are evenly spaced at `fps`, otherwise `fps` is their

@@ -112,6 +112,8 @@ class LazyFrames:
         return self._read_one(number % len(self))
 
     def __array__(self, dtype=None, copy=None) -> np.ndarray:
+        if copy is False:
+            raise ValueError("copy: expected True or None for frames that are read from a file, got False.")
         return np.asarray(self[:], dtype)
 
     def _read_one(self, number: int) -> np.ndarray:

@@ -64,28 +64,28 @@ def decode_file(
 
     Raises `VideoError` for a file that cannot be read.
     """
-    passed = Passed()
+    decoded = DecodedFrames()
     with closing(VideoDecoder(path, deinterlace=deinterlace)) as decoder:
         fps = decoder.fps if 0 < decoder.fps <= MAX_FPS else DEFAULT_FPS
-        kept = keep(select_frames(decoder.frames(), start, stop, passed))
-        if not passed.positions:
+        kept = keep(select_frames(decoder.frames(), start, stop, decoded))
+        if not decoded.positions:
             cure = "The file is damaged or its codec is unknown here; convert it with ffmpeg."
             got = f"none in {str(path)!r}"
             raise video_error("path", expected="a video with frames that decode", got=got, cure=cure)
-        positions, stamps = np.array(passed.positions, np.int64), np.array(passed.stamps, np.int64)
-        time_base, num_reached = float(decoder.time_base), passed.positions[-1] + 1
-        seconds = make_increasing((np.append(stamps, passed.following) * time_base).tolist(), fps)
+        positions, stamps = np.array(decoded.positions, np.int64), np.array(decoded.stamps, np.int64)
+        time_base, num_reached = float(decoder.time_base), decoded.positions[-1] + 1
+        seconds = make_increasing((np.append(stamps, decoded.following) * time_base).tolist(), fps)
         seconds, end = seconds[: len(stamps)], float(seconds[-1])
-        if not passed.following:
-            last = decoder.find_last_duration(passed.duration, seconds[-1] - seconds[0], num_reached)
+        if not decoded.following:
+            last = decoder.find_last_duration(decoded.duration, seconds[-1] - seconds[0], num_reached)
             end = float(seconds[-1] + last) if last else 0.0
         last = max(end - seconds[-1], 0.0)
         num_total = max(_count_declared(decoder, seconds, fps, num_reached, last), num_reached)
         notes, aspect, threads = (), decoder.pixel_aspect, decoder.threads
         if abs(aspect - 1) > 0.01:
             notes += (f"pixels are {aspect:.3g} times as wide as high; frames are kept as stored, not stretched.",)
-        if passed.hdr:
-            notes += (f"colors are HDR ({' and '.join(sorted(passed.hdr))}), and are tone-mapped to SDR.",)
+        if decoded.hdr:
+            notes += (f"colors are HDR ({' and '.join(sorted(decoded.hdr))}), and are tone-mapped to SDR.",)
         if decoder.has_converted:
             notes += ("interlaced frames are converted to progressive ones.",)
     # The container's count may be an estimate, so the range is checked against the decoded frames as well.
@@ -97,7 +97,7 @@ def decode_file(
 
 
 @dataclass
-class Passed:
+class DecodedFrames:
     """The frames that were decoded: their positions and stamps, the transfer functions of those in HDR, the duration of
     the last one by the decoder, and the stamp of the one after it, in a list, if that was decoded, too."""
 
@@ -108,21 +108,23 @@ class Passed:
     following: list[int] = field(default_factory=list)
 
 
-def select_frames(frames: Iterable[DecodedFrame], start: int, stop: int | None, passed: Passed) -> Iterator[np.ndarray]:
-    """The frames from `start` up to `stop`; each decoded on the way is noted in `passed`, and so is the next one.
+def select_frames(
+    frames: Iterable[DecodedFrame], start: int, stop: int | None, decoded: DecodedFrames
+) -> Iterator[np.ndarray]:
+    """The frames from `start` up to `stop`; all that are decoded are recorded in `decoded`, and so is the next one.
 
     Frames before `start` are decoded and dropped: seeking stops at key frames.
     """
     for frame in frames:
         if stop is not None and frame.position >= stop:
-            if passed.positions and frame.position == passed.positions[-1] + 1:
-                passed.following.append(frame.stamp)
+            if decoded.positions and frame.position == decoded.positions[-1] + 1:
+                decoded.following.append(frame.stamp)
             return
-        passed.positions.append(frame.position)
-        passed.stamps.append(frame.stamp)
-        passed.duration = frame.decoded.duration or 0
+        decoded.positions.append(frame.position)
+        decoded.stamps.append(frame.stamp)
+        decoded.duration = frame.decoded.duration or 0
         if frame.position >= start:
-            passed.hdr |= {frame.hdr} - {None}
+            decoded.hdr |= {frame.hdr} - {None}
             yield frame.to_array()
 
 

@@ -90,7 +90,7 @@ def write_video(
         cure = "For one image: write_image." if suffix == ".png" else "Rename the output."
         raise video_error("path", expected=expected, got=repr(path.name), cure=cure)
     failures: list[OSError] = []
-    frames = _check_frames(_noting_failures(frames, failures))
+    frames = _check_frames(_record_failures(frames, failures))
     first = next(frames)
     encoding = choose_encoding(suffix, codec, crf, pixel_format, first.shape)
     if sound is not None:
@@ -167,7 +167,7 @@ def _match_times(frames: Iterable[np.ndarray], num: int) -> Iterator[np.ndarray]
         raise video_error("frames", expected=f"{num}, as many as times, or one fewer", got=got)
 
 
-def _noting_failures(frames: Iterable[np.ndarray], failures: list[OSError]) -> Iterator[np.ndarray]:
+def _record_failures(frames: Iterable[np.ndarray], failures: list[OSError]) -> Iterator[np.ndarray]:
     """The frames; an OSError of making them is added to `failures`, to be told from those of writing."""
     try:
         yield from frames

@@ -17,8 +17,8 @@ from foldgauss.video.compression.quantize import (
     Rule,
     clamp_unit,
     compute_steps,
-    path_power,
-    path_span,
+    trajectory_power,
+    trajectory_span,
 )
 
 #: Neighbors that predict a value; candidates for them in each grid square; weight of time in their distance.
@@ -48,7 +48,7 @@ class ColumnContexts:
         known = {"origin": decoder.origin(name), "step": compute_steps(halves, name)}
         if name in COLORS and self._info.shared:
             return dataclasses.replace(Column.without_contexts(rows), near=np.arange(-1, rows - 1)[:, None], **known)
-        power = path_power(name)
+        power = trajectory_power(name)
         near = self._nearest if power or name in ("angle", "shade", *COLORS) else self._in_cell
         scale = np.ones(rows)
         for _ in range(power):  # not a power, whose last bit libraries do not agree on
@@ -65,7 +65,7 @@ class ColumnContexts:
             self._in_cell = find_latest_in_cell(numbers, 1 << sum(info.cells))
         if name == "y0":
             v = decoder.values
-            middle, self._half = path_span(clamp_unit(v["time"]), v["duration"], info.reach)
+            middle, self._half = trajectory_span(clamp_unit(v["time"]), v["duration"], info.reach)
             at = v["x0"], v["y0"], TIME_WEIGHT * middle
             if info.paths is not None:  # within the rectangle of the cells
                 (x, y), longer = info.paths.middle, max(info.paths.sides)

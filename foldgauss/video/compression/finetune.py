@@ -33,7 +33,7 @@ def finetune_model(
     seed: int = 0,
     on_pass: Callable[[], None] = lambda: None,
 ) -> VideoModel:
-    """The model after `passes` over its frames in random order, by least squares and the fit's Adam.
+    """The model after `passes` over its frames in random order: Adam with the fit's rates, mean squared error.
 
     Frame times do not change, nor do those leaves of `FoldedSplats` of the Gaussians that `fixed` marks.
     `target(k, step)` returns what frame k is compared with. `shared`: each Gaussian's color index; Gaussians with the

@@ -2,10 +2,11 @@
 
 Each Gaussian is described by *columns*, parameters whose errors affect the image independently: size and stretch (mean
 and half difference of the logarithms of its standard deviations, the longer axis first), duration, opacity, time, angle
-modulo half a turn, color along fixed axes, and its path over the span of time in which it is visible, as Legendre
-polynomials. A column's step follows from earlier columns by a rule stated in the file, so that Gaussians that are
-hardly visible get coarse steps and need few bits. Absent parameters are stored in no column: powers above the path's
-own degree, times of static Gaussians, opacities of opaque ones; and shared colors are stored once.
+modulo half a turn, color along fixed axes, and its trajectory, m_s + f(m_t - t), over the span of time in which it is
+visible, as Legendre polynomials. A column's step follows from earlier columns by a rule stated in the file, so that
+Gaussians that are hardly visible get coarse steps and need few bits. Absent parameters are stored in no column: powers
+above the trajectory's own degree, times of static Gaussians, opacities of opaque ones; and shared colors are stored
+once.
 
 A model with shared paths (`SharedPaths`) has a column of their numbers; their maps are rounded in steps of model space
 too fine to be seen.
@@ -37,7 +38,8 @@ MAX_DEGREE = 15
 LARGEST = 2**30 - 1
 #: Columns from which the steps of others may be computed.
 FEATURES = ("class", "size", "stretch", "duration", "opacity")
-#: Columns of plain integers: the cell of space and time, the class (how visible), absent parameters, the path's degree.
+#: Columns of plain integers: the cell of space and time, the class (how visible), absent parameters, the degree
+#: of the trajectory.
 #: So are `path`, the number of the shared path, and `shade`, that of the shared color.
 INTEGER_COLUMNS = ("cell", "class", "without", "degree")
 COLORS = ("luma", "blue", "green")
@@ -61,8 +63,8 @@ AXES = np.array(
 _LN2, _SQRT2 = 0.6931471805599453, 1.4142135623730951
 #: Step of the frame times' logits: a thousandth of an interval.
 TIME_STEP = 2.0**-10
-#: Least squared error, in steps, that the last power of a path must save: its two coefficients need some eight bits,
-#: and with fine steps a bit saves 2 ln 2 / 12.
+#: Least squared error, in steps, that the last power of a trajectory must save: its two coefficients need some eight
+#: bits, and with fine steps a bit saves 2 ln 2 / 12.
 POWER_WORTH = 0.9
 #: Largest absolute exponent of sqrt(2) of a step.
 _MAX_EXPONENT = 120
@@ -72,21 +74,21 @@ _MAX_STEP = {"time": 0.125, "angle": 0.125, "size": 0.35, "stretch": 0.5, "durat
 
 def column_names(degree: int, shared: int = 0, num_paths: int = 0) -> tuple[str, ...]:
     """The columns of a model in order; `shared` is the number of shared colors, 0 if they are not shared."""
-    path = tuple(f"{axis}{k}" for k in range(degree + 1) for axis in "xy")
+    trajectory = tuple(f"{axis}{k}" for k in range(degree + 1) for axis in "xy")
     return (
         *INTEGER_COLUMNS,
         *(("path",) if num_paths else ()),
         *FEATURES[1:],
         "time",
-        *path,
+        *trajectory,
         "angle",
         *(("shade",) if shared else ()),
         *COLORS,
     )
 
 
-def path_power(name: str) -> int:
-    """The power of a column of the path; 0 for other columns."""
+def trajectory_power(name: str) -> int:
+    """The power of a column of the trajectory; 0 for other columns."""
     return int(name[1:]) if name[0] in "xy" else 0
 
 
@@ -127,7 +129,7 @@ class CompactInfo:
     """Constants of the model, stored in the header.
 
     `cells`: binary logarithms of the numbers of cells along x, y and time. `shared`: the number of shared colors; 0 if
-    each Gaussian has its own. `reach`: half-width of a path's span of time, in sigma_t.
+    each Gaussian has its own. `reach`: half-width of a trajectory's span of time, in sigma_t.
     """
 
     num_gaussians: int
@@ -179,7 +181,7 @@ class ColumnDecoder:
         """Which Gaussians have a value in the next column; the others' integer is 0."""
         if name in ABSENT:
             return (self.values["without"].astype(np.int32) & ABSENT[name][0]) == 0
-        if power := path_power(name):
+        if power := trajectory_power(name):
             return self.values["degree"] >= power
         return np.ones(self.rows(name), bool)
 
@@ -208,7 +210,7 @@ class ColumnDecoder:
             value, feature = (np.where(self.has(name), value, other) for other in (instead, counts_as))
         if name in FEATURES:
             self._features.append(feature)
-        if path_power(name):
+        if trajectory_power(name):
             value = np.where(self.has(name), value, 0.0)
         self.values[name] = value
 
@@ -241,7 +243,7 @@ def locate_cells(
     x: Float[np.ndarray, " num"], y: Float[np.ndarray, " num"], time: Float[np.ndarray, " num"], info: CompactInfo
 ) -> Int32[np.ndarray, " num"]:
     """Indices of the cells of these positions or of the nearest ones: bits of x, y, time in turns, lowest first."""
-    out, place = np.zeros(len(x), np.int64), 0
+    out, bit = np.zeros(len(x), np.int64), 0
     along = []
     for value, (middle, side), bits in zip((x, y, time), _extents(info), info.cells, strict=True):
         index = np.floor(((value - middle) / side + 0.5) * 2**bits)
@@ -249,19 +251,19 @@ def locate_cells(
     for k in range(max(info.cells)):
         for index, bits in zip(along, info.cells, strict=True):
             if k < bits:
-                out |= ((index >> k) & 1) << place
-                place += 1
+                out |= ((index >> k) & 1) << bit
+                bit += 1
     return out.astype(np.int32)
 
 
 def cell_centers(cell: Int[np.ndarray, " num"], info: CompactInfo) -> list[Float[np.ndarray, " num"]]:
     """The centers of cells along x, y and time."""
-    along, place = [np.zeros(len(cell), np.int64) for _ in range(3)], 0
+    along, bit = [np.zeros(len(cell), np.int64) for _ in range(3)], 0
     for k in range(max(info.cells)):
         for axis, bits in enumerate(info.cells):
             if k < bits:
-                along[axis] |= ((cell >> place) & 1) << k
-                place += 1
+                along[axis] |= ((cell >> bit) & 1) << k
+                bit += 1
     out = []
     for index, (middle, side), bits in zip(along, _extents(info), info.cells, strict=True):
         out.append(middle + ((index + 0.5) / 2**bits - 0.5) * side)
@@ -277,7 +279,7 @@ def dequantize(quantized: Quantized) -> VideoModel:
     """The decoded model, the same bits everywhere."""
     info, v = quantized.info, decode_values(quantized)
     time = clamp_unit(v["time"])
-    place = _monomials(v, time, info)
+    polynomials = _monomials(v, time, info)
     log_scale = np.stack([v["size"] + v["stretch"], v["size"] - v["stretch"]], 1)
     luma, blue, green = v["luma"], v["blue"], v["green"]
     color = np.stack([luma * AXES[0, c] + blue * AXES[1, c] + green * AXES[2, c] for c in range(3)], 1)
@@ -286,12 +288,12 @@ def dequantize(quantized: Quantized) -> VideoModel:
         return array.astype(np.float32) + np.float32(0)  # +0 instead of -0: absent parameters are +0
 
     splats = FoldedSplats(
-        loc=single(place[:, 0]),
+        loc=single(polynomials[:, 0]),
         log_scale=single(log_scale),
         angle_logit=single(_logit(clamp_unit(v["angle"]))),
         time_loc_logit=single(_logit(time)),
         log_time_scale=single(v["duration"]),
-        coefficients=single(place[:, 1:]),
+        coefficients=single(polynomials[:, 1:]),
         opacity_logit=single(v["opacity"]),
         color_dc=single(color),
         envelope=TimeLikelihood(np.float32(info.power), np.float32(info.floor)),
@@ -322,10 +324,10 @@ def _logit(x: Float[np.ndarray, " num"]) -> Float[np.ndarray, " num"]:
     return _log(x) - _log(1 - x)
 
 
-def path_span(
+def trajectory_span(
     time: Float[np.ndarray, " num"], duration: Float[np.ndarray, " num"], reach: float
 ) -> tuple[Float[np.ndarray, " num"], Float[np.ndarray, " num"]]:
-    """Middle and half-width of the span of time that a path describes: `reach` sigma_t on either side, within the clip.
+    """Middle and half-width of the span of time of a trajectory: `reach` sigma_t on either side, within the clip.
 
     sigma_t is rounded to a power of sqrt(2), which needs no exponential.
     """
@@ -351,7 +353,7 @@ def _monomials(
 ) -> Float[np.ndarray, "num degree+1 2"]:
     """Paths in powers of u = m_t - t: row 0 is m_s, row k is c_k."""
     degree, table = info.degree, legendre(info.degree)
-    middle, half = path_span(time, v["duration"], info.reach)
+    middle, half = trajectory_span(time, v["duration"], info.reach)
     out = np.empty((info.num_gaussians, degree + 1, 2))
     at, scale = (time - middle) / half, -1.0 / half
     for axis in range(2):
@@ -377,7 +379,7 @@ def _monomials(
 
 @dataclasses.dataclass(frozen=True)
 class ExactColumns:
-    """A model's columns before rounding; the path is still `place`, in powers of u."""
+    """A model's columns before rounding; trajectories are still `polynomials`, in powers of u."""
 
     info: CompactInfo
     swapped: Bool[np.ndarray, " num"]
@@ -385,13 +387,13 @@ class ExactColumns:
     without: Int32[np.ndarray, " num"]
     shade: Int32[np.ndarray, " num"] | None
     values: dict[str, Float[np.ndarray, " num"]]
-    place: Float[np.ndarray, "num degree+1 2"]
+    polynomials: Float[np.ndarray, "num degree+1 2"]
     logits: Float[np.ndarray, " intervals"]
     path: Int32[np.ndarray, " num"] | None = None
     paths: SharedPaths | None = None
 
     def has(self, name: str) -> Bool[np.ndarray, " num"]:
-        """Which Gaussians have a value in a column other than the path's."""
+        """Which Gaussians have a value in a column other than the trajectory's."""
         return (self.without & ABSENT.get(name, (0,))[0]) == 0
 
 
@@ -417,9 +419,9 @@ def compute_columns(model: VideoModel) -> ExactColumns:
         "angle": (turn + np.where(swapped, 0.0, -0.25)) % 0.5 + 0.25,
     }
     values |= dict(zip(("luma", "blue", "green"), (leaf("color_dc") @ AXES.T).T, strict=True))
-    place = np.concatenate([leaf("loc")[:, None], leaf("coefficients")], 1)
+    polynomials = np.concatenate([leaf("loc")[:, None], leaf("coefficients")], 1)
     own = swapped, turn, splats.static + 2 * splats.opaque.astype(np.int32), shade
-    exact = ExactColumns(info, *own, values, place, np.asarray(model.frame_times.logits, np.float64))
+    exact = ExactColumns(info, *own, values, polynomials, np.asarray(model.frame_times.logits, np.float64))
     if splats.paths is None:
         return exact
     check_paths(splats)
@@ -480,10 +482,10 @@ def choose_cell_bits(num_gaussians: int, size: tuple[int, int]) -> tuple[int, in
     return (more, fewer, of_time) if width >= height else (fewer, more, of_time)
 
 
-def path_matrix(
+def trajectory_matrix(
     time: Float[np.ndarray, " num"], duration: Float[np.ndarray, " num"], info: CompactInfo
 ) -> Float[np.ndarray, "num degree+1 degree+1"]:
-    """M with (m_s, c_1, ..) = M (path's columns), by decoding unit vectors."""
+    """M with (m_s, c_1, ..) = M (trajectory's columns), by decoding unit vectors."""
     num, degree = len(time), info.degree
     info = dataclasses.replace(info, num_gaussians=num)
     out = np.empty((num, degree + 1, degree + 1))
@@ -510,7 +512,7 @@ def quantize(
     if info.shared:
         first = np.unique(exact.shade, return_index=True)[1]
         values |= {name: values[name][first] for name in COLORS} | {"shade": exact.shade}
-    # The path's degree is known only after rounding it.
+    # The trajectory's degree is known only after rounding it.
     whole = {"degree": np.full(info.num_gaussians, info.degree, np.int32)}
     columns, saved = _round_columns(info.column_names, values | whole, exact, rules)
     columns["degree"] = degrees = _choose_degrees(saved)
@@ -524,10 +526,10 @@ def quantize(
 
 
 def find_cells(exact: ExactColumns) -> Int32[np.ndarray, " num"]:
-    """The cell of each Gaussian, from the middle of its path."""
+    """The cell of each Gaussian, from the middle of its trajectory."""
     values = exact.values
-    path = _compute_paths(exact, values)
-    return locate_cells(path["x0"], path["y0"], clamp_unit(values["time"]), exact.info)
+    columns = _compute_trajectories(exact, values)
+    return locate_cells(columns["x0"], columns["y0"], clamp_unit(values["time"]), exact.info)
 
 
 def _choose_degrees(saved: Float[np.ndarray, "degree+1 num"]) -> Int32[np.ndarray, " num"]:
@@ -536,24 +538,24 @@ def _choose_degrees(saved: Float[np.ndarray, "degree+1 num"]) -> Int32[np.ndarra
     return worth.max(axis=0, initial=0).astype(np.int32)
 
 
-def unrounded_paths(quantized: Quantized, exact: ExactColumns) -> Float[np.ndarray, "num degree+1 2"]:
+def unrounded_trajectories(quantized: Quantized, exact: ExactColumns) -> Float[np.ndarray, "num degree+1 2"]:
     """Paths before rounding, in powers of u = decoded m_t - t, truncated to the stored degrees."""
     info, values = quantized.info, decode_values(quantized)
-    path = _compute_paths(exact, values)
-    place = np.stack([np.stack([path[f"{axis}{k}"] for axis in "xy"], 1) for k in range(info.degree + 1)], 1)
-    place[np.arange(info.degree + 1) > quantized.columns["degree"][:, None]] = 0
-    return path_matrix(clamp_unit(values["time"]), values["duration"], info) @ place
+    columns = _compute_trajectories(exact, values)
+    polynomials = np.stack([np.stack([columns[f"{axis}{k}"] for axis in "xy"], 1) for k in range(info.degree + 1)], 1)
+    polynomials[np.arange(info.degree + 1) > quantized.columns["degree"][:, None]] = 0
+    return trajectory_matrix(clamp_unit(values["time"]), values["duration"], info) @ polynomials
 
 
 def _round_columns(
     names: tuple[str, ...], values: dict[str, np.ndarray], exact: ExactColumns, rules: dict[str, Rule]
 ) -> tuple[dict[str, Int32[np.ndarray, " rows"]], Float[np.ndarray, "degree+1 num"]]:
-    """The integers of all columns, and the squared error, in steps, that the path's powers save."""
+    """The integers of all columns, and the squared error, in steps, that the trajectory's powers save."""
     decoder, columns = ColumnDecoder(rules, exact.info), {}
     saved = np.zeros((exact.info.degree + 1, exact.info.num_gaussians))
     for name in names:
         if name == "x0":
-            values = values | _compute_paths(exact, decoder.values)
+            values = values | _compute_trajectories(exact, decoder.values)
         halves = decoder.half_exponents(name)
         origin, steps = decoder.origin(name), compute_steps(halves, name)
         scaled = np.where(decoder.has(name), (values[name] - origin) / steps, 0)
@@ -569,16 +571,16 @@ def _round_columns(
             )
         columns[name] = numbers.astype(np.int32)
         decoder.add(name, columns[name], halves)
-        if path_power(name):
-            saved[path_power(name)] += scaled**2 - (scaled - numbers) ** 2
+        if trajectory_power(name):
+            saved[trajectory_power(name)] += scaled**2 - (scaled - numbers) ** 2
     return columns, saved
 
 
-def _compute_paths(exact: ExactColumns, decoded: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The path's columns: the same path in time, relative to the m_t and the span that are decoded."""
+def _compute_trajectories(exact: ExactColumns, decoded: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The trajectory's columns: the same curve in time, relative to the m_t and the span that are decoded."""
     time = clamp_unit(decoded["time"])
-    place = shift_path(exact.place, time - exact.values["time"])
-    matrix = path_matrix(time, decoded["duration"], exact.info)
+    polynomials = shift_path(exact.polynomials, time - exact.values["time"])
+    matrix = trajectory_matrix(time, decoded["duration"], exact.info)
     size = np.abs(matrix).max(2, keepdims=True)  # rows differ greatly in size: c_k scales with a power of time
-    path = np.linalg.solve(matrix / size, place / size)
-    return {f"{axis}{k}": path[:, k, a] for k in range(path.shape[1]) for a, axis in enumerate("xy")}
+    solved = np.linalg.solve(matrix / size, polynomials / size)
+    return {f"{axis}{k}": solved[:, k, a] for k in range(solved.shape[1]) for a, axis in enumerate("xy")}

@@ -1,10 +1,10 @@
 """Compression search: the coarsest quantization of a model within a stated loss of PSNR.
 
 Each parameter's step is chosen by the sensitivity of the images to it (`estimate_sensitivities`): by rate-distortion
-theory, every parameter then adds the same error. A single factor scales all steps; it is found by bisection, and each
-try is rendered and measured. Gaussians whose removal costs less than their bits are dropped, the others are reordered
-(`sort_order`), and parameters that are not rounded yet are fine-tuned to the clip (`finetune`) to compensate for those
-that are.
+theory, every parameter then adds the same error. A common factor 2^coarseness scales all steps; the coarseness is found
+by bisection, and each try is rendered and measured. Gaussians whose removal costs less than their bits are dropped, the
+others are reordered (`sort_order`), and parameters that are not rounded yet are fine-tuned to the clip (`finetune`) to
+compensate for those that are.
 """
 
 import dataclasses
@@ -36,7 +36,7 @@ from foldgauss.video.compression.quantize import (
     index_colors,
     is_integral,
     quantize,
-    unrounded_paths,
+    unrounded_trajectories,
 )
 from foldgauss.video.compression.sensitivity import estimate_sensitivities
 from foldgauss.video.compression.sort_order import find_overlaps, sort_by_cell
@@ -49,19 +49,20 @@ from foldgauss.video.models.splats import SH_C0
 from foldgauss.video.models.video_model import VideoModel, check_model
 from foldgauss.video.selection.contributions import Contributions
 
-#: PSNR assumed of the fit if neither its clip nor its PSNR is given: few fits are better, and of worse ones the loss
-#: is less than stated.
+#: PSNR assumed of the fit if neither its clip nor its PSNR is given. If the true one is lower, the loss is less than
+#: stated.
 ASSUMED_PSNR = 40.0
 #: PSNR of an image that differs only by rounding to 8 bits, an error of variance 1/12. Better frames, such as black
 #: ones, count as this: an invisible loss in them would otherwise cost all others their bits.
 EXACT_PSNR = 10 * math.log10(12 * 255**2)
 #: Frames that a try is measured on; the result is measured on all.
 TRIED_FRAMES = 24
-#: Binary logarithms of the factor of all steps: the finest, the coarsest, and the tolerance of the search.
+#: Coarseness, the binary logarithm of the common factor of all steps: the finest, the coarsest, and the tolerance of
+#: the search.
 _FINEST, _COARSEST, _CLOSE = -8.0, 9.0, 0.05
 #: A Gaussian is dropped if that adds less error than this multiple of a parameter's own: its bits, times 2 ln 2.
 _WORTH = 40.0
-#: How much coarser, in powers of two, the first try with fine-tuning is; and the loss per power of two, dB.
+#: How much greater the coarseness of the first try with fine-tuning is; and the loss per power of two, dB.
 _COARSER, _SLOPE = 1.7, 0.7
 #: Gaussians are dropped in stages, each with passes / 2 passes of fine-tuning, after which the model should have lost
 #: this fraction of the allowed loss.
@@ -70,21 +71,22 @@ _STAGES, _STAGES_OF_PASSES, _DROPPING = 5, 2, 0.75
 #: leaves the fraction `_LEFT` of what was dropped; beside that it gains some dB, at first about `_FIRST_GAINED`, and in
 #: each stage `_FADING` times as many as in the one before.
 _FIRST_GAINED, _FADING, _LEFT, _MOST_DROPPED = 0.35, 0.8, 0.13, 6.0
-#: How much coarser or finer, in powers of two, the steps may be at which a dropped Gaussian is not worth its bits.
+#: How much greater or less than that of rounding alone the coarseness may be at which a Gaussian is not worth its bits.
 _DROPPED_RANGE = 24.0
-#: Leaves of `FoldedSplats` that are rounded together. Stages of rounding: the group, the share of the Gaussians whose
-#: leaves of it are rounded then or earlier, and the passes that fine-tune everything else, as a fraction of `passes`.
+#: Leaves of `FoldedSplats` that are rounded together. Stages of rounding: the group, the fraction of the Gaussians
+#: whose leaves of it are rounded then or earlier, and the passes that fine-tune everything else, as a fraction of
+#: `passes`.
 SHAPE = ("log_scale", "angle_logit", "time_loc_logit", "log_time_scale", "opacity_logit")
-PATH, COLOR = ("loc", "coefficients"), ("color_dc",)
-_GROUPS = SHAPE, PATH, COLOR
+TRAJECTORY, COLOR = ("loc", "coefficients"), ("color_dc",)
+_GROUPS = SHAPE, TRAJECTORY, COLOR
 _RoundingStages = tuple[tuple[tuple[str, ...], float, float], ...]
 _ROUNDING: _RoundingStages = (
     *((SHAPE, 0.4, 0.15), (SHAPE, 0.75, 0.15), (SHAPE, 1.0, 0.1)),
-    *((PATH, 0.5, 0.1), (PATH, 1.0, 0.075)),
+    *((TRAJECTORY, 0.5, 0.1), (TRAJECTORY, 1.0, 0.075)),
     (COLOR, 0.5, 0.05),
 )
 #: The same with fewer than so many passes, of which each of those stages would have one or two.
-_ROUNDING_SHORT, _FEW_PASSES = ((SHAPE, 1.0, 0.25), (PATH, 1.0, 0.125)), 24
+_ROUNDING_SHORT, _FEW_PASSES = ((SHAPE, 1.0, 0.25), (TRAJECTORY, 1.0, 0.125)), 24
 _SEED = 0
 #: Tries with fine-tuning; the fraction of the allowed loss that they aim at, and the one that ends them.
 _TRIES, _AIM, _ENOUGH = 6, 0.97, 0.94
@@ -137,10 +139,11 @@ def compress(
     (`FoldedSplats.degrees`, `static`, `opaque`) stay absent, and shared colors stay shared. Shared paths stay as they
     are, to about a fiftieth of a pixel.
 
-    With the clip, fine-tuning compensates for losses and allows coarser steps: all leaves for half of the `passes` each
-    time Gaussians have been dropped; and in each try of a factor of the steps for about 5/8 of them (3/8 of fewer than
-    24), while ever more leaves of ever more Gaussians are rounded. More passes make smaller files. With 0 passes every
-    parameter is the model's own, rounded.
+    With the clip, fine-tuning compensates for losses and allows coarser steps. Each of five stages of pruning is
+    followed by `passes / 2` passes over the clip. Each try of a coarseness of the steps takes another 5/8 `passes`
+    (3/8 of fewer than 24), in which parameters are rounded group by group while the others adapt. More passes make
+    smaller files. Without the clip, or with 0 passes, Gaussians that are not worth their bits are dropped, and the
+    parameters of the others are rounded.
     `on_step(what, loss_db)` is called now and then, with NaN before anything has been measured.
 
     Raises ValueError for anything but a `VideoModel` (bake edits first), for NaN or infinities, several envelopes, a
@@ -159,32 +162,34 @@ def compress(
     loss = _Loss(model, frames, psnr)
     found = None
     if passes and frames is not None:
-        plan = _Plan(model)
-        rounded = _search_rounded(plan, loss, max_loss_db, on_step)
-        found = _search_finetuned(model, plan, rounded.factor, loss, max_loss_db, passes, on_step)
+        quantizer = _Quantizer(model)
+        rounded = _search_rounded(quantizer, loss, max_loss_db, on_step)
+        found = _search_finetuned(model, quantizer, rounded.coarseness, loss, max_loss_db, passes, on_step)
     if found is None:
-        found = _search_rounded(_Plan(_reorder(model, loss, max_loss_db)), loss, max_loss_db, on_step)
+        found = _search_rounded(_Quantizer(_reorder(model, loss, max_loss_db)), loss, max_loss_db, on_step)
     dropped = model.num_gaussians - found.model.num_gaussians
     return Compressed(found.quantized, found.model, found.loss_db, loss.psnr, loss.measured_by, dropped)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Try:
-    factor: float
+    """A model quantized with steps times 2^`coarseness`, what it decodes to, and its loss in dB."""
+
+    coarseness: float
     quantized: Quantized
     model: VideoModel
     loss_db: float
 
 
-def _search_rounded(plan: "_Plan", loss: "_Loss", max_loss: float, on_step: Callable) -> _Try:
+def _search_rounded(quantizer: "_Quantizer", loss: "_Loss", max_loss: float, on_step: Callable) -> _Try:
     """The coarsest steps that lose at most `max_loss`, without fine-tuning."""
 
-    def attempt(factor: float, which: Int[np.ndarray, " some"]) -> _Try:
-        quantized = plan.quantize(factor, plan.keep(factor))
+    def attempt(coarseness: float, which: Int[np.ndarray, " some"]) -> _Try:
+        quantized = quantizer.quantize(coarseness, quantizer.keep(coarseness))
         model = dequantize(quantized)
         measured = loss(model, which)
         on_step("rounding", measured)
-        return _Try(factor, quantized, model, measured)
+        return _Try(coarseness, quantized, model, measured)
 
     fine, coarse = _FINEST, _COARSEST
     while coarse - fine > _CLOSE:
@@ -201,14 +206,17 @@ def _search_rounded(plan: "_Plan", loss: "_Loss", max_loss: float, on_step: Call
 
 def _search_finetuned(
     model: VideoModel,
-    complete: "_Plan",
-    least: float,
+    complete: "_Quantizer",
+    base: float,
     loss: "_Loss",
     max_loss: float,
     passes: int,
     on_step: Callable,
 ) -> _Try | None:
-    """The coarsest steps found that lose at most `max_loss` after fine-tuning; None unless above the factor `least`."""
+    """The coarsest steps found that lose at most `max_loss` after fine-tuning; None if rounding alone allows as coarse.
+
+    `base`: the coarseness that rounding alone allows.
+    """
 
     def finetune(model: VideoModel, fraction: float, what: str, **how: object) -> VideoModel:
         return finetune_model(
@@ -216,11 +224,11 @@ def _search_finetuned(
         )
 
     ordering = _FIRST_ORDERING * min(passes / _WITH_PASSES, 1) * min(max_loss / _WITH_LOSS, 1) ** 2
-    smaller = _drop_in_stages(model, complete, least, loss, max_loss, ordering, finetune, on_step)
+    smaller = _drop_in_stages(model, complete, base, loss, max_loss, ordering, finetune, on_step)
     rounding = _ROUNDING if passes >= _FEW_PASSES else _ROUNDING_SHORT
     # Where the last stage leaves too little of the loss for rounding, the one before.
     tries = (
-        _search_factor(_Plan(_reorder(one, loss, max_loss)), least, loss, max_loss, rounding, finetune, on_step)
+        _search_coarseness(_Quantizer(_reorder(one, loss, max_loss)), base, loss, max_loss, rounding, finetune, on_step)
         for one in reversed(smaller)
     )
     return next(filter(None, tries), None)
@@ -228,8 +236,8 @@ def _search_finetuned(
 
 def _drop_in_stages(
     model: VideoModel,
-    plan: "_Plan",
-    least: float,
+    quantizer: "_Quantizer",
+    base: float,
     loss: "_Loss",
     max_loss: float,
     ordering: float,
@@ -244,7 +252,7 @@ def _drop_in_stages(
     for stages_left in reversed(range(_STAGES)):
         dropped = min(max((_DROPPING * max_loss - so_far + _FADING * gained) / _LEFT, 0.0), most)
         if dropped:
-            current = _drop(current, plan, loss, least, so_far + dropped)
+            current = _drop(current, quantizer, loss, base, so_far + dropped)
         current = _Sorting(current)(ordering * loss.error)
         what, seed = "fine-tuning after dropping Gaussians", _STAGES - 1 - stages_left
         current = finetune(current, 1 / _STAGES_OF_PASSES, what, seed=seed, shared=index_colors(current))
@@ -255,13 +263,13 @@ def _drop_in_stages(
             kept.append((current, so_far))
         elif so_far - stages_left * _FADING * gained > max_loss:  # too many to make up for
             (current, so_far), most, ordering = kept[-1], most / 2, ordering / _LESS_ORDERING
-        plan = _Plan(current)
+        quantizer = _Quantizer(current)
     return [model for model, _ in kept]
 
 
-def _search_factor(
-    plan: "_Plan",
-    least: float,
+def _search_coarseness(
+    quantizer: "_Quantizer",
+    base: float,
     loss: "_Loss",
     max_loss: float,
     stages: _RoundingStages,
@@ -269,54 +277,55 @@ def _search_factor(
     on_step: Callable,
 ) -> _Try | None:
     """As `_search_finetuned`, without dropping Gaussians; `stages` of rounding as `_ROUNDING`."""
-    best, tried, factor = None, {}, least + _COARSER
+    best, tried, coarseness = None, {}, base + _COARSER
     for _ in range(_TRIES):
-        quantized = _round_in_stages(plan, factor, finetune, stages)
+        quantized = _round_in_stages(quantizer, coarseness, finetune, stages)
         decoded = dequantize(quantized)
-        tried[factor] = measured = loss(decoded, loss.all_frames)
+        tried[coarseness] = measured = loss(decoded, loss.all_frames)
         on_step("fine-tuned", measured)
-        if measured <= max_loss and (best is None or factor > best.factor):
-            best = _Try(factor, quantized, decoded, measured)
+        if measured <= max_loss and (best is None or coarseness > best.coarseness):
+            best = _Try(coarseness, quantized, decoded, measured)
             if measured > _ENOUGH * max_loss:
                 break
-        factor = _next_factor(tried, max_loss, least)
-        if factor is None:
+        coarseness = _next_coarseness(tried, max_loss, base)
+        if coarseness is None:
             break
     return best
 
 
-def _next_factor(tried: dict[float, float], max_loss: float, least: float) -> float | None:
-    """The next factor to try: between those on either side of `max_loss`, or a bounded step beyond the last one.
+def _next_coarseness(tried: dict[float, float], max_loss: float, base: float) -> float | None:
+    """The next coarseness to try, greater than `base`; None if there is none.
 
-    The squared error is modelled as a constant plus that of rounding, which grows as 4^factor.
+    It is between those on either side of `max_loss`, or a bounded step beyond the last one.
+    The squared error is modelled as a constant plus that of rounding, which grows as 4^coarseness.
     """
     aim = _AIM * max_loss
-    below = max((factor for factor, loss in tried.items() if loss <= max_loss), default=None)
-    above = min((factor for factor, loss in tried.items() if loss > max_loss), default=None)
+    below = max((coarseness for coarseness, loss in tried.items() if loss <= max_loss), default=None)
+    above = min((coarseness for coarseness, loss in tried.items() if loss > max_loss), default=None)
     if below is not None and above is not None:
         if above - below < 0.5 * _CLOSE:
             return None
         wanted, less, more = (10 ** (loss / 10) for loss in (aim, tried[below], tried[above]))
         fraction = (wanted - less) / max(more - less, 1e-9)
-        factor = math.log(max(4.0**below + fraction * (4.0**above - 4.0**below), 1e-9), 4)
-        return below + min(max(factor - below, 0.1 * (above - below)), 0.9 * (above - below))
-    nearest, *others = sorted(tried, key=lambda factor: abs(tried[factor] - aim))
+        coarseness = math.log(max(4.0**below + fraction * (4.0**above - 4.0**below), 1e-9), 4)
+        return below + min(max(coarseness - below, 0.1 * (above - below)), 0.9 * (above - below))
+    nearest, *others = sorted(tried, key=lambda coarseness: abs(tried[coarseness] - aim))
     slope = _SLOPE
     if others:
         slope = (tried[others[0]] - tried[nearest]) / (others[0] - nearest)
         slope = min(max(slope, 0.3 * _SLOPE), 2 * _SLOPE)
-    factor = nearest + min((aim - tried[nearest]) / slope, _MAX_EXTRAPOLATION)
-    return factor if least < factor <= _COARSEST + 2 else None
+    coarseness = nearest + min((aim - tried[nearest]) / slope, _MAX_EXTRAPOLATION)
+    return coarseness if base < coarseness <= _COARSEST + 2 else None
 
 
-def _drop(model: VideoModel, plan: "_Plan", loss: "_Loss", least: float, most: float) -> VideoModel:
+def _drop(model: VideoModel, quantizer: "_Quantizer", loss: "_Loss", base: float, most: float) -> VideoModel:
     """The model without as many of the Gaussians that matter least as costs at most `most` dB."""
-    fine, coarse = least - _DROPPED_RANGE, least + _DROPPED_RANGE
+    fine, coarse = base - _DROPPED_RANGE, base + _DROPPED_RANGE
     while coarse - fine > 2 * _CLOSE:
         middle = (fine + coarse) / 2
-        lost = loss(_take(model, plan.keep(middle)), loss.sampled_frames)
+        lost = loss(_take(model, quantizer.keep(middle)), loss.sampled_frames)
         fine, coarse = (middle, coarse) if lost <= most else (fine, middle)
-    return _take(model, plan.keep(fine))
+    return _take(model, quantizer.keep(fine))
 
 
 def _reorder(model: VideoModel, loss: "_Loss", max_loss: float) -> VideoModel:
@@ -351,16 +360,18 @@ def _take(model: VideoModel, which: Bool[np.ndarray, " num"] | Int[np.ndarray, "
 _Fixed = dict[tuple[str, ...], Bool[np.ndarray, " num"]]
 
 
-def _round_in_stages(plan: "_Plan", factor: float, finetune: Callable, stages: _RoundingStages) -> Quantized:
-    """The model quantized with steps times 2^factor, in `stages` as those of `_ROUNDING`."""
-    quantized, exact = plan.quantize(factor), plan.exact
+def _round_in_stages(
+    quantizer: "_Quantizer", coarseness: float, finetune: Callable, stages: _RoundingStages
+) -> Quantized:
+    """The model quantized with steps times 2^coarseness, in `stages` as those of `_ROUNDING`."""
+    quantized, exact = quantizer.quantize(coarseness), quantizer.exact
     num, rng = exact.info.num_gaussians, np.random.default_rng(_SEED)
     ranks = dict.fromkeys(_GROUPS, rng.permutation(num) / num)
     if exact.shade is not None:  # Gaussians that share a color are rounded together
         ranks[COLOR] = (rng.permutation(exact.info.shared) / exact.info.shared)[exact.shade]
     fixed = {group: np.zeros(num, bool) for group in _GROUPS}
-    for group, share, fraction in stages:
-        fixed[group] = ranks[group] < share
+    for group, rounded, fraction in stages:
+        fixed[group] = ranks[group] < rounded
         start = _round_fixed(quantized, exact, fixed)
         frozen = {name: which for group, which in fixed.items() for name in group}
         tuned = finetune(start, fraction, "fine-tuning the rest", fixed=frozen, seed=1, shared=exact.shade)
@@ -375,16 +386,16 @@ def _round_fixed(quantized: Quantized, exact: ExactColumns, fixed: _Fixed) -> Vi
     """The model whose leaves are decoded where they are `fixed`, and exact elsewhere."""
     model, v = dequantize(quantized), exact.values
     time = clamp_unit(np.where(fixed[SHAPE], decode_values(quantized)["time"], v["time"]))
-    moved = shift_path(exact.place, time - v["time"])
-    place = np.where(fixed[SHAPE][:, None, None], unrounded_paths(quantized, exact), moved)
+    moved = shift_path(exact.polynomials, time - v["time"])
+    polynomials = np.where(fixed[SHAPE][:, None, None], unrounded_trajectories(quantized, exact), moved)
     leaves = {
         "log_scale": np.stack([v["size"] + v["stretch"], v["size"] - v["stretch"]], 1),
         "angle_logit": scipy.special.logit(clamp_unit(v["angle"])),
         "time_loc_logit": scipy.special.logit(time),
         "log_time_scale": v["duration"],
         "opacity_logit": v["opacity"],
-        "loc": place[:, 0],
-        "coefficients": place[:, 1:],
+        "loc": polynomials[:, 0],
+        "coefficients": polynomials[:, 1:],
         "color_dc": np.stack([v[name] for name in COLORS], 1) @ AXES,
     }
     for group, which in fixed.items():
@@ -400,9 +411,9 @@ def _keep_fixed(quantized: Quantized, exact: ExactColumns, tuned: VideoModel, fi
     now, decoded = compute_columns(tuned), decode_values(quantized)
     of = {name: fixed[COLOR if name in COLORS else SHAPE] for name in now.values}
     values = {name: np.where(of[name], decoded[name], now.values[name]) for name in now.values}
-    # Rounded paths are rounded again from the same exact ones, hence to the same integers.
-    place = np.where(fixed[PATH][:, None, None], exact.place, now.place)
-    return dataclasses.replace(exact, values=values | {"time": clamp_unit(values["time"])}, place=place)
+    # Rounded trajectories are rounded again from the same exact ones, hence to the same integers.
+    polynomials = np.where(fixed[TRAJECTORY][:, None, None], exact.polynomials, now.polynomials)
+    return dataclasses.replace(exact, values=values | {"time": clamp_unit(values["time"])}, polynomials=polynomials)
 
 
 class _Loss:
@@ -448,8 +459,8 @@ class _Loss:
         return np.ascontiguousarray(np.moveaxis(image, -1, 0) * np.float32(1 / 255)), background
 
 
-class _Plan:
-    """Quantizes a model by rules that are fixed except for the common factor of the steps."""
+class _Quantizer:
+    """Quantizes a model by rules that are fixed but for the coarseness."""
 
     def __init__(self, model: VideoModel):
         self.exact = compute_columns(model)
@@ -505,14 +516,17 @@ class _Plan:
                 summed = np.bincount(self.exact.shade, sensitivity[name])
                 self._fits[name] = np.array([0.5 * np.log2(np.mean(summed) + 1e-30)])
 
-    def keep(self, factor: float) -> Bool[np.ndarray, " num"]:
+    def keep(self, coarseness: float) -> Bool[np.ndarray, " num"]:
         """The Gaussians that are worth their bits at such steps; at least one."""
-        kept = self._removal > _WORTH * 4.0**factor / 12
+        kept = self._removal > _WORTH * 4.0**coarseness / 12
         kept[np.argmax(self._removal)] = True
         return kept
 
-    def quantize(self, factor: float, kept: Bool[np.ndarray, " num"] | None = None) -> Quantized:
-        """The Gaussians `kept` (None: all), with steps times 2^factor: a parameter's error is about 4^factor / 12."""
+    def quantize(self, coarseness: float, kept: Bool[np.ndarray, " num"] | None = None) -> Quantized:
+        """The Gaussians `kept` (None: all), with steps times 2^coarseness.
+
+        A parameter's squared error, summed over the clip, is about 4^coarseness / 12, in levels of 8 bits.
+        """
         kept = np.ones(len(self._removal), bool) if kept is None else kept
         exact = _select_rows(self.exact, kept)
         rules, shared = {}, exact.info.shared
@@ -526,7 +540,7 @@ class _Plan:
             slopes = (-1.0,) if name in FEATURES else (-1.0, *(-slope for slope in slopes))
             if name in COLORS and shared:
                 slopes = ()
-            rules[name] = Rule(origin, round(factor - exponent, 4), slopes)
+            rules[name] = Rule(origin, round(coarseness - exponent, 4), slopes)
         return quantize(exact, self._classes[kept], rules)
 
 
@@ -540,5 +554,5 @@ def _select_rows(exact: ExactColumns, kept: Bool[np.ndarray, " num"]) -> ExactCo
         used, shade = np.unique(shade[kept], return_inverse=True)
         info, shade = dataclasses.replace(info, shared=len(used)), shade.ravel().astype(np.int32)
     path = None if exact.path is None else exact.path[kept]
-    own = exact.swapped[kept], exact.turn[kept], exact.without[kept], shade, values, exact.place[kept]
+    own = exact.swapped[kept], exact.turn[kept], exact.without[kept], shade, values, exact.polynomials[kept]
     return ExactColumns(info, *own, exact.logits, path, exact.paths)

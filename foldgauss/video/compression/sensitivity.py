@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from foldgauss.render import cpu
-from foldgauss.video.compression.quantize import AXES, ExactColumns, path_matrix
+from foldgauss.video.compression.quantize import AXES, ExactColumns, trajectory_matrix
 from foldgauss.video.models.conditioning import backpropagate
 from foldgauss.video.models.row_layout import columns
 from foldgauss.video.selection.contributions import Contributions
@@ -47,18 +47,18 @@ class _ColumnGradients:
     def __init__(self, exact: ExactColumns):
         v, info = exact.values, exact.info
         self._exact, self._at = exact, columns(info.degree)
-        self._matrix = path_matrix(v["time"], v["duration"], info)
+        self._matrix = trajectory_matrix(v["time"], v["duration"], info)
         self._flip = np.where(exact.swapped, -1.0, 1.0)
         k = np.arange(1, info.degree + 1)[:, None]
-        # A later m_t with the same path in time, see `shift_path`.
-        self._by_time = np.concatenate([k * exact.place[:, 1:], np.zeros((len(self._flip), 1, 2))], 1)
-        path = [f"{axis}{j}" for j in range(info.degree + 1) for axis in "xy"]
-        self.names = ["size", "stretch", "duration", "opacity", "time", "angle", "luma", "blue", "green", *path]
+        # A later m_t with the same curve in time, see `shift_path`.
+        self._by_time = np.concatenate([k * exact.polynomials[:, 1:], np.zeros((len(self._flip), 1, 2))], 1)
+        trajectory = [f"{axis}{j}" for j in range(info.degree + 1) for axis in "xy"]
+        self.names = ["size", "stretch", "duration", "opacity", "time", "angle", "luma", "blue", "green", *trajectory]
 
     def __call__(self, rows: Float[np.ndarray, "alive width"], alive: np.ndarray) -> dict[str, np.ndarray]:
         at, v = self._at, self._exact.values
         scale = rows[:, at["log_scale"]]
-        place = np.concatenate([rows[:, at["loc"]], rows[:, at["coefficients"]]], 1).reshape(len(rows), -1, 2)
+        polynomials = np.concatenate([rows[:, at["loc"]], rows[:, at["coefficients"]]], 1).reshape(len(rows), -1, 2)
         time, turn = v["time"][alive], self._exact.turn[alive]
         by_time = rows[:, at["time_loc_logit"].start] / np.maximum(time * (1 - time), 1e-12)
         made = {
@@ -66,9 +66,9 @@ class _ColumnGradients:
             "stretch": (scale[:, 0] - scale[:, 1]) * self._flip[alive],
             "duration": rows[:, at["log_time_scale"].start],
             "opacity": rows[:, at["opacity_logit"].start],
-            "time": by_time - (place * self._by_time[alive]).sum((1, 2)),
+            "time": by_time - (polynomials * self._by_time[alive]).sum((1, 2)),
             "angle": rows[:, at["angle_logit"].start] / np.maximum(turn * (1 - turn), 1e-12),
         }
         made |= dict(zip(("luma", "blue", "green"), AXES @ rows[:, at["color_dc"]].T, strict=True))
-        path = np.einsum("njk,nja->nka", self._matrix[alive], place)
-        return made | {f"{axis}{k}": path[:, k, a] for k in range(path.shape[1]) for a, axis in enumerate("xy")}
+        by_power = np.einsum("njk,nja->nka", self._matrix[alive], polynomials)
+        return made | {f"{axis}{k}": by_power[:, k, a] for k in range(by_power.shape[1]) for a, axis in enumerate("xy")}

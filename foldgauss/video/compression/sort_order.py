@@ -18,8 +18,8 @@ from foldgauss.video.selection.contributions import Contributions
 
 #: About how many pixels of a frame are sampled, on a grid, and its least spacing.
 _POINTS, _STRIDE = 4000, 2
-#: Layers of a pixel that are examined, from the front. Least transmittance that is assumed: a Gaussian hidden by many
-#: together could otherwise pass each of them for free. Product of alphas and transmittance below which two Gaussians do
+#: Layers of a pixel that are examined, from the front. Least transmittance that is assumed: otherwise a Gaussian behind
+#: many could be swapped with each of them at no cost. Product of alphas and transmittance below which two Gaussians do
 #: not overlap.
 _LAYERS, _MIN_TRANSMITTANCE, _FAINT = 256, 0.2, 0.004
 _EMPTY = -1

@@ -5,11 +5,9 @@ those with m_s mapped, A f and A Sigma_s A^T; f is a polynomial, so its coeffici
 t -> t_0 + shift + r (t - t_0) maps m_t; sigma_t becomes abs(r) sigma_t, and the argument of the fold grows by r, so c_k
 becomes c_k / r^k. Source: VeGaS eq:cond_dens.
 
-Gaussians on a shared path A(t) are drawn at A(t) (q + f), and E A(t) (q + f) = (E A(t) E^-1) E (q + f): an affine map E
-is baked as above, and they get the path E A E^-1. With a change of time, the times of the path are mapped as m_t is.
-
-Computed in float64, then rounded to the parameters' dtype. A function returns None where no parameters represent the
-edit.
+Gaussians on a shared path A(t) are rendered at A(t) (q + f), and E A(t) (q + f) = (E A(t) E^-1) E (q + f): an affine
+map E is baked as above, and they get the path E A E^-1. With a change of time, the times of the path are mapped as m_t
+is.
 """
 
 import dataclasses

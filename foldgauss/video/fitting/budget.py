@@ -75,7 +75,7 @@ class StepPlanner:
         if not state.plan:
             enough = self.seconds >= PLANNED_AT[0] * budget
             return enough or (self.config.steps is not None and state.step >= self.config.steps * PLANNED_AT[0])
-        # By the plan, too: where the machine has become faster, it would end before its time.
+        # Also by the steps of the plan: where steps have become faster, the fit would otherwise end early.
         before = max((state.seconds - self.seconds) / budget, state.planned_progress)
         now = max(state.seconds / budget, measure_progress(state, self.config))
         return any(before < part <= now for part in PLANNED_AT)

@@ -74,7 +74,7 @@ PUBLISHED_RATES = LearningRates(
     log_time_scale=1e-3,
     frame_times=1e-3,
 )
-#: Standard deviations, in its units, above which the published code draws a Gaussian.
+#: Standard deviations, in its units, above which the published code renders a Gaussian.
 PUBLISHED_SCALE_CUTOFF = 1e-4
 #: The fields that each preset changes, see `FitConfig.preset`.
 PRESETS: dict[str, dict[str, Any]] = {
@@ -208,7 +208,7 @@ class FitConfig:
     scale_cutoff: float = field(
         default=0.0,
         metadata=setting(
-            "Gaussians are drawn only where both standard deviations exceed this, in model units",
+            "Gaussians are rendered only where both standard deviations exceed this, in model units",
             "These are shrunk by the envelope. The published code has 1e-4 of its units, 0.18 px of 640x1280.",
             bounds="[0, 1)",
             group=MODEL,
@@ -350,7 +350,9 @@ class FitConfig:
     decayed: str = field(
         default="all", metadata=setting("Which learning rates decay: all, or that of positions", choices=DECAYED)
     )
-    two_cameras: bool = field(default=False, metadata=setting("Fit mirrored views too, see above"))
+    two_cameras: bool = field(
+        default=False, metadata=setting("Also fit the mirrored frames, as seen by an opposite camera")
+    )
     growth: Growth | None = field(
         default=None, metadata=setting("Densification", unset="the number of Gaussians stays the same")
     )
@@ -426,8 +428,8 @@ class FitConfig:
           7, batches of 3, 30,000 steps, 0.8 L1 + 0.2 D-SSIM, two opposite cameras, the published learning rates, of
           which only that of positions decays (to 1/100), Adam updates of all Gaussians, the published rasterizer's
           constants. Other numbers of steps scale the growth schedule in proportion, but not the learning rates, so fits
-          of a few thousand steps stop early. Not reproduced: the published code skips Gaussians thinner than 1e-4 of
-          its units.
+          of a few thousand steps stop early. As in the published code a Gaussian is rendered only where both standard
+          deviations, multiplied by the envelope, exceed 1e-4 of its units (`scale_cutoff`).
           Source: VeGaS, "Implementation Details", and constants of its published code.
 
         Raises ValueError for an unknown name or change. Example: `FitConfig.preset("paper", steps=3000)`.

@@ -89,9 +89,11 @@ def fit(
     Alpha, by which colors are premultiplied, is learned by compositing frames and splats over random backgrounds:
     `psnr` and `loss` are measured over these. The model is rendered over black by default.
 
-    `observers` are called with (state, info) after every step: progress bars, checkpoints. Raises ValueError for
-    frames or settings that cannot be fitted. No budget includes the compilation of kernels, some 20 s when they are
-    used for the first time. Without `minutes` the bits are the same for any number of threads.
+    `fps`: frames per second. `observers` are called with (state, info) after every step: progress bars, checkpoints.
+    `every`: the history keeps every so many steps, and the last. Raises ValueError for frames or settings that cannot
+    be fitted, and `FitDiverged` as `config.on_divergence` has it; otherwise a fit that diverges warns by
+    `DivergenceWarning` and goes on from its last finite state. No budget includes the compilation of kernels, some 20 s
+    when they are used for the first time. Without `minutes` the bits are the same for any number of threads.
 
     Example: `fit(frames, FitConfig(steps=1000)).model.render(0.5)`. Source: VeGaS, section 4.
     """
@@ -116,7 +118,9 @@ def fit_steps(
     motion: Motion | None = None,
     clock: Callable[[], float] = time.perf_counter,
 ) -> Iterator[tuple[FitState, FitInfo]]:
-    """The steps of a fit, from the start or resumed from `state`: yields (state, info) after each one.
+    """The steps of a fit to `frames`, as of `fit`, from the start or resumed from `state`: yields (state, info).
+
+    The state is updated in place: take `state.copy()` of one to keep. Raises and warns as `fit`.
 
     `motion`: the optical flow of the frames, where it is already known; computing it takes some hundredths of a second
     per frame. `clock` gives seconds, of which `FitConfig.minutes` is a budget: with `time.process_time` and one thread,

@@ -94,7 +94,7 @@ class PerGaussian(StateArray):
         return np.concatenate([value, self.build(sizes)])
 
 
-class OfGrowth(StateArray):
+class StatisticsArray(StateArray):
     """`GradientStatistics`, which begin anew whenever the number of Gaussians changes; None where nothing grows."""
 
     per_gaussian: ClassVar[bool] = True
@@ -111,7 +111,7 @@ class OfGrowth(StateArray):
 
 
 @dataclasses.dataclass(frozen=True)
-class Shared(StateArray):
+class CodebookArray(StateArray):
     """A `Codebook` of values of `width` numbers, whose entries `Sizes` has under `name`; new Gaussians end sharing."""
 
     name: str
@@ -147,7 +147,7 @@ class PerFrame(StateArray):
 
 
 @dataclasses.dataclass(frozen=True)
-class OfPaths(StateArray):
+class PathMapsArray(StateArray):
     """The map of each shared path at each frame, (num_frames, paths, 2, 3), or a moment of these."""
 
     def spec(self, sizes: Sizes) -> jax.ShapeDtypeStruct:
@@ -171,7 +171,7 @@ _ROW = PerGaussian(np.float32, ("width",))
 # --------------------------------------------------------------------------------------------------- state
 
 
-class Held(Protocol):
+class DeviceState(Protocol):
     """The arrays of a fit that are on a device, fetched only where they are read."""
 
     num: int  #: Gaussians
@@ -183,7 +183,7 @@ class Held(Protocol):
     def is_finite(self, name: str) -> bool:
         """Whether all values of a field are finite, as computed on the device."""
 
-    def copy(self) -> "Held":
+    def copy(self) -> "DeviceState":
         """A copy on the device, which later steps do not change."""
 
 
@@ -202,16 +202,18 @@ class FitState:
     counts: np.ndarray = field(metadata=_stored(PerGaussian(np.int32)))  # steps each Gaussian has taken
     kinds: np.ndarray = field(metadata=_stored(PerGaussian(np.uint8)))  # its parameters, see `sparse_storage`
     newborn: np.ndarray = field(metadata=_stored(PerGaussian(np.bool_)))  # born in the last round of pruning
-    colors: Codebook = field(metadata=_stored(Shared("colors", 3)))
-    shapes: Codebook = field(metadata=_stored(Shared("shapes", 2)))  # of the two standard deviations
+    colors: Codebook = field(metadata=_stored(CodebookArray("colors", 3)))
+    shapes: Codebook = field(metadata=_stored(CodebookArray("shapes", 2)))  # of the two standard deviations
     frame_errors: np.ndarray = field(metadata=_stored(PerFrame()))  # mean squared error when last seen, 0 before
     time_logits: np.ndarray = field(metadata=_stored(PerFrame(intervals=True)))
     time_moments: optax.OptState = field(metadata=_stored(PerFrame(intervals=True, moments=True)))
-    path_maps: np.ndarray = field(metadata=_stored(OfPaths()))  # of each frame, in model space
-    path_first: np.ndarray = field(metadata=_stored(OfPaths()))  # their moments
-    path_second: np.ndarray = field(metadata=_stored(OfPaths()))
+    path_maps: np.ndarray = field(metadata=_stored(PathMapsArray()))  # of each frame, in model space
+    path_first: np.ndarray = field(metadata=_stored(PathMapsArray()))  # their moments
+    path_second: np.ndarray = field(metadata=_stored(PathMapsArray()))
     frame_counts: np.ndarray = field(metadata=_stored(PerFrame(np.int32)))  # steps that each frame's maps have taken
-    statistics: GradientStatistics | None = field(metadata=_stored(OfGrowth()))  # None without densification to come
+    statistics: GradientStatistics | None = field(
+        metadata=_stored(StatisticsArray())
+    )  # None without densification to come
     step: int = field(default=0, metadata=_COUNT)
     plan: int = field(default=0, metadata=_COUNT)  # steps of the whole fit; 0 until minutes have been planned
     planned_step: int = field(default=0, metadata=_COUNT)  # where the plan was last changed, and the fraction of the
@@ -224,7 +226,7 @@ class FitState:
     improve_by: int = field(default=0, metadata=_COUNT)  # and with those of the start
     start_errors: tuple[tuple[int, float], ...] = field(default=(), metadata=_ERRORS)  # (frame, error) at the start
     last_finite: "FitState | None" = None  # the last state known to be good, which has none of its own
-    held: ClassVar[Held | None] = None  # of a fit on a device, an attribute of the instance
+    held: ClassVar[DeviceState | None] = None  # of a fit on a device, an attribute of the instance
 
     @classmethod
     def array_fields(cls) -> Mapping[str, StateArray]:
@@ -306,7 +308,7 @@ class FitState:
         for name in self.array_fields():
             setattr(self, name, jax.tree.map(np.array, getattr(self.last_finite, name)))
 
-    def hold(self, held: Held) -> None:
+    def hold(self, held: DeviceState) -> None:
         """From now on all arrays are those of `held`."""
         for name in ARRAYS:
             self.__dict__.pop(name, None)

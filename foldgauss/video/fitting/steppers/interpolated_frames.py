@@ -54,7 +54,7 @@ class Prefetcher:
 
     @property
     def num_prepared(self) -> int:
-        """Of images that are kept."""
+        """Number of images that are kept, made or being made."""
         return len(self._images)
 
     def prepare(self, step: int, progress: float, frames: Iterable[int], size: tuple[int, int]) -> bool:

@@ -46,7 +46,7 @@ _FIELDS = FitState.array_fields()
 
 
 class HeldArrays:
-    """The arrays of a `FitState` on a device, a `state.Held`. The next step consumes them."""
+    """The arrays of a `FitState` on a device, a `state.DeviceState`. The next step consumes them."""
 
     def __init__(self, arrays: DeviceArrays, num: int, growing: bool, report: Report | None):
         self.arrays, self.num, self.growing, self.report = arrays, num, growing, report
