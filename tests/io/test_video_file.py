@@ -382,7 +382,12 @@ def test_alpha_is_written_and_read_back(tmp_path, name, error):
 )
 def test_codecs_and_pixel_formats(tmp_path, name, options, quality):
     frames = _moving(5, 64, 96)
-    clip = read_video(write_video(tmp_path / name, frames, 29.97, **options))
+    path = write_video(tmp_path / name, frames, 29.97, **options)
+    with av.open(str(path)) as container:
+        first = next(container.decode(video=0))
+        tags = first.colorspace, first.color_primaries, first.color_trc  # 1: BT.709
+        assert first.format.is_rgb or tags == (1, 1, 1)
+    clip = read_video(path)
     assert (clip.num_frames, clip.times, clip.notes) == (5, None, ())
     assert clip.fps == pytest.approx(29.97, rel=1e-3)
     with np.errstate(divide="ignore"):
@@ -545,6 +550,17 @@ def _tone_bytes(path, hertz, rate, layout):
         frame.sample_rate, frame.pts = rate, 0
         container.mux([*stream.encode(frame), *stream.encode()])
     return path.read_bytes()
+
+
+def test_one_channel_is_as_loud_as_two(tmp_path):
+    heard = []
+    for layout in ("mono", "stereo"):
+        (tmp_path / "a.aac").write_bytes(_tone_bytes(tmp_path / "a.aac", 440, 48_000, layout))
+        path = write_video(tmp_path / f"{layout}.mp4", _moving(8), 10, sound=Sound(tmp_path / "a.aac"))
+        with av.open(str(path)) as container:
+            samples = np.concatenate([frame.to_ndarray() for frame in container.decode(audio=0)], axis=1)
+        heard.append(np.sqrt(2 * np.mean(samples[:, 12_000:24_000] ** 2, axis=1)))
+    np.testing.assert_allclose(heard, 0.3, rtol=0.05)
 
 
 def test_sound_may_change_its_format(tmp_path):

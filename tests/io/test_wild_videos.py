@@ -13,6 +13,7 @@ import subprocess
 import wave
 import zipfile
 import zlib
+from fractions import Fraction
 
 import av
 import cv2
@@ -250,6 +251,16 @@ def test_videos_are_turned_upright(tmp_path, mp4, turns, across):
     np.testing.assert_array_equal(
         read_video(tmp_path / "turned.mp4").frames, np.rot90(stored, -turns, (1, 2))[:, :, ::across]
     )
+
+
+@pytest.mark.parametrize(("degrees", "beyond"), [(30, 30), (80, -10)])
+def test_other_rotations_are_told(tmp_path, mp4, degrees, beyond):
+    cos, sin = (round(65536 * one(np.radians(degrees))) for one in (np.cos, np.sin))
+    matrix = struct.pack(">9i", cos, sin, 0, -sin, cos, 0, 0, 0, 1 << 30)
+    (tmp_path / "a.mp4").write_bytes(_with_box(mp4, b"tkhd", lambda content: content[:40] + matrix + content[76:]))
+    clip = read_video(tmp_path / "a.mp4")
+    assert clip.size == ((48, 64) if degrees < 45 else (64, 48))
+    assert clip.notes == (f"the file asks for a rotation by {beyond} degrees beyond multiples of 90; it is left out.",)
 
 
 def test_decoded_frames_are_not_kept(mp4, tmp_path):
@@ -549,6 +560,38 @@ def test_alpha_of_videos_is_kept(tmp_path, name, options):
     assert not clip.frames[:, 40:].any()  # transparent, so their colors are gone
 
 
+def _ramp(num_frames=2):
+    """Every level of alpha, and colors that are premultiplied by it."""
+    ramp = np.broadcast_to(np.arange(256, dtype=np.uint8), (num_frames, 64, 256))
+    return np.stack([ramp // 2, ramp // 2, ramp // 2, ramp], -1)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [("a.mov", {}), ("a.mkv", {}), ("a.webm", {"crf": 0}), ("a.mov", {"pixel_format": "yuva444p10le"})],
+)
+def test_alpha_is_written_and_read_to_the_level(tmp_path, name, options):
+    clip = read_video(write_video(tmp_path / name, _ramp(), 10, **options))
+    np.testing.assert_array_equal(clip.frames[..., 3], _ramp()[..., 3])
+    nearly = np.full((2, 64, 96, 4), 254, np.uint8)
+    assert read_video(write_video(tmp_path / f"b{name}", nearly, 10, **options)).has_alpha
+
+
+@pytest.mark.parametrize("kind", ["rgba64le", "gbrap10le", "gbrap12le", "gbrap16le", "ya16le"])
+def test_deep_alpha_is_rounded_to_nearest(kind):
+    """Alpha of 10 to 16 bits, the levels between those of 8 bits included."""
+    bits = 10 if "10" in kind else 12 if "12" in kind else 16
+    alpha = np.linspace(0, (1 << bits) - 1, 2048).round().astype(np.uint16)
+    channels = {"rgba64le": 4, "ya16le": 2}.get(kind, 1)
+    frame = av.VideoFrame(2048, 2, kind)
+    for plane in frame.planes:  # the last one, or all channels of packed formats: alpha is their last
+        rows = np.zeros((plane.height, plane.line_size // 2), np.uint16)
+        rows[:, channels - 1 : channels * 2048 : channels] = alpha
+        plane.update(rows)
+    image = decoder.DecodedFrame(0, 0, frame, (2, 2048)).to_array()
+    np.testing.assert_array_equal(image[0, :, 3], np.floor(alpha / ((1 << bits) - 1) * 255 + 0.5))
+
+
 # --------------------------------------------------------------------------------------------- interlaced
 
 
@@ -715,6 +758,48 @@ def test_frames_of_an_avi_are_shown_in_their_order(tmp_path):
     clip = read_video(tmp_path / "a.avi")
     assert (clip.num_frames, clip.num_declared, clip.fps, clip.times) == (12, 12, 10, None)
     assert np.abs(clip.frames.astype(int) - _waves(12)).mean() < 3
+
+
+@pytest.mark.parametrize("codec", ["mjpeg", "mpeg4"])
+def test_frames_that_an_avi_repeats_are_not_missed(tmp_path, codec):
+    """Frame 4 is shown for four tenths; the file counts 12, and stores 9."""
+    with av.open(str(tmp_path / "a.avi"), "w") as container:
+        stream = container.add_stream(codec, rate=10, options={"q": "2"})
+        stream.height, stream.width, stream.pix_fmt = 48, 64, "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        for k in (0, 1, 2, 3, 7, 8, 9, 10, 11):
+            frame = av.VideoFrame.from_ndarray(_waves(12)[k], format="rgb24")
+            frame.pts, frame.time_base = k, 1 / Fraction(10)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    clip = read_video(tmp_path / "a.avi")
+    assert (clip.num_frames, clip.num_declared, clip.duration) == (9, 9, pytest.approx(1.2))
+    np.testing.assert_allclose(clip.times, [0, 0.1, 0.2, 0.3, 0.7, 0.8, 0.9, 1.0, 1.1], atol=1e-6)
+    assert [note for note in clip.notes if "decode" in note] == []
+    with pytest.raises(VideoError, match="A:B within 0:9"):
+        read_video(tmp_path / "a.avi", frames=(9, 12))
+
+
+def test_the_rate_of_raw_av1_is_a_guess(tmp_path):
+    with av.open(str(tmp_path / "a.obu"), "w") as container:
+        stream = container.add_stream("libsvtav1", rate=10, options={"preset": "12"})
+        stream.height, stream.width, stream.pix_fmt = 64, 64, "yuv420p"
+        for frame in _waves(8, 64, 64):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode())
+    clip = read_video(tmp_path / "a.obu")
+    assert clip.num_frames == 8
+    assert "records no usable frame rate" in clip.notes[0]
+
+
+def test_an_unknown_matrix_is_named(tmp_path):
+    """That of its frames in the H.264 stream, YCgCo."""
+    with av.open(str(tmp_path / "a.mkv"), "w") as container:
+        stream = container.add_stream("libx264", rate=10, options={"x264-params": "colormatrix=YCgCo"})
+        stream.height, stream.width, stream.pix_fmt = 48, 64, "yuv444p"
+        for frame in _waves():
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode())
+    _refused(tmp_path / "a.mkv", "frames that FFmpeg converts to RGB", "YCgCo", "zscale=matrix=709")
 
 
 @pytest.mark.parametrize("kind", ["matroska", "webm", "mpegts", "flv"])

@@ -106,7 +106,10 @@ def _refuse_options(path: Path, options: VideoOptions) -> None:
     """Refuse options of video files for another kind of output."""
     given = [name for name, value in options._asdict().items() if value is not None]
     if given:
-        raise wrong_use(f"--{given[0].replace('_', '-')}", expected="a video file for it", got=repr(path.name))
+        cure = f"Leave it out, or write {', '.join(VIDEO_SUFFIXES[:-1])} or {VIDEO_SUFFIXES[-1]}."
+        raise wrong_use(
+            f"--{given[0].replace('_', '-')}", expected="a video file for it", got=repr(path.name), cure=cure
+        )
 
 
 def choose_sound(path: Path | None, timeline: Timeline, about: dict[str, Any], fps: float) -> Sound | None:

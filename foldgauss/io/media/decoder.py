@@ -1,5 +1,6 @@
 """A video decoder restricted to one local file: PyAV, that is FFmpeg's libraries."""
 
+import math
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -36,7 +37,18 @@ CONVERSION = (
 #: Luma of limited range as that of full range: FFmpeg's conversion takes all gray video for full range.
 _EXPANDED = np.rint(np.clip((np.arange(256) - 16) * (255 / 219), 0, 255)).astype(np.uint8)
 #: FFmpeg's numbers of matrices: not declared, and those that its conversion does not know.
-_UNSPECIFIED, _UNKNOWN_MATRICES = 2, {10: "BT.2020 with constant luminance", 14: "ICtCp"}
+_UNSPECIFIED = 2
+_UNKNOWN_MATRICES = {
+    8: "YCgCo",
+    10: "BT.2020 with constant luminance",
+    11: "Y'D'zD'x",
+    12: "a matrix derived from the primaries",
+    13: "a matrix derived from the primaries, with constant luminance",
+    14: "ICtCp",
+    15: "IPT-C2",
+    16: "YCgCo-Re",
+    17: "YCgCo-Ro",
+}
 #: FFmpeg's decoders of VP8 and VP9 drop alpha; these are the ones that keep it.
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 
@@ -46,15 +58,17 @@ class DecodedFrame:
     """A frame that decodes. `position`: in the file, with the frames lost to damage counted. `stamp`: in units of
     `VideoDecoder.time_base`; 0 for a stream without time stamps. `size`: (height, width) of the video as stored, to
     which a frame of another size is stretched. `matrix`: (a, b, c, d), right is shown along (a, b), down along (c, d),
-    in units of 2^-16. `converter`: one for all frames, since FFmpeg takes longer to prepare it than to convert
-    a small frame."""
+    in units of 2^-16. `converters`, to 8 bits and to 16: the same for all frames, since FFmpeg takes longer to prepare
+    one than to convert a small frame."""
 
     position: int
     stamp: int
     decoded: av.VideoFrame
     size: Size
     matrix: tuple[int, int, int, int] = (1 << 16, 0, 0, 1 << 16)
-    converter: VideoReformatter = field(default_factory=VideoReformatter)
+    converters: tuple[VideoReformatter, VideoReformatter] = field(
+        default_factory=lambda: (VideoReformatter(), VideoReformatter())
+    )
 
     @property
     def hdr(self) -> str | None:
@@ -67,32 +81,46 @@ class DecodedFrame:
         HDR is tone-mapped. Raises `VideoError` for what FFmpeg cannot convert, such as the extreme
         sizes of a damaged file.
         """
-        has_alpha = any(part.is_alpha for part in self.decoded.format.components)
-        (height, width), kind, matrix = self.size, "bgra" if has_alpha else "bgr24", None
-        if self.hdr is not None:  # FFmpeg 8 converts 4:2:0 to packed 16 bits wrongly, but not to planar ones
-            kind = "gbrap16le" if has_alpha else "gbrp16le"
-            matrix = Colorspace.BT2020 if self.decoded.colorspace == _UNSPECIFIED else None
-        try:
-            how = {"src_colorspace": matrix, "interpolation": CONVERSION}
-            image = self.converter.reformat(self.decoded, width, height, kind, **how).to_ndarray()
-        except av.FFmpegError as error:
-            given = f"{self.decoded.format.name}, {self.decoded.height}x{self.decoded.width}"
-            if self.decoded.colorspace in _UNKNOWN_MATRICES:
-                given += f", {_UNKNOWN_MATRICES[self.decoded.colorspace]}"
-            got = f"one that it cannot ({given}, to be shown at {height}x{width})"
-            cure = "The file is damaged, or convert it with ffmpeg."
-            raise video_error("path", expected="frames that FFmpeg converts to RGB", got=got, cure=cure) from error
+        alpha_bits = min(next((part.bits for part in self.decoded.format.components if part.is_alpha), 0), 16)
+        deep = None
+        if self.hdr is not None or alpha_bits > 8:
+            deep = self._convert("gbrap16le" if alpha_bits else "gbrp16le")
         if self.hdr is not None:
-            image = map_tones(self.decoded, image, self.hdr)
-        elif self.decoded.format.name.startswith("gray") and self.decoded.color_range == ColorRange.MPEG:
-            image = _EXPANDED[image]
-        if has_alpha:
+            image = map_tones(self.decoded, deep, self.hdr)
+        else:
+            image = self._convert("bgra" if alpha_bits else "bgr24")
+            if self.decoded.format.name.startswith("gray") and self.decoded.color_range == ColorRange.MPEG:
+                image = _EXPANDED[image]
+        if alpha_bits > 8:
+            image[..., 3] = round_alpha(deep[..., 3] >> (16 - alpha_bits), (1 << alpha_bits) - 1, 255)
+        if alpha_bits:
             opaque = image[..., 3].min() == 255
             image = np.ascontiguousarray(image[..., :3]) if opaque else premultiply(image)
         a, b, c, d = self.matrix
         if abs(b) > abs(a):
             image, a, d = image.swapaxes(0, 1), c, b
         return np.ascontiguousarray(image[:: 1 if d >= 0 else -1, :: 1 if a >= 0 else -1])
+
+    def _convert(self, kind: str) -> np.ndarray:
+        """The frame as FFmpeg converts it to `kind`: of 8 bits, or planar and of 16, where 4:2:0 becomes wrong in
+        packed formats of FFmpeg 8. Raises `VideoError` where FFmpeg cannot."""
+        height, width = self.size
+        matrix = Colorspace.BT2020 if self.hdr is not None and self.decoded.colorspace == _UNSPECIFIED else None
+        how = {"src_colorspace": matrix, "interpolation": CONVERSION}
+        try:
+            return self.converters["16" in kind].reformat(self.decoded, width, height, kind, **how).to_ndarray()
+        except av.FFmpegError as error:
+            given = f"{self.decoded.format.name}, {self.decoded.height}x{self.decoded.width}"
+            cure = "The file is damaged, or convert it with ffmpeg."
+            if name := _UNKNOWN_MATRICES.get(self.decoded.colorspace):
+                given, cure = f"{given}, {name}", "Convert it: ffmpeg -i IN -vf zscale=matrix=709 OUT."
+            got = f"one that it cannot ({given}, to be shown at {height}x{width})"
+            raise video_error("path", expected="frames that FFmpeg converts to RGB", got=got, cure=cure) from error
+
+
+def round_alpha(alpha: np.ndarray, largest: int, wanted: int) -> np.ndarray:
+    """Alpha from 0 to `largest` in the range from 0 to `wanted`, to nearest: FFmpeg rounds part of it up."""
+    return (alpha.astype(np.uint32) * (2 * wanted) + largest) // (2 * largest)
 
 
 class VideoDecoder:
@@ -118,10 +146,13 @@ class VideoDecoder:
         self.pixel_aspect = float(self._stream.sample_aspect_ratio or 1) or 1.0  # width by height; 1 where unknown
         #: Whether an edit list may hide frames that the container counts.
         self.hides_frames = self._container.format.name.startswith("mov")
+        self._is_avi = self._container.format.name == "avi"
+        self._num_repeated = 0  # frames that an AVI counts, but does not store: the one before is shown again
         self.has_converted = False  # whether any frame was interlaced
+        self.tilt = 0  # degrees by which a frame is to be rotated beyond a multiple of 90
         self._closed = False
         self._size = self._codec.height, self._codec.width
-        self._converter = VideoReformatter()
+        self._converters = VideoReformatter(), VideoReformatter()
         self._angle: int | None = None  # of the display matrix
         self._last = -1  # position of the frame decoded last
         self._before: int | None = None  # its time stamp
@@ -139,8 +170,8 @@ class VideoDecoder:
     @property
     def num_declared(self) -> int:
         """The number of frames that the container counts, including those that an edit list hides; 0 where it does not
-        count them."""
-        return self._stream.frames if 0 < self._stream.frames < MAX_FRAMES else 0
+        count them. Of an AVI those that it does not store are known only once they are passed."""
+        return self._stream.frames - self._num_repeated if 0 < self._stream.frames < MAX_FRAMES else 0
 
     @property
     def declared_seconds(self) -> float | None:
@@ -176,7 +207,7 @@ class VideoDecoder:
         `duration` is that of the decoder, in units of `time_base`: in an MP4 that of another frame where frames are
         stored in another order, in Matroska often a default.
         """
-        if self.hides_frames:
+        if self.hides_frames or self._is_avi:
             is_known = self.declared_seconds is not None and self.num_declared in (0, num_frames)
             return max(self.declared_seconds - elapsed, 0.0) if is_known else 0.0
         if "matroska" not in self._container.format.name:
@@ -200,7 +231,7 @@ class VideoDecoder:
             self._last = self._find_position(stamp)
             self._size = self._size if all(self._size) else (frame.height, frame.width)
             matrix = self._find_matrix(frame)
-            yield DecodedFrame(self._last, stamp or 0, frame, self._size, matrix, self._converter)
+            yield DecodedFrame(self._last, stamp or 0, frame, self._size, matrix, self._converters)
             if self._closed:  # FFmpeg would read on in memory that is freed
                 return
 
@@ -211,6 +242,8 @@ class VideoDecoder:
             data = frame.side_data.get("DISPLAYMATRIX")
             numbers = [1 << 16, 0, 0, 0, 1 << 16] if data is None else np.frombuffer(data, np.int32)[:5].tolist()
             self._angle, self._matrix = frame.rotation, (numbers[0], numbers[1], numbers[3], numbers[4])
+            a, b = self._matrix[:2]
+            self.tilt = self.tilt or (round(math.degrees(math.atan2(b, a))) + 45) % 90 - 45
         return self._matrix
 
     def _decode(self) -> Iterator[av.VideoFrame]:
@@ -233,11 +266,14 @@ class VideoDecoder:
 
     def _read_packets(self) -> Iterator[av.Packet]:
         """The packets of the stream, of which those that cannot be read are left out."""
-        num_errors = 0
+        num_errors, before = 0, None
         while num_errors < MAX_ERRORS:
             try:
                 for packet in self._container.demux(self._stream):
                     if packet.size:
+                        if self._is_avi and packet.dts is not None:
+                            self._num_repeated += 0 if before is None else max(packet.dts - before - 1, 0)
+                            before = packet.dts
                         num_errors = 0
                         yield packet
                 return
@@ -268,9 +304,9 @@ class VideoDecoder:
         yield from filter_frame(graph, None)
 
     def _find_stamp(self, frame: av.VideoFrame) -> int | None:
-        """AVI stores no times: FFmpeg numbers its packets, in the order of decoding."""
-        if self._container.format.name != "avi":
-            return frame.pts
+        """AVI stores no times: FFmpeg numbers its packets, in the order of decoding. Of raw AV1 it makes times up."""
+        if not self._is_avi:
+            return None if self._container.format.name == "obu" else frame.pts
         return frame.dts if frame.dts is not None or self._before is None else self._before + 1
 
     def _find_position(self, stamp: int | None) -> int:

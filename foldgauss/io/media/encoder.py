@@ -20,7 +20,7 @@ from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTr
 from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_integer, is_within
 from foldgauss.io._atomic import PathLike
 from foldgauss.io.media.clip import VideoError, check_readable, video_error
-from foldgauss.io.media.decoder import CONVERSION, VideoDecoder, filter_frame, open_container
+from foldgauss.io.media.decoder import CONVERSION, VideoDecoder, filter_frame, open_container, round_alpha
 from foldgauss.io.media.format_detection import SOUND_DEMUXERS
 
 os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 writes to stderr
@@ -184,6 +184,10 @@ def encode_video(
                 open_with_own_priority(stream.codec_context)
             given = av.VideoFrame.from_ndarray(image, format="rgba" if image.shape[2] == 4 else "rgb24")
             given = converter.reformat(given, format=pixel_format.name, dst_colorspace=matrix, interpolation=CONVERSION)
+            if image.shape[2] == 4 and len(given.planes) == 4:
+                _set_alpha(given.planes[3], image[..., 3], (1 << pixel_format.components[3].bits) - 1)
+            if matrix is not None:  # ProRes writes those of its frames
+                given.color_primaries, given.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
             begin, end = (number, number + 1) if ticks is None else ticks[number : number + 2]
             given.pts, given.time_base = begin, clock
             container.mux(_set_durations(stream.encode(given), ticks))
@@ -263,7 +267,9 @@ def _unify_sound(source: av.container.InputContainer, stream: av.AudioStream) ->
             kind = frame.sample_rate, frame.format.name, frame.layout.name
             if kind != of_graph:
                 yield from filter_frame(graph, None)
-                graph, of_graph = _link_sound_filters(steps, *kind, stream.time_base), kind
+                # FFmpeg's conversion of one channel to two makes it quieter, as if it were in the middle of others.
+                both = [("pan", "stereo|c0=c0|c1=c0")] if frame.layout.nb_channels == 1 else []
+                graph, of_graph = _link_sound_filters([*both, *steps], *kind, stream.time_base), kind
             yield from filter_frame(graph, frame)
     yield from filter_frame(graph, None)
 
@@ -300,6 +306,14 @@ def open_with_own_priority(context: av.VideoCodecContext) -> None:
         with suppress(OSError):  # it has ended
             if os.sched_getscheduler(thread) != policy:
                 os.sched_setscheduler(thread, policy, parameters)
+
+
+def _set_alpha(plane: av.video.plane.VideoPlane, alpha: np.ndarray, largest: int) -> None:
+    """Write alpha of 8 bits to a plane from 0 to `largest`, to nearest, which FFmpeg's conversion is not."""
+    kind = np.uint8 if largest < 256 else np.uint16
+    rows = np.zeros((plane.height, plane.line_size // kind().itemsize), kind)
+    rows[:, : plane.width] = round_alpha(alpha, 255, largest)
+    plane.update(rows)
 
 
 def _pad(frame: np.ndarray, steps: tuple[int, int]) -> np.ndarray:

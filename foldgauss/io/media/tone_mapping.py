@@ -80,8 +80,8 @@ def map_tones(
 ) -> UInt8[np.ndarray, "height width bgr"]:
     """A frame of the transfer function "PQ" or "HLG" as SDR.
 
-    `image`: its red, green and blue, and alpha if there are four channels, as FFmpeg converts them to 16 bits. The
-    result has blue first, as OpenCV has it.
+    `image`: its red, green and blue as FFmpeg converts them to 16 bits, and alpha, which is not converted, if there are
+    four channels. The result has blue first, as OpenCV has it.
     """
     limited, bits = not frame.format.is_rgb and frame.color_range != ColorRange.JPEG, frame.format.components[0].bits
     white = _LIMITED_WHITE if limited else ((1 << bits) - 1) << (16 - bits)
@@ -133,5 +133,3 @@ def _map_tones(image, out, shown, factor, lowered, codes, matrix, luminance, bri
             gain = _look_up(lowered, min(np.sqrt(most) / brightest, 1.0))
             for c in range(3):
                 out[y, x, 2 - c] = int(_look_up(codes, np.sqrt(min(max(own[c] * gain, 0.0), 1.0))) + 0.5)
-            if image.shape[2] == 4:
-                out[y, x, 3] = (image[y, x, 3] + 128) // 257

@@ -86,6 +86,10 @@ def decode_file(
             notes += (f"pixels are {aspect:.3g} times as wide as high; frames are kept as stored, not stretched.",)
         if decoded.hdr:
             notes += (f"colors are HDR ({' and '.join(sorted(decoded.hdr))}), and are tone-mapped to SDR.",)
+        if decoder.tilt:
+            notes += (
+                f"the file asks for a rotation by {decoder.tilt} degrees beyond multiples of 90; it is left out.",
+            )
         if decoder.has_converted:
             notes += ("interlaced frames are converted to progressive ones.",)
     # The container's count may be an estimate, so the range is checked against the decoded frames as well.

@@ -139,7 +139,7 @@ def compress(
     (`FoldedSplats.degrees`, `static`, `opaque`) stay absent, and shared colors stay shared. Shared paths stay as they
     are, to about a fiftieth of a pixel.
 
-    With the clip, fine-tuning compensates for losses and allows coarser steps. Each of five stages of pruning is
+    With the clip, fine-tuning compensates for losses and allows coarser steps. Each of five or six stages of pruning is
     followed by `passes / 2` passes over the clip. Each try of a coarseness of the steps takes another 5/8 `passes`
     (3/8 of fewer than 24), in which parameters are rounded group by group while the others adapt. More passes make
     smaller files. Without the clip, or with 0 passes, Gaussians that are not worth their bits are dropped, and the
@@ -249,20 +249,25 @@ def _drop_in_stages(
     `ordering`: what reordering may add to the squared error before fine-tuning, as a fraction of the model's own.
     """
     kept, current, so_far, gained, most = [(model, 0.0)], model, 0.0, _FIRST_GAINED, _MOST_DROPPED
-    for stages_left in reversed(range(_STAGES)):
+    for stage in range(_STAGES + 1):  # one more where the last one loses too much
+        stages_left = max(_STAGES - 1 - stage, 0)
         dropped = min(max((_DROPPING * max_loss - so_far + _FADING * gained) / _LEFT, 0.0), most)
         if dropped:
             current = _drop(current, quantizer, loss, base, so_far + dropped)
         current = _Sorting(current)(ordering * loss.error)
-        what, seed = "fine-tuning after dropping Gaussians", _STAGES - 1 - stages_left
-        current = finetune(current, 1 / _STAGES_OF_PASSES, what, seed=seed, shared=index_colors(current))
-        before, so_far = so_far, loss(current, loss.all_frames)
-        on_step("dropped", so_far)
-        gained = _LEFT * dropped + before - so_far
-        if so_far <= max_loss:
-            kept.append((current, so_far))
-        elif so_far - stages_left * _FADING * gained > max_loss:  # too many to make up for
-            (current, so_far), most, ordering = kept[-1], most / 2, ordering / _LESS_ORDERING
+        what = "fine-tuning after dropping Gaussians"
+        current = finetune(current, 1 / _STAGES_OF_PASSES, what, seed=stage, shared=index_colors(current))
+        lost = loss(current, loss.all_frames)
+        on_step("dropped", lost)
+        gained_now = _LEFT * dropped + so_far - lost
+        if lost - max(stages_left * _FADING * gained_now, 0.0) > max_loss:  # more than the other stages make up for
+            (current, so_far), most, ordering = kept[-1], dropped / 2 or most, ordering / _LESS_ORDERING
+        else:
+            so_far, gained = lost, gained_now
+            if lost <= max_loss:
+                kept.append((current, lost))
+                if not stages_left:
+                    break
         quantizer = _Quantizer(current)
     return [model for model, _ in kept]
 
