@@ -461,31 +461,29 @@ def test_dropping_uses_the_loss_that_it_may_cost():
 
 
 @pytest.mark.parametrize(("last", "kept"), [([0.15], "01234"), ([0.5, 0.15], "01235"), ([0.5, 0.5], "0123")])
-def test_a_last_stage_that_loses_too_much_is_repeated_with_half_as_many(monkeypatch, last, kept):
-    module, dropped = sys.modules["foldgauss.video.compression.search"], []
+def test_a_last_stage_that_loses_too_much_is_repeated_without_dropping(monkeypatch, last, kept):
+    module = sys.modules["foldgauss.video.compression.search"]
     losses = iter([0.0, 0.05, 0.1, 0.12, *last])
 
     class Loss:
-        error, all_frames, now = 1.0, None, 0.0
+        error, all_frames = 1.0, None
 
         def __call__(self, model, which):
-            self.now = next(losses)
-            return self.now
+            return next(losses)
 
-    def drop(model, quantizer, loss, base, most):
-        dropped.append(most - (loss.now if loss.now < 0.2 else 0.12))
-        return model
-
-    monkeypatch.setattr(module, "_drop", drop)
+    monkeypatch.setattr(module, "_drop", lambda model, *limits: f"less of {model}")
     monkeypatch.setattr(module, "_Sorting", lambda model: lambda budget: model)
     monkeypatch.setattr(module, "_Quantizer", lambda model: None)
     monkeypatch.setattr(module, "index_colors", lambda model: None)
-    tuned = lambda model, fraction, what, seed, shared: str(seed)  # noqa: E731
-    found = module._drop_in_stages("model", None, 0.0, Loss(), 0.2, 1.0, tuned, lambda what, loss_db: None)
+    tuned = []
+
+    def finetune(model, fraction, what, seed, shared):
+        tuned.append(model)
+        return str(seed)
+
+    found = module._drop_in_stages("model", None, 0.0, Loss(), 0.2, 1.0, finetune, lambda what, loss_db: None)
     assert "".join(found) == "model" + kept
-    if len(last) == 2:
-        assert dropped[-1] == pytest.approx(dropped[-2] / 2)
-        assert next(losses, None) is None
+    assert tuned == ["less of model", *(f"less of {k}" for k in range(4)), "3"][: 4 + len(last)]
 
 
 def test_order_found_before_fine_tuning_shortens_the_column_of_cells():

@@ -249,7 +249,7 @@ def _drop_in_stages(
     `ordering`: what reordering may add to the squared error before fine-tuning, as a fraction of the model's own.
     """
     kept, current, so_far, gained, most = [(model, 0.0)], model, 0.0, _FIRST_GAINED, _MOST_DROPPED
-    for stage in range(_STAGES + 1):  # one more where the last one loses too much
+    for stage in range(_STAGES + 1):  # where the last one loses too much, another one that drops none
         stages_left = max(_STAGES - 1 - stage, 0)
         dropped = min(max((_DROPPING * max_loss - so_far + _FADING * gained) / _LEFT, 0.0), most)
         if dropped:
@@ -261,7 +261,8 @@ def _drop_in_stages(
         on_step("dropped", lost)
         gained_now = _LEFT * dropped + so_far - lost
         if lost - max(stages_left * _FADING * gained_now, 0.0) > max_loss:  # more than the other stages make up for
-            (current, so_far), most, ordering = kept[-1], dropped / 2 or most, ordering / _LESS_ORDERING
+            current, so_far = kept[-1]
+            most, ordering = (dropped / 2 or most, ordering / _LESS_ORDERING) if stages_left else (0.0, ordering)
         else:
             so_far, gained = lost, gained_now
             if lost <= max_loss:
