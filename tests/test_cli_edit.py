@@ -132,7 +132,7 @@ def test_what_edit_refuses(work, tmp_path, capsys):
     tone = write_tone(tmp_path / "tone.wav", 1.0)
     code, told = refused(model, baked, "--out", target, "--sound", tone)
     assert code == 2
-    assert "--sound: expected a video or a folder as --out" in told
+    assert "--sound: expected a video as --out" in told
     code, told = refused(model, baked, "--out", tmp_path / "images", "--sound", tone)
     assert code == 2
     assert "--sound: expected a video file for it, got 'images'" in told

@@ -253,13 +253,13 @@ def test_videos_are_turned_upright(tmp_path, mp4, turns, across):
     )
 
 
-@pytest.mark.parametrize(("degrees", "beyond"), [(30, 30), (80, -10)])
+@pytest.mark.parametrize(("degrees", "beyond"), [(30, 30), (80, -10), (-30, -30)])
 def test_other_rotations_are_told(tmp_path, mp4, degrees, beyond):
     cos, sin = (round(65536 * one(np.radians(degrees))) for one in (np.cos, np.sin))
     matrix = struct.pack(">9i", cos, sin, 0, -sin, cos, 0, 0, 0, 1 << 30)
     (tmp_path / "a.mp4").write_bytes(_with_box(mp4, b"tkhd", lambda content: content[:40] + matrix + content[76:]))
     clip = read_video(tmp_path / "a.mp4")
-    assert clip.size == ((48, 64) if degrees < 45 else (64, 48))
+    assert clip.size == ((48, 64) if abs(degrees) < 45 else (64, 48))
     assert clip.notes == (f"the file asks for a rotation by {beyond} degrees beyond multiples of 90; it is left out.",)
 
 
@@ -575,6 +575,15 @@ def test_alpha_is_written_and_read_to_the_level(tmp_path, name, options):
     np.testing.assert_array_equal(clip.frames[..., 3], _ramp()[..., 3])
     nearly = np.full((2, 64, 96, 4), 254, np.uint8)
     assert read_video(write_video(tmp_path / f"b{name}", nearly, 10, **options)).has_alpha
+
+
+@pytest.mark.parametrize("kind", ["bgra", "yuva444p", "yuva444p10le", "rgba64le"])
+def test_alpha_of_hdr_is_kept(kind):
+    """Of 8 bits, too, which tone mapping leaves out."""
+    frame = av.VideoFrame.from_ndarray(np.full((48, 64, 4), 200, np.uint8), format="bgra").reformat(format=kind)
+    frame.color_trc = 16  # PQ
+    alpha = decoder.DecodedFrame(0, 0, frame, (48, 64)).to_array()[..., 3]
+    assert np.abs(alpha.astype(int) - 200).max() <= 1
 
 
 @pytest.mark.parametrize("kind", ["rgba64le", "gbrap10le", "gbrap12le", "gbrap16le", "ya16le"])

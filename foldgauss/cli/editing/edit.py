@@ -69,9 +69,9 @@ def edit_command(
     script = read_edit_script(script_path)
     as_model = out_path.suffix.lower() == MODEL_SUFFIX
     image_size = parse_size(size)
-    for option, given in (("--size", image_size), ("--sound", sound)):
+    for option, given, fits in (("--size", image_size, "a video or a folder"), ("--sound", sound, "a video")):
         if as_model and given is not None:
-            raise wrong_use(option, expected="a video or a folder as --out", got=out_path)
+            raise wrong_use(option, expected=f"{fits} as --out", got=out_path)
     if not as_model:
         check_image_path(out_path, others=MODEL_SUFFIX)
         refuse_huge(image_size)

@@ -22,7 +22,7 @@ from foldgauss.io.media.image_files import premultiply
 from foldgauss.io.media.tone_mapping import HDR, map_tones
 
 MAX_ERRORS = 1000  # packets in a row that cannot be read after which a video has ended
-MAX_FRAMES = 1 << 31  # a container that declares more is damaged
+MAX_FRAMES = 1 << 30  # a container that declares as many does not know, or is damaged
 MAX_LOST_FRAMES = 1_000_000  # a time stamp that implies a larger gap counts as damaged
 MAX_THREADS = 16
 #: Chroma is interpolated, and rounded to nearest: FFmpeg's default repeats it and rounds it down, which makes each
@@ -91,7 +91,7 @@ class DecodedFrame:
             image = self._convert("bgra" if alpha_bits else "bgr24")
             if self.decoded.format.name.startswith("gray") and self.decoded.color_range == ColorRange.MPEG:
                 image = _EXPANDED[image]
-        if alpha_bits > 8:
+        if alpha_bits and deep is not None:
             image[..., 3] = round_alpha(deep[..., 3] >> (16 - alpha_bits), (1 << alpha_bits) - 1, 255)
         if alpha_bits:
             opaque = image[..., 3].min() == 255
@@ -113,7 +113,10 @@ class DecodedFrame:
             given = f"{self.decoded.format.name}, {self.decoded.height}x{self.decoded.width}"
             cure = "The file is damaged, or convert it with ffmpeg."
             if name := _UNKNOWN_MATRICES.get(self.decoded.colorspace):
-                given, cure = f"{given}, {name}", "Convert it: ffmpeg -i IN -vf zscale=matrix=709 OUT."
+                given, cure = (
+                    f"{given}, {name}",
+                    "Convert it, where ffmpeg can: ffmpeg -i IN -vf zscale=matrix=709 OUT.",
+                )
             got = f"one that it cannot ({given}, to be shown at {height}x{width})"
             raise video_error("path", expected="frames that FFmpeg converts to RGB", got=got, cure=cure) from error
 
@@ -243,7 +246,7 @@ class VideoDecoder:
             numbers = [1 << 16, 0, 0, 0, 1 << 16] if data is None else np.frombuffer(data, np.int32)[:5].tolist()
             self._angle, self._matrix = frame.rotation, (numbers[0], numbers[1], numbers[3], numbers[4])
             a, b = self._matrix[:2]
-            self.tilt = self.tilt or (round(math.degrees(math.atan2(b, a))) + 45) % 90 - 45
+            self.tilt = self.tilt or 45 - (45 - round(math.degrees(math.atan2(b, a)))) % 90
         return self._matrix
 
     def _decode(self) -> Iterator[av.VideoFrame]:
@@ -266,13 +269,13 @@ class VideoDecoder:
 
     def _read_packets(self) -> Iterator[av.Packet]:
         """The packets of the stream, of which those that cannot be read are left out."""
-        num_errors, before = 0, None
+        num_errors, before = 0, (self._stream.start_time or 0) - 1
         while num_errors < MAX_ERRORS:
             try:
                 for packet in self._container.demux(self._stream):
                     if packet.size:
                         if self._is_avi and packet.dts is not None:
-                            self._num_repeated += 0 if before is None else max(packet.dts - before - 1, 0)
+                            self._num_repeated += max(packet.dts - before - 1, 0)
                             before = packet.dts
                         num_errors = 0
                         yield packet
@@ -306,7 +309,7 @@ class VideoDecoder:
     def _find_stamp(self, frame: av.VideoFrame) -> int | None:
         """AVI stores no times: FFmpeg numbers its packets, in the order of decoding. Of raw AV1 it makes times up."""
         if not self._is_avi:
-            return None if self._container.format.name == "obu" else frame.pts
+            return None if self._container.format.name in ("obu", "av1") else frame.pts
         return frame.dts if frame.dts is not None or self._before is None else self._before + 1
 
     def _find_position(self, stamp: int | None) -> int:

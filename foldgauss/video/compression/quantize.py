@@ -351,7 +351,7 @@ def legendre(degree: int) -> Float[np.ndarray, "degree+1 degree+1"]:
 def _monomials(
     v: dict[str, np.ndarray], time: Float[np.ndarray, " num"], info: CompactInfo
 ) -> Float[np.ndarray, "num degree+1 2"]:
-    """Paths in powers of u = m_t - t: row 0 is m_s, row k is c_k."""
+    """Trajectories in powers of u = m_t - t: row 0 is m_s, row k is c_k."""
     degree, table = info.degree, legendre(info.degree)
     middle, half = trajectory_span(time, v["duration"], info.reach)
     out = np.empty((info.num_gaussians, degree + 1, 2))
@@ -539,7 +539,7 @@ def _choose_degrees(saved: Float[np.ndarray, "degree+1 num"]) -> Int32[np.ndarra
 
 
 def unrounded_trajectories(quantized: Quantized, exact: ExactColumns) -> Float[np.ndarray, "num degree+1 2"]:
-    """Paths before rounding, in powers of u = decoded m_t - t, truncated to the stored degrees."""
+    """Trajectories before rounding, in powers of u = decoded m_t - t, truncated to the stored degrees."""
     info, values = quantized.info, decode_values(quantized)
     columns = _compute_trajectories(exact, values)
     polynomials = np.stack([np.stack([columns[f"{axis}{k}"] for axis in "xy"], 1) for k in range(info.degree + 1)], 1)

@@ -90,6 +90,9 @@ _ROUNDING_SHORT, _FEW_PASSES = ((SHAPE, 1.0, 0.25), (TRAJECTORY, 1.0, 0.125)), 2
 _SEED = 0
 #: Tries with fine-tuning; the fraction of the allowed loss that they aim at, and the one that ends them.
 _TRIES, _AIM, _ENOUGH = 6, 0.97, 0.94
+#: How many powers of two finer than without fine-tuning the steps may be where half of the Gaussians are dropped: for
+#: each, a Gaussian needs about a fifth more bits.
+_FINER = 4.0
 #: Most powers of two by which a try may extrapolate.
 _MAX_EXTRAPOLATION = 2.0
 #: Fraction of the allowed squared error that reordering may add if all pairs whose order is given up are swapped; and
@@ -213,7 +216,7 @@ def _search_finetuned(
     passes: int,
     on_step: Callable,
 ) -> _Try | None:
-    """The coarsest steps found that lose at most `max_loss` after fine-tuning; None if rounding alone allows as coarse.
+    """The smallest model found that loses at most `max_loss` after fine-tuning; None if rounding alone is as small.
 
     `base`: the coarseness that rounding alone allows.
     """
@@ -227,11 +230,13 @@ def _search_finetuned(
     smaller = _drop_in_stages(model, complete, base, loss, max_loss, ordering, finetune, on_step)
     rounding = _ROUNDING if passes >= _FEW_PASSES else _ROUNDING_SHORT
     # Where the last stage leaves too little of the loss for rounding, the one before.
-    tries = (
-        _search_coarseness(_Quantizer(_reorder(one, loss, max_loss)), base, loss, max_loss, rounding, finetune, on_step)
-        for one in reversed(smaller)
-    )
-    return next(filter(None, tries), None)
+    for one in reversed(smaller):
+        least = max(base - _FINER * (model.num_gaussians / one.num_gaussians - 1), _FINEST)
+        quantizer = _Quantizer(_reorder(one, loss, max_loss))
+        found = _search_coarseness(quantizer, base, least, loss, max_loss, rounding, finetune, on_step)
+        if found is not None:
+            return found
+    return None
 
 
 def _drop_in_stages(
@@ -249,11 +254,13 @@ def _drop_in_stages(
     `ordering`: what reordering may add to the squared error before fine-tuning, as a fraction of the model's own.
     """
     kept, current, so_far, gained, most = [(model, 0.0)], model, 0.0, _FIRST_GAINED, _MOST_DROPPED
+    since_kept = 0.0  # dB dropped
     for stage in range(_STAGES + 1):  # where the last one loses too much, another one that drops none
         stages_left = max(_STAGES - 1 - stage, 0)
         dropped = min(max((_DROPPING * max_loss - so_far + _FADING * gained) / _LEFT, 0.0), most)
         if dropped:
-            current = _drop(current, quantizer, loss, base, so_far + dropped)
+            own = quantizer if current is model else _Quantizer(current)
+            current, since_kept = _drop(current, own, loss, base, so_far + dropped), since_kept + dropped
         current = _Sorting(current)(ordering * loss.error)
         what = "fine-tuning after dropping Gaussians"
         current = finetune(current, 1 / _STAGES_OF_PASSES, what, seed=stage, shared=index_colors(current))
@@ -262,27 +269,32 @@ def _drop_in_stages(
         gained_now = _LEFT * dropped + so_far - lost
         if lost - max(stages_left * _FADING * gained_now, 0.0) > max_loss:  # more than the other stages make up for
             current, so_far = kept[-1]
-            most, ordering = (dropped / 2 or most, ordering / _LESS_ORDERING) if stages_left else (0.0, ordering)
+            most, ordering = (since_kept / 2 or most, ordering / _LESS_ORDERING) if stages_left else (0.0, ordering)
+            since_kept = 0.0
         else:
             so_far, gained = lost, gained_now
             if lost <= max_loss:
                 kept.append((current, lost))
+                since_kept = 0.0
                 if not stages_left:
                     break
-        quantizer = _Quantizer(current)
     return [model for model, _ in kept]
 
 
 def _search_coarseness(
     quantizer: "_Quantizer",
     base: float,
+    least: float,
     loss: "_Loss",
     max_loss: float,
     stages: _RoundingStages,
     finetune: Callable,
     on_step: Callable,
 ) -> _Try | None:
-    """As `_search_finetuned`, without dropping Gaussians; `stages` of rounding as `_ROUNDING`."""
+    """As `_search_finetuned`, without dropping Gaussians; `stages` of rounding as `_ROUNDING`.
+
+    None where no coarseness above `least` is found.
+    """
     best, tried, coarseness = None, {}, base + _COARSER
     for _ in range(_TRIES):
         quantized = _round_in_stages(quantizer, coarseness, finetune, stages)
@@ -293,14 +305,14 @@ def _search_coarseness(
             best = _Try(coarseness, quantized, decoded, measured)
             if measured > _ENOUGH * max_loss:
                 break
-        coarseness = _next_coarseness(tried, max_loss, base)
+        coarseness = _next_coarseness(tried, max_loss, least)
         if coarseness is None:
             break
     return best
 
 
-def _next_coarseness(tried: dict[float, float], max_loss: float, base: float) -> float | None:
-    """The next coarseness to try, greater than `base`; None if there is none.
+def _next_coarseness(tried: dict[float, float], max_loss: float, least: float) -> float | None:
+    """The next coarseness to try, greater than `least`; None if there is none.
 
     It is between those on either side of `max_loss`, or a bounded step beyond the last one.
     The squared error is modelled as a constant plus that of rounding, which grows as 4^coarseness.
@@ -321,7 +333,7 @@ def _next_coarseness(tried: dict[float, float], max_loss: float, base: float) ->
         slope = (tried[others[0]] - tried[nearest]) / (others[0] - nearest)
         slope = min(max(slope, 0.3 * _SLOPE), 2 * _SLOPE)
     coarseness = nearest + min((aim - tried[nearest]) / slope, _MAX_EXTRAPOLATION)
-    return coarseness if base < coarseness <= _COARSEST + 2 else None
+    return coarseness if least < coarseness <= _COARSEST + 2 else None
 
 
 def _drop(model: VideoModel, quantizer: "_Quantizer", loss: "_Loss", base: float, most: float) -> VideoModel:
