@@ -31,6 +31,7 @@ from foldgauss.video.compression.quantize import (
     column_names,
     compute_columns,
     dequantize,
+    estimate_bits,
     is_integral,
     legendre,
     quantize,
@@ -484,6 +485,37 @@ def test_a_last_stage_that_loses_too_much_is_repeated_without_dropping(monkeypat
     found = module._drop_in_stages("model", None, 0.0, Loss(), 0.2, 1.0, finetune, lambda what, loss_db: None)
     assert "".join(found) == "model" + kept
     assert tuned == ["less of model", *(f"less of {k}" for k in range(4)), "3"][: 4 + len(last)]
+
+
+@pytest.mark.parametrize(("left", "coarseness", "chosen"), [(30, 5.0, 40), (30, 1.0, 30), (15, 5.0, 15)])
+def test_few_dropped_gaussians_are_kept_where_that_is_smaller(monkeypatch, left, coarseness, chosen):
+    """All 40 Gaussians with steps of 2^`coarseness` against `left` of them with steps of 2^2."""
+    search = sys.modules["foldgauss.video.compression.search"]
+    model = soft_model(degree=3, options=RenderOptions())
+    pruned = search._take(model, np.arange(left))
+
+    def search_coarseness(quantizer, *limits):
+        whole = len(quantizer.exact.values["time"]) == 40
+        quantized = quantizer.quantize(coarseness if whole else 2.0)
+        return search._Try(0.0, quantized, dequantize(quantized), 0.1)
+
+    monkeypatch.setattr(search, "_drop_in_stages", lambda *given: [model, pruned])
+    monkeypatch.setattr(search, "_search_coarseness", search_coarseness)
+    assert compress(model, clip_of(model), max_loss_db=0.3).model.num_gaussians == chosen
+
+
+def test_estimated_bits_rank_files():
+    """Steps twice as coarse, and a third fewer Gaussians."""
+    model = crowd(soft_model(degree=3, options=RenderOptions()), copies=60)
+    search = sys.modules["foldgauss.video.compression.search"]
+    quantizer = search._Quantizer(model)
+    kept = np.arange(model.num_gaussians) % 3 > 0
+    files = [quantizer.quantize(2.0), quantizer.quantize(3.0), quantizer.quantize(2.0, kept)]
+    ratios = [
+        [count(one) / count(files[0]) for one in files[1:]]
+        for count in (estimate_bits, lambda one: len(pack_compact(one)))
+    ]
+    np.testing.assert_allclose(*ratios, atol=0.08)
 
 
 def test_order_found_before_fine_tuning_shortens_the_column_of_cells():

@@ -166,6 +166,12 @@ class Quantized:
     knots: Int32[np.ndarray, "paths knots"] | None = None
 
 
+def estimate_bits(quantized: Quantized) -> float:
+    """About how many bits the Gaussians take, without regard to contexts: to compare versions of the same model."""
+    columns = quantized.columns | {"cell": np.diff(quantized.columns["cell"], prepend=0)}
+    return sum(float(np.log2(1 + np.abs(numbers)).sum()) + len(numbers) for numbers in columns.values())
+
+
 # ------------------------------------------------------------------------------------------ decoding
 
 

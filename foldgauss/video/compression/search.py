@@ -32,6 +32,7 @@ from foldgauss.video.compression.quantize import (
     compute_columns,
     decode_values,
     dequantize,
+    estimate_bits,
     find_cells,
     index_colors,
     is_integral,
@@ -229,14 +230,19 @@ def _search_finetuned(
     ordering = _FIRST_ORDERING * min(passes / _WITH_PASSES, 1) * min(max_loss / _WITH_LOSS, 1) ** 2
     smaller = _drop_in_stages(model, complete, base, loss, max_loss, ordering, finetune, on_step)
     rounding = _ROUNDING if passes >= _FEW_PASSES else _ROUNDING_SHORT
-    # Where the last stage leaves too little of the loss for rounding, the one before.
-    for one in reversed(smaller):
+
+    def search(one: VideoModel) -> _Try | None:
         least = max(base - _FINER * (model.num_gaussians / one.num_gaussians - 1), _FINEST)
         quantizer = _Quantizer(_reorder(one, loss, max_loss))
-        found = _search_coarseness(quantizer, base, least, loss, max_loss, rounding, finetune, on_step)
-        if found is not None:
-            return found
-    return None
+        return _search_coarseness(quantizer, base, least, loss, max_loss, rounding, finetune, on_step)
+
+    # Where the last stage leaves too little of the loss for rounding, the one before.
+    found = next(filter(None, map(search, reversed(smaller))), None)
+    # Where few Gaussians could be dropped, coarser steps for all of them may need fewer bits.
+    if found is not None and model.num_gaussians / 2 < found.model.num_gaussians < model.num_gaussians:
+        candidates = filter(None, (found, search(model)))
+        found = min(candidates, key=lambda one: estimate_bits(one.quantized))
+    return found
 
 
 def _drop_in_stages(
@@ -254,30 +260,25 @@ def _drop_in_stages(
     `ordering`: what reordering may add to the squared error before fine-tuning, as a fraction of the model's own.
     """
     kept, current, so_far, gained, most = [(model, 0.0)], model, 0.0, _FIRST_GAINED, _MOST_DROPPED
-    since_kept = 0.0  # dB dropped
     for stage in range(_STAGES + 1):  # where the last one loses too much, another one that drops none
         stages_left = max(_STAGES - 1 - stage, 0)
         dropped = min(max((_DROPPING * max_loss - so_far + _FADING * gained) / _LEFT, 0.0), most)
         if dropped:
             own = quantizer if current is model else _Quantizer(current)
-            current, since_kept = _drop(current, own, loss, base, so_far + dropped), since_kept + dropped
+            current = _drop(current, own, loss, base, so_far + dropped)
         current = _Sorting(current)(ordering * loss.error)
         what = "fine-tuning after dropping Gaussians"
         current = finetune(current, 1 / _STAGES_OF_PASSES, what, seed=stage, shared=index_colors(current))
-        lost = loss(current, loss.all_frames)
-        on_step("dropped", lost)
-        gained_now = _LEFT * dropped + so_far - lost
-        if lost - max(stages_left * _FADING * gained_now, 0.0) > max_loss:  # more than the other stages make up for
+        before, so_far = so_far, loss(current, loss.all_frames)
+        on_step("dropped", so_far)
+        gained = _LEFT * dropped + before - so_far
+        if so_far <= max_loss:
+            kept.append((current, so_far))
+            if not stages_left:
+                break
+        elif so_far - stages_left * _FADING * gained > max_loss:  # too many to make up for
             current, so_far = kept[-1]
-            most, ordering = (since_kept / 2 or most, ordering / _LESS_ORDERING) if stages_left else (0.0, ordering)
-            since_kept = 0.0
-        else:
-            so_far, gained = lost, gained_now
-            if lost <= max_loss:
-                kept.append((current, lost))
-                since_kept = 0.0
-                if not stages_left:
-                    break
+            most, ordering = (most / 2, ordering / _LESS_ORDERING) if stages_left else (0.0, ordering)
     return [model for model, _ in kept]
 
 
