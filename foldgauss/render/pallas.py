@@ -52,8 +52,10 @@ except ImportError:
     CompilerParams = None
 
 #: Sides of tiles, in px; powers of two, as a program's arrays must be. With 16 each thread of a warp holds 8 pixels, so
-#: that sums over a tile are mostly sums within threads.
+#: that sums over a tile are mostly sums within threads. An image of fewer than `FEW_TILES` of these has smaller ones:
+#: they would not occupy a GPU.
 TILES, TILE_SIZE, WARPS = (8, 16, 32), 16, 1
+SMALL_TILE_SIZE, FEW_TILES = 8, 1024
 #: Entries between two tests whether all pixels are finished.
 CHUNK = 16
 #: The largest alpha ceiling: the backward pass divides by 1 - alpha.
@@ -90,9 +92,16 @@ def is_preferred(options: RenderOptions) -> bool:
     return options.tile_size in (None, *TILES) and options.alpha_ceiling <= HIGHEST_CEILING
 
 
+def choose_tile_size(size: tuple[int, int]) -> int:
+    """The side of the tiles of an image of `size` (height, width), unless `RenderOptions.tile_size` gives it."""
+    height, width = size
+    return SMALL_TILE_SIZE if -(-height // TILE_SIZE) * -(-width // TILE_SIZE) < FEW_TILES else TILE_SIZE
+
+
 def _plan(leaves, size, compositing, options) -> Plan:
     options = dataclasses.replace(options, transmittance_stop=max(options.transmittance_stop, LOWEST_STOP))
-    return make_plan(leaves, size, compositing, options, tile=options.tile_size or TILE_SIZE, batch_pixels=1)
+    tile = options.tile_size or choose_tile_size(size)
+    return make_plan(leaves, size, compositing, options, tile=tile, batch_pixels=1)
 
 
 # ---------------------------------------------------------------------------------------------- programs
@@ -215,8 +224,8 @@ def _initial_state(plan: Plan, channels: int):
 
 
 def _forward(plan: Plan, leaves):
-    """The number of rounds until no splat or no unfinished pixel was left; transmittance, colors, and last entries of
-    the last round."""
+    """The number of rounds until no splat or no unfinished pixel was left; transmittance, colors, and of the last round
+    its last entries and lists."""
     mean, factor, opacity, color, _ = leaves
     projected = project(plan, mean, factor, opacity)
     fields = pack_fields(projected, mean, opacity, color)
@@ -225,12 +234,15 @@ def _forward(plan: Plan, leaves):
         return (carry[1] < len(mean)) & jnp.any(carry[2] > plan.stop)
 
     def composite(carry):
-        number, begin, transmittance, color, _ = carry
+        number, begin, transmittance, color, _, _ = carry
         lists, end = make_lists(plan, projected, mean, begin)
-        return number + 1, end, *_composite(plan, lists, fields, transmittance, color)
+        return number + 1, end, *_composite(plan, lists, fields, transmittance, color), lists
 
     transmittance, planes = _initial_state(plan, color.shape[1])
-    start = jnp.int32(0), jnp.int32(0), transmittance, planes, jnp.zeros(transmittance.shape, jnp.int32)
+    no_lists = jax.tree.map(
+        lambda spec: jnp.zeros(spec.shape, spec.dtype), jax.eval_shape(lambda: make_lists(plan, projected, mean, 0)[0])
+    )
+    start = jnp.int32(0), jnp.int32(0), transmittance, planes, jnp.zeros(transmittance.shape, jnp.int32), no_lists
     number, _, *state = jax.lax.while_loop(more, composite, start)
     return number, *state
 
@@ -241,16 +253,16 @@ def _render(plan: Plan, leaves):
 
 
 def _render_fwd(plan: Plan, leaves):
-    num, transmittance, color, last = _forward(plan, leaves)
+    num, transmittance, color, last, lists = _forward(plan, leaves)
     planes = [plane + transmittance * own for plane, own in zip(color, leaves[4], strict=True)]
-    return join_tiles(plan, jnp.stack(planes).swapaxes(1, 2)), (leaves, transmittance, last, num)
+    return join_tiles(plan, jnp.stack(planes).swapaxes(1, 2)), (leaves, transmittance, last, lists, num)
 
 
 _render_jit = jax.jit(_render, static_argnums=0)
 
 
 def _render_bwd(plan: Plan, residuals, grad_image):
-    leaves, final_transmittance, final_last, num = residuals
+    leaves, *of_last_round, num = residuals
     mean, factor, opacity, color, background = leaves
     projected = project(plan, mean, factor, opacity)
     fields = pack_fields(projected, mean, opacity, color)
@@ -266,14 +278,14 @@ def _render_bwd(plan: Plan, residuals, grad_image):
 
     def backward_round(carry):
         number, sums, behind = carry
-        begin, transmittance = start_of(number)
-        lists, _ = make_lists(plan, projected, mean, begin)
 
         def replay():
+            begin, transmittance = start_of(number)
+            lists, _ = make_lists(plan, projected, mean, begin)
             after, _, last = _composite(plan, lists, fields[:, :COLOR], transmittance, no_colors)
-            return after, last
+            return [after, last, lists]
 
-        transmittance, last = jax.lax.cond(number == num - 1, lambda: (final_transmittance, final_last), replay)
+        transmittance, last, lists = jax.lax.cond(number == num - 1, lambda: of_last_round, replay)
         own, behind = _backward(plan, lists, fields, transmittance, last, grad, behind)
         return number - 1, sums.at[lists.splat].add(own, mode="drop"), behind
 
@@ -281,7 +293,7 @@ def _render_bwd(plan: Plan, residuals, grad_image):
     sums = jnp.zeros((len(mean), MOMENTS + color.shape[1]), jnp.float32)
     start = num - 1, sums, jnp.sum(grad * background[:, None, None], axis=0)
     _, sums, _ = jax.lax.while_loop(lambda carry: carry[0] >= 0, backward_round, start)
-    d_background = jnp.sum(final_transmittance[None] * grad, axis=(1, 2))
+    d_background = jnp.sum(of_last_round[0][None] * grad, axis=(1, 2))
     return ((*gradients_from_sums(projected, sums, factor, opacity), d_background),)
 
 

@@ -151,8 +151,12 @@ def indices(count: int) -> Int[Array, " count"]:
 
 
 def _running_sum(counts: Int[Array, " num"]) -> Int[Array, " num"]:
-    """Inclusive prefix sum that saturates: the pairs of a million large splats would overflow."""
-    return jax.lax.associative_scan(lambda a, b: jnp.minimum(a + b, _SATURATED), jnp.minimum(counts, _SATURATED))
+    """Inclusive prefix sum that saturates: the pairs of a million large splats would overflow, as a float sum shows.
+
+    (`associative_scan` of a sum that saturates would be a hundred GPU programs.)
+    """
+    overflows = jnp.cumsum(counts.astype(jnp.float32)) > 1.5 * _SATURATED
+    return jnp.where(overflows, _SATURATED, jnp.minimum(jnp.cumsum(counts), _SATURATED))
 
 
 def pack_fields(projected: Projected, mean, opacity, color) -> Float[Array, "num+1 fields"]:
@@ -196,7 +200,8 @@ def make_lists(plan: Plan, projected: Projected, mean, begin) -> tuple[Lists, In
     tile, splat = _sort_by_tile(tile, owner, plan.num_tiles, num)
     splat = jnp.where(tile < plan.num_tiles, splat, num)
     padded = plan.num_batches * plan.batch
-    bounds = jnp.searchsorted(tile, indices(padded + 1), side="left").astype(jnp.int32)
+    # Unrolled it is one GPU program; as a loop, several for each step of the search.
+    bounds = jnp.searchsorted(tile, indices(padded + 1), side="left", method="scan_unrolled").astype(jnp.int32)
     bounds = jnp.where(indices(padded + 1) <= plan.num_tiles, bounds, bounds[plan.num_tiles])
     length = bounds[1:] - bounds[:-1]
     order = jnp.argsort(-length).astype(jnp.int32).reshape(plan.num_batches, plan.batch)
@@ -291,8 +296,9 @@ def checkpoint_rounds(plan: Plan, start, num, attenuate: Callable):
         begins, stored = begins.at[k].set(begin), stored.at[k].set(transmittance)
         return begins, stored, *advance(jnp.where(k < last, stride, 0), begin, transmittance)
 
-    empty = jnp.zeros(STORED_ROUNDS, jnp.int32), jnp.zeros((STORED_ROUNDS, *start.shape), start.dtype)
-    begins, stored, *_ = jax.lax.fori_loop(0, last + 1, store, (*empty, jnp.int32(0), start))
+    # Those of the first round, which are all that a single one needs.
+    first = jnp.zeros(STORED_ROUNDS, jnp.int32), jnp.broadcast_to(start, (STORED_ROUNDS, *start.shape))
+    begins, stored, *_ = jax.lax.fori_loop(0, jnp.where(num > 1, last + 1, 0), store, (*first, jnp.int32(0), start))
     return lambda number: advance(number % stride, begins[number // stride], stored[number // stride])
 
 

@@ -33,7 +33,7 @@ from foldgauss.video.fitting.config import (
 )
 from foldgauss.video.fitting.loop import check_frames, start, start_from, to_model
 from foldgauss.video.fitting.schedule import steps_per_pass
-from foldgauss.video.fitting.steppers import cpu_stepper
+from foldgauss.video.fitting.steppers import cpu_stepper, interpolated_frames
 from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
 from foldgauss.video.models.prepared import PreparedModel
 
@@ -123,7 +123,7 @@ def test_a_frame_twice_in_a_batch_counts_twice(monkeypatch):
         monkeypatch.setattr(
             cpu_stepper, "update_frame_times", lambda w, m, by_time, rate: (seen.update(t=by_time) or w, m)
         )
-        monkeypatch.setattr(cpu_stepper, "choose_views", lambda *given, batch=batch: np.array(batch))
+        monkeypatch.setattr(interpolated_frames, "choose_views", lambda *given, batch=batch: np.array(batch))
         CpuStepper(frames, config, state).step(state, 0.0)
         steps.append((seen["t"], state.rows.copy()))
     assert abs(steps[0][0][1]) > 0

@@ -182,20 +182,17 @@ def _has_parameter(kinds: UInt8[Array, " num"], degree: int, width: int) -> Bool
 
 def _rate_factors(rows, kinds, degree: int, units: RateUnits) -> Float[Array, "num width"]:
     """The factors by which each Gaussian's size and duration scale its learning rates, see `config.LearningRates`."""
-    factors, place = jnp.ones_like(rows), columns(degree)
-    size = short = jnp.ones_like(rows[:, 0])
+    place, (of_size, of_time) = columns(degree), np.zeros((2, rows.shape[1]), np.float32)
+    of_size[place["loc"]] = of_size[place["coefficients"]] = 1
+    of_time[place["time_loc_logit"]], of_time[place["coefficients"]] = 1, -np.repeat(np.arange(1, degree + 1), 2)
+    size = time = jnp.zeros_like(rows[:, 0])  # logarithms
     if units.size > 0:
-        size = jnp.exp(np.float32(0.5) * rows[:, place["log_scale"]].sum(axis=1)) / np.float32(units.size)
-        factors = factors.at[:, place["loc"]].set(size[:, None])
+        size = rows[:, place["log_scale"]].mean(axis=1) - np.float32(math.log(units.size))
     if units.time > 0:
         static = (kinds.astype(jnp.int32) & STATIC_BIT) > 0
-        spread = jnp.exp(rows[:, place["log_time_scale"].start])
-        wide = jnp.where(static, np.float32(STATIC_TIME_SCALE), spread) / np.float32(units.time)
-        factors, short = factors.at[:, place["time_loc_logit"].start].set(wide), 1 / wide
-    for column in range(place["coefficients"].start, place["coefficients"].stop, 2):
-        size = size * short
-        factors = factors.at[:, column : column + 2].set(size[:, None])
-    return factors
+        time = jnp.where(static, np.float32(math.log(STATIC_TIME_SCALE)), rows[:, place["log_time_scale"].start])
+        time = time - np.float32(math.log(units.time))
+    return jnp.exp(size[:, None] * of_size[None] + time[:, None] * of_time[None])
 
 
 # ------------------------------------------------------------------------------------------------ frame times

@@ -47,15 +47,20 @@ def choose_views(config: FitConfig, num_frames: int, step: int, errors: np.ndarr
     views, evenly among the others, are drawn in proportion to the errors; frames without one count as average. The
     others pass through all views, in an order that depends on the seed and the pass only.
     """
-    num, in_turn = num_views(config, num_frames), fraction_in_turn(config)
-    positions = np.arange(step * config.batch_size, (step + 1) * config.batch_size)
-    taken = np.floor(positions * in_turn).astype(int)
-    views = np.array([_shuffle(config, num, k // num)[k % num] for k in taken])
-    drawn = np.floor((positions + 1) * in_turn).astype(int) == taken
+    num, (views, drawn) = num_views(config, num_frames), find_views_in_turn(config, num_frames, step)
     if drawn.any():
         rng = np.random.default_rng([config.seed, 7, step])
         views[drawn] = rng.choice(num, drawn.sum(), p=_chances(errors, num))
     return views
+
+
+def find_views_in_turn(config: FitConfig, num_frames: int, step: int) -> tuple[np.ndarray, np.ndarray]:
+    """The views of a step if none were drawn by error, and which are drawn (they are the next ones in turn here)."""
+    num, in_turn = num_views(config, num_frames), fraction_in_turn(config)
+    positions = np.arange(step * config.batch_size, (step + 1) * config.batch_size)
+    taken = np.floor(positions * in_turn).astype(int)
+    views = np.array([_shuffle(config, num, k // num)[k % num] for k in taken])
+    return views, np.floor((positions + 1) * in_turn).astype(int) == taken
 
 
 def _chances(errors: np.ndarray, num: int) -> np.ndarray:

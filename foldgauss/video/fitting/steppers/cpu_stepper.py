@@ -16,7 +16,6 @@ from foldgauss.video.fitting.pruning.relocation import relocate
 from foldgauss.video.fitting.schedule import (
     RateSchedule,
     choose_start_frames,
-    choose_views,
     plan_levels,
     shrink_frame,
     steps_per_pass,
@@ -30,7 +29,7 @@ from foldgauss.video.fitting.state import (
     update_paths,
     update_rows,
 )
-from foldgauss.video.fitting.steppers.interpolated_frames import make_interpolated
+from foldgauss.video.fitting.steppers.interpolated_frames import choose_targets, make_interpolated
 from foldgauss.video.fitting.steppers.loss import ImageLoss, image_loss, squared_loss
 from foldgauss.video.fitting.steppers.protocol import StepResult
 from foldgauss.video.models.background import random_background
@@ -85,11 +84,9 @@ class CpuStepper:
         losses, alive, visited = [], [], set()
         squared = progress >= 1 - config.l2_fraction
         screen = None if state.statistics is None else np.full(len(state.rows), -1, np.float32)
-        for view in choose_views(config, num_frames, state.step, state.frame_errors):
-            k, mirrored = int(view) % num_frames, int(view) >= num_frames
-            fraction = None
-            if self.interpolation is not None:
-                fraction = self.interpolation.choose(state.step, progress, k)
+        views, fractions = choose_targets(self.interpolation, config, num_frames, state, progress)
+        for view, fraction in zip(views.tolist(), fractions, strict=True):
+            k, mirrored = view % num_frames, view >= num_frames
             t = times[k] if fraction is None else (1 - fraction) * times[k] + fraction * times[k + 1]
             settings = {"squared": squared, "mirrored": mirrored, "screen": screen, "fraction": fraction}
             own_path = by_path[k] if fraction is None else None

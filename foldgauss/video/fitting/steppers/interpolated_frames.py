@@ -13,6 +13,8 @@ from jaxtyping import Float32
 
 from foldgauss._runtime.threads import num_threads
 from foldgauss.video.fitting.config import FitConfig, chosen_interpolation
+from foldgauss.video.fitting.schedule import choose_views, find_views_in_turn, fraction_in_turn
+from foldgauss.video.fitting.state import FitState
 from foldgauss.video.motion.optical_flow import Motion
 
 #: Times lie at least this fraction of an interval away from both of its frames.
@@ -39,12 +41,23 @@ class InterpolatedFrames:
         return self.motion.interpolate(self.frames, k, fraction, size).image * np.float32(1 / 255)
 
 
-class Prefetcher:
-    """Makes images of later steps on threads, while a device computes; the same bits as without.
+def choose_targets(
+    interpolation: InterpolatedFrames | None, config: FitConfig, num_frames: int, state: FitState, progress: float
+) -> tuple[np.ndarray, list[float | None]]:
+    """The views of a step, and for each the fraction of `InterpolatedFrames.choose`.
 
-    Which views a step has may depend on the steps before it. An image that was not prepared, since its step was
-    expected to have other views, is made when it is needed.
+    Interpolated ones are views in turn, never drawn by error: so they are known before the steps until then.
     """
+    views = choose_views(config, num_frames, state.step, state.frame_errors)
+    if interpolation is None:
+        return views, [None] * len(views)
+    _, drawn = find_views_in_turn(config, num_frames, state.step)
+    given = zip(views % num_frames, drawn, strict=True)
+    return views, [None if by_error else interpolation.choose(state.step, progress, int(k)) for k, by_error in given]
+
+
+class Prefetcher:
+    """Makes images of later steps on threads, while a device computes; the same bits as without."""
 
     def __init__(self, interpolation: InterpolatedFrames, most: int | None = None):
         """At most `most` images are kept, by default two for each thread: a process that ends waits for them."""
@@ -69,7 +82,7 @@ class Prefetcher:
         return True
 
     def interpolate(self, step: int, k: int, fraction: float, size: tuple[int, int]) -> np.ndarray:
-        """`InterpolatedFrames.interpolate` of a frame of a step."""
+        """`InterpolatedFrames.interpolate` of a frame of a step, which was prepared or is made now."""
         future = self._images.get((step, k, size))
         return self.interpolation.interpolate(k, fraction, size) if future is None else future.result()
 
@@ -84,4 +97,5 @@ def make_interpolated(
 ) -> InterpolatedFrames | None:
     """The interpolated frames of a fit to `frames`; None where it has none, and so needs no optical flow for them."""
     chance = chosen_interpolation(config, alpha=frames.shape[3] == 4) if len(frames) > 1 else 0.0
+    chance = min(chance / fraction_in_turn(config), 1.0)
     return InterpolatedFrames(frames, config, chance, find_motion()) if chance > 0 else None

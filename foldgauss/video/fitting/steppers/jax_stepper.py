@@ -17,13 +17,13 @@ from foldgauss.video.fitting.pruning.relocation import relocate
 from foldgauss.video.fitting.schedule import (
     RateSchedule,
     choose_start_frames,
-    choose_views,
+    find_views_in_turn,
     plan_levels,
     shrink_frame,
     steps_per_pass,
 )
 from foldgauss.video.fitting.state import DeviceArrays, FitState, Sizes, frame_times
-from foldgauss.video.fitting.steppers.interpolated_frames import Prefetcher, make_interpolated
+from foldgauss.video.fitting.steppers.interpolated_frames import Prefetcher, choose_targets, make_interpolated
 from foldgauss.video.fitting.steppers.jax_step import (
     Control,
     InterpolatedViews,
@@ -137,7 +137,8 @@ class JaxStepper:
             self.adopt(state)
         held, config = state.held, self.config
         rates, time_rate = self.rates.at(progress, state.backoffs)
-        views = choose_views(config, self.num_frames, state.step, state.frame_errors)
+        size = self.levels[level].size
+        views, fractions = choose_targets(self.interpolation, config, self.num_frames, state, progress)
         control = Control(
             views=views.astype(np.int32),
             num=np.int32(held.num),
@@ -145,24 +146,23 @@ class JaxStepper:
             rates=rates,
             time_rate=time_rate,
             path_rate=self.rates.of_paths(progress, state.backoffs),
-            interpolated=self._interpolate(views, state.step, progress, self.levels[level].size),
+            interpolated=self._interpolate(views, fractions, state.step, size),
         )
-        self._prepare(state, progress, self.levels[level].size)
+        self._prepare(state, progress, size)
         arrays, report = compile_step(self.programs[level])(held.arrays, self.images[level], control)
         report = jax.device_get(report)
         state.hold(HeldArrays(arrays, held.num, held.growing, report))
         return StepResult(float(report.loss), int(report.num_alive), state.is_finite("rows"))
 
     def _interpolate(
-        self, views: np.ndarray, step: int, progress: float, size: tuple[int, int]
+        self, views: np.ndarray, chosen: list[float | None], step: int, size: tuple[int, int]
     ) -> InterpolatedViews | None:
         """The interpolated targets of a step, of `size`; None if the fit has none at all."""
         if self.interpolation is None:
             return None
         fractions = np.full(len(views), -1.0, np.float32)
         targets = np.zeros((len(views), *size, 3), np.float32)
-        for n, k in enumerate(views % self.num_frames):
-            fraction = self.interpolation.choose(step, progress, int(k))
+        for n, (k, fraction) in enumerate(zip(views % self.num_frames, chosen, strict=True)):
             if fraction is not None:
                 fractions[n], targets[n] = fraction, self.prefetcher.interpolate(step, int(k), fraction, size)
         if (fractions < 0).all():  # the device has zeros already
@@ -172,15 +172,15 @@ class JaxStepper:
         return InterpolatedViews(fractions, targets)
 
     def _prepare(self, state: FitState, progress: float, size: tuple[int, int]) -> None:
-        """Have the interpolated frames of the next steps prepared, which are chosen by the errors as they are now."""
+        """Have the interpolated frames of the next steps prepared."""
         if self.prefetcher is None:
             return
         self.prefetcher.drop(state.step if size == self._prepared_size else math.inf)
         first = max(state.step + 1, self._prepared if size == self._prepared_size else 0)
         self._prepared, self._prepared_size = first, size
         for step in range(first, state.step + 1 + STEPS_AHEAD):
-            views = choose_views(self.config, self.num_frames, step, state.frame_errors)
-            if not self.prefetcher.prepare(step, progress, map(int, views % self.num_frames), size):
+            views, drawn = find_views_in_turn(self.config, self.num_frames, step)
+            if not self.prefetcher.prepare(step, progress, (views[~drawn] % self.num_frames).tolist(), size):
                 break
             self._prepared = step + 1
 
