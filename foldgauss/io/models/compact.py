@@ -34,6 +34,8 @@ from foldgauss.video.compression.quantize import (
     MAX_CELL_BITS,
     MAX_DEGREE,
     MAX_SHARED,
+    MAX_TIME_BITS,
+    TIME_BITS,
     CompactInfo,
     Quantized,
     Rule,
@@ -98,6 +100,8 @@ def pack_compact(quantized: Quantized, metadata: dict | None = None) -> bytes:
         "metadata": to_json_types(metadata or {}),
     }
     num_values = info.num_gaussians * len(descriptions) + header["num_frames"] + _count_path_numbers(info)
+    if info.time_bits == TIME_BITS:
+        del header["time_bits"]
     if info.paths is None:
         del header["paths"]
     else:
@@ -274,7 +278,11 @@ def _parse_info(header: dict) -> CompactInfo:
     for name, interval in bounds.items():
         _check(is_within(header[name], interval), name, header[name])
     check_one_of("compositing", header["compositing"], COMPOSITINGS)
-    known = {field.name: header[field.name] for field in dataclasses.fields(CompactInfo) if field.name != "paths"}
+    optional = {"paths": None, "time_bits": header.get("time_bits", TIME_BITS)}
+    bits = optional["time_bits"]
+    _check(is_integer(bits, 0) and bits <= MAX_TIME_BITS, "time_bits", bits)
+    names = (field.name for field in dataclasses.fields(CompactInfo))
+    known = {name: header[name] for name in names if name not in optional} | optional
     made = {"size": tuple(size), "cells": tuple(cells), "options": RenderOptions(**header["options"])}
     made["paths"] = _parse_paths(header["paths"], header["num_frames"]) if "paths" in header else None
     return CompactInfo(**known | made)

@@ -308,13 +308,13 @@ function decodeColumns(header, streamOf, onColumn) {
 }
 
 /** Shared paths: the times of their knots, and their maps. */
-function decodePaths({ paths }, stream, intervals) {
+function decodePaths({ paths }, stream, logits) {
   const { num_paths: num, num_knots: knots, bits } = paths, total = num * knots;
   const times = new Float32Array(total), matrices = new Float32Array(6 * total);
   const before = (i, width) => (Math.floor(i / width) % knots > 0 ? i - width : -1);
   if (paths.at_frames) {
-    const largest = intervals.reduce((a, b) => Math.max(a, b), -Infinity), sums = [0];
-    for (const own of intervals) sums.push(sums.at(-1) + exp((own - largest) * 2 ** -10));
+    const largest = logits.reduce((a, b) => Math.max(a, b), -Infinity), sums = [0];
+    for (const own of logits) sums.push(sums.at(-1) + exp(own - largest));
     for (let i = 0; i < total; i++) times[i] = i % knots ? sums[i % knots] / sums.at(-1) : 0;
   } else {
     const numbers = Array.from(decodeColumn(stream(paths.knots), emptyColumn(total)));
@@ -342,13 +342,15 @@ export function decode(buffer, onColumn = () => {}) {
   const stream = (length) => bytes.subarray(start, (start += length));
   const v = decodeColumns(header, stream, onColumn);
   const intervals = decodeColumn(stream(header.intervals), emptyColumn(header.num_frames - 1));
+  const step = 2 ** -(header.time_bits ?? 10);
+  const logits = Float64Array.from(intervals, (q) => q * step);
   const leaves = {
     loc: new Float32Array(2 * num), log_scale: new Float32Array(2 * num), angle_logit: new Float32Array(num),
     time_loc_logit: new Float32Array(num), log_time_scale: new Float32Array(num),
     coefficients: new Float32Array(2 * num * degree), opacity_logit: new Float32Array(num),
-    color_dc: new Float32Array(3 * num), frame_times: Float32Array.from(intervals, (q) => q * 2 ** -10),
+    color_dc: new Float32Array(3 * num), frame_times: Float32Array.from(logits),
   };
-  if (header.paths) Object.assign(leaves, { path_index: Uint8Array.from(v.path) }, decodePaths(header, stream, intervals));
+  if (header.paths) Object.assign(leaves, { path_index: Uint8Array.from(v.path) }, decodePaths(header, stream, logits));
   const table = legendre(degree), powers = new Float64Array(degree + 1);
   for (let i = 0; i < num; i++) {
     const time = inClip(v.time[i]);

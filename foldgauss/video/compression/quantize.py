@@ -61,8 +61,9 @@ AXES = np.array(
     ]
 )
 _LN2, _SQRT2 = 0.6931471805599453, 1.4142135623730951
-#: Step of the frame times' logits: a thousandth of an interval.
-TIME_STEP = 2.0**-10
+#: Frame times are rounded to a fraction of 2^-TIME_BITS of each interval, or as much finer as moves no frame by more
+#: than `TIME_ERROR` of the median interval: the interval of a cut is some hundred frames long.
+TIME_BITS, MAX_TIME_BITS, TIME_ERROR = 10, 24, 0.005
 #: Least squared error, in steps, that the last power of a trajectory must save: its two coefficients need some eight
 #: bits, and with fine steps a bit saves 2 ln 2 / 12.
 POWER_WORTH = 0.9
@@ -129,7 +130,8 @@ class CompactInfo:
     """Constants of the model, stored in the header.
 
     `cells`: binary logarithms of the numbers of cells along x, y and time. `shared`: the number of shared colors; 0 if
-    each Gaussian has its own. `reach`: half-width of a trajectory's span of time, in sigma_t.
+    each Gaussian has its own. `reach`: half-width of a trajectory's span of time, in sigma_t. The step of the frame
+    times' logits is 2^-`time_bits`.
     """
 
     num_gaussians: int
@@ -145,6 +147,11 @@ class CompactInfo:
     compositing: str
     scale_cutoff: float
     paths: PathsInfo | None = None
+    time_bits: int = TIME_BITS
+
+    @property
+    def time_step(self) -> float:
+        return 2.0**-self.time_bits
 
     @property
     def column_names(self) -> tuple[str, ...]:
@@ -305,10 +312,10 @@ def dequantize(quantized: Quantized) -> VideoModel:
         envelope=TimeLikelihood(np.float32(info.power), np.float32(info.floor)),
     )
     if info.paths is not None:
-        knots, maps = decode_paths(info.paths, quantized.maps, quantized.knots, quantized.intervals * TIME_STEP)
+        knots, maps = decode_paths(info.paths, quantized.maps, quantized.knots, quantized.intervals * info.time_step)
         index = quantized.columns["path"].astype(np.uint8)
         splats = dataclasses.replace(splats, path_index=index, paths=SharedPaths(single(knots), single(maps)))
-    times = FrameTimes(single(quantized.intervals * TIME_STEP))
+    times = FrameTimes(single(quantized.intervals * info.time_step))
     shared = (info.size, info.fps, info.options, info.compositing, info.scale_cutoff)
     return VideoModel(splats, times, *shared)
 
@@ -476,7 +483,27 @@ def _make_info(model: VideoModel) -> CompactInfo:
         options=model.options,
         compositing=model.compositing,
         scale_cutoff=float(model.scale_cutoff),
+        time_bits=choose_time_bits(np.asarray(model.frame_times.logits, np.float64)),
     )
+
+
+def choose_time_bits(logits: Float[np.ndarray, " intervals"]) -> int:
+    """The fewest bits from `TIME_BITS` on with which rounding moves no frame by more than `TIME_ERROR` intervals."""
+    if not len(logits):
+        return TIME_BITS
+    logits = logits - logits.max()
+    median = np.median(np.exp(logits))
+    for bits in range(TIME_BITS, MAX_TIME_BITS):
+        moved = np.cumsum(np.exp(_round_times(logits, bits) * 2.0**-bits) - np.exp(logits))
+        moved -= moved[-1] * np.cumsum(np.exp(logits)) / np.exp(logits).sum()  # they end at 1
+        if np.abs(moved).max() <= TIME_ERROR * median:
+            return bits
+    return MAX_TIME_BITS
+
+
+def _round_times(logits: Float[np.ndarray, " intervals"], bits: int) -> Int32[np.ndarray, " intervals"]:
+    """Integers of logits up to 0; those of intervals that are 0 in float64 have the least one."""
+    return np.rint(np.maximum(logits, -1e5) * 2.0**bits).astype(np.int64).clip(-LARGEST).astype(np.int32)
 
 
 def choose_cell_bits(num_gaussians: int, size: tuple[int, int]) -> tuple[int, int, int]:
@@ -526,7 +553,7 @@ def quantize(
         for axis in "xy":
             columns[f"{axis}{k}"] = np.where(degrees >= k, columns[f"{axis}{k}"], 0).astype(np.int32)
     logits = exact.logits - exact.logits.max(initial=-np.inf)
-    intervals = np.rint(np.maximum(logits, -1e5) / TIME_STEP).astype(np.int32)
+    intervals = _round_times(logits, info.time_bits)
     paths = {} if info.paths is None else round_paths(info.paths, exact.paths, LARGEST)
     return Quantized(info, rules, columns, intervals, **paths)
 

@@ -291,7 +291,8 @@ class FitConfig:
         default=None,
         metadata=setting(
             "Of the steps before interpolation ends, the fraction that fits frames interpolated by optical flow",
-            "Improves the times between frames, for slow motion. Interpolation ends at `interpolation_end`.",
+            "Improves the times between frames, for slow motion. Interpolation ends at `interpolation_end`. Views that "
+            "are drawn by error (`error_fraction`) are never interpolated.",
             bounds="[0, 1)",
             unset=f"{INTERPOLATION_FRACTION:g}; 0 with an economy, alpha or no optical flow",
             option="--interpolation-fraction",
