@@ -25,6 +25,7 @@ from foldgauss.video import FitConfig, compress, fit, layers
 from foldgauss.video.compression.finetune import finetune_model
 from foldgauss.video.compression.quantize import (
     AXES,
+    TIME_BITS,
     Rule,
     _choose_degrees,
     _log,
@@ -110,6 +111,22 @@ def test_frame_times_and_cut_are_kept():
     model = eqx.tree_at(lambda m: m.frame_times.logits, model, logits)
     again = dequantize(fine(model))
     np.testing.assert_allclose(again.frame_times.times(), model.frame_times.times(), atol=1e-3)
+
+
+def with_cuts(model):
+    """The first two intervals are those of cuts."""
+    logits = np.full(5, 0.001).cumsum()
+    logits[:2] += np.log([149.7, 151.3])
+    return eqx.tree_at(lambda m: m.frame_times.logits, model, np.float32(logits))
+
+
+def test_frames_after_cuts_keep_their_times(tmp_path):
+    model = with_cuts(soft_model(num_frames=6))
+    quantized = fine(model)
+    assert quantized.info.time_bits > TIME_BITS == fine(soft_model()).info.time_bits
+    again = load_video_model(save_compact(tmp_path / "m.fgz", quantized))
+    times = np.asarray(model.frame_times.times(), np.float64)
+    assert np.abs(np.asarray(again.frame_times.times()) - times).max() < 0.006 * np.median(np.diff(times))
 
 
 def of_kinds(model, seed=0):
@@ -670,14 +687,18 @@ def test_paths_are_legendre_series_over_the_span():
         "paths",
         "paths at other times",
         "paths of a crowd",
+        "cuts",
+        "cuts and paths",
     ],
 )
 def test_the_decoder_for_browsers_gives_the_same_bits(tmp_path, how):
     model = soft_model(options=RenderOptions(), **({} if isinstance(how, str) else how))
     if isinstance(how, str) and "crowd" in how:
         model = crowd(model)
+    if isinstance(how, str) and "cuts" in how:
+        model = with_cuts(model)
     if isinstance(how, str) and "paths" in how:
-        if how != "paths":
+        if how.startswith("paths "):
             model = eqx.tree_at(lambda m: m.frame_times.logits, model, np.float32([0, 0.1, -0.3, 0.2, -7.0, 2.5]))
         model = on_paths(model, at_frames=how != "paths at other times")
     if how == "crowd of kinds":
@@ -879,6 +900,9 @@ def test_changed_by_a_transfer_as_text(tmp_path, good):
         ("intervals", 0),
         ("metadata", 5),
         ("scale_cutoff", True),
+        ("time_bits", 25),
+        ("time_bits", -1),
+        ("time_bits", 10.5),
     ],
 )
 def test_forged_header_is_rejected(tmp_path, good, key, value):
