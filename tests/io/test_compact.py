@@ -25,7 +25,6 @@ from foldgauss.video import FitConfig, compress, fit, layers
 from foldgauss.video.compression.finetune import finetune_model
 from foldgauss.video.compression.quantize import (
     AXES,
-    TIME_BITS,
     Rule,
     _choose_degrees,
     _log,
@@ -40,6 +39,7 @@ from foldgauss.video.compression.quantize import (
     trajectory_span,
     unrounded_trajectories,
 )
+from foldgauss.video.compression.quantized_times import TIME_BITS
 from foldgauss.video.models.metrics import evaluate
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.row_layout import shift_path

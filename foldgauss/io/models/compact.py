@@ -34,8 +34,6 @@ from foldgauss.video.compression.quantize import (
     MAX_CELL_BITS,
     MAX_DEGREE,
     MAX_SHARED,
-    MAX_TIME_BITS,
-    TIME_BITS,
     CompactInfo,
     Quantized,
     Rule,
@@ -43,6 +41,7 @@ from foldgauss.video.compression.quantize import (
     is_integral,
 )
 from foldgauss.video.compression.quantized_paths import MAX_PATH_BITS, PathsInfo
+from foldgauss.video.compression.quantized_times import MAX_TIME_BITS, TIME_BITS
 from foldgauss.video.models.shared_paths import MAX_PATHS
 from foldgauss.video.models.video_model import VideoModel
 

@@ -26,6 +26,7 @@ from foldgauss._runtime.checks import invalid
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions
 from foldgauss.video.compression.quantized_paths import PathsInfo, decode_paths, describe_paths, round_paths
+from foldgauss.video.compression.quantized_times import TIME_BITS, choose_time_bits, round_times
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.row_layout import shift_path
 from foldgauss.video.models.shared_paths import SharedPaths, check_paths
@@ -61,9 +62,6 @@ AXES = np.array(
     ]
 )
 _LN2, _SQRT2 = 0.6931471805599453, 1.4142135623730951
-#: Frame times are rounded to a fraction of 2^-TIME_BITS of each interval, or as much finer as moves no frame by more
-#: than `TIME_ERROR` of the median interval: the interval of a cut is some hundred frames long.
-TIME_BITS, MAX_TIME_BITS, TIME_ERROR = 10, 24, 0.005
 #: Least squared error, in steps, that the last power of a trajectory must save: its two coefficients need some eight
 #: bits, and with fine steps a bit saves 2 ln 2 / 12.
 POWER_WORTH = 0.9
@@ -487,25 +485,6 @@ def _make_info(model: VideoModel) -> CompactInfo:
     )
 
 
-def choose_time_bits(logits: Float[np.ndarray, " intervals"]) -> int:
-    """The fewest bits from `TIME_BITS` on with which rounding moves no frame by more than `TIME_ERROR` intervals."""
-    if not len(logits):
-        return TIME_BITS
-    logits = logits - logits.max()
-    median = np.median(np.exp(logits))
-    for bits in range(TIME_BITS, MAX_TIME_BITS):
-        moved = np.cumsum(np.exp(_round_times(logits, bits) * 2.0**-bits) - np.exp(logits))
-        moved -= moved[-1] * np.cumsum(np.exp(logits)) / np.exp(logits).sum()  # they end at 1
-        if np.abs(moved).max() <= TIME_ERROR * median:
-            return bits
-    return MAX_TIME_BITS
-
-
-def _round_times(logits: Float[np.ndarray, " intervals"], bits: int) -> Int32[np.ndarray, " intervals"]:
-    """Integers of logits up to 0; those of intervals that are 0 in float64 have the least one."""
-    return np.rint(np.maximum(logits, -1e5) * 2.0**bits).astype(np.int64).clip(-LARGEST).astype(np.int32)
-
-
 def choose_cell_bits(num_gaussians: int, size: tuple[int, int]) -> tuple[int, int, int]:
     """Bits of cells along x, y and time: about eight Gaussians per cell, a quarter of the bits for time."""
     total = min(max(round(math.log2(num_gaussians / 8)), 0), MAX_CELL_BITS)
@@ -553,7 +532,7 @@ def quantize(
         for axis in "xy":
             columns[f"{axis}{k}"] = np.where(degrees >= k, columns[f"{axis}{k}"], 0).astype(np.int32)
     logits = exact.logits - exact.logits.max(initial=-np.inf)
-    intervals = _round_times(logits, info.time_bits)
+    intervals = round_times(logits, info.time_bits, LARGEST)
     paths = {} if info.paths is None else round_paths(info.paths, exact.paths, LARGEST)
     return Quantized(info, rules, columns, intervals, **paths)
 
