@@ -37,6 +37,26 @@ def test_agrees_with_reference(kind, compositing, options):
     check(*jax.tree.map(np.asarray, (grads, picture)), judgement)
 
 
+@pytest.mark.parametrize(
+    ("num", "most"),
+    [(0, 1), (1, 2**30), (10, 5), (100_000, 20), (4_000, 540_000), (1_000_000, 130_000), (3, 2**31 - 1)],
+)
+def test_running_sums_of_slots_saturate(num, most):
+    counts = np.random.default_rng(0).integers(0, most, num, dtype=np.int32)
+    expected = np.minimum(np.cumsum(counts, dtype=np.int64), tiles._SATURATED)
+    found = np.asarray(tiles._running_sum(jnp.asarray(counts)))
+    assert found.dtype == np.int32
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_small_images_have_small_tiles():
+    sides = [pallas.choose_tile_size(size) for size in ((1, 1), (320, 640), (512, 511), (512, 512), (640, 1280))]
+    assert sides == [8, 8, 16, 16, 16]
+    leaves = *jax.tree.leaves(scene("plain")[0]), BACKGROUND
+    for given, side in ((None, 8), (32, 32)):
+        assert pallas._plan(leaves, (40, 60), "over", RenderOptions(tile_size=given)).tile == side
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("tile", [8, 16, 32])
 def test_several_rounds_equal_one(tile):

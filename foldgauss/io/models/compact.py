@@ -277,11 +277,10 @@ def _parse_info(header: dict) -> CompactInfo:
     for name, interval in bounds.items():
         _check(is_within(header[name], interval), name, header[name])
     check_one_of("compositing", header["compositing"], COMPOSITINGS)
-    optional = {"paths": None, "time_bits": header.get("time_bits", TIME_BITS)}
-    bits = optional["time_bits"]
-    _check(is_integer(bits, 0) and bits <= MAX_TIME_BITS, "time_bits", bits)
-    names = (field.name for field in dataclasses.fields(CompactInfo))
-    known = {name: header[name] for name in names if name not in optional} | optional
+    time_bits = header.get("time_bits", TIME_BITS)
+    _check(is_integer(time_bits, 0) and time_bits <= MAX_TIME_BITS, "time_bits", time_bits)
+    names = {field.name for field in dataclasses.fields(CompactInfo)} - {"paths", "time_bits"}
+    known = {name: header[name] for name in names} | {"time_bits": time_bits}
     made = {"size": tuple(size), "cells": tuple(cells), "options": RenderOptions(**header["options"])}
     made["paths"] = _parse_paths(header["paths"], header["num_frames"]) if "paths" in header else None
     return CompactInfo(**known | made)

@@ -292,7 +292,7 @@ class FitConfig:
         metadata=setting(
             "Of the steps before interpolation ends, the fraction that fits frames interpolated by optical flow",
             "Improves the times between frames, for slow motion. Interpolation ends at `interpolation_end`. Views that "
-            "are drawn by error (`error_fraction`) are never interpolated.",
+            "are drawn by error (`error_fraction`) are never interpolated, which limits the fraction.",
             bounds="[0, 1)",
             unset=f"{INTERPOLATION_FRACTION:g}; 0 with an economy, alpha or no optical flow",
             option="--interpolation-fraction",
