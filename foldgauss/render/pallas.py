@@ -14,6 +14,7 @@ times faster than `xla` (docs/gpu.md), so engine "auto" chooses it there.
 
 import dataclasses
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
@@ -92,15 +93,18 @@ def is_preferred(options: RenderOptions) -> bool:
     return options.tile_size in (None, *TILES) and options.alpha_ceiling <= HIGHEST_CEILING
 
 
-def choose_tile_size(size: tuple[int, int]) -> int:
-    """The side of the tiles of an image of `size` (height, width), unless `RenderOptions.tile_size` gives it."""
-    height, width = size
-    return SMALL_TILE_SIZE if -(-height // TILE_SIZE) * -(-width // TILE_SIZE) < FEW_TILES else TILE_SIZE
+def choose_tile_size(size: tuple[int, int], capacity: int | None = None) -> int:
+    """The side of the tiles of an image of `size` (height, width), unless `RenderOptions.tile_size` gives it.
+
+    `capacity`: `RenderOptions.list_capacity`, at least the number of tiles.
+    """
+    large, small = (math.prod(-(-side // tile) for side in size) for tile in (TILE_SIZE, SMALL_TILE_SIZE))
+    return SMALL_TILE_SIZE if large < FEW_TILES and small <= (capacity or small) else TILE_SIZE
 
 
 def _plan(leaves, size, compositing, options) -> Plan:
     options = dataclasses.replace(options, transmittance_stop=max(options.transmittance_stop, LOWEST_STOP))
-    tile = options.tile_size or choose_tile_size(size)
+    tile = options.tile_size or choose_tile_size(size, options.list_capacity)
     return make_plan(leaves, size, compositing, options, tile=tile, batch_pixels=1)
 
 

@@ -118,9 +118,9 @@ class RenderOptions:
     support_radius: float | None = None
     #: Side of the square tiles of the splats' lists, in px: speed only. None: the engine's fastest.
     tile_size: int | None = None
-    #: Capacity for (tile, splat) pairs in engine "xla": memory and speed only, since splats beyond it are rendered in
-    #: further rounds. At least the number of tiles; None: counted where the splats are concrete, else (inside `jit`,
-    #: `vmap`) derived from the numbers of splats and tiles.
+    #: Capacity for (tile, splat) pairs in engines "xla" and "pallas": memory and speed only, since splats beyond it are
+    #: rendered in further rounds. At least the number of tiles; None: counted where the splats are concrete, else
+    #: (inside `jit`, `vmap`) derived from the numbers of splats and tiles.
     list_capacity: int | None = None
 
     def __post_init__(self) -> None:

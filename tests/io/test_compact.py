@@ -18,7 +18,7 @@ from soft_models import SIZE, on_paths, soft_model
 import foldgauss.io.page
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import ModelFileError, datasets, load_compact, load_video_model, save_compact, save_video_model
-from foldgauss.io.models.compact import MAGIC, VERSION, is_compact, pack_compact
+from foldgauss.io.models.compact import MAGIC, VERSIONS, is_compact, pack_compact
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, compress, fit, layers
@@ -124,7 +124,9 @@ def test_frames_after_cuts_keep_their_times(tmp_path):
     model = with_cuts(soft_model(num_frames=6))
     quantized = fine(model)
     assert quantized.info.time_bits > TIME_BITS == fine(soft_model()).info.time_bits
-    again = load_video_model(save_compact(tmp_path / "m.fgz", quantized))
+    path = save_compact(tmp_path / "m.fgz", quantized)
+    assert [data[len(MAGIC)] for data in (path.read_bytes(), pack_compact(fine(soft_model())))] == [3, 2]
+    again = load_video_model(path)
     times = np.asarray(model.frame_times.times(), np.float64)
     assert np.abs(np.asarray(again.frame_times.times()) - times).max() < 0.006 * np.median(np.diff(times))
 
@@ -820,7 +822,7 @@ def resealed(data, change=lambda header: None, cut=None, spaces=0):
     change(header)
     text = json.dumps(header).encode() + b" " * spaces
     body = text + data[start + length :][:cut]
-    numbers = (VERSION, len(text), zlib.crc32(body))
+    numbers = (VERSIONS[1], len(text), zlib.crc32(body))
     return MAGIC + b"".join(number.to_bytes(4, "little") for number in numbers) + body
 
 
@@ -847,15 +849,13 @@ def test_damaged_everywhere(tmp_path, good):
 def test_later_version_is_rejected(tmp_path, good):
     data = bytearray(good)
     data[len(MAGIC)] = 9
-    refused(tmp_path, bytes(data), r"expected a compact model of version 2, .* got version 9 .* Update foldgauss")
+    refused(tmp_path, bytes(data), r"expected a compact model of version 2 or 3, .* got version 9 .* Update foldgauss")
 
 
 def test_earlier_version_is_rejected(tmp_path, good):
     data = bytearray(good)
     data[len(MAGIC)] = 1
-    refused(
-        tmp_path, bytes(data), r"expected a compact model of version 2, .* got version 1 .* Compress the model again"
-    )
+    refused(tmp_path, bytes(data), r"model of version 2 or 3, .* got version 1 .* Compress the model again")
 
 
 def test_changed_by_a_transfer_as_text(tmp_path, good):

@@ -53,8 +53,8 @@ def test_small_images_have_small_tiles():
     sides = [pallas.choose_tile_size(size) for size in ((1, 1), (320, 640), (512, 511), (512, 512), (640, 1280))]
     assert sides == [8, 8, 16, 16, 16]
     leaves = *jax.tree.leaves(scene("plain")[0]), BACKGROUND
-    for given, side in ((None, 8), (32, 32)):
-        assert pallas._plan(leaves, (40, 60), "over", RenderOptions(tile_size=given)).tile == side
+    for given, side in ({}, 8), ({"tile_size": 32}, 32), ({"list_capacity": 40}, 8), ({"list_capacity": 39}, 16):
+        assert pallas._plan(leaves, (40, 60), "over", RenderOptions(**given)).tile == side
 
 
 @pytest.mark.slow

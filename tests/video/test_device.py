@@ -33,7 +33,7 @@ from foldgauss.video import (
     fit_steps,
 )
 from foldgauss.video.fitting.loop import start
-from foldgauss.video.fitting.schedule import choose_views, plan_levels
+from foldgauss.video.fitting.schedule import plan_levels
 from foldgauss.video.fitting.state import FitState, paths_of
 from foldgauss.video.fitting.steppers import jax_stepper
 from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
@@ -138,9 +138,10 @@ def test_step_matches_the_cpu(progress):
 def test_step_with_interpolated_frames_matches_the_cpu(progress):
     """A batch of frames and of images between frames, and later one of frames alone."""
     config = dataclasses.replace(CONFIG, batch_size=4, interpolation_fraction=0.5)
-    chosen = CpuStepper(FRAMES, config, start(FRAMES, config)).interpolation.choose
-    views = choose_views(config, len(FRAMES), 20, warm_state(config).frame_errors)
-    assert 0 < sum(chosen(20, 0.1, int(k)) is not None for k in views) < 4
+    state = warm_state(config)
+    interpolation = CpuStepper(FRAMES, config, start(FRAMES, config)).interpolation
+    _, fractions = choose_targets(interpolation, config, len(FRAMES), state, 0.1)
+    assert 0 < sum(fraction is not None for fraction in fractions) < 4
     _, there = compare_steps(config, progress)
     assert np.abs(there.rows - warm_state(config).rows).max() > 1e-3  # it did step
 

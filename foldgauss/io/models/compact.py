@@ -48,7 +48,8 @@ from foldgauss.video.models.video_model import VideoModel
 COMPACT_SUFFIX = ".fgz"
 #: As in PNG: a byte that is not ASCII, line ends of both kinds, which a transfer as text would change, an end of file.
 MAGIC = b"\x8bFGZ\r\n\x1a\n"
-VERSION = 2
+#: The second one is the first one with `time_bits`, which readers of the first one would ignore.
+VERSIONS = 2, 3
 #: Magic, version, length of the header, checksum of all that follows.
 _FIXED = len(MAGIC) + 12
 #: Limit of numbers per byte, so that a small file cannot claim much memory; files are padded with spaces. Clips need 1.
@@ -111,7 +112,7 @@ def pack_compact(quantized: Quantized, metadata: dict | None = None) -> bytes:
     data = b"".join(streams)
     text += b" " * (-(-num_values // _MOST_PER_BYTE) - len(text) - len(data))
     body = text + data
-    numbers = (VERSION, len(text), zlib.crc32(body))
+    numbers = (VERSIONS["time_bits" in header], len(text), zlib.crc32(body))
     return MAGIC + b"".join(number.to_bytes(4, "little") for number in numbers) + body
 
 
@@ -198,9 +199,9 @@ def _read_header(path: Path, data: bytes) -> tuple[dict, bytes]:
     if len(data) < _FIXED:
         raise _unreadable(path, f"one cut off after {len(data)} bytes")
     version, length, checksum = (int.from_bytes(data[k : k + 4], "little") for k in range(len(MAGIC), _FIXED, 4))
-    if version != VERSION:
-        expected, got = f"a compact model of version {VERSION}, which this program reads", f"version {version} in"
-        cure = "Compress the model again." if version < VERSION else "Update foldgauss."
+    if version not in VERSIONS:
+        expected = f"a compact model of version {VERSIONS[0]} or {VERSIONS[1]}, which this program reads"
+        got, cure = f"version {version} in", "Compress the model again." if version < 2 else "Update foldgauss."
         raise model_file_error("path", expected=expected, got=f"{got} {str(path)!r}", cure=cure)
     body = data[_FIXED:]
     if length > len(body) or zlib.crc32(body) != checksum:

@@ -335,7 +335,7 @@ function decodePaths({ paths }, stream, logits) {
 export function decode(buffer, onColumn = () => {}) {
   const bytes = new Uint8Array(buffer), fixed = new DataView(buffer);
   if (bytes.length < 20 || MAGIC.some((own, k) => bytes[k] !== own)) throw new Error("not a compact model");
-  if (fixed.getUint32(8, true) !== 2) throw new Error("a compact model of another version");
+  if (![2, 3].includes(fixed.getUint32(8, true))) throw new Error("a compact model of another version");
   let start = 20 + fixed.getUint32(12, true);
   const header = JSON.parse(new TextDecoder().decode(bytes.subarray(20, start)));
   const num = header.num_gaussians, degree = header.degree;

@@ -25,5 +25,5 @@ def choose_time_bits(logits: Float[np.ndarray, " intervals"]) -> int:
 def round_times(
     logits: Float[np.ndarray, " intervals"], bits: int, largest: int = 2**30 - 1
 ) -> Int32[np.ndarray, " intervals"]:
-    """Integers of logits up to 0; those of intervals that are 0 in float64 have the least one, -`largest`."""
+    """Integers of logits up to 0; those of intervals that are 0 in float64 are limited to -`largest`."""
     return np.rint(np.maximum(logits, -1e5) * 2.0**bits).astype(np.int64).clip(-largest).astype(np.int32)
