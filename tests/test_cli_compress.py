@@ -127,9 +127,27 @@ def test_an_edit_that_is_fitted_away_is_told(work, tmp_path, capsys):
 
 def test_without_the_clip(work, tmp_path, capsys):
     assert run("compress", work / "model.safetensors", "--out", tmp_path / "m.fgz", "--passes", 0) == 0
-    told = " ".join(capsys.readouterr().err.split())
+    shown, told = capsys.readouterr()
+    told = " ".join(told.split())
     assert "the loss is estimated, from images of the model and a PSNR of 33.30 dB, recorded in the file" in told
+    assert "loss, estimated" in shown
+    assert "no smaller" not in told
     assert load_video_model(tmp_path / "m.fgz").num_frames == FRAMES
+
+
+def test_a_file_that_is_no_smaller_is_told(work, tmp_path, capsys):
+    assert run("compress", work / "model.safetensors", "--max-loss-db", 3, "--out", tmp_path / "m.fgz") == 0
+    assert run("compress", tmp_path / "m.fgz", "--max-loss-db", 0.01, "--out", tmp_path / "n.fgz") == 0
+    assert "n.fgz is no smaller than" in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_a_clip_of_fewer_frames(work, tmp_path, capsys):
+    write_video(tmp_path / "short", np.zeros((FRAMES - 1, *SIZE, 3), np.uint8), 12.0)
+    for command in ("compress", "evaluate"):
+        assert run(command, work / "model.safetensors", tmp_path / "short") == 2
+        told = " ".join(capsys.readouterr().err.split())
+        assert "VIDEO: expected 5 frames as in the model, got 4" in told
+        assert "Give the clip that it was fitted to." in told
 
 
 @pytest.mark.parametrize(
@@ -140,6 +158,7 @@ def test_without_the_clip(work, tmp_path, capsys):
         (["--max-loss-db", "nan"], "--max-loss-db: expected a loss in (0, 60] dB"),
         (["--frames", "0:5"], "--frames: expected a VIDEO"),
         (["--passes", "-1"], "passes"),
+        (["--passes", "5"], "--passes: expected a VIDEO to fine-tune to, got none"),
         (["nowhere.mp4"], "nowhere.mp4"),
         (["--out", "missing/m.fgz"], "missing"),
     ],

@@ -307,7 +307,7 @@ def _fit_and_record(job: FitJob, report: Report) -> dict[str, Any]:
         "file_digest": file_digest(job.target),
         "peak_bytes": peak_bytes(),
         "warnings": [
-            *(clip_warnings(clip) if job.index is None else ()),
+            *(clip.notes if job.index is None else ()),
             *dict.fromkeys(caught),
             *missed_psnr(job.config, scores.mean_psnr, info),
         ],
@@ -323,13 +323,6 @@ def missed_psnr(config: FitConfig, mean_psnr: float, info: FitInfo) -> list[str]
     if config.economy is None or config.economy.psnr is None or info.stopped_by == "smallest_at_psnr":
         return []
     return [f"{config.economy.psnr:g} dB was not reached, got {mean_psnr:.2f} dB after {info.step:,} steps."]
-
-
-def clip_warnings(clip: Clip) -> list[str]:
-    """Warnings about a clip: frames that cannot be decoded, and its notes."""
-    lost = clip.num_declared - clip.num_frames
-    missing = [f"only {clip.num_frames} of {clip.num_declared} frames decode; those are used."] if lost > 0 else []
-    return [*missing, *clip.notes]
 
 
 def peak_bytes() -> int | None:

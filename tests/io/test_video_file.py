@@ -283,8 +283,9 @@ def test_damaged_video_tells_what_was_promised(tmp_path):
         read_video(path, size=(16, 32), frames=(18, 20))
     _one_line(caught, "18:20", "of 132 frames decode")
     # What decodes past the damage is blemished, but in its place.
-    assert "frames 17 to 23 cannot be decoded" in clip.notes[0]
-    assert "frames 0:17 are intact" in clip.notes[0]
+    assert clip.notes[0] == f"only {clip.num_frames} of 132 frames decode; those are used."
+    assert "frames 17 to 23 cannot be decoded" in clip.notes[1]
+    assert "frames 0:17 are intact" in clip.notes[1]
     late = read_video(path, size=(16, 32), frames=(120, 130))
     assert late.num_frames == late.num_declared == 10
     np.testing.assert_array_equal(late.frames, clip.frames[120 - 7 : 130 - 7])

@@ -833,6 +833,8 @@ def test_a_tail_cut_off(tmp_path, kept):
     assert clip.num_declared == 8
     np.testing.assert_array_equal(clip.frames[:kept], _noise()[:kept])
     assert clip.num_frames <= kept + 1
+    lost = (f"only {clip.num_frames} of 8 frames decode; those are used.",)
+    assert clip.notes == (() if clip.num_frames == 8 else lost)
 
 
 @pytest.mark.parametrize("broken", [(0, 1), (3, 4), (0, 3)], ids=str)
@@ -844,7 +846,8 @@ def test_broken_frames_are_left_out(tmp_path, broken):
     sound = [k for k in range(8) if k not in broken and k - 1 not in broken]
     np.testing.assert_array_equal(clip.frames, _noise()[sound])
     assert clip.num_declared == 8
-    assert "cannot be decoded and are left out" in clip.notes[0]
+    assert clip.notes[0] == f"only {len(sound)} of 8 frames decode; those are used."
+    assert "cannot be decoded and are left out" in clip.notes[1]
     shown = np.array(sound) / 10
     if np.ptp(np.diff(sound)):  # there is a gap in the middle
         np.testing.assert_allclose(clip.times, shown - shown[0], atol=1e-3)
@@ -866,6 +869,7 @@ def test_a_broken_animation(tmp_path, name):
         except VideoError:
             continue
         assert clip.num_frames < clip.num_declared <= 8
+        assert clip.notes[0].startswith(f"only {clip.num_frames} of {clip.num_declared} frames decode")
         np.testing.assert_array_equal(clip.frames, whole.frames[: clip.num_frames])
 
 

@@ -73,8 +73,8 @@ def compress_command(
 ) -> None:
     """Write a model as a compact file, a fraction of its size.
 
-    It can be rendered, evaluated, edited and exported like any model. It loses at most --max-loss-db of PSNR. See
-    docs/compress.md.
+    It can be rendered, evaluated, edited and exported like any model. It loses at most --max-loss-db of PSNR; without
+    VIDEO, this is an estimate. See docs/compress.md.
     """
     suffix = f".float16{MODEL_SUFFIX}" if float16 else COMPACT_SUFFIX
     target = Path(f"{model_path.resolve().stem}{suffix}") if out_path is None else out_path
@@ -89,6 +89,8 @@ def compress_command(
         raise wrong_use("--float16", expected=f"no {name}", got="both; parameters are only rounded")
     if frames is not None and video is None:
         raise wrong_use("--frames", expected="a VIDEO to take them from", got="none")
+    if passes not in (0, PASSES) and video is None:
+        raise wrong_use("--passes", expected="a VIDEO to fine-tune to", got="none", cure="Give it, or no --passes.")
     refuse_input(target, "model", model_path)
     refuse_existing(target, overwrite)
     check_writable(target)
@@ -114,6 +116,8 @@ def compress_command(
         "bits_per_pixel": 8 * after / (model.num_frames * model.size[0] * model.size[1]),
     }
     print_figures(str(target), figures)
+    if after >= before:
+        warn(f"{target} is no smaller than {model_path}.")
 
 
 def save_compressed(target: Path, made: Compressed, about: dict[str, Any], *, known: bool = True) -> None:
@@ -181,4 +185,5 @@ def _write_compressed(
             f"{made.psnr:.2f} dB, {source}. Give VIDEO for a smaller file and a measured loss.",
             soft_wrap=True,
         )
-    return {"loss_db": made.loss_db, "num_gaussians": made.model.num_gaussians, "num_dropped": made.num_dropped}
+    loss = "estimated_loss_db" if clip is None else "loss_db"
+    return {loss: made.loss_db, "num_gaussians": made.model.num_gaussians, "num_dropped": made.num_dropped}

@@ -35,7 +35,7 @@ from foldgauss.io.history import HistoryFile, read_history, write_curves
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.video_model import MODEL_SUFFIX, check_model_name
 from foldgauss.jobs.job import FitJob
-from foldgauss.jobs.runner import FitRun, clip_warnings, missed_psnr, run_fit
+from foldgauss.jobs.runner import FitRun, missed_psnr, run_fit
 from foldgauss.jobs.runner import Stopped as FitStopped
 from foldgauss.jobs.segments import read_segment_seconds
 from foldgauss.video.fitting.config import FitConfig, planned_steps
@@ -255,7 +255,7 @@ def _print_plan(clip: Clip, config: FitConfig, display: Display) -> None:
     except ValueError as error:
         raise WrongUse(name_option(str(error))) from error
     height, width = clip.size
-    for text in clip_warnings(clip):
+    for text in clip.notes:
         warn(f"{clip.source}: {text}")
     num, at_most = plan_gaussians(config, clip.num_frames, height, width)
     steps = planned_steps(config, clip.num_frames)

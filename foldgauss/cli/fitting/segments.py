@@ -146,8 +146,6 @@ def _plan_with_progress(plan: partial[LongFit], display: Display) -> LongFit:
 
 def _print_plan(fit: LongFit, config: FitConfig, display: Display, video: Path, options: WorkerOptions) -> None:
     index = fit.index
-    if index.num_declared > index.num_frames:
-        warn(f"only {index.num_frames} of {index.num_declared} frames of {video} decode; those are used.")
     lengths = [stop - first for first, stop in fit.spans]
     size = index.size if fit.jobs[0].size is None else fit.jobs[0].size
     for note in (*index.notes, *describe_crop([index.size], size)):

@@ -39,7 +39,7 @@ from foldgauss.io.media.clip import Clip
 from foldgauss.io.media.video_reading import read_video
 from foldgauss.io.models.video_model import load_video_model, save_video_model
 from foldgauss.io.provenance import fingerprint
-from foldgauss.jobs.runner import clip_warnings, fit_metadata, mean_scores
+from foldgauss.jobs.runner import fit_metadata, mean_scores
 from foldgauss.video.compression.search import compress
 from foldgauss.video.fitting.config import TYPICAL_LIFETIME, FitConfig, chosen_num_gaussians, planned_steps
 from foldgauss.video.fitting.initialize import measure_lifetime
@@ -124,7 +124,7 @@ def tradeoff_command(
     refuse_foreign(out_dir, FILES, "tradeoff", record=RECORD, known=known, cure=", or start over with --overwrite")
     settings = {"axes": list(chosen), "minutes": None if steps else minutes, "steps": steps, "seed": seed}
     clip = read_video(video, frames=parse_frames(frames), size=parse_size(size))
-    for text in clip_warnings(clip):
+    for text in clip.notes:
         warn(f"{clip.source}: {text}")
     make_folder(out_dir)
     own = tuple(out_dir / name for name in sorted(FILES - {RECORD}))

@@ -52,9 +52,14 @@ def read_fitted_clip(
         asked = f"the clip that the model was fitted to, frames {wanted[0]}:{wanted[1]} of {about.get('clip')}"
         raise WrongUse(f"VIDEO: expected {asked}, got {str(video)!r}, which has fewer. Give that clip.") from error
     if same_number and clip.num_frames != model.num_frames:
-        raise WrongUse(
-            f"--frames: expected {model.num_frames} frames as in the model, got {clip.num_frames} of {clip.source!r}. "
-            f"Give those that it was fitted to, as 0:{model.num_frames}."
+        fewer = frames is None and clip.num_frames < model.num_frames
+        raise wrong_use(
+            "VIDEO" if fewer else "--frames",
+            expected=f"{model.num_frames} frames as in the model",
+            got=f"{clip.num_frames} of {clip.source!r}",
+            cure="Give the clip that it was fitted to."
+            if fewer
+            else f"Give those that it was fitted to, as 0:{model.num_frames}.",
         )
     if has_other_frames(about, clip):
         warn(

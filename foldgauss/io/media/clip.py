@@ -165,6 +165,13 @@ def no_frames_error(start: int, stop: int | None, num_decoded: int, num_total: i
     return video_error("frames", expected="a range with frames that decode", got=got, cure="Choose earlier frames.")
 
 
+def describe_lost(num_decoded: int, num_declared: int) -> tuple[str, ...]:
+    """A note if fewer frames of a range decode than its container declares."""
+    if num_decoded >= num_declared:
+        return ()
+    return (f"only {num_decoded} of {num_declared} frames decode; those are used.",)
+
+
 def format_range(start: int, stop: int | None) -> str:
     return f"{start}:{'' if stop is None else stop}"
 

@@ -19,6 +19,7 @@ from foldgauss.io.media.clip import (
     VideoError,
     check_num_pixels,
     check_range_within,
+    describe_lost,
     format_num_bytes,
     format_size,
     no_frames_error,
@@ -275,7 +276,8 @@ def read_animation(path: Path, start: int, stop: int | None, prepare: Callable) 
         raise no_frames_error(start, stop, len(delays), num_total, path)
     shown = np.cumsum([0, *delays[start:]]) / 1000
     rate = estimate_rate(shown[:-1], (len(shown) - 1) / shown[-1], float(shown[-1]))
-    return kept, (num_total if stop is None else stop) - start, rate, ()
+    num = (num_total if stop is None else stop) - start
+    return kept, num, rate, describe_lost(len(kept), num)
 
 
 def _count_declared_images(animation: Image.Image) -> int:

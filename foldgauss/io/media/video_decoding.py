@@ -9,7 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from foldgauss.io.media.clip import RangeFacts, ReadResult, check_range_within, no_frames_error, video_error
+from foldgauss.io.media.clip import (
+    RangeFacts,
+    ReadResult,
+    check_range_within,
+    describe_lost,
+    no_frames_error,
+    video_error,
+)
 from foldgauss.io.media.decoder import MAX_FRAMES, DecodedFrame, VideoDecoder
 from foldgauss.io.media.frame_rate import DEFAULT_FPS, MAX_FPS, estimate_num_frames, estimate_rate, make_increasing
 from foldgauss.io.media.resizing import copy_to_blocks
@@ -54,7 +61,8 @@ class DecodeReport(NamedTuple):
         if np.ptp(self.stamps[:end]) == 0 and end > 1:  # a raw stream: the rate is FFmpeg's guess
             rate = rate._replace(guessed=True)
         gaps = _describe_gaps([start - 1, *self.positions[first:end].tolist()])
-        return (self.num_total if stop is None else stop) - start, rate, self.notes + gaps
+        num_declared = (self.num_total if stop is None else stop) - start
+        return num_declared, rate, describe_lost(end - first, num_declared) + self.notes + gaps
 
 
 def decode_file(
