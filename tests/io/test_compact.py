@@ -480,10 +480,10 @@ def test_dropping_uses_the_loss_that_it_may_cost():
     assert model.num_gaussians > kept[0].num_gaussians > kept[1].num_gaussians > kept[2].num_gaussians
 
 
-def drop_in_stages(monkeypatch, losses):
-    """The models of stages after which so many dB are lost, each the number of its stage, and what they began with."""
+@pytest.mark.parametrize(("last", "kept"), [([0.15], "01234"), ([0.5, 0.15], "01235"), ([0.5, 0.5], "0123")])
+def test_a_last_stage_that_loses_too_much_is_repeated_without_dropping(monkeypatch, last, kept):
     module = sys.modules["foldgauss.video.compression.search"]
-    losses = iter(losses)
+    losses = iter([0.0, 0.05, 0.1, 0.12, *last])
 
     class Loss:
         error, all_frames = 1.0, None
@@ -502,26 +502,8 @@ def drop_in_stages(monkeypatch, losses):
         return str(seed)
 
     found = module._drop_in_stages("model", None, 0.0, Loss(), 0.2, 1.0, finetune, lambda what, loss_db: None)
-    assert next(losses, None) is None
-    return found, tuned
-
-
-@pytest.mark.parametrize(("last", "kept"), [([0.15], "01234"), ([0.5, 0.15], "01235"), ([0.5, 0.5], "0123")])
-def test_a_last_stage_that_loses_too_much_is_repeated_without_dropping(monkeypatch, last, kept):
-    found, tuned = drop_in_stages(monkeypatch, [0.0, 0.05, 0.1, 0.12, *last])
     assert "".join(found) == "model" + kept
     assert tuned == ["less of model", *(f"less of {k}" for k in range(4)), "3"][: 4 + len(last)]
-
-
-@pytest.mark.parametrize(("last", "kept"), [([0.1], "6"), ([0.5, 0.1], "7"), ([0.5, 0.5], "")])
-def test_stages_go_on_while_each_drops_the_most(monkeypatch, last, kept):
-    found, tuned = drop_in_stages(monkeypatch, [-2.0, -1.8, -1.5, -1.0, -0.6, -0.1, *last])
-    assert "".join(found) == "model012345" + kept
-    assert tuned[6:] == ["less of 5", "5"][: len(last)]
-
-
-def test_there_is_an_end_of_stages(monkeypatch):
-    assert "".join(drop_in_stages(monkeypatch, [-9.0] * 11)[0]) == "model012345678910"
 
 
 @pytest.mark.parametrize(("left", "coarseness", "chosen"), [(30, 5.0, 40), (30, 1.0, 30), (15, 5.0, 15)])

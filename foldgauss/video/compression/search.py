@@ -65,9 +65,9 @@ _FINEST, _COARSEST, _CLOSE = -8.0, 9.0, 0.05
 _WORTH = 40.0
 #: How much greater the coarseness of the first try with fine-tuning is; and the loss per power of two, dB.
 _COARSER, _SLOPE = 1.7, 0.7
-#: Gaussians are dropped in so many stages, or in up to the second number of them while each drops as many as it may. A
-#: stage has passes / 2 passes of fine-tuning. Then the model should have lost this fraction of the allowed loss.
-_STAGES, _MAX_STAGES, _STAGES_OF_PASSES, _DROPPING = 5, 10, 2, 0.75
+#: Gaussians are dropped in stages, each with passes / 2 passes of fine-tuning, after which the model should have lost
+#: this fraction of the allowed loss.
+_STAGES, _STAGES_OF_PASSES, _DROPPING = 5, 2, 0.75
 #: How many dB a stage drops, at most `_MOST_DROPPED`: as many as fine-tuning is expected to make up for. Fine-tuning
 #: leaves the fraction `_LEFT` of what was dropped; beside that it gains some dB, at first about `_FIRST_GAINED`, and in
 #: each stage `_FADING` times as many as in the one before.
@@ -143,8 +143,8 @@ def compress(
     (`FoldedSplats.degrees`, `static`, `opaque`) stay absent, and shared colors stay shared. Shared paths stay as they
     are, to about a fiftieth of a pixel.
 
-    With the clip, fine-tuning compensates for losses and allows coarser steps. Each of five to eleven stages of pruning
-    is followed by `passes / 2` passes over the clip. Each try of a coarseness of the steps takes another 5/8 `passes`
+    With the clip, fine-tuning compensates for losses and allows coarser steps. Each of five or six stages of pruning is
+    followed by `passes / 2` passes over the clip. Each try of a coarseness of the steps takes another 5/8 `passes`
     (3/8 of fewer than 24), in which parameters are rounded group by group while the others adapt. More passes make
     smaller files. Without the clip, or with 0 passes, Gaussians that are not worth their bits are dropped, and the
     parameters of the others are rounded.
@@ -260,7 +260,7 @@ def _drop_in_stages(
     `ordering`: what reordering may add to the squared error before fine-tuning, as a fraction of the model's own.
     """
     kept, current, so_far, gained, most = [(model, 0.0)], model, 0.0, _FIRST_GAINED, _MOST_DROPPED
-    for stage in range(_MAX_STAGES + 1):  # where the last one loses too much, another one that drops none
+    for stage in range(_STAGES + 1):  # where the last one loses too much, another one that drops none
         stages_left = max(_STAGES - 1 - stage, 0)
         dropped = min(max((_DROPPING * max_loss - so_far + _FADING * gained) / _LEFT, 0.0), most)
         if dropped:
@@ -272,14 +272,13 @@ def _drop_in_stages(
         before, so_far = so_far, loss(current, loss.all_frames)
         on_step("dropped", so_far)
         gained = _LEFT * dropped + before - so_far
-        done = not stages_left and (not most or (so_far <= max_loss and dropped < most))
         if so_far <= max_loss:
             kept.append((current, so_far))
+            if not stages_left:
+                break
         elif so_far - stages_left * _FADING * gained > max_loss:  # too many to make up for
             current, so_far = kept[-1]
             most, ordering = (most / 2, ordering / _LESS_ORDERING) if stages_left else (0.0, ordering)
-        if done:
-            break
     return [model for model, _ in kept]
 
 
