@@ -201,7 +201,10 @@ def _read_header(path: Path, data: bytes) -> tuple[dict, bytes]:
     version, length, checksum = (int.from_bytes(data[k : k + 4], "little") for k in range(len(MAGIC), _FIXED, 4))
     if version not in VERSIONS:
         expected = f"a compact model of version {VERSIONS[0]} or {VERSIONS[1]}, which this program reads"
-        got, cure = f"version {version} in", "Compress the model again." if version < 2 else "Update foldgauss."
+        got, cure = (
+            f"version {version} in",
+            "Compress the model again." if version < VERSIONS[0] else "Update foldgauss.",
+        )
         raise model_file_error("path", expected=expected, got=f"{got} {str(path)!r}", cure=cure)
     body = data[_FIXED:]
     if length > len(body) or zlib.crc32(body) != checksum:
