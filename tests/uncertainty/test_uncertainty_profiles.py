@@ -22,6 +22,7 @@ from foldgauss.uncertainty import (
 )
 from foldgauss.uncertainty.likelihood import likelihood_profiles as drawing
 from foldgauss.uncertainty.likelihood.residuals import Sketches
+from foldgauss.video.models.shared_paths import SharedPaths
 
 
 @pytest.fixture(scope="module")
@@ -185,6 +186,17 @@ def test_another_seeded_model_is_another_scene():
 def test_clip_that_begins_later_than_its_model_warns():
     with pytest.warns(UserWarning, match="Frame 0 is held at time 0"):
         likelihood_profiles(model(), clip(0.3 + 0.7 * uneven()), noise=white(0.02))
+
+
+def test_gaussians_on_shared_paths_warn():
+    still = np.array([[[[1, 0, 0], [0, 1, 0]]]], np.float32)  # one path, one knot
+    index = np.arange(len(model().splats.loc)) % 4 == 0
+    splats = dataclasses.replace(
+        model().splats, path_index=index.astype(np.uint8), paths=SharedPaths(np.zeros((1, 1), np.float32), still)
+    )
+    with pytest.warns(UserWarning, match="25% of the Gaussians follow shared paths.*--no-follow-camera"):
+        found = likelihood_profiles(dataclasses.replace(model(), splats=splats), clip(uneven()), noise=white())
+    assert len(found.notes) == 1
 
 
 def test_a_reach_that_is_too_short_is_widened_or_refused(monkeypatch):

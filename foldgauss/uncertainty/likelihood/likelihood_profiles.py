@@ -75,8 +75,8 @@ def likelihood_profiles(
 
     `video` need not be the clip that the model was fitted to, nor have as many frames: each frame is compared at all
     times, or only within `reach` frame times of its own (default for more than 400 frames: 100, widened as needed). But
-    its first frame is at time 0 of the model and its last at 1; a warning is given if that does not fit, or if the
-    model may be of another clip of the same scene. `noise`: "effective" or "score" (see
+    its first frame is at time 0 of the model and its last at 1; a warning is given if that does not fit, if the
+    model may be of another clip of the same scene, and if its Gaussians follow shared paths, which may absorb the times. `noise`: "effective" or "score" (see
     `effective_fraction`, `score_fraction`), "independent", or a `FrameNoise`. `on_render` is called with the
     numbers of images rendered and planned so far.
 
@@ -95,7 +95,7 @@ def likelihood_profiles(
     _check_changes(residuals.frames)
     builder = ProfileBuilder(residuals, reach, on_render)
     builder.compare_coarse()
-    notes = _check_explained(residuals.frames, builder)
+    notes = _check_paths(model) + _check_explained(residuals.frames, builder)
     profiles = builder.build(noise)
     _check_identified(profiles.curves)
     notes += _check_ends(profiles.curves, builder.model_times)
@@ -300,6 +300,18 @@ def _check_identified(curves: ProfileCurves) -> None:
         got = f"log-likelihoods that change by at most {rises[1:-1].max():.2g} over all times"
         cure = "The times are not identified: nothing changes, or the noise is too great (5 gray levels: 5 / 255)."
         raise invalid("video", expected="frames that identify their times", got=got, cure=cure)
+
+
+def _check_paths(model: VideoModel) -> list[str]:
+    """A warning for Gaussians on paths: their maps, one for each frame, can explain what its time would."""
+    splats = model.splats
+    if splats.paths is None or not (num_on_path := np.count_nonzero(splats.path_index)):
+        return []
+    fraction = num_on_path / len(splats.path_index)
+    return [
+        f"{fraction:.0%} of the Gaussians follow shared paths, whose maps of each frame can absorb what its time would "
+        "tell. Fit the model with --no-follow-camera (FitConfig(follow_camera=False)) to study frame times."
+    ]
 
 
 def _check_ends(curves: ProfileCurves, model_times: np.ndarray) -> list[str]:

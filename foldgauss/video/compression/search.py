@@ -143,7 +143,7 @@ def compress(
     (`FoldedSplats.degrees`, `static`, `opaque`) stay absent, and shared colors stay shared. Shared paths stay as they
     are, to about a fiftieth of a pixel.
 
-    With the clip, fine-tuning compensates for losses and allows coarser steps. Each of five or six stages of pruning is
+    With the clip, fine-tuning compensates for losses and allows coarser steps. Each of five stages of pruning is
     followed by `passes / 2` passes over the clip. Each try of a coarseness of the steps takes another 5/8 `passes`
     (3/8 of fewer than 24), in which parameters are rounded group by group while the others adapt. More passes make
     smaller files. Without the clip, or with 0 passes, Gaussians that are not worth their bits are dropped, and the

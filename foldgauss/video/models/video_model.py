@@ -84,7 +84,7 @@ class VideoModel(eqx.Module):
 
     `size` is (height, width) of the frames it was fitted to, `fps` their rate; `options` and `compositing` ("over" or
     "sum") are those of the fit, and must be rendered with. `scale_cutoff`: a Gaussian is rendered only where its
-    standard deviations exceed it, in model units; 0 except for imported VeGaS videos.
+    standard deviations exceed it, in model units; 0 except for imported VeGaS videos and the preset `paper`.
 
     Units: time is [0, 1], frame k at `frame_times.times()[k]`; lengths are in model space, see `FoldedSplats`.
     Example: `fit(frames).model.render(0.5)`. Source: VeGaS, section 4.
