@@ -324,7 +324,7 @@ def test_a_part_of_a_clip_counts_from_its_first_frame(long, counting):
     _as_read(index, long, [(0, 5), (200, 220), (350, 360)], start=100)
     assert counting.converted == 35  # those from the key frame before a span are only decoded
     np.testing.assert_array_equal(LazyFrames(index, first=350)[:], clip.frames[350:])
-    with pytest.raises(VideoError, match="first, stop: expected a range within 0:360"):
+    with pytest.raises(VideoError, match="frames: expected A:B within 0:360"):
         read_indexed(index, 350, 361)
 
 
@@ -387,6 +387,27 @@ def test_folders_are_read_by_the_names_indexed(tmp_path):
     (path / "00005.png").unlink()
     with pytest.raises(VideoError, match="frame 4 differs"):
         read_indexed(index, 3, 8)
+
+
+def test_missing_numbers_of_a_folder_are_noted(tmp_path):
+    path = write_frames(tmp_path / "frames", _moving(12))
+    (path / "00005.png").unlink()
+    index = index_video(path)
+    for first, stop in ((2, 8), (6, 10)):
+        assert read_indexed(index, first, stop).notes == read_video(path, frames=(first, stop)).notes
+    assert "1 number is missing" in read_indexed(index, 2, 8).notes[0]
+
+
+@pytest.mark.parametrize("error", [ValueError, OSError, IndexError])
+def test_an_error_of_the_caller_is_no_damage_of_an_animation(tmp_path, error):
+    first, *rest = map(Image.fromarray, _moving(5))
+    first.save(tmp_path / "a.gif", save_all=True, append_images=rest)
+
+    def fail():
+        raise error("the caller's own")
+
+    with pytest.raises((error, VideoError), match="the caller's own"):
+        index_video(tmp_path / "a.gif", on_frame=fail)
 
 
 @pytest.mark.parametrize("name", ["a.gif", "a.webp", "a.png"])
@@ -706,8 +727,8 @@ def test_what_arrays_refuse_is_refused(long_index):
     for which in ("a", 1.5, (1, 2), [1, 2]):
         with pytest.raises(ValueError, match="expected the number of a frame, or a slice"):
             lazy[which]
-    for span in ((5, 5), (0, 0), (0, 621), (-2, 3)):
-        with pytest.raises(VideoError, match="expected a range within 0:620"):
+    for span in ((5, 5), (0, 0), (0, 621), (-2, 3), (620, 621)):
+        with pytest.raises(VideoError, match="frames: expected A:B"):
             long_index.span(*span)
     for options in ({"first": 5, "stop": 5}, {"stop": 621}, {"first": -1}, {"run": 0}, {"size": (0, 5)}):
         with pytest.raises(VideoError, match="expected"):

@@ -36,19 +36,7 @@ CONVERSION = (
 )
 #: Luma of limited range as that of full range: FFmpeg's conversion takes all gray video for full range.
 _EXPANDED = np.rint(np.clip((np.arange(256) - 16) * (255 / 219), 0, 255)).astype(np.uint8)
-#: FFmpeg's numbers of matrices: not declared, and those that its conversion does not know.
-_UNSPECIFIED = 2
-_UNKNOWN_MATRICES = {
-    8: "YCgCo",
-    10: "BT.2020 with constant luminance",
-    11: "Y'D'zD'x",
-    12: "a matrix derived from the primaries",
-    13: "a matrix derived from the primaries, with constant luminance",
-    14: "ICtCp",
-    15: "IPT-C2",
-    16: "YCgCo-Re",
-    17: "YCgCo-Ro",
-}
+_UNSPECIFIED = 2  # FFmpeg's number of a matrix that is not declared
 #: FFmpeg's decoders of VP8 and VP9 drop alpha; these are the ones that keep it.
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 
@@ -110,14 +98,10 @@ class DecodedFrame:
         try:
             return self.converters["16" in kind].reformat(self.decoded, width, height, kind, **how).to_ndarray()
         except av.FFmpegError as error:
-            given = f"{self.decoded.format.name}, {self.decoded.height}x{self.decoded.width}"
-            cure = "The file is damaged, or convert it with ffmpeg."
-            if name := _UNKNOWN_MATRICES.get(self.decoded.colorspace):
-                given, cure = (
-                    f"{given}, {name}",
-                    "Convert it, where ffmpeg can: ffmpeg -i IN -vf zscale=matrix=709 OUT.",
-                )
+            frame = self.decoded
+            given = f"{frame.format.name}, {frame.height}x{frame.width}, matrix {frame.colorspace} of ITU-T H.273"
             got = f"one that it cannot ({given}, to be shown at {height}x{width})"
+            cure = "The file is damaged, or of an unknown matrix: ffmpeg -i IN -vf zscale=matrix=709 OUT."
             raise video_error("path", expected="frames that FFmpeg converts to RGB", got=got, cure=cure) from error
 
 

@@ -17,16 +17,13 @@ _IMAGES = (_PNG, _GIF, b"\xff\xd8\xff", b"II*\0", b"MM\0*")
 _PLAYLISTS = (b"#EXTM3U", b"ffconcat", b"v=0", b"[playlist]", b"[Reference]", b"<ASX", b"<asx", b"RTSPtext")
 _ADDRESS = (b"http://", b"https://", b"rtsp://", b"rtmp://", b"udp://", b"file://")
 LIST = "a list of other files or addresses"
+_AUDIO = (b"ID3", b"\xff\xfb", b"fLaC", b"OggS")
 _KINDS = (
     (b"PK\x03\x04", "a zip archive"),
     (b"\x1f\x8b", "a gzip archive"),
     (b"%PDF", "a PDF"),
     (b"\x89HDF", "an HDF5 file"),
     (b"ply\n", "a PLY file"),
-    (b"ID3", "audio"),
-    (b"\xff\xfb", "audio"),
-    (b"fLaC", "audio"),
-    (b"OggS", "audio"),
 )
 
 
@@ -38,7 +35,7 @@ def describe_kind(head: bytes) -> str | None:
     for magic, kind in _KINDS:
         if head.startswith(magic):
             return kind
-    if head[:4] == b"RIFF" and head[8:12] == b"WAVE":
+    if head.startswith(_AUDIO) or (head[:4] == b"RIFF" and head[8:12] == b"WAVE"):
         return "audio"
     if head[8:9] == b"{" and int.from_bytes(head[:8], "little") < 100_000_000:
         return "a .safetensors file, probably a model"

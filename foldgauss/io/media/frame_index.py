@@ -4,10 +4,7 @@ import hashlib
 import json
 import operator
 import os
-import zipfile
-import zlib
 from collections.abc import Callable
-from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -17,34 +14,21 @@ from foldgauss.io._atomic import PathLike, atomic_path, check_path
 from foldgauss.io.media.clip import (
     Range,
     Size,
-    VideoError,
     check_fps,
     check_range,
+    check_range_within,
     check_readable,
-    format_range,
     translate_os_errors,
     video_error,
 )
-from foldgauss.io.media.frame_rate import describe_rate, make_increasing
-from foldgauss.io.media.image_files import image_paths, read_folder
-from foldgauss.io.media.video_decoding import DecodeReport, decode_file, read_video_file
-from foldgauss.io.media.video_reading import choose_reader
+from foldgauss.io.media.frame_rate import FrameRate, describe_rate
+from foldgauss.io.media.image_files import image_paths
+from foldgauss.io.media.video_decoding import DecodeReport
+from foldgauss.io.media.video_reading import read_frames
 from foldgauss.video.motion.optical_flow import CutFinder
 
 DIGEST_BYTES = 16
-_FORMAT = 3
-#: What NumPy raises for other files, and our own checks for other arrays.
-_LOAD_ERRORS = (
-    OSError,
-    EOFError,
-    LookupError,
-    TypeError,
-    ValueError,
-    AttributeError,
-    NotImplementedError,  # zipfile: an unknown compression method
-    zipfile.BadZipFile,
-    zlib.error,
-)
+_FORMAT = 4
 
 
 class FrameIndex:
@@ -105,15 +89,10 @@ class FrameIndex:
         """Frames in the range, including those lost to damage between others."""
         return int(self.positions[-1]) + 1
 
-    @cached_property
+    @property
     def report(self) -> DecodeReport:
-        about = self._about
-        time_base, notes = about["time_base"], tuple(about["shape_notes"])
-        seconds = make_increasing((self.stamps * time_base).tolist(), about["rate"])
-        arrays = self.places, self.stamps, seconds
-        return DecodeReport(
-            about["rate"], about["num_total"], notes, *arrays, time_base, about["threads"], about["end"]
-        )
+        """That of a video file."""
+        return DecodeReport(**self._about["report"] | {"positions": self.places, "stamps": self.stamps})
 
     def span(self, first: int, stop: int) -> tuple[int, int]:
         """The range, for `read_indexed`, of the frames `first` up to `stop` of those that decode: the same numbers
@@ -123,16 +102,9 @@ class FrameIndex:
 
     def check_frames(self, first: int, stop: int | None) -> tuple[int, int]:
         """A range of frames that decode. Raises `VideoError` for one that is empty or beyond the clip."""
-        first, stop = operator.index(first), self.num_frames if stop is None else operator.index(stop)
-        if not 0 <= first < stop <= self.num_frames:
-            raise self.range_error(first, stop, self.num_frames)
+        first, stop = check_range((operator.index(first), self.num_frames if stop is None else operator.index(stop)))
+        check_range_within(first, stop, self.num_frames, self.source)
         return first, stop
-
-    def range_error(self, first: int, stop: int | None, num: int) -> VideoError:
-        """The error for a range that is empty or beyond the `num` frames of the clip."""
-        expected = f"a range within 0:{num}, the frames of {self.source!r}"
-        cure = f"Choose stop <= {num} and first below it."
-        return video_error("first, stop", expected=expected, got=format_range(first, stop), cure=cure)
 
     def save(self, path: PathLike) -> Path:
         """Write to a file (.npz), whole or not at all; returns the path. Raises `OutputError`."""
@@ -159,7 +131,7 @@ class FrameIndex:
                 return cls(about, arrays)
         except FileNotFoundError:
             raise
-        except _LOAD_ERRORS as error:
+        except Exception as error:  # its type depends on the damage
             expected, got = "an index of a clip, as FrameIndex.save writes it", repr(str(path))
             cure = "Make it again: index_video(CLIP).save(PATH)."
             raise video_error("path", expected=expected, got=got, cure=cure) from error
@@ -194,7 +166,6 @@ def index_video(
     if fps is not None:
         check_fps(fps)
     digests, transparent, finder = bytearray(), bytearray(), CutFinder() if find_cuts else None
-    report, names = None, []
 
     def record(image: np.ndarray) -> Size:
         """Record what the index needs of a frame; its size."""
@@ -206,37 +177,26 @@ def index_video(
         return image.shape[:2]
 
     with translate_os_errors(path):
-        reader = choose_reader(path)
-        if reader is read_video_file:
-            found, report = decode_file(path, start, stop, lambda decoded: list(map(record, decoded)), deinterlace)
-        else:
-            found = reader(path, start, stop, record)
-            if reader is read_folder:
-                names = [entry.name for entry in image_paths(path)[start:stop]]
+        found, report = read_frames(path, start, stop, lambda images: list(map(record, images)), deinterlace)
+        names = [entry.name for entry in image_paths(path)[start:stop]] if path.is_dir() else []
     kept, num_declared, rate, notes = found
-    if fps is None:
-        notes += describe_rate(rate)
+    rate = rate if fps is None else FrameRate(float(fps))
     about = {
         "source": str(path),
         "path": os.path.abspath(path),
         "kind": "video" if report else "folder" if names else "pictures",
         "start": start,
         "fixed_fps": None if fps is None else float(fps),
-        "fps": float(rate.fps if fps is None else fps),
-        "first_second": rate.first_second if fps is None else 0.0,
-        "duration": rate.duration if fps is None else None,
-        "end": report.end if report else 0.0,
+        "fps": float(rate.fps),
+        "first_second": rate.first_second,
+        "duration": rate.duration,
         "size": [int(side) for side in kept[-1]],
         "num_declared": int(num_declared),
-        "notes": list(notes),
+        "notes": [*notes, *describe_rate(rate)],
         "cuts": [] if finder is None else finder.found,
         "names": names,
-        "rate": float(report.fps if report else rate.fps),
-        "num_total": int(report.num_total) if report else 0,
-        "time_base": report.time_base if report else 0.0,
-        "threads": report.threads if report else 0,
         "deinterlace": bool(deinterlace),
-        "shape_notes": list(report.notes) if report else [],
+        "report": report and report._asdict() | {"positions": None, "stamps": None},  # which are arrays
     }
     arrays = {
         "stamps": report.stamps if report else np.zeros(len(kept), np.int64),
@@ -244,4 +204,4 @@ def index_video(
         "digests": np.frombuffer(bytes(digests), np.uint8).reshape(-1, DIGEST_BYTES),
         "transparent": np.frombuffer(transparent, np.uint8).astype(bool),
     }
-    return FrameIndex(about, arrays if fps is not None or rate.times is None else arrays | {"times": rate.times})
+    return FrameIndex(about, arrays if rate.times is None else arrays | {"times": rate.times})

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 DEFAULT_FPS = 25.0  # of a folder of images, and of a container without a usable rate
 MIN_FPS = 1e-5  # encoders take it as a fraction with a denominator of at most 100,000
@@ -85,14 +85,7 @@ def make_increasing(stamps: list[float], fps: float) -> Float[np.ndarray, " num_
     return np.array(seconds)
 
 
-def estimate_num_frames(
-    seconds: Float[np.ndarray, " num_frames"], duration: float, fps: float, num_reached: int, last: float
-) -> int:
-    """Total number of frames of a container that records only its duration; frame `num_reached` is at seconds[-1].
-
-    `last`: for how long it is shown by the container; 0 where that is unknown.
-    """
-    remaining, intervals = duration - seconds[-1], np.diff(seconds)
-    if remaining <= MAX_LAST_DURATION * max(1 / fps, intervals.max(initial=0.0), last):
-        return num_reached
-    return num_reached - 1 + round(remaining / (intervals.mean() if len(intervals) else 1 / fps))
+def count_ticks(times: Float[np.ndarray, " num"], least: int = 1) -> Int[np.ndarray, " num"]:
+    """Times rounded to whole units, at least `least` apart: where frames come more quickly, they are moved apart."""
+    ticks, apart = np.rint(times).astype(np.int64), least * np.arange(len(times))
+    return np.maximum.accumulate(ticks - apart) + apart

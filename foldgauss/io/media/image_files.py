@@ -2,11 +2,9 @@
 
 import mmap
 import re
-import struct
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from itertools import count, islice
 from pathlib import Path
 
 import cv2
@@ -27,7 +25,7 @@ from foldgauss.io.media.clip import (
     video_error,
 )
 from foldgauss.io.media.format_detection import is_image_format, min_file_bytes, parse_image_size
-from foldgauss.io.media.frame_rate import DEFAULT_FPS, FrameRate, estimate_rate
+from foldgauss.io.media.frame_rate import estimate_rate
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 GIF_DELAY = 100.0  # milliseconds for which browsers show a frame that has no duration of its own
@@ -35,17 +33,6 @@ MAX_FRAMES = 1_000_000  # of an animation
 #: OpenCV's LOG_LEVEL_SILENT, which has no name up to OpenCV 4.
 _LOG_LEVEL_SILENT = 0
 _WIDTH, _HEIGHT, _BITS, _EXTRA_SAMPLES = 256, 257, 258, 338  # tags of a TIFF
-#: What Pillow raises for damaged files.
-_PILLOW_ERRORS = (
-    EOFError,
-    OSError,
-    SyntaxError,
-    ValueError,
-    IndexError,
-    OverflowError,
-    struct.error,
-    Image.DecompressionBombError,
-)
 
 
 @contextmanager
@@ -63,16 +50,15 @@ def silence_opencv() -> Iterator[None]:
 # ---------------------------------------------------------------------------------------------- folders
 
 
-def read_folder(folder: Path, start: int, stop: int | None, prepare: Callable) -> ReadResult:
-    """The images of a folder."""
+def choose_images(folder: Path, start: int, stop: int | None) -> list[Path]:
+    """The images of a folder from `start` up to `stop`. Raises `VideoError` where there are none."""
     images = image_paths(folder)
     if not images:
         expected = "a folder with images (" + ", ".join(s[1:] for s in IMAGE_SUFFIXES) + ")"
         got, cure = f"{str(folder)!r} without any", "Give the folder that holds the frames, or a video file."
         raise video_error("path", expected=expected, got=got, cure=cure)
     check_range_within(start, stop, len(images), folder)
-    frames, num, rate, notes = read_images(images[start:stop], prepare)
-    return frames, num, rate, notes + describe_missing(images[start:stop])
+    return images[start:stop]
 
 
 def image_paths(folder: Path) -> list[Path]:
@@ -139,15 +125,9 @@ def _is_jpeg_sequence(path: Path, head: bytes) -> bool:
         return data.find(b"\xff\xd9\xff\xd8\xff") >= 0
 
 
-def read_image_file(path: Path, start: int, stop: int | None, prepare: Callable) -> ReadResult:
-    """As `read_folder`, for a file with one image."""
-    check_range_within(start, stop, 1, path)
-    return read_images([path], prepare)
-
-
-def read_images(paths: list[Path], prepare: Callable) -> ReadResult:
+def read_images(paths: list[Path]) -> Iterator[np.ndarray]:
     """Images of one size."""
-    first_shape, kept = None, []
+    first_shape = None
     for path in paths:
         image = read_image(path)
         first_shape = first_shape or image.shape[:2]
@@ -156,14 +136,13 @@ def read_images(paths: list[Path], prepare: Callable) -> ReadResult:
             got = f"{format_size(image.shape)} in {path.name!r}"
             cure = "Resize the images, or choose others with frames=(A, B)."
             raise video_error("path", expected=expected, got=got, cure=cure)
-        kept.append(prepare(image))
-    return kept, len(paths), FrameRate(DEFAULT_FPS), ()
+        yield image
 
 
 def read_image(path: Path) -> np.ndarray:
     """One image as uint8 BGR, shape (height, width, 3), or premultiplied BGRA, (height, width, 4)."""
     head = read_head(path)
-    _check_image_header(path, head)
+    tags = _check_image_header(path, head)
     # UNCHANGED keeps a fourth channel; JPEG has none, and COLOR also applies its orientation.
     flags = cv2.IMREAD_COLOR if head.startswith(b"\xff\xd8") else cv2.IMREAD_UNCHANGED
     with silence_opencv():
@@ -181,20 +160,17 @@ def read_image(path: Path) -> np.ndarray:
     if image.ndim == 2:
         with_alpha = _read_gray_with_alpha(path)
         return cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if with_alpha is None else with_alpha
-    return premultiply(image) if image.shape[2] == 4 and not _is_premultiplied(path) else image
-
-
-def _is_premultiplied(path: Path) -> bool:
-    """Whether OpenCV returns colors times alpha: for a TIFF that declares it, unless it is straight and of 16 bits."""
-    tags = _read_tiff_tags(path)
-    return tags.get(_EXTRA_SAMPLES) == [1] or (tags.get(_EXTRA_SAMPLES) == [2] and tags.get(_BITS, [8])[0] == 8)
+    # OpenCV returns colors times alpha for a TIFF that declares it, unless it is straight and of 16 bits.
+    extra = tags.get(_EXTRA_SAMPLES)
+    is_premultiplied = extra == [1] or (extra == [2] and tags.get(_BITS, [8])[0] == 8)
+    return image if image.shape[2] == 3 or is_premultiplied else premultiply(image)
 
 
 def _read_gray_with_alpha(path: Path) -> np.ndarray | None:
     """Premultiplied BGRA of a gray PNG or TIFF with alpha, which OpenCV drops; None without alpha, or of 16 bits, which
     Pillow cannot read with alpha."""
     with (
-        suppress(*_PILLOW_ERRORS),
+        suppress(Exception),  # Pillow's decoders raise anything
         warnings.catch_warnings(action="ignore"),
         Image.open(path, formats=("PNG", "TIFF")) as image,
     ):
@@ -205,7 +181,7 @@ def _read_gray_with_alpha(path: Path) -> np.ndarray | None:
 
 def _read_tiff_tags(path: Path) -> dict[int, list[int]]:
     """What the first directory of a TIFF says of size, bits and alpha; empty for other files."""
-    with suppress(*_PILLOW_ERRORS), warnings.catch_warnings(action="ignore"), open(path, "rb") as file:
+    with suppress(Exception), warnings.catch_warnings(action="ignore"), open(path, "rb") as file:
         head = file.read(8)
         directory = ImageFileDirectory_v2(head if head[2:3] != b"+" else head + file.read(8))  # "+": BigTIFF
         file.seek(directory.next)
@@ -221,8 +197,9 @@ def premultiply(image: np.ndarray) -> np.ndarray:
     return np.concatenate([((image[..., :3] * alpha + 127) // 255).astype(np.uint8), image[..., 3:]], axis=-1)
 
 
-def _check_image_header(path: Path, head: bytes) -> None:
-    """Raise for an image whose header claims more pixels than are accepted, or than its bytes can hold."""
+def _check_image_header(path: Path, head: bytes) -> dict[int, list[int]]:
+    """Raise for an image whose header claims more pixels than are accepted, or than its bytes can hold; returns the
+    tags of a TIFF."""
     tags = _read_tiff_tags(path)
     if {_HEIGHT, _WIDTH} <= tags.keys():
         size = tags[_HEIGHT][0], tags[_WIDTH][0]
@@ -231,6 +208,7 @@ def _check_image_header(path: Path, head: bytes) -> None:
     check_num_pixels(path, size)
     if size is not None and path.stat().st_size < min_file_bytes(head, size):
         raise _undecodable_error(path)
+    return tags
 
 
 def _undecodable_error(path: Path) -> VideoError:
@@ -241,36 +219,28 @@ def _undecodable_error(path: Path) -> VideoError:
 # ------------------------------------------------------------------------------------------- animations
 
 
-def read_animation(path: Path, start: int, stop: int | None, prepare: Callable) -> ReadResult:
+def read_animation(path: Path, start: int, stop: int | None, keep: Callable) -> ReadResult | None:
     """The frames of a GIF, PNG or WebP with their alpha and times, which no decoder in FFmpeg keeps both.
 
-    A PNG or WebP that is not animated is left to the image decoder, which keeps 16 bits.
+    None for a PNG or WebP that is not animated: it is left to the image decoder, which keeps 16 bits.
     """
     _check_image_header(path, read_head(path))
-    kept, delays, damaged, size = [], [], False, None
-    try:
-        with warnings.catch_warnings(action="ignore"), Image.open(path, formats=("GIF", "PNG", "WEBP")) as animation:
+    delays, num_declared = [], 0
+    with warnings.catch_warnings(action="ignore"):
+        try:
+            animation = Image.open(path, formats=("GIF", "PNG", "WEBP"))
+        except Exception as error:
+            raise _undecodable_error(path) from error
+        with animation:
             if animation.format != "GIF" and not getattr(animation, "is_animated", False):
-                return read_image_file(path, start, stop, prepare)
-            num_declared = _count_declared_images(animation)
-            for number in islice(count(), min(num_declared or MAX_FRAMES, stop or MAX_FRAMES)):
-                animation.seek(number)
-                animation.load()
-                size = size or animation.size
-                if animation.size != size:  # Pillow lets a damaged frame enlarge the image
-                    damaged = True
-                    break
-                delays.append(animation.info.get("duration") or GIF_DELAY)
-                if number >= start:
-                    rgba = np.asarray(animation.convert("RGBA"))
-                    kept.append(prepare(premultiply(cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA))))
-    except VideoError:
-        raise
-    except _PILLOW_ERRORS:
-        damaged = True
+                return None
+            with suppress(Exception):  # a damaged GIF, whose frames are counted by reading them
+                num_declared = animation.n_frames
+            num = min(num_declared or MAX_FRAMES, stop or MAX_FRAMES)
+            kept = keep(_decode_animation(animation, start, num, delays))
     if not delays:
         raise _undecodable_error(path)
-    num_total = max(num_declared, len(delays) + damaged)
+    num_total = num_declared or len(delays) + (len(delays) < (stop or MAX_FRAMES))
     check_range_within(start, stop, num_total, path)
     if not kept:
         raise no_frames_error(start, stop, len(delays), num_total, path)
@@ -280,9 +250,21 @@ def read_animation(path: Path, start: int, stop: int | None, prepare: Callable) 
     return kept, num, rate, describe_lost(len(kept), num)
 
 
-def _count_declared_images(animation: Image.Image) -> int:
-    """Their number as the file gives it; 0 for a damaged GIF, whose frames are counted by reading them."""
-    try:
-        return animation.n_frames
-    except _PILLOW_ERRORS:
-        return 0
+def _decode_animation(animation: Image.Image, start: int, stop: int, delays: list[float]) -> Iterator[np.ndarray]:
+    """The frames from `start` up to `stop`, or to damage; `delays` receives those of the frames before, too."""
+    size = None
+    for number in range(stop):
+        try:
+            animation.seek(number)
+            animation.load()
+            rgba = np.asarray(animation.convert("RGBA")) if number >= start else None
+        except MemoryError:
+            raise
+        except Exception:
+            return
+        size = size or animation.size
+        if animation.size != size:  # Pillow lets a damaged frame enlarge the image
+            return
+        delays.append(animation.info.get("duration") or GIF_DELAY)
+        if rgba is not None:
+            yield premultiply(cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA))

@@ -13,6 +13,7 @@ from foldgauss.io.media.clip import (
     VideoError,
     check_frame_size,
     check_range,
+    check_range_within,
     check_readable,
     no_frames_error,
     translate_os_errors,
@@ -20,10 +21,10 @@ from foldgauss.io.media.clip import (
 )
 from foldgauss.io.media.decoder import DecodedFrame, VideoDecoder
 from foldgauss.io.media.frame_index import FrameIndex, digest_frame
-from foldgauss.io.media.frame_rate import FrameRate, describe_rate
-from foldgauss.io.media.image_files import read_images
+from foldgauss.io.media.frame_rate import DEFAULT_FPS, FrameRate, describe_rate
+from foldgauss.io.media.image_files import describe_missing, read_images
 from foldgauss.io.media.resizing import convert_channels, describe_crop, make_resizer
-from foldgauss.io.media.video_reading import choose_reader
+from foldgauss.io.media.video_reading import read_frames
 
 #: Frames before the wanted one at which a seek aims, in turn: after a seek into the middle of a stream, frames may show
 #: artifacts until the next key frame.
@@ -45,9 +46,7 @@ def read_indexed(index: FrameIndex, first: int, stop: int | None, *, size: Size 
     decodes, and a file that is not the one indexed.
     """
     first, stop = check_range((operator.index(first), None if stop is None else operator.index(stop)))
-    num = max(index.num_positions, index.num_declared)
-    if first >= num or (stop is not None and stop > num):
-        raise index.range_error(first, stop, num)
+    check_range_within(first, stop, max(index.num_positions, index.num_declared), index.source)
     path = check_readable(index.path)
     size = check_frame_size(size)
     low, high = np.searchsorted(index.positions, [first, index.num_positions if stop is None else stop]).tolist()
@@ -115,26 +114,29 @@ class IndexedReader:
             for image in self._decode_video(first, stop):
                 take(image)
             return stop - first, FrameRate(index.fps), ()
-        numbers = iter(range(first, stop))
 
-        def check_and_take(image: np.ndarray) -> object:
-            number = next(numbers)
-            if not self._is_frame(number, image):
-                raise _changed_error(index, number)
-            return take(image)
+        def take_all(images: Iterator[np.ndarray]) -> list[object]:
+            return [take(self._check(number, image)) for number, image in enumerate(images, first)]
 
         if index.kind == "folder":
             paths = [index.path / name for name in index.names[first:stop]]
             for number, path in enumerate(paths, first):
                 if not path.is_file():
                     raise _changed_error(index, number)
-            facts = read_images(paths, check_and_take)[1:]
+            taken = take_all(read_images(paths))
+            facts = len(paths), FrameRate(DEFAULT_FPS), describe_missing(paths)
         else:
-            facts = choose_reader(index.path)(index.path, index.start + first, index.start + stop, check_and_take)[1:]
-        missing = next(numbers, None)
-        if missing is not None:
-            raise _changed_error(index, missing)
+            span = index.start + first, index.start + stop
+            found, _ = read_frames(index.path, *span, take_all, deinterlace=True)
+            taken, facts = found[0], found[1:]
+        if len(taken) < stop - first:
+            raise _changed_error(index, first + len(taken))
         return facts
+
+    def _check(self, number: int, image: np.ndarray) -> np.ndarray:
+        if not self._is_frame(number, image):
+            raise _changed_error(self.index, number)
+        return image
 
     def _is_frame(self, number: int, image: np.ndarray) -> bool:
         return digest_frame(image) == self.index.digests[number].tobytes()

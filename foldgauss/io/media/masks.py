@@ -12,8 +12,8 @@ from PIL import Image
 
 from foldgauss._runtime.checks import check_within, invalid, is_integer
 from foldgauss.io._atomic import PathLike, check_path, missing_error
-from foldgauss.io.media.clip import Range, Size, format_size
-from foldgauss.io.media.image_files import IMAGE_SUFFIXES, image_paths
+from foldgauss.io.media.clip import Range, Size, check_range, format_size
+from foldgauss.io.media.image_files import IMAGE_SUFFIXES, choose_images
 from foldgauss.io.media.resizing import aspect_window
 from foldgauss.io.media.video_reading import read_video
 from foldgauss.render.splats import check_size
@@ -60,39 +60,25 @@ def read_masks(
         raise missing_error(path, "an image, a folder or a video")
     if label is not None and not (is_integer(label, 1) and label < VOID):
         raise invalid("label", expected=f"an object's label, 1 to {VOID - 1}", got=repr(label))
-    masks = _read(path, label, frames, level)
+    is_image = path.suffix.lower() in IMAGE_SUFFIXES
+    if level != MASK_LEVEL and (path.is_dir() or is_image):
+        raise invalid("level", expected="a video with it", got=f"images, {str(path)!r}", cure="They have labels.")
+    if path.is_dir():
+        masks = _select_label(choose_images(path, *check_range(frames)), label, path)
+    elif is_image:
+        if frames is not None:
+            raise invalid("frames", expected="a folder or a video with them", got=f"the image {str(path)!r}")
+        masks = _select_label([path], label, path)[0]
+    else:
+        if label is not None:
+            cure = "Leave label out, or give a folder of PNGs."
+            raise invalid("label", expected="images with labels", got=f"the video {str(path)!r}", cure=cure)
+        check_within("level", level, "(0, 1]", "a fraction of white in (0, 1]")
+        masks = read_video(path, frames=frames).over_black.max(-1) >= 255 * level
     if size is None:
         return masks
     check_size(size)
     return np.ascontiguousarray(masks[..., *aspect_window(masks.shape[-2:], size)])
-
-
-def _read(path: Path, label: int | None, frames: Range | None, level: float) -> Bool[np.ndarray, "*num height width"]:
-    """The masks in their own size."""
-    if level != MASK_LEVEL and (path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES):
-        raise invalid("level", expected="a video with it", got=f"images, {str(path)!r}", cure="They have labels.")
-    if path.is_dir():
-        return _select_label(_choose_images(path, frames), label, path)
-    if path.suffix.lower() in IMAGE_SUFFIXES:
-        if frames is not None:
-            raise invalid("frames", expected="a folder or a video with them", got=f"the image {str(path)!r}")
-        return _select_label([path], label, path)[0]
-    if label is not None:
-        cure = "Leave label out, or give a folder of PNGs."
-        raise invalid("label", expected="images with labels", got=f"the video {str(path)!r}", cure=cure)
-    check_within("level", level, "(0, 1]", "a fraction of white in (0, 1]")
-    return read_video(path, frames=frames).over_black.max(-1) >= 255 * level
-
-
-def _choose_images(folder: Path, frames: Range | None) -> list[Path]:
-    images = image_paths(folder)
-    start, stop = frames if frames is not None else (None, None)
-    for name, k in (("start", start), ("stop", stop)):
-        if k is not None and not (is_integer(k, 0) and k <= len(images)):
-            raise invalid("frames", expected=f"a range in {len(images)} images", got=f"{name} {k!r}")
-    if not images[start:stop]:
-        raise invalid("path", expected="a folder with images in it", got=f"{str(folder)!r}, {len(images)} images")
-    return images[start:stop]
 
 
 def _select_label(paths: list[Path], label: int | None, source: Path) -> Bool[np.ndarray, "num_frames height width"]:

@@ -122,14 +122,12 @@ def _map_tones(image, out, shown, factor, lowered, codes, matrix, luminance, bri
             red, green, blue = shown[image[y, x, 0]], shown[image[y, x, 1]], shown[image[y, x, 2]]
             light = luminance[0] * red + luminance[1] * green + luminance[2] * blue
             scale = _look_up(factor, np.sqrt(light) / brightest)
-            most = 1e-9
             own = (
                 scale * (matrix[0, 0] * red + matrix[0, 1] * green + matrix[0, 2] * blue),
                 scale * (matrix[1, 0] * red + matrix[1, 1] * green + matrix[1, 2] * blue),
                 scale * (matrix[2, 0] * red + matrix[2, 1] * green + matrix[2, 2] * blue),
             )
-            for c in range(3):
-                most = max(most, own[c])
+            most = max(1e-9, own[0], own[1], own[2])
             gain = _look_up(lowered, min(np.sqrt(most) / brightest, 1.0))
             for c in range(3):
                 out[y, x, 2 - c] = int(_look_up(codes, np.sqrt(min(max(own[c] * gain, 0.0), 1.0))) + 0.5)

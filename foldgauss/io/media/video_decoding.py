@@ -1,8 +1,7 @@
 """One pass through a video file: its frames, and what the container reports about them."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -18,32 +17,23 @@ from foldgauss.io.media.clip import (
     video_error,
 )
 from foldgauss.io.media.decoder import MAX_FRAMES, DecodedFrame, VideoDecoder
-from foldgauss.io.media.frame_rate import DEFAULT_FPS, MAX_FPS, estimate_num_frames, estimate_rate, make_increasing
-from foldgauss.io.media.resizing import copy_to_blocks
-
-
-def read_video_file(
-    path: Path, start: int, stop: int | None, prepare: Callable, *, deinterlace: bool = True
-) -> ReadResult:
-    """The frames of a video file."""
-    return decode_file(path, start, stop, lambda frames: copy_to_blocks(map(prepare, frames)), deinterlace)[0]
+from foldgauss.io.media.frame_rate import DEFAULT_FPS, MAX_FPS, MAX_LAST_DURATION, estimate_rate, make_increasing
 
 
 class DecodeReport(NamedTuple):
     """What a pass through a video file finds besides its frames.
 
     `fps`: the container's rate, or the default in its place. `num_total`: number of frames, missing ones included.
-    `notes`: about the shape of pixels, HDR and interlacing. Of all frames decoded `positions`, `stamps` in units of
-    `time_base` seconds, and increasing times in `seconds`. `threads`: of the decoder. `end`: when the last
-    of these ends, in seconds as well; 0 where that is unknown.
+    `notes`: about the shape of pixels, HDR and interlacing. Of all frames decoded `positions`, and `stamps` in units of
+    `time_base` seconds. `threads`: of the decoder. `end`: when the last of these ends, in seconds as well; 0 where that
+    is unknown.
     """
 
     fps: float
     num_total: int
-    notes: tuple[str, ...]
+    notes: list[str]
     positions: np.ndarray
     stamps: np.ndarray
-    seconds: np.ndarray
     time_base: float
     threads: int
     end: float
@@ -53,16 +43,16 @@ class DecodeReport(NamedTuple):
 
         Those that decode are the numbers `first` up to `end` of all frames decoded.
         """
-        last = self.end
-        if end < len(self.seconds):  # until the next one is shown, unless others were lost before it
-            last = float(self.seconds[end]) if self.positions[end] == self.positions[end - 1] + 1 else 0.0
-        rate = estimate_rate(self.seconds[first:end], self.fps, last)
-        rate = rate._replace(first_second=float(self.seconds[first] - self.seconds[0]))
+        seconds, last = make_increasing((self.stamps * self.time_base).tolist(), self.fps), self.end
+        if end < len(seconds):  # until the next one is shown, unless others were lost before it
+            last = float(seconds[end]) if self.positions[end] == self.positions[end - 1] + 1 else 0.0
+        rate = estimate_rate(seconds[first:end], self.fps, last)
+        rate = rate._replace(first_second=float(seconds[first] - seconds[0]))
         if np.ptp(self.stamps[:end]) == 0 and end > 1:  # a raw stream: the rate is FFmpeg's guess
             rate = rate._replace(guessed=True)
         gaps = _describe_gaps([start - 1, *self.positions[first:end].tolist()])
         num_declared = (self.num_total if stop is None else stop) - start
-        return num_declared, rate, describe_lost(end - first, num_declared) + self.notes + gaps
+        return num_declared, rate, (*describe_lost(end - first, num_declared), *self.notes, *gaps)
 
 
 def decode_file(
@@ -72,85 +62,74 @@ def decode_file(
 
     Raises `VideoError` for a file that cannot be read.
     """
-    decoded = DecodedFrames()
+    places, ticks, following, transfers, duration = [], [], [], set(), 0
+
+    def select(frames: Iterator[DecodedFrame]) -> Iterator[np.ndarray]:
+        """The frames from `start` up to `stop`; all that are decoded are recorded, and so is the next one.
+
+        Frames before `start` are decoded and dropped: seeking stops at key frames.
+        """
+        nonlocal duration
+        for frame in frames:
+            if stop is not None and frame.position >= stop:
+                if places and frame.position == places[-1] + 1:
+                    following.append(frame.stamp)
+                return
+            places.append(frame.position)
+            ticks.append(frame.stamp)
+            duration = frame.decoded.duration or 0
+            if frame.position >= start:
+                transfers.add(frame.hdr)
+                yield frame.to_array()
+
     with closing(VideoDecoder(path, deinterlace=deinterlace)) as decoder:
         fps = decoder.fps if 0 < decoder.fps <= MAX_FPS else DEFAULT_FPS
-        kept = keep(select_frames(decoder.frames(), start, stop, decoded))
-        if not decoded.positions:
+        kept = keep(select(decoder.frames()))
+        if not places:
             cure = "The file is damaged or its codec is unknown here; convert it with ffmpeg."
             got = f"none in {str(path)!r}"
             raise video_error("path", expected="a video with frames that decode", got=got, cure=cure)
-        positions, stamps = np.array(decoded.positions, np.int64), np.array(decoded.stamps, np.int64)
-        time_base, num_reached = float(decoder.time_base), decoded.positions[-1] + 1
-        seconds = make_increasing((np.append(stamps, decoded.following) * time_base).tolist(), fps)
+        positions, stamps = np.array(places, np.int64), np.array(ticks, np.int64)
+        time_base, num_reached = float(decoder.time_base), places[-1] + 1
+        seconds = make_increasing((np.append(stamps, following) * time_base).tolist(), fps)
         seconds, end = seconds[: len(stamps)], float(seconds[-1])
-        if not decoded.following:
-            last = decoder.find_last_duration(decoded.duration, seconds[-1] - seconds[0], num_reached)
+        if not following:
+            last = decoder.find_last_duration(duration, seconds[-1] - seconds[0], num_reached)
             end = float(seconds[-1] + last) if last else 0.0
         last = max(end - seconds[-1], 0.0)
         num_total = max(_count_declared(decoder, seconds, fps, num_reached, last), num_reached)
-        notes, aspect, threads = (), decoder.pixel_aspect, decoder.threads
+        notes, aspect, threads = [], decoder.pixel_aspect, decoder.threads
         if abs(aspect - 1) > 0.01:
-            notes += (f"pixels are {aspect:.3g} times as wide as high; frames are kept as stored, not stretched.",)
-        if decoded.hdr:
-            notes += (f"colors are HDR ({' and '.join(sorted(decoded.hdr))}), and are tone-mapped to SDR.",)
+            notes.append(f"pixels are {aspect:.3g} times as wide as high; frames are kept as stored, not stretched.")
+        if hdr := sorted(transfers - {None}):
+            notes.append(f"colors are HDR ({' and '.join(hdr)}), and are tone-mapped to SDR.")
         if decoder.tilt:
-            notes += (
-                f"the file asks for a rotation by {decoder.tilt} degrees beyond multiples of 90; it is left out.",
-            )
+            turn = f"{decoder.tilt} degrees beyond multiples of 90"
+            notes.append(f"the file asks for a rotation by {turn}; it is left out.")
         if decoder.has_converted:
-            notes += ("interlaced frames are converted to progressive ones.",)
+            notes.append("interlaced frames are converted to progressive ones.")
     # The container's count may be an estimate, so the range is checked against the decoded frames as well.
     check_range_within(start, stop, num_total, path)
     if not kept:
         raise no_frames_error(start, stop, len(stamps), num_total, path)
-    report = DecodeReport(fps, num_total, notes, positions, stamps, seconds, time_base, threads, end)
+    report = DecodeReport(fps, num_total, notes, positions, stamps, time_base, threads, end)
     return (kept, *report.describe_span(len(stamps) - len(kept), len(stamps), start, stop)), report
-
-
-@dataclass
-class DecodedFrames:
-    """The frames that were decoded: their positions and stamps, the transfer functions of those in HDR, the duration of
-    the last one by the decoder, and the stamp of the one after it, in a list, if that was decoded, too."""
-
-    positions: list[int] = field(default_factory=list)
-    stamps: list[int] = field(default_factory=list)
-    hdr: set[str] = field(default_factory=set)
-    duration: int = 0
-    following: list[int] = field(default_factory=list)
-
-
-def select_frames(
-    frames: Iterable[DecodedFrame], start: int, stop: int | None, decoded: DecodedFrames
-) -> Iterator[np.ndarray]:
-    """The frames from `start` up to `stop`; all that are decoded are recorded in `decoded`, and so is the next one.
-
-    Frames before `start` are decoded and dropped: seeking stops at key frames.
-    """
-    for frame in frames:
-        if stop is not None and frame.position >= stop:
-            if decoded.positions and frame.position == decoded.positions[-1] + 1:
-                decoded.following.append(frame.stamp)
-            return
-        decoded.positions.append(frame.position)
-        decoded.stamps.append(frame.stamp)
-        decoded.duration = frame.decoded.duration or 0
-        if frame.position >= start:
-            decoded.hdr |= {frame.hdr} - {None}
-            yield frame.to_array()
 
 
 def _count_declared(decoder: VideoDecoder, seconds: np.ndarray, fps: float, num_reached: int, last: float) -> int:
     """The number of frames that the container declares, where frame `num_reached` is shown at seconds[-1] for `last`.
 
-    Its own count includes frames that an edit list hides, as in an MP4 that was cut without encoding.
+    Its own count includes frames that an edit list hides, as in an MP4 that was cut without encoding; where it has
+    none, the number follows from its duration.
     """
     shown, num_declared = decoder.declared_seconds, decoder.num_declared
     if num_declared and not decoder.hides_frames:
         return num_declared
     if shown is None:
         return num_declared or num_reached
-    estimated = estimate_num_frames(seconds - seconds[0], shown, fps, num_reached, last)
+    left, intervals, estimated = shown - (seconds[-1] - seconds[0]), np.diff(seconds), num_reached
+    if left > MAX_LAST_DURATION * max(1 / fps, intervals.max(initial=0.0), last):
+        estimated += round(left / (intervals.mean() if len(intervals) else 1 / fps)) - 1
     if estimated >= MAX_FRAMES:  # a damaged header
         return num_reached
     return min(num_declared, estimated) if num_declared else estimated

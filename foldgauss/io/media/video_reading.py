@@ -1,8 +1,9 @@
-"""Reading clips: `read_video` detects the format and chooses the reader."""
+"""Reading clips: `read_video`, and `read_frames`, which detects the format."""
 
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Iterator
 from pathlib import Path
+
+import numpy as np
 
 from foldgauss.io._atomic import PathLike
 from foldgauss.io.media.clip import (
@@ -13,15 +14,16 @@ from foldgauss.io.media.clip import (
     check_fps,
     check_frame_size,
     check_range,
+    check_range_within,
     check_readable,
     read_head,
     translate_os_errors,
 )
 from foldgauss.io.media.format_detection import may_be_animation
-from foldgauss.io.media.frame_rate import FrameRate, describe_rate
-from foldgauss.io.media.image_files import is_image_file, read_animation, read_folder, read_image_file
-from foldgauss.io.media.resizing import describe_crop, make_resizer, stack_frames
-from foldgauss.io.media.video_decoding import read_video_file
+from foldgauss.io.media.frame_rate import DEFAULT_FPS, FrameRate, describe_rate
+from foldgauss.io.media.image_files import choose_images, describe_missing, is_image_file, read_animation, read_images
+from foldgauss.io.media.resizing import copy_to_blocks, describe_crop, make_resizer, stack_frames
+from foldgauss.io.media.video_decoding import DecodeReport, decode_file
 
 
 def read_video(
@@ -67,10 +69,8 @@ def read_video(
     if fps is not None:
         check_fps(fps)
     with translate_os_errors(path):
-        reader = choose_reader(path)
-        if reader is read_video_file:
-            reader = partial(reader, deinterlace=deinterlace)
-        kept, num_declared, rate, notes = reader(path, start, stop, prepare)
+        found, _ = read_frames(path, start, stop, lambda images: copy_to_blocks(map(prepare, images)), deinterlace)
+    kept, num_declared, rate, notes = found
     rate = rate if fps is None else FrameRate(fps)
     notes += describe_rate(rate)
     if size is not None and center_crop is None:
@@ -79,9 +79,21 @@ def read_video(
     return Clip(stack_frames(kept), *about)
 
 
-def choose_reader(path: Path) -> Callable[..., ReadResult]:
+def read_frames(
+    path: Path, start: int, stop: int | None, keep: Callable[[Iterator[np.ndarray]], list], deinterlace: bool
+) -> tuple[ReadResult, DecodeReport | None]:
+    """The frames of a clip from `start` up to `stop`, of which `keep` makes a list, and the report of a video file.
+
+    They are BGR or premultiplied BGRA, as stored. Raises `VideoError` and OSError.
+    """
+    may_move = not path.is_dir() and may_be_animation(read_head(path))
+    if may_move and (found := read_animation(path, start, stop, keep)) is not None:
+        return found, None
     if path.is_dir():
-        return read_folder
-    if may_be_animation(read_head(path)):
-        return read_animation
-    return read_image_file if is_image_file(path) else read_video_file
+        paths = choose_images(path, start, stop)
+    elif may_move or is_image_file(path):
+        check_range_within(start, stop, 1, path)
+        paths = [path]
+    else:
+        return decode_file(path, start, stop, keep, deinterlace)
+    return (keep(read_images(paths)), len(paths), FrameRate(DEFAULT_FPS), describe_missing(paths)), None

@@ -14,7 +14,7 @@ from foldgauss._runtime.checks import check_one_of, short_repr
 from foldgauss.io._atomic import PathLike, atomic_folder, atomic_path, check_path, output_error
 from foldgauss.io.media.clip import check_fps, format_size, video_error
 from foldgauss.io.media.encoder import VIDEO_SUFFIXES, Sound, check_sound, choose_encoding, encode_video, straighten
-from foldgauss.io.media.frame_rate import MAX_SECONDS, are_rising_seconds
+from foldgauss.io.media.frame_rate import MAX_SECONDS, are_rising_seconds, count_ticks
 
 ANIMATION_SUFFIXES = (".gif", ".webp")
 IMAGE_FORMATS = ("png", "webp")  # of folders of frames; both lossless
@@ -73,7 +73,10 @@ def write_video(
         raise video_error("frames", expected="an iterable of images", got=type(frames).__name__, cure=cure)
     check_one_of("image_format", image_format, IMAGE_FORMATS)
     if times is not None:
-        times = _check_times(times)
+        if not are_rising_seconds(times):
+            expected = f"seconds that rise from 0 to at most {MAX_SECONDS:,.0f}, one for each frame"
+            raise video_error("times", expected=expected, got=short_repr(times))
+        times = np.array(times, np.float64)
         frames = _match_times(frames, len(times))
     suffix = path.suffix.lower()
     options = {"codec": codec, "crf": crf, "pixel_format": pixel_format, "sound": sound}
@@ -89,8 +92,7 @@ def write_video(
         expected = "a name ending in .mp4, .webm, .mov, .mkv, .gif or .webp, or a folder (no extension) for images"
         cure = "For one image: write_image." if suffix == ".png" else "Rename the output."
         raise video_error("path", expected=expected, got=repr(path.name), cure=cure)
-    failures: list[OSError] = []
-    frames = _check_frames(_record_failures(frames, failures))
+    frames = _check_frames(frames)
     first = next(frames)
     encoding = choose_encoding(suffix, codec, crf, pixel_format, first.shape)
     if sound is not None:
@@ -98,11 +100,9 @@ def write_video(
     with atomic_path(path) as temporary:
         try:
             encode_video(temporary, chain([first], frames), float(fps), encoding, sound, times)
-        except OSError as error:
-            if error in failures:
-                raise
-            raise output_error(path, error) from error
-        except av.FFmpegError as error:
+        except av.FFmpegError as error:  # an OSError of making the frames is none of these
+            if isinstance(error, OSError):
+                raise output_error(path, error) from error
             expected, got = f"frames that {encoding.codec.encoder} takes", f"{format_size(first.shape)} at {fps:g} fps"
             cure = f"It says: {error.strerror}. Take another size, rate or codec."
             raise video_error("frames", expected=expected, got=got, cure=cure) from error
@@ -147,13 +147,6 @@ def write_image(path: PathLike, image: np.ndarray) -> Path:
     return path
 
 
-def _check_times(times: Sequence[float]) -> np.ndarray:
-    if not are_rising_seconds(times):
-        expected = f"seconds that rise from 0 to at most {MAX_SECONDS:,.0f}, one for each frame"
-        raise video_error("times", expected=expected, got=short_repr(times))
-    return np.array(times, np.float64)
-
-
 def _match_times(frames: Iterable[np.ndarray], num: int) -> Iterator[np.ndarray]:
     """The frames. Raises `VideoError` unless there are as many as times, `num`, or one fewer: the last is the end."""
     count = 0
@@ -165,15 +158,6 @@ def _match_times(frames: Iterable[np.ndarray], num: int) -> Iterator[np.ndarray]
     if not num - 1 <= count <= num:
         got = f"more than {num}" if count > num else f"{count}"
         raise video_error("frames", expected=f"{num}, as many as times, or one fewer", got=got)
-
-
-def _record_failures(frames: Iterable[np.ndarray], failures: list[OSError]) -> Iterator[np.ndarray]:
-    """The frames; an OSError of making them is added to `failures`, to be told from those of writing."""
-    try:
-        yield from frames
-    except OSError as error:
-        failures.append(error)
-        raise
 
 
 def _check_frames(frames: Iterable[np.ndarray], channels: tuple[int, ...] = (3, 4)) -> Iterator[np.ndarray]:
@@ -214,12 +198,6 @@ def _encode_image(frame: np.ndarray, image_format: str = "png") -> bytes:
 # ------------------------------------------------------------------------------------------- animations
 
 
-def _durations(ends: np.ndarray, least: int) -> list[int]:
-    """Whole durations between these times, at least `least`: where frames come more quickly, they are moved apart."""
-    ends, apart = np.rint(ends).astype(int), least * np.arange(len(ends))
-    return np.diff(np.maximum.accumulate(ends - apart) + apart).tolist()
-
-
 def _write_animation(
     path: Path, suffix: str, frames: Iterable[np.ndarray], fps: float, times: np.ndarray | None
 ) -> Path:
@@ -237,10 +215,10 @@ def _write_animation(
         try:
             if suffix == ".gif":
                 # Milliseconds, in whole hundredths of a second, whose sums are the true times rounded.
-                durations = [10 * duration for duration in _durations(100 * ends, least=2)]
+                durations = (10 * np.diff(count_ticks(100 * ends, least=2))).tolist()
                 first.save(temporary, "GIF", duration=durations, optimize=False, **shared)
             else:
-                durations = 1000 / fps if times is None else _durations(1000 * ends, least=1)
+                durations = 1000 / fps if times is None else np.diff(count_ticks(1000 * ends)).tolist()
                 first.save(temporary, "WEBP", duration=durations, quality=WEBP_QUALITY, **shared)
         except OSError as error:
             raise output_error(path, error) from error

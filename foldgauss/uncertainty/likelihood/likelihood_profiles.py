@@ -76,9 +76,9 @@ def likelihood_profiles(
     `video` need not be the clip that the model was fitted to, nor have as many frames: each frame is compared at all
     times, or only within `reach` frame times of its own (default for more than 400 frames: 100, widened as needed). But
     its first frame is at time 0 of the model and its last at 1; a warning is given if that does not fit, if the
-    model may be of another clip of the same scene, and if its Gaussians follow shared paths, which may absorb the times. `noise`: "effective" or "score" (see
-    `effective_fraction`, `score_fraction`), "independent", or a `FrameNoise`. `on_render` is called with the
-    numbers of images rendered and planned so far.
+    model may be of another clip of the same scene, and if Gaussians follow shared paths, which may absorb the times.
+    `noise`: "effective" or "score" (see `effective_fraction`, `score_fraction`), "independent", or a `FrameNoise`.
+    `on_render` is called with the numbers of images rendered and planned so far.
 
     Raises ValueError for a video of another size, one that the model does not explain, one that does not identify its
     times, and best times at the ends of a given `reach`.
