@@ -7,8 +7,10 @@ from pathlib import Path
 import latex2mathml.converter
 from mkdocs.structure.files import File, Files
 from nbconvert import MarkdownExporter
+from typer.cli import get_docs_for_click
 
 from foldgauss._runtime.settings import markdown_table
+from foldgauss.cli.app.application import load_commands
 
 ROOT = Path(__file__).parents[1]
 #: Files of the repository that are pages of the site, too.
@@ -17,6 +19,8 @@ ROOT_PAGES = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.m
 _IMAGE = re.compile(r"\]\((output_[\w.]+)\)")
 #: Where an API page shows the table of a dataclass of settings.
 _SETTINGS = re.compile(r"<!-- settings of ([\w.]+)\.(\w+) -->")
+#: Where a page lists the options of all commands.
+_COMMANDS = "<!-- options of all commands -->"
 _MATHS = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.S)
 
 
@@ -34,7 +38,9 @@ def on_files(files: Files, config) -> Files:
 
 
 def on_page_markdown(markdown: str, page, config, files) -> str:
-    """Links to files of the repository become links to their pages, and marks of settings become tables of them."""
+    """Links to files of the repository become links to their pages, and marks of settings and options lists of them."""
+    if _COMMANDS in markdown:
+        markdown = markdown.replace(_COMMANDS, _options())
     markdown = _SETTINGS.sub(
         lambda found: markdown_table(getattr(importlib.import_module(found[1]), found[2])), markdown
     )
@@ -52,8 +58,13 @@ def on_page_content(html: str, page, config, files) -> str:
     return _MATHS.sub(_mathml, html)
 
 
-def _settings_table(found: re.Match) -> str:
-    return markdown_table(getattr(importlib.import_module(found[1]), found[2]))
+def _options() -> str:
+    """The arguments and options of every command, by Typer."""
+    parts = []
+    for name, command in load_commands().items():
+        context = command.context_class(command, info_name=f"foldgauss {name}")
+        parts.append(get_docs_for_click(obj=command, ctx=context, name=name, indent=1, call_prefix="foldgauss"))
+    return "".join(parts)
 
 
 def _mathml(found: re.Match) -> str:

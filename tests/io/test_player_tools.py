@@ -111,7 +111,9 @@ def test_a_button_selects_what_moves(browser, compact, tmp_path, monkeypatch):
     assert plain.page.locator("#select-moving").is_hidden()
     plain.close()
     masks[:, :, 1:] = False  # a column of pixels
-    with pytest.raises(NothingMoves, match="moving: expected an object that has Gaussians of its own, got one that covers up to 40 of"):
+    with pytest.raises(
+        NothingMoves, match="moving: expected an object that has Gaussians of its own, got one that covers up to 40 of"
+    ):
         html_page(compact, moving=True)
 
 
