@@ -5,9 +5,9 @@
                                      [--minutes M | --steps N] [--rate R] [--set NAME=VALUE ...] [--seed S]
 
 Without options: *carphone*, of which 15% of the frames are left out and 15% of the rest shown twice, at random; 2
-minutes for each of two fits, alike but for `learn_frame_times`. The true time of a frame is its place in the clip as it
-was, in frame intervals; the first and the last frame stay, since a model's times begin at 0 and end at 1. (*Bunny* has
-doubled frames of its own, of which this would know nothing.)
+minutes for each of two fits that do not follow the camera, alike but for `learn_frame_times`. The true time of a frame
+is its place in the clip as it was, in frame intervals; the first and the last frame stay, since a model's times begin
+at 0 and end at 1. (*Bunny* has doubled frames of its own, of which this would know nothing.)
 
 Beside the PSNR of both stand, for the learned times, the root mean square of what they are off by, against that of even
 ones; the correlation of learned with true deviations from even times; and that of learned with true steps from frame to
@@ -127,7 +127,8 @@ def main(arguments: list[str] | None = None) -> None:
         parser.error(str(error))
     rates = LearningRates() if options.rate is None else LearningRates(frame_times=options.rate)
     own = {"num_gaussians": options.gaussians, "rates": rates, "seed": options.seed}
-    config = FitConfig(**own | budget | dict(options.set or ()))
+    # Maps of the camera at each frame would absorb what its time tells.
+    config = FitConfig(**{"follow_camera": False} | own | budget | dict(options.set or ()))
     made = {}
     for name in (FIXED, LEARNED):
         own = dataclasses.replace(config, learn_frame_times=name == LEARNED)

@@ -33,6 +33,7 @@ import re
 import shlex
 import tomllib
 import warnings
+import wave
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -48,7 +49,7 @@ from PIL import Image
 from foldgauss import video
 from foldgauss.cli.fitting import demo
 from foldgauss.cli.viewing import view as viewing
-from foldgauss.io import datasets, export, save_video_model, write_image, write_video
+from foldgauss.io import Sound, datasets, export, save_video_model, write_image, write_video
 from foldgauss.video import FitConfig, fit
 
 ROOT = Path(__file__).parents[1]
@@ -157,6 +158,8 @@ def _run_command(words: list[str], where: str) -> None:
 def _foldgauss(words: list[str], where: str) -> None:
     words = _alone(words)
     more = CHEAPER.get(words[0], [])
+    if words[0] == "compress" and words[2:3] != [] and words[2].startswith("-"):
+        more = []  # without a clip there are no passes
     given = {word.partition("=")[0] for word in words}
     if not given & {"--steps", "--minutes", "--only"} and not (words[0] == "compress" and "--passes" in given):
         words = [*words, *more]
@@ -296,7 +299,12 @@ def _clip() -> np.ndarray:
 
 def _video(name: str):
     def make(folder: Path) -> None:
-        write_video(folder / name, _clip(), 25.0)
+        silence = folder / "silence.wav"
+        with wave.open(str(silence), "wb") as sound:
+            sound.setparams((1, 2, 8000, 0, "NONE", ""))
+            sound.writeframes(bytes(16_000))
+        write_video(folder / name, _clip(), 25.0, sound=Sound(silence))
+        silence.unlink()
 
     return make
 
@@ -353,7 +361,7 @@ def _holidays(folder: Path) -> None:
 
 def _ply(folder: Path) -> None:
     """A video as the published code writes it."""
-    model = fit(_clip(), FitConfig(num_gaussians=100, steps=5), fps=24.0).model
+    model = fit(_clip(), FitConfig(num_gaussians=100, steps=5, follow_camera=False), fps=24.0).model
     export(model, "ply", folder / "point_cloud.ply")
 
 
@@ -373,7 +381,7 @@ GIVEN = {
     "README.md": ("holiday.mp4", "masks", "film.mp4", "holidays"),
     "docs/commands.md": ("holiday.mp4",),
     "docs/compress.md": ("holiday.mp4", "holiday.safetensors"),
-    "docs/editing.md": ("holiday.safetensors", "edits.toml"),
+    "docs/editing.md": ("holiday.mp4", "holiday.safetensors", "edits.toml"),
     "docs/fit.md": ("holiday.mp4", "DAVIS", "folder/of/images"),
     "docs/format.md": ("holiday.mp4", "holiday.safetensors"),
     "docs/formats.md": ("holiday.safetensors", "point_cloud.ply"),
@@ -383,7 +391,7 @@ GIVEN = {
     "docs/results.md": ("holiday.mp4",),
     "docs/scale.md": ("film.mp4", "holidays"),
     "docs/slow-motion.md": ("holiday.mp4",),
-    "docs/uncertainty.md": ("clip.mp4", "model.safetensors"),
+    "docs/uncertainty.md": ("clip.mp4",),
 }
 
 

@@ -119,8 +119,8 @@ class Guard:
             state.last_finite = state.copy()
 
     def finish(self, state: FitState) -> None:
-        """At the end of a fit with no back-off left: if its frames are worse than they were, restore the last state."""
-        if not self.comparable or state.backoffs < MAX_BACKOFFS:
+        """At the end of a fit that has backed off: if frames are worse than they were, restore the last state kept."""
+        if not self.comparable or not state.backoffs:
             return
         worse, kept = self._error_ratio(state), state.last_finite
         if worse > MUCH_WORSE or self._start_ratio(state) > max(self._start_ratio(kept), 1):
