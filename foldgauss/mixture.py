@@ -14,6 +14,7 @@ of the paper, arXiv:2411.11024. All classes share the methods of `AbstractMixtur
 """
 
 import math
+from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
@@ -449,7 +450,7 @@ def _responsibilities(mixture: AbstractMixture, x: Array) -> Array:
 def _map_pairs(mixture: AbstractMixture, x: Array, function) -> Array:
     """`function` of log weights (k, 1, *batch) and log p_k(x) (k, n, *batch); its results start with (n, *batch)."""
     rank, components = len(mixture.batch_shape), mixture.components
-    rows, shape = _flatten_points(mixture, x)
+    rows, restore = _flatten_points(mixture, x)
     if isinstance(components, FoldedGaussian | Gaussian):
         components = move_components_first(components, rank)
         pairs = lambda rows: pair_log_prob(components, rows)  # noqa: E731
@@ -457,16 +458,28 @@ def _map_pairs(mixture: AbstractMixture, x: Array, function) -> Array:
         pairs = lambda rows: jnp.moveaxis(components.log_prob(_add_component_axis(mixture, rows)), -1, 0)  # noqa: E731
     log_weights = jnp.expand_dims(jnp.moveaxis(mixture.log_weights, rank, 0), 1)
     size = max(1, _CHUNK // (math.prod(mixture.batch_shape) * mixture.num_components))
-    result = map_in_chunks(pairs, lambda log_p: function(log_weights, log_p), rows, size)
-    return result.reshape(*shape, *result.shape[1 + rank :])
+    return restore(map_in_chunks(pairs, lambda log_p: function(log_weights, log_p), rows, size))
 
 
-def _flatten_points(mixture: AbstractMixture, x: Array) -> tuple[Array, tuple[int, ...]]:
-    """Points as (n, *batch, d), and their shape (*sample, *batch)."""
-    event, batch = len(mixture.event_shape), mixture.batch_shape
-    shape = jnp.broadcast_shapes(x.shape[: x.ndim - event], batch)
-    points = math.prod(shape[: len(shape) - len(batch)])
-    return jnp.broadcast_to(x, (*shape, *mixture.event_shape)).reshape(points, *batch, *mixture.event_shape), shape
+def _flatten_points(mixture: AbstractMixture, x: Array) -> tuple[Array, Callable[[Array], Array]]:
+    """Points as (n, *batch, d), and the function from results (n, *batch, ...) to those of the points' own shape.
+
+    Where the batch has an axis of size 1 and the points more, these are among the n.
+    """
+    event, batch = mixture.event_shape, mixture.batch_shape
+    shape = jnp.broadcast_shapes(x.shape[: x.ndim - len(event)], batch)
+    num_sample = len(shape) - len(batch)
+    wide = [axis for axis, n in enumerate(batch, num_sample) if n != shape[axis]]
+    front = tuple(range(len(wide)))
+    kept = [axis for axis in range(len(shape)) if axis not in wide]
+    num = math.prod(shape[axis] for axis in (*wide, *range(num_sample)))
+    rows = jnp.moveaxis(jnp.broadcast_to(x, (*shape, *event)), wide, front).reshape(num, *batch, *event)
+
+    def restore(result: Array) -> Array:
+        tail = result.shape[1 + len(batch) :]
+        return jnp.moveaxis(result.reshape(*(shape[axis] for axis in (*wide, *kept)), *tail), front, wide)
+
+    return rows, restore
 
 
 def _add_component_axis(mixture: AbstractMixture, x: Array) -> Array:

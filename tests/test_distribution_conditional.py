@@ -637,7 +637,7 @@ def test_gradients_go_through_the_integral():
 @pytest.mark.parametrize(
     ("indices", "expected"),
     [
-        *(([], "whole"), ([0.5], "whole"), ([np.inf], "whole"), ("s", "whole")),
+        *(([], "whole"), ([0.5], "whole"), ([np.inf], "whole"), ("s", "whole"), ([True, False], "whole")),
         *(([3], "numbers from"), ([0, 0], "each"), ([2, -1], "each")),
     ],
 )

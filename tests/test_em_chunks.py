@@ -407,6 +407,11 @@ def test_invalid_chunks_raise(data, weights, match):
         _fit(data, weights)
 
 
+def test_a_number_of_numpy_is_the_weight_of_all():
+    parts = np.split(_tracks(), [350])
+    _assert_same(_fit(parts, np.float64(0.5)), _fit(parts, 0.5), rtol=0)
+
+
 def test_rows_that_change_between_passes_raise():
     left = iter([[X, X], [X, X], [X]])  # the first is taken by the check that there are several passes
     with pytest.raises(ValueError, match="X: expected the same rows in each pass, got 100 at first and 50 now"):

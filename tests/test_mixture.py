@@ -539,6 +539,22 @@ def test_batches_of_mixtures():
     assert FoldedMixture(_components(loc=loc), logits=np.zeros(3)).log_weights.shape == (4, 3)
 
 
+def test_axes_of_size_one_broadcast_with_the_points():
+    """Densities of some points at some times: a batch of (5, 1) or (1, 5, 1) and points (7,)."""
+    rng = np.random.default_rng(0)
+    given = {"loc": rng.normal(size=(3, 2)), "scale_tril": 0.5 * np.eye(2), "time_loc": np.linspace(0, 1, 3)}
+    mixture = FoldedMixture(FoldedGaussian(**given, time_scale=0.3), weights=np.ones(3) / 3)
+    t, x = jnp.linspace(0, 1, 5), jnp.asarray(rng.normal(size=(2, 1, 5, 7, 2)), jnp.float32)
+    each = [mixture.condition_time(one) for one in t]
+    for shape in ((5, 1), (1, 5, 1)):
+        at_times = mixture.condition_time(t.reshape(shape))
+        for method in ("log_prob", "component_log_prob", "responsibilities"):
+            found = getattr(at_times, method)(x)
+            expected = np.stack([getattr(one, method)(x[:, :, k]) for k, one in enumerate(each)], 2)
+            np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
+        assert at_times.pdf(x[0, 0, 0]).shape == np.broadcast_shapes(shape, (7,))
+
+
 def test_made_and_used_inside_transformations():
     components, x = _components(), _points(8)
     made = jax.jit(jax.vmap(lambda w: FoldedMixture(components, weights=w)))(jnp.array([WEIGHTS, [1.0, 1.0, 1.0]]))

@@ -30,7 +30,7 @@ from foldgauss.jobs import runner
 
 resource = pytest.importorskip("resource", reason="limits to the size of files are POSIX's; CI runs it on Linux")
 
-SMALL = ["--gaussians", "400", "--steps", "30", "--quiet"]
+SMALL = ["--gaussians", "400", "--steps", "30", "--no-follow-camera", "--quiet"]
 SCRIPT = '[[edits]]\ndo = "move"\noffset = [0.1, 0.0]\n'
 OLDER = b"older"
 

@@ -105,7 +105,8 @@ def normalize_indices(indices, dim: int) -> tuple[int, ...]:
     """Coordinates counted from 0, each once, from any integers (negative ones count from the end)."""
     cure = f"The coordinates are 0 to {dim - 1}, time is {dim - 1} (or -1)."
     try:
-        given = [int(i) for i in np.atleast_1d(np.asarray(indices)) if i == int(i)]
+        given = np.atleast_1d(np.asarray(indices))
+        given = [int(i) for i in given if i == int(i)] if given.dtype != bool else None  # a mask is not indices
     except (TypeError, ValueError, OverflowError):
         given = None
     if given is None or len(given) != np.size(indices) or not given:

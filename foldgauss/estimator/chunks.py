@@ -279,7 +279,7 @@ def _is_array(value) -> bool:
     """Whether `value` is one array of rows, such as a list of numbers."""
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):
         return len(value) > 0 and isinstance(value[0], Real)
-    return hasattr(value, "__array__") or hasattr(value, "shape")
+    return not isinstance(value, Real) and (hasattr(value, "__array__") or hasattr(value, "shape"))
 
 
 def _check_weights(number: int, weights, num: int) -> np.ndarray:

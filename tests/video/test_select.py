@@ -263,6 +263,16 @@ def test_labels_do_not_propagate_across_a_cut():
     assert len(truth(DISC) - before) > 10
 
 
+def test_masks_of_a_smaller_size_have_rounded_sides():
+    """480 of 1920 columns and 204 or 205 of 818 rows, as `select(moving=True)` renders images."""
+    large = dataclasses.replace(soft_model(), size=(818, 1920))
+    for rows in (204, 205):
+        assert len(by_mask(large, np.ones((rows, 480), bool), frame=0))
+    for rows in (203, 206):
+        with pytest.raises(ValueError, match="mask: expected the aspect"):
+            by_mask(large, np.ones((rows, 480), bool), frame=0)
+
+
 @pytest.mark.parametrize(
     ("mask", "options", "match"),
     [

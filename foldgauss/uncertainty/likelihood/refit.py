@@ -232,6 +232,7 @@ def iter_refits(
     for name, value, least in (("replicates", replicates, 1), ("first", first, 0), ("seed", seed, 0)):
         if not is_integer(value, least):
             raise invalid(name, expected=f"a whole number >= {least}", got=repr(value))
+    video = np.asarray(video)
     residuals = _check_video(model, video, method)
     if method == "frames" and not 2 <= replicates <= len(video) - 2:
         cure = "Each frame but the first and the last is left out once."

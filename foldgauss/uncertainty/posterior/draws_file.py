@@ -143,9 +143,9 @@ def is_sealed(path: Path) -> bool:
 
 def read_fingerprint(path: Path, wanted: str | None = None, shape: tuple[int, int, int] = (0, 0, 0)) -> str:
     """The fingerprint of the run in a file, which may be untrusted; if it is `wanted`, all ensembles are validated."""
+    if not is_sealed(path):  # outside of `try`: a file that cannot be read is not damaged
+        raise _damaged(path)
     try:
-        if not is_sealed(path):
-            raise _damaged(path)
         with import_optional("h5py").File(path) as file:
             found = file.attrs.get("fingerprint", "")
             complete = isinstance(found, str)

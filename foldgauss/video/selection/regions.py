@@ -156,7 +156,8 @@ def _check_mask(model: VideoModel, mask: np.ndarray, ndim: int) -> np.ndarray:
         raise invalid("mask", expected="bool, or fractions in [0, 1]", got="other values")
     (height, width), (rows, columns) = model.size, mask.shape[-2:]
     off = min(abs(columns * height / rows - width), abs(rows * width / columns - height))
-    if off > ROUNDING:
+    # The sides of a smaller mask are rounded, too.
+    if off > max(ROUNDING, 0.5 * max(height, width) / max(rows, columns)) + 1e-6:
         got, cure = f"{rows}x{columns}", "Crop it as the frames were cropped."
         raise invalid("mask", expected=f"the aspect of the model's {height}x{width}", got=got, cure=cure)
     return mask

@@ -197,7 +197,9 @@ class JaxStepper:
     def relocate(self, state: FitState) -> None:
         """On the host."""
         config, (height, width) = self.config, self.size
-        spec = ConditioningSpec(config.degree, config.power, config.floor, (height, width))
+        spec = ConditioningSpec(
+            config.degree, config.power, config.floor, (height, width), scale_cutoff=config.scale_cutoff
+        )
         state.fetch_all()
         relocate(state, self.frames, config, spec, self.find_motion() if config.follow_motion else None)
         self.adopt(state)
