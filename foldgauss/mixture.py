@@ -590,7 +590,7 @@ def _take_components(components, component: Array, batch: tuple[int, ...]):
     def pick(leaf):
         if set(leaf.shape[: rank + 1]) == {1}:
             return leaf.reshape(*(1,) * component.ndim, *leaf.shape[rank + 1 :])
-        rows = leaf.reshape(size, *leaf.shape[rank:])
+        rows = jnp.broadcast_to(leaf, (*batch, *leaf.shape[rank:])).reshape(size, *leaf.shape[rank:])
         return rows[jnp.broadcast_to(place, flat.shape), flat].reshape(*component.shape, *leaf.shape[rank + 1 :])
 
     return jax.tree.map(pick, expand_leaves(components, rank + 1))

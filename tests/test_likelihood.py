@@ -237,6 +237,8 @@ def test_time_search_never_decreases(x64):
 def test_unbounded_joint_fit_raises():
     with pytest.raises(ValueError, match=r"envelope: expected a floor above 0 where power \(d-1\) > 2"):
         fit(_points(), time="joint", envelope=TimeLikelihood(2.0))
+    fits = jax.vmap(lambda power: fit(_points(), time="joint", envelope=TimeLikelihood(power, 1e-3)).log_likelihood)
+    assert np.isfinite(fits(jnp.array([1.0, 2.0]))).all()  # a power that is not known yet
 
 
 def test_a_floor_bounds_the_ridge(x64):

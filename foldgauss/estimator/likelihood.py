@@ -563,9 +563,11 @@ def _check_time(time_loc, time_scale, dtype):
 
 
 def _check_bounded(envelope: AbstractEnvelope, dim: int) -> None:
-    if not isinstance(envelope, TimeLikelihood) or isinstance(envelope.floor, jax.core.Tracer):
+    if not isinstance(envelope, TimeLikelihood):
         return
-    if float(envelope.floor) == 0 and float(envelope.power) * (dim - 1) > 2:
+    if any(isinstance(value, jax.core.Tracer) for value in (envelope.floor, envelope.power)):
+        return
+    if np.any((np.asarray(envelope.floor) == 0) & (np.asarray(envelope.power) * (dim - 1) > 2)):
         cure = "The likelihood is unbounded on the ridge: pass TimeLikelihood(power, floor=1e-3), or time='own'."
         raise invalid("envelope", expected="a floor above 0 where power (d-1) > 2", got="floor 0", cure=cure)
 

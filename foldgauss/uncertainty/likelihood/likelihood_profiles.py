@@ -149,11 +149,13 @@ class ProfileBuilder:
             for k, error in zip(near, self.residuals.squared_errors(image, near), strict=True):
                 for each, value in zip(found[k], (t, error, sketch), strict=True):
                     each.append(value)
-        for each, columns in zip(self.samples, found, strict=True):
-            each.set_coarse(*map(np.array, columns))
-        if self.reach is None:
-            return True
-        edge = [k for k, each in enumerate(self.samples) if each.best_at_end(times)]
+        edge = [k for k, (times_of_frame, *_) in enumerate(found) if len(times_of_frame) < 3]  # too few for a curve
+        if not edge:
+            for each, columns in zip(self.samples, found, strict=True):
+                each.set_coarse(*map(np.array, columns))
+            if self.reach is None:
+                return True
+            edge = [k for k, each in enumerate(self.samples) if each.best_at_end(times)]
         if edge and not self.own_reach:
             got = f"the best times of frames {edge[:5]} at the ends of {self.reach}"
             raise invalid("reach", expected="enough for every frame", got=got, cure="Give more, or None.")

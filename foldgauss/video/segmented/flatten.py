@@ -43,7 +43,8 @@ def flatten_video(video: VideoModel | EditedVideo | SegmentedVideo) -> VideoMode
 def _check_alike(layers: tuple[Layer, ...], lead: VideoModel) -> None:
     for layer in layers:
         model = layer.model
-        if jax.tree.map(_unique_values, model.splats.envelope) != jax.tree.map(_unique_values, lead.splats.envelope):
+        own, other = (jax.tree.map(_unique_values, one.splats.envelope) for one in (model, lead))
+        if own != other or (len(layers) > 1 and any(len(values) > 1 for values in (own.power, own.floor))):
             raise invalid("model", expected="layers with one envelope", got="several", cure=_CURE)
         if model.scale_cutoff != lead.scale_cutoff:
             raise invalid("model", expected="layers with one scale_cutoff", got="several", cure=_CURE)
@@ -66,6 +67,9 @@ def _concatenate(parts: list[FoldedSplats]) -> FoldedSplats:
         return leaves
 
     path_index, paths = join_paths(parts)
-    shared = {"envelope": parts[0].envelope, "path_index": path_index, "paths": paths}
+    envelope = parts[0].envelope
+    if len(parts) > 1:  # it has the same values for all Gaussians, see `_check_alike`
+        envelope = jax.tree.map(lambda leaf: jnp.ravel(leaf)[0], envelope)
+    shared = {"envelope": envelope, "path_index": path_index, "paths": paths}
     names = [field.name for field in dataclasses.fields(FoldedSplats) if field.name not in shared]
     return FoldedSplats(**{name: jnp.concatenate(gather(name)) for name in names}, **shared)
