@@ -14,7 +14,6 @@ of the paper, arXiv:2411.11024. All classes share the methods of `AbstractMixtur
 """
 
 import math
-from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
@@ -24,7 +23,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float, Int, Key
 
-from foldgauss._numerics.batch import align, as_value, broadcast_leaves, check_event, expand_leaves
+from foldgauss._numerics.batch import align, as_value, broadcast_leaves, check_event, expand_leaves, flatten_points
 from foldgauss._numerics.factor import normalize_indices
 from foldgauss._runtime import notebook_hooks
 from foldgauss._runtime.checks import invalid
@@ -450,7 +449,7 @@ def _responsibilities(mixture: AbstractMixture, x: Array) -> Array:
 def _map_pairs(mixture: AbstractMixture, x: Array, function) -> Array:
     """`function` of log weights (k, 1, *batch) and log p_k(x) (k, n, *batch); its results start with (n, *batch)."""
     rank, components = len(mixture.batch_shape), mixture.components
-    rows, restore = _flatten_points(mixture, x)
+    rows, restore = flatten_points(x, mixture.batch_shape, mixture.event_shape)
     if isinstance(components, FoldedGaussian | Gaussian):
         components = move_components_first(components, rank)
         pairs = lambda rows: pair_log_prob(components, rows)  # noqa: E731
@@ -459,27 +458,6 @@ def _map_pairs(mixture: AbstractMixture, x: Array, function) -> Array:
     log_weights = jnp.expand_dims(jnp.moveaxis(mixture.log_weights, rank, 0), 1)
     size = max(1, _CHUNK // (math.prod(mixture.batch_shape) * mixture.num_components))
     return restore(map_in_chunks(pairs, lambda log_p: function(log_weights, log_p), rows, size))
-
-
-def _flatten_points(mixture: AbstractMixture, x: Array) -> tuple[Array, Callable[[Array], Array]]:
-    """Points as (n, *batch, d), and the function from results (n, *batch, ...) to those of the points' own shape.
-
-    Where the batch has an axis of size 1 and the points more, these are among the n.
-    """
-    event, batch = mixture.event_shape, mixture.batch_shape
-    shape = jnp.broadcast_shapes(x.shape[: x.ndim - len(event)], batch)
-    num_sample = len(shape) - len(batch)
-    wide = [axis for axis, n in enumerate(batch, num_sample) if n != shape[axis]]
-    front = tuple(range(len(wide)))
-    kept = [axis for axis in range(len(shape)) if axis not in wide]
-    num = math.prod(shape[axis] for axis in (*wide, *range(num_sample)))
-    rows = jnp.moveaxis(jnp.broadcast_to(x, (*shape, *event)), wide, front).reshape(num, *batch, *event)
-
-    def restore(result: Array) -> Array:
-        tail = result.shape[1 + len(batch) :]
-        return jnp.moveaxis(result.reshape(*(shape[axis] for axis in (*wide, *kept)), *tail), front, wide)
-
-    return rows, restore
 
 
 def _add_component_axis(mixture: AbstractMixture, x: Array) -> Array:

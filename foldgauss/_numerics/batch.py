@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 from typing import TypeVar, get_args
 
@@ -89,6 +90,22 @@ def broadcast_leaves(module: _ModuleT, batch: tuple[int, ...]) -> _ModuleT:
 
 def batch_shape_of(parts: list[tuple[Array, int]]) -> tuple[int, ...]:
     return jnp.broadcast_shapes(*(x.shape[: x.ndim - event] for x, event in parts))
+
+
+def flatten_points(x: Array, batch: tuple[int, ...], event: tuple[int, ...]) -> tuple[Array, Callable[[Array], Array]]:
+    """Points as (n, *batch, *event), and the function from results (n, *batch, ...) to those of the points' own shape.
+
+    Where the batch has an axis of size 1 and the points more, these are among the n.
+    """
+    shape = jnp.broadcast_shapes(x.shape[: x.ndim - len(event)], batch)
+    wide = [axis for axis, n in enumerate(batch, len(shape) - len(batch)) if n != shape[axis]]
+    points = jnp.moveaxis(jnp.broadcast_to(x, (*shape, *event)), wide, front := tuple(range(len(wide))))
+    own = points.shape[: len(shape)]
+
+    def restore(result: Array) -> Array:
+        return jnp.moveaxis(result.reshape(*own, *result.shape[1 + len(batch) :]), front, wide)
+
+    return points.reshape(math.prod(own[: len(own) - len(batch) + len(wide)]), *batch, *event), restore
 
 
 # --- dtypes -------------------------------------------------------------------------------------------------
