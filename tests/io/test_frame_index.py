@@ -727,8 +727,14 @@ def test_what_arrays_refuse_is_refused(long_index):
     for which in ("a", 1.5, (1, 2), [1, 2]):
         with pytest.raises(ValueError, match="expected the number of a frame, or a slice"):
             lazy[which]
-    for span in ((5, 5), (0, 0), (0, 621), (-2, 3), (620, 621)):
-        with pytest.raises(VideoError, match="frames: expected A:B"):
+    for span, expected in (
+        ((0, 621), "within 0:620, .* got 0:621"),
+        ((620, 621), "within 0:620, .* got 620:621"),
+        ((5, 5), "with at least 1 frame, got 5:5"),
+        ((0, 0), "with at least 1 frame, got 0:0"),
+        ((-2, 3), "counted from the start, got -2:3"),
+    ):
+        with pytest.raises(VideoError, match=f"frames: expected A:B {expected}"):
             long_index.span(*span)
     for options in ({"first": 5, "stop": 5}, {"stop": 621}, {"first": -1}, {"run": 0}, {"size": (0, 5)}):
         with pytest.raises(VideoError, match="expected"):
