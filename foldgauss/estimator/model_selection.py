@@ -9,6 +9,7 @@ from jaxtyping import Float
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 
+from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer
 from foldgauss.estimator.chunks import is_chunked
 from foldgauss.estimator.folded_gaussian_mixture import EMStatus, FoldedGaussianMixture
@@ -109,4 +110,4 @@ def _assign_folds(num: int, folds: int, groups: np.ndarray | None) -> np.ndarray
         raise invalid("groups", expected=f"shape ({num},)", got=f"shape {np.shape(groups)}", cure="One per row of X.")
     if not is_integer(folds, 2) or folds > len(names):
         raise invalid("folds", expected=f"a whole number from 2 to {len(names)}", got=folds, cure="Fewer parts.")
-    return (np.random.default_rng(0).permutation(len(names)) % folds)[which]
+    return (make_generator(Stream.CROSS_VALIDATION).permutation(len(names)) % folds)[which]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_integer
 from foldgauss.io._atomic import PathLike
 from foldgauss.io.media.clip import Clip, Range, Size, format_size
@@ -102,7 +103,7 @@ def ball(
     inside = np.hypot(x + 0.5 - center, y + 0.5 - height / 2) < height / 5
     ground = np.stack([0.3 + 0.2 * np.sin(0.15 * x), 0.5 + 0.2 * np.cos(0.1 * y), 0.3 + 0 * x], axis=-1)
     values = 255 * np.where(inside[..., None], [0.9, 0.3, 0.1], ground)
-    noisy = values + np.random.default_rng(seed).normal(0, noise, values.shape)
+    noisy = values + make_generator(Stream.SYNTHETIC_NOISE, seed=seed).normal(0, noise, values.shape)
     return MaskedClip(_synthetic("ball", noisy, fps), inside.astype(np.uint8))
 
 

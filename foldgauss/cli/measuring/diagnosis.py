@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from foldgauss import __version__
+from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime import threads
 from foldgauss._runtime.device import default_platform
 from foldgauss._runtime.machine import cpu_model
@@ -205,7 +206,7 @@ class _Failed(Exception):
 
 
 def _scene() -> Splats2D:
-    rng = np.random.default_rng(0)
+    rng = make_generator(Stream.DIAGNOSIS)
     mean = rng.uniform(0, 1, (NUM_SPLATS, 2)) * [SIZE[1], SIZE[0]]
     factor = rng.normal(size=(NUM_SPLATS, 2, 2)) * 3 + 2 * np.eye(2)
     leaves = mean, factor, rng.uniform(0.2, 0.9, NUM_SPLATS), rng.uniform(0, 1, (NUM_SPLATS, 3))

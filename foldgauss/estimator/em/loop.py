@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss.envelope import AbstractEnvelope, Constant
 from foldgauss.estimator.em.components import Parameters
 from foldgauss.estimator.em.m_step import Model, newton_step, profile_log_likelihood, update_components
@@ -297,7 +298,7 @@ def _jitter(states: State, number: int) -> State:
     **Source:** Rose 1998, Deterministic annealing for clustering, compression, classification, regression.
     """
     params = states.params
-    noise = _JITTER * np.random.default_rng(number).normal(size=params.curve[:, :, 0].shape)
+    noise = _JITTER * make_generator(Stream.EM_JITTER, number).normal(size=params.curve[:, :, 0].shape)
     shift = jnp.einsum("rkab,rkb->rka", params.tril, jnp.asarray(noise, params.curve.dtype))
     return states._replace(params=params._replace(curve=params.curve.at[:, :, 0].add(shift)))
 

@@ -13,6 +13,7 @@ import scipy.ndimage
 import scipy.stats
 from jaxtyping import Bool, Float32, Float64, Int
 
+from foldgauss._numerics.random_streams import Stream, make_generator, seed_sequence
 from foldgauss._runtime.checks import invalid
 from foldgauss.uncertainty.likelihood.likelihood_profiles import ProfileBuilder
 from foldgauss.uncertainty.likelihood.noise import NOISES, FrameNoise
@@ -109,7 +110,7 @@ def simulated_ranks(
     increments = Increments.with_free(np.linspace(0.0, 1.0, num_frames), None, concentration)
     cache = _RenderCache(model)
     ranks, true, converged = [], [], 0
-    for seeds in np.random.SeedSequence(seed).spawn(replicates):
+    for seeds in seed_sequence(Stream.CALIBRATION, seed=seed).spawn(replicates):
         rng = np.random.default_rng(seeds)
         times = increments.draw_prior(rng, 1)[0]
         frames = cache.simulate_frames(times, noise.scale, correlation, rng)
@@ -148,7 +149,7 @@ def ecdf_band(
 
 @functools.lru_cache(maxsize=32)
 def _band(replicates: int, num_ranks: int, level: float, seed: int) -> np.ndarray:
-    rng = np.random.default_rng(seed)
+    rng = make_generator(Stream.RANK_BAND, seed=seed)
     fractions = np.arange(1, num_ranks) / num_ranks  # all ranks are at most the last
     counts = rng.multinomial(replicates, np.full(num_ranks, 1 / num_ranks), ENVELOPES)[:, :-1].cumsum(1)
     # Two-sided tail probabilities of all possible counts.
@@ -241,7 +242,7 @@ def _sample_posterior(
     found = frame_time_posterior(log_prob=log_prob, steps=steps, ensembles=2, seed=seed, progress=False)
     if len(found.draws) < draws:
         raise invalid("steps", expected=f"enough steps for {draws} kept draws", got=steps)
-    which = np.random.default_rng(seed).choice(len(found.draws), draws, replace=False)
+    which = make_generator(Stream.THINNING, seed=seed).choice(len(found.draws), draws, replace=False)
     return found.draws[which], found.converged
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float64, UInt8
 
+from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.checks import invalid, is_integer, is_within
 from foldgauss.uncertainty.likelihood.color_normal_equations import ColorEquations, FrameAt, solve_conjugate_gradient
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles
@@ -83,7 +84,9 @@ def marginalize_colors(
         if equations.num <= most_dense:
             curve: _Dense | _Estimated = _Dense(equations, k)
         else:
-            signs = np.random.default_rng([seed, k]).choice([-1.0, 1.0], size=(int(np.prod(model.size)), probes))
+            signs = make_generator(Stream.COLOR_PROBE, k, seed=seed).choice(
+                [-1.0, 1.0], size=(int(np.prod(model.size)), probes)
+            )
             curve = _Estimated(equations, k, signs)
         _refine(curve, nodes[k], values[k], *_neighbor_times(times, k))
         nodes[k], values[k] = _join(*curve.profile(), nodes[k], values[k])

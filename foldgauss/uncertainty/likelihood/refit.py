@@ -18,6 +18,7 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Bool, Float, Float32, Float64, UInt8
 
+from foldgauss._numerics.random_streams import Stream, make_generator, seed_sequence
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.uncertainty.likelihood.likelihood_profiles import check_explained
 from foldgauss.uncertainty.likelihood.residuals import Residuals
@@ -31,8 +32,6 @@ METHODS, STARTS, PLACES = ("pixels", "frames", "order"), ("model", "scratch"), (
 START_AT = 0.7
 #: The least `FitConfig.cooldown_fraction` of refits: the spread is that of the estimate, not of its last steps.
 COOLDOWN_FRACTION = 0.2
-#: Streams of random numbers derived from the seed: one for frames, one for the seeds of fits.
-_FRAMES, _FITS = 0, 1
 #: Grid search for the time of a left-out frame: points per grid, and number of ever finer grids.
 GRID_POINTS, GRID_ROUNDS = 33, 3
 
@@ -242,13 +241,14 @@ def iter_refits(
     config = _fix_steps(config, len(video), start, steps)
     start_from(model, config, 1)  # raises if the config does not match the model
     for number in range(first, replicates):
-        own = dataclasses.replace(config, seed=int(np.random.SeedSequence([seed, _FITS, number]).generate_state(1)[0]))
+        own = dataclasses.replace(config, seed=int(seed_sequence(Stream.REFIT, number, seed=seed).generate_state(1)[0]))
         if method == "frames":
             yield _leave_out_frames(model, video, own, number, replicates)
             continue
         frames = video
         if method == "pixels":
-            frames = resample_frames(residuals, block, np.random.default_rng([seed, _FRAMES, number]), place=place)
+            rng = make_generator(Stream.RESAMPLED_FRAME, number, seed=seed)
+            frames = resample_frames(residuals, block, rng, place=place)
         state = start_from(model, own, own.steps, START_AT) if start == "model" else None
         fitted, psnr = _fit(frames, own, model.fps, state)
         times = np.asarray(fitted.frame_times.times(), np.float64)

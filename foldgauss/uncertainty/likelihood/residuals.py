@@ -7,6 +7,7 @@ import numba as nb
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
+from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.checks import invalid, short_repr
 from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
@@ -117,7 +118,7 @@ class Sketches:
     """
 
     def __init__(self, num_values: int):
-        rng = np.random.default_rng(0)
+        rng = make_generator(Stream.SKETCH)
         self._bins = rng.integers(0, BINS, num_values, dtype=np.int16)
         self._signs = rng.choice(np.array([-1, 1], np.float32), num_values)
 

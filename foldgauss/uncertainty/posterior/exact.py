@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.special import gammaln
 
+from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.checks import invalid, is_within
 from foldgauss._runtime.kernels import inline, kernel
 from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves
@@ -84,7 +85,7 @@ class ExactPosterior:
 
     def sample(self, num: int, seed: int = 0) -> Float64[np.ndarray, "num num_frames"]:
         """Independent draws from the joint posterior, by backward sampling."""
-        rng, alpha = np.random.default_rng(seed), self.increments.concentration
+        rng, alpha = make_generator(Stream.POSTERIOR_DRAW, seed=seed), self.increments.concentration
         times = np.broadcast_to(self.increments.held, (num, self.increments.num_frames)).copy()
         which = {k: n for n, k in enumerate(np.flatnonzero(self.increments.free))}
         for first, last in self.increments.runs:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, UInt8
 
+from foldgauss._numerics.random_streams import Stream, seed_sequence
 from foldgauss._runtime.checks import invalid, short_repr
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles, likelihood_profiles
 from foldgauss.uncertainty.likelihood.noise import FrameNoise
@@ -170,7 +171,7 @@ class _Run:
         if backend.iteration:
             sampler.start = backend.get_last_sample()
             return sampler
-        seeds = np.random.SeedSequence([self.seed, n])
+        seeds = seed_sequence(Stream.WALKERS, n, seed=self.seed)
         times = self.laplace.sample(self.walkers, np.random.default_rng(seeds))
         state = emcee.State(self.log_prob.increments.coordinates(times))
         state.random_state = np.random.RandomState(np.random.MT19937(seeds)).get_state()

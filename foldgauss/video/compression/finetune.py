@@ -6,6 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
+from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss.render import cpu
 from foldgauss.video.fitting.codebook import Codebook
 from foldgauss.video.fitting.config import FitConfig
@@ -53,7 +54,7 @@ def finetune_model(
     steps = passes * model.num_frames
     for step in range(steps):
         if step % model.num_frames == 0:
-            order = np.random.default_rng([seed, step]).permutation(model.num_frames)
+            order = make_generator(Stream.FINE_TUNING_ORDER, step, seed=seed).permutation(model.num_frames)
             on_pass()
         k = int(order[step % model.num_frames])
         wanted, background = target(k, step)

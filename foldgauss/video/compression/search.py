@@ -16,6 +16,7 @@ import numpy as np
 import scipy
 from jaxtyping import Bool, Float, Float32, Int
 
+from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.checks import invalid, is_integer, is_within
 from foldgauss.video.compression.finetune import finetune_model
 from foldgauss.video.compression.quantize import (
@@ -88,7 +89,6 @@ _ROUNDING: _RoundingStages = (
 )
 #: The same with fewer than so many passes, of which each of those stages would have one or two.
 _ROUNDING_SHORT, _FEW_PASSES = ((SHAPE, 1.0, 0.25), (TRAJECTORY, 1.0, 0.125)), 24
-_SEED = 0
 #: Tries with fine-tuning; the fraction of the allowed loss that they aim at, and the one that ends them.
 _TRIES, _AIM, _ENOUGH = 6, 0.97, 0.94
 #: How many powers of two finer than without fine-tuning the steps may be where half of the Gaussians are dropped: for
@@ -384,7 +384,7 @@ def _round_in_stages(
 ) -> Quantized:
     """The model quantized with steps times 2^coarseness, in `stages` as those of `_ROUNDING`."""
     quantized, exact = quantizer.quantize(coarseness), quantizer.exact
-    num, rng = exact.info.num_gaussians, np.random.default_rng(_SEED)
+    num, rng = exact.info.num_gaussians, make_generator(Stream.ROUNDING_ORDER)
     ranks = dict.fromkeys(_GROUPS, rng.permutation(num) / num)
     if exact.shade is not None:  # Gaussians that share a color are rounded together
         ranks[COLOR] = (rng.permutation(exact.info.shared) / exact.info.shared)[exact.shade]

@@ -3,13 +3,13 @@
 import numpy as np
 from jaxtyping import Float
 
+from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss.render import cpu
 from foldgauss.video.compression.quantize import AXES, ExactColumns, trajectory_matrix
 from foldgauss.video.models.conditioning import backpropagate
 from foldgauss.video.models.row_layout import columns
 from foldgauss.video.selection.contributions import Contributions
 
-_SEED = 0
 #: Levels of an 8-bit image.
 LEVELS = 255.0
 
@@ -24,7 +24,7 @@ def estimate_sensitivities(
     pixel and one draw per frame. A contribution is in pixels: that of each Gaussian to the frame that shows most of it.
     Source: M. F. Hutchinson (1990), "A stochastic estimator of the trace".
     """
-    rng, shape = np.random.default_rng(_SEED), (3, *contributions.size)
+    rng, shape = make_generator(Stream.SENSITIVITY_PROBE), (3, *contributions.size)
     degree, num, prepared = exact.info.degree, contributions.num_gaussians, contributions.prepared
     to_columns = _ColumnGradients(exact)
     total: dict[str, np.ndarray] = {name: np.zeros(num) for name in to_columns.names}

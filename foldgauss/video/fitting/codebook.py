@@ -8,6 +8,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float, Float32, Int, Int32
 
+from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss.video.fitting.adam import adam_step
 
 #: Rounds of Lloyd's algorithm, and the sizes of codebooks that are tried.
@@ -110,7 +111,7 @@ def average_clusters(
 
 def _cluster(values: np.ndarray, weight: np.ndarray, size: int, seed: int) -> np.ndarray:
     """Weighted k-means: the cluster of each value."""
-    rng = np.random.default_rng([seed, 5])
+    rng = make_generator(Stream.CODEBOOK, seed=seed)
     chance = np.maximum(weight, 1e-9 * weight.max() + 1e-300)
     center = values[rng.choice(len(values), size, replace=False, p=chance / chance.sum())]
     for _ in range(_LLOYD_ROUNDS):

@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 
+from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss.render import pixels_per_unit
 from foldgauss.video.fitting.config import FitConfig, most_gaussians
 from foldgauss.video.fitting.growth import GradientStatistics, Growth
@@ -67,7 +68,7 @@ def densify(
     place, num = columns(degree), len(rows)
     cloned, parents = _choose_parents(rows, statistics, growth, place, max_num - num)
     clones = rows[cloned]
-    rng = np.random.default_rng([seed, 2, step])
+    rng = make_generator(Stream.SPLIT, step, seed=seed)
     halves = [_draw_half(rows[parents], rng, growth.shrinking, place) for _ in range(2)]
     stays = np.ones(num, bool)
     stays[parents] = False

@@ -9,6 +9,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float, Float32, UInt8
 
+from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.fitting.growth import PUBLISHED_UNIT
@@ -83,7 +84,7 @@ def initialize(
     those of objects, describes the motion better than a fold alone, starts follow it. `num_gaussians` may be a function
     of their mean lifetime in frames.
     """
-    rng = np.random.default_rng([seed, 0])
+    rng = make_generator(Stream.INITIALIZATION, seed=seed)
     num_frames = len(frames)
     times = np.linspace(0, 1, num_frames) if times is None else np.asarray(times, np.float64)
     density_of = lambda k: measure_detail(frames[k])  # noqa: E731
@@ -122,7 +123,7 @@ def initialize(
 
 def measure_lifetime(frames: UInt8[np.ndarray, "num_frames height width 3"], motion: Motion, degree: int) -> float:
     """The mean number of frames in which the Gaussians of `initialize` are alive, if the frames are evenly spaced."""
-    rng, times = np.random.default_rng(0), np.linspace(0, 1, len(frames))
+    rng, times = make_generator(Stream.LIFETIME), np.linspace(0, 1, len(frames))
     envelope = TimeLikelihood(power=np.float32(1))
 
     def make(home: np.ndarray, position: np.ndarray) -> tuple[FoldedSplats, np.ndarray]:
@@ -155,7 +156,7 @@ def initialize_uniform(
     wide as the distance to their `NEIGHBORS` nearest, faint and gray.
     Source: VeGaS, "Implementation Details", and constants of its published code.
     """
-    rng = np.random.default_rng([seed, 0])
+    rng = make_generator(Stream.INITIALIZATION, seed=seed)
     frame = np.array(size[::-1]) / max(size)
     loc = rng.uniform(-0.5, 0.5, (num_gaussians, 2)) * frame
     near = min(NEIGHBORS, num_gaussians - 1)

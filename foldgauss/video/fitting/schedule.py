@@ -6,6 +6,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.models.row_layout import columns
 
@@ -49,7 +50,7 @@ def choose_views(config: FitConfig, num_frames: int, step: int, errors: np.ndarr
     """
     num, (views, drawn) = num_views(config, num_frames), find_views_in_turn(config, num_frames, step)
     if drawn.any():
-        rng = np.random.default_rng([config.seed, 7, step])
+        rng = make_generator(Stream.ERROR_WEIGHTED_FRAME, step, seed=config.seed)
         views[drawn] = rng.choice(num, drawn.sum(), p=_chances(errors, num))
     return views
 
@@ -71,7 +72,7 @@ def _chances(errors: np.ndarray, num: int) -> np.ndarray:
 
 
 def _shuffle(config: FitConfig, num: int, epoch: int) -> np.ndarray:
-    return np.random.default_rng([config.seed, 1, epoch]).permutation(num)
+    return make_generator(Stream.FRAME_ORDER, epoch, seed=config.seed).permutation(num)
 
 
 def choose_start_frames(num_frames: int) -> np.ndarray:

@@ -9,17 +9,17 @@ the splats' transmittance is that of the frame.
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.checks import invalid
 
 BLACK = (0.0, 0.0, 0.0)
 #: Red, green and blue in [0, 1]; None: transparent, images get alpha.
 Background = tuple[float, float, float] | None
-_STREAM = 3  # random stream of the seed: others are the starts, the order of frames and growth
 
 
 def random_background(seed: int, step: int) -> Float[np.ndarray, "3"]:
     """The background color of a step: it depends on nothing else, so that a resumed fit repeats it."""
-    return np.random.default_rng([seed, _STREAM, step]).random(3, np.float32)
+    return make_generator(Stream.BACKGROUND, step, seed=seed).random(3, np.float32)
 
 
 def composite(

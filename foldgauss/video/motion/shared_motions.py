@@ -6,6 +6,7 @@ import itertools
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.video.motion.camera_path import INLIER, LEAST_INLIERS, SIDE, fit_affine, pixels_to_model
 from foldgauss.video.motion.optical_flow import Motion
@@ -229,7 +230,7 @@ class _Points:
         home = np.repeat(homes, [which.sum() for which in textured])
         position = np.concatenate([np.zeros((0, 2)), *(grid[which] for which in textured)])
         if len(home) > MAX_TRACKS:
-            drawn = np.sort(np.random.default_rng(0).choice(len(home), MAX_TRACKS, replace=False))
+            drawn = np.sort(make_generator(Stream.TRACK).choice(len(home), MAX_TRACKS, replace=False))
             home, position = home[drawn], position[drawn]
         tracks = clip.motion.follow(home, position.astype(np.float32), longest=TRACK_REACH)
         long = tracks.reach > 2

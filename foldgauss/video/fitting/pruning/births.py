@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
+from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss.render import cpu
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.initialize import (
@@ -45,7 +46,7 @@ def make_newborns(
     `errors` are the squared errors of the frames, up to a common factor; `spec` is that of whole frames. With
     `with_static`, Gaussians whose pixel never changes are static.
     """
-    rng = np.random.default_rng([config.seed, 3, state.step])
+    rng = make_generator(Stream.BIRTH, state.step, seed=config.seed)
     times, window, paths = np.asarray(frame_times(state.time_logits)), find_windows(state.rows, spec), paths_of(state)
     spec, colors = dataclasses.replace(spec, paths=paths), np.ascontiguousarray(frames[..., :3])
     home = np.sort(rng.choice(len(frames), num, p=errors / errors.sum()))

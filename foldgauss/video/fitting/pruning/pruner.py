@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss.render import pixels_per_unit
 from foldgauss.video.fitting.codebook import Codebook, average_clusters, find_clusters
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, most_gaussians
@@ -152,7 +153,7 @@ class Pruner:
         config = self._config
         motion = self._find_motion() if config.follow_motion else None
         new = make_newborns(num, state, self._frames, scores.errors, config, self._spec, motion, with_static=True)
-        order = shuffle_into(len(state.rows), num, np.random.default_rng([config.seed, 6, state.step]))
+        order = shuffle_into(len(state.rows), num, make_generator(Stream.BIRTH_DEPTH, state.step, seed=config.seed))
         state.extend(new, find_initial_kinds(new, config.degree), newborn=np.ones(num, bool))
         state.keep(order)
 

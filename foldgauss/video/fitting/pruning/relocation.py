@@ -8,6 +8,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float, Float32, Int
 
+from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss.video.fitting.adam import BETA2
 from foldgauss.video.fitting.budget import measure_progress
 from foldgauss.video.fitting.config import FitConfig
@@ -75,7 +76,7 @@ def _find_places(state: FitState, new: np.ndarray, kinds: np.ndarray, config: Fi
     timed, static = np.flatnonzero(~is_static(state.kinds)), np.flatnonzero(is_static(state.kinds))
     place = np.append(timed, num)[np.searchsorted(np.sort(state.rows[timed, at]), new[:, at])]
     if len(static):
-        rng, which = np.random.default_rng([config.seed, 8, state.step]), is_static(kinds)
+        rng, which = make_generator(Stream.RELOCATION_DEPTH, state.step, seed=config.seed), is_static(kinds)
         place[which] = rng.choice(static, which.sum())
     return place
 

@@ -10,6 +10,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float, Float32
 
+from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss.render import RenderOptions, cpu
 from foldgauss.video.models.conditioning import ConditioningSpec, condition
 from foldgauss.video.models.row_layout import columns
@@ -161,7 +162,7 @@ def measure_scores(
 
     Squares of the frames' derivatives are estimated without bias by random signs, as in `compression.sensitivity`.
     """
-    num, place, rng = len(rows), columns(shape.degree), np.random.default_rng([seed, 4])
+    num, place, rng = len(rows), columns(shape.degree), make_generator(Stream.PRUNING_PROBE, seed=seed)
     center = 1 / (1 + np.exp(-rows[:, place["time_loc_logit"]][:, 0].astype(float)))
     spread = np.exp(rows[:, place["log_time_scale"]][:, 0].astype(float))
     span = np.minimum(TAU_MAX * spread, 1.0)

@@ -11,6 +11,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import numpy as np
 from jaxtyping import Float32
 
+from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.threads import num_threads
 from foldgauss.video.fitting.config import FitConfig, chosen_interpolation
 from foldgauss.video.fitting.schedule import choose_views, find_views_in_turn, fraction_in_turn
@@ -32,7 +33,7 @@ class InterpolatedFrames:
         """At which fraction of the way from frame k to the next the time of a step lies; None for the frame itself."""
         if progress >= self.config.interpolation_end or k in self.left_out or not step:
             return None
-        rng = np.random.default_rng([self.config.seed, 2, step, k])
+        rng = make_generator(Stream.INTERPOLATED_FRAME, step, k, seed=self.config.seed)
         chosen, fraction = rng.random() < self.chance, rng.uniform(MARGIN, 1 - MARGIN)
         return fraction if chosen else None
 

@@ -1,0 +1,56 @@
+"""Independent random generators, one for each use of a seed."""
+
+import enum
+
+import numpy as np
+
+
+@enum.unique
+class Stream(enum.IntEnum):
+    """The uses of random numbers. Each has its own stream, so that none repeats the draws of another.
+
+    A value is part of the results: a new use takes the next value.
+    """
+
+    INITIALIZATION = 0
+    FRAME_ORDER = 1
+    SPLIT = 2  #: halves of Gaussians that densification splits
+    BIRTH = 3
+    BIRTH_DEPTH = 4
+    RELOCATION_DEPTH = 5
+    BACKGROUND = 6
+    INTERPOLATED_FRAME = 7
+    ERROR_WEIGHTED_FRAME = 8
+    PRUNING_PROBE = 9
+    CODEBOOK = 10
+    LIFETIME = 11
+    TRACK = 12
+    ROUNDING_ORDER = 13
+    SENSITIVITY_PROBE = 14
+    FINE_TUNING_ORDER = 15
+    SKETCH = 16
+    COLOR_PROBE = 17
+    REFIT = 18
+    RESAMPLED_FRAME = 19
+    WALKERS = 20
+    POSTERIOR_DRAW = 21
+    CALIBRATION = 22
+    RANK_BAND = 23
+    THINNING = 24
+    EM_JITTER = 25
+    CROSS_VALIDATION = 26
+    SYNTHETIC_NOISE = 27
+    DIAGNOSIS = 28
+
+
+def seed_sequence(stream: Stream, *place: int, seed: int = 0) -> np.random.SeedSequence:
+    """The seed of `stream` for a user's `seed`, at a `place` in it: a step, or a step and a frame.
+
+    Sequences of different streams, places or seeds (below 2^128) are independent. **Source:** `spawn_key` of NumPy.
+    """
+    return np.random.SeedSequence(seed, spawn_key=(stream, *place))
+
+
+def make_generator(stream: Stream, *place: int, seed: int = 0) -> np.random.Generator:
+    """A generator for `seed_sequence`."""
+    return np.random.default_rng(seed_sequence(stream, *place, seed=seed))
