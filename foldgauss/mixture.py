@@ -543,8 +543,8 @@ def _sample(mixture: AbstractMixture, key, sample_shape: tuple[int, ...]):
 
 def _sample_from(mixture: AbstractMixture, key, sample_shape, component: Array) -> Array:
     """One sample from each of the chosen components."""
-    components, batch = mixture.components, mixture.batch_shape
-    if isinstance(components, FoldedGaussian | Gaussian) and not _shares_parameters(components):
+    components, batch, choice = mixture.components, mixture.batch_shape, mixture.num_components > 1
+    if choice and isinstance(components, FoldedGaussian | Gaussian) and not _shares_parameters(components):
         if isinstance(components, Gaussian) or not components.fold.shares_leaves:
             components = broadcast_leaves(components, (*batch, mixture.num_components))
         return _take_components(components, component, batch).sample(key)
