@@ -5,7 +5,8 @@
 *density*, *shapes* and *marginals* are drawn from distributions of two coordinates. *pipeline* and *cameras* show 25
 frames of *bikes* at 160x384, the rider of `benchmarks.editing`, fitted with 20,000 Gaussians in 3,000 steps, half of
 which learn what lies between frames; `--models` keeps that model, and takes the one that is there. *distribution* and
-*uncertainty* are the examples of README; the latter fits 46 frames of *Bunny* at 80x160 and samples their times.
+*uncertainty* are the examples of README; the latter fits 46 frames of *Bunny* at 80x160 and samples their times, and
+*increments*, for docs/uncertainty.md, all 132.
 Others: `benchmarks.animation`, `benchmarks.record_figures`.
 """
 
@@ -26,10 +27,12 @@ from benchmarks import _common
 from benchmarks.editing import Scene, fitted, rider
 from foldgauss import Constant, FoldedGaussian, PolynomialFold, TimeLikelihood, ZeroFold
 from foldgauss.analysis.plot import plot_density
+from foldgauss.io import Clip
 from foldgauss.io._atomic import atomic_path
 from foldgauss.io.datasets import bunny
 from foldgauss.render import Camera, Gaussians3D, project, render
-from foldgauss.uncertainty import frame_time_posterior, increment_intervals, irregularities
+from foldgauss.uncertainty import FrameTimePosterior, frame_time_posterior, increment_intervals, irregularities
+from foldgauss.uncertainty.diagnostics.plots import plot_increments
 from foldgauss.video import FitConfig, VideoModel, fit
 
 BLUE, RED, GREY = "#2b5c8a", "#c2452d", "#5a5f66"
@@ -44,6 +47,8 @@ EXAMPLE_SIZE = 5.0, 3.2
 HALO = {"path_effects": [patheffects.withStroke(linewidth=3, foreground="white")]}
 #: Frames of *Bunny* in the example of uncertainty: 57 and 82 repeat the ones before.
 REPEATING = 40, 86
+#: Gaussians and steps for each frame of a clip whose times are sampled.
+PER_FRAME = 130, 32
 #: One in so many Gaussians has its outline drawn.
 EVERY = 4
 
@@ -245,9 +250,7 @@ def distribution() -> plt.Figure:
 def uncertainty() -> plt.Figure:
     """README's example: the steps between frames of *Bunny*, two of which are repeated in the file itself."""
     first, stop = REPEATING
-    clip = bunny(frames=REPEATING, size=(80, 160))
-    model = fit(clip.frames, FitConfig(num_gaussians=6_000, steps=1_500), fps=clip.fps).model
-    posterior = frame_time_posterior(model, clip.frames, progress=False)
+    posterior = _frame_times(bunny(frames=REPEATING, size=(80, 160)))
     found = increment_intervals(posterior, 0.9)
     fig, ax = plt.subplots(figsize=EXAMPLE_SIZE)
     ax.axhline(1, color=GREY, lw=0.8)
@@ -264,8 +267,32 @@ def uncertainty() -> plt.Figure:
     return fig
 
 
+def _frame_times(clip: Clip) -> FrameTimePosterior:
+    """Times of the frames, given a fit without shared paths."""
+    gaussians, steps = (rate * len(clip.frames) for rate in PER_FRAME)
+    config = FitConfig(num_gaussians=gaussians, steps=steps, follow_camera=False)
+    return frame_time_posterior(fit(clip.frames, config, fps=clip.fps).model, clip.frames, progress=False)
+
+
+def increments() -> plt.Figure:
+    """All steps between frames of *Bunny*, with what is reported; below, how much the frames themselves differ."""
+    clip = bunny(size=(80, 160))
+    posterior = _frame_times(clip)
+    print(posterior.message, *irregularities(posterior), sep="\n")
+    fig, (above, below) = plt.subplots(2, 1, figsize=(8.6, 5.2), sharex=True, height_ratios=(2, 1))
+    plot_increments(posterior, above, level=0.9)
+    above.get_legend().remove()
+    above.set(title="", xlabel="", ylabel="step / median step")
+    change = np.sqrt((np.diff(clip.frames.astype(np.float64), axis=0) ** 2).mean((1, 2, 3)))
+    below.semilogy(np.arange(len(change)) + 0.5, change, ".-", color=GREY, lw=0.8)
+    below.set(xlabel="interval between frames", ylabel="difference of frames\n(gray levels, rms)")
+    below.grid(alpha=0.25)
+    return fig
+
+
 DRAWN = {"density": density, "marginals": marginals, "shapes": shapes}
 EXAMPLES = {"distribution": distribution, "uncertainty": uncertainty}
+GUIDES = {"increments": increments}
 FROM_CLIP = {"pipeline": pipeline, "cameras": cameras}
 #: The names of files begin with what they are of.
 PREFIX = dict.fromkeys((*DRAWN, *FROM_CLIP), "concept-") | dict.fromkeys(EXAMPLES, "example-")
@@ -279,7 +306,7 @@ def write(path: Path, figure: plt.Figure) -> None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    every = (*DRAWN, *EXAMPLES, *FROM_CLIP)
+    every = (*DRAWN, *EXAMPLES, *GUIDES, *FROM_CLIP)
     parser = _common.parser(__doc__)
     parser.add_argument("--out", type=Path, default=Path("docs"), metavar="FOLDER", help="[docs]")
     parser.add_argument("--only", choices=every, action="append", metavar="NAME", help="[all]")
@@ -288,7 +315,7 @@ def main(arguments: list[str] | None = None) -> None:
     matplotlib.use("Agg")
     wanted = options.only or every
     options.out.mkdir(parents=True, exist_ok=True)
-    made = {name: (DRAWN | EXAMPLES)[name]() for name in wanted if name not in FROM_CLIP}
+    made = {name: (DRAWN | EXAMPLES | GUIDES)[name]() for name in wanted if name not in FROM_CLIP}
     if set(wanted) & FROM_CLIP.keys():
         if options.models is not None:
             options.models.mkdir(parents=True, exist_ok=True)
@@ -296,7 +323,7 @@ def main(arguments: list[str] | None = None) -> None:
         model = fitted(scene._replace(name="figures"), CONFIG, options.models)
         made |= {name: FROM_CLIP[name](scene, model) for name in wanted if name in FROM_CLIP}
     for name, figure in made.items():
-        write(options.out / f"{PREFIX[name]}{name}.png", figure)
+        write(options.out / f"{PREFIX.get(name, '')}{name}.png", figure)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,9 @@
 
     python -m benchmarks.record_figures [--records FOLDER] [--out FOLDER] [--only NAME ...]
 
-- *quality-time*: PSNR against minutes of fitting, *Bunny*, from `defaults.json` (`benchmarks.defaults`), beside the
-  figures of the VeGaS paper (table:init-gauss).
+- *quality-time*: PSNR and megabytes (float32) against minutes of fitting, *Bunny*, from `defaults.json` and
+  `defaults-followed.json` (`benchmarks.defaults`), beside the figures of the VeGaS paper (table:init-gauss). Points are
+  not joined: load, number of Gaussians and its rule differ.
 - *quality-bytes*: bytes at equal PSNR relative to x264 *medium* (BD-rate), from `codecs.json` (`benchmarks.codecs`).
 - *tradeoff-clips*: PSNR against CPU time and against bytes, from `tradeoff-clips.json` (`benchmarks.tradeoff_clips`).
 
@@ -37,11 +38,16 @@ STYLE = {
     "lines.markersize": 7,
     "figure.constrained_layout.use": True,
 }
-#: Sizes of *Bunny* and the runs of `defaults.json` at each.
+#: Runs of *Bunny* in the figure of time: record, names, color, whether the marker is filled, and the offset of its text
+#: in points.
 BUNNY = {
-    "160x320": (GREEN, ("bunny-160-1", "bunny-160")),
-    "640x1280": (BLUE, ("bunny-640-5", "bunny-640", "bunny-640-60")),
+    "160x320": ("defaults", ("bunny-160-1", "bunny-160"), GREEN, True, 8),
+    "160x320, another day: 0.6 times the steps": ("defaults-followed", ("bunny-160-1", "bunny-160"), GREEN, False, -20),
+    "640x1280": ("defaults", ("bunny-640-5", "bunny-640"), BLUE, True, 8),
+    "640x1280, earlier rule for the number of Gaussians": ("defaults", ("bunny-640-60",), BLUE, False, 8),
 }
+#: Megabytes of a million Gaussians of degree 7: 25 float32 parameters each.
+PAPER_MEGABYTES = 100
 #: Coders of `codecs.json` in the figure of bytes: marker, color, label.
 CODERS = {
     "SVT-AV1 6": ("v", GREY, "AV1"),
@@ -61,26 +67,30 @@ Runs = dict[str, dict[str, Any]]
 
 def quality_time(records: Path) -> plt.Figure:
     """PSNR against minutes of fitting, here and in the paper."""
-    runs = _read(records, "defaults")["runs"]
-    fig, ax = plt.subplots(figsize=(WIDTH, 3.6))
-    for size, (color, names) in BUNNY.items():
-        points = [(runs[name]["seconds"] / 60, runs[name]["psnr"]) for name in names if name in runs]
-        ax.plot(*zip(*points, strict=True), "o-", color=color, label=f"foldgauss, {size}, 2 CPU cores")
-        for minutes, psnr in points:
-            ax.annotate(f"{psnr:.1f}", (minutes, psnr), (-4, 5), textcoords="offset points", ha="right", color=color)
+    fig, ax = plt.subplots(figsize=(WIDTH, 4.2))
+    for label, (record, names, color, filled, offset) in BUNNY.items():
+        runs = _read(records, record)["runs"]
+        for name in names:
+            minutes, psnr, size = runs[name]["seconds"] / 60, runs[name]["psnr"], 4e-6 * runs[name]["floats"]
+            style = {"color": color, "mfc": color if filled else "white"}
+            ax.plot(minutes, psnr, "o", label=f"foldgauss, {label}" if name == names[0] else None, **style)
+            ax.annotate(f"{psnr:.1f}, {size:.0f} MB", (minutes, psnr), (0, offset), textcoords="offset points",
+                        ha="center", color=color, fontsize=9)  # fmt: skip
     minutes, psnr = zip(*((_to_minutes(time), psnr) for psnr, _, time in PAPER_STARTS.values()), strict=True)
     ax.plot(minutes, psnr, "x", color=ORANGE, mew=2, label="VeGaS as published, 640x1280")
-    most = max(psnr)
-    place = (minutes[psnr.index(most)], min(psnr))
-    ax.annotate(f"{min(psnr):.1f} to {most:.1f}", place, (0, -16), textcoords="offset points", ha="right", color=ORANGE)
+    sizes = [PAPER_MEGABYTES * count for _, count, _ in PAPER_STARTS.values()]
+    text = f"{min(psnr):.1f} to {max(psnr):.1f}, {min(sizes):.0f} to {max(sizes):.0f} MB"
+    ax.annotate(
+        text, (max(minutes), min(psnr)), (0, -16), textcoords="offset points", ha="right", color=ORANGE, fontsize=9
+    )
     ax.set(xscale="log", xlabel="minutes of fitting", ylabel="PSNR (dB), mean over all frames")
     ticks = [1, 2, 5, 10, 20, 60]
     ax.set_xticks(ticks, [str(tick) for tick in ticks])
     ax.minorticks_off()
-    ax.set_xlim(0.6, 90)
+    ax.set_xlim(0.6, 110)
     low, high = ax.get_ylim()
     ax.set_ylim(low - 0.5, high + 0.6)
-    fig.legend(loc="outside upper left", fontsize=9.5)
+    fig.legend(loc="outside upper left", fontsize=9)
     return fig
 
 

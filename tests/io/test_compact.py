@@ -796,6 +796,8 @@ def test_models_that_the_format_cannot_hold_are_rejected():
         compress(layers(model, model))
     with pytest.raises(ValueError, match=r"model.degree: expected at most 15"):
         compress(soft_model(degree=16))
+    with pytest.raises(ValueError, match=r"degree: expected .* 15"):
+        FitConfig(degree=16)
     with pytest.raises(ValueError, match=r"frames: expected uint8"):
         compress(model, np.zeros((2, *SIZE, 3), np.uint8))
     for wrong in (0.0, -1, np.nan, "a"):

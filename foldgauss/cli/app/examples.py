@@ -150,12 +150,12 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
         ),
         "uncertainty": (
             Example(
-                "Tables and figures into holiday-uncertainty",
-                "foldgauss uncertainty holiday.safetensors holiday.mp4",
+                "Tables and figures into steady-uncertainty, of a model that was fitted with --no-follow-camera",
+                "foldgauss uncertainty steady.safetensors holiday.mp4",
             ),
             Example(
                 "Frames 10 to 19 only, with unknown colors",
-                "foldgauss uncertainty holiday.safetensors holiday.mp4 --only 10:20 --level colors",
+                "foldgauss uncertainty steady.safetensors holiday.mp4 --only 10:20 --level colors",
             ),
         ),
         "tradeoff": (

@@ -60,7 +60,7 @@ def compress_command(
     passes: Annotated[
         int,
         typer.Option(
-            help=f"Passes over VIDEO of fine-tuning, about {USUAL_PASSES} times as many in all stages; 0: none.",
+            help="Passes over VIDEO of fine-tuning, 3 to 7 times as many in all stages; 0: none.",
             min=0,
         ),
     ] = PASSES,

@@ -22,7 +22,7 @@ def view_command(
     original_quality: OriginalQuality = QUALITY,
     moving: Annotated[
         bool,
-        typer.Option("--moving-object", help="Find the object that moves (about 1 s per frame): a button selects it."),
+        typer.Option("--moving-object", help="Find the object that moves (0.5 s per frame): a button selects it."),
     ] = False,
     port: Annotated[int, typer.Option(help="Serve at this port.", min=0, max=65535, show_default="a free one")] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the browser.")] = True,

@@ -32,7 +32,6 @@ from foldgauss.video.compression.quantize import (
     FEATURES,
     LARGEST,
     MAX_CELL_BITS,
-    MAX_DEGREE,
     MAX_SHARED,
     CompactInfo,
     Quantized,
@@ -42,6 +41,7 @@ from foldgauss.video.compression.quantize import (
 )
 from foldgauss.video.compression.quantized_paths import MAX_PATH_BITS, PathsInfo
 from foldgauss.video.compression.quantized_times import MAX_TIME_BITS, TIME_BITS
+from foldgauss.video.fitting.config import MAX_DEGREE
 from foldgauss.video.models.shared_paths import MAX_PATHS
 from foldgauss.video.models.video_model import VideoModel
 

@@ -27,14 +27,13 @@ from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions
 from foldgauss.video.compression.quantized_paths import PathsInfo, decode_paths, describe_paths, round_paths
 from foldgauss.video.compression.quantized_times import TIME_BITS, choose_time_bits, round_times
+from foldgauss.video.fitting.config import MAX_DEGREE
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.row_layout import shift_path
 from foldgauss.video.models.shared_paths import SharedPaths, check_paths
 from foldgauss.video.models.splats import OPAQUE_LOGIT, STATIC_LOG_TIME_SCALE, TAU_MAX, FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
 
-#: Higher degrees lose digits in sums of Legendre polynomials; fits use at most 7.
-MAX_DEGREE = 15
 #: Largest absolute value of a column's integers that the range coder accepts.
 LARGEST = 2**30 - 1
 #: Columns from which the steps of others may be computed.

@@ -52,8 +52,8 @@ class LearningRates:
 UNIT_TIME, UNIT_SIZE = 0.06, 0.005
 #: Their state takes about 3 GB at degree 3; the paper's largest fit ends with 1.8 million.
 MAX_GAUSSIANS = 10_000_000
-#: Beyond this degree, float32 cannot tell the powers of u and their gradients apart.
-MAX_DEGREE = 16
+#: Beyond this degree, float32 cannot tell the powers of u and their gradients apart; compact files hold no more either.
+MAX_DEGREE = 15
 #: A low-pass filter of 0.1 px^2 fits finer detail than the usual 0.3.
 FINE = RenderOptions(low_pass=0.1)
 #: How Gaussians are initialized; which learning rates decay.
@@ -480,7 +480,7 @@ def default_num_gaussians(
     lifetime: float = TYPICAL_LIFETIME,
     threads: int | None = None,
 ) -> int:
-    """The number of Gaussians that is best for the budget, see docs/fit.md for the measurements.
+    """The number of Gaussians that is best for the budget, see notes/experiments.md for the measurements.
 
     `lifetime` is the mean number of frames in which a Gaussian is alive, which depends on the motion in the clip. The
     number is the smallest of three, where a core has x microseconds for each pixel of all frames, p pixels each:
