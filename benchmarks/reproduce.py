@@ -3,8 +3,8 @@
     python -m benchmarks.reproduce --folder FOLDER [--tables | --only NAME ...] [--size HxW | --crop HxW] [--frames A:B]
                                    [--clip PATH] [--steps N] [--seed S] [--engine E] [--json FILE] [--plot FILE]
 
-*Bunny* or another clip, by default all 132 frames of 640x1280, in the published 30,000 steps of 3 frames: hours on the CPU of a desktop
-machine; `--engine auto` uses a GPU where JAX sees one. A smaller `--size` has Gaussians at the start in proportion to
+*Bunny* or another clip, by default all 132 frames of 640x1280, in the published 30,000 steps of 3 frames: hours on the
+CPU of a desktop machine; `--engine auto` uses a GPU where JAX sees one. A smaller `--size` has Gaussians at the start in proportion to
 its pixels, and lengths, rates of positions and thresholds of gradients that are the same in pixels (`config_of`).
 Smaller frames show more detail per pixel; `--crop` instead fits the central window of the frames, with as much detail
 as they have.
@@ -267,7 +267,8 @@ def main(arguments: list[str] | None = None) -> None:
         config = config_of(name, clip.size, options.steps, options.seed)
         config = dataclasses.replace(config, engine=options.engine)
         done[name] = runs.get(name, lambda name=name, config=config: run_to_end(clip, name, config, options.folder))
-    title = f"{options.clip.stem if options.clip else 'Bunny'}, {clip.num_frames} frames of {clip.size[0]}x{clip.size[1]}, {options.steps:,} steps"
+    name = options.clip.stem if options.clip else "Bunny"
+    title = f"{name}, {clip.num_frames} frames of {clip.size[0]}x{clip.size[1]}, {options.steps:,} steps"
     show(done, title + (", not resized" if options.crop else ""))
     if options.plot:
         plot_curves(options.folder, done, options.plot)
