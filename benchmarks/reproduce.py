@@ -4,8 +4,9 @@
                                    [--clip PATH] [--steps N] [--seed S] [--engine E] [--json FILE] [--plot FILE]
 
 *Bunny* or another clip, by default all 132 frames of 640x1280, in the published 30,000 steps of 3 frames: hours on the
-CPU of a desktop machine; `--engine auto` uses a GPU where JAX sees one. A smaller `--size` has Gaussians at the start in proportion to
-its pixels, and lengths, rates of positions and thresholds of gradients that are the same in pixels (`config_of`).
+CPU of a desktop machine; `--engine auto` uses a GPU where JAX sees one. A smaller `--size` has Gaussians at the start
+in proportion to its pixels, and lengths, rates of positions and thresholds of gradients that are the same in pixels
+(`config_of`).
 Smaller frames show more detail per pixel; `--crop` instead fits the central window of the frames, with as much detail
 as they have.
 `VARIANTS` lists the fits: "as published", the power of the paper's text instead of its code's, other batches and
