@@ -4,6 +4,8 @@ import dataclasses
 import datetime
 import json
 import statistics
+import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,9 +13,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks._common import console, describe_machine
-from foldgauss.io import Clip
+from foldgauss._runtime.threads import num_threads
+from foldgauss.io import Clip, save_video_model
 from foldgauss.io._atomic import atomic_path
-from foldgauss.video import FitConfig, VideoModel, fit, fit_steps, psnr, ssim
+from foldgauss.video import FitConfig, VideoModel, fit_steps, psnr, ssim
+from foldgauss.video.fitting.state import to_model
 
 Run = dict[str, Any]
 
@@ -83,13 +87,27 @@ def scores(model: Any, frames: np.ndarray, *, with_ssim: bool = True) -> Run:
     )
 
 
-def fitted(clip: Clip, config: FitConfig, *, with_ssim: bool = True) -> tuple[VideoModel, Run]:
-    """A fit, its quality and what it took; `seconds` are those of fitting, starts and motion included."""
-    result = fit(clip.frames, config, fps=clip.fps)
-    seconds, steps = result.history[-1].seconds, result.history[-1].step
-    run = scores(result.model, clip.frames, with_ssim=with_ssim)
-    run |= {"gaussians": result.model.num_gaussians, "floats": result.model.num_parameters, "steps": steps}
-    return result.model, run | {"frames_seen": steps * config.batch_size, "seconds": seconds}
+def fitted(clip: Clip, config: FitConfig, *, with_ssim: bool = True, cpu_time: bool = False) -> tuple[VideoModel, Run]:
+    """A fit, its quality, its size and its cost; `seconds` include initialization and motion.
+
+    With `cpu_time`, seconds and the budget are those of the processor, divided by the number of threads: the wall time
+    on a quiet machine, so that fits beside other work are comparable.
+    """
+    clock = (lambda: time.process_time() / num_threads()) if cpu_time else time.perf_counter
+    for state, info in fit_steps(clip.frames, config, clock=clock):
+        last = info
+    model = to_model(state, config, clip.frames.shape[1:3], clip.fps)
+    run = scores(model, clip.frames, with_ssim=with_ssim)
+    run |= {"gaussians": model.num_gaussians, "floats": model.num_parameters, "steps": last.step}
+    run |= size_on_disk(model, clip)
+    return model, run | {"frames_seen": last.step * config.batch_size, "seconds": last.seconds}
+
+
+def size_on_disk(model: VideoModel, clip: Clip) -> Run:
+    """Bytes of the float32 model file, and bits per pixel of the clip."""
+    with tempfile.TemporaryDirectory() as folder:
+        num_bytes = save_video_model(Path(folder) / "model.safetensors", model).stat().st_size
+    return {"bytes": num_bytes, "bits_per_pixel": 8 * num_bytes / clip.frames[..., 0].size}
 
 
 #: Steps that a pace is measured by, after some in which kernels are loaded.

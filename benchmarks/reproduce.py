@@ -1,11 +1,12 @@
 """The paper's recipe to its end: preset `paper` with all its steps, and with one thing changed.
 
     python -m benchmarks.reproduce --folder FOLDER [--tables | --only NAME ...] [--size HxW | --crop HxW] [--frames A:B]
-                                   [--steps N] [--seed S] [--engine E] [--json FILE] [--plot FILE]
+                                   [--clip PATH] [--steps N] [--seed S] [--engine E] [--json FILE] [--plot FILE]
 
-*Bunny*, by default all 132 frames of 640x1280, in the published 30,000 steps of 3 frames: hours on the CPU of a desktop
-machine; `--engine auto` uses a GPU where JAX sees one. A smaller `--size` has Gaussians at the start in proportion to
-its pixels, and lengths, rates of positions and thresholds of gradients that are the same in pixels (`config_of`).
+*Bunny* or another clip, by default all 132 frames of 640x1280, in the published 30,000 steps of 3 frames: hours on the
+CPU of a desktop machine; `--engine auto` uses a GPU where JAX sees one. A smaller `--size` has Gaussians at the start
+in proportion to its pixels, and lengths, rates of positions and thresholds of gradients that are the same in pixels
+(`config_of`).
 Smaller frames show more detail per pixel; `--crop` instead fits the central window of the frames, with as much detail
 as they have.
 `VARIANTS` lists the fits: "as published", the power of the paper's text instead of its code's, other batches and
@@ -33,7 +34,7 @@ import numpy as np
 
 from benchmarks import _common, fit_clip
 from benchmarks._common import console
-from benchmarks._runs import Run, Runs, scaled, scores
+from benchmarks._runs import Run, Runs, scaled, scores, size_on_disk
 from foldgauss.io import Clip, read_video
 from foldgauss.io._atomic import atomic_path
 from foldgauss.io.datasets import bunny, sample_clip
@@ -219,6 +220,7 @@ def run_to_end(clip: Clip, name: str, config: FitConfig, folder: Path) -> Run:
     state, info = run_steps(fit_steps(clip.frames, config, state), observe, checkpoint, CHECKPOINT_SECONDS)
     model = to_model(state, config, clip.size, clip.fps)
     run = scores(model, clip.frames) | {"gaussians": model.num_gaussians, "steps": info.step}
+    run |= {"floats": model.num_parameters} | size_on_disk(model, clip)
     checkpoint.remove()
     return run | {"seconds": info.seconds, "cpu_hours": curve.cpu_seconds() / 3600}
 
@@ -240,8 +242,10 @@ def show(runs: dict[str, Run], title: str) -> None:
 
 
 def read_clip(options: argparse.Namespace) -> Clip:
-    if options.crop:
-        return read_video(sample_clip("bunny"), frames=options.frames, center_crop=options.crop)
+    if options.crop or options.clip:
+        size = None if options.crop else options.size
+        path = options.clip or sample_clip("bunny")
+        return read_video(path, frames=options.frames, center_crop=options.crop, size=size)
     return bunny(size=options.size, frames=options.frames)
 
 
@@ -252,6 +256,8 @@ def main(arguments: list[str] | None = None) -> None:
     setting = {"size": clip.size, "frames": clip.num_frames, "steps": options.steps, "seed": options.seed}
     if options.crop:
         setting["cropped"] = True
+    if options.clip:
+        setting["clip"] = options.clip.stem
     try:
         options.folder.mkdir(parents=True, exist_ok=True)
         runs = Runs(options.json, setting)
@@ -262,7 +268,8 @@ def main(arguments: list[str] | None = None) -> None:
         config = config_of(name, clip.size, options.steps, options.seed)
         config = dataclasses.replace(config, engine=options.engine)
         done[name] = runs.get(name, lambda name=name, config=config: run_to_end(clip, name, config, options.folder))
-    title = f"Bunny, {clip.num_frames} frames of {clip.size[0]}x{clip.size[1]}, {options.steps:,} steps"
+    name = options.clip.stem if options.clip else "Bunny"
+    title = f"{name}, {clip.num_frames} frames of {clip.size[0]}x{clip.size[1]}, {options.steps:,} steps"
     show(done, title + (", not resized" if options.crop else ""))
     if options.plot:
         plot_curves(options.folder, done, options.plot)
@@ -273,6 +280,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _parser():
     parser = _common.parser(__doc__)
+    parser.add_argument("--clip", type=Path, metavar="PATH", help="instead of Bunny")
     parser.add_argument("--folder", type=Path, required=True, help="of checkpoints and curves")
     shown = parser.add_mutually_exclusive_group()
     shown.add_argument("--size", type=_common.size, metavar="HxW", default=FULL, help="[640x1280]")

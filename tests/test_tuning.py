@@ -71,7 +71,7 @@ class TestDefaults:
         """Fits that take no time, of clips that are not read; their settings."""
         made = []
 
-        def fitted(clip, config, *, with_ssim):
+        def fitted(clip, config, *, with_ssim, cpu_time):
             assert not with_ssim
             made.append(config)
             gaussians = config.max_gaussians or 40_000
@@ -86,15 +86,15 @@ class TestDefaults:
 
     def test_every_fit_has_a_figure_asked(self, folder):
         rows = {"psnr": 30.0, "worst_psnr": 29.0, "floats": 1, "worst_below_mean": 1.0}
-        names = [*defaults.all_fits(folder, None), defaults.FOLDER_MEAN]
-        assert names[-3:] == ["clips/fast", "clips/slow", "clips, mean"]
+        names = [*defaults.all_fits(folder, None), *(f"{prefix}mean" for prefix in defaults.FOLDER_CHANGES)]
+        assert names[-3:] == ["clips-600k/slow", "clips/mean", "clips-600k/mean"]
         assert all(list(defaults.judgements(name, rows)) for name in names)
 
     def test_nothing_but_what_a_user_gives(self):
         fits = defaults.all_fits(None, None)
         assert fits["bunny-160"].config == FitConfig(minutes=2)
         assert fits["bunny-160"].source.size == (160, 320)
-        assert fits["bunny-640-620k"].config == FitConfig(minutes=15, max_gaussians=620_000)
+        assert fits["bunny-640-620k"].config == FitConfig(minutes=10, max_gaussians=620_000)
         assert fits["bunny-640-620k"].source.size == (640, 1280)
         assert fits["smallest"].config == FitConfig(economy=Economy(psnr=33))
 
@@ -153,7 +153,7 @@ class TestDefaults:
         assert "--only: expected some of bunny-160, bunny-160-1, bunny-640," in capsys.readouterr().err
 
     def test_clips_of_a_folder(self, folder, monkeypatch, capsys):
-        monkeypatch.setattr(defaults, "FOLDER_CHANGES", {"steps": 10, "num_gaussians": 60})
+        monkeypatch.setitem(defaults.FOLDER_CHANGES, "clips/", {"steps": 10, "num_gaussians": 60})
         defaults.main(["--clips", str(folder), "--only", "clips/fast"])
         shown = printed(capsys)
         assert "mean - worst <= 3" in shown
