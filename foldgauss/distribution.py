@@ -12,13 +12,15 @@ from jaxtyping import Array, ArrayLike, Float, Key
 from foldgauss._numerics.batch import (
     BatchModule,
     align,
+    as_event,
+    as_sample_shape,
     as_value,
     batch_shape_of,
     broadcast,
     broadcast_leaves,
     cast,
     check_batch,
-    check_event,
+    check_finite,
     check_positive,
     common_dtype,
     expand_leaves,
@@ -32,7 +34,7 @@ from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.threads import check_not_forked
 from foldgauss.analysis import interop, moments
 from foldgauss.analysis.conditional import TimeDensity, TimeMixture, conditional_gaussian, time_density, time_mixture
-from foldgauss.envelope import AbstractEnvelope, TimeLikelihood, as_envelope
+from foldgauss.envelope import AbstractEnvelope, TimeLikelihood, as_envelope, check_peak
 from foldgauss.fold import AbstractFold, ZeroFold, as_fold, evaluate_shift, restrict_fold
 from foldgauss.gaussian import Gaussian, Normal, times_exp
 
@@ -104,11 +106,13 @@ class FoldedGaussian(BatchModule):
         check_loc(loc)
         tril = resolve_scale_tril(given, dim=loc.shape[-1], dtype=dtype, validate=validate_args)
         if validate_args:
+            check_finite("loc", loc)
+            check_finite("time_loc", time_loc)
             check_positive("time_scale", time_scale)
         fold = ZeroFold(loc.shape[-1]) if fold is None else as_fold(fold)
         fold = _check_fold(cast(fold, dtype), loc)
         envelope = TimeLikelihood(power=1.0) if envelope is None else envelope
-        envelope = cast(_as_checked_envelope(envelope), dtype)
+        envelope = cast(as_envelope(envelope), dtype)
         # Every leaf has all batch dimensions, so that slices, `vmap` over the distribution, and an axis that `vmap`
         # over this constructor adds in front are well defined.
         parts = [(loc, 1), (tril, 2), (time_loc, 0), (time_scale, 0)]
@@ -117,6 +121,8 @@ class FoldedGaussian(BatchModule):
         self.envelope = broadcast_leaves(envelope, batch)
         # Parameters of a callable (say a network) are not copied per component: they keep axes of size 1.
         self.fold = expand_leaves(fold, len(batch)) if fold.shares_leaves else broadcast_leaves(fold, batch)
+        if validate_args:
+            check_peak(self.envelope, self.time_loc, self.time_scale)
 
     @property
     def event_shape(self) -> tuple[int, ...]:
@@ -168,8 +174,7 @@ class FoldedGaussian(BatchModule):
 
         **Source:** eq:foldgauss. **Raises:** ValueError if the last dimension of value is not d.
         """
-        value = as_value(value, self.loc.dtype)
-        check_event("value", value, self.event_shape)
+        value = as_event("value", value, self.loc.dtype, self.event_shape)
         leaves, structure = jax.tree.flatten(self)
 
         def scaled_log_prob(root, s, t, *leaves):
@@ -213,7 +218,7 @@ class FoldedGaussian(BatchModule):
         check_not_forked()
         time_key, space_key = jax.random.split(key)
         # Every batch element has its own t, even where only loc or the fold has batch dimensions.
-        shape = (*sample_shape, *self.batch_shape)
+        shape = (*as_sample_shape(sample_shape), *self.batch_shape)
         noise = jax.random.normal(time_key, shape, self.loc.dtype)
         noise, time_loc, time_scale = align([(noise, 0), (self.time_loc, 0), (self.time_scale, 0)])
         t = time_loc + time_scale * noise
@@ -285,8 +290,7 @@ class FoldedGaussian(BatchModule):
 
     def _broadcast_value(self, x) -> Array:
         """x, checked, with all batch dimensions."""
-        x = as_value(x, self.loc.dtype)
-        check_event("x", x, self.event_shape)
+        x = as_event("x", x, self.loc.dtype, self.event_shape)
         return jnp.broadcast_to(x, (*jnp.broadcast_shapes(x.shape[:-1], self.batch_shape), *self.event_shape))
 
     # --- moments --------------------------------------------------------------------------------------------
@@ -400,8 +404,7 @@ class FoldedGaussian(BatchModule):
         **Source:** eq:cond_dens. **Raises:** ValueError on invalid indices, all indices, or a wrong shape of values.
         """
         indices = normalize_indices(indices, self.event_shape[0])
-        values = as_value(values, self.loc.dtype)
-        check_event("values", values, (len(indices),))
+        values = as_event("values", values, self.loc.dtype, (len(indices),))
         rest = tuple(i for i in range(self._time_index) if i not in indices)
         if self._time_index not in indices:
             return time_mixture(self, rest, indices, values, keeps_time=True)
@@ -421,9 +424,7 @@ class FoldedGaussian(BatchModule):
 
         **Source:** Bayes' rule on eq:foldgauss. **Raises:** ValueError if the last dimension of s is not d-1.
         """
-        s = as_value(s, self.loc.dtype)
-        check_event("s", s, self.loc.shape[-1:])
-        return time_density(self, s)
+        return time_density(self, as_event("s", s, self.loc.dtype, self.loc.shape[-1:]))
 
     @property
     def _time_index(self) -> int:
@@ -467,10 +468,3 @@ def _check_fold(fold: AbstractFold, loc: Array) -> AbstractFold:
         expected = f"shifts of shape (*batch, {loc.shape[-1]})"
         raise invalid("fold", expected=expected, got=f"shape {shape}", cure="It maps u to d-1 space coordinates.")
     return fold
-
-
-def _as_checked_envelope(envelope) -> AbstractEnvelope:
-    if not (isinstance(envelope, AbstractEnvelope) or callable(envelope)):
-        cure = "Constant(), TimeLikelihood(power=...), a callable that returns log a, or plain_envelope(a)."
-        raise invalid("envelope", expected="an envelope or a callable", got=repr(envelope), cure=cure)
-    return as_envelope(envelope)

@@ -19,11 +19,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from foldgauss._numerics.batch import BatchModule
+from foldgauss._numerics.batch import BatchModule, concrete_value
 from foldgauss._numerics.pointwise import call_elementwise, split_parameters
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import check_signature, invalid, short_repr
 
 __all__ = ["AbstractEnvelope", "CallableEnvelope", "Constant", "TimeLikelihood", "as_envelope", "plain_envelope"]
+
+#: log a at time_loc that is still rounding of 0, also in half precision; a function that returns a itself has 1 there.
+_PEAK_ROUNDING = 1e-2
 
 
 class AbstractEnvelope(BatchModule):
@@ -91,10 +94,10 @@ class TimeLikelihood(AbstractEnvelope):
 
     def __init__(self, power: ArrayLike = 1.0, floor: ArrayLike = 0.0):
         self.power, self.floor = _float_array(power), _float_array(floor)
-        if _any(self.power, lambda x: (x < 0) | np.isinf(x)):
+        if _any(self.power, lambda x: ~((x >= 0) & (x < np.inf))):
             cure = "The paper's text has 1, its code 2."
             raise invalid("power", expected="a finite number >= 0", got=power, cure=cure)
-        if _any(self.floor, lambda x: (x < 0) | (x >= 1)):
+        if _any(self.floor, lambda x: ~((x >= 0) & (x < 1))):
             raise invalid("floor", expected="a number in [0, 1)", got=floor, cure="For a = 1 use Constant().")
 
     def log_a(self, t, *, time_loc, time_scale):
@@ -163,7 +166,23 @@ def as_envelope(envelope: AbstractEnvelope | Callable) -> AbstractEnvelope:
 
     **Example:** `as_envelope(lambda t, m, scale: -jnp.abs((t - m) / scale))`
     """
-    return envelope if isinstance(envelope, AbstractEnvelope) else CallableEnvelope(envelope)
+    if isinstance(envelope, AbstractEnvelope):
+        return envelope
+    if not callable(envelope):
+        cure = "Constant(), TimeLikelihood(power=...), a callable that returns log a, or plain_envelope(a)."
+        raise invalid("envelope", expected="an envelope or a callable", got=short_repr(envelope), cure=cure)
+    check_signature("envelope", envelope, "t", "time_loc", "time_scale")
+    return CallableEnvelope(envelope)
+
+
+def check_peak(envelope: AbstractEnvelope, time_loc: ArrayLike, time_scale: ArrayLike) -> None:
+    """Raise if log a > 0 at time_loc, as where a function returns a itself; traced values pass."""
+    if envelope.is_closed:  # a built-in one
+        return
+    peak = concrete_value(envelope.log_a(time_loc, time_loc=time_loc, time_scale=time_scale))
+    if peak is not None and (peak > _PEAK_ROUNDING).any():
+        cure = "For a function that returns a itself use plain_envelope(a)."
+        raise invalid("envelope", expected="log a <= 0 at time_loc", got=f"log a = {peak.max():g}", cure=cure)
 
 
 class _Logarithm(eqx.Module):

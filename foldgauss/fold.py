@@ -20,6 +20,8 @@ from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 from foldgauss._numerics.batch import (
     BatchModule,
     as_value,
+    check_finite,
+    check_positive,
     common_dtype,
     concrete_value,
     expand_leaves,
@@ -28,7 +30,7 @@ from foldgauss._numerics.batch import (
 from foldgauss._numerics.piecewise import locate
 from foldgauss._numerics.pointwise import call_elementwise, split_parameters
 from foldgauss._numerics.triangular import join_columns, split_columns
-from foldgauss._runtime.checks import invalid, is_integer
+from foldgauss._runtime.checks import check_signature, invalid, is_integer, short_repr
 from foldgauss._runtime.threads import check_not_forked
 
 __all__ = [
@@ -252,8 +254,7 @@ class FourierFold(AbstractFold):
             raise invalid(
                 "cosine", expected="the shape of sine", got=got, cure="Pass zeros for the one that is not used."
             )
-        if not isinstance(self.period, jax.core.Tracer) and (np.asarray(self.period) <= 0).any():
-            raise invalid("period", expected="positive values", got=period, cure="It is a duration.")
+        check_positive("period", self.period, cure="It is a duration.")
 
     @property
     def order(self) -> int:
@@ -384,6 +385,8 @@ class SharedPathFold(AbstractFold):
         if self.times.ndim < 2 or not dims or self.matrices.shape[-4:] != (*self.times.shape[-2:], *dims):
             expected, got = "times (paths, knots) and matrices (paths, knots, d-1, d)", f"{self.times.shape}"
             raise invalid("times, matrices", expected=expected, got=f"{got} and {self.matrices.shape}")
+        for name in ("anchor", "time_loc", "times", "matrices"):
+            check_finite(name, getattr(self, name))
         times, index = concrete_value(self.times), concrete_value(self.index)
         if times is not None and (np.diff(times) < 0).any():
             raise invalid("times", expected="times that do not decrease", got=times.tolist())
@@ -444,7 +447,13 @@ def as_fold(fold: AbstractFold | Callable) -> AbstractFold:
 
     **Example:** `as_fold(lambda u: jnp.stack([u, u**2]))`
     """
-    return fold if isinstance(fold, AbstractFold) else CallableFold(fold)
+    if isinstance(fold, AbstractFold):
+        return fold
+    if not callable(fold):
+        cure = "For coefficients use PolynomialFold(coefficients)."
+        raise invalid("fold", expected="a fold or a callable u -> (d-1,)", got=short_repr(fold), cure=cure)
+    check_signature("fold", fold, "u")
+    return CallableFold(fold)
 
 
 def evaluate_shift(fold: AbstractFold, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
@@ -498,6 +507,7 @@ def _coefficient_rows(name: str, x: ArrayLike, count: str, rows: str) -> Float[A
     if x.ndim < 2 or x.shape[-1] < 1:
         cure = f"{rows}; a single space coordinate still needs its own axis."
         raise invalid(name, expected=f"shape (*batch, {count}, d-1)", got=f"shape {x.shape}", cure=cure)
+    check_finite(name, x)
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
 
 
@@ -565,5 +575,5 @@ def restrict_fold(fold: AbstractFold, indices: tuple[int, ...]) -> AbstractFold:
     if isinstance(fold, ZeroFold):
         return ZeroFold(len(indices))
     if isinstance(fold, PolynomialFold):
-        return PolynomialFold(fold.coefficients[..., np.array(indices)])
+        return jax.tree.map(lambda coefficients: coefficients[..., np.array(indices)], fold)
     return RestrictedFold(fold, indices)

@@ -18,10 +18,12 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Key
 from foldgauss._numerics.batch import (
     BatchModule,
     align,
+    as_event,
+    as_sample_shape,
     as_value,
     batch_shape_of,
     check_batch,
-    check_event,
+    check_finite,
     check_positive,
     common_dtype,
     ranked_leaves,
@@ -81,6 +83,7 @@ class Normal(BatchModule):
         dtype = common_dtype(loc, scale)
         self.loc, self.scale = align([(jnp.asarray(loc, dtype), 0), (jnp.asarray(scale, dtype), 0)])
         if validate_args:
+            check_finite("loc", self.loc)
             check_positive("scale", self.scale)
 
     @property
@@ -177,6 +180,8 @@ class Gaussian(BatchModule):
         check_loc(loc)
         check_matrix("scale_tril", tril, loc.shape[-1])
         if validate_args:
+            check_finite("loc", loc)
+            check_finite("log_scale", log_scale)
             check_tril(tril)
         parts = [(loc, 1), (tril, 2), (log_scale, 0)]
         check_batch(parts)
@@ -231,8 +236,7 @@ class Gaussian(BatchModule):
 
     def log_prob(self, value: Float[Array, "*#batch dim"]) -> Float[Array, "*#batch"]:
         """log N(loc, Sigma)(value)."""
-        value = as_value(value, self.loc.dtype)
-        check_event("value", value, self.event_shape)
+        value = as_event("value", value, self.loc.dtype, self.event_shape)
         parts = [(value, 1), (self.loc, 1), (self.base_tril, 2), (self.log_scale, 0)]
         return evaluate_with_safe_grad(_scaled_log_prob, *align(parts))
 
@@ -246,7 +250,7 @@ class Gaussian(BatchModule):
 
     def sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Random samples (*sample_shape, *batch, dim), differentiable in the parameters."""
-        shape = (*sample_shape, *self.batch_shape, *self.event_shape)
+        shape = (*as_sample_shape(sample_shape), *self.batch_shape, *self.event_shape)
         noise = jax.random.normal(key, shape, self.loc.dtype)
         noise, loc, tril, log_scale = align([(noise, 1), (self.loc, 1), (self.base_tril, 2), (self.log_scale, 0)])
         scale = jnp.exp(log_scale)[..., None]
@@ -276,8 +280,7 @@ class Gaussian(BatchModule):
         indices = normalize_indices(indices, self.event_shape[0])
         rest = tuple(i for i in range(self.event_shape[0]) if i not in indices)
         check_rest(rest)
-        values = as_value(values, self.loc.dtype)
-        check_event("values", values, (len(indices),))
+        values = as_event("values", values, self.loc.dtype, (len(indices),))
         return condition_on_first(self.marginal((*indices, *rest)), values)
 
 

@@ -23,7 +23,15 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float, Int, Key
 
-from foldgauss._numerics.batch import align, as_value, broadcast_leaves, check_event, expand_leaves, flatten_points
+from foldgauss._numerics.batch import (
+    align,
+    as_event,
+    as_sample_shape,
+    as_value,
+    broadcast_leaves,
+    expand_leaves,
+    flatten_points,
+)
 from foldgauss._numerics.factor import normalize_indices
 from foldgauss._runtime import notebook_hooks
 from foldgauss._runtime.checks import invalid
@@ -135,7 +143,7 @@ class AbstractMixture(eqx.Module):
 
         **Example:** `x, component = mixture.sample(jax.random.key(0), (1000,), return_component=True)`
         """
-        x, component = _sample(self, key, tuple(sample_shape))
+        x, component = _sample(self, key, as_sample_shape(sample_shape))
         return (x, component) if return_component else x
 
     # --- moments --------------------------------------------------------------------------------------------
@@ -163,10 +171,7 @@ class AbstractMixture(eqx.Module):
         return jnp.sqrt(self.variance)
 
     def _checked(self, x) -> Array:
-        x = as_value(x, self.logits.dtype)
-        if self.event_shape:
-            check_event("value", x, self.event_shape)
-        return x
+        return as_event("value", x, self.logits.dtype, self.event_shape)
 
     # --- interoperability -------------------------------------------------------------------------------------
 
@@ -301,8 +306,7 @@ class FoldedMixture(_WeightedMixture):
 
         **Source:** Bayes' rule on eq:foldgauss. **Raises:** ValueError if the last dimension of s is not d-1.
         """
-        s = as_value(s, self.logits.dtype)
-        check_event("s", s, (self.event_shape[0] - 1,))
+        s = as_event("s", s, self.logits.dtype, (self.event_shape[0] - 1,))
         components = self.components.time_given_space(s[..., None, :])
         return TimePosterior(components, posterior_logits(self.log_weights, components.log_normalizer))
 
@@ -477,9 +481,7 @@ def _at_time(mixture: FoldedMixture, t: Array) -> GaussianMixture:
 
 def _condition(mixture: AbstractMixture, indices, values: ArrayLike):
     indices = normalize_indices(indices, mixture.event_shape[0])
-    values = as_value(values, mixture.logits.dtype)
-    check_event("values", values, (len(indices),))
-    values = values[..., None, :]
+    values = as_event("values", values, mixture.logits.dtype, (len(indices),))[..., None, :]
     rest = mixture.components.condition(indices, values)
     log_evidence = _log_evidence(mixture.components, rest, indices, values)
     return _mixture_of(rest, posterior_logits(mixture.log_weights, log_evidence))
@@ -543,8 +545,9 @@ def _sample(mixture: AbstractMixture, key, sample_shape: tuple[int, ...]):
 
 def _sample_from(mixture: AbstractMixture, key, sample_shape, component: Array) -> Array:
     """One sample from each of the chosen components."""
-    components, batch, choice = mixture.components, mixture.batch_shape, mixture.num_components > 1
-    if choice and isinstance(components, FoldedGaussian | Gaussian) and not _shares_parameters(components):
+    components, batch = mixture.components, mixture.batch_shape
+    single = mixture.num_components == 1
+    if isinstance(components, FoldedGaussian | Gaussian) and not single and not _shares_parameters(components):
         if isinstance(components, Gaussian) or not components.fold.shares_leaves:
             components = broadcast_leaves(components, (*batch, mixture.num_components))
         return _take_components(components, component, batch).sample(key)

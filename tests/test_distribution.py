@@ -1,6 +1,7 @@
 """The Folded-Gaussian: against scipy, a NumPy twin, quadrature and its own samples; and far out."""
 
 import pickle
+from functools import partial
 from operator import itemgetter
 
 import equinox as eqx
@@ -14,8 +15,9 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from foldgauss.distribution import FoldedGaussian, Gaussian, Normal
-from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood, plain_envelope
-from foldgauss.fold import CallableFold, PolynomialFold, ZeroFold
+from foldgauss.envelope import AbstractEnvelope, CallableEnvelope, Constant, TimeLikelihood, plain_envelope
+from foldgauss.fold import CallableFold, FourierFold, PolynomialFold, SharedPathFold, SplineFold, ZeroFold
+from foldgauss.mixture import FoldedMixture, GaussianMixture
 
 TAUS = [0.0, 5.0, 13.3, 14.0, 19.0, 40.0, 1e3]
 BEND = [[0.8, -0.5], [0.6, 0.9]]  # odd and even powers, so that each sign mistake shows
@@ -341,8 +343,8 @@ def test_absurd_times_are_minus_infinity(fold):
 def test_nan_in_nan_out():
     assert np.isnan(LOG_PROB(_dist(), jnp.array([0.0, jnp.nan, 0.3])))
     assert np.isnan(LOG_PROB(_dist(), jnp.array([0.0, 0.0, jnp.nan])))
-    assert np.isnan(LOG_PROB(_dist(loc=jnp.array([0.0, jnp.nan])), jnp.zeros(3)))
-    assert np.isnan(LOG_PROB(_dist(time_scale=jnp.nan), jnp.zeros(3)))
+    for changes in ({"loc": jnp.array([0.0, jnp.nan])}, {"time_scale": jnp.nan}):
+        assert np.isnan(LOG_PROB(_dist(**changes, validate_args=False), jnp.zeros(3)))
 
 
 def test_an_envelope_of_minus_infinity_is_no_nan():
@@ -523,8 +525,12 @@ def test_dtype_follows_the_arrays():
         ({"loc": jnp.zeros((3, 2)), "time_loc": jnp.zeros(4)}, "batch"),
         ({"fold": PolynomialFold(jnp.ones((3, 1)))}, "fold"),
         ({"fold": lambda u: u}, "fold"),
-        ({"fold": 3}, "function"),
+        ({"fold": 3}, "fold"),
+        ({"fold": [[0.1, 0.2]]}, "fold"),
+        ({"fold": lambda u, v: u}, "fold"),
         ({"envelope": "time"}, "envelope"),
+        ({"envelope": TimeLikelihood}, "envelope"),
+        ({"envelope": lambda t: -t}, "envelope"),
     ],
 )
 def test_bad_input_names_the_parameter(changes, name):
@@ -541,6 +547,94 @@ def test_bad_values_name_the_parameter():
         Normal(0.0, -1.0)
 
 
+PATH = {"anchor": [0.0], "time_loc": 0.5, "index": 1, "times": [[0.0, 1.0]], "matrices": [[[[1.0, 0.0]], [[2.0, 0.0]]]]}
+#: Every parameter of every public class, by a function that constructs the class with this value in it.
+NUMBERS = {
+    "loc": [
+        lambda x: _dist(loc=[0.0, x]),
+        lambda x: Gaussian([0.0, x], jnp.eye(2)),
+        lambda x: Normal(x, 1.0),
+    ],
+    "scale_tril": [
+        lambda x: _dist(scale_tril=[[1.0, 0.0], [x, 1.0]]),
+        lambda x: _dist(scale_tril=[[1.0, 0.0], [0.0, x]]),
+        lambda x: Gaussian([0.0, 1.0], [[1.0, 0.0], [x, 1.0]]),
+    ],
+    "covariance_matrix": [lambda x: _dist(scale_tril=None, covariance_matrix=[[x, 0.0], [0.0, 1.0]])],
+    "precision_matrix": [lambda x: _dist(scale_tril=None, precision_matrix=[[1.0, x], [x, 1.0]])],
+    "scale": [lambda x: _dist(scale_tril=None, scale=[x, 1.0]), lambda x: Normal(0.0, x)],
+    "log_scale": [lambda x: Gaussian([0.0], [[1.0]], log_scale=x)],
+    "time_loc": [lambda x: _dist(time_loc=x), lambda x: SharedPathFold(ZeroFold(1), **(PATH | {"time_loc": x}))],
+    "time_scale": [lambda x: _dist(time_scale=x)],
+    "weights": [lambda x: FoldedMixture(_batch(), weights=[1.0, x])],
+    "logits": [
+        lambda x: FoldedMixture(_batch(), logits=[0.0, abs(x)]),
+        lambda x: GaussianMixture(_batch().condition_time(0.2), logits=[0.0, abs(x)]),
+    ],
+    "coefficients": [
+        lambda x: PolynomialFold([[0.1], [x]]),
+        lambda x: SplineFold([-1, -1, 0, 1, 1], [[2.0], [x], [1.0]], degree=1),
+    ],
+    "knots": [lambda x: SplineFold([-1, -1, 0, 1, x], [[2.0], [0.0], [1.0]], degree=1)],
+    "sine": [lambda x: FourierFold([[x]], [[0.0]], period=1.0)],
+    "cosine": [lambda x: FourierFold([[0.0]], [[x]], period=1.0)],
+    "period": [lambda x: FourierFold([[1.0]], [[1.0]], period=x)],
+    "anchor": [lambda x: SharedPathFold(ZeroFold(1), **(PATH | {"anchor": [x]}))],
+    "times": [lambda x: SharedPathFold(ZeroFold(1), **(PATH | {"times": [[0.0, x]]}))],
+    "matrices": [lambda x: SharedPathFold(ZeroFold(1), **(PATH | {"matrices": [[[[x, 0.0]], [[1.0, 0.0]]]]}))],
+    "power": [lambda x: TimeLikelihood(power=x)],
+    "floor": [lambda x: TimeLikelihood(floor=x)],
+}
+
+
+def _batch():
+    return _dist(loc=jnp.zeros((2, 2)))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("name", NUMBERS)
+def test_parameters_that_are_not_finite_are_refused(name, value):
+    for make in NUMBERS[name]:
+        with pytest.raises(ValueError, match=f"^{name}: expected .*, got "):
+            make(value)
+
+
 def test_values_are_not_looked_at_under_tracing_or_on_request():
     jax.eval_shape(lambda scale: _dist(time_scale=scale).log_prob(jnp.zeros(3)), -1.0)
-    _dist(time_scale=-1.0, validate_args=False)
+    own = lambda t, m, scale: jnp.exp(-jnp.abs(t - m) / scale)  # noqa: E731
+    jax.eval_shape(lambda scale: _dist(time_scale=scale, envelope=own).log_prob(jnp.zeros(3)), 1.0)
+    _dist(time_scale=-1.0, loc=jnp.full(2, jnp.nan), envelope=own, validate_args=False)
+
+
+def test_a_function_that_returns_a_instead_of_its_logarithm_is_refused():
+    class Plain(AbstractEnvelope):
+        def log_a(self, t, *, time_loc, time_scale):
+            return jnp.exp(-jnp.abs(t - time_loc) / time_scale)
+
+    plain = lambda t, m, scale: 1 / (1 + ((t - m) / scale) ** 2)  # noqa: E731
+    for envelope in (plain, CallableEnvelope(plain), Plain()):
+        with pytest.raises(
+            ValueError, match=r"^envelope: expected log a <= 0 at time_loc, got log a = 1\. .*plain_env"
+        ):
+            _dist(envelope=envelope, time_loc=jnp.array([0.1, 5.0]))
+    rounded = lambda t, m, scale: 1e-6 - jnp.abs(t - m)  # noqa: E731
+    for envelope in (plain_envelope(plain), rounded, lambda t, m, scale: -jnp.abs(t - m), lambda t, m, scale: -jnp.inf):
+        _dist(envelope=envelope)
+
+
+def test_a_number_is_the_value_of_a_single_coordinate():
+    dist, mixture = _dist(), FoldedMixture(_batch(), logits=[0.0, 0.0])
+    line = FoldedGaussian([0.0], [[1.0]], time_loc=0.5, time_scale=1.0)
+    lines = FoldedMixture(FoldedGaussian([[0.0]], [[1.0]], time_loc=0.5, time_scale=1.0), logits=[0.0])
+    for one in (dist, mixture, dist.condition_time(0.2), mixture.condition_time(0.2)):
+        for index in (0, -1):
+            assert jax.eval_shape(partial(one.condition, index), 0.2).batch_shape == ()
+    for one in (dist, mixture):
+        assert jax.eval_shape(lambda one: one.condition(0, 0.1).condition(0, 0.2), one).batch_shape == ()
+    for one in (line, lines):
+        assert jax.eval_shape(one.time_given_space, 0.3).batch_shape == ()
+    for one in (dist.marginal(-1), mixture.marginal(-1), mixture.condition_time(0.2).marginal(1), line.marginal(0)):
+        assert jax.eval_shape(one.log_prob, 0.2).shape == ()
+    np.testing.assert_array_equal(mixture.marginal(-1).cdf(0.2), mixture.marginal(-1).cdf([0.2]))
+    with pytest.raises(ValueError, match=r"^value: expected shape \(\*batch, 3\), got shape \(\)"):
+        dist.log_prob(0.2)

@@ -219,7 +219,8 @@ def test_as_fold_wraps_only_what_is_no_fold():
         (lambda: SharedPathFold(ZeroFold(2), jnp.ones(2), time_loc=0.0, index=3, **PATHS), "index"),
         (lambda: SharedPathFold(ZeroFold(2), jnp.ones(2), time_loc=0.0, index=-1, **PATHS), "index"),
         (lambda: SharedPathFold(ZeroFold(1), [1.0], time_loc=0, index=1, times=[[1, 0]], matrices=MOVES), "times"),
-        (lambda: as_fold(3.0), "function"),
+        (lambda: as_fold(3.0), "fold"),
+        (lambda: CallableFold(3.0), "function"),
     ],
 )
 def test_bad_input_names_the_parameter(make, name):

@@ -425,3 +425,13 @@ def test_select_degree_checks_arguments():
         select_degree(_points(), 1, degree=2)
     with pytest.raises(ValueError, match="options: expected options of fit, got envelop"):
         select_degree(_points(), 1, envelop=2)
+
+
+def test_a_function_is_an_envelope():
+    own = fit(_points(), envelope=lambda t, m, scale: -0.5 * ((t - m) / scale) ** 2)
+    built_in = fit(_points(), envelope=TimeLikelihood(1.0))
+    np.testing.assert_allclose(own.log_likelihood, built_in.log_likelihood, rtol=1e-5)
+    with pytest.raises(ValueError, match=r"^envelope: expected log a <= 0 at time_loc, .*plain_envelope"):
+        fit(_points(), envelope=lambda t, m, scale: jnp.exp(-0.5 * ((t - m) / scale) ** 2))
+    with pytest.raises(ValueError, match=r"^envelope: expected an envelope or a callable, got None"):
+        fit(_points(), envelope=None)

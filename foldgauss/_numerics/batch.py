@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TypeVar, get_args
 
 import equinox as eqx
@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import invalid, is_integer, short_repr
 from foldgauss._runtime.threads import check_not_forked
 
 _ModuleT = TypeVar("_ModuleT", bound=eqx.Module)
@@ -150,17 +150,38 @@ def check_batch(parts: list[tuple[Array, int]]) -> tuple[int, ...]:
         raise invalid("batch", expected="leading dimensions that broadcast", got=shapes, cure=cure) from None
 
 
-def check_event(name: str, value: Array, event_shape: tuple[int, ...]) -> None:
-    if value.shape[-1:] != event_shape:
+def as_event(name: str, x: ArrayLike, dtype, event_shape: tuple[int, ...]) -> Array:
+    """`as_value` of shape (*batch, *event_shape), checked; a single coordinate may be a number."""
+    value = as_value(x, dtype)
+    value = value.reshape(1) if value.ndim == 0 and event_shape == (1,) else value
+    if event_shape and value.shape[-1:] != event_shape:
         expected = f"shape (*batch, {event_shape[0]})"
         raise invalid(name, expected=expected, got=f"shape {value.shape}", cure="Time, if any, is last.")
+    return value
 
 
-def check_positive(name: str, scale: Array) -> None:
-    scale = concrete_value(scale)
-    if scale is not None and (scale <= 0).any():  # a NaN passes, and propagates
-        got, cure = f"a least of {np.nanmin(scale)}", "It is a standard deviation."
-        raise invalid(name, expected="positive numbers", got=got, cure=cure)
+def as_sample_shape(sample_shape: int | Sequence[int]) -> tuple[int, ...]:
+    """The shape as a tuple; a whole number is that of one axis."""
+    shape = sample_shape if isinstance(sample_shape, Sequence) else (sample_shape,)
+    if not all(is_integer(n, 0) for n in shape):
+        cure = "For n samples pass n or (n,)."
+        raise invalid("sample_shape", expected="whole numbers >= 0", got=short_repr(sample_shape), cure=cure)
+    return tuple(int(n) for n in shape)
+
+
+def check_finite(name: str, x: Array) -> None:
+    """Raise if an entry is NaN or infinite, unless the values are traced."""
+    value = concrete_value(x)
+    if value is not None and not np.isfinite(value).all():
+        raise invalid(name, expected="finite numbers", got="NaN" if np.isnan(value).any() else "infinity")
+
+
+def check_positive(name: str, x: Array, cure: str = "It is a standard deviation.") -> None:
+    """Raise if an entry is not positive and finite, unless the values are traced."""
+    check_finite(name, x)
+    value = concrete_value(x)
+    if value is not None and (value <= 0).any():
+        raise invalid(name, expected="positive numbers", got=f"a least of {value.min()}", cure=cure)
 
 
 # --- one at a time --------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
-from foldgauss._numerics.batch import check_positive, concrete_value
+from foldgauss._numerics.batch import check_finite, check_positive, concrete_value
 from foldgauss._runtime.checks import invalid
 
 
@@ -60,6 +60,7 @@ def _diagonal(scale: Array, dim: int, validate: bool) -> Array:
 
 
 def check_tril(tril: Array) -> None:
+    check_finite("scale_tril", tril)
     tril = concrete_value(tril)
     if tril is None:
         return
@@ -70,22 +71,21 @@ def check_tril(tril: Array) -> None:
     diagonal = np.diagonal(tril, axis1=-2, axis2=-1)
     if (diagonal <= 0).any():
         cure = "Flip the sign of its column: Sigma stays the same."
-        raise invalid(
-            "scale_tril", expected="a positive diagonal", got=f"a least entry of {np.nanmin(diagonal)}", cure=cure
-        )
+        got = f"a least entry of {diagonal.min()}"
+        raise invalid("scale_tril", expected="a positive diagonal", got=got, cure=cure)
 
 
 def check_and_factorize(name: str, covariance: Array, validate: bool) -> Array:
     tril, value = jnp.linalg.cholesky(covariance), concrete_value(covariance)
     if not validate or value is None:
         return tril
+    check_finite(name, covariance)
     # Asymmetry of the size of rounding is allowed.
     tolerance = 1e3 * np.finfo(value.dtype).eps * np.abs(value).max((-1, -2), initial=0, keepdims=True)
     if (np.abs(value - np.swapaxes(value, -1, -2)) > tolerance).any():
         cure = "For a factor use scale_tril; against rounding use (C + C.T) / 2."
         raise invalid(name, expected="symmetric matrices", got="another", cure=cure)
-    # NaN of the input propagates; only one that Cholesky adds is an error.
-    if (np.isnan(np.asarray(tril)).any((-1, -2)) & ~np.isnan(value).any((-1, -2))).any():
+    if np.isnan(np.asarray(tril)).any():
         cure = "Add a small multiple of the identity, or drop a coordinate that the others determine."
         raise invalid(name, expected="positive definite matrices", got="another", cure=cure)
     return tril

@@ -25,6 +25,9 @@ def call_elementwise(parameters: PyTree, static: PyTree, ranks: tuple[int, ...],
         leaves, axis = [jnp.broadcast_to(x, batch + e) for x, e in zip(leaves, events, strict=True)], 0
     to = () if axis is None else (flat[0].size,)
     parameters = [x.reshape(to + e) for x, e in zip(leaves, events, strict=True)]
-    one = lambda leaves, *scalars: eqx.combine(jax.tree.unflatten(treedef, leaves), static)(*scalars)  # noqa: E731
+
+    def one(leaves, *scalars):
+        return jnp.asarray(eqx.combine(jax.tree.unflatten(treedef, leaves), static)(*scalars))
+
     result = jax.vmap(one, in_axes=(axis, *[0] * len(flat)))(parameters, *flat)
     return result.reshape(batch + result.shape[1:])

@@ -11,7 +11,7 @@ from jax import lax
 from jax.scipy.special import log_ndtr, logsumexp
 from jaxtyping import Array, Float, Key
 
-from foldgauss._numerics.batch import as_value, batch_shape_of, check_event, map_over_batch, ranked_leaves
+from foldgauss._numerics.batch import as_event, as_sample_shape, as_value, batch_shape_of, map_over_batch, ranked_leaves
 from foldgauss._numerics.factor import check_rest, normalize_indices
 from foldgauss._runtime.checks import invalid
 from foldgauss.analysis.narrow_crossings import ROUNDING, crossing_modes, crossing_panels, gaussian_at
@@ -89,7 +89,7 @@ class TimeDensity(eqx.Module):
 
     def sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Draws of shape (*sample_shape, *batch), by the quantile function."""
-        shape = (*sample_shape, *self.batch_shape)
+        shape = (*as_sample_shape(sample_shape), *self.batch_shape)
         smallest = float(jnp.finfo(self.values.dtype).tiny)  # not 0, whose quantile is -inf
         return self.icdf(jax.random.uniform(key, shape, self.values.dtype, minval=smallest))
 
@@ -197,7 +197,7 @@ class TimeMixture(eqx.Module):
     def sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Draws of shape (*sample_shape, *batch, n): t first, then space given t."""
         time_key, space_key = jax.random.split(key)
-        shape = (*sample_shape, *self.batch_shape)
+        shape = (*as_sample_shape(sample_shape), *self.batch_shape)
         if self.time is None:
             noise = jax.random.normal(time_key, shape, self.values.dtype)
             loc, scale = (jnp.broadcast_to(x, shape) for x in (self.parent.time_loc, self.parent.time_scale))
@@ -236,8 +236,7 @@ class TimeMixture(eqx.Module):
         """The other coordinates, given these: exact, a Gaussian, if time is among the given."""
         indices = normalize_indices(indices, self.event_shape[0])
         offset = self._num_given
-        values = as_value(values, self.values.dtype)
-        check_event("values", values, (len(indices),))
+        values = as_event("values", values, self.values.dtype, (len(indices),))
         shape = jnp.broadcast_shapes(values.shape[:-1], self.batch_shape)
         both = jnp.concatenate([_over(self.values, shape), _over(values, shape)], axis=-1)
         given = (*range(offset), *(offset + i for i in indices))
@@ -260,9 +259,7 @@ class TimeMixture(eqx.Module):
         return jnp.zeros((), self.values.dtype) if self.time is None else self.time.log_normalizer
 
     def _checked(self, x):
-        x = as_value(x, self.values.dtype)
-        check_event("value", x, self.event_shape)
-        return x
+        return as_event("value", x, self.values.dtype, self.event_shape)
 
     def _with_values(self, x):
         shape = jnp.broadcast_shapes(x.shape[:-1], self.values.shape[:-1])

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
-from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
+from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood, as_envelope, check_peak
 from foldgauss.estimator.em.initialization import INITIALIZERS
 
 __all__ = ["check_array", "check_column", "check_parameters", "check_sizes", "make_envelope"]
@@ -83,11 +83,10 @@ def check_array(name: str, value, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def make_envelope(envelope) -> AbstractEnvelope:
-    """The envelope itself, or the one with this name. Raises ValueError for anything else."""
+    """The envelope with this name, or as by `as_envelope`. Raises ValueError for anything else."""
     if isinstance(envelope, str):
         check_one_of("envelope", envelope, tuple(_ENVELOPES))
         return _ENVELOPES[envelope]()
-    if not isinstance(envelope, AbstractEnvelope):
-        expected, cure = f"an envelope or one of {', '.join(_ENVELOPES)}", "as_envelope(f)."
-        raise invalid("envelope", expected=expected, got=repr(envelope), cure=cure)
+    envelope = as_envelope(envelope)
+    check_peak(envelope, 0.0, 1.0)
     return envelope
