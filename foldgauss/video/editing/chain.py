@@ -83,7 +83,7 @@ class Edit:
 
     Edits apply in the order of the calls, each to the result of those before. An edit that a folded model represents
     exactly at all times is **baked** into its parameters: translations; affine maps about a fixed point; opacities that
-    stay below 1; colors; deletion and copies; retiming that shows nothing before the first frame or after the last. All others are kept as
+    stay below 1; colors; deletion and copies; retiming within the clip. All others are kept as
     **overlays**, applied to the conditioned Gaussians at each time: edits over a span, edits about the selection's own
     center, clocks, functions, depth. `video()` is a plain `VideoModel` if all edits could be baked. Gaussians that are
     not selected stay the same to the bit, and an edit that changes nothing (a factor 1, an angle 0) is skipped.

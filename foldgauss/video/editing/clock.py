@@ -41,7 +41,7 @@ class Clock:
 
     @classmethod
     def shifted(cls, shift: float = 0.0, stretch: float = 1.0, *, about: float = 0.0) -> "Clock":
-        """Own time t of [0, 1] is shown at `about + shift + stretch (t - about)`: later by `shift`, slower by `stretch`.
+        """Own time t in [0, 1] is shown at about + shift + stretch (t - about): later by `shift`, slower by `stretch`.
 
         A negative stretch runs backwards.
         """

@@ -395,7 +395,10 @@ def _interpolate(before: SelectedGaussians, after: SelectedGaussians, progress: 
 
 
 class Retiming(eqx.Module):
-    """Gaussians with their own clock, held in [0, 1], over a span or always: at progress s their time is t + s (clock(t) - t)."""
+    """Gaussians with their own clock, over a span or always: at progress s their time is t + s (clock(t) - t).
+
+    `clock(t)` is clipped to [0, 1], the times that the model was fitted to.
+    """
 
     mask: Bool[np.ndarray, " num_gaussians"]
     span: Span | None = eqx.field(static=True)
