@@ -72,6 +72,7 @@ EDITS = {
     "matrix": 'do = "recolor"\nmatrix = [[0, 1, 0], [0, 0, 1], [1, 0, 0]]\n',
     "later": 'do = "retime"\nshift = 0.15\n',
     "backwards": 'do = "retime"\nstretch = -0.7\nabout = 0.5\n',
+    "later and earlier": 'do = "retime"\nshift = 0.5\n\n[[edits]]\ndo = "retime"\nshift = -0.3\n',
     "freeze": 'do = "freeze"\nat = 2.5\n',
     "front": 'do = "to_front"\n',
     "back": 'do = "to_back"\n',

@@ -179,7 +179,7 @@ def test_nothing_is_replaced_unasked(work, tmp_path, capsys):
     copy = tmp_path / "c.fgz"
     copy.write_bytes((work / "model.safetensors").read_bytes())  # told by its bytes: it is a float32 model
     assert run("compress", copy, "--out", copy, "--overwrite") == 2
-    assert "another file than the model" in capsys.readouterr().err
+    assert "another path than the model" in capsys.readouterr().err
 
 
 def test_edited_models_are_refused(work, tmp_path, capsys):

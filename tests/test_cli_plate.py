@@ -1,12 +1,14 @@
 """`foldgauss plate`, and edit scripts that select by motion."""
 
+import shutil
+
 import numpy as np
 import pytest
 from commands import run, seconds_heard, write_tone
 from soft_models import soft_model
 
 from foldgauss.cli.viewing import plate
-from foldgauss.io import load_video_model, read_masks, read_video, save_video_model
+from foldgauss.io import load_video_model, read_masks, read_video, save_video_model, write_image
 from foldgauss.io.edit_script import EditScriptError, parse_edit_script
 from foldgauss.video import NothingMoves, by_mask, edit
 from foldgauss.video.motion.moving_object import nothing_moves
@@ -60,7 +62,7 @@ def test_scripts_say_where_nothing_moves(model, tmp_path, monkeypatch, capsys):
     assert run("plate", model, "--out", tmp_path / "images") == 1
     told = capsys.readouterr().err
     assert "moving: expected an object that moves against the background, got none." in told
-    assert "Remove an object by foldgauss edit, selected by a mask, a box or a click" in told
+    assert "Give masks of the object by --masks, or remove it by foldgauss edit" in told
     assert not list(tmp_path.iterdir())
 
 
@@ -88,9 +90,10 @@ def test_an_object_without_gaussians_is_told(monkeypatch):
 @pytest.mark.usefixtures("searched")
 def test_the_plate_and_its_masks_are_written(model, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert run("plate", model, "--masks", "masks", "--out", "images") == 0
+    assert run("plate", model, "--save-masks", "masks", "--out", "images") == 0
     told = capsys.readouterr().out
-    assert "An object was found in 7 of 7 frames, where it covers " in told
+    assert "Motion against the background covers 15.6% to 15.6% of the image, in 7 of 7 frames." in told
+    assert "Parts that stand still are not found and stay" in told
     assert "7 frames at 25 frames per second" in told
     np.testing.assert_array_equal(read_masks("masks"), MASKS)
     filled, frames = read_video("images").frames, np.stack(list(MODEL.frames()))
@@ -100,14 +103,54 @@ def test_the_plate_and_its_masks_are_written(model, tmp_path, monkeypatch, capsy
     assert read_video("m.plate.mp4").frames.shape == frames.shape
     assert seconds_heard("m.plate.mp4") == pytest.approx(len(frames) / 25, abs=0.03)
     capsys.readouterr()
-    for options in ([], ["--masks", "masks", "--out", "p.mp4"], ["--out", "images"]):
+    for options in ([], ["--save-masks", "masks", "--out", "p.mp4"], ["--out", "images"]):
         assert run("plate", model, *options) == 2
         told = capsys.readouterr()
         assert "exists. Choose another path, or add --overwrite." in told.err
         assert "Searching" not in told.out
     assert not (tmp_path / "p.mp4").exists()
     (tmp_path / "empty").mkdir()
-    assert run("plate", model, "--masks", "masks", "--out", "empty", "--overwrite") == 0
+    assert run("plate", model, "--save-masks", "masks", "--out", "empty", "--overwrite") == 0
+
+
+@pytest.mark.parametrize("form", ["folder", "image", "whole clip"])
+def test_own_masks_are_used_and_stay(model, tmp_path, monkeypatch, capsys, form):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(plate, "find_moving_object", None)  # nothing is searched for
+    given = {"folder": MASKS, "image": MASKS[:1], "whole clip": np.concatenate([MASKS, MASKS])}[form]
+    write_masks(tmp_path / "masks", given)
+    masks = "masks/00000.png" if form == "image" else "masks"
+    assert run("plate", model, "--masks", masks, "--out", "images", "--save-masks", "used") == 0
+    told = capsys.readouterr()
+    assert "Searching" not in told.out
+    assert "% of the removed area is shown by no frame" in told.err
+    assert "It is a smear: take more frames" in told.err
+    np.testing.assert_array_equal(read_masks("used"), MASKS)
+    np.testing.assert_array_equal(read_masks("masks"), given)
+    for options in (["--out", "masks"], ["--save-masks", "masks"]):
+        assert run("plate", model, "--masks", "masks", *options, "--overwrite") == 2
+        assert f"{options[0]}: expected another path than the masks, got masks." in capsys.readouterr().err
+    np.testing.assert_array_equal(read_masks("masks"), given)
+
+
+def write_masks(folder, masks):
+    folder.mkdir()
+    for k, mask in enumerate(masks):
+        write_image(folder / f"{k:05d}.png", np.repeat(np.uint8(255 * mask)[..., None], 3, -1))
+
+
+@pytest.mark.parametrize(
+    ("masks", "message"),
+    [
+        (MASKS[:3], "--masks: expected one mask, or one for each of 7 frames, got 3 masks"),
+        (np.zeros_like(MASKS), "--masks: expected masks that are not empty"),
+    ],
+)
+def test_other_masks_are_refused(model, tmp_path, monkeypatch, capsys, masks, message):
+    monkeypatch.chdir(tmp_path)
+    write_masks(tmp_path / "masks", masks)
+    assert run("plate", model, "--masks", "masks") == 2
+    assert message in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -115,14 +158,14 @@ def test_the_plate_and_its_masks_are_written(model, tmp_path, monkeypatch, capsy
     [
         (["--out", "x.png"], "--out: expected"),
         (["--size", "0x3"], "--size: expected HxW"),
-        (["--masks", "x.png"], "--masks: expected a folder, without extension, got x.png"),
+        (["--save-masks", "x.png"], "--save-masks: expected a folder, without extension, got x.png"),
         (["--codec", "divx"], "--codec: expected"),
         (["--crf", "99"], "--crf: expected a whole number from 0 to 51 for h264, got 99."),
         (["--crf", "20", "--out", "x.gif"], "--crf: expected a video file for it, got 'x.gif'."),
         (["--codec", "h264", "--out", "images"], "--codec: expected a video file for it, got 'images'."),
         (["--sound", "none.wav"], "--sound: expected a file, got 'none.wav', which is missing"),
         (["--codec", "av1"], "frames: expected at least 64x64 for av1"),
-        (["--out", "x", "--masks", "./x"], "--masks: expected another folder than --out, got x."),
+        (["--out", "x", "--save-masks", "./x"], "--save-masks: expected another folder than --out, got x."),
     ],
 )
 @pytest.mark.usefixtures("searched")
@@ -136,7 +179,7 @@ def test_mistakes_are_told_and_nothing_is_written(model, tmp_path, monkeypatch, 
 
 
 @pytest.mark.usefixtures("searched")
-@pytest.mark.parametrize("options", [["--masks", "mine"], ["--masks", "masks", "--out", "mine"]])
+@pytest.mark.parametrize("options", [["--save-masks", "mine"], ["--save-masks", "masks", "--out", "mine"]])
 def test_folders_of_other_files_are_refused_before_the_search(model, tmp_path, monkeypatch, capsys, options):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine").mkdir()
@@ -157,3 +200,34 @@ def test_a_file_in_place_of_a_folder_is_refused_before_the_search(model, tmp_pat
     assert "expected a folder for frames, got the file 'mine'" in told.err
     assert "Searching" not in told.out
     assert (tmp_path / "mine").read_text() == "mine"
+
+
+INPUTS = {
+    "render, sound": ["render", "m.safetensors", "--sound", "in.mp4", "--out", "in.mp4"],
+    "stabilize, sound": ["stabilize", "m.safetensors", "--sound", "in.mp4", "--out", "in.mp4"],
+    "plate, sound": ["plate", "m.safetensors", "--sound", "in.mp4", "--out", "in.mp4"],
+    "plate, masks": ["plate", "m.safetensors", "--masks", "in.mp4", "--out", "in.mp4"],
+    "edit, sound": ["edit", "m.safetensors", "s.toml", "--sound", "in.mp4", "--out", "in.mp4"],
+    "edit, mask": ["edit", "m.safetensors", "s.toml", "--out", "in"],
+    "edit, layer": ["edit", "m.safetensors", "s.toml", "--out", "in.safetensors"],
+    "export": ["export", "m.safetensors", "--format", "html", "--original", "in.html", "--out", "in.html"],
+    "compress": ["compress", "m.safetensors", "in.fgz", "--out", "in.fgz"],
+    "evaluate": ["evaluate", "m.safetensors", "in.json", "--json", "in.json"],
+    "figure, image": ["figure", "reconstruction", "m.safetensors", "in.png", "--out", "in.png"],
+    "figure, folder": ["figure", "reconstruction", "m.safetensors", "in", "--out", "in/0.png"],
+    "fit": ["fit", "in.safetensors", "--out", "in.safetensors"],
+}
+
+
+@pytest.mark.parametrize("name", INPUTS)
+def test_no_command_replaces_its_inputs(model, tmp_path, monkeypatch, capsys, name):
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(model, "m.safetensors")
+    (tmp_path / "in").mkdir()
+    for own in ("in.mp4", "in.safetensors", "in.html", "in.fgz", "in.json", "in.png", "in/0.png"):
+        (tmp_path / own).write_bytes(b"mine")
+    (tmp_path / "s.toml").write_text('[selections.it]\nmask = "in"\n[[layers]]\nmodel = "in.safetensors"\n')
+    files = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    assert run(*INPUTS[name], "--overwrite") == 2
+    assert "Inputs are never replaced." in " ".join(capsys.readouterr().err.split())
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == files

@@ -205,7 +205,7 @@ ACTIONS = {
             "matrix": _Kind("three rows of three numbers", _rows_check(3, 3)),
         },
     ),
-    "retime": _Action(optional={"shift": _NUMBER, "stretch": _NUMBER, "about": _NUMBER, "outside": _TEXT}),
+    "retime": _Action(optional={"shift": _NUMBER, "stretch": _NUMBER, "about": _NUMBER}),
     "freeze": _Action({"at": _NUMBER}),
     "to_front": _Action(spans=False),
     "to_back": _Action(spans=False),
@@ -222,6 +222,14 @@ class EditScript:
     text: str
     folder: Path  # paths are relative to it
     _includes: tuple[Path, ...] = ()  # the path of this script and of those that include it
+
+    @property
+    def inputs(self) -> list[Path]:
+        """The files and folders that the script names: masks, selections, models and scripts."""
+        tables = [*self.tables.get("selections", {}).values(), *self.tables.get("layers", ())]
+        return [
+            self._path(table[key]) for table in tables for key in ("mask", "file", "model", "script") if key in table
+        ]
 
     def apply(self, video: Video) -> Video:
         """The edited video: a plain `VideoModel` if all edits could be baked; segmented if `video` is.

@@ -87,7 +87,6 @@ originals = false
 [[edits]]
 do = "retime"
 shift = 0.1
-outside = \'\'\'hold\'\'\'
 [[edits]]
 do = "to_front"
 [[edits]]

@@ -162,8 +162,8 @@ CHAINS = {
         lambda e, **when: e.recolor(gain=0.5, offset=(0.1, 0, 0), matrix=np.eye(3)[[1, 0, 2]], **when),
     ),
     "retime": (
-        'shift = 0.1\nstretch = -1\nabout = 0.5\noutside = "hold"',
-        lambda e, **when: e.retime(shift=0.1, stretch=-1, about=0.5, outside="hold", **when),
+        "shift = 0.1\nstretch = -1\nabout = 0.5",
+        lambda e, **when: e.retime(shift=0.1, stretch=-1, about=0.5, **when),
     ),
     "freeze": ("at = 2.5", lambda e, **w: e.freeze(2.5, **w)),
     "to_front": ("", lambda e: e.to_front()),

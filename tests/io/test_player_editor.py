@@ -1,5 +1,6 @@
 """The player's edits: their pictures, scripts and models are those of `foldgauss edit`, and nothing done is lost."""
 
+import dataclasses
 import json
 import re
 
@@ -69,7 +70,9 @@ def test_the_edited_model_is_that_of_foldgauss_edit(opened, compact, tmp_path):
         np.testing.assert_array_equal(getattr(plain.splats, name), getattr(model.splats, name), name)
     np.testing.assert_allclose(plain.splats.time_loc_logit, model.splats.time_loc_logit, rtol=1e-6, atol=1e-6)
     assert (plain.size, plain.fps, plain.options, plain.num_frames) == (model.size, model.fps, model.options, 7)
-    text = "".join(IT + "".join(f"{EDITS[name]}\n[[edits]]\n" for name in ("transform", "gain", "copies", "fainter")))
+    text = "".join(
+        IT + "".join(f"{EDITS[name]}\n[[edits]]\n" for name in ("transform", "gain", "copies, smaller", "fainter"))
+    )
     text += EDITS["front"]
     read_script(page, text)
     download(page, "#download-model", tmp_path / "edited.safetensors")
@@ -84,18 +87,26 @@ def test_the_edited_model_is_that_of_foldgauss_edit(opened, compact, tmp_path):
 
 def test_a_model_that_no_file_holds_is_told(opened, compact):
     page = opened(compact)
+    for edit in ("shift = 0.9", "shift = -0.02", "stretch = 0.9"):
+        read_script(page, IT + f'do = "retime"\n{edit}\n')
+        page.page.click("#files-open")
+        page.page.click("#download-model")
+        told = page.page.locator("#toast").inner_text()
+        assert re.search(r"^\d+ Gaussians were moved in time, .* which no model file holds", told)
+        assert "foldgauss edit MODEL SCRIPT --out edited.mp4" in told
+        page.page.keyboard.press("Escape")
+
+
+def test_what_no_image_has_is_left_out_of_the_model(opened, tmp_path):
+    """Gaussians of the middle of the clip, moved behind its end."""
+    model = soft_model(options=RenderOptions())
+    short = {
+        name: np.where(OBJECT, np.float32(value), getattr(model.splats, name))
+        for name, value in (("time_loc_logit", 0), ("log_time_scale", -3))
+    }
+    model = dataclasses.replace(model, splats=dataclasses.replace(model.splats, **short))
+    page = opened(save_compact(tmp_path / "m.fgz", quantize_finely(model)))
     read_script(page, IT + 'do = "retime"\nshift = 0.9\n')
-    page.page.click("#files-open")
-    page.page.click("#download-model")
-    told = page.page.locator("#toast").inner_text()
-    assert re.search(r"^\d+ Gaussians were moved in time beyond the clip, by up to [\d.]+ frames", told)
-    assert "Make Later, Speed or Delay that much less" in told
-    assert "foldgauss edit MODEL SCRIPT --out edited.mp4" in told
-
-
-def test_what_no_image_has_is_left_out_of_the_model(opened, compact, tmp_path):
-    page = opened(compact)
-    read_script(page, IT + 'do = "retime"\nshift = 9\n')
     download(page, "#download-model", tmp_path / "edited.safetensors")
     model = load_video_model(tmp_path / "edited.safetensors")
     assert model.num_gaussians == NUM - OBJECT.sum()

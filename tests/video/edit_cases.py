@@ -43,7 +43,7 @@ BAKED = MAPS | {
     "color": lambda e, **when: e.recolor((0.9, 0.2, 0.1), **when),
     "hue": lambda e, **when: e.recolor(hue=0.6, **when),
     "vanish": lambda e, **when: e.vanish(**when),
-    "later": lambda e, **when: e.retime(shift=0.04, **when),
+    "later": lambda e, **when: e.retime(shift=0.04, stretch=1.2, about=0.5, **when),
     "slower": lambda e, **when: e.retime(stretch=1.2, about=0.5, **when),
     "reverse": lambda e, **when: e.retime(stretch=-1, about=0.5, **when),
     "multiply": lambda e, **when: e.multiply([(0.2, 0.1), (0.1, -0.1)], about=(0, 0), scale=(0.8, 1.2), **when),

@@ -44,7 +44,15 @@ def test_what_is_baked_is_what_the_overlay_draws(name):
 def test_edits_of_one_object_reuse_its_paths_and_leave_others_as_they_are():
     once = edit(MODEL).select(OBJECT).move((0.1, 0)).video().splats
     assert once.paths.num_paths == 4
-    twice = edit(MODEL).select(OBJECT).move((0.1, 0)).rotate(0.3, about=(0, 0)).retime(shift=0.05).video().splats
+    twice = (
+        edit(MODEL)
+        .select(OBJECT)
+        .move((0.1, 0))
+        .rotate(0.3, about=(0, 0))
+        .retime(stretch=1.2, about=0.5)
+        .video()
+        .splats
+    )
     assert twice.paths.num_paths == 4
     np.testing.assert_array_equal(twice.paths.matrices[:2], MODEL.splats.paths.matrices)
     np.testing.assert_array_equal(twice.paths.times[:2], MODEL.splats.paths.times)

@@ -112,7 +112,7 @@ CHAINS = {
     "copies": lambda e: e.multiply([(0.1, 0.0), (0.2, 0.1)], delays=[0.05, 0.2], scale=0.8).to_front(),
     "copies over a span": lambda e: e.multiply([(0.1, 0.0)], delays=0.1, originals=True, frames=(1, 4)).opacity(0.5),
     "later": lambda e: e.retime(shift=0.05),
-    "held": lambda e: e.retime(stretch=2, about=0.3, outside="hold", frames=(1, None)),
+    "held": lambda e: e.retime(stretch=2, about=0.3, frames=(1, None)),
     "a clock": lambda e: e.retime(clock=Clock((0, 0.5, 1), (0, 1, 0))),
     "still": lambda e: e.freeze(2.5).to_back(),
     "gone": lambda e: e.vanish().select().opacity(0.7),
@@ -447,7 +447,7 @@ def test_clocks_go_by_the_clip(evenly):
     np.testing.assert_allclose(half.render(8 * per_frame), wanted.render(float(own[4])), atol=1e-4)
 
 
-def test_the_first_segment_goes_on_before_the_clip_and_the_last_behind_it():
+def test_the_first_segment_holds_before_the_clip_and_the_last_behind_it():
     """As a model of one piece does: there is no other segment to ask."""
     video = soft_video(evenly=True)
     first, last = (video.segments[k].model for k in (0, 2))
@@ -459,7 +459,7 @@ def test_the_first_segment_goes_on_before_the_clip_and_the_last_behind_it():
     assert begin.segments[1:] == video.segments[1:]
     uneven = soft_video()
     model = uneven.segments[0].model
-    early = Clock.frozen(-2 * float(model.frame_times.times()[1]))
+    early = Clock.frozen(0.0)
     begin = edit(uneven).select(SegmentedSelection((Selection(OBJECT), *none[1:]))).retime(shift=2 / steps).video()
     wanted = edit(model).select(OBJECT).retime(clock=early).video()
     np.testing.assert_allclose(begin.render(0.0), wanted.render(0.0), atol=1e-4)

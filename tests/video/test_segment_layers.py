@@ -54,7 +54,7 @@ def front(kind):
         return chain.select(OBJECT).multiply([(0.2, 0)], frames=(None, 6), ease=2).rotate(0.4, frame=11).video()
     if kind == "clocks":
         chain = edit(short_lived()).select(lambda model: np.arange(model.num_gaussians) % 2 == 0)
-        return chain.retime(stretch=-1, about=0.5, outside="hold").select().freeze(3, frames=(2, 6)).video()
+        return chain.retime(stretch=-1, about=0.5).select().freeze(3, frames=(2, 6)).video()
     return edit(model).apply(brighter).video()
 
 

@@ -80,9 +80,8 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
         ),
         "plate": (
             Example("Without the moving object, into holiday.plate.mp4", "foldgauss plate holiday.safetensors"),
-            Example(
-                "And its masks, for edit scripts", "foldgauss plate holiday.safetensors --out empty.mp4 --masks masks"
-            ),
+            Example("And its masks", "foldgauss plate holiday.safetensors --out empty.mp4 --save-masks masks"),
+            Example("With masks of your own", "foldgauss plate holiday.safetensors --out mine.mp4 --masks masks"),
         ),
         "evaluate": (
             Example("PSNR and SSIM of every frame", "foldgauss evaluate holiday.safetensors holiday.mp4"),

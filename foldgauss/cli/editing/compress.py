@@ -14,7 +14,7 @@ from foldgauss.cli.app.application import WrongUse, app, err, warn, wrong_use
 from foldgauss.cli.app.completion import complete_clips
 from foldgauss.cli.shared.arguments import FittedFrames, ModelFile, Overwrite
 from foldgauss.cli.shared.clips import is_other_clip, read_fitted_clip, refuse_segments
-from foldgauss.cli.shared.outputs import refuse_existing, refuse_input
+from foldgauss.cli.shared.outputs import refuse_existing, refuse_inputs
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import print_figures
 from foldgauss.io._atomic import check_writable
@@ -91,7 +91,7 @@ def compress_command(
         raise wrong_use("--frames", expected="a VIDEO to take them from", got="none")
     if passes not in (0, PASSES) and video is None:
         raise wrong_use("--passes", expected="a VIDEO to fine-tune to", got="none", cure="Give it, or no --passes.")
-    refuse_input(target, "model", model_path)
+    refuse_inputs(target, {"model": model_path, "clip": video})
     refuse_existing(target, overwrite)
     check_writable(target)
     refuse_segments(model_path)

@@ -11,7 +11,7 @@ from foldgauss.cli.app.application import WrongUse, app, out, wrong_use
 from foldgauss.cli.app.completion import complete_files
 from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, parse_size
 from foldgauss.cli.shared.log_lines import print_log
-from foldgauss.cli.shared.outputs import check_image_path, name_after, refuse_existing, refuse_huge, refuse_input
+from foldgauss.cli.shared.outputs import check_image_path, name_after, refuse_existing, refuse_huge, refuse_inputs
 from foldgauss.cli.shared.rendering import (
     SoundFile,
     VideoOptions,
@@ -65,8 +65,9 @@ def edit_command(
     """
     if out_path is None:
         out_path = name_after(model_path, f".{script_path.stem}{MODEL_SUFFIX}")
-    refuse_input(out_path, "model", model_path)
     script = read_edit_script(script_path)
+    inputs = {"model": model_path, "script": script_path, "sound": sound}
+    refuse_inputs(out_path, inputs | {f"script's {path.name}": path for path in script.inputs})
     as_model = out_path.suffix.lower() == MODEL_SUFFIX
     image_size = parse_size(size)
     for option, given, fits in (("--size", image_size, "a video or a folder"), ("--sound", sound, "a video")):
@@ -131,7 +132,7 @@ def segment_command(
         check_model_name(out_path, "--out")
     except ValueError as error:
         raise WrongUse(str(error)) from error
-    refuse_input(out_path, "model", model_path)
+    refuse_inputs(out_path, {"model": model_path})
     refuse_existing(out_path, overwrite)
     check_writable(out_path)
     video, about = load_video_model(model_path), read_origin(model_path)

@@ -18,7 +18,7 @@ from foldgauss.cli.shared.arguments import (
     parse_times,
 )
 from foldgauss.cli.shared.clips import read_fitted_clip
-from foldgauss.cli.shared.outputs import check_image_path, name_after, refuse_existing, refuse_huge, refuse_input
+from foldgauss.cli.shared.outputs import check_image_path, name_after, refuse_existing, refuse_huge, refuse_inputs
 from foldgauss.cli.shared.rendering import advance_over, progress_bar
 from foldgauss.io._atomic import check_writable
 from foldgauss.io.exchange.export_import import FORMATS, export, import_model
@@ -76,7 +76,7 @@ def export_command(
             "html": ".html",
         }
         out_path = name_after(model_path, endings.get(file_format, f"-{file_format}"))
-    refuse_input(out_path, "model", model_path)
+    refuse_inputs(out_path, {"model": model_path, "clip": original})
     if segmented and out_path.suffix and not out_path.is_dir():
         cure = "Each segment becomes a file in it."
         raise wrong_use("--out", expected="a folder without extension", got=out_path, cure=cure)

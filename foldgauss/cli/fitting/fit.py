@@ -26,7 +26,7 @@ from foldgauss.cli.fitting.progress import Display, Observer, display_progress, 
 from foldgauss.cli.fitting.segments import describe_budgets, fit_in_segments, plan_gaussians
 from foldgauss.cli.fitting.workers import WorkerOptions
 from foldgauss.cli.shared.arguments import Frames, NewClip, Overwrite, Size, parse_frames, parse_size
-from foldgauss.cli.shared.outputs import name_after, refuse_existing, refuse_input
+from foldgauss.cli.shared.outputs import name_after, refuse_existing, refuse_inputs
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import format_count, print_figures, summarize_scores
 from foldgauss.io._atomic import OutputError, check_writable
@@ -90,7 +90,7 @@ def fit(
     workers.
     """
     target = name_after(video, MODEL_SUFFIX) if out_path is None else out_path
-    refuse_input(target, "clip", video)
+    refuse_inputs(target, {"clip": video})
     try:
         check_model_name(target, "out")
     except ValueError as error:

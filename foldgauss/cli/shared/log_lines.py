@@ -4,17 +4,20 @@ import contextlib
 import logging
 from collections.abc import Iterator
 
-from foldgauss.cli.app.application import err, out
+from foldgauss.cli.app.application import err, out, warn
 
 #: So many starts of shots are printed.
 LISTED_STARTS = 8
 
 
 class _Printer(logging.Handler):
-    """Prints the message of each record on one line."""
+    """Prints the message of each record on one line, as a warning if it is one."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        out.print(record.getMessage(), soft_wrap=True)
+        if record.levelno >= logging.WARNING:
+            warn(record.getMessage())
+        else:
+            out.print(record.getMessage(), soft_wrap=True)
 
 
 @contextlib.contextmanager

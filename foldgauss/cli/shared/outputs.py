@@ -1,11 +1,12 @@
 """Checks and default names of outputs, before any work is done."""
 
 import os
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from foldgauss.cli.app.application import WrongUse, wrong_use
 from foldgauss.io._atomic import OutputError, check_replaceable, check_writable
+from foldgauss.io.media.image_files import IMAGE_SUFFIXES
 from foldgauss.io.media.resizing import memory_limit
 from foldgauss.io.media.video_writing import ANIMATION_SUFFIXES, FRAME_NAMES, VIDEO_SUFFIXES
 
@@ -31,17 +32,20 @@ def refuse_existing(path: Path, overwrite: bool, option: str = "--out") -> None:
         raise WrongUse(f"{option}: {path} exists. Choose another path, or add --overwrite.")
 
 
-def refuse_input(path: Path, what: str, source: Path, option: str = "--out") -> None:
-    """Refuse an output in place of its own source, which an error would destroy."""
-    # os.path: a name that is too long does not exist here; creating the file reports it.
-    if os.path.exists(path) and os.path.exists(source) and path.samefile(source):
-        raise WrongUse(f"{option}: expected another file than the {what}, got {path}.")
+def refuse_inputs(path: Path, inputs: Mapping[str, Path | None], option: str = "--out") -> None:
+    """Refuse an output in place of one of the command's `inputs` by name, or of an image in a folder of one."""
+    for what, source in inputs.items():
+        # os.path: a name that is too long does not exist here; creating the file reports it.
+        if source is None or not (os.path.exists(path) and os.path.exists(source)):
+            continue
+        if path.samefile(source) or (path.suffix.lower() in IMAGE_SUFFIXES and path.parent.samefile(source)):
+            raise WrongUse(f"{option}: expected another path than the {what}, got {path}. Inputs are never replaced.")
 
 
-def check_images_output(path: Path, source: Path, overwrite: bool, option: str = "--out") -> None:
-    """Refuse a video, an image or a folder of frames made from the model `source` that could not be written."""
+def check_images_output(path: Path, inputs: Mapping[str, Path | None], overwrite: bool, option: str = "--out") -> None:
+    """Refuse a video, an image or a folder of frames that could not be written, or that is one of the `inputs`."""
+    refuse_inputs(path, inputs, option)
     if not path.is_dir():
-        refuse_input(path, "model", source, option)
         refuse_existing(path, overwrite, option)
         if not path.suffix:
             check_replaceable(path, overwrite, pattern=FRAME_NAMES)

@@ -19,7 +19,7 @@ from foldgauss.cli.shared.arguments import (
     override_constants,
 )
 from foldgauss.cli.shared.clips import read_fitted_clip
-from foldgauss.cli.shared.outputs import refuse_existing, refuse_input
+from foldgauss.cli.shared.outputs import refuse_existing, refuse_inputs
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import print_figures, summarize_scores, write_json
 from foldgauss.io._atomic import check_writable
@@ -48,8 +48,7 @@ def evaluate_command(
     segments has a row for each segment; --json has every frame.
     """
     if json_path is not None:
-        for what, source in (("model", model_path), ("clip", video)):
-            refuse_input(json_path, what, source, "--json")
+        refuse_inputs(json_path, {"model": model_path, "clip": video}, "--json")
         refuse_existing(json_path, overwrite, "--json")
         check_writable(json_path)
     model = load_video_model(model_path)

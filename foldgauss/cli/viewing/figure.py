@@ -13,7 +13,7 @@ from foldgauss.cli.app.help import App
 from foldgauss.cli.shared.arguments import FittedClip, FittedFrames, ModelFile, Overwrite
 from foldgauss.cli.shared.clips import Video, read_fitted_clip
 from foldgauss.cli.shared.contact_sheet import make_comparison_sheet, make_contact_sheet
-from foldgauss.cli.shared.outputs import IMAGE_SUFFIX, name_after, refuse_existing, refuse_huge
+from foldgauss.cli.shared.outputs import IMAGE_SUFFIX, name_after, refuse_existing, refuse_huge, refuse_inputs
 from foldgauss.cli.shared.rendering import Flow
 from foldgauss.io._atomic import check_writable
 from foldgauss.io.media.video_writing import write_image
@@ -53,7 +53,7 @@ def interpolation(
     """Show images between two frames: t, t+1/4, t+2/4, t+3/4, t+1."""
     if not 2 <= parts <= MAX_PARTS:
         raise wrong_use("--parts", expected=f"a whole number from 2 to {MAX_PARTS}", got=parts)
-    out_path = _check_output(out_path, model_path, "interpolation", overwrite)
+    out_path = _check_output(out_path, {"model": model_path}, "interpolation", overwrite)
     model = load_video_model(model_path)
     if model.num_frames < 2:
         raise wrong_use("MODEL", expected="at least 2 frames", got=model.num_frames)
@@ -87,7 +87,7 @@ def reconstruction(
 
     The PSNR above a row is measured at the size of the model, in 8 bits.
     """
-    out_path = _check_output(out_path, model_path, "reconstruction", overwrite)
+    out_path = _check_output(out_path, {"model": model_path, "clip": video}, "reconstruction", overwrite)
     model = load_video_model(model_path)
     size, num = _size(model, width), model.num_frames
     if size[1] > model.size[1]:
@@ -106,10 +106,11 @@ def reconstruction(
     _write(out_path, make_comparison_sheet(*small, captions), "; ".join(captions))
 
 
-def _check_output(path: Path | None, model_path: Path, kind: str, overwrite: bool) -> Path:
-    path = name_after(model_path, f".{kind}{IMAGE_SUFFIX}") if path is None else path
+def _check_output(path: Path | None, inputs: dict[str, Path], kind: str, overwrite: bool) -> Path:
+    path = name_after(inputs["model"], f".{kind}{IMAGE_SUFFIX}") if path is None else path
     if path.suffix.lower() != IMAGE_SUFFIX:
         raise wrong_use("--out", expected="a name ending in .png", got=path)
+    refuse_inputs(path, inputs)
     refuse_existing(path, overwrite)
     check_writable(path)
     return path

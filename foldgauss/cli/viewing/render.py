@@ -102,7 +102,7 @@ def render(
         raise wrong_use("--format", expected="a folder as --out", got=out_path)
     if image_format is not None and image_format not in IMAGE_FORMATS:
         raise wrong_use("--format", expected="one of " + ", ".join(IMAGE_FORMATS), got=image_format)
-    check_images_output(out_path, model_path, overwrite)
+    check_images_output(out_path, {"model": model_path, "sound": sound}, overwrite)
     model = load_video_model(model_path)
     constants = override_constants(model.options, alpha_cutoff, support_radius, transmittance_stop)
     model = model.with_options(constants)

@@ -68,7 +68,7 @@ def stabilize_command(
     if out_path is None:
         out_path = name_after(model_path, f".stable{VIDEO_SUFFIXES[0]}")
     check_image_path(out_path)
-    check_images_output(out_path, model_path, overwrite)
+    check_images_output(out_path, {"model": model_path, "sound": sound}, overwrite)
     if fixed and smoothing != SMOOTHING:
         raise wrong_use("--fixed", expected="no --smoothing", got="both; the camera stands still")
     model = load_video_model(model_path)

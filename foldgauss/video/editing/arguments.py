@@ -107,8 +107,8 @@ def check_select_arguments(selection: object, criteria: dict[str, object]) -> No
 
 
 def warn_if_outside_clip(parameter: str, shift: float, stretch: float, about: float, num_frames: int) -> None:
-    """Warn of a line of times that leaves nothing in the clip."""
+    """Warn of a line of times with which the selection stands still in the whole clip."""
     ends = [about + shift + stretch * (own - about) for own in (0.0, 1.0)]
     if max(ends) < 0 or min(ends) > 1:
-        text = f"{parameter}: expected times of a clip of [0, 1], got {shift:g}: nothing of it is left there."
+        text = f"{parameter}: expected times of a clip of [0, 1], got {shift:g}: it stands still throughout."
         warnings.warn(f"{text} For frames divide by {max(num_frames - 1, 1)}.", stacklevel=3)

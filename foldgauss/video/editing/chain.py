@@ -83,7 +83,7 @@ class Edit:
 
     Edits apply in the order of the calls, each to the result of those before. An edit that a folded model represents
     exactly at all times is **baked** into its parameters: translations; affine maps about a fixed point; opacities that
-    stay below 1; colors; deletion and copies; retiming whose time locations stay within (0, 1). All others are kept as
+    stay below 1; colors; deletion and copies; retiming within the clip. All others are kept as
     **overlays**, applied to the conditioned Gaussians at each time: edits over a span, edits about the selection's own
     center, clocks, functions, depth. `video()` is a plain `VideoModel` if all edits could be baked. Gaussians that are
     not selected stay the same to the bit, and an edit that changes nothing (a factor 1, an angle 0) is skipped.
@@ -278,7 +278,7 @@ class Edit:
             one, still = dataclasses.replace(copied, selection=Selection(mask)), (0.0, 0.0)
             one = one._map(0.0, ((size, 0.0), (0.0, size)), still, about, when)
             one = one._map(turn, IDENTITY, still, about, when)._map(0.0, IDENTITY, shift, None, when)
-            one = one._retime_linearly(delay, 1.0, 0.0, "continue", when, "delays")
+            one = one._retime_linearly(delay, 1.0, 0.0, when, "delays")
             if span is not None:
                 one = one._edit_layers(lambda layer, mask: add_edit(layer, Opacity(mask, span, factor=1.0, before=0.0)))
             copied = dataclasses.replace(one, selection=copied.selection)
@@ -384,27 +384,26 @@ class Edit:
         shift: float = 0.0,
         stretch: float = 1.0,
         about: float = 0.0,
-        outside: str = "continue",
         clock: Clock | None = None,
         **when: Unpack[When],
     ) -> "Edit":
         """Change the selection's timing: what it shows at t it shows at `about + shift + stretch (t - about)`.
 
         A positive shift is later; a stretch above 1 is slower, below 0 backwards (`stretch=-1, about=0.5` reverses the
-        clip). Baked without a span if all time locations stay within (0, 1), else done by a clock that renders the
-        same. Before the first frame and after the last, folds are extrapolated (`outside` "continue", for short times
-        only, as no frame was fitted there) or the selection stands still ("hold", always a clock). Or give any `clock`.
+        clip). Before it begins and after it ends the selection stands still, as its first or last frame shows it. Baked
+        without a span if it never stands still and all time locations stay within (0, 1), else done by a clock. Or give
+        any `clock`.
 
         A clock changes the model's own time: spans of earlier edits stay where they are.
 
         **Units:** times in [0, 1]; n evenly timed frames lie 1 / (n - 1) apart.
         """
         if clock is not None:
-            _check_clock(clock, (shift, stretch, about) != (0, 1, 0), outside)
+            _check_clock(clock, (shift, stretch, about) != (0, 1, 0))
             return self._retime_by_clock(clock, when, "clock")
-        Clock.shifted(shift, stretch, about=about, outside=outside)  # checks them
+        Clock.shifted(shift, stretch, about=about)  # checks them
         warn_if_outside_clip("shift", shift, stretch, about, self._num_frames)
-        return self._retime_linearly(shift, stretch, about, outside, when, "shift")
+        return self._retime_linearly(shift, stretch, about, when, "shift")
 
     def _retime_by_clock(self, clock: Clock, when: When, parameter: str) -> "Edit":
         """Add a clock."""
@@ -413,12 +412,11 @@ class Edit:
             clock = self._window.own_clock(clock)
         return self._apply(partial(Retiming, clock=clock), when)
 
-    def _retime_linearly(
-        self, shift: float, stretch: float, about: float, outside: str, when: When, parameter: str
-    ) -> "Edit":
+    def _retime_linearly(self, shift: float, stretch: float, about: float, when: When, parameter: str) -> "Edit":
         """Show t at about + shift + stretch (t - about), baked where possible."""
-        clock = Clock.shifted(shift, stretch, about=about, outside=outside)
-        identity = (shift, stretch) == (0, 1) and outside == "continue"
+        clock = Clock.shifted(shift, stretch, about=about)
+        never_holds = clock.times[0] <= 0 and clock.times[-1] >= 1
+        identity = (shift, stretch) == (0, 1)
         if self._window is not None and not identity:
             own = self._window.own_line(shift, stretch, about)
             if own is None:
@@ -428,7 +426,7 @@ class Edit:
             clock = self._window.own_clock(clock)
         bake = partial(apply_retiming, shift=float(shift), stretch=float(stretch), about=float(about))
         # Between shots a clock shows the nearer frame, which parameters cannot represent.
-        bakes = outside == "continue" and not any(layer.holds_frames for layer in self._video.layers)
+        bakes = never_holds and not any(layer.holds_frames for layer in self._video.layers)
         return self._apply(partial(Retiming, clock=clock), when, bake if bakes else None, skip=identity)
 
     def freeze(self, at: float, **when: Unpack[When]) -> "Edit":
@@ -581,11 +579,9 @@ class Edit:
         return np.asarray(self._video.frame_times.times(), np.float64)
 
 
-def _check_clock(clock: object, has_line: bool, outside: str) -> None:
+def _check_clock(clock: object, has_line: bool) -> None:
     if has_line:
         raise invalid("clock", expected="a clock, or shift, stretch and about", got="both")
-    if outside != "continue":
-        raise invalid("outside", expected="none beside a clock", got=outside, cure="Clock(..., outside=...).")
     if not isinstance(clock, Clock):
         cure = "Clock(times, own_times) is linear between knots." if callable(clock) else ""
         raise invalid("clock", expected="a Clock", got=type(clock).__name__, cure=cure)

@@ -125,11 +125,11 @@ class ClipWindow:
             return Clock.frozen(0.0)
         if self.is_even:
             times = tuple(self._own_time(t) for t in clock.times)
-            return Clock(times, tuple(self._own_time(t) for t in clock.own_times), clock.outside)
+            return Clock(times, tuple(self._own_time(t) for t in clock.own_times))
         shown = self._corners(clock)
         own = np.array([clock(position / self._steps) * self._steps for position in shown])
-        times = np.interp(shown - self.first, np.arange(len(self.times)), self.times)
-        return Clock(*distinct_knots(times, self._extrapolate(own - self.first)))
+        times, own_times = (np.interp(x - self.first, np.arange(len(self.times)), self.times) for x in (shown, own))
+        return Clock(*distinct_knots(times, own_times))
 
     def _corners(self, clock: Clock) -> Float64[np.ndarray, " corners"]:
         """Positions where the clock's slope changes in own time: its knots, and where it or the clip passes a frame."""
@@ -142,13 +142,6 @@ class ClipWindow:
             passed = range(max(int(np.ceil(low)), self.first), min(int(np.floor(high)), self.last) + 1)
             corners |= {one + (other - one) * (k - begin) / (end - begin) for k in passed if low < k < high}
         return np.array(sorted(corners))
-
-    def _extrapolate(self, positions: Float64[np.ndarray, " num"]) -> Float64[np.ndarray, " num"]:
-        """Own times at positions among the own frames, extrapolated linearly before the first and after the last."""
-        times, last = self.times, len(self.times) - 1
-        before, after = np.minimum(positions, 0), np.maximum(positions - last, 0)
-        inside = np.interp(positions, np.arange(last + 1), times)
-        return inside + before * (times[1] - times[0]) + after * (times[-1] - times[-2])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -4,40 +4,34 @@ import dataclasses
 
 import numpy as np
 
-from foldgauss._runtime.checks import check_one_of, invalid
+from foldgauss._runtime.checks import invalid
 from foldgauss.video.editing.arguments import check_increasing, check_number, check_numbers
-
-OUTSIDE = ("hold", "continue")
 
 
 @dataclasses.dataclass(frozen=True)
 class Clock:
     """An object's own time as a function of the video's time: linear between knots (t, own time).
 
-    Before the first and after the last knot the own time is constant (`outside` "hold") or extrapolated linearly
-    ("continue", which needs two knots). Clocks may run backwards.
+    Before the first and after the last knot the own time is constant. Clocks may run backwards. At own times below 0
+    and above 1 the first and the last frame are shown: no frame was fitted beyond them, and folds that are extrapolated
+    there soon scatter.
 
-    **Units:** model time, which is [0, 1]; n evenly timed frames lie 1 / (n - 1) apart. At an own time outside [0, 1]
-    the folds are extrapolated beyond the frames that the model was fitted to.
+    **Units:** model time, which is [0, 1]; n evenly timed frames lie 1 / (n - 1) apart.
 
     **Example:** `Clock((0.0, 0.5, 1.0), (0.0, 0.5, 0.0))` runs to the middle and back.
 
-    **Raises:** ValueError for knots that are not finite, of different lengths or not increasing, and for an unknown
-    `outside`.
+    **Raises:** ValueError for knots that are not finite, of different lengths or not increasing.
     """
 
     times: tuple[float, ...]
     own_times: tuple[float, ...]
-    outside: str = "hold"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "times", check_numbers("times", self.times))
         object.__setattr__(self, "own_times", check_numbers("own_times", self.own_times))
-        check_one_of("outside", self.outside, OUTSIDE)
-        least = 2 if self.outside == "continue" else 1
-        if len(self.times) < least or len(self.times) != len(self.own_times):
+        if not self.times or len(self.times) != len(self.own_times):
             got = f"{len(self.times)} and {len(self.own_times)}"
-            raise invalid("times, own_times", expected=f"as many of each, at least {least}", got=got)
+            raise invalid("times, own_times", expected="as many of each, at least 1", got=got)
         check_increasing("times", self.times)
 
     @classmethod
@@ -46,12 +40,10 @@ class Clock:
         return cls((0.0,), (own_time,))
 
     @classmethod
-    def shifted(
-        cls, shift: float = 0.0, stretch: float = 1.0, *, about: float = 0.0, outside: str = "continue"
-    ) -> "Clock":
-        """Own time t is shown at `about + shift + stretch (t - about)`: later by `shift`, slower by `stretch`.
+    def shifted(cls, shift: float = 0.0, stretch: float = 1.0, *, about: float = 0.0) -> "Clock":
+        """Own time t in [0, 1] is shown at about + shift + stretch (t - about): later by `shift`, slower by `stretch`.
 
-        A negative stretch runs backwards. With `outside` "hold" the own time stays within [0, 1].
+        A negative stretch runs backwards.
         """
         shift, stretch, about = (
             check_number(name, x) for name, x in (("shift", shift), ("stretch", stretch), ("about", about))
@@ -59,13 +51,8 @@ class Clock:
         if stretch == 0:
             raise invalid("stretch", expected="a number other than 0", got=stretch, cure="To stop time: Clock.frozen.")
         knots = sorted((about + shift + stretch * (own - about), own) for own in (0.0, 1.0))
-        return cls(*zip(*knots, strict=True), outside=outside)
+        return cls(*zip(*knots, strict=True))
 
     def __call__(self, t: float) -> float:
         """The own time at time t."""
-        if self.outside == "continue":
-            side = 0 if t < self.times[0] else -2 if t > self.times[-1] else None
-            if side is not None:
-                (a, b), (own_a, own_b) = self.times[side:][:2], self.own_times[side:][:2]
-                return own_a + (t - a) * (own_b - own_a) / (b - a)
         return float(np.interp(t, self.times, self.own_times))

@@ -395,7 +395,10 @@ def _interpolate(before: SelectedGaussians, after: SelectedGaussians, progress: 
 
 
 class Retiming(eqx.Module):
-    """Gaussians with their own clock, over a span or always: at progress s their time is t + s (clock(t) - t)."""
+    """Gaussians with their own clock, over a span or always: at progress s their time is t + s (clock(t) - t).
+
+    `clock(t)` is clipped to [0, 1], the times that the model was fitted to.
+    """
 
     mask: Bool[np.ndarray, " num_gaussians"]
     span: Span | None = eqx.field(static=True)
@@ -404,9 +407,10 @@ class Retiming(eqx.Module):
     def own_time(self, t: float) -> float:
         """The time at which the Gaussians are conditioned at the video's time t."""
         progress = 1.0 if self.span is None else self.span.progress(t)
+        own = min(max(self.clock(t), 0.0), 1.0)
         if progress in (0, 1):  # exactly
-            return self.clock(t) if progress else t
-        return t + progress * (self.clock(t) - t)
+            return own if progress else t
+        return t + progress * (own - t)
 
 
 #: The edits that can be saved, by their names in files.

@@ -33,6 +33,9 @@ LEAST_POINTS = 8
 PLATE_FRAMES, PLATE_REACH = 14, 40
 #: Holes of a plate are filled from frames in which at least this fraction of a pixel is uncovered.
 UNCOVERED = 250 / 255
+#: Where no frame shows more than this fraction of the removed area, half of that is farther than `MARGIN` from what is
+#: known: wider than the rims that interpolation closes unseen.
+MUCH_UNKNOWN = 0.1
 #: What an object covers is replaced with this margin, and a soft edge of this width; fractions of the longer side.
 MARGIN, SOFT_EDGE = 0.012, 0.004
 
@@ -110,8 +113,9 @@ def fill_background(frames: Frames, masks: Masks, *, alignment: Alignment | None
     """The frames without what the masks cover: other frames, moved as the background, show what is behind it.
 
     A pixel is the median of the frames that show it, up to `PLATE_REACH` frames away within its shot. One that no
-    frame shows is interpolated from its surroundings; the fraction of these is logged, at level INFO. Pixels away from
-    the masks stay as they are. `alignment` is that of the frames (default: estimated here).
+    frame shows is interpolated from its surroundings; the fraction of these is logged, at level INFO, or as a warning
+    if it is above `MUCH_UNKNOWN`. Pixels away from the masks stay as they are. `alignment` is that of the frames
+    (default: estimated here).
 
     Raises ValueError for frames of another type, and masks of another size.
     Example: `fill_background(frames, find_moving_object(frames, shadow=True))`.
@@ -149,7 +153,10 @@ def _log_unknown(unknown: int, removed: int) -> None:
     """Log how many of the removed pixels no frame shows."""
     if unknown:
         percent = f"{100 * unknown / removed:.0f}%" if 100 * unknown >= removed else "Less than 1%"
-        _LOG.info("%s of the removed area is shown by no frame and filled from its surroundings.", percent)
+        much = unknown > MUCH_UNKNOWN * removed
+        cure = " It is a smear: take more frames, in which the object moves away from it." if much else ""
+        text = "%s of the removed area is shown by no frame and filled from its surroundings.%s"
+        _LOG.log(logging.WARNING if much else logging.INFO, text, percent, cure)
     elif removed:
         _LOG.info("All of the removed area is shown by other frames.")
 

@@ -4,30 +4,31 @@ import { frameTimes } from "./timeline.js";
 
 export const TEXTURE_WIDTH = 2048;
 export const SH_C0 = 0.28209479177387814;
+const ENDLESS = 1e30; // a time before or after all others
 const TAU_MAX = Math.sqrt(-2 * Math.log(0.01)); // beyond, a Gaussian is not rendered
 /** log sigma_t of Gaussians without a time of their own, as STATIC_LOG_TIME_SCALE in foldgauss.video.models.splats. */
 export const STATIC = Math.fround(Math.log(1024));
 
 export const sigmoid = (x) => 1 / (1 + Math.exp(-x));
 
-/** Numbers per Gaussian of each leaf; `coefficients` has two per power; only a model with shared paths has `path_index`. */
+/** Numbers per Gaussian of each leaf; `coefficients` has two per power; only a model with shared paths has `path_index`. `held`: see `prepare`. */
 export const WIDTHS = {
   loc: () => 2, log_scale: () => 2, angle_logit: () => 1, time_loc: () => 1, log_time_scale: () => 1,
-  coefficients: (degree) => 2 * degree, opacity_logit: () => 1, color_dc: () => 3, path_index: () => 1,
+  coefficients: (degree) => 2 * degree, opacity_logit: () => 1, color_dc: () => 3, path_index: () => 1, held: () => 2,
 };
 
 /**
  * Prepare a model for rendering and editing from a file's header and leaves, named and laid out as in FoldedSplats.
  *
- * Its `leaves` hold m_t itself, `time_loc` in double precision, since an edit may move it out of the clip. Texels of a
- * Gaussian: 0: m_s, m_t, sigma_t; 1: two standard deviations, cosine and sine of the first one's angle;
- * 2: red, green, blue, opacity; 3 and on: the path's coefficients, two powers each; in a model with shared paths a last
- * one with the number of its shared path.
+ * Its `leaves` hold m_t itself, `time_loc` in double precision, since an edit may move it out of the clip, and `held`,
+ * the first and the last time at which a Gaussian moves: before and after it stands still. Texels of a Gaussian: 0: m_s,
+ * m_t, sigma_t; 1: two standard deviations, cosine and sine of the first one's angle; 2: red, green, blue, opacity; 3 and
+ * on: the path's coefficients, two powers each; the last one: the number of its shared path, and `held`.
  */
 export function prepare({ header, leaves: { time_loc_logit: logits, frame_times: intervals, path_times, path_matrices, path_index, ...rest } }) {
   const num = header.num_gaussians, { degree } = header, paths = pathsOf(header, { path_times, path_matrices });
-  const texels = 3 + Math.ceil(degree / 2) + (paths ? 1 : 0), rows = Math.ceil((num * texels) / TEXTURE_WIDTH);
-  const leaves = { ...rest, time_loc: Float64Array.from(logits, sigmoid) };
+  const texels = 4 + Math.ceil(degree / 2), rows = Math.ceil((num * texels) / TEXTURE_WIDTH);
+  const leaves = { ...rest, time_loc: Float64Array.from(logits, sigmoid), held: Float32Array.from({ length: 2 * num }, (_, k) => (k % 2 ? ENDLESS : -ENDLESS)) };
   if (paths) leaves.path_index = Uint32Array.from(path_index);
   const values = new Float32Array(4 * TEXTURE_WIDTH * rows), times = frameTimes(intervals);
   for (let i = 0; i < num; i++) fillTexels(values, i, leaves, texels, degree);
@@ -49,7 +50,7 @@ export function fillTexels(values, i, leaves, texels, degree) {
   for (let c = 0; c < 3; c++) values[at + 8 + c] = Math.max(0.5 + SH_C0 * leaves.color_dc[3 * i + c], 0);
   values[at + 11] = sigmoid(leaves.opacity_logit[i]);
   for (let k = 0; k < 2 * degree; k++) values[at + 12 + k] = leaves.coefficients[2 * degree * i + k];
-  if (leaves.path_index) values[at + 4 * texels - 4] = leaves.path_index[i];
+  values.set([leaves.path_index?.[i] ?? 0, leaves.held[2 * i], leaves.held[2 * i + 1]], at + 4 * texels - 4);
 }
 
 /** Time windows in which Gaussians are rendered: near m_t, and above the file's scale cutoff. */
@@ -83,8 +84,8 @@ function fingerprint(values, num) {
 
 /** A Gaussian conditioned on a time: center, variances along its axes with the low-pass filter's added, axes. Model units. */
 export function condition(model, i, time, lowPass) {
-  const { values, texels, degree, header } = model, at = 4 * texels * i;
-  const u = values[at + 2] - time, tau = u / values[at + 3];
+  const { values, texels, degree, header } = model, at = 4 * texels * i, last = at + 4 * texels - 4;
+  const u = values[at + 2] - Math.min(Math.max(time, values[last + 1]), values[last + 2]), tau = u / values[at + 3];
   const a = header.floor + (1 - header.floor) * Math.exp(-0.5 * header.power * tau * tau);
   let x = 0, y = 0;
   for (let k = 2 * degree - 2; k >= 0; k -= 2) {
@@ -96,7 +97,7 @@ export function condition(model, i, time, lowPass) {
     first: values[at + 4] ** 2 * a + lowPass, second: values[at + 5] ** 2 * a + lowPass,
     cos: values[at + 6], sin: values[at + 7], opacity: values[at + 11],
   };
-  const path = model.paths ? values[at + 4 * texels - 4] : 0;
+  const path = values[last];
   return path ? moved(own, mapsAt(model.paths, time).subarray(6 * path, 6 * path + 6), lowPass) : own;
 }
 

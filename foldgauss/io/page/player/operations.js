@@ -125,7 +125,7 @@ export const ACTIONS = {
     apply: (state, keys, { states }) => applyColors(state, colorMap(keys, states)),
   },
   retime: {
-    optional: { shift: NUMBER, stretch: NUMBER, about: NUMBER, outside: ["\"continue\"", (own) => own === "continue"] }, timed: true,
+    optional: { shift: NUMBER, stretch: NUMBER, about: NUMBER }, timed: true,
     check: ({ stretch = 1 }) => (stretch === 0 ? "stretch: expected a number other than 0. To stop time use freeze." : ""),
     apply: (state, { shift = 0, stretch = 1, about = 0 }) => applyRetiming(state, shift, stretch, about),
   },

@@ -97,16 +97,22 @@ export function withColor(states, color) {
   return (own) => color.map((one) => (one * dot(own, LUMINANCE) * total) / weighted);
 }
 
-/** Show time t at about + shift + stretch (t - about). Of Gaussians without a time of their own only the shared path has one. */
+/**
+ * Show time t of [0, 1] at about + shift + stretch (t - about); before and after, the selection stands still. Of Gaussians
+ * without a time of their own only the shared path has one.
+ */
 export function applyRetiming(state, shift, stretch, about) {
   const { degree } = state.model, windows = state.model.windows.slice(), moved = (t) => about + shift + stretch * (t - about);
-  const after = withChanged(state, ["time_loc", "log_time_scale", "coefficients"], (leaves, i) => {
+  const after = withChanged(state, ["time_loc", "log_time_scale", "coefficients", "held"], (leaves, i) => {
     if (isStatic(leaves, i)) return;
     leaves.time_loc[i] = moved(leaves.time_loc[i]);
     leaves.log_time_scale[i] += Math.log(Math.abs(stretch));
     for (let k = 0; k < 2 * degree; k++) leaves.coefficients[2 * degree * i + k] /= stretch ** (1 + (k >> 1));
-    const ends = [moved(windows[2 * i]), moved(windows[2 * i + 1])];
-    [windows[2 * i], windows[2 * i + 1]] = stretch > 0 ? ends : ends.reverse();
+    const own = [2 * i, 2 * i + 1], [from, to] = own.map((k) => windows[k]);
+    const held = [0, 1].map((t) => Math.min(Math.max(t, leaves.held[2 * i]), leaves.held[2 * i + 1]));
+    const isSeen = from < held[1] && to > held[0]; // where it stands still it stays alive, or dead
+    const seen = isSeen ? [from < held[0] ? -Infinity : from, to > held[1] ? Infinity : to] : [0, 0];
+    for (const [into, times] of [[leaves.held, held], [windows, seen]]) times.map(moved).sort((one, other) => one - other).forEach((t, k) => (into[own[k]] = t));
   }, changedPaths(state, (path) => retimed(path, moved)));
   return { ...after, model: { ...after.model, windows } };
 }

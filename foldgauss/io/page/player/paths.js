@@ -77,9 +77,10 @@ export function conjugated({ times, matrices }, [a, b, c, d], [x, y]) {
   return { times, matrices: after };
 }
 
-/** A path whose time t is shown at moved(t), which may run backwards. */
-export function retimed({ times, matrices }, moved) {
-  const after = times.map(moved), num = times.length;
+/** A path whose time t of [0, 1] is shown at moved(t), which may run backwards; it stands still before and after. */
+export function retimed(path, moved) {
+  const num = path.times.length, times = path.times.map((t) => Math.min(Math.max(t, 0), 1)), after = times.map(moved), matrices = new Float64Array(6 * num);
+  times.forEach((t, k) => matrices.set(mapsAt({ count: 1, knots: num, ...path }, t).subarray(6), 6 * k));
   if (after[0] <= after[num - 1]) return { times: after, matrices };
   return { times: after.reverse(), matrices: matrices.map((_, k) => matrices[6 * (num - 1 - Math.floor(k / 6)) + (k % 6)]) };
 }

@@ -192,7 +192,6 @@ export class Renderer {
     this.takeMaps(model, time);
     gl.uniform1i(at.gaussians, 0);
     gl.uniform1i(at.maps, 2);
-    gl.uniform1i(at.hasPaths, model.paths ? 1 : 0);
     gl.uniform1i(at.texels, model.texels);
     gl.uniform1i(at.degree, model.degree);
     gl.uniform1f(at.time, time);

@@ -10,6 +10,7 @@ const ABSENT = {
   time_loc_logit: [STATIC_BIT, 0], log_time_scale: [STATIC_BIT, STATIC], opacity_logit: [OPAQUE_BIT, 8],
 };
 const MOST_PATHS = 255;
+const EARLY = 1e-6; // of the clip: rounding of times
 const DAMAGED = "The file is damaged or cut short. Copy it again.";
 
 /** {header, leaves} of a video model. Throws an Error for display. */
@@ -99,12 +100,10 @@ function rows(table, index, width) {
 
 /** A model as a file that foldgauss opens: float32, all leaves dense. Throws an Error for display where none can hold it. */
 export function writeSafetensors(model, metadata) {
-  const { header, num, degree, leaves, intervals } = model, { paths, index } = withoutUnused(model);
-  const outside = leaves.time_loc.filter((own) => !(own > 0 && own < 1));
-  if (outside.length) {
-    const frames = intervals.length * outside.reduce((most, own) => Math.max(most, own - 1, -own), 0);
-    throw new Error(`${outside.length.toLocaleString("en")} Gaussians were moved in time beyond the clip, by up to ${frames.toFixed(1)} frames, where no model file holds them. Make Later, Speed or Delay that much less; or download the edit script, and render it: foldgauss edit MODEL SCRIPT --out edited.mp4.`);
-  }
+  const { header, num, degree, leaves, intervals, windows } = model, { paths, index } = withoutUnused(model);
+  const { held, time_loc: times } = leaves, isStill = (own, i) => (windows[2 * i] < held[2 * i] && held[2 * i] > EARLY) || (windows[2 * i + 1] > held[2 * i + 1] && held[2 * i + 1] < 1 - EARLY);
+  const beyond = times.filter((own, i) => !(own > 0 && own < 1) || isStill(own, i));
+  if (beyond.length) throw new Error(`${beyond.length.toLocaleString("en")} Gaussians were moved in time, beyond the clip or to where they begin or end within it, which no model file holds. Download the edit script, and render it: foldgauss edit MODEL SCRIPT --out edited.mp4.`);
   if (paths?.count > MOST_PATHS) throw new Error(`The edits give Gaussians ${paths.count} shared paths; a model file holds ${MOST_PATHS}. Make fewer copies; or download the edit script, and render it: foldgauss edit MODEL SCRIPT --out edited.mp4.`);
   const logits = Float32Array.from(leaves.time_loc, (own) => Math.log(own) - Math.log1p(-own));
   const tensors = {

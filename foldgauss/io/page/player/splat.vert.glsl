@@ -7,7 +7,6 @@ precision highp sampler2D;
 uniform sampler2D gaussians; // `texels` of each, see gaussians.js
 uniform sampler2D maps; // of each shared path at this time: two texels, the rows (L | b)
 uniform int texels, degree;
-uniform bool hasPaths; // then the last texel of a Gaussian has the number of its shared path, from 1
 uniform float time, envelopePower, envelopeFloor;
 uniform float unit; // pixels of the target per unit of model space
 uniform vec2 origin, target; // the frame's center and the target's size, pixels
@@ -49,10 +48,11 @@ void main() {
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0); // outside: not rendered
   if (!(paint.a >= cutoff)) return;
 
-  float u = place.z - time, tau = u / place.w;
+  vec4 last = texel(index, texels - 1); // number of its shared path, from 1, and the times at which it moves
+  float u = place.z - clamp(time, last.y, last.z), tau = u / place.w;
   float shrink = sqrt(envelopeFloor + (1.0 - envelopeFloor) * exp(-0.5 * envelopePower * tau * tau));
   vec2 mean = place.xy + path(index, u), deviations = shape.xy * shrink, first = shape.zw;
-  int moving = hasPaths ? int(texel(index, texels - 1).x) : 0;
+  int moving = int(last.x);
   if (moving > 0) {
     vec3 top = row(moving, 0), bottom = row(moving, 1);
     mat2 linear = mat2(top.x, bottom.x, top.y, bottom.y);
