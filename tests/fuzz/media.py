@@ -277,7 +277,7 @@ def _read_clip(path: Path) -> None:
         _refused(path)
     if number == 1:
         with contextlib.suppress(VideoError):  # which an interlaced clip raises
-            read_video(path, deinterlace=False)
+            read_video(path, deinterlace="refuse")
     clip = read_video(path, **_WANTED[number])
     assert clip.num_frames >= 1
 

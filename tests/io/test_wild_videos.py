@@ -610,8 +610,8 @@ def test_interlaced_is_refused_or_converted(tmp_path, codec):
     frames = _waves(8, 64, 96)
     quality = ("-q:v", "1") if codec == "mpeg2video" else ("-crf", "5")
     _ffmpeg("-c:v", codec, *quality, "-flags", "+ilme+ildct", tmp_path / "a.mkv", frames=frames, rate=25)
-    with pytest.raises(VideoError, match=r"interlaced fields.*deinterlace=True"):
-        read_video(tmp_path / "a.mkv", deinterlace=False)
+    with pytest.raises(VideoError, match=r"interlaced fields.*deinterlace='frames'"):
+        read_video(tmp_path / "a.mkv", deinterlace="refuse")
     for chosen in (None, (2, 3)):
         clip = read_video(tmp_path / "a.mkv", frames=chosen)
         assert clip.notes == ("interlaced frames are converted to progressive ones.",)
@@ -644,7 +644,7 @@ def test_fields_of_different_times_are_separated(tmp_path):
 
 def test_deinterlacing_leaves_progressive_frames_alone(tmp_path):
     path = _exact_avi(tmp_path / "a.avi", _noise())
-    for deinterlace in (False, True):
+    for deinterlace in ("refuse", "frames"):
         clip = read_video(path, deinterlace=deinterlace)
         np.testing.assert_array_equal(clip.frames, _noise())
         assert clip.notes == ()
