@@ -172,6 +172,7 @@ def test_a_variable_frame_rate_is_kept(tmp_path, capsys):
         ("even", model, "--fps", 30),
         ("half", model, "--speed", 0.5, "--fps", 15),
         ("back", model, "--speed", -1, "--fps", 30),
+        ("slower", model, "--speed", 0.5),
         ("held", model, "--remap", f"0={14 / 30},1={14 / 30}"),
     ):
         assert run("render", own, "--out", tmp_path / f"{name}.mp4", *options) == 0
@@ -180,8 +181,9 @@ def test_a_variable_frame_rate_is_kept(tmp_path, capsys):
     for name, expected in (("as-fitted", times), ("compact", times), ("twice", between), ("slow", slower * between)):
         np.testing.assert_allclose(read[name].times, expected, atol=1e-4)
         assert read[name].duration == pytest.approx(slower * end if name == "slow" else end, abs=1e-4)
-    for name, frames in (("even", 41), ("half", 41), ("back", 32), ("held", 5)):
+    for name, frames in (("even", 41), ("half", 41), ("back", 32), ("slower", 28), ("held", 11)):
         assert (read[name].times, read[name].num_frames) == (None, frames)
+    assert read["slower"].fps == read["held"].fps == pytest.approx(10)  # the rate of the shortest interval, 0.1 s
     fitted = read["as-fitted"].frames.astype(int)
     for shown, frame in ((0, 0), (3, 1), (6, 2), (14, 3), (17, 4), (31, 5), (40, 5)):  # the last one is held
         assert np.abs(read["even"].frames[shown].astype(int) - fitted[frame]).mean() < 2

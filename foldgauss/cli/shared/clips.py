@@ -79,16 +79,8 @@ def _read_lazily(
     with err.status(f"Indexing {video.name}"):
         index = index_video(video, frames=frames, find_cuts=False, **reading)
     lazy = LazyFrames(index, size)
-    about = (
-        index.source,
-        index.num_declared,
-        index.times,
-        index.notes,
-        index.first_second,
-        index.duration,
-        index.reading,
-    )
-    return Clip(lazy, index.fps, *about)
+    about = index.source, index.num_declared, index.times, index.notes, index.first_second, index.duration
+    return Clip(lazy, index.fps, *about, index.reading)
 
 
 def is_other_clip(model_path: Path, clip: Clip, measure_psnr: Callable[[], float]) -> bool:

@@ -36,6 +36,7 @@ MAX_ERRORS = 1000  # packets in a row that cannot be read after which a video ha
 MAX_FRAMES = 1 << 30  # a container that declares as many does not know, or is damaged
 MAX_LOST_FRAMES = 1_000_000  # a time stamp that implies a larger gap counts as damaged
 MAX_THREADS = 16
+MAX_DELAY = MAX_THREADS + 16  # frames that the decoder holds when it meets damage: one for each thread, and reordering
 MAX_ASPECT = 10.0  # width by height of a pixel, or the inverse; a larger one counts as damaged
 EQUAL_ASPECT = 0.01  # by which pixels that count as square may differ: containers round
 #: Chroma is interpolated, and rounded to nearest: FFmpeg's default repeats it and rounds it down, which makes each
@@ -164,8 +165,8 @@ class VideoDecoder:
         self._converters = VideoReformatter(), VideoReformatter()
         self._angle: int | None = None  # of the display matrix
         self._last = -1  # position of the frame decoded last
-        self._before: int | None = None  # its time stamp
-        self._damaged = False  # since then
+        self._before: int | None = None  # the largest time stamp
+        self._num_suspect = 0  # frames before which others may have been lost to damage
 
     def close(self) -> None:
         """Close the file; `frames` that are being read end."""
@@ -251,13 +252,14 @@ class VideoDecoder:
         with suppress(av.FFmpegError):  # a damaged index: continue where the decoder is
             self._container.seek(stamp // self._per_stored, stream=self._stream)
         self._codec.flush_buffers()
-        self._last, self._before, self._damaged = -1, None, False
+        self._last, self._before, self._num_suspect = -1, None, 0
 
     def frames(self) -> Iterator[DecodedFrame]:
         """The frames that decode, in the order in which they are shown. Raises `VideoError` for interlaced ones that
         are not to be converted."""
         for frame in self._convert_interlaced(self._decode()):
             stamp = self._find_stamp(frame)
+            self._num_suspect = MAX_DELAY if frame.is_corrupt else self._num_suspect
             self._last = self._find_position(stamp)
             self.stored_size = self.stored_size if all(self.stored_size) else (frame.height, frame.width)
             matrix = self._find_matrix(frame)
@@ -281,20 +283,20 @@ class VideoDecoder:
             try:
                 found = self._codec.decode(packet)
             except av.FFmpegError:
-                self._damaged = True
+                self._num_suspect = MAX_DELAY
                 continue
             self._read_bytes = max(self._read_bytes, (packet.pos or 0) + packet.size)
             yield from map(self._stamp, found)
         self._at_end = True
         # A damaged frame may end the decoding of those buffered; each call passes one.
-        for _ in range(MAX_THREADS + 16):
+        for _ in range(MAX_DELAY):
             try:
                 yield from map(self._stamp, self._codec.decode(None))
                 return
             except av.EOFError:
                 return
             except av.FFmpegError:
-                self._damaged = True
+                self._num_suspect = MAX_DELAY
 
     def _read_packets(self) -> Iterator[av.Packet]:
         """The packets of the stream, of which those that cannot be read are left out."""
@@ -302,6 +304,8 @@ class VideoDecoder:
         while num_errors < MAX_ERRORS:
             try:
                 for packet in self._container.demux(self._stream):
+                    if packet.is_corrupt:
+                        self._num_suspect = MAX_DELAY
                     if packet.size:
                         if self._is_avi and packet.dts is not None:
                             self._num_repeated += max(packet.dts - before - 1, 0)
@@ -310,7 +314,7 @@ class VideoDecoder:
                         yield packet
                 return
             except av.FFmpegError:
-                self._damaged, num_errors = True, num_errors + 1
+                self._num_suspect, num_errors = MAX_DELAY, num_errors + 1
 
     def _convert_interlaced(self, frames: Iterator[av.VideoFrame]) -> Iterator[av.VideoFrame]:
         """Interlaced frames converted to progressive ones, each to one of the same time; others are passed on.
@@ -355,11 +359,13 @@ class VideoDecoder:
     def _find_position(self, stamp: int | None) -> int:
         """The position of the next frame; the number of frames lost before it to damage is estimated by time stamps."""
         lost, frame = 0, 1 / (self._rate or Fraction(DEFAULT_FPS)) / self.time_base
-        if self._damaged and stamp is not None:
+        if self._num_suspect and stamp is not None:
             start = (self._stream.start_time or 0) * self._per_stored
             before = self._before if self._before is not None else start - frame
             lost = round((stamp - before) / frame) - 1
-        self._damaged, self._before = False, stamp
+        self._num_suspect = max(self._num_suspect - 1, 0)
+        if stamp is not None and (self._before is None or stamp > self._before):  # damage may disorder frames
+            self._before = stamp
         return self._last + 1 + (lost if 0 < lost < MAX_LOST_FRAMES else 0)
 
     def _choose_codec(self, threads: int) -> av.VideoCodecContext:
