@@ -21,6 +21,7 @@ from foldgauss.io.media.clip import (
     check_reading,
     read_head,
     translate_os_errors,
+    video_error,
 )
 from foldgauss.io.media.format_detection import may_be_animation
 from foldgauss.io.media.frame_rate import DEFAULT_FPS, FrameRate, describe_rate
@@ -95,17 +96,20 @@ def read_frames(
 
     They are BGR or premultiplied BGRA, as stored. Raises `VideoError` and OSError.
     """
-    levels = Levels(reading.levels)
     may_move = not path.is_dir() and may_be_animation(read_head(path))
+    if not (may_move or path.is_dir() or is_image_file(path)):
+        return decode_file(path, start, stop, keep, reading)
+    if reading.deinterlace == "fields":
+        got, cure = f"images, {str(path)!r}", "Leave deinterlace='fields' out."
+        raise video_error("deinterlace", expected="a video of interlaced frames", got=got, cure=cure)
+    levels = Levels(reading.levels)
     if may_move and (found := read_animation(path, start, stop, keep)) is not None:
         levels.describe(path)
         return found, None
     if path.is_dir():
         paths = choose_images(path, start, stop)
-    elif may_move or is_image_file(path):
+    else:
         check_range_within(start, stop, 1, path)
         paths = [path]
-    else:
-        return decode_file(path, start, stop, keep, reading)
     kept, rate = keep(read_images(paths, levels)), FrameRate(DEFAULT_FPS)
     return (kept, len(paths), rate, describe_missing(paths) + levels.describe(path)), None
