@@ -25,6 +25,7 @@ from foldgauss.cli.shared.timeline import Timeline
 from foldgauss.cli.viewing import info as drawing
 from foldgauss.io import load_video_model, read_video, save_video_model, write_image, write_video
 from foldgauss.io.models.model_file import read_header
+from foldgauss.io.models.video_model import CLIP_NOTES, read_metadata
 from foldgauss.jobs import runner
 from foldgauss.video import interpolate_frames
 
@@ -172,6 +173,7 @@ def test_a_variable_frame_rate_is_kept(tmp_path, capsys):
         ("even", model, "--fps", 30),
         ("half", model, "--speed", 0.5, "--fps", 15),
         ("back", model, "--speed", -1, "--fps", 30),
+        ("slower", model, "--speed", 0.5),
         ("held", model, "--remap", f"0={14 / 30},1={14 / 30}"),
     ):
         assert run("render", own, "--out", tmp_path / f"{name}.mp4", *options) == 0
@@ -180,14 +182,44 @@ def test_a_variable_frame_rate_is_kept(tmp_path, capsys):
     for name, expected in (("as-fitted", times), ("compact", times), ("twice", between), ("slow", slower * between)):
         np.testing.assert_allclose(read[name].times, expected, atol=1e-4)
         assert read[name].duration == pytest.approx(slower * end if name == "slow" else end, abs=1e-4)
-    for name, frames in (("even", 41), ("half", 41), ("back", 32), ("held", 5)):
+    for name, frames in (("even", 41), ("half", 41), ("back", 32), ("slower", 28), ("held", 11)):
         assert (read[name].times, read[name].num_frames) == (None, frames)
+    assert read["slower"].fps == read["held"].fps == pytest.approx(10)  # the rate of the shortest interval, 0.1 s
     fitted = read["as-fitted"].frames.astype(int)
     for shown, frame in ((0, 0), (3, 1), (6, 2), (14, 3), (17, 4), (31, 5), (40, 5)):  # the last one is held
         assert np.abs(read["even"].frames[shown].astype(int) - fitted[frame]).mean() < 2
         assert np.abs(read["half"].frames[shown].astype(int) - fitted[frame]).mean() < 2
         assert np.abs(read["back"].frames[31 - min(shown, 31)].astype(int) - fitted[frame]).mean() < 2
     assert np.abs(read["held"].frames.astype(int) - fitted[3]).mean() < 2
+
+
+def test_how_a_clip_was_read_is_kept(tmp_path, capsys):
+    """Images with the values of 12 bits are dark; with their level of white, every command reads them so."""
+    clip, model = tmp_path / "clips" / "clip", tmp_path / "m.safetensors"
+    few = ("--gaussians", 400, "--steps", 5)
+    clip.mkdir(parents=True)
+    for k, frame in enumerate(blobs()):
+        cv2.imwrite(str(clip / f"{k}.png"), frame[..., ::-1].astype(np.uint16) * 16)
+    assert run("fit", clip, "--out", model, *few) == 0
+    assert "the largest value is 4,080 of 65,535, as in data of 12 bits, which look dark" in capsys.readouterr().err
+    assert run("evaluate", model, clip) == 0
+    assert "the largest value is 4,080" in capsys.readouterr().err
+    for options in ((), ("--segment-seconds", 0.1)):
+        assert run("fit", clip, "--out", model, "--overwrite", "--levels", 4080, *options, *few) == 0
+        assert read_metadata(model)["reading"] == {"levels": 4080}
+        assert load_video_model(model).render(0.5).max() > 0.8
+        capsys.readouterr()
+        assert run("evaluate", model, clip) == 0
+        assert "warning" not in capsys.readouterr().err
+    assert {"reading"} <= set(CLIP_NOTES)  # which edit and compress keep
+    assert run("fit-many", tmp_path / "clips", "--out", tmp_path / "models", "--levels", 4080, *few) == 0
+    assert read_metadata(tmp_path / "models" / "clip.safetensors")["reading"] == {"levels": 4080}
+    for option, value in (("--levels", 0), ("--levels", 65536), ("--deinterlace", "yes")):
+        capsys.readouterr()
+        assert run("fit", clip, "--out", tmp_path / "a.safetensors", option, value) == 2
+        assert f"{option}: expected" in capsys.readouterr().err
+    assert run("fit", clip, "--out", tmp_path / "a.safetensors", "--deinterlace", "fields", *few) == 1
+    assert "deinterlace: expected a video of interlaced frames, got images" in capsys.readouterr().err
 
 
 def test_sound_of_a_range_begins_with_it(tmp_path):

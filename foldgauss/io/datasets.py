@@ -12,7 +12,7 @@ import numpy as np
 from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_integer
 from foldgauss.io._atomic import PathLike
-from foldgauss.io.media.clip import Clip, Range, Size, format_size
+from foldgauss.io.media.clip import Clip, Levels, Range, Size, format_size
 from foldgauss.io.media.image_files import image_paths, read_image
 from foldgauss.io.media.masks import read_labels
 from foldgauss.io.media.resizing import center_window
@@ -130,6 +130,7 @@ def frames(
     size: Size | None = None,
     fps: float = 25.0,
     center_crop: Size | None = None,
+    levels: int | None = None,
 ) -> Clip:
     """The images of a folder as a clip, in natural order (img2 before img10); the options are `read_video`'s.
 
@@ -138,7 +139,7 @@ def frames(
     if os.path.isfile(folder):
         cure = "Read a video file with foldgauss.io.read_video."
         raise invalid("folder", expected="a folder of images", got=f"the file {str(folder)!r}", cure=cure)
-    return read_video(folder, frames=frames, size=size, fps=fps, center_crop=center_crop)
+    return read_video(folder, frames=frames, size=size, fps=fps, center_crop=center_crop, levels=levels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +190,7 @@ def davis(
     found = [path for path in paths if path.is_file()]
     if len(found) < len(paths):
         return MaskedClip(clip, None, f"{len(found)} of {len(paths)} frames have a mask in {str(place)!r}")
-    masks, whole = read_labels(paths), read_image(shown[0]).shape[:2]
+    masks, whole = read_labels(paths), read_image(shown[0], Levels()).shape[:2]
     if masks.shape[1:] != whole:
         got = f"{format_size(masks.shape[1:])} in {str(place)!r}"
         cure = "Frames and masks are of different resolutions: unpack the data set again."

@@ -21,11 +21,12 @@ def describe_source(clip: Clip, seed: int) -> dict[str, Any]:
     return {"clip": Path(clip.source).name, "seed": seed, "frames_digest": fingerprint(clip)["frames_digest"]}
 
 
-def describe_times(clip: Clip | FrameIndex) -> dict[str, Any]:
+def describe_reading(clip: Clip | FrameIndex) -> dict[str, Any]:
     """The metadata about when frames are shown: `frame_seconds`, with the end, where they are not evenly spaced, and
-    `first_second`, as of `Clip`."""
+    `first_second`, as of `Clip`; and the options other than default by which they were read, `reading`."""
     about: dict[str, Any] = {} if clip.times is None else {"frame_seconds": [*clip.times.tolist(), clip.duration]}
-    return about | ({"first_second": clip.first_second} if clip.first_second else {})
+    about |= {"first_second": clip.first_second} if clip.first_second else {}
+    return about | ({"reading": clip.reading.changed} if clip.reading.changed else {})
 
 
 def has_other_frames(about: Mapping[str, Any], clip: Clip) -> bool:

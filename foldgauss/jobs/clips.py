@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from foldgauss._runtime.checks import invalid
+from foldgauss.io.media.clip import AS_STORED, Reading
 from foldgauss.io.media.image_files import IMAGE_SUFFIXES, image_paths, natural_sort_key
 from foldgauss.io.media.video_writing import ANIMATION_SUFFIXES
 from foldgauss.io.models.video_model import MODEL_SUFFIX
@@ -61,6 +62,7 @@ def make_jobs(
     size: tuple[int, int] | None = None,
     frames: tuple[int | None, int | None] | None = None,
     checkpoint_seconds: float | None = None,
+    reading: Reading = AS_STORED,
 ) -> list[FitJob]:
     """A job for each clip; models go to the folder `out` under the clips' names, with suffix where stems are equal.
 
@@ -77,6 +79,7 @@ def make_jobs(
             size,
             frames,
             checkpoint_seconds=checkpoint_seconds,
+            reading=reading,
             folder=str(out / RECORDS),
             source=_stamp(clip),
         )

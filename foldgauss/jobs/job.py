@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from foldgauss.io.media.clip import AS_STORED, Reading
 from foldgauss.video.fitting.config import FitConfig, rename_settings
 
 #: Fields of a record besides the request and the scores of each frame.
@@ -23,9 +24,9 @@ class FitJob:
 
     `clip` and `target` are paths that every worker can open; `size` is the (height, width) of the frames, or None;
     `frames` the range (first, stop) of the clip, or None. With `index`, the file of a `FrameIndex`, frames are found by
-    seeking, and counted as `index.span` does. `fps` replaces the clip's frame rate. `source` identifies the clip:
-    results of another source are not reused. `metadata` is added to that of the model file. Checkpoint and record are
-    in `folder`, by default beside the model.
+    seeking, and counted as `index.span` does. `reading`: options of `read_video`, without an index. `fps` replaces the
+    clip's frame rate. `source` identifies the clip: results of another source are not reused. `metadata` is added to
+    that of the model file. Checkpoint and record are in `folder`, by default beside the model.
     """
 
     name: str
@@ -35,6 +36,7 @@ class FitJob:
     size: tuple[int, int] | None = None
     frames: tuple[int | None, int | None] | None = None
     index: str | None = None
+    reading: Reading = AS_STORED
     fps: float | None = None
     checkpoint_seconds: float | None = None
     folder: str | None = None
@@ -45,6 +47,7 @@ class FitJob:
     def request(self) -> dict[str, Any]:
         """What the results depend on, as JSON represents it: results of an equal request are reused."""
         asked = {"config": dataclasses.asdict(self.config), "size": self.size, "frames": self.frames}
+        asked |= {"reading": self.reading.changed}
         return json.loads(json.dumps(asked | {"source": self.source}))
 
     @property

@@ -24,7 +24,7 @@ from foldgauss.io.media.indexed_reader import read_indexed
 from foldgauss.io.media.video_reading import read_video
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.io.models.video_model import save_video_model
-from foldgauss.io.provenance import describe_source, describe_times, fingerprint
+from foldgauss.io.provenance import describe_reading, describe_source, fingerprint
 from foldgauss.jobs.job import FitJob, file_digest, read_record
 from foldgauss.jobs.warning_capture import WarningCapture
 from foldgauss.video.fitting.config import FitConfig
@@ -175,15 +175,15 @@ def _replacing(checkpoint: Checkpoint, steps: Iterable[tuple[FitState, FitInfo]]
 def read_clip(job: FitJob) -> Clip:
     """The frames of a job."""
     if job.index is None:
-        return read_video(job.clip, frames=job.frames, size=job.size)
+        return read_video(job.clip, frames=job.frames, size=job.size, **job.reading._asdict())
     index = FrameIndex.load(job.index)
     clip = read_indexed(index, *index.span(*job.frames), size=job.size)
     return clip if job.fps is None else dataclasses.replace(clip, fps=job.fps)
 
 
 def fit_metadata(clip: Clip, seed: int, frames: tuple[int | None, int | None] | None) -> dict[str, Any]:
-    """Metadata of a fitted model: its clip, the range of frames, the seed, and times of frames as `describe_times`."""
-    return describe_source(clip, seed) | {"frames": frames} | describe_times(clip)
+    """Metadata of a fitted model: its clip, the range of frames, the seed, and what `describe_reading` returns."""
+    return describe_source(clip, seed) | {"frames": frames} | describe_reading(clip)
 
 
 def mean_scores(scores: Evaluation) -> dict[str, float]:

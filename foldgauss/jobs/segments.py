@@ -16,11 +16,12 @@ from jaxtyping import Float
 
 from foldgauss._runtime.checks import invalid, is_integer, is_within
 from foldgauss.io._atomic import OutputError, atomic_path
+from foldgauss.io.media.clip import AS_STORED, Reading
 from foldgauss.io.media.frame_index import FrameIndex, index_video
 from foldgauss.io.media.indexed_reader import read_indexed
 from foldgauss.io.models.segmented import join_segments
 from foldgauss.io.models.video_model import load_video_model
-from foldgauss.io.provenance import describe_times
+from foldgauss.io.provenance import describe_reading
 from foldgauss.jobs.job import FitJob, file_digest
 from foldgauss.video.fitting.config import FitConfig, rename_settings
 from foldgauss.video.models.metrics import psnr, ssim
@@ -169,14 +170,16 @@ def plan_long_fit(
     segment_seconds: float = SEGMENT_SECONDS,
     overlap: int = OVERLAP,
     checkpoint_seconds: float | None = None,
+    reading: Reading = AS_STORED,
     on_frame: Callable[[], None] = lambda: None,
     restart: bool = False,
 ) -> LongFit:
     """Index a clip and plan its segments, or continue the plan that exists, unless `restart`.
 
     Segments end at scene cuts near their length, `segment_seconds`; otherwise they share `overlap` frames with the
-    next. `config` is that of each segment; its `max_size_mb` is divided among them by their frames. `clip`, `size` and
-    `frames` as in `read_video`. Memory grows with the clip by some tens of bytes per frame only.
+    next. `config` is that of each segment; its `max_size_mb` is divided among them by their frames. `clip`, `size`,
+    `frames` and the options of `reading` as in `read_video`. Memory grows with the clip by some tens of bytes per frame
+    only.
 
     Raises ValueError for settings out of range, for a folder with the plan of other settings or another clip, and with
     `restart` for one with other files; `VideoError`, FileNotFoundError, `OutputError`.
@@ -190,14 +193,14 @@ def plan_long_fit(
         raise invalid("overlap", expected="a whole number of frames >= 1", got=repr(overlap))
     clip, target = Path(clip).absolute(), Path(target).absolute()
     folder = segments_folder(target)
-    request = {"config": dataclasses.asdict(config), "size": size, "frames": frames}
+    request = {"config": dataclasses.asdict(config), "size": size, "frames": frames, "reading": reading.changed}
     request = json.loads(json.dumps(request | {"segment_seconds": float(segment_seconds), "overlap": overlap}))
     if restart:
         _check_folder(folder)
     plan = None if restart else _load_plan(folder, request)
     index = _load_index(folder, plan, clip)
     if index is None:
-        index = index_video(clip, frames=frames, on_frame=on_frame)
+        index = index_video(clip, frames=frames, on_frame=on_frame, **reading._asdict())
         if plan is not None and plan["digest"] != index.digest:
             cure = "Use that clip, or start over with --overwrite."
             expected = f"the clip that the fit was started with, {plan['clip']!r}"
@@ -215,7 +218,7 @@ def plan_long_fit(
     with atomic_path(folder / _PLAN) as temporary:
         temporary.write_text(json.dumps(kept) + "\n")
     metadata = {"clip": clip.name, "seed": config.seed, "frames": frames, "clip_digest": index.digest}
-    metadata |= describe_times(index)
+    metadata |= describe_reading(index)
     jobs = _make_jobs(
         clip, folder, config, index, spans, size, checkpoint_seconds, 0 if frames is None else frames[0] or 0
     )

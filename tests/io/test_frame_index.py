@@ -575,7 +575,7 @@ def test_what_is_refused_is_refused_alike(tmp_path, long):
 def test_interlaced_clips_are_refused_or_converted(tmp_path):
     path = _encoded(tmp_path / "a.mkv", _moving(60), *X264, "-g", "20", "-flags", "+ilme+ildct")
     with pytest.raises(VideoError, match="interlaced"):
-        index_video(path, deinterlace=False)
+        index_video(path, deinterlace="refuse")
     index = index_video(path)
     for first, stop in ((0, 5), (37, 41)):
         whole = read_video(path, frames=(first, stop))

@@ -48,6 +48,26 @@ def test_gray_levels_stored_otherwise(tmp_path, mode):
     np.testing.assert_array_equal(read_masks(tmp_path / "mask.png"), labels(3) == 1)
 
 
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+@pytest.mark.parametrize("white", [2, 256, 4080, 65535])
+def test_masks_of_16_bits(tmp_path, white, suffix):
+    """Labels as those of 8 bits; one larger value besides 0 is white."""
+    for k, truth in enumerate((labels(3) == 1, np.zeros(SIZE, bool))):
+        Image.fromarray(np.where(truth, np.uint16(white), np.uint16(0))).save(tmp_path / f"{k}{suffix}")
+    np.testing.assert_array_equal(read_masks(tmp_path), [labels(3) == 1, np.zeros(SIZE, bool)])
+    np.testing.assert_array_equal(read_masks(tmp_path, label=min(white, 3) if white < 256 else 1)[0], labels(3) == 1)
+    Image.fromarray(labels(3).astype(np.uint16) * 300).save(tmp_path / f"2{suffix}")
+    with pytest.raises(ValueError, match="expected masks with labels up to 255, got labels up to 10,964"):
+        read_masks(tmp_path)
+
+
+def test_notes_of_a_mask_video_are_warnings(tmp_path):
+    path = write_video(tmp_path / "mask.webm", [np.full((*SIZE, 3), 20 * k, np.uint8) for k in range(10)], 25)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.warns(UserWarning, match="mask.webm: only 7 of 10 frames decode"):
+        assert len(read_masks(path)) == 7
+
+
 def test_a_video_is_cut_at_a_level(tmp_path):
     frames = [np.repeat(np.where(labels(k) == 1, 200, 30).astype(np.uint8)[..., None], 3, -1) for k in range(4)]
     path = write_video(tmp_path / "mask.mp4", frames, 25)

@@ -15,7 +15,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from foldgauss.io import Clip, Sound, VideoError, read_video, write_frames, write_image, write_video
+from foldgauss.io import (
+    Clip,
+    Sound,
+    VideoError,
+    index_video,
+    read_indexed,
+    read_video,
+    write_frames,
+    write_image,
+    write_video,
+)
 from foldgauss.io._atomic import OutputError
 from foldgauss.io.datasets import sample_clip
 from foldgauss.io.media import resizing
@@ -309,6 +319,46 @@ def test_folder_is_sorted_naturally(folder):
     assert clip.frames[:, 0, 0, 0].tolist() == [10, 20, 90, 100, 110]
     assert (clip.fps, clip.num_declared, clip.frames.flags.c_contiguous) == (25.0, 5, True)
     assert read_video(folder, frames=(1, 3)).frames[:, 0, 0, 0].tolist() == [20, 90]
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
+@pytest.mark.parametrize("kind", ["gray.png", "color.png", "alpha.png", "gray.tif", "folder"])
+def test_values_of_fewer_bits_in_images_of_16(tmp_path, kind, bits):
+    """As of cameras and microscopes: read as they are, with a note, or with the level of white."""
+    white, truth = (1 << bits) - 1, np.linspace(0, 255, 256).astype(np.uint8).reshape(16, 16)
+    image = np.rint(truth.astype(float) * white / 255).astype(np.uint16)
+    if kind not in ("gray.png", "gray.tif"):
+        image = np.stack([image] * 3 + [np.full_like(image, 65535)] * (kind == "alpha.png"), -1)
+    path = tmp_path / ("a.tif" if kind == "gray.tif" else "a.png")
+    assert cv2.imwrite(str(path), image)
+    if kind == "folder":
+        assert cv2.imwrite(str(tmp_path / "b.png"), 0 * image)  # without a note of its own
+        path = tmp_path
+    clip, index = read_video(path, levels=white), index_video(path, levels=white)
+    np.testing.assert_array_equal(clip.frames[0, ..., 1], truth)
+    np.testing.assert_array_equal(read_indexed(index, 0, 1).frames, clip.frames[:1])
+    assert (clip.notes, clip.reading.levels, index.reading.levels) == ((), white, white)
+    told = f"the largest value is {white:,} of 65,535, as in data of {bits} bits, which look dark; "
+    told += f"levels={white} (--levels {white}) makes {white} white."
+    notes = read_video(path).notes
+    assert notes == index_video(path).notes == (() if bits == 16 else (told,))
+    if bits > 8:
+        assert read_video(path, levels=white // 2).notes[0].startswith(f"values of up to {white:,} are above levels=")
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.tif", "a.gif", "a.mkv"])
+def test_levels_of_clips_of_8_bits_are_refused(tmp_path, name):
+    if name in ("a.gif", "a.mkv"):
+        write_video(tmp_path / name, _moving(2), 10)
+    else:
+        assert cv2.imwrite(str(tmp_path / name), _moving(1)[0])
+    for reader in (read_video, index_video):
+        with pytest.raises(VideoError, match="levels: expected images or videos of 16 bits") as caught:
+            reader(tmp_path / name, levels=4095)
+        _one_line(caught, name)
+    for levels in (0, 65536, 1.5, True):
+        with pytest.raises(VideoError, match="levels: expected the value of white"):
+            read_video(tmp_path / name, levels=levels)
 
 
 def test_gray_and_16_bit_images(tmp_path):

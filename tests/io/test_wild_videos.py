@@ -23,7 +23,7 @@ from commands import run
 from PIL import Image
 from PIL.GifImagePlugin import GifImageFile
 
-from foldgauss.io import VideoError, load_video_model, read_video, write_video
+from foldgauss.io import VideoError, index_video, load_video_model, read_indexed, read_masks, read_video, write_video
 from foldgauss.io.media import clip as clip_module
 from foldgauss.io.media import decoder
 
@@ -298,6 +298,48 @@ def test_frames_of_another_size_are_stretched(tmp_path):
     assert clip.num_frames in (11, 12)  # the last frame before may be lost in the decoder
     expected = [cv2.resize(frame, (64, 48), interpolation=cv2.INTER_AREA) for frame in _waves(6, 96, 128)]
     assert np.abs(clip.frames[-6:].astype(int) - expected).mean() < 4
+    assert clip.notes[-1].startswith("6 frames, the first of them ")
+    assert clip.notes[-1].endswith("are of another size than the video's 48x64, and stretched to it.")
+    assert not any("another size" in note for note in read_video(tmp_path / "c.ts", frames=(0, 4)).notes)
+    index = index_video(tmp_path / "c.ts")
+    assert index.notes == clip.notes
+    assert read_indexed(index, 0, 4).notes == read_video(tmp_path / "c.ts", frames=(0, 4)).notes
+
+
+DAMAGED = {"a.ts": "mpeg2video", "b.ts": "libx264", "a.mp4": "libx264", "a.mkv": "libx264", "a.avi": "mpeg4"}
+DAMAGED |= {"a.flv": "libx264", "a.mpg": "mpeg2video", "a.m2v": "mpeg2video", "b.flv": "flv"}
+
+
+def _damaged(path, codec, first, last):
+    """A clip whose bytes from one fraction to another are random, as if a copy had failed."""
+    frames = np.clip(_waves(50, 64, 96) + _noise(50, 64, 96) // 8.0, 0, 255).astype(np.uint8)
+    _ffmpeg("-c:v", codec, "-pix_fmt", "yuv420p", "-g", "10", path, frames=frames, rate=25)
+    data = path.read_bytes()
+    low, high = int(first * len(data)), int(last * len(data))
+    path.write_bytes(data[:low] + np.random.default_rng(0).bytes(high - low) + data[high:])
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_damage_in_the_middle_is_noted(tmp_path, name):
+    _damaged(tmp_path / name, DAMAGED[name], 0.4, 0.42)
+    clip = read_video(tmp_path / name)
+    signs = ("damaged, and may show artifacts", "cannot be decoded", "frames are shown for 0.04 to")
+    told = [note for note in clip.notes if any(sign in note for sign in signs)]
+    assert told
+    assert not any(note in read_video(tmp_path / name, frames=(0, 3)).notes for note in told)
+    index = index_video(tmp_path / name)
+    assert (index.num_frames, index.notes) == (clip.num_frames, clip.notes)
+
+
+@pytest.mark.parametrize("name", [name for name in DAMAGED if not name.endswith("mp4")])  # which ends with its index
+def test_a_file_that_ends_in_random_bytes_is_noted(tmp_path, name):
+    _damaged(tmp_path / name, DAMAGED[name], 0.7, 1.0)
+    clip = read_video(tmp_path / name)
+    assert clip.num_frames < 45
+    ends = ("% of the file hold no frame that decodes.", "frames decode; those are used.", "may show artifacts.")
+    assert any(note.endswith(ends) for note in clip.notes)
+    early = read_video(tmp_path / name, frames=(0, 10)).notes
+    assert [note for note in early if "no usable frame rate" not in note] == []
 
 
 def test_a_declared_size_that_cannot_be_converted_to_is_an_error():
@@ -307,11 +349,69 @@ def test_a_declared_size_that_cannot_be_converted_to_is_an_error():
         frame.to_array()
 
 
-def test_pixels_that_are_not_square_are_told(tmp_path):
-    _ffmpeg("-vf", "setsar=16/15", "-c:v", "ffv1", tmp_path / "a.mkv", frames=_waves())
-    clip = read_video(tmp_path / "a.mkv")
-    assert clip.size == (48, 64)
-    assert "1.07 times as wide" in clip.notes[0]
+@pytest.mark.parametrize(
+    ("name", "codec"), [("a.mkv", "ffv1"), ("a.mp4", "libx264"), ("a.ts", "mpeg2video"), ("a.h264", "libx264")]
+)
+@pytest.mark.parametrize(
+    ("aspect", "size"), [("2/1", (48, 128)), ("16/15", (48, 68)), ("1/2", (96, 64)), ("30/1", (48, 64))]
+)
+@pytest.mark.filterwarnings("ignore::UserWarning")  # of the masks
+def test_pixels_become_square(tmp_path, name, codec, aspect, size):
+    """MPEG-2 stores only a few aspects of the image, which is 4:3 or 16:9 then."""
+    quality = {"ffv1": (), "libx264": ("-crf", "5", "-pix_fmt", "yuv420p"), "mpeg2video": ("-q:v", "1")}[codec]
+    rate, stored = (25, "4/3") if codec == "mpeg2video" else (10, aspect)
+    if codec == "mpeg2video":
+        size = (48, 85)  # 64 columns of 4/3 each, 16:9
+    _ffmpeg("-vf", f"setsar={stored}", "-c:v", codec, *quality, tmp_path / name, frames=_waves(), rate=rate)
+    clip = read_video(tmp_path / name)
+    assert clip.size == size
+    told = "kept as stored" if size == (48, 64) else f"stretched to {size[0]}x{size[1]}"
+    assert "times as wide as high" in clip.notes[0]
+    assert told in clip.notes[0]
+    expected = [cv2.resize(frame, size[::-1], interpolation=cv2.INTER_LINEAR) for frame in _waves()]
+    assert np.abs(clip.frames - np.array(expected, int)).mean() < 3
+    assert read_masks(tmp_path / name).shape == clip.frames.shape[:3]
+    index = index_video(tmp_path / name)
+    assert index.size == size
+    np.testing.assert_array_equal(read_indexed(index, 2, 4).frames, clip.frames[2:4])
+
+
+def _coded(codec, name, frames, pixel_format, **options):
+    """A file of `frames`, of one plane or more, without conversion."""
+    with av.open(str(name), "w") as out:
+        stream = out.add_stream(codec, rate=10, **options)
+        stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], pixel_format
+        for frame in frames:
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format=pixel_format)))
+        out.mux(stream.encode())
+    return name
+
+
+@pytest.mark.parametrize("pixel_format", ["gray16le", "rgb48le"])
+@pytest.mark.parametrize("bits", [10, 12, 16])
+def test_levels_of_a_video_of_16_bits(tmp_path, bits, pixel_format):
+    white, truth = (1 << bits) - 1, _waves()
+    truth[:, 0, 0] = 255
+    values = np.rint(truth * (white / 255)).astype(np.uint16)
+    path = _coded("ffv1", tmp_path / "a.mkv", values if pixel_format == "rgb48le" else values[..., 0], pixel_format)
+    whole, index = read_video(path, levels=white), index_video(path, levels=white)
+    np.testing.assert_array_equal(whole.frames, truth)
+    np.testing.assert_array_equal(read_indexed(index, 3, 6).frames, truth[3:6])
+    assert (whole.notes, index.notes, index.reading) == ((), (), ("frames", white))
+    notes = read_video(path).notes
+    assert notes == () if bits == 16 else f"levels={white} (--levels {white})" in notes[0]
+
+
+@pytest.mark.parametrize("pixel_format", ["gray10le", "gray12le", "gbrp12le"])
+def test_a_format_of_fewer_bits_needs_no_levels(tmp_path, pixel_format):
+    bits = int(pixel_format[4:6])
+    values = np.tile(np.arange(64, dtype=np.uint16) * (((1 << bits) - 1) // 63), (2, 48, 1))
+    values = values if pixel_format.startswith("gray") else np.stack([values] * 3, -1)
+    clip = read_video(_coded("ffv1", tmp_path / "a.mkv", values, pixel_format))
+    assert clip.notes == ()
+    assert np.abs(clip.frames[0, 0, :, 0] - np.linspace(0, 255, 64)).max() < 4
+    with pytest.raises(VideoError, match="levels: expected images or videos of 16 bits"):
+        read_video(tmp_path / "a.mkv", levels=4095)
 
 
 @pytest.mark.parametrize(("transfer", "name"), [(16, "PQ"), (18, "HLG"), (1, None)])
@@ -610,8 +710,8 @@ def test_interlaced_is_refused_or_converted(tmp_path, codec):
     frames = _waves(8, 64, 96)
     quality = ("-q:v", "1") if codec == "mpeg2video" else ("-crf", "5")
     _ffmpeg("-c:v", codec, *quality, "-flags", "+ilme+ildct", tmp_path / "a.mkv", frames=frames, rate=25)
-    with pytest.raises(VideoError, match=r"interlaced fields.*deinterlace=True"):
-        read_video(tmp_path / "a.mkv", deinterlace=False)
+    with pytest.raises(VideoError, match=r"interlaced fields.*deinterlace='frames'"):
+        read_video(tmp_path / "a.mkv", deinterlace="refuse")
     for chosen in (None, (2, 3)):
         clip = read_video(tmp_path / "a.mkv", frames=chosen)
         assert clip.notes == ("interlaced frames are converted to progressive ones.",)
@@ -642,9 +742,42 @@ def test_fields_of_different_times_are_separated(tmp_path):
     assert teeth(clip.frames) < 0.3 * teeth(frames)
 
 
+@pytest.mark.parametrize(
+    ("name", "codec"), [("a.mkv", "mpeg2video"), ("a.ts", "libx264"), ("a.avi", "mpeg2video"), ("a.mp4", "libx264")]
+)
+def test_fields_become_frames_at_twice_the_rate(tmp_path, name, codec):
+    """A bright bar moves in each field: 25 interlaced frames a second show 50 of its places."""
+    places, rows, x = 4 + 2 * np.arange(24), np.arange(64), np.arange(96)
+    bars = np.repeat(255 * np.exp(-((x - places[:, None]) ** 2) / 32)[:, None, :, None], 3, -1)
+    frames = np.where(rows[:, None, None] % 2 == 0, bars[0::2], bars[1::2]).astype(np.uint8)
+    quality = ("-q:v", "1") if codec == "mpeg2video" else ("-crf", "1", "-pix_fmt", "yuv420p")
+    options = ("-vf", "setfield=tff", "-c:v", codec, *quality, "-flags", "+ilme+ildct", "-bf", "0")
+    _ffmpeg(*options, tmp_path / name, frames=frames, rate=25)
+    clip = read_video(tmp_path / name, deinterlace="fields")
+    assert (clip.num_frames, clip.num_declared, clip.fps, clip.times) == (24, 24, 50, None)
+    bright = (clip.frames[..., 1] / 255.0) ** 2
+    assert np.abs(bright.mean(1) @ x / bright.mean(1).sum(-1) - places)[4:-1].max() < 1
+    index = index_video(tmp_path / name, deinterlace="fields")
+    assert index.reading.changed == {"deinterlace": "fields"}
+    for span in ((0, 5), (9, 12), (15, 24)):
+        part = read_video(tmp_path / name, frames=span, deinterlace="fields")
+        np.testing.assert_array_equal(part.frames, clip.frames[slice(*span)])
+        found = read_indexed(index, *span)
+        np.testing.assert_array_equal(found.frames, part.frames)
+        assert (found.fps, found.first_second, found.notes) == (part.fps, part.first_second, part.notes)
+
+
+def test_fields_of_a_progressive_video_are_refused(tmp_path, mp4):
+    (tmp_path / "a.mp4").write_bytes(mp4)
+    with pytest.raises(VideoError, match="deinterlace: expected a first frame of two fields, got a progressive one"):
+        read_video(tmp_path / "a.mp4", deinterlace="fields")
+    with pytest.raises(ValueError, match="deinterlace: expected one of 'frames', 'fields', 'refuse', got True"):
+        read_video(tmp_path / "a.mp4", deinterlace=True)
+
+
 def test_deinterlacing_leaves_progressive_frames_alone(tmp_path):
     path = _exact_avi(tmp_path / "a.avi", _noise())
-    for deinterlace in (False, True):
+    for deinterlace in ("refuse", "frames"):
         clip = read_video(path, deinterlace=deinterlace)
         np.testing.assert_array_equal(clip.frames, _noise())
         assert clip.notes == ()

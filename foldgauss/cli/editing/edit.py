@@ -143,7 +143,7 @@ def segment_command(
         raise wrong_use("NUMBER", expected=expected, got=number)
     segment = video.segments[number]
     begins = (about.get("frames") or [0])[0] or 0
-    whole = keep_origin(about, "clip") | {"frames": [begins + segment.first, begins + segment.stop]}
+    whole = keep_origin(about, "clip", "reading") | {"frames": [begins + segment.first, begins + segment.stop]}
     known = whole | dict(segment.metadata)
     seconds = read_frame_seconds(about, video.num_frames)
     if seconds is not None:  # the segment's own frames may be evenly spaced, at another rate than the whole clip's

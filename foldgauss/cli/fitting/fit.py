@@ -25,14 +25,24 @@ from foldgauss.cli.fitting.options import (
 from foldgauss.cli.fitting.progress import Display, Observer, display_progress, print_json, save_previews
 from foldgauss.cli.fitting.segments import describe_budgets, fit_in_segments, plan_gaussians
 from foldgauss.cli.fitting.workers import WorkerOptions
-from foldgauss.cli.shared.arguments import Frames, NewClip, Overwrite, Size, parse_frames, parse_size
+from foldgauss.cli.shared.arguments import (
+    Deinterlace,
+    Frames,
+    Levels,
+    NewClip,
+    Overwrite,
+    Size,
+    parse_frames,
+    parse_reading,
+    parse_size,
+)
 from foldgauss.cli.shared.outputs import name_after, refuse_existing, refuse_inputs
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import format_count, print_figures, summarize_scores
 from foldgauss.io._atomic import OutputError, check_writable
 from foldgauss.io._lock import lock_output
 from foldgauss.io.history import HistoryFile, read_history, write_curves
-from foldgauss.io.media.clip import Clip
+from foldgauss.io.media.clip import DEINTERLACE, Clip
 from foldgauss.io.models.video_model import MODEL_SUFFIX, check_model_name
 from foldgauss.jobs.job import FitJob
 from foldgauss.jobs.runner import FitRun, missed_psnr, run_fit
@@ -57,6 +67,8 @@ def fit(
     ] = None,
     size: Size = None,
     frames: Frames = None,
+    levels: Levels = None,
+    deinterlace: Deinterlace = DEINTERLACE[0],
     overwrite: Overwrite = False,
     resume: Annotated[
         bool,
@@ -102,6 +114,7 @@ def fit(
         config,
         parse_size(size),
         parse_frames(frames),
+        reading=parse_reading(deinterlace, levels),
         checkpoint_seconds=checkpoint_seconds,
     )
     display = choose_display(quiet, log_json)

@@ -24,10 +24,20 @@ from foldgauss.cli.fitting.options import (
 )
 from foldgauss.cli.fitting.segments import print_failures
 from foldgauss.cli.fitting.workers import WorkerOptions
-from foldgauss.cli.shared.arguments import Frames, Overwrite, Size, parse_frames, parse_size
+from foldgauss.cli.shared.arguments import (
+    Deinterlace,
+    Frames,
+    Levels,
+    Overwrite,
+    Size,
+    parse_frames,
+    parse_reading,
+    parse_size,
+)
 from foldgauss.cli.shared.outputs import make_folder
 from foldgauss.cli.shared.tables import format_count, write_json
 from foldgauss.io._lock import lock_output
+from foldgauss.io.media.clip import DEINTERLACE
 from foldgauss.jobs import FitJob, Outcome, find_clips, make_jobs
 from foldgauss.jobs.clips import RECORDS
 from foldgauss.jobs.job import read_record, read_request, write_request
@@ -69,6 +79,8 @@ def fit_many(
     ] = None,
     size: Size = None,
     frames: Frames = None,
+    levels: Levels = None,
+    deinterlace: Deinterlace = DEINTERLACE[0],
     overwrite: Overwrite = False,
     checkpoint_seconds: CheckpointSeconds = None,
     workers: Workers = None,
@@ -99,6 +111,7 @@ def fit_many(
             size=parse_size(size),
             frames=parse_frames(frames),
             checkpoint_seconds=checkpoint_seconds,
+            reading=parse_reading(deinterlace, levels),
         )
     except ValueError as error:
         raise WrongUse(name_option(str(error))) from error

@@ -45,6 +45,7 @@ def fit_in_segments(
         frames=job.frames,
         segment_seconds=SEGMENT_SECONDS if segment_seconds is None else segment_seconds,
         checkpoint_seconds=job.checkpoint_seconds,
+        reading=job.reading,
         restart=restart,
     )
     with options.open_pool() as pool:  # first: workers start while the clip is indexed

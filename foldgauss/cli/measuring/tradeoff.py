@@ -30,12 +30,21 @@ from foldgauss.cli.measuring.tradeoff_record import (
     changed_settings,
     report,
 )
-from foldgauss.cli.shared.arguments import Frames, NewClip, Size, parse_frames, parse_size
+from foldgauss.cli.shared.arguments import (
+    Deinterlace,
+    Frames,
+    Levels,
+    NewClip,
+    Size,
+    parse_frames,
+    parse_reading,
+    parse_size,
+)
 from foldgauss.cli.shared.outputs import make_folder, name_after, refuse_foreign
 from foldgauss.cli.shared.rendering import TIME_LEFT
 from foldgauss.io._atomic import atomic_path
 from foldgauss.io._lock import lock_output
-from foldgauss.io.media.clip import Clip
+from foldgauss.io.media.clip import DEINTERLACE, Clip
 from foldgauss.io.media.video_reading import read_video
 from foldgauss.io.models.video_model import load_video_model, save_video_model
 from foldgauss.io.provenance import fingerprint
@@ -96,6 +105,8 @@ def tradeoff_command(
     ] = None,
     size: Size = None,
     frames: Frames = None,
+    levels: Levels = None,
+    deinterlace: Deinterlace = DEINTERLACE[0],
     seed: Annotated[int, typer.Option(help="Seed of all fits.")] = 0,
     clock: Annotated[
         str,
@@ -123,14 +134,16 @@ def tradeoff_command(
     known = overwrite or os.path.exists(out_dir / RECORD)
     refuse_foreign(out_dir, FILES, "tradeoff", record=RECORD, known=known, cure=", or start over with --overwrite")
     settings = {"axes": list(chosen), "minutes": None if steps else minutes, "steps": steps, "seed": seed}
-    clip = read_video(video, frames=parse_frames(frames), size=parse_size(size))
+    reading = parse_reading(deinterlace, levels)
+    clip = read_video(video, frames=parse_frames(frames), size=parse_size(size), **reading._asdict())
     for text in clip.notes:
         warn(f"{clip.source}: {text}")
     make_folder(out_dir)
     own = tuple(out_dir / name for name in sorted(FILES - {RECORD}))
     context.with_resource(lock_output(out_dir / RECORD, own=own, what="tradeoff"))
     record = Record(out_dir / RECORD, {"version": __version__} | settings | fingerprint(clip), restart=overwrite)
-    run = _Run(clip, record, Commands(video, size, frames, out_dir), fit_metadata(clip, seed, parse_frames(frames)))
+    commands = Commands(video, size, frames, out_dir, reading)
+    run = _Run(clip, record, commands, fit_metadata(clip, seed, parse_frames(frames)))
     base = run.plan_base(wanted, chosen, minutes, steps)
     points, skipped = plan_points(base, chosen, clip.num_frames, clip.size, has_alpha=clip.has_alpha)
     for one in skipped:

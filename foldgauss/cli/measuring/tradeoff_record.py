@@ -22,6 +22,7 @@ from foldgauss.cli.fitting.options import CONFIG_FIELDS
 from foldgauss.cli.shared.tables import write_json
 from foldgauss.io._atomic import atomic_path
 from foldgauss.io.figures import write_tradeoff
+from foldgauss.io.media.clip import AS_STORED, Reading
 from foldgauss.render import RenderOptions
 from foldgauss.video.fitting.config import FitConfig, rename_options, rename_settings
 from foldgauss.video.tradeoff import FLOAT16, FLOAT32, MAX_LOSS_DB, PASSES, Point, Skipped, knee, pareto_front
@@ -157,6 +158,7 @@ class Commands:
     size: str | None
     frames: str | None
     folder: Path
+    reading: Reading = AS_STORED
 
     def format_point(self, point: Point) -> str:
         """The command that fits the model of `point`, or converts or evaluates that of the base."""
@@ -173,6 +175,7 @@ class Commands:
         words = ["fit", str(self.video), "--out", f"{name}.safetensors"]
         words += [] if self.size is None else ["--size", self.size]
         words += [] if self.frames is None else ["--frames", self.frames]
+        words += [f"--{name}={value}" for name, value in self.reading.changed.items()]
         default = FitConfig()
         words += _changed(point.config, default, FIT_OPTIONS)
         words += _changed(point.config.options, default.options, RENDER_OPTIONS)

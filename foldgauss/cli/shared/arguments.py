@@ -9,7 +9,8 @@ import numpy as np
 import typer
 
 from foldgauss.cli.app.application import WrongUse, name_option, wrong_use
-from foldgauss.cli.app.completion import complete_clips, complete_models
+from foldgauss.cli.app.completion import complete_choice, complete_clips, complete_models
+from foldgauss.io.media.clip import DEINTERLACE, Reading, check_reading
 from foldgauss.render import RenderOptions
 
 #: Largest number of times, which at usual rates play for an hour.
@@ -30,6 +31,20 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing o
 Size = Annotated[str | None, typer.Option(metavar="HxW", help="Height x width in pixels, such as 160x320.")]
 Frames = Annotated[
     str | None, typer.Option(metavar="A:B", help="Frames A up to, not including, B; either may be omitted.")
+]
+Levels = Annotated[
+    int | None,
+    typer.Option(
+        metavar="N", help="Value of white in a clip of 16 bits, such as 4095 for data of 12 [default: 65535]."
+    ),
+]
+Deinterlace = Annotated[
+    str,
+    typer.Option(
+        metavar="frames|fields|refuse",
+        help="An interlaced frame becomes one, or two at twice the rate, one of each field; or is refused.",
+        autocompletion=complete_choice(DEINTERLACE),
+    ),
 ]
 FittedFrames = Annotated[
     str | None,
@@ -93,6 +108,13 @@ def parse_frames(text: str | None) -> tuple[int | None, int | None] | None:
     if not colon or any(part and not part.isdecimal() for part in (first, last)):
         raise WrongUse(f"--frames: expected A:B with whole numbers >= 0, as 0:24, got {text!r}.")
     return (int(first) if first else None), (int(last) if last else None)
+
+
+def parse_reading(deinterlace: str, levels: int | None) -> Reading:
+    try:
+        return check_reading(deinterlace, levels)
+    except ValueError as error:
+        raise WrongUse(name_option(str(error))) from error
 
 
 def parse_color(text: str) -> tuple[float, float, float] | None:

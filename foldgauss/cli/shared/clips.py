@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from foldgauss.cli.app.application import WrongUse, err, warn, wrong_use
 from foldgauss.cli.shared.arguments import parse_frames
@@ -45,12 +46,14 @@ def read_fitted_clip(
     wanted = parse_frames(frames) if frames is not None else (tuple(kept) if kept else None)
     try:
         read = _read_lazily if isinstance(model, SegmentedVideo) else read_video
-        clip = read(video, frames=wanted, size=model.size)
+        clip = read(video, frames=wanted, size=model.size, **about.get("reading", {}))
     except ValueError as error:
         if frames is not None or not str(error).startswith("frames:"):
             raise
         asked = f"the clip that the model was fitted to, frames {wanted[0]}:{wanted[1]} of {about.get('clip')}"
         raise WrongUse(f"VIDEO: expected {asked}, got {str(video)!r}, which has fewer. Give that clip.") from error
+    for note in clip.notes:
+        warn(f"{clip.source}: {note}")
     if same_number and clip.num_frames != model.num_frames:
         fewer = frames is None and clip.num_frames < model.num_frames
         raise wrong_use(
@@ -69,13 +72,15 @@ def read_fitted_clip(
     return clip
 
 
-def _read_lazily(video: Path, *, frames: tuple[int | None, int | None] | None, size: tuple[int, int]) -> Clip:
+def _read_lazily(
+    video: Path, *, frames: tuple[int | None, int | None] | None, size: tuple[int, int], **reading: Any
+) -> Clip:
     """As `read_video`, with only some frames in memory."""
     with err.status(f"Indexing {video.name}"):
-        index = index_video(video, frames=frames, find_cuts=False)
+        index = index_video(video, frames=frames, find_cuts=False, **reading)
     lazy = LazyFrames(index, size)
     about = index.source, index.num_declared, index.times, index.notes, index.first_second, index.duration
-    return Clip(lazy, index.fps, *about)
+    return Clip(lazy, index.fps, *about, index.reading)
 
 
 def is_other_clip(model_path: Path, clip: Clip, measure_psnr: Callable[[], float]) -> bool:

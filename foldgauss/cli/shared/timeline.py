@@ -13,6 +13,7 @@ from foldgauss.video.models.frame_times import interpolated_times, played_positi
 
 MAX_UPSAMPLE, MAX_IMAGES = MAX_TIMES, 10 * MAX_TIMES
 MIN_SPEED, MAX_SECONDS = 1e-4, 1e6
+MAX_EVEN_FPS = 60.0  # frames per second, of usual displays: a constant rate is not made higher for short intervals
 
 Upsample = Annotated[int | None, typer.Option(help="Frames per original interval [default: 1].")]
 Fps = Annotated[
@@ -61,8 +62,13 @@ class Timeline:
         """Whether one image is asked for."""
         return self.frame is not None or (self.chosen is not None and len(self.chosen) == 1)
 
-    def rate(self, fps: float) -> float:
-        """Frames per second of the output."""
+    def rate(self, fps: float, seconds: np.ndarray | None = None) -> float:
+        """Frames per second of the output.
+
+        With `speed` and `remap`, a clip with `seconds` gets the rate of its shortest interval, up to `MAX_EVEN_FPS`.
+        """
+        if self.fps is None and seconds is not None and (self.speed is not None or self.remap is not None):
+            return max(fps, min(float(1 / np.diff(seconds).min()), MAX_EVEN_FPS))
         return fps * (self.upsample or 1) if self.fps is None else self.fps
 
     def playing_speed(self, fps: float) -> float:
@@ -95,7 +101,7 @@ class Timeline:
             return interpolated_times(frame_times, self.upsample)
         if self.stamps(fps, seconds) is not None:
             return frame_times
-        rate = self.rate(fps) / fps
+        rate = self.rate(fps, seconds) / fps
         if self.remap is not None:
             self._refuse_long("--remap", self.remap[-1][0] * fps * rate)
             positions = remapped_positions(self.remap, fps, rate)

@@ -107,9 +107,10 @@ def render(
     constants = override_constants(model.options, alpha_cutoff, support_radius, transmittance_stop)
     model = model.with_options(constants)
     refuse_huge(image_size or model.size)
-    about, rate = read_origin(model_path), timeline.rate(model.fps)
+    about = read_origin(model_path)
     options = VideoOptions(codec, crf, pixel_format, choose_sound(sound, timeline, about, model.fps))
     seconds = read_frame_seconds(about, model.num_frames)
+    rate = timeline.rate(model.fps, seconds)
     shown = timeline.times(np.asarray(model.frame_times.times()), model.fps, seconds)
     timeline.warn_of_end(model.num_frames, model.fps, seconds)
     render_to_file(

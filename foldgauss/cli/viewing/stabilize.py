@@ -73,9 +73,10 @@ def stabilize_command(
         raise wrong_use("--fixed", expected="no --smoothing", got="both; the camera stands still")
     model = load_video_model(model_path)
     refuse_huge(image_size or model.size)
-    about, rate = read_origin(model_path), timeline.rate(model.fps)
+    about = read_origin(model_path)
     options = VideoOptions(codec, crf, pixel_format, choose_sound(sound, timeline, about, model.fps))
     seconds = read_frame_seconds(about, model.num_frames)
+    rate = timeline.rate(model.fps, seconds)
     shown = timeline.times(np.asarray(model.frame_times.times()), model.fps, seconds)
     check_video_options(out_path, image_size or model.size, rate, options, background_color)
     with progress_bar("Estimating the camera's path", model.num_frames) as advance:

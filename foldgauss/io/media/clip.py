@@ -6,16 +6,21 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from foldgauss._runtime.checks import invalid, is_within
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.io._atomic import PathLike, check_path, missing_error
 from foldgauss.io.media.format_detection import HEAD_BYTES
 from foldgauss.io.media.frame_rate import MAX_FPS, MIN_FPS, FrameRate
 
 MAX_PIXELS = 1 << 28  # of one image, 16384x16384: a header may claim any size
 VIDEO = "a video file or a folder of images"
+#: What becomes of an interlaced frame: one frame, one for each of its two fields, or an error.
+DEINTERLACE = ("frames", "fields", "refuse")
+WHITE = (1 << 16) - 1  # the value of white in data of 16 bits
+DEPTHS = (8, 10, 12, 14)  # bits of cameras and microscopes whose values are stored in 16
 Range = tuple[int | None, int | None]
 Size = tuple[int, int]  # (height, width)
 #: (frames declared within a range, frame rate, notes)
@@ -27,6 +32,53 @@ ReadResult = tuple[list[np.ndarray], *RangeFacts]
 class VideoError(ValueError):
     """A clip cannot be read or written as requested; the one-line message says what was expected, what was got, and
     how to correct it."""
+
+
+class Reading(NamedTuple):
+    """Options of `read_video` that decide which frames a file has, and their colors; see there."""
+
+    deinterlace: str = "frames"
+    levels: int | None = None
+
+    @property
+    def changed(self) -> dict[str, Any]:
+        """The options that differ from their defaults."""
+        return {name: value for name, value in self._asdict().items() if value != self._field_defaults[name]}
+
+
+AS_STORED = Reading()
+
+
+class Levels:
+    """Converts values of 16 bits to 8. `white`: the value that becomes 255, None for 65535. `most`: the largest value;
+    -1 where none was converted."""
+
+    def __init__(self, white: int | None = None):
+        self.white, self.most = white, -1
+
+    def convert(self, image: np.ndarray) -> np.ndarray:
+        """uint8 from uint16, to nearest. The last of four channels is alpha, whose values are not recorded."""
+        self.most = max(self.most, int(image[..., :3].max()) if image.ndim == 3 else int(image.max()))
+        white = self.white or WHITE
+        return ((np.minimum(image, white).astype(np.uint32) * 255 + white // 2) // white).astype(np.uint8)
+
+    def describe(self, path: Path) -> tuple[str, ...]:
+        """A note where the values that were converted seem to have fewer bits, or are clipped.
+
+        Raises `VideoError` where `white` is given, but no frame of `path` has 16 bits.
+        """
+        if self.white is not None and self.most < 0:
+            got, cure = f"a clip of fewer bits, {str(path)!r}", "Leave levels out."
+            raise video_error("levels", expected="images or videos of 16 bits, in RGB or gray", got=got, cure=cure)
+        if self.white is not None:
+            clipped = f"values of up to {self.most:,} are above levels={self.white} and become white."
+            return (clipped,) if self.most > self.white else ()
+        whites = ((1 << bits) - 1 for bits in DEPTHS)
+        white = next((white for white in whites if 0 < self.most <= white), None)
+        if white is None:
+            return ()
+        found = f"the largest value is {self.most:,} of {WHITE:,}, as in data of {white.bit_length()} bits"
+        return (f"{found}, which look dark; levels={white} (--levels {white}) makes {white} white.",)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +93,7 @@ class Clip:
     (num_frames,), in seconds from the first one; None where frames are evenly spaced at `fps`, otherwise `fps` is their
     mean rate. `duration`: seconds to the end of the last one, where there are `times`. `notes`: remarks on how the file
     was read, one line each. `first_second`: when the first frame of a range is shown, in seconds from the first frame
-    of the video file; 0 of images, and where `fps` was given.
+    of the video file; 0 of images, and where `fps` was given. `reading`: the options by which it was read.
     """
 
     frames: np.ndarray
@@ -52,6 +104,7 @@ class Clip:
     notes: tuple[str, ...] = ()
     first_second: float = 0.0
     duration: float | None = None
+    reading: Reading = AS_STORED
 
     @property
     def has_alpha(self) -> bool:
@@ -146,6 +199,14 @@ def check_fps(fps: float) -> None:
         raise video_error("fps", expected=f"a rate in [{MIN_FPS:g}, {MAX_FPS:g}]", got=repr(fps), cure="Try 25.")
 
 
+def check_reading(deinterlace: str, levels: int | None) -> Reading:
+    check_one_of("deinterlace", deinterlace, DEINTERLACE)
+    if levels is not None and not (is_integer(levels, 1) and levels <= WHITE):
+        cure = "Of data of 12 bits it is 4095."
+        raise video_error("levels", expected=f"the value of white, 1 to {WHITE}", got=repr(levels), cure=cure)
+    return Reading(deinterlace, levels)
+
+
 def check_num_pixels(path: Path, size: Size | None) -> None:
     """Raise where a header claims more than `MAX_PIXELS`, before memory is allocated for them."""
     if size is not None and size[0] * size[1] > MAX_PIXELS:
@@ -170,6 +231,15 @@ def describe_lost(num_decoded: int, num_declared: int) -> tuple[str, ...]:
     if num_decoded >= num_declared:
         return ()
     return (f"only {num_decoded} of {num_declared} frames decode; those are used.",)
+
+
+def describe_few(positions: list[int], what: str) -> tuple[str, ...]:
+    """A note about frames at these positions; `what`: their property, as a predicate without its verb."""
+    if not positions:
+        return ()
+    which = f"frame {positions[0]} is"
+    which = which if len(positions) == 1 else f"{len(positions):,} frames, the first of them {positions[0]}, are"
+    return (f"{which} {what}.",)
 
 
 def format_range(start: int, stop: int | None) -> str:

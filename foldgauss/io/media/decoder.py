@@ -15,7 +15,18 @@ from av.filter import Graph
 from av.stream import Disposition
 from av.video.reformatter import ColorRange, Colorspace, Interpolation, VideoReformatter
 
-from foldgauss.io.media.clip import VIDEO, Size, VideoError, check_num_pixels, format_num_bytes, read_head, video_error
+from foldgauss.io.media.clip import (
+    AS_STORED,
+    VIDEO,
+    Levels,
+    Reading,
+    Size,
+    VideoError,
+    check_num_pixels,
+    format_num_bytes,
+    read_head,
+    video_error,
+)
 from foldgauss.io.media.format_detection import DEMUXERS, LIST, describe_kind
 from foldgauss.io.media.frame_rate import DEFAULT_FPS
 from foldgauss.io.media.image_files import premultiply
@@ -25,6 +36,9 @@ MAX_ERRORS = 1000  # packets in a row that cannot be read after which a video ha
 MAX_FRAMES = 1 << 30  # a container that declares as many does not know, or is damaged
 MAX_LOST_FRAMES = 1_000_000  # a time stamp that implies a larger gap counts as damaged
 MAX_THREADS = 16
+MAX_DELAY = MAX_THREADS + 16  # frames that the decoder holds when it meets damage: one for each thread, and reordering
+MAX_ASPECT = 10.0  # width by height of a pixel, or the inverse; a larger one counts as damaged
+EQUAL_ASPECT = 0.01  # by which pixels that count as square may differ: containers round
 #: Chroma is interpolated, and rounded to nearest: FFmpeg's default repeats it and rounds it down, which makes each
 #: channel about 1 level too dark.
 CONVERSION = (
@@ -44,10 +58,10 @@ _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 @dataclass(frozen=True)
 class DecodedFrame:
     """A frame that decodes. `position`: in the file, with the frames lost to damage counted. `stamp`: in units of
-    `VideoDecoder.time_base`; 0 for a stream without time stamps. `size`: (height, width) of the video as stored, to
-    which a frame of another size is stretched. `matrix`: (a, b, c, d), right is shown along (a, b), down along (c, d),
-    in units of 2^-16. `converters`, to 8 bits and to 16: the same for all frames, since FFmpeg takes longer to prepare
-    one than to convert a small frame."""
+    `VideoDecoder.time_base`; 0 for a stream without time stamps. `size`: (height, width) of the video with square
+    pixels, to which each frame is stretched. `matrix`: (a, b, c, d), right is shown along (a, b), down along (c, d), in
+    units of 2^-16. `converters`, to 8 bits and to 16: the same for all frames, since FFmpeg takes longer to prepare one
+    than to convert a small frame. `levels` converts frames of 16 bits."""
 
     position: int
     stamp: int
@@ -57,6 +71,7 @@ class DecodedFrame:
     converters: tuple[VideoReformatter, VideoReformatter] = field(
         default_factory=lambda: (VideoReformatter(), VideoReformatter())
     )
+    levels: Levels = field(default_factory=Levels)
 
     @property
     def hdr(self) -> str | None:
@@ -70,16 +85,19 @@ class DecodedFrame:
         sizes of a damaged file.
         """
         alpha_bits = min(next((part.bits for part in self.decoded.format.components if part.is_alpha), 0), 16)
-        deep = None
-        if self.hdr is not None or alpha_bits > 8:
+        kind, deep = self.decoded.format, None
+        has_levels = kind.components[0].bits == 16 and (kind.is_rgb or kind.name.startswith(("gray", "ya")))
+        if self.hdr is not None or alpha_bits > 8 or has_levels:
             deep = self._convert("gbrap16le" if alpha_bits else "gbrp16le")
         if self.hdr is not None:
             image = map_tones(self.decoded, deep, self.hdr)
+        elif has_levels:
+            image = cv2.cvtColor(self.levels.convert(deep), cv2.COLOR_RGBA2BGRA if alpha_bits else cv2.COLOR_RGB2BGR)
         else:
             image = self._convert("bgra" if alpha_bits else "bgr24")
-            if self.decoded.format.name.startswith("gray") and self.decoded.color_range == ColorRange.MPEG:
-                image = _EXPANDED[image]
-        if alpha_bits and deep is not None:
+        if kind.name.startswith("gray") and self.decoded.color_range == ColorRange.MPEG:
+            image = _EXPANDED[image]
+        if alpha_bits and deep is not None and self.levels.white is None:
             image[..., 3] = round_alpha(deep[..., 3] >> (16 - alpha_bits), (1 << alpha_bits) - 1, 255)
         if alpha_bits:
             opaque = image[..., 3].min() == 255
@@ -114,23 +132,26 @@ class VideoDecoder:
     """An open video file, which is to be closed.
 
     `threads`: of FFmpeg's decoder, 0 for its default. How damaged frames decode depends on their number.
-    `deinterlace`: convert interlaced frames to progressive ones (FFmpeg's bwdif); otherwise they are refused.
+    `reading`: as of `read_video`; interlaced frames are converted to progressive ones by FFmpeg's bwdif.
 
     Raises `VideoError` for a file that does not open, or has too many pixels.
     """
 
-    def __init__(self, path: Path, threads: int = 0, deinterlace: bool = True):
-        self._path, self._deinterlace, self._container = path, deinterlace, open_container(path)
+    def __init__(self, path: Path, threads: int = 0, reading: Reading = AS_STORED):
+        self._path, self._deinterlace, self._container = path, reading.deinterlace, open_container(path)
+        self._per_stored = 2 if self._deinterlace == "fields" else 1  # frames that each stored one becomes
+        self.levels = Levels(reading.levels)
         try:
             self._stream = _choose_stream(self._container, path)
-            check_num_pixels(path, (self._stream.height, self._stream.width))
+            self.pixel_aspect = float(self._stream.sample_aspect_ratio or 1) or 1.0  # width by height; 1 where unknown
+            check_num_pixels(path, self._find_size(self._stream.height, self._stream.width))
             self._codec = self._choose_codec(threads)
         except VideoError:
             self.close()
             raise
-        self.time_base = self._stream.time_base or Fraction(1, 1000)
-        self.fps = float(self._stream.guessed_rate or 0)  # that the container declares; 0 where there is none
-        self.pixel_aspect = float(self._stream.sample_aspect_ratio or 1) or 1.0  # width by height; 1 where unknown
+        self.time_base = (self._stream.time_base or Fraction(1, 1000)) / self._per_stored
+        self._rate = (self._stream.guessed_rate or 0) * self._per_stored
+        self.fps = float(self._rate)  # that the container declares; 0 where there is none
         #: Whether an edit list may hide frames that the container counts.
         self.hides_frames = self._container.format.name.startswith("mov")
         self._is_avi = self._container.format.name == "avi"
@@ -138,12 +159,14 @@ class VideoDecoder:
         self.has_converted = False  # whether any frame was interlaced
         self.tilt = 0  # degrees by which a frame is to be rotated beyond a multiple of 90
         self._closed = False
-        self._size = self._codec.height, self._codec.width
+        self.stored_size = self._codec.height, self._codec.width  # which frames of another size are stretched to
+        self._read_bytes = 0  # up to the end of the last packet that decodes
+        self._at_end = False
         self._converters = VideoReformatter(), VideoReformatter()
         self._angle: int | None = None  # of the display matrix
         self._last = -1  # position of the frame decoded last
-        self._before: int | None = None  # its time stamp
-        self._damaged = False  # since then
+        self._before: int | None = None  # the largest time stamp
+        self._num_suspect = 0  # frames before which others may have been lost to damage
 
     def close(self) -> None:
         """Close the file; `frames` that are being read end."""
@@ -158,7 +181,28 @@ class VideoDecoder:
     def num_declared(self) -> int:
         """The number of frames that the container counts, including those that an edit list hides; 0 where it does not
         count them. Of an AVI those that it does not store are known only once they are passed."""
-        return self._stream.frames - self._num_repeated if 0 < self._stream.frames < MAX_FRAMES else 0
+        num = self._stream.frames - self._num_repeated if 0 < self._stream.frames < MAX_FRAMES else 0
+        return num * self._per_stored
+
+    @property
+    def unread_fraction(self) -> float:
+        """The fraction of the file after the last packet that decodes, once the end is reached; 0 where the container
+        declares frames or a duration, which tell more."""
+        if not (self._at_end and self._read_bytes) or self.num_declared or self.declared_seconds is not None:
+            return 0.0
+        return 1 - self._read_bytes / self._path.stat().st_size
+
+    @property
+    def size(self) -> Size:
+        """(height, width) of frames with square pixels, before they are turned upright."""
+        return self._find_size(*self.stored_size)
+
+    def _find_size(self, height: int, width: int) -> Size:
+        """The size at which pixels are square: one side is kept, and the other is enlarged."""
+        aspect = self.pixel_aspect
+        if abs(aspect - 1) <= EQUAL_ASPECT or not 1 / MAX_ASPECT <= aspect <= MAX_ASPECT:
+            return height, width
+        return (height, round(width * aspect)) if aspect > 1 else (round(height / aspect), width)
 
     @property
     def declared_seconds(self) -> float | None:
@@ -200,25 +244,26 @@ class VideoDecoder:
         if "matroska" not in self._container.format.name:
             return 0.0
         seconds, rates = duration * self.time_base, (self._stream.average_rate, self._stream.guessed_rate)
-        is_default = any(abs(seconds - 1 / rate) <= 1.5 * self.time_base for rate in rates if rate)
+        is_default = any(abs(seconds - 1 / rate / self._per_stored) <= 1.5 * self.time_base for rate in rates if rate)
         return 0.0 if is_default else float(max(seconds, 0))
 
     def seek(self, stamp: int) -> None:
         """Continue at the last key frame up to `stamp`; positions are counted from there."""
         with suppress(av.FFmpegError):  # a damaged index: continue where the decoder is
-            self._container.seek(stamp, stream=self._stream)
+            self._container.seek(stamp // self._per_stored, stream=self._stream)
         self._codec.flush_buffers()
-        self._last, self._before, self._damaged = -1, None, False
+        self._last, self._before, self._num_suspect = -1, None, 0
 
     def frames(self) -> Iterator[DecodedFrame]:
         """The frames that decode, in the order in which they are shown. Raises `VideoError` for interlaced ones that
         are not to be converted."""
         for frame in self._convert_interlaced(self._decode()):
             stamp = self._find_stamp(frame)
+            self._num_suspect = MAX_DELAY if frame.is_corrupt else self._num_suspect
             self._last = self._find_position(stamp)
-            self._size = self._size if all(self._size) else (frame.height, frame.width)
+            self.stored_size = self.stored_size if all(self.stored_size) else (frame.height, frame.width)
             matrix = self._find_matrix(frame)
-            yield DecodedFrame(self._last, stamp or 0, frame, self._size, matrix, self._converters)
+            yield DecodedFrame(self._last, stamp or 0, frame, self.size, matrix, self._converters, self.levels)
             if self._closed:  # FFmpeg would read on in memory that is freed
                 return
 
@@ -238,18 +283,20 @@ class VideoDecoder:
             try:
                 found = self._codec.decode(packet)
             except av.FFmpegError:
-                self._damaged = True
+                self._num_suspect = MAX_DELAY
                 continue
-            yield from found
+            self._read_bytes = max(self._read_bytes, (packet.pos or 0) + packet.size)
+            yield from map(self._stamp, found)
+        self._at_end = True
         # A damaged frame may end the decoding of those buffered; each call passes one.
-        for _ in range(MAX_THREADS + 16):
+        for _ in range(MAX_DELAY):
             try:
-                yield from self._codec.decode(None)
+                yield from map(self._stamp, self._codec.decode(None))
                 return
             except av.EOFError:
                 return
             except av.FFmpegError:
-                self._damaged = True
+                self._num_suspect = MAX_DELAY
 
     def _read_packets(self) -> Iterator[av.Packet]:
         """The packets of the stream, of which those that cannot be read are left out."""
@@ -257,6 +304,8 @@ class VideoDecoder:
         while num_errors < MAX_ERRORS:
             try:
                 for packet in self._container.demux(self._stream):
+                    if packet.is_corrupt:
+                        self._num_suspect = MAX_DELAY
                     if packet.size:
                         if self._is_avi and packet.dts is not None:
                             self._num_repeated += max(packet.dts - before - 1, 0)
@@ -265,24 +314,31 @@ class VideoDecoder:
                         yield packet
                 return
             except av.FFmpegError:
-                self._damaged, num_errors = True, num_errors + 1
+                self._num_suspect, num_errors = MAX_DELAY, num_errors + 1
 
     def _convert_interlaced(self, frames: Iterator[av.VideoFrame]) -> Iterator[av.VideoFrame]:
-        """Interlaced frames converted to progressive ones, each to one of the same time; others are passed on."""
+        """Interlaced frames converted to progressive ones, each to one of the same time; others are passed on.
+
+        With "fields" each stored frame becomes two; a video that does not begin with an interlaced one is refused.
+        """
         graph, of_graph = None, None
         for frame in frames:
             if graph is None and not frame.interlaced_frame:
+                if self._deinterlace == "fields":
+                    got, cure = f"a progressive one in {str(self._path)!r}", "Leave deinterlace='fields' out."
+                    raise video_error("deinterlace", expected="a first frame of two fields", got=got, cure=cure)
                 yield frame
                 continue
-            if not self._deinterlace:
+            if self._deinterlace == "refuse":
                 got = f"one of interlaced fields, {str(self._path)!r}"
-                cure = "Convert it while reading, with deinterlace=True."
+                cure = "Convert it while reading, with deinterlace='frames' or 'fields'."
                 raise video_error("path", expected="a video of progressive frames", got=got, cure=cure)
             kind = frame.height, frame.width, frame.format.name
             if graph is None or kind != of_graph:
                 yield from filter_frame(graph, None)
                 try:
-                    graph, of_graph, self.has_converted = _make_deinterlacer(frame, self.time_base), kind, True
+                    graph = _make_deinterlacer(frame, self.time_base, self._per_stored)
+                    of_graph, self.has_converted = kind, True
                 except av.FFmpegError as error:  # bwdif takes at least 3 rows and columns of each channel
                     got = f"interlaced ones of {frame.height}x{frame.width} (height x width) in {str(self._path)!r}"
                     cure = "Convert it with ffmpeg."
@@ -290,19 +346,26 @@ class VideoDecoder:
             yield from filter_frame(graph, frame)
         yield from filter_frame(graph, None)
 
+    def _stamp(self, frame: av.VideoFrame) -> av.VideoFrame:
+        """The frame with its time. AVI stores none: FFmpeg numbers its packets, in the order of decoding. Of raw AV1 it
+        makes times up."""
+        if self._is_avi or self._container.format.name in ("obu", "av1"):
+            frame.pts = frame.dts if self._is_avi else None
+        return frame
+
     def _find_stamp(self, frame: av.VideoFrame) -> int | None:
-        """AVI stores no times: FFmpeg numbers its packets, in the order of decoding. Of raw AV1 it makes times up."""
-        if not self._is_avi:
-            return None if self._container.format.name in ("obu", "av1") else frame.pts
-        return frame.dts if frame.dts is not None or self._before is None else self._before + 1
+        return self._before + 1 if self._is_avi and frame.pts is None and self._before is not None else frame.pts
 
     def _find_position(self, stamp: int | None) -> int:
         """The position of the next frame; the number of frames lost before it to damage is estimated by time stamps."""
-        lost, frame = 0, 1 / (self._stream.guessed_rate or Fraction(DEFAULT_FPS)) / self.time_base
-        if self._damaged and stamp is not None:
-            before = self._before if self._before is not None else (self._stream.start_time or 0) - frame
+        lost, frame = 0, 1 / (self._rate or Fraction(DEFAULT_FPS)) / self.time_base
+        if self._num_suspect and stamp is not None:
+            start = (self._stream.start_time or 0) * self._per_stored
+            before = self._before if self._before is not None else start - frame
             lost = round((stamp - before) / frame) - 1
-        self._damaged, self._before = False, stamp
+        self._num_suspect = max(self._num_suspect - 1, 0)
+        if stamp is not None and (self._before is None or stamp > self._before):  # damage may disorder frames
+            self._before = stamp
         return self._last + 1 + (lost if 0 < lost < MAX_LOST_FRAMES else 0)
 
     def _choose_codec(self, threads: int) -> av.VideoCodecContext:
@@ -349,10 +412,11 @@ def _choose_stream(container: av.container.InputContainer, path: Path) -> av.Vid
     raise video_error("path", expected=VIDEO, got=got)
 
 
-def _make_deinterlacer(frame: av.VideoFrame, clock: Fraction) -> Graph:
+def _make_deinterlacer(frame: av.VideoFrame, clock: Fraction, num: int) -> Graph:
+    """A filter that makes `num` frames, 1 or 2, of each: of two fields, or one of each field. `clock`: theirs."""
     graph = Graph()
-    source = graph.add_buffer(width=frame.width, height=frame.height, format=frame.format, time_base=clock)
-    filtered = graph.add("bwdif", "mode=send_frame:deint=interlaced")  # one frame for each frame
+    source = graph.add_buffer(width=frame.width, height=frame.height, format=frame.format, time_base=clock * num)
+    filtered = graph.add("bwdif", "mode=send_field:deint=all" if num == 2 else "mode=send_frame:deint=interlaced")
     same_clock = graph.add("settb", f"{clock.numerator}/{clock.denominator}")  # bwdif's would be twice as fast
     graph.link_nodes(source, filtered, same_clock, graph.add("buffersink")).configure()
     return graph

@@ -13,11 +13,13 @@ import numpy as np
 from foldgauss.io._atomic import PathLike, atomic_path, check_path
 from foldgauss.io.media.clip import (
     Range,
+    Reading,
     Size,
     check_fps,
     check_range,
     check_range_within,
     check_readable,
+    check_reading,
     translate_os_errors,
     video_error,
 )
@@ -28,18 +30,18 @@ from foldgauss.io.media.video_reading import read_frames
 from foldgauss.video.motion.optical_flow import CutFinder
 
 DIGEST_BYTES = 16
-_FORMAT = 4
+_FORMAT = 5
 
 
 class FrameIndex:
     """The index of a clip; made by `index_video`.
 
     `source`: the path as given. `kind`: "video", "folder" or "pictures" (an animation, or one image). `num_frames`,
-    `fps`, `times`, `duration`, `first_second`, `num_declared`, `notes`: as in `Clip`. `size`: (height, width) of the
-    frames as stored. `has_alpha`: whether any frame is transparent anywhere. `cuts`: the frames, in order, that begin a
-    new shot; empty where they were not searched for. `digest`: of all frames as stored, in hexadecimal; it shows
-    whether a file is still the one that was indexed. `positions`: int64 (num_frames,), the position of each frame in
-    the range: k for frame k, except in a clip that lost frames to damage.
+    `fps`, `times`, `duration`, `first_second`, `num_declared`, `notes`, `reading`: as in `Clip`. `size`: (height,
+    width) of the frames. `has_alpha`: whether any frame is transparent anywhere. `cuts`: the frames, in order, that
+    begin a new shot; empty where they were not searched for. `digest`: of all frames as stored, in hexadecimal; it
+    shows whether a file is still the one that was indexed. `positions`: int64 (num_frames,), the position of each frame
+    in the range: k for frame k, except in a clip that lost frames to damage.
 
     About 40 bytes per frame. It can be pickled, and saved with `save`.
     """
@@ -58,7 +60,7 @@ class FrameIndex:
         self.kind: str = about["kind"]
         self.start: int = about["start"]
         self.names: list[str] = about["names"]
-        self.deinterlace: bool = about["deinterlace"]
+        self.reading = Reading(**about["reading"])
         self.fixed_fps: float | None = about["fixed_fps"]
         self.fps: float = about["fps"]
         self.first_second: float = about["first_second"]
@@ -151,18 +153,20 @@ def index_video(
     fps: float | None = None,
     on_frame: Callable[[], object] = lambda: None,
     find_cuts: bool = True,
-    deinterlace: bool = True,
+    deinterlace: str = "frames",
+    levels: int | None = None,
 ) -> FrameIndex:
     """Decode a clip once, frame by frame, and return its index. Memory: a few frames, and some 100 bytes per frame.
 
-    `path`, `fps` and `deinterlace` as in `read_video`, with the same errors. `frames = (A, B)` restricts the clip to
-    A <= i < B; the index counts from A. `on_frame()` is called after each frame that is kept. `find_cuts`: search for
-    frames that begin a new shot, as `foldgauss.video.motion.optical_flow.Motion.cuts` does.
+    `path`, `fps`, `deinterlace` and `levels` as in `read_video`, with the same errors. `frames = (A, B)` restricts the
+    clip to A <= i < B; the index counts from A. `on_frame()` is called after each frame that is kept. `find_cuts`:
+    search for frames that begin a new shot, as `foldgauss.video.motion.optical_flow.Motion.cuts` does.
 
     Raises `FileNotFoundError` for a missing path, `VideoError` for everything else that cannot be read.
     """
     path = check_readable(path)
     start, stop = check_range(frames)
+    reading = check_reading(deinterlace, levels)
     if fps is not None:
         check_fps(fps)
     digests, transparent, finder = bytearray(), bytearray(), CutFinder() if find_cuts else None
@@ -177,7 +181,7 @@ def index_video(
         return image.shape[:2]
 
     with translate_os_errors(path):
-        found, report = read_frames(path, start, stop, lambda images: list(map(record, images)), deinterlace)
+        found, report = read_frames(path, start, stop, lambda images: list(map(record, images)), reading)
         names = [entry.name for entry in image_paths(path)[start:stop]] if path.is_dir() else []
     kept, num_declared, rate, notes = found
     rate = rate if fps is None else FrameRate(float(fps))
@@ -195,7 +199,7 @@ def index_video(
         "notes": [*notes, *describe_rate(rate)],
         "cuts": [] if finder is None else finder.found,
         "names": names,
-        "deinterlace": bool(deinterlace),
+        "reading": reading.changed,
         "report": report and report._asdict() | {"positions": None, "stamps": None},  # which are arrays
     }
     arrays = {

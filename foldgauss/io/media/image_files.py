@@ -13,6 +13,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from foldgauss.io.media.clip import (
+    Levels,
     ReadResult,
     VideoError,
     check_num_pixels,
@@ -125,11 +126,11 @@ def _is_jpeg_sequence(path: Path, head: bytes) -> bool:
         return data.find(b"\xff\xd9\xff\xd8\xff") >= 0
 
 
-def read_images(paths: list[Path]) -> Iterator[np.ndarray]:
+def read_images(paths: list[Path], levels: Levels) -> Iterator[np.ndarray]:
     """Images of one size."""
     first_shape = None
     for path in paths:
-        image = read_image(path)
+        image = read_image(path, levels)
         first_shape = first_shape or image.shape[:2]
         if image.shape[:2] != first_shape:
             expected = f"images of one size, {format_size(first_shape)} as in {paths[0].name!r}"
@@ -139,8 +140,11 @@ def read_images(paths: list[Path]) -> Iterator[np.ndarray]:
         yield image
 
 
-def read_image(path: Path) -> np.ndarray:
-    """One image as uint8 BGR, shape (height, width, 3), or premultiplied BGRA, (height, width, 4)."""
+def read_image(path: Path, levels: Levels) -> np.ndarray:
+    """One image as uint8 BGR, shape (height, width, 3), or premultiplied BGRA, (height, width, 4).
+
+    `levels` converts those of 16 bits, and then records their largest value.
+    """
     head = read_head(path)
     tags = _check_image_header(path, head)
     # UNCHANGED keeps a fourth channel; JPEG has none, and COLOR also applies its orientation.
@@ -153,7 +157,7 @@ def read_image(path: Path) -> np.ndarray:
     if image is None:
         raise _undecodable_error(path)
     if image.dtype == np.uint16:
-        image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)  # 65535 = 255 * 257, to nearest
+        image = levels.convert(image)
     if image.dtype != np.uint8:
         got, cure = f"{image.dtype} in {str(path)!r}", "Convert it to an 8-bit PNG."
         raise video_error("path", expected="images of 8 or 16 bits", got=got, cure=cure)

@@ -8,6 +8,7 @@ import numpy as np
 
 from foldgauss.io.media.clip import (
     Clip,
+    Levels,
     RangeFacts,
     Size,
     VideoError,
@@ -63,7 +64,7 @@ def read_indexed(index: FrameIndex, first: int, stop: int | None, *, size: Size 
     if index.fixed_fps is not None:
         rate = FrameRate(index.fixed_fps)
     notes += describe_rate(rate) + crop
-    about = index.source, num_declared, rate.times, notes, rate.first_second, rate.duration
+    about = index.source, num_declared, rate.times, notes, rate.first_second, rate.duration, index.reading
     return Clip(frames, float(rate.fps), *about)
 
 
@@ -123,11 +124,12 @@ class IndexedReader:
             for number, path in enumerate(paths, first):
                 if not path.is_file():
                     raise _changed_error(index, number)
-            taken = take_all(read_images(paths))
-            facts = len(paths), FrameRate(DEFAULT_FPS), describe_missing(paths)
+            levels = Levels(index.reading.levels)
+            taken = take_all(read_images(paths, levels))
+            facts = len(paths), FrameRate(DEFAULT_FPS), describe_missing(paths) + levels.describe(index.path)
         else:
             span = index.start + first, index.start + stop
-            found, _ = read_frames(index.path, *span, take_all, deinterlace=True)
+            found, _ = read_frames(index.path, *span, take_all, index.reading)
             taken, facts = found[0], found[1:]
         if len(taken) < stop - first:
             raise _changed_error(index, first + len(taken))
@@ -179,7 +181,7 @@ class IndexedReader:
         index = self.index
         if target <= 0 or self._decoder is None:
             self.close()
-            self._decoder = VideoDecoder(index.path, index.report.threads, index.deinterlace)
+            self._decoder = VideoDecoder(index.path, index.report.threads, index.reading)
             self._last = -1
         if target > 0:
             self._decoder.seek(int(index.stamps[target]))

@@ -21,6 +21,7 @@ from foldgauss.render.splats import check_size
 MASK_LEVEL = 0.5  # fraction of white from which a pixel of a video belongs to the mask
 #: Pillow modes whose stored values are labels: palette, grayscale, and black and white.
 _LABEL_MODES = ("P", "L", "1")
+_DEEP_MODES = ("I;16", "I;16B", "I")  # grayscale of 16 bits
 _COLOR_MODES = {"RGB": 3, "RGBA": 3, "LA": 1}  # channels besides alpha
 #: Other formats are not decoded, whatever the suffix: Pillow would pass some, such as PostScript, to other programs.
 _FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
@@ -44,6 +45,7 @@ def read_masks(
     - An image (palette or grayscale, as the annotations of DAVIS): bool (height, width). A folder of them, in natural
       order: bool (num_frames, height, width). `label` is the object's label; None selects all objects, which is
       everything except 0 (background) and 255 (void). Black and white images have one object with label 1.
+      Labels of 16 bits are read as those of 8; of black and white ones, white may have any value above 255.
     - A video: bool (num_frames, height, width), True where the brightest channel is at least `level` of white.
 
     `frames = (A, B)` keeps A <= i < B of a folder or video, None for an open end. `size` = (height, width) crops the
@@ -74,7 +76,10 @@ def read_masks(
             cure = "Leave label out, or give a folder of PNGs."
             raise invalid("label", expected="images with labels", got=f"the video {str(path)!r}", cure=cure)
         check_within("level", level, "(0, 1]", "a fraction of white in (0, 1]")
-        masks = read_video(path, frames=frames).over_black.max(-1) >= 255 * level
+        clip = read_video(path, frames=frames)
+        for note in clip.notes:
+            warnings.warn(f"{path}: {note}", stacklevel=2)
+        masks = clip.over_black.max(-1) >= 255 * level
     if size is None:
         return masks
     check_size(size)
@@ -99,7 +104,7 @@ def read_labels(paths: Sequence[Path]) -> np.ndarray:
     A palette image gives the *index* of each pixel, whatever its color (OpenCV gives the color, hence Pillow here); a
     grayscale one its level, also where that is stored as three equal channels or with alpha, which is ignored. Masks
     that are all black and white, as those of DAVIS 2016, become 0 and 1. Raises ValueError for an image that does not
-    decode, has colors instead of labels, or differs in size.
+    decode, has colors or larger numbers instead of labels, or differs in size.
     """
     masks, modes = [], set()
     for path in paths:
@@ -135,8 +140,21 @@ def _read_label_image(path: Path) -> tuple[np.ndarray, str]:
     channels = _COLOR_MODES.get(mode)  # grayscale as paint programs store it, and one mask of bear in DAVIS
     if channels is not None and (pixels[..., :channels] == pixels[..., :1]).all():
         mode, pixels = "L", pixels[..., 0]
+    if mode in _DEEP_MODES:
+        mode, pixels = "L", _narrow(pixels, path)
     if mode not in _LABEL_MODES:
         got = f"an image of mode {mode!r} in {str(path)!r}"
         cure = "Its colors were stored in place of the labels; use the original PNG."
         raise invalid("path", expected="masks with a label per pixel (palette or grayscale)", got=got, cure=cure)
     return pixels.astype(np.uint8) * (_WHITE if mode == "1" else 1), mode
+
+
+def _narrow(pixels: np.ndarray, path: Path) -> np.ndarray:
+    """Labels of 16 bits in the range of 8; where there are only 0 and one larger value, black and white."""
+    most = pixels.max()
+    if most > VOID and np.isin(pixels, (0, most)).all():
+        return np.where(pixels == most, _WHITE, 0)
+    if most > VOID:
+        got, cure = f"labels up to {most:,} in {str(path)!r}", "Renumber them, or store one object in black and white."
+        raise invalid("path", expected=f"masks with labels up to {VOID}", got=got, cure=cure)
+    return pixels

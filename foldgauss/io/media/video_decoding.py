@@ -10,14 +10,19 @@ import numpy as np
 
 from foldgauss.io.media.clip import (
     RangeFacts,
+    Reading,
     ReadResult,
     check_range_within,
+    describe_few,
     describe_lost,
     no_frames_error,
     video_error,
 )
-from foldgauss.io.media.decoder import MAX_FRAMES, DecodedFrame, VideoDecoder
+from foldgauss.io.media.decoder import EQUAL_ASPECT, MAX_FRAMES, DecodedFrame, VideoDecoder
 from foldgauss.io.media.frame_rate import DEFAULT_FPS, MAX_FPS, MAX_LAST_DURATION, estimate_rate, make_increasing
+
+#: Fraction of a file after its last frame, above which it is reported; sound may follow the last frame.
+MAX_UNREAD = 0.2
 
 
 class DecodeReport(NamedTuple):
@@ -26,7 +31,8 @@ class DecodeReport(NamedTuple):
     `fps`: the container's rate, or the default in its place. `num_total`: number of frames, missing ones included.
     `notes`: about the shape of pixels, HDR and interlacing. Of all frames decoded `positions`, and `stamps` in units of
     `time_base` seconds. `threads`: of the decoder. `end`: when the last of these ends, in seconds as well; 0 where that
-    is unknown.
+    is unknown. `damaged`: the positions of frames that decode with errors. `resized`: of those of another size than the
+    video, `stored_size`.
     """
 
     fps: float
@@ -37,6 +43,9 @@ class DecodeReport(NamedTuple):
     time_base: float
     threads: int
     end: float
+    damaged: list[int]
+    resized: list[int]
+    stored_size: list[int]
 
     def describe_span(self, first: int, end: int, start: int, stop: int | None) -> RangeFacts:
         """Number of frames declared from position `start` up to `stop`, their rate, and notes.
@@ -50,19 +59,25 @@ class DecodeReport(NamedTuple):
         rate = rate._replace(first_second=float(seconds[first] - seconds[0]))
         if np.ptp(self.stamps[:end]) == 0 and end > 1:  # a raw stream: the rate is FFmpeg's guess
             rate = rate._replace(guessed=True)
-        gaps = _describe_gaps([start - 1, *self.positions[first:end].tolist()])
+        places = self.positions[first:end].tolist()
+        gaps, of_span = _describe_gaps([start - 1, *places]), range(places[0], places[-1] + 1)
+        gaps += describe_few([one for one in self.damaged if one in of_span], "damaged, and may show artifacts")
+        height, width = self.stored_size
+        what = f"of another size than the video's {height}x{width}, and stretched to it"
+        gaps += describe_few([one for one in self.resized if one in of_span], what)
         num_declared = (self.num_total if stop is None else stop) - start
         return num_declared, rate, (*describe_lost(end - first, num_declared), *self.notes, *gaps)
 
 
 def decode_file(
-    path: Path, start: int, stop: int | None, keep: Callable[[Iterator[np.ndarray]], list], deinterlace: bool
+    path: Path, start: int, stop: int | None, keep: Callable[[Iterator[np.ndarray]], list], reading: Reading
 ) -> tuple[ReadResult, DecodeReport]:
     """Decode a video file once; `keep` makes the list of its BGR or BGRA frames from `start` up to `stop`.
 
     Raises `VideoError` for a file that cannot be read.
     """
     places, ticks, following, transfers, duration = [], [], [], set(), 0
+    damaged, resized = [], []
 
     def select(frames: Iterator[DecodedFrame]) -> Iterator[np.ndarray]:
         """The frames from `start` up to `stop`; all that are decoded are recorded, and so is the next one.
@@ -78,11 +93,15 @@ def decode_file(
             places.append(frame.position)
             ticks.append(frame.stamp)
             duration = frame.decoded.duration or 0
+            if frame.decoded.is_corrupt:
+                damaged.append(frame.position)
+            if (frame.decoded.height, frame.decoded.width) != decoder.stored_size:
+                resized.append(frame.position)
             if frame.position >= start:
                 transfers.add(frame.hdr)
                 yield frame.to_array()
 
-    with closing(VideoDecoder(path, deinterlace=deinterlace)) as decoder:
+    with closing(VideoDecoder(path, reading=reading)) as decoder:
         fps = decoder.fps if 0 < decoder.fps <= MAX_FPS else DEFAULT_FPS
         kept = keep(select(decoder.frames()))
         if not places:
@@ -99,8 +118,10 @@ def decode_file(
         last = max(end - seconds[-1], 0.0)
         num_total = max(_count_declared(decoder, seconds, fps, num_reached, last), num_reached)
         notes, aspect, threads = [], decoder.pixel_aspect, decoder.threads
-        if abs(aspect - 1) > 0.01:
-            notes.append(f"pixels are {aspect:.3g} times as wide as high; frames are kept as stored, not stretched.")
+        if abs(aspect - 1) > EQUAL_ASPECT:
+            (height, width), is_kept = decoder.size, decoder.size == decoder.stored_size
+            shown = "kept as stored" if is_kept else f"stretched to {height}x{width}"
+            notes.append(f"pixels are {aspect:.3g} times as wide as high; frames are {shown}.")
         if hdr := sorted(transfers - {None}):
             notes.append(f"colors are HDR ({' and '.join(hdr)}), and are tone-mapped to SDR.")
         if decoder.tilt:
@@ -108,11 +129,16 @@ def decode_file(
             notes.append(f"the file asks for a rotation by {turn}; it is left out.")
         if decoder.has_converted:
             notes.append("interlaced frames are converted to progressive ones.")
+        if (unread := decoder.unread_fraction) > MAX_UNREAD:
+            notes.append(f"the last {unread:.0%} of the file hold no frame that decodes.")
+        notes += decoder.levels.describe(path) if kept else ()
+        stored_size = list(decoder.stored_size)
     # The container's count may be an estimate, so the range is checked against the decoded frames as well.
     check_range_within(start, stop, num_total, path)
     if not kept:
         raise no_frames_error(start, stop, len(stamps), num_total, path)
-    report = DecodeReport(fps, num_total, notes, positions, stamps, time_base, threads, end)
+    about = positions, stamps, time_base, threads, end, damaged, resized, stored_size
+    report = DecodeReport(fps, num_total, notes, *about)
     return (kept, *report.describe_span(len(stamps) - len(kept), len(stamps), start, stop)), report
 
 
@@ -145,4 +171,5 @@ def _describe_gaps(positions: list[int]) -> tuple[str, ...]:
     num = sum(after - first for first, after in gaps)
     intact = f"frames {positions[0] + 1}:{first} are intact" if first > positions[0] + 1 else "throughout"
     which = which if len(gaps) == 1 else f"{num} frames, the first of them {first},"
-    return (f"{which} cannot be decoded and are left out; what follows may show artifacts, {intact}.",)
+    are = "is" if num == 1 else "are"
+    return (f"{which} cannot be decoded and {are} left out; what follows may show artifacts, {intact}.",)

@@ -13,6 +13,7 @@ import numpy as np
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io._atomic import PathLike, check_path
+from foldgauss.io.media.clip import AS_STORED, check_reading
 from foldgauss.io.media.frame_rate import are_rising_seconds
 from foldgauss.io.models.compact import COMPACT_SUFFIX, compact_metadata, is_compact, load_compact_model
 from foldgauss.io.models.model_file import (
@@ -38,7 +39,7 @@ from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
 MODEL_SUFFIX = ".safetensors"
 #: Metadata of which frames of which clip a model shows, and when the clip shows them.
-CLIP_NOTES = ("clip", "frames", "frame_seconds", "first_second")
+CLIP_NOTES = ("clip", "frames", "frame_seconds", "first_second", "reading")
 VIDEO, EDITED = PARTS
 
 
@@ -128,10 +129,19 @@ def _is_range(value: object) -> bool:
     return value[1] is None or value[1] > (value[0] or 0)
 
 
+def _is_reading(value: object) -> bool:
+    """Whether these are options of `read_video`, as `Reading.changed` returns them."""
+    try:
+        return bool(check_reading(**AS_STORED._replace(**value)._asdict()))
+    except (TypeError, ValueError):
+        return False
+
+
 #: Metadata that `fit` and `compress` write and later commands read, with their checks.
 _NOTES: dict[str, Callable[[object], bool]] = {
     **dict.fromkeys(("clip", "frames_digest", "clip_digest"), lambda value: isinstance(value, str)),
     "frames": _is_range,
+    "reading": _is_reading,
     "frame_seconds": lambda value: isinstance(value, list) and _are_numbers(value) and are_rising_seconds(value),
     "first_second": lambda value: is_within(value, "[0, inf)"),
     "seed": lambda value: is_integer(value, 0),
