@@ -295,22 +295,19 @@ class FoldedGaussian(BatchModule):
 
     # --- moments --------------------------------------------------------------------------------------------
 
-    def moments(self) -> moments.Moments:
-        """Mean and covariance of x = (s, t), and an estimate of their error.
+    def moments(self, order: int = 64) -> tuple[Float[Array, "*batch d"], Float[Array, "*batch d d"]]:
+        """Mean and covariance of x = (s, t).
 
             E s = loc + E f(u),  Cov s = E[a] Sigma + Cov f(u),  Cov(s, t) = -E[f(u) u],  u ~ N(0, time_scale^2)
 
-        Closed forms for zero, polynomial and Fourier folds and the built-in envelopes. Other folds and envelopes are
-        integrated adaptively, splines and shared paths piece by piece. `error_estimate` is large where a function is
-        too rough for that. A bump narrower than a hundredth of `time_scale` may be missed.
+        Exact for zero and polynomial folds; others use a Gauss-Hermite rule of `order` nodes. E[a] is exact for the
+        built-in envelopes; others use a fixed quadrature.
 
-        **Shapes:** mean (*batch, d), covariance (*batch, d, d), error_estimate (*batch,).
-
-        **Example:** `mean, covariance, error = dist.moments()`
+        **Shapes:** (*batch, d) and (*batch, d, d). **Example:** `mean, covariance = dist.moments()`
 
         **Source:** eq:cond_dens, by total mean and covariance.
         """
-        return moments.moments(self)
+        return moments.moments(self, order)
 
     @property
     def mean(self) -> Float[Array, "*batch d"]:
@@ -349,9 +346,7 @@ class FoldedGaussian(BatchModule):
 
             H = log(2 pi e time_scale^2) / 2 + log det(2 pi e Sigma) / 2 + (d-1) E[log a] / 2
 
-        Exact without a floor, where E[log a] = -power / 2; otherwise E[log a] is integrated adaptively.
-
-        **Units:** nats.
+        Exact without a floor, where E[log a] = -power / 2; otherwise E[log a] is a fixed quadrature. **Units:** nats.
 
         **Source:** the chain rule of eq:foldgauss. **Example:** `dist.entropy()`.
         """

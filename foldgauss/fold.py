@@ -7,7 +7,7 @@ from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -36,7 +36,6 @@ from foldgauss._runtime.threads import check_not_forked
 __all__ = [
     "AbstractFold",
     "CallableFold",
-    "FoldMoments",
     "FourierFold",
     "PolynomialFold",
     "SharedPathFold",
@@ -44,14 +43,6 @@ __all__ = [
     "ZeroFold",
     "as_fold",
 ]
-
-
-class FoldMoments(NamedTuple):
-    """Moments of f(u) for normal u: E f (*batch, d-1), Cov f (*batch, d-1, d-1) and E[f u] (*batch, d-1)."""
-
-    mean: Float[Array, "*batch d-1"]
-    covariance: Float[Array, "*batch d-1 d-1"]
-    cross: Float[Array, "*batch d-1"]
 
 
 class AbstractFold(BatchModule):
@@ -72,14 +63,6 @@ class AbstractFold(BatchModule):
     @abstractmethod
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
         """The shift f(u)."""
-
-    def closed_moments(self, scale: Float[Array, "*batch"]) -> FoldMoments | None:
-        """The moments of f(u), u ~ N(0, scale^2), in closed form; None: there is none, they are integrated."""
-        return None
-
-    def breakpoints(self) -> Float[Array, " n"]:
-        """The u at which f or a derivative jumps, of one fold without batch; panels of quadrature end there."""
-        return jnp.zeros(0)
 
 
 class ZeroFold(AbstractFold):
@@ -105,10 +88,6 @@ class ZeroFold(AbstractFold):
         check_not_forked()
         return jnp.zeros((*jnp.shape(u), self.dim), jnp.result_type(u))
 
-    def closed_moments(self, scale: Float[Array, "*batch"]) -> FoldMoments:
-        zero = self(scale)
-        return FoldMoments(zero, jnp.zeros((*zero.shape, self.dim), zero.dtype), zero)
-
 
 class PolynomialFold(AbstractFold):
     """The paper's fold, a polynomial without constant term.
@@ -123,8 +102,7 @@ class PolynomialFold(AbstractFold):
     **Example:** `PolynomialFold([[-1.0], [0.5]])(4.0)  # [-4 + 8] = [4.]`
 
     **Source:** f of eq:cond_dens, a polynomial as in the text after eq:cond_pdf_2d.
-    **Raises:** ValueError if `coefficients` has fewer than two dimensions or no space coordinate, or values so small
-    that they are not normal numbers.
+    **Raises:** ValueError if `coefficients` has fewer than two dimensions or no space coordinate.
     """
 
     coefficients: Float[Array, "*batch degree d-1"]
@@ -133,12 +111,6 @@ class PolynomialFold(AbstractFold):
 
     def __init__(self, coefficients: ArrayLike):
         self.coefficients = _coefficient_rows("coefficients", coefficients, "degree", "Row k-1 holds c_k")
-        values, smallest = concrete_value(self.coefficients), float(jnp.finfo(self.coefficients.dtype).tiny)
-        if values is not None and ((values != 0) & (np.abs(values) < smallest)).any():
-            cure = "JAX computes with smaller ones as with 0: use a larger unit of time, or float64."
-            raise invalid(
-                "coefficients", expected=f"0 or sizes of at least {smallest:.3g}", got="smaller ones", cure=cure
-            )
 
     @property
     def degree(self) -> int:
@@ -154,20 +126,6 @@ class PolynomialFold(AbstractFold):
         for k in reversed(range(self.degree)):  # Horner's scheme
             shift = u * (shift + coefficients[..., k, :])
         return shift
-
-    def closed_moments(self, scale: Float[Array, "*batch"]) -> FoldMoments:
-        """By E z^k = (k - 1)!! for even k, with the powers of the scale put into the coefficients."""
-        dtype, degree = self.coefficients.dtype, self.degree
-        normal = np.array([_normal_moment(k) for k in range(2 * degree + 2)])
-        k = np.arange(1, degree + 1)
-        covariances = jnp.asarray(normal[k[:, None] + k] - np.outer(normal[k], normal[k]), dtype)
-        scaled = self.coefficients
-        for power in range(degree):  # c_k scale^k in k steps: scale^k alone may overflow
-            scaled = scaled.at[..., power:, :].multiply(scale[..., None, None])
-        mean = jnp.einsum("k,...ki->...i", jnp.asarray(normal[k], dtype), scaled)
-        covariance = jnp.einsum("...ki,kl,...lj->...ij", scaled, covariances, scaled)
-        cross = jnp.einsum("k,...ki->...i", jnp.asarray(normal[k + 1], dtype), scaled) * scale[..., None]
-        return FoldMoments(mean, covariance, cross)
 
 
 class SplineFold(AbstractFold):
@@ -211,9 +169,6 @@ class SplineFold(AbstractFold):
         v = jnp.clip(u, self.knots[k], self.knots[n])
         terms = [b * coefficients[..., i, :] for i, b in enumerate(_spline_basis(v, self.knots, k))]
         return sum(terms, 0 * v)  # 0 * v: a NaN propagates through degree 0, too
-
-    def breakpoints(self) -> Float[Array, " n"]:
-        return jnp.asarray(self.knots[self.degree : len(self.knots) - self.degree], self.coefficients.dtype)
 
     def centered(self) -> "SplineFold":
         """The fold minus its constant, f(u) - f(0); add `fold(0.0)` to `loc` to keep the distribution unchanged."""
@@ -276,24 +231,6 @@ class FourierFold(AbstractFold):
         batch = jnp.broadcast_shapes(u.shape[:-1], period.shape[:-1], sine.shape[:-2])
         return jnp.broadcast_to(shift, (*batch, sine.shape[-1]))
 
-    def closed_moments(self, scale: Float[Array, "*batch"]) -> FoldMoments:
-        """By E cos(w u) = exp(-w^2 scale^2 / 2), in differences without cancellation.
-
-        With q = (2 pi scale / period)^2: Cov(cos k, cos l) = e^(-(k-l)^2 q / 2) (e^(-k l q) - 1)^2 / 2 and Cov(sin k,
-        sin l) = -e^(-(k-l)^2 q / 2) (e^(-2 k l q) - 1) / 2, of the k-th and the l-th harmonic.
-        """
-        k = jnp.arange(1, self.order + 1, dtype=self.sine.dtype)
-        frequency = (2 * jnp.pi / self.period)[..., None] * k
-        phase = frequency * scale[..., None]
-        product, gap = phase[..., :, None] * phase[..., None, :], phase[..., :, None] - phase[..., None, :]
-        common = 0.5 * jnp.exp(-0.5 * gap**2)
-        quadratic = lambda rows, matrix: jnp.einsum("...ki,...kl,...lj->...ij", rows, matrix, rows)  # noqa: E731
-        covariance = quadratic(self.cosine, common * jnp.expm1(-product) ** 2)
-        covariance = covariance - quadratic(self.sine, common * jnp.expm1(-2 * product))
-        mean = (jnp.expm1(-0.5 * phase**2)[..., None] * self.cosine).sum(-2)
-        cross = ((phase * jnp.exp(-0.5 * phase**2))[..., None] * self.sine).sum(-2) * scale[..., None]
-        return FoldMoments(mean, covariance, cross)
-
 
 class CallableFold(AbstractFold):
     """Any function of one scalar, with or without parameters, as a fold: `f(u) = function(u)`.
@@ -337,7 +274,8 @@ class SharedPathFold(AbstractFold):
     the last. `anchor` is q, the place that the path moves, `time_loc` is m_t, and `fold` is g, with g(0) = 0. So
     f(0) = 0, and with `loc` = A(m_t) q (`home`) the center at time t is A(t) (q + g(m_t - t)).
 
-    A fold moves centers only: that a path also turns and stretches the covariance is not represented.
+    A fold moves centers only: that a path also turns and stretches the covariance is not represented. Moments are by
+    quadrature, with an error of some percent of a jump where two times of a path are equal.
 
     **Shapes:** `times` (paths, knots), which do not decrease, and `matrices` (paths, knots, d-1, d), rows (linear part
     | offset), usually without batch dimensions; `anchor` (*batch, d-1); `time_loc` (*batch,); `index` (*batch,), whole
@@ -425,10 +363,6 @@ class SharedPathFold(AbstractFold):
         shift = own.fold(u)
         moved = _apply_maps(own.maps(own.time_loc - u), own.anchor + shift) - own.home
         return jnp.where((own.index > 0)[..., None], moved, shift)
-
-    def breakpoints(self) -> Float[Array, " n"]:
-        knots = self.time_loc - self.times[jnp.maximum(self.index - 1, 0)]
-        return jnp.concatenate([knots, self.fold.breakpoints().astype(knots.dtype)])
 
     def _aligned(self, u: Array) -> tuple["SharedPathFold", Array]:
         """The fold and u, with equal batch ranks."""
@@ -535,11 +469,6 @@ def _spline_basis(v: Array, knots: tuple[float, ...], degree: int) -> list[Array
     return basis
 
 
-def _normal_moment(k: int) -> float:
-    """E z^k for standard normal z."""
-    return 0.0 if k % 2 else float(np.prod(np.arange(k - 1, 0, -2, dtype=float)))
-
-
 def _ramp(v: Array, start: float, end: float) -> Array:
     return (v - start) / (end - start) if start < end else jnp.zeros_like(v)
 
@@ -560,15 +489,6 @@ class RestrictedFold(AbstractFold):
 
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch kept"]:
         return self.fold(u)[..., np.array(self.indices)]
-
-    def closed_moments(self, scale: Float[Array, "*batch"]) -> FoldMoments | None:
-        whole, kept = self.fold.closed_moments(scale), np.array(self.indices)
-        if whole is None:
-            return None
-        return FoldMoments(whole.mean[..., kept], whole.covariance[..., kept[:, None], kept], whole.cross[..., kept])
-
-    def breakpoints(self) -> Float[Array, " n"]:
-        return self.fold.breakpoints()
 
 
 def restrict_fold(fold: AbstractFold, indices: tuple[int, ...]) -> AbstractFold:

@@ -587,7 +587,7 @@ def _moments(mixture: AbstractMixture) -> tuple[Array, Array]:
 
 def _component_moments(components) -> tuple[Array, Array]:
     if isinstance(components, FoldedGaussian):
-        return components.moments()[:2]
+        return components.moments()
     if isinstance(components, TimeDensity):
         return components.mean[..., None], components.variance[..., None, None]
     return components.mean, components.covariance_matrix

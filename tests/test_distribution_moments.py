@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 from scipy import integrate
 from scipy.interpolate import BSpline
-from scipy.special import expit
 
-from foldgauss.analysis.divergence import kl_divergence
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
-from foldgauss.fold import FourierFold, PolynomialFold, SharedPathFold, SplineFold, ZeroFold
+from foldgauss.fold import FourierFold, PolynomialFold, SplineFold, ZeroFold
 from foldgauss.gaussian import Gaussian, times_exp
 
 BEND = np.array([[0.8, -0.5], [0.6, 0.9], [-0.7, 0.4]])
@@ -83,7 +81,7 @@ def _book_moments(power, floor, coefficients=BEND, scale=0.3):
 
 def test_moments_equal_gauss_hermite():
     powers, floors = np.array([0.0, 1.0, 2.0, 1.0]), np.array([0.0, 0.0, 0.1, 0.3])
-    mean, covariance, _ = MOMENTS(_dist(powers, floors))
+    mean, covariance = MOMENTS(_dist(powers, floors))
     for i in range(4):
         expected = _book_moments(powers[i], floors[i])
         np.testing.assert_allclose(mean[i], expected[0], rtol=1e-11, atol=1e-11)
@@ -93,86 +91,19 @@ def test_moments_equal_gauss_hermite():
 @pytest.mark.parametrize("degree", [0, 1, 12])
 def test_moments_at_any_degree(degree):
     coefficients = np.random.default_rng(degree).normal(size=(degree, 2))
-    mean, covariance, _ = MOMENTS(_dist(fold=PolynomialFold(coefficients)))
+    mean, covariance = MOMENTS(_dist(fold=PolynomialFold(coefficients)))
     expected = _book_moments(1.0, 0.0, coefficients)
     np.testing.assert_allclose(mean, expected[0], rtol=1e-11, atol=1e-11)
     np.testing.assert_allclose(covariance, expected[1], rtol=1e-11, atol=1e-11)
 
 
-def test_moments_of_any_fold_are_integrated():
+def test_moments_of_any_fold_are_gauss_hermite_of_the_order_given():
     bend = jnp.asarray(BEND)
     polynomial = lambda u: u * (bend[0] + u * (bend[1] + u * bend[2]))  # noqa: E731
-    for a, b in zip(MOMENTS(_dist(fold=polynomial))[:2], MOMENTS(_dist())[:2], strict=True):
+    for a, b in zip(MOMENTS(_dist(fold=polynomial)), MOMENTS(_dist()), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-13)
-
-
-STEP = SharedPathFold(
-    ZeroFold(1), [1.0], time_loc=0.0, index=1, times=[[-0.5, 0.2, 0.2]], matrices=[[[[1.0, 0]], [[2.0, 0]], [[5.0, 1]]]]
-)
-#: Folds in one space coordinate that a rule of fixed nodes integrates wrongly, in NumPy, and where they are not smooth.
-ROUGH = {
-    "fourier": (FourierFold([[1.0]], [[0.0]], period=0.7), lambda u: np.sin(2 * np.pi * u / 0.7), ()),
-    "fast": (FourierFold([[0.0], [1]], [[1.0], [0]], period=0.05), None, ()),
-    "spline": (
-        SplineFold([-1, -1, 0, 1, 1], [[2.0], [0.0], [1.0]], degree=1),
-        lambda u: np.interp(u, [-1, 0, 1], [2, 0, 1]),
-        (-1, 0, 1),
-    ),
-    "path": (STEP, lambda u: np.where(-u < 0.2, np.interp(-u, [-0.5, 0.2], [1, 2]), 6) - 1 - 5 / 7, (0.5, -0.2)),
-    "steep": (lambda u: jax.nn.sigmoid((u - 0.1) / 0.01)[None], lambda u: expit((u - 0.1) / 0.01), (0.1,)),
-    "bump": (lambda u: jnp.exp(-(((u - 2) / 0.02) ** 2))[None], lambda u: np.exp(-(((u - 2) / 0.02) ** 2)), (2,)),
-    "kink": (lambda u: jnp.abs(u - 0.3)[None], lambda u: np.abs(u - 0.3), (0.3,)),
-}
-
-
-@pytest.mark.parametrize("name", ROUGH)
-def test_moments_and_divergences_of_rough_folds(name):
-    fold, function, points = ROUGH[name]
-    if function is None:  # 2 pi / 0.05 is fast enough that all cosines average out
-        function = lambda u: np.sin(80 * np.pi * u) + np.cos(40 * np.pi * u) - 1  # noqa: E731
-    base = {"loc": [0.0], "scale_tril": [[0.1]], "time_loc": 0.0, "time_scale": 1.0, "envelope": Constant()}
-    dist = FoldedGaussian(**base, fold=fold)
-    edges = np.unique(np.clip([*np.linspace(-12, 12, 4801), *points], -12, 12))
-    y, rule = np.polynomial.legendre.leggauss(16)
-    half = 0.5 * np.diff(edges)[:, None]
-    u = edges[:-1, None] + half * (1 + y)
-    weights, values = half * rule * np.exp(-(u**2) / 2) / np.sqrt(2 * np.pi), function(u)
-    mean = (weights * values).sum()
-    variance, cross = (weights * (values - mean) ** 2).sum(), (weights * values * u).sum()
-    found = MOMENTS(dist)
-    tolerance = max(1e-12, 10 * float(found.error_estimate))
-    assert found.error_estimate < 1e-7
-    np.testing.assert_allclose(found.mean, [mean, 0], atol=tolerance)
-    np.testing.assert_allclose(found.covariance, [[variance + 0.01, -cross], [-cross, 1]], atol=tolerance)
-    plain = FoldedGaussian(**base)
-    for q_envelope in (Constant(), TimeLikelihood(0.5, 0.1)):  # in closed form but for the fold, and by quadrature
-        q = FoldedGaussian(**(base | {"envelope": q_envelope}))
-        divergence, error = kl_divergence(dist, q, return_error=True)
-        envelope = np.exp(q_envelope.log_a(u, time_loc=0.0, time_scale=1.0))
-        inner = 0.5 * (1 / envelope - 1 + np.log(envelope) + (values / 0.1) ** 2 / envelope)
-        expected = (weights * inner).sum()
-        np.testing.assert_allclose(divergence, expected, atol=max(1e-11 * expected, 30 * float(error)))
-        assert error < 1e-4 * expected
-    wrong = MOMENTS(FoldedGaussian(**base, fold=lambda u: 1.01 * dist.fold(u)))  # a larger fold is seen
-    assert np.abs(wrong.mean - found.mean).max() + np.abs(wrong.covariance - found.covariance).max() > 1e-5
-    assert kl_divergence(plain, plain) == 0
-
-
-@pytest.mark.parametrize(("degree", "time_scale"), [(7, 4e5), (8, 8e4), (10, 8e3), (15, 1e9), (12, 1e-6)])
-def test_moments_are_finite_in_float32_where_they_fit(degree, time_scale):
-    coefficients = np.zeros((degree, 1), np.float32)
-    coefficients[0] = 4 / time_scale
-    dist = FoldedGaussian(
-        np.zeros(1, np.float32),
-        np.eye(1, dtype=np.float32),
-        time_loc=np.float32(0),
-        time_scale=np.float32(time_scale),
-        fold=PolynomialFold(coefficients),
-        envelope=Constant(),
-    )
-    found = MOMENTS(dist)
-    assert found.mean.dtype == np.float32
-    np.testing.assert_allclose(found.covariance[0], [17, -4 * time_scale], rtol=1e-5)
+    low = MOMENTS(_dist(fold=polynomial), order=2)[1]  # exact to degree 3 only: the covariance needs 6
+    assert np.abs(low - MOMENTS(_dist())[1]).max() > 1e-4
 
 
 def test_moments_and_entropy_are_those_of_the_samples():
@@ -180,7 +111,7 @@ def test_moments_and_entropy_are_those_of_the_samples():
     for envelope, key in [(TimeLikelihood(1.0), 1), (TimeLikelihood(2.0, 0.2), 2), (Slope(), 3)]:
         dist = _dist(envelope=envelope)
         x = np.asarray(SAMPLE(dist, jax.random.key(key), (n,)))
-        mean, covariance, _ = MOMENTS(dist)
+        mean, covariance = MOMENTS(dist)
         centered = x - np.asarray(mean)
         z = centered.mean(0) / (x.std(0) / np.sqrt(n))
         products = centered[:, :, None] * centered[:, None, :]
@@ -207,9 +138,11 @@ FOLDS = {
 
 @pytest.mark.parametrize("name", [pytest.param("spline", marks=pytest.mark.slow), "fourier"])
 def test_moments_of_splines_and_sines(name):
+    # Gauss-Hermite of order 64: to rounding for a sine as slow as this; to 4e-4 for a cubic spline with knots 1.7
+    # standard deviations apart, which is not analytic.
     ours, fold = FOLDS[name]
     dist = _dist(fold=ours())
-    mean, covariance, _ = MOMENTS(dist)
+    mean, covariance = MOMENTS(dist)
 
     def expected(function):
         """E of a function of (center, t) under t, by scipy, piece by piece between the knots."""
@@ -220,8 +153,9 @@ def test_moments_of_splines_and_sines(name):
     y = expected(lambda x: x)
     spread = expected(lambda x: np.outer(x - y, x - y))
     spread[:2, :2] += TRIL @ TRIL.T / np.sqrt(2)
-    np.testing.assert_allclose(mean, y, atol=1e-10)
-    np.testing.assert_allclose(covariance, spread, atol=1e-10)
+    tolerance = 1e-10 if name == "fourier" else 1e-3
+    np.testing.assert_allclose(mean, y, atol=tolerance)
+    np.testing.assert_allclose(covariance, spread, atol=tolerance)
     n = 200_000
     x = np.asarray(SAMPLE(dist, jax.random.key(4), (n,)))
     centered = x - np.asarray(mean)
@@ -249,7 +183,7 @@ def test_moments_and_entropy_in_float32(time_scale):
             fold=fold,
             envelope=TimeLikelihood(powers, floors),
         )
-        mean, covariance, _ = MOMENTS(dist)
+        mean, covariance = MOMENTS(dist)
         unit = np.r_[1.0, 1.0, time_scale]
         entropy = ENTROPY(dist)
         assert mean.dtype == covariance.dtype == entropy.dtype == dtype

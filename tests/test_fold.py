@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from jaxtyping import Array, Float
 from scipy.interpolate import BSpline
 
-from foldgauss._numerics.piecewise import locate, locate_in_rows
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.fold import (
     AbstractFold,
@@ -203,7 +202,6 @@ def test_as_fold_wraps_only_what_is_no_fold():
     [
         (lambda: PolynomialFold([1.0, 2.0]), "coefficients"),
         (lambda: PolynomialFold(jnp.zeros((3, 0))), "coefficients"),
-        (lambda: PolynomialFold(np.float32([[1.0], [1e-40]])), "coefficients"),
         (lambda: ZeroFold(0), "dim"),
         (lambda: SplineFold([0, 1, 2], [[1.0], [2.0]], degree=1), "knots"),
         (lambda: SplineFold([0, 2, 1, 3], [[1.0], [2.0]], degree=1), "knots"),
@@ -308,16 +306,6 @@ def path_gaussians(num=5, dtype=np.float64, **changes) -> FoldedGaussian:
     return FoldedGaussian(fold.home, scale=scale, time_loc=time_loc, time_scale=dtype(0.2), fold=fold)
 
 
-def test_a_piecewise_path_ends_at_its_last_knot():
-    """Also where several knots are equal at the end, in JAX, NumPy and row by row."""
-    times, t = np.array([[-0.5, 0.2, 0.2], [0.1, 0.1, 0.7]]), np.array([[-1.0, 0.2, 0.5, 9.0], [0.0, 0.1, 0.4, 9.0]])
-    expected = [[0, 2, 2, 2], [0, 1, 1.5, 2]]  # places in knots
-    by_jax = locate(jnp.asarray(times)[:, None], jnp.asarray(t))
-    by_numpy, by_rows = locate(times[:, None], t), locate_in_rows(times, np.arange(2)[:, None], t)
-    for before, after, fraction in (map(np.asarray, by_jax), by_numpy, by_rows):
-        np.testing.assert_allclose((1 - fraction) * before + fraction * after, expected, atol=1e-6)
-
-
 def test_distributions_on_paths():
     with jax.enable_x64(True):
         dist = path_gaussians()
@@ -342,7 +330,7 @@ def test_distributions_on_paths():
 def test_samples_on_paths_have_their_moments():
     dist = path_gaussians(dtype=np.float32, times=[[-0.5, 0.1, 0.6], [0.2, 0.5, 0.9]])
     x = np.asarray(jax.jit(lambda dist, key: dist.sample(key, (200_000,)))(dist, jax.random.key(0)), np.float64)
-    mean, covariance, _ = dist.moments()
+    mean, covariance = dist.moments()
     for k in range(5):
         own = np.cov(x[:, k].T)
         np.testing.assert_allclose(x[:, k].mean(0), mean[k], atol=5 * np.sqrt(np.diag(own).max() / len(x)))

@@ -1,47 +1,32 @@
 """Moments, entropy and mode of a Folded-Gaussian: in closed form where one exists, else by quadrature over time."""
 
-from typing import NamedTuple
-
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
 from foldgauss._numerics.batch import broadcast_leaves, concrete_value, expand_leaves, map_over_batch
 from foldgauss._runtime.checks import invalid
-from foldgauss.analysis.quadrature import find_peaks, normal_panels
+from foldgauss.analysis.quadrature import find_peaks, gauss_hermite, normal_rule
 from foldgauss.envelope import Constant, TimeLikelihood
-from foldgauss.fold import FoldMoments
+from foldgauss.fold import PolynomialFold, ZeroFold
 
-__all__ = ["Moments", "entropy", "mean_envelope", "mean_log_envelope", "mode", "moments"]
+__all__ = ["entropy", "mean_envelope", "mean_log_envelope", "mode", "moments"]
 
 _LOG_2PI_E = float(np.log(2 * np.pi * np.e))
 # The mode is not unique if the density elsewhere on the ridge is as high up to this relative difference.
 _TIE = 1e-6
 
 
-class Moments(NamedTuple):
-    """Mean and covariance of x = (s, t), time last, and an estimate of their error.
-
-    `error_estimate` (*batch,) is the largest error of E f(u), E[f(u) u / time_scale] and Cov f(u), relative to the root
-    mean square of f, or to its square. For closed forms it is one rounding.
-    """
-
-    mean: Float[Array, "*batch d"]
-    covariance: Float[Array, "*batch d d"]
-    error_estimate: Float[Array, "*batch"]
-
-
-def moments(dist) -> Moments:
-    """The first two moments of a Folded-Gaussian: see `FoldedGaussian.moments`."""
+def moments(dist, order: int) -> tuple[Float[Array, "*batch d"], Float[Array, "*batch d d"]]:
+    """Mean (*batch, d) and covariance (*batch, d, d) of x = (s, t), time last: see `FoldedGaussian.moments`."""
     dist = broadcast_leaves(dist, dist.batch_shape)
-    (mean_f, cov_f, cross), error = _fold_moments(dist)
+    mean_f, cov_f, cross = _fold_moments(dist, order)
     mean = jnp.concatenate([dist.loc + mean_f, dist.time_loc[..., None]], axis=-1)
     sigma = dist.scale_tril @ jnp.swapaxes(dist.scale_tril, -1, -2)
     space = mean_envelope(dist)[..., None, None] * sigma + cov_f
     last = jnp.concatenate([-cross, (dist.time_scale**2)[..., None]], axis=-1)
     upper = jnp.concatenate([space, -cross[..., :, None]], axis=-1)
-    return Moments(mean, jnp.concatenate([upper, last[..., None, :]], axis=-2), error)
+    return mean, jnp.concatenate([upper, last[..., None, :]], axis=-2)
 
 
 def entropy(dist) -> Float[Array, "*batch"]:
@@ -60,7 +45,7 @@ def mean_envelope(dist) -> Float[Array, "*batch"]:
         return jnp.ones_like(dist.time_loc)
     if isinstance(envelope, TimeLikelihood):
         return envelope.floor + (1 - envelope.floor) / jnp.sqrt(1 + envelope.power)
-    return _expected_envelope(dist)[0]
+    return _expected_envelope(dist, jnp.exp)
 
 
 def mean_log_envelope(dist) -> Float[Array, "*batch"]:
@@ -69,11 +54,12 @@ def mean_log_envelope(dist) -> Float[Array, "*batch"]:
     if isinstance(envelope, Constant):
         return jnp.zeros_like(dist.time_loc)
     if not isinstance(envelope, TimeLikelihood):
-        return _expected_envelope(dist)[1]
+        return _expected_envelope(dist, lambda log_a: log_a)
     floor = concrete_value(envelope.floor)
     if floor is not None and not floor.any():
         return -0.5 * envelope.power
-    return jnp.where(envelope.floor == 0, -0.5 * envelope.power, _expected_envelope(dist)[1])
+    floored = _expected_envelope(dist, lambda log_a: log_a)
+    return jnp.where(envelope.floor == 0, -0.5 * envelope.power, floored)
 
 
 def mode(dist) -> Float[Array, "*batch d"]:
@@ -92,43 +78,45 @@ def mode(dist) -> Float[Array, "*batch d"]:
     return jnp.where(unique[..., None], _ridge(filled, filled.time_loc), jnp.nan)
 
 
-def _fold_moments(dist) -> tuple[FoldMoments, Array]:
-    """The moments of f(u) for u ~ N(0, time_scale^2), and their error relative to the root mean square of f."""
-    closed = dist.fold.closed_moments(dist.time_scale)
-    if closed is not None:
-        return closed, jnp.full_like(dist.time_loc, jnp.finfo(dist.time_loc.dtype).eps)
-    return map_over_batch(_integrate_fold, dist)
+def _fold_moments(dist, order: int):
+    """E f(u), Cov f(u), E[f(u) u] for u ~ N(0, time_scale^2)."""
+    if isinstance(dist.fold, ZeroFold):
+        zero = jnp.zeros_like(dist.loc)
+        return zero, jnp.zeros_like(dist.scale_tril), zero
+    if isinstance(dist.fold, PolynomialFold):
+        return _polynomial_moments(dist.fold.coefficients, dist.time_scale)
+    z, weights = (jnp.asarray(x, dist.loc.dtype) for x in gauss_hermite(order))
+    z = z.reshape(-1, *(1,) * dist.time_scale.ndim)
+    values = expand_leaves(dist.fold, dist.time_scale.ndim + 1)(z * dist.time_scale[None])
+    mean = jnp.tensordot(weights, values, axes=1)
+    centered = values - mean[None]
+    covariance = jnp.tensordot(weights, centered[..., :, None] * centered[..., None, :], axes=1)
+    cross = jnp.tensordot(weights, values * z[..., None], axes=1) * dist.time_scale[..., None]
+    return mean, covariance, cross
 
 
-def _integrate_fold(dist):
-    """`_fold_moments` of one distribution by adaptive quadrature."""
-    frozen = lax.stop_gradient(dist)
-    breaks = (frozen.fold.breakpoints() / frozen.time_scale).astype(dist.time_loc.dtype)
-    panels = normal_panels(lambda tau: frozen.fold(frozen.time_scale * tau), breaks)
-    shift = dist.fold(dist.time_scale * panels.nodes)
-    mean = panels.expectation(shift)
-    centered = shift - mean[None, None]
-    products, tilted = centered[..., :, None] * centered[..., None, :], shift * panels.nodes[..., None]
-    found = FoldMoments(mean, panels.expectation(products), panels.expectation(tilted) * dist.time_scale)
-    square = panels.expectation(jnp.square(shift).sum(-1))
-    square = jnp.where(square > 0, square, 1)
-    errors = [panels.expectation_error(values).max() for values in (shift, tilted)]
-    error = jnp.maximum(jnp.stack(errors).max() / jnp.sqrt(square), panels.expectation_error(products).max() / square)
-    return found, lax.stop_gradient(error)
+def _polynomial_moments(coefficients: Float[Array, "*batch degree dim"], scale: Float[Array, "*batch"]):
+    """Exact, by E z^k = (k - 1)!! for even k, with the powers of the scale put into the coefficients."""
+    degree, dtype = coefficients.shape[-2], coefficients.dtype
+    normal = np.array([_normal_moment(k) for k in range(2 * degree + 2)])
+    k = np.arange(1, degree + 1)
+    covariances = normal[k[:, None] + k] - np.outer(normal[k], normal[k])
+    powers = scale[..., None] ** jnp.asarray(k, dtype).reshape((1,) * scale.ndim + (degree,))
+    scaled = coefficients * powers[..., None]
+    mean = jnp.einsum("k,...ki->...i", jnp.asarray(normal[k], dtype), scaled)
+    covariance = jnp.einsum("...ki,kl,...lj->...ij", scaled, jnp.asarray(covariances, dtype), scaled)
+    cross = jnp.einsum("k,...ki->...i", jnp.asarray(normal[k + 1], dtype), scaled) * scale[..., None]
+    return mean, covariance, cross
 
 
-def _expected_envelope(dist) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
-    """E[a(t)] and E[log a(t)] by adaptive quadrature."""
-    return map_over_batch(_integrate_envelope, dist)
+def _normal_moment(k: int) -> float:
+    return 0.0 if k % 2 else float(np.prod(np.arange(k - 1, 0, -2, dtype=float)))
 
 
-def _integrate_envelope(dist):
-    """`_expected_envelope` of one distribution."""
-    log_a = lambda dist, tau: _log_envelope(dist, tau.ravel()).reshape(tau.shape)  # noqa: E731
-    frozen = lax.stop_gradient(dist)
-    panels = normal_panels(lambda tau: log_a(frozen, tau)[..., None], jnp.zeros(0, dist.time_loc.dtype))
-    values = log_a(dist, panels.nodes)
-    return panels.expectation(jnp.exp(values)), panels.expectation(values)
+def _expected_envelope(dist, function) -> Float[Array, "*batch"]:
+    """E function(log a(t))."""
+    z, weights = (jnp.asarray(x, dist.loc.dtype) for x in normal_rule())
+    return jnp.tensordot(weights, function(_log_envelope(dist, z)), axes=1)
 
 
 def _log_envelope(dist, tau: Float[Array, " tau"]) -> Float[Array, " tau *batch"]:

@@ -25,7 +25,7 @@ __all__ = [
     "find_peaks",
     "gauss_hermite",
     "is_within_any",
-    "normal_panels",
+    "normal_rule",
 ]
 
 _Log = Callable[[Float[Array, "..."]], Float[Array, "..."]]
@@ -69,7 +69,6 @@ _BASE = np.r_[-REACH, -1e3, -1e2, -40.0, -20.0, np.linspace(-10, 10, 41), 20.0, 
 _TAIL = np.geomspace(10, REACH, 150)
 SEARCH_GRID = np.r_[-_TAIL[::-1], np.linspace(-10, 10, 401)[1:-1], _TAIL]
 _LADDER = 20.0 * 4.0 ** -np.arange(13)  # distances of panel edges around each peak
-_NORMAL_EDGES = np.linspace(-12, 12, 193)  # exp(-72) of a normal is beyond
 _ROUNDS, _SPLITS = 24, 16  # halvings, and panels halved in each
 _GOLDEN = float((np.sqrt(5) - 1) / 2)
 
@@ -78,6 +77,16 @@ _GOLDEN = float((np.sqrt(5) - 1) / 2)
 def gauss_hermite(order: int) -> tuple[np.ndarray, np.ndarray]:
     """Nodes and weights with `sum(w g(z)) = E g(z)`, z standard normal: exact for polynomials to 2 order - 1."""
     z, weights = np.polynomial.hermite_e.hermegauss(order)
+    return z, weights / weights.sum()
+
+
+@cache
+def normal_rule() -> tuple[np.ndarray, np.ndarray]:
+    """As `gauss_hermite`, for functions other than polynomials: Gauss-Legendre on panels of width 1/4."""
+    y, weights = np.polynomial.legendre.leggauss(12)
+    centers = np.arange(-12, 12, 0.25)[:, None] + 0.125
+    z = (centers + 0.125 * y).ravel()
+    weights = np.tile(0.125 * weights, len(centers)) * np.exp(-0.5 * z * z)
     return z, weights / weights.sum()
 
 
@@ -141,16 +150,6 @@ class Panels(BatchModule):
         weighs = lax.expand_dims(weights > 0, range(2, function.ndim))
         return jnp.tensordot(weights, jnp.where(weighs, function, 0), axes=2)
 
-    def expectation_error(self, function: Float[Array, "panels 15 *event"]) -> Float[Array, "*event"]:
-        """Estimated absolute error of `expectation`: the difference of the two rules, at least the rounding."""
-        weights = self.weights
-        weighs = lax.expand_dims(weights > 0, range(2, function.ndim))
-        terms = jnp.einsum("pn,pn...->pn...", weights, jnp.where(weighs, function, 0))
-        difference = jnp.asarray(1 - _GAUSS / _KRONROD, terms.dtype)  # of the two rules, per Kronrod weight
-        error = jnp.abs(jnp.einsum("n,pn...->p...", difference, terms)).sum(0)
-        size = jnp.abs(terms).sum((0, 1))
-        return jnp.maximum(error, 10 * jnp.finfo(terms.dtype).eps * size)
-
     def cdf(self, x: Float[Array, ""]) -> Float[Array, ""]:
         """Fraction of the integral left of x; one integral, not a batch."""
         # Panels without width in x are atoms: right-continuous, P(X <= x).
@@ -197,28 +196,20 @@ class Panels(BatchModule):
 
 
 def adaptive_panels(
-    log_f: _Log,
-    guides: Float[Array, " guides"],
-    *,
-    search: _Log | None = None,
-    spikes: Panels | None = None,
-    breaks: Float[Array, " breaks"] | None = None,
+    log_f: _Log, guides: Float[Array, " guides"], *, search: _Log | None = None, spikes: Panels | None = None
 ) -> Panels:
     """Panels for the integral of exp(log_f) over [-REACH, REACH], fine around `guides` (see `find_peaks`).
 
-    No panel crosses one of the `breaks`. `log_f` is elementwise. `search` is `log_f` without derivatives, if it has
-    parameters to be differentiated. `spikes` (panels of shape (spikes, panels)) replace log_f, each from its first edge
-    to its last. See `diverges` for an integral that is infinite.
+    `log_f` is elementwise. `search` is `log_f` without derivatives, if it has parameters to be differentiated. `spikes`
+    (panels of shape (spikes, panels)) replace log_f, each from its first edge to its last. See `diverges` for an
+    integral that is infinite.
     """
     search, guides = log_f if search is None else search, lax.stop_gradient(guides)
-    ladder = jnp.asarray(np.r_[0, _LADDER, -_LADDER], guides.dtype)
-    extra = (jnp.where(jnp.isnan(guides), 0, guides)[:, None] + ladder[None, :]).ravel()
-    edges = jnp.concatenate([jnp.asarray(_BASE, guides.dtype), extra, *([] if breaks is None else [breaks])])
     if spikes is None:
-        left, right = _found_panels(partial(_estimates, search, None), edges)
+        left, right = _found_panels(search, guides, None)
         return Panels(left, right, _nodes(left, right), _log_width(left, right), log_f(_nodes(left, right)))
     holes = lax.stop_gradient((spikes.left[:, 0], spikes.right[:, -1]))
-    left, right = _found_panels(partial(_estimates, search, holes), jnp.concatenate([edges, *holes]))
+    left, right = _found_panels(search, guides, holes)
     # Panels inside a hole shrink to its low edge, so that right edges stay sorted.
     middle = 0.5 * (left + right)[None]
     low = jnp.where((middle > holes[0][:, None]) & (middle < holes[1][:, None]), holes[0][:, None], -jnp.inf).max(0)
@@ -229,30 +220,6 @@ def adaptive_panels(
     both = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), around, flat)
     order = jnp.argsort(lax.stop_gradient(both.left + both.right))
     return jax.tree.map(lambda x: x[order], both)
-
-
-def normal_panels(function: Callable, breaks: Float[Array, " breaks"]) -> Panels:
-    """Panels for expectations under a standard normal of a function from (...) to (..., m), and of its square.
-
-    They are halved where these integrals err most, from panels of 1/8 on [-12, 12]; none crosses one of the `breaks`. A
-    feature narrower than 1/100 that leaves no step behind it may be missed.
-    """
-    grid = jnp.asarray(_NORMAL_EDGES, breaks.dtype)
-    squares = jnp.square(function(grid)).sum(-1) * jnp.exp(-0.5 * grid**2)
-    size = jnp.sqrt(jnp.where(jnp.isfinite(squares), squares, 0).mean())
-    size = jnp.where(size > 0, size, 1)
-
-    def log_error(left: Array, right: Array) -> Array:
-        nodes = _nodes(left, right)
-        values = function(nodes) / size
-        terms = jnp.exp(-0.5 * nodes**2)[..., None] * jnp.concatenate([values, values**2], axis=-1)
-        difference = jnp.einsum("n,pnm->pm", jnp.asarray(_KRONROD - _GAUSS, nodes.dtype), terms)
-        return jnp.log(jnp.abs(difference).max(-1)) + _log_width(left, right)
-
-    edges = jnp.concatenate([grid, jnp.clip(breaks, grid[0], grid[-1])])
-    left, right = lax.stop_gradient(_found_panels(log_error, lax.stop_gradient(edges)))
-    nodes = _nodes(left, right)
-    return Panels(left, right, nodes, _log_width(left, right), -0.5 * nodes**2)
 
 
 def diverges(log_f: _Log, panels: Panels) -> Array:
@@ -300,11 +267,17 @@ def is_within_any(holes: tuple[Array, Array], x: Array) -> Array:
     return ((x[None] > low) & (x[None] < high)).any(0)
 
 
-def _found_panels(estimates: Callable[[Array, Array], Array], edges: Array) -> tuple[Array, Array]:
-    """Left and right edges after all halvings of the panels of the largest `estimates` of the log error, sorted."""
+def _found_panels(log_f: _Log, guides: Array, holes: tuple[Array, Array] | None) -> tuple[Array, Array]:
+    """Left and right edges after all halvings, sorted; no panel crosses an edge of a hole, which is left out."""
+    dtype = guides.dtype
+    ladder = jnp.asarray(np.r_[0, _LADDER, -_LADDER], dtype)
+    extra = (jnp.where(jnp.isnan(guides), 0, guides)[:, None] + ladder[None, :]).ravel()
+    borders = [] if holes is None else [*holes]
+    edges = jnp.concatenate([jnp.asarray(_BASE, dtype), extra, *borders])
     edges = jnp.sort(jnp.clip(edges, -REACH, REACH))
-    spare = jnp.full(_ROUNDS * _SPLITS, edges[-1])
+    spare = jnp.full(_ROUNDS * _SPLITS, REACH, dtype)
     left, right = jnp.concatenate([edges[:-1], spare]), jnp.concatenate([edges[1:], spare])
+    estimates = partial(_estimates, log_f, holes)
     log_error = estimates(left, right)
     first_spare = edges.size - 1
 
@@ -325,7 +298,6 @@ def _found_panels(estimates: Callable[[Array, Array], Array], edges: Array) -> t
 
 
 def _estimates(log_f: _Log, holes, left: Array, right: Array) -> Array:
-    """log |Kronrod - Gauss| of each panel, -inf in a hole."""
     log_error = _log_error(_log_width(left, right), log_f(_nodes(left, right)))
     return log_error if holes is None else jnp.where(is_within_any(holes, 0.5 * (left + right)), -jnp.inf, log_error)
 

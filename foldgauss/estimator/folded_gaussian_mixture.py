@@ -329,7 +329,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
             return params
         num, dtype = len(params.time_loc), params.curve.dtype
         mixture = to_mixture(params, scaling, Constant())
-        means, covariances = (np.asarray(z, np.float64) for z in mixture.components.moments()[:2])
+        means, covariances = (np.asarray(z, np.float64) for z in mixture.components.moments())
         weights = np.exp(np.asarray(params.log_weights, np.float64))
         dim = means.shape[1]
         order = self._order_columns(dim)
@@ -366,7 +366,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         self._params = params
         with enable_dtype(params.curve.dtype):
             mixture = to_mixture(params, self._scaling, self._envelope)
-            means, covariances, _ = mixture.components.moments()
+            means, covariances = mixture.components.moments()
             order = self._order_columns(means.shape[-1])
             back = np.argsort(order)
             self.means_ = np.asarray(means)[:, back]
