@@ -62,6 +62,11 @@ class AbstractFold(BatchModule):
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
         """The shift f(u)."""
 
+    @property
+    def breaks(self) -> Float[Array, " breaks"]:
+        """Where a single fold, not a batch, is not smooth: u at which quadrature divides the range."""
+        return jnp.zeros(0)
+
 
 class ZeroFold(AbstractFold):
     """No fold: `f(u) = 0`, a static center.
@@ -168,6 +173,10 @@ class SplineFold(AbstractFold):
         terms = [b * coefficients[..., i, :] for i, b in enumerate(_spline_basis(v, self.knots, k))]
         return sum(terms, 0 * v)  # 0 * v: a NaN propagates through degree 0, too
 
+    @property
+    def breaks(self) -> Float[Array, " breaks"]:
+        return jnp.asarray(self.knots, self.coefficients.dtype)
+
     def centered(self) -> "SplineFold":
         """The fold minus its constant, f(u) - f(0); add `fold(0.0)` to `loc` to keep the distribution unchanged."""
         here = self(jnp.zeros((), self.coefficients.dtype))
@@ -273,8 +282,7 @@ class SharedPathFold(AbstractFold):
     the last. `anchor` is q, the place that the path moves, `time_loc` is m_t, and `fold` is g, with g(0) = 0. So
     f(0) = 0, and with `loc` = A(m_t) q (`home`) the center at time t is A(t) (q + g(m_t - t)).
 
-    A fold moves centers only: that a path also turns and stretches the covariance is not represented. Moments are by
-    quadrature, with an error of some percent of a jump where two times of a path are equal.
+    A fold moves centers only: that a path also turns and stretches the covariance is not represented.
 
     **Shapes:** `times` (paths, knots), which do not decrease, and `matrices` (paths, knots, d-1, d), rows (linear part
     | offset), usually without batch dimensions; `anchor` (*batch, d-1); `time_loc` (*batch,); `index` (*batch,), whole
@@ -360,6 +368,11 @@ class SharedPathFold(AbstractFold):
         shift = own.fold(u)
         moved = _apply_maps(own.maps(own.time_loc - u), own.anchor + shift) - own.home
         return jnp.where((own.index > 0)[..., None], moved, shift)
+
+    @property
+    def breaks(self) -> Float[Array, " breaks"]:
+        knots = self.times[jnp.maximum(self.index - 1, 0)]
+        return jnp.concatenate([self.time_loc - knots, self.fold.breaks.astype(knots.dtype)])
 
     def _aligned(self, u: Array) -> tuple["SharedPathFold", Array]:
         """The fold and u, with equal batch ranks."""
@@ -479,6 +492,10 @@ class RestrictedFold(AbstractFold):
 
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch kept"]:
         return self.fold(u)[..., np.array(self.indices)]
+
+    @property
+    def breaks(self) -> Float[Array, " breaks"]:
+        return self.fold.breaks
 
 
 def restrict_fold(fold: AbstractFold, indices: tuple[int, ...]) -> AbstractFold:
