@@ -3,6 +3,7 @@
 A fold maps the scalar `u = time_loc - t` (note the sign) to R^(d-1).
 """
 
+import warnings
 from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
@@ -100,7 +101,8 @@ class PolynomialFold(AbstractFold):
     **Shapes:** `coefficients` (*batch, degree, d-1), row `k - 1` is `c_k`; u (*batch,) -> (*batch, d-1),
     leading dimensions broadcast. Degree 0 is allowed and is the zero fold.
 
-    **Units:** `c_k` is space / time^k, u is time.
+    **Units:** `c_k` is space / time^k, u is time. Coefficients below the smallest normal number count as 0, with a
+    RuntimeWarning unless they are traced: JAX computes so. Choose a larger unit of time, or float64.
 
     **Example:** `PolynomialFold([[-1.0], [0.5]])(4.0)  # [-4 + 8] = [4.]`
 
@@ -114,6 +116,10 @@ class PolynomialFold(AbstractFold):
 
     def __init__(self, coefficients: ArrayLike):
         self.coefficients = _coefficient_rows("coefficients", coefficients, "degree", "Row k-1 holds c_k")
+        known = concrete_value(self.coefficients)
+        if known is not None and ((known != 0) & (np.abs(known) < (least := jnp.finfo(known.dtype).tiny))).any():
+            text = f"PolynomialFold: coefficients below {least:.2g}, the smallest normal {known.dtype}, count as 0."
+            warnings.warn(text, RuntimeWarning, stacklevel=2)
 
     @property
     def degree(self) -> int:

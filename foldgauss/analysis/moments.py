@@ -1,5 +1,6 @@
 """Moments, entropy and mode of a Folded-Gaussian: in closed form where one exists, else by quadrature over time."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -126,7 +127,7 @@ def _integrated_fold(fold, scale):
     def values(z):
         return fold((z * scale).ravel()).reshape(*z.shape, -1)
 
-    edges = fold.breaks / scale
+    edges = fold.breaks.astype(scale.dtype) / scale
     panels = normal_panels(lambda z: lax.stop_gradient(values(z)), edges, scale.dtype)
     y = values(panels.nodes)
     mean = panels.expectation(y)
@@ -146,16 +147,28 @@ def _polynomial_moments(coefficients: Float[Array, "*batch degree dim"], scale: 
     normal = np.array([_normal_moment(k) for k in range(2 * degree + 2)])
     size = np.sqrt(normal[2 * k])
     covariances = normal[k[:, None] + k] / size[:, None] / size - np.outer(normal[k] / size, normal[k] / size)
-    # One power at a time: scale^k overflows where a coefficient is 0 or small.
-    scaled, rows = [], coefficients * jnp.asarray(size, dtype).reshape((1,) * scale.ndim + (degree, 1))
-    for row in range(degree):
-        rows = rows[..., min(row, 1) :, :] * scale[..., None, None]
-        scaled.append(rows[..., 0, :])
-    scaled = jnp.stack(scaled, axis=-2) if degree else coefficients
+    scaled = _times_powers(coefficients * jnp.asarray(size, dtype).reshape((1,) * scale.ndim + (degree, 1)), scale)
     mean = jnp.einsum("k,...ki->...i", jnp.asarray(normal[k] / size, dtype), scaled)
     covariance = jnp.einsum("...ki,kl,...lj->...ij", scaled, jnp.asarray(covariances, dtype), scaled)
     cross = jnp.einsum("k,...ki->...i", jnp.asarray(normal[k + 1] / size, dtype), scaled) * scale[..., None]
     return mean, covariance, cross
+
+
+@jax.custom_jvp
+def _times_powers(rows: Float[Array, "*batch degree dim"], scale: Float[Array, "*batch"]):
+    """Row k - 1 times scale^k, one factor at a time: the power itself overflows where a coefficient is 0 or small."""
+    scaled = []
+    for row in range(rows.shape[-2]):
+        rows = rows[..., min(row, 1) :, :] * scale[..., None, None]
+        scaled.append(rows[..., 0, :])
+    return jnp.stack(scaled, axis=-2) if scaled else rows
+
+
+@_times_powers.defjvp
+def _times_powers_jvp(primals, tangents):
+    scaled, scale = _times_powers(*primals), primals[1]
+    k = jnp.arange(1, scaled.shape[-2] + 1, dtype=scale.dtype).reshape((1,) * scale.ndim + (-1, 1))
+    return scaled, _times_powers(tangents[0], scale) + k * scaled * (tangents[1] / scale)[..., None, None]
 
 
 def _normal_moment(k: int) -> float:

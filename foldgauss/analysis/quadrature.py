@@ -349,15 +349,15 @@ def _halved(estimates: Callable[[Array, Array], Array], left: Array, right: Arra
 
 
 def _panel_errors(weights: Float[Array, "*batch 15"], values: Float[Array, "*batch 15"]) -> Float[Array, "*batch"]:
-    """QUADPACK's estimates of the error of sums over the Kronrod nodes, whose `weights` include any density.
+    """Estimated errors of sums over the Kronrod nodes, whose `weights` include any density, as in QUADPACK.
 
-    The difference to the Gauss rule, as a fraction of the values' mean deviation in the panel, to the power of 1.5.
+    The difference to the Gauss rule, smaller where it is a small fraction of the values' mean deviation in the panel.
     """
     weight = weights.sum(-1, keepdims=True)
     center = (weights * values).sum(-1, keepdims=True) / jnp.where(weight > 0, weight, 1)
     spread = (weights * jnp.abs(values - center)).sum(-1)
     difference = jnp.abs((weights * values) @ jnp.asarray(1 - _GAUSS / _KRONROD, weights.dtype))
-    return spread * jnp.minimum(1, (200 * difference / jnp.where(spread > 0, spread, 1)) ** 1.5)
+    return difference * jnp.minimum(1, (200 * difference / jnp.where(spread > 0, spread, 1)) ** 0.5)
 
 
 def _estimates(log_f: _Log, holes, left: Array, right: Array) -> Array:
