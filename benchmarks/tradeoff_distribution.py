@@ -1,9 +1,6 @@
-"""Speed against accuracy on the side of the distribution: quadrature order, precision, and how an E-step is computed.
+"""Speed against accuracy on the side of the distribution: precision, and how an E-step is computed.
 
     python -m benchmarks.tradeoff_distribution [--json FILE] [--points N] [--components K] [--rounds N]
-
-**Quadrature order**: mean and covariance of a Folded-Gaussian, `moments(order)`, with Fourier folds of shorter and
-shorter period; the error is the largest of all numbers, in float64, against a trapezoid rule in 20,001 nodes.
 
 **Precision**: log-densities and their gradient by every parameter (degree 3, envelope), float32 beside float64. The
 error is the largest difference to float64, relative to 1 + |value|; `benchmarks.numerics` has that at the extremes.
@@ -27,53 +24,9 @@ from benchmarks._common import Task
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import Constant, TimeLikelihood
 from foldgauss.estimator.em.components import Parameters, evaluate_densities
-from foldgauss.fold import FourierFold, PolynomialFold
+from foldgauss.fold import PolynomialFold
 
-ORDERS = (4, 8, 16, 32, 64, 128)
-#: Periods of the Fourier fold in units of the time's deviation: the shorter, the more nodes a rule needs.
-PERIODS = (6.0, 2.0, 1.0)
 SHIFTS = (0.0, 10.0, 100.0)
-
-
-def fourier(period: float, dtype) -> FoldedGaussian:
-    """A circle of radius 1/2 in the plane, time_scale 1."""
-    rows = np.array([[0.5, 0.0]]), np.array([[0.0, 0.5]])
-    fold = FourierFold(*(row.astype(dtype) for row in rows), period=period)
-    time = {"time_loc": dtype(0), "time_scale": dtype(1)}
-    return FoldedGaussian(np.zeros(2, dtype), 0.1 * np.eye(2, dtype=dtype), **time, fold=fold, envelope=Constant())
-
-
-def moments_by_hand(dist: FoldedGaussian, period: float) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and covariance by a trapezoid rule in 20,001 nodes, exact to rounding for what is smooth."""
-    u = np.linspace(-12, 12, 20_001)
-    weights = np.exp(-u * u / 2)
-    weights /= weights.sum()
-    values = np.concatenate([np.asarray(jax.vmap(dist.fold)(jnp.asarray(u))), -u[:, None]], 1)
-    mean = weights @ values
-    covariance = (values - mean).T @ (weights[:, None] * (values - mean))
-    covariance[:2, :2] += 0.01 * np.eye(2)
-    return mean, covariance
-
-
-def quadrature(rounds: int, figures: dict[str, float]) -> None:
-    shown = _common.table(
-        "moments(order) of Fourier folds", "order", "us", *(f"error, period {period:g}" for period in PERIODS)
-    )
-    with jax.enable_x64(True):
-        dists = {period: fourier(period, np.float64) for period in PERIODS}
-        truth = {period: moments_by_hand(dist, period) for period, dist in dists.items()}
-        made = {order: jax.jit(lambda dist, order=order: dist.moments(order)) for order in ORDERS}
-        tasks = {order: Task(lambda f=f: jax.block_until_ready(f(dists[PERIODS[0]]))) for order, f in made.items()}
-        seconds = _common.interleaved(tasks, rounds)
-        for order, function in made.items():
-            errors = []
-            for period, dist in dists.items():
-                found = zip(function(dist), truth[period], strict=True)
-                errors.append(max(float(np.abs(np.asarray(a) - b).max()) for a, b in found))
-                figures[f"moments, order {order}, period {period:g}: error"] = errors[-1]
-            figures[f"moments, order {order} (us)"] = micro = 1e6 * float(np.median(seconds[order]))
-            shown.add_row(str(order), f"{micro:.0f}", *(f"{error:.0e}" for error in errors))
-    _common.console.print(shown)
 
 
 def precision(num: int, rounds: int, figures: dict[str, float]) -> None:
@@ -204,7 +157,6 @@ def main(arguments: list[str] | None = None) -> None:
     made.add_argument("--rounds", type=_common.whole, default=7, help="[7]")
     options = _common.parse(made, arguments)
     facts, figures = _common.describe_machine(), {}
-    quadrature(options.rounds, figures)
     precision(options.points, options.rounds, figures)
     e_step(options.points, options.components, options.rounds, figures)
     _common.finish(options.json, figures, facts, points=options.points, components=options.components)

@@ -3,6 +3,7 @@
 A fold maps the scalar `u = time_loc - t` (note the sign) to R^(d-1).
 """
 
+import warnings
 from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
@@ -64,6 +65,11 @@ class AbstractFold(BatchModule):
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
         """The shift f(u)."""
 
+    @property
+    def breaks(self) -> Float[Array, " breaks"]:
+        """Where a single fold, not a batch, is not smooth: u at which quadrature divides the range."""
+        return jnp.zeros(0)
+
 
 class ZeroFold(AbstractFold):
     """No fold: `f(u) = 0`, a static center.
@@ -97,7 +103,8 @@ class PolynomialFold(AbstractFold):
     **Shapes:** `coefficients` (*batch, degree, d-1), row `k - 1` is `c_k`; u (*batch,) -> (*batch, d-1),
     leading dimensions broadcast. Degree 0 is allowed and is the zero fold.
 
-    **Units:** `c_k` is space / time^k, u is time.
+    **Units:** `c_k` is space / time^k, u is time. Coefficients below the smallest normal number count as 0, with a
+    RuntimeWarning unless they are traced: JAX computes so. Choose a larger unit of time, or float64.
 
     **Example:** `PolynomialFold([[-1.0], [0.5]])(4.0)  # [-4 + 8] = [4.]`
 
@@ -111,6 +118,10 @@ class PolynomialFold(AbstractFold):
 
     def __init__(self, coefficients: ArrayLike):
         self.coefficients = _coefficient_rows("coefficients", coefficients, "degree", "Row k-1 holds c_k")
+        known = concrete_value(self.coefficients)
+        if known is not None and ((known != 0) & (np.abs(known) < (least := jnp.finfo(known.dtype).tiny))).any():
+            text = f"PolynomialFold: coefficients below {least:.2g}, the smallest normal {known.dtype}, count as 0."
+            warnings.warn(text, RuntimeWarning, stacklevel=2)
 
     @property
     def degree(self) -> int:
@@ -169,6 +180,10 @@ class SplineFold(AbstractFold):
         v = jnp.clip(u, self.knots[k], self.knots[n])
         terms = [b * coefficients[..., i, :] for i, b in enumerate(_spline_basis(v, self.knots, k))]
         return sum(terms, 0 * v)  # 0 * v: a NaN propagates through degree 0, too
+
+    @property
+    def breaks(self) -> Float[Array, " breaks"]:
+        return jnp.asarray(self.knots, self.coefficients.dtype)
 
     def centered(self) -> "SplineFold":
         """The fold minus its constant, f(u) - f(0); add `fold(0.0)` to `loc` to keep the distribution unchanged."""
@@ -274,8 +289,7 @@ class SharedPathFold(AbstractFold):
     the last. `anchor` is q, the place that the path moves, `time_loc` is m_t, and `fold` is g, with g(0) = 0. So
     f(0) = 0, and with `loc` = A(m_t) q (`home`) the center at time t is A(t) (q + g(m_t - t)).
 
-    A fold moves centers only: that a path also turns and stretches the covariance is not represented. Moments are by
-    quadrature, with an error of some percent of a jump where two times of a path are equal.
+    A fold moves centers only: that a path also turns and stretches the covariance is not represented.
 
     **Shapes:** `times` (paths, knots), which do not decrease, and `matrices` (paths, knots, d-1, d), rows (linear part
     | offset), usually without batch dimensions; `anchor` (*batch, d-1); `time_loc` (*batch,); `index` (*batch,), whole
@@ -363,6 +377,11 @@ class SharedPathFold(AbstractFold):
         shift = own.fold(u)
         moved = _apply_maps(own.maps(own.time_loc - u), own.anchor + shift) - own.home
         return jnp.where((own.index > 0)[..., None], moved, shift)
+
+    @property
+    def breaks(self) -> Float[Array, " breaks"]:
+        knots = self.times[jnp.maximum(self.index - 1, 0)]
+        return jnp.concatenate([self.time_loc - knots, self.fold.breaks.astype(knots.dtype)])
 
     def _aligned(self, u: Array) -> tuple["SharedPathFold", Array]:
         """The fold and u, with equal batch ranks."""
@@ -489,6 +508,10 @@ class RestrictedFold(AbstractFold):
 
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch kept"]:
         return self.fold(u)[..., np.array(self.indices)]
+
+    @property
+    def breaks(self) -> Float[Array, " breaks"]:
+        return self.fold.breaks
 
 
 def restrict_fold(fold: AbstractFold, indices: tuple[int, ...]) -> AbstractFold:

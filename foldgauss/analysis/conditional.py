@@ -390,8 +390,9 @@ def _space_panels(parent, s) -> tuple[Panels, Array, Array]:
 def _log_rounding(parent, s, near, spikes: Panels | None):
     """log of the error of p(s) from the rounding of s - c(tau), where the ridge comes that close.
 
-    For the whitened residual z with rounding q the density has a factor of at most exp(-(z - q)^2 / 2), and an error of
-    at most q (z + q). Crossings on their own panels (`spikes`) are integrated exactly and excluded.
+    The density has a factor exp(-z^2 / 2) of the whitened residual z, whose rounding q changes its logarithm by at most
+    q (z + q): estimates above 1 are errors of log p. For z <= 2 q the point may be on the ridge. Crossings on their own
+    panels (`spikes`) are integrated exactly and excluded.
     """
     tau = jnp.where(jnp.isnan(near), 0, near)
     eps, tril = jnp.finfo(s.dtype).eps, parent.scale_tril[: s.size, : s.size]
@@ -410,8 +411,9 @@ def _log_rounding(parent, s, near, spikes: Panels | None):
     rate = length(speed, inverse)
     log_width = jnp.minimum(0, log_scale - jnp.log(jnp.where(rate > 0, rate, 1)))
     log_det = jnp.log(jnp.diagonal(tril)).sum() + s.size * (log_scale + _HALF_LOG_2PI)
-    log_best = -0.5 * (tau**2 + jnp.maximum(z - q, 0) ** 2) - _HALF_LOG_2PI - log_det + log_width
-    log_error = log_best + jnp.log(q * (z + q))
+    close, change = z <= 2 * q, q * (z + q)
+    log_best = -0.5 * (tau**2 + jnp.where(close, 0, z) ** 2) - _HALF_LOG_2PI - log_det + log_width
+    log_error = log_best + jnp.log(jnp.where(close, jnp.minimum(1, change), change))
     counts = ~jnp.isnan(near) & jnp.isfinite(place).all(-1)
     if spikes is not None:
         counts = counts & ~is_within_any((spikes.left[:, 0], spikes.right[:, -1]), tau)

@@ -1,65 +1,55 @@
 """Moments, entropy and mode of a Folded-Gaussian: in closed form where one exists, else by quadrature over time."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
-from foldgauss._numerics.batch import broadcast_leaves, concrete_value, expand_leaves, map_over_batch
+from foldgauss._numerics.batch import broadcast_leaves, concrete_value, map_over_batch
 from foldgauss._runtime.checks import invalid
-from foldgauss.analysis.quadrature import find_peaks, gauss_hermite, normal_rule
+from foldgauss.analysis.quadrature import find_peaks, normal_panels, warn_of_error
 from foldgauss.envelope import Constant, TimeLikelihood
-from foldgauss.fold import PolynomialFold, ZeroFold
+from foldgauss.fold import FourierFold, PolynomialFold, ZeroFold
 
-__all__ = ["entropy", "mean_envelope", "mean_log_envelope", "mode", "moments"]
+__all__ = ["entropy", "mean_log_envelope", "mode", "moments"]
 
 _LOG_2PI_E = float(np.log(2 * np.pi * np.e))
 # The mode is not unique if the density elsewhere on the ridge is as high up to this relative difference.
 _TIE = 1e-6
 
 
-def moments(dist, order: int) -> tuple[Float[Array, "*batch d"], Float[Array, "*batch d d"]]:
+def moments(dist, *, with_error: bool = False) -> tuple[Array, ...]:
     """Mean (*batch, d) and covariance (*batch, d, d) of x = (s, t), time last: see `FoldedGaussian.moments`."""
     dist = broadcast_leaves(dist, dist.batch_shape)
-    mean_f, cov_f, cross = _fold_moments(dist, order)
+    mean_f, cov_f, cross, error_f = _fold_moments(dist)
+    mean_a, error_a = _envelope_means(dist)[0]
     mean = jnp.concatenate([dist.loc + mean_f, dist.time_loc[..., None]], axis=-1)
     sigma = dist.scale_tril @ jnp.swapaxes(dist.scale_tril, -1, -2)
-    space = mean_envelope(dist)[..., None, None] * sigma + cov_f
+    space = mean_a[..., None, None] * sigma + cov_f
     last = jnp.concatenate([-cross, (dist.time_scale**2)[..., None]], axis=-1)
     upper = jnp.concatenate([space, -cross[..., :, None]], axis=-1)
-    return mean, jnp.concatenate([upper, last[..., None, :]], axis=-2)
+    covariance = jnp.concatenate([upper, last[..., None, :]], axis=-2)
+    error = lax.stop_gradient(jnp.maximum(error_f, error_a))
+    warn_of_error("moments", error)
+    return (mean, covariance, error) if with_error else (mean, covariance)
 
 
-def entropy(dist) -> Float[Array, "*batch"]:
+def entropy(dist, *, with_error: bool = False) -> Array | tuple[Array, Array]:
     """Differential entropy in nats, (*batch,): see `FoldedGaussian.entropy`."""
     dist = broadcast_leaves(dist, dist.batch_shape)
     dim = dist.loc.shape[-1]
     log_det = jnp.log(jnp.diagonal(dist.scale_tril, axis1=-2, axis2=-1)).sum(-1)
     gaussian = 0.5 * (dim + 1) * _LOG_2PI_E + jnp.log(dist.time_scale) + log_det
-    return gaussian + 0.5 * dim * mean_log_envelope(dist)
+    mean_log_a, error = mean_log_envelope(dist)
+    warn_of_error("entropy", error / jnp.maximum(1, jnp.abs(mean_log_a)))
+    value = gaussian + 0.5 * dim * mean_log_a
+    return (value, 0.5 * dim * error) if with_error else value
 
 
-def mean_envelope(dist) -> Float[Array, "*batch"]:
-    """E[a(t)] in (0, 1]: 1, or floor + (1 - floor) / sqrt(1 + power), or by quadrature (eq:a_func_2d)."""
-    envelope = dist.envelope
-    if isinstance(envelope, Constant):
-        return jnp.ones_like(dist.time_loc)
-    if isinstance(envelope, TimeLikelihood):
-        return envelope.floor + (1 - envelope.floor) / jnp.sqrt(1 + envelope.power)
-    return _expected_envelope(dist, jnp.exp)
-
-
-def mean_log_envelope(dist) -> Float[Array, "*batch"]:
-    """E[log a(t)] <= 0: 0, or -power / 2 without a floor, or by quadrature."""
-    envelope = dist.envelope
-    if isinstance(envelope, Constant):
-        return jnp.zeros_like(dist.time_loc)
-    if not isinstance(envelope, TimeLikelihood):
-        return _expected_envelope(dist, lambda log_a: log_a)
-    floor = concrete_value(envelope.floor)
-    if floor is not None and not floor.any():
-        return -0.5 * envelope.power
-    floored = _expected_envelope(dist, lambda log_a: log_a)
-    return jnp.where(envelope.floor == 0, -0.5 * envelope.power, floored)
+def mean_log_envelope(dist) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+    """E[log a(t)] <= 0, and its estimated error."""
+    return _envelope_means(dist)[1]
 
 
 def mode(dist) -> Float[Array, "*batch d"]:
@@ -78,57 +68,126 @@ def mode(dist) -> Float[Array, "*batch d"]:
     return jnp.where(unique[..., None], _ridge(filled, filled.time_loc), jnp.nan)
 
 
-def _fold_moments(dist, order: int):
-    """E f(u), Cov f(u), E[f(u) u] for u ~ N(0, time_scale^2)."""
-    if isinstance(dist.fold, ZeroFold):
-        zero = jnp.zeros_like(dist.loc)
-        return zero, jnp.zeros_like(dist.scale_tril), zero
-    if isinstance(dist.fold, PolynomialFold):
-        return _polynomial_moments(dist.fold.coefficients, dist.time_scale)
-    z, weights = (jnp.asarray(x, dist.loc.dtype) for x in gauss_hermite(order))
-    z = z.reshape(-1, *(1,) * dist.time_scale.ndim)
-    values = expand_leaves(dist.fold, dist.time_scale.ndim + 1)(z * dist.time_scale[None])
-    mean = jnp.tensordot(weights, values, axes=1)
-    centered = values - mean[None]
-    covariance = jnp.tensordot(weights, centered[..., :, None] * centered[..., None, :], axes=1)
-    cross = jnp.tensordot(weights, values * z[..., None], axes=1) * dist.time_scale[..., None]
-    return mean, covariance, cross
+def _envelope_means(dist):
+    """(E[a(t)], its estimated error) and (E[log a(t)], its estimated error), exact but for floors and other envelopes.
+
+    E[a] is 1, or floor + (1 - floor) / sqrt(1 + power) (eq:a_func_2d), and E[log a] 0, or -power / 2 without a floor.
+    """
+    envelope, zero = dist.envelope, jnp.zeros_like(dist.time_loc)
+    if isinstance(envelope, Constant):
+        return (zero + 1, zero), (zero, zero)
+    if not isinstance(envelope, TimeLikelihood):
+        return map_over_batch(_integrated_envelope, dist)
+    mean = envelope.floor + (1 - envelope.floor) / jnp.sqrt(1 + envelope.power), zero
+    plain, floor = (-0.5 * envelope.power, zero), concrete_value(envelope.floor)
+    if floor is not None and not floor.any():
+        return mean, plain
+    floored = map_over_batch(_integrated_envelope, dist)[1]
+    return mean, tuple(jnp.where(envelope.floor == 0, a, b) for a, b in zip(plain, floored, strict=True))
+
+
+def _integrated_envelope(dist):
+    """As `_envelope_means`, of one distribution, by quadrature."""
+
+    def values(dist, tau):
+        log_a = _log_envelope(dist, tau)
+        return jnp.stack([jnp.exp(log_a), log_a], -1)
+
+    frozen = lax.stop_gradient(dist)
+    panels = normal_panels(lambda tau: values(frozen, tau), jnp.zeros(0, dist.loc.dtype), dist.loc.dtype)
+    found = panels.expectation(values(dist, panels.nodes))
+    unit = lax.stop_gradient(jnp.stack([jnp.ones_like(found[1]), jnp.maximum(1, jnp.abs(found[1]))]))
+    error = unit * panels.expectation_error(values(frozen, panels.nodes) / unit[None, None])
+    return (found[0], error[0]), (found[1], error[1])
+
+
+def _log_envelope(dist, tau: Float[Array, "*tau"]) -> Float[Array, "*tau"]:
+    """log a at standardized times; one distribution, not a batch."""
+    if isinstance(dist.envelope, TimeLikelihood):  # depends on tau only, which t = time_loc + ... may round
+        return dist.envelope.log_a(tau, time_loc=jnp.zeros_like(dist.time_loc), time_scale=jnp.ones_like(dist.time_loc))
+    t = dist.time_loc + dist.time_scale * tau
+    return dist.envelope.log_a(t, time_loc=dist.time_loc, time_scale=dist.time_scale)
+
+
+def _fold_moments(dist):
+    """E f(u), Cov f(u), E[f(u) u] for u ~ N(0, time_scale^2), and the estimated error in standard deviations."""
+    fold, scale, zero = dist.fold, dist.time_scale, jnp.zeros_like(dist.time_loc)
+    if isinstance(fold, ZeroFold):
+        return jnp.zeros_like(dist.loc), jnp.zeros_like(dist.scale_tril), jnp.zeros_like(dist.loc), zero
+    if isinstance(fold, PolynomialFold):
+        return *_polynomial_moments(fold.coefficients, scale), zero
+    if isinstance(fold, FourierFold):
+        return *_fourier_moments(fold, scale), zero
+    return map_over_batch(_integrated_fold, fold, (scale, 0))
+
+
+def _integrated_fold(fold, scale):
+    """As `_fold_moments`, of one fold, by quadrature."""
+
+    def values(z):
+        return fold((z * scale).ravel()).reshape(*z.shape, -1)
+
+    edges = fold.breaks.astype(scale.dtype) / scale
+    panels = normal_panels(lambda z: lax.stop_gradient(values(z)), edges, scale.dtype)
+    y = values(panels.nodes)
+    mean = panels.expectation(y)
+    unit = lax.stop_gradient(jnp.sqrt(panels.expectation((y - mean[None, None]) ** 2)))
+    unit = jnp.where(unit > 0, unit, 1)
+    y = (y - mean[None, None]) / unit[None, None]  # whose squares do not overflow
+    products = y[..., :, None] * jnp.concatenate([y, panels.nodes[..., None]], -1)[..., None, :]
+    found, error = panels.expectation(products), panels.expectation_error(products).max()
+    error = jnp.maximum(error, panels.expectation_error(y).max())
+    return mean, found[:, :-1] * unit[:, None] * unit[None], found[:, -1] * unit * scale, error
 
 
 def _polynomial_moments(coefficients: Float[Array, "*batch degree dim"], scale: Float[Array, "*batch"]):
-    """Exact, by E z^k = (k - 1)!! for even k, with the powers of the scale put into the coefficients."""
+    """Exact, by E z^k = (k - 1)!! for even k, with the deviations of u^k put into the coefficients."""
     degree, dtype = coefficients.shape[-2], coefficients.dtype
-    normal = np.array([_normal_moment(k) for k in range(2 * degree + 2)])
     k = np.arange(1, degree + 1)
-    covariances = normal[k[:, None] + k] - np.outer(normal[k], normal[k])
-    powers = scale[..., None] ** jnp.asarray(k, dtype).reshape((1,) * scale.ndim + (degree,))
-    scaled = coefficients * powers[..., None]
-    mean = jnp.einsum("k,...ki->...i", jnp.asarray(normal[k], dtype), scaled)
+    normal = np.array([_normal_moment(k) for k in range(2 * degree + 2)])
+    size = np.sqrt(normal[2 * k])
+    covariances = normal[k[:, None] + k] / size[:, None] / size - np.outer(normal[k] / size, normal[k] / size)
+    scaled = _times_powers(coefficients * jnp.asarray(size, dtype).reshape((1,) * scale.ndim + (degree, 1)), scale)
+    mean = jnp.einsum("k,...ki->...i", jnp.asarray(normal[k] / size, dtype), scaled)
     covariance = jnp.einsum("...ki,kl,...lj->...ij", scaled, jnp.asarray(covariances, dtype), scaled)
-    cross = jnp.einsum("k,...ki->...i", jnp.asarray(normal[k + 1], dtype), scaled) * scale[..., None]
+    cross = jnp.einsum("k,...ki->...i", jnp.asarray(normal[k + 1] / size, dtype), scaled) * scale[..., None]
     return mean, covariance, cross
+
+
+@jax.custom_jvp
+def _times_powers(rows: Float[Array, "*batch degree dim"], scale: Float[Array, "*batch"]):
+    """Row k - 1 times scale^k, one factor at a time: the power itself overflows where a coefficient is 0 or small."""
+    scaled = []
+    for row in range(rows.shape[-2]):
+        rows = rows[..., min(row, 1) :, :] * scale[..., None, None]
+        scaled.append(rows[..., 0, :])
+    return jnp.stack(scaled, axis=-2) if scaled else rows
+
+
+@_times_powers.defjvp
+def _times_powers_jvp(primals, tangents):
+    scaled, scale = _times_powers(*primals), primals[1]
+    k = jnp.arange(1, scaled.shape[-2] + 1, dtype=scale.dtype).reshape((1,) * scale.ndim + (-1, 1))
+    return scaled, _times_powers(tangents[0], scale) + k * scaled * (tangents[1] / scale)[..., None, None]
 
 
 def _normal_moment(k: int) -> float:
     return 0.0 if k % 2 else float(np.prod(np.arange(k - 1, 0, -2, dtype=float)))
 
 
-def _expected_envelope(dist, function) -> Float[Array, "*batch"]:
-    """E function(log a(t))."""
-    z, weights = (jnp.asarray(x, dist.loc.dtype) for x in normal_rule())
-    return jnp.tensordot(weights, function(_log_envelope(dist, z)), axes=1)
-
-
-def _log_envelope(dist, tau: Float[Array, " tau"]) -> Float[Array, " tau *batch"]:
-    dist = broadcast_leaves(dist, dist.batch_shape)
-    rank = dist.time_loc.ndim + 1
-    tau = tau.reshape(-1, *(1,) * (rank - 1))
-    if isinstance(dist.envelope, TimeLikelihood):  # depends on tau only, which t = time_loc + ... may round
-        zero, one = jnp.zeros_like(dist.time_loc)[None], jnp.ones_like(dist.time_scale)[None]
-        return expand_leaves(dist.envelope, rank).log_a(tau, time_loc=zero, time_scale=one)
-    t = dist.time_loc[None] + dist.time_scale[None] * tau
-    envelope = expand_leaves(dist.envelope, rank)
-    return envelope.log_a(t, time_loc=dist.time_loc[None], time_scale=dist.time_scale[None])
+def _fourier_moments(fold: FourierFold, scale: Float[Array, "*batch"]):
+    """Exact, by E e^(iaz) = e^(-a^2/2), with Cov(sin az, sin bz) and Cov(cos az, cos bz) without cancellation."""
+    k = jnp.arange(1, fold.order + 1, dtype=scale.dtype)
+    a = 2 * jnp.pi * (scale / fold.period)[..., None] * k.reshape((1,) * scale.ndim + (fold.order,))
+    product, near = a[..., :, None] * a[..., None, :], 0.5 * jnp.exp(-0.5 * (a[..., :, None] - a[..., None, :]) ** 2)
+    sines, cosines = -near * jnp.expm1(-2 * product), near * jnp.expm1(-product) ** 2
+    mean = jnp.einsum("...k,...ki->...i", jnp.expm1(-0.5 * a**2), fold.cosine)
+    covariance = sum(
+        jnp.einsum("...ki,...kl,...lj->...ij", rows, matrix, rows)
+        for rows, matrix in ((fold.sine, sines), (fold.cosine, cosines))
+    )
+    cross = jnp.einsum("...k,...ki->...i", a * jnp.exp(-0.5 * a**2), fold.sine) * scale[..., None]
+    return mean, covariance, cross
 
 
 def _ridge(dist, t) -> Float[Array, "*batch d"]:
