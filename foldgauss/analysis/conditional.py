@@ -11,7 +11,14 @@ from jax import lax
 from jax.scipy.special import log_ndtr, logsumexp
 from jaxtyping import Array, Float, Key
 
-from foldgauss._numerics.batch import as_value, batch_shape_of, check_event, map_over_batch, ranked_leaves
+from foldgauss._numerics.batch import (
+    as_value,
+    batch_shape_of,
+    check_event,
+    compile_eager,
+    map_over_batch,
+    ranked_leaves,
+)
 from foldgauss._numerics.factor import check_rest, normalize_indices
 from foldgauss._runtime.checks import invalid
 from foldgauss.analysis.narrow_crossings import ROUNDING, crossing_modes, crossing_panels, gaussian_at
@@ -69,7 +76,10 @@ class TimeDensity(eqx.Module):
 
     def log_prob(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
         """log p(t | s)."""
-        value = as_value(value, self.values.dtype)
+        return self._log_prob(as_value(value, self.values.dtype))
+
+    @compile_eager
+    def _log_prob(self, value: Array) -> Array:
         shape = jnp.broadcast_shapes(value.shape, self.batch_shape)
         value = jnp.broadcast_to(value, shape)[..., None]
         joint = self.parent.log_prob(jnp.concatenate([_over(self.values, shape), value], axis=-1))
@@ -196,6 +206,10 @@ class TimeMixture(eqx.Module):
 
     def sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Draws of shape (*sample_shape, *batch, n): t first, then space given t."""
+        return self._sample(key, tuple(sample_shape))
+
+    @compile_eager(static=("sample_shape",))
+    def _sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...]) -> Array:
         time_key, space_key = jax.random.split(key)
         shape = (*sample_shape, *self.batch_shape)
         if self.time is None:

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from foldgauss._numerics.batch import broadcast_leaves, concrete_value, expand_leaves, map_over_batch
+from foldgauss._numerics.batch import broadcast_leaves, compile_eager, concrete_value, expand_leaves, map_over_batch
 from foldgauss._runtime.checks import invalid
 from foldgauss.analysis.quadrature import find_peaks, gauss_hermite, normal_rule
 from foldgauss.envelope import Constant, TimeLikelihood
@@ -17,6 +17,7 @@ _LOG_2PI_E = float(np.log(2 * np.pi * np.e))
 _TIE = 1e-6
 
 
+@compile_eager(static=("order",))
 def moments(dist, order: int) -> tuple[Float[Array, "*batch d"], Float[Array, "*batch d d"]]:
     """Mean (*batch, d) and covariance (*batch, d, d) of x = (s, t), time last: see `FoldedGaussian.moments`."""
     dist = broadcast_leaves(dist, dist.batch_shape)
