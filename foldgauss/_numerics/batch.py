@@ -217,9 +217,14 @@ def map_over_batch(function: Callable, *items):
 def _map_eager(function: Callable, structure, flat: list[np.ndarray], size: int):
     """In chunks of one of few sizes, so that batches of any size share a compiled program."""
     width = next((n for n in _SIZES if size <= n), _CHUNK)
-    index = [np.minimum(np.arange(start, start + width), size - 1) for start in range(0, size, width)]
-    results = [_map_flat(function, structure, [x[rows] for x in flat]) for rows in index]
+    chunks = [[fill_up(x[start : start + width], width) for x in flat] for start in range(0, size, width)]
+    results = [_map_flat(function, structure, chunk) for chunk in chunks]
     return jax.tree.map(lambda *parts: _join(parts)[:size], *results)
+
+
+def fill_up(x: np.ndarray, size: int) -> np.ndarray:
+    """`size` rows: those of x, then its last one again."""
+    return x[np.minimum(np.arange(size), len(x) - 1)]
 
 
 def _join(parts: tuple[Array, ...]):

@@ -16,6 +16,8 @@ from foldgauss._numerics.batch import (
     batch_shape_of,
     check_event,
     compile_eager,
+    concrete_value,
+    fill_up,
     map_over_batch,
     ranked_leaves,
 )
@@ -125,8 +127,11 @@ class TimeDensity(eqx.Module):
         batch, rank = self.batch_shape, len(self.batch_shape)
         shape = jnp.broadcast_shapes(x.shape, batch)
         flat = jnp.broadcast_to(x, shape).reshape(-1, int(np.prod(batch)))
+        count, values = len(flat), concrete_value(flat)
+        if values is not None and values.size:  # a power of two, so that few programs serve all numbers of samples
+            flat = fill_up(values, 1 << (count - 1).bit_length())
         panels = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[rank:]), self.panels)
-        return _each(function, panels, flat).reshape(shape)
+        return _each(function, panels, jnp.asarray(flat))[:count].reshape(shape)
 
     def _tau(self, t):
         shape = jnp.broadcast_shapes(t.shape, self.batch_shape)
