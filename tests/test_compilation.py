@@ -1,13 +1,16 @@
 """Compiled programs: few for many distributions and batch sizes, since each holds memory maps, and takes seconds."""
 
+from collections.abc import Callable
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import Array, Float
 
-from foldgauss._numerics.batch import map_over_batch
+from foldgauss._numerics.batch import BatchModule, map_over_batch
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.fold import PolynomialFold
 
@@ -67,6 +70,23 @@ def _cube(x):
 
 def test_few_programs_serve_all_batch_sizes():
     _cube.traced = []
-    for size in range(1, 200, 3):
-        map_over_batch(_cube, (jnp.ones(size), 0))
+    for size in range(1, 200, 13):
+        map_over_batch(_cube, (np.ones(size, np.float32), 0))
     assert len(_cube.traced) == 3
+
+
+class _Slanted(BatchModule):
+    """A module with a function that may close over tracers."""
+
+    x: Float[Array, "*batch"]
+    function: Callable = eqx.field(static=True)
+
+
+def _apply(module):
+    return module.function(module.x)
+
+
+@pytest.mark.parametrize("size", [5, 100])
+def test_mapped_functions_may_close_over_tracers(size):
+    total = lambda slope: map_over_batch(_apply, _Slanted(jnp.ones(size), lambda x: slope * x)).sum()  # noqa: E731
+    assert jax.grad(total)(0.7) == size

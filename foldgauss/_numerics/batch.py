@@ -218,7 +218,8 @@ def _map_eager(function: Callable, structure, flat: list[np.ndarray], size: int)
     """In chunks of one of few sizes, so that batches of any size share a compiled program."""
     width = next((n for n in _SIZES if size <= n), _CHUNK)
     chunks = [[fill_up(x[start : start + width], width) for x in flat] for start in range(0, size, width)]
-    results = [_map_flat(function, structure, chunk) for chunk in chunks]
+    # One after the other: jaxlib's solver for batches can deadlock if two programs run at once (`solve_upper_matrix`).
+    results = [jax.tree.map(_as_numpy, _map_flat(function, structure, chunk)) for chunk in chunks]
     return jax.tree.map(lambda *parts: _join(parts)[:size], *results)
 
 
@@ -227,10 +228,13 @@ def fill_up(x: np.ndarray, size: int) -> np.ndarray:
     return x[np.minimum(np.arange(size), len(x) - 1)]
 
 
-def _join(parts: tuple[Array, ...]):
-    if any(isinstance(x, jax.core.Tracer) for x in parts):  # of what a user's function closes over
-        return jnp.concatenate(parts)
-    return np.concatenate([np.asarray(x) for x in parts])
+def _as_numpy(x: Array) -> Array | np.ndarray:
+    """The values, waited for; tracers, of what a user's function closes over, as they are."""
+    return x if isinstance(x, jax.core.Tracer) else np.asarray(x)
+
+
+def _join(parts: tuple) -> Array | np.ndarray:
+    return (np if isinstance(parts[0], np.ndarray) else jnp).concatenate(parts)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
