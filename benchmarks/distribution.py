@@ -3,10 +3,13 @@
     python -m benchmarks.distribution [--points N] [--rounds N] [--json FILE]
 
 d = 3, f = 0 and a = 1 is the case all of them can do. Peers are measured where they import (`pip install numpyro`).
-Every ratio is of two medians from the same run, in turn; ratios above 1 mean that foldgauss is faster.
+Every ratio is of two medians from the same run, in turn; ratios above 1 mean that foldgauss is faster. First calls are
+those of this process, with their compilation: seconds, of the processor too, and memory maps where /proc shows them.
 """
 
 import importlib.util
+import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -82,6 +85,35 @@ def _tasks(points: int) -> dict[str, common.Task]:
     return tasks
 
 
+def _first_calls() -> dict[str, float]:
+    """Figures of eager first calls at 1,000 points, and of integrals over time for a second number of points."""
+    dist, x = _distributions()["degree 3, envelope"], np.random.default_rng(common.SEED).normal(size=(1000, 3)) * 0.3
+    x, key, space = x.astype(np.float32), jax.random.key(common.SEED), dist.marginal((0, 1))
+    calls = {
+        "log_prob": lambda: dist.log_prob(x),
+        "sample": lambda: dist.sample(key, (1000,)),
+        "moments": dist.moments,
+        "grad_log_prob": lambda: dist.grad_log_prob(x),
+        "space log_prob": lambda: space.log_prob(x[:, :2]),
+        "space log_prob, again": lambda: space.log_prob(x[:, :2]),
+        "space log_prob, 900 points": lambda: space.log_prob(x[:900, :2]),
+        "mean of time given space": lambda: dist.time_given_space(x[0, :2]).mean,
+    }
+    figures = {}
+    for name, call in calls.items():
+        maps, seconds, processor = _num_maps(), time.perf_counter(), time.process_time()
+        jax.block_until_ready(call())
+        figures[f"first {name} (s)"] = time.perf_counter() - seconds
+        figures[f"first {name} (s of processor)"] = time.process_time() - processor
+        figures[f"first {name} (memory maps)"] = _num_maps() - maps
+    return figures
+
+
+def _num_maps() -> int:
+    maps = Path("/proc/self/maps")
+    return maps.read_text().count("\n") if maps.exists() else 0
+
+
 def _sample_arguments(peer, key, points: int) -> dict[str, object]:
     numpyros = type(peer).__module__.startswith("numpyro")
     return {"key": key, "sample_shape": (points,)} if numpyros else {"seed": key, "sample_shape": (points,)}
@@ -105,8 +137,9 @@ def main(arguments: list[str] | None = None) -> None:
     made.add_argument("--rounds", type=common.whole, default=7)
     options = common.parse(made, arguments)
     jnp.zeros(1).block_until_ready()
+    first = _first_calls()
     seconds = common.interleaved(_tasks(options.points), options.rounds)
-    figures = _figures({name: float(np.median(times)) for name, times in seconds.items()})
+    figures = first | _figures({name: float(np.median(times)) for name, times in seconds.items()})
     common.finish(options.json, figures, common.machine(), points=options.points)
 
 

@@ -23,6 +23,7 @@ from foldgauss._numerics.batch import (
     check_finite,
     check_positive,
     common_dtype,
+    compile_eager,
     expand_leaves,
     ranked_leaves,
 )
@@ -174,7 +175,10 @@ class FoldedGaussian(BatchModule):
 
         **Source:** eq:foldgauss. **Raises:** ValueError if the last dimension of value is not d.
         """
-        value = as_event("value", value, self.loc.dtype, self.event_shape)
+        return self._log_prob(as_event("value", value, self.loc.dtype, self.event_shape))
+
+    @compile_eager
+    def _log_prob(self, value: Array) -> Array:
         leaves, structure = jax.tree.flatten(self)
 
         def scaled_log_prob(root, s, t, *leaves):
@@ -215,10 +219,13 @@ class FoldedGaussian(BatchModule):
 
         **Source:** eq:foldgauss, by ancestral sampling.
         """
-        check_not_forked()
+        return self._sample(key, as_sample_shape(sample_shape))
+
+    @compile_eager(static=("sample_shape",))
+    def _sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...]) -> Array:
         time_key, space_key = jax.random.split(key)
         # Every batch element has its own t, even where only loc or the fold has batch dimensions.
-        shape = (*as_sample_shape(sample_shape), *self.batch_shape)
+        shape = (*sample_shape, *self.batch_shape)
         noise = jax.random.normal(time_key, shape, self.loc.dtype)
         noise, time_loc, time_scale = align([(noise, 0), (self.time_loc, 0), (self.time_scale, 0)])
         t = time_loc + time_scale * noise
@@ -239,7 +246,11 @@ class FoldedGaussian(BatchModule):
 
         **Source:** eq:foldgauss, differentiated. **Raises:** as `log_prob`.
         """
-        return jax.grad(lambda x: self.log_prob(x).sum())(self._broadcast_value(x))
+        return self._grad_log_prob(self._broadcast_value(x))
+
+    @compile_eager
+    def _grad_log_prob(self, x: Array) -> Array:
+        return jax.grad(lambda x: self.log_prob(x).sum())(x)
 
     def observed_information(self, x: Float[Array, "*#batch d"]) -> Float[Array, "*#batch d d"]:
         """The negative Hessian of `log_prob` in x: a precision matrix where the density is locally Gaussian.
@@ -250,7 +261,10 @@ class FoldedGaussian(BatchModule):
 
         **Source:** eq:foldgauss, differentiated twice. **Raises:** as `log_prob`.
         """
-        x = self._broadcast_value(x)
+        return self._observed_information(self._broadcast_value(x))
+
+    @compile_eager
+    def _observed_information(self, x: Array) -> Array:
         directions = jnp.eye(x.shape[-1], dtype=x.dtype)
         column = lambda e: jax.jvp(self.grad_log_prob, (x,), (jnp.broadcast_to(e, x.shape),))[1]  # noqa: E731
         return -jax.vmap(column, out_axes=-1)(directions)
@@ -266,7 +280,10 @@ class FoldedGaussian(BatchModule):
 
         **Source:** eq:transform_s. **Raises:** ValueError if the last dimension of x is not d.
         """
-        x = self._broadcast_value(x)
+        return self._fold_to_normal(self._broadcast_value(x))
+
+    @compile_eager
+    def _fold_to_normal(self, x: Array) -> tuple[Array, Array]:
         at = self.condition_time(x[..., -1])
         z, log_det = _whiten(at, x[..., :-1])
         loc, scale = (jnp.broadcast_to(y, log_det.shape) for y in (self.time_loc, self.time_scale))
@@ -282,7 +299,10 @@ class FoldedGaussian(BatchModule):
 
         **Source:** eq:transform_s. **Raises:** ValueError if the last dimension of z is not d.
         """
-        z = self._broadcast_value(z)
+        return self._normal_to_fold(self._broadcast_value(z))
+
+    @compile_eager
+    def _normal_to_fold(self, z: Array) -> tuple[Array, Array]:
         loc, scale = (jnp.broadcast_to(y, z.shape[:-1]) for y in (self.time_loc, self.time_scale))
         t = loc + scale * z[..., -1]
         s, log_det = _unwhiten(self.condition_time(t), z[..., :-1])
@@ -430,9 +450,9 @@ class FoldedGaussian(BatchModule):
 
     # --- interoperability and display ---------------------------------------------------------------------------
 
-    def to_numpyro(self):
+    def to_numpyro(self, *, validate_args: bool | None = None):
         """This distribution as a numpyro distribution: see `foldgauss.analysis.interop.to_numpyro`."""
-        return interop.to_numpyro(self)
+        return interop.to_numpyro(self, validate_args=validate_args)
 
     def to_scipy(self):
         """This distribution as a frozen scipy distribution: see `foldgauss.analysis.interop.to_scipy`."""

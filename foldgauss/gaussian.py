@@ -26,6 +26,7 @@ from foldgauss._numerics.batch import (
     check_finite,
     check_positive,
     common_dtype,
+    compile_eager,
     ranked_leaves,
 )
 from foldgauss._numerics.factor import check_loc, check_matrix, check_rest, check_tril, marginal_tril, normalize_indices
@@ -236,7 +237,10 @@ class Gaussian(BatchModule):
 
     def log_prob(self, value: Float[Array, "*#batch dim"]) -> Float[Array, "*#batch"]:
         """log N(loc, Sigma)(value)."""
-        value = as_event("value", value, self.loc.dtype, self.event_shape)
+        return self._log_prob(as_event("value", value, self.loc.dtype, self.event_shape))
+
+    @compile_eager
+    def _log_prob(self, value: Array) -> Array:
         parts = [(value, 1), (self.loc, 1), (self.base_tril, 2), (self.log_scale, 0)]
         return evaluate_with_safe_grad(_scaled_log_prob, *align(parts))
 
@@ -250,7 +254,11 @@ class Gaussian(BatchModule):
 
     def sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Random samples (*sample_shape, *batch, dim), differentiable in the parameters."""
-        shape = (*as_sample_shape(sample_shape), *self.batch_shape, *self.event_shape)
+        return self._sample(key, as_sample_shape(sample_shape))
+
+    @compile_eager(static=("sample_shape",))
+    def _sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...]) -> Array:
+        shape = (*sample_shape, *self.batch_shape, *self.event_shape)
         noise = jax.random.normal(key, shape, self.loc.dtype)
         noise, loc, tril, log_scale = align([(noise, 1), (self.loc, 1), (self.base_tril, 2), (self.log_scale, 0)])
         scale = jnp.exp(log_scale)[..., None]

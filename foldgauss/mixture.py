@@ -175,9 +175,9 @@ class AbstractMixture(eqx.Module):
 
     # --- interoperability -------------------------------------------------------------------------------------
 
-    def to_numpyro(self):
+    def to_numpyro(self, *, validate_args: bool | None = None):
         """This mixture as a numpyro distribution: see `foldgauss.analysis.interop.to_numpyro`."""
-        return to_numpyro(self)
+        return to_numpyro(self, validate_args=validate_args)
 
     def to_scipy(self):
         """This mixture as a frozen scipy distribution: see `foldgauss.analysis.interop.to_scipy`."""

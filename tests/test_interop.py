@@ -1,5 +1,7 @@
 """The numpyro and scipy bridges: the same numbers in other clothes, and a short NUTS through one of them."""
 
+import copy
+import pickle
 import subprocess
 import sys
 
@@ -15,7 +17,7 @@ from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import Constant
 from foldgauss.fold import PolynomialFold
 from foldgauss.gaussian import Gaussian, Normal
-from foldgauss.mixture import FoldedMixture
+from foldgauss.mixture import AbstractMixture, FoldedMixture
 
 COVARIANCE = np.array([[0.5, 0.2], [0.2, 0.4]])
 
@@ -85,6 +87,28 @@ def test_scipy_draws_follow_scipys_conventions():
     np.testing.assert_array_equal(frozen.rvs(5, random_state=7), frozen.rvs(5, random_state=7))
     assert (frozen.rvs(5, random_state=7) != frozen.rvs(5, random_state=8)).any()
     assert (frozen.rvs(5) != frozen.rvs(5)).any()
+
+
+@pytest.mark.parametrize("size", [None, (), 0, 1, (1,), 5, (2, 1), (1, 3), (2, 3)])
+@pytest.mark.parametrize("dim", [0, 1, 3])
+def test_scipy_sizes_are_those_of_scipy(size, dim):
+    """dim 0 is a distribution on the line, scipy's `norm`."""
+    twin = stats.multivariate_normal(np.zeros(dim)) if dim else stats.norm(0.0, 1.0)
+    frozen = to_scipy(Gaussian(jnp.zeros(dim), jnp.eye(dim)) if dim else Normal(0.0, 1.0))
+    assert np.shape(frozen.rvs(size, random_state=0)) == np.shape(twin.rvs(size, random_state=0))
+
+
+@pytest.mark.parametrize("size", [-1, 2.5, (2, -1), True, "3", np.nan])
+def test_scipy_sizes_are_checked(size):
+    with pytest.raises(ValueError, match="size: expected a whole number >= 0"):
+        to_scipy(Normal(0.0, 1.0)).rvs(size)
+
+
+@pytest.mark.parametrize("dimensions", [[5], 3, [-4], [0.9], [0, 0], [0, -3], [], [True], "time", [np.nan]])
+@pytest.mark.parametrize("make", [_dist, lambda: Gaussian(jnp.zeros(3), jnp.eye(3))], ids=["folded", "gaussian"])
+def test_scipy_marginals_check_dimensions(make, dimensions):
+    with pytest.raises(ValueError, match="dimensions: expected"):
+        to_scipy(make()).marginal(dimensions)
 
 
 def test_scipy_samples_belong_to_the_density():
@@ -267,6 +291,133 @@ def test_numpyro_distributions_are_pytrees(each):
         np.testing.assert_allclose(other, log_prob, rtol=2e-5, atol=1e-5)
 
 
+def _leaves_match(bridge, again):
+    assert jax.tree.structure(again.base) == jax.tree.structure(bridge.base)
+    for ours, theirs in zip(jax.tree.leaves(bridge), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+#: Those that are no integrals over time, not even their divergences: nothing takes long to compile.
+CHEAP = {
+    "folded": lambda: _dist(envelope=Constant(), time_loc=jnp.array([0.2, 0.4])),
+    **{name: EVERY[name][0] for name in ("normal", "gaussian", "mixture")},
+}
+
+
+@pytest.fixture(params=CHEAP)
+def cheap(request, numpyro):
+    return to_numpyro(CHEAP[request.param]())
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))], ids=["deepcopy", "pickle"])
+def test_numpyro_distributions_are_copied(cheap, copied):
+    for bridge in (cheap, cheap.expand((3, *cheap.batch_shape))):
+        again = copied(bridge)
+        assert type(again) is type(bridge)
+        assert (again.batch_shape, again.event_shape) == (bridge.batch_shape, bridge.event_shape)
+    _leaves_match(cheap, copied(cheap))
+    assert repr(cheap).startswith("<foldgauss.analysis.interop")
+
+
+def test_numpyro_classes_do_not_infer_shapes(cheap):
+    """A wrong shape would be believed: numpyro's vectors raise, too."""
+    with pytest.raises(NotImplementedError, match="batch_shape and event_shape"):
+        type(cheap).infer_shapes((4, 1), (4, 1, 1))
+
+
+def test_numpyro_distributions_pass_through_scan_and_cond(cheap):
+    """As carry and as operand, with the same structure on both sides."""
+
+    @jax.jit
+    def run(bridge):
+        carried, _ = jax.lax.scan(lambda bridge, _: (bridge, None), bridge, length=2)
+        return jax.lax.cond(True, lambda bridge: bridge, lambda bridge: bridge, carried)
+
+    _leaves_match(cheap, run(cheap))
+
+
+def test_numpyro_entropy_and_divergence(cheap):
+    from numpyro.distributions import kl_divergence
+
+    if isinstance(cheap.base, AbstractMixture):
+        with pytest.raises(NotImplementedError, match="entropy: expected a distribution that has one"):
+            cheap.entropy()
+        with pytest.raises(ValueError, match="Across classes, estimate it"):
+            kl_divergence(cheap, cheap)
+        return
+    np.testing.assert_array_equal(cheap.entropy(), cheap.base.entropy())
+    wide, joint = cheap.expand((3, *cheap.batch_shape)), cheap.to_event(len(cheap.batch_shape))
+    divergence = lambda p, q: kl_divergence(p, q)  # noqa: E731  numpyro's dispatcher is no function to JAX
+    np.testing.assert_allclose(jax.jit(divergence)(cheap, cheap), np.zeros(cheap.batch_shape), atol=1e-6)
+    assert jax.eval_shape(divergence, wide, cheap).shape == wide.batch_shape
+    assert jax.eval_shape(divergence, joint, joint).shape == ()
+
+
+def test_numpyro_divergence_of_gaussians_is_numpyros(numpyro):
+    distributions = numpyro.distributions
+    ours = [to_numpyro(Normal(0.1, 0.4)), to_numpyro(Normal(0.5, 1.2))]
+    theirs = [distributions.Normal(0.1, 0.4), distributions.Normal(0.5, 1.2)]
+    np.testing.assert_allclose(distributions.kl_divergence(*ours), distributions.kl_divergence(*theirs), rtol=1e-6)
+
+
+def test_numpyro_cdf(cheap):
+    bridge = cheap
+    if bridge.event_shape:
+        for name in ("cdf", "icdf"):
+            with pytest.raises(NotImplementedError, match=f"{name}: expected a distribution that has one"):
+                getattr(bridge, name)(0.3)
+        return
+    twin = stats.norm(bridge.base.loc, bridge.base.scale)
+    np.testing.assert_allclose(bridge.cdf(0.3), twin.cdf(0.3), rtol=1e-5)
+    np.testing.assert_allclose(bridge.icdf(0.3), twin.ppf(0.3), rtol=1e-5)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_numpyro_warns_out_of_the_support(cheap, value):
+    x = np.full((*cheap.batch_shape, *cheap.event_shape), value, np.float32)
+    checked = to_numpyro(cheap.base, validate_args=True)
+    with pytest.warns(UserWarning, match="Out-of-support values provided to log prob method"):
+        assert np.isneginf(checked.log_prob(x)).all()
+    to_numpyro(cheap.base, validate_args=False).log_prob(x)  # no warning, which would be an error in this suite
+
+
+def test_numpyro_validation_reaches_the_constructor(numpyro):
+    spoiled = eqx.tree_at(lambda dist: dist.time_scale, _dist(), jnp.asarray(-1.0))
+    with numpyro.validation_enabled(True):
+        with pytest.raises(ValueError, match="invalid time_scale parameter"):
+            spoiled.to_numpyro()
+        spoiled.to_numpyro(validate_args=False)
+    with numpyro.validation_enabled(False):
+        spoiled.to_numpyro()
+        with pytest.raises(ValueError, match="invalid time_scale parameter"):
+            spoiled.to_numpyro(validate_args=True)
+
+
+@pytest.mark.parametrize("logits", [[-np.inf, -np.inf], [0.0, np.inf], [np.nan, 0.0]])
+def test_numpyro_validates_weights(numpyro, logits):
+    mixture = _mixture()
+    to_numpyro(eqx.tree_at(lambda dist: dist.logits, mixture, jnp.array([0.0, -jnp.inf])), validate_args=True)
+    spoiled = eqx.tree_at(lambda dist: dist.logits, mixture, jnp.array(logits))
+    with pytest.raises(ValueError, match="invalid logits parameter"):
+        to_numpyro(spoiled, validate_args=True)
+
+
+def test_numpyro_moments_belong_to_the_draws(cheap):
+    x = np.asarray(SAMPLE(cheap, jax.random.key(0), (4000,)), np.float64)
+    mean, variance = (np.asarray(y) for y in MEAN_AND_VARIANCE(cheap))
+    # 6 standard errors; the excess kurtosis of these is below 8. Power: a mean that is off by 15% of sd is caught.
+    assert (np.abs(x.mean(0) - mean) < 6 * np.sqrt(variance / 4000)).all()
+    np.testing.assert_allclose(x.var(0), variance, rtol=6 * np.sqrt(10 / 4000))
+
+
+def test_numpyro_log_prob_has_gradients(cheap):
+    value = cheap.sample(jax.random.key(0))
+    by_leaves, by_value = jax.jit(jax.grad(lambda bridge, x: bridge.log_prob(x).sum(), argnums=(0, 1)))(cheap, value)
+    assert by_value.shape == value.shape
+    assert all(np.isfinite(leaf).all() for leaf in [by_value, *jax.tree.leaves(by_leaves)])
+    assert np.abs(by_value).sum() > 0
+
+
 @pytest.mark.slow
 def test_numpyro_svi_finds_a_latent_folded_gaussian(numpyro):
     """The ELBO of a guide of the right family rises to the evidence, 0 here; with reparametrized gradients."""
@@ -317,13 +468,9 @@ def test_numpyro_model_under_nuts_finds_the_fold(numpyro):
 
 
 def test_missing_numpyro_names_the_extra(monkeypatch):
-    from foldgauss.analysis import interop as bridges
-
     monkeypatch.setitem(sys.modules, "numpyro", None)
-    bridges._numpyro_class.cache_clear()
     with pytest.raises(ImportError, match=r"pip install 'foldgauss\[numpyro\]'"):
         to_numpyro(_dist())
-    bridges._numpyro_class.cache_clear()
 
 
 def test_import_leaves_optional_libraries_alone():

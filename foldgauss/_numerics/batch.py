@@ -184,26 +184,87 @@ def check_positive(name: str, x: Array, cure: str = "It is a standard deviation.
         raise invalid(name, expected="positive numbers", got=f"a least of {value.min()}", cure=cure)
 
 
-# --- one at a time --------------------------------------------------------------------------------------------
+# --- compilation ----------------------------------------------------------------------------------------------
+
+
+def compile_eager(function: Callable | None = None, *, static: tuple[str, ...] = ()):
+    """Compile a function of modules and arrays where it is called eagerly: its many small kernels become one program.
+
+    Inside other transformations, and for user functions, which may close over tracers or over what changes, it is
+    called as it is. `static` names the parameters that are no arrays.
+    """
+    if function is None:
+        return functools.partial(compile_eager, static=static)
+    compiled = jax.jit(function, static_argnames=static)
+
+    @functools.wraps(function)
+    def call(*args, **kwargs):
+        check_not_forked()
+        return (compiled if _is_eager((args, kwargs)) else function)(*args, **kwargs)
+
+    return call
+
+
+def _is_eager(arguments) -> bool:
+    """Whether no argument is traced, and none contains a user's function."""
+    if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(arguments)):
+        return False
+    parts = jax.tree.leaves(arguments, is_leaf=lambda x: hasattr(x, "is_closed"))
+    return all(getattr(x, "is_closed", True) for x in parts)
+
 
 # Batch elements that are evaluated at once, which limits memory.
 _CHUNK = 64
+# Eager batches are filled up to one of these sizes: as many programs serve all batches.
+_SIZES = (1, 8, _CHUNK)
 
 
-@eqx.filter_jit
 def map_over_batch(function: Callable, *items):
     """`function` of unbatched items, mapped over all their batch dimensions; compiled.
 
     `function` must be defined at module level, since a new closure would be compiled each time. Each item is a module
     with `leaf_ranks`, or a pair (array, event rank).
     """
-    arrays = [ranked_leaves(x) if isinstance(x, eqx.Module) else [x] for x in items]
-    batch = check_batch([part for parts in arrays for part in parts])
-    size = int(np.prod(batch))
-    flat = [broadcast_leaves(x, batch) if isinstance(x, eqx.Module) else broadcast([x], batch)[0] for x in items]
-    flat = jax.tree.map(lambda x: x.reshape(size, *x.shape[len(batch) :]), flat)
+    parts = [part for x in items for part in (ranked_leaves(x) if isinstance(x, eqx.Module) else [x])]
+    batch, structure = check_batch(parts), jax.tree.structure([x if isinstance(x, eqx.Module) else x[0] for x in items])
+    traced = any(isinstance(x, jax.core.Tracer) for x, _ in parts)
+    own, size = jnp if traced else np, math.prod(batch)  # NumPy compiles nothing
+    shapes = [(x, x.shape[x.ndim - rank :]) for x, rank in parts]
+    flat = [own.broadcast_to(own.asarray(x), (*batch, *event)).reshape(size, *event) for x, event in shapes]
+    result = _map_flat(function, structure, flat) if traced or not size else _map_eager(function, structure, flat, size)
+    return jax.tree.map(lambda x: jnp.asarray(x.reshape((*batch, *x.shape[1:]))), result)
+
+
+def _map_eager(function: Callable, structure, flat: list[np.ndarray], size: int):
+    """In chunks of one of few sizes, so that batches of any size share a compiled program."""
+    width = next((n for n in _SIZES if size <= n), _CHUNK)
+    chunks = [[fill_up(x[start : start + width], width) for x in flat] for start in range(0, size, width)]
+    # One after the other: jaxlib's solver for batches can deadlock if two programs run at once (`solve_upper_matrix`).
+    results = [jax.tree.map(_as_numpy, _map_flat(function, structure, chunk)) for chunk in chunks]
+    return jax.tree.map(lambda *parts: _join(parts)[:size], *results)
+
+
+def fill_up(x: np.ndarray, size: int) -> np.ndarray:
+    """`size` rows: those of x, then its last one again."""
+    return x[np.minimum(np.arange(size), len(x) - 1)]
+
+
+def _as_numpy(x: Array) -> Array | np.ndarray:
+    """The values, waited for; tracers, of what a user's function closes over, as they are."""
+    return x if isinstance(x, jax.core.Tracer) else np.asarray(x)
+
+
+def _join(parts: tuple) -> Array | np.ndarray:
+    return (np if isinstance(parts[0], np.ndarray) else jnp).concatenate(parts)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _map_flat(function: Callable, structure, flat: list[Array]):
+    one = lambda leaves: function(*jax.tree.unflatten(structure, leaves))  # noqa: E731
+    size = len(flat[0])
     if size <= _CHUNK:
-        result = jax.vmap(function)(*flat)
-    else:
-        result = lax.map(lambda x: function(*x), flat, batch_size=_CHUNK)
-    return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), result)
+        return jax.vmap(one)(flat)
+    # Filled up to whole chunks, since a last smaller one would be compiled apart.
+    fill = [lax.stop_gradient(jnp.broadcast_to(x[-1:], (-size % _CHUNK, *x.shape[1:]))) for x in flat]
+    full = [jnp.concatenate(pair) for pair in zip(flat, fill, strict=True)]
+    return jax.tree.map(lambda x: x[:size], lax.map(one, full, batch_size=_CHUNK))

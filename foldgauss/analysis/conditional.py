@@ -11,7 +11,17 @@ from jax import lax
 from jax.scipy.special import log_ndtr, logsumexp
 from jaxtyping import Array, Float, Key
 
-from foldgauss._numerics.batch import as_event, as_sample_shape, as_value, batch_shape_of, map_over_batch, ranked_leaves
+from foldgauss._numerics.batch import (
+    as_event,
+    as_sample_shape,
+    as_value,
+    batch_shape_of,
+    compile_eager,
+    concrete_value,
+    fill_up,
+    map_over_batch,
+    ranked_leaves,
+)
 from foldgauss._numerics.factor import check_rest, normalize_indices
 from foldgauss._runtime.checks import invalid
 from foldgauss.analysis.narrow_crossings import ROUNDING, crossing_modes, crossing_panels, gaussian_at
@@ -69,7 +79,10 @@ class TimeDensity(eqx.Module):
 
     def log_prob(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
         """log p(t | s)."""
-        value = as_value(value, self.values.dtype)
+        return self._log_prob(as_value(value, self.values.dtype))
+
+    @compile_eager
+    def _log_prob(self, value: Array) -> Array:
         shape = jnp.broadcast_shapes(value.shape, self.batch_shape)
         value = jnp.broadcast_to(value, shape)[..., None]
         joint = self.parent.log_prob(jnp.concatenate([_over(self.values, shape), value], axis=-1))
@@ -115,8 +128,11 @@ class TimeDensity(eqx.Module):
         batch, rank = self.batch_shape, len(self.batch_shape)
         shape = jnp.broadcast_shapes(x.shape, batch)
         flat = jnp.broadcast_to(x, shape).reshape(-1, int(np.prod(batch)))
+        count, values = len(flat), concrete_value(flat)
+        if values is not None and values.size:  # a power of two, so that few programs serve all numbers of samples
+            flat = fill_up(values, 1 << (count - 1).bit_length())
         panels = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[rank:]), self.panels)
-        return _each(function, panels, flat).reshape(shape)
+        return _each(function, panels, jnp.asarray(flat))[:count].reshape(shape)
 
     def _tau(self, t):
         shape = jnp.broadcast_shapes(t.shape, self.batch_shape)
@@ -196,8 +212,12 @@ class TimeMixture(eqx.Module):
 
     def sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Draws of shape (*sample_shape, *batch, n): t first, then space given t."""
+        return self._sample(key, as_sample_shape(sample_shape))
+
+    @compile_eager(static=("sample_shape",))
+    def _sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...]) -> Array:
         time_key, space_key = jax.random.split(key)
-        shape = (*as_sample_shape(sample_shape), *self.batch_shape)
+        shape = (*sample_shape, *self.batch_shape)
         if self.time is None:
             noise = jax.random.normal(time_key, shape, self.values.dtype)
             loc, scale = (jnp.broadcast_to(x, shape) for x in (self.parent.time_loc, self.parent.time_scale))

@@ -11,7 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._numerics.factor import normalize_indices
+from foldgauss._runtime.checks import invalid, is_integer
+from foldgauss.analysis.divergence import kl_divergence
 
 if TYPE_CHECKING:
     import numpyro
@@ -19,7 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["FrozenDistribution", "to_numpyro", "to_scipy"]
 
 
-def to_numpyro(dist: Any) -> "numpyro.distributions.Distribution":
+def to_numpyro(dist: Any, *, validate_args: bool | None = None) -> "numpyro.distributions.Distribution":
     """`dist` as a numpyro distribution, differentiable in its parameters: for models, NUTS and SVI.
 
     For anything here with `log_prob`, `sample`, `batch_shape`, `event_shape` and `has_rsample`. Parameters may be
@@ -29,6 +31,11 @@ def to_numpyro(dist: Any) -> "numpyro.distributions.Distribution":
 
     **Shapes:** `batch_shape` and `event_shape` are those of `dist`; the support is all of R^d. `arg_constraints` names
     every array of `dist`. Draws of mixtures are not reparametrized (`has_rsample` is False).
+
+    `validate_args` checks parameters against these constraints and warns of values out of the support; None is
+    numpyro's own setting (`numpyro.enable_validation`), which does not change the checks of our constructors.
+    `entropy`, `cdf`, `icdf` and `mode` are those of `dist` and raise NotImplementedError where it has none;
+    `numpyro.distributions.kl_divergence` of two of them is `foldgauss.analysis.divergence.kl_divergence`.
 
     **Example:**
 
@@ -40,18 +47,42 @@ def to_numpyro(dist: Any) -> "numpyro.distributions.Distribution":
 
     **Source:** eq:foldgauss. **Raises:** ImportError that names the extra if numpyro is missing.
     """
-    return _numpyro_class()(dist)
+    return _numpyro_class()(dist, validate_args=validate_args)
 
 
-@functools.cache
 def _numpyro_class() -> type:
     """The class, made on first use: numpyro must be imported to have its base."""
     try:
-        from numpyro import distributions
+        import numpyro
     except ImportError as error:
         raise ImportError("to_numpyro needs numpyro: pip install 'foldgauss[numpyro]'.") from error
+    return _make_class(numpyro.distributions)
+
+
+@functools.cache
+def _make_class(distributions) -> type:
+    from numpyro.distributions.kl import kl_divergence as numpyro_divergence
+    from numpyro.distributions.util import validate_sample
 
     constraints = distributions.constraints
+
+    class Logits(constraints.Constraint):
+        """Numbers below infinity, not all of them -inf, which is a weight of 0."""
+
+        event_dim = 1
+
+        def __call__(self, x):
+            return (x < jnp.inf).all(-1) & (x > -jnp.inf).any(-1)
+
+        def __repr__(self):
+            return "logits"
+
+        def feasible_like(self, prototype):
+            return jnp.zeros_like(prototype)
+
+        def tree_flatten(self):
+            return (), ((), {})
+
     by_name = {
         "scale": constraints.positive,
         "time_scale": constraints.positive,
@@ -59,7 +90,7 @@ def _numpyro_class() -> type:
         "base_tril": constraints.lower_cholesky,
         "power": constraints.nonnegative,
         "floor": constraints.unit_interval,
-        "logits": constraints.dependent(is_discrete=False, event_dim=1),  # -inf is a weight of 0
+        "logits": Logits(),
     }
 
     class Constraints(dict):
@@ -88,10 +119,18 @@ def _numpyro_class() -> type:
             self.base = base
             super().__init__(base.batch_shape, base.event_shape, validate_args=validate_args)
 
+        def __reduce__(self):
+            return _blank_numpyro, (), self.__dict__  # the class is local, which pickle cannot find
+
         def __getattr__(self, name):
             if name != "base" and name in (leaves := _named_leaves(self.base)):
                 return leaves[name][0]
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+        @classmethod
+        def infer_shapes(cls, *args, **kwargs):
+            """Not implemented, as for numpyro's own vectors: the shape of an event is not the shape of a parameter."""
+            raise NotImplementedError("infer_shapes: use batch_shape and event_shape of the distribution.")
 
         @property
         def reparametrized_params(self):
@@ -108,6 +147,7 @@ def _numpyro_class() -> type:
         def sample(self, key, sample_shape=()):
             return self.base.sample(key, sample_shape)
 
+        @validate_sample
         def log_prob(self, value):
             return self.base.log_prob(value)
 
@@ -119,7 +159,37 @@ def _numpyro_class() -> type:
         def variance(self):
             return self.base.variance
 
+        @property
+        def mode(self):
+            return _part(self.base, "mode")
+
+        def entropy(self):
+            return _part(self.base, "entropy")()
+
+        def cdf(self, value):
+            return _part(self.base, "cdf")(value)
+
+        def icdf(self, q):
+            return _part(self.base, "icdf")(q)
+
+    @numpyro_divergence.register(NumpyroDistribution, NumpyroDistribution)
+    def _(p, q):
+        return kl_divergence(p.base, q.base)
+
     return NumpyroDistribution
+
+
+def _blank_numpyro():
+    """An instance without state, for pickle."""
+    made = _numpyro_class()
+    return made.__new__(made)
+
+
+def _part(dist: Any, name: str):
+    """A method or property; NotImplementedError where the class of `dist` has none, as in numpyro."""
+    if not hasattr(type(dist), name):
+        raise NotImplementedError(f"{name}: expected a distribution that has one, got {type(dist).__name__}.")
+    return getattr(dist, name)
 
 
 def _named_leaves(dist: Any) -> dict[str, tuple[Any, int | None]]:
@@ -151,7 +221,8 @@ def to_scipy(dist: Any) -> "FrozenDistribution":
 class FrozenDistribution:
     """A distribution as scipy would freeze it: `pdf`, `logpdf`, `rvs`, `entropy`, `marginal`, `mean`, `cov`.
 
-    **Shapes:** points (..., d) as NumPy arrays, time last; of one coordinate (...) will do. `rvs(size)` is (size, d).
+    **Shapes:** points (..., d) as NumPy arrays, time last; of one coordinate (...) will do. `rvs(size)` is
+    (size, d), or (size,) if d is 1.
 
     **Example:** `to_scipy(dist).marginal([0]).pdf(0.3)`
 
@@ -178,11 +249,17 @@ class FrozenDistribution:
         """Density at x (*points, d)."""
         return np.exp(self.logpdf(x))
 
-    def rvs(self, size=1, random_state=None) -> np.ndarray:
-        """`size` draws, (*size, d); a single one comes as (d,). `random_state`: None, an int, or a NumPy generator."""
-        shape = (size,) if isinstance(size, int | np.integer) else tuple(size)
+    def rvs(self, size=None, random_state=None) -> np.ndarray:
+        """Random draws: (d,) by default, else (*size, d) without axes of size 1, as scipy has it.
+
+        For a distribution on the line (`event_shape == ()`) the shape is `size`. `random_state`: None, an int, or a
+        NumPy generator. **Raises:** ValueError unless `size` is a whole number >= 0, or a tuple of them.
+        """
+        shape = () if size is None else tuple(np.atleast_1d(np.asarray(size)).tolist())
+        if not all(is_integer(n, 0) for n in shape):
+            raise invalid("size", expected="a whole number >= 0, or a tuple of them", got=repr(size))
         draws = np.asarray(self._base.sample(_key(random_state), shape))
-        return draws[0] if shape == (1,) else draws
+        return draws.squeeze()[()] if self._event else draws[()]
 
     def entropy(self) -> np.ndarray:
         """Differential entropy in nats."""
@@ -193,9 +270,7 @@ class FrozenDistribution:
         if not hasattr(self._base, "marginal"):
             cure = "Take all coordinates of interest from the joint distribution at once."
             raise invalid("dimensions", expected="a distribution with marginals", got=repr(self), cure=cure)
-        indices = (dimensions,) if isinstance(dimensions, int | np.integer) else tuple(dimensions)
-        indices = tuple(int(i) % self.dim for i in indices)
-        return FrozenDistribution(self._base.marginal(indices))
+        return FrozenDistribution(self._base.marginal(normalize_indices(dimensions, self.dim, name="dimensions")))
 
     @property
     def mean(self) -> np.ndarray:

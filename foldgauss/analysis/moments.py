@@ -6,7 +6,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from foldgauss._numerics.batch import broadcast_leaves, concrete_value, map_over_batch
+from foldgauss._numerics.batch import broadcast_leaves, compile_eager, concrete_value, map_over_batch
 from foldgauss._runtime.checks import invalid
 from foldgauss.analysis.quadrature import find_peaks, normal_panels, warn_of_error
 from foldgauss.envelope import Constant, TimeLikelihood
@@ -21,6 +21,13 @@ _TIE = 1e-6
 
 def moments(dist, *, with_error: bool = False) -> tuple[Array, ...]:
     """Mean (*batch, d) and covariance (*batch, d, d) of x = (s, t), time last: see `FoldedGaussian.moments`."""
+    mean, covariance, error = _moments(dist)
+    warn_of_error("moments", error)
+    return (mean, covariance, error) if with_error else (mean, covariance)
+
+
+@compile_eager
+def _moments(dist) -> tuple[Array, Array, Array]:
     dist = broadcast_leaves(dist, dist.batch_shape)
     mean_f, cov_f, cross, error_f = _fold_moments(dist)
     mean_a, error_a = _envelope_means(dist)[0]
@@ -30,9 +37,7 @@ def moments(dist, *, with_error: bool = False) -> tuple[Array, ...]:
     last = jnp.concatenate([-cross, (dist.time_scale**2)[..., None]], axis=-1)
     upper = jnp.concatenate([space, -cross[..., :, None]], axis=-1)
     covariance = jnp.concatenate([upper, last[..., None, :]], axis=-2)
-    error = lax.stop_gradient(jnp.maximum(error_f, error_a))
-    warn_of_error("moments", error)
-    return (mean, covariance, error) if with_error else (mean, covariance)
+    return mean, covariance, lax.stop_gradient(jnp.maximum(error_f, error_a))
 
 
 def entropy(dist, *, with_error: bool = False) -> Array | tuple[Array, Array]:

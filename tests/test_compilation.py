@@ -1,0 +1,92 @@
+"""Compiled programs: few for many distributions and batch sizes, since each holds memory maps, and takes seconds."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array, Float
+
+from foldgauss._numerics.batch import BatchModule, map_over_batch
+from foldgauss.distribution import FoldedGaussian
+from foldgauss.fold import PolynomialFold
+
+MAPS = Path("/proc/self/maps")
+
+
+def _dist(degree, dim):
+    fold = PolynomialFold(np.linspace(-0.5, 0.5, degree * dim, dtype=np.float32).reshape(degree, dim))
+    scale = np.full(dim, 0.3, np.float32)
+    return FoldedGaussian(np.zeros(dim, np.float32), scale=scale, time_loc=0.4, time_scale=0.3, fold=fold)
+
+
+def _num_maps() -> int:
+    return MAPS.read_text().count("\n")
+
+
+@pytest.mark.skipif(not MAPS.exists(), reason="memory maps are read from /proc, which this system lacks")
+def test_densities_of_many_structures_need_few_memory_maps():
+    """A process may have 65,530; the kernels of an eager density would need about 110 for each structure."""
+    structures = [_dist(degree, dim) for degree in (1, 2, 3) for dim in (1, 2)]
+    structures[0].log_prob(np.zeros(2, np.float32))
+    before = _num_maps()
+    for i, dist in enumerate(structures):
+        dist.log_prob(np.zeros((100 + i, *dist.event_shape), np.float32))
+    assert (_num_maps() - before) / len(structures) < 40
+
+
+@pytest.mark.skipif(not MAPS.exists(), reason="memory maps are read from /proc, which this system lacks")
+def test_batches_of_many_sizes_share_an_integral():
+    """A program of an integral over time needs 300 memory maps; one for each size would need 600 or more."""
+    marginal, before = _dist(2, 2).marginal((0, 1)), _num_maps()
+    for size in (20, 65, 100):
+        assert marginal.log_prob(np.zeros((size, 2), np.float32)).shape == (size,)
+    assert _num_maps() - before < 500
+
+
+def _square(x):
+    _square.traced.append(x.shape)
+    return x**2
+
+
+@pytest.mark.parametrize("shape", [(), (0,), (1,), (7,), (64,), (65,), (3, 50)])
+def test_batches_of_any_size_are_mapped(shape):
+    """Eagerly and traced; the padding adds nothing to values and gradients."""
+    _square.traced = []
+    x = jnp.arange(np.prod(shape, dtype=int), dtype=jnp.float32).reshape(shape)
+    np.testing.assert_array_equal(map_over_batch(_square, (x, 0)), x**2)
+    total = lambda x: map_over_batch(_square, (x, 0)).sum()  # noqa: E731
+    np.testing.assert_array_equal(jax.jit(jax.grad(total))(x), 2 * x)
+    assert all(traced == () for traced in _square.traced)
+
+
+def _cube(x):
+    _cube.traced.append(x.shape)
+    return x**3
+
+
+def test_few_programs_serve_all_batch_sizes():
+    _cube.traced = []
+    for size in range(1, 200, 6):
+        map_over_batch(_cube, (np.ones(size, np.float32), 0))
+    assert len(_cube.traced) == 3
+
+
+class _Slanted(BatchModule):
+    """A module with a function that may close over tracers."""
+
+    x: Float[Array, "*batch"]
+    function: Callable = eqx.field(static=True)
+
+
+def _apply(module):
+    return module.function(module.x)
+
+
+@pytest.mark.parametrize("size", [5, 100])
+def test_mapped_functions_may_close_over_tracers(size):
+    total = lambda slope: map_over_batch(_apply, _Slanted(jnp.ones(size), lambda x: slope * x)).sum()  # noqa: E731
+    assert jax.grad(total)(0.7) == size
