@@ -571,12 +571,17 @@ def test_conditions_far_from_zero_use_the_fits_dtype():
         fitted.condition(-1, np.nan)
 
 
-def test_times_too_coarse_for_float32_warn():
+def test_times_too_coarse_for_float32_are_refused_or_counted_from_an_origin():
     fits = FoldedGaussianMixture(K, degree=1, random_state=0)
     _quiet(fits, _blobs() + np.array([0, 0, 1e3])).to_mixture()  # a spacing of 6e-5; warnings are errors
     far = _quiet(fits, _blobs() + np.array([0, 0, 1e6]))
-    with pytest.warns(UserWarning, match=r"float32 times.*Subtract an offset"):
+    with pytest.raises(ValueError, match=r"times.*float32.*time_origin=\d+.*Subtract an offset"):
         far.to_mixture()
+    with pytest.raises(ValueError, match="Subtract an offset"):
+        far.condition(0, 0.0)  # time is left over
+    time = float(far.time_means_[0])
+    near = far.to_mixture(time_origin=1e6).condition_time(time - 1e6).mean
+    np.testing.assert_allclose(near, far.condition(-1, time).mean, rtol=1e-3)
     with jax.enable_x64(True):
         assert far.to_mixture().components.loc.dtype == jnp.float64
     far.sample(3), far.condition(-1, 1e6)  # in the precision of the fit
@@ -598,3 +603,71 @@ def test_warm_start_ignores_fits_of_other_sizes():
 def test_invalid_initial_values_and_columns_raise(options):
     with pytest.raises(ValueError, match=next(iter(options))):
         FoldedGaussianMixture(3, degree=1, **options).fit(_blobs())
+
+
+@pytest.mark.parametrize("name", ["iris", "wine"])
+def test_one_start_is_as_good_as_scikit_learns(name):
+    from sklearn import datasets
+
+    x = getattr(datasets, f"load_{name}")().data[:, :5]
+    ours, theirs = (
+        np.mean([_quiet(kind(3, random_state=seed, **options), x).score(x) for seed in range(10)])
+        for kind, options in ((FoldedGaussianMixture, {"degree": 1}), (GaussianMixture, {}))
+    )
+    assert ours > theirs - 1e-3
+
+
+def test_warm_start_of_single_iterations_converges():
+    parts = FoldedGaussianMixture(K, degree=1, random_state=0, max_iter=1, warm_start=True)
+    assert any(_quiet(parts, _blobs()).converged_ for _ in range(100))
+
+
+@pytest.mark.parametrize("chunked", [False, True])
+def test_rows_of_weight_zero_may_hold_nan(chunked):
+    x = _blobs()
+    more, weights = np.concatenate([x, np.full((1, 3), np.nan)]), np.append(np.ones(len(x)), 0.0)
+    rows, options = [more] if chunked else more, {"degree": 1, "random_state": 0}
+    whole = _quiet(FoldedGaussianMixture(K, **options), x)
+    weighed = _quiet(FoldedGaussianMixture(K, **options), rows, sample_weight=weights)
+    assert weighed.lower_bound_ == pytest.approx(whole.lower_bound_, rel=1e-9)
+    with pytest.raises(ValueError, match="NaN"):
+        FoldedGaussianMixture(K, **options).fit(rows, sample_weight=np.ones(len(more)))
+
+
+@pytest.mark.parametrize("dtype", ["datetime64[s]", "timedelta64[s]", "complex128"])
+def test_dates_and_complex_numbers_are_refused(dtype):
+    from foldgauss.estimator.likelihood import fit
+
+    x = np.zeros((9, 2), dtype)
+    for call in (FoldedGaussianMixture(1, degree=1).fit, fit):
+        with pytest.raises(ValueError, match=r"(?i)^x: expected .*numbers, got") as raised:
+            call(x)
+        assert len(str(raised.value)) < 200
+
+
+def test_columns_of_a_data_frame_are_named():
+    pandas, x = pytest.importorskip("pandas"), _blobs()
+    table = pandas.DataFrame(x, columns=["t", "a", "b"])
+    named = _quiet(FoldedGaussianMixture(K, degree=1, random_state=0, time_column="t"), table)
+    first = _quiet(FoldedGaussianMixture(K, degree=1, random_state=0, time_column=0), x)
+    np.testing.assert_array_equal(named.means_, first.means_)
+    np.testing.assert_array_equal(named.condition("t", 0.5).mean, first.condition(0, 0.5).mean)
+    with pytest.raises(ValueError, match=r"columns: expected a column of 3, or one of t, a, b, got 'c'"):
+        named.condition("c", 0.5)
+
+
+def test_a_function_is_an_envelope():
+    from foldgauss.estimator.likelihood import fit
+
+    def log_a(t, time_loc, time_scale):
+        return -0.1 * jnp.abs((t - time_loc) / time_scale)
+
+    assert np.isfinite(_quiet(FoldedGaussianMixture(1, degree=1, envelope=log_a, max_iter=2), _blobs()).lower_bound_)
+    assert fit(_blobs(), envelope=log_a).success
+
+
+def test_maximum_likelihood_refuses_times_that_its_dtype_does_not_resolve():
+    from foldgauss.estimator.likelihood import fit
+
+    with pytest.raises(ValueError, match="x: expected times that float32 resolves"):
+        fit(_blobs() + np.array([0, 0, 1.7e9]))

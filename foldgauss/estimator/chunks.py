@@ -335,7 +335,7 @@ def _map_chunk(function, fitted, width: int, x, number: int):
 
 def _check_values(number: int, row: int, x: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """The weights in the dtype of x. **Raises:** ValueError on NaN, infinity, and negative weights."""
-    finite = np.isfinite(x).all(1)
+    finite = np.isfinite(x).all(1) | (weights == 0)
     if not finite.all():
         got = f"NaN or infinity in its row {row + int(np.argmin(finite))}"
         raise invalid(f"X, chunk {number}", expected="finite numbers", got=got, cure="Remove such rows.")

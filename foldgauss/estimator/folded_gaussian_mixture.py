@@ -12,29 +12,29 @@ import numpy as np
 from jaxtyping import Float, Int
 from sklearn.base import BaseEstimator, ClassNamePrefixFeaturesOutMixin, DensityMixin, TransformerMixin
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.utils import check_random_state
+from sklearn.utils import assert_all_finite, check_random_state
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
 
 from foldgauss._runtime.checks import invalid, is_integer
 from foldgauss._runtime.threads import check_not_forked
-from foldgauss.envelope import Constant
+from foldgauss.envelope import Constant, TimeLikelihood
 from foldgauss.estimator.chunks import Chunks, is_chunked, open_chunks, summarize_rows
 from foldgauss.estimator.em.components import Parameters
-from foldgauss.estimator.em.initialization import draw_subset, initialize, params_from_gaussians, restrict_covariances
+from foldgauss.estimator.em.initialization import draw_subset, initialize, restrict_covariances
 from foldgauss.estimator.em.loop import EMStatus, Run, broadcast_degrees, run_em, select_best
 from foldgauss.estimator.em.m_step import Model
 from foldgauss.estimator.em.online import FORGETTING, compute_batch_statistics, update_online
 from foldgauss.estimator.em.prune import count_parameters, drop_unused, prune_mixture
-from foldgauss.estimator.em.scaling import Scaling, compute_scaling, to_mixture
+from foldgauss.estimator.em.scaling import Scaling, check_export, compute_scaling, to_mixture
 from foldgauss.estimator.em.statistics import Blocks, Points, enable_dtype, make_points
 from foldgauss.estimator.parameter_checks import (
-    check_array,
     check_column,
     check_parameters,
+    check_real,
     check_sizes,
     make_envelope,
 )
-from foldgauss.estimator.precisions import factor_precisions, invert_precisions
+from foldgauss.estimator.precisions import factor_precisions, replace_initial
 from foldgauss.estimator.prediction import (
     FittedParameters,
     compute_log_densities,
@@ -44,7 +44,7 @@ from foldgauss.estimator.prediction import (
     predict_responsibilities,
     sum_log_prob,
 )
-from foldgauss.estimator.rows import ChunkedRows, Rows, order_columns, put_time_last
+from foldgauss.estimator.rows import ChunkedRows, Rows, order_columns
 from foldgauss.mixture import FoldedMixture
 
 __all__ = ["EMStatus", "FoldedGaussianMixture"]
@@ -61,8 +61,6 @@ _POINTS_PER_COMPONENT = 8
 #: The highest degree fitted in float32. Beyond, with times far from normal, a curve's normal equations lose more digits
 #: than float32 has: up to 1 nat a point at degree 10.
 _MAX_SINGLE_DEGREE = 6
-#: Spacings of floating-point times up to this fraction of a component's spread are harmless.
-_MAX_SPACING = 0.01
 
 
 class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, DensityMixin, BaseEstimator):
@@ -85,9 +83,9 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
     * `n_components`: K, or "auto": starting from `max_components`, components are removed while `criterion` decreases.
     * `degree`: of every component's polynomial f, or "auto": chosen per component, up to `max_degree`.
     * `covariance_type`: of Sigma_k, "full", "diag", "spherical" or "tied". Each component has its own variance of time.
-    * `envelope`: "constant" (a = 1), "time_likelihood" (the paper's, `TimeLikelihood(power=1, floor=1e-3)`), or any
-      envelope. It is not fitted; see `gradient_fit` for that.
-    * `time_column`: the column of X that is time; by default the last one, as in `FoldedGaussian`.
+    * `envelope`: "constant" (a = 1), "time_likelihood" (the paper's, `TimeLikelihood(power=1, floor=1e-3)`), any
+      envelope, or a function as in `as_envelope`. It is not fitted; see `gradient_fit` for that.
+    * `time_column`: the column of X that is time, an index or a data frame's name; by default the last one.
     * `tol`, `max_iter`, `n_init`, `reg_covar`, `weights_init`, `means_init`, `precisions_init`, `random_state`,
       `warm_start`, `verbose`: as in GaussianMixture. `reg_covar` is added to the variances of each Sigma_k
       and of time, in the units of X.
@@ -212,11 +210,15 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
     def _check_rows(self, X, sample_weight, reset: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """Rows with time last, and weights, in the dtype of the fit."""
         check_not_forked()
-        X = validate_data(self, X, dtype=[np.float64, np.float32], ensure_min_samples=2 if reset else 1, reset=reset)
+        check_real("X", X)
+        options = {"dtype": [np.float64, np.float32], "ensure_min_samples": 2 if reset else 1, "reset": reset}
+        X = validate_data(self, X, ensure_all_finite=sample_weight is None, **options)
         weights = _check_sample_weight(sample_weight, X, dtype=X.dtype, ensure_non_negative=True)
+        if sample_weight is not None:
+            assert_all_finite(X[weights > 0], estimator_name=type(self).__name__, input_name="X")
         least = 1 if self.n_components == "auto" or not reset else self.n_components
         check_sizes(X.shape[1], int((weights > 0).sum()), weights.sum(), least)
-        return put_time_last(X, check_column(self.time_column, X.shape[1])), weights
+        return X[:, self._order_columns(X.shape[1])], weights
 
     def _check_chunks(self, X, sample_weight, double: bool) -> ChunkedRows:
         """Chunks of rows, after a first pass over them."""
@@ -227,14 +229,17 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
             raise invalid("X", expected="at least 2 rows", got=summary.num_rows)
         width = chunks.width
         check_sizes(width, summary.size, summary.total, 1 if self.n_components == "auto" else self.n_components)
-        order = self._order_columns(width)
         vars(self).pop("feature_names_in_", None)
+        order = self._order_columns(width)
         self.n_features_in_ = width
         dtype = np.dtype(np.float32 if summary.single and not double else np.float64)
         return ChunkedRows(chunks, summary, sizes, order, dtype)
 
     def _order_columns(self, num_columns: int) -> Int[np.ndarray, " d"]:
-        return order_columns(check_column(self.time_column, num_columns), num_columns)
+        return order_columns(self._time_index(num_columns), num_columns)
+
+    def _time_index(self, num_columns: int) -> int:
+        return check_column(self.time_column, num_columns, getattr(self, "feature_names_in_", None))
 
     def _run(self, data: Rows | ChunkedRows) -> tuple[Run, Model]:
         auto = "auto" in (self.n_components, self.degree)
@@ -266,6 +271,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
                 tol=self.tol,
                 max_steps=self.max_iter,
                 annealing=self.annealing,
+                last=-np.inf if warm is None else self.lower_bound_ + scaling.log_volume,
                 observe=_print_progress if self.verbose else None,
             )
         )
@@ -273,7 +279,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
             run, model = self._prune(run, points, envelope, model, total)
         self._scaling, self._envelope, self._floor = scaling, envelope, floor
         vars(self).pop("_online", None)
-        self._fitted_with = self.covariance_type, check_column(self.time_column, num_columns)
+        self._fitted_with = self.covariance_type, self._time_index(num_columns)
         return run._replace(log_likelihood=run.log_likelihood - scaling.log_volume), model
 
     def _prune(self, run: Run, points: Points | Blocks, envelope, model: Model, total: float) -> tuple[Run, Model]:
@@ -304,7 +310,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         """The number of components and degree to continue with; None if there is no compatible earlier fit."""
         if not self.warm_start or not hasattr(self, "_params") or self._params.tril.shape[-1] + 1 != num_columns:
             return None
-        same = self._fitted_with == (self.covariance_type, check_column(self.time_column, num_columns))
+        same = self._fitted_with == (self.covariance_type, self._time_index(num_columns))
         same &= self.n_components in ("auto", len(self.weights_)) and self.degree in ("auto", self._params.degree)
         return (len(self.weights_), self._params.degree) if same else None
 
@@ -319,34 +325,8 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
             if subset is None and whole is None:
                 whole = data.take()
             one = initialize(self.init_params, *(whole if subset is None else data.take(subset)), model, degree, rng)
-            made.append(restrict_covariances(self._replace_initial(one, scaling, degree), self.covariance_type))
+            made.append(restrict_covariances(replace_initial(self, one, scaling, degree), self.covariance_type))
         return jax.tree.map(lambda *z: jnp.stack(z), *made)
-
-    def _replace_initial(self, params: Parameters, scaling: Scaling, degree: int) -> Parameters:
-        """Replace the initial values that `weights_init`, `means_init` and `precisions_init` define."""
-        given = (self.weights_init, self.means_init, self.precisions_init)
-        if all(z is None for z in given):
-            return params
-        num, dtype = len(params.time_loc), params.curve.dtype
-        mixture = to_mixture(params, scaling, Constant())
-        means, covariances = (np.asarray(z, np.float64) for z in mixture.components.moments())
-        weights = np.exp(np.asarray(params.log_weights, np.float64))
-        dim = means.shape[1]
-        order = self._order_columns(dim)
-        if self.weights_init is not None:
-            weights = check_array("weights_init", self.weights_init, (num,))
-            if not ((weights >= 0).all() and np.isclose(weights.sum(), 1)):
-                raise invalid(
-                    "weights_init", expected="weights with sum 1", got=weights.tolist(), cure="Divide by the sum."
-                )
-        if self.means_init is not None:
-            means = check_array("means_init", self.means_init, (num, dim))[:, order]
-        if self.precisions_init is not None:
-            covariances = invert_precisions(self.precisions_init, self.covariance_type, num, dim)[:, order][:, :, order]
-        scale = scaling.scale
-        return params_from_gaussians(
-            weights, (means - scaling.shift) / scale, covariances / (scale[:, None] * scale), degree, dtype
-        )
 
     @property
     def precisions_cholesky_(self) -> np.ndarray:
@@ -403,6 +383,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
             return self._fit_first_batch(X, sample_weight)
         check_parameters(self)
         x, weights = self._check_rows(X, sample_weight, reset=False)
+        x, weights = x[weights > 0], weights[weights > 0]
         sums, seen, batches, model = self._online
         with enable_dtype(self._params.curve.dtype):
             scaled = self._scaling.apply(x.astype(self._params.curve.dtype))
@@ -425,7 +406,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
     def _fit_first_batch(self, X, sample_weight):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ConvergenceWarning)
-            scaled = self.fit(X, sample_weight=sample_weight)._scaled(X).astype(self._params.curve.dtype)
+            scaled = self._fit(X, sample_weight)
         if self.status_ in (EMStatus.NOT_FINITE, EMStatus.SINGULAR):
             warnings.warn(
                 f"The first batch ended as {self.status_.name}. {_CURES[self.status_]}",
@@ -434,7 +415,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
             )
         with enable_dtype(scaled.dtype):
             weights = _check_sample_weight(sample_weight, scaled, dtype=scaled.dtype)
-            points = make_points(scaled, weights, len(self.weights_), self.devices)
+            points = make_points(scaled[weights > 0], weights[weights > 0], len(self.weights_), self.devices)
             sums = compute_batch_statistics(self._arrays(scaled.dtype), points)
             model = Model(jnp.asarray(self.degrees_), jnp.asarray(self._floor, scaled.dtype), self.covariance_type)
         self._online = (sums, float(weights.sum(dtype=np.float64)), 1, model)
@@ -523,30 +504,22 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
 
     # --- the mixture --------------------------------------------------------------------------------------------
 
-    def to_mixture(self) -> FoldedMixture:
+    def to_mixture(self, time_origin: float = 0.0) -> FoldedMixture:
         """The fitted `FoldedMixture`, **time last**; in float32 unless JAX has float64 enabled.
 
-        Warns if times far from zero are then too coarsely spaced for how fast the components move.
+        Its times are those of X less `time_origin`, as Unix times require in float32.
+
+        **Raises:** ValueError if times in that dtype are too coarse for how fast the components move, or their powers
+        out of its range.
         """
         check_is_fitted(self)
+        if time_origin != 0 and not isinstance(self._envelope, Constant | TimeLikelihood):
+            raise invalid("time_origin", expected="0 with a function as envelope", got=time_origin)
         dtype = jax.dtypes.canonicalize_dtype(self._params.curve.dtype)
         if dtype != self._params.curve.dtype:
-            self._warn_of_coarse_times(dtype)
+            check_export(self._params, self._scaling, dtype, time_origin)
         params = Parameters(*(jnp.asarray(z, dtype) for z in self._params))
-        return to_mixture(params, self._scaling, self._envelope)
-
-    def _warn_of_coarse_times(self, dtype) -> None:
-        step = np.spacing((np.abs(self.time_means_) + 3 * self.time_scales_).astype(dtype)).astype(np.float64)
-        variances = np.diagonal(self.space_covariances_, axis1=-2, axis2=-1)
-        speed = np.abs(self.fold_coefficients_[:, :1]).sum(1) / np.sqrt(variances)
-        worst = float((step * np.maximum(1 / self.time_scales_, speed.max(1))).max())
-        if worst > _MAX_SPACING:
-            warnings.warn(
-                f"In {np.dtype(dtype).name} times are so coarse that a component moves or fades by {worst:.2g} of "
-                "its own spread between adjacent values. Subtract an offset from the time column before the fit, or "
-                "enable float64: jax.config.update('jax_enable_x64', True).",
-                stacklevel=3,
-            )
+        return to_mixture(params, self._scaling, self._envelope, time_origin)
 
     def sample(self, n_samples=1) -> tuple[Float[np.ndarray, "n d"], Int[np.ndarray, " n"]]:
         """(X, components): draws from the fitted mixture; deterministic for an integer `random_state`."""
@@ -563,26 +536,32 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
     def condition(self, columns, values):
         """The mixture of the other columns, **time last**, given values of these: `FoldedMixture.condition`.
 
+        Columns are indices, or names if the fit was to a data frame.
+
         **Example:** `fitted.condition(-1, 0.5)  # space at time 0.5`
+
+        **Raises:** ValueError as `to_mixture` if time is not given, and is too coarse in the dtype of the result.
         """
         check_is_fitted(self)
-        num = self.n_features_in_
-        order = list(self._order_columns(num))
-        columns = np.atleast_1d(np.asarray(columns))
-        if columns.ndim != 1 or columns.dtype.kind not in "iu" or ((columns < -num) | (columns >= num)).any():
-            raise invalid("columns", expected=f"columns of {num}", got=columns.tolist(), cure="They are those of X.")
+        num, names = self.n_features_in_, getattr(self, "feature_names_in_", None)
+        columns = [columns] if isinstance(columns, str) or np.ndim(columns) == 0 else columns
+        columns = [check_column(column, num, names, "columns") for column in columns]
+        if self._time_index(num) not in columns:
+            check_export(self._params, self._scaling, jax.dtypes.canonicalize_dtype(self._params.curve.dtype), None)
+        order = self._order_columns(num).tolist()
         values = np.atleast_1d(np.asarray(values, np.float64))
         if not np.isfinite(values).all():
             raise invalid("values", expected="finite numbers", got=values.tolist())
         with enable_dtype(self._params.curve.dtype):  # times far from zero need float64
-            mixture = self.to_mixture().condition([order.index(int(c) % num) for c in columns], values)
+            mixture = self.to_mixture().condition([order.index(column) for column in columns], values)
         return jax.tree.map(lambda z: jnp.asarray(z, jax.dtypes.canonicalize_dtype(z.dtype)), mixture)
 
     def _scaled(self, X) -> np.ndarray:
         check_not_forked()
         check_is_fitted(self)
+        check_real("X", X)
         X = validate_data(self, X, dtype=[np.float64, np.float32], reset=False)
-        return self._scaling.apply(put_time_last(X, check_column(self.time_column, X.shape[1])))
+        return self._scaling.apply(X[:, self._order_columns(X.shape[1])])
 
     def _arrays(self, dtype) -> Parameters:
         return Parameters(*(jnp.asarray(z, dtype) for z in self._params))

@@ -5,13 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
+from sklearn.utils import _safe_indexing
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.threads import check_not_forked
 from foldgauss.estimator.em.statistics import enable_dtype
 from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
-from foldgauss.estimator.parameter_checks import check_column
+from foldgauss.estimator.parameter_checks import check_column, check_real
 from foldgauss.estimator.rows import order_columns
 
 __all__ = ["FoldedMixtureRegressor"]
@@ -93,8 +94,12 @@ class FoldedMixtureRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         (ConvergenceWarning) if EM did not converge, see `mixture_.status_`.
         """
         check_not_forked()
+        check_real("X", X)
+        if np.ndim(sample_weight) == 1 and len(sample_weight) == len(y):  # rows of weight 0 may hold NaN
+            present = np.flatnonzero(sample_weight)
+            X, y, sample_weight = (_safe_indexing(z, present) for z in (X, y, sample_weight))
         X, y = validate_data(self, X, y, dtype=np.float64, multi_output=True, y_numeric=True, ensure_min_samples=2)
-        column = check_column(self.time_column, X.shape[1])
+        column = check_column(self.time_column, X.shape[1], getattr(self, "feature_names_in_", None))
         mixture = FoldedGaussianMixture(**self.get_params(deep=False) | {"time_column": column})
         self.mixture_ = mixture.fit(np.column_stack([X, y]), sample_weight=sample_weight)
         self.n_iter_, self._target_shape = self.mixture_.n_iter_, y.shape[1:]

@@ -12,6 +12,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree
 from foldgauss._runtime.checks import invalid, is_integer
 from foldgauss._runtime.threads import check_not_forked
 from foldgauss.envelope import CallableEnvelope
+from foldgauss.estimator.em.scaling import check_time_resolution
+from foldgauss.estimator.parameter_checks import check_real
 from foldgauss.mixture import FoldedMixture
 
 __all__ = ["GradientFit", "fit_gradient"]
@@ -76,6 +78,8 @@ def fit_gradient(
         raise invalid("steps", expected="a whole number >= 1", got=repr(steps))
     check_not_forked()
     dtype = mixture.logits.dtype
+    check_real("x", x)
+    check_time_resolution("x", x, dtype)
     x = jnp.asarray(x, dtype)
     if x.ndim != 2 or x.shape[1:] != mixture.event_shape:
         raise invalid(

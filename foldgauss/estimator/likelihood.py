@@ -4,6 +4,7 @@ Not the |X| "folded normal" of scipy and numpyro: here a Gaussian's *center* fol
 """
 
 import inspect
+from collections.abc import Callable
 from enum import IntEnum
 from statistics import NormalDist
 from typing import NamedTuple
@@ -22,7 +23,8 @@ from foldgauss._runtime.checks import check_one_of, invalid, is_integer
 from foldgauss._runtime.threads import check_not_forked
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood
-from foldgauss.estimator.parameter_checks import make_envelope
+from foldgauss.estimator.em.scaling import check_time_resolution
+from foldgauss.estimator.parameter_checks import check_real, make_envelope
 from foldgauss.estimator.profile_likelihood import Profile, Space, maximize
 from foldgauss.fold import PolynomialFold
 
@@ -175,7 +177,7 @@ def fit(
     x: Float[ArrayLike, "n d"],
     *,
     degree: int = 1,
-    envelope: AbstractEnvelope | str = "constant",
+    envelope: AbstractEnvelope | Callable | str = "constant",
     time: str = "own",
     time_loc: ArrayLike | None = None,
     time_scale: ArrayLike | None = None,
@@ -193,10 +195,10 @@ def fit(
     * for `time="own"` their marginal estimates, weighted mean and standard deviation of t;
     * for `time="joint"` a local maximum of the joint likelihood, by BFGS from those estimates; there may be several.
 
-    `envelope` is "constant", "time_likelihood" (`TimeLikelihood(power=1, floor=1e-3)`) or any envelope. It is not
-    fitted. Why the default is not the paper's: see `foldgauss.envelope`. A floor is a *modeling* choice, and kept in
-    the fitted distribution: without one the density on the ridge is unbounded where `power (d-1) > 2`, and outlying
-    times make a joint likelihood degenerate.
+    `envelope` is "constant", "time_likelihood" (`TimeLikelihood(power=1, floor=1e-3)`), any envelope, or a
+    function as in `as_envelope`. It is not fitted. Why the default is not the paper's: see `foldgauss.envelope`. A
+    floor is a *modeling* choice, and kept in the fitted distribution: without one the density on the ridge is unbounded
+    where `power (d-1) > 2`, and outlying times make a joint likelihood degenerate.
 
     **Shapes:** x (n, d), time last; `weights` (n,), frequency weights: 2 repeats a point, 0 leaves it out (such a row
     may hold NaN). A single fit; use `jax.vmap` for many. `covariance_type` is "full" or "diag" (the paper's).
@@ -533,6 +535,8 @@ def _cross_validate(plan: _Plan, parts) -> Float[Array, " degrees"]:
 
 def _check_points(x) -> Float[Array, "n d"]:
     check_not_forked()
+    check_real("x", x)
+    check_time_resolution("x", x, jax.dtypes.canonicalize_dtype(getattr(x, "dtype", float)))
     x = jnp.asarray(x)
     x = x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
     if x.ndim != 2 or x.shape[1] < 2:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
+from sklearn.utils import _safe_indexing
 
 from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer
@@ -60,7 +61,7 @@ def select_mixture(
         raise invalid("degrees", expected='whole numbers >= 0 or "auto"', got=degrees)
     parts, least = None, np.inf
     if not is_chunked(X):
-        X = np.asarray(X)
+        X = X if hasattr(X, "shape") else np.asarray(X)  # a data frame keeps the names of its columns
         parts = _assign_folds(len(X), folds, groups) if criterion == "cv" else None
         least = len(X) if parts is None else min(int((parts != part).sum()) for part in range(parts.max() + 1))
     elif criterion == "cv":
@@ -89,10 +90,12 @@ def _penalize(estimator, X, criterion: str) -> float:
 def _cross_validate(estimator, X, parts) -> float:
     total = 0.0
     for part in range(parts.max() + 1):
-        fitted = _fit_or_none(clone(estimator), X[parts != part])
+        fitted = _fit_or_none(clone(estimator), _safe_indexing(X, np.flatnonzero(parts != part)))
         if fitted is None:
             return np.inf
-        total += -2 * float(fitted.score_samples(X[parts == part]).sum(dtype=np.float64))
+        total += -2 * float(
+            fitted.score_samples(_safe_indexing(X, np.flatnonzero(parts == part))).sum(dtype=np.float64)
+        )
     return total if np.isfinite(total) else np.inf
 
 

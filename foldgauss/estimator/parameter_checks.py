@@ -5,11 +5,18 @@ from numbers import Integral
 import jax
 import numpy as np
 
-from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within, short_repr
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood, as_envelope, check_peak
 from foldgauss.estimator.em.initialization import INITIALIZERS
 
-__all__ = ["check_array", "check_column", "check_parameters", "check_sizes", "make_envelope"]
+__all__ = [
+    "check_array",
+    "check_column",
+    "check_parameters",
+    "check_real",
+    "check_sizes",
+    "make_envelope",
+]
 
 _COVARIANCES = ("full", "diag", "spherical", "tied")
 _ENVELOPES = {"constant": Constant, "time_likelihood": lambda: TimeLikelihood(power=1.0, floor=1e-3)}
@@ -65,11 +72,28 @@ def check_sizes(num_columns: int, num_points: int, total: float, least: int) -> 
         )
 
 
-def check_column(column, num_columns: int) -> int:
-    """The index of the time column, not negative."""
-    if not isinstance(column, Integral) or isinstance(column, bool) or not -num_columns <= column < num_columns:
-        raise invalid("time_column", expected=f"a column of {num_columns}", got=repr(column), cure="-1 is the last.")
-    return int(column) % num_columns
+def check_column(column, num_columns: int, names=None, parameter: str = "time_column") -> int:
+    """The index of a column, not negative, given by index or by its name in a data frame with these `names`."""
+    index = list(names).index(column) if names is not None and column in list(names) else column
+    if not isinstance(index, Integral) or isinstance(index, bool) or not -num_columns <= index < num_columns:
+        known = f", or one of {', '.join(names)}" if names is not None else ""
+        cure = "-1 is the last." if names is not None or not isinstance(column, str) else "Names need a data frame."
+        raise invalid(parameter, expected=f"a column of {num_columns}{known}", got=repr(column), cure=cure)
+    return int(index) % num_columns
+
+
+def check_real(name: str, X) -> None:
+    """Raise if rows hold dates, durations or complex numbers, which other libraries convert or report at length."""
+    kinds = getattr(X, "dtypes", None)
+    if kinds is None:
+        kinds = [np.asarray(X).dtype if isinstance(X, list | tuple) else getattr(X, "dtype", None)]
+    for kind in map(str, kinds):
+        if kind.lower().startswith(("date", "time", "duration")):
+            cure = "Convert times to seconds as floats, from an origin near them."
+            raise invalid(name, expected="numbers", got=kind, cure=cure)
+        if kind.startswith("complex"):
+            cure = "Complex data not supported: pass real and imaginary parts as columns."
+            raise invalid(name, expected="real numbers", got=kind, cure=cure)
 
 
 def check_array(name: str, value, shape: tuple[int, ...]) -> np.ndarray:
@@ -83,7 +107,7 @@ def check_array(name: str, value, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def make_envelope(envelope) -> AbstractEnvelope:
-    """The envelope with this name, or as by `as_envelope`. Raises ValueError for anything else."""
+    """The envelope itself, that of a function, or the one with this name. Raises ValueError for anything else."""
     if isinstance(envelope, str):
         check_one_of("envelope", envelope, tuple(_ENVELOPES))
         return _ENVELOPES[envelope]()

@@ -9,7 +9,7 @@ from foldgauss.estimator.chunks import Chunks, RowSummary, collect_rows, weighte
 from foldgauss.estimator.em.scaling import RowTransform, Scaling
 from foldgauss.estimator.em.statistics import Blocks, Points, make_points
 
-__all__ = ["ChunkedRows", "Rows", "order_columns", "put_time_last"]
+__all__ = ["ChunkedRows", "Rows", "order_columns"]
 
 
 class Rows(NamedTuple):
@@ -92,7 +92,3 @@ class ChunkedRows(NamedTuple):
 def order_columns(column: int, num_columns: int) -> Int[np.ndarray, " d"]:
     """The indices of the columns of X, with the time column last."""
     return np.append(np.delete(np.arange(num_columns), column), column)
-
-
-def put_time_last(X: np.ndarray, column: int) -> np.ndarray:
-    return X if column == X.shape[1] - 1 else X[:, order_columns(column, X.shape[1])]

@@ -208,18 +208,20 @@ def run_em(
     tol: float = 1e-3,
     max_steps: int = 100,
     annealing: float = 1.0,
+    last: float = -np.inf,
     observe=None,
 ) -> list[Run]:
-    """Run EM from every start (leading axis) in one program, or one for each block; `total` is the sum of weights.
+    """Run EM from every start (leading axis) in one program, or one for each block; `total` is the sum of weights, and
+    `last` the mean log-likelihood before the start, if a run is continued.
 
     A component with less mass than `least_mass` is reset to half of the heaviest one, at most as often as there are
     components. A run has converged when the mean log-likelihood changes by less than `tol`, at temperature 1 (for at
     least `SETTLING_STEPS` steps if annealed), without a reset, and with no larger predicted gain rejected.
     """
-    first_end = 2 if annealing == 1.0 else ANNEALING_STEPS + SETTLING_STEPS
+    first_end = 1 if annealing == 1.0 else ANNEALING_STEPS + SETTLING_STEPS
     states, restarts = State(starts, jnp.ones_like(starts.time_loc)), len(starts.time_loc)
     step_all = _step_over_blocks if isinstance(points, Blocks) else _step_restarts
-    before, lasts = states, np.full(restarts, -np.inf)
+    before, lasts = states, np.full(restarts, last)
     statuses = np.full(restarts, EMStatus.NOT_CONVERGED)
     done, num_steps = np.zeros(restarts, bool), np.zeros(restarts, int)
     resets, histories = np.zeros(restarts, int), [[] for _ in range(restarts)]

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from foldgauss._runtime.checks import invalid
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
 from foldgauss.estimator.chunks import Piece
@@ -13,7 +14,11 @@ from foldgauss.estimator.em.components import Parameters
 from foldgauss.fold import PolynomialFold
 from foldgauss.mixture import FoldedMixture
 
-__all__ = ["RowTransform", "Scaling", "compute_scaling", "to_mixture"]
+__all__ = ["RowTransform", "Scaling", "check_export", "check_time_resolution", "compute_scaling", "to_mixture"]
+
+#: Spacings of floating-point times up to this fraction of a spread are harmless.
+_MAX_SPACING = 0.01
+_COARSE_CURE = "Subtract an offset from the time column, or enable float64: jax.config.update('jax_enable_x64', True)."
 
 
 class Scaling(NamedTuple):
@@ -58,8 +63,41 @@ def compute_scaling(mean, variance, envelope: AbstractEnvelope, covariance: str)
     return Scaling(shift, scale)
 
 
-def to_mixture(params: Parameters, scaling: Scaling, envelope: AbstractEnvelope) -> FoldedMixture:
-    """Convert components to a mixture in the units of the points."""
+def check_time_resolution(name: str, x, dtype) -> None:
+    """Raise if `dtype`, to which JAX converts these rows (n, d), holds their times too coarsely."""
+    if not isinstance(x, np.ndarray) or x.dtype == dtype or x.ndim != 2 or not x.size:
+        return
+    t = x[np.isfinite(x[:, -1]), -1].astype(np.float64)
+    if len(t) and np.spacing(np.abs(t).max().astype(dtype)) > _MAX_SPACING * t.std() > 0:
+        expected, got = f"times that {np.dtype(dtype).name} resolves", f"times from {t.min():.10g} to {t.max():.10g}"
+        raise invalid(name, expected=expected, got=got, cure=_COARSE_CURE)
+
+
+def check_export(params: Parameters, scaling: Scaling, dtype, origin: float | None) -> None:
+    """Raise if `to_mixture` in this dtype would be wrong: its times too coarse, or powers of them out of range.
+
+    The cure names `time_origin` unless `origin` is None.
+    """
+    _, time_loc, time_scale, curve, tril = (np.asarray(z, np.float64) for z in params)
+    times, spread = scaling.shift[-1] + scaling.scale[-1] * time_loc, scaling.scale[-1] * time_scale
+    step = np.spacing((np.abs(times - (origin or 0)) + 3 * spread).astype(dtype)).astype(np.float64) / spread
+    speed = np.abs(curve[:, 1:2]).sum(1) / np.sqrt((tril**2).sum(-1))
+    worst = float((step * np.maximum(1, speed.max(1, initial=0))).max())
+    if worst > _MAX_SPACING:
+        got = f"{np.dtype(dtype).name}, whose adjacent times differ by {worst:.2g} of a component's spread"
+        cure = "" if origin is None else f"Pass time_origin={round(times.mean())}, from which times are then counted. "
+        raise invalid("times", expected="a dtype that resolves them", got=got, cure=cure + _COARSE_CURE)
+    if (params.degree + 1) * np.abs(np.log(spread)).max() > np.log(float(np.finfo(dtype).max)):
+        got = (
+            f"spreads of time up to {spread.max():.2g} at degree {params.degree}, out of {np.dtype(dtype).name}'s range"
+        )
+        raise invalid(
+            "times", expected="units near their spread", got=got, cure="Divide the time column, or use float64."
+        )
+
+
+def to_mixture(params: Parameters, scaling: Scaling, envelope: AbstractEnvelope, origin: float = 0.0) -> FoldedMixture:
+    """Convert components to a mixture in the units of the points, with times counted from `origin`."""
     dtype = params.curve.dtype
     log_weights, time_loc, time_scale, curve, tril = (np.asarray(z, np.float64) for z in params)
     space, time = scaling.scale[:-1], scaling.scale[-1]
@@ -69,7 +107,7 @@ def to_mixture(params: Parameters, scaling: Scaling, envelope: AbstractEnvelope)
     components = FoldedGaussian(
         jnp.asarray(scaling.shift[:-1] + space * curve[:, 0], dtype),
         jnp.asarray(space[:, None] * tril, dtype),
-        time_loc=jnp.asarray(scaling.shift[-1] + time * time_loc, dtype),
+        time_loc=jnp.asarray(scaling.shift[-1] - origin + time * time_loc, dtype),
         time_scale=jnp.asarray(time_scale, dtype),
         fold=PolynomialFold(jnp.asarray(coefficients, dtype)),
         envelope=envelope,
