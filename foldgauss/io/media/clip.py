@@ -141,6 +141,20 @@ def check_frame_size(size: Size | None, parameter: str = "size") -> Size | None:
     return int(sides[0]), int(sides[1])
 
 
+def clamp_stop(start: int, stop: int | None, num_total: int, path: Path) -> int:
+    """The end of a range in a clip of `num_total` frames, which may end before. Raises `VideoError` if empty."""
+    check_range_within(start, None, num_total, path)
+    return num_total if stop is None else min(stop, num_total)
+
+
+def describe_clamped(num: int, start: int, stop: int | None) -> tuple[str, ...]:
+    """A note if a range ends beyond its clip, which has `num` frames from `start` on."""
+    if stop is None or num >= stop - start:
+        return ()
+    end = start + num
+    return (f"frames {format_range(start, stop)} were asked for, and the clip ends at {end}: {start}:{end} are used.",)
+
+
 def check_fps(fps: float) -> None:
     if not is_within(fps, f"[{MIN_FPS}, {MAX_FPS}]"):
         raise video_error("fps", expected=f"a rate in [{MIN_FPS:g}, {MAX_FPS:g}]", got=repr(fps), cure="Try 25.")

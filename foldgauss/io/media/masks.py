@@ -46,9 +46,9 @@ def read_masks(
       everything except 0 (background) and 255 (void). Black and white images have one object with label 1.
     - A video: bool (num_frames, height, width), True where the brightest channel is at least `level` of white.
 
-    `frames = (A, B)` keeps A <= i < B of a folder or video, None for an open end. `size` = (height, width) crops the
-    masks to that aspect around the center, as `read_video` crops frames, without resizing them: use the same value as
-    for the fit.
+    `frames = (A, B)` keeps A <= i < B of a folder or video, None for an open end, as `read_video`. `size` = (height,
+    width) crops the masks to that aspect around the center, as `read_video` crops frames, without resizing them: use
+    the same value as for the fit.
 
     **Example:** `by_mask(model, read_masks("DAVIS/Annotations/480p/bear", label=1))`.
 

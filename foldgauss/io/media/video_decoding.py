@@ -11,7 +11,7 @@ import numpy as np
 from foldgauss.io.media.clip import (
     RangeFacts,
     ReadResult,
-    check_range_within,
+    clamp_stop,
     describe_lost,
     no_frames_error,
     video_error,
@@ -109,11 +109,11 @@ def decode_file(
         if decoder.has_converted:
             notes.append("interlaced frames are converted to progressive ones.")
     # The container's count may be an estimate, so the range is checked against the decoded frames as well.
-    check_range_within(start, stop, num_total, path)
+    end_of_range = clamp_stop(start, stop, num_total, path)
     if not kept:
         raise no_frames_error(start, stop, len(stamps), num_total, path)
     report = DecodeReport(fps, num_total, notes, positions, stamps, time_base, threads, end)
-    return (kept, *report.describe_span(len(stamps) - len(kept), len(stamps), start, stop)), report
+    return (kept, *report.describe_span(len(stamps) - len(kept), len(stamps), start, end_of_range)), report
 
 
 def _count_declared(decoder: VideoDecoder, seconds: np.ndarray, fps: float, num_reached: int, last: float) -> int:
