@@ -5,7 +5,8 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -33,6 +34,9 @@ def check_path(path: object, order: str = "") -> Path:
 
 def missing_error(path: PathLike, expected: str) -> FileNotFoundError:
     """The error for an input that does not exist."""
+    if address := re.fullmatch("([A-Za-z][A-Za-z0-9+.-]+):/+(.*)", str(path)):  # of whose slashes Path keeps one
+        got = repr("://".join(address.groups()))
+        return FileNotFoundError(f"path: expected {expected}, got the address {got}. Download it first.")
     text = f"path: expected {expected}, got {str(path)!r}, which is missing."
     return FileNotFoundError(f"{text} Check the spelling and the current folder.")
 
@@ -132,6 +136,23 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
             os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_or_keep(path: Path, write: Callable[[Path], object]) -> None:
+    """Write the result of a long computation by `write(path)`; if that fails, to the folder for temporary files.
+
+    Raises `OutputError`, which says where the result is, if it is not at `path`.
+    """
+    try:
+        write(path)
+    except OSError as error:
+        folder = Path(tempfile.mkdtemp(prefix="foldgauss-"))
+        try:
+            write(folder / path.name)
+        except OSError:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise OutputError(f"{error} In the folder for temporary files, too: the result is lost.") from error
+        raise OutputError(f"{error} It is kept in {folder / path.name}: move it to a place of yours.") from error
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 
 from foldgauss import __version__
-from foldgauss.io._atomic import OutputError, atomic_path
+from foldgauss.io._atomic import OutputError, atomic_path, write_or_keep
 from foldgauss.io._lock import lock_output
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.media.frame_index import FrameIndex
@@ -112,6 +112,14 @@ class FitRun:
         metadata |= describe_fit(self.job.config, self.state)
         metadata |= {} if scores is None else mean_scores(scores)
         save_video_model(self.job.target, self.model, metadata=metadata)
+
+    def save_or_keep(self, scores: Evaluation | None = None) -> None:
+        """Write the model, elsewhere if it cannot be written to its target, as `write_or_keep`."""
+
+        def save(path: Path) -> None:
+            dataclasses.replace(self, job=dataclasses.replace(self.job, target=str(path))).save(scores)
+
+        write_or_keep(Path(self.job.target), save)
 
 
 def run_fit(
@@ -309,7 +317,7 @@ def _fit_and_record(job: FitJob, report: Report) -> dict[str, Any]:
     run.save_checkpoint()  # the evaluation may be interrupted
     clip, info = run.clip, run.info
     scores = evaluate(run.model, clip.frames)
-    run.save(scores)
+    run.save(scores) if job.checkpoint.exists() else run.save_or_keep(scores)
     record = {
         "asked": job.request,
         "num_frames": clip.num_frames,

@@ -223,10 +223,10 @@ def _save_model(run: FitRun) -> None:
         run.save()
     except OSError as error:
         run.save_checkpoint()
-        checkpoint = run.job.checkpoint
-        text = "The checkpoint could not be written either: the fit is lost."
-        if checkpoint.exists():
-            text = f"The fit is kept in {checkpoint}: --resume continues it, and writes the model."
+        if not run.job.checkpoint.exists():
+            run.save_or_keep()
+            return
+        text = f"The fit is kept in {run.job.checkpoint}: --resume continues it, and writes the model."
         raise OutputError(f"{error} {text}") from error
 
 

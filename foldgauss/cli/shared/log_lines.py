@@ -2,12 +2,39 @@
 
 import contextlib
 import logging
+import threading
+import time
 from collections.abc import Iterator
 
 from foldgauss.cli.app.application import err, out
 
 #: So many starts of shots are printed.
 LISTED_STARTS = 8
+#: Seconds between two lines about a computation, where there is no terminal.
+LINE_SECONDS = 30.0
+
+
+@contextlib.contextmanager
+def show_status(text: str) -> Iterator[None]:
+    """What is being done, on a terminal; elsewhere a line at the start, and one every `LINE_SECONDS`."""
+    if err.is_terminal:
+        with err.status(text):
+            yield
+        return
+    ended, begun = threading.Event(), time.monotonic()
+
+    def repeat() -> None:
+        while not ended.wait(LINE_SECONDS):
+            err.print(f"{text}: {time.monotonic() - begun:.0f} s", soft_wrap=True)
+
+    err.print(text, soft_wrap=True)
+    thread = threading.Thread(target=repeat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 class _Printer(logging.Handler):

@@ -1,7 +1,6 @@
 """Clips in memory, and the error and argument checks that readers and writers of clips share."""
 
 import os
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -77,15 +76,13 @@ class Clip:
 
 def check_readable(path: PathLike) -> Path:
     """The path of an existing file or folder. Raises `FileNotFoundError`, or `VideoError` for pipes and devices."""
-    address, path = str(path), check_path(path)
+    path = check_path(path)
     if os.path.isdir(path) or os.path.isfile(path):
         return path
     if os.path.exists(path):
         got, cure = f"{str(path)!r}, a pipe or a device", "Save its output to a file."
         raise video_error("path", expected=VIDEO, got=got, cure=cure)
-    if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", address):
-        raise FileNotFoundError(f"path: expected {VIDEO}, got the address {address!r}. Download it first.")
-    raise missing_error(address, VIDEO)
+    raise missing_error(path, VIDEO)
 
 
 @contextmanager
