@@ -78,7 +78,8 @@ def test_a_ply_is_to_be_imported(tmp_path, capsys):
     assert "foldgauss import" in capsys.readouterr().err
 
 
-def test_a_page_is_told_of_where_there_is_no_terminal(model, tmp_path, capsys):
+def test_a_page_is_told_of_where_there_is_no_terminal(model, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("foldgauss.cli.shared.log_lines.FIRST_LINE_SECONDS", 0.0)
     assert run("export", model, "--format", "html", "--out", tmp_path / "new" / "p.html") == 0
     assert "Writing the page" in capsys.readouterr().err
 

@@ -10,13 +10,13 @@ from foldgauss.cli.app.application import err, out
 
 #: So many starts of shots are printed.
 LISTED_STARTS = 8
-#: Seconds between two lines about a computation, where there is no terminal.
-LINE_SECONDS = 30.0
+#: Seconds before the first line of a log, which is early since options may be mistyped, and between two lines.
+FIRST_LINE_SECONDS, LINE_SECONDS = 10.0, 30.0
 
 
 @contextlib.contextmanager
 def show_status(text: str) -> Iterator[None]:
-    """What is being done, on a terminal; elsewhere a line at the start, and one every `LINE_SECONDS`."""
+    """What is being done, on a terminal; elsewhere a line now and then if it takes long."""
     if err.is_terminal:
         with err.status(text):
             yield
@@ -24,10 +24,11 @@ def show_status(text: str) -> Iterator[None]:
     ended, begun = threading.Event(), time.monotonic()
 
     def repeat() -> None:
-        while not ended.wait(LINE_SECONDS):
+        pause = FIRST_LINE_SECONDS
+        while not ended.wait(pause):
+            pause = LINE_SECONDS
             err.print(f"{text}: {time.monotonic() - begun:.0f} s", soft_wrap=True)
 
-    err.print(text, soft_wrap=True)
     thread = threading.Thread(target=repeat, daemon=True)
     thread.start()
     try:

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from foldgauss.cli.app.application import WrongUse, err, name_option, out, wrong_use
 from foldgauss.cli.app.completion import complete_choice
 from foldgauss.cli.shared.clips import Video
-from foldgauss.cli.shared.log_lines import LINE_SECONDS
+from foldgauss.cli.shared.log_lines import FIRST_LINE_SECONDS, LINE_SECONDS
 from foldgauss.cli.shared.outputs import IMAGE_SUFFIX
 from foldgauss.cli.shared.tables import format_count
 from foldgauss.cli.shared.timeline import Timeline
@@ -142,7 +142,7 @@ def progress_bar(title: str, total: int, shown: bool = True) -> Iterator[Callabl
     columns = TextColumn("{task.description}"), BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn()
     with Progress(*columns, *TIME_LEFT, console=err, disable=not (shown and err.is_terminal)) as progress:
         task = progress.add_task(title, total=total)
-        due = time.monotonic() + LINE_SECONDS
+        due = time.monotonic() + FIRST_LINE_SECONDS
 
         def advance() -> None:
             nonlocal due
