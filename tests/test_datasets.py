@@ -180,7 +180,8 @@ def test_davis_names_what_is_there(root, tmp_path):
     _fails(ValueError, "sequence", root, "../480p/bear")
     _fails(ValueError, "resolution: expected one of '480p', got '720p'", root, "bear", "720p")
     _fails(ValueError, "center_crop: expected at most the frame's 40x60.*50x50", root, "bear", center_crop=(50, 50))
-    _fails(ValueError, "frames: expected A:B within 0:4", root, "bear", frames=(0, 9))
+    _fails(ValueError, "frames: expected A:B within 0:4", root, "bear", frames=(4, 9))
+    assert datasets.davis(root, "bear", frames=(1, 9)).clip.num_frames == 3
 
 
 def test_davis_refuses_masks_that_do_not_fit(root):

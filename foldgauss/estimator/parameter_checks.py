@@ -5,7 +5,7 @@ from numbers import Integral
 import jax
 import numpy as np
 
-from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within, short_repr
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood, as_envelope, check_peak
 from foldgauss.estimator.em.initialization import INITIALIZERS
 

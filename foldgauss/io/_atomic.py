@@ -5,7 +5,8 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -33,21 +34,21 @@ def check_path(path: object, order: str = "") -> Path:
 
 def missing_error(path: PathLike, expected: str) -> FileNotFoundError:
     """The error for an input that does not exist."""
+    if address := re.fullmatch("([A-Za-z][A-Za-z0-9+.-]+):/+(.*)", str(path)):  # of whose slashes Path keeps one
+        got = repr("://".join(address.groups()))
+        return FileNotFoundError(f"path: expected {expected}, got the address {got}. Download it first.")
     text = f"path: expected {expected}, got {str(path)!r}, which is missing."
     return FileNotFoundError(f"{text} Check the spelling and the current folder.")
 
 
 def _check_target(path: Path) -> None:
-    """Raise where a rename to `path` would fail, before any work is done."""
+    """Make the folder of `path`, and raise where a rename to it would fail, before any work is done."""
     if not path.name:
         raise OutputError(f"path: expected the name of a file, got {str(path)!r}. Add a file name.")
-    if not os.path.exists(path.parent):
-        raise OutputError(
-            f"path: expected an existing folder, got {str(path.parent)!r}, which is missing. "
-            "Create it first, or choose another output path."
-        )
-    if not path.parent.is_dir():
+    if path.parent.exists() and not path.parent.is_dir():
         raise OutputError(f"path: expected a folder, got the file {str(path.parent)!r}. Choose another path.")
+    with translate_output_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
     with translate_output_errors(path), suppress(FileNotFoundError):
         os.lstat(path)  # raises for a name that is too long for `path`, though not for the temporary file
 
@@ -110,7 +111,7 @@ def _new_file(path: Path) -> Path:
 
 
 def check_writable(path: PathLike) -> None:
-    """Check before long work whether `atomic_path(path)` will succeed. Raises `OutputError`."""
+    """Check before long work whether `atomic_path(path)` will succeed; makes its folder. Raises `OutputError`."""
     _new_file(Path(path)).unlink(missing_ok=True)  # the holder of the lock may have removed it
 
 
@@ -122,7 +123,7 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
     the format by it. It is flushed to disk before the rename.
     On any exception, including `KeyboardInterrupt`, it is removed and an existing `path` stays unchanged.
 
-    Raises `OutputError` if the parent folder is missing or not writable, or if `path` is not a regular file.
+    Missing folders are made. Raises `OutputError` if the folder is not writable, or if `path` is not a regular file.
     """
     path = Path(path)
     temporary = _new_file(path)
@@ -137,6 +138,23 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def write_or_keep(path: Path, write: Callable[[Path], object]) -> None:
+    """Write the result of a long computation by `write(path)`; if that fails, to the folder for temporary files.
+
+    Raises `OutputError`, which says where the result is, if it is not at `path`.
+    """
+    try:
+        write(path)
+    except OSError as error:
+        folder = Path(tempfile.mkdtemp(prefix="foldgauss-"))
+        try:
+            write(folder / path.name)
+        except OSError:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise OutputError(f"{error} In the folder for temporary files, too: the result is lost.") from error
+        raise OutputError(f"{error} It is kept in {folder / path.name}: move it to a place of yours.") from error
+
+
 @contextmanager
 def atomic_folder(folder: PathLike, overwrite: bool = False, *, pattern: str, what: str = "frames") -> Iterator[Path]:
     """Provide a temporary folder beside `folder`, and rename it to `folder` when the block ends without an error.
@@ -145,7 +163,7 @@ def atomic_folder(folder: PathLike, overwrite: bool = False, *, pattern: str, wh
     before the block and again after it, since that may have taken hours, unless it is empty, or contains only `what`
     and `overwrite` is given. `pattern` matches the names of `what`; other files are never deleted.
 
-    Raises `OutputError` if the folder is refused, or its parent is missing or not writable.
+    Missing parents are made. Raises `OutputError` if the folder is refused, or its parent is not writable.
     """
     given, folder = Path(folder), Path(folder).resolve()
     check_replaceable(given, overwrite, pattern=pattern, what=what)

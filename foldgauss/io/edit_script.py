@@ -35,6 +35,7 @@ import numpy as np
 from foldgauss._runtime.checks import invalid
 from foldgauss.io._atomic import PathLike
 from foldgauss.io._toml_lines import key_lines
+from foldgauss.io.media.clip import Range
 from foldgauss.io.media.masks import read_masks
 from foldgauss.io.models.selections import load_selection, parse_indices, parse_ranges
 from foldgauss.io.models.video_model import load_video_model
@@ -231,15 +232,18 @@ class EditScript:
             self._path(table[key]) for table in tables for key in ("mask", "file", "model", "script") if key in table
         ]
 
-    def apply(self, video: Video) -> Video:
+    def apply(self, video: Video, frames: Range | None = None) -> Video:
         """The edited video: a plain `VideoModel` if all edits could be baked; segmented if `video` is.
+
+        `frames`: the range of its clip that the video shows, as its file names it; masks of the whole clip are cut to
+        it.
 
         **Raises:** `EditScriptError`, with the line, for values that the edits refuse and files that cannot be read.
         """
         edits, named = edit(video), {}
         for name, table in self.tables.get("selections", {}).items():
             with self._context("selections", name, path="file" if "file" in table else "mask"):
-                named[name] = self._select(video, table, named)
+                named[name] = self._select(video, table, named, frames)
         for number, table in enumerate(self.tables.get("edits", ())):
             context = self._context("edits", number, **{ACTIONS[table["do"]].angle: "degrees"})
             with context:
@@ -253,7 +257,9 @@ class EditScript:
                 video = edit(video).seen_from(Camera.front(video.size[0] / video.size[1]).orbit(*angles)).video()
         return video
 
-    def _select(self, video: Video, table: dict[str, Any], named: dict[str, Selected]) -> Selected:
+    def _select(
+        self, video: Video, table: dict[str, Any], named: dict[str, Selected], frames: Range | None
+    ) -> Selected:
         if table.keys() & _COMBINATION.keys():
             return _combine(table, named)
         if "indices" in table:
@@ -268,6 +274,9 @@ class EditScript:
         if "mask" in criteria:
             options = {key: criteria.pop(key) for key in _MASK_FILE.keys() & criteria.keys()}
             masks = read_masks(self._path(criteria["mask"]), **options, size=video.size)
+            if masks.ndim == 3 and frames is not None and len(masks) != video.num_frames:
+                shown = masks[slice(*frames)]  # of masks of the whole clip
+                masks = shown if len(shown) == video.num_frames else masks
             criteria["mask"] = _masks_of_frames(masks, video.num_frames, criteria)
         return edit(video).select(**criteria).selection
 

@@ -16,7 +16,8 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 
-from foldgauss.io._atomic import OutputError, atomic_path
+from foldgauss import __version__
+from foldgauss.io._atomic import OutputError, atomic_path, write_or_keep
 from foldgauss.io._lock import lock_output
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.media.frame_index import FrameIndex
@@ -27,7 +28,7 @@ from foldgauss.io.models.video_model import save_video_model
 from foldgauss.io.provenance import describe_reading, describe_source, fingerprint
 from foldgauss.jobs.job import FitJob, file_digest, read_record
 from foldgauss.jobs.warning_capture import WarningCapture
-from foldgauss.video.fitting.config import FitConfig
+from foldgauss.video.fitting.config import FitConfig, expected_steps
 from foldgauss.video.fitting.divergence import FitDiverged
 from foldgauss.video.fitting.loop import FitInfo, fit_steps
 from foldgauss.video.fitting.state import FitState, to_model
@@ -38,6 +39,8 @@ from foldgauss.video.models.video_model import VideoModel
 CHECKPOINT_SECONDS, REPORT_SECONDS = 30.0, 1.0
 #: Seconds that a job waits for another one of the same target: a worker that is believed dead may be about to finish.
 WAIT_SECONDS = 60.0
+#: A fraction of the expected steps below which a fit by minutes warns.
+FEW_STEPS = 0.5
 #: Number of clip shapes whose compiled programs are kept.
 MAX_SHAPES = 8
 
@@ -106,8 +109,17 @@ class FitRun:
     def save(self, scores: Evaluation | None = None) -> None:
         """Write the model, with its mean scores once they are measured."""
         metadata = fit_metadata(self.clip, self.job.config.seed, self.job.frames) | self.job.metadata
+        metadata |= describe_fit(self.job.config, self.state)
         metadata |= {} if scores is None else mean_scores(scores)
         save_video_model(self.job.target, self.model, metadata=metadata)
+
+    def save_or_keep(self, scores: Evaluation | None = None) -> None:
+        """Write the model, elsewhere if it cannot be written to its target, as `write_or_keep`."""
+
+        def save(path: Path) -> None:
+            dataclasses.replace(self, job=dataclasses.replace(self.job, target=str(path))).save(scores)
+
+        write_or_keep(Path(self.job.target), save)
 
 
 def run_fit(
@@ -147,9 +159,11 @@ def run_steps(
 
     Raises as `run_fit`.
     """
-    saved = time.monotonic()
+    saved, before = time.monotonic(), time.process_time()
     try:
         for state, info in steps:
+            now = time.process_time()
+            state.processor_seconds, before = state.processor_seconds + now - before, now
             stop = observe(state, info) and info.progress < 1
             due = time.monotonic() - saved > (CHECKPOINT_SECONDS if seconds is None else seconds)
             if checkpoint is not None and (stop or due):
@@ -183,7 +197,20 @@ def read_clip(job: FitJob) -> Clip:
 
 def fit_metadata(clip: Clip, seed: int, frames: tuple[int | None, int | None] | None) -> dict[str, Any]:
     """Metadata of a fitted model: its clip, the range of frames, the seed, and what `describe_reading` returns."""
+    if frames is not None and frames[1] is not None:  # the range may end beyond the clip
+        frames = frames[0], min(frames[1], (frames[0] or 0) + clip.num_declared)
     return describe_source(clip, seed) | {"frames": frames} | describe_reading(clip)
+
+
+def describe_fit(config: FitConfig, state: FitState) -> dict[str, Any]:
+    """Metadata of how a model was fitted: version, budgets and steps; with `minutes`, which make fits differ with the
+    load of the machine, also the seconds spent and those of its processors."""
+    budgets = {name: getattr(config, name) for name in ("steps", "minutes", "target_psnr")}
+    about = {"version": __version__, "steps": state.step}
+    about["budget"] = {name: value for name, value in budgets.items() if value is not None}
+    if config.minutes is not None:
+        about |= {"fit_seconds": round(state.seconds, 2), "processor_seconds": round(state.processor_seconds, 2)}
+    return about
 
 
 def mean_scores(scores: Evaluation) -> dict[str, float]:
@@ -290,7 +317,7 @@ def _fit_and_record(job: FitJob, report: Report) -> dict[str, Any]:
     run.save_checkpoint()  # the evaluation may be interrupted
     clip, info = run.clip, run.info
     scores = evaluate(run.model, clip.frames)
-    run.save(scores)
+    run.save(scores) if job.checkpoint.exists() else run.save_or_keep(scores)
     record = {
         "asked": job.request,
         "num_frames": clip.num_frames,
@@ -310,6 +337,7 @@ def _fit_and_record(job: FitJob, report: Report) -> dict[str, Any]:
             *(clip.notes if job.index is None else ()),
             *dict.fromkeys(caught),
             *missed_psnr(job.config, scores.mean_psnr, info),
+            *few_steps(run),
         ],
     }
     with atomic_path(job.record) as temporary:
@@ -323,6 +351,18 @@ def missed_psnr(config: FitConfig, mean_psnr: float, info: FitInfo) -> list[str]
     if config.economy is None or config.economy.psnr is None or info.stopped_by == "smallest_at_psnr":
         return []
     return [f"{config.economy.psnr:g} dB was not reached, got {mean_psnr:.2f} dB after {info.step:,} steps."]
+
+
+def few_steps(run: FitRun) -> list[str]:
+    """A warning if the minutes gave far fewer steps than they are expected to, in a list that is otherwise empty."""
+    expected, info = expected_steps(run.job.config, *run.clip.size), run.info
+    if info.stopped_by != "minutes" or info.step >= FEW_STEPS * expected:
+        return []
+    return [
+        f"{run.job.config.minutes:g} minutes gave {info.step:,} of about {expected:,.0f} expected steps, too few for "
+        f"{run.model.num_gaussians:,} Gaussians, as on a busy or slow machine. Give more --minutes, fewer "
+        "--max-gaussians, or a quieter machine."
+    ]
 
 
 def peak_bytes() -> int | None:

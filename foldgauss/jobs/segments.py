@@ -20,7 +20,7 @@ from foldgauss.io.media.clip import AS_STORED, Reading
 from foldgauss.io.media.frame_index import FrameIndex, index_video
 from foldgauss.io.media.indexed_reader import read_indexed
 from foldgauss.io.models.segmented import join_segments
-from foldgauss.io.models.video_model import load_video_model
+from foldgauss.io.models.video_model import keep_origin, load_video_model, read_metadata
 from foldgauss.io.provenance import describe_reading
 from foldgauss.jobs.job import FitJob, file_digest
 from foldgauss.video.fitting.config import FitConfig, rename_settings
@@ -78,8 +78,14 @@ class LongFit:
                 shutil.copyfile(sources[0][1], temporary)
             return JoinedFit(self.target, tuple(psnr_of.tolist()), tuple(ssim_of.tolist()), ())
         means = {"mean_psnr": round(float(psnr_of.mean()), 3), "mean_ssim": round(float(ssim_of.mean()), 4)}
-        join_segments(self.target, sources, metadata=self.metadata | means)
+        join_segments(self.target, sources, metadata=self.metadata | means | self._describe_fits())
         return JoinedFit(self.target, tuple(psnr_of.tolist()), tuple(ssim_of.tolist()), tuple(fades))
+
+    def _describe_fits(self) -> dict[str, Any]:
+        """The metadata of `describe_fit`, with the sums of the segments."""
+        each = [read_metadata(job.target) for job in self.jobs]
+        summed = [name for name in ("steps", "fit_seconds", "processor_seconds") if name in each[0]]
+        return keep_origin(each[0], "version", "budget") | {name: sum(one[name] for one in each) for name in summed}
 
     def _score_fades(self, video: SegmentedVideo, fades, psnr_of, ssim_of, on_frame) -> None:
         """Replace the scores of shared frames by those of the joined video."""
@@ -217,6 +223,8 @@ def plan_long_fit(
     kept = {"clip": str(clip), "digest": index.digest, "stamp": _stamp(clip), "asked": request, "spans": spans}
     with atomic_path(folder / _PLAN) as temporary:
         temporary.write_text(json.dumps(kept) + "\n")
+    if frames is not None and frames[1] is not None:  # the range may end beyond the clip
+        frames = frames[0], min(frames[1], (frames[0] or 0) + index.num_declared)
     metadata = {"clip": clip.name, "seed": config.seed, "frames": frames, "clip_digest": index.digest}
     metadata |= describe_reading(index)
     jobs = _make_jobs(

@@ -433,8 +433,8 @@ def test_animations(tmp_path, name):
     np.testing.assert_array_equal(read_indexed(part, 5, 7).frames, clip.frames[7:9, ..., :3])  # all opaque
 
 
-@pytest.mark.parametrize(("name", "says"), [("a.gif", "expected A:B within 0:"), ("a.png", "differs")])
-def test_an_animation_that_lost_frames_is_refused(tmp_path, name, says):
+@pytest.mark.parametrize("name", ["a.gif", "a.png"])
+def test_an_animation_that_lost_frames_is_refused(tmp_path, name):
     """A GIF does not promise a number of frames, a PNG does."""
     path = tmp_path / name
     first, *rest = map(Image.fromarray, _moving(12))
@@ -443,7 +443,7 @@ def test_an_animation_that_lost_frames_is_refused(tmp_path, name, says):
     data = path.read_bytes()
     path.write_bytes(data[: 3 * len(data) // 4])
     np.testing.assert_array_equal(LazyFrames(index)[1:3], read_video(path).frames[1:3])
-    with pytest.raises(VideoError, match=says):
+    with pytest.raises(VideoError, match="differs"):
         read_indexed(index, 3, 12)
 
 
@@ -564,7 +564,7 @@ def test_what_is_refused_is_refused_alike(tmp_path, long):
         with pytest.raises(expected.type) as caught:
             index_video(path)
         assert str(caught.value) == str(expected.value)
-    for options in ({"frames": (5, 3)}, {"frames": (600, 700)}, {"frames": (-1, 3)}, {"fps": 0}, {"fps": np.nan}):
+    for options in ({"frames": (5, 3)}, {"frames": (700, 800)}, {"frames": (-1, 3)}, {"fps": 0}, {"fps": np.nan}):
         with pytest.raises(VideoError) as expected:
             read_video(long, **options)
         with pytest.raises(VideoError) as caught:
@@ -666,7 +666,7 @@ def test_what_is_no_index_is_refused(tmp_path, long_index):
     with pytest.raises(FileNotFoundError):
         FrameIndex.load(tmp_path / "missing")
     with pytest.raises(OutputError):
-        long_index.save(tmp_path / "missing" / "a.npz")
+        long_index.save(path / "a.npz")
 
 
 # ------------------------------------------------------------------------------------------ as an array

@@ -269,10 +269,12 @@ def test_sources_that_make_no_clip_are_refused(chosen, message, work, tmp_path):
 
 
 def test_where_it_cannot_be_written_is_known_before(work, tmp_path):
-    with pytest.raises(OutputError, match="expected an existing folder"):
-        join_segments(tmp_path / "missing" / "out.safetensors", sources(work))
-    with pytest.raises(OutputError, match="expected an existing folder"):
-        save_video_model(tmp_path / "missing" / "out.safetensors", load_video_model(work / "long.safetensors"))
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(OutputError, match="expected a folder, got the file"):
+        join_segments(tmp_path / "file" / "out.safetensors", sources(work))
+    with pytest.raises(OutputError, match="expected a folder, got the file"):
+        save_video_model(tmp_path / "file" / "out.safetensors", load_video_model(work / "long.safetensors"))
+    assert join_segments(tmp_path / "new" / "er" / "out.safetensors", sources(work)).exists()
 
 
 def rewritten(path, change):

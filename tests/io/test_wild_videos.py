@@ -830,8 +830,11 @@ def test_frames_that_an_edit_list_hides_are_not_missed(tmp_path, mp4):
     whole, clip = read_video(tmp_path / "a.mp4"), read_video(tmp_path / "cut.mp4")
     assert (whole.num_declared, clip.num_declared, clip.fps, clip.times) == (8, 5, 10, None)
     np.testing.assert_array_equal(clip.frames, whole.frames[3:])
+    clamped = read_video(tmp_path / "cut.mp4", frames=(0, 6))
+    assert clamped.num_frames == clamped.num_declared == 5
+    assert clamped.notes == ("frames 0:6 were asked for, and the clip ends at 5: 0:5 are used.",)
     with pytest.raises(VideoError, match="within 0:5"):
-        read_video(tmp_path / "cut.mp4", frames=(0, 6))
+        read_video(tmp_path / "cut.mp4", frames=(5, 6))
 
 
 @pytest.mark.parametrize("name", [b"elst", b"edts"])

@@ -9,6 +9,7 @@ import threading
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,6 +21,8 @@ from foldgauss.io._atomic import OutputError
 from foldgauss.io._lock import lock_output
 from foldgauss.jobs import FitJob, Stopped, fit_job
 from foldgauss.jobs.job import read_record
+from foldgauss.jobs.runner import few_steps
+from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.economy import Economy
 
 NUM_FRAMES = 10
@@ -247,3 +250,15 @@ def test_the_largest_memory_is_that_of_the_process_alone():
     program = "from foldgauss.jobs.runner import peak_bytes; print(peak_bytes())"
     ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120)
     assert 2**26 < int(ran.stdout) < len(own) < fitting.peak_bytes()
+
+
+@pytest.mark.parametrize(("steps", "stopped_by", "told"), [(400, "minutes", 1), (600, "minutes", 0), (400, "steps", 0)])
+def test_minutes_that_give_far_fewer_steps_than_planned_are_told(steps, stopped_by, told, monkeypatch):
+    monkeypatch.setattr("foldgauss.video.fitting.config.num_threads", lambda: 2)
+    config = FitConfig(minutes=1.0, batch_size=1)  # 120 s of a core, of which a step takes 0.12 s: 1,000 steps
+    clip, info = SimpleNamespace(size=(300, 1000)), SimpleNamespace(step=steps, stopped_by=stopped_by)
+    run = SimpleNamespace(job=SimpleNamespace(config=config), clip=clip, info=info)
+    run.model = SimpleNamespace(num_gaussians=5000)
+    texts = few_steps(run)
+    assert len(texts) == told
+    assert all("400 of about 1,000 expected steps" in text and "5,000 Gaussians" in text for text in texts)

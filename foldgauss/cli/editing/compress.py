@@ -17,7 +17,7 @@ from foldgauss.cli.shared.clips import is_other_clip, read_fitted_clip, refuse_s
 from foldgauss.cli.shared.outputs import refuse_existing, refuse_inputs
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import print_figures
-from foldgauss.io._atomic import check_writable
+from foldgauss.io._atomic import check_writable, write_or_keep
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.compact import COMPACT_SUFFIX, check_compact_name, save_compact
 from foldgauss.io.models.video_model import (
@@ -177,7 +177,8 @@ def _write_compressed(
             f"fine-tuning came {gain:.1f} dB closer to the clip than the model. Either its fit had not converged, or "
             "it was edited, and the passes have undone the edits. --passes 0 does without fine-tuning."
         )
-    save_compressed(target, made, about, known=clip is not None or known_psnr is not None)
+    known = clip is not None or known_psnr is not None
+    write_or_keep(target, lambda path: save_compressed(path, made, about, known=known))
     if clip is None:
         source = "recorded in the file" if known_psnr is not None else "assumed"
         err.print(

@@ -85,7 +85,7 @@ def edit_command(
         options = VideoOptions(sound=choose_sound(sound, Timeline(), about, model.fps))
         check_video_options(out_path, image_size or model.size, model.fps, options)
     with print_log():
-        edited = script.apply(model)
+        edited = script.apply(model, about.get("frames"))
     if as_model:
         about = keep_origin(about, *CLIP_NOTES) | {"edited_by": script_path.name}
         if isinstance(edited, SegmentedVideo):

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from foldgauss.cli.app.application import app, err, out, wrong_use
+from foldgauss.cli.app.application import app, out, wrong_use
 from foldgauss.cli.app.completion import complete_choice, complete_files
 from foldgauss.cli.shared.arguments import (
     ModelFile,
@@ -18,6 +18,7 @@ from foldgauss.cli.shared.arguments import (
     parse_times,
 )
 from foldgauss.cli.shared.clips import read_fitted_clip
+from foldgauss.cli.shared.log_lines import show_status
 from foldgauss.cli.shared.outputs import check_image_path, name_after, refuse_existing, refuse_huge, refuse_inputs
 from foldgauss.cli.shared.rendering import advance_over, progress_bar
 from foldgauss.io._atomic import check_writable
@@ -96,7 +97,7 @@ def export_command(
     if file_format == "html":
         check_writable(out_path)
         frames = None if original is None else read_fitted_clip(model, model_path, original, None)
-        with err.status("Writing the page"):
+        with show_status("Writing the page"):
             write_html(out_path, model_path, original=frames, quality=original_quality)
         size = out_path.stat().st_size / 1e6
         out.print(f"{out_path}: a page of {size:.1f} MB, {model.num_gaussians:,} Gaussians", soft_wrap=True)

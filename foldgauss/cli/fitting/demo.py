@@ -21,7 +21,7 @@ from foldgauss.io.media.video_reading import read_video
 from foldgauss.io.media.video_writing import write_image, write_video
 from foldgauss.io.models.video_model import save_video_model
 from foldgauss.io.provenance import describe_source
-from foldgauss.jobs.runner import mean_scores, run_steps
+from foldgauss.jobs.runner import describe_fit, mean_scores, run_steps
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.loop import fit_steps
 from foldgauss.video.fitting.state import to_model
@@ -52,7 +52,7 @@ def demo(
     figures = summarize_scores(model, scores) | summarize_fit(info)
     frames = {"psnr": scores.psnr, "ssim": scores.ssim}
     write_json(out_dir / RECORD, figures | frames)  # first: the next demo may then replace this one, however it ends
-    metadata = describe_source(clip, CONFIG.seed) | mean_scores(scores)
+    metadata = describe_source(clip, CONFIG.seed) | describe_fit(CONFIG, state) | mean_scores(scores)
     figures["file_bytes"] = save_video_model(out_dir / "model.safetensors", model, metadata=metadata).stat().st_size
     write_video(out_dir / "reconstruction.mp4", images, clip.fps)
     shown = np.linspace(0, clip.num_frames - 1, 4).round().astype(int)

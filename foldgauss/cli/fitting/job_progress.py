@@ -10,7 +10,8 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 
 from foldgauss.cli.app.application import Stopped, err
 from foldgauss.cli.app.signals import note_signals
-from foldgauss.cli.fitting.progress import FIRST_LINE_SECONDS, LINE_SECONDS, Display, print_json
+from foldgauss.cli.fitting.progress import Display, print_json
+from foldgauss.cli.shared.log_lines import FIRST_LINE_SECONDS, LINE_SECONDS
 from foldgauss.cli.shared.rendering import TIME_LEFT
 from foldgauss.jobs import FitJob, Outcome, WorkerPool, run_here, run_on
 from foldgauss.jobs import Progress as JobProgress

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
 
 from foldgauss.cli.shared.contact_sheet import make_comparison_sheet
+from foldgauss.cli.shared.log_lines import FIRST_LINE_SECONDS, LINE_SECONDS
 from foldgauss.io.history import HistoryFile, info_line
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.media.video_writing import write_image
@@ -25,8 +26,6 @@ Observer = Callable[[FitState, FitInfo], None]
 Display = Literal["bar", "lines", "json", "quiet"]
 
 BAR_SECONDS = 0.1
-#: Seconds before the first line of a log, which is early since options may be mistyped, and between two lines.
-FIRST_LINE_SECONDS, LINE_SECONDS = 10.0, 30.0
 JSON_SECONDS = 1.0
 PREVIEW_SECONDS = 10.0
 

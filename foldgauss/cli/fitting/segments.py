@@ -8,8 +8,9 @@ from typing import Any
 
 from foldgauss.cli.app.application import Stopped, WrongUse, err, name_option, out, warn
 from foldgauss.cli.fitting.job_progress import emit_json, run_jobs
-from foldgauss.cli.fitting.progress import LINE_SECONDS, Display
+from foldgauss.cli.fitting.progress import Display
 from foldgauss.cli.fitting.workers import WorkerOptions
+from foldgauss.cli.shared.log_lines import LINE_SECONDS
 from foldgauss.cli.shared.rendering import progress_bar
 from foldgauss.cli.shared.tables import format_count, print_figures
 from foldgauss.io.media.resizing import describe_crop

@@ -40,6 +40,7 @@ from foldgauss.cli.shared.arguments import (
     parse_reading,
     parse_size,
 )
+from foldgauss.cli.shared.log_lines import show_status
 from foldgauss.cli.shared.outputs import make_folder, name_after, refuse_foreign
 from foldgauss.cli.shared.rendering import TIME_LEFT
 from foldgauss.io._atomic import atomic_path
@@ -172,7 +173,7 @@ class _Run:
         full = planned_steps(wanted, self.clip.num_frames)
         if not self.record.plan:
             num = self._choose_number(wanted)
-            with err.status("Measuring the throughput"):
+            with show_status("Measuring the throughput"):
                 throughput = self._measure_throughput(dataclasses.replace(wanted, num_gaussians=num, steps=PILOT_STEPS))
             base = dataclasses.replace(wanted, num_gaussians=num, steps=full)
             points, _ = plan_points(base, axes, self.clip.num_frames, self.clip.size, has_alpha=self.clip.has_alpha)

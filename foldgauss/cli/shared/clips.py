@@ -4,8 +4,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from foldgauss.cli.app.application import WrongUse, err, warn, wrong_use
+from foldgauss.cli.app.application import WrongUse, warn, wrong_use
 from foldgauss.cli.shared.arguments import parse_frames
+from foldgauss.cli.shared.log_lines import show_status
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.media.frame_index import index_video
 from foldgauss.io.media.lazy_frames import LazyFrames
@@ -76,7 +77,7 @@ def _read_lazily(
     video: Path, *, frames: tuple[int | None, int | None] | None, size: tuple[int, int], **reading: Any
 ) -> Clip:
     """As `read_video`, with only some frames in memory."""
-    with err.status(f"Indexing {video.name}"):
+    with show_status(f"Indexing {video.name}"):
         index = index_video(video, frames=frames, find_cuts=False, **reading)
     lazy = LazyFrames(index, size)
     about = index.source, index.num_declared, index.times, index.notes, index.first_second, index.duration

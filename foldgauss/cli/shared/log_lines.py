@@ -2,12 +2,40 @@
 
 import contextlib
 import logging
+import threading
+import time
 from collections.abc import Iterator
 
 from foldgauss.cli.app.application import err, out, warn
 
 #: So many starts of shots are printed.
 LISTED_STARTS = 8
+#: Seconds before the first line of a log, which is early since options may be mistyped, and between two lines.
+FIRST_LINE_SECONDS, LINE_SECONDS = 10.0, 30.0
+
+
+@contextlib.contextmanager
+def show_status(text: str) -> Iterator[None]:
+    """What is being done, on a terminal; elsewhere a line now and then if it takes long."""
+    if err.is_terminal:
+        with err.status(text):
+            yield
+        return
+    ended, begun = threading.Event(), time.monotonic()
+
+    def repeat() -> None:
+        pause = FIRST_LINE_SECONDS
+        while not ended.wait(pause):
+            pause = LINE_SECONDS
+            err.print(f"{text}: {time.monotonic() - begun:.0f} s", soft_wrap=True)
+
+    thread = threading.Thread(target=repeat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 class _Printer(logging.Handler):

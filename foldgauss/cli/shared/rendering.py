@@ -1,5 +1,6 @@
 """Frames of models with a progress bar: rendered to files, and evaluated."""
 
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from foldgauss.cli.app.application import WrongUse, err, name_option, out, wrong_use
 from foldgauss.cli.app.completion import complete_choice
 from foldgauss.cli.shared.clips import Video
+from foldgauss.cli.shared.log_lines import FIRST_LINE_SECONDS, LINE_SECONDS
 from foldgauss.cli.shared.outputs import IMAGE_SUFFIX
 from foldgauss.cli.shared.tables import format_count
 from foldgauss.cli.shared.timeline import Timeline
@@ -80,9 +82,7 @@ def check_video_options(
     """Refuse options that do not fit the output `path` for such frames, before they are computed."""
     suffix = path.suffix.lower()
     _check_rate(path, fps)
-    if background is None and suffix in ANIMATION_SUFFIXES and not path.is_dir():
-        expected, cure = f"a color for {suffix}", "Take .webm, .mov, .mkv or a folder."
-        raise wrong_use("--background", expected=expected, got="none", cure=cure)
+    _refuse_transparent(path, background)
     if suffix not in VIDEO_SUFFIXES:
         _refuse_options(path, options)
     if suffix not in VIDEO_SUFFIXES or path.is_dir():
@@ -93,6 +93,14 @@ def check_video_options(
         )
     except ValueError as error:
         raise WrongUse(name_option(str(error)) if str(error).startswith(options._fields) else str(error)) from error
+
+
+def _refuse_transparent(path: Path, background: Background) -> None:
+    """Refuse images with alpha for a GIF or WebP."""
+    suffix = path.suffix.lower()
+    if background is None and suffix in ANIMATION_SUFFIXES and not path.is_dir():
+        expected, cure = f"a color for {suffix}", "Take .webm, .mov, .mkv or a folder."
+        raise wrong_use("--background", expected=expected, got="none", cure=cure)
 
 
 def _check_rate(path: Path, fps: float) -> None:
@@ -130,11 +138,21 @@ TIME_LEFT = (TextColumn("left"), TimeRemainingColumn())
 
 @contextmanager
 def progress_bar(title: str, total: int, shown: bool = True) -> Iterator[Callable[[], None]]:
-    """A progress bar on a terminal; yields the function that advances it."""
+    """A progress bar on a terminal, elsewhere a line now and then; yields the function that advances it."""
     columns = TextColumn("{task.description}"), BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn()
     with Progress(*columns, *TIME_LEFT, console=err, disable=not (shown and err.is_terminal)) as progress:
         task = progress.add_task(title, total=total)
-        yield lambda: progress.advance(task)
+        due = time.monotonic() + FIRST_LINE_SECONDS
+
+        def advance() -> None:
+            nonlocal due
+            progress.advance(task)
+            if shown and not err.is_terminal and time.monotonic() > due:
+                due = time.monotonic() + LINE_SECONDS
+                done = progress.tasks[task].completed
+                err.print(f"{title}: {done:,.0f} of {total:,}", soft_wrap=True)
+
+        yield advance
 
 
 def advance_over(items: Iterable[Any], advance: Callable[[], None]) -> Iterator[Any]:
@@ -181,6 +199,7 @@ def render_to_file(
     `flow`: between frames, averages with predictions by optical flow, see `interpolate_frames`. `stamps`: seconds at
     which the images are shown; None where they are evenly spaced at `fps`.
     """
+    _refuse_transparent(path, background)
     if flow:
         images = interpolate_frames(model, times, size, background=background)
     else:

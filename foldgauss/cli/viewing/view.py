@@ -9,6 +9,7 @@ import typer
 from foldgauss.cli.app.application import app, err, out, wrong_use
 from foldgauss.cli.shared.arguments import ModelFile, Original, OriginalQuality
 from foldgauss.cli.shared.clips import read_fitted_clip
+from foldgauss.cli.shared.log_lines import show_status
 from foldgauss.cli.viewing.page_server import PageServer, make_token, script_path
 from foldgauss.io.models.video_model import load_video_model
 from foldgauss.io.page.player_page import QUALITY, SaveTarget, html_page, warn_of_size
@@ -38,7 +39,7 @@ def view_command(
     script, token = script_path(model_path), make_token()
     target = SaveTarget(script.name, token)
     make_page = partial(html_page, model_path, original=frames, quality=original_quality, save_to=target)
-    with err.status("Searching for what moves, writing the page" if moving else "Writing the page"):
+    with show_status("Searching for what moves, writing the page" if moving else "Writing the page"):
         try:
             page = make_page(moving=moving)
         except NothingMoves as error:

@@ -1,7 +1,6 @@
 """Clips in memory, and the error and argument checks that readers and writers of clips share."""
 
 import os
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -130,15 +129,13 @@ class Clip:
 
 def check_readable(path: PathLike) -> Path:
     """The path of an existing file or folder. Raises `FileNotFoundError`, or `VideoError` for pipes and devices."""
-    address, path = str(path), check_path(path)
+    path = check_path(path)
     if os.path.isdir(path) or os.path.isfile(path):
         return path
     if os.path.exists(path):
         got, cure = f"{str(path)!r}, a pipe or a device", "Save its output to a file."
         raise video_error("path", expected=VIDEO, got=got, cure=cure)
-    if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", address):
-        raise FileNotFoundError(f"path: expected {VIDEO}, got the address {address!r}. Download it first.")
-    raise missing_error(address, VIDEO)
+    raise missing_error(path, VIDEO)
 
 
 @contextmanager
@@ -192,6 +189,20 @@ def check_frame_size(size: Size | None, parameter: str = "size") -> Size | None:
         cure = "Write it as HEIGHTxWIDTH, such as 160x320."
         raise video_error(parameter, expected="height and width of whole pixels, at least 1", got=got, cure=cure)
     return int(sides[0]), int(sides[1])
+
+
+def clamp_stop(start: int, stop: int | None, num_total: int, path: Path) -> int:
+    """The end of a range in a clip of `num_total` frames, which may end before. Raises `VideoError` if empty."""
+    check_range_within(start, None, num_total, path)
+    return num_total if stop is None else min(stop, num_total)
+
+
+def describe_clamped(num: int, start: int, stop: int | None) -> tuple[str, ...]:
+    """A note if a range ends beyond its clip, which has `num` frames from `start` on."""
+    if stop is None or num >= stop - start:
+        return ()
+    end = start + num
+    return (f"frames {format_range(start, stop)} were asked for, and the clip ends at {end}: {start}:{end} are used.",)
 
 
 def check_fps(fps: float) -> None:

@@ -17,7 +17,7 @@ from foldgauss.io.media.clip import (
     ReadResult,
     VideoError,
     check_num_pixels,
-    check_range_within,
+    clamp_stop,
     describe_lost,
     format_num_bytes,
     format_size,
@@ -58,8 +58,7 @@ def choose_images(folder: Path, start: int, stop: int | None) -> list[Path]:
         expected = "a folder with images (" + ", ".join(s[1:] for s in IMAGE_SUFFIXES) + ")"
         got, cure = f"{str(folder)!r} without any", "Give the folder that holds the frames, or a video file."
         raise video_error("path", expected=expected, got=got, cure=cure)
-    check_range_within(start, stop, len(images), folder)
-    return images[start:stop]
+    return images[start : clamp_stop(start, stop, len(images), folder)]
 
 
 def image_paths(folder: Path) -> list[Path]:
@@ -245,12 +244,12 @@ def read_animation(path: Path, start: int, stop: int | None, keep: Callable) -> 
     if not delays:
         raise _undecodable_error(path)
     num_total = num_declared or len(delays) + (len(delays) < (stop or MAX_FRAMES))
-    check_range_within(start, stop, num_total, path)
+    stop = clamp_stop(start, stop, num_total, path)
     if not kept:
         raise no_frames_error(start, stop, len(delays), num_total, path)
     shown = np.cumsum([0, *delays[start:]]) / 1000
     rate = estimate_rate(shown[:-1], (len(shown) - 1) / shown[-1], float(shown[-1]))
-    num = (num_total if stop is None else stop) - start
+    num = stop - start
     return kept, num, rate, describe_lost(len(kept), num)
 
 

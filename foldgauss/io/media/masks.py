@@ -48,9 +48,9 @@ def read_masks(
       Labels of 16 bits are read as those of 8; of black and white ones, white may have any value above 255.
     - A video: bool (num_frames, height, width), True where the brightest channel is at least `level` of white.
 
-    `frames = (A, B)` keeps A <= i < B of a folder or video, None for an open end. `size` = (height, width) crops the
-    masks to that aspect around the center, as `read_video` crops frames, without resizing them: use the same value as
-    for the fit.
+    `frames = (A, B)` keeps A <= i < B of a folder or video, None for an open end, as `read_video`. `size` = (height,
+    width) crops the masks to that aspect around the center, as `read_video` crops frames, without resizing them: use
+    the same value as for the fit.
 
     **Example:** `by_mask(model, read_masks("DAVIS/Annotations/480p/bear", label=1))`.
 

@@ -12,7 +12,7 @@ from foldgauss.io.media.clip import (
     RangeFacts,
     Reading,
     ReadResult,
-    check_range_within,
+    clamp_stop,
     describe_few,
     describe_lost,
     no_frames_error,
@@ -134,12 +134,12 @@ def decode_file(
         notes += decoder.levels.describe(path) if kept else ()
         stored_size = list(decoder.stored_size)
     # The container's count may be an estimate, so the range is checked against the decoded frames as well.
-    check_range_within(start, stop, num_total, path)
+    end_of_range = clamp_stop(start, stop, num_total, path)
     if not kept:
         raise no_frames_error(start, stop, len(stamps), num_total, path)
     about = positions, stamps, time_base, threads, end, damaged, resized, stored_size
     report = DecodeReport(fps, num_total, notes, *about)
-    return (kept, *report.describe_span(len(stamps) - len(kept), len(stamps), start, stop)), report
+    return (kept, *report.describe_span(len(stamps) - len(kept), len(stamps), start, end_of_range)), report
 
 
 def _count_declared(decoder: VideoDecoder, seconds: np.ndarray, fps: float, num_reached: int, last: float) -> int:

@@ -16,9 +16,10 @@ from foldgauss.io.media.clip import (
     check_fps,
     check_frame_size,
     check_range,
-    check_range_within,
     check_readable,
     check_reading,
+    clamp_stop,
+    describe_clamped,
     read_head,
     translate_os_errors,
     video_error,
@@ -42,7 +43,8 @@ def read_video(
 ) -> Clip:
     """Read a video file, a folder of images in natural order (img2 before img10), or one image as a clip of one frame.
 
-    `frames = (A, B)` keeps frames A <= i < B, None for an open end. `size = (height, width)` crops each frame to that
+    `frames = (A, B)` keeps frames A <= i < B, None for an open end; of a clip that ends before
+    B, those up to its end, with a note. `size = (height, width)` crops each frame to that
     aspect around its center (to whole pixels), then resizes it, by area averaging to shrink and by cubic interpolation
     to enlarge: (160, 320) of a 1280x720 clip is rows 40 to 680. `fps` overrides the rate of the container (25 for
     images). `center_crop = (height, width)` first crops that window around the center (an odd remainder is cut below
@@ -96,6 +98,14 @@ def read_frames(
 
     They are BGR or premultiplied BGRA, as stored. Raises `VideoError` and OSError.
     """
+    (kept, num_declared, rate, notes), report = _read_format(path, start, stop, keep, reading)
+    return (kept, num_declared, rate, describe_clamped(num_declared, start, stop) + tuple(notes)), report
+
+
+def _read_format(
+    path: Path, start: int, stop: int | None, keep: Callable[[Iterator[np.ndarray]], list], reading: Reading
+) -> tuple[ReadResult, DecodeReport | None]:
+    """As `read_frames`, without the note about a range that ends beyond the clip."""
     may_move = not path.is_dir() and may_be_animation(read_head(path))
     if not (may_move or path.is_dir() or is_image_file(path)):
         return decode_file(path, start, stop, keep, reading)
@@ -109,7 +119,7 @@ def read_frames(
     if path.is_dir():
         paths = choose_images(path, start, stop)
     else:
-        check_range_within(start, stop, 1, path)
+        clamp_stop(start, stop, 1, path)
         paths = [path]
     kept, rate = keep(read_images(paths, levels)), FrameRate(DEFAULT_FPS)
     return (kept, len(paths), rate, describe_missing(paths) + levels.describe(path)), None

@@ -368,6 +368,8 @@ def model_file_error(parameter: str, *, expected: str, got: object, cure: str = 
 
 def _unreadable_error(path: Path, got: str) -> ModelFileError:
     cure = "Give a file that `foldgauss fit` wrote."
+    if got == _MAGIC[b"ply"]:
+        cure = "Convert it to a model first: foldgauss import PLY. The commands and the player open that."
     return model_file_error("path", expected=f"a {FORMAT} file", got=f"{got}: {str(path)!r}", cure=cure)
 
 
