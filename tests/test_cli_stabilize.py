@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 from commands import run
+from soft_models import soft_model
 from tiny_clips import NUM_FRAMES, model_of_12
 
+from foldgauss.cli.shared import timeline
 from foldgauss.io import load_video_model, read_video, save_video_model
-from foldgauss.video import FitConfig, fit, interpolate_frames, interpolated_times, stabilize
+from foldgauss.video import FitConfig, fit, interpolate_frames, interpolated_times, stabilize, times_at
 
 
 @pytest.fixture(scope="module")
@@ -76,3 +78,20 @@ def test_shots_are_named(tmp_path, capsys):
     save_video_model(tmp_path / "m.safetensors", fit(frames, FitConfig(num_gaussians=200, steps=20), fps=5.0).model)
     assert run("stabilize", tmp_path / "m.safetensors", "--out", tmp_path / "images") == 0
     assert "shots, each on its own; they begin at frames 0, " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["render", "stabilize"])
+def test_repeated_frames_take_less_time(tmp_path, monkeypatch, capsys, command):
+    model, images = soft_model(), tmp_path / "images"
+    monkeypatch.setattr(timeline, "even_durations", lambda video: np.array([1, 1, 0.25, 1, 1, 1]))
+    save_video_model(tmp_path / "m.safetensors", model)
+    options = ["--border", "keep"] if command == "stabilize" else []
+    how = ["--skip-repeats", "--upsample", "2", "--no-flow", "--out", images, *options]
+    assert run(command, tmp_path / "m.safetensors", *how) == 0
+    assert "Frames that repeat the one before: 3." in capsys.readouterr().out
+    shown = np.interp(np.arange(13) / 2, [0, 1, 2, 2.25, 3.25, 4.25, 5.25], np.arange(7))
+    video = stabilize(model, border="keep") if command == "stabilize" else model
+    wanted = list(video.frames(times_at(np.asarray(model.frame_times.times()), shown)))
+    np.testing.assert_allclose(read_video(images).frames, wanted, atol=1)
+    assert run(command, tmp_path / "m.safetensors", *how, "--overwrite", "--sound", tmp_path / "m.safetensors") == 2
+    assert "--skip-repeats: expected no --sound" in capsys.readouterr().err

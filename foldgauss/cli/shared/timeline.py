@@ -1,16 +1,21 @@
 """The times and the frame rate of a rendered video, from the options of commands."""
 
 import dataclasses
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import typer
 
-from foldgauss.cli.app.application import warn, wrong_use
+from foldgauss.cli.app.application import out, warn, wrong_use
 from foldgauss.cli.shared.arguments import MAX_TIMES
+from foldgauss.cli.shared.clips import Video
 from foldgauss.io.media.frame_rate import MAX_FPS, MIN_FPS
 from foldgauss.video.models.frame_times import interpolated_times, played_positions, remapped_positions, times_at
+from foldgauss.video.motion.slow_motion import even_durations
 
+#: So many repeated frames are printed.
+LISTED_REPEATS = 8
 MAX_UPSAMPLE, MAX_IMAGES = MAX_TIMES, 10 * MAX_TIMES
 MIN_SPEED, MAX_SECONDS = 1e-4, 1e6
 MAX_EVEN_FPS = 60.0  # frames per second, of usual displays: a constant rate is not made higher for short intervals
@@ -20,6 +25,12 @@ Fps = Annotated[
     float | None, typer.Option(help="Frames per second [default: as the clip; with --upsample K, K times as many].")
 ]
 Speed = Annotated[float | None, typer.Option(help="Playback speed: 0.25 is slow motion, -1 backwards.")]
+
+
+SkipRepeats = Annotated[
+    bool,
+    typer.Option("--skip-repeats", help="Shorten intervals in which frames repeat, which stutter when slow."),
+]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,6 +123,23 @@ class Timeline:
         if seconds is not None:
             return times_at(frame_times, _place(_seconds_played(seconds, fps * rate, speed), seconds))
         return times_at(frame_times, played_positions(len(frame_times), rate, speed=speed))
+
+    def without_repeats(
+        self, video: Video, seconds: np.ndarray | None, sound: Path | None
+    ) -> tuple["Timeline", np.ndarray]:
+        """The timeline at a constant rate, and the clip's seconds with less between a frame and its repetition."""
+        others = {"--times": self.chosen, "--frame": self.frame, "--remap": self.remap, "--sound": sound}
+        for name, value in others.items():
+            if value is not None:
+                raise wrong_use("--skip-repeats", expected=f"no {name}", got="both")
+        durations, fps = even_durations(video), video.fps
+        repeats = np.flatnonzero(durations < 1) + 1
+        numbers = ", ".join(map(str, repeats[:LISTED_REPEATS])) + (", ..." if len(repeats) > LISTED_REPEATS else "")
+        out.print(f"Frames that repeat the one before: {numbers or 'none'}.", soft_wrap=True)
+        shown = np.full(video.num_frames, 1 / fps) if seconds is None else np.diff(seconds)
+        shown[:-1] *= durations
+        timeline = dataclasses.replace(self, upsample=None, fps=self.rate(fps), speed=self.playing_speed(fps))
+        return timeline, np.append(0.0, np.cumsum(shown))
 
     def warn_of_end(self, num_frames: int, fps: float, seconds: np.ndarray | None) -> None:
         """Warn if `remap` exceeds the clip."""

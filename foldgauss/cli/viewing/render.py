@@ -37,7 +37,7 @@ from foldgauss.cli.shared.rendering import (
     choose_sound,
     render_to_file,
 )
-from foldgauss.cli.shared.timeline import Fps, Speed, Timeline, Upsample, parse_remap
+from foldgauss.cli.shared.timeline import Fps, SkipRepeats, Speed, Timeline, Upsample, parse_remap
 from foldgauss.io.media.video_writing import IMAGE_FORMATS, VIDEO_SUFFIXES
 from foldgauss.io.models.video_model import load_video_model, read_frame_seconds, read_origin
 
@@ -57,6 +57,7 @@ def render(
     upsample: Upsample = None,
     fps: Fps = None,
     speed: Speed = None,
+    skip_repeats: SkipRepeats = False,
     remap: Annotated[
         str | None,
         typer.Option(metavar="S=C,S=C,..", help="Second C of the clip at second S: 0=0,1=1,3=1,4=2 holds second 1."),
@@ -111,6 +112,8 @@ def render(
     options = VideoOptions(codec, crf, pixel_format, choose_sound(sound, timeline, about, model.fps))
     seconds = read_frame_seconds(about, model.num_frames)
     rate = timeline.rate(model.fps, seconds)
+    if skip_repeats:
+        timeline, seconds = timeline.without_repeats(model, seconds, sound)
     shown = timeline.times(np.asarray(model.frame_times.times()), model.fps, seconds)
     timeline.warn_of_end(model.num_frames, model.fps, seconds)
     render_to_file(

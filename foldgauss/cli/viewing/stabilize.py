@@ -24,7 +24,7 @@ from foldgauss.cli.shared.rendering import (
     render_to_file,
     video_option,
 )
-from foldgauss.cli.shared.timeline import Fps, Speed, Timeline, Upsample
+from foldgauss.cli.shared.timeline import Fps, SkipRepeats, Speed, Timeline, Upsample
 from foldgauss.io.media.video_writing import VIDEO_SUFFIXES
 from foldgauss.io.models.video_model import load_video_model, read_frame_seconds, read_origin
 from foldgauss.video.motion.stabilization import BORDERS, MAX_ZOOM, SMOOTHING, stabilize
@@ -51,6 +51,7 @@ def stabilize_command(
     upsample: Upsample = None,
     fps: Fps = None,
     speed: Speed = None,
+    skip_repeats: SkipRepeats = False,
     background: Annotated[
         str, typer.Option(metavar="RRGGBB", help="Background color, such as ffffff; none: with alpha.")
     ] = "000000",
@@ -77,6 +78,8 @@ def stabilize_command(
     options = VideoOptions(codec, crf, pixel_format, choose_sound(sound, timeline, about, model.fps))
     seconds = read_frame_seconds(about, model.num_frames)
     rate = timeline.rate(model.fps, seconds)
+    if skip_repeats:
+        timeline, seconds = timeline.without_repeats(model, seconds, sound)
     shown = timeline.times(np.asarray(model.frame_times.times()), model.fps, seconds)
     check_video_options(out_path, image_size or model.size, rate, options, background_color)
     with progress_bar("Estimating the camera's path", model.num_frames) as advance:

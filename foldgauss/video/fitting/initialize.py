@@ -51,6 +51,9 @@ AT_ONCE = 8 * CHUNK  # tracks held by all threads
 #: Trial starts per frame, from which follows how long starts are visible: so many sigma_t to either side. In long clips
 #: at most `MAX_PILOTS` in all, since they would take longer than the fit.
 PILOT, CORE, ROUNDS, MAX_PILOTS = 32, 1.5, 50, 40_000
+#: Gaussians start up to this fraction of the longer side outside the first and the last frame, too: without them the
+#: background shines through the border. Those of other frames come from neighbors in which they were inside.
+BEYOND = 0.03
 #: With fewer starts than this per frame, their frames are drawn at even distances.
 FEW_STARTS = 16
 #: Fraction of the starts that is spread so that all frames are covered equally, however short the tracks there. With
@@ -99,7 +102,7 @@ def initialize(
         home = _draw(chance, (np.arange(num_gaussians) + rng.random()) / num_gaussians)
     else:
         home = np.sort(rng.choice(num_frames, num_gaussians, p=chance))
-    position, density = draw_positions(home, density_of, rng)
+    position, density = draw_positions(home, density_of, rng, (0, num_frames - 1))
     splats, spread = make(home, position, longer)
     static = find_constant(frames, home, position) if with_static else np.zeros(num_gaussians, bool)
     splats, spread = make_static(splats, static), np.where(static, np.exp(STATIC_LOG_TIME_SCALE), spread)
@@ -179,18 +182,25 @@ def initialize_uniform(
 
 
 def draw_positions(
-    home: np.ndarray, density_of: Callable[[int], np.ndarray], rng: np.random.Generator
+    home: np.ndarray,
+    density_of: Callable[[int], np.ndarray],
+    rng: np.random.Generator,
+    wide: Sequence[int] = (),
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions (num, 2) in pixels, one for each of the frames `home`, and the density, per pixel, there.
 
-    `density_of(k)` is the density over the pixels of frame k, (height, width), summing to 1.
+    `density_of(k)` is the density over the pixels of frame k, (height, width), summing to 1. In the frames `wide`,
+    positions are also drawn outside, see `BEYOND`, where the density is that of the border.
     """
     position, density = np.empty((len(home), 2)), np.empty(len(home))
     for k in np.unique(home):
         here, own = np.flatnonzero(home == k), density_of(k)
+        beyond = round(BEYOND * max(own.shape)) if k in wide else 0
+        own = np.pad(own, beyond, mode="edge")
+        own /= own.sum()
         pixel = _draw(own.ravel(), rng.random(len(here)))
         density[here] = own.ravel()[pixel]
-        position[here] = np.stack(np.divmod(pixel, own.shape[1])[::-1], -1)
+        position[here] = np.stack(np.divmod(pixel, own.shape[1])[::-1], -1) - beyond
     return position + rng.random(position.shape), density
 
 

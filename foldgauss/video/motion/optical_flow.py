@@ -104,9 +104,9 @@ class Motion:
         cls, frames: UInt8[np.ndarray, "frames height width 3"], preset: int = cv2.DISOPTICAL_FLOW_PRESET_MEDIUM
     ) -> "Motion":
         num, height, width, _ = frames.shape
-        flow_size = _fit_size(_flow_side(height, width), height, width)
+        flow_size = fit_size(_flow_side(height, width), height, width)
         cells = max(MAP_BYTES, MAP_FRACTION * frames.size) / (BYTES_PER_CELL * num)
-        kept = _fit_size(min(KEPT_SIDE, math.sqrt(cells * max(height, width) / min(height, width))), height, width)
+        kept = fit_size(min(KEPT_SIDE, math.sqrt(cells * max(height, width) / min(height, width))), height, width)
         small = np.empty((num, *kept[::-1], 3), np.uint8)
         flows = np.empty((2, num - 1, *kept[::-1], 2), np.float16)
         unit = np.float32([width / flow_size[0], height / flow_size[1]])
@@ -213,7 +213,7 @@ class Motion:
             frame if frame.shape[:2] == size else cv2.resize(frame, (columns, rows), interpolation=cv2.INTER_AREA)
             for frame in frames[k : k + 2]
         ]
-        flow_size = _fit_size(_flow_side(rows, columns), rows, columns)
+        flow_size = fit_size(_flow_side(rows, columns), rows, columns)
         small = [cv2.resize(image, flow_size, interpolation=cv2.INTER_AREA) for image in pair]
         motions = self._find_motions(small, k, fraction)
         differences = np.stack([_compare_moved(small, motion) for motion in motions])
@@ -307,7 +307,7 @@ class CutFinder:
 
     def add(self, frame: UInt8[np.ndarray, "height width 3"]) -> None:
         """Add the next frame. It is kept until the one after it, so it must not change."""
-        size = _fit_size(FAST_SIDE, *frame.shape[:2])
+        size = fit_size(FAST_SIDE, *frame.shape[:2])
         now = frame, cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
         if self._before is not None:
             large, small = zip(self._before, now, strict=True)
@@ -327,7 +327,7 @@ def motion_finder(frames: np.ndarray, motion: Motion | None = None) -> Callable[
     return find_motion
 
 
-def _fit_size(side: float, height: int, width: int) -> tuple[int, int]:
+def fit_size(side: float, height: int, width: int) -> tuple[int, int]:
     """(width, height) with the longer side at most `side`, and none below 16: the flow needs a patch."""
     scale = min(1.0, side / max(height, width))
     return max(16, round(width * scale)), max(16, round(height * scale))
