@@ -218,7 +218,7 @@ def test_how_a_clip_was_read_is_kept(tmp_path, capsys):
         capsys.readouterr()
         assert run("fit", clip, "--out", tmp_path / "a.safetensors", option, value) == 2
         assert f"{option}: expected" in capsys.readouterr().err
-    assert run("fit", clip, "--out", tmp_path / "a.safetensors", "--deinterlace", "fields", *few) == 1
+    assert run("fit", clip, "--out", tmp_path / "a.safetensors", "--deinterlace", "fields", *few) == 2
     assert "deinterlace: expected a video of interlaced frames, got images" in capsys.readouterr().err
 
 

@@ -752,7 +752,7 @@ def test_nothing_is_said_on_stderr(tmp_path, long):
 import sys
 from foldgauss.io import LazyFrames, index_video, read_indexed
 index = index_video(sys.argv[1], find_cuts=False)
-read_indexed(index, 300, 305)
+read_indexed(index, 400, 405)
 LazyFrames(index)[200:210]
 """
     environment = {name: value for name, value in os.environ.items() if not name.startswith("OPENCV")}

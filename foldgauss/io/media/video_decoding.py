@@ -128,7 +128,9 @@ def decode_file(
             turn = f"{decoder.tilt} degrees beyond multiples of 90"
             notes.append(f"the file asks for a rotation by {turn}; it is left out.")
         if decoder.has_converted:
-            notes.append("interlaced frames are converted to progressive ones.")
+            by_field = reading.deinterlace == "fields"
+            each = "one of each field" if by_field else "one of each; --deinterlace fields makes two"
+            notes.append(f"interlaced frames are converted to progressive ones, {each}.")
         if (unread := decoder.unread_fraction) > MAX_UNREAD:
             notes.append(f"the last {unread:.0%} of the file hold no frame that decodes.")
         notes += decoder.levels.describe(path) if kept else ()
