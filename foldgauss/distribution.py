@@ -71,8 +71,8 @@ class FoldedGaussian(BatchModule):
         dist.condition_time(0.8).loc                 # [0.09] = f(0.5 - 0.8)
 
     **Source:** eq:foldgauss with eq:cond_dens. **Raises:** ValueError that names the parameter. Shapes
-    are always checked, values (positive `time_scale`, a valid factor or covariance) unless they are traced or
-    `validate_args=False`.
+    are always checked, values (finite numbers, positive `time_scale`, a valid factor or covariance, log a <= 0 at
+    `time_loc`) unless they are traced or `validate_args=False`.
     """
 
     loc: Float[Array, "*#batch d-1"]
@@ -210,12 +210,12 @@ class FoldedGaussian(BatchModule):
         """FN(x), shapes as in `log_prob`. **Source:** eq:foldgauss."""
         return jnp.exp(self.log_prob(value))
 
-    def sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
+    def sample(self, key: Key[Array, ""], sample_shape: int | tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Random samples x = (s, t): first t, then s given t; differentiable in all parameters.
 
-        **Shapes:** -> (*sample_shape, *batch, d), time last.
+        **Shapes:** -> (*sample_shape, *batch, d), time last; a number n as `sample_shape` is (n,).
 
-        **Example:** `dist.sample(jax.random.key(0), (1000,))`
+        **Example:** `dist.sample(jax.random.key(0), 1000)`
 
         **Source:** eq:foldgauss, by ancestral sampling.
         """
@@ -232,7 +232,7 @@ class FoldedGaussian(BatchModule):
         s = self.condition_time(t).sample(space_key)
         return jnp.concatenate([s, t[..., None]], axis=-1)
 
-    def sample_and_log_prob(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> tuple[Array, Array]:
+    def sample_and_log_prob(self, key: Key[Array, ""], sample_shape: int | tuple[int, ...] = ()) -> tuple[Array, Array]:
         """Samples and their `log_prob`. **Shapes:** -> (*sample_shape, *batch, d) and (*sample_shape, *batch)."""
         x = self.sample(key, sample_shape)
         return x, self.log_prob(x)
@@ -415,7 +415,7 @@ class FoldedGaussian(BatchModule):
         coordinates and time (last), integrated numerically.
 
         **Shapes:** `indices`: n integers, -1 is time; `values` (*batch, n) in the same order; the result has the
-        other coordinates in ascending order.
+        other coordinates in ascending order. For one coordinate a number will do: `dist.condition(-1, 0.5)`.
 
         **Example:** `dist.condition([0], [0.3]).sample(key)  # the other space coordinates, and time`
 

@@ -84,7 +84,7 @@ class TimeLikelihood(AbstractEnvelope):
 
     **Example:** `TimeLikelihood(power=2).log_a(1.5, time_loc=0.5, time_scale=0.5)  # -2 * 2^2 / 2 = -4.`
 
-    **Source:** eq:a_func_2d. **Raises:** ValueError if `power` is negative or infinite, or `floor` is outside [0, 1).
+    **Source:** eq:a_func_2d. **Raises:** ValueError if `power` is negative or not finite, or `floor` is outside [0, 1).
     """
 
     power: Float[Array, "*#batch"]

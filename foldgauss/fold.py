@@ -109,7 +109,7 @@ class PolynomialFold(AbstractFold):
     **Example:** `PolynomialFold([[-1.0], [0.5]])(4.0)  # [-4 + 8] = [4.]`
 
     **Source:** f of eq:cond_dens, a polynomial as in the text after eq:cond_pdf_2d.
-    **Raises:** ValueError if `coefficients` has fewer than two dimensions or no space coordinate.
+    **Raises:** ValueError if `coefficients` has fewer than two dimensions, no space coordinate, or is not finite.
     """
 
     coefficients: Float[Array, "*batch degree d-1"]
@@ -157,8 +157,8 @@ class SplineFold(AbstractFold):
     **Example:** `SplineFold([-1, -1, 0, 1, 1], [[2.0], [0.0], [1.0]], degree=1)(0.5)  # halfway: [0.5]`
 
     **Source:** the "suitably chosen" f of eq:transform_s; the recursion is that of Cox and de Boor. **Raises:**
-    ValueError if `degree` is not an integer >= 0, or the knots decrease, are not finite, leave no domain, or are not
-    n + degree + 1.
+    ValueError if `degree` is not an integer >= 0, the coefficients are not finite, or the knots decrease, are not
+    finite, leave no domain, or are not n + degree + 1.
     """
 
     coefficients: Float[Array, "*batch n d-1"]
@@ -205,8 +205,8 @@ class FourierFold(AbstractFold):
 
     **Example:** `FourierFold([[1.0]], [[0.5]], period=4.0)(1.0)  # [1 - 0.5] = [0.5]`
 
-    **Source:** the "suitably chosen" f of eq:transform_s. **Raises:** ValueError if sine and cosine differ in shape, or
-    `period` is not positive.
+    **Source:** the "suitably chosen" f of eq:transform_s. **Raises:** ValueError if sine and cosine differ in shape or
+    are not finite, or `period` is not positive.
     """
 
     sine: Float[Array, "*batch order d-1"]
@@ -302,8 +302,8 @@ class SharedPathFold(AbstractFold):
     **Example:** `SharedPathFold(ZeroFold(1), [2.0], time_loc=0.5, index=1, times=[[0.0, 1.0]], matrices=[[[[1.0, 0.0]],
     [[3.0, 0.0]]]])(-0.5)  # from 2 * 2 to 3 * 2: [2.]`
 
-    **Source:** the "suitably chosen" f of eq:transform_s. **Raises:** ValueError for shapes that do not fit, times that
-    decrease, and for paths that there are not.
+    **Source:** the "suitably chosen" f of eq:transform_s. **Raises:** ValueError for shapes that do not fit, numbers
+    that are not finite, times that decrease, and for paths that there are not.
     """
 
     fold: AbstractFold

@@ -71,7 +71,7 @@ class Normal(BatchModule):
 
     **Example:** `Normal(0.0, 1.0).log_prob(0.0)  # -0.9189`
 
-    **Source:** eq:normal_pdf. **Raises:** ValueError if `scale` is not positive.
+    **Source:** eq:normal_pdf. **Raises:** ValueError if `scale` is not positive, or a number is not finite.
     """
 
     loc: Float[Array, "*#batch"]
@@ -136,11 +136,11 @@ class Normal(BatchModule):
         """N(loc, scale^2)(value)."""
         return jnp.exp(self.log_prob(value))
 
-    def sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
+    def sample(self, key: Key[Array, ""], sample_shape: int | tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Random samples (*sample_shape, *batch), differentiable in the parameters."""
         return _as_gaussian(self).sample(key, sample_shape)[..., 0]
 
-    def sample_and_log_prob(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> tuple[Array, Array]:
+    def sample_and_log_prob(self, key: Key[Array, ""], sample_shape: int | tuple[int, ...] = ()) -> tuple[Array, Array]:
         """Random samples and their log-densities, both (*sample_shape, *batch)."""
         value = self.sample(key, sample_shape)
         return value, self.log_prob(value)
@@ -159,7 +159,7 @@ class Gaussian(BatchModule):
 
     **Example:** `Gaussian(jnp.zeros(2), jnp.eye(2)).log_prob(jnp.zeros(2))  # -1.8379`
 
-    **Source:** eq:cond_dens. **Raises:** ValueError on a wrong shape or an invalid factor.
+    **Source:** eq:cond_dens. **Raises:** ValueError on a wrong shape, an invalid factor, NaN or infinity.
     """
 
     loc: Float[Array, "*#batch dim"]
@@ -252,7 +252,7 @@ class Gaussian(BatchModule):
         """N(loc, Sigma)(value)."""
         return jnp.exp(self.log_prob(value))
 
-    def sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
+    def sample(self, key: Key[Array, ""], sample_shape: int | tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Random samples (*sample_shape, *batch, dim), differentiable in the parameters."""
         return self._sample(key, as_sample_shape(sample_shape))
 
@@ -264,7 +264,7 @@ class Gaussian(BatchModule):
         scale = jnp.exp(log_scale)[..., None]
         return loc + join_columns([scale * y for y in multiply_lower(tril, split_columns(noise))])
 
-    def sample_and_log_prob(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> tuple[Array, Array]:
+    def sample_and_log_prob(self, key: Key[Array, ""], sample_shape: int | tuple[int, ...] = ()) -> tuple[Array, Array]:
         """Random samples (*sample_shape, *batch, dim) and their log-densities (*sample_shape, *batch)."""
         value = self.sample(key, sample_shape)
         return value, self.log_prob(value)
@@ -281,7 +281,7 @@ class Gaussian(BatchModule):
     def condition(self, indices, values: Float[Array, "*#batch n"]) -> "Gaussian":
         """The other coordinates, in ascending order, given these.
 
-        **Shapes:** values (*batch, n), in the indices' order.
+        **Shapes:** values (*batch, n), in the indices' order; for one coordinate a number will do.
 
         **Raises:** ValueError on invalid indices, all indices, or a wrong shape of values.
         """

@@ -134,14 +134,14 @@ class AbstractMixture(eqx.Module):
         return _responsibilities(self, self._checked(value))
 
     def sample(
-        self, key: Key[Array, ""], sample_shape: tuple[int, ...] = (), return_component: bool = False
+        self, key: Key[Array, ""], sample_shape: int | tuple[int, ...] = (), return_component: bool = False
     ) -> Float[Array, "..."] | tuple[Float[Array, "..."], Int[Array, "..."]]:
         """Random samples: first a component, then x from it; differentiable in the components' parameters.
 
         **Shapes:** -> (*sample_shape, *batch, d), and with `return_component` the component indices
-        (*sample_shape, *batch).
+        (*sample_shape, *batch); a number n as `sample_shape` is (n,).
 
-        **Example:** `x, component = mixture.sample(jax.random.key(0), (1000,), return_component=True)`
+        **Example:** `x, component = mixture.sample(jax.random.key(0), 1000, return_component=True)`
         """
         x, component = _sample(self, key, as_sample_shape(sample_shape))
         return (x, component) if return_component else x
@@ -288,7 +288,7 @@ class FoldedMixture(_WeightedMixture):
         If time is given it is exact, a GaussianMixture; otherwise it is integrated numerically.
 
         **Shapes:** `indices`: n integers, -1 is time; `values` (*batch, n) in the same order; the result has the
-        other coordinates in ascending order.
+        other coordinates in ascending order. For one coordinate a number will do: `mixture.condition(-1, 0.5)`.
 
         **Example:** `mixture.condition([0], [0.3]).sample(key)  # the other space coordinates, and time`
 

@@ -173,7 +173,8 @@ def check_finite(name: str, x: Array) -> None:
     """Raise if an entry is NaN or infinite, unless the values are traced."""
     value = concrete_value(x)
     if value is not None and not np.isfinite(value).all():
-        raise invalid(name, expected="finite numbers", got="NaN" if np.isnan(value).any() else "infinity")
+        index = tuple(np.argwhere(~np.isfinite(value))[0].tolist())
+        raise invalid(name, expected="finite numbers", got=f"{value[index]} at index {index}")
 
 
 def check_positive(name: str, x: Array, cure: str = "It is a standard deviation.") -> None:

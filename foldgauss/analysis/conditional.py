@@ -100,7 +100,7 @@ class TimeDensity(eqx.Module):
         """The quantile: the inverse of `cdf`, -inf at 0 and +inf at 1."""
         return self._time(self._elementwise(Panels.icdf, as_value(q, self.values.dtype)))
 
-    def sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
+    def sample(self, key: Key[Array, ""], sample_shape: int | tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Draws of shape (*sample_shape, *batch), by the quantile function."""
         shape = (*as_sample_shape(sample_shape), *self.batch_shape)
         smallest = float(jnp.finfo(self.values.dtype).tiny)  # not 0, whose quantile is -inf
@@ -210,7 +210,7 @@ class TimeMixture(eqx.Module):
         infinite, last = (jnp.broadcast_to(y[..., 0], mass.shape) for y in (infinite, value))
         return jnp.where(infinite, (last > 0).astype(mass.dtype), mass)
 
-    def sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
+    def sample(self, key: Key[Array, ""], sample_shape: int | tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Draws of shape (*sample_shape, *batch, n): t first, then space given t."""
         return self._sample(key, as_sample_shape(sample_shape))
 
