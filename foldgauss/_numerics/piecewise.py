@@ -18,8 +18,7 @@ def locate(
     before = xp.clip((times <= t[..., None]).sum(-1, dtype=np.int32) - 1, 0, max(last - 1, 0))
     after = xp.minimum(before + 1, last)
     begun, ended = (xp.take_along_axis(times, k[..., None], -1)[..., 0] for k in (before, after))
-    span = ended - begun
-    return before, after, xp.clip((t - begun) / xp.where(span > 0, span, 1), 0, 1)
+    return before, after, _fraction(xp, t, begun, ended)
 
 
 def locate_in_rows(
@@ -34,5 +33,11 @@ def locate_in_rows(
     before = np.clip(before, 0, max(last - 1, 0))
     after = np.minimum(before + 1, last)
     begun, ended = times[row, before], times[row, after]
+    return before, after, _fraction(np, t, begun, ended)
+
+
+def _fraction(xp, t, begun, ended):
+    """The fraction of the way from `begun` to `ended`; where they are equal, 0 before them and 1 from them on."""
     span = ended - begun
-    return before, after, np.clip((t - begun) / np.where(span > 0, span, 1), 0, 1)
+    inside = xp.clip((t - begun) / xp.where(span > 0, span, 1), 0, 1)
+    return xp.where(span > 0, inside, (t >= ended).astype(inside.dtype))

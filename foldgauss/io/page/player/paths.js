@@ -21,7 +21,7 @@ export function mapsAt(paths, time) {
     const end = last + knots - 1;
     while (last < end - 1 && times[last + 1] <= time) last++;
     const next = Math.min(last + 1, end), span = times[next] - times[last];
-    const fraction = Math.min(Math.max((time - times[last]) / (span > 0 ? span : 1), 0), 1);
+    const fraction = span > 0 ? Math.min(Math.max((time - times[last]) / span, 0), 1) : Number(time >= times[next]);
     for (let k = 0; k < 6; k++) maps[6 * (p + 1) + k] = (1 - fraction) * matrices[6 * last + k] + fraction * matrices[6 * next + k];
   }
   latest.set(paths, { time, maps });
