@@ -1,4 +1,4 @@
-"""Bytes, loss and bits per pixel of compact files. Beside video codecs: benchmarks/codecs.py.
+"""Bytes, loss and bits per pixel of compact files. Beside video codecs: benchmarks/rate_distortion.py.
 
     python -m benchmarks.compress [--json FILE] [--model FILE --clip NAME --size HxW --frames N] [--loss DB]
         [--passes N]

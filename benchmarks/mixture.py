@@ -1,172 +1,85 @@
-"""Mixtures beside scikit-learn's and gmmx's: log-densities, one iteration of EM, and what bending brings.
+"""Mixtures beside scikit-learn's: whole fits, log-densities, and what bending brings.
 
-    python -m benchmarks.mixture [--points [N ...]] [--components K] [--rounds N] [--skip-bending] [--json FILE]
+    python -m benchmarks.mixture [--points [N ...]] [--components K] [--iterations I] [--rounds N] [--skip-bending]
+                                 [--json FILE]
 
-d = 3, full covariances, a linear fold and a = 1: the model that all of them have. scikit-learn computes in float64,
-gmmx in float32; gmmx is measured where it imports (`pip install gmmx`). Ratios above 1 mean that foldgauss is faster;
-all are of medians of one run in which the tasks take turns. Errors are the largest against scikit-learn's float64.
-Bending: mixtures chosen by BIC or by cross-validation (tracks kept whole), the mean log-density of points held out, and
-its difference to scikit-learn's by the same rule (± one standard error, a track being one draw).
+Speed: d = 3, full covariances, a linear fold and a = 1, the model that both have. Both start at the same parameters,
+make the same number of iterations of EM, and compute in the same dtype. Ratios above 1 mean that foldgauss is faster;
+they are of medians of rounds in which the two take turns. Bending: mixtures chosen by BIC or by cross-validation
+(tracks kept whole), the mean log-density of points held out, and its difference to scikit-learn's by the same rule (±
+one standard error, a track being one draw).
 """
 
-import contextlib
-import importlib.util
 import time
+import warnings
 
-import jax
-import jax.numpy as jnp
 import numpy as np
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.mixture import GaussianMixture
 
 from benchmarks import _bending, _common
-from foldgauss.envelope import Constant
-from foldgauss.estimator.em.initialization import params_from_gaussians
-from foldgauss.estimator.em.loop import State, _step_restarts, broadcast_degrees
-from foldgauss.estimator.em.m_step import Model
-from foldgauss.estimator.em.scaling import Scaling, to_mixture
-from foldgauss.estimator.em.statistics import make_points
 from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
 
 DIM = 3
-REG = 0.0  # scikit-learn adds it to the covariance as a whole, foldgauss to that of space given time and to time's
+COMPONENTS = 10
+ITERATIONS = 20
+DTYPES = (np.float32, np.float64)
 
 
-class Problem:
-    """Points from a mixture, and one start for all."""
-
-    def __init__(self, num: int, components: int):
-        rng = np.random.default_rng(_common.SEED)
-        means = rng.normal(size=(components, DIM)) * 2
-        factors = rng.normal(size=(components, DIM, DIM)) * 0.3 + 0.3 * np.eye(DIM)
-        labels = rng.integers(0, components, num)
-        self.x = means[labels] + np.einsum("nij,nj->ni", factors[labels], rng.normal(size=(num, DIM)))
-        self.weights = np.full(components, 1 / components)
-        self.means = means + 0.1 * rng.normal(size=means.shape)
-        self.covariances = np.einsum("kij,klj->kil", factors, factors) + 0.1 * np.eye(DIM)
-
-
-def _scikit_learns(problem: Problem) -> tuple[dict, dict]:
-    """Tasks, and their results once."""
-    model = GaussianMixture(len(problem.weights), reg_covar=REG)
-    model.weights_, model.means_, model.covariances_ = problem.weights, problem.means, problem.covariances
-    model.precisions_cholesky_ = np.linalg.inv(np.linalg.cholesky(problem.covariances)).swapaxes(1, 2)
-
-    def em():
-        stepped = GaussianMixture(len(problem.weights), reg_covar=REG)
-        stepped.__dict__.update(model.__dict__)
-        _, log_shares = stepped._e_step(problem.x)
-        stepped._m_step(problem.x, log_shares)
-        return stepped.means_, stepped.covariances_
-
-    return {"score": lambda: model.score_samples(problem.x), "em": em}
+def make_problem(num: int, components: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Points from a mixture, and parameters near it as arguments of both estimators."""
+    rng = np.random.default_rng(_common.SEED)
+    means = rng.normal(size=(components, DIM)) * 2
+    factors = rng.normal(size=(components, DIM, DIM)) * 0.3 + 0.3 * np.eye(DIM)
+    labels = rng.integers(0, components, num)
+    x = means[labels] + np.einsum("nij,nj->ni", factors[labels], rng.normal(size=(num, DIM)))
+    covariances = np.einsum("kij,klj->kil", factors, factors) + 0.1 * np.eye(DIM)
+    start = {"weights": np.full(components, 1 / components), "means": means + 0.1 * rng.normal(size=means.shape)}
+    start["precisions"] = np.linalg.inv(covariances)
+    return x, {f"{name}_init": values for name, values in start.items()}
 
 
-def _ours(problem: Problem, dtype) -> dict:
-    num, x = len(problem.weights), problem.x.astype(dtype)
-    scaling = Scaling(problem.x.mean(0), problem.x.std(0))
-    scale = scaling.scale
-    params = params_from_gaussians(
-        problem.weights,
-        (problem.means - scaling.shift) / scale,
-        problem.covariances / (scale[:, None] * scale),
-        1,
-        dtype,
-    )
-    fitted = FoldedGaussianMixture(num, degree=1)
-    fitted._params, fitted._scaling, fitted._envelope = (
-        type(params)(*map(np.asarray, params)),
-        scaling,
-        Constant(),
-    )
-    fitted.n_features_in_, fitted.weights_ = DIM, problem.weights
-    points = make_points(scaling.apply(x), np.ones(len(x), dtype), num)
-    state = jax.tree.map(lambda z: z[None], State(params, jnp.ones_like(params.time_loc)))
-    model = Model(broadcast_degrees(1, num), jnp.asarray(REG / scale**2, dtype), "full")
-    frozen = jnp.zeros(1, bool)
-
-    def em():
-        new = jax.block_until_ready(_step_restarts(state, frozen, points, Constant(), model, None))[0].params
-        mixture = to_mixture(jax.tree.map(lambda z: z[0], new), scaling, Constant())
-        return tuple(map(np.asarray, mixture.components.moments()))
-
-    def em_alone():
-        return jax.block_until_ready(_step_restarts(state, frozen, points, Constant(), model, None))
-
-    return {"score": lambda: fitted.score_samples(x), "em": em_alone, "em result": em}
-
-
-def _gmmxs(problem: Problem) -> dict:
-    import gmmx
-
-    x = jnp.asarray(problem.x, jnp.float32)
-    start = {"means": problem.means, "covariances": problem.covariances, "weights": problem.weights}
-    model = gmmx.GaussianMixtureModelJax.from_squeezed(**{k: jnp.asarray(v, jnp.float32) for k, v in start.items()})
-    fitter = gmmx.EMFitter(max_iter=1, reg_covar=REG)
-    step = jax.jit(lambda x, model: fitter.m_step(x, model, fitter.e_step(x, model)[1]))
-    score = jax.jit(lambda x, model: model.score_samples(x))
-    return {
-        "score": lambda: jax.block_until_ready(score(x, model)),
-        "em": lambda: jax.block_until_ready(step(x, model)),
+def time_fits(num: int, components: int, iterations: int, rounds: int) -> dict[str, float]:
+    """Median seconds, by dtype, estimator and task, and the mean log-density that each fit reaches."""
+    x, start = make_problem(num, components)
+    stopping = {"max_iter": iterations, "tol": 0.0}
+    makers = {
+        "foldgauss": lambda: FoldedGaussianMixture(components, degree=1, **stopping, **start),
+        "sklearn": lambda: GaussianMixture(components, **stopping, **start),
     }
+    seconds, figures = {}, {}
+    for round_ in range(-1, rounds):  # the first round compiles
+        for dtype in DTYPES:
+            own = x.astype(dtype)
+            for who, make in makers.items():
+                begun = time.perf_counter()
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", ConvergenceWarning)
+                    fitted = make().fit(own)
+                middle = time.perf_counter()
+                scores = fitted.score_samples(own)
+                if round_ >= 0:
+                    seconds.setdefault((who, "fit", dtype), []).append(middle - begun)
+                    seconds.setdefault((who, "score", dtype), []).append(time.perf_counter() - middle)
+                figures[f"{who}, mean log-density, {dtype.__name__}, {num}"] = float(np.mean(scores, dtype=np.float64))
+    medians = {f"{who}, {task} (s), {dtype.__name__}, {num}": np.median(v) for (who, task, dtype), v in seconds.items()}
+    return figures | medians
 
 
-def _measured(num: int, components: int, rounds: int) -> tuple[dict[str, float], dict[str, float]]:
-    """Median seconds by "who: task", and errors."""
-    problem = Problem(num, components)
-    with jax.enable_x64(True):
-        double = _ours(problem, np.float64)
-    engines = {
-        "sklearn": (_scikit_learns(problem), contextlib.nullcontext),
-        "float32": (_ours(problem, np.float32), contextlib.nullcontext),
-        "float64": (double, lambda: jax.enable_x64(True)),
-    }
-    if importlib.util.find_spec("gmmx") and num <= 100_000:  # it keeps n k d^2 numbers
-        engines["gmmx"] = (_gmmxs(problem), contextlib.nullcontext)
-    errors, truth = {}, {}
-    for who, (tasks, precision) in engines.items():
-        with precision():
-            found = tasks["score"]()  # which also compiles
-            stepped = (tasks.get("em result") or tasks["em"])()
-            tasks["em"]()
-        if who == "sklearn":
-            truth = {"score": found, "step": stepped}
-        elif who != "gmmx":
-            errors[f"{who}: score"] = float(np.abs(found - truth["score"]).max())
-            errors[f"{who}: means"] = float(np.abs(stepped[0] - truth["step"][0]).max())
-            errors[f"{who}: covariances"] = float(np.abs(stepped[1] - truth["step"][1]).max())
-    seconds = {f"{who}: {task}": [] for who in engines for task in ("score", "em")}
-    for _ in range(rounds):
-        for who, (tasks, precision) in engines.items():
-            for task in ("score", "em"):
-                time.sleep(_common.PAUSE)
-                with precision():
-                    begun = time.perf_counter()
-                    result = tasks[task]()
-                    seconds[f"{who}: {task}"].append(time.perf_counter() - begun)
-                del result
-    return {name: float(np.median(values)) for name, values in seconds.items()}, errors
-
-
-def _shown(num: int, components: int, median: dict[str, float], errors: dict[str, float]) -> dict[str, float]:
-    title = f"{num:,} points, {components} components"
-    shown = _common.table(
-        title, "who", "score (ms)", "EM step (ms)", "error: score", "error: means", "error: covariances"
-    )
-    figures = {}
-    for who in dict.fromkeys(name.partition(":")[0] for name in median):
-        each = [
-            f"{errors[f'{who}: {what}']:.1e}" if f"{who}: {what}" in errors else ""
-            for what in ("score", "means", "covariances")
-        ]
-        shown.add_row(who, *(f"{1e3 * median[f'{who}: {task}']:.1f}" for task in ("score", "em")), *each)
-    _common.console.print(shown)
-    for task in ("score", "em"):
-        for rival in ("sklearn", "gmmx"):
-            if f"{rival}: {task}" in median:
-                for dtype in ("float32", "float64"):
-                    name = f"{task}_over_{rival}" + ("" if dtype == "float32" else "_float64")
-                    figures[f"{name} {num}"] = median[f"{rival}: {task}"] / median[f"{dtype}: {task}"]
-    return figures | {f"error {name} {num}": value for name, value in errors.items()}
+def show_fits(num: int, components: int, iterations: int, figures: dict[str, float]) -> dict[str, float]:
+    """Print the seconds, and return the ratios."""
+    title = f"{num:,} points, {components} components, {iterations} iterations"
+    columns = ("task, dtype", "foldgauss (s)", "scikit-learn (s)", "ratio", "mean log-density", "scikit-learn's")
+    table, ratios = _common.table(title, *columns), {}
+    for dtype in (dtype.__name__ for dtype in DTYPES):
+        densities = [figures[f"{who}, mean log-density, {dtype}, {num}"] for who in ("foldgauss", "sklearn")]
+        for task in ("fit", "score"):
+            ours, theirs = (figures[f"{who}, {task} (s), {dtype}, {num}"] for who in ("foldgauss", "sklearn"))
+            ratios[f"{task}_over_sklearn_{dtype} {num}"] = theirs / ours
+            shown = (f"{ours:.2f}", f"{theirs:.2f}", f"{theirs / ours:.1f}", *(f"{value:.4f}" for value in densities))
+            table.add_row(f"{task}, {dtype}", *shown)
+    _common.console.print(table)
+    return ratios
 
 
 def _bends() -> dict[str, float]:
@@ -192,19 +105,16 @@ def _bends() -> dict[str, float]:
 
 def main(arguments: list[str] | None = None) -> None:
     made = _common.parser(__doc__)
-    made.add_argument(
-        "--points", type=_common.whole, nargs="*", default=[100_000, 1_000_000], help="none: bending alone"
-    )
-    made.add_argument("--components", type=_common.whole, default=64)
+    made.add_argument("--points", type=_common.whole, nargs="*", default=[1_000_000], help="none: bending alone")
+    made.add_argument("--components", type=_common.whole, default=COMPONENTS)
+    made.add_argument("--iterations", type=_common.whole, default=ITERATIONS)
     made.add_argument("--rounds", type=_common.whole, default=3)
     made.add_argument("--skip-bending", action="store_true", help="speed alone")
     options = _common.parse(made, arguments)
     figures = {}
     for num in options.points:
-        figures |= _shown(num, options.components, *_measured(num, options.components, options.rounds))
-    for num in sorted(options.points):  # the figures' plain names: at the most points that each was measured at
-        for name in [name for name in figures if name.endswith(f" {num}") and "_over_" in name]:
-            figures[name.rpartition(" ")[0]] = figures[name]
+        figures |= time_fits(num, options.components, options.iterations, options.rounds)
+        figures |= show_fits(num, options.components, options.iterations, figures)
     if not options.skip_bending:
         figures |= _bends()
     _common.finish(

@@ -5,8 +5,6 @@
 - *quality-time*: PSNR and megabytes (float32) against minutes of fitting, *Bunny*, from `defaults.json` and
   `defaults-followed.json` (`benchmarks.defaults`), beside the figures of the VeGaS paper (table:init-gauss). Points are
   not joined: load, number of Gaussians and its rule differ.
-- *quality-bytes*: bytes at equal PSNR of RGB relative to x264 *medium* in 4:4:4 (BD-rate), from
-  `rate-distortion.json` (`benchmarks.rate_distortion`).
 - *tradeoff-clips*: PSNR against CPU time and against bytes, from `tradeoff-clips.json` (`benchmarks.tradeoff_clips`).
 
 Each figure is 5 inches wide, so that its text is readable on a screen of 360 pixels.
@@ -49,13 +47,6 @@ BUNNY = {
 }
 #: Megabytes of a million Gaussians of degree 7: 25 float32 parameters each.
 PAPER_MEGABYTES = 100
-#: Coders of `rate-distortion.json` in the figure of bytes: marker, color, label.
-CODERS = {
-    "SVT-AV1 6": ("v", GREY, "AV1 (4:2:0)"),
-    "x265 medium": ("^", GREY, "H.265"),
-    "x264 veryslow": ("s", ORANGE, "H.264, veryslow"),
-    "foldgauss": ("o", BLUE, "foldgauss (.fgz)"),
-}
 CLIPS = {"bunny": BLUE, "bikes": ORANGE, "carphone": GREEN}
 #: Presets in the figure of the trade-off, which are drawn apart from the budgets: marker and label.
 PRESETS = {"draft": ("^", "--preset draft"), "standard": ("s", "no option")}
@@ -101,28 +92,6 @@ def _to_minutes(text: str) -> float:
     return 60 * int(hours or 0) + int(minutes) + int(seconds) / 60
 
 
-def quality_bytes(records: Path) -> plt.Figure:
-    """A row for each clip: bytes at equal PSNR, as multiples of those of x264 medium."""
-    rates = _read(records, "rate-distortion")["bd_rates"]
-    fig, ax = plt.subplots(figsize=(WIDTH, 3.6))
-    rows = range(len(rates))[::-1]
-    ax.axvline(1, color="black", lw=1)
-    for coder, (marker, color, label) in CODERS.items():
-        times = [1 + by_coder[coder]["psnr"][0] for by_coder in rates.values()]
-        ax.plot(times, rows, marker, color=color, label=label, ms=9 if coder == "foldgauss" else 6, zorder=3)
-        if coder == "foldgauss":
-            for row, value in zip(rows, times, strict=True):
-                ax.annotate(f"{value:.2g}", (value, row), (0, 8), textcoords="offset points", ha="center", color=color)
-    ax.set_xscale("log")
-    ticks = [0.5, 1, 2, 5, 10]
-    ax.set_xticks(ticks, [f"{tick:g}x" for tick in ticks])
-    ax.minorticks_off()
-    ax.set(yticks=rows, yticklabels=list(rates), xlabel="bytes at equal PSNR, relative to H.264 (x264 medium, 4:4:4)")
-    ax.set_ylim(-0.5, len(rates) - 0.4)
-    fig.legend(loc="outside upper left", ncols=2, fontsize=9.5, columnspacing=1, handletextpad=0.3)
-    return fig
-
-
 def tradeoff_clips(records: Path) -> plt.Figure:
     """Above, PSNR against CPU time; below, against the bytes of model files and compact files."""
     runs = _read(records, "tradeoff-clips")["runs"]
@@ -163,7 +132,7 @@ def _read(folder: Path, name: str) -> dict[str, Any]:
     return json.loads((folder / f"{name}.json").read_text())
 
 
-FIGURES = {"quality-time": quality_time, "quality-bytes": quality_bytes, "tradeoff-clips": tradeoff_clips}
+FIGURES = {"quality-time": quality_time, "tradeoff-clips": tradeoff_clips}
 
 
 def main(arguments: list[str] | None = None) -> None:

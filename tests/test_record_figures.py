@@ -30,13 +30,6 @@ def test_figure_of_time_has_every_fit_of_bunny_and_the_papers():
     assert len(PAPER_STARTS) == len({point for point in points if point[0] > 50 and point[1] < 40})
 
 
-def test_figure_of_bytes_has_every_clip():
-    points = _points(record_figures.quality_bytes(record_figures.RECORDS))
-    rates = json.loads((record_figures.RECORDS / "rate-distortion.json").read_text())["bd_rates"]
-    for name, by_coder in rates.items():
-        assert round(1 + by_coder["foldgauss"]["psnr"][0], 6) in {x for x, _ in points}, name
-
-
 def test_figure_of_the_trade_off_has_every_run():
     points = _points(record_figures.tradeoff_clips(record_figures.RECORDS))
     runs = json.loads((record_figures.RECORDS / "tradeoff-clips.json").read_text())["runs"]
