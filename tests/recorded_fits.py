@@ -1,8 +1,7 @@
 """Four tiny fits and their recorded digests: plain, economical, growing and published.
 
 The digests changed with the defaults; those of the growing and the published fit also with the uniform starts, and with
-what the gradient of m_t clones; the first three with starts around the first and
-the last frame. The plain fit is without the interpolated frames that are the default since.
+what the gradient of m_t clones. The plain fit is without the interpolated frames that are the default since.
 
 python tests/recorded_fits.py   prints what test_recorded_fits.py compares with, as JSON
 """

@@ -113,7 +113,7 @@ def test_starts_surround_the_first_and_the_last_frame_only():
     home, density = np.repeat([0, 1, 2], 4000), np.full((40, 64), 1 / 2560)
     position, found = draw_positions(home, lambda k: density, np.random.default_rng(0), (0, 2))
     outside = ((position < 0) | (position > [64, 40])).any(1)
-    for k, fraction in ((0, 1 - 2560 / (44 * 68)), (1, 0), (2, 1 - 2560 / (44 * 68))):
+    for k, fraction in ((0, 1 - 2560 / (56 * 80)), (1, 0), (2, 1 - 2560 / (56 * 80))):
         assert outside[home == k].mean() == pytest.approx(fraction, abs=0.04)
         assert found[home == k] == pytest.approx((1 - fraction) / 2560)
-    assert ((position > -2) & (position < [66, 42])).all()
+    assert ((position > -8) & (position < [72, 48])).all()

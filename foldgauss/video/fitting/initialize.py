@@ -51,9 +51,10 @@ AT_ONCE = 8 * CHUNK  # tracks held by all threads
 #: Trial starts per frame, from which follows how long starts are visible: so many sigma_t to either side. In long clips
 #: at most `MAX_PILOTS` in all, since they would take longer than the fit.
 PILOT, CORE, ROUNDS, MAX_PILOTS = 32, 1.5, 50, 40_000
-#: Gaussians start up to this fraction of the longer side outside the first and the last frame, too: without them the
-#: background shines through the border. Those of other frames come from neighbors in which they were inside.
-BEYOND = 0.03
+#: Pixels outside the first and the last frame in which Gaussians start, too, about two standard deviations of a start:
+#: without them the background shines through the border. Those of other frames come from neighbors
+#: in which they were inside.
+BEYOND = 8
 #: With fewer starts than this per frame, their frames are drawn at even distances.
 FEW_STARTS = 16
 #: Fraction of the starts that is spread so that all frames are covered equally, however short the tracks there. With
@@ -190,13 +191,12 @@ def draw_positions(
     """Positions (num, 2) in pixels, one for each of the frames `home`, and the density, per pixel, there.
 
     `density_of(k)` is the density over the pixels of frame k, (height, width), summing to 1. In the frames `wide`,
-    positions are also drawn outside, see `BEYOND`, where the density is that of the border.
+    positions are also drawn up to `BEYOND` pixels outside, where the density is that of the border.
     """
     position, density = np.empty((len(home), 2)), np.empty(len(home))
     for k in np.unique(home):
-        here, own = np.flatnonzero(home == k), density_of(k)
-        beyond = round(BEYOND * max(own.shape)) if k in wide else 0
-        own = np.pad(own, beyond, mode="edge")
+        here, beyond = np.flatnonzero(home == k), BEYOND if k in wide else 0
+        own = np.pad(density_of(k), beyond, mode="edge")
         own /= own.sum()
         pixel = _draw(own.ravel(), rng.random(len(here)))
         density[here] = own.ravel()[pixel]
