@@ -15,7 +15,7 @@ from foldgauss.video.fitting.config import (
     FitConfig,
     default_num_gaussians,
 )
-from foldgauss.video.fitting.initialize import ELONGATION, count_alive, draw_positions, initialize, sample_orientations
+from foldgauss.video.fitting.initialize import ELONGATION, count_alive, initialize, sample_orientations
 from foldgauss.video.motion.optical_flow import Motion
 
 
@@ -106,14 +106,3 @@ def test_longer_lifetimes_mean_fewer_gaussians():
     assert alive[2] == pytest.approx(MOST_PER_PIXEL * 160 * 320, rel=1e-4)
     given = FitConfig(minutes=1.0, economy=Economy())
     assert default_num_gaussians(given, *size, lifetime=8.0) == default_num_gaussians(given, *size, lifetime=100.0)
-
-
-def test_starts_surround_the_first_and_the_last_frame_only():
-    """Without starts outside, the border of the first picture is half covered, and dark."""
-    home, density = np.repeat([0, 1, 2], 4000), np.full((40, 64), 1 / 2560)
-    position, found = draw_positions(home, lambda k: density, np.random.default_rng(0), (0, 2))
-    outside = ((position < 0) | (position > [64, 40])).any(1)
-    for k, fraction in ((0, 1 - 2560 / (56 * 80)), (1, 0), (2, 1 - 2560 / (56 * 80))):
-        assert outside[home == k].mean() == pytest.approx(fraction, abs=0.04)
-        assert found[home == k] == pytest.approx((1 - fraction) / 2560)
-    assert ((position > -8) & (position < [72, 48])).all()

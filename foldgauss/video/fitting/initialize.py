@@ -51,10 +51,6 @@ AT_ONCE = 8 * CHUNK  # tracks held by all threads
 #: Trial starts per frame, from which follows how long starts are visible: so many sigma_t to either side. In long clips
 #: at most `MAX_PILOTS` in all, since they would take longer than the fit.
 PILOT, CORE, ROUNDS, MAX_PILOTS = 32, 1.5, 50, 40_000
-#: Pixels outside the first and the last frame in which Gaussians start, too, about two standard deviations of a start:
-#: without them the background shines through the border. Those of other frames come from neighbors
-#: in which they were inside.
-BEYOND = 8
 #: With fewer starts than this per frame, their frames are drawn at even distances.
 FEW_STARTS = 16
 #: Fraction of the starts that is spread so that all frames are covered equally, however short the tracks there. With
@@ -103,7 +99,7 @@ def initialize(
         home = _draw(chance, (np.arange(num_gaussians) + rng.random()) / num_gaussians)
     else:
         home = np.sort(rng.choice(num_frames, num_gaussians, p=chance))
-    position, density = draw_positions(home, density_of, rng, (0, num_frames - 1))
+    position, density = draw_positions(home, density_of, rng)
     splats, spread = make(home, position, longer)
     static = find_constant(frames, home, position) if with_static else np.zeros(num_gaussians, bool)
     splats, spread = make_static(splats, static), np.where(static, np.exp(STATIC_LOG_TIME_SCALE), spread)
@@ -183,24 +179,18 @@ def initialize_uniform(
 
 
 def draw_positions(
-    home: np.ndarray,
-    density_of: Callable[[int], np.ndarray],
-    rng: np.random.Generator,
-    wide: Sequence[int] = (),
+    home: np.ndarray, density_of: Callable[[int], np.ndarray], rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions (num, 2) in pixels, one for each of the frames `home`, and the density, per pixel, there.
 
-    `density_of(k)` is the density over the pixels of frame k, (height, width), summing to 1. In the frames `wide`,
-    positions are also drawn up to `BEYOND` pixels outside, where the density is that of the border.
+    `density_of(k)` is the density over the pixels of frame k, (height, width), summing to 1.
     """
     position, density = np.empty((len(home), 2)), np.empty(len(home))
     for k in np.unique(home):
-        here, beyond = np.flatnonzero(home == k), BEYOND if k in wide else 0
-        own = np.pad(density_of(k), beyond, mode="edge")
-        own /= own.sum()
+        here, own = np.flatnonzero(home == k), density_of(k)
         pixel = _draw(own.ravel(), rng.random(len(here)))
         density[here] = own.ravel()[pixel]
-        position[here] = np.stack(np.divmod(pixel, own.shape[1])[::-1], -1) - beyond
+        position[here] = np.stack(np.divmod(pixel, own.shape[1])[::-1], -1)
     return position + rng.random(position.shape), density
 
 
