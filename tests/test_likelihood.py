@@ -433,5 +433,5 @@ def test_a_function_is_an_envelope():
     np.testing.assert_allclose(own.log_likelihood, built_in.log_likelihood, rtol=1e-5)
     with pytest.raises(ValueError, match=r"^envelope: expected log a <= 0 at time_loc, .*plain_envelope"):
         fit(_points(), envelope=lambda t, m, scale: jnp.exp(-0.5 * ((t - m) / scale) ** 2))
-    with pytest.raises(ValueError, match=r"^envelope: expected an envelope or a callable, got None"):
+    with pytest.raises(ValueError, match=r"^envelope: expected an envelope, a function .*, got None"):
         fit(_points(), envelope=None)

@@ -5,7 +5,7 @@ from numbers import Integral
 import jax
 import numpy as np
 
-from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within, short_repr
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood, as_envelope, check_peak
 from foldgauss.estimator.em.initialization import INITIALIZERS
 
@@ -111,6 +111,9 @@ def make_envelope(envelope) -> AbstractEnvelope:
     if isinstance(envelope, str):
         check_one_of("envelope", envelope, tuple(_ENVELOPES))
         return _ENVELOPES[envelope]()
+    if isinstance(envelope, type) or not (callable(envelope) or isinstance(envelope, AbstractEnvelope)):
+        expected = f"an envelope, a function (t, time_loc, time_scale) -> log a, or one of {', '.join(_ENVELOPES)}"
+        raise invalid("envelope", expected=expected, got=short_repr(envelope))
     envelope = as_envelope(envelope)
     check_peak(envelope, 0.0, 1.0)
     return envelope

@@ -617,8 +617,9 @@ def test_missing_paths(tmp_path):
             read(tmp_path / "none.ply")
         with pytest.raises(FormatError):
             read(tmp_path)
+    file = write_vegas_ply(tmp_path / "new" / "v.ply", random_model())
     with pytest.raises(OutputError, match="folder"):
-        write_vegas_ply(tmp_path / "none" / "v.ply", random_model())
+        write_vegas_ply(file / "v.ply", random_model())
 
 
 @pytest.fixture(scope="module")

@@ -885,14 +885,14 @@ def test_folder_without_images(tmp_path):
     _one_line(caught, "png", "without any")
 
 
-@pytest.mark.parametrize("frames", [(0, 9), (8, None), (20, 30), (3, 3), (5, 2), (-3, None), (0, -1)])
+@pytest.mark.parametrize("frames", [(8, None), (20, 30), (3, 3), (5, 2), (-3, None), (0, -1)])
 def test_bad_range(clip_file, frames):
     with pytest.raises(VideoError) as caught:
         read_video(clip_file, frames=frames)
     _one_line(caught, "frames: expected", f"{frames[0]}:")
 
 
-@pytest.mark.parametrize("frames", [(0, 6), (5, None), (9, 12)])
+@pytest.mark.parametrize("frames", [(5, None), (9, 12)])
 def test_bad_range_of_a_folder(folder, frames):
     with pytest.raises(VideoError) as caught:
         read_video(folder, frames=frames)
@@ -1109,9 +1109,7 @@ def test_other_extensions_list_the_choices(tmp_path, name):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    "name", ["missing/out.mp4", "missing/out", "file/out.webm", "file", 256 * "n", 256 * "n" + ".mp4"]
-)
+@pytest.mark.parametrize("name", ["file/out.webm", "file", 256 * "n", 256 * "n" + ".mp4"])
 def test_output_that_cannot_be_written(tmp_path, name):
     (tmp_path / "file").write_text("a file")
     with pytest.raises(OutputError) as caught:
@@ -1155,7 +1153,7 @@ def test_write_image_round_trip_and_refusals(tmp_path):
     with pytest.raises(VideoError, match="image: expected uint8"):
         write_image(tmp_path / "b.png", image / 255)
     with pytest.raises(OutputError):
-        write_image(tmp_path / "missing" / "a.png", image)
+        write_image(path / "a.png", image)
     assert list(tmp_path.iterdir()) == [path]
 
 

@@ -15,7 +15,9 @@ from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
 from foldgauss.video.models.row_layout import columns
 
 CLIP = moving_blobs()
-CONFIG = FitConfig(num_gaussians=200, steps=240, cooldown_fraction=0, interpolation_fraction=0.0, follow_camera=False)
+CONFIG = FitConfig(
+    num_gaussians=200, steps=240, seed=1, cooldown_fraction=0, interpolation_fraction=0.0, follow_camera=False
+)
 RATES = LearningRates()
 
 

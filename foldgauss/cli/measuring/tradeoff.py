@@ -47,9 +47,9 @@ from foldgauss.io._atomic import atomic_path
 from foldgauss.io._lock import lock_output
 from foldgauss.io.media.clip import DEINTERLACE, Clip
 from foldgauss.io.media.video_reading import read_video
-from foldgauss.io.models.video_model import load_video_model, save_video_model
+from foldgauss.io.models.video_model import load_video_model, read_metadata, save_video_model
 from foldgauss.io.provenance import fingerprint
-from foldgauss.jobs.runner import fit_metadata, mean_scores
+from foldgauss.jobs.runner import describe_fit, fit_metadata, mean_scores
 from foldgauss.video.compression.search import compress
 from foldgauss.video.fitting.config import TYPICAL_LIFETIME, FitConfig, chosen_num_gaussians, planned_steps
 from foldgauss.video.fitting.initialize import measure_lifetime
@@ -281,9 +281,9 @@ class _Run:
             if point.reuses_base:
                 shown, scores, spent = self._measure_variant(self._load_base(base, show), point, path, show)
             else:
-                shown, spent = self._fit_model(point.config, show)
+                shown, spent, about = self._fit_model(point.config, show)
                 scores = evaluate(shown, self.clip.frames)
-                save_video_model(path, shown, metadata=self.about | mean_scores(scores))
+                save_video_model(path, shown, metadata=about | mean_scores(scores))
             num_bytes = (self.folder / BASE if point.played is not None else path).stat().st_size
         show("playing")
         if point.axis == "base":
@@ -316,7 +316,7 @@ class _Run:
             return shown, evaluate(shown, self.clip.frames), fitted
         if point.stored == FLOAT16:
             score = functools.partial(evaluate, frames=self.clip.frames)
-            scores = save_float16(path, model, self.about, score)
+            scores = save_float16(path, model, read_metadata(self.folder / BASE), score)
             return load_video_model(path), scores, fitted
         begun = _Spent.now()
         compressed = compress(
@@ -334,13 +334,14 @@ class _Run:
         """Load the model of the base, which is fitted again if its file is missing."""
         path = self.folder / BASE
         if not path.exists():
-            model, _ = self._fit_model(base, show)
-            save_video_model(path, model, metadata=self.about | mean_scores(evaluate(model, self.clip.frames)))
+            model, _, about = self._fit_model(base, show)
+            save_video_model(path, model, metadata=about | mean_scores(evaluate(model, self.clip.frames)))
         if self._kept is None:
             self._kept = load_video_model(path)
         return self._kept
 
-    def _fit_model(self, config: FitConfig, show: Report) -> tuple[VideoModel, "_Spent"]:
+    def _fit_model(self, config: FitConfig, show: Report) -> tuple[VideoModel, "_Spent", dict[str, Any]]:
+        """The model, what it took, and the metadata of its file."""
         if not self._warm:
             list(self._fit(dataclasses.replace(config, steps=2), lambda info: None))
             self._warm = True
@@ -357,7 +358,8 @@ class _Run:
         if config.follow_motion:  # which `fit` includes in its time
             spent = spent.plus(_Spent(**self.record.plan["motion"]))
         show("evaluating")
-        return to_model(state, config, self.clip.size, self.clip.fps), spent
+        model = to_model(state, config, self.clip.size, self.clip.fps)
+        return model, spent, self.about | describe_fit(config, state)
 
 
 class _Spent(NamedTuple):
