@@ -207,6 +207,7 @@ INPUTS = {
     "stabilize, sound": ["stabilize", "m.safetensors", "--sound", "in.mp4", "--out", "in.mp4"],
     "plate, sound": ["plate", "m.safetensors", "--sound", "in.mp4", "--out", "in.mp4"],
     "plate, masks": ["plate", "m.safetensors", "--masks", "in.mp4", "--out", "in.mp4"],
+    "plate, folder": ["plate", "m.safetensors", "--masks", "in/0.png", "--out", "out.mp4", "--save-masks", "in"],
     "edit, sound": ["edit", "m.safetensors", "s.toml", "--sound", "in.mp4", "--out", "in.mp4"],
     "edit, mask": ["edit", "m.safetensors", "s.toml", "--out", "in"],
     "edit, layer": ["edit", "m.safetensors", "s.toml", "--out", "in.safetensors"],

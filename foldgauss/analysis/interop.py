@@ -174,7 +174,10 @@ def _make_class(distributions) -> type:
 
     @numpyro_divergence.register(NumpyroDistribution, NumpyroDistribution)
     def _(p, q):
-        return kl_divergence(p.base, q.base)
+        try:
+            return kl_divergence(p.base, q.base)
+        except ValueError as error:  # numpyro then estimates it by samples
+            raise NotImplementedError(str(error)) from error
 
     return NumpyroDistribution
 

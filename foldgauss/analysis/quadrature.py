@@ -232,7 +232,7 @@ def normal_panels(
 def warn_of_error(name: str, error: Float[Array, "*batch"]) -> None:
     """Warn of an estimated error above the tolerance, 5e-7 in float64, if it is known, i.e. not traced."""
     concrete = concrete_value(error)
-    if concrete is not None and (concrete > np.finfo(concrete.dtype).eps ** 0.4).any():
+    if concrete is not None and (concrete > float(jnp.finfo(concrete.dtype).eps) ** 0.4).any():
         text = f"The quadrature of {name} has an estimated error of up to {concrete.max():.1g}."
         warnings.warn(text, RuntimeWarning, stacklevel=3)
 

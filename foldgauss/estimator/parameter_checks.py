@@ -87,7 +87,7 @@ def check_real(name: str, X) -> None:
     kinds = getattr(X, "dtypes", None)
     if kinds is None:
         kinds = [np.asarray(X).dtype if isinstance(X, list | tuple) else getattr(X, "dtype", None)]
-    for kind in map(str, kinds):
+    for kind in map(str, np.atleast_1d(np.asarray(kinds, object))):
         if kind.lower().startswith(("date", "time", "duration")):
             cure = "Convert times to seconds as floats, from an origin near them."
             raise invalid(name, expected="numbers", got=kind, cure=cure)

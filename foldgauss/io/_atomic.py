@@ -45,7 +45,7 @@ def _check_target(path: Path) -> None:
     """Make the folder of `path`, and raise where a rename to it would fail, before any work is done."""
     if not path.name:
         raise OutputError(f"path: expected the name of a file, got {str(path)!r}. Add a file name.")
-    if path.parent.exists() and not path.parent.is_dir():
+    if os.path.exists(path.parent) and not path.parent.is_dir():
         raise OutputError(f"path: expected a folder, got the file {str(path.parent)!r}. Choose another path.")
     with translate_output_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -146,11 +146,13 @@ def write_or_keep(path: Path, write: Callable[[Path], object]) -> None:
     try:
         write(path)
     except OSError as error:
-        folder = Path(tempfile.mkdtemp(prefix="foldgauss-"))
+        folder = None
         try:
+            folder = Path(tempfile.mkdtemp(prefix="foldgauss-"))
             write(folder / path.name)
         except OSError:
-            shutil.rmtree(folder, ignore_errors=True)
+            if folder is not None:
+                shutil.rmtree(folder, ignore_errors=True)
             raise OutputError(f"{error} In the folder for temporary files, too: the result is lost.") from error
         raise OutputError(f"{error} It is kept in {folder / path.name}: move it to a place of yours.") from error
 

@@ -38,7 +38,7 @@ from foldgauss.io._toml_lines import key_lines
 from foldgauss.io.media.clip import Range
 from foldgauss.io.media.masks import read_masks
 from foldgauss.io.models.selections import load_selection, parse_indices, parse_ranges
-from foldgauss.io.models.video_model import load_video_model
+from foldgauss.io.models.video_model import load_video_model, read_origin
 from foldgauss.render import Camera
 from foldgauss.video.editing.chain import Edit, edit
 from foldgauss.video.editing.edited_video import EditedVideo
@@ -303,13 +303,14 @@ class EditScript:
             return layers(*front, video, *behind, timeline=len(front))
 
     def _load_layer(self, table: dict[str, Any]) -> Video:
-        other: Video = load_video_model(self._path(table["model"]))
+        other: Video = load_video_model(file := self._path(table["model"]))
         if "script" in table:
             path = self._path(table["script"])
             if path.resolve() in self._includes:
                 raise invalid("script", expected="a script that does not include itself", got=repr(table["script"]))
             script = read_edit_script(path)
-            other = dataclasses.replace(script, _includes=script._includes + self._includes).apply(other)
+            script = dataclasses.replace(script, _includes=script._includes + self._includes)
+            other = script.apply(other, read_origin(file).get("frames"))
         return edit(other).freeze(table["freeze"]).video() if "freeze" in table else other
 
     def _path(self, given: str) -> Path:

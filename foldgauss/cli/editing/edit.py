@@ -67,7 +67,7 @@ def edit_command(
         out_path = name_after(model_path, f".{script_path.stem}{MODEL_SUFFIX}")
     script = read_edit_script(script_path)
     inputs = {"model": model_path, "script": script_path, "sound": sound}
-    refuse_inputs(out_path, inputs | {f"script's {path.name}": path for path in script.inputs})
+    refuse_inputs(out_path, inputs | {f"script's {path}": path for path in script.inputs})
     as_model = out_path.suffix.lower() == MODEL_SUFFIX
     image_size = parse_size(size)
     for option, given, fits in (("--size", image_size, "a video or a folder"), ("--sound", sound, "a video")):

@@ -33,12 +33,14 @@ def refuse_existing(path: Path, overwrite: bool, option: str = "--out") -> None:
 
 
 def refuse_inputs(path: Path, inputs: Mapping[str, Path | None], option: str = "--out") -> None:
-    """Refuse an output in place of one of the command's `inputs` by name, or of an image in a folder of one."""
+    """Refuse an output in place of one of the command's `inputs` by name, of an image in a folder that is one, or of a
+    folder that holds one."""
     for what, source in inputs.items():
         # os.path: a name that is too long does not exist here; creating the file reports it.
         if source is None or not (os.path.exists(path) and os.path.exists(source)):
             continue
-        if path.samefile(source) or (path.suffix.lower() in IMAGE_SUFFIXES and path.parent.samefile(source)):
+        into = path.suffix.lower() in IMAGE_SUFFIXES and path.parent.samefile(source)
+        if into or path.samefile(source) or path.resolve() in source.resolve().parents:
             raise WrongUse(f"{option}: expected another path than the {what}, got {path}. Inputs are never replaced.")
 
 

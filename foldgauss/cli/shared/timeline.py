@@ -18,7 +18,7 @@ from foldgauss.video.motion.slow_motion import even_durations
 LISTED_REPEATS = 8
 MAX_UPSAMPLE, MAX_IMAGES = MAX_TIMES, 10 * MAX_TIMES
 MIN_SPEED, MAX_SECONDS = 1e-4, 1e6
-MAX_EVEN_FPS = 60.0  # frames per second, of usual displays: a constant rate is not made higher for short intervals
+MAX_EVEN_FPS = 50.0  # frames per second, the most of a GIF: a constant rate is not made higher for short intervals
 
 Upsample = Annotated[int | None, typer.Option(help="Frames per original interval [default: 1].")]
 Fps = Annotated[
@@ -138,7 +138,7 @@ class Timeline:
         out.print(f"Frames that repeat the one before: {numbers or 'none'}.", soft_wrap=True)
         shown = np.full(video.num_frames, 1 / fps) if seconds is None else np.diff(seconds)
         shown[:-1] *= durations
-        timeline = dataclasses.replace(self, upsample=None, fps=self.rate(fps), speed=self.playing_speed(fps))
+        timeline = dataclasses.replace(self, upsample=None, fps=self.rate(fps, seconds), speed=self.playing_speed(fps))
         return timeline, np.append(0.0, np.cumsum(shown))
 
     def warn_of_end(self, num_frames: int, fps: float, seconds: np.ndarray | None) -> None:

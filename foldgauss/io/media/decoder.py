@@ -159,6 +159,7 @@ class VideoDecoder:
         self.has_converted = False  # whether any frame was interlaced
         self.tilt = 0  # degrees by which a frame is to be rotated beyond a multiple of 90
         self._closed = False
+        self._has_sought = False
         self.stored_size = self._codec.height, self._codec.width  # which frames of another size are stretched to
         self._read_bytes = 0  # up to the end of the last packet that decodes
         self._at_end = False
@@ -252,6 +253,7 @@ class VideoDecoder:
         with suppress(av.FFmpegError):  # a damaged index: continue where the decoder is
             self._container.seek(stamp // self._per_stored, stream=self._stream)
         self._codec.flush_buffers()
+        self._has_sought = True
         self._last, self._before, self._num_suspect = -1, None, 0
 
     def frames(self) -> Iterator[DecodedFrame]:
@@ -323,7 +325,8 @@ class VideoDecoder:
         """
         graph, of_graph = None, None
         for frame in frames:
-            if graph is None and not frame.interlaced_frame:
+            follows = self._deinterlace == "fields" and self._has_sought  # interlaced ones before the place sought
+            if graph is None and not frame.interlaced_frame and not follows:
                 if self._deinterlace == "fields":
                     got, cure = f"a progressive one in {str(self._path)!r}", "Leave deinterlace='fields' out."
                     raise video_error("deinterlace", expected="a first frame of two fields", got=got, cure=cure)

@@ -126,7 +126,7 @@ class IndexedReader:
                     raise _changed_error(index, number)
             levels = Levels(index.reading.levels)
             taken = take_all(read_images(paths, levels))
-            facts = len(paths), FrameRate(DEFAULT_FPS), describe_missing(paths) + levels.describe(index.path)
+            facts = len(paths), FrameRate(DEFAULT_FPS), describe_missing(paths)
         else:
             span = index.start + first, index.start + stop
             found, _ = read_frames(index.path, *span, take_all, index.reading)
