@@ -10,8 +10,10 @@ from foldgauss.cli.app.application import err, out, warn
 
 #: So many starts of shots are printed.
 LISTED_STARTS = 8
-#: Seconds before the first line of a log, which is early since options may be mistyped, and between two lines.
-FIRST_LINE_SECONDS, LINE_SECONDS = 10.0, 30.0
+#: Seconds before the first line of a log, which is early since options may be mistyped.
+FIRST_LINE_SECONDS = 10.0
+#: Seconds between two lines of a log.
+LINE_SECONDS = 30.0
 
 
 @contextlib.contextmanager

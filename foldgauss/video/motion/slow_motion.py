@@ -18,9 +18,10 @@ from foldgauss.video.motion.optical_flow import Motion, both_flows, fit_size
 FLOW_WEIGHT, HALVING_DIFFERENCE = 0.75, 4000.0
 #: So near to a frame, in intervals, its own image is shown.
 NEAR = 1e-3
-#: A frame repeats the one before if less than this fraction of the motion beside the two is between them, and that is
-#: steady: the product of the motions before and after is more than this fraction of the larger one's square.
-REPEATED, ALIKE = 0.5, 0.25
+#: A frame repeats the one before if less than this fraction of the motion beside the two is between them.
+REPEATED = 0.5
+#: Motion is steady if the product of the motions before and after is more than this fraction of the larger's square.
+ALIKE = 0.25
 #: Longer side, in pixels, of the images that this is measured on.
 COMPARED_SIDE = 240
 #: OpenCV moves images with fewer pixels than this on each side.
