@@ -90,7 +90,7 @@ def scores(model: Any, frames: np.ndarray, *, with_ssim: bool = True) -> Run:
 def fitted(clip: Clip, config: FitConfig, *, with_ssim: bool = True, cpu_time: bool = False) -> tuple[VideoModel, Run]:
     """A fit, its quality, its size and its cost; `seconds` include initialization and motion.
 
-    With `cpu_time`, seconds and the budget are those of the processor, divided by the number of threads: the wall time
+    With `cpu_time`, seconds and the budget are processor time divided by the number of threads. This is the wall time
     on a quiet machine, so that fits beside other work are comparable.
     """
     clock = (lambda: time.process_time() / num_threads()) if cpu_time else time.perf_counter

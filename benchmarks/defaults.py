@@ -11,7 +11,7 @@ number of Gaussians or the PSNR of the smallest model. All else is the default.
 - `bikes`, `carphone`: at their own sizes, 5 and 2 minutes;
 - `smallest`: *Bunny* at 160x320, the smallest model at 33 dB;
 - `clips/NAME`: every subfolder of `--clips`, a folder of images each, 10 minutes; and their mean;
-- `clips-600k/NAME`: the same with at most 600,000 Gaussians.
+- `clips-600k/NAME`: every subfolder with at most 600,000 Gaussians, 10 minutes.
 
 PSNR is that of 8-bit images, the mean over all frames and that of the worst frame. Seconds are wall time of the fit,
 starts and motion included, reading and evaluation not; with --cpu-time, seconds and minutes are processor time divided

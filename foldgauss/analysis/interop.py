@@ -176,7 +176,7 @@ def _make_class(distributions) -> type:
     def _(p, q):
         try:
             return kl_divergence(p.base, q.base)
-        except ValueError as error:  # numpyro then estimates it by samples
+        except ValueError as error:  # numpyro's signal that it has to estimate by samples
             raise NotImplementedError(str(error)) from error
 
     return NumpyroDistribution
