@@ -45,7 +45,7 @@ from foldgauss.io.history import HistoryFile, read_history, write_curves
 from foldgauss.io.media.clip import DEINTERLACE, Clip
 from foldgauss.io.models.video_model import MODEL_SUFFIX, check_model_name
 from foldgauss.jobs.job import FitJob
-from foldgauss.jobs.runner import FitRun, few_steps, missed_psnr, run_fit
+from foldgauss.jobs.runner import FitRun, busy_processors, missed_psnr, run_fit
 from foldgauss.jobs.runner import Stopped as FitStopped
 from foldgauss.jobs.segments import read_segment_seconds
 from foldgauss.video.fitting.config import FitConfig, planned_steps
@@ -162,7 +162,7 @@ def fit(
     job.checkpoint.unlink(missing_ok=True)
     for text in missed_psnr(config, scores.mean_psnr, run.info):
         warn(f"--smallest-at-psnr: {text} Give more --steps, or more --gaussians at the start.")
-    for text in few_steps(run):
+    for text in busy_processors(run):
         warn(f"--minutes: {text}")
     figures = summarize_scores(run.model, scores) | summarize_fit(run.info) | {"stopped_by": run.info.stopped_by}
     _print_results(run, display, figures | {"file_bytes": target.stat().st_size})
