@@ -360,7 +360,7 @@ def missed_psnr(config: FitConfig, mean_psnr: float, info: FitInfo) -> list[str]
 
 
 def busy_processors(run: FitRun) -> list[str]:
-    """A warning if a fit by minutes waited for processors longer than it computed, in a list that is otherwise empty."""
+    """A warning if a fit by minutes waited for processors longer than it computed; otherwise no text."""
     got = run.state.processor_seconds
     asked = got + run.state.waiting_seconds
     if run.info.stopped_by != "minutes" or got >= LEAST_PROCESSOR_FRACTION * asked:
