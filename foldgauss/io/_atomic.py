@@ -9,10 +9,12 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TypeVar
 
 from foldgauss._runtime.checks import invalid, short_repr
 
 PathLike = str | os.PathLike
+Result = TypeVar("Result")
 #: Characters of an output's name that the name of its temporary file repeats.
 KEPT = 40
 #: Errors that free space cures: a full disk, a quota, a limit on the size of files.
@@ -138,23 +140,32 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def write_or_keep(path: Path, write: Callable[[Path], object]) -> None:
-    """Write the result of a long computation by `write(path)`; if that fails, to the folder for temporary files.
+def write_or_keep(
+    path: Path, write: Callable[[Path], Result], ask: Callable[[Path, OSError], Path | None] = lambda path, error: None
+) -> Result:
+    """Write the result of a long computation by `write(path)`; if that fails, to the path that `ask` returns; if there
+    is none, or it fails, too, to the folder for temporary files. Returns what `write` does.
 
-    Raises `OutputError`, which says where the result is, if it is not at `path`.
+    Raises `OutputError`, which says where the result is, if it is in the folder for temporary files.
     """
     try:
-        write(path)
+        return write(path)
     except OSError as error:
-        folder = None
+        failure = error
+    if another := ask(path, failure):
         try:
-            folder = Path(tempfile.mkdtemp(prefix="foldgauss-"))
-            write(folder / path.name)
-        except OSError:
-            if folder is not None:
-                shutil.rmtree(folder, ignore_errors=True)
-            raise OutputError(f"{error} In the folder for temporary files, too: the result is lost.") from error
-        raise OutputError(f"{error} It is kept in {folder / path.name}: move it to a place of yours.") from error
+            return write(another)
+        except OSError as error:
+            failure = error
+    folder = None
+    try:
+        folder = Path(tempfile.mkdtemp(prefix="foldgauss-"))
+        write(folder / path.name)
+    except OSError:
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise OutputError(f"{failure} In the folder for temporary files, too: the result is lost.") from failure
+    raise OutputError(f"{failure} It is kept in {folder / path.name}: move it to a place of yours.") from failure
 
 
 @contextmanager

@@ -114,13 +114,11 @@ class FitRun:
         metadata |= {} if scores is None else mean_scores(scores)
         save_video_model(self.job.target, self.model, metadata=metadata)
 
-    def save_or_keep(self, scores: Evaluation | None = None) -> None:
-        """Write the model, elsewhere if it cannot be written to its target, as `write_or_keep`."""
-
-        def save(path: Path) -> None:
-            dataclasses.replace(self, job=dataclasses.replace(self.job, target=str(path))).save(scores)
-
-        write_or_keep(Path(self.job.target), save)
+    def save_to(self, path: Path, scores: Evaluation | None = None) -> "FitRun":
+        """Write the model to `path`; returns the run with that as its target."""
+        moved = dataclasses.replace(self, job=dataclasses.replace(self.job, target=str(path)))
+        moved.save(scores)
+        return moved
 
 
 def run_fit(
@@ -323,7 +321,10 @@ def _fit_and_record(job: FitJob, report: Report) -> dict[str, Any]:
     run.save_checkpoint()  # the evaluation may be interrupted
     clip, info = run.clip, run.info
     scores = evaluate(run.model, clip.frames)
-    run.save(scores) if job.checkpoint.exists() else run.save_or_keep(scores)
+    if job.checkpoint.exists():
+        run.save(scores)
+    else:
+        write_or_keep(Path(job.target), lambda path: run.save_to(path, scores))
     record = {
         "asked": job.request,
         "num_frames": clip.num_frames,

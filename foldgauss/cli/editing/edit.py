@@ -11,7 +11,14 @@ from foldgauss.cli.app.application import WrongUse, app, out, wrong_use
 from foldgauss.cli.app.completion import complete_files
 from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, parse_size
 from foldgauss.cli.shared.log_lines import print_log
-from foldgauss.cli.shared.outputs import check_image_path, name_after, refuse_existing, refuse_huge, refuse_inputs
+from foldgauss.cli.shared.outputs import (
+    check_image_path,
+    name_after,
+    refuse_existing,
+    refuse_huge,
+    refuse_inputs,
+    write_result,
+)
 from foldgauss.cli.shared.rendering import (
     SoundFile,
     VideoOptions,
@@ -90,7 +97,7 @@ def edit_command(
         about = keep_origin(about, *CLIP_NOTES) | {"edited_by": script_path.name}
         if isinstance(edited, SegmentedVideo):
             edited = _drop_scores(model, edited)
-        save_video_model(out_path, edited, metadata=about)
+        out_path = write_result(out_path, lambda path: save_video_model(path, edited, metadata=about))
         kind = "a plain model" if isinstance(edited, VideoModel) else "a model with edits"
         if isinstance(edited, SegmentedVideo):
             kind = f"a model in {len(edited.segments)} segments"

@@ -36,10 +36,10 @@ from foldgauss.cli.shared.arguments import (
     parse_reading,
     parse_size,
 )
-from foldgauss.cli.shared.outputs import name_after, refuse_existing, refuse_inputs
+from foldgauss.cli.shared.outputs import ask_output, name_after, refuse_existing, refuse_inputs
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import format_count, print_figures, summarize_scores
-from foldgauss.io._atomic import OutputError, check_writable
+from foldgauss.io._atomic import OutputError, check_writable, write_or_keep
 from foldgauss.io._lock import lock_output
 from foldgauss.io.history import HistoryFile, read_history, write_curves
 from foldgauss.io.media.clip import DEINTERLACE, Clip
@@ -150,7 +150,8 @@ def fit(
         resume="required" if resume else "never",
         on_checkpoint_error=lambda error, step: warn(f"no checkpoint at step {step}: {error}"),
     )
-    _save_model(run)
+    run = _save_model(run)
+    target = Path(run.job.target)
     with _keep_state_on_interrupt(run):
         if history is not None:
             _save_curves(curves, history)
@@ -230,17 +231,21 @@ def _check_checkpoint(checkpoint: Path, resume: bool, overwrite: bool) -> None:
         raise WrongUse(f"--resume: expected a stopped fit in {checkpoint}, got none. Start it without --resume.")
 
 
-def _save_model(run: FitRun) -> None:
-    """Write the model before its evaluation, which may be interrupted; if that fails, the state is saved instead."""
-    try:
-        run.save()
-    except OSError as error:
+def _save_model(run: FitRun) -> FitRun:
+    """Write the model before its evaluation, which may be interrupted; if that fails, also the state.
+
+    Returns the run with the path of the model as its target.
+    """
+
+    def ask(path: Path, error: OSError) -> Path | None:
         run.save_checkpoint()
-        if not run.job.checkpoint.exists():
-            run.save_or_keep()
-            return
-        text = f"The fit is kept in {run.job.checkpoint}: --resume continues it, and writes the model."
-        raise OutputError(f"{error} {text}") from error
+        another = ask_output(path, error)
+        if another is None and run.job.checkpoint.exists():
+            text = f"The fit is kept in {run.job.checkpoint}: --resume continues it, and writes the model."
+            raise OutputError(f"{error} {text}") from error
+        return another
+
+    return write_or_keep(Path(run.job.target), run.save_to, ask)
 
 
 @contextmanager

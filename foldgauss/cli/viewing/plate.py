@@ -1,5 +1,6 @@
 """The command `plate`."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -96,9 +97,9 @@ def plate_command(
         masks = _find_object(frames, alignment) if masks is None else masks
         plate = fill_background(frames, masks, alignment=alignment)
     stamps = read_frame_seconds(about, model.num_frames)
-    write_images(out_path, plate, len(plate), model.fps, overwrite=overwrite, options=options, stamps=stamps)
+    write_images(out_path, lambda: plate, len(plate), model.fps, overwrite=overwrite, options=options, stamps=stamps)
     if save_masks is not None:
-        images = (np.repeat(np.uint8(255 * mask)[..., None], 3, -1) for mask in masks)
+        images = partial(map, lambda mask: np.repeat(np.uint8(255 * mask)[..., None], 3, -1), masks)
         write_images(save_masks, images, len(masks), model.fps, overwrite=overwrite, stamps=stamps)
 
 
