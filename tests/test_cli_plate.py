@@ -47,6 +47,28 @@ def test_scripts_select_what_moves(model, tmp_path, capsys):
     assert load_video_model(tmp_path / "gone.safetensors").num_gaussians == wanted.num_gaussians
 
 
+@pytest.mark.parametrize("command", ["edit", "plate"])
+def test_masks_as_stored_are_those_of_the_stretched_clip(command, tmp_path):
+    """Of a clip with pixels twice as wide as high; a model file names both sizes."""
+    height, width = MODEL.size
+    about = {"stretched": ((height, width // 2), MODEL.size)}
+    save_video_model(tmp_path / "m.safetensors", MODEL, metadata=about)
+    mask = np.repeat(np.uint8(255 * MASKS[0])[..., None], 3, -1)
+    write_image(tmp_path / "shown.png", mask)
+    write_image(tmp_path / "stored.png", np.ascontiguousarray(mask[:, ::2]))
+    made = []
+    for name in ("shown", "stored"):
+        script, target = tmp_path / f"{name}.toml", tmp_path / f"{name}-{command}"
+        words = (
+            [script, "--out", target] if command == "edit" else ["--masks", tmp_path / f"{name}.png", "--out", target]
+        )
+        script.write_text(f'[selections.it]\nmask = "{name}.png"\nframe = 2\n[[edits]]\nselect = "it"\ndo = "vanish"\n')
+        assert run(command, tmp_path / "m.safetensors", *words) == 0
+        made.append(read_video(target).frames)
+    assert (made[0] != np.stack(list(MODEL.frames()))).any()
+    np.testing.assert_array_equal(*made)
+
+
 def test_scripts_say_where_nothing_moves(model, tmp_path, monkeypatch, capsys):
     def search(frames, **options):
         raise nothing_moves("an object that moves against the background", "none")

@@ -92,7 +92,7 @@ def edit_command(
         options = VideoOptions(sound=choose_sound(sound, Timeline(), about, model.fps))
         check_video_options(out_path, image_size or model.size, model.fps, options)
     with print_log():
-        edited = script.apply(model, about.get("frames"))
+        edited = script.apply(model, about)
     if as_model:
         about = keep_origin(about, *CLIP_NOTES) | {"edited_by": script_path.name}
         if isinstance(edited, SegmentedVideo):
@@ -150,7 +150,8 @@ def segment_command(
         raise wrong_use("NUMBER", expected=expected, got=number)
     segment = video.segments[number]
     begins = (about.get("frames") or [0])[0] or 0
-    whole = keep_origin(about, "clip", "reading") | {"frames": [begins + segment.first, begins + segment.stop]}
+    whole = keep_origin(about, "clip", "reading", "stretched")
+    whole |= {"frames": [begins + segment.first, begins + segment.stop]}
     known = whole | dict(segment.metadata)
     seconds = read_frame_seconds(about, video.num_frames)
     if seconds is not None:  # the segment's own frames may be evenly spaced, at another rate than the whole clip's

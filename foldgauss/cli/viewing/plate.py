@@ -105,7 +105,7 @@ def plate_command(
 
 def _read_masks(path: Path, model: Video, size: tuple[int, int], about: dict[str, Any]) -> Masks:
     """The user's masks, one for each frame of the model, at the size of the images."""
-    masks = read_masks(path, size=model.size)
+    masks = read_masks(path, size=model.size, stretched=about.get("stretched"))
     masks = masks.reshape(-1, *masks.shape[-2:])  # one image is for all frames
     first, num = (about.get("frames") or (0,))[0] or 0, model.num_frames
     if len(masks) >= first + num:

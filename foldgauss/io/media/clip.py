@@ -22,6 +22,7 @@ WHITE = (1 << 16) - 1  # the value of white in data of 16 bits
 DEPTHS = (8, 10, 12, 14)  # bits of cameras and microscopes whose values are stored in 16
 Range = tuple[int | None, int | None]
 Size = tuple[int, int]  # (height, width)
+Stretch = tuple[Size, Size]  # the size of frames as stored, and that to which they are stretched
 #: (frames declared within a range, frame rate, notes)
 RangeFacts = tuple[int, FrameRate, tuple[str, ...]]
 #: (prepared frames, and the facts)
@@ -93,6 +94,8 @@ class Clip:
     mean rate. `duration`: seconds to the end of the last one, where there are `times`. `notes`: remarks on how the file
     was read, one line each. `first_second`: when the first frame of a range is shown, in seconds from the first frame
     of the video file; 0 of images, and where `fps` was given. `reading`: the options by which it was read.
+    `stretched`: of a video whose pixels are not square, the size of its frames as stored, upright, and that with square
+    pixels, before `size` applies; otherwise None.
     """
 
     frames: np.ndarray
@@ -104,6 +107,7 @@ class Clip:
     first_second: float = 0.0
     duration: float | None = None
     reading: Reading = AS_STORED
+    stretched: Stretch | None = None
 
     @property
     def has_alpha(self) -> bool:

@@ -78,6 +78,11 @@ class DecodedFrame:
         """The transfer function of a frame in HDR, "PQ" or "HLG"; None for others."""
         return HDR.get(self.decoded.color_trc)
 
+    @property
+    def is_turned(self) -> bool:
+        """Whether rows of the frame are columns of the upright image."""
+        return abs(self.matrix[1]) > abs(self.matrix[0])
+
     def to_array(self) -> np.ndarray:
         """Upright and uint8: BGR of shape (height, width, 3), or premultiplied BGRA of shape (height, width, 4).
 
@@ -103,7 +108,7 @@ class DecodedFrame:
             opaque = image[..., 3].min() == 255
             image = np.ascontiguousarray(image[..., :3]) if opaque else premultiply(image)
         a, b, c, d = self.matrix
-        if abs(b) > abs(a):
+        if self.is_turned:
             image, a, d = image.swapaxes(0, 1), c, b
         return np.ascontiguousarray(image[:: 1 if d >= 0 else -1, :: 1 if a >= 0 else -1])
 
