@@ -482,6 +482,7 @@ def _as_ycbcr(signal, bits, limited):
         ("yuv420p10le", 9, False, True),
         ("yuv420p12le", 9, True, True),
         ("yuv444p10le", 9, True, True),
+        *((f"gray{bits}le", 9, limited, True) for bits in (10, 12, 16) for limited in (True, False)),
     ],
 )
 def test_hdr_is_tone_mapped(tmp_path, transfer, kind, primaries, limited, declared):
@@ -490,11 +491,14 @@ def test_hdr_is_tone_mapped(tmp_path, transfer, kind, primaries, limited, declar
     signal[0] = np.linspace(0, 1, 8)[:, None]
     signal[1, :3] = 0.7 * np.eye(3)
     signal = signal.repeat(8, 0).repeat(8, 1)
-    if kind.startswith("yuv"):
-        planes, signal = _as_ycbcr(signal, int(kind[7:9]), limited)
+    if kind.startswith("gray"):
+        signal[...] = signal[..., :1]
+    if kind.startswith(("yuv", "gray")):
+        planes, signal = _as_ycbcr(signal, int(kind.removesuffix("le")[-2:]), limited)
         side = 2 if "420" in kind else 1
         frame = av.VideoFrame(64, 48, kind)
-        for plane, codes in zip(frame.planes, (planes[0], *(one[::side, ::side] for one in planes[1:])), strict=True):
+        sampled = [planes[0], *(one[::side, ::side] for one in planes[1:])][: len(frame.planes)]
+        for plane, codes in zip(frame.planes, sampled, strict=True):
             rows = np.zeros((plane.height, plane.line_size // 2), np.uint16)
             rows[:, : plane.width] = codes
             plane.update(rows.tobytes())
@@ -512,6 +516,8 @@ def test_hdr_is_tone_mapped(tmp_path, transfer, kind, primaries, limited, declar
         out.mux(stream.encode(frame))
         out.mux(stream.encode(None))
     frames = read_video(tmp_path / "a.mkv").frames.astype(float)
+    with pytest.raises(VideoError, match="levels: expected .*, got HDR, whose tone mapping defines white"):
+        read_video(tmp_path / "a.mkv", levels=4095)
     if transfer == "PQ":
         grid = 10_000 * np.linspace(0, 1, 200_001) ** 4
         light = np.interp(signal, _pq(grid), grid)

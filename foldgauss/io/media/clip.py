@@ -62,13 +62,13 @@ class Levels:
         white = self.white or WHITE
         return ((np.minimum(image, white).astype(np.uint32) * 255 + white // 2) // white).astype(np.uint8)
 
-    def describe(self, path: Path) -> tuple[str, ...]:
+    def describe(self, path: Path, kind: str = "a clip of fewer bits") -> tuple[str, ...]:
         """A note where the values that were converted seem to have fewer bits, or are clipped.
 
-        Raises `VideoError` where `white` is given, but no frame of `path` has 16 bits.
+        Raises `VideoError` where `white` is given, but applies to no frame of `path`, a clip of this `kind`.
         """
         if self.white is not None and self.most < 0:
-            got, cure = f"a clip of fewer bits, {str(path)!r}", "Leave levels out."
+            got, cure = f"{kind}, {str(path)!r}", "Leave levels out."
             raise video_error("levels", expected="images or videos of 16 bits, in RGB or gray", got=got, cure=cure)
         if self.white is not None:
             clipped = f"values of up to {self.most:,} are above levels={self.white} and become white."

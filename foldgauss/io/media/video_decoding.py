@@ -135,7 +135,8 @@ def decode_file(
             notes.append(f"interlaced frames are converted to progressive ones, {each}.")
         if (unread := decoder.unread_fraction) > MAX_UNREAD:
             notes.append(f"the last {unread:.0%} of the file hold no frame that decodes.")
-        notes += decoder.levels.describe(path) if kept else ()
+        kind = {"kind": "HDR, whose tone mapping defines white"} if hdr else {}
+        notes += decoder.levels.describe(path, **kind) if kept else ()
         stored_size, order = list(decoder.stored_size), -1 if is_turned else 1
         stretched = decoder.stored_size[::order], decoder.size[::order]
     # The container's count may be an estimate, so the range is checked against the decoded frames as well.
