@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import typer
+from commands import run
 
-from foldgauss.cli.app.main import main
 from foldgauss.cli.shared.outputs import ask_output
 from foldgauss.io import load_video_model, write_image, write_video
 from foldgauss.io._atomic import OutputError, write_or_keep
@@ -17,12 +17,6 @@ from foldgauss.io.datasets import waves
 from foldgauss.io.models.video_model import read_metadata
 
 FIT = ["--steps", "3", "--gaussians", "60", "--quiet"]
-
-
-def run(*words):
-    with pytest.raises(SystemExit) as ended:
-        main([str(word) for word in words])
-    return ended.value.code or 0
 
 
 @pytest.fixture(scope="module")

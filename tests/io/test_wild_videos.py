@@ -399,7 +399,7 @@ def test_levels_of_a_video_of_16_bits(tmp_path, bits, pixel_format):
     np.testing.assert_array_equal(read_indexed(index, 3, 6).frames, truth[3:6])
     assert (whole.notes, index.notes, index.reading) == ((), (), ("frames", white))
     notes = read_video(path).notes
-    assert notes == () if bits == 16 else f"levels={white} (--levels {white})" in notes[0]
+    assert notes == () if bits == 16 else f"levels={white} (foldgauss fit --levels {white})" in notes[0]
 
 
 @pytest.mark.parametrize("pixel_format", ["gray10le", "gray12le", "gbrp12le"])
@@ -516,7 +516,7 @@ def test_hdr_is_tone_mapped(tmp_path, transfer, kind, primaries, limited, declar
         out.mux(stream.encode(frame))
         out.mux(stream.encode(None))
     frames = read_video(tmp_path / "a.mkv").frames.astype(float)
-    with pytest.raises(VideoError, match="levels: expected .*, got HDR, whose tone mapping defines white"):
+    with pytest.raises(VideoError, match=r"levels: expected .*, got HDR, whose tone mapping defines white"):
         read_video(tmp_path / "a.mkv", levels=4095)
     if transfer == "PQ":
         grid = 10_000 * np.linspace(0, 1, 200_001) ** 4
@@ -720,8 +720,8 @@ def test_interlaced_is_refused_or_converted(tmp_path, codec):
         read_video(tmp_path / "a.mkv", deinterlace="refuse")
     for chosen in (None, (2, 3)):
         clip = read_video(tmp_path / "a.mkv", frames=chosen)
-        told = "interlaced frames are converted to progressive ones, one of each; --deinterlace fields makes two."
-        assert clip.notes == (told,)
+        told = "interlaced frames are converted to progressive ones, one of each; "
+        assert clip.notes == (f"{told}foldgauss fit --deinterlace fields makes two.",)
         expected = frames[slice(*chosen) if chosen else ...]
         assert clip.frames.shape == expected.shape
         assert (clip.fps, clip.times) == (25, None)

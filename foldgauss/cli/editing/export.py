@@ -103,7 +103,7 @@ def export_command(
     model = load_video_model(model_path)
     if file_format == "html":
         check_writable(out_path)
-        frames = None if original is None else read_fitted_clip(model, model_path, original, None)
+        frames = None if original is None else read_fitted_clip(model, model_path, original, None, name="--original")
         with show_status("Writing the page"):
             out_path = write_result(
                 out_path, lambda path: write_html(path, model_path, original=frames, quality=original_quality)

@@ -107,8 +107,8 @@ def _refuse_transparent(path: Path, background: Background) -> None:
 def _check_rate(path: Path, fps: float) -> None:
     most = MAX_GIF_FPS if path.suffix.lower() == ".gif" else MAX_FPS
     if path.suffix and not path.is_dir() and fps > most:
-        expected, cure = f"at most {most:g} frames per second", "Give a lower rate, or write to a folder."
-        raise wrong_use("--fps", expected=expected, got=f"{fps:g}", cure=cure)
+        expected, cure = f"at most {most:g} frames per second in it", "Choose a lower rate, another format or a folder."
+        raise wrong_use("--out", expected=expected, got=f"{fps:g} for {path}", cure=cure)
 
 
 def _refuse_options(path: Path, options: VideoOptions) -> None:

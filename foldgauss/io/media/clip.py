@@ -78,7 +78,7 @@ class Levels:
         if white is None:
             return ()
         found = f"the largest value is {self.most:,} of {WHITE:,}, as in data of {white.bit_length()} bits"
-        return (f"{found}, which look dark; levels={white} (--levels {white}) makes {white} white.",)
+        return (f"{found}, which look dark; levels={white} (foldgauss fit --levels {white}) makes {white} white.",)
 
 
 @dataclass(frozen=True, eq=False)

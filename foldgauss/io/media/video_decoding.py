@@ -131,7 +131,7 @@ def decode_file(
             notes.append(f"the file asks for a rotation by {turn}; it is left out.")
         if decoder.has_converted:
             by_field = reading.deinterlace == "fields"
-            each = "one of each field" if by_field else "one of each; --deinterlace fields makes two"
+            each = "one of each field" if by_field else "one of each; foldgauss fit --deinterlace fields makes two"
             notes.append(f"interlaced frames are converted to progressive ones, {each}.")
         if (unread := decoder.unread_fraction) > MAX_UNREAD:
             notes.append(f"the last {unread:.0%} of the file hold no frame that decodes.")
