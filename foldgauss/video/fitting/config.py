@@ -313,7 +313,7 @@ class FitConfig:
         default=0.3,
         metadata=setting(
             "Fraction of the views that are chosen in proportion to the squared errors of the frames",
-            "In between, all frames are visited in turn. Improves the worst frames. Ignored with `economy.psnr`, not with an economy without it.",
+            "In between, all frames are visited in turn. Improves the worst frames. Ignored with `economy.psnr`.",
             bounds="[0, 1)",
             option="--error-fraction",
             group=OPTIMIZATION,
