@@ -1,5 +1,6 @@
 """What commands say of inputs that they do not read, and where outputs go."""
 
+import dataclasses
 import errno
 import os
 from pathlib import Path
@@ -11,7 +12,7 @@ import typer
 from commands import run
 
 from foldgauss.cli.shared.outputs import ask_output
-from foldgauss.io import load_video_model, write_image, write_video
+from foldgauss.io import load_video_model, save_video_model, write_image, write_video
 from foldgauss.io._atomic import OutputError, write_or_keep
 from foldgauss.io.datasets import waves
 from foldgauss.io.models.video_model import read_metadata
@@ -190,3 +191,80 @@ def test_answers_about_another_place(answer, path, tmp_path, monkeypatch):
     monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
     monkeypatch.setattr("typer.prompt", prompt)
     assert ask_output(Path("full/v.mp4"), OSError("full")) == (path and Path(path))
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["info", "PIPE"],
+        ["view", "PIPE"],
+        ["render", "PIPE"],
+        ["export", "PIPE", "--format", "html"],
+        ["uncertainty", "PIPE", "CLIP"],
+        ["evaluate", "MODEL", "PIPE"],
+        ["fit", "PIPE"],
+        ["edit", "MODEL", "PIPE"],
+        ["plate", "MODEL", "--masks", "PIPE"],
+        ["render", "MODEL", "--sound", "PIPE"],
+        ["import", "PIPE"],
+    ],
+    ids=" ".join,
+)
+def test_a_pipe_is_refused_before_it_is_opened(words, work, model, tmp_path, monkeypatch, capsys):
+    """To open it would wait for a program that writes to it."""
+    pipe, read = tmp_path / "pipe.png", open
+    os.mkfifo(pipe)
+
+    def open_other(path, *arguments, **options):
+        assert str(path) != str(pipe), "opened"
+        return read(path, *arguments, **options)
+
+    monkeypatch.setattr("builtins.open", open_other)
+    monkeypatch.setattr("io.open", open_other)
+    monkeypatch.chdir(tmp_path)
+    inputs = {"PIPE": pipe, "MODEL": model, "CLIP": work / "clip.mp4"}
+    assert run(*(inputs.get(word, word) for word in words)) in (1, 2)
+    assert str(pipe) in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["fit", "LOOP"], ["compress", "LOOP"], ["edit", "MODEL", "LOOP"], ["plate", "LOOP"]])
+def test_a_link_to_itself_is_missing(words, model, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("loop").symlink_to("loop")
+    assert run(*({"LOOP": "loop", "MODEL": model}.get(word, word) for word in words)) == 2
+    assert "got 'loop', which is missing" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["fit", ""], ["render", "m.safetensors", "--out", ""], ["render", "m", "--out="]])
+def test_an_empty_argument_is_not_the_current_folder(words, tmp_path, monkeypatch, capsys):
+    """As of a shell variable that is not set."""
+    monkeypatch.chdir(tmp_path)
+    write_image("0.png", np.zeros((8, 8, 3), np.uint8))
+    assert run(*words) == 2
+    assert "arguments: expected a value for each, got an empty one" in capsys.readouterr().err
+    assert os.listdir() == ["0.png"]
+
+
+@pytest.mark.parametrize("words", [["fit-many", "LONG"], ["render", "MODEL", "--out", "LONG"]])
+def test_an_error_of_the_system_is_told_as_others(words, model, capsys):
+    assert run(*({"LONG": 300 * "x", "MODEL": model}.get(word, word) for word in words)) == 1
+    assert "error: path: expected one that can be used, got 'xxx" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["plate", "MODEL", "--masks", "MASK"], ["edit", "MODEL", "SCRIPT"]])
+def test_a_rate_too_high_for_a_gif_is_told_without_an_option_for_it(words, model, tmp_path, capsys):
+    fast = dataclasses.replace(load_video_model(model), fps=60.0)
+    inputs = {"MODEL": save_video_model(tmp_path / "fast.safetensors", fast)}
+    inputs["MASK"] = write_image(tmp_path / "mask.png", np.full((4, 4, 3), 255, np.uint8))
+    inputs["SCRIPT"] = tmp_path / "s.toml"
+    inputs["SCRIPT"].write_text('[[edits]]\ndo = "recolor"\ngain = 0.5\n')
+    assert run(*(inputs.get(word, word) for word in words), "--out", tmp_path / "x.gif") == 2
+    assert "--out: expected at most 50 frames per second in it, got 60 for" in capsys.readouterr().err
+
+
+def test_a_folder_with_other_files_is_refused_and_nothing_is_exported(model, full, capsys):
+    (full / "notes.txt").touch()
+    assert run("export", model, "--format", "obj", "--out", full) == 1
+    assert "got" in (told := capsys.readouterr().err)
+    assert "It is kept" not in told
+    assert not any((full.parent / "temporary").iterdir())

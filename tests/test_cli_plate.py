@@ -81,18 +81,18 @@ def test_scripts_say_where_nothing_moves(model, tmp_path, monkeypatch, capsys):
         parse_edit_script(SCRIPT.replace("true", "false"))
     with pytest.raises(NothingMoves):
         edit(MODEL).select(moving=True)
-    assert run("plate", model, "--out", tmp_path / "images") == 1
+    assert run("plate", model, "--out", tmp_path / "images") == 2
     told = capsys.readouterr().err
-    assert "moving: expected an object that moves against the background, got none." in told
+    assert "MODEL: expected an object that moves against the background, got none." in told
     assert "Give masks of the object by --masks, or remove it by foldgauss edit" in told
     assert not list(tmp_path.iterdir())
 
 
 def test_too_few_frames_are_refused_before_the_search(tmp_path, capsys):
     save_video_model(tmp_path / "m.safetensors", soft_model(num_frames=2))
-    assert run("plate", tmp_path / "m.safetensors", "--out", tmp_path / "images") == 1
+    assert run("plate", tmp_path / "m.safetensors", "--out", tmp_path / "images") == 2
     told = capsys.readouterr()
-    assert "moving: expected a video of 3 frames at least, got 2. Fit more frames" in told.err
+    assert "MODEL: expected at least 3 frames, got 2. Fit more frames" in told.err
     assert "Searching" not in told.out
     with pytest.raises(NothingMoves, match=r"moving: expected a video of 3 frames at least, got 2\. Select by a mask"):
         edit(soft_model(num_frames=2)).select(moving=True)

@@ -27,6 +27,10 @@ class OutputError(OSError):
     """An output path cannot be written; the one-line message says how to correct it."""
 
 
+class OutputRefused(OutputError):
+    """An existing output must not be replaced; found before any work is done."""
+
+
 def check_path(path: object, order: str = "") -> Path:
     """`path` as a Path. Raises ValueError for another type, with `order`, the order of the arguments, as a hint."""
     if not isinstance(path, PathLike):
@@ -41,6 +45,20 @@ def missing_error(path: PathLike, expected: str) -> FileNotFoundError:
         return FileNotFoundError(f"path: expected {expected}, got the address {got}. Download it first.")
     text = f"path: expected {expected}, got {str(path)!r}, which is missing."
     return FileNotFoundError(f"{text} Check the spelling and the current folder.")
+
+
+def check_input(path: Path, expected: str) -> None:
+    """Raise FileNotFoundError for an input that is missing, ValueError for a pipe or a device: opening may not end."""
+    if not os.path.exists(path):
+        raise missing_error(path, expected)
+    if not (os.path.isfile(path) or os.path.isdir(path)):
+        got = f"{str(path)!r}, a pipe or a device"
+        raise invalid("path", expected=expected, got=got, cure="Save its output to a file.")
+
+
+def resolve(path: PathLike) -> Path:
+    """The absolute path without symbolic links; unlike Path.resolve() also of a link to itself."""
+    return Path(os.path.realpath(path))
 
 
 def _check_target(path: Path) -> None:
@@ -146,10 +164,13 @@ def write_or_keep(
     """Write the result of a long computation by `write(path)`; if that fails, to the path that `ask` returns; if there
     is none, or it fails, too, to the folder for temporary files. Returns what `write` does.
 
-    Raises `OutputError`, which says where the result is, if it is in the folder for temporary files.
+    Raises `OutputError`, which says where the result is, if it is in the folder for temporary files; and
+    `OutputRefused` as `write(path)`.
     """
     try:
         return write(path)
+    except OutputRefused:
+        raise
     except OSError as error:
         failure = error
     if another := ask(path, failure):
@@ -178,7 +199,7 @@ def atomic_folder(folder: PathLike, overwrite: bool = False, *, pattern: str, wh
 
     Missing parents are made. Raises `OutputError` if the folder is refused, or its parent is not writable.
     """
-    given, folder = Path(folder), Path(folder).resolve()
+    given, folder = Path(folder), resolve(folder)
     check_replaceable(given, overwrite, pattern=pattern, what=what)
     _check_target(folder)
     temporary, aside = temporary_name(folder, ""), temporary_name(folder, "")
@@ -188,7 +209,10 @@ def atomic_folder(folder: PathLike, overwrite: bool = False, *, pattern: str, wh
         with _name_output(folder, temporary):
             yield temporary
         try:
-            check_replaceable(given, overwrite, pattern=pattern, what=what)
+            try:
+                check_replaceable(given, overwrite, pattern=pattern, what=what)
+            except OutputRefused as refusal:  # of what has come meanwhile
+                raise OutputError(str(refusal)) from refusal
             if folder.exists():
                 os.replace(folder, aside)
             os.replace(temporary, folder)
@@ -202,21 +226,21 @@ def atomic_folder(folder: PathLike, overwrite: bool = False, *, pattern: str, wh
 
 
 def check_replaceable(folder: Path, overwrite: bool, *, pattern: str, what: str = "frames") -> None:
-    """Raise `OutputError` unless `atomic_folder` may replace `folder`."""
+    """Raise `OutputRefused` unless `atomic_folder` may replace `folder`."""
     if not os.path.exists(folder):
         return
     if not folder.is_dir():
-        raise OutputError(f"path: expected a folder for {what}, got the file {str(folder)!r}. Choose another name.")
+        raise OutputRefused(f"path: expected a folder for {what}, got the file {str(folder)!r}. Choose another name.")
     with translate_output_errors(folder):
         names = [entry.name for entry in folder.iterdir()]
     foreign = [name for name in names if not re.fullmatch(pattern, name)]
     if foreign:
-        raise OutputError(
+        raise OutputRefused(
             f"path: expected an empty folder or one of numbered {what}, got {str(folder)!r} with "
             f"{min(foreign)!r} in it. Choose another folder."
         )
     if names and not overwrite:
-        raise OutputError(
+        raise OutputRefused(
             f"path: expected a new or empty folder, got {str(folder)!r} with {len(names)} {what}. "
             "Choose another folder, or allow overwriting."
         )

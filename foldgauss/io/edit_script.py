@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.io._atomic import PathLike
+from foldgauss.io._atomic import PathLike, resolve
 from foldgauss.io._toml_lines import key_lines
 from foldgauss.io.media.masks import read_masks
 from foldgauss.io.models.selections import load_selection, parse_indices, parse_ranges
@@ -307,7 +307,7 @@ class EditScript:
         other: Video = load_video_model(file := self._path(table["model"]))
         if "script" in table:
             path = self._path(table["script"])
-            if path.resolve() in self._includes:
+            if resolve(path) in self._includes:
                 raise invalid("script", expected="a script that does not include itself", got=repr(table["script"]))
             script = read_edit_script(path)
             script = dataclasses.replace(script, _includes=script._includes + self._includes)
@@ -344,7 +344,7 @@ def read_edit_script(path: PathLike) -> EditScript:
     except OSError as error:
         raise EditScriptError(f"{path}: expected a file that can be read, got {error}.") from error
     script = parse_edit_script(text, source=str(path), folder=path.parent)
-    return dataclasses.replace(script, _includes=(path.resolve(),))
+    return dataclasses.replace(script, _includes=(resolve(path),))
 
 
 def parse_edit_script(text: str, *, source: str = "script", folder: PathLike = ".") -> EditScript:

@@ -17,7 +17,7 @@ from foldgauss.cli.shared.clips import is_other_clip, read_fitted_clip, refuse_s
 from foldgauss.cli.shared.outputs import refuse_existing, refuse_inputs, write_result
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import print_figures
-from foldgauss.io._atomic import check_writable
+from foldgauss.io._atomic import check_writable, resolve
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.compact import COMPACT_SUFFIX, check_compact_name, save_compact
 from foldgauss.io.models.video_model import (
@@ -77,7 +77,7 @@ def compress_command(
     VIDEO, this is an estimate. See docs/compress.md.
     """
     suffix = f".float16{MODEL_SUFFIX}" if float16 else COMPACT_SUFFIX
-    target = Path(f"{model_path.resolve().stem}{suffix}") if out_path is None else out_path
+    target = Path(f"{resolve(model_path).stem}{suffix}") if out_path is None else out_path
     try:
         check_model_name(target, "--out") if float16 else check_compact_name(target, "--out")
     except ValueError as error:

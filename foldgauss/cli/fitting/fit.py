@@ -39,7 +39,7 @@ from foldgauss.cli.shared.arguments import (
 from foldgauss.cli.shared.outputs import ask_output, name_after, refuse_existing, refuse_inputs
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import format_count, print_figures, summarize_scores
-from foldgauss.io._atomic import OutputError, check_writable, write_or_keep
+from foldgauss.io._atomic import OutputError, check_writable, resolve, write_or_keep
 from foldgauss.io._lock import lock_output
 from foldgauss.io.history import HistoryFile, read_history, write_curves
 from foldgauss.io.media.clip import DEINTERLACE, Clip
@@ -207,16 +207,16 @@ def _check_records(target: Path, video: Path, history: Path | None, preview: Pat
         if path is not None and path.suffix != suffix:
             raise wrong_use(option, expected=f"a name ending in {suffix}", got=path)
     places = [("--history", history), ("--history", None if history is None else curves), ("--preview", preview)]
-    taken = {target.resolve(), video.resolve()}
+    taken = {resolve(target), resolve(video)}
     for option, path in places:
         if path is None:
             continue
-        if video.is_dir() and path.resolve().parent == video.resolve():
+        if video.is_dir() and resolve(path).parent == resolve(video):
             cure = "It would be a frame there."
             raise wrong_use(option, expected="a place outside the clip's folder", got=path, cure=cure)
-        if path.resolve() in taken:
+        if resolve(path) in taken:
             raise WrongUse(f"{option}: expected a file of its own, got {path}, which has another use. Choose another.")
-        taken.add(path.resolve())
+        taken.add(resolve(path))
         refuse_existing(path, overwrite, option)
         check_writable(path)
     return curves

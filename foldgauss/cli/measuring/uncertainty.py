@@ -22,7 +22,7 @@ from foldgauss.cli.shared.arguments import FittedClip, FittedFrames, ModelFile, 
 from foldgauss.cli.shared.clips import read_fitted_clip, refuse_segments
 from foldgauss.cli.shared.outputs import name_after, write_result
 from foldgauss.cli.shared.rendering import TIME_LEFT
-from foldgauss.io._atomic import OutputError, atomic_path, check_writable, output_error, write_or_keep
+from foldgauss.io._atomic import OutputError, atomic_path, check_writable, output_error, resolve, write_or_keep
 from foldgauss.io._lock import lock_output
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.video_model import load_video_model, read_origin
@@ -170,7 +170,7 @@ def _check_folder(folder: Path, video: Path, overwrite: bool) -> None:
     """Refuse a folder that cannot be used, before any work; it is created later."""
     if folder.exists() and not folder.is_dir():
         raise wrong_use("--out", expected="a folder", got=f"the file {folder}")
-    if video.is_dir() and folder.resolve() == video.resolve():
+    if video.is_dir() and resolve(folder) == resolve(video):
         cure = "Plots would be frames there."
         raise wrong_use("--out", expected="a folder other than the clip's", got=folder, cure=cure)
     shown = [

@@ -8,7 +8,7 @@ from pathlib import Path
 import typer
 
 from foldgauss.cli.app.application import WrongUse, err, wrong_use
-from foldgauss.io._atomic import OutputError, Result, check_replaceable, check_writable, write_or_keep
+from foldgauss.io._atomic import OutputError, Result, check_replaceable, check_writable, resolve, write_or_keep
 from foldgauss.io.media.image_files import IMAGE_SUFFIXES
 from foldgauss.io.media.resizing import memory_limit
 from foldgauss.io.media.video_writing import ANIMATION_SUFFIXES, FRAME_NAMES, VIDEO_SUFFIXES
@@ -18,7 +18,7 @@ IMAGE_SUFFIX = ".png"
 
 def name_after(source: Path, ending: str) -> Path:
     """The default name of an output: in the current folder, after its source."""
-    whole = source if source.name not in ("", "..") else source.resolve()
+    whole = source if source.name not in ("", "..") else resolve(source)
     return Path(f"{whole.name if whole.is_dir() else whole.stem}{ending}")
 
 
@@ -43,7 +43,7 @@ def refuse_inputs(path: Path, inputs: Mapping[str, Path | None], option: str = "
         if source is None or not (os.path.exists(path) and os.path.exists(source)):
             continue
         into = path.suffix.lower() in IMAGE_SUFFIXES and path.parent.samefile(source)
-        if into or path.samefile(source) or path.resolve() in source.resolve().parents:
+        if into or path.samefile(source) or resolve(path) in resolve(source).parents:
             raise WrongUse(f"{option}: expected another path than the {what}, got {path}. Inputs are never replaced.")
 
 

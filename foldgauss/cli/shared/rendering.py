@@ -1,5 +1,6 @@
 """Frames of models with a progress bar: rendered to files, and evaluated."""
 
+import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -128,7 +129,8 @@ def choose_sound(path: Path | None, timeline: Timeline, about: dict[str, Any], f
     if timeline.remap is not None or timeline.chosen is not None or timeline.is_single or (timeline.speed or 1.0) < 0:
         raise wrong_use("--sound", expected="a constant speed forwards", got="other times", cure="Leave --sound out.")
     if not path.is_file():
-        raise wrong_use("--sound", expected="a file", got=f"{str(path)!r}, which is missing")
+        got = f"{str(path)!r}, which is {'none' if os.path.exists(path) else 'missing'}"
+        raise wrong_use("--sound", expected="a file", got=got)
     first = (about.get("frames") or (0,))[0] or 0
     return Sound(path, about.get("first_second", first / fps), timeline.playing_speed(fps))
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
-from foldgauss.io._atomic import PathLike, check_path, missing_error
+from foldgauss.io._atomic import PathLike, check_path, missing_error, resolve
 from foldgauss.io.media.format_detection import HEAD_BYTES
 from foldgauss.io.media.frame_rate import MAX_FPS, MIN_FPS, FrameRate
 
@@ -155,7 +155,7 @@ def translate_os_errors(path: Path) -> Iterator[None]:
 def read_head(path: Path) -> bytes:
     """The first bytes of a file. Raises `VideoError` for a name that is not Unicode: OpenCV crashes on it."""
     try:
-        str(path.resolve()).encode()
+        str(resolve(path)).encode()
     except UnicodeEncodeError as error:
         got, cure = f"{str(path)!a}, which is not Unicode", "Rename the file or its folder."
         raise video_error("path", expected="a name that OpenCV can open", got=got, cure=cure) from error

@@ -15,6 +15,7 @@ from av.filter import Graph
 from av.stream import Disposition
 from av.video.reformatter import ColorRange, Colorspace, Interpolation, VideoReformatter
 
+from foldgauss.io._atomic import resolve
 from foldgauss.io.media.clip import (
     AS_STORED,
     VIDEO,
@@ -401,7 +402,7 @@ def open_container(path: Path, demuxers: str = DEMUXERS) -> av.container.InputCo
     # An absolute path, because FFmpeg takes 'name:rest' for a protocol. One local file and nothing that it refers to.
     options = {"protocol_whitelist": "file", "format_whitelist": demuxers}
     try:
-        return av.open(f"file:{path.resolve()}", options=options, metadata_errors="replace")
+        return av.open(f"file:{resolve(path)}", options=options, metadata_errors="replace")
     except (av.FFmpegError, ValueError) as error:
         about = format_num_bytes(path) + (f", {kind}" if kind else "")
         got = f"{str(path)!r} ({about}), which does not open as a video"

@@ -1,7 +1,6 @@
 """Object masks from images, folders of images and videos."""
 
 import math
-import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +10,7 @@ from jaxtyping import Bool
 from PIL import Image
 
 from foldgauss._runtime.checks import check_within, invalid, is_integer
-from foldgauss.io._atomic import PathLike, check_path, missing_error
+from foldgauss.io._atomic import PathLike, check_input, check_path
 from foldgauss.io.media.clip import Range, Size, Stretch, check_frame_size, check_range, format_size
 from foldgauss.io.media.image_files import IMAGE_SUFFIXES, choose_images
 from foldgauss.io.media.resizing import aspect_window
@@ -60,8 +59,7 @@ def read_masks(
     that do not apply, and as `read_video`.
     """
     path = check_path(path)
-    if not os.path.exists(path):
-        raise missing_error(path, "an image, a folder or a video")
+    check_input(path, "an image, a folder or a video")
     if label is not None and not (is_integer(label, 1) and label < VOID):
         raise invalid("label", expected=f"an object's label, 1 to {VOID - 1}", got=repr(label))
     is_image = path.suffix.lower() in IMAGE_SUFFIXES
