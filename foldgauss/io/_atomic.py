@@ -43,8 +43,19 @@ def missing_error(path: PathLike, expected: str) -> FileNotFoundError:
     if address := re.fullmatch("([A-Za-z][A-Za-z0-9+.-]+):/+(.*)", str(path)):  # of whose slashes Path keeps one
         got = repr("://".join(address.groups()))
         return FileNotFoundError(f"path: expected {expected}, got the address {got}. Download it first.")
-    text = f"path: expected {expected}, got {str(path)!r}, which is missing."
+    text = f"path: expected {expected}, got {str(path)!r}, {describe_missing(path)}."
     return FileNotFoundError(f"{text} Check the spelling and the current folder.")
+
+
+def describe_missing(path: PathLike) -> str:
+    """Why a path does not exist for this process, as "which is missing"."""
+    try:
+        os.stat(path)
+    except (FileNotFoundError, NotADirectoryError, ValueError):
+        return "which is missing"
+    except OSError as error:  # in a folder without permission, a link to itself, a name that is too long
+        return f"which cannot be reached ({error.strerror})"
+    return "which is missing"  # it has come meanwhile
 
 
 def check_input(path: Path, expected: str) -> None:

@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.io._atomic import PathLike, resolve
+from foldgauss.io._atomic import PathLike, describe_missing, resolve
 from foldgauss.io._toml_lines import key_lines
 from foldgauss.io.media.masks import read_masks
 from foldgauss.io.models.selections import load_selection, parse_indices, parse_ranges
@@ -330,7 +330,7 @@ def read_edit_script(path: PathLike) -> EditScript:
     """
     path = Path(path)
     if not os.path.exists(path):
-        raise FileNotFoundError(f"script: expected a TOML file, got {str(path)!r}, which is missing.")
+        raise FileNotFoundError(f"script: expected a TOML file, got {str(path)!r}, {describe_missing(path)}.")
     if not path.is_file():
         raise EditScriptError(f"{path}: expected a TOML file, got a folder or a device.")
     if path.stat().st_size > MAX_BYTES:
