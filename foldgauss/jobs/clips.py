@@ -39,7 +39,8 @@ def find_clips(folder: str | os.PathLike) -> FoundClips:
     """
     folder = Path(folder)
     if not folder.exists():
-        raise FileNotFoundError(f"folder: expected a folder with clips, got {str(folder)!r}, {describe_missing(folder)}.")
+        got = f"{str(folder)!r}, {describe_missing(folder)}"
+        raise FileNotFoundError(f"folder: expected a folder with clips, got {got}.")
     if not folder.is_dir():
         cure = f"One clip alone: foldgauss fit {folder}."
         raise invalid("folder", expected="a folder with clips", got=f"the file {str(folder)!r}", cure=cure)
