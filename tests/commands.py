@@ -1,6 +1,7 @@
 """The command as the tests call it."""
 
 import math
+import re
 import wave
 from pathlib import Path
 
@@ -9,13 +10,42 @@ import numpy as np
 import pytest
 
 from foldgauss import cli
+from foldgauss.cli.app import application
 
 
 def run(*arguments):
-    """Exit code of the command, run in this process."""
-    with pytest.raises(SystemExit) as done:
-        cli.main([str(argument) for argument in arguments])
+    """Exit code of the command, run in this process. Its messages must not name options that it does not have."""
+    texts, words = [], [str(argument) for argument in arguments]
+    show = application.err.print
+
+    def record(*shown, **how):
+        texts.extend(one for one in shown if isinstance(one, str))
+        show(*shown, **how)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(application.err, "print", record)
+        with pytest.raises(SystemExit) as done:
+            cli.main(words)
+    assert not _find_foreign_options(words, texts)
     return done.value.code or 0
+
+
+def _find_foreign_options(words, texts):
+    """Options in texts that the command does not have, other than those of another command or program that is named."""
+    known = {
+        name: application.load_commands(name).get(name) for name in application.COMMANDS if name in (*words, "fit")
+    }
+    commands = [*known.values(), *(one for group in known.values() for one in getattr(group, "commands", {}).values())]
+    own = {"--debug", "--help"} | {
+        option
+        for command in commands
+        if command.name in words
+        for parameter in command.params
+        for option in (*parameter.opts, *parameter.secondary_opts)
+    }
+    named = [(text, found) for text in texts for found in re.finditer(r"(?<![\w/-])--[a-z][a-z0-9-]+", text)]
+    elsewhere = re.compile(r"(\bfit\b[^.;:]*|foldgauss [a-z]+ [^:;]*|dask [^.;:]*|pip [^.;:]*)$", re.IGNORECASE)
+    return [text for text, found in named if found[0] not in own and not elsewhere.search(text[: found.start()])]
 
 
 def write_tone(path: Path, seconds: float) -> Path:

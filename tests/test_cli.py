@@ -204,6 +204,7 @@ def test_how_a_clip_was_read_is_kept(tmp_path, capsys):
     assert "the largest value is 4,080 of 65,535, as in data of 12 bits, which look dark" in capsys.readouterr().err
     assert run("evaluate", model, clip) == 0
     assert "the largest value is 4,080" in capsys.readouterr().err
+    write_video(tmp_path / "8.mp4", blobs(), 10.0)
     for options in ((), ("--segment-seconds", 0.1)):
         assert run("fit", clip, "--out", model, "--overwrite", "--levels", 4080, *options, *few) == 0
         assert read_metadata(model)["reading"] == {"levels": 4080}
@@ -211,6 +212,13 @@ def test_how_a_clip_was_read_is_kept(tmp_path, capsys):
         capsys.readouterr()
         assert run("evaluate", model, clip) == 0
         assert "warning" not in capsys.readouterr().err
+        for words in (["evaluate", model], ["figure", "reconstruction", model]):
+            assert run(*words, tmp_path / "8.mp4") == 2
+            told = capsys.readouterr().err
+            assert "VIDEO: expected the clip that the model was fitted to, clip read with levels=4080, got" in told
+        page = ("--format", "html", "--out", tmp_path / "p.html")
+        assert run("export", model, *page, "--original", tmp_path / "8.mp4") == 2
+        assert "--original: expected the clip that the model was fitted to, clip read with" in capsys.readouterr().err
     assert {"reading"} <= set(CLIP_NOTES)  # which edit and compress keep
     assert run("fit-many", tmp_path / "clips", "--out", tmp_path / "models", "--levels", 4080, *few) == 0
     assert read_metadata(tmp_path / "models" / "clip.safetensors")["reading"] == {"levels": 4080}

@@ -1,23 +1,23 @@
 """What commands say of inputs that they do not read, and where outputs go."""
 
+import dataclasses
+import errno
+import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import typer
+from commands import run
 
-from foldgauss.cli.app.main import main
-from foldgauss.io import load_video_model, write_image, write_video
+from foldgauss.cli.shared.outputs import ask_output
+from foldgauss.io import load_video_model, save_video_model, write_image, write_video
 from foldgauss.io._atomic import OutputError, write_or_keep
 from foldgauss.io.datasets import waves
 from foldgauss.io.models.video_model import read_metadata
 
 FIT = ["--steps", "3", "--gaussians", "60", "--quiet"]
-
-
-def run(*words):
-    with pytest.raises(SystemExit) as ended:
-        main([str(word) for word in words])
-    return ended.value.code or 0
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def test_masks_of_the_whole_clip_fit_a_model_of_some_frames(work, model, tmp_pat
     for k in range(6):
         write_image(tmp_path / "masks" / f"{k}.png", np.full((*size, 3), 255, np.uint8))
     (tmp_path / "s.toml").write_text(
-        '[selections]\nall = {mask = "masks"}\n[[edits]]\nselect = "all"\ndo = "move"\noffset = [0.1, 0.0]\n'
+        '[selections]\nall = {mask = "masks"}\n[[edits]]\ndo = "move"\noffset = [0.1, 0.0]\n'
     )
     assert run("edit", model, tmp_path / "s.toml", "--out", tmp_path / "e.safetensors") == 0
 
@@ -95,3 +95,176 @@ def test_a_result_without_room_is_kept_elsewhere(tmp_path, monkeypatch):
     with pytest.raises(OutputError, match=r"no room\. It is kept in .*m.safetensors"):
         write_or_keep(tmp_path / "full" / "m.safetensors", write)
     assert [path.read_text() for path in tmp_path.glob("*/m.safetensors")] == ["result"]
+
+
+#: Commands that write after long work, by what they write; CLIP, MODEL, MASK and SCRIPT are inputs, OUT is the output.
+WRITING = {
+    "m.safetensors": ["fit", "CLIP", *FIT, "--out", "OUT"],
+    "joined.safetensors": ["fit", "CLIP", *FIT, "--segment-seconds", "0.3", "--out", "OUT"],
+    "v.mp4": ["render", "MODEL", "--out", "OUT"],
+    "frames": ["render", "MODEL", "--out", "OUT"],
+    "one.png": ["render", "MODEL", "--frame", "1", "--out", "OUT"],
+    "stable.webp": ["stabilize", "MODEL", "--out", "OUT"],
+    "plate.mp4": ["plate", "MODEL", "--masks", "MASK", "--out", "OUT"],
+    "masks": ["plate", "MODEL", "--masks", "MASK", "--out", "plate.mp4", "--save-masks", "OUT"],
+    "edited.safetensors": ["edit", "MODEL", "SCRIPT", "--out", "OUT"],
+    "edited.mp4": ["edit", "MODEL", "SCRIPT", "--out", "OUT"],
+    "m.fgz": ["compress", "MODEL", "--out", "OUT"],
+    "half.safetensors": ["compress", "MODEL", "--float16", "--out", "OUT"],
+    "p.html": ["export", "MODEL", "--format", "html", "--out", "OUT"],
+    "m.ply": ["export", "MODEL", "--format", "ply", "--out", "OUT"],
+    "scenes": ["export", "MODEL", "--format", "ply3dgs", "--out", "OUT"],
+    "mesh": ["export", "MODEL", "--format", "obj", "--out", "OUT"],
+    "between.png": ["figure", "interpolation", "MODEL", "--out", "OUT"],
+    "rows.png": ["figure", "reconstruction", "MODEL", "CLIP", "--out", "OUT"],
+    "s.json": ["evaluate", "MODEL", "CLIP", "--json", "OUT"],
+}
+
+
+@pytest.fixture
+def full(tmp_path, monkeypatch):
+    """A folder on a full disk, and another for temporary files."""
+    (tmp_path / "full").mkdir()
+    (tmp_path / "temporary").mkdir()
+    replace = os.replace
+
+    def replace_outside(source, target):
+        if Path(target).parent == tmp_path / "full":
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        replace(source, target)
+
+    monkeypatch.setattr("os.replace", replace_outside)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "full"
+
+
+def write_to_full(name, work, full):
+    """The exit code of the command that writes this file."""
+    write_image(full.parent / "mask.png", np.full((4, 4, 3), 255, np.uint8))
+    (full.parent / "s.toml").write_text('[[edits]]\ndo = "recolor"\ngain = 0.5\n')
+    inputs = {"CLIP": work / "clip.mp4", "MODEL": work / "a" / "b" / "m.safetensors", "OUT": full / name}
+    inputs |= {"MASK": full.parent / "mask.png", "SCRIPT": full.parent / "s.toml"}
+    return run(*(inputs.get(word, word) for word in WRITING[name]))
+
+
+@pytest.mark.parametrize("name", WRITING)
+def test_a_result_for_a_full_disk_is_kept(name, work, full, monkeypatch, capsys):
+    monkeypatch.setattr("typer.prompt", lambda *words, **options: pytest.fail("asked without a terminal"))
+    assert write_to_full(name, work, full) == 1
+    (kept,) = full.parent.glob(f"temporary/*/{name}")
+    last = capsys.readouterr().err.strip().splitlines()[-1]
+    assert last.startswith("error: ")
+    assert f"It is kept in {kept}" in last
+    assert not (full / name).exists()
+
+
+@pytest.mark.parametrize("name", WRITING)
+def test_on_a_terminal_another_place_is_asked_for(name, work, full, monkeypatch, capsys):
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
+    monkeypatch.setattr("typer.prompt", lambda *words, **options: str(full.parent))
+    assert write_to_full(name, work, full) == 0
+    assert (full.parent / name).exists()
+    assert "No space left on device" in capsys.readouterr().err
+    assert not any((full.parent / "temporary").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("answer", "path"),
+    [
+        ("", None),
+        ("taken.mp4", None),
+        ("new.MP4", "new.MP4"),
+        ("new", "new/v.mp4"),
+        (".", "v.mp4"),
+        (typer.Abort(), None),
+    ],
+)
+def test_answers_about_another_place(answer, path, tmp_path, monkeypatch):
+    def prompt(*words, **options):
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    monkeypatch.chdir(tmp_path)
+    Path("taken.mp4").touch()
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
+    monkeypatch.setattr("typer.prompt", prompt)
+    assert ask_output(Path("full/v.mp4"), OSError("full")) == (path and Path(path))
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["info", "PIPE"],
+        ["view", "PIPE"],
+        ["render", "PIPE"],
+        ["export", "PIPE", "--format", "html"],
+        ["uncertainty", "PIPE", "CLIP"],
+        ["evaluate", "MODEL", "PIPE"],
+        ["fit", "PIPE"],
+        ["edit", "MODEL", "PIPE"],
+        ["plate", "MODEL", "--masks", "PIPE"],
+        ["render", "MODEL", "--sound", "PIPE"],
+        ["import", "PIPE"],
+    ],
+    ids=" ".join,
+)
+def test_a_pipe_is_refused_before_it_is_opened(words, work, model, tmp_path, monkeypatch, capsys):
+    """To open it would wait for a program that writes to it."""
+    pipe, read = tmp_path / "pipe.png", open
+    os.mkfifo(pipe)
+
+    def open_other(path, *arguments, **options):
+        assert str(path) != str(pipe), "opened"
+        return read(path, *arguments, **options)
+
+    monkeypatch.setattr("builtins.open", open_other)
+    monkeypatch.setattr("io.open", open_other)
+    monkeypatch.chdir(tmp_path)
+    inputs = {"PIPE": pipe, "MODEL": model, "CLIP": work / "clip.mp4"}
+    assert run(*(inputs.get(word, word) for word in words)) in (1, 2)
+    assert str(pipe) in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["fit", "LOOP"], ["compress", "LOOP"], ["edit", "MODEL", "LOOP"], ["plate", "LOOP"]])
+def test_a_link_to_itself_is_told(words, model, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("loop").symlink_to("loop")
+    assert run(*({"LOOP": "loop", "MODEL": model}.get(word, word) for word in words)) == 2
+    assert "got 'loop', which cannot be reached (Too many levels of symbolic links)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["fit", ""], ["render", "m.safetensors", "--out", ""], ["render", "m", "--out="]])
+def test_an_empty_argument_is_not_the_current_folder(words, tmp_path, monkeypatch, capsys):
+    """As of a shell variable that is not set."""
+    monkeypatch.chdir(tmp_path)
+    write_image("0.png", np.zeros((8, 8, 3), np.uint8))
+    assert run(*words) == 2
+    assert "arguments: expected a value for each, got an empty one" in capsys.readouterr().err
+    assert os.listdir() == ["0.png"]
+
+
+@pytest.mark.parametrize("words", [["fit-many", "LONG"], ["render", "MODEL", "--out", "LONG"]])
+def test_an_error_of_the_system_is_told_as_others(words, model, capsys):
+    assert run(*({"LONG": 300 * "x", "MODEL": model}.get(word, word) for word in words)) == 1
+    assert "error: path: expected one that can be used, got 'xxx" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["plate", "MODEL", "--masks", "MASK"], ["edit", "MODEL", "SCRIPT"]])
+def test_a_rate_too_high_for_a_gif_is_told_without_an_option_for_it(words, model, tmp_path, capsys):
+    fast = dataclasses.replace(load_video_model(model), fps=60.0)
+    inputs = {"MODEL": save_video_model(tmp_path / "fast.safetensors", fast)}
+    inputs["MASK"] = write_image(tmp_path / "mask.png", np.full((4, 4, 3), 255, np.uint8))
+    inputs["SCRIPT"] = tmp_path / "s.toml"
+    inputs["SCRIPT"].write_text('[[edits]]\ndo = "recolor"\ngain = 0.5\n')
+    assert run(*(inputs.get(word, word) for word in words), "--out", tmp_path / "x.gif") == 2
+    assert "--out: expected at most 50 frames per second in it, got 60 for" in capsys.readouterr().err
+
+
+def test_a_folder_with_other_files_is_refused_and_nothing_is_exported(model, full, capsys):
+    (full / "notes.txt").touch()
+    assert run("export", model, "--format", "obj", "--out", full) == 1
+    assert "got" in (told := capsys.readouterr().err)
+    assert "It is kept" not in told
+    assert not any((full.parent / "temporary").iterdir())

@@ -47,6 +47,28 @@ def test_scripts_select_what_moves(model, tmp_path, capsys):
     assert load_video_model(tmp_path / "gone.safetensors").num_gaussians == wanted.num_gaussians
 
 
+@pytest.mark.parametrize("command", ["edit", "plate"])
+def test_masks_as_stored_are_those_of_the_stretched_clip(command, tmp_path):
+    """Of a clip with pixels twice as wide as high; a model file names both sizes."""
+    height, width = MODEL.size
+    about = {"stretched": ((height, width // 2), MODEL.size)}
+    save_video_model(tmp_path / "m.safetensors", MODEL, metadata=about)
+    mask = np.repeat(np.uint8(255 * MASKS[0])[..., None], 3, -1)
+    write_image(tmp_path / "shown.png", mask)
+    write_image(tmp_path / "stored.png", np.ascontiguousarray(mask[:, ::2]))
+    made = []
+    for name in ("shown", "stored"):
+        script, target = tmp_path / f"{name}.toml", tmp_path / f"{name}-{command}"
+        words = (
+            [script, "--out", target] if command == "edit" else ["--masks", tmp_path / f"{name}.png", "--out", target]
+        )
+        script.write_text(f'[selections.it]\nmask = "{name}.png"\nframe = 2\n[[edits]]\nselect = "it"\ndo = "vanish"\n')
+        assert run(command, tmp_path / "m.safetensors", *words) == 0
+        made.append(read_video(target).frames)
+    assert (made[0] != np.stack(list(MODEL.frames()))).any()
+    np.testing.assert_array_equal(*made)
+
+
 def test_scripts_say_where_nothing_moves(model, tmp_path, monkeypatch, capsys):
     def search(frames, **options):
         raise nothing_moves("an object that moves against the background", "none")
@@ -59,18 +81,18 @@ def test_scripts_say_where_nothing_moves(model, tmp_path, monkeypatch, capsys):
         parse_edit_script(SCRIPT.replace("true", "false"))
     with pytest.raises(NothingMoves):
         edit(MODEL).select(moving=True)
-    assert run("plate", model, "--out", tmp_path / "images") == 1
+    assert run("plate", model, "--out", tmp_path / "images") == 2
     told = capsys.readouterr().err
-    assert "moving: expected an object that moves against the background, got none." in told
+    assert "MODEL: expected an object that moves against the background, got none." in told
     assert "Give masks of the object by --masks, or remove it by foldgauss edit" in told
     assert not list(tmp_path.iterdir())
 
 
 def test_too_few_frames_are_refused_before_the_search(tmp_path, capsys):
     save_video_model(tmp_path / "m.safetensors", soft_model(num_frames=2))
-    assert run("plate", tmp_path / "m.safetensors", "--out", tmp_path / "images") == 1
+    assert run("plate", tmp_path / "m.safetensors", "--out", tmp_path / "images") == 2
     told = capsys.readouterr()
-    assert "moving: expected a video of 3 frames at least, got 2. Fit more frames" in told.err
+    assert "MODEL: expected at least 3 frames, got 2. Fit more frames" in told.err
     assert "Searching" not in told.out
     with pytest.raises(NothingMoves, match=r"moving: expected a video of 3 frames at least, got 2\. Select by a mask"):
         edit(soft_model(num_frames=2)).select(moving=True)

@@ -56,7 +56,7 @@ def test_options_reach_the_video(model, tmp_path, monkeypatch, capsys):
         (["--crf", "99"], "--crf: expected"),
         (["--background", "none"], "frames: expected RGB for h264 in .mp4"),
         (["--background", "none", "--out", "x.gif"], "--background: expected a color for .gif, got none"),
-        (["--fps", "60", "--out", "x.gif"], "--fps: expected at most 50 frames per second, got 60"),
+        (["--fps", "60", "--out", "x.gif"], "--out: expected at most 50 frames per second in it, got 60 for x.gif"),
         (["--out", "x.png"], "--out: expected"),
         (["--size", "0x3"], "--size: expected HxW"),
     ],

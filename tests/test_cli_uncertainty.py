@@ -1,7 +1,9 @@
 """`foldgauss uncertainty`: what it leaves, what it refuses, and that a killed run loses nothing."""
 
 import csv
+import errno
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -113,6 +115,23 @@ def test_a_finished_run_says_so_and_others_are_kept(work, done, capsys, no_pictu
         assert (done / "frame_times.csv").read_bytes() == table
         assert (done / "chains.h5").read_bytes() == before
     assert {path.name for path in done.iterdir()} == FILES
+
+
+def test_tables_for_a_full_disk_are_kept(work, done, tmp_path, capsys, monkeypatch, no_pictures):
+    target, replace = tmp_path / "short", os.replace
+    shutil.copytree(done, target)
+
+    def replace_outside(source, place):
+        if Path(place).parent == target and Path(place).name != "chains.h5":
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        replace(source, place)
+
+    monkeypatch.setattr("os.replace", replace_outside)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert run(*arguments(work, target, *SHORT)) == 1
+    (kept,) = tmp_path.glob("foldgauss-*/short")
+    assert f"It is kept in {kept}" in " ".join(capsys.readouterr().err.split())
+    assert table_of(kept) == table_of(done)
 
 
 @pytest.mark.slow

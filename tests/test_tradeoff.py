@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import errno
 import json
 import math
 import os
@@ -359,6 +360,30 @@ def test_motion_is_found_once_and_counted_in_every_fit(clip, tmp_path, monkeypat
     assert record["plan"]["pace"]["start"] < spent  # what it takes is not planned for in every fit
     assert all(row["seconds"] > spent for row in record["points"])
     assert all(row["cpu_seconds"] > record["plan"]["motion"]["cpu"] for row in record["points"])
+
+
+@pytest.mark.parametrize(("name", "writes"), [("tradeoff.json", 3), ("tradeoff.csv", 1)])  # the last point, the table
+def test_points_for_a_full_disk_are_kept(clip, tmp_path, capsys, monkeypatch, name, writes):
+    target, count, replace = tmp_path / "results", [], os.replace
+
+    def replace_until_full(source, place):
+        if Path(place) == target / name:
+            count.append(place)
+        if len(count) >= writes and Path(place).parent == target:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        replace(source, place)
+
+    monkeypatch.setattr("os.replace", replace_until_full)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert run("tradeoff", clip, "--out", target, "--axes", "compositing", *QUICK) == 1
+    told = " ".join(capsys.readouterr().err.split())
+    assert f"The points before it are kept in {target / 'tradeoff.json'}: the same command continues." in told
+    monkeypatch.setattr("os.replace", replace)
+    for elsewhere in tmp_path.glob("foldgauss-*/tradeoff.json"):
+        assert str(elsewhere) in told
+        replace(elsewhere, target / elsewhere.name)
+    monkeypatch.setattr(command._Run, "_fit_model", lambda *given: pytest.fail("fitted again"))
+    assert run("tradeoff", clip, "--out", target, "--axes", "compositing", *QUICK) == 0
 
 
 def test_stopped_by_hand(clip, tmp_path, capsys, monkeypatch):

@@ -9,10 +9,12 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TypeVar
 
 from foldgauss._runtime.checks import invalid, short_repr
 
 PathLike = str | os.PathLike
+Result = TypeVar("Result")
 #: Characters of an output's name that the name of its temporary file repeats.
 KEPT = 40
 #: Errors that free space cures: a full disk, a quota, a limit on the size of files.
@@ -23,6 +25,10 @@ OWNED: set[Path] = set()
 
 class OutputError(OSError):
     """An output path cannot be written; the one-line message says how to correct it."""
+
+
+class OutputRefused(OutputError):
+    """An existing output must not be replaced; found before any work is done."""
 
 
 def check_path(path: object, order: str = "") -> Path:
@@ -37,8 +43,33 @@ def missing_error(path: PathLike, expected: str) -> FileNotFoundError:
     if address := re.fullmatch("([A-Za-z][A-Za-z0-9+.-]+):/+(.*)", str(path)):  # of whose slashes Path keeps one
         got = repr("://".join(address.groups()))
         return FileNotFoundError(f"path: expected {expected}, got the address {got}. Download it first.")
-    text = f"path: expected {expected}, got {str(path)!r}, which is missing."
+    text = f"path: expected {expected}, got {str(path)!r}, {describe_missing(path)}."
     return FileNotFoundError(f"{text} Check the spelling and the current folder.")
+
+
+def describe_missing(path: PathLike) -> str:
+    """Why a path does not exist for this process, as "which is missing"."""
+    try:
+        os.stat(path)
+    except (FileNotFoundError, NotADirectoryError, ValueError):
+        return "which is missing"
+    except OSError as error:  # in a folder without permission, a link to itself, a name that is too long
+        return f"which cannot be reached ({error.strerror})"
+    return "which is missing"  # it has come meanwhile
+
+
+def check_input(path: Path, expected: str) -> None:
+    """Raise FileNotFoundError for an input that is missing, ValueError for a pipe or a device: opening may not end."""
+    if not os.path.exists(path):
+        raise missing_error(path, expected)
+    if not (os.path.isfile(path) or os.path.isdir(path)):
+        got = f"{str(path)!r}, a pipe or a device"
+        raise invalid("path", expected=expected, got=got, cure="Save its output to a file.")
+
+
+def resolve(path: PathLike) -> Path:
+    """The absolute path without symbolic links; unlike Path.resolve() also of a link to itself."""
+    return Path(os.path.realpath(path))
 
 
 def _check_target(path: Path) -> None:
@@ -138,23 +169,35 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def write_or_keep(path: Path, write: Callable[[Path], object]) -> None:
-    """Write the result of a long computation by `write(path)`; if that fails, to the folder for temporary files.
+def write_or_keep(
+    path: Path, write: Callable[[Path], Result], ask: Callable[[Path, OSError], Path | None] = lambda path, error: None
+) -> Result:
+    """Write the result of a long computation by `write(path)`; if that fails, to the path that `ask` returns; if there
+    is none, or it fails, too, to the folder for temporary files. Returns what `write` does.
 
-    Raises `OutputError`, which says where the result is, if it is not at `path`.
+    Raises `OutputError`, which says where the result is, if it is in the folder for temporary files; and
+    `OutputRefused` as `write(path)`.
     """
     try:
-        write(path)
+        return write(path)
+    except OutputRefused:
+        raise
     except OSError as error:
-        folder = None
+        failure = error
+    if another := ask(path, failure):
         try:
-            folder = Path(tempfile.mkdtemp(prefix="foldgauss-"))
-            write(folder / path.name)
-        except OSError:
-            if folder is not None:
-                shutil.rmtree(folder, ignore_errors=True)
-            raise OutputError(f"{error} In the folder for temporary files, too: the result is lost.") from error
-        raise OutputError(f"{error} It is kept in {folder / path.name}: move it to a place of yours.") from error
+            return write(another)
+        except OSError as error:
+            failure = error
+    folder = None
+    try:
+        folder = Path(tempfile.mkdtemp(prefix="foldgauss-"))
+        write(folder / path.name)
+    except OSError:
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise OutputError(f"{failure} In the folder for temporary files, too: the result is lost.") from failure
+    raise OutputError(f"{failure} It is kept in {folder / path.name}: move it to a place of yours.") from failure
 
 
 @contextmanager
@@ -167,7 +210,7 @@ def atomic_folder(folder: PathLike, overwrite: bool = False, *, pattern: str, wh
 
     Missing parents are made. Raises `OutputError` if the folder is refused, or its parent is not writable.
     """
-    given, folder = Path(folder), Path(folder).resolve()
+    given, folder = Path(folder), resolve(folder)
     check_replaceable(given, overwrite, pattern=pattern, what=what)
     _check_target(folder)
     temporary, aside = temporary_name(folder, ""), temporary_name(folder, "")
@@ -177,7 +220,10 @@ def atomic_folder(folder: PathLike, overwrite: bool = False, *, pattern: str, wh
         with _name_output(folder, temporary):
             yield temporary
         try:
-            check_replaceable(given, overwrite, pattern=pattern, what=what)
+            try:
+                check_replaceable(given, overwrite, pattern=pattern, what=what)
+            except OutputRefused as refusal:  # of what has come meanwhile
+                raise OutputError(str(refusal)) from refusal
             if folder.exists():
                 os.replace(folder, aside)
             os.replace(temporary, folder)
@@ -191,21 +237,21 @@ def atomic_folder(folder: PathLike, overwrite: bool = False, *, pattern: str, wh
 
 
 def check_replaceable(folder: Path, overwrite: bool, *, pattern: str, what: str = "frames") -> None:
-    """Raise `OutputError` unless `atomic_folder` may replace `folder`."""
+    """Raise `OutputRefused` unless `atomic_folder` may replace `folder`."""
     if not os.path.exists(folder):
         return
     if not folder.is_dir():
-        raise OutputError(f"path: expected a folder for {what}, got the file {str(folder)!r}. Choose another name.")
+        raise OutputRefused(f"path: expected a folder for {what}, got the file {str(folder)!r}. Choose another name.")
     with translate_output_errors(folder):
         names = [entry.name for entry in folder.iterdir()]
     foreign = [name for name in names if not re.fullmatch(pattern, name)]
     if foreign:
-        raise OutputError(
+        raise OutputRefused(
             f"path: expected an empty folder or one of numbered {what}, got {str(folder)!r} with "
             f"{min(foreign)!r} in it. Choose another folder."
         )
     if names and not overwrite:
-        raise OutputError(
+        raise OutputRefused(
             f"path: expected a new or empty folder, got {str(folder)!r} with {len(names)} {what}. "
             "Choose another folder, or allow overwriting."
         )

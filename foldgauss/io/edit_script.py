@@ -28,14 +28,14 @@ from collections import deque
 from collections.abc import Callable, Collection, Mapping
 from functools import reduce
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.io._atomic import PathLike
+from foldgauss.io._atomic import PathLike, describe_missing, resolve
 from foldgauss.io._toml_lines import key_lines
-from foldgauss.io.media.clip import Range
 from foldgauss.io.media.masks import read_masks
 from foldgauss.io.models.selections import load_selection, parse_indices, parse_ranges
 from foldgauss.io.models.video_model import load_video_model, read_origin
@@ -232,18 +232,18 @@ class EditScript:
             self._path(table[key]) for table in tables for key in ("mask", "file", "model", "script") if key in table
         ]
 
-    def apply(self, video: Video, frames: Range | None = None) -> Video:
+    def apply(self, video: Video, origin: Mapping[str, Any] = MappingProxyType({})) -> Video:
         """The edited video: a plain `VideoModel` if all edits could be baked; segmented if `video` is.
 
-        `frames`: the range of its clip that the video shows, as its file names it; masks of the whole clip are cut to
-        it.
+        `origin`: the metadata of its file, as `read_metadata` returns them: `frames`, the range of its clip that the
+        video shows, to which masks of the whole clip are cut, and `stretched`, as of `read_masks`.
 
         **Raises:** `EditScriptError`, with the line, for values that the edits refuse and files that cannot be read.
         """
         edits, named = edit(video), {}
         for name, table in self.tables.get("selections", {}).items():
             with self._context("selections", name, path="file" if "file" in table else "mask"):
-                named[name] = self._select(video, table, named, frames)
+                named[name] = self._select(video, table, named, origin)
         for number, table in enumerate(self.tables.get("edits", ())):
             context = self._context("edits", number, **{ACTIONS[table["do"]].angle: "degrees"})
             with context:
@@ -258,7 +258,7 @@ class EditScript:
         return video
 
     def _select(
-        self, video: Video, table: dict[str, Any], named: dict[str, Selected], frames: Range | None
+        self, video: Video, table: dict[str, Any], named: dict[str, Selected], origin: Mapping[str, Any]
     ) -> Selected:
         if table.keys() & _COMBINATION.keys():
             return _combine(table, named)
@@ -273,7 +273,8 @@ class EditScript:
             return found & edit(video).select(**criteria).selection if criteria else found
         if "mask" in criteria:
             options = {key: criteria.pop(key) for key in _MASK_FILE.keys() & criteria.keys()}
-            masks = read_masks(self._path(criteria["mask"]), **options, size=video.size)
+            options |= {"size": video.size, "stretched": origin.get("stretched")}
+            masks, frames = read_masks(self._path(criteria["mask"]), **options), origin.get("frames")
             if masks.ndim == 3 and frames is not None and len(masks) != video.num_frames:
                 shown = masks[slice(*frames)]  # of masks of the whole clip
                 masks = shown if len(shown) == video.num_frames else masks
@@ -306,11 +307,11 @@ class EditScript:
         other: Video = load_video_model(file := self._path(table["model"]))
         if "script" in table:
             path = self._path(table["script"])
-            if path.resolve() in self._includes:
+            if resolve(path) in self._includes:
                 raise invalid("script", expected="a script that does not include itself", got=repr(table["script"]))
             script = read_edit_script(path)
             script = dataclasses.replace(script, _includes=script._includes + self._includes)
-            other = script.apply(other, read_origin(file).get("frames"))
+            other = script.apply(other, read_origin(file))
         return edit(other).freeze(table["freeze"]).video() if "freeze" in table else other
 
     def _path(self, given: str) -> Path:
@@ -329,7 +330,7 @@ def read_edit_script(path: PathLike) -> EditScript:
     """
     path = Path(path)
     if not os.path.exists(path):
-        raise FileNotFoundError(f"script: expected a TOML file, got {str(path)!r}, which is missing.")
+        raise FileNotFoundError(f"script: expected a TOML file, got {str(path)!r}, {describe_missing(path)}.")
     if not path.is_file():
         raise EditScriptError(f"{path}: expected a TOML file, got a folder or a device.")
     if path.stat().st_size > MAX_BYTES:
@@ -343,7 +344,7 @@ def read_edit_script(path: PathLike) -> EditScript:
     except OSError as error:
         raise EditScriptError(f"{path}: expected a file that can be read, got {error}.") from error
     script = parse_edit_script(text, source=str(path), folder=path.parent)
-    return dataclasses.replace(script, _includes=(path.resolve(),))
+    return dataclasses.replace(script, _includes=(resolve(path),))
 
 
 def parse_edit_script(text: str, *, source: str = "script", folder: PathLike = ".") -> EditScript:

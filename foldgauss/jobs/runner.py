@@ -17,6 +17,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 
 from foldgauss import __version__
+from foldgauss._runtime.machine import waiting_seconds
 from foldgauss.io._atomic import OutputError, atomic_path, write_or_keep
 from foldgauss.io._lock import lock_output
 from foldgauss.io.media.clip import Clip
@@ -28,7 +29,7 @@ from foldgauss.io.models.video_model import save_video_model
 from foldgauss.io.provenance import describe_reading, describe_source, fingerprint
 from foldgauss.jobs.job import FitJob, file_digest, read_record
 from foldgauss.jobs.warning_capture import WarningCapture
-from foldgauss.video.fitting.config import FitConfig, expected_steps
+from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.divergence import FitDiverged
 from foldgauss.video.fitting.loop import FitInfo, fit_steps
 from foldgauss.video.fitting.state import FitState, to_model
@@ -39,8 +40,8 @@ from foldgauss.video.models.video_model import VideoModel
 CHECKPOINT_SECONDS, REPORT_SECONDS = 30.0, 1.0
 #: Seconds that a job waits for another one of the same target: a worker that is believed dead may be about to finish.
 WAIT_SECONDS = 60.0
-#: A fraction of the expected steps below which a fit by minutes warns.
-FEW_STEPS = 0.5
+#: A fraction of the processor time that its threads asked for, below which a fit by minutes warns.
+LEAST_PROCESSOR_FRACTION = 0.5
 #: Number of clip shapes whose compiled programs are kept.
 MAX_SHAPES = 8
 
@@ -113,13 +114,11 @@ class FitRun:
         metadata |= {} if scores is None else mean_scores(scores)
         save_video_model(self.job.target, self.model, metadata=metadata)
 
-    def save_or_keep(self, scores: Evaluation | None = None) -> None:
-        """Write the model, elsewhere if it cannot be written to its target, as `write_or_keep`."""
-
-        def save(path: Path) -> None:
-            dataclasses.replace(self, job=dataclasses.replace(self.job, target=str(path))).save(scores)
-
-        write_or_keep(Path(self.job.target), save)
+    def save_to(self, path: Path, scores: Evaluation | None = None) -> "FitRun":
+        """Write the model to `path`; returns the run with that as its target."""
+        moved = dataclasses.replace(self, job=dataclasses.replace(self.job, target=str(path)))
+        moved.save(scores)
+        return moved
 
 
 def run_fit(
@@ -159,15 +158,19 @@ def run_steps(
 
     Raises as `run_fit`.
     """
-    saved, before = time.monotonic(), time.process_time()
+    saved, spent, waited = time.monotonic(), time.process_time(), waiting_seconds()
     try:
         for state, info in steps:
-            now = time.process_time()
-            state.processor_seconds, before = state.processor_seconds + now - before, now
             stop = observe(state, info) and info.progress < 1
             due = time.monotonic() - saved > (CHECKPOINT_SECONDS if seconds is None else seconds)
-            if checkpoint is not None and (stop or due):
-                checkpoint.try_save(state)
+            if stop or due or info.progress >= 1:
+                now = time.process_time(), waiting_seconds()
+                state.processor_seconds += now[0] - spent
+                state.waiting_seconds += max(now[1] - waited, 0.0)  # threads that have ended are not counted
+                spent, waited = now
+            if stop or due:
+                if checkpoint is not None:
+                    checkpoint.try_save(state)
                 saved = time.monotonic()
             if stop:
                 raise Stopped(f"stopped after step {info.step}")
@@ -204,12 +207,13 @@ def fit_metadata(clip: Clip, seed: int, frames: tuple[int | None, int | None] | 
 
 def describe_fit(config: FitConfig, state: FitState) -> dict[str, Any]:
     """Metadata of how a model was fitted: version, budgets and steps; with `minutes`, which make fits differ with the
-    load of the machine, also the seconds spent and those of its processors."""
+    load of the machine, also the seconds spent, those of its processors, and those of waiting for them."""
     budgets = {name: getattr(config, name) for name in ("steps", "minutes", "target_psnr")}
     about = {"version": __version__, "steps": state.step}
     about["budget"] = {name: value for name, value in budgets.items() if value is not None}
     if config.minutes is not None:
-        about |= {"fit_seconds": round(state.seconds, 2), "processor_seconds": round(state.processor_seconds, 2)}
+        about |= {"fit_seconds": round(state.seconds, 2)}
+        about |= {name: round(getattr(state, name), 2) for name in ("processor_seconds", "waiting_seconds")}
     return about
 
 
@@ -317,7 +321,10 @@ def _fit_and_record(job: FitJob, report: Report) -> dict[str, Any]:
     run.save_checkpoint()  # the evaluation may be interrupted
     clip, info = run.clip, run.info
     scores = evaluate(run.model, clip.frames)
-    run.save(scores) if job.checkpoint.exists() else run.save_or_keep(scores)
+    if job.checkpoint.exists():
+        run.save(scores)
+    else:
+        write_or_keep(Path(job.target), lambda path: run.save_to(path, scores))
     record = {
         "asked": job.request,
         "num_frames": clip.num_frames,
@@ -337,7 +344,7 @@ def _fit_and_record(job: FitJob, report: Report) -> dict[str, Any]:
             *(clip.notes if job.index is None else ()),
             *dict.fromkeys(caught),
             *missed_psnr(job.config, scores.mean_psnr, info),
-            *few_steps(run),
+            *busy_processors(run),
         ],
     }
     with atomic_path(job.record) as temporary:
@@ -353,15 +360,15 @@ def missed_psnr(config: FitConfig, mean_psnr: float, info: FitInfo) -> list[str]
     return [f"{config.economy.psnr:g} dB was not reached, got {mean_psnr:.2f} dB after {info.step:,} steps."]
 
 
-def few_steps(run: FitRun) -> list[str]:
-    """A warning if the minutes gave far fewer steps than they are expected to, in a list that is otherwise empty."""
-    expected, info = expected_steps(run.job.config, *run.clip.size), run.info
-    if info.stopped_by != "minutes" or info.step >= FEW_STEPS * expected:
+def busy_processors(run: FitRun) -> list[str]:
+    """A warning if a fit by minutes waited for processors longer than it computed; otherwise no text."""
+    got = run.state.processor_seconds
+    asked = got + run.state.waiting_seconds
+    if run.info.stopped_by != "minutes" or got >= LEAST_PROCESSOR_FRACTION * asked:
         return []
     return [
-        f"{run.job.config.minutes:g} minutes gave {info.step:,} of about {expected:,.0f} expected steps, too few for "
-        f"{run.model.num_gaussians:,} Gaussians, as on a busy or slow machine. Give more --minutes, fewer "
-        "--max-gaussians, or a quieter machine."
+        f"the processors were busy: this fit got {got:,.1f} of the {asked:,.1f} processor seconds that its threads "
+        f"asked for, and took {run.info.step:,} steps. Give more --minutes, or use a quieter machine."
     ]
 
 

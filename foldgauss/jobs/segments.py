@@ -84,7 +84,7 @@ class LongFit:
     def _describe_fits(self) -> dict[str, Any]:
         """The metadata of `describe_fit`, with the sums of the segments."""
         each = [read_metadata(job.target) for job in self.jobs]
-        summed = [name for name in ("steps", "fit_seconds", "processor_seconds") if name in each[0]]
+        summed = [name for name in ("steps", "fit_seconds", "processor_seconds", "waiting_seconds") if name in each[0]]
         return keep_origin(each[0], "version", "budget") | {name: sum(one[name] for one in each) for name in summed}
 
     def _score_fades(self, video: SegmentedVideo, fades, psnr_of, ssim_of, on_frame) -> None:

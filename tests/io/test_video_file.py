@@ -339,7 +339,7 @@ def test_values_of_fewer_bits_in_images_of_16(tmp_path, kind, bits):
     np.testing.assert_array_equal(read_indexed(index, 0, 1).frames, clip.frames[:1])
     assert (clip.notes, clip.reading.levels, index.reading.levels) == ((), white, white)
     told = f"the largest value is {white:,} of 65,535, as in data of {bits} bits, which look dark; "
-    told += f"levels={white} (--levels {white}) makes {white} white."
+    told += f"levels={white} (foldgauss fit --levels {white}) makes {white} white."
     notes = read_video(path).notes
     assert notes == index_video(path).notes == (() if bits == 16 else (told,))
     if bits > 8:

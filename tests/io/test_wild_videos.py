@@ -399,7 +399,7 @@ def test_levels_of_a_video_of_16_bits(tmp_path, bits, pixel_format):
     np.testing.assert_array_equal(read_indexed(index, 3, 6).frames, truth[3:6])
     assert (whole.notes, index.notes, index.reading) == ((), (), ("frames", white))
     notes = read_video(path).notes
-    assert notes == () if bits == 16 else f"levels={white} (--levels {white})" in notes[0]
+    assert notes == () if bits == 16 else f"levels={white} (foldgauss fit --levels {white})" in notes[0]
 
 
 @pytest.mark.parametrize("pixel_format", ["gray10le", "gray12le", "gbrp12le"])
@@ -482,6 +482,7 @@ def _as_ycbcr(signal, bits, limited):
         ("yuv420p10le", 9, False, True),
         ("yuv420p12le", 9, True, True),
         ("yuv444p10le", 9, True, True),
+        *((f"gray{bits}le", 9, limited, True) for bits in (10, 12, 16) for limited in (True, False)),
     ],
 )
 def test_hdr_is_tone_mapped(tmp_path, transfer, kind, primaries, limited, declared):
@@ -490,11 +491,14 @@ def test_hdr_is_tone_mapped(tmp_path, transfer, kind, primaries, limited, declar
     signal[0] = np.linspace(0, 1, 8)[:, None]
     signal[1, :3] = 0.7 * np.eye(3)
     signal = signal.repeat(8, 0).repeat(8, 1)
-    if kind.startswith("yuv"):
-        planes, signal = _as_ycbcr(signal, int(kind[7:9]), limited)
+    if kind.startswith("gray"):
+        signal[...] = signal[..., :1]
+    if kind.startswith(("yuv", "gray")):
+        planes, signal = _as_ycbcr(signal, int(kind.removesuffix("le")[-2:]), limited)
         side = 2 if "420" in kind else 1
         frame = av.VideoFrame(64, 48, kind)
-        for plane, codes in zip(frame.planes, (planes[0], *(one[::side, ::side] for one in planes[1:])), strict=True):
+        sampled = [planes[0], *(one[::side, ::side] for one in planes[1:])][: len(frame.planes)]
+        for plane, codes in zip(frame.planes, sampled, strict=True):
             rows = np.zeros((plane.height, plane.line_size // 2), np.uint16)
             rows[:, : plane.width] = codes
             plane.update(rows.tobytes())
@@ -512,6 +516,8 @@ def test_hdr_is_tone_mapped(tmp_path, transfer, kind, primaries, limited, declar
         out.mux(stream.encode(frame))
         out.mux(stream.encode(None))
     frames = read_video(tmp_path / "a.mkv").frames.astype(float)
+    with pytest.raises(VideoError, match=r"levels: expected .*, got HDR, whose tone mapping defines white"):
+        read_video(tmp_path / "a.mkv", levels=4095)
     if transfer == "PQ":
         grid = 10_000 * np.linspace(0, 1, 200_001) ** 4
         light = np.interp(signal, _pq(grid), grid)
@@ -714,8 +720,8 @@ def test_interlaced_is_refused_or_converted(tmp_path, codec):
         read_video(tmp_path / "a.mkv", deinterlace="refuse")
     for chosen in (None, (2, 3)):
         clip = read_video(tmp_path / "a.mkv", frames=chosen)
-        told = "interlaced frames are converted to progressive ones, one of each; --deinterlace fields makes two."
-        assert clip.notes == (told,)
+        told = "interlaced frames are converted to progressive ones, one of each; "
+        assert clip.notes == (f"{told}foldgauss fit --deinterlace fields makes two.",)
         expected = frames[slice(*chosen) if chosen else ...]
         assert clip.frames.shape == expected.shape
         assert (clip.fps, clip.times) == (25, None)

@@ -21,8 +21,7 @@ from foldgauss.io._atomic import OutputError
 from foldgauss.io._lock import lock_output
 from foldgauss.jobs import FitJob, Stopped, fit_job
 from foldgauss.jobs.job import read_record
-from foldgauss.jobs.runner import few_steps
-from foldgauss.video.fitting.config import FitConfig
+from foldgauss.jobs.runner import busy_processors
 from foldgauss.video.fitting.economy import Economy
 
 NUM_FRAMES = 10
@@ -252,13 +251,27 @@ def test_the_largest_memory_is_that_of_the_process_alone():
     assert 2**26 < int(ran.stdout) < len(own) < fitting.peak_bytes()
 
 
-@pytest.mark.parametrize(("steps", "stopped_by", "told"), [(400, "minutes", 1), (600, "minutes", 0), (400, "steps", 0)])
-def test_minutes_that_give_far_fewer_steps_than_planned_are_told(steps, stopped_by, told, monkeypatch):
-    monkeypatch.setattr("foldgauss.video.fitting.config.num_threads", lambda: 2)
-    config = FitConfig(minutes=1.0, batch_size=1)  # 120 s of a core, of which a step takes 0.12 s: 1,000 steps
-    clip, info = SimpleNamespace(size=(300, 1000)), SimpleNamespace(step=steps, stopped_by=stopped_by)
-    run = SimpleNamespace(job=SimpleNamespace(config=config), clip=clip, info=info)
-    run.model = SimpleNamespace(num_gaussians=5000)
-    texts = few_steps(run)
+@pytest.mark.parametrize(("waited", "stopped_by", "told"), [(61, "minutes", 1), (59, "minutes", 0), (61, "steps", 0)])
+def test_a_fit_by_minutes_warns_where_other_programs_had_the_processors(waited, stopped_by, told):
+    state = SimpleNamespace(processor_seconds=60.0, waiting_seconds=float(waited))
+    texts = busy_processors(SimpleNamespace(state=state, info=SimpleNamespace(step=400, stopped_by=stopped_by)))
     assert len(texts) == told
-    assert all("400 of about 1,000 expected steps" in text and "5,000 Gaussians" in text for text in texts)
+    assert all("got 60.0 of the 121.0 processor seconds" in text and "400 steps" in text for text in texts)
+
+
+@pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="a file of Linux")
+def test_threads_that_share_a_processor_wait_and_a_sleeping_one_does_not():
+    """Four threads that compute without the GIL on one processor: each waits for the others most of the time."""
+    program = """
+import os, hashlib, time
+from concurrent.futures import ThreadPoolExecutor
+from foldgauss._runtime.machine import waiting_seconds
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+time.sleep(0.3)
+with ThreadPoolExecutor(4) as pool:
+    list(pool.map(lambda data: [hashlib.blake2b(data) for _ in range(150)], [bytes(1 << 20)] * 4))
+    print(time.process_time(), waiting_seconds())
+"""
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120)
+    spent, waited = map(float, ran.stdout.split())
+    assert waited > 1.2 * spent

@@ -1,10 +1,21 @@
 """Runs the command and converts errors into one line and an exit code."""
 
+import re
 import sys
 import warnings
 
+from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.interrupts import raise_on_sigterm
-from foldgauss.cli.app.application import Stopped, WrongUse, err, load_commands, name_option, root_command, warn
+from foldgauss.cli.app.application import (
+    Stopped,
+    WrongUse,
+    err,
+    load_commands,
+    name_option,
+    root_command,
+    warn,
+    wrong_use,
+)
 
 WRONG_USE, FAILURE = 2, 1
 
@@ -19,6 +30,9 @@ def _run(arguments: list[str] | None) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in arguments  # removed, so that it may be anywhere
     try:
+        if any(not argument or re.fullmatch("--[a-z-]+=", argument) for argument in arguments):
+            cure = "Leave it out, or set the shell variable that it stands for."  # a path would be the current folder
+            raise wrong_use("arguments", expected="a value for each", got="an empty one", cure=cure)
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
             root_command()([argument for argument in arguments if argument != "--debug"], prog_name="foldgauss")
@@ -27,7 +41,7 @@ def _run(arguments: list[str] | None) -> None:
             raise
         if isinstance(error, SystemError) and isinstance(error.__cause__, KeyboardInterrupt):
             error = error.__cause__  # Ctrl-C while a compiled kernel returned
-        text = " ".join(str(error).split()) or type(error).__name__
+        text = " ".join(_describe(error).split()) or type(error).__name__
         text = text.replace("allow overwriting", "add --overwrite")  # of folders
         option = name_option(text)
         if _names_option(text) and option.partition(":")[0] in arguments:
@@ -36,6 +50,18 @@ def _run(arguments: list[str] | None) -> None:
             text = f"{type(error).__name__}: {text[:300]} (--debug shows the traceback)"
         err.print(f"error: {text}", style="red", soft_wrap=True)
         sys.exit(_exit_code(error))
+
+
+def _describe(error: BaseException) -> str:
+    """The message of an error; that of the system about a path or a closed output as other errors have it."""
+    if not isinstance(error, OSError) or error.strerror is None:
+        return str(error)
+    if error.filename is None:
+        return f"output: expected one that can be written, got one that cannot ({error.strerror})."
+    cure = "Choose another, or change its permissions."
+    return str(
+        invalid("path", expected="one that can be used", got=f"{str(error.filename)!r} ({error.strerror})", cure=cure)
+    )
 
 
 def _show_warning(message: Warning | str, *where: object) -> None:

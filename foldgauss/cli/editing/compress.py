@@ -14,10 +14,10 @@ from foldgauss.cli.app.application import WrongUse, app, err, warn, wrong_use
 from foldgauss.cli.app.completion import complete_clips
 from foldgauss.cli.shared.arguments import FittedFrames, ModelFile, Overwrite
 from foldgauss.cli.shared.clips import is_other_clip, read_fitted_clip, refuse_segments
-from foldgauss.cli.shared.outputs import refuse_existing, refuse_inputs
+from foldgauss.cli.shared.outputs import refuse_existing, refuse_inputs, write_result
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import print_figures
-from foldgauss.io._atomic import check_writable, write_or_keep
+from foldgauss.io._atomic import check_writable, resolve
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.compact import COMPACT_SUFFIX, check_compact_name, save_compact
 from foldgauss.io.models.video_model import (
@@ -77,7 +77,7 @@ def compress_command(
     VIDEO, this is an estimate. See docs/compress.md.
     """
     suffix = f".float16{MODEL_SUFFIX}" if float16 else COMPACT_SUFFIX
-    target = Path(f"{model_path.resolve().stem}{suffix}") if out_path is None else out_path
+    target = Path(f"{resolve(model_path).stem}{suffix}") if out_path is None else out_path
     try:
         check_model_name(target, "--out") if float16 else check_compact_name(target, "--out")
     except ValueError as error:
@@ -105,9 +105,9 @@ def compress_command(
         got = f"{str(video)!r}, another clip"
         raise wrong_use("VIDEO", expected="the clip that the model was fitted to", got=got, cure=cure)
     if float16:
-        figures = _write_float16(target, model, about, clip)
+        target, figures = _write_float16(target, model, about, clip)
     else:
-        figures = _write_compressed(target, model, about, clip, max_loss_db, passes)
+        target, figures = _write_compressed(target, model, about, clip, max_loss_db, passes)
     before, after = model_path.stat().st_size, target.stat().st_size
     figures |= {
         "bytes_before": before,
@@ -120,11 +120,11 @@ def compress_command(
         warn(f"{target} is no smaller than {model_path}.")
 
 
-def save_compressed(target: Path, made: Compressed, about: dict[str, Any], *, known: bool = True) -> None:
+def save_compressed(target: Path, made: Compressed, about: dict[str, Any], *, known: bool = True) -> Path:
     """Write a compact file with the metadata `about`, and its PSNR if that is `known`."""
     about = keep_origin(about, *CLIP_NOTES, "frames_digest", "seed")
     about |= {"mean_psnr": round(made.psnr - made.loss_db, 3)} if known else {}
-    save_compact(target, made.quantized, metadata=about | {"loss_db": round(made.loss_db, 4)})
+    return save_compact(target, made.quantized, metadata=about | {"loss_db": round(made.loss_db, 4)})
 
 
 def save_float16(target: Path, model: VideoModel, about: dict[str, Any], score: Score | None) -> Evaluation | None:
@@ -139,19 +139,25 @@ def save_float16(target: Path, model: VideoModel, about: dict[str, Any], score: 
     return scores
 
 
-def _write_float16(target: Path, model: VideoModel, about: dict[str, Any], clip: Clip | None) -> dict[str, Any]:
+def _write_float16(
+    target: Path, model: VideoModel, about: dict[str, Any], clip: Clip | None
+) -> tuple[Path, dict[str, Any]]:
     def score(model: VideoModel) -> Evaluation:
         return evaluate_with_progress(model, clip.frames)
 
     before = None if clip is None else score(model)
-    scores = save_float16(target, model, about, None if clip is None else score)
+
+    def write(path: Path) -> tuple[Path, Evaluation | None]:
+        return path, save_float16(path, model, about, None if clip is None else score)
+
+    target, scores = write_result(target, write)
     lost = {} if scores is None else {"loss_db": before.mean_psnr - scores.mean_psnr}
-    return lost | {"num_gaussians": model.num_gaussians}
+    return target, lost | {"num_gaussians": model.num_gaussians}
 
 
 def _write_compressed(
     target: Path, model: VideoModel, about: dict[str, Any], clip: Clip | None, max_loss_db: float, passes: int
-) -> dict[str, Any]:
+) -> tuple[Path, dict[str, Any]]:
     known_psnr = about.get("mean_psnr")
     columns = SpinnerColumn(), TimeElapsedColumn(), TextColumn("{task.description}")
     with Progress(*columns, console=err, disable=not err.is_terminal, transient=True) as bar:
@@ -178,7 +184,7 @@ def _write_compressed(
             "it was edited, and the passes have undone the edits. --passes 0 does without fine-tuning."
         )
     known = clip is not None or known_psnr is not None
-    write_or_keep(target, lambda path: save_compressed(path, made, about, known=known))
+    target = write_result(target, lambda path: save_compressed(path, made, about, known=known))
     if clip is None:
         source = "recorded in the file" if known_psnr is not None else "assumed"
         err.print(
@@ -187,4 +193,4 @@ def _write_compressed(
             soft_wrap=True,
         )
     loss = "estimated_loss_db" if clip is None else "loss_db"
-    return {loss: made.loss_db, "num_gaussians": made.model.num_gaussians, "num_dropped": made.num_dropped}
+    return target, {loss: made.loss_db, "num_gaussians": made.model.num_gaussians, "num_dropped": made.num_dropped}

@@ -11,7 +11,14 @@ from foldgauss.cli.app.application import WrongUse, app, out, wrong_use
 from foldgauss.cli.app.completion import complete_files
 from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, parse_size
 from foldgauss.cli.shared.log_lines import print_log
-from foldgauss.cli.shared.outputs import check_image_path, name_after, refuse_existing, refuse_huge, refuse_inputs
+from foldgauss.cli.shared.outputs import (
+    check_image_path,
+    name_after,
+    refuse_existing,
+    refuse_huge,
+    refuse_inputs,
+    write_result,
+)
 from foldgauss.cli.shared.rendering import (
     SoundFile,
     VideoOptions,
@@ -85,12 +92,12 @@ def edit_command(
         options = VideoOptions(sound=choose_sound(sound, Timeline(), about, model.fps))
         check_video_options(out_path, image_size or model.size, model.fps, options)
     with print_log():
-        edited = script.apply(model, about.get("frames"))
+        edited = script.apply(model, about)
     if as_model:
         about = keep_origin(about, *CLIP_NOTES) | {"edited_by": script_path.name}
         if isinstance(edited, SegmentedVideo):
             edited = _drop_scores(model, edited)
-        save_video_model(out_path, edited, metadata=about)
+        out_path = write_result(out_path, lambda path: save_video_model(path, edited, metadata=about))
         kind = "a plain model" if isinstance(edited, VideoModel) else "a model with edits"
         if isinstance(edited, SegmentedVideo):
             kind = f"a model in {len(edited.segments)} segments"
@@ -143,7 +150,8 @@ def segment_command(
         raise wrong_use("NUMBER", expected=expected, got=number)
     segment = video.segments[number]
     begins = (about.get("frames") or [0])[0] or 0
-    whole = keep_origin(about, "clip", "reading") | {"frames": [begins + segment.first, begins + segment.stop]}
+    whole = keep_origin(about, "clip", "reading", "stretched")
+    whole |= {"frames": [begins + segment.first, begins + segment.stop]}
     known = whole | dict(segment.metadata)
     seconds = read_frame_seconds(about, video.num_frames)
     if seconds is not None:  # the segment's own frames may be evenly spaced, at another rate than the whole clip's

@@ -19,12 +19,19 @@ from foldgauss.cli.shared.arguments import (
 )
 from foldgauss.cli.shared.clips import read_fitted_clip
 from foldgauss.cli.shared.log_lines import show_status
-from foldgauss.cli.shared.outputs import check_image_path, name_after, refuse_existing, refuse_huge, refuse_inputs
-from foldgauss.cli.shared.rendering import advance_over, progress_bar
+from foldgauss.cli.shared.outputs import (
+    check_image_path,
+    name_after,
+    refuse_existing,
+    refuse_huge,
+    refuse_inputs,
+    write_result,
+)
+from foldgauss.cli.shared.rendering import progress_bar, write_images
 from foldgauss.io._atomic import check_writable
 from foldgauss.io.exchange.export_import import FORMATS, export, import_model
 from foldgauss.io.exchange.pseudomesh import read_pseudomesh
-from foldgauss.io.media.video_writing import VIDEO_SUFFIXES, write_video
+from foldgauss.io.media.video_writing import VIDEO_SUFFIXES
 from foldgauss.io.models.segmented import is_segmented
 from foldgauss.io.models.video_model import (
     MODEL_SUFFIX,
@@ -96,9 +103,11 @@ def export_command(
     model = load_video_model(model_path)
     if file_format == "html":
         check_writable(out_path)
-        frames = None if original is None else read_fitted_clip(model, model_path, original, None)
+        frames = None if original is None else read_fitted_clip(model, model_path, original, None, name="--original")
         with show_status("Writing the page"):
-            write_html(out_path, model_path, original=frames, quality=original_quality)
+            out_path = write_result(
+                out_path, lambda path: write_html(path, model_path, original=frames, quality=original_quality)
+            )
         size = out_path.stat().st_size / 1e6
         out.print(f"{out_path}: a page of {size:.1f} MB, {model.num_gaussians:,} Gaussians", soft_wrap=True)
         return
@@ -106,8 +115,12 @@ def export_command(
         cure = "Its frames can be exported as ply3dgs or obj."
         raise wrong_use("MODEL", expected="a plain model for ply", got="one with edits", cure=cure)
     num_frames = model.num_frames if chosen is None else len(chosen)
-    with progress_bar("Writing", num_frames, shown=file_format != "ply") as advance:
-        path = export(model, file_format, out_path, times=chosen, overwrite=overwrite, on_frame=advance)
+
+    def write(path: Path) -> Path:
+        with progress_bar("Writing", num_frames, shown=file_format != "ply") as advance:
+            return export(model, file_format, path, times=chosen, overwrite=overwrite, on_frame=advance)
+
+    path = write_result(out_path, write)
     frames = f"{num_frames:,} frame{'' if num_frames == 1 else 's'}"
     most = "" if file_format == "ply" else "up to "  # a frame has only its live Gaussians
     text = f"{_NAMES[file_format]} ({file_format}), {frames}, {most}{model.num_gaussians:,} Gaussians"
@@ -151,9 +164,7 @@ def import_command(
         refuse_huge(image_size)
         mesh = read_pseudomesh(source, size=image_size, fps=fps)
         refuse_huge(mesh.size)
-        with progress_bar("Rendering", mesh.num_frames) as advance:
-            write_video(out_path, advance_over(mesh.frames(), advance), mesh.fps, overwrite=overwrite)
-        out.print(f"{out_path}: {mesh.num_frames} frames at {mesh.fps:g} frames per second", soft_wrap=True)
+        write_images(out_path, mesh.frames, mesh.num_frames, mesh.fps, overwrite=overwrite)
         return
     if out_path.suffix.lower() != MODEL_SUFFIX:
         raise wrong_use("--out", expected=f"a name ending in {MODEL_SUFFIX}", got=out_path)

@@ -13,7 +13,7 @@ from foldgauss.cli.fitting.fit import stop_on_signals, summarize_fit
 from foldgauss.cli.fitting.options import choose_display
 from foldgauss.cli.fitting.progress import display_progress
 from foldgauss.cli.shared.contact_sheet import make_comparison_sheet
-from foldgauss.cli.shared.outputs import make_folder, refuse_foreign
+from foldgauss.cli.shared.outputs import make_folder, refuse_foreign, write_result
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import print_figures, summarize_scores, write_json
 from foldgauss.io.datasets import sample_clip
@@ -51,15 +51,22 @@ def demo(
     scores = evaluate_with_progress(model, clip.frames, images.append)
     figures = summarize_scores(model, scores) | summarize_fit(info)
     frames = {"psnr": scores.psnr, "ssim": scores.ssim}
-    write_json(out_dir / RECORD, figures | frames)  # first: the next demo may then replace this one, however it ends
     metadata = describe_source(clip, CONFIG.seed) | describe_fit(CONFIG, state) | mean_scores(scores)
-    figures["file_bytes"] = save_video_model(out_dir / "model.safetensors", model, metadata=metadata).stat().st_size
-    write_video(out_dir / "reconstruction.mp4", images, clip.fps)
     shown = np.linspace(0, clip.num_frames - 1, 4).round().astype(int)
     captions = [f"frame {k}, {scores.psnr[k]:.1f} dB" for k in shown]
     sheet = make_comparison_sheet([clip.frames[k] for k in shown], [images[k] for k in shown], captions)
-    write_image(out_dir / "comparison.png", sheet)
-    write_json(out_dir / RECORD, figures | frames)
+
+    def write(folder: Path) -> Path:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(folder / RECORD, figures | frames)  # first: the next demo may then replace this one, however it ends
+        saved = save_video_model(folder / "model.safetensors", model, metadata=metadata)
+        write_video(folder / "reconstruction.mp4", images, clip.fps)
+        write_image(folder / "comparison.png", sheet)
+        figures["file_bytes"] = saved.stat().st_size
+        write_json(folder / RECORD, figures | frames)
+        return folder
+
+    out_dir = write_result(out_dir, write)
     print_figures("Demo", figures)
     for name, what in (
         ("comparison.png", "original, reconstruction and error side by side"),

@@ -36,16 +36,16 @@ from foldgauss.cli.shared.arguments import (
     parse_reading,
     parse_size,
 )
-from foldgauss.cli.shared.outputs import name_after, refuse_existing, refuse_inputs
+from foldgauss.cli.shared.outputs import ask_output, name_after, refuse_existing, refuse_inputs
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import format_count, print_figures, summarize_scores
-from foldgauss.io._atomic import OutputError, check_writable
+from foldgauss.io._atomic import OutputError, check_writable, resolve, write_or_keep
 from foldgauss.io._lock import lock_output
 from foldgauss.io.history import HistoryFile, read_history, write_curves
 from foldgauss.io.media.clip import DEINTERLACE, Clip
 from foldgauss.io.models.video_model import MODEL_SUFFIX, check_model_name
 from foldgauss.jobs.job import FitJob
-from foldgauss.jobs.runner import FitRun, few_steps, missed_psnr, run_fit
+from foldgauss.jobs.runner import FitRun, busy_processors, missed_psnr, run_fit
 from foldgauss.jobs.runner import Stopped as FitStopped
 from foldgauss.jobs.segments import read_segment_seconds
 from foldgauss.video.fitting.config import FitConfig, planned_steps
@@ -150,7 +150,8 @@ def fit(
         resume="required" if resume else "never",
         on_checkpoint_error=lambda error, step: warn(f"no checkpoint at step {step}: {error}"),
     )
-    _save_model(run)
+    run = _save_model(run)
+    target = Path(run.job.target)
     with _keep_state_on_interrupt(run):
         if history is not None:
             _save_curves(curves, history)
@@ -162,7 +163,7 @@ def fit(
     job.checkpoint.unlink(missing_ok=True)
     for text in missed_psnr(config, scores.mean_psnr, run.info):
         warn(f"--smallest-at-psnr: {text} Give more --steps, or more --gaussians at the start.")
-    for text in few_steps(run):
+    for text in busy_processors(run):
         warn(f"--minutes: {text}")
     figures = summarize_scores(run.model, scores) | summarize_fit(run.info) | {"stopped_by": run.info.stopped_by}
     _print_results(run, display, figures | {"file_bytes": target.stat().st_size})
@@ -206,16 +207,16 @@ def _check_records(target: Path, video: Path, history: Path | None, preview: Pat
         if path is not None and path.suffix != suffix:
             raise wrong_use(option, expected=f"a name ending in {suffix}", got=path)
     places = [("--history", history), ("--history", None if history is None else curves), ("--preview", preview)]
-    taken = {target.resolve(), video.resolve()}
+    taken = {resolve(target), resolve(video)}
     for option, path in places:
         if path is None:
             continue
-        if video.is_dir() and path.resolve().parent == video.resolve():
+        if video.is_dir() and resolve(path).parent == resolve(video):
             cure = "It would be a frame there."
             raise wrong_use(option, expected="a place outside the clip's folder", got=path, cure=cure)
-        if path.resolve() in taken:
+        if resolve(path) in taken:
             raise WrongUse(f"{option}: expected a file of its own, got {path}, which has another use. Choose another.")
-        taken.add(path.resolve())
+        taken.add(resolve(path))
         refuse_existing(path, overwrite, option)
         check_writable(path)
     return curves
@@ -230,17 +231,21 @@ def _check_checkpoint(checkpoint: Path, resume: bool, overwrite: bool) -> None:
         raise WrongUse(f"--resume: expected a stopped fit in {checkpoint}, got none. Start it without --resume.")
 
 
-def _save_model(run: FitRun) -> None:
-    """Write the model before its evaluation, which may be interrupted; if that fails, the state is saved instead."""
-    try:
-        run.save()
-    except OSError as error:
+def _save_model(run: FitRun) -> FitRun:
+    """Write the model before its evaluation, which may be interrupted; if that fails, also the state.
+
+    Returns the run with the path of the model as its target.
+    """
+
+    def ask(path: Path, error: OSError) -> Path | None:
         run.save_checkpoint()
-        if not run.job.checkpoint.exists():
-            run.save_or_keep()
-            return
-        text = f"The fit is kept in {run.job.checkpoint}: --resume continues it, and writes the model."
-        raise OutputError(f"{error} {text}") from error
+        another = ask_output(path, error)
+        if another is None and run.job.checkpoint.exists():
+            text = f"The fit is kept in {run.job.checkpoint}: --resume continues it, and writes the model."
+            raise OutputError(f"{error} {text}") from error
+        return another
+
+    return write_or_keep(Path(run.job.target), run.save_to, ask)
 
 
 @contextmanager

@@ -36,6 +36,7 @@ from foldgauss.cli.shared.arguments import (
 )
 from foldgauss.cli.shared.outputs import make_folder
 from foldgauss.cli.shared.tables import format_count, write_json
+from foldgauss.io._atomic import resolve
 from foldgauss.io._lock import lock_output
 from foldgauss.io.media.clip import DEINTERLACE
 from foldgauss.jobs import FitJob, Outcome, find_clips, make_jobs
@@ -97,8 +98,8 @@ def fit_many(
     display = choose_display(quiet, log_json)
     options = WorkerOptions(workers, scheduler, threads)
     found = find_clips(folder)
-    out_dir = Path(f"{folder.resolve().name}-models") if out_dir is None else out_dir
-    if out_dir.exists() and out_dir.resolve() == folder.resolve():
+    out_dir = Path(f"{resolve(folder).name}-models") if out_dir is None else out_dir
+    if out_dir.exists() and resolve(out_dir) == resolve(folder):
         raise WrongUse(f"--out: expected another folder than the clips', got {out_dir}.")
     make_folder(out_dir)
     make_folder(out_dir / RECORDS)

@@ -1,5 +1,6 @@
 """`fit` of a clip in segments, run by workers or by this process."""
 
+import dataclasses
 import time
 from contextlib import nullcontext
 from functools import partial
@@ -11,6 +12,7 @@ from foldgauss.cli.fitting.job_progress import emit_json, run_jobs
 from foldgauss.cli.fitting.progress import Display
 from foldgauss.cli.fitting.workers import WorkerOptions
 from foldgauss.cli.shared.log_lines import LINE_SECONDS
+from foldgauss.cli.shared.outputs import write_result
 from foldgauss.cli.shared.rendering import progress_bar
 from foldgauss.cli.shared.tables import format_count, print_figures
 from foldgauss.io.media.resizing import describe_crop
@@ -62,7 +64,12 @@ def fit_in_segments(
     if failed:
         others = f"; the others are kept in {fit.folder}" if len(failed) < len(outcomes) else ""
         raise Stopped(f"{len(failed)} of {len(outcomes)} segments failed{others}. {again}")
-    joined = _join_with_progress(fit, outcomes, display)
+
+    def join(path: Path) -> JoinedFit:
+        return _join_with_progress(dataclasses.replace(fit, target=path), outcomes, display)
+
+    joined = write_result(target, join)
+    target = joined.path
     fit.clean_up()
     figures = _summarize(fit, joined, outcomes, job.config)
     figures |= {"wall_seconds": round(time.monotonic() - begun, 2), "file_bytes": target.stat().st_size}

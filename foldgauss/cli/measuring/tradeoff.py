@@ -43,7 +43,7 @@ from foldgauss.cli.shared.arguments import (
 from foldgauss.cli.shared.log_lines import show_status
 from foldgauss.cli.shared.outputs import make_folder, name_after, refuse_foreign
 from foldgauss.cli.shared.rendering import TIME_LEFT
-from foldgauss.io._atomic import atomic_path
+from foldgauss.io._atomic import OutputError, atomic_path
 from foldgauss.io._lock import lock_output
 from foldgauss.io.media.clip import DEINTERLACE, Clip
 from foldgauss.io.media.video_reading import read_video
@@ -151,11 +151,14 @@ def tradeoff_command(
         err.print(f"note: {one.name} is left out: {one.why}.", soft_wrap=True)
     try:
         failed = run.measure(points, base)
+        missing = {one.name for one in failed}
+        report(record, [point for point in points if point.name not in missing], skipped + failed, clock)
     except KeyboardInterrupt:
         kept = f"{len(record.rows)} of {len(points)} points are kept in {record.path}"
         raise Stopped(f"stopped; {kept}. Run the same command again to continue.") from None
-    missing = {one.name for one in failed}
-    report(record, [point for point in points if point.name not in missing], skipped + failed, clock)
+    except OSError as error:
+        kept = f"The points before it are kept in {record.path}: the same command continues."
+        raise OutputError(f"{error} {kept}") from error
 
 
 class _Run:

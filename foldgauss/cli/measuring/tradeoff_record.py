@@ -20,7 +20,7 @@ from foldgauss.analysis.plot import Panel
 from foldgauss.cli.app.application import WrongUse, out, warn
 from foldgauss.cli.fitting.options import CONFIG_FIELDS
 from foldgauss.cli.shared.tables import write_json
-from foldgauss.io._atomic import atomic_path
+from foldgauss.io._atomic import atomic_path, write_or_keep
 from foldgauss.io.figures import write_tradeoff
 from foldgauss.io.media.clip import AS_STORED, Reading
 from foldgauss.render import RenderOptions
@@ -101,7 +101,8 @@ class Record:
     def save(self) -> None:
         kept = {"settings": self.settings, "machine": self.machine, "plan": self.plan}
         kept |= {"left_out": self.left_out, "fronts": self.fronts}
-        write_json(self.path, kept | {"points": list(self.rows.values())})
+        kept |= {"points": list(self.rows.values())}
+        write_or_keep(self.path, lambda path: write_json(path, kept))
 
 
 #: The type of each column, and a function that checks it.

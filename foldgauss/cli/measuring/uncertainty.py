@@ -20,9 +20,9 @@ from foldgauss.cli.app.completion import complete_choice
 from foldgauss.cli.measuring.profiles_file import is_profiles_file, load_profiles, save_profiles
 from foldgauss.cli.shared.arguments import FittedClip, FittedFrames, ModelFile, Overwrite
 from foldgauss.cli.shared.clips import read_fitted_clip, refuse_segments
-from foldgauss.cli.shared.outputs import name_after
+from foldgauss.cli.shared.outputs import name_after, write_result
 from foldgauss.cli.shared.rendering import TIME_LEFT
-from foldgauss.io._atomic import OutputError, atomic_path, check_writable, output_error
+from foldgauss.io._atomic import OutputError, atomic_path, check_writable, output_error, resolve, write_or_keep
 from foldgauss.io._lock import lock_output
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.video_model import load_video_model, read_origin
@@ -140,13 +140,14 @@ def uncertainty_command(
                 warn(note)
         else:
             profiles = _compute_profiles(model, clip, noise, level, wanted, bars)
-            save_profiles(out_dir / PROFILES, key, profiles)
+            write_or_keep(out_dir / PROFILES, lambda path: save_profiles(path, key, profiles))
         log_prob = frame_time_log_prob(model, frames=wanted, concentration=concentration, profiles=profiles)
         settings = {"walkers": walkers, "ensembles": ensembles, "steps": steps, "seed": seed}
         posterior = _sample(out_dir / CHAINS, overwrite, bars, profiles=profiles, log_prob=log_prob, **settings)
     fitted = np.asarray(model.frame_times.times(), np.float64) if model.num_frames == clip.num_frames else None
-    _write(out_dir, posterior, fitted, f"{model_path.name}, by {Path(clip.source).name}", level)
-    _print_summary(out_dir, posterior)
+    title = f"{model_path.name}, by {Path(clip.source).name}"
+    written = write_result(out_dir, lambda folder: _write(folder, posterior, fitted, title, level))
+    _print_summary(written, posterior)
 
 
 def _parse_only(text: str | None) -> list[int] | None:
@@ -169,7 +170,7 @@ def _check_folder(folder: Path, video: Path, overwrite: bool) -> None:
     """Refuse a folder that cannot be used, before any work; it is created later."""
     if folder.exists() and not folder.is_dir():
         raise wrong_use("--out", expected="a folder", got=f"the file {folder}")
-    if video.is_dir() and folder.resolve() == video.resolve():
+    if video.is_dir() and resolve(folder) == resolve(video):
         cure = "Plots would be frames there."
         raise wrong_use("--out", expected="a folder other than the clip's", got=folder, cure=cure)
     shown = [
@@ -312,8 +313,9 @@ def _sample(path: Path, overwrite: bool, bars, **arguments: Any) -> FrameTimePos
     return posterior
 
 
-def _write(folder: Path, posterior: FrameTimePosterior, fitted: np.ndarray | None, title: str, level: str) -> None:
-    """Write all files, each atomically, the most important ones first."""
+def _write(folder: Path, posterior: FrameTimePosterior, fitted: np.ndarray | None, title: str, level: str) -> Path:
+    """Write all files, each atomically, the most important ones first; returns the folder."""
+    folder.mkdir(parents=True, exist_ok=True)
     flagged = irregularities(posterior)
     _write_table(folder / "frame_times.csv", frame_table(posterior, fitted))
     with atomic_path(folder / "summary.md") as temporary:
@@ -326,6 +328,7 @@ def _write(folder: Path, posterior: FrameTimePosterior, fitted: np.ndarray | Non
     _save_plot(folder / "trace.png", plots.plot_trace, posterior)
     if posterior.profiles is not None:
         _save_plot(folder / "correlation.png", plots.plot_correlation, posterior.profiles)
+    return folder
 
 
 def _save_plot(path: Path, plot: Callable, *arguments: Any, **options: Any) -> None:

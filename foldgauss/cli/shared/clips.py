@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from foldgauss.cli.app.application import WrongUse, warn, wrong_use
+from foldgauss.cli.app.application import warn, wrong_use
 from foldgauss.cli.shared.arguments import parse_frames
 from foldgauss.cli.shared.log_lines import show_status
 from foldgauss.io.media.clip import Clip
@@ -34,35 +34,49 @@ def refuse_segments(model_path: Path) -> None:
 
 
 def read_fitted_clip(
-    model: Video, model_path: Path, video: Path, frames: str | None, *, same_number: bool = True
+    model: Video,
+    model_path: Path,
+    video: Path,
+    frames: str | None,
+    *,
+    same_number: bool = True,
+    name: str = "VIDEO",
 ) -> Clip:
     """The frames that a model was fitted to, at its size, or those given; warns if they differ from the fitted ones.
 
-    Those of a model in segments are `LazyFrames`, since the clip may be larger than memory.
+    Those of a model in segments are `LazyFrames`, since the clip may be larger than memory. `name`: of the argument or
+    option of the clip; as an option it comes without --frames.
 
-    Raises WrongUse, with `same_number`, for another number of frames than the model's.
+    Raises WrongUse, with `same_number`, for another number of frames than the model's, and for a clip to which the
+    recorded range or options of reading do not apply.
     """
     about = read_origin(model_path)
-    kept = about.get("frames")
+    kept, reading = about.get("frames"), about.get("reading", {})
     wanted = parse_frames(frames) if frames is not None else (tuple(kept) if kept else None)
     try:
         read = _read_lazily if isinstance(model, SegmentedVideo) else read_video
-        clip = read(video, frames=wanted, size=model.size, **about.get("reading", {}))
+        clip = read(video, frames=wanted, size=model.size, **reading)
     except ValueError as error:
-        if frames is not None or not str(error).startswith("frames:"):
+        parameter = str(error).partition(":")[0]
+        if parameter == "frames" and frames is None:
+            as_fitted, got = f"frames {wanted[0]}:{wanted[1]} of {about.get('clip')}", "which has fewer"
+        elif parameter in reading:
+            as_fitted = f"{about.get('clip')} read with {parameter}={reading[parameter]!r}"
+            got = "to which that does not apply"
+        else:
             raise
-        asked = f"the clip that the model was fitted to, frames {wanted[0]}:{wanted[1]} of {about.get('clip')}"
-        raise WrongUse(f"VIDEO: expected {asked}, got {str(video)!r}, which has fewer. Give that clip.") from error
+        expected = f"the clip that the model was fitted to, {as_fitted}"
+        raise wrong_use(name, expected=expected, got=f"{str(video)!r}, {got}", cure="Give that clip.") from error
     for note in clip.notes:
         warn(f"{clip.source}: {note}")
     if same_number and clip.num_frames != model.num_frames:
-        fewer = frames is None and clip.num_frames < model.num_frames
+        by_clip = name.startswith("--") or (frames is None and clip.num_frames < model.num_frames)
         raise wrong_use(
-            "VIDEO" if fewer else "--frames",
+            name if by_clip else "--frames",
             expected=f"{model.num_frames} frames as in the model",
             got=f"{clip.num_frames} of {clip.source!r}",
             cure="Give the clip that it was fitted to."
-            if fewer
+            if by_clip
             else f"Give those that it was fitted to, as 0:{model.num_frames}.",
         )
     if has_other_frames(about, clip):

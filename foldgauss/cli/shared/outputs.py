@@ -1,11 +1,14 @@
-"""Checks and default names of outputs, before any work is done."""
+"""Outputs: default names, checks before any work is done, and writing of results that took long."""
 
 import os
-from collections.abc import Collection, Mapping
+import sys
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 
-from foldgauss.cli.app.application import WrongUse, wrong_use
-from foldgauss.io._atomic import OutputError, check_replaceable, check_writable
+import typer
+
+from foldgauss.cli.app.application import WrongUse, err, wrong_use
+from foldgauss.io._atomic import OutputError, Result, check_replaceable, check_writable, resolve, write_or_keep
 from foldgauss.io.media.image_files import IMAGE_SUFFIXES
 from foldgauss.io.media.resizing import memory_limit
 from foldgauss.io.media.video_writing import ANIMATION_SUFFIXES, FRAME_NAMES, VIDEO_SUFFIXES
@@ -15,7 +18,7 @@ IMAGE_SUFFIX = ".png"
 
 def name_after(source: Path, ending: str) -> Path:
     """The default name of an output: in the current folder, after its source."""
-    whole = source if source.name not in ("", "..") else source.resolve()
+    whole = source if source.name not in ("", "..") else resolve(source)
     return Path(f"{whole.name if whole.is_dir() else whole.stem}{ending}")
 
 
@@ -40,7 +43,7 @@ def refuse_inputs(path: Path, inputs: Mapping[str, Path | None], option: str = "
         if source is None or not (os.path.exists(path) and os.path.exists(source)):
             continue
         into = path.suffix.lower() in IMAGE_SUFFIXES and path.parent.samefile(source)
-        if into or path.samefile(source) or path.resolve() in source.resolve().parents:
+        if into or path.samefile(source) or resolve(path) in resolve(source).parents:
             raise WrongUse(f"{option}: expected another path than the {what}, got {path}. Inputs are never replaced.")
 
 
@@ -93,3 +96,35 @@ def make_folder(path: Path) -> None:
     except OSError as error:
         raise OutputError(f"--out: cannot create the folder {path} ({error.strerror}). Choose another.") from error
     check_writable(path / "model.safetensors")
+
+
+def write_result(path: Path, write: Callable[[Path], Result]) -> Result:
+    """Write the result of long work by `write(path)`, which is called again with another path if that fails: one from
+    the user, where there is a terminal, then one in the folder for temporary files. Raises as `write_or_keep`.
+    """
+    return write_or_keep(path, write, ask_output)
+
+
+def ask_output(path: Path, error: OSError) -> Path | None:
+    """Another path for an output, from the user; None without a terminal or an answer, and for one that exists.
+
+    A folder, or an answer of another suffix than `path`, becomes the folder of the output.
+    """
+    if sys.stdin is None or not sys.stdin.isatty():
+        return None
+    err.print(f"error: {error}", style="red", soft_wrap=True)
+    try:
+        answer = typer.prompt("Another path for it (Enter: a temporary folder)", "", show_default=False, err=True)
+    except typer.Abort:
+        return None
+    if not answer.strip():
+        return None
+    another = Path(answer.strip()).expanduser()
+    if another.suffix.lower() != path.suffix.lower() or another.is_dir():
+        another = another / path.name
+    try:
+        refuse_existing(another, overwrite=False)
+    except WrongUse as refusal:
+        err.print(f"error: {refusal}", style="red", soft_wrap=True)
+        return None
+    return another

@@ -1,8 +1,10 @@
 """Frames of models with a progress bar: rendered to files, and evaluated."""
 
+import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -14,7 +16,7 @@ from foldgauss.cli.app.application import WrongUse, err, name_option, out, wrong
 from foldgauss.cli.app.completion import complete_choice
 from foldgauss.cli.shared.clips import Video
 from foldgauss.cli.shared.log_lines import FIRST_LINE_SECONDS, LINE_SECONDS
-from foldgauss.cli.shared.outputs import IMAGE_SUFFIX
+from foldgauss.cli.shared.outputs import IMAGE_SUFFIX, write_result
 from foldgauss.cli.shared.tables import format_count
 from foldgauss.cli.shared.timeline import Timeline
 from foldgauss.io.media.encoder import CODECS, Sound, choose_encoding
@@ -106,8 +108,8 @@ def _refuse_transparent(path: Path, background: Background) -> None:
 def _check_rate(path: Path, fps: float) -> None:
     most = MAX_GIF_FPS if path.suffix.lower() == ".gif" else MAX_FPS
     if path.suffix and not path.is_dir() and fps > most:
-        expected, cure = f"at most {most:g} frames per second", "Give a lower rate, or write to a folder."
-        raise wrong_use("--fps", expected=expected, got=f"{fps:g}", cure=cure)
+        expected, cure = f"at most {most:g} frames per second in it", "Choose a lower rate, another format or a folder."
+        raise wrong_use("--out", expected=expected, got=f"{fps:g} for {path}", cure=cure)
 
 
 def _refuse_options(path: Path, options: VideoOptions) -> None:
@@ -127,7 +129,8 @@ def choose_sound(path: Path | None, timeline: Timeline, about: dict[str, Any], f
     if timeline.remap is not None or timeline.chosen is not None or timeline.is_single or (timeline.speed or 1.0) < 0:
         raise wrong_use("--sound", expected="a constant speed forwards", got="other times", cure="Leave --sound out.")
     if not path.is_file():
-        raise wrong_use("--sound", expected="a file", got=f"{str(path)!r}, which is missing")
+        got = f"{str(path)!r}, which is {'none' if os.path.exists(path) else 'missing'}"
+        raise wrong_use("--sound", expected="a file", got=got)
     first = (about.get("frames") or (0,))[0] or 0
     return Sound(path, about.get("first_second", first / fps), timeline.playing_speed(fps))
 
@@ -200,16 +203,15 @@ def render_to_file(
     which the images are shown; None where they are evenly spaced at `fps`.
     """
     _refuse_transparent(path, background)
-    if flow:
-        images = interpolate_frames(model, times, size, background=background)
-    else:
-        images = model.frames(times, size, background=background)
+    render = partial(interpolate_frames, model) if flow else model.frames
+    images = partial(render, times, size, background=background)
     if path.suffix.lower() == IMAGE_SUFFIX and not path.is_dir():
         if len(times) != 1:
             cure = "Choose it by --times T, or write to a folder (a name without extension)."
             raise wrong_use("--out", expected="one image for a .png", got=f"{len(times):,} images", cure=cure)
         _refuse_options(path, options)
-        write_image(path, next(images))
+        image = next(images())
+        path = write_result(path, lambda path: write_image(path, image))
         out.print(f"{path}: the image at time {times[0]:g}", soft_wrap=True)
         return
     how = {"image_format": image_format, "overwrite": overwrite, "options": options, "stamps": stamps}
@@ -218,7 +220,7 @@ def render_to_file(
 
 def write_images(
     path: Path,
-    images: Iterable[np.ndarray],
+    images: Callable[[], Iterable[np.ndarray]],
     num: int,
     fps: float,
     *,
@@ -227,23 +229,20 @@ def write_images(
     options: VideoOptions = VideoOptions(),  # noqa: B008
     stamps: np.ndarray | None = None,
 ) -> None:
-    """Write `num` images as a video or to a folder. `stamps`: as in `render_to_file`."""
+    """Write `num` images as a video or to a folder, elsewhere if that fails. `stamps`: as in `render_to_file`."""
     _check_rate(path, fps)
-    with progress_bar("Rendering", num) as advance:
-        try:
-            write_video(
-                path,
-                advance_over(images, advance),
-                min(fps, MAX_FPS),
-                overwrite=overwrite,
-                image_format=image_format,
-                times=stamps,
-                **options._asdict(),
-            )
-        except ValueError as error:
-            if not str(error).startswith(VideoOptions._fields):
-                raise
-            raise WrongUse(name_option(str(error))) from error
+
+    def write(path: Path) -> Path:
+        how = {"overwrite": overwrite, "image_format": image_format, "times": stamps, **options._asdict()}
+        with progress_bar("Rendering", num) as advance:
+            try:
+                return write_video(path, advance_over(images(), advance), min(fps, MAX_FPS), **how)
+            except ValueError as error:
+                if not str(error).startswith(VideoOptions._fields):
+                    raise
+                raise WrongUse(name_option(str(error))) from error
+
+    path = write_result(path, write)
     rate = f"at {fps:g} frames per second"
     if stamps is not None and path.suffix and not path.is_dir():
         rate = f"unevenly spaced as in the clip, {num / stamps[-1]:.4g} per second on average"

@@ -19,7 +19,7 @@ from foldgauss.cli.shared.arguments import (
     override_constants,
 )
 from foldgauss.cli.shared.clips import read_fitted_clip
-from foldgauss.cli.shared.outputs import refuse_existing, refuse_inputs
+from foldgauss.cli.shared.outputs import refuse_existing, refuse_inputs, write_result
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import print_figures, summarize_scores, write_json
 from foldgauss.io._atomic import check_writable
@@ -63,10 +63,11 @@ def evaluate_command(
         figures["mean_psnr_on_white"] = round(on_white.mean_psnr, 3)
     figures["bits_per_pixel"] = 8 * num_bytes / (model.num_frames * model.size[0] * model.size[1])
     figures["frames_per_second"] = round(measure_frame_rate(model), 1)
-    if json_path is not None:
-        write_json(json_path, figures | {"psnr": scores.psnr, "ssim": scores.ssim})
     _print_segments(model, scores) if isinstance(model, SegmentedVideo) else _print_frames(scores)
     print_figures(str(model_path), figures)
+    if json_path is not None:
+        figures |= {"psnr": scores.psnr, "ssim": scores.ssim}
+        write_result(json_path, lambda path: write_json(path, figures))
 
 
 def _print_segments(model: SegmentedVideo, scores: Evaluation) -> None:

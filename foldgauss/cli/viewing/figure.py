@@ -13,7 +13,14 @@ from foldgauss.cli.app.help import App
 from foldgauss.cli.shared.arguments import FittedClip, FittedFrames, ModelFile, Overwrite
 from foldgauss.cli.shared.clips import Video, read_fitted_clip
 from foldgauss.cli.shared.contact_sheet import make_comparison_sheet, make_contact_sheet
-from foldgauss.cli.shared.outputs import IMAGE_SUFFIX, name_after, refuse_existing, refuse_huge, refuse_inputs
+from foldgauss.cli.shared.outputs import (
+    IMAGE_SUFFIX,
+    name_after,
+    refuse_existing,
+    refuse_huge,
+    refuse_inputs,
+    write_result,
+)
 from foldgauss.cli.shared.rendering import Flow
 from foldgauss.io._atomic import check_writable
 from foldgauss.io.media.video_writing import write_image
@@ -145,5 +152,5 @@ def _find_middle_interval(model: Video) -> int:
 
 
 def _write(path: Path, image: np.ndarray, what: str) -> None:
-    write_image(path, image)
+    path = write_result(path, lambda path: write_image(path, image))
     out.print(f"{path}: {what}", soft_wrap=True)

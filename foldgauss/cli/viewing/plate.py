@@ -1,5 +1,6 @@
 """The command `plate`."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,11 +26,12 @@ from foldgauss.cli.shared.rendering import (
     write_images,
 )
 from foldgauss.cli.shared.timeline import Timeline
+from foldgauss.io._atomic import resolve
 from foldgauss.io.media.masks import read_masks
 from foldgauss.io.media.video_writing import VIDEO_SUFFIXES
 from foldgauss.io.models.video_model import load_video_model, read_frame_seconds, read_origin
 from foldgauss.video.motion.background_plate import Alignment, Frames, Masks, fill_background
-from foldgauss.video.motion.moving_object import LEAST_FRAMES, NothingMoves, find_moving_object, nothing_moves
+from foldgauss.video.motion.moving_object import LEAST_FRAMES, NothingMoves, find_moving_object
 
 #: What can be done where the search finds nothing, or the wrong thing.
 _CURE = "Give masks of the object by --masks, or remove it by foldgauss edit; see docs/editing.md."
@@ -72,12 +74,12 @@ def plate_command(
     for option, path in (("--out", out_path), ("--save-masks", save_masks)):
         if path is not None:
             check_images_output(path, inputs, overwrite, option)
-    if save_masks is not None and save_masks.resolve() == out_path.resolve():
+    if save_masks is not None and resolve(save_masks) == resolve(out_path):
         raise wrong_use("--save-masks", expected="another folder than --out", got=save_masks)
     model = load_video_model(model_path)
     if model.num_frames < LEAST_FRAMES:
         cure = "Fit more frames: a plate is what other frames show behind the object."
-        raise nothing_moves(f"a video of {LEAST_FRAMES} frames at least", model.num_frames, cure)
+        raise wrong_use("MODEL", expected=f"at least {LEAST_FRAMES} frames", got=model.num_frames, cure=cure)
     image_size = image_size or model.size
     refuse_huge(image_size)
     about = read_origin(model_path)
@@ -96,15 +98,15 @@ def plate_command(
         masks = _find_object(frames, alignment) if masks is None else masks
         plate = fill_background(frames, masks, alignment=alignment)
     stamps = read_frame_seconds(about, model.num_frames)
-    write_images(out_path, plate, len(plate), model.fps, overwrite=overwrite, options=options, stamps=stamps)
+    write_images(out_path, lambda: plate, len(plate), model.fps, overwrite=overwrite, options=options, stamps=stamps)
     if save_masks is not None:
-        images = (np.repeat(np.uint8(255 * mask)[..., None], 3, -1) for mask in masks)
+        images = partial(map, lambda mask: np.repeat(np.uint8(255 * mask)[..., None], 3, -1), masks)
         write_images(save_masks, images, len(masks), model.fps, overwrite=overwrite, stamps=stamps)
 
 
 def _read_masks(path: Path, model: Video, size: tuple[int, int], about: dict[str, Any]) -> Masks:
     """The user's masks, one for each frame of the model, at the size of the images."""
-    masks = read_masks(path, size=model.size)
+    masks = read_masks(path, size=model.size, stretched=about.get("stretched"))
     masks = masks.reshape(-1, *masks.shape[-2:])  # one image is for all frames
     first, num = (about.get("frames") or (0,))[0] or 0, model.num_frames
     if len(masks) >= first + num:
@@ -122,7 +124,9 @@ def _find_object(frames: Frames, alignment: Alignment) -> Masks:
     try:
         masks = find_moving_object(frames, shadow=True, alignment=alignment)
     except NothingMoves as error:
-        raise nothing_moves("an object that moves against the background", "none", _CURE) from error
+        raise wrong_use(
+            "MODEL", expected="an object that moves against the background", got="none", cure=_CURE
+        ) from error
     covered = masks.mean((1, 2))[masks.any((1, 2))]
     if len(covered):
         size = f"{covered.min():.1%} to {covered.max():.1%}"

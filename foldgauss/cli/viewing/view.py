@@ -35,7 +35,7 @@ def view_command(
     """
     frames = None
     if original is not None:
-        frames = read_fitted_clip(load_video_model(model_path), model_path, original, None)
+        frames = read_fitted_clip(load_video_model(model_path), model_path, original, None, name="--original")
     script, token = script_path(model_path), make_token()
     target = SaveTarget(script.name, token)
     make_page = partial(html_page, model_path, original=frames, quality=original_quality, save_to=target)

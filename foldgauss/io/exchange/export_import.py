@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid
-from foldgauss.io._atomic import OutputError, PathLike, atomic_folder, check_path, check_writable
+from foldgauss.io._atomic import OutputRefused, PathLike, atomic_folder, check_path, check_writable
 from foldgauss.io.exchange.gaussians_ply import write_3dgs_frames, write_3dgs_ply
 from foldgauss.io.exchange.ply_file import format_error
 from foldgauss.io.exchange.pseudomesh import write_pseudomesh
@@ -110,7 +110,7 @@ def _check_new(path: Path, overwrite: bool) -> None:
     check_writable(path)
     if path.exists() and not overwrite:
         text = f"path: expected a new file, got {str(path)!r}, which exists."
-        raise OutputError(f"{text} Choose another path, or allow overwriting.")
+        raise OutputRefused(f"{text} Choose another path, or allow overwriting.")
 
 
 def import_model(path: PathLike, *, size: Size | None = None, fps: float | None = None) -> VideoModel:

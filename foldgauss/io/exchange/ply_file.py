@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.io._atomic import PathLike, atomic_path, missing_error
+from foldgauss.io._atomic import PathLike, atomic_path, check_input
 
 _SIZES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
@@ -145,11 +145,10 @@ def read_ply(path: PathLike, wanted: Iterable[str]) -> Ply:
 
 
 def read_bytes(path: Path) -> bytes:
-    """The content of a file. Raises `FileNotFoundError`, and `FormatError` where it cannot be read."""
+    """The content of a file. Raises as `check_input`, and `FormatError` where it cannot be read."""
+    check_input(path, "a file")
     try:
         return path.read_bytes()
-    except FileNotFoundError:
-        raise missing_error(path, "a file") from None
     except OSError as error:
         expected, got = "a file that can be read", error.strerror or str(error)
         raise format_error(path, expected=expected, got=got, cure="Give the path of a file.") from error

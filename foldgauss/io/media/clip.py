@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
-from foldgauss.io._atomic import PathLike, check_path, missing_error
+from foldgauss.io._atomic import PathLike, check_path, missing_error, resolve
 from foldgauss.io.media.format_detection import HEAD_BYTES
 from foldgauss.io.media.frame_rate import MAX_FPS, MIN_FPS, FrameRate
 
@@ -22,6 +22,7 @@ WHITE = (1 << 16) - 1  # the value of white in data of 16 bits
 DEPTHS = (8, 10, 12, 14)  # bits of cameras and microscopes whose values are stored in 16
 Range = tuple[int | None, int | None]
 Size = tuple[int, int]  # (height, width)
+Stretch = tuple[Size, Size]  # the size of frames as stored, and that to which they are stretched
 #: (frames declared within a range, frame rate, notes)
 RangeFacts = tuple[int, FrameRate, tuple[str, ...]]
 #: (prepared frames, and the facts)
@@ -61,13 +62,13 @@ class Levels:
         white = self.white or WHITE
         return ((np.minimum(image, white).astype(np.uint32) * 255 + white // 2) // white).astype(np.uint8)
 
-    def describe(self, path: Path) -> tuple[str, ...]:
+    def describe(self, path: Path, kind: str = "a clip of fewer bits") -> tuple[str, ...]:
         """A note where the values that were converted seem to have fewer bits, or are clipped.
 
-        Raises `VideoError` where `white` is given, but no frame of `path` has 16 bits.
+        Raises `VideoError` where `white` is given, but applies to no frame of `path`, a clip of this `kind`.
         """
         if self.white is not None and self.most < 0:
-            got, cure = f"a clip of fewer bits, {str(path)!r}", "Leave levels out."
+            got, cure = f"{kind}, {str(path)!r}", "Leave levels out."
             raise video_error("levels", expected="images or videos of 16 bits, in RGB or gray", got=got, cure=cure)
         if self.white is not None:
             clipped = f"values of up to {self.most:,} are above levels={self.white} and become white."
@@ -77,7 +78,7 @@ class Levels:
         if white is None:
             return ()
         found = f"the largest value is {self.most:,} of {WHITE:,}, as in data of {white.bit_length()} bits"
-        return (f"{found}, which look dark; levels={white} (--levels {white}) makes {white} white.",)
+        return (f"{found}, which look dark; levels={white} (foldgauss fit --levels {white}) makes {white} white.",)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +94,8 @@ class Clip:
     mean rate. `duration`: seconds to the end of the last one, where there are `times`. `notes`: remarks on how the file
     was read, one line each. `first_second`: when the first frame of a range is shown, in seconds from the first frame
     of the video file; 0 of images, and where `fps` was given. `reading`: the options by which it was read.
+    `stretched`: of a video whose pixels are not square, the size of its frames as stored, upright, and that with square
+    pixels, before `size` applies; otherwise None.
     """
 
     frames: np.ndarray
@@ -104,6 +107,7 @@ class Clip:
     first_second: float = 0.0
     duration: float | None = None
     reading: Reading = AS_STORED
+    stretched: Stretch | None = None
 
     @property
     def has_alpha(self) -> bool:
@@ -151,7 +155,7 @@ def translate_os_errors(path: Path) -> Iterator[None]:
 def read_head(path: Path) -> bytes:
     """The first bytes of a file. Raises `VideoError` for a name that is not Unicode: OpenCV crashes on it."""
     try:
-        str(path.resolve()).encode()
+        str(resolve(path)).encode()
     except UnicodeEncodeError as error:
         got, cure = f"{str(path)!a}, which is not Unicode", "Rename the file or its folder."
         raise video_error("path", expected="a name that OpenCV can open", got=got, cure=cure) from error

@@ -15,9 +15,11 @@ from av.filter import Graph
 from av.stream import Disposition
 from av.video.reformatter import ColorRange, Colorspace, Interpolation, VideoReformatter
 
+from foldgauss.io._atomic import resolve
 from foldgauss.io.media.clip import (
     AS_STORED,
     VIDEO,
+    WHITE,
     Levels,
     Reading,
     Size,
@@ -30,7 +32,7 @@ from foldgauss.io.media.clip import (
 from foldgauss.io.media.format_detection import DEMUXERS, LIST, describe_kind
 from foldgauss.io.media.frame_rate import DEFAULT_FPS
 from foldgauss.io.media.image_files import premultiply
-from foldgauss.io.media.tone_mapping import HDR, map_tones
+from foldgauss.io.media.tone_mapping import HDR, LIMITED_WHITE, map_tones
 
 MAX_ERRORS = 1000  # packets in a row that cannot be read after which a video has ended
 MAX_FRAMES = 1 << 30  # a container that declares as many does not know, or is damaged
@@ -50,6 +52,9 @@ CONVERSION = (
 )
 #: Luma of limited range as that of full range: FFmpeg's conversion takes all gray video for full range.
 _EXPANDED = np.rint(np.clip((np.arange(256) - 16) * (255 / 219), 0, 255)).astype(np.uint8)
+#: Likewise in 16 bits, up to the white that FFmpeg makes of color video of limited range.
+_EXPANDED_DEEP = np.rint(np.clip((np.arange(1 << 16) - 16 * 256) * (LIMITED_WHITE / (219 * 256)), 0, WHITE))
+_EXPANDED_DEEP = _EXPANDED_DEEP.astype(np.uint16)
 _UNSPECIFIED = 2  # FFmpeg's number of a matrix that is not declared
 #: FFmpeg's decoders of VP8 and VP9 drop alpha; these are the ones that keep it.
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
@@ -78,6 +83,11 @@ class DecodedFrame:
         """The transfer function of a frame in HDR, "PQ" or "HLG"; None for others."""
         return HDR.get(self.decoded.color_trc)
 
+    @property
+    def is_turned(self) -> bool:
+        """Whether rows of the frame are columns of the upright image."""
+        return abs(self.matrix[1]) > abs(self.matrix[0])
+
     def to_array(self) -> np.ndarray:
         """Upright and uint8: BGR of shape (height, width, 3), or premultiplied BGRA of shape (height, width, 4).
 
@@ -89,13 +99,14 @@ class DecodedFrame:
         has_levels = kind.components[0].bits == 16 and (kind.is_rgb or kind.name.startswith(("gray", "ya")))
         if self.hdr is not None or alpha_bits > 8 or has_levels:
             deep = self._convert("gbrap16le" if alpha_bits else "gbrp16le")
+        is_limited_gray = kind.name.startswith("gray") and self.decoded.color_range == ColorRange.MPEG
         if self.hdr is not None:
-            image = map_tones(self.decoded, deep, self.hdr)
+            image = map_tones(self.decoded, _EXPANDED_DEEP[deep] if is_limited_gray else deep, self.hdr)
         elif has_levels:
             image = cv2.cvtColor(self.levels.convert(deep), cv2.COLOR_RGBA2BGRA if alpha_bits else cv2.COLOR_RGB2BGR)
         else:
             image = self._convert("bgra" if alpha_bits else "bgr24")
-        if kind.name.startswith("gray") and self.decoded.color_range == ColorRange.MPEG:
+        if is_limited_gray and self.hdr is None:
             image = _EXPANDED[image]
         if alpha_bits and deep is not None and self.levels.white is None:
             image[..., 3] = round_alpha(deep[..., 3] >> (16 - alpha_bits), (1 << alpha_bits) - 1, 255)
@@ -103,7 +114,7 @@ class DecodedFrame:
             opaque = image[..., 3].min() == 255
             image = np.ascontiguousarray(image[..., :3]) if opaque else premultiply(image)
         a, b, c, d = self.matrix
-        if abs(b) > abs(a):
+        if self.is_turned:
             image, a, d = image.swapaxes(0, 1), c, b
         return np.ascontiguousarray(image[:: 1 if d >= 0 else -1, :: 1 if a >= 0 else -1])
 
@@ -391,7 +402,7 @@ def open_container(path: Path, demuxers: str = DEMUXERS) -> av.container.InputCo
     # An absolute path, because FFmpeg takes 'name:rest' for a protocol. One local file and nothing that it refers to.
     options = {"protocol_whitelist": "file", "format_whitelist": demuxers}
     try:
-        return av.open(f"file:{path.resolve()}", options=options, metadata_errors="replace")
+        return av.open(f"file:{resolve(path)}", options=options, metadata_errors="replace")
     except (av.FFmpegError, ValueError) as error:
         about = format_num_bytes(path) + (f", {kind}" if kind else "")
         got = f"{str(path)!r} ({about}), which does not open as a video"

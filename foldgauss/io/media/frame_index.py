@@ -15,6 +15,7 @@ from foldgauss.io.media.clip import (
     Range,
     Reading,
     Size,
+    Stretch,
     check_fps,
     check_range,
     check_range_within,
@@ -30,16 +31,16 @@ from foldgauss.io.media.video_reading import read_frames
 from foldgauss.video.motion.optical_flow import CutFinder
 
 DIGEST_BYTES = 16
-_FORMAT = 5
+_FORMAT = 6
 
 
 class FrameIndex:
     """The index of a clip; made by `index_video`.
 
     `source`: the path as given. `kind`: "video", "folder" or "pictures" (an animation, or one image). `num_frames`,
-    `fps`, `times`, `duration`, `first_second`, `num_declared`, `notes`, `reading`: as in `Clip`. `size`: (height,
-    width) of the frames. `has_alpha`: whether any frame is transparent anywhere. `cuts`: the frames, in order, that
-    begin a new shot; empty where they were not searched for. `digest`: of all frames as stored, in hexadecimal; it
+    `fps`, `times`, `duration`, `first_second`, `num_declared`, `notes`, `reading`, `stretched`: as in `Clip`. `size`:
+    (height, width) of the frames. `has_alpha`: whether any frame is transparent anywhere. `cuts`: the frames, in order,
+    that begin a new shot; empty where they were not searched for. `digest`: of all frames as stored, in hexadecimal; it
     shows whether a file is still the one that was indexed. `positions`: int64 (num_frames,), the position of each frame
     in the range: k for frame k, except in a clip that lost frames to damage.
 
@@ -66,6 +67,7 @@ class FrameIndex:
         self.first_second: float = about["first_second"]
         self.duration: float | None = about["duration"]
         self.size: Size = tuple(about["size"])
+        self.stretched: Stretch | None = about["report"] and about["report"]["stretched"]
         self.num_declared: int = about["num_declared"]
         self.notes: tuple[str, ...] = tuple(about["notes"])
         self.cuts: list[int] = list(about["cuts"])

@@ -65,7 +65,7 @@ def read_indexed(index: FrameIndex, first: int, stop: int | None, *, size: Size 
         rate = FrameRate(index.fixed_fps)
     notes += describe_rate(rate) + crop
     about = index.source, num_declared, rate.times, notes, rate.first_second, rate.duration, index.reading
-    return Clip(frames, float(rate.fps), *about)
+    return Clip(frames, float(rate.fps), *about, index.stretched)
 
 
 class IndexedReader:

@@ -1,7 +1,6 @@
 """Object masks from images, folders of images and videos."""
 
 import math
-import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,8 +10,8 @@ from jaxtyping import Bool
 from PIL import Image
 
 from foldgauss._runtime.checks import check_within, invalid, is_integer
-from foldgauss.io._atomic import PathLike, check_path, missing_error
-from foldgauss.io.media.clip import Range, Size, check_range, format_size
+from foldgauss.io._atomic import PathLike, check_input, check_path
+from foldgauss.io.media.clip import Range, Size, Stretch, check_frame_size, check_range, format_size
 from foldgauss.io.media.image_files import IMAGE_SUFFIXES, choose_images
 from foldgauss.io.media.resizing import aspect_window
 from foldgauss.io.media.video_reading import read_video
@@ -39,6 +38,7 @@ def read_masks(
     frames: Range | None = None,
     size: Size | None = None,
     level: float = MASK_LEVEL,
+    stretched: Stretch | None = None,
 ) -> Bool[np.ndarray, "height width"] | Bool[np.ndarray, "num_frames height width"]:
     """The masks of an object, as `foldgauss.video.by_mask` takes them.
 
@@ -50,7 +50,8 @@ def read_masks(
 
     `frames = (A, B)` keeps A <= i < B of a folder or video, None for an open end, as `read_video`. `size` = (height,
     width) crops the masks to that aspect around the center, as `read_video` crops frames, without resizing them: use
-    the same value as for the fit.
+    the same value as for the fit. `stretched`: `Clip.stretched` of a clip whose pixels are not square; masks of the
+    size of its frames as stored are stretched as these are.
 
     **Example:** `by_mask(model, read_masks("DAVIS/Annotations/480p/bear", label=1))`.
 
@@ -58,8 +59,7 @@ def read_masks(
     that do not apply, and as `read_video`.
     """
     path = check_path(path)
-    if not os.path.exists(path):
-        raise missing_error(path, "an image, a folder or a video")
+    check_input(path, "an image, a folder or a video")
     if label is not None and not (is_integer(label, 1) and label < VOID):
         raise invalid("label", expected=f"an object's label, 1 to {VOID - 1}", got=repr(label))
     is_image = path.suffix.lower() in IMAGE_SUFFIXES
@@ -80,6 +80,10 @@ def read_masks(
         for note in clip.notes:
             warnings.warn(f"{path}: {note}", stacklevel=2)
         masks = clip.over_black.max(-1) >= 255 * level
+    if stretched is not None:
+        stored, shown = (check_frame_size(one, "stretched") for one in stretched)
+        rows, columns = ((2 * np.arange(new) + 1) * old // (2 * new) for old, new in zip(stored, shown, strict=True))
+        masks = masks[..., rows[:, None], columns] if masks.shape[-2:] == stored else masks
     if size is None:
         return masks
     check_size(size)

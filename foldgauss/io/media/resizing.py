@@ -64,10 +64,11 @@ def describe_crop(sizes: Iterable[Size], want: Size) -> tuple[str, ...]:
     for height, width in sizes:
         rows, columns = aspect_window((height, width), want)
         lost = 1 - (rows.stop - rows.start) * (columns.stop - columns.start) / (height * width)
-        if lost > CROP_REPORTED:
-            scale = (want[0] * want[1] / (height * width)) ** 0.5
-            whole = f"{max(1, round(scale * height))}x{max(1, round(scale * width))}"
-            return (f"{want[0]}x{want[1]} crops {lost:.0%} of frames of {height}x{width}; {whole} keeps all of them.",)
+        scale = (want[0] * want[1] / (height * width)) ** 0.5
+        whole = max(1, round(scale * height)), max(1, round(scale * width))
+        if lost > CROP_REPORTED and whole != tuple(want):
+            cure = f"{whole[0]}x{whole[1]} keeps all of them."
+            return (f"{want[0]}x{want[1]} crops {lost:.0%} of frames of {height}x{width}; {cure}",)
     return ()
 
 

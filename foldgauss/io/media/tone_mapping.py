@@ -40,7 +40,7 @@ _TO_BT709 = {
     ColorPrimaries.SMPTE432: _FROM_P3,
 }
 #: Signal of white that FFmpeg makes of YUV of limited range, in 16 bits.
-_LIMITED_WHITE = 65283
+LIMITED_WHITE = 65283
 #: Tables have this many entries, at equal steps of the square root of light, up to `_BRIGHTEST` times `PEAK`: PQ has up
 #: to 10,000 cd/m2, and colors outside BT.709 have higher channels than that.
 _ENTRIES, _BRIGHTEST = 8192, 20.0
@@ -83,8 +83,11 @@ def map_tones(
     `image`: its red, green and blue as FFmpeg converts them to 16 bits, and alpha, which is not converted, if there are
     four channels. The result has blue first, as OpenCV has it.
     """
-    limited, bits = not frame.format.is_rgb and frame.color_range != ColorRange.JPEG, frame.format.components[0].bits
-    white = _LIMITED_WHITE if limited else ((1 << bits) - 1) << (16 - bits)
+    kind = frame.format
+    is_full = kind.is_rgb or frame.color_range == ColorRange.JPEG
+    is_full |= kind.name.startswith("gray") and frame.color_range != ColorRange.MPEG  # as gray video that is not HDR
+    bits = kind.components[0].bits
+    white = ((1 << bits) - 1) << (16 - bits) if is_full else LIMITED_WHITE
     matrix = np.array(_TO_BT709.get(frame.color_primaries, np.eye(3)))
     out = np.empty(image.shape, np.uint8)
     _map_tones(image, out, *_tables(transfer, white), matrix, np.array(_LUMINANCE), np.sqrt(_BRIGHTEST))

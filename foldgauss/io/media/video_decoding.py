@@ -12,6 +12,7 @@ from foldgauss.io.media.clip import (
     RangeFacts,
     Reading,
     ReadResult,
+    Stretch,
     clamp_stop,
     describe_few,
     describe_lost,
@@ -32,7 +33,7 @@ class DecodeReport(NamedTuple):
     `notes`: about the shape of pixels, HDR and interlacing. Of all frames decoded `positions`, and `stamps` in units of
     `time_base` seconds. `threads`: of the decoder. `end`: when the last of these ends, in seconds as well; 0 where that
     is unknown. `damaged`: the positions of frames that decode with errors. `resized`: of those of another size than the
-    video, `stored_size`.
+    video, `stored_size`. `stretched`: as of `Clip`.
     """
 
     fps: float
@@ -46,6 +47,7 @@ class DecodeReport(NamedTuple):
     damaged: list[int]
     resized: list[int]
     stored_size: list[int]
+    stretched: Stretch | None
 
     def describe_span(self, first: int, end: int, start: int, stop: int | None) -> RangeFacts:
         """Number of frames declared from position `start` up to `stop`, their rate, and notes.
@@ -77,14 +79,14 @@ def decode_file(
     Raises `VideoError` for a file that cannot be read.
     """
     places, ticks, following, transfers, duration = [], [], [], set(), 0
-    damaged, resized = [], []
+    damaged, resized, is_turned = [], [], False
 
     def select(frames: Iterator[DecodedFrame]) -> Iterator[np.ndarray]:
         """The frames from `start` up to `stop`; all that are decoded are recorded, and so is the next one.
 
         Frames before `start` are decoded and dropped: seeking stops at key frames.
         """
-        nonlocal duration
+        nonlocal duration, is_turned
         for frame in frames:
             if stop is not None and frame.position >= stop:
                 if places and frame.position == places[-1] + 1:
@@ -92,7 +94,7 @@ def decode_file(
                 return
             places.append(frame.position)
             ticks.append(frame.stamp)
-            duration = frame.decoded.duration or 0
+            duration, is_turned = frame.decoded.duration or 0, frame.is_turned
             if frame.decoded.is_corrupt:
                 damaged.append(frame.position)
             if (frame.decoded.height, frame.decoded.width) != decoder.stored_size:
@@ -129,17 +131,20 @@ def decode_file(
             notes.append(f"the file asks for a rotation by {turn}; it is left out.")
         if decoder.has_converted:
             by_field = reading.deinterlace == "fields"
-            each = "one of each field" if by_field else "one of each; --deinterlace fields makes two"
+            each = "one of each field" if by_field else "one of each; foldgauss fit --deinterlace fields makes two"
             notes.append(f"interlaced frames are converted to progressive ones, {each}.")
         if (unread := decoder.unread_fraction) > MAX_UNREAD:
             notes.append(f"the last {unread:.0%} of the file hold no frame that decodes.")
-        notes += decoder.levels.describe(path) if kept else ()
-        stored_size = list(decoder.stored_size)
+        kind = {"kind": "HDR, whose tone mapping defines white"} if hdr else {}
+        notes += decoder.levels.describe(path, **kind) if kept else ()
+        stored_size, order = list(decoder.stored_size), -1 if is_turned else 1
+        stretched = decoder.stored_size[::order], decoder.size[::order]
     # The container's count may be an estimate, so the range is checked against the decoded frames as well.
     end_of_range = clamp_stop(start, stop, num_total, path)
     if not kept:
         raise no_frames_error(start, stop, len(stamps), num_total, path)
     about = positions, stamps, time_base, threads, end, damaged, resized, stored_size
+    about += (stretched if stretched[0] != stretched[1] else None,)
     report = DecodeReport(fps, num_total, notes, *about)
     return (kept, *report.describe_span(len(stamps) - len(kept), len(stamps), start, end_of_range)), report
 

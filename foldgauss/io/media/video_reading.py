@@ -81,14 +81,14 @@ def read_video(
     if fps is not None:
         check_fps(fps)
     with translate_os_errors(path):
-        found, _ = read_frames(path, start, stop, lambda images: copy_to_blocks(map(prepare, images)), reading)
+        found, report = read_frames(path, start, stop, lambda images: copy_to_blocks(map(prepare, images)), reading)
     kept, num_declared, rate, notes = found
     rate = rate if fps is None else FrameRate(fps)
     notes += describe_rate(rate)
     if size is not None and center_crop is None:
         notes += describe_crop(sizes, size)
     about = float(rate.fps), str(path), num_declared, rate.times, notes, rate.first_second, rate.duration, reading
-    return Clip(stack_frames(kept), *about)
+    return Clip(stack_frames(kept), *about, report and report.stretched)
 
 
 def read_frames(

@@ -7,6 +7,7 @@ against the size of the file, and invalid content raises only `ModelFileError`.
 import dataclasses
 import io
 import json
+import os
 import zlib
 from pathlib import Path
 from typing import Any
@@ -155,6 +156,8 @@ def _describe_maps(about: PathsInfo) -> range_coder.Column:
 
 def is_compact(path: PathLike) -> bool:
     """Whether a file starts with the magic bytes of compact files; False for one that cannot be read."""
+    if not os.path.isfile(path):  # to open a pipe may not end
+        return False
     try:
         with open(path, "rb") as file:
             return file.read(4) == MAGIC[:4]

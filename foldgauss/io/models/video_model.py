@@ -13,7 +13,7 @@ import numpy as np
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io._atomic import PathLike, check_path
-from foldgauss.io.media.clip import AS_STORED, check_reading
+from foldgauss.io.media.clip import AS_STORED, check_frame_size, check_reading
 from foldgauss.io.media.frame_rate import are_rising_seconds
 from foldgauss.io.models.compact import COMPACT_SUFFIX, compact_metadata, is_compact, load_compact_model
 from foldgauss.io.models.model_file import (
@@ -39,7 +39,7 @@ from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
 MODEL_SUFFIX = ".safetensors"
 #: Metadata of which frames of which clip a model shows, and when the clip shows them.
-CLIP_NOTES = ("clip", "frames", "frame_seconds", "first_second", "reading")
+CLIP_NOTES = ("clip", "frames", "frame_seconds", "first_second", "reading", "stretched")
 VIDEO, EDITED = PARTS
 
 
@@ -137,11 +137,20 @@ def _is_reading(value: object) -> bool:
         return False
 
 
+def _is_stretch(value: object) -> bool:
+    """Whether these are two sizes of frames, as `Clip.stretched`."""
+    try:
+        return len(value) == 2 and all(isinstance(one, list) and check_frame_size(one) for one in value)
+    except (TypeError, ValueError):
+        return False
+
+
 #: Metadata that `fit` and `compress` write and later commands read, with their checks.
 _NOTES: dict[str, Callable[[object], bool]] = {
     **dict.fromkeys(("clip", "frames_digest", "clip_digest"), lambda value: isinstance(value, str)),
     "frames": _is_range,
     "reading": _is_reading,
+    "stretched": _is_stretch,
     "frame_seconds": lambda value: isinstance(value, list) and _are_numbers(value) and are_rising_seconds(value),
     "first_second": lambda value: is_within(value, "[0, inf)"),
     "seed": lambda value: is_integer(value, 0),

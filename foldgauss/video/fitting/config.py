@@ -507,12 +507,6 @@ def default_num_gaussians(
     return max(round(min(by_time, by_life, by_size)), 1)
 
 
-def expected_steps(config: FitConfig, height: int, width: int) -> float:
-    """Steps that `minutes` are expected to give frames of this size, by which the number of Gaussians is chosen."""
-    steps = 60e6 * (config.minutes or math.inf) * num_threads() / (PIXEL_TIME * height * width * config.batch_size)
-    return min(steps, config.steps or math.inf)
-
-
 def parameters_per_gaussian(degree: int) -> int:
     return 11 + 2 * degree
 
