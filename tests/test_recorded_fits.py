@@ -84,6 +84,7 @@ EARLIER = FitConfig(
 )
 #: Settings that v0.1 did not have.
 LATER = (
+    "border_weight",
     "scale_rates_by_size",
     "cooldown_fraction",
     "error_fraction",

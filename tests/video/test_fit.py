@@ -8,6 +8,8 @@ import jax
 import numpy as np
 import pytest
 from clips import moving_blobs
+from skimage.data import coffee
+from skimage.transform import resize
 from test_optical_flow import panning
 
 from foldgauss._runtime import threads as _threads
@@ -35,6 +37,7 @@ from foldgauss.video.fitting.loop import check_frames, start, start_from, to_mod
 from foldgauss.video.fitting.schedule import steps_per_pass
 from foldgauss.video.fitting.steppers import cpu_stepper, interpolated_frames
 from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
+from foldgauss.video.fitting.steppers.loss import border_weights
 from foldgauss.video.models.prepared import PreparedModel
 
 CONFIG = FitConfig(num_gaussians=800, steps=60)
@@ -95,6 +98,19 @@ def test_every_setting_works(changes):
 def test_odd_clips(shape):
     frames = moving_blobs(*shape)
     assert evaluate(fit(frames, CONFIG).model, frames).mean_psnr > 18
+
+
+def test_borders_of_a_pan():
+    """No Gaussian starts beyond the frame, so the outermost pixels are covered from one side, and come out too dark."""
+    image = resize(coffee(), (200, 300), anti_aliasing=True)
+    picture = np.uint8(np.round(255 * image))
+    frames, dark = np.stack([picture[60:108, 40 + 4 * k : 104 + 4 * k] for k in range(12)]), {}
+    for weight in (1.0, FitConfig().border_weight):
+        model = fit(frames, FitConfig(num_gaussians=900, steps=240, border_weight=weight)).model
+        ends = np.stack(list(model.frames()))[[0, -1]].astype(float) - frames[[0, -1]]
+        dark[weight] = -ends[:, border_weights(48, 64, 2.0) == 2].mean()
+    assert dark[1.0] > 0.5  # levels
+    assert abs(dark[FitConfig().border_weight]) < 0.75 * dark[1.0]
 
 
 def test_flat_clip():
@@ -369,6 +385,7 @@ def test_file_size_limits_the_number_of_gaussians():
         ({"target_psnr": 0}, "target_psnr"),
         ({"max_size_mb": -1.0}, "max_size_mb"),
         ({"l2_fraction": 1.5}, "l2_fraction"),
+        ({"border_weight": 0.5}, "border_weight"),
         ({"follow_motion": 1}, "follow_motion"),
         ({"batch_size": 0}, "batch_size"),
         ({"power": -1.0}, "power"),

@@ -335,7 +335,9 @@ def test_fit_resets_opacities_on_schedule():
 
 def test_screen_gradient_is_in_units_of_half_the_image():
     """Against finite differences: the loss as one Gaussian's mean moves by a share of half the picture."""
-    config = FitConfig(num_gaussians=1, degree=0, seed=3, ssim_fraction=0.0, growth=Growth(), follow_motion=False)
+    config = FitConfig(
+        num_gaussians=1, degree=0, seed=3, ssim_fraction=0.0, border_weight=1.0, growth=Growth(), follow_motion=False
+    )
     frames = moving_blobs(2, 24, 40)
 
     def stepper_of(state):

@@ -59,6 +59,7 @@ def test_the_published_numbers():
     paper = FitConfig.preset("paper")
     assert (paper.num_gaussians, paper.degree, paper.batch_size, paper.steps) == (500_000, 7, 3, 30_000)
     assert (paper.power, paper.ssim_fraction, paper.l2_fraction, paper.floor) == (2.0, 0.2, 0.0, 0.0)
+    assert paper.border_weight == 1
     assert paper.options == RenderOptions()
     assert paper.scale_cutoff == pytest.approx(1e-4 / (2 * TAN))
     assert paper.growth == Growth()

@@ -4,9 +4,13 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from jaxtyping import Float
 
 from foldgauss.cli.app.application import err, out, warn
+from foldgauss.video.models.frame_times import is_cut
 
 #: So many starts of shots are printed.
 LISTED_STARTS = 8
@@ -64,8 +68,17 @@ def print_log() -> Iterator[None]:
         logger.setLevel(before)
 
 
-def print_shots(starts: tuple[int, ...]) -> None:
-    """Print where shots begin if there are several."""
+def print_shots(starts: tuple[int, ...], times: Float[np.ndarray, " frames"]) -> None:
+    """Print where shots begin if there are several, and warn of those that no cut between frame times explains."""
     if len(starts) > 1:
-        listed = ", ".join(map(str, starts[:LISTED_STARTS])) + (", ..." if len(starts) > LISTED_STARTS else "")
-        err.print(f"{len(starts)} shots, each on its own; they begin at frames {listed}.")
+        err.print(f"{len(starts)} shots, each on its own; they begin at frames {_listed(starts)}.")
+    lost = sorted(set(starts[1:]) - set(1 + np.flatnonzero(is_cut(times))))
+    if lost:
+        warn(
+            f"The motion of the camera was not found before frames {_listed(lost)}, and there is no cut: the picture may "
+            "jump there. A longer fit shows more to follow, above all where contrast is low."
+        )
+
+
+def _listed(frames: Sequence[int]) -> str:
+    return ", ".join(map(str, frames[:LISTED_STARTS])) + (", ..." if len(frames) > LISTED_STARTS else "")

@@ -93,7 +93,7 @@ def plate_command(
             advance()
     out.print("Searching for what moves against the background ..." if masks is None else "Aligning frames ...")
     alignment = Alignment.from_frames(frames)
-    print_shots(alignment.starts)
+    print_shots(alignment.starts, np.asarray(model.frame_times.times()))
     with print_log():
         masks = _find_object(frames, alignment) if masks is None else masks
         plate = fill_background(frames, masks, alignment=alignment)

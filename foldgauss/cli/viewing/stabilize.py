@@ -87,7 +87,7 @@ def stabilize_command(
             video = stabilize(model, smoothing=smoothing, fixed=fixed, border=border, on_frame=advance)
         except ValueError as error:
             raise WrongUse(name_option(str(error))) from error
-    print_shots(video.path.starts)
+    print_shots(video.path.starts, video.path.times)
     if border == "crop" and f"{video.zoom:.2f}" != "1.00":
         out.print(f"Enlarged by {video.zoom:.2f} to hide the borders.")
     render_to_file(

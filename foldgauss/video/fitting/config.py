@@ -96,6 +96,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "half_fraction": 0.0,
         "sparse_updates": False,
         "l2_fraction": 0.0,
+        "border_weight": 1.0,
         "rates": PUBLISHED_RATES,
         "final_rate": 0.01,
         "cooldown_fraction": 0.0,
@@ -285,6 +286,14 @@ class FitConfig:
         default=0.3,
         metadata=setting(
             "Fraction of the steps, at the end, whose loss is the squared error, which PSNR measures", bounds="[0, 1]"
+        ),
+    )
+    border_weight: float = field(
+        default=4.0,
+        metadata=setting(
+            "Factor of the gradient of the loss at the outermost pixels, which are covered from one side only",
+            "With 1 they are too dark in the first and last frames of pans.",
+            bounds="[1, inf)",
         ),
     )
     interpolation_fraction: float | None = field(

@@ -30,7 +30,7 @@ from foldgauss.video.fitting.state import (
     update_rows,
 )
 from foldgauss.video.fitting.steppers.interpolated_frames import choose_targets, make_interpolated
-from foldgauss.video.fitting.steppers.loss import ImageLoss, image_loss, squared_loss
+from foldgauss.video.fitting.steppers.loss import ImageLoss, border_weights, image_loss, squared_loss
 from foldgauss.video.fitting.steppers.protocol import StepResult
 from foldgauss.video.models.background import random_background
 from foldgauss.video.models.conditioning import (
@@ -183,6 +183,7 @@ class CpuStepper:
             weight = self._weight(state.frame_errors, k)
         gradient = loss.gradient
         gradient *= np.float32(weight / self.config.batch_size)
+        gradient *= border_weights(*gradient.shape[1:], self.config.border_weight)
         gradients = cpu.backward(trace, gradient)
         if mirrored:
             mirror(*gradients[:2], 0, out=gradients[:2])

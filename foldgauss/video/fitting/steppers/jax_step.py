@@ -23,6 +23,7 @@ from foldgauss.video.fitting.adam import BETA1, BETA2, EPSILON, RateUnits, maske
 from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.fitting.state import SIZE_STRIDE, DeviceArrays, FitState, Sizes, frame_times
 from foldgauss.video.fitting.steppers.jax_loss import compute_losses
+from foldgauss.video.fitting.steppers.loss import border_weights
 from foldgauss.video.models.row_layout import columns, unpack
 from foldgauss.video.models.shared_paths import move_splats
 from foldgauss.video.models.splats import TAU_MAX
@@ -77,6 +78,7 @@ class Program:
     options: RenderOptions
     engine: str
     ssim_fraction: float
+    border_weight: float
     batch_size: int
     sparse_updates: bool
     rate_units: RateUnits
@@ -276,7 +278,7 @@ def _differentiate(program: Program, rows, path_maps, times, frames, control: Co
         return jnp.sum(own) / program.batch_size, errors
 
     (loss, errors), by_images = jax.value_and_grad(mean_loss, has_aux=True)(images)
-    (by_splats,) = to_splats(by_images)
+    (by_splats,) = to_splats(by_images * border_weights(*program.size, program.border_weight)[None, :, :, None])
     by_rows, by_maps, by_t = to_rows(by_splats)
     return Gradients(
         loss,

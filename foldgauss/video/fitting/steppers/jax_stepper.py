@@ -246,6 +246,7 @@ class JaxStepper:
             options=config.options,
             engine=self.engine,
             ssim_fraction=config.ssim_fraction,
+            border_weight=config.border_weight,
             batch_size=config.batch_size,
             sparse_updates=config.sparse_updates,
             rate_units=config.rate_units,

@@ -6,11 +6,13 @@ SSIM: Wang et al. 2004, with the published rasterizers' choices: 11 Gaussian tap
 covariance, data range 1. In XLA this loss costs more than the splats; here strips of rows pass through the cache once.
 """
 
+import functools
 import math
 from typing import NamedTuple
 
 import numba as nb
 import numpy as np
+from jaxtyping import Float32
 
 from foldgauss._numerics.simd import LANES, broadcast, load, select, store, window
 from foldgauss._runtime.checks import invalid
@@ -241,3 +243,12 @@ def squared_loss(rendered: np.ndarray, target: np.ndarray) -> ImageLoss:
     error = float(np.vdot(difference, difference)) / difference.size
     difference *= np.float32(2 * SQUARE_WEIGHT / difference.size)
     return ImageLoss(SQUARE_WEIGHT * error, difference, error, None)
+
+
+@functools.cache
+def border_weights(height: int, width: int, weight: float) -> Float32[np.ndarray, "height width"]:
+    """`weight` at the outermost pixels and 1 elsewhere: factors of the gradient of a loss by the image."""
+    weights = np.full((height, width), weight, np.float32)
+    weights[1:-1, 1:-1] = 1
+    weights.flags.writeable = False
+    return weights
