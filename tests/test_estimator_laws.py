@@ -25,9 +25,10 @@ def _blobs(seed=0, dtype=np.float64):
 
 
 def _fit(x, num=K, *, groups=None, **options):
+    groups = {} if groups is None else {"groups": groups}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
-        return FoldedGaussianMixture(num, **({"degree": 1, "random_state": 0} | options)).fit(x, groups=groups)
+        return FoldedGaussianMixture(num, **({"degree": 1, "random_state": 0} | options)).fit(x, **groups)
 
 
 @pytest.mark.parametrize("kind", SOME_KINDS)

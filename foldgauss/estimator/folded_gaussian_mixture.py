@@ -44,7 +44,15 @@ from foldgauss.estimator.prediction import (
     predict_responsibilities,
     sum_log_prob,
 )
-from foldgauss.estimator.rows import ChunkedRows, Rows, check_groups, find_extreme, order_columns, refuse_groups
+from foldgauss.estimator.rows import (
+    ChunkedRows,
+    Rows,
+    check_groups,
+    find_extreme,
+    order_columns,
+    refuse_groups,
+    warn_narrow,
+)
 from foldgauss.mixture import FoldedMixture
 
 __all__ = ["EMStatus", "FoldedGaussianMixture"]
@@ -58,8 +66,6 @@ _CURES = {
 }
 #: With "auto", the initial number of components is at most the number of points divided by this.
 _POINTS_PER_COMPONENT = 8
-#: A component is narrow if its variance is less than this many squared gaps; one of them is added to every variance.
-_NARROW = 1.25
 #: The highest degree fitted in float32. Beyond, with times far from normal, a curve's normal equations lose more digits
 #: than float32 has: up to 1 nat a point at degree 10.
 _MAX_SINGLE_DEGREE = 6
@@ -296,7 +302,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         if auto and warm is None and run.status != EMStatus.NOT_FINITE:
             run, model = self._prune(run, points, envelope, model, total)
         self._scaling, self._envelope, self._floor = scaling, envelope, floor
-        _warn_narrow(run.params, gaps)
+        warn_narrow(run.params.tril, gaps)
         vars(self).pop("_online", None)
         self._fitted_with = self.covariance_type, self._time_index(num_columns)
         return run._replace(log_likelihood=run.log_likelihood - scaling.log_volume), model
@@ -587,21 +593,6 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
 
     def _arrays(self, dtype) -> Parameters:
         return Parameters(*(jnp.asarray(z, dtype) for z in self._params))
-
-
-def _warn_narrow(params: Parameters, gaps: Float[np.ndarray, " d"] | float) -> None:
-    """Warn of components most of whose variance, in some direction of space, is the gap between groups."""
-    if not np.any(gaps):
-        return
-    whitened = np.asarray(params.tril, np.float64) / np.sqrt(np.maximum(gaps[:-1], np.finfo(np.float64).tiny))[:, None]
-    narrow = int((np.linalg.svd(whitened, compute_uv=False)[:, -1] ** 2 < _NARROW).sum())
-    if narrow:
-        warnings.warn(
-            f"{narrow} of {len(whitened)} components are as narrow as the gap between groups and may each describe one "
-            "group only. Lower n_components or max_components, or fit more groups.",
-            ConvergenceWarning,
-            stacklevel=5,
-        )
 
 
 def _print_progress(number: int, values: np.ndarray) -> None:

@@ -1,19 +1,23 @@
 """The training data of a fit: rows in memory or in chunks, under one interface, and the order of their columns."""
 
+import warnings
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+from sklearn.exceptions import ConvergenceWarning
 
 from foldgauss._runtime.checks import invalid
 from foldgauss.estimator.chunks import Chunks, RowSummary, collect_rows, weighted_moments
 from foldgauss.estimator.em.scaling import RowTransform, Scaling
 from foldgauss.estimator.em.statistics import Blocks, Points, make_points
 
-__all__ = ["ChunkedRows", "Rows", "check_groups", "find_extreme", "order_columns", "refuse_groups"]
+__all__ = ["ChunkedRows", "Rows", "check_groups", "find_extreme", "order_columns", "refuse_groups", "warn_narrow"]
 
 #: Rows from which the gaps between groups are measured; their median is precise to about 10%.
 _GAP_ROWS = 200
+#: A component is narrow if its variance is less than this many squared gaps; one of them is added to every variance.
+_NARROW = 1.25
 
 
 class Rows(NamedTuple):
@@ -145,6 +149,21 @@ def refuse_groups(groups) -> None:
     """Raise if there are groups, for chunks of rows."""
     if groups is not None:
         raise invalid("groups", expected="None for chunks of rows", got="groups", cure="Or pass one array.")
+
+
+def warn_narrow(tril: Float[np.ndarray, "k d-1 d-1"], gaps: Float[np.ndarray, " d"] | float) -> None:
+    """Warn of components most of whose variance, in some direction of space, is the gap between groups."""
+    if not np.any(gaps):
+        return
+    whitened = np.asarray(tril, np.float64) / np.sqrt(np.maximum(gaps[:-1], np.finfo(np.float64).tiny))[:, None]
+    narrow = int((np.linalg.svd(whitened, compute_uv=False)[:, -1] ** 2 < _NARROW).sum())
+    if narrow:
+        warnings.warn(
+            f"{narrow} of {len(whitened)} components are as narrow as the gap between groups and may each describe one "
+            "group only. Lower n_components or max_components, or fit more groups.",
+            ConvergenceWarning,
+            stacklevel=5,
+        )
 
 
 def order_columns(column: int, num_columns: int) -> Int[np.ndarray, " d"]:
