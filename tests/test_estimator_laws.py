@@ -199,7 +199,9 @@ def test_groups_keep_components_from_collapsing_onto_one_curve():
 @pytest.mark.slow
 def test_automatic_choice_with_groups_generalizes():
     (x, groups), (held, _) = _demonstrations(0, 8), _demonstrations(1, 5)
-    plain, grouped = (_fit(x, "auto", degree="auto", time_column=0, groups=g) for g in (None, groups))
+    plain, grouped = (
+        _fit(x, "auto", degree="auto", max_components=20, time_column=0, groups=g) for g in (None, groups)
+    )
     assert len(grouped.weights_) < len(plain.weights_)
     assert grouped.score(held) > plain.score(held) + 2
 
