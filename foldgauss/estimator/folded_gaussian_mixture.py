@@ -44,7 +44,15 @@ from foldgauss.estimator.prediction import (
     predict_responsibilities,
     sum_log_prob,
 )
-from foldgauss.estimator.rows import ChunkedRows, Rows, order_columns
+from foldgauss.estimator.rows import (
+    ChunkedRows,
+    Rows,
+    check_groups,
+    find_extreme,
+    order_columns,
+    refuse_groups,
+    warn_narrow,
+)
 from foldgauss.mixture import FoldedMixture
 
 __all__ = ["EMStatus", "FoldedGaussianMixture"]
@@ -97,8 +105,8 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
     * `criterion`: "bic" or "aic", for "auto".
     * `devices`: the number of JAX devices that the points are distributed over.
 
-    **dtype:** float32 data are fitted in float32, those with degrees above 6 and all others in float64, whatever JAX's
-    default is.
+    **dtype:** float32 data are fitted in float32, those with degrees above 6 or of units whose powers float32 does not
+    hold, and all others, in float64, whatever JAX's default is.
 
     **Fitted:** `weights_` (K,), `means_` (K, d) and `covariances_` (K, d, d) of whole components, columns as
     in X, `locs_` (K, d-1), `space_covariances_` (K, d-1, d-1), `time_means_`, `time_scales_` (K,), `fold_coefficients_`
@@ -167,35 +175,48 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
 
     # --- fitting --------------------------------------------------------------------------------------------
 
-    def fit(self, X, y=None, sample_weight=None):
+    def fit(self, X, y=None, sample_weight=None, groups=None):
         """Fit to rows of X (n, d); `sample_weight` (n,) are frequency weights: 2 repeats a point, 0 leaves it out.
+
+        `groups` (n,) are the independent units of dependent rows, such as the track of each row. Then the total weight
+        in `criterion` is their number G, the effective sample size n / (1 + (m - 1) rho) of groups of m = n / G rows
+        for correlation rho = 1 within a group: -2 G mean log p + parameters log G. To the variances is added the
+        squared gap between groups: in each column, the median squared distance to the nearest row of another group. A
+        narrower component would hold rows of one group only. A warning is given if components are as narrow as that.
+
+        **Source:** Kish 1965, Survey Sampling, for the effective sample size.
 
         **Raises:** ValueError on invalid parameters, NaN or infinity, fewer points than components, and chunks whose
         columns differ, that can be iterated only once, or that change from one pass to the next. Warns
         (ConvergenceWarning) if EM did not converge, see `status_`.
         """
-        self._fit(X, sample_weight)
+        self._fit(X, sample_weight, groups)
         return self
 
-    def fit_predict(self, X, y=None, sample_weight=None) -> Int[np.ndarray, " n"]:
+    def fit_predict(self, X, y=None, sample_weight=None, groups=None) -> Int[np.ndarray, " n"]:
         """Fit, and return the most likely component of each row, as `predict`."""
-        scaled = self._fit(X, sample_weight)
+        scaled = self._fit(X, sample_weight, groups)
         if scaled is None:
             return self.predict(X)
         with enable_dtype(scaled.dtype):
             return self._responsibilities(scaled).argmax(1)
 
-    def _fit(self, X, sample_weight):
+    def _fit(self, X, sample_weight, groups=None):
         check_parameters(self)
-        double = (self.max_degree if self.degree == "auto" else self.degree) > _MAX_SINGLE_DEGREE
         if is_chunked(X):
-            x, data = None, self._check_chunks(X, sample_weight, double)
+            refuse_groups(groups)
+            x, data = None, self._check_chunks(X, sample_weight)
         else:
             x, weights = self._check_rows(X, sample_weight)
-            if double:
-                x, weights = x.astype(np.float64), weights.astype(np.float64)
             present = weights > 0
-            data = Rows(x[present], weights[present])
+            data = Rows(x[present], weights[present], check_groups(groups, present))
+        degree = self.max_degree if self.degree == "auto" else self.degree
+        if data.dtype == np.float32 and (degree > _MAX_SINGLE_DEGREE or find_extreme(data, degree) is not None):
+            data = data.astype(np.dtype(np.float64))
+        if (column := find_extreme(data, degree)) is not None:
+            column, cure = self._order_columns(self.n_features_in_)[column], "Divide it by its standard deviation."
+            expected = f"columns whose spread to the power {degree + 1} float64 holds"
+            raise invalid("X", expected=expected, got=f"another in column {column}", cure=cure)
         with enable_dtype(data.dtype):
             run, model = self._run(data)
         self._set_fitted(run, model)
@@ -205,7 +226,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
                 ConvergenceWarning,
                 stacklevel=3,
             )
-        return None if x is None else self._scaling.apply(x)
+        return None if x is None else self._scaling.apply(x.astype(data.dtype))
 
     def _check_rows(self, X, sample_weight, reset: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """Rows with time last, and weights, in the dtype of the fit."""
@@ -220,7 +241,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         check_sizes(X.shape[1], int((weights > 0).sum()), weights.sum(), least)
         return X[:, self._order_columns(X.shape[1])], weights
 
-    def _check_chunks(self, X, sample_weight, double: bool) -> ChunkedRows:
+    def _check_chunks(self, X, sample_weight) -> ChunkedRows:
         """Chunks of rows, after a first pass over them."""
         check_not_forked()
         chunks = open_chunks(X, sample_weight)
@@ -232,7 +253,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         vars(self).pop("feature_names_in_", None)
         order = self._order_columns(width)
         self.n_features_in_ = width
-        dtype = np.dtype(np.float32 if summary.single and not double else np.float64)
+        dtype = np.dtype(np.float32 if summary.single else np.float64)
         return ChunkedRows(chunks, summary, sizes, order, dtype)
 
     def _order_columns(self, num_columns: int) -> Int[np.ndarray, " d"]:
@@ -243,7 +264,9 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
 
     def _run(self, data: Rows | ChunkedRows) -> tuple[Run, Model]:
         auto = "auto" in (self.n_components, self.degree)
-        if auto and data.total < data.size:  # normalized weights: information criteria need the number of points
+        if data.num_groups is not None:
+            data = data.reweight(data.num_groups / data.total)
+        elif auto and data.total < data.size:  # normalized weights: information criteria need the number of points
             data = data.reweight(data.size / data.total)
         mean, variance = data.moments()
         num_columns, total = len(mean), data.total
@@ -255,7 +278,8 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         else:
             scaling, (num, degree) = self._scaling, warm
         data = data.rescale(scaling)
-        floor = (self.reg_covar + self.reg_relative * variance) / scaling.scale**2
+        gaps = data.gaps()
+        floor = (self.reg_covar + self.reg_relative * variance) / scaling.scale**2 + gaps
         degrees = broadcast_degrees(degree if warm is None else self.degrees_, num)
         model = Model(degrees, jnp.asarray(floor, data.dtype), self.covariance_type)
         starts = self._starts(data, scaling, model, degree, warm is not None)
@@ -278,6 +302,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         if auto and warm is None and run.status != EMStatus.NOT_FINITE:
             run, model = self._prune(run, points, envelope, model, total)
         self._scaling, self._envelope, self._floor = scaling, envelope, floor
+        warn_narrow(run.params.tril, gaps)
         vars(self).pop("_online", None)
         self._fitted_with = self.covariance_type, self._time_index(num_columns)
         return run._replace(log_likelihood=run.log_likelihood - scaling.log_volume), model
@@ -468,11 +493,13 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         points = make_points(y, np.ones(len(y), y.dtype), len(self._params.time_loc))
         return np.asarray(compute_responsibilities(self._arrays(y.dtype), self._envelope, points))[: len(y)]
 
-    def _mean_score(self, X) -> tuple[float, int]:
-        """The mean log p(x), and the number of rows."""
+    def _mean_score(self, X, groups=None) -> tuple[float, int]:
+        """The mean log p(x), and the number of rows, or of groups."""
         if not is_chunked(X):
             value = self.score_samples(X)
-            return float(value.mean(dtype=np.float64)), len(value)
+            which = check_groups(groups, np.ones(len(value), bool))
+            return float(value.mean(dtype=np.float64)), len(value) if which is None else int(which.max()) + 1
+        refuse_groups(groups)
         parts = list(self._open_chunks(X).run(sum_log_prob, self._fitted_parameters()))
         num = sum(size for _, size in parts)
         if not num:
@@ -488,14 +515,14 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         envelope = jax.tree.map(lambda z: np.asarray(z) if isinstance(z, jax.Array) else z, self._envelope)
         return FittedParameters(self._params, envelope, self._scaling, self._order_columns(self.n_features_in_))
 
-    def bic(self, X) -> float:
-        """-2 log-likelihood + parameters log n: smaller is better."""
-        mean, num = self._mean_score(X)
+    def bic(self, X, groups=None) -> float:
+        """-2 log-likelihood + parameters log n: smaller is better. `groups` as in `fit`: n is their number."""
+        mean, num = self._mean_score(X, groups)
         return -2 * mean * num + self._n_parameters() * float(np.log(num))
 
-    def aic(self, X) -> float:
-        """-2 log-likelihood + 2 parameters: smaller is better."""
-        mean, num = self._mean_score(X)
+    def aic(self, X, groups=None) -> float:
+        """-2 log-likelihood + 2 parameters: smaller is better. `groups` as in `fit`: their number replaces n."""
+        mean, num = self._mean_score(X, groups)
         return -2 * mean * num + 2 * self._n_parameters()
 
     def _n_parameters(self) -> int:
@@ -561,7 +588,8 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         check_is_fitted(self)
         check_real("X", X)
         X = validate_data(self, X, dtype=[np.float64, np.float32], reset=False)
-        return self._scaling.apply(X[:, self._order_columns(X.shape[1])])
+        dtype = np.result_type(X, self._params.curve)  # parameters fitted in float64 may be out of float32's range
+        return self._scaling.apply(X[:, self._order_columns(X.shape[1])].astype(dtype))
 
     def _arrays(self, dtype) -> Parameters:
         return Parameters(*(jnp.asarray(z, dtype) for z in self._params))

@@ -87,8 +87,8 @@ class FoldedMixtureRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.criterion = criterion
         self.random_state = random_state
 
-    def fit(self, X, y, sample_weight=None):
-        """Fit the mixture of (X, y); `sample_weight` (n,) are frequency weights, as in `FoldedGaussianMixture.fit`.
+    def fit(self, X, y, sample_weight=None, groups=None):
+        """Fit the mixture of (X, y); `sample_weight` (n,) and `groups` (n,) as in `FoldedGaussianMixture.fit`.
 
         **Raises:** ValueError on invalid parameters, NaN or infinity, and fewer rows than components. Warns
         (ConvergenceWarning) if EM did not converge, see `mixture_.status_`.
@@ -98,10 +98,11 @@ class FoldedMixtureRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if np.ndim(sample_weight) == 1 and len(sample_weight) == len(y):  # rows of weight 0 may hold NaN
             present = np.flatnonzero(sample_weight)
             X, y, sample_weight = (_safe_indexing(z, present) for z in (X, y, sample_weight))
+            groups = None if groups is None else np.asarray(groups)[present]
         X, y = validate_data(self, X, y, dtype=np.float64, multi_output=True, y_numeric=True, ensure_min_samples=2)
         column = check_column(self.time_column, X.shape[1], getattr(self, "feature_names_in_", None))
         mixture = FoldedGaussianMixture(**self.get_params(deep=False) | {"time_column": column})
-        self.mixture_ = mixture.fit(np.column_stack([X, y]), sample_weight=sample_weight)
+        self.mixture_ = mixture.fit(np.column_stack([X, y]), sample_weight=sample_weight, groups=groups)
         self.n_iter_, self._target_shape = self.mixture_.n_iter_, y.shape[1:]
         return self
 

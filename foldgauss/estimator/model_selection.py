@@ -41,8 +41,10 @@ def select_mixture(
     """Select the number of components and the degree that minimize a criterion.
 
     * "bic": -2 log-likelihood + parameters log n; "aic": + 2 parameters;
-    * "cv": -2 times the log-likelihood of held-out points, in `folds` folds; with `groups` (n,) each group stays in one
-      fold (the points of one track, for example).
+    * "cv": -2 times the log-likelihood of held-out points, in `folds` folds.
+
+    `groups` (n,) are the units of dependent rows, such as the track of each row, as in `FoldedGaussianMixture.fit`:
+    "cv" keeps each group in one fold, the other criteria count groups instead of rows.
 
     A degree of "auto" is chosen for each component by itself, up to `max_degree`.
 
@@ -73,24 +75,29 @@ def select_mixture(
     for i, size in enumerate(sizes):
         for j, degree in enumerate(degrees):
             one = clone(estimator).set_params(n_components=int(size), degree=degree)
-            scores[i, j] = _cross_validate(one, X, parts) if criterion == "cv" else _penalize(one, X, criterion)
+            scores[i, j] = (
+                _cross_validate(one, X, parts, groups) if criterion == "cv" else _penalize(one, X, groups, criterion)
+            )
             if scores[i, j] < np.inf and scores[i, j] == scores.min():
                 chosen = one
     if not np.isfinite(scores).any():
         raise invalid("X", expected="points that some mixture fits", got="none", cure="Raise reg_covar.")
     # For "bic" and "aic" it is fitted already; fitting again could find another optimum.
-    return MixtureChoice(chosen.fit(X) if criterion == "cv" else chosen, scores, sizes, degrees)
+    return MixtureChoice(chosen.fit(X, groups=groups) if criterion == "cv" else chosen, scores, sizes, degrees)
 
 
-def _penalize(estimator, X, criterion: str) -> float:
-    fitted = _fit_or_none(estimator, X)
-    return np.inf if fitted is None else getattr(fitted, criterion)(X)
+def _penalize(estimator, X, groups, criterion: str) -> float:
+    fitted = _fit_or_none(estimator, X, groups)
+    return np.inf if fitted is None else getattr(fitted, criterion)(X, groups)
 
 
-def _cross_validate(estimator, X, parts) -> float:
+def _cross_validate(estimator, X, parts, groups) -> float:
     total = 0.0
     for part in range(parts.max() + 1):
-        fitted = _fit_or_none(clone(estimator), _safe_indexing(X, np.flatnonzero(parts != part)))
+        kept = parts != part
+        # The rows of a single group give no gap between groups.
+        some = None if groups is None or len(np.unique(np.asarray(groups)[kept])) < 2 else np.asarray(groups)[kept]
+        fitted = _fit_or_none(clone(estimator), _safe_indexing(X, np.flatnonzero(kept)), some)
         if fitted is None:
             return np.inf
         total += -2 * float(
@@ -99,10 +106,10 @@ def _cross_validate(estimator, X, parts) -> float:
     return total if np.isfinite(total) else np.inf
 
 
-def _fit_or_none(estimator, X) -> FoldedGaussianMixture | None:
+def _fit_or_none(estimator, X, groups) -> FoldedGaussianMixture | None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
-        fitted = estimator.fit(X)
+        fitted = estimator.fit(X, groups=groups)
     return None if fitted.status_ == EMStatus.NOT_FINITE else fitted
 
 

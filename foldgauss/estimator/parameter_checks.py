@@ -28,7 +28,7 @@ def check_parameters(estimator) -> None:
         value = getattr(estimator, name)
         if value != "auto" and not is_integer(value, least):
             raise invalid(name, expected=f'a whole number >= {least} or "auto"', got=repr(value))
-    for name, least in {"max_components": 1, "max_degree": 0, "max_iter": 1, "n_init": 1, "devices": 1}.items():
+    for name, least in {"max_components": 1, "max_degree": 0, "max_iter": 0, "n_init": 1, "devices": 1}.items():
         if not is_integer(getattr(estimator, name), least):
             raise invalid(name, expected=f"a whole number >= {least}", got=repr(getattr(estimator, name)))
     for name in ("tol", "reg_covar", "reg_relative"):

@@ -59,7 +59,7 @@ def sum_log_prob(pieces: Iterable[Piece], fitted: FittedParameters) -> tuple[flo
 
 def _evaluate_rows(function, fitted: FittedParameters, x: np.ndarray) -> np.ndarray:
     """Apply a compiled function of points to rows of X, in blocks of few shapes, so that all chunks share programs."""
-    y = fitted.scaling.apply(x[:, fitted.order])
+    y = fitted.scaling.apply(x[:, fitted.order].astype(np.result_type(x, fitted.params.curve)))
     num = len(fitted.params.time_loc)
     with enable_dtype(y.dtype):
         params = Parameters(*(jnp.asarray(z, y.dtype) for z in fitted.params))

@@ -1,15 +1,23 @@
 """The training data of a fit: rows in memory or in chunks, under one interface, and the order of their columns."""
 
+import warnings
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+from sklearn.exceptions import ConvergenceWarning
 
+from foldgauss._runtime.checks import invalid
 from foldgauss.estimator.chunks import Chunks, RowSummary, collect_rows, weighted_moments
 from foldgauss.estimator.em.scaling import RowTransform, Scaling
 from foldgauss.estimator.em.statistics import Blocks, Points, make_points
 
-__all__ = ["ChunkedRows", "Rows", "order_columns"]
+__all__ = ["ChunkedRows", "Rows", "check_groups", "find_extreme", "order_columns", "refuse_groups", "warn_narrow"]
+
+#: Rows from which the gaps between groups are measured; their median is precise to about 10%.
+_GAP_ROWS = 200
+#: A component is narrow if its variance is less than this many squared gaps; one of them is added to every variance.
+_NARROW = 1.25
 
 
 class Rows(NamedTuple):
@@ -17,6 +25,7 @@ class Rows(NamedTuple):
 
     x: Float[np.ndarray, "n d"]
     weights: Float[np.ndarray, " n"]
+    groups: Int[np.ndarray, " n"] | None = None
 
     @property
     def dtype(self) -> np.dtype:
@@ -34,11 +43,29 @@ class Rows(NamedTuple):
         """Weighted mean and variance of each column."""
         return weighted_moments(self.x, self.weights)
 
+    def astype(self, dtype: np.dtype) -> "Rows":
+        return self._replace(x=self.x.astype(dtype), weights=self.weights.astype(dtype))
+
     def reweight(self, factor: float) -> "Rows":
         return self._replace(weights=self.weights * self.dtype.type(factor))
 
     def rescale(self, scaling: Scaling) -> "Rows":
         return self._replace(x=scaling.apply(self.x))
+
+    @property
+    def num_groups(self) -> int | None:
+        return None if self.groups is None else len(np.unique(self.groups))
+
+    def gaps(self) -> Float[np.ndarray, " d"] | float:
+        """The median squared distance in each column to the nearest row of another group; 0 without groups."""
+        if self.groups is None:
+            return 0.0
+
+        def one(row: int) -> np.ndarray:
+            square = (self.x[self.groups != self.groups[row]] - self.x[row]) ** 2
+            return square[square.sum(1).argmin()]
+
+        return np.median([one(row) for row in np.unique(np.linspace(0, self.size - 1, _GAP_ROWS).astype(int))], axis=0)
 
     def take(self, subset: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """The rows with these indices (None: all), and their weights."""
@@ -58,6 +85,7 @@ class ChunkedRows(NamedTuple):
     dtype: np.dtype
     factor: float = 1.0
     scaling: Scaling | None = None
+    num_groups = None
 
     @property
     def size(self) -> int:
@@ -75,6 +103,12 @@ class ChunkedRows(NamedTuple):
         """Weighted mean and variance of each column."""
         return self.summary.mean[self.order], self.summary.scatter[self.order] / self.summary.total
 
+    def gaps(self) -> float:
+        return 0.0
+
+    def astype(self, dtype: np.dtype) -> "ChunkedRows":
+        return self._replace(dtype=dtype)
+
     def reweight(self, factor: float) -> "ChunkedRows":
         return self._replace(factor=factor)
 
@@ -87,6 +121,49 @@ class ChunkedRows(NamedTuple):
 
     def to_points(self, num_components: int, devices: int) -> Blocks:
         return Blocks(self.chunks, self.transform, self.dtype, num_components, self.sizes, devices)
+
+
+def find_extreme(data: Rows | ChunkedRows, degree: int) -> int | None:
+    """A column whose powers, in covariances and coefficients of this degree, are out of the dtype's range."""
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        mean, variance = data.moments()
+        # A column is measured from its mean: the fit handles offsets, but not their squares beyond the range.
+        size = (degree + 1) * np.abs(0.5 * np.log(variance))
+        extreme = (size > np.log(float(np.finfo(data.dtype).max))) & (variance > 0) | ~np.isfinite(variance + mean**2)
+    return int(extreme.argmax()) if extreme.any() else None
+
+
+def check_groups(groups, present: np.ndarray) -> Int[np.ndarray, " n"] | None:
+    """The number of the group of each row that is present."""
+    if groups is None:
+        return None
+    if np.shape(groups) != present.shape:
+        raise invalid("groups", expected=f"shape {present.shape}", got=f"shape {np.shape(groups)}", cure="One per row.")
+    names, which = np.unique(np.asarray(groups)[present], return_inverse=True)
+    if len(names) < 2:
+        raise invalid("groups", expected="at least 2 groups", got=len(names), cure="Add tracks, or leave groups out.")
+    return which
+
+
+def refuse_groups(groups) -> None:
+    """Raise if there are groups, for chunks of rows."""
+    if groups is not None:
+        raise invalid("groups", expected="None for chunks of rows", got="groups", cure="Or pass one array.")
+
+
+def warn_narrow(tril: Float[np.ndarray, "k d-1 d-1"], gaps: Float[np.ndarray, " d"] | float) -> None:
+    """Warn of components most of whose variance, in some direction of space, is the gap between groups."""
+    if not np.any(gaps):
+        return
+    whitened = np.asarray(tril, np.float64) / np.sqrt(np.maximum(gaps[:-1], np.finfo(np.float64).tiny))[:, None]
+    narrow = int((np.linalg.svd(whitened, compute_uv=False)[:, -1] ** 2 < _NARROW).sum())
+    if narrow:
+        warnings.warn(
+            f"{narrow} of {len(whitened)} components are as narrow as the gap between groups and may each describe one "
+            "group only. Lower n_components or max_components, or fit more groups.",
+            ConvergenceWarning,
+            stacklevel=5,
+        )
 
 
 def order_columns(column: int, num_columns: int) -> Int[np.ndarray, " d"]:
