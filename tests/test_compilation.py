@@ -1,5 +1,6 @@
 """Compiled programs: few for many distributions and batch sizes, since each holds memory maps, and takes seconds."""
 
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -73,6 +74,23 @@ def test_few_programs_serve_all_batch_sizes():
     for size in range(1, 200, 6):
         map_over_batch(_cube, (np.ones(size, np.float32), 0))
     assert len(_cube.traced) == 3
+
+
+def _lookup(table, x):
+    return table[0] + x
+
+
+def test_what_a_batch_shares_is_not_copied_for_each_element():
+    """Such as the path of a camera, which the Gaussians of a video share."""
+    table, x = np.ones((1, 20_000), np.float32), np.arange(1000, dtype=np.float32)
+    map_over_batch(_lookup, (table, 1), (x, 0))  # compiled
+    tracemalloc.start()
+    try:
+        np.testing.assert_array_equal(map_over_batch(_lookup, (table, 1), (x, 0)), x + 1)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 0.3 * table.nbytes * len(x)
 
 
 class _Slanted(BatchModule):

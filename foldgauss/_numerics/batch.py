@@ -230,16 +230,24 @@ def map_over_batch(function: Callable, *items):
     batch, structure = check_batch(parts), jax.tree.structure([x if isinstance(x, eqx.Module) else x[0] for x in items])
     traced = any(isinstance(x, jax.core.Tracer) for x, _ in parts)
     own, size = jnp if traced else np, math.prod(batch)  # NumPy compiles nothing
-    shapes = [(x, x.shape[x.ndim - rank :]) for x, rank in parts]
-    flat = [own.broadcast_to(own.asarray(x), (*batch, *event)).reshape(size, *event) for x, event in shapes]
+    shapes = [(own.asarray(x), x.shape[x.ndim - rank :]) for x, rank in parts]
+    flat = [_flatten(own, x, batch, event) for x, event in shapes]
     result = _map_flat(function, structure, flat) if traced or not size else _map_eager(function, structure, flat, size)
     return jax.tree.map(lambda x: jnp.asarray(x.reshape((*batch, *x.shape[1:]))), result)
+
+
+def _flatten(own, x: np.ndarray | Array, batch: tuple[int, ...], event: tuple[int, ...]) -> np.ndarray | Array:
+    """`x` for each element of the batch, (size, *event). What all share, such as a path, is not copied by NumPy."""
+    size = math.prod(batch)
+    if x.size == math.prod(event):
+        return own.broadcast_to(x.reshape(1, *event), (size, *event))
+    return own.broadcast_to(x, (*batch, *event)).reshape(size, *event)
 
 
 def _map_eager(function: Callable, structure, flat: list[np.ndarray], size: int):
     """In chunks of one of few sizes, so that batches of any size share a compiled program."""
     width = next((n for n in _SIZES if size <= n), _CHUNK)
-    chunks = [[fill_up(x[start : start + width], width) for x in flat] for start in range(0, size, width)]
+    chunks = ([fill_up(x[start : start + width], width) for x in flat] for start in range(0, size, width))
     # One after the other: jaxlib's solver for batches can deadlock if two programs run at once (`solve_upper_matrix`).
     results = [jax.tree.map(_as_numpy, _map_flat(function, structure, chunk)) for chunk in chunks]
     return jax.tree.map(lambda *parts: _join(parts)[:size], *results)
