@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Float
 
-from foldgauss._numerics.batch import BatchModule, map_over_batch
+from foldgauss._numerics.batch import BatchModule, _compile_flat, map_over_batch
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.fold import PolynomialFold
 
@@ -74,6 +74,18 @@ def test_few_programs_serve_all_batch_sizes():
     for size in range(1, 200, 6):
         map_over_batch(_cube, (np.ones(size, np.float32), 0))
     assert len(_cube.traced) == 3
+
+
+def _scaled(table, x):
+    return table[: len(x)] * x
+
+
+def test_programs_that_are_not_used_any_more_are_dropped():
+    """A process that makes many distributions, each with integrals of its own, would run out of memory maps."""
+    for length in range(1, 40):
+        map_over_batch(_scaled, (np.ones(100, np.float32), 1), (np.ones(length, np.float32), 1))
+    kept = _compile_flat.cache_info()
+    assert kept.currsize == kept.maxsize < 40
 
 
 def _lookup(table, x):

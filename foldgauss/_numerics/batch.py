@@ -218,6 +218,8 @@ def _is_eager(arguments) -> bool:
 _CHUNK = 64
 # Eager batches are filled up to one of these sizes: as many programs serve all batches.
 _SIZES = (1, 8, _CHUNK)
+# Programs that are kept. An integral over time takes some 300 of the 65,530 memory maps that a Linux process may have.
+_PROGRAMS = 32
 
 
 def map_over_batch(function: Callable, *items):
@@ -248,9 +250,16 @@ def _map_eager(function: Callable, structure, flat: list[np.ndarray], size: int)
     """In chunks of one of few sizes, so that batches of any size share a compiled program."""
     width = next((n for n in _SIZES if size <= n), _CHUNK)
     chunks = ([fill_up(x[start : start + width], width) for x in flat] for start in range(0, size, width))
+    program = _compile_flat(function, structure, tuple((x.shape[1:], x.dtype) for x in flat), width)
     # One after the other: jaxlib's solver for batches can deadlock if two programs run at once (`solve_upper_matrix`).
-    results = [jax.tree.map(_as_numpy, _map_flat(function, structure, chunk)) for chunk in chunks]
+    results = [jax.tree.map(_as_numpy, program(chunk)) for chunk in chunks]
     return jax.tree.map(lambda *parts: _join(parts)[:size], *results)
+
+
+@functools.lru_cache(maxsize=_PROGRAMS)
+def _compile_flat(function: Callable, structure, leaves: tuple, width: int) -> Callable:
+    """The program for these shapes, as a function of its own, which is dropped with all that it holds."""
+    return jax.jit(functools.partial(_map_flat.__wrapped__, function, structure))
 
 
 def fill_up(x: np.ndarray, size: int) -> np.ndarray:
