@@ -445,7 +445,7 @@ def test_minutes_become_steps(clip, tmp_path, capsys, monkeypatch, minutes, step
     ("options", "told"),
     [
         (["--axes", "time,speed"], "--axes: expected some of time, gaussians, degree"),
-        (["--axes", ""], "--axes: expected some of"),
+        (["--axes", ","], "--axes: expected some of"),
         (["--clock", "sun"], "--clock: expected one of 'wall', 'cpu'"),
         (["--minutes", "0"], "--minutes: expected a number above 0"),
         (["--minutes", "nan"], "--minutes: expected a number above 0"),

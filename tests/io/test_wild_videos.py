@@ -1152,8 +1152,8 @@ def test_names_that_are_no_unicode_are_refused(tmp_path, mp4, made):
 def test_a_pattern_is_no_file(tmp_path):
     for number in range(3):
         (tmp_path / f"img{number:03d}.png").write_bytes(_png(_noise(3)[number]))
-    for name in ("img%03d.png", "*.png", "a" * 5000):
-        with pytest.raises(FileNotFoundError, match="missing"):
+    for name, told in {"img%03d.png": "missing", "*.png": "missing", "a" * 5000: "File name too long"}.items():
+        with pytest.raises(FileNotFoundError, match=told):
             read_video(tmp_path / name)
 
 

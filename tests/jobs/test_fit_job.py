@@ -269,7 +269,7 @@ from foldgauss._runtime.machine import waiting_seconds
 os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 time.sleep(0.3)
 with ThreadPoolExecutor(4) as pool:
-    list(pool.map(lambda data: [hashlib.blake2b(data) for _ in range(150)], [bytes(1 << 20)] * 4))
+    list(pool.map(lambda data: [hashlib.blake2b(data) for _ in range(10)], [bytes(1 << 24)] * 4))
     print(time.process_time(), waiting_seconds())
 """
     ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120)

@@ -28,6 +28,16 @@ def usual(optimized) -> float:
 
 
 @pytest.fixture(scope="module")
+def slowed(optimized) -> float:
+    """dB of the fit whose rates fall at step 100 as those of a fit that backs off."""
+
+    def back_off(state):
+        state.backoffs = 1
+
+    return _fit_with(back_off)
+
+
+@pytest.fixture(scope="module")
 def begun() -> float:
     """dB after one step."""
     return evaluate(fit(CLIP, dataclasses.replace(CONFIG, steps=1)).model, CLIP).mean_psnr
@@ -47,13 +57,13 @@ def _fit_with(change, config: FitConfig = CONFIG, at: int = 100) -> float:
     ("leaf", "value"),
     [("loc", np.nan), ("opacity_logit", np.inf), ("coefficients", -np.inf), ("log_time_scale", np.nan)],
 )
-def test_nonfinite_parameter_is_named_and_repaired(usual, leaf, value):
+def test_nonfinite_parameter_is_named_and_repaired(slowed, leaf, value):
     def spoil(state):
         state.rows[17, columns(CONFIG.degree)[leaf]] = value
 
     with pytest.warns(DivergenceWarning, match=rf"step 101: .*no finite {leaf} in 1 Gaussians, the first of them 17"):
         got = _fit_with(spoil)
-    assert got > usual - 3  # 240 steps, half of them at a quarter of the rates
+    assert got > slowed - 1.2  # steps since the last state kept are lost (seeds 0 to 5: 0.8 to 1.0 dB)
 
 
 def test_nonfinite_frame_times_are_named():

@@ -290,11 +290,7 @@ class FitConfig:
     )
     border_weight: float = field(
         default=4.0,
-        metadata=setting(
-            "Factor of the gradient of the loss at the outermost pixels, which are covered from one side only",
-            "With 1 they are too dark in the first and last frames of pans.",
-            bounds="[1, inf)",
-        ),
+        metadata=setting("Factor of the gradient at the outermost pixels, covered from one side", bounds="[1, inf)"),
     )
     interpolation_fraction: float | None = field(
         default=None,
