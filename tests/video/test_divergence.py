@@ -22,12 +22,6 @@ RATES = LearningRates()
 
 
 @pytest.fixture(scope="module")
-def usual(optimized) -> float:
-    """dB of the fit that nothing happens to."""
-    return evaluate(fit(CLIP, CONFIG).model, CLIP).mean_psnr
-
-
-@pytest.fixture(scope="module")
 def slowed(optimized) -> float:
     """dB of the fit whose rates fall at step 100 as those of a fit that backs off."""
 
