@@ -87,7 +87,7 @@ def test_motion_that_was_not_found_is_told_from_cuts(capsys):
     print_shots((0, 3, 5), np.array([0, 0.05, 0.1, 0.85, 0.9, 0.95, 1.0]))
     told = " ".join(capsys.readouterr().err.split())
     assert "3 shots, each on its own; they begin at frames 0, 3, 5." in told
-    assert "not found before frames 5, and there is no cut" in told
+    assert "not found before frames 5, and the model has no cut there" in told
     print_shots((0, 3), np.array([0, 0.05, 0.1, 0.85, 0.9, 0.95, 1.0]))
     assert "warning" not in capsys.readouterr().err
 

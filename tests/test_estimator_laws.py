@@ -9,7 +9,7 @@ pytest.importorskip("sklearn")
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.mixture import GaussianMixture
 
-from foldgauss.estimator import EMStatus, FoldedGaussianMixture
+from foldgauss.estimator import EMStatus, FoldedGaussianMixture, FoldedMixtureRegressor
 
 K, N = 3, 300
 KINDS = ("full", "tied", "diag", "spherical")
@@ -214,7 +214,22 @@ def test_criteria_count_groups():
     assert fitted.aic(x, groups) == pytest.approx(-10 * fitted.score(x) + penalty * 2)
 
 
-@pytest.mark.parametrize(("rows", "groups"), [("array", [0]), ("array", np.zeros(N)), ("chunks", np.arange(N))])
+@pytest.mark.parametrize("num", [50, 70])
+def test_groups_of_a_weighted_regression_are_one_per_row(num):
+    x = _blobs()[:60]
+    with pytest.raises(ValueError, match=r"^groups: expected shape \(60,\)"):
+        FoldedMixtureRegressor(2).fit(x[:, :1], x[:, 1], np.ones(60), np.arange(num) // 5)
+
+
+@pytest.mark.parametrize(
+    ("rows", "groups"),
+    [
+        ("array", [0]),
+        ("array", np.zeros(N)),
+        ("array", np.array(["a", None] * (N // 2), object)),
+        ("chunks", np.arange(N)),
+    ],
+)
 def test_invalid_groups_raise(rows, groups):
     x = _blobs()
     with pytest.raises(ValueError, match=r"^groups: expected"):

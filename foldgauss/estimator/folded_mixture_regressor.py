@@ -13,7 +13,7 @@ from foldgauss._runtime.threads import check_not_forked
 from foldgauss.estimator.em.statistics import enable_dtype
 from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
 from foldgauss.estimator.parameter_checks import check_column, check_real
-from foldgauss.estimator.rows import order_columns
+from foldgauss.estimator.rows import check_groups, order_columns
 
 __all__ = ["FoldedMixtureRegressor"]
 
@@ -96,6 +96,7 @@ class FoldedMixtureRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         check_not_forked()
         check_real("X", X)
         if np.ndim(sample_weight) == 1 and len(sample_weight) == len(y):  # rows of weight 0 may hold NaN
+            check_groups(groups, np.ones(len(y), bool))  # before the rows are taken
             present = np.flatnonzero(sample_weight)
             X, y, sample_weight = (_safe_indexing(z, present) for z in (X, y, sample_weight))
             groups = None if groups is None else np.asarray(groups)[present]

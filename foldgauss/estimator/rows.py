@@ -139,7 +139,10 @@ def check_groups(groups, present: np.ndarray) -> Int[np.ndarray, " n"] | None:
         return None
     if np.shape(groups) != present.shape:
         raise invalid("groups", expected=f"shape {present.shape}", got=f"shape {np.shape(groups)}", cure="One per row.")
-    names, which = np.unique(np.asarray(groups)[present], return_inverse=True)
+    try:
+        names, which = np.unique(np.asarray(groups)[present], return_inverse=True)
+    except TypeError as error:  # None among strings
+        raise invalid("groups", expected="numbers or strings", got="a mixture", cure="Name each track.") from error
     if len(names) < 2:
         raise invalid("groups", expected="at least 2 groups", got=len(names), cure="Add tracks, or leave groups out.")
     return which

@@ -189,15 +189,15 @@ def write_or_keep(
             return write(another)
         except OSError as error:
             failure = error
-    folder = None
+    folder, name = None, Path(os.path.abspath(path)).name  # "..", too, has a name of its own
     try:
         folder = Path(tempfile.mkdtemp(prefix="foldgauss-"))
-        write(folder / path.name)
+        write(folder / name)
     except OSError:
         if folder is not None:
             shutil.rmtree(folder, ignore_errors=True)
         raise OutputError(f"{failure} In the folder for temporary files, too: the result is lost.") from failure
-    raise OutputError(f"{failure} It is kept in {folder / path.name}: move it to a place of yours.") from failure
+    raise OutputError(f"{failure} It is kept in {folder / name}: move it to a place of yours.") from failure
 
 
 @contextmanager

@@ -75,8 +75,8 @@ def print_shots(starts: tuple[int, ...], times: Float[np.ndarray, " frames"]) ->
     lost = sorted(set(starts[1:]) - set(1 + np.flatnonzero(is_cut(times))))
     if lost:
         warn(
-            f"The motion of the camera was not found before frames {_listed(lost)}, and there is no cut: the picture "
-            "may jump there. A longer fit shows more to follow, above all where contrast is low."
+            f"The motion of the camera was not found before frames {_listed(lost)}, and the model has no cut "
+            "there: the picture may jump. A longer fit shows more to follow, above all where contrast is low."
         )
 
 
