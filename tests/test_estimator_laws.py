@@ -9,7 +9,7 @@ pytest.importorskip("sklearn")
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.mixture import GaussianMixture
 
-from foldgauss.estimator import EMStatus, FoldedGaussianMixture, FoldedMixtureRegressor
+from foldgauss.estimator import EMStatus, FoldedGaussianMixture, FoldedMixtureRegressor, select_mixture
 
 K, N = 3, 300
 KINDS = ("full", "tied", "diag", "spherical")
@@ -194,6 +194,9 @@ def test_groups_keep_components_from_collapsing_onto_one_curve():
     assert plain.score(held) < grouped.score(held) - 2
     with pytest.warns(ConvergenceWarning, match=r"of 12 components are as narrow as the gap.*Lower n_components"):
         FoldedGaussianMixture(12, degree=3, time_column=0, random_state=0).fit(x, groups=groups)
+    base = FoldedGaussianMixture(time_column=0, random_state=0)
+    with pytest.warns(ConvergenceWarning, match=r"of 12 components are as narrow as the gap"):  # of the fit it returns
+        select_mixture(base, x, n_components=[12], degrees=[3], groups=groups)
 
 
 @pytest.mark.slow

@@ -34,7 +34,7 @@ def to_numpyro(dist: Any, *, validate_args: bool | None = None) -> "numpyro.dist
 
     `validate_args` checks parameters against these constraints and warns of values out of the support; None is
     numpyro's own setting (`numpyro.enable_validation`), which does not change the checks of our constructors.
-    `entropy`, `cdf`, `icdf` and `mode` are those of `dist` and raise NotImplementedError where it has none;
+    `entropy`, `cdf`, `icdf` and `mode` are those of `dist`. Where `dist` has none, they raise as numpyro's own methods do.
     `numpyro.distributions.kl_divergence` of two of them is `foldgauss.analysis.divergence.kl_divergence`.
 
     **Example:**
@@ -129,8 +129,9 @@ def _make_class(distributions) -> type:
 
         @classmethod
         def infer_shapes(cls, *args, **kwargs):
-            """Not implemented, as for numpyro's own vectors: the shape of an event is not the shape of a parameter."""
-            raise NotImplementedError("infer_shapes: use batch_shape and event_shape of the distribution.")
+            """Raises as for numpyro's own vectors: the shape of an event does not follow from those of parameters."""
+            told = "infer_shapes: use batch_shape and event_shape of the distribution."
+            raise NotImplementedError(told)  # numpyro's signal that a class cannot infer shapes
 
         @property
         def reparametrized_params(self):
@@ -176,8 +177,8 @@ def _make_class(distributions) -> type:
     def _(p, q):
         try:
             return kl_divergence(p.base, q.base)
-        except ValueError as error:  # numpyro's signal that it has to estimate by samples
-            raise NotImplementedError(str(error)) from error
+        except ValueError as error:
+            raise NotImplementedError(str(error)) from error  # numpyro then estimates by samples
 
     return NumpyroDistribution
 
@@ -189,9 +190,10 @@ def _blank_numpyro():
 
 
 def _part(dist: Any, name: str):
-    """A method or property; NotImplementedError where the class of `dist` has none, as in numpyro."""
+    """A method or property. Where the class of `dist` has none, raises as numpyro's distributions do."""
     if not hasattr(type(dist), name):
-        raise NotImplementedError(f"{name}: expected a distribution that has one, got {type(dist).__name__}.")
+        told = f"{name}: expected a distribution that has one, got {type(dist).__name__}."
+        raise NotImplementedError(told)  # numpyro's signal that a distribution lacks a method
     return getattr(dist, name)
 
 

@@ -71,19 +71,27 @@ def select_mixture(
     if max(sizes) > least:
         got, cure = max(sizes), "Fewer components."
         raise invalid("n_components", expected=f"at most {least}, the points of a fit", got=got, cure=cure)
-    scores, chosen = np.full((len(sizes), len(degrees)), np.inf), None
+    scores, chosen, told = np.full((len(sizes), len(degrees)), np.inf), None, []
     for i, size in enumerate(sizes):
         for j, degree in enumerate(degrees):
             one = clone(estimator).set_params(n_components=int(size), degree=degree)
-            scores[i, j] = (
-                _cross_validate(one, X, parts, groups) if criterion == "cv" else _penalize(one, X, groups, criterion)
-            )
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always", ConvergenceWarning)
+                scores[i, j] = (
+                    _cross_validate(one, X, parts, groups)
+                    if criterion == "cv"
+                    else _penalize(one, X, groups, criterion)
+                )
             if scores[i, j] < np.inf and scores[i, j] == scores.min():
-                chosen = one
+                chosen, told = one, caught
     if not np.isfinite(scores).any():
         raise invalid("X", expected="points that some mixture fits", got="none", cure="Raise reg_covar.")
-    # For "bic" and "aic" it is fitted already; fitting again could find another optimum.
-    return MixtureChoice(chosen.fit(X, groups=groups) if criterion == "cv" else chosen, scores, sizes, degrees)
+    if criterion == "cv":
+        chosen.fit(X, groups=groups)
+    else:  # fitted already: fitting again could find another optimum
+        for warning in told:
+            warnings.warn(warning.message, stacklevel=2)
+    return MixtureChoice(chosen, scores, sizes, degrees)
 
 
 def _penalize(estimator, X, groups, criterion: str) -> float:
@@ -107,9 +115,7 @@ def _cross_validate(estimator, X, parts, groups) -> float:
 
 
 def _fit_or_none(estimator, X, groups) -> FoldedGaussianMixture | None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        fitted = estimator.fit(X, groups=groups)
+    fitted = estimator.fit(X, groups=groups)
     return None if fitted.status_ == EMStatus.NOT_FINITE else fitted
 
 

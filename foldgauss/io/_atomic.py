@@ -193,9 +193,11 @@ def write_or_keep(
     try:
         folder = Path(tempfile.mkdtemp(prefix="foldgauss-"))
         write(folder / name)
-    except OSError:
+    except BaseException as error:  # Ctrl-C, too, leaves nothing half-written
         if folder is not None:
             shutil.rmtree(folder, ignore_errors=True)
+        if not isinstance(error, OSError):
+            raise
         raise OutputError(f"{failure} In the folder for temporary files, too: the result is lost.") from failure
     raise OutputError(f"{failure} It is kept in {folder / name}: move it to a place of yours.") from failure
 

@@ -206,8 +206,11 @@ def fit_metadata(clip: Clip, seed: int, frames: tuple[int | None, int | None] | 
 
 
 def describe_fit(config: FitConfig, state: FitState) -> dict[str, Any]:
-    """Metadata of how a model was fitted: version, budgets and steps; with `minutes`, which make fits differ with the
-    load of the machine, also the seconds spent, those of its processors, and those of waiting for them."""
+    """Metadata of how a model was fitted: version, budgets and steps.
+
+    A fit by `minutes` depends on the load of the machine. Its metadata also hold the seconds of the clock, of the
+    processors, and of waiting for processors.
+    """
     budgets = {name: getattr(config, name) for name in ("steps", "minutes", "target_psnr")}
     about = {"version": __version__, "steps": state.step}
     about["budget"] = {name: value for name, value in budgets.items() if value is not None}

@@ -1,5 +1,6 @@
 """Runs the command and converts errors into one line and an exit code."""
 
+import errno
 import re
 import sys
 import warnings
@@ -18,6 +19,8 @@ from foldgauss.cli.app.application import (
 )
 
 WRONG_USE, FAILURE = 2, 1
+#: Errors of the system that writing raises: closed pipes, full disks, quotas, limits on files, broken devices.
+OUTPUT_ERRORS = (errno.EPIPE, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EBADF)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -53,10 +56,12 @@ def _run(arguments: list[str] | None) -> None:
 
 
 def _describe(error: BaseException) -> str:
-    """The message of an error; that of the system about a path or a closed output as other errors have it."""
+    """The message of an error. Errors of the system are worded as ours, and name the path or the output."""
     if not isinstance(error, OSError) or error.strerror is None:
         return str(error)
     if error.filename is None:
+        if error.errno not in OUTPUT_ERRORS:
+            return f"the system refused: {error.strerror}."
         return f"output: expected one that can be written, got one that cannot ({error.strerror})."
     cure = "Choose another, or change its permissions."
     return str(

@@ -44,8 +44,8 @@ def read_fitted_clip(
 ) -> Clip:
     """The frames that a model was fitted to, at its size, or those given; warns if they differ from the fitted ones.
 
-    Those of a model in segments are `LazyFrames`, since the clip may be larger than memory. `name`: of the argument or
-    option of the clip; as an option it comes without --frames.
+    For a model in segments the frames are `LazyFrames`, since the clip may be larger than memory. `name` is the
+    argument or the option that gives the clip. Commands with such an option have no --frames.
 
     Raises WrongUse, with `same_number`, for another number of frames than the model's, and for a clip to which the
     recorded range or options of reading do not apply.
