@@ -31,7 +31,7 @@ def run(*arguments):
 
 
 def _find_foreign_options(words, texts):
-    """Options in texts that the command lacks. Options of another command or program that the text names are left out."""
+    """Options in texts that the command lacks. Those of other commands or programs it names are not meant."""
     known = {
         name: application.load_commands(name).get(name) for name in application.COMMANDS if name in (*words, "fit")
     }

@@ -9,7 +9,8 @@ pytest.importorskip("sklearn")
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.mixture import GaussianMixture
 
-from foldgauss.estimator import EMStatus, FoldedGaussianMixture, FoldedMixtureRegressor, select_mixture
+from foldgauss.estimator import EMStatus, FoldedGaussianMixture, FoldedMixtureRegressor
+from foldgauss.estimator.model_selection import select_mixture
 
 K, N = 3, 300
 KINDS = ("full", "tied", "diag", "spherical")

@@ -34,7 +34,7 @@ def to_numpyro(dist: Any, *, validate_args: bool | None = None) -> "numpyro.dist
 
     `validate_args` checks parameters against these constraints and warns of values out of the support; None is
     numpyro's own setting (`numpyro.enable_validation`), which does not change the checks of our constructors.
-    `entropy`, `cdf`, `icdf` and `mode` are those of `dist`. Where `dist` has none, they raise as numpyro's own methods do.
+    `entropy`, `cdf`, `icdf` and `mode` are those of `dist`. Where it has none, they raise as numpyro's methods do.
     `numpyro.distributions.kl_divergence` of two of them is `foldgauss.analysis.divergence.kl_divergence`.
 
     **Example:**
