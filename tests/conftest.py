@@ -31,6 +31,8 @@ sys.dont_write_bytecode = False
 import jax  # noqa: E402
 import pytest  # noqa: E402
 
+from foldgauss._numerics import batch  # noqa: E402
+
 # A shell starts what runs in its background without Ctrl-C, and our tests of Ctrl-C are heirs to that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and threading.current_thread() is threading.main_thread():
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -46,12 +48,17 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 @pytest.fixture(scope="module")
 def optimized():
     """Compiled as for users from here to the end of the module, for what depends on the last bits."""
-    jax.clear_caches()
+    _clear_caches()
     before = jax.config.read("jax_disable_most_optimizations")
     jax.config.update("jax_disable_most_optimizations", False)
     yield
     jax.config.update("jax_disable_most_optimizations", before)
+    _clear_caches()
+
+
+def _clear_caches():
     jax.clear_caches()
+    batch._compile_flat.cache_clear()
 
 
 def pytest_unconfigure():
@@ -63,4 +70,4 @@ def pytest_unconfigure():
 def _forget_compiled_code():
     """What one module compiled the next hardly needs (7% of it): kept, it comes to gigabytes in each worker."""
     yield
-    jax.clear_caches()
+    _clear_caches()

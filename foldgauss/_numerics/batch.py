@@ -218,8 +218,11 @@ def _is_eager(arguments) -> bool:
 _CHUNK = 64
 # Eager batches are filled up to one of these sizes: as many programs serve all batches.
 _SIZES = (1, 8, _CHUNK)
-# Programs that are kept. An integral over time takes some 300 of the 65,530 memory maps that a Linux process may have.
+# Programs that are kept. An integral over time takes some 100 of the 65,530 memory maps that a Linux process may have.
 _PROGRAMS = 32
+# XLA's older code generator for the CPU, one module a program: a third of the memory maps, two thirds of the time to
+# compile, and integrals are as fast. Only where programs are many and large: it is slower for samples of many points.
+_COMPACT = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
 
 
 def map_over_batch(function: Callable, *items):
@@ -234,7 +237,10 @@ def map_over_batch(function: Callable, *items):
     own, size = jnp if traced else np, math.prod(batch)  # NumPy compiles nothing
     shapes = [(own.asarray(x), x.shape[x.ndim - rank :]) for x, rank in parts]
     flat = [_flatten(own, x, batch, event) for x, event in shapes]
-    result = _map_flat(function, structure, flat) if traced or not size else _map_eager(function, structure, flat, size)
+    if traced or not size:
+        result = _map_flat(function, structure, flat)
+    else:
+        result = _map_eager(function, structure, flat, size, closed=_is_eager(items))
     return jax.tree.map(lambda x: jnp.asarray(x.reshape((*batch, *x.shape[1:]))), result)
 
 
@@ -246,20 +252,35 @@ def _flatten(own, x: np.ndarray | Array, batch: tuple[int, ...], event: tuple[in
     return own.broadcast_to(x, (*batch, *event)).reshape(size, *event)
 
 
-def _map_eager(function: Callable, structure, flat: list[np.ndarray], size: int):
+def _map_eager(function: Callable, structure, flat: list[np.ndarray], size: int, *, closed: bool):
     """In chunks of one of few sizes, so that batches of any size share a compiled program."""
     width = next((n for n in _SIZES if size <= n), _CHUNK)
     chunks = ([fill_up(x[start : start + width], width) for x in flat] for start in range(0, size, width))
-    program = _compile_flat(function, structure, tuple((x.shape[1:], x.dtype) for x in flat), width)
+    shapes = tuple(jax.ShapeDtypeStruct((width, *x.shape[1:]), x.dtype) for x in flat)
+    program = _compile_flat(function, structure, shapes, closed)
     # One after the other: jaxlib's solver for batches can deadlock if two programs run at once (`solve_upper_matrix`).
     results = [jax.tree.map(_as_numpy, program(chunk)) for chunk in chunks]
     return jax.tree.map(lambda *parts: _join(parts)[:size], *results)
 
 
 @functools.lru_cache(maxsize=_PROGRAMS)
-def _compile_flat(function: Callable, structure, leaves: tuple, width: int) -> Callable:
-    """The program for these shapes, as a function of its own, which is dropped with all that it holds."""
-    return jax.jit(functools.partial(_map_flat.__wrapped__, function, structure))
+def _compile_flat(function: Callable, structure, shapes: tuple, closed: bool) -> Callable:
+    """The program for these shapes, as a function of its own, which is dropped with all that it holds.
+
+    What is not closed may close over tracers, or be called inside another program: JAX takes no options there.
+    """
+    program = jax.jit(functools.partial(_map_flat.__wrapped__, function, structure))
+    return program.lower(list(shapes)).compile(compiler_options=_known_options()) if closed else program
+
+
+@functools.cache
+def _known_options() -> dict[str, bool | int] | None:
+    """`_COMPACT`, or None if this version of XLA has no such options."""
+    try:
+        jax.jit(jnp.zeros_like).lower(np.float32(0)).compile(compiler_options=_COMPACT)
+    except jax.errors.JaxRuntimeError:
+        return None
+    return _COMPACT
 
 
 def fill_up(x: np.ndarray, size: int) -> np.ndarray:

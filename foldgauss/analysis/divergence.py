@@ -7,7 +7,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from foldgauss._numerics.batch import broadcast_leaves, concrete_value, expand_leaves, map_over_batch
+from foldgauss._numerics.batch import broadcast_leaves, compile_eager, concrete_value, expand_leaves, map_over_batch
 from foldgauss._runtime.checks import invalid
 from foldgauss.analysis.moments import mean_log_envelope
 from foldgauss.analysis.quadrature import (
@@ -65,12 +65,18 @@ def kl_divergence(p, q, *, with_error: bool = False) -> Array | tuple[Array, Arr
 
 def _kl_folded(p, q):
     """The divergence and its estimated error."""
-    dim = p.loc.shape[-1]
-    (ratio, mahalanobis, log_ratio), errors = _expectations(p, q)
-    trace, log_det = _trace_and_log_det(p.scale_tril, q.scale_tril)
+    found, errors = _expectations(p, q)
+    return _chain_rule(p.time_marginal, q.time_marginal, p.scale_tril, q.scale_tril, found, errors)
+
+
+@compile_eager
+def _chain_rule(time_p: Normal, time_q: Normal, tril_p, tril_q, found, errors):
+    """The divergence and its estimated error, of those of its expectations over time."""
+    dim, (ratio, mahalanobis, log_ratio) = tril_p.shape[-1], found
+    trace, log_det = _trace_and_log_det(tril_p, tril_q)
     space = 0.5 * (trace * ratio - dim + log_det + dim * log_ratio + mahalanobis)
     error = 0.5 * (trace * errors[0] + errors[1] + dim * errors[2])
-    return _kl_normal(p.time_loc, p.time_scale, q.time_loc, q.time_scale) + space, error
+    return _kl_normal(time_p.loc, time_p.scale, time_q.loc, time_q.scale) + space, error
 
 
 def _check_pair(p, q) -> None:
@@ -141,19 +147,23 @@ def _time_likelihood(dist):
 
 def _exact(p, q, own, power_q):
     """Gaussian integrals: 1 / a_q is the exponential of a square, so it tilts the normal of t into another."""
+    plain = _tilted(p, q, jnp.ones_like(power_q), power_q)
+    return _exact_expectations(p, q, own, power_q, plain, _mean_square_distance(p, q, *plain[1:]), mean_log_envelope(p))
+
+
+@compile_eager
+def _exact_expectations(p, q, own, power_q, plain, distance, log_p):
     power_p, floor_p = own
-    plain, peaked = _tilted(p, q, 1.0, power_q), _tilted(p, q, 1 + power_p, power_q)
+    peaked = _tilted(p, q, 1 + power_p, power_q)
     # a_p = floor + (1 - floor) exp(..): without a floor its first term must not count, not even if infinite.
     ratio = (1 - floor_p) * peaked[0] + jnp.where(floor_p > 0, floor_p * plain[0], 0)
-    mass, mean, scale = plain
-    distance, error = _mean_square_distance(p, q, mean, scale)
+    mass, (distance, error), (mean_log_p, error_log) = plain[0], distance, log_p
     finite = jnp.isfinite(mass)
     # Centers that are the same count as such, even if the mass is infinite.
     mahalanobis, error = (jnp.where(finite, jnp.where(finite, mass, 1) * x, jnp.inf) for x in (distance, error))
     mahalanobis, error = (jnp.where(distance == 0, 0, x) for x in (mahalanobis, error))
     offset = (p.time_loc - q.time_loc) / q.time_scale
     mean_log_q = -0.5 * power_q * ((p.time_scale / q.time_scale) ** 2 + offset**2)
-    mean_log_p, error_log = mean_log_envelope(p)
     return (ratio, mahalanobis, mean_log_q - mean_log_p), (jnp.zeros_like(ratio), error, error_log)
 
 
@@ -161,6 +171,12 @@ def _mean_square_distance(p, q, mean, scale):
     """E |L_q^-1 (center_p - center_q)|^2 under t ~ N(mean, scale^2), 0 if only rounding, and its estimated error."""
     if not all(isinstance(x.fold, ZeroFold | PolynomialFold) for x in (p, q)):
         return map_over_batch(_integrated_distance, p, q, (mean, 0), (scale, 0))
+    return _polynomial_distance(p, q, mean, scale)
+
+
+@compile_eager
+def _polynomial_distance(p, q, mean, scale):
+    """As `_mean_square_distance`, exact."""
     degree = max(x.fold.degree if isinstance(x.fold, PolynomialFold) else 0 for x in (p, q))
     z, weights = (jnp.asarray(x, mean.dtype).reshape(-1, *(1,) * mean.ndim) for x in gauss_hermite(degree + 2))
     log_square, same = _center_distance(p, q, mean[None] + scale[None] * z)
@@ -187,6 +203,7 @@ def _break_times(p, q) -> Float[Array, " breaks"]:
     return jnp.concatenate([x.time_loc - x.fold.breaks.astype(x.time_loc.dtype) for x in (p, q)])
 
 
+@compile_eager
 def _tilted(p, q, sharpness, power_q):
     """Mass, mean and scale of N(t; p) exp(-(sharpness - 1) tau_p^2 / 2 + power_q tau_q^2 / 2); +inf mass if none."""
     # In units of p's time_scale, whose square may not fit the dtype.

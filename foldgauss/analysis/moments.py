@@ -21,20 +21,25 @@ _TIE = 1e-6
 
 def moments(dist, *, with_error: bool = False) -> tuple[Array, ...]:
     """Mean (*batch, d) and covariance (*batch, d, d) of x = (s, t), time last: see `FoldedGaussian.moments`."""
-    mean, covariance, error = _moments(dist)
+    fold, envelope = dist.fold, dist.envelope
+    if not isinstance(fold, ZeroFold | PolynomialFold | FourierFold):
+        fold = map_over_batch(_integrated_fold, fold, (dist.time_scale, 0))
+    if not isinstance(envelope, Constant | TimeLikelihood):
+        envelope = _integrate_envelope(dist)[0]
+    mean, covariance, error = _moments(dist.loc, dist.scale_tril, dist.time_loc, dist.time_scale, fold, envelope)
     warn_of_error("moments", error)
     return (mean, covariance, error) if with_error else (mean, covariance)
 
 
 @compile_eager
-def _moments(dist) -> tuple[Array, Array, Array]:
-    dist = broadcast_leaves(dist, dist.batch_shape)
-    mean_f, cov_f, cross, error_f = _fold_moments(dist)
-    mean_a, error_a = _envelope_means(dist)[0]
-    mean = jnp.concatenate([dist.loc + mean_f, dist.time_loc[..., None]], axis=-1)
-    sigma = dist.scale_tril @ jnp.swapaxes(dist.scale_tril, -1, -2)
+def _moments(loc, scale_tril, time_loc, time_scale, fold, envelope) -> tuple[Array, Array, Array]:
+    """`fold` and `envelope` are those of the distribution, or their integrals where there is no closed form."""
+    mean_f, cov_f, cross, error_f = fold if isinstance(fold, tuple) else _fold_moments(fold, loc, time_scale)
+    mean_a, error_a = envelope if isinstance(envelope, tuple) else (_mean_envelope(envelope, time_loc), 0)
+    mean = jnp.concatenate([loc + mean_f, time_loc[..., None]], axis=-1)
+    sigma = scale_tril @ jnp.swapaxes(scale_tril, -1, -2)
     space = mean_a[..., None, None] * sigma + cov_f
-    last = jnp.concatenate([-cross, (dist.time_scale**2)[..., None]], axis=-1)
+    last = jnp.concatenate([-cross, (time_scale**2)[..., None]], axis=-1)
     upper = jnp.concatenate([space, -cross[..., :, None]], axis=-1)
     covariance = jnp.concatenate([upper, last[..., None, :]], axis=-2)
     return mean, covariance, lax.stop_gradient(jnp.maximum(error_f, error_a))
@@ -42,19 +47,32 @@ def _moments(dist) -> tuple[Array, Array, Array]:
 
 def entropy(dist, *, with_error: bool = False) -> Array | tuple[Array, Array]:
     """Differential entropy in nats, (*batch,): see `FoldedGaussian.entropy`."""
-    dist = broadcast_leaves(dist, dist.batch_shape)
-    dim = dist.loc.shape[-1]
-    log_det = jnp.log(jnp.diagonal(dist.scale_tril, axis1=-2, axis2=-1)).sum(-1)
-    gaussian = 0.5 * (dim + 1) * _LOG_2PI_E + jnp.log(dist.time_scale) + log_det
-    mean_log_a, error = mean_log_envelope(dist)
-    warn_of_error("entropy", error / jnp.maximum(1, jnp.abs(mean_log_a)))
-    value = gaussian + 0.5 * dim * mean_log_a
-    return (value, 0.5 * dim * error) if with_error else value
+    value, error, relative = _entropy(dist.scale_tril, dist.time_scale, mean_log_envelope(dist))
+    warn_of_error("entropy", relative)
+    return (value, error) if with_error else value
+
+
+@compile_eager
+def _entropy(scale_tril, time_scale, mean_log) -> tuple[Array, Array, Array]:
+    """The entropy, its estimated error, and that of E[log a] relative to max(1, E[log a])."""
+    dim, (mean_log_a, error) = scale_tril.shape[-1], mean_log
+    log_det = jnp.log(jnp.diagonal(scale_tril, axis1=-2, axis2=-1)).sum(-1)
+    gaussian = 0.5 * (dim + 1) * _LOG_2PI_E + jnp.log(time_scale) + log_det
+    return gaussian + 0.5 * dim * mean_log_a, 0.5 * dim * error, error / jnp.maximum(1, jnp.abs(mean_log_a))
 
 
 def mean_log_envelope(dist) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
-    """E[log a(t)] <= 0, and its estimated error."""
-    return _envelope_means(dist)[1]
+    """E[log a(t)] <= 0, and its estimated error: exact, 0 or -power / 2, but for floors and other envelopes."""
+    envelope, zero = dist.envelope, jnp.zeros_like(dist.time_loc)
+    if isinstance(envelope, Constant):
+        return zero, zero
+    if not isinstance(envelope, TimeLikelihood):
+        return _integrate_envelope(dist)[1]
+    plain, floor = (-0.5 * envelope.power, zero), concrete_value(envelope.floor)
+    if floor is not None and not floor.any():
+        return plain
+    floored = _integrate_envelope(dist)[1]
+    return tuple(jnp.where(envelope.floor == 0, a, b) for a, b in zip(plain, floored, strict=True))
 
 
 def mode(dist) -> Float[Array, "*batch d"]:
@@ -73,61 +91,51 @@ def mode(dist) -> Float[Array, "*batch d"]:
     return jnp.where(unique[..., None], _ridge(filled, filled.time_loc), jnp.nan)
 
 
-def _envelope_means(dist):
-    """(E[a(t)], its estimated error) and (E[log a(t)], its estimated error), exact but for floors and other envelopes.
-
-    E[a] is 1, or floor + (1 - floor) / sqrt(1 + power) (eq:a_func_2d), and E[log a] 0, or -power / 2 without a floor.
-    """
-    envelope, zero = dist.envelope, jnp.zeros_like(dist.time_loc)
+def _mean_envelope(envelope, time_loc: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """E[a(t)]: 1, or floor + (1 - floor) / sqrt(1 + power) (eq:a_func_2d)."""
     if isinstance(envelope, Constant):
-        return (zero + 1, zero), (zero, zero)
-    if not isinstance(envelope, TimeLikelihood):
-        return map_over_batch(_integrated_envelope, dist)
-    mean = envelope.floor + (1 - envelope.floor) / jnp.sqrt(1 + envelope.power), zero
-    plain, floor = (-0.5 * envelope.power, zero), concrete_value(envelope.floor)
-    if floor is not None and not floor.any():
-        return mean, plain
-    floored = map_over_batch(_integrated_envelope, dist)[1]
-    return mean, tuple(jnp.where(envelope.floor == 0, a, b) for a, b in zip(plain, floored, strict=True))
+        return jnp.ones_like(time_loc)
+    return envelope.floor + (1 - envelope.floor) / jnp.sqrt(1 + envelope.power)
 
 
-def _integrated_envelope(dist):
-    """As `_envelope_means`, of one distribution, by quadrature."""
+def _integrate_envelope(dist):
+    """(E[a(t)], its estimated error) and (E[log a(t)], its estimated error); one program for all folds."""
+    return map_over_batch(_integrated_envelope, dist.envelope, (dist.time_loc, 0), (dist.time_scale, 0))
 
-    def values(dist, tau):
-        log_a = _log_envelope(dist, tau)
+
+def _integrated_envelope(*parts):
+    """As `_integrate_envelope`, of one envelope with its `time_loc` and `time_scale`, by quadrature."""
+
+    def values(parts, tau):
+        log_a = _log_envelope(*parts, tau)
         return jnp.stack([jnp.exp(log_a), log_a], -1)
 
-    frozen = lax.stop_gradient(dist)
-    panels = normal_panels(lambda tau: values(frozen, tau), jnp.zeros(0, dist.loc.dtype), dist.loc.dtype)
-    found = panels.expectation(values(dist, panels.nodes))
+    frozen, dtype = lax.stop_gradient(parts), parts[1].dtype
+    panels = normal_panels(lambda tau: values(frozen, tau), jnp.zeros(0, dtype), dtype)
+    found = panels.expectation(values(parts, panels.nodes))
     unit = lax.stop_gradient(jnp.stack([jnp.ones_like(found[1]), jnp.maximum(1, jnp.abs(found[1]))]))
     error = unit * panels.expectation_error(values(frozen, panels.nodes) / unit[None, None])
     return (found[0], error[0]), (found[1], error[1])
 
 
-def _log_envelope(dist, tau: Float[Array, "*tau"]) -> Float[Array, "*tau"]:
-    """log a at standardized times; one distribution, not a batch."""
-    if isinstance(dist.envelope, TimeLikelihood):  # depends on tau only, which t = time_loc + ... may round
-        return dist.envelope.log_a(tau, time_loc=jnp.zeros_like(dist.time_loc), time_scale=jnp.ones_like(dist.time_loc))
-    t = dist.time_loc + dist.time_scale * tau
-    return dist.envelope.log_a(t, time_loc=dist.time_loc, time_scale=dist.time_scale)
+def _log_envelope(envelope, time_loc, time_scale, tau: Float[Array, "*tau"]) -> Float[Array, "*tau"]:
+    """log a at standardized times; one envelope, not a batch."""
+    if isinstance(envelope, TimeLikelihood):  # depends on tau only, which t = time_loc + ... may round
+        return envelope.log_a(tau, time_loc=jnp.zeros_like(time_loc), time_scale=jnp.ones_like(time_loc))
+    return envelope.log_a(time_loc + time_scale * tau, time_loc=time_loc, time_scale=time_scale)
 
 
-def _fold_moments(dist):
-    """E f(u), Cov f(u), E[f(u) u] for u ~ N(0, time_scale^2), and the estimated error in standard deviations."""
-    fold, scale, zero = dist.fold, dist.time_scale, jnp.zeros_like(dist.time_loc)
+def _fold_moments(fold, loc, scale):
+    """E f(u), Cov f(u), E[f(u) u] for u ~ N(0, time_scale^2), and no error, where they have closed forms."""
     if isinstance(fold, ZeroFold):
-        return jnp.zeros_like(dist.loc), jnp.zeros_like(dist.scale_tril), jnp.zeros_like(dist.loc), zero
+        return jnp.zeros_like(loc), jnp.zeros((*loc.shape, loc.shape[-1]), loc.dtype), jnp.zeros_like(loc), 0 * scale
     if isinstance(fold, PolynomialFold):
-        return *_polynomial_moments(fold.coefficients, scale), zero
-    if isinstance(fold, FourierFold):
-        return *_fourier_moments(fold, scale), zero
-    return map_over_batch(_integrated_fold, fold, (scale, 0))
+        return *_polynomial_moments(fold.coefficients, scale), 0 * scale
+    return *_fourier_moments(fold, scale), 0 * scale
 
 
 def _integrated_fold(fold, scale):
-    """As `_fold_moments`, of one fold, by quadrature."""
+    """As `_fold_moments`, of one fold of any kind, by quadrature, with the estimated error in standard deviations."""
 
     def values(z):
         return fold((z * scale).ravel()).reshape(*z.shape, -1)
@@ -232,7 +240,7 @@ def _highest_tau(dist):
     grid, dim = jnp.asarray(np.linspace(-40, 40, 3201), dist.loc.dtype), dist.loc.shape[-1]
 
     def log_ridge(tau):
-        return -0.5 * tau**2 - 0.5 * dim * _log_envelope(dist, tau)
+        return -0.5 * tau**2 - 0.5 * dim * _log_envelope(dist.envelope, dist.time_loc, dist.time_scale, tau)
 
     best = find_peaks(log_ridge, grid, 2)
     heights = jnp.where(jnp.isnan(best), -jnp.inf, log_ridge(jnp.where(jnp.isnan(best), 0, best)))
