@@ -107,7 +107,7 @@ class AbstractMixture(eqx.Module):
 
         **Raises:** ValueError if the last dimension of value is not d.
         """
-        return _log_prob(self, self._checked(value))
+        return _reduce_pairs(_log_prob, self, self._checked(value))
 
     def pdf(self, value: Float[Array, "*#batch d"]) -> Float[Array, "*#batch"]:
         """p(x), shapes as in `log_prob`."""
@@ -118,7 +118,7 @@ class AbstractMixture(eqx.Module):
 
         **Shapes:** value (*sample, *batch, d) -> (*sample, *batch, k).
         """
-        return _component_log_prob(self, self._checked(value))
+        return _reduce_pairs(_component_log_prob, self, self._checked(value))
 
     def responsibilities(self, value: Float[Array, "*#batch d"]) -> Float[Array, "*#batch k"]:
         """P(component k | x) = w_k p_k(x) / p(x): they sum to 1.
@@ -131,7 +131,7 @@ class AbstractMixture(eqx.Module):
 
         **Source:** Bayes' rule. **Raises:** as `log_prob`.
         """
-        return _responsibilities(self, self._checked(value))
+        return _reduce_pairs(_responsibilities, self, self._checked(value))
 
     def sample(
         self, key: Key[Array, ""], sample_shape: int | tuple[int, ...] = (), return_component: bool = False
@@ -432,26 +432,35 @@ def _check_components(components, kind: type) -> None:
 # --- densities -----------------------------------------------------------------------------------------------
 
 
-@eqx.filter_jit
-def _component_log_prob(mixture: AbstractMixture, x: Array) -> Array:
-    return _map_pairs(mixture, x, lambda log_weights, log_components: jnp.moveaxis(log_components, 0, -1))
+def _component_log_prob(log_weights: Array, log_components: Array, axis: int) -> Array:
+    return jnp.moveaxis(log_components, axis, -1)
+
+
+def _log_prob(log_weights: Array, log_components: Array, axis: int) -> Array:
+    return log_sum_exp(log_joint(log_weights, log_components), axis)
+
+
+def _responsibilities(log_weights: Array, log_components: Array, axis: int) -> Array:
+    joint = posterior_logits(log_weights, log_components, axis)
+    return jnp.moveaxis(jax.nn.softmax(joint, axis=axis), axis, -1)
+
+
+def _reduce_pairs(function, mixture: AbstractMixture, x: Array) -> Array:
+    """`function(log w_k, log p_k(x), axis)`, one of those above, where `axis` is that of the components."""
+    if isinstance(mixture.components, TimeMixture):  # whose integrals are programs of their own, which are shared
+        log_components = mixture.components.log_prob(_add_component_axis(mixture, x))
+        return _reduce_last(function, mixture.log_weights, log_components)
+    return _map_pairs(function, mixture, x)
 
 
 @eqx.filter_jit
-def _log_prob(mixture: AbstractMixture, x: Array) -> Array:
-    return _map_pairs(mixture, x, lambda *logs: log_sum_exp(log_joint(*logs), 0))
+def _reduce_last(function, log_weights: Array, log_components: Array) -> Array:
+    return function(log_weights, log_components, -1)
 
 
 @eqx.filter_jit
-def _responsibilities(mixture: AbstractMixture, x: Array) -> Array:
-    def normalized(*logs):
-        return jnp.moveaxis(jax.nn.softmax(posterior_logits(*logs, axis=0), axis=0), 0, -1)
-
-    return _map_pairs(mixture, x, normalized)
-
-
-def _map_pairs(mixture: AbstractMixture, x: Array, function) -> Array:
-    """`function` of log weights (k, 1, *batch) and log p_k(x) (k, n, *batch); its results start with (n, *batch)."""
+def _map_pairs(function, mixture: AbstractMixture, x: Array) -> Array:
+    """In chunks, of log weights (k, 1, *batch) and log p_k(x) (k, n, *batch); results start with (n, *batch)."""
     rank, components = len(mixture.batch_shape), mixture.components
     rows, restore = flatten_points(x, mixture.batch_shape, mixture.event_shape)
     if isinstance(components, FoldedGaussian | Gaussian):
@@ -461,7 +470,7 @@ def _map_pairs(mixture: AbstractMixture, x: Array, function) -> Array:
         pairs = lambda rows: jnp.moveaxis(components.log_prob(_add_component_axis(mixture, rows)), -1, 0)  # noqa: E731
     log_weights = jnp.expand_dims(jnp.moveaxis(mixture.log_weights, rank, 0), 1)
     size = max(1, _CHUNK // (math.prod(mixture.batch_shape) * mixture.num_components))
-    return restore(map_in_chunks(pairs, lambda log_p: function(log_weights, log_p), rows, size))
+    return restore(map_in_chunks(pairs, lambda log_p: function(log_weights, log_p, 0), rows, size))
 
 
 def _add_component_axis(mixture: AbstractMixture, x: Array) -> Array:
@@ -580,14 +589,22 @@ def _take_components(components, component: Array, batch: tuple[int, ...]):
 # --- moments -------------------------------------------------------------------------------------------------
 
 
-@eqx.filter_jit
 def _moments(mixture: AbstractMixture) -> tuple[Array, Array]:
-    return mixture_moments(mixture.weights, *_component_moments(mixture.components))
-
-
-def _component_moments(components) -> tuple[Array, Array]:
+    components = mixture.components
+    if isinstance(components, Gaussian):
+        return _gaussian_moments(mixture)
     if isinstance(components, FoldedGaussian):
-        return components.moments()
-    if isinstance(components, TimeDensity):
-        return components.mean[..., None], components.variance[..., None, None]
-    return components.mean, components.covariance_matrix
+        found = components.moments()
+    elif isinstance(components, TimeDensity):
+        found = components.mean[..., None], components.variance[..., None, None]
+    else:
+        found = components.mean, components.covariance_matrix
+    return _mixture_moments(mixture.weights, *found)
+
+
+_mixture_moments = jax.jit(mixture_moments)
+
+
+@eqx.filter_jit
+def _gaussian_moments(mixture: AbstractMixture) -> tuple[Array, Array]:
+    return mixture_moments(mixture.weights, mixture.components.mean, mixture.components.covariance_matrix)

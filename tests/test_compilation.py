@@ -145,8 +145,6 @@ def test_what_a_batch_shares_is_not_copied_for_each_element():
 class _Slanted(BatchModule):
     """A module with a function that may close over tracers."""
 
-    is_closed = False
-
     x: Float[Array, "*batch"]
     function: Callable = eqx.field(static=True)
 

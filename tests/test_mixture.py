@@ -157,7 +157,7 @@ def test_chunks_hold_few_pairs_of_point_and_component(monkeypatch):
 
     monkeypatch.setattr(mixture_module, "map_in_chunks", chunks)
     monkeypatch.setattr(mixture_module, "_CHUNK", 100)
-    mixture_module._map_pairs(_mixture(), _points(40), lambda log_weights, log_p: log_p[0])
+    mixture_module._map_pairs(lambda log_weights, log_p, axis: log_p[0], _mixture(), _points(40))
     assert seen == [100 // 3]
 
 

@@ -237,10 +237,7 @@ def map_over_batch(function: Callable, *items):
     own, size = jnp if traced else np, math.prod(batch)  # NumPy compiles nothing
     shapes = [(own.asarray(x), x.shape[x.ndim - rank :]) for x, rank in parts]
     flat = [_flatten(own, x, batch, event) for x, event in shapes]
-    if traced or not size:
-        result = _map_flat(function, structure, flat)
-    else:
-        result = _map_eager(function, structure, flat, size, closed=_is_eager(items))
+    result = _map_flat(function, structure, flat) if traced or not size else _map_eager(function, structure, flat, size)
     return jax.tree.map(lambda x: jnp.asarray(x.reshape((*batch, *x.shape[1:]))), result)
 
 
@@ -252,25 +249,25 @@ def _flatten(own, x: np.ndarray | Array, batch: tuple[int, ...], event: tuple[in
     return own.broadcast_to(x, (*batch, *event)).reshape(size, *event)
 
 
-def _map_eager(function: Callable, structure, flat: list[np.ndarray], size: int, *, closed: bool):
+def _map_eager(function: Callable, structure, flat: list[np.ndarray], size: int):
     """In chunks of one of few sizes, so that batches of any size share a compiled program."""
     width = next((n for n in _SIZES if size <= n), _CHUNK)
     chunks = ([fill_up(x[start : start + width], width) for x in flat] for start in range(0, size, width))
     shapes = tuple(jax.ShapeDtypeStruct((width, *x.shape[1:]), x.dtype) for x in flat)
-    program = _compile_flat(function, structure, shapes, closed)
+    program = _compile_flat(function, structure, shapes)
     # One after the other: jaxlib's solver for batches can deadlock if two programs run at once (`solve_upper_matrix`).
     results = [jax.tree.map(_as_numpy, program(chunk)) for chunk in chunks]
     return jax.tree.map(lambda *parts: _join(parts)[:size], *results)
 
 
 @functools.lru_cache(maxsize=_PROGRAMS)
-def _compile_flat(function: Callable, structure, shapes: tuple, closed: bool) -> Callable:
-    """The program for these shapes, as a function of its own, which is dropped with all that it holds.
-
-    What is not closed may close over tracers, or be called inside another program: JAX takes no options there.
-    """
-    program = jax.jit(functools.partial(_map_flat.__wrapped__, function, structure))
-    return program.lower(list(shapes)).compile(compiler_options=_known_options()) if closed else program
+def _compile_flat(function: Callable, structure, shapes: tuple[jax.ShapeDtypeStruct, ...]) -> Callable:
+    """The program for these shapes, as a function of its own, which is dropped with all that it holds."""
+    program, arguments = jax.jit(functools.partial(_map_flat.__wrapped__, function, structure)), list(shapes)
+    captured = jax.make_jaxpr(program)(arguments).consts  # tracers that a user's function closes over
+    if any(isinstance(x, jax.core.Tracer) for x in captured):
+        return program  # a part of another program, which takes no options
+    return program.lower(arguments).compile(compiler_options=_known_options())
 
 
 @functools.cache
