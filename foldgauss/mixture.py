@@ -41,10 +41,11 @@ from foldgauss.analysis.interop import to_numpyro, to_scipy
 from foldgauss.analysis.mixture_weights import (
     broadcast_weights,
     choose_components,
-    log_joint,
-    log_sum_exp,
+    log_component_densities,
+    log_density,
     mixture_moments,
     posterior_logits,
+    responsibilities,
     weighted_sum,
 )
 from foldgauss.analysis.pair_densities import map_in_chunks, move_components_first, pair_log_prob
@@ -107,7 +108,7 @@ class AbstractMixture(eqx.Module):
 
         **Raises:** ValueError if the last dimension of value is not d.
         """
-        return _reduce_pairs(_log_prob, self, self._checked(value))
+        return _reduce_pairs(log_density, self, self._checked(value))
 
     def pdf(self, value: Float[Array, "*#batch d"]) -> Float[Array, "*#batch"]:
         """p(x), shapes as in `log_prob`."""
@@ -118,7 +119,7 @@ class AbstractMixture(eqx.Module):
 
         **Shapes:** value (*sample, *batch, d) -> (*sample, *batch, k).
         """
-        return _reduce_pairs(_component_log_prob, self, self._checked(value))
+        return _reduce_pairs(log_component_densities, self, self._checked(value))
 
     def responsibilities(self, value: Float[Array, "*#batch d"]) -> Float[Array, "*#batch k"]:
         """P(component k | x) = w_k p_k(x) / p(x): they sum to 1.
@@ -131,7 +132,7 @@ class AbstractMixture(eqx.Module):
 
         **Source:** Bayes' rule. **Raises:** as `log_prob`.
         """
-        return _reduce_pairs(_responsibilities, self, self._checked(value))
+        return _reduce_pairs(responsibilities, self, self._checked(value))
 
     def sample(
         self, key: Key[Array, ""], sample_shape: int | tuple[int, ...] = (), return_component: bool = False
@@ -432,21 +433,8 @@ def _check_components(components, kind: type) -> None:
 # --- densities -----------------------------------------------------------------------------------------------
 
 
-def _component_log_prob(log_weights: Array, log_components: Array, axis: int) -> Array:
-    return jnp.moveaxis(log_components, axis, -1)
-
-
-def _log_prob(log_weights: Array, log_components: Array, axis: int) -> Array:
-    return log_sum_exp(log_joint(log_weights, log_components), axis)
-
-
-def _responsibilities(log_weights: Array, log_components: Array, axis: int) -> Array:
-    joint = posterior_logits(log_weights, log_components, axis)
-    return jnp.moveaxis(jax.nn.softmax(joint, axis=axis), axis, -1)
-
-
 def _reduce_pairs(function, mixture: AbstractMixture, x: Array) -> Array:
-    """`function(log w_k, log p_k(x), axis)`, one of those above, where `axis` is that of the components."""
+    """`function(log w_k, log p_k(x), axis)`, one of those imported, where `axis` is that of the components."""
     if isinstance(mixture.components, TimeMixture):  # whose integrals are programs of their own, which are shared
         log_components = mixture.components.log_prob(_add_component_axis(mixture, x))
         return _reduce_last(function, mixture.log_weights, log_components)

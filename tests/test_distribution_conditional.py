@@ -464,7 +464,7 @@ def test_the_other_coordinate_where_time_is_known_to_the_last_digit():
 @pytest.mark.slow
 def test_points_on_a_curve_to_rounding_are_said_to_be():
     # In two space coordinates the density next to the curve hangs on the rounding of s, if the curve is narrow enough.
-    for scale, low, high in [(0.1, 0, 1e-9), (1e-17, 0.5, np.inf)]:
+    for scale, low, high in [(0.1, 0, 1e-9), (1e-17, 1.0, np.inf)]:
         dist = _dist(2, scale_tril=scale * np.eye(2))
         x = _points(dist, 5)
         errors = np.r_[dist.marginal([0, 1]).error_estimate(x[:, :2]), dist.time_given_space(x[:, :2]).error_estimate]
@@ -527,6 +527,31 @@ def _far_quantities(dist, s, tau):
     }
 
 
+def test_estimated_errors_near_a_ridge_are_no_smaller_than_the_errors():
+    """In float32, where s - c(tau) rounds: on the curve, some roundings from it, and 30; from wide ridges to one as narrow."""
+    rng, scales = np.random.default_rng(0), np.array([1e-2, 1e-3, 1e-7])
+    with jax.enable_x64(False):
+        narrow = FoldedGaussian(
+            np.tile(np.float32([0.1, -0.4]), (3, 1)),
+            np.float32([[1.0, 0.0], [0.3, 0.7]]) * scales[:, None, None].astype(np.float32),
+            time_loc=np.float32([0.4] * 3),
+            time_scale=np.float32([0.3] * 3),
+            fold=PolynomialFold(np.float32([[0.8, -0.5], [0.6, 0.9]])),
+            envelope=TimeLikelihood(),
+        )
+        center = np.asarray(narrow.condition_time(np.float32(rng.normal(0.4, 0.6, size=(64, 3)))).loc)
+        away = 1 + np.float32([0, 6e-8, 2e-6])[:, None, None, None] * rng.normal(size=(3, *center.shape))
+        s = np.float32(center * away)
+        here = narrow.marginal([0, 1])
+        log_p, estimate = np.asarray(here.log_prob(s)), np.asarray(here.error_estimate(s))
+    exact = jax.tree.map(lambda x: np.asarray(x, np.float64), narrow).marginal([0, 1])
+    error = np.abs(log_p - np.asarray(exact.log_prob(np.float64(s))))
+    assert log_p.dtype == np.float32
+    assert (error <= estimate).all()
+    typical = np.median(estimate, (0, 1)) / np.median(error, (0, 1))
+    assert (typical < [60, 60, 300]).all()  # and no larger than they have to be; measured: 21, 22, 136
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("dim", [1, 2])
 def test_float32_far_out_agrees_with_float64(dim):
@@ -566,6 +591,7 @@ def test_float32_far_out_agrees_with_float64(dim):
     assert all(x.dtype == np.float32 for x in here.values())
     assert all((np.isfinite(x) | np.isneginf(x)).all() for x in (here["log p"], here["first"]))
     assert np.isfinite(here["first cdf"]).all()
+    assert not np.isnan([here["error"], here["first error"]]).any()
     reached = np.isfinite(here["log p"])
     assert reached.mean() > 0.7
     assert np.isposinf(here["error"][~reached]).all()

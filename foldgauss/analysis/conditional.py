@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.scipy.special import log_ndtr, logsumexp
+from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Float, Key
 
 from foldgauss._numerics.batch import (
@@ -44,6 +44,7 @@ _CROSSINGS = 24  # candidate times at which the ridge comes near
 _BEST = 10  # of them, around which panels are refined
 _MAXIMA = 6  # peaks of the density around which panels are refined
 _MODES = 8
+_AVERAGED = 0.1  # of the rounding at some 100 nodes across the ridge, where the residual is about 1
 
 
 class TimeDensity(eqx.Module):
@@ -400,19 +401,19 @@ def _space_panels(parent, s) -> tuple[Panels, Array, Array]:
     spikes, log_unseen = crossing_panels(parent, s) if s.size == 1 else (None, jnp.asarray(-jnp.inf, s.dtype))
     panels = adaptive_panels(_log_joint(parent, s), guides, search=log_f, spikes=spikes)
     log_total = panels.log_total
-    log_error = jnp.logaddexp(log_unseen, _log_rounding(*frozen, near, spikes))
-    error = panels.error_estimate + jnp.exp(log_error - jnp.where(jnp.isneginf(log_total), 0, log_total))
+    log_size = jnp.where(jnp.isneginf(log_total), 0, log_total)
+    error = panels.error_estimate + jnp.exp(log_unseen - log_size) + _rounding(*frozen, near, spikes, log_size)
     infinite = diverges(log_f, panels)
     error = jnp.where(infinite | jnp.isneginf(log_total), jnp.inf, error)
     return panels, jnp.where(infinite, jnp.inf, log_total), lax.stop_gradient(error)
 
 
-def _log_rounding(parent, s, near, spikes: Panels | None):
-    """log of the error of p(s) from the rounding of s - c(tau), where the ridge comes that close.
+def _rounding(parent, s, near, spikes: Panels | None, log_total):
+    """The relative error of p(s) from the rounding of s - c(tau), where the ridge comes that close.
 
     The density has a factor exp(-z^2 / 2) of the whitened residual z, whose rounding q changes its logarithm by at most
-    q (z + q): estimates above 1 are errors of log p. For z <= 2 q the point may be on the ridge. Crossings on their own
-    panels (`spikes`) are integrated exactly and excluded.
+    q (z + q), and by their average over the width of the ridge: estimates above 1 are errors of log p. For z <= 2 q the
+    point may be on the ridge. Crossings on their own panels (`spikes`) are integrated exactly and excluded.
     """
     tau = jnp.where(jnp.isnan(near), 0, near)
     eps, tril = jnp.finfo(s.dtype).eps, parent.scale_tril[: s.size, : s.size]
@@ -431,13 +432,16 @@ def _log_rounding(parent, s, near, spikes: Panels | None):
     rate = length(speed, inverse)
     log_width = jnp.minimum(0, log_scale - jnp.log(jnp.where(rate > 0, rate, 1)))
     log_det = jnp.log(jnp.diagonal(tril)).sum() + s.size * (log_scale + _HALF_LOG_2PI)
-    close, change = z <= 2 * q, q * (z + q)
-    log_best = -0.5 * (tau**2 + jnp.where(close, 0, z) ** 2) - _HALF_LOG_2PI - log_det + log_width
-    log_error = log_best + jnp.log(jnp.where(close, jnp.minimum(1, change), change))
-    counts = ~jnp.isnan(near) & jnp.isfinite(place).all(-1)
+    close, change = z <= 2 * q, q * (z + q + _AVERAGED)
+    # log of the mass near this point, if it is on the ridge whenever it may be, in units of p(s).
+    log_share = -0.5 * (tau**2 + jnp.where(close, 0, z) ** 2) - _HALF_LOG_2PI - log_det + log_width - log_total
+    # On the ridge quadrature may find q times that mass, since the residual is rounded to 0 over q times the width.
+    reach = log_share + jnp.where(close, jnp.log(jnp.maximum(1, q)), 2 * change)
+    error = change * jnp.exp(jnp.minimum(0, reach)) + jnp.where(close, jnp.maximum(0, log_share), 0)
+    counts = ~jnp.isnan(near) & jnp.isfinite(log_share + change)
     if spikes is not None:
         counts = counts & ~is_within_any((spikes.left[:, 0], spikes.right[:, -1]), tau)
-    return logsumexp(jnp.where(counts, log_error, -jnp.inf))
+    return jnp.where(counts, error, 0).sum()
 
 
 def _modes(parent, values, panels: Panels):

@@ -16,10 +16,11 @@ from foldgauss._runtime.checks import invalid
 __all__ = [
     "broadcast_weights",
     "choose_components",
-    "log_joint",
-    "log_sum_exp",
+    "log_component_densities",
+    "log_density",
     "mixture_moments",
     "posterior_logits",
+    "responsibilities",
     "weighted_sum",
 ]
 
@@ -67,7 +68,7 @@ def _log_weights(weights: Array) -> Array:
     return jnp.where(present, jnp.log(jnp.where(present, weights, 1)), -jnp.inf)
 
 
-def log_joint(log_weights: Array, log_components: Array) -> Array:
+def _log_joint(log_weights: Array, log_components: Array) -> Array:
     """log w_k p_k, -inf where the component is absent, whatever its density."""
     (log_weights,) = align([(log_weights, 0)], log_components.ndim)
     absent = jnp.isneginf(log_weights)
@@ -77,7 +78,7 @@ def log_joint(log_weights: Array, log_components: Array) -> Array:
 
 def posterior_logits(log_weights: Array, log_evidence: Array, axis: int = -1) -> Array:
     """log w_k p_k; log w_k where all p_k are 0. Where some p_k are infinite, they share all the weight equally."""
-    joint = log_joint(log_weights, log_evidence)
+    joint = _log_joint(log_weights, log_evidence)
     infinite = jnp.isposinf(joint)
     joint = jnp.where(infinite.any(axis, keepdims=True), jnp.where(infinite, 0, -jnp.inf), joint)
     all_zero = jnp.isneginf(joint).all(axis, keepdims=True)
@@ -85,12 +86,28 @@ def posterior_logits(log_weights: Array, log_evidence: Array, axis: int = -1) ->
     return jnp.where(all_zero, log_weights, joint)
 
 
-def log_sum_exp(joint: Array, axis: int) -> Array:
+def _log_sum_exp(joint: Array, axis: int) -> Array:
     """logsumexp whose gradient is 0 where all terms are -inf; +inf stays +inf."""
     largest = lax.stop_gradient(joint.max(axis, keepdims=True))
     usable = jnp.isfinite(largest)
     shifted = jnp.where(usable, joint - jnp.where(usable, largest, 0), 0)
     return jnp.where(usable, jnp.log(jnp.exp(shifted).sum(axis, keepdims=True)) + largest, largest).squeeze(axis)
+
+
+def log_component_densities(log_weights: Array, log_components: Array, axis: int) -> Array:
+    """log p_k, with the components last."""
+    return jnp.moveaxis(log_components, axis, -1)
+
+
+def log_density(log_weights: Array, log_components: Array, axis: int) -> Array:
+    """log sum_k w_k p_k."""
+    return _log_sum_exp(_log_joint(log_weights, log_components), axis)
+
+
+def responsibilities(log_weights: Array, log_components: Array, axis: int) -> Array:
+    """w_k p_k / sum_j w_j p_j, with the components last."""
+    joint = posterior_logits(log_weights, log_components, axis)
+    return jnp.moveaxis(jax.nn.softmax(joint, axis=axis), axis, -1)
 
 
 def weighted_sum(weights: Array, values: Array, event_rank: int = 0) -> Array:

@@ -127,7 +127,8 @@ class Panels(BatchModule):
     @property
     def weights(self) -> Float[Array, "*batch panels 15"]:
         """Fractions of the integral; their sum is 1, which exp(log_weights - log_total) misses for large log_total."""
-        return jax.nn.softmax(self.log_weights, axis=(-2, -1))
+        # XLA may compute one value twice, rounded differently: a log-weight of -1e20 would exceed its maximum by 1e13.
+        return jax.nn.softmax(lax.optimization_barrier(self.log_weights), axis=(-2, -1))
 
     @property
     def probabilities(self) -> Float[Array, "*batch panels"]:
