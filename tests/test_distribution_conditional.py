@@ -528,7 +528,7 @@ def _far_quantities(dist, s, tau):
 
 
 def test_estimated_errors_near_a_ridge_are_no_smaller_than_the_errors():
-    """In float32, where s - c(tau) rounds: on the curve, some roundings from it, and 30; from wide ridges to one as narrow."""
+    """In float32, where s - c(tau) rounds: on the curve and next to it, for wide ridges and for narrow ones."""
     rng, scales = np.random.default_rng(0), np.array([1e-2, 1e-3, 1e-7])
     with jax.enable_x64(False):
         narrow = FoldedGaussian(

@@ -11,6 +11,7 @@ from sklearn.mixture import GaussianMixture
 
 from foldgauss.estimator import EMStatus, FoldedGaussianMixture, FoldedMixtureRegressor
 from foldgauss.estimator.model_selection import select_mixture
+from foldgauss.estimator.rows import warn_smooth
 
 K, N = 3, 300
 KINDS = ("full", "tied", "diag", "spherical")
@@ -191,7 +192,9 @@ def _demonstrations(seed, num):
 
 def test_groups_keep_components_from_collapsing_onto_one_curve():
     (x, groups), (held, _) = _demonstrations(0, 5), _demonstrations(1, 5)
-    plain, grouped = (_fit(x, 12, degree=3, time_column=0, groups=g) for g in (None, groups))
+    with pytest.warns(UserWarning, match="smooth curves.*groups"):
+        plain = _fit(x, 12, degree=3, time_column=0)
+    grouped = _fit(x, 12, degree=3, time_column=0, groups=groups)
     assert plain.score(held) < grouped.score(held) - 2
     with pytest.warns(ConvergenceWarning, match=r"of 12 components are as narrow as the gap.*Lower n_components"):
         FoldedGaussianMixture(12, degree=3, time_column=0, random_state=0).fit(x, groups=groups)
@@ -200,12 +203,27 @@ def test_groups_keep_components_from_collapsing_onto_one_curve():
         select_mixture(base, x, n_components=[12], degrees=[3], groups=groups)
 
 
+@pytest.mark.parametrize("kind", ["independent", "sorted by time", "narrow and sorted", "random walk", "noisy curves"])
+def test_rows_that_are_no_smooth_curves_do_not_warn(kind, recwarn):
+    rng = np.random.default_rng(0)
+    t, noise = rng.uniform(size=(600, 1)), rng.normal(size=(600, 2))
+    x = {
+        "independent": np.hstack([noise, t]),
+        "sorted by time": np.hstack([noise, np.sort(t, 0)]),
+        "narrow and sorted": np.hstack([np.sin(6 * np.sort(t, 0)) + 1e-6 * noise, np.sort(t, 0)]),
+        "random walk": np.hstack([noise.cumsum(0), np.linspace(0, 1, 600)[:, None]]),
+        "noisy curves": _demonstrations(0, 5)[0] + 0.02 * rng.normal(size=(600, 3)),
+    }[kind]
+    warn_smooth(x)
+    assert not recwarn
+
+
 @pytest.mark.slow
 def test_automatic_choice_with_groups_generalizes():
     (x, groups), (held, _) = _demonstrations(0, 8), _demonstrations(1, 5)
-    plain, grouped = (
-        _fit(x, "auto", degree="auto", max_components=20, time_column=0, groups=g) for g in (None, groups)
-    )
+    with pytest.warns(UserWarning, match="smooth curves.*groups"):
+        plain = _fit(x, "auto", degree="auto", max_components=20, time_column=0)
+    grouped = _fit(x, "auto", degree="auto", max_components=20, time_column=0, groups=groups)
     assert len(grouped.weights_) < len(plain.weights_)
     assert grouped.score(held) > plain.score(held) + 2
 

@@ -48,10 +48,11 @@ from foldgauss.estimator.rows import (
     ChunkedRows,
     Rows,
     check_groups,
-    find_extreme,
+    choose_dtype,
     order_columns,
     refuse_groups,
     warn_narrow,
+    warn_smooth,
 )
 from foldgauss.mixture import FoldedMixture
 
@@ -66,9 +67,6 @@ _CURES = {
 }
 #: With "auto", the initial number of components is at most the number of points divided by this.
 _POINTS_PER_COMPONENT = 8
-#: The highest degree fitted in float32. Beyond, with times far from normal, a curve's normal equations lose more digits
-#: than float32 has: up to 1 nat a point at degree 10.
-_MAX_SINGLE_DEGREE = 6
 
 
 class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, DensityMixin, BaseEstimator):
@@ -210,13 +208,10 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
             x, weights = self._check_rows(X, sample_weight)
             present = weights > 0
             data = Rows(x[present], weights[present], check_groups(groups, present))
+            if groups is None and self.n_components != 1:
+                warn_smooth(data.x)
         degree = self.max_degree if self.degree == "auto" else self.degree
-        if data.dtype == np.float32 and (degree > _MAX_SINGLE_DEGREE or find_extreme(data, degree) is not None):
-            data = data.astype(np.dtype(np.float64))
-        if (column := find_extreme(data, degree)) is not None:
-            column, cure = self._order_columns(self.n_features_in_)[column], "Divide it by its standard deviation."
-            expected = f"columns whose spread to the power {degree + 1} float64 holds"
-            raise invalid("X", expected=expected, got=f"another in column {column}", cure=cure)
+        data = data.astype(choose_dtype(data, degree, self._order_columns(self.n_features_in_)))
         with enable_dtype(data.dtype):
             run, model = self._run(data)
         self._set_fitted(run, model)
