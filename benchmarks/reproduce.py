@@ -1,7 +1,7 @@
 """The paper's recipe to its end: preset `paper` with all its steps, and with one thing changed.
 
     python -m benchmarks.reproduce --folder FOLDER [--tables | --only NAME ...] [--size HxW | --crop HxW] [--frames A:B]
-                                   [--clip PATH] [--steps N] [--seed S] [--engine E] [--json FILE] [--plot FILE]
+                                   [--clip PATH] [--steps N] [--seed S] [--engine E] [--default] [--json FILE] [--plot FILE]
 
 *Bunny* or another clip, by default all 132 frames of 640x1280, in the published 30,000 steps of 3 frames: hours on the
 CPU of a desktop machine; `--engine auto` uses a GPU where JAX sees one. A smaller `--size` has Gaussians at the start
@@ -18,7 +18,8 @@ start with 100,000: their 38.53 dB for batch 3 and degree 7 is the first row of 
 FOLDER keeps a checkpoint of the fit under way and, for each fit, the curve NAME.csv of running PSNR (of all frames,
 each with the error it had when a step last rendered it) and number of Gaussians against steps. The same command
 continues a fit after its checkpoint; with --json also after the fits that are done. `cpu_hours` are of the process,
-over all its runs.
+over all its runs. With --default a fit of the defaults follows, with at most as many Gaussians as the first fit ends
+with, for as long as that took (processor time of all threads together).
 """
 
 import argparse
@@ -34,7 +35,8 @@ import numpy as np
 
 from benchmarks import _common, fit_clip
 from benchmarks._common import console
-from benchmarks._runs import Run, Runs, scaled, scores, size_on_disk
+from benchmarks._runs import Run, Runs, fitted, scaled, scores, size_on_disk
+from foldgauss._runtime.threads import num_threads
 from foldgauss.io import Clip, read_video
 from foldgauss.io._atomic import atomic_path
 from foldgauss.io.datasets import bunny, sample_clip
@@ -225,6 +227,13 @@ def run_to_end(clip: Clip, name: str, config: FitConfig, folder: Path) -> Run:
     return run | {"seconds": info.seconds, "cpu_hours": curve.cpu_seconds() / 3600}
 
 
+def run_default(clip: Clip, config: FitConfig) -> Run:
+    """A fit whose minutes are processor time, of all threads together as `cpu_hours` are."""
+    threads = num_threads()
+    run = fitted(clip, dataclasses.replace(config, minutes=config.minutes / threads), cpu_time=True)[1]
+    return run | {"cpu_hours": run["seconds"] * threads / 3600}
+
+
 def show(runs: dict[str, Run], title: str) -> None:
     """Print the fits, with differences to the first, beside what the paper reports for `FULL`."""
     columns = "fit", "PSNR, dB", "", "worst frame", "SSIM", "Gaussians", "CPU hours", "paper: PSNR", "", "million"
@@ -268,6 +277,10 @@ def main(arguments: list[str] | None = None) -> None:
         config = config_of(name, clip.size, options.steps, options.seed)
         config = dataclasses.replace(config, engine=options.engine)
         done[name] = runs.get(name, lambda name=name, config=config: run_to_end(clip, name, config, options.folder))
+    if options.default:
+        first = next(iter(done.values()))
+        equal = FitConfig(max_gaussians=first["gaussians"], minutes=60 * first["cpu_hours"], seed=options.seed)
+        done["default"] = runs.get("default", lambda: run_default(clip, equal))
     name = options.clip.stem if options.clip else "Bunny"
     title = f"{name}, {clip.num_frames} frames of {clip.size[0]}x{clip.size[1]}, {options.steps:,} steps"
     show(done, title + (", not resized" if options.crop else ""))
@@ -293,6 +306,7 @@ def _parser():
     chosen.add_argument("--only", nargs="+", choices=names, metavar="NAME", help=f"these of {'; '.join(names)}")
     parser.add_argument("--seed", type=int, default=0, help="[0]")
     parser.add_argument("--engine", choices=FIT_ENGINES, default="auto", help="that computes the steps [auto]")
+    parser.add_argument("--default", action="store_true", help="beside the first fit, at equal number and time")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the curves here (PNG)")
     return parser
 
