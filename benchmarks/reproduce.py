@@ -1,7 +1,8 @@
 """The paper's recipe to its end: preset `paper` with all its steps, and with one thing changed.
 
     python -m benchmarks.reproduce --folder FOLDER [--tables | --only NAME ...] [--size HxW | --crop HxW] [--frames A:B]
-                                   [--clip PATH] [--steps N] [--seed S] [--engine E] [--default] [--json FILE] [--plot FILE]
+                                   [--clip PATH] [--steps N] [--seed S] [--engine E] [--default] [--json FILE]
+                                   [--plot FILE]
 
 *Bunny* or another clip, by default all 132 frames of 640x1280, in the published 30,000 steps of 3 frames: hours on the
 CPU of a desktop machine; `--engine auto` uses a GPU where JAX sees one. A smaller `--size` has Gaussians at the start
