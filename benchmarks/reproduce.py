@@ -235,15 +235,15 @@ def run_default(clip: Clip, config: FitConfig) -> Run:
     return run | {"cpu_hours": run["seconds"] * threads / 3600}
 
 
-def show(runs: dict[str, Run], title: str) -> None:
-    """Print the fits, with differences to the first, beside what the paper reports for `FULL`."""
+def show(runs: dict[str, Run], title: str, *, beside_paper: bool) -> None:
+    """Print the fits, with differences to the first, for *Bunny* beside what the paper reports for `FULL`."""
     columns = "fit", "PSNR, dB", "", "worst frame", "SSIM", "Gaussians", "CPU hours", "paper: PSNR", "", "million"
     table = _common.table(title, *columns)
     first = next(iter(runs))
     for name, run in runs.items():
         gain = f"{run['psnr'] - runs[first]['psnr']:+.2f}"
         figures = f"{run['psnr']:.2f}", gain, f"{run['worst_psnr']:.2f}", f"{run['ssim']:.4f}"
-        theirs, reference = published(name), published(first)
+        theirs, reference = (published(name), published(first)) if beside_paper else (None, None)
         beside = ("", "", "")
         if theirs is not None:
             beside = f"{theirs[0]}", "" if reference is None else f"{theirs[0] - reference[0]:+.2f}", f"{theirs[1]}"
@@ -284,7 +284,7 @@ def main(arguments: list[str] | None = None) -> None:
         done["default"] = runs.get("default", lambda: run_default(clip, equal))
     name = options.clip.stem if options.clip else "Bunny"
     title = f"{name}, {clip.num_frames} frames of {clip.size[0]}x{clip.size[1]}, {options.steps:,} steps"
-    show(done, title + (", not resized" if options.crop else ""))
+    show(done, title + (", not resized" if options.crop else ""), beside_paper=options.clip is None)
     if options.plot:
         plot_curves(options.folder, done, options.plot)
     figures = {f"psnr, {name}": run["psnr"] for name, run in done.items()}
