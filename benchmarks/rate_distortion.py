@@ -16,7 +16,8 @@ over the decoded 8-bit frames:
 Seconds are of the processor, to encode (to fit and compress) and to decode all frames (to render them).
 
 BD-rate (Bjontegaard 2001, VCEG-M33): how many more bytes a coder takes at equal quality than x264 medium, by piecewise
-cubic interpolation of log bytes over the common range, which is printed; none where there is no common range. With
+cubic interpolation of log bytes. All coders are compared over the range of quality of the compact files, as far as both
+cover it; the range is printed, and none where there is no common one. With
 --json finished runs are kept, and the same command goes on after them.
 """
 
@@ -157,15 +158,18 @@ def run_foldgauss(frames: np.ndarray, fps: float, config: FitConfig, passes: int
         return score(frames, decoded, path.stat().st_size, encode_s, decode_s) | size
 
 
-def bd_rate(reference: list[Run], other: list[Run], quality: str) -> tuple[float, float, float] | None:
-    """Relative difference of bytes at equal quality, and its range of quality; None without a common range."""
+def bd_rate(
+    reference: list[Run], other: list[Run], quality: str, within: list[Run]
+) -> tuple[float, float, float] | None:
+    """Relative difference of bytes at equal quality over the range of quality that all cover; None without one."""
     curves = []
     for runs in (reference, other):
         points = sorted((run[quality], np.log(run["bytes"])) for run in runs)
         values, log_bytes = np.array(points).T
         increasing = np.r_[True, np.diff(values) > 1e-6]
         curves.append((values[increasing], log_bytes[increasing]))
-    low, high = max(q[0] for q, _ in curves), min(q[-1] for q, _ in curves)
+    limits = [run[quality] for run in within]
+    low, high = max(min(limits), *(q[0] for q, _ in curves)), min(max(limits), *(q[-1] for q, _ in curves))
     if high <= low or any(len(q) < 2 for q, _ in curves):
         return None
     first, second = (PchipInterpolator(q, r).integrate(low, high) for q, r in curves)
@@ -197,7 +201,8 @@ def show(clip: str, by_coder: dict[str, list[Run]]) -> dict[str, dict[str, tuple
             table.add_row(name, *(format(run[figure], form) for figure, form in forms.items()))
     console.print(table)
     names = [name for name in by_coder if name != REFERENCE]
-    rates = {name: {q: bd_rate(by_coder[REFERENCE], by_coder[name], q) for q in QUALITIES} for name in names}
+    base, ours = by_coder[REFERENCE], by_coder[OURS]
+    rates = {name: {q: bd_rate(base, by_coder[name], q, ours) for q in QUALITIES} for name in names}
     table = _common.table(f"{clip}: BD-rate to {REFERENCE}, and its range of quality", "coder", *QUALITIES.values())
     for name, by_quality in rates.items():
         shown = (
