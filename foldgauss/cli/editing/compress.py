@@ -60,7 +60,7 @@ def compress_command(
     passes: Annotated[
         int,
         typer.Option(
-            help="Passes over VIDEO of fine-tuning, 3 to 7 times as many in all stages; 0: none.",
+            help="Passes over VIDEO of fine-tuning, 3 to 12 times as many in all stages; 0: none.",
             min=0,
         ),
     ] = PASSES,
