@@ -30,6 +30,7 @@ sys.dont_write_bytecode = False
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
+from hypothesis import settings  # noqa: E402
 
 from foldgauss._numerics import batch  # noqa: E402
 
@@ -43,6 +44,9 @@ gc.set_threshold(200_000, 50, 50)
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+# The same examples in every run, so that a test fails by a change and not by its draw. `.ci/slow` draws others.
+settings.register_profile("same", derandomize=True)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 
 
 @pytest.fixture(scope="module")
