@@ -553,6 +553,18 @@ def test_estimated_errors_near_a_ridge_are_no_smaller_than_the_errors():
 
 
 @pytest.mark.slow
+def test_a_ridge_that_quadrature_misses_is_said_to_be():
+    """At loc itself nothing rounds, but panels end before a ridge of 1e-13, whose mass is that of a Gaussian."""
+    for scale in (1e-10, 1e-13, 1e-16):
+        dist = _dist(2, power=1.0, scale_tril=scale * TRIL[:2, :2])
+        speed = np.linalg.solve(TRIL[:2, :2], 0.3 * BEND[0, :2])  # in units of the ridge's width, per time_scale
+        truth = -np.log(2 * np.pi * scale * TRIL[0, 0] * TRIL[1, 1] * np.linalg.norm(speed))
+        marginal = dist.marginal([0, 1])
+        error = abs(float(marginal.log_prob(LOC[:2])) - truth)
+        np.testing.assert_allclose(marginal.error_estimate(LOC[:2]), error, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", [1, 2])
 def test_float32_far_out_agrees_with_float64(dim):
     # name: offset of space and time, time_scale, scale of space, power, floor

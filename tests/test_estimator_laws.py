@@ -192,8 +192,9 @@ def _demonstrations(seed, num):
 
 def test_groups_keep_components_from_collapsing_onto_one_curve():
     (x, groups), (held, _) = _demonstrations(0, 5), _demonstrations(1, 5)
-    with pytest.warns(UserWarning, match="smooth curves.*groups"):
-        plain = _fit(x, 12, degree=3, time_column=0)
+    with pytest.warns(UserWarning, match="smooth curves.*groups") as told:
+        plain = FoldedGaussianMixture(12, degree=3, time_column=0, random_state=0).fit(x)
+    assert told[0].filename == __file__
     grouped = _fit(x, 12, degree=3, time_column=0, groups=groups)
     assert plain.score(held) < grouped.score(held) - 2
     with pytest.warns(ConvergenceWarning, match=r"of 12 components are as narrow as the gap.*Lower n_components"):
@@ -203,7 +204,10 @@ def test_groups_keep_components_from_collapsing_onto_one_curve():
         select_mixture(base, x, n_components=[12], degrees=[3], groups=groups)
 
 
-@pytest.mark.parametrize("kind", ["independent", "sorted by time", "narrow and sorted", "random walk", "noisy curves"])
+@pytest.mark.parametrize(
+    "kind",
+    ["independent", "sorted by time", "narrow and sorted", "random walk", "noisy curves", "rounded", "grid", "huge"],
+)
 def test_rows_that_are_no_smooth_curves_do_not_warn(kind, recwarn):
     rng = np.random.default_rng(0)
     t, noise = rng.uniform(size=(600, 1)), rng.normal(size=(600, 2))
@@ -213,6 +217,9 @@ def test_rows_that_are_no_smooth_curves_do_not_warn(kind, recwarn):
         "narrow and sorted": np.hstack([np.sin(6 * np.sort(t, 0)) + 1e-6 * noise, np.sort(t, 0)]),
         "random walk": np.hstack([noise.cumsum(0), np.linspace(0, 1, 600)[:, None]]),
         "noisy curves": _demonstrations(0, 5)[0] + 0.02 * rng.normal(size=(600, 3)),
+        "rounded": np.column_stack([np.round(0.4 * noise), np.arange(600.0)]),
+        "grid": np.stack(np.meshgrid(*[np.arange(8.0)] * 3), -1).reshape(-1, 3),
+        "huge": np.hstack([1e200 * noise, t]),
     }[kind]
     warn_smooth(x)
     assert not recwarn

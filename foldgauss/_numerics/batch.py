@@ -234,29 +234,29 @@ def map_over_batch(function: Callable, *items):
     parts = [part for x in items for part in (ranked_leaves(x) if isinstance(x, eqx.Module) else [x])]
     batch, structure = check_batch(parts), jax.tree.structure([x if isinstance(x, eqx.Module) else x[0] for x in items])
     traced = any(isinstance(x, jax.core.Tracer) for x, _ in parts)
-    own, size = jnp if traced else np, math.prod(batch)  # NumPy compiles nothing
-    shapes = [(own.asarray(x), x.shape[x.ndim - rank :]) for x, rank in parts]
-    flat = [_flatten(own, x, batch, event) for x, event in shapes]
-    result = _map_flat(function, structure, flat) if traced or not size else _map_eager(function, structure, flat, size)
+    own, outer = jnp if traced else np, batch or (1,)  # NumPy compiles nothing
+    wide = [own.broadcast_to(own.asarray(x), (*outer, *x.shape[x.ndim - rank :])) for x, rank in parts]
+    if traced or not math.prod(batch):
+        flat = [x.reshape(math.prod(outer), *x.shape[len(outer) :]) for x in wide]
+        result = _map_flat(function, structure, flat)
+    else:
+        result = _map_eager(function, structure, wide, outer)
     return jax.tree.map(lambda x: jnp.asarray(x.reshape((*batch, *x.shape[1:]))), result)
 
 
-def _flatten(own, x: np.ndarray | Array, batch: tuple[int, ...], event: tuple[int, ...]) -> np.ndarray | Array:
-    """`x` for each element of the batch, (size, *event). What all share, such as a path, is not copied by NumPy."""
+def _map_eager(function: Callable, structure, wide: list[np.ndarray], batch: tuple[int, ...]):
+    """In chunks of one of few sizes, so that batches of any size share a compiled program.
+
+    `wide` are views: what the elements of a batch share, such as a path, is copied for those of a chunk only.
+    """
     size = math.prod(batch)
-    if x.size == math.prod(event):
-        return own.broadcast_to(x.reshape(1, *event), (size, *event))
-    return own.broadcast_to(x, (*batch, *event)).reshape(size, *event)
-
-
-def _map_eager(function: Callable, structure, flat: list[np.ndarray], size: int):
-    """In chunks of one of few sizes, so that batches of any size share a compiled program."""
     width = next((n for n in _SIZES if size <= n), _CHUNK)
-    chunks = ([fill_up(x[start : start + width], width) for x in flat] for start in range(0, size, width))
-    shapes = tuple(jax.ShapeDtypeStruct((width, *x.shape[1:]), x.dtype) for x in flat)
+    shapes = tuple(jax.ShapeDtypeStruct((width, *x.shape[len(batch) :]), x.dtype) for x in wide)
     program = _compile_flat(function, structure, shapes)
-    # One after the other: jaxlib's solver for batches can deadlock if two programs run at once (`solve_upper_matrix`).
-    results = [jax.tree.map(_as_numpy, program(chunk)) for chunk in chunks]
+    results = []
+    for start in range(0, size, width):  # not at once: jaxlib's solver for batches can deadlock (`solve_upper_matrix`)
+        rows = np.unravel_index(np.minimum(np.arange(start, start + width), size - 1), batch)
+        results.append(jax.tree.map(_as_numpy, program([x[rows] for x in wide])))
     return jax.tree.map(lambda *parts: _join(parts)[:size], *results)
 
 

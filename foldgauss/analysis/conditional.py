@@ -44,6 +44,8 @@ _CROSSINGS = 24  # candidate times at which the ridge comes near
 _BEST = 10  # of them, around which panels are refined
 _MAXIMA = 6  # peaks of the density around which panels are refined
 _MODES = 8
+_LOG_NARROW = -7.0  # width of a ridge over which log a and the density of time hardly change
+_MISSED = 0.1  # mass on a ridge beyond that of the integral that is no error of its estimate
 _AVERAGED = 0.1  # of the rounding at some 100 nodes across the ridge, where the residual is about 1
 
 
@@ -433,11 +435,15 @@ def _rounding(parent, s, near, spikes: Panels | None, log_total):
     log_width = jnp.minimum(0, log_scale - jnp.log(jnp.where(rate > 0, rate, 1)))
     log_det = jnp.log(jnp.diagonal(tril)).sum() + s.size * (log_scale + _HALF_LOG_2PI)
     close, change = z <= 2 * q, q * (z + q + _AVERAGED)
-    # log of the mass near this point, if it is on the ridge whenever it may be, in units of p(s).
-    log_share = -0.5 * (tau**2 + jnp.where(close, 0, z) ** 2) - _HALF_LOG_2PI - log_det + log_width - log_total
+    if s.size == 1:  # a crossing that rounding moves stays one, but where the curve turns back
+        change = jnp.where(close, jnp.minimum(1, change), change)
+    # log of the mass near this point, if it is on the ridge whenever it may be, in units of p(s). The integral over a
+    # narrow ridge is that of a Gaussian; wide ones may have less mass, where the curve bends.
+    log_share = -0.5 * (tau**2 + jnp.where(close, 0, z) ** 2) - log_det + log_width - log_total
+    log_share = log_share - jnp.where(log_width < _LOG_NARROW, 0, _HALF_LOG_2PI)
     # On the ridge quadrature may find q times that mass, since the residual is rounded to 0 over q times the width.
     reach = log_share + jnp.where(close, jnp.log(jnp.maximum(1, q)), 2 * change)
-    error = change * jnp.exp(jnp.minimum(0, reach)) + jnp.where(close, jnp.maximum(0, log_share), 0)
+    error = change * jnp.exp(jnp.minimum(0, reach)) + jnp.where(close & (log_share > _MISSED), log_share, 0)
     counts = ~jnp.isnan(near) & jnp.isfinite(log_share + change)
     if spikes is not None:
         counts = counts & ~is_within_any((spikes.left[:, 0], spikes.right[:, -1]), tau)

@@ -181,20 +181,21 @@ def refuse_groups(groups) -> None:
 
 
 def warn_smooth(x: Float[np.ndarray, "n d"]) -> None:
-    """Warn of successive rows on smooth curves, which count as one observation rather than as many."""
+    """Warn of successive rows on smooth curves in space, which count as one observation rather than as many."""
     if len(x) < 10:
         return
-    x = np.asarray(x[:10_000], np.float64)
-    scale = x.std(0)
-    step = np.diff(x / np.where(scale > 0, scale, 1), axis=0)
-    first, second = (np.median(np.linalg.norm(y, axis=1)) for y in (step, np.diff(step, axis=0)))
-    if second < _SMOOTH * first:
+    space = np.asarray(x[:10_000, :-1], np.float64)
+    with np.errstate(all="ignore"):  # units out of range are refused elsewhere
+        scale = space.std(0)
+        step = np.diff(space / np.where(scale > 0, scale, 1), axis=0)
+        first, second = (np.median(np.linalg.norm(y, axis=1)) for y in (step, np.diff(step, axis=0)))
+    if 1e-6 * first < second < _SMOOTH * first:  # not steps that are all the same: a grid of points
         warnings.warn(
             f"Successive rows lie on smooth curves (second differences are {second / first:.0%} of the first ones), so "
             "that components may collapse onto single curves. Pass the curve of each row as groups, and hold out "
             "whole curves to compare mixtures.",
             UserWarning,
-            stacklevel=5,
+            stacklevel=4,
         )
 
 
