@@ -16,9 +16,9 @@ over the decoded 8-bit frames:
 Seconds are of the processor, to encode (to fit and compress) and to decode all frames (to render them).
 
 BD-rate (Bjontegaard 2001, VCEG-M33): how many more bytes a coder takes at equal quality than x264 medium, by piecewise
-cubic interpolation of log bytes. All coders are compared over the range of quality of the compact files, as far as both
-cover it; the range is printed, and none where there is no common one. With
---json finished runs are kept, and the same command goes on after them.
+cubic interpolation of log bytes. The range of quality is that of the compact files, as far as both coders cover it. It
+is printed beside each figure. The figure is "none" if there is no common range.
+With --json finished runs are kept, and the same command goes on after them.
 """
 
 import argparse

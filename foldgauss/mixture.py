@@ -434,7 +434,7 @@ def _check_components(components, kind: type) -> None:
 
 
 def _reduce_pairs(function, mixture: AbstractMixture, x: Array) -> Array:
-    """`function(log w_k, log p_k(x), axis)`, one of those imported, where `axis` is that of the components."""
+    """Return `function(log w_k, log p_k(x), axis)` of `mixture_weights`. The components are along `axis`."""
     if isinstance(mixture.components, TimeMixture):  # whose integrals are programs of their own, which are shared
         log_components = mixture.components.log_prob(_add_component_axis(mixture, x))
         return _reduce_last(function, mixture.log_weights, log_components)

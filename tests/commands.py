@@ -31,7 +31,7 @@ def run(*arguments):
 
 
 def _find_foreign_options(words, texts):
-    """Options in texts that the command lacks. Those of other commands or programs it names are not meant."""
+    """Return options in texts that the command lacks, except those of other commands or programs that a text names."""
     known = {
         name: application.load_commands(name).get(name) for name in application.COMMANDS if name in (*words, "fit")
     }

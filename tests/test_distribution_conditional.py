@@ -539,7 +539,7 @@ def test_estimated_errors_near_a_ridge_are_no_smaller_than_the_errors():
             fold=PolynomialFold(np.float32([[0.8, -0.5], [0.6, 0.9]])),
             envelope=TimeLikelihood(),
         )
-        center = np.asarray(narrow.condition_time(np.float32(rng.normal(0.4, 0.6, size=(64, 3)))).loc)
+        center = np.asarray(narrow.condition_time(np.float32(rng.normal(0.4, 0.6, size=(32, 3)))).loc)
         away = 1 + np.float32([0, 6e-8, 2e-6])[:, None, None, None] * rng.normal(size=(3, *center.shape))
         s = np.float32(center * away)
         here = narrow.marginal([0, 1])
@@ -554,7 +554,7 @@ def test_estimated_errors_near_a_ridge_are_no_smaller_than_the_errors():
 
 @pytest.mark.slow
 def test_a_ridge_that_quadrature_misses_is_said_to_be():
-    """At loc itself nothing rounds, but panels end before a ridge of 1e-13, whose mass is that of a Gaussian."""
+    """Panels are wider than a ridge of 1e-13. The estimated error is the mass of that ridge, a Gaussian integral."""
     for scale in (1e-10, 1e-13, 1e-16):
         dist = _dist(2, power=1.0, scale_tril=scale * TRIL[:2, :2])
         speed = np.linalg.solve(TRIL[:2, :2], 0.3 * BEND[0, :2])  # in units of the ridge's width, per time_scale

@@ -247,7 +247,7 @@ def map_over_batch(function: Callable, *items):
 def _map_eager(function: Callable, structure, wide: list[np.ndarray], batch: tuple[int, ...]):
     """In chunks of one of few sizes, so that batches of any size share a compiled program.
 
-    `wide` are views: what the elements of a batch share, such as a path, is copied for those of a chunk only.
+    The arrays of `wide` are views. Values that the batch shares, such as a path, are copied for one chunk at a time.
     """
     size = math.prod(batch)
     width = next((n for n in _SIZES if size <= n), _CHUNK)

@@ -45,7 +45,7 @@ _BEST = 10  # of them, around which panels are refined
 _MAXIMA = 6  # peaks of the density around which panels are refined
 _MODES = 8
 _LOG_NARROW = -7.0  # width of a ridge over which log a and the density of time hardly change
-_MISSED = 0.1  # mass on a ridge beyond that of the integral that is no error of its estimate
+_MISSED = 0.1  # quadrature missed a ridge if log of its mass exceeds log of the integral by more than this
 _AVERAGED = 0.1  # of the rounding at some 100 nodes across the ridge, where the residual is about 1
 
 
@@ -437,11 +437,11 @@ def _rounding(parent, s, near, spikes: Panels | None, log_total):
     close, change = z <= 2 * q, q * (z + q + _AVERAGED)
     if s.size == 1:  # a crossing that rounding moves stays one, but where the curve turns back
         change = jnp.where(close, jnp.minimum(1, change), change)
-    # log of the mass near this point, if it is on the ridge whenever it may be, in units of p(s). The integral over a
-    # narrow ridge is that of a Gaussian; wide ones may have less mass, where the curve bends.
+    # log_share is log of the mass near this point divided by p(s). Points that may be on the ridge count as on it.
+    # The mass of a narrow ridge is that of a Gaussian. A wide ridge may have less mass, since the curve bends.
     log_share = -0.5 * (tau**2 + jnp.where(close, 0, z) ** 2) - log_det + log_width - log_total
     log_share = log_share - jnp.where(log_width < _LOG_NARROW, 0, _HALF_LOG_2PI)
-    # On the ridge quadrature may find q times that mass, since the residual is rounded to 0 over q times the width.
+    # Quadrature may find q times the mass of a ridge, since rounded residuals are 0 over q times its width.
     reach = log_share + jnp.where(close, jnp.log(jnp.maximum(1, q)), 2 * change)
     error = change * jnp.exp(jnp.minimum(0, reach)) + jnp.where(close & (log_share > _MISSED), log_share, 0)
     counts = ~jnp.isnan(near) & jnp.isfinite(log_share + change)

@@ -71,7 +71,7 @@ def _kl_folded(p, q):
 
 @compile_eager
 def _chain_rule(time_p: Normal, time_q: Normal, tril_p, tril_q, found, errors):
-    """The divergence and its estimated error, of those of its expectations over time."""
+    """Return the divergence and its estimated error. `found` are expectations over time, with `errors`."""
     dim, (ratio, mahalanobis, log_ratio) = tril_p.shape[-1], found
     trace, log_det = _trace_and_log_det(tril_p, tril_q)
     space = 0.5 * (trace * ratio - dim + log_det + dim * log_ratio + mahalanobis)

@@ -34,7 +34,7 @@ def to_numpyro(dist: Any, *, validate_args: bool | None = None) -> "numpyro.dist
 
     `validate_args` checks parameters against these constraints and warns of values out of the support; None is
     numpyro's own setting (`numpyro.enable_validation`), which does not change the checks of our constructors.
-    `entropy`, `cdf`, `icdf` and `mode` are those of `dist`. Where it has none, they raise as numpyro's methods do.
+    The methods `entropy`, `cdf`, `icdf` and `mode` call those of `dist`. They raise NotImplementedError if it has none.
     `numpyro.distributions.kl_divergence` of two of them is `foldgauss.analysis.divergence.kl_divergence`.
 
     **Example:**
@@ -129,7 +129,7 @@ def _make_class(distributions) -> type:
 
         @classmethod
         def infer_shapes(cls, *args, **kwargs):
-            """Raises as for numpyro's own vectors: the shape of an event does not follow from those of parameters."""
+            """Raise NotImplementedError, as numpyro's vectors do: parameters do not determine the shape of an event."""
             told = "infer_shapes: use batch_shape and event_shape of the distribution."
             raise NotImplementedError(told)  # numpyro's signal that a class cannot infer shapes
 

@@ -33,7 +33,7 @@ def moments(dist, *, with_error: bool = False) -> tuple[Array, ...]:
 
 @compile_eager
 def _moments(loc, scale_tril, time_loc, time_scale, fold, envelope) -> tuple[Array, Array, Array]:
-    """`fold` and `envelope` are those of the distribution, or their integrals where there is no closed form."""
+    """Return the moments and their error. `fold` and `envelope` have closed forms, or are tuples of integrals."""
     mean_f, cov_f, cross, error_f = fold if isinstance(fold, tuple) else _fold_moments(fold, loc, time_scale)
     mean_a, error_a = envelope if isinstance(envelope, tuple) else (_mean_envelope(envelope, time_loc), 0)
     mean = jnp.concatenate([loc + mean_f, time_loc[..., None]], axis=-1)
@@ -54,7 +54,7 @@ def entropy(dist, *, with_error: bool = False) -> Array | tuple[Array, Array]:
 
 @compile_eager
 def _entropy(scale_tril, time_scale, mean_log) -> tuple[Array, Array, Array]:
-    """The entropy, its estimated error, and that of E[log a] relative to max(1, E[log a])."""
+    """Return the entropy, its estimated error, and the estimated error of E[log a] relative to max(1, |E[log a]|)."""
     dim, (mean_log_a, error) = scale_tril.shape[-1], mean_log
     log_det = jnp.log(jnp.diagonal(scale_tril, axis1=-2, axis2=-1)).sum(-1)
     gaussian = 0.5 * (dim + 1) * _LOG_2PI_E + jnp.log(time_scale) + log_det

@@ -139,7 +139,7 @@ class ChunkedRows(NamedTuple):
 
 
 def choose_dtype(data: Rows | ChunkedRows, degree: int, order: Int[np.ndarray, " d"]) -> np.dtype:
-    """That of the data, or float64 where float32 holds too few digits or powers; `order` is that of X's columns."""
+    """Return the dtype of the data, or float64 if float32 is too short. Column i of the data is order[i] of X."""
     if data.dtype == np.float32 and (degree > _MAX_SINGLE_DEGREE or _find_extreme(data, degree) is not None):
         data = data.astype(np.dtype(np.float64))
     if (column := _find_extreme(data, degree)) is not None:
