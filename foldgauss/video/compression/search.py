@@ -35,7 +35,6 @@ from foldgauss.video.compression.quantize import (
     dequantize,
     estimate_bits,
     find_cells,
-    index_colors,
     is_integral,
     quantize,
     unrounded_trajectories,
@@ -268,7 +267,7 @@ def _drop_in_stages(
             current = _drop(current, own, loss, base, so_far + dropped)
         current = _Sorting(current)(ordering * loss.error)
         what = "fine-tuning after dropping Gaussians"
-        current = finetune(current, 1 / _STAGES_OF_PASSES, what, seed=stage, shared=index_colors(current))
+        current = finetune(current, 1 / _STAGES_OF_PASSES, what, seed=stage)
         before, so_far = so_far, loss(current, loss.all_frames)
         on_step("dropped", so_far)
         gained = _LEFT * dropped + before - so_far
@@ -393,7 +392,7 @@ def _round_in_stages(
         fixed[group] = ranks[group] < rounded
         start = _round_fixed(quantized, exact, fixed)
         frozen = {name: which for group, which in fixed.items() for name in group}
-        tuned = finetune(start, fraction, "fine-tuning the rest", fixed=frozen, seed=1, shared=exact.shade)
+        tuned = finetune(start, fraction, "fine-tuning the rest", fixed=frozen, seed=1)
         exact = _keep_fixed(quantized, exact, tuned, fixed)
         columns = quantized.columns
         cells = np.where(fixed[SHAPE], columns["cell"], find_cells(exact))

@@ -10,9 +10,9 @@ from jaxtyping import Float, Float32, Int
 
 from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss.video.fitting.adam import BETA2
+from foldgauss.video.fitting.births import make_newborns
 from foldgauss.video.fitting.budget import measure_progress
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.pruning.births import make_newborns
 from foldgauss.video.fitting.schedule import steps_per_pass
 from foldgauss.video.fitting.state import FitState, frame_times
 from foldgauss.video.models.conditioning import ConditioningSpec, find_windows
@@ -27,12 +27,11 @@ _MIN_COUNT = 5
 
 
 def relocates(config: FitConfig) -> bool:
-    """Whether a fit relocates Gaussians: densification and economy add Gaussians themselves.
+    """Whether a fit relocates Gaussians: densification adds Gaussians itself.
 
     Where Adam updates all Gaussians in every step, its moments do not tell which ones matter.
     """
-    adds = config.growth is not None or config.economy is not None
-    return config.relocated_fraction > 0 and not adds and config.sparse_updates
+    return config.relocated_fraction > 0 and config.growth is None and config.sparse_updates
 
 
 def is_relocation_due(state: FitState, config: FitConfig) -> bool:
@@ -50,8 +49,8 @@ def relocate(
 ) -> None:
     """Move the fraction `config.relocated_fraction` of the Gaussians that can be judged; their moments start at zero.
 
-    Frames and pixels of the new ones are drawn by squared error, and they have the degree of the fit. If the model has
-    static Gaussians, new ones at constant pixels are static too. `spec` is that of whole frames.
+    Frames and pixels of the new ones are drawn by squared error, and they have the degree of the fit. `spec` is that of
+    whole frames.
     """
     times = np.asarray(frame_times(state.time_logits))
     influence = measure_influence(state, find_windows(state.rows, spec), times, config.degree)
@@ -60,8 +59,7 @@ def relocate(
         return
     stay = np.ones(len(state.rows), bool)
     stay[np.argsort(influence, kind="stable")[:num]] = False
-    errors, with_static = state.frame_errors.astype(float), bool(is_static(state.kinds).any())
-    new = make_newborns(num, state, frames, errors, config, spec, motion, with_static=with_static)
+    new = make_newborns(num, state, frames, state.frame_errors.astype(float), config, spec, motion)
     kinds = find_initial_kinds(new, config.degree)
     state.keep(np.flatnonzero(stay))
     place = _find_places(state, new, kinds, config)
@@ -87,8 +85,8 @@ def measure_influence(
     """How much the frames depend on each Gaussian, up to a common factor; infinite where that is not known.
 
     Adam's second moment of the opacity is the mean square of dL/do over the frames where the Gaussian is alive. The
-    signs of the errors in it are about random, so o^2 times it estimates what the Gaussian adds to a frame, as
-    `PruningScores.second_order` does, without another pass over the frames. Gaussians with few steps and opaque ones
+    signs of the errors in it are about random, so o^2 times it estimates what the Gaussian adds to a frame, without
+    another pass over the frames. Gaussians with few steps and opaque ones
     are not judged; those alive in no frame have none.
     """
     at = columns(degree)["opacity_logit"].start
