@@ -295,7 +295,7 @@ class TestTune:
 class TestStep:
     def test_every_part_is_timed(self):
         """A function that the fit no longer calls would leave its part at zero."""
-        config = FitConfig(num_gaussians=200, degree=2, steps=40, quarter_fraction=0.0, half_fraction=0.0)
+        config = FitConfig(num_gaussians=200, degree=2, steps=40)
         records, state, num_alive = step.measure(blob(), config, num_steps=3)
         assert len(records) == 3
         assert len(state.rows) == 200

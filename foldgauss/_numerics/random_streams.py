@@ -16,7 +16,6 @@ class Stream(enum.IntEnum):
     FRAME_ORDER = 1
     SPLIT = 2  #: halves of Gaussians that densification splits
     BIRTH = 3
-    RELOCATION_DEPTH = 5
     BACKGROUND = 6
     INTERPOLATED_FRAME = 7
     ERROR_WEIGHTED_FRAME = 8

@@ -257,7 +257,7 @@ def run(config, kept=None):
     numbers = []
     for state, info in fit_steps(FRAMES, config, kept):
         numbers.append(info.num_gaussians)
-        parts = (state.rows, state.first, state.second, state.counts, state.kinds, state.newborn)
+        parts = (state.rows, state.first, state.second, state.counts, state.kinds)
         assert len({len(part) for part in parts}) == 1
     return numbers, state
 
@@ -354,7 +354,7 @@ def test_screen_gradient_is_in_units_of_half_the_image():
         step = stepper_of(state)
         moved = dataclasses.replace(state, rows=rows)
         options = {"squared": False, "mirrored": False, "screen": None, "fraction": None}
-        return step._differentiate(moved, k, np.float32(k), step.shapes[-1], None, **options)[0].value
+        return step._differentiate(moved, k, np.float32(k), step.spec, None, **options)[0].value
 
     small = 0.02
     slope = [(loss(small, 0) - loss(-small, 0)) / (2 * small), (loss(0, small) - loss(0, -small)) / (2 * small)]

@@ -8,7 +8,6 @@ import numpy as np
 import scipy
 from jaxtyping import Float, Float32, Int
 
-from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss.video.fitting.adam import BETA2
 from foldgauss.video.fitting.births import make_newborns
 from foldgauss.video.fitting.budget import measure_progress
@@ -17,7 +16,7 @@ from foldgauss.video.fitting.schedule import steps_per_pass
 from foldgauss.video.fitting.state import FitState, frame_times
 from foldgauss.video.models.conditioning import ConditioningSpec, find_windows
 from foldgauss.video.models.row_layout import columns
-from foldgauss.video.models.sparse_storage import find_initial_kinds, is_opaque, is_static
+from foldgauss.video.models.sparse_storage import find_initial_kinds, is_opaque
 from foldgauss.video.motion.optical_flow import Motion
 
 #: The fractions of the plan after which Gaussians are relocated.
@@ -62,21 +61,16 @@ def relocate(
     new = make_newborns(num, state, frames, state.frame_errors.astype(float), config, spec, motion)
     kinds = find_initial_kinds(new, config.degree)
     state.keep(np.flatnonzero(stay))
-    place = _find_places(state, new, kinds, config)
+    place = _find_places(state, new, config)
     order = np.argsort(np.concatenate([np.arange(len(state.rows)) + 0.5, place]), kind="stable")
     state.extend(new, kinds)
     state.keep(order)
 
 
-def _find_places(state: FitState, new: np.ndarray, kinds: np.ndarray, config: FitConfig) -> Int[np.ndarray, " new"]:
-    """Where new Gaussians lie in depth: among those of their time, which are in its order; static ones among static."""
-    at, num = columns(config.degree)["time_loc_logit"].start, len(state.rows)
-    timed, static = np.flatnonzero(~is_static(state.kinds)), np.flatnonzero(is_static(state.kinds))
-    place = np.append(timed, num)[np.searchsorted(np.sort(state.rows[timed, at]), new[:, at])]
-    if len(static):
-        rng, which = make_generator(Stream.RELOCATION_DEPTH, state.step, seed=config.seed), is_static(kinds)
-        place[which] = rng.choice(static, which.sum())
-    return place
+def _find_places(state: FitState, new: np.ndarray, config: FitConfig) -> Int[np.ndarray, " new"]:
+    """Where new Gaussians lie in depth: among those of their time, which are in its order."""
+    at = columns(config.degree)["time_loc_logit"].start
+    return np.searchsorted(np.sort(state.rows[:, at]), new[:, at])
 
 
 def measure_influence(
