@@ -411,7 +411,7 @@ def test_growth_waits_for_the_plan():
 def test_minutes_bind_while_gaussians_grow(monkeypatch):
     """The pace at the start says nothing of ten times as many."""
     config = FitConfig.preset("paper", num_gaussians=20, degree=1, steps=None, minutes=0.01)
-    monkeypatch.setattr(StepPlanner, "update", lambda self, state, level: setattr(state, "plan", 10**6))
+    monkeypatch.setattr(StepPlanner, "update", lambda self, state: setattr(state, "plan", 10**6))
     *_, (state, last) = fit_steps(FRAMES, config)
     assert last.stopped_by == "minutes"
     assert state.seconds < 5
