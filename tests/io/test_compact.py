@@ -494,7 +494,6 @@ def test_a_last_stage_that_loses_too_much_is_repeated_without_dropping(monkeypat
     monkeypatch.setattr(module, "_drop", lambda model, *limits: f"less of {model}")
     monkeypatch.setattr(module, "_Sorting", lambda model: lambda budget: model)
     monkeypatch.setattr(module, "_Quantizer", lambda model: None)
-    monkeypatch.setattr(module, "index_colors", lambda model: None)
     tuned = []
 
     def finetune(model, fraction, what, seed, shared):
