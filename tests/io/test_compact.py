@@ -496,7 +496,7 @@ def test_a_last_stage_that_loses_too_much_is_repeated_without_dropping(monkeypat
     monkeypatch.setattr(module, "_Quantizer", lambda model: None)
     tuned = []
 
-    def finetune(model, fraction, what, seed, shared):
+    def finetune(model, fraction, what, seed):
         tuned.append(model)
         return str(seed)
 
