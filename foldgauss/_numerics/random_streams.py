@@ -17,7 +17,6 @@ class Stream(enum.IntEnum):
     SPLIT = 2  #: halves of Gaussians that densification splits
     BIRTH = 3
     BIRTH_DEPTH = 4
-    RELOCATION_DEPTH = 5
     BACKGROUND = 6
     INTERPOLATED_FRAME = 7
     ERROR_WEIGHTED_FRAME = 8

@@ -4,17 +4,15 @@ from collections.abc import Callable
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float32, Int32
+from jaxtyping import Bool, Float32
 
 from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss.render import cpu
-from foldgauss.video.fitting.codebook import Codebook
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.state import FitState, update_rows
 from foldgauss.video.models.conditioning import backpropagate, condition, update_windows
 from foldgauss.video.models.prepared import PreparedModel
 from foldgauss.video.models.row_layout import columns, unpack
-from foldgauss.video.models.sparse_storage import find_kinds
 from foldgauss.video.models.video_model import VideoModel
 
 #: Learning rates decay exponentially between these fractions of a fit's first ones: the model is near its optimum.
@@ -30,15 +28,13 @@ def finetune_model(
     passes: int,
     *,
     fixed: dict[str, Bool[np.ndarray, " num"]] | None = None,
-    shared: Int32[np.ndarray, " num"] | None = None,
     seed: int = 0,
     on_pass: Callable[[], None] = lambda: None,
 ) -> VideoModel:
     """The model after `passes` over its frames in random order: Adam with the fit's rates, mean squared error.
 
     Frame times do not change, nor do those leaves of `FoldedSplats` of the Gaussians that `fixed` marks.
-    `target(k, step)` returns what frame k is compared with. `shared`: each Gaussian's color index; Gaussians with the
-    same index keep the same color. Deterministic.
+    `target(k, step)` returns what frame k is compared with. Deterministic.
     """
     prepared = PreparedModel(model, model.size)
     rows, window, spec = prepared.rows, prepared.window, prepared.spec
@@ -48,8 +44,7 @@ def finetune_model(
         rates[place] = getattr(config.rates, name)
         if fixed:
             free[:, place] = ~fixed[name][:, None]
-    kinds, codebook = find_kinds(rows, model.degree), Codebook.create(shared, 3)
-    state = FitState.create(rows, kinds, model.frame_times.logits, colors=codebook)
+    state = FitState.create(rows, model.frame_times.logits)
     grad, times = np.zeros_like(rows), np.asarray(model.frame_times.times())
     steps = passes * model.num_frames
     for step in range(steps):

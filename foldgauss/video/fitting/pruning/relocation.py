@@ -6,9 +6,8 @@ The number of Gaussians stays the same. Source: relocation of dead Gaussians in 
 
 import numpy as np
 import scipy
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float, Float32
 
-from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss.video.fitting.adam import BETA2
 from foldgauss.video.fitting.budget import measure_progress
 from foldgauss.video.fitting.config import FitConfig
@@ -17,7 +16,6 @@ from foldgauss.video.fitting.schedule import steps_per_pass
 from foldgauss.video.fitting.state import FitState, frame_times
 from foldgauss.video.models.conditioning import ConditioningSpec, find_windows
 from foldgauss.video.models.row_layout import columns
-from foldgauss.video.models.sparse_storage import find_initial_kinds, is_opaque, is_static
 from foldgauss.video.motion.optical_flow import Motion
 
 #: The fractions of the plan after which Gaussians are relocated.
@@ -50,8 +48,7 @@ def relocate(
 ) -> None:
     """Move the fraction `config.relocated_fraction` of the Gaussians that can be judged; their moments start at zero.
 
-    Frames and pixels of the new ones are drawn by squared error, and they have the degree of the fit. If the model has
-    static Gaussians, new ones at constant pixels are static too. `spec` is that of whole frames.
+    Frames and pixels of the new ones are drawn by squared error. `spec` is that of whole frames.
     """
     times = np.asarray(frame_times(state.time_logits))
     influence = measure_influence(state, find_windows(state.rows, spec), times, config.degree)
@@ -60,25 +57,14 @@ def relocate(
         return
     stay = np.ones(len(state.rows), bool)
     stay[np.argsort(influence, kind="stable")[:num]] = False
-    errors, with_static = state.frame_errors.astype(float), bool(is_static(state.kinds).any())
-    new = make_newborns(num, state, frames, errors, config, spec, motion, with_static=with_static)
-    kinds = find_initial_kinds(new, config.degree)
+    errors = state.frame_errors.astype(float)
+    new = make_newborns(num, state, frames, errors, config, spec, motion, with_static=False)
     state.keep(np.flatnonzero(stay))
-    place = _find_places(state, new, kinds, config)
+    at = columns(config.degree)["time_loc_logit"].start  # depth: among those of their time, which are in its order
+    place = np.searchsorted(np.sort(state.rows[:, at]), new[:, at])
     order = np.argsort(np.concatenate([np.arange(len(state.rows)) + 0.5, place]), kind="stable")
-    state.extend(new, kinds)
+    state.extend(new)
     state.keep(order)
-
-
-def _find_places(state: FitState, new: np.ndarray, kinds: np.ndarray, config: FitConfig) -> Int[np.ndarray, " new"]:
-    """Where new Gaussians lie in depth: among those of their time, which are in its order; static ones among static."""
-    at, num = columns(config.degree)["time_loc_logit"].start, len(state.rows)
-    timed, static = np.flatnonzero(~is_static(state.kinds)), np.flatnonzero(is_static(state.kinds))
-    place = np.append(timed, num)[np.searchsorted(np.sort(state.rows[timed, at]), new[:, at])]
-    if len(static):
-        rng, which = make_generator(Stream.RELOCATION_DEPTH, state.step, seed=config.seed), is_static(kinds)
-        place[which] = rng.choice(static, which.sum())
-    return place
 
 
 def measure_influence(
@@ -88,8 +74,8 @@ def measure_influence(
 
     Adam's second moment of the opacity is the mean square of dL/do over the frames where the Gaussian is alive. The
     signs of the errors in it are about random, so o^2 times it estimates what the Gaussian adds to a frame, as
-    `PruningScores.second_order` does, without another pass over the frames. Gaussians with few steps and opaque ones
-    are not judged; those alive in no frame have none.
+    `PruningScores.second_order` does, without another pass over the frames. Gaussians with few steps are
+    not judged; those alive in no frame have none.
     """
     at = columns(degree)["opacity_logit"].start
     opacity = scipy.special.expit(state.rows[:, at].astype(float))
@@ -97,5 +83,4 @@ def measure_influence(
     life = np.searchsorted(times, window[:, 1]) - np.searchsorted(times, window[:, 0])
     influence = life * square / np.maximum(1 - opacity, 1e-6) ** 2  # dL/do = dL/dlogit / (o (1 - o))
     influence[(state.counts < _MIN_COUNT) & (life > 0)] = np.inf
-    influence[is_opaque(state.kinds)] = np.inf
     return influence
