@@ -16,8 +16,6 @@ from foldgauss.video.fitting.state import frame_times
 from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
 from foldgauss.video.models.conditioning import ConditioningSpec, condition
 from foldgauss.video.models.row_layout import columns
-from foldgauss.video.models.sparse_storage import OPAQUE_BIT, STATIC_BIT, is_static
-from foldgauss.video.models.splats import STATIC_LOG_TIME_SCALE
 from foldgauss.video.motion.optical_flow import motion_finder
 
 FRAMES = moving_blobs()
@@ -77,12 +75,9 @@ def test_new_gaussians_are_where_errors_are():
 
 
 def test_only_gaussians_that_can_be_judged_move():
-    """Of 20, half; opaque ones and those with few steps stay."""
+    """Of 20, half; those with few steps stay."""
     state = fitted_state()
-    opacity = columns(CONFIG.degree)["opacity_logit"].start
-    state.kinds[:240] |= OPAQUE_BIT
-    state.rows[:240, opacity] = 30
-    state.counts[240:280] = 4
+    state.counts[:280] = 4
     before = state.rows.copy()
     relocate(state, FRAMES, dataclasses.replace(CONFIG, relocated_fraction=0.5), SPEC, None)
     kept = {row.tobytes() for row in state.rows}
@@ -100,32 +95,6 @@ def test_gaussians_alive_in_no_frame_move_first():
     relocate(state, FRAMES, dataclasses.replace(CONFIG, relocated_fraction=0.01), SPEC, None)
     kept = {row.tobytes() for row in state.rows}
     assert not any(row.tobytes() in kept for row in before)
-
-
-@pytest.mark.parametrize("some", [False, True])
-def test_places_in_depth_where_gaussians_are_static(some):
-    """New ones of a time lie among those of it, whatever is static behind them; new static ones among the static."""
-    state, at = fitted_state(), columns(CONFIG.degree)
-    static = np.arange(300) >= (200 if some else 0)
-    state.kinds[static] |= STATIC_BIT
-    state.rows[static, at["time_loc_logit"].start] = 0
-    state.rows[static, at["log_time_scale"].start] = STATIC_LOG_TIME_SCALE
-    state.frame_errors[:] = 1e-12
-    state.frame_errors[5] = 0.1
-    frames = FRAMES if some else np.repeat(FRAMES[:1], len(FRAMES), axis=0)
-    relocate(state, frames, dataclasses.replace(CONFIG, relocated_fraction=0.2), SPEC, None)
-    new, static = np.flatnonzero(state.counts == 0), is_static(state.kinds)
-    assert len(new) == 60
-    if some:
-        last = np.flatnonzero(~static & (state.counts > 0)).max()
-        moving, resting = new[~static[new]], new[static[new]]
-        assert len(moving)
-        assert len(resting)
-        assert moving.min() > 0.4 * last  # their time is the last frame's
-        assert (resting > last).all()
-    else:
-        assert static[new].all()
-        assert new.min() < 60 < 240 < new.max()  # anywhere among the others
 
 
 @pytest.mark.parametrize(

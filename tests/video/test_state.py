@@ -109,9 +109,9 @@ def test_keep_cuts_every_per_gaussian_array():
 
 def test_extend_fills_every_per_gaussian_array():
     state, before = make_state(), make_state()
-    rows, kinds = np.full((2, WIDTH), 5, np.float32), np.full(2, 3, np.uint8)
-    state.extend(rows, kinds, newborn=np.ones(2, bool))
-    given = {"rows": rows, "kinds": kinds, "newborn": np.ones(2, bool)}
+    rows = np.full((2, WIDTH), 5, np.float32)
+    state.extend(rows, newborn=np.ones(2, bool))
+    given = {"rows": rows, "newborn": np.ones(2, bool)}
     for name, kind in FitState.array_fields().items():
         if isinstance(kind, PerGaussian):
             new = given.get(name, kind.build(Sizes(2, WIDTH, FRAMES)))

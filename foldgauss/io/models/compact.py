@@ -53,8 +53,6 @@ VERSION = 4
 _FIXED = len(MAGIC) + 12
 #: Limit of numbers per byte, so that a small file cannot claim much memory; files are padded with spaces. Clips need 1.
 _MOST_PER_BYTE = 32
-#: A file may have so many in any case.
-_ALWAYS_ALLOWED = 1 << 18
 _SIDE = 1 << 20  # largest side of an image: a decoder holds it in memory
 
 
@@ -223,8 +221,8 @@ def _decode(header: dict, body: bytes, whole_length: int) -> Quantized:
     num, num_frames = info.num_gaussians, header["num_frames"]
     _check(is_integer(num_frames, 1), "num_frames", num_frames)
     names = info.column_names
-    most = max(_MOST_PER_BYTE * whole_length, _ALWAYS_ALLOWED)
-    _check(num * len(names) + num_frames + _count_path_numbers(info) <= most, "num_gaussians", num)
+    num_values = num * len(names) + num_frames + _count_path_numbers(info)
+    _check(num_values <= _MOST_PER_BYTE * whole_length, "num_gaussians", num)
     descriptions = header["columns"]
     _check(isinstance(descriptions, list) and len(descriptions) == len(names), "columns", "others")
     of_paths = [header["paths"][name] for name in ("knots", "maps")] if info.paths else [0, 0]
