@@ -337,7 +337,7 @@ def test_facts_that_make_no_sense_are_refused_of_one_segment_too(name, value, wo
     "change",
     [
         setting("segments", 2, "header", "envelope", to="Other"),
-        setting("segments", 2, "header", "stored", to={"powers": 3}),
+        setting("segments", 2, "header", "degree", to=4),
         lambda header, outer: outer.update({"segments.2.splats.more": outer.pop("segments.2.splats.angle_logit")}),
     ],
 )
