@@ -23,7 +23,6 @@ FRAMES, SIZE = (0, 12), (80, 160)
 #: Fits by name: what is kept of them differs. Frame times are learned in all. Checkpoints are of 2 to 4 MB.
 FITS = {
     "plain": ["--gaussians", "20000", "--steps", "400"],
-    "economy": ["--gaussians", "20000", "--steps", "400", "--economy"],
     "growth": [
         *("--preset", "paper", "--gaussians", "4000", "--max-gaussians", "20000"),
         *("--degree", "3", "--steps", "400"),

@@ -115,8 +115,8 @@ TIMED, UNTIMED = 12, 4
 
 
 def seconds_per_step(clip: Clip, config: FitConfig, num_gaussians: int) -> float:
-    """The median of some steps at full size with so many Gaussians, none of them born or dead."""
-    still = {"num_gaussians": num_gaussians, "growth": None, "quarter_fraction": 0.0, "half_fraction": 0.0}
+    """The median of some steps with so many Gaussians, none of them born or dead."""
+    still = {"num_gaussians": num_gaussians, "growth": None}
     timed = dataclasses.replace(config, steps=UNTIMED + TIMED, minutes=None, **still)
     seconds = [info.seconds for _, info in fit_steps(clip.frames, timed)]
     return statistics.median(np.diff(seconds[UNTIMED - 1 :]))

@@ -15,7 +15,6 @@ from foldgauss.io.datasets import bunny
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.io.models.video_model import load_video_model, save_video_model
 from foldgauss.video import FitConfig, evaluate
-from foldgauss.video.fitting.economy import Economy
 from foldgauss.video.fitting.loop import fit_steps, to_model
 
 #: Frames and size of the clip, Gaussians and steps of each short fit.
@@ -91,11 +90,10 @@ def soak(minutes: float, folder: Path, tell: Callable[[str], None] = print) -> l
 
 
 def _kind(number: int) -> FitConfig:
-    """Plain, economical and growing fits in turn, each with a seed of its own."""
+    """Plain and growing fits in turn, each with a seed of its own."""
     common = {"num_gaussians": GAUSSIANS, "steps": STEPS, "seed": number}
     kinds = (
         FitConfig(**common),
-        FitConfig(**common, economy=Economy()),
         FitConfig.preset("paper", **common | {"num_gaussians": 1000}, degree=3, max_gaussians=GAUSSIANS),
     )
     return kinds[number % len(kinds)]

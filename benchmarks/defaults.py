@@ -2,14 +2,13 @@
 
     python -m benchmarks.defaults [--clips FOLDER] [--only NAME ...] [--json FILE] [--half] [--cpu-time] [--afresh]
 
-Each fit is given nothing but what a user would give: a clip, its size, the minutes, and in two of them the largest
-number of Gaussians or the PSNR of the smallest model. All else is the default.
+Each fit is given nothing but what a user would give: a clip, its size, the minutes, and in some of them the largest
+number of Gaussians. All else is the default.
 
 - `bunny-160`, `bunny-160-1`: *Bunny* at 160x320, 2 minutes and 1 minute;
 - `bunny-640`, `bunny-640-5`, `bunny-640-60`: at 640x1280, 15, 5 and 60 minutes;
 - `bunny-640-620k`: at 640x1280, 10 minutes with at most 620,000 Gaussians, as many as the models of the paper have;
 - `bikes`, `carphone`: at their own sizes, 5 and 2 minutes;
-- `smallest`: *Bunny* at 160x320, the smallest model at 33 dB;
 - `clips/NAME`: every subfolder of `--clips`, a folder of images each, 10 minutes; and their mean;
 - `clips-600k/NAME`: every subfolder with at most 600,000 Gaussians, 10 minutes.
 
@@ -36,7 +35,7 @@ from benchmarks import _common
 from benchmarks._clips import ClipSource, folder_sources, sample_sources
 from benchmarks._common import console
 from benchmarks._runs import Run, Runs, fitted
-from foldgauss.video import Economy, FitConfig
+from foldgauss.video import FitConfig
 
 
 class Case(NamedTuple):
@@ -57,7 +56,6 @@ CASES = {
     "bunny-640-620k": Case("bunny", None, {"minutes": 10, "max_gaussians": 620_000}),
     "bikes": Case("bikes", None, {"minutes": 5}),
     "carphone": Case("carphone", None, {"minutes": 2}),
-    "smallest": Case("bunny", SMALL, {"economy": Economy(psnr=33)}),
 }
 #: Changes for the clips of a folder, by the prefix of the fits' names.
 FOLDER_CHANGES = {"clips/": {"minutes": 10}, "clips-600k/": {"minutes": 10, "max_gaussians": 600_000}}
@@ -80,7 +78,7 @@ class AtMost(NamedTuple):
         return value <= self.limit
 
     def __str__(self) -> str:
-        return f"<= {self.limit:,g}" if self.limit < 10_000 else f"<= {self.limit:,.0f}"
+        return f"<= {self.limit:,g}"
 
 
 #: The figures asked of each fit, by name of the fit or prefix of `FOLDER_CHANGES`.
@@ -94,7 +92,6 @@ ASKED: dict[str, dict[str, AtLeast | AtMost]] = {
     "bunny-640-620k": {"psnr": AtLeast(40)},
     "bikes": {"psnr": AtLeast(38.5), "worst_psnr": AtLeast(33)},
     "carphone": {"psnr": AtLeast(40)},
-    "smallest": {"floats": AtMost(65_000)},
     "clips/": {"worst_below_mean": AtMost(3)},
     "clips/mean": {"psnr": AtLeast(33)},
     "clips-600k/": {"worst_below_mean": AtMost(3)},
@@ -103,7 +100,7 @@ ASKED: dict[str, dict[str, AtLeast | AtMost]] = {
 #: The loss of PSNR, dB, with half of the Gaussians.
 ASKED_LOSS = AtMost(1.5)
 #: How the figures are called in the table.
-SHOWN = {"psnr": "PSNR", "worst_psnr": "worst", "floats": "parameters", "worst_below_mean": "mean - worst"}
+SHOWN = {"psnr": "PSNR", "worst_psnr": "worst", "worst_below_mean": "mean - worst"}
 
 
 class Fit(NamedTuple):

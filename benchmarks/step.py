@@ -185,7 +185,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = _common.parse(parser, arguments)
     facts = _common.describe_machine()
     frames = read_video(sample_clip("bunny"), size=options.size).frames
-    config = FitConfig(num_gaussians=options.gaussians, degree=3, steps=3000, quarter_fraction=0.0, half_fraction=0.0)
+    config = FitConfig(num_gaussians=options.gaussians, degree=3, steps=3000)
     records, state, num_alive = measure(frames, config, options.steps)
     naive = naive_adam(state, config, max(7, options.steps // 2))
     height, width = options.size

@@ -75,7 +75,7 @@ CHEAPER = {
 }
 #: The page whose `foldgauss demo` takes all its steps; on others it takes `STEPS`.
 WHOLE_DEMO = "README.md"
-#: One axis for `tradeoff` without axes, instead of all eleven, which have their own tests.
+#: One axis for `tradeoff` without axes, instead of all nine, which have their own tests.
 ONE_AXIS = ["--axes", "power"]
 SIZE, NUM_FRAMES = (48, 80), 12
 

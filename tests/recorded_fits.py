@@ -1,4 +1,4 @@
-"""Four tiny fits and their recorded digests: plain, economical, growing and published.
+"""Three tiny fits and their recorded digests: plain, growing and published.
 
 The digests changed with the defaults; those of the growing and the published fit also with the uniform starts, and with
 what the gradient of m_t clones. The plain fit is without the interpolated frames that are the default since.
@@ -16,14 +16,13 @@ import jax
 import numpy as np
 from threadpoolctl import threadpool_info
 
-from foldgauss.video import Economy, FitConfig, Growth, compress, evaluate, fit
+from foldgauss.video import FitConfig, Growth, compress, evaluate, fit
 
 SIZE, NUM_FRAMES = (32, 48), 5
 #: The default when the bits were recorded; of the radius in pixels nothing is pruned by default now.
 GROWTH = Growth(prune_radius=20.0)
 CONFIGS = {
     "plain": FitConfig(num_gaussians=120, steps=60, seed=2, interpolation_fraction=0.0),
-    "economical": FitConfig(num_gaussians=120, steps=120, seed=2, economy=Economy()),
     "growing": FitConfig.preset(
         "paper", num_gaussians=80, steps=120, seed=2, degree=3, growth=GROWTH, final_rate=1.0, initialization="clip"
     ),

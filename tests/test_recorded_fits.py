@@ -1,6 +1,5 @@
 """Fits keep their bits, and model files of earlier versions keep loading."""
 
-import dataclasses
 import hashlib
 import json
 import os
@@ -13,8 +12,6 @@ import pytest
 import recorded_fits
 
 from foldgauss.io import load_selection, load_video_model, read_vegas_ply
-from foldgauss.video import Economy, FitConfig, LearningRates
-from foldgauss.video.fitting.config import rename_options, rename_settings
 
 DATA = Path(__file__).parent / "data" / "v0.1"
 RECORDED = json.loads((DATA / "fits.json").read_text())
@@ -62,47 +59,3 @@ def test_selection_and_ply_of_an_earlier_version_load():
     selection = load_selection(DATA / "selection.safetensors", model)
     assert 0 < np.count_nonzero(selection.mask) < model.num_gaussians
     assert read_vegas_ply(DATA / "vegas.ply").num_gaussians == model.num_gaussians
-
-
-#: Defaults that were others in v0.1; it knew no learning rates in units of each Gaussian's size.
-EARLIER = FitConfig(
-    rates=LearningRates(
-        loc=6.9e-4,
-        coefficients=4e-3,
-        log_scale=0.06,
-        angle_logit=0.06,
-        opacity_logit=0.15,
-        color_dc=0.06,
-        time_loc_logit=0.04,
-        log_time_scale=0.1,
-        frame_times=3e-3,
-    ),
-    final_rate=0.07,
-    quarter_fraction=0.2,
-    half_fraction=0.4,
-    interpolation_fraction=0.0,
-)
-#: Settings that v0.1 did not have.
-LATER = (
-    "border_weight",
-    "scale_rates_by_size",
-    "cooldown_fraction",
-    "error_fraction",
-    "relocated_fraction",
-    "interpolation_end",
-    "follow_camera",
-    "scale_cutoff",
-)
-
-
-def test_settings_in_records_of_an_earlier_version_are_read():
-    recorded = json.loads((DATA / "settings.json").read_text())
-    changes = {"economy": Economy(), "scale_rates_by_duration": False, "interpolation_fraction": 0.25}
-    for name, config in {"default": EARLIER, "economy": dataclasses.replace(EARLIER, **changes)}.items():
-        expected = json.loads(json.dumps(dataclasses.asdict(config)))
-        for later in LATER:
-            del expected[later]
-        del expected["rates"]["paths"]
-        assert rename_settings(recorded[name]) == expected
-    assert rename_settings(["own_time"]) == ["own_time"]
-    assert rename_options("fit a.mp4 --ssim-share 0.1 --steps 5") == "fit a.mp4 --ssim-fraction 0.1 --steps 5"

@@ -124,7 +124,7 @@ def moving_disc(num_frames=5, size=(48, 64)):
 
 
 CLIP = moving_disc()
-SMALL = FitConfig(num_gaussians=2500, steps=12, half_fraction=0.3, quarter_fraction=0.0)
+SMALL = FitConfig(num_gaussians=2500, steps=12)
 
 
 def leaves_of(fitted) -> list[np.ndarray]:
@@ -559,7 +559,7 @@ MADE = """
     from pathlib import Path
     import jax, numpy as np
     from foldgauss.io import save_compact, save_video_model, write_image
-    from foldgauss.video import Economy, FitConfig, compress, fit
+    from foldgauss.video import FitConfig, compress, fit
     folder, long = Path(sys.argv[1]), sys.argv[2] == "long"
     y, x = np.mgrid[:96, :128]
     discs = np.stack([np.exp(-((x - at) ** 2 + (y - 48) ** 2) / 200) for at in (30, 45, 60, 75, 90)])[..., None]
@@ -573,8 +573,6 @@ MADE = """
         paper = {"initialization": "clip", "num_gaussians": 3000, "max_gaussians": 6000}
         configs |= {
             "paper": FitConfig.preset("paper", steps=60, **paper),
-            "economy": change(usual, economy=Economy()),
-            "smallest": change(usual, economy=Economy(psnr=25.0)),
             "batches": change(usual, batch_size=3, two_cameras=True, interpolation_fraction=0.3),
             "sum": change(usual, compositing="sum"),
             "target": change(usual, target_psnr=30.0),

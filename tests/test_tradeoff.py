@@ -125,7 +125,7 @@ def test_knee(cost, quality, expected):
 
 
 def test_each_variant_changes_one_setting_and_has_a_command():
-    made, left = plan_points(BASE, tuple(AXES), 132, (320, 640))
+    made, left = plan_points(BASE, tuple(AXES), 132)
     assert left == []
     assert len({point.name for point in made}) == len(made) == 1 + sum(map(len, AXES.values()))
     commands = kept.Commands(Path("my clip.mp4"), "320x640", "0:132", Path("out"))
@@ -133,14 +133,11 @@ def test_each_variant_changes_one_setting_and_has_a_command():
     assert len(set(lines)) == len(lines)
     for point, line in zip(made, lines, strict=True):
         changed = kept.changed_settings(point, BASE)
-        allowed = {"base": (0,), "batch": (2,), "schedule": (1, 2)}.get(point.axis, (1,))
-        assert len(changed) in allowed
+        assert len(changed) == {"base": 0, "batch": 2}.get(point.axis, 1)
         assert "my clip.mp4" in shlex.split(line)
     assert made[0].config == BASE
     shown = dict(zip((point.name for point in made), lines, strict=True))
-    assert shown["schedule half 0.4"].endswith("--gaussians 400 --steps 1000 --half-fraction 0.4")
     assert shown["power 2"].split()[-2:] == ["--power", "2.0"]
-    assert shown["economy on"].endswith("--steps 1000 --economy")  # a flag
     assert shown["time 250 steps"].split()[-2:] == ["--steps", "250"]
     assert shown["cutoff radius 2, fitted"].endswith("--support-radius 2.0")
     assert shown["cutoff radius 2, played"] == (
@@ -151,14 +148,13 @@ def test_each_variant_changes_one_setting_and_has_a_command():
 @pytest.mark.parametrize(
     ("where", "axis", "why"),
     [
-        ({}, "schedule", "changes nothing at 24x32"),
         ({"has_alpha": True}, "compositing", "alpha"),
         ({"num_frames": 3}, "batch", "3 frames"),
     ],
 )
 def test_variants_that_do_not_apply_are_skipped(where, axis, why):
     where = {"num_frames": FRAMES, "has_alpha": False} | where
-    made, left = plan_points(BASE, (axis,), where["num_frames"], SIZE, has_alpha=where["has_alpha"])
+    made, left = plan_points(BASE, (axis,), where["num_frames"], has_alpha=where["has_alpha"])
     assert {one.name.split()[0] for one in left} == {axis}
     assert all(why in one.why for one in left)
     assert len(made) + len(left) == 1 + len(AXES[axis])
@@ -166,7 +162,7 @@ def test_variants_that_do_not_apply_are_skipped(where, axis, why):
 
 @pytest.mark.parametrize("seconds", [50.0, 200.0, 3600.0])
 def test_steps_fill_the_time(seconds):
-    made, _ = plan_points(BASE, tuple(AXES), 132, (320, 640))
+    made, _ = plan_points(BASE, tuple(AXES), 132)
     pace = Throughput(start=0.5, step=0.03, evaluation=0.1)
     steps = estimate_steps(seconds, made, pace, 132)
     assert estimate_seconds(made, steps, pace, 132) <= seconds < estimate_seconds(made, steps + 1, pace, 132)
@@ -208,8 +204,8 @@ def test_everything_is_there(done, clip):
         "tradeoff.json",
         "tradeoff.png",
     }
-    assert {row["axis"] for row in rows.values()} == {"base", *AXES} - {"schedule"}
-    assert set(record["left_out"]) == {f"schedule {turn.value}" for turn in AXES["schedule"]}
+    assert {row["axis"] for row in rows.values()} == {"base", *AXES}
+    assert record["left_out"] == {}
     assert {"cpu", "cores", "load_average", "jax"} <= set(record["machine"])
     assert min(cv2.imread(str(done / "tradeoff.png")).shape[:2]) > 500
     with open(done / "tradeoff.csv", newline="") as file:
@@ -239,7 +235,7 @@ def test_commands_reproduce_their_points(done, tmp_path, monkeypatch):
     """One of each kind: the same PSNR, and where it writes a file the same bytes."""
     monkeypatch.chdir(tmp_path)
     rows = {name_of(row): row for row in record_of(done)["points"]}
-    chosen = ["batch 2", "cutoff stop 0.1, fitted", "cutoff alpha 1/32, played", "economy on"]
+    chosen = ["batch 2", "cutoff stop 0.1, fitted", "cutoff alpha 1/32, played"]
     for name in [*chosen, "precision compact"]:
         words = shlex.split(rows[name]["command"])
         assert words[0] == "foldgauss"
@@ -510,12 +506,12 @@ def test_without_matplotlib_only_the_plot_is_missing(done, clip, capsys, monkeyp
 def test_options_of_fit_reach_the_fit(clip, tmp_path, monkeypatch):
     seen, steps = [], runner.fit_steps
     monkeypatch.setattr(runner, "fit_steps", lambda frames, config, state: seen.append(config) or steps(frames, config))
-    options = ["--ssim-fraction", 0.3, "--quarter-fraction", 0.1, "--half-fraction", 0.2]
+    options = ["--ssim-fraction", 0.3, "--error-fraction", 0.1]
     options += ["--alpha-cutoff", 0.01, "--support-radius", 2, "--transmittance-stop", 0.02]
     target = tmp_path / "m.safetensors"
     assert run("fit", clip, "--out", target, "--gaussians", 50, "--steps", 2, *options, "--quiet") == 0
     (config,) = seen
-    assert (config.ssim_fraction, config.quarter_fraction, config.half_fraction) == (0.3, 0.1, 0.2)
+    assert (config.ssim_fraction, config.error_fraction) == (0.3, 0.1)
     options = load_video_model(target).options
     assert (options.alpha_cutoff, options.support_radius, options.transmittance_stop) == (0.01, 2.0, 0.02)
     assert options.low_pass == FitConfig().options.low_pass

@@ -11,7 +11,7 @@ from soft_models import on_paths, soft_model
 from benchmarks import compress, defaults, step
 from benchmarks._clips import folder_sources, sample_sources
 from foldgauss.io import Clip, write_video
-from foldgauss.video import Economy, FitConfig
+from foldgauss.video import FitConfig
 
 SIZE, NUM_FRAMES = (40, 64), 8
 
@@ -96,18 +96,17 @@ class TestDefaults:
         assert fits["bunny-160"].source.size == (160, 320)
         assert fits["bunny-640-620k"].config == FitConfig(minutes=10, max_gaussians=620_000)
         assert fits["bunny-640-620k"].source.size == (640, 1280)
-        assert fits["smallest"].config == FitConfig(economy=Economy(psnr=33))
 
     def test_rows_are_kept_and_judged(self, fits, tmp_path, capsys):
         path = tmp_path / "d.json"
-        command = ["--only", "bunny-160", "bikes", "smallest", "--json", str(path)]
+        command = ["--only", "bunny-160", "bikes", "carphone", "--json", str(path)]
         defaults.main(command)
         shown = printed(capsys)
         assert len(fits) == 3
         assert "PSNR >= 42 yes" in shown
-        assert "parameters <= 65,000 no" in shown
+        assert "PSNR >= 40 yes" in shown
         figures = json.loads(path.read_text())["figures"]
-        assert (figures["met_bunny-160"], figures["met_bikes"], figures["met_smallest"]) == (1, 1, 0)
+        assert (figures["met_bunny-160"], figures["met_bikes"], figures["met_carphone"]) == (1, 1, 1)
         defaults.main(command)
         assert len(fits) == 3
         defaults.main([*command, "--afresh"])
@@ -295,7 +294,7 @@ class TestTune:
 class TestStep:
     def test_every_part_is_timed(self):
         """A function that the fit no longer calls would leave its part at zero."""
-        config = FitConfig(num_gaussians=200, degree=2, steps=40, quarter_fraction=0.0, half_fraction=0.0)
+        config = FitConfig(num_gaussians=200, degree=2, steps=40)
         records, state, num_alive = step.measure(blob(), config, num_steps=3)
         assert len(records) == 3
         assert len(state.rows) == 200

@@ -9,19 +9,16 @@ import numpy as np
 class Stream(enum.IntEnum):
     """The uses of random numbers. Each has its own stream, so that none repeats the draws of another.
 
-    A value is part of the results: a new use takes the next value.
+    A value is part of the results: a new use takes the next value, and none is used again.
     """
 
     INITIALIZATION = 0
     FRAME_ORDER = 1
     SPLIT = 2  #: halves of Gaussians that densification splits
     BIRTH = 3
-    BIRTH_DEPTH = 4
     BACKGROUND = 6
     INTERPOLATED_FRAME = 7
     ERROR_WEIGHTED_FRAME = 8
-    PRUNING_PROBE = 9
-    CODEBOOK = 10
     LIFETIME = 11
     TRACK = 12
     ROUNDING_ORDER = 13

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from foldgauss.io.media.clip import AS_STORED, Reading
-from foldgauss.video.fitting.config import FitConfig, rename_settings
+from foldgauss.video.fitting.config import FitConfig
 
 #: Fields of a record besides the request and the scores of each frame.
 _RECORD = {"num_frames", "size", "fps", "num_gaussians", "mean_psnr", "mean_ssim", "steps", "seconds", "stopped_by"}
@@ -72,7 +72,7 @@ def read_record(job: FitJob) -> dict[str, Any] | None:
     """
     try:
         record = json.loads(job.record.read_text())
-        same = rename_settings(record["asked"]) == job.request and os.path.getsize(job.target) == record["file_bytes"]
+        same = record["asked"] == job.request and os.path.getsize(job.target) == record["file_bytes"]
         same = same and len(record["psnr"]) == len(record["ssim"]) == record["num_frames"] and record.keys() >= _RECORD
         same = same and (job.index is None or record["file_digest"] == file_digest(job.target))
     except _UNREADABLE:
@@ -97,4 +97,4 @@ def read_request(job: FitJob) -> dict[str, Any] | None:
         asked = json.loads(job.record.read_text())["asked"]
     except _UNREADABLE:
         return None
-    return rename_settings(asked) if isinstance(asked, dict) else None
+    return asked if isinstance(asked, dict) else None

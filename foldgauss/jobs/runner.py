@@ -346,7 +346,6 @@ def _fit_and_record(job: FitJob, report: Report) -> dict[str, Any]:
         "warnings": [
             *(clip.notes if job.index is None else ()),
             *dict.fromkeys(caught),
-            *missed_psnr(job.config, scores.mean_psnr, info),
             *busy_processors(run),
         ],
     }
@@ -354,13 +353,6 @@ def _fit_and_record(job: FitJob, report: Report) -> dict[str, Any]:
         temporary.write_text(json.dumps(record) + "\n")
     job.checkpoint.unlink(missing_ok=True)
     return record
-
-
-def missed_psnr(config: FitConfig, mean_psnr: float, info: FitInfo) -> list[str]:
-    """A warning if the PSNR of `Economy` was not reached, in a list that is otherwise empty."""
-    if config.economy is None or config.economy.psnr is None or info.stopped_by == "smallest_at_psnr":
-        return []
-    return [f"{config.economy.psnr:g} dB was not reached, got {mean_psnr:.2f} dB after {info.step:,} steps."]
 
 
 def busy_processors(run: FitRun) -> list[str]:

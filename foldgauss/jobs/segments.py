@@ -23,7 +23,7 @@ from foldgauss.io.models.segmented import join_segments
 from foldgauss.io.models.video_model import keep_origin, load_video_model, read_metadata
 from foldgauss.io.provenance import describe_reading
 from foldgauss.jobs.job import FitJob, file_digest
-from foldgauss.video.fitting.config import FitConfig, rename_settings
+from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.models.metrics import psnr, ssim
 from foldgauss.video.segmented.segmented_video import Segment, SegmentedVideo, plan_segments
 
@@ -318,7 +318,7 @@ def _load_plan(folder: Path, request: dict[str, Any]) -> dict[str, Any] | None:
     """The plan in the folder; None if it cannot be read. Raises ValueError if it is that of another request."""
     try:
         plan = json.loads((folder / _PLAN).read_text())
-        before = rename_settings(plan["asked"])
+        before = plan["asked"]
         before.get("config", {}).get("seed")
         plan["digest"], plan["clip"]
         plan["spans"] = [(int(first), int(stop)) for first, stop in plan["spans"]]

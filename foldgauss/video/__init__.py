@@ -13,7 +13,6 @@ from foldgauss.video.editing.overlays import SelectedGaussians
 from foldgauss.video.editing.span import Span
 from foldgauss.video.fitting.config import FitConfig, LearningRates
 from foldgauss.video.fitting.divergence import DivergenceWarning, FitDiverged
-from foldgauss.video.fitting.economy import Economy
 from foldgauss.video.fitting.growth import Growth
 from foldgauss.video.fitting.loop import FitInfo, FitResult, FitState, fit, fit_steps, start_from
 from foldgauss.video.fitting.per_frame_baseline import IndependentFrames, independent_frames
@@ -59,7 +58,6 @@ __all__ = [
     "Clock",
     "Compressed",
     "DivergenceWarning",
-    "Economy",
     "Edit",
     "EditedVideo",
     "Evaluation",

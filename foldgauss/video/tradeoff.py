@@ -13,8 +13,6 @@ from foldgauss._runtime.checks import invalid
 from foldgauss.render import RenderOptions
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.economy import Economy
-from foldgauss.video.fitting.schedule import plan_levels
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
@@ -94,17 +92,11 @@ AXES: Mapping[str, tuple[Variant, ...]] = MappingProxyType(
             Variant("2", fit={"batch_size": 2}, scale={"steps": 1 / 2}),
             Variant("4", fit={"batch_size": 4}, scale={"steps": 1 / 4}),
         ),
-        "schedule": (
-            Variant("half 0.4", fit={"half_fraction": 0.4}, work=0.7),
-            Variant("quarter 0.2, half 0.4", fit={"quarter_fraction": 0.2, "half_fraction": 0.4}, work=0.55),
-            Variant("quarter 0.4, half 0.5", fit={"quarter_fraction": 0.4, "half_fraction": 0.5}, work=0.4),
-        ),
         "cutoff": _cutoffs(),
         "precision": tuple(Variant(stored, stored=stored) for stored in PASSES),
         "power": (Variant("0", fit={"power": 0.0}), Variant("2", fit={"power": 2.0})),
         "compositing": (Variant("sum", fit={"compositing": "sum"}, work=0.85),),
         "ssim": (Variant("0", fit={"ssim_fraction": 0.0}, work=0.85), Variant("0.5", fit={"ssim_fraction": 0.5})),
-        "economy": (Variant("on", fit={"economy": Economy()}, work=1.5),),
     }
 )
 
@@ -147,7 +139,7 @@ def check_axes(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def plan_points(
-    base: FitConfig, axes: Sequence[str], num_frames: int, size: tuple[int, int], *, has_alpha: bool = False
+    base: FitConfig, axes: Sequence[str], num_frames: int, *, has_alpha: bool = False
 ) -> tuple[list[Point], list[Skipped]]:
     """The base and every variant of `axes`, one setting changed at a time; and the variants skipped.
 
@@ -158,7 +150,7 @@ def plan_points(
     for axis in check_axes(axes):
         for variant in AXES[axis]:
             point = _apply(variant, axis, base)
-            why = _why_skipped(point, base, num_frames, size, has_alpha)
+            why = _why_skipped(point, base, num_frames, has_alpha)
             if why:
                 skipped.append(Skipped(point.name, why))
             else:
@@ -175,17 +167,14 @@ def _apply(variant: Variant, axis: str, base: FitConfig) -> Point:
     return Point(axis, variant.value.format(**scaled), config, played, variant.stored, variant.work)
 
 
-def _why_skipped(point: Point, base: FitConfig, num_frames: int, size: tuple[int, int], has_alpha: bool) -> str:
+def _why_skipped(point: Point, base: FitConfig, num_frames: int, has_alpha: bool) -> str:
     if has_alpha and point.config.compositing == "sum":
         return "sums have no alpha, but the frames do"
     if point.config.batch_size > num_frames:
         return f"there are {num_frames} frames"
     if point.reuses_base:
         return ""
-    fractions = {"quarter_fraction": base.quarter_fraction, "half_fraction": base.half_fraction}
-    same = dataclasses.replace(point.config, **fractions) == base
-    same = same and plan_levels(point.config, size) == plan_levels(base, size)
-    return f"it changes nothing at {size[0]}x{size[1]}" if same else ""
+    return "it changes nothing" if point.config == base else ""
 
 
 class Throughput(NamedTuple):

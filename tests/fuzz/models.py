@@ -28,7 +28,6 @@ from foldgauss.render import Camera, RenderOptions
 from foldgauss.video import FoldedSplats, FrameTimes, SegmentedVideo, VideoModel, layers
 from foldgauss.video.compression.quantize import Rule, column_names, compute_columns, is_integral, quantize
 from foldgauss.video.editing.chain import edit
-from foldgauss.video.fitting.codebook import Codebook
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.fitting.state import FitState
@@ -228,12 +227,11 @@ def _checkpoint_seeds() -> list[bytes]:
         return rng.normal(size=shape).astype(np.float32)
 
     counts, width, num = np.arange(3, dtype=np.int32), 14, 3
-    shared = Codebook(np.array([0, 1, 0], np.int32), floats(2, 3), floats(2, 3), np.zeros(2, np.int32))
     kept, state = [], None
     for statistics in (None, GradientStatistics(floats(num), floats(num), counts)):
         state = FitState.create(
             floats(num, width), floats(2), counts=counts, first=floats(num, width),
-            second=floats(num, width), colors=shared, frame_errors=floats(3), statistics=statistics,
+            second=floats(num, width), frame_errors=floats(3), statistics=statistics,
             step=5, plan=100, seconds=1.5, last_finite=state, start_errors=((0, 0.1),),
         )  # fmt: skip
         kept.append(written(lambda path, one=state: save_checkpoint(path, one, config=_CONFIG, source=_SOURCE)))

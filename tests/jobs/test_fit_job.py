@@ -22,7 +22,6 @@ from foldgauss.io._lock import lock_output
 from foldgauss.jobs import FitJob, Stopped, fit_job
 from foldgauss.jobs.job import read_record
 from foldgauss.jobs.runner import busy_processors
-from foldgauss.video.fitting.economy import Economy
 
 NUM_FRAMES = 10
 
@@ -210,12 +209,6 @@ def test_warnings_are_told_by_the_job_that_gave_them(clip, tmp_path, monkeypatch
         records = first.result(), second
     assert [record["warnings"] for record in records] == [["of first"], ["of second"]]
     assert (warnings.filters, warnings.showwarning) == (before, shown)
-
-
-def test_a_psnr_that_was_not_reached_is_told(clip, tmp_path):
-    config = dataclasses.replace(CONFIG, economy=Economy(psnr=60.0))
-    (told,) = fit_job(job_of(clip, tmp_path, config=config))["warnings"]
-    assert told.startswith("60 dB was not reached, got ")
 
 
 def test_files_go_where_they_are_asked_to(clip, tmp_path):

@@ -3,7 +3,6 @@
 import copy
 import dataclasses
 import json
-import math
 import os
 import subprocess
 import sys
@@ -23,7 +22,6 @@ from foldgauss.io.models.video_model import load_video_model
 from foldgauss.render import RenderOptions, api
 from foldgauss.video import (
     DivergenceWarning,
-    Economy,
     FitConfig,
     FitDiverged,
     Growth,
@@ -33,7 +31,6 @@ from foldgauss.video import (
     fit_steps,
 )
 from foldgauss.video.fitting.loop import start
-from foldgauss.video.fitting.schedule import plan_levels
 from foldgauss.video.fitting.state import FitState, paths_of
 from foldgauss.video.fitting.steppers import jax_stepper
 from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
@@ -107,14 +104,14 @@ def close(one, other, share=1e-5):
     np.testing.assert_allclose(one, other, atol=share * max(np.abs(other).max(initial=0), 1e-12), rtol=1e-4)
 
 
-def compare_steps(config: FitConfig, progress: float, level: int = -1, outside: int = 0):
+def compare_steps(config: FitConfig, progress: float, outside: int = 0):
     """By the CPU and by XLA; the first Gaussians `outside` the picture."""
     here, there = warm_state(config), warm_state(config)
     for state in (here, there):
         state.rows[:outside, columns(config.degree)["loc"]] = 5.0
-    figures = CpuStepper(FRAMES, config, here).step(here, progress, level)
+    figures = CpuStepper(FRAMES, config, here).step(here, progress)
     stepper = JaxStepper(FRAMES, config, there, "xla")
-    own = stepper.step(there, progress, level)
+    own = stepper.step(there, progress)
     close(own, figures, share=1e-6)
     assert own[2] == figures[2]
     for name in ("rows", "first", "second", "frame_errors", "time_logits", "path_maps", "path_first", "path_second"):
@@ -151,8 +148,8 @@ def test_prepared_images_are_the_same_and_are_dropped():
     chosen = [interpolation.choose(step, 0.0, k) is not None for step in (3, 4) for k in range(len(FRAMES))]
     prefetcher, made = Prefetcher(interpolation, most=sum(chosen)), []
     for step in (3, 4):
-        assert prefetcher.prepare(step, 0.0, range(len(FRAMES)), (32, 40))
-    assert not prefetcher.prepare(5, 0.0, [*range(len(FRAMES))] * 9, (16, 20))  # no more are kept
+        assert prefetcher.prepare(step, 0.0, range(len(FRAMES)))
+    assert not prefetcher.prepare(5, 0.0, [*range(len(FRAMES))] * 9)  # no more are kept
     prefetcher.drop(1)
     assert prefetcher.num_prepared == sum(chosen) > 0
     direct, interpolation.interpolate = interpolation.interpolate, lambda *call: made.append(call)
@@ -160,14 +157,14 @@ def test_prepared_images_are_the_same_and_are_dropped():
         for k in range(len(FRAMES)):
             fraction = interpolation.choose(step, 0.0, k)
             if fraction is not None:
-                image = prefetcher.interpolate(step, k, fraction, (32, 40))
-                np.testing.assert_array_equal(image, direct(k, fraction, (32, 40)))
+                image = prefetcher.interpolate(step, k, fraction)
+                np.testing.assert_array_equal(image, direct(k, fraction))
         prefetcher.drop(step)
     assert not made
-    prefetcher.drop(math.inf)
+    prefetcher.drop(6)
     assert prefetcher.num_prepared == 0
-    prefetcher.interpolate(5, 0, 0.5, (32, 40))  # not prepared
-    assert made == [(0, 0.5, (32, 40))]
+    prefetcher.interpolate(5, 0, 0.5)  # not prepared
+    assert made == [(0, 0.5)]
 
 
 def test_interpolated_views_do_not_depend_on_errors():
@@ -221,14 +218,6 @@ def test_step_of_growing_batches_matches_the_cpu():
     assert arrays.rows.shape == (250, here.rows.shape[1])
     for array in (arrays.rows, arrays.first, arrays.second, arrays.statistics.screen):
         assert not np.asarray(array)[60:].any()
-
-
-@pytest.mark.slow
-def test_coarse_step_matches_the_cpu(monkeypatch):
-    monkeypatch.setattr("foldgauss.video.fitting.schedule.MIN_SIDE", 16)
-    config = dataclasses.replace(CONFIG, half_fraction=0.3)
-    assert [level.size for level in plan_levels(config, FRAMES.shape[1:3])] == [(16, 20), (32, 40)]
-    compare_steps(config, 0.1, level=0)
 
 
 @pytest.mark.slow
@@ -290,7 +279,7 @@ def test_conditioning_matches_the_cpu(power, floor, cutoff):
     config = dataclasses.replace(CONFIG, power=power, floor=floor)
     state = warm_state(config, steps=5)
     step = JaxStepper(FRAMES, CONFIG, copy.deepcopy(state), "xla")  # of whose program only the sizes count
-    program = dataclasses.replace(step.programs[-1], power=power, floor=floor, scale_cutoff=cutoff)
+    program = dataclasses.replace(step.program, power=power, floor=floor, scale_cutoff=cutoff)
     paths = paths_of(state)
     spec = ConditioningSpec(3, power, floor, program.size, paths=paths, scale_cutoff=cutoff)
     window = find_windows(state.rows, spec)
@@ -365,7 +354,7 @@ def test_step_donates_its_arrays():
 def test_step_does_not_call_the_host(engine, config):
     """For a GPU the whole step is one program: triton's are the only calls out of it."""
     step = JaxStepper(FRAMES, config, start(FRAMES, config), "xla")
-    program = dataclasses.replace(step.programs[-1], engine=engine)
+    program = dataclasses.replace(step.program, engine=engine)
     text = lower_step(program, ("cuda",)).as_text()
     assert "callback" not in text
     assert "infeed" not in text
@@ -517,7 +506,6 @@ def test_auto_is_the_cpu_without_a_gpu(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert choose_engine(FRAMES, FitConfig()) == "pallas"
     assert choose_engine(FRAMES, FitConfig(options=RenderOptions(alpha_ceiling=1.0))) == "xla"
-    assert choose_engine(FRAMES, FitConfig(economy=Economy())) == "cpu"
     assert choose_engine(FRAMES, FitConfig(engine="cpu")) == "cpu"
     assert choose_engine(FRAMES, FitConfig(engine="pallas")) == "pallas"
     for device in (jax.devices("cpu")[0], "cpu"):
@@ -530,7 +518,6 @@ def test_auto_is_the_cpu_without_a_gpu(monkeypatch):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"economy": Economy()}, "with an economy, got 'xla'. Give engine='cpu'"),
         ({"engine": "pallas", "options": RenderOptions(alpha_ceiling=1.0)}, "alpha_ceiling"),
         ({"engine": "pallas", "options": RenderOptions(tile_size=12)}, "tile_size"),
     ],
@@ -542,14 +529,12 @@ def test_unsupported_settings_are_refused(changes, message):
         choose_engine(FRAMES, dataclasses.replace(CONFIG, **changes))
 
 
-def test_fit_refuses_unsupported_settings(monkeypatch):
+def test_alpha_is_refused(monkeypatch):
+    """Before anything is computed; where the engine is chosen, the CPU takes it."""
     monkeypatch.setattr(sys.modules["foldgauss.video.fitting.loop"], "_warm_up", lambda *_: pytest.fail("too late"))
-    with pytest.raises(ValueError, match="with an economy"):
-        next(fit_steps(FRAMES, dataclasses.replace(CONFIG, economy=Economy())))
-
-
-def test_alpha_is_refused():
     frames = np.concatenate([FRAMES, FRAMES[..., :1]], axis=-1)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert choose_engine(frames, FitConfig()) == "cpu"
     with pytest.raises(ValueError, match="engine: expected 'cpu' with frames that have alpha, got 'xla'"):
         next(fit_steps(frames, CONFIG))
 
@@ -626,9 +611,8 @@ def test_the_command(tmp_path, capsys):
     assert run("fit", tmp_path / "clip", *options, "--engine", "xla") == 0
     assert "engine xla on " in capsys.readouterr().out
     assert evaluate(load_video_model(model), FRAMES).mean_psnr > 25
-    for wrong, message in ((["xla", "--economy"], "--engine: expected 'cpu' with an economy"), (["gpu"], "--engine")):
-        assert run("fit", tmp_path / "clip", *options, "--overwrite", "--engine", *wrong) == 2
-        assert message in capsys.readouterr().err
+    assert run("fit", tmp_path / "clip", *options, "--overwrite", "--engine", "gpu") == 2
+    assert "--engine: expected one of" in capsys.readouterr().err
 
 
 # -------------------------------------------------------------------------------------- its own benchmark

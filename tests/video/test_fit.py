@@ -15,7 +15,6 @@ from test_optical_flow import panning
 from foldgauss._runtime import threads as _threads
 from foldgauss.render import RenderOptions
 from foldgauss.video import (
-    Economy,
     FitConfig,
     LearningRates,
     evaluate,
@@ -209,8 +208,8 @@ def test_interpolation_is_the_default():
 
 @pytest.mark.parametrize(
     ("changes", "alpha"),
-    [({"follow_motion": False}, False), ({"economy": Economy()}, False), ({}, True)],
-    ids=["no motion", "economy", "alpha"],
+    [({"follow_motion": False}, False), ({}, True)],
+    ids=["no motion", "alpha"],
 )
 def test_interpolation_is_off_by_default_where_it_is_not_supported(changes, alpha):
     assert chosen_interpolation(FitConfig(**changes), alpha=alpha) == 0
@@ -296,13 +295,6 @@ def test_the_first_budget_binds(budgets, binds):
         assert last.step == 7
     if binds == "target_psnr":
         assert last.step < 400
-
-
-def test_steps_bind_in_overtime_too():
-    """A PSNR out of reach is tried for half as long again; the minutes have not run out by then."""
-    budgets = {"steps": 20, "minutes": 10.0, "economy": Economy(psnr=99.0)}
-    *_, (_, last) = fit_steps(moving_blobs(), dataclasses.replace(CONFIG, **budgets))
-    assert (last.stopped_by, last.step) == ("steps", 30)
 
 
 def white_squares() -> np.ndarray:

@@ -257,7 +257,7 @@ def run(config, kept=None):
     numbers = []
     for state, info in fit_steps(FRAMES, config, kept):
         numbers.append(info.num_gaussians)
-        parts = (state.rows, state.first, state.second, state.counts, state.newborn)
+        parts = (state.rows, state.first, state.second, state.counts)
         assert len({len(part) for part in parts}) == 1
     return numbers, state
 
@@ -354,7 +354,7 @@ def test_screen_gradient_is_in_units_of_half_the_image():
         step = stepper_of(state)
         moved = dataclasses.replace(state, rows=rows)
         options = {"squared": False, "mirrored": False, "screen": None, "fraction": None}
-        return step._differentiate(moved, k, np.float32(k), step.shapes[-1], None, **options)[0].value
+        return step._differentiate(moved, k, np.float32(k), step.spec, None, **options)[0].value
 
     small = 0.02
     slope = [(loss(small, 0) - loss(-small, 0)) / (2 * small), (loss(0, small) - loss(0, -small)) / (2 * small)]
@@ -411,7 +411,7 @@ def test_growth_waits_for_the_plan():
 def test_minutes_bind_while_gaussians_grow(monkeypatch):
     """The pace at the start says nothing of ten times as many."""
     config = FitConfig.preset("paper", num_gaussians=20, degree=1, steps=None, minutes=0.01)
-    monkeypatch.setattr(StepPlanner, "update", lambda self, state, level: setattr(state, "plan", 10**6))
+    monkeypatch.setattr(StepPlanner, "update", lambda self, state: setattr(state, "plan", 10**6))
     *_, (state, last) = fit_steps(FRAMES, config)
     assert last.stopped_by == "minutes"
     assert state.seconds < 5

@@ -6,7 +6,6 @@ from clips import moving_blobs
 
 from foldgauss._runtime import threads
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.video import Economy
 from foldgauss.video.fitting import initialize as start_module
 from foldgauss.video.fitting.config import (
     ALIVE_POWER,
@@ -104,5 +103,3 @@ def test_longer_lifetimes_mean_fewer_gaussians():
     alive = [default_num_gaussians(FitConfig(minutes=m), *size, lifetime=132.0, threads=2) for m in (0.25, 1.0, 99.0)]
     assert alive[1] == pytest.approx(4**ALIVE_POWER * alive[0], rel=1e-4)
     assert alive[2] == pytest.approx(MOST_PER_PIXEL * 160 * 320, rel=1e-4)
-    given = FitConfig(minutes=1.0, economy=Economy())
-    assert default_num_gaussians(given, *size, lifetime=8.0) == default_num_gaussians(given, *size, lifetime=100.0)

@@ -8,7 +8,7 @@ import pytest
 from clips import moving_blobs
 
 from foldgauss.render import RenderOptions
-from foldgauss.video import Economy, FitConfig, Growth, evaluate, fit, independent_frames, psnr
+from foldgauss.video import FitConfig, Growth, evaluate, fit, independent_frames, psnr
 from foldgauss.video.fitting.per_frame_baseline import PARAMETERS, _StepBudget
 
 FRAMES = moving_blobs(5, 24, 40)
@@ -104,7 +104,6 @@ def test_minutes_end_the_fits():
         ({"max_size_mb": 1.0}, "max_size_mb"),
         ({"target_psnr": 30.0}, "target_psnr"),
         ({"growth": Growth()}, "growth"),
-        ({"economy": Economy()}, "economy"),
         ({"interpolation_fraction": 0.1}, "interpolation_fraction"),
         ({"initialization": "uniform", "follow_motion": False}, "initialization"),
     ],

@@ -162,7 +162,7 @@ def test_both_views_give_the_same_gradients():
             state,
             2,
             np.float32(0.6),
-            step.shapes[-1],
+            step.spec,
             None,
             squared=False,
             mirrored=mirrored,

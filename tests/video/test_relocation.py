@@ -8,10 +8,10 @@ import pytest
 from clips import moving_blobs
 
 from foldgauss.render import cpu
-from foldgauss.video import Economy, FitConfig, Growth, LearningRates, evaluate, fit, fit_steps
+from foldgauss.video import FitConfig, Growth, LearningRates, evaluate, fit, fit_steps
 from foldgauss.video.fitting.loop import start
-from foldgauss.video.fitting.pruning.relocation import RELOCATED_AT, measure_influence, relocate
-from foldgauss.video.fitting.schedule import COLD, OVERTIME_FACTOR, RateSchedule, choose_views, steps_per_pass
+from foldgauss.video.fitting.relocation import RELOCATED_AT, measure_influence, relocate
+from foldgauss.video.fitting.schedule import COLD, RateSchedule, choose_views, steps_per_pass
 from foldgauss.video.fitting.state import frame_times
 from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
 from foldgauss.video.models.conditioning import ConditioningSpec, condition
@@ -97,6 +97,19 @@ def test_gaussians_alive_in_no_frame_move_first():
     assert not any(row.tobytes() in kept for row in before)
 
 
+def test_new_gaussians_lie_among_those_of_their_time():
+    state, at = fitted_state(), columns(CONFIG.degree)
+    state.frame_errors[:] = 1e-12
+    state.frame_errors[5] = 0.1
+    relocate(state, FRAMES, dataclasses.replace(CONFIG, relocated_fraction=0.2), SPEC, None)
+    new = np.flatnonzero(state.counts == 0)
+    assert len(new) == 60
+    times = np.sort(state.rows[state.counts > 0, at["time_loc_logit"].start])
+    for place in new:
+        before = (state.counts[:place] > 0).sum()
+        assert before == np.searchsorted(times, state.rows[place, at["time_loc_logit"].start])
+
+
 @pytest.mark.parametrize(
     ("changes", "times"),
     [
@@ -107,7 +120,6 @@ def test_gaussians_alive_in_no_frame_move_first():
         pytest.param({"two_cameras": True, "batch_size": 2}, 3, marks=pytest.mark.slow),
         ({"interpolation_fraction": 0.5}, 3),
         pytest.param({"compositing": "sum"}, 3, marks=pytest.mark.slow),
-        ({"economy": Economy()}, 0),
         ({"growth": Growth()}, 0),
         ({"rates": LearningRates(color_dc=1e5)}, 0),  # it diverges
     ],
@@ -215,24 +227,15 @@ def test_frames_without_an_error_count_as_average(unknown):
 
 
 def test_rates_cool_down():
-    """As without a cooldown until it begins, continuous there, and almost 0 at the end; in overtime more again."""
+    """As without a cooldown until it begins, continuous there, and almost 0 at the end."""
     warm, cool = (RateSchedule(FitConfig(final_rate=0.25, cooldown_fraction=part)) for part in (0.0, 0.2))
     for progress in (0.0, 0.5, 0.7999):
         np.testing.assert_allclose(cool.at(progress, 0)[0], warm.at(progress, 0)[0], rtol=1e-6)
     np.testing.assert_allclose(cool.at(0.9, 0)[0], (COLD + 0.5 * (1 - COLD)) * warm.at(0.9, 0)[0], rtol=1e-5)
-    for progress, left in ((1.0, COLD), (1.4, OVERTIME_FACTOR)):
-        np.testing.assert_allclose(cool.at(progress, 0)[0], left * warm.at(progress, 0)[0], rtol=1e-5)
+    np.testing.assert_allclose(cool.at(1.0, 0)[0], COLD * warm.at(1.0, 0)[0], rtol=1e-5)
 
 
 def test_the_published_recipe_has_none_of_it():
     config = FitConfig.preset("paper")
     assert (config.cooldown_fraction, config.error_fraction, config.relocated_fraction) == (0, 0, 0)
     assert start(FRAMES, dataclasses.replace(config, num_gaussians=50)).num_gaussians == 50
-
-
-def test_a_mean_psnr_takes_all_views_in_turn():
-    """Its weights of the frames presuppose that each is seen as often."""
-    config, errors = FitConfig(num_gaussians=20, economy=Economy(psnr=30)), np.array([1.0, 2.0, 90.0])
-    assert steps_per_pass(config, 3) == 3
-    assert np.bincount(all_views(config, errors, 30)).tolist() == [10, 10, 10]
-    assert np.bincount(all_views(dataclasses.replace(config, economy=Economy()), errors, 30))[2] > 12

@@ -11,7 +11,6 @@ from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.video import FitConfig
 from foldgauss.video.fitting.state import (
     ARRAYS,
-    CodebookArray,
     DeviceArrays,
     FitState,
     PerFrame,
@@ -23,7 +22,7 @@ from foldgauss.video.fitting.steppers import jax_stepper
 from foldgauss.video.fitting.steppers.jax_stepper import JaxStepper
 
 NUM, WIDTH, FRAMES = 7, 13, 4
-SIZES = Sizes(NUM, WIDTH, FRAMES, growing=True, colors=3, shapes=2)
+SIZES = Sizes(NUM, WIDTH, FRAMES, growing=True)
 
 
 def random_arrays(sizes: Sizes, kinds: dict[str, StateArray]) -> dict:
@@ -52,7 +51,7 @@ def test_every_field_has_metadata():
     names = {one.name for one in dataclasses.fields(FitState)}
     assert names == {*arrays, *counters, "last_finite"}
     assert tuple(arrays) == ARRAYS
-    assert set(DeviceArrays._fields) == {name for name, kind in arrays.items() if kind.on_device}
+    assert DeviceArrays._fields == ARRAYS
 
 
 def test_sizes_describe_all_arrays():
@@ -65,7 +64,7 @@ def test_sizes_describe_all_arrays():
 
 def test_a_checkpoint_holds_every_field(tmp_path):
     state = make_state()
-    state.last_finite = make_state(Sizes(NUM + 2, WIDTH, FRAMES, colors=1))
+    state.last_finite = make_state(Sizes(NUM + 2, WIDTH, FRAMES))
     path, config = tmp_path / "checkpoint", FitConfig()
     save_checkpoint(path, state, config=config, source={})
     assert_equal(load_checkpoint(path, config=config, source={}), state)
@@ -82,7 +81,7 @@ def test_a_copy_has_every_field_and_its_own_arrays():
 
 
 def test_restore_takes_every_array_back():
-    state, kept = make_state(), make_state(Sizes(NUM - 2, WIDTH, FRAMES, colors=2))
+    state, kept = make_state(), make_state(Sizes(NUM - 2, WIDTH, FRAMES))
     kept.rows += 1
     state.last_finite, state.step = kept, 17
     state.restore()
@@ -98,9 +97,6 @@ def test_keep_cuts_every_per_gaussian_array():
         now, then = getattr(state, name), getattr(before, name)
         if isinstance(kind, PerGaussian):
             np.testing.assert_array_equal(now, then[index])
-        elif isinstance(kind, CodebookArray):
-            np.testing.assert_array_equal(now.index, then.index[index])
-            np.testing.assert_array_equal(now.first, then.first)
         elif isinstance(kind, PerFrame):
             jax.tree.map(np.testing.assert_array_equal, now, then)
     assert not any(part.any() or len(part) != 3 for part in state.statistics)
@@ -110,13 +106,13 @@ def test_keep_cuts_every_per_gaussian_array():
 def test_extend_fills_every_per_gaussian_array():
     state, before = make_state(), make_state()
     rows = np.full((2, WIDTH), 5, np.float32)
-    state.extend(rows, newborn=np.ones(2, bool))
-    given = {"rows": rows, "newborn": np.ones(2, bool)}
+    state.extend(rows)
+    given = {"rows": rows}
     for name, kind in FitState.array_fields().items():
         if isinstance(kind, PerGaussian):
             new = given.get(name, kind.build(Sizes(2, WIDTH, FRAMES)))
             np.testing.assert_array_equal(getattr(state, name), np.concatenate([getattr(before, name), new]))
-    assert state.sizes == Sizes(NUM + 2, WIDTH, FRAMES, growing=True)  # nothing is shared any more
+    assert state.sizes == Sizes(NUM + 2, WIDTH, FRAMES, growing=True)
 
 
 @jax.tree_util.register_dataclass
@@ -144,7 +140,7 @@ def test_a_new_array_is_added_in_one_place():
 
 @pytest.mark.parametrize("growing", [False, True])
 def test_a_device_gives_every_array_back(monkeypatch, growing):
-    """Arrays are padded there, and fetched without the padding; a Gaussian's share in codebooks is not supported."""
+    """Arrays are padded there, and fetched without the padding."""
     for name in ("compile_step", "compile_error"):  # no step is taken here
         monkeypatch.setattr(jax_stepper, name, lambda program: None)
     frames = np.zeros((FRAMES, 8, 8, 3), np.uint8)

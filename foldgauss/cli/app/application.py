@@ -109,5 +109,5 @@ def load_commands(*names: str) -> dict[str, Any]:
 def name_option(text: str) -> str:
     """The message of an error about a setting, with the name of its option: num_gaussians becomes --gaussians."""
     name, colon, rest = text.partition(":")
-    name = name.replace("num_gaussians", "gaussians").replace("economy.psnr", "smallest_at_psnr")
+    name = name.replace("num_gaussians", "gaussians")
     return f"--{name.replace('_', '-')}{colon}{rest}"

@@ -28,7 +28,7 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
                 "Five minutes, at 160x320 pixels",
                 "foldgauss fit holiday.mp4 --size 160x320 --minutes 5",
             ),
-            Example("A small file", "foldgauss fit holiday.mp4 --economy --max-size-mb 2"),
+            Example("A small file", "foldgauss fit holiday.mp4 --max-size-mb 2"),
             Example("Frames as images; resume a stopped fit", "foldgauss fit frames/ --resume"),
             Example(
                 "For slow motion above all",

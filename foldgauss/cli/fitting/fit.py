@@ -45,7 +45,7 @@ from foldgauss.io.history import HistoryFile, read_history, write_curves
 from foldgauss.io.media.clip import DEINTERLACE, Clip
 from foldgauss.io.models.video_model import MODEL_SUFFIX, check_model_name
 from foldgauss.jobs.job import FitJob
-from foldgauss.jobs.runner import FitRun, busy_processors, missed_psnr, run_fit
+from foldgauss.jobs.runner import FitRun, busy_processors, run_fit
 from foldgauss.jobs.runner import Stopped as FitStopped
 from foldgauss.jobs.segments import read_segment_seconds
 from foldgauss.video.fitting.config import FitConfig, planned_steps
@@ -161,8 +161,6 @@ def fit(
     except OSError as error:
         warn(f"{target} is written, but its scores could not be added: {error}")
     job.checkpoint.unlink(missing_ok=True)
-    for text in missed_psnr(config, scores.mean_psnr, run.info):
-        warn(f"--smallest-at-psnr: {text} Give more --steps, or more --gaussians at the start.")
     for text in busy_processors(run):
         warn(f"--minutes: {text}")
     figures = summarize_scores(run.model, scores) | summarize_fit(run.info) | {"stopped_by": run.info.stopped_by}
@@ -290,9 +288,6 @@ def _print_plan(clip: Clip, config: FitConfig, display: Display) -> None:
     if display in ("json", "quiet"):
         return
     plan = describe_budgets(config, steps)
-    if config.economy is not None:
-        psnr = config.economy.psnr
-        plan += ", pruned by description length" if psnr is None else f", the smallest at {psnr:g} dB"
     growing = "" if config.growth is None else " at the start"
     computed = f"{num_threads()} threads" if engine == "cpu" else f"engine {engine} on {describe_device()}"
     out.print(

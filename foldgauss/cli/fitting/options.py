@@ -14,7 +14,6 @@ from foldgauss.cli.app.completion import complete_choice
 from foldgauss.cli.fitting.progress import Display
 from foldgauss.cli.shared.arguments import AlphaCutoff, SupportRadius, TransmittanceStop, override_constants
 from foldgauss.video.fitting.config import BUDGET, MODEL, OPTIMIZATION, PRESETS, FitConfig
-from foldgauss.video.fitting.economy import Economy
 
 #: Panels of `fit --help`, by group of settings.
 PANELS = {MODEL: "Model", BUDGET: "Budgets: the first that is reached ends the fit", OPTIMIZATION: "Optimization"}
@@ -72,15 +71,15 @@ Threads = Annotated[
 ]
 
 
-def _fields(kind: type) -> dict[str, dataclasses.Field]:
-    """The fields that have an option, by the option's name as a parameter."""
-    fields = [field for field in dataclasses.fields(kind) if setting_of(field).option]
+def _fields() -> dict[str, dataclasses.Field]:
+    """The fields of `FitConfig` that have an option, by the option's name as a parameter."""
+    fields = [field for field in dataclasses.fields(FitConfig) if setting_of(field).option]
     names = (setting_of(field).option.split("/")[0] for field in fields)
     return {name.removeprefix("--").replace("-", "_"): field for name, field in zip(names, fields, strict=True)}
 
 
-#: Options of `FitConfig`, of which `--economy` is a flag, and of `Economy`.
-CONFIG_FIELDS, ECONOMY_FIELDS = _fields(FitConfig), _fields(Economy)
+#: Options of `FitConfig`.
+CONFIG_FIELDS = _fields()
 _CONSTANTS = {
     "alpha_cutoff": AlphaCutoff,
     "support_radius": SupportRadius,
@@ -88,17 +87,14 @@ _CONSTANTS = {
 }
 
 
-def config_from_options(preset: str, *, economy: bool, **options: Any) -> FitConfig:
+def config_from_options(preset: str, **options: Any) -> FitConfig:
     """The configuration that options, by the names of their parameters, come to; None leaves the preset's value.
 
     Raises WrongUse for values that are not valid.
     """
     given = {name: value for name, value in options.items() if value is not None}
     changes = {field.name: given[name] for name, field in CONFIG_FIELDS.items() if name in given}
-    pruning = {field.name: given[name] for name, field in ECONOMY_FIELDS.items() if name in given}
     try:
-        if economy or pruning:
-            changes["economy"] = Economy(**pruning)
         config = FitConfig.preset(preset, **changes)
     except ValueError as error:
         raise WrongUse(name_option(str(error))) from error
@@ -109,12 +105,12 @@ def config_from_options(preset: str, *, economy: bool, **options: Any) -> FitCon
 def fit_options(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command, instead of its parameter `config`, an option for each setting of a fit.
 
-    The options are generated from the metadata of `FitConfig` and `Economy`; the command is called with the `FitConfig`
-    that `config_from_options` makes of them.
+    The options are generated from the metadata of `FitConfig`; the command is called with the `FitConfig` that
+    `config_from_options` makes of them.
     """
     options = [
         inspect.Parameter("preset", _KIND, default="standard", annotation=Preset),
-        *(_option(name, field) for fields in (CONFIG_FIELDS, ECONOMY_FIELDS) for name, field in fields.items()),
+        *(_option(name, field) for name, field in CONFIG_FIELDS.items()),
         *(inspect.Parameter(name, _KIND, default=None, annotation=kind) for name, kind in _CONSTANTS.items()),
     ]
     own = list(inspect.signature(command).parameters.values())
@@ -135,17 +131,15 @@ _KIND = inspect.Parameter.POSITIONAL_OR_KEYWORD
 
 
 def _option(name: str, field: dataclasses.Field) -> inspect.Parameter:
-    """The parameter of a command for one setting; a setting that is itself a dataclass becomes a flag."""
-    about, kind = setting_of(field), type_of(field)
-    is_flag = dataclasses.is_dataclass(kind)
+    """The parameter of a command for one setting."""
+    about = setting_of(field)
     option = typer.Option(
         about.option,
-        help=f"{about.help}{'' if is_flag else _default(field)}.",
+        help=f"{about.help}{_default(field)}.",
         rich_help_panel=PANELS[about.group],
         autocompletion=complete_choice(about.choices) if about.choices else None,
     )
-    annotation = Annotated[bool if is_flag else kind | None, option]
-    return inspect.Parameter(name, _KIND, default=False if is_flag else None, annotation=annotation)
+    return inspect.Parameter(name, _KIND, default=None, annotation=Annotated[type_of(field) | None, option])
 
 
 def _default(field: dataclasses.Field) -> str:

@@ -144,7 +144,7 @@ def tradeoff_command(
     commands = Commands(video, size, frames, out_dir, reading)
     run = _Run(clip, record, commands, fit_metadata(clip, seed, parse_frames(frames)))
     base = run.plan_base(wanted, chosen, minutes, steps)
-    points, skipped = plan_points(base, chosen, clip.num_frames, clip.size, has_alpha=clip.has_alpha)
+    points, skipped = plan_points(base, chosen, clip.num_frames, has_alpha=clip.has_alpha)
     for one in skipped:
         err.print(f"note: {one.name} is left out: {one.why}.", soft_wrap=True)
     try:
@@ -177,7 +177,7 @@ class _Run:
             with show_status("Measuring the throughput"):
                 throughput = self._measure_throughput(dataclasses.replace(wanted, num_gaussians=num, steps=PILOT_STEPS))
             base = dataclasses.replace(wanted, num_gaussians=num, steps=full)
-            points, _ = plan_points(base, axes, self.clip.num_frames, self.clip.size, has_alpha=self.clip.has_alpha)
+            points, _ = plan_points(base, axes, self.clip.num_frames, has_alpha=self.clip.has_alpha)
             allowed = estimate_steps(60 * minutes / MARGIN, points, throughput, self.clip.num_frames)
             least = max(LEAST_STEPS, self.clip.num_frames)  # so that the base sees every frame
             chosen = min(max(allowed, least), full) if steps is None else steps

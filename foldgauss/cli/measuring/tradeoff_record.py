@@ -24,15 +24,13 @@ from foldgauss.io._atomic import atomic_path, write_or_keep
 from foldgauss.io.figures import write_tradeoff
 from foldgauss.io.media.clip import AS_STORED, Reading
 from foldgauss.render import RenderOptions
-from foldgauss.video.fitting.config import FitConfig, rename_options, rename_settings
+from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.tradeoff import FLOAT32, MAX_LOSS_DB, PASSES, Point, Skipped, knee, pareto_front
 
 RECORD, ROWS, PLOT, BASE = "tradeoff.json", "tradeoff.csv", "tradeoff.png", "base.safetensors"
 FILES = {RECORD, ROWS, PLOT, BASE}
 #: Options of `fit` by field of `FitConfig`, and of `fit` and `evaluate` by constant of `RenderOptions`.
 FIT_OPTIONS = {field.name: setting_of(field).option for field in CONFIG_FIELDS.values()}
-#: Options without a value.
-FLAGS = {"economy": "--economy"}
 RENDER_OPTIONS = {
     name: f"--{name.replace('_', '-')}" for name in ("alpha_cutoff", "support_radius", "transmittance_stop")
 }
@@ -88,8 +86,6 @@ class Record:
                 raise ValueError("parts are missing")
             for number, row in enumerate(kept["points"], 1):
                 _check_row(number, row)
-                row["value"] = row["value"].replace("compact, mended", "compact, finetuned")  # as it was called before
-                row |= {"settings": rename_settings(row["settings"]), "command": rename_options(row["command"])}
             _check_rest(kept)
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise WrongUse(
@@ -189,8 +185,6 @@ def _changed(now: FitConfig | RenderOptions, before: FitConfig | RenderOptions, 
 
 
 def _words(name: str, value: Any, options: dict[str, str]) -> list[str]:
-    if name in FLAGS:
-        return [FLAGS[name]]
     on, _, off = options[name].partition("/")
     return [on if value else off] if off else [on, str(value)]
 
@@ -198,7 +192,7 @@ def _words(name: str, value: Any, options: dict[str, str]) -> list[str]:
 def changed_settings(point: Point, base: FitConfig) -> dict[str, Any]:
     """Every setting that differs from the base."""
     changed = {
-        field.name: "on" if field.name in FLAGS else getattr(point.config, field.name)
+        field.name: getattr(point.config, field.name)
         for field in dataclasses.fields(base)
         if field.name != "options" and getattr(point.config, field.name) != getattr(base, field.name)
     }

@@ -285,10 +285,8 @@ def _fix_steps(config: FitConfig, num_frames: int, start: str, steps: int | None
             raise invalid("steps", expected="a number for a config with minutes alone", got=None, cure=cure)
         steps = planned_steps(dataclasses.replace(config, minutes=None), num_frames)
         steps = steps if start == "scratch" else max(1, round((1 - START_AT) * steps))
-    economy = None if start == "model" else config.economy  # the model's Gaussians are kept
-    changes = {"minutes": None, "target_psnr": None, "economy": economy}
-    changes["cooldown_fraction"] = max(config.cooldown_fraction, COOLDOWN_FRACTION)
-    return dataclasses.replace(config, steps=steps, **changes)
+    cooldown = max(config.cooldown_fraction, COOLDOWN_FRACTION)
+    return dataclasses.replace(config, steps=steps, minutes=None, target_psnr=None, cooldown_fraction=cooldown)
 
 
 def resample_frames(

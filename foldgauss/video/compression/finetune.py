@@ -65,6 +65,6 @@ def finetune_model(
         backpropagate(rows, done, cpu.backward(trace, by_image), spec, grad)
         grad[done.alive] *= free[done.alive]  # Adam does not move what never had a gradient
         rate = np.float32(FIRST_RATE * (LAST_RATE / FIRST_RATE) ** (step / steps))
-        update_rows(state, grad, done.alive, rates * rate, degree=model.degree, units=config.rate_units)
+        update_rows(state, grad, done.alive, rates * rate, units=config.rate_units)
         update_windows(rows, done.alive, window, spec)
     return eqx.tree_at(lambda m: m.splats, model, unpack(rows, model.degree, model.splats.envelope, model.splats.paths))

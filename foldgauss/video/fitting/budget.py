@@ -5,18 +5,11 @@ import math
 import numpy as np
 
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.economy import MIN_PASSES_PER_ROUND
-from foldgauss.video.fitting.schedule import Level, find_level, relative_area, steps_per_pass, work_after
+from foldgauss.video.fitting.schedule import steps_per_pass
 from foldgauss.video.fitting.state import FitState, mean_psnr
 
 #: A fit to a target PSNR evaluates all frames once in so many passes, which takes a tenth of its time.
 PASSES_PER_EVALUATION = 4
-#: A fit of the smallest model at a PSNR that it has not reached goes on to so many times its plan.
-OVERTIME = 1.5
-#: Births make steps slower by this factor, at first.
-BIRTH_SLOWDOWN = 1.15
-#: A round of pruning costs as much for each frame as so many steps with it: a forward pass and four backward.
-STEPS_PER_ROUND = 2.0
 #: The speed is measured after so many steps, in which kernels are compiled or loaded, over at least so many.
 WARM_UP, MIN_STEPS = 5, 10
 #: The fractions of the time or of the plan, whichever is first, at which the number of steps is planned, by the speed
@@ -30,47 +23,37 @@ class StepPlanner:
     """Turns minutes into a number of steps, by the measured speed, and corrects it at stated times (`PLANNED_AT`).
 
     The plan is a part of the state: everything else in a fit is a function of steps and of the plan, so that a resumed
-    fit continues as if it had not been interrupted. Densification and pruning follow a schedule of the whole plan: with
-    them it is made once.
+    fit continues as if it had not been interrupted. Densification follows a schedule of the whole plan: with it the
+    plan is made once.
     """
 
-    def __init__(self, config: FitConfig, levels: list[Level], num_frames: int):
-        self.config, self.levels, self.count, self.work, self.seconds = config, levels, 0, 0.0, 0.0
+    def __init__(self, config: FitConfig):
+        self.config, self.count, self.seconds = config, -WARM_UP, 0.0  # steps since the last plan, and their time
         self.before = 0.0  # the state's seconds after the step before
-        rounds = 0 if config.economy is None else config.economy.rounds
-        self.for_pruning = STEPS_PER_ROUND * rounds * num_frames / config.batch_size  # steps' worth of time, at most
-        self.once = config.economy is not None or config.growth is not None
 
-    def update(self, state: FitState, level: int) -> None:
-        """Plan the steps of the whole fit, if it is time, after a step at `level`."""
+    def update(self, state: FitState) -> None:
+        """Plan the steps of the whole fit, if it is time, after a step."""
         config, passed = self.config, state.seconds - self.before
         self.before = state.seconds
-        if config.minutes is None or (state.plan and (self.once or state.step >= state.plan)):
+        if config.minutes is None or (state.plan and (config.growth is not None or state.step >= state.plan)):
             return
         budget = 60 * config.minutes
         if not state.plan and (state.step == config.steps or state.seconds >= budget):
             state.plan = state.step
             return
         self.count += 1
-        if self.count > WARM_UP * len(self.levels):
-            self.work += relative_area(self.levels, self.levels[level])
+        if self.count > 0:
             self.seconds += passed
         if not self._is_due(state, budget):
             return
-        progress = measure_progress(state, config) if state.plan else 0.0
-        work_of_step = work_after(self.levels, progress) / (1 - progress)  # the mean of the steps that are left
-        left = (budget - state.seconds) * self.work / self.seconds / SLOWDOWN / work_of_step
-        if not state.plan and self.for_pruning:
-            most = left * STEPS_PER_ROUND / (STEPS_PER_ROUND + MIN_PASSES_PER_ROUND)
-            left = left / BIRTH_SLOWDOWN - min(self.for_pruning, most)
+        left = (budget - state.seconds) * self.count / self.seconds / SLOWDOWN
         if state.plan:
-            state.planned_step, state.planned_progress = state.step, progress
+            state.planned_step, state.planned_progress = state.step, measure_progress(state, config)
         state.plan = min(state.step + max(int(left), 0), config.steps or math.inf)
-        self.count, self.work, self.seconds = WARM_UP * len(self.levels), 0.0, 0.0
+        self.count, self.seconds = 0, 0.0
 
     def _is_due(self, state: FitState, budget: float) -> bool:
-        measured = self.count - WARM_UP * len(self.levels)
-        if measured < MIN_STEPS * (1 if state.plan else len(self.levels)):
+        if self.count < MIN_STEPS:
             return False
         if not state.plan:
             enough = self.seconds >= PLANNED_AT[0] * budget
@@ -84,22 +67,22 @@ class StepPlanner:
 class TimeLeft:
     """Estimates how long a fit will still take, by the speed since it began or was resumed, without the first steps."""
 
-    def __init__(self, state: FitState, config: FitConfig, levels: list[Level]):
-        self.config, self.levels, self.first = config, levels, state.step + WARM_UP
-        self.seconds, self.work = math.nan, math.inf
+    def __init__(self, state: FitState, config: FitConfig):
+        self.config, self.first = config, state.step + WARM_UP
+        self.seconds, self.progress = math.nan, math.inf
 
     def estimate(self, state: FitState, progress: float) -> float:
         """Seconds; at most what is left of the minutes, where they are limited."""
         most = math.inf if self.config.minutes is None else max(60 * self.config.minutes - state.seconds, 0.0)
-        work = 1 - work_after(self.levels, progress) / work_after(self.levels, 0.0)
         if state.step <= self.first or not state.plan:
-            self.seconds, self.work = state.seconds, work
-        known = work > self.work
-        return min((state.seconds - self.seconds) * (1 - work) / (work - self.work), most) if known else most
+            self.seconds, self.progress = state.seconds, progress
+        if progress <= self.progress:
+            return most
+        return min((state.seconds - self.seconds) * (1 - progress) / (progress - self.progress), most)
 
 
 def measure_progress(state: FitState, config: FitConfig, step: int | None = None) -> float:
-    """The fraction of the plan that is done, above 1 in overtime; without a plan, of the steps asked for, or 0.
+    """The fraction of the plan that is done; without a plan, of the steps asked for, or 0.
 
     `step`: after so many steps instead of those taken, by the present plan.
     """
@@ -110,34 +93,14 @@ def measure_progress(state: FitState, config: FitConfig, step: int | None = None
     return done + (1 - done) * (step - start) / max(plan - start, 1)
 
 
-def next_level(state: FitState, config: FitConfig, levels: list[Level]) -> int:
-    """The level of the next step; while the speed is measured, all in turn."""
-    return find_level(levels, measure_progress(state, config)) if state.plan else state.step % len(levels)
-
-
-def starts_level(state: FitState, config: FitConfig, levels: list[Level], level: int) -> bool:
-    """Whether the next step is the first one of a `level` of the plan."""
-    return state.plan > 0 and level != find_level(levels, measure_progress(state, config, state.step - 1))
-
-
 def find_limit(state: FitState, config: FitConfig, frames: np.ndarray) -> str | None:
-    """The budget that ends the fit now: "steps", "minutes", "target_psnr" or "smallest_at_psnr"."""
+    """The budget that ends the fit now: "steps", "minutes" or "target_psnr"."""
     if config.target_psnr is not None and _reaches_target(state, config, frames):
         return "target_psnr"
     # Minutes are planned by the speed with the Gaussians at the start, and by that of steps alone: where Gaussians are
     # added, or frames evaluated between steps, the clock decides.
-    by_clock = config.growth is not None or config.target_psnr is not None or config.economy is not None
-    late = by_clock and config.minutes is not None and state.seconds >= 60 * config.minutes
-    wanted = None if config.economy is None else config.economy.psnr
-    if wanted is not None and state.plan:
-        over = late or state.step >= OVERTIME * state.plan
-        if not over and (state.step < state.plan or (state.step - state.plan) % len(frames)):
-            return None
-        if np.isfinite(state.rows).all() and mean_psnr(state, config, frames) >= wanted:
-            return "smallest_at_psnr"
-        if not over:
-            return None
-    if late:
+    by_clock = config.growth is not None or config.target_psnr is not None
+    if by_clock and config.minutes is not None and state.seconds >= 60 * config.minutes:
         return "minutes"
     if not state.plan or state.step < state.plan:
         return None

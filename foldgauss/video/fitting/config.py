@@ -1,10 +1,7 @@
 """The configuration of a fit, its presets, and the defaults that depend on the clip."""
 
 import dataclasses
-import math
-from collections.abc import Mapping
 from dataclasses import field
-from types import MappingProxyType
 from typing import Any
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_within
@@ -12,7 +9,6 @@ from foldgauss._runtime.settings import check_settings, setting
 from foldgauss._runtime.threads import num_threads
 from foldgauss.render import COMPOSITINGS, RenderOptions
 from foldgauss.video.fitting.adam import RateUnits
-from foldgauss.video.fitting.economy import Economy
 from foldgauss.video.fitting.growth import EXTENT, PUBLISHED_STEPS, PUBLISHED_UNIT, Growth
 
 
@@ -92,8 +88,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "follow_camera": False,
         "scale_rates_by_duration": False,
         "scale_rates_by_size": False,
-        "quarter_fraction": 0.0,
-        "half_fraction": 0.0,
         "sparse_updates": False,
         "l2_fraction": 0.0,
         "border_weight": 1.0,
@@ -123,8 +117,8 @@ class FitConfig:
     """The configuration of a fit; `FitConfig.preset` returns named ones.
 
     `steps`, `minutes` and `target_psnr` are budgets: the fit ends at the first that is reached. Minutes are converted
-    into steps by the measured speed, and corrected until the end; with `growth` and `economy` once. With these or a
-    target PSNR the clock ends a fit that is late. The target PSNR is checked every four passes over the frames. With
+    into steps by the measured speed, and corrected until the end; with `growth` once. With it or a target PSNR the
+    clock ends a fit that is late. The target PSNR is checked every four passes over the frames. With
     neither steps nor minutes, the fit takes `DEFAULT_STEPS`, or more for long clips.
 
     With `two_cameras`, half of the views of a pass are those of an opposite camera: the mirrored frame, and the splats
@@ -178,7 +172,6 @@ class FitConfig:
         default=None,
         metadata=setting(
             "Stop once the mean PSNR over all frames reaches this, in dB",
-            "Frames are then fitted at full size only.",
             bounds="(0, inf)",
             option="--target-psnr",
             group=BUDGET,
@@ -263,25 +256,6 @@ class FitConfig:
         default=True,
         metadata=setting("Learning rates are in units of each Gaussian's size", "See `LearningRates`."),
     )
-    quarter_fraction: float = field(
-        default=0.0,
-        metadata=setting(
-            "Fraction of the steps, at the start, with frames at a quarter of their size",
-            "Frames that are too small stay at full size.",
-            bounds="[0, 1]",
-            option="--quarter-fraction",
-            group=OPTIMIZATION,
-        ),
-    )
-    half_fraction: float = field(
-        default=0.0,
-        metadata=setting(
-            "Fraction of the steps, after those, with frames at half of their size",
-            bounds="[0, 1]",
-            option="--half-fraction",
-            group=OPTIMIZATION,
-        ),
-    )
     l2_fraction: float = field(
         default=0.3,
         metadata=setting(
@@ -299,7 +273,7 @@ class FitConfig:
             "Improves the times between frames, for slow motion. Interpolation ends at `interpolation_end`. Views that "
             "are drawn by error (`error_fraction`) are never interpolated, which limits the fraction.",
             bounds="[0, 1)",
-            unset=f"{INTERPOLATION_FRACTION:g}; 0 with an economy, alpha or no optical flow",
+            unset=f"{INTERPOLATION_FRACTION:g}; 0 with alpha or no optical flow",
             option="--interpolation-fraction",
             group=OPTIMIZATION,
         ),
@@ -318,7 +292,7 @@ class FitConfig:
         default=0.3,
         metadata=setting(
             "Fraction of the views that are chosen in proportion to the squared errors of the frames",
-            "In between, all frames are visited in turn. Improves the worst frames. Ignored with `economy.psnr`.",
+            "In between, all frames are visited in turn. Improves the worst frames.",
             bounds="[0, 1)",
             option="--error-fraction",
             group=OPTIMIZATION,
@@ -328,7 +302,7 @@ class FitConfig:
         default=0.05,
         metadata=setting(
             "Fraction of the Gaussians moved, three times, from the smallest contributions to the largest errors",
-            "Ignored with `growth` or `economy`, which add Gaussians themselves, and without `sparse_updates`.",
+            "Ignored with `growth`, which adds Gaussians itself, and without `sparse_updates`.",
             bounds="[0, 0.5]",
             option="--relocated-fraction",
             group=OPTIMIZATION,
@@ -361,15 +335,6 @@ class FitConfig:
     )
     growth: Growth | None = field(
         default=None, metadata=setting("Densification", unset="the number of Gaussians stays the same")
-    )
-    economy: Economy | None = field(
-        default=None,
-        metadata=setting(
-            "Prune the Gaussians, powers and colors that cost more bits than they save",
-            unset="nothing is pruned",
-            option="--economy",
-            group=MODEL,
-        ),
     )
     compositing: str = field(
         default="over",
@@ -405,16 +370,6 @@ class FitConfig:
 
     def __post_init__(self) -> None:
         check_settings(self)
-        if self.quarter_fraction + self.half_fraction > 1:
-            got = f"{self.quarter_fraction:g} and {self.half_fraction:g}"
-            raise invalid("quarter_fraction, half_fraction", expected="at most 1 together", got=got)
-        if self.economy is not None and self.compositing == "sum":
-            # Contributions to a sum overlap: the worth of each says nothing about the worth of several.
-            cure = "Leave the economy out, or use 'over'."
-            raise invalid("compositing", expected="'over' with an economy", got="'sum'", cure=cure)
-        if self.economy is not None and self.target_psnr is not None:
-            cure = "For the smallest model at a PSNR use Economy(psnr=...), or --smallest-at-psnr, alone."
-            raise invalid("target_psnr", expected="None with an economy", got=self.target_psnr, cure=cure)
         if self.initialization == "uniform" and self.follow_motion:
             raise invalid("follow_motion", expected="False with initialization 'uniform'", got=True)
 
@@ -468,12 +423,6 @@ TYPICAL_LIFETIME, SHORTEST_LIFETIME = 35.0, 2.0
 ALIVE, ALIVE_POWER, ALIVE_PIXEL_POWER = 0.378, 0.55, 0.95
 #: More Gaussians than this in each pixel gain nothing, however much time there is.
 MOST_PER_PIXEL = 1.6
-#: The default number of Gaussians for the economy, which adds those that pay: so many for the square root of a frame's
-#: pixels; and this fraction of it for the smallest model at a PSNR. (Bunny 80x160 at 33 dB, which takes 3,100: 31.9
-#: thousand parameters from 20,000 Gaussians, 30.9 from 14,000, 36.2 from 40,000.)
-ECONOMICAL, SMALLEST_FRACTION = 177, 0.7
-#: Factor on the default steps for the smallest model at a PSNR: the fit must make up for what is pruned.
-SMALLEST_TIMES = 5
 
 
 def default_num_gaussians(
@@ -496,9 +445,6 @@ def default_num_gaussians(
     """
     area = height * width
     pixels = num_frames * area
-    if config.economy is not None:
-        fraction = SMALLEST_FRACTION if _is_smallest(config) else 1.0
-        return max(round(fraction * ECONOMICAL * math.sqrt(area) * max(1.0, num_frames / 250)), 1)
     steps, budgets = planned_steps(config, num_frames), []  # in microseconds for each pixel of all frames
     if steps is not None:
         budgets.append(PIXEL_TIME * steps * config.batch_size / num_frames)
@@ -547,53 +493,14 @@ def planned_steps(config: FitConfig, num_frames: int) -> int | None:
     """Steps of the whole fit; None where only the time limits it."""
     if config.minutes is not None:
         return config.steps
-    steps = max(DEFAULT_STEPS, -(-DEFAULT_VISITS * num_frames // config.batch_size))
-    return config.steps or (SMALLEST_TIMES * steps if _is_smallest(config) else steps)
+    return config.steps or max(DEFAULT_STEPS, -(-DEFAULT_VISITS * num_frames // config.batch_size))
 
 
 def chosen_interpolation(config: FitConfig, *, alpha: bool) -> float:
     """The fraction of the first steps that fit interpolated frames; `alpha`: whether the frames have it.
 
-    By default none do where optical flow is not used or does not tell what is there (behind alpha), and with an
-    economy, which weighs bits against the errors of frames.
+    By default none do where optical flow is not used or does not tell what is there (behind alpha).
     """
     if config.interpolation_fraction is not None:
         return config.interpolation_fraction
-    supported = config.follow_motion and config.economy is None and not alpha
-    return INTERPOLATION_FRACTION if supported else 0.0
-
-
-def _is_smallest(config: FitConfig) -> bool:
-    """Whether the smallest model at a PSNR is asked for."""
-    return config.economy is not None and config.economy.psnr is not None
-
-
-#: Names that settings had before they were renamed, in records that earlier versions wrote.
-_EARLIER_NAMES: Mapping[str, str] = MappingProxyType(
-    {
-        "own_time": "scale_rates_by_duration",
-        "only_alive": "sparse_updates",
-        "falling": "decayed",
-        "square_share": "l2_fraction",
-        "between_share": "interpolation_fraction",
-        "ssim_share": "ssim_fraction",
-        "quarter_share": "quarter_fraction",
-        "half_share": "half_fraction",
-        "first_share": "first_fraction",
-        "last_share": "last_fraction",
-    }
-)
-
-
-def rename_settings(settings: Any) -> Any:
-    """Settings of a record, as of `dataclasses.asdict(config)`, by their present names; no dict: as it is."""
-    if not isinstance(settings, dict):
-        return settings
-    return {_EARLIER_NAMES.get(name, name): rename_settings(value) for name, value in settings.items()}
-
-
-def rename_options(command: str) -> str:
-    """A command of a record, with the present names of its options."""
-    for earlier, name in _EARLIER_NAMES.items():
-        command = command.replace(f"--{earlier.replace('_', '-')} ", f"--{name.replace('_', '-')} ")
-    return command
+    return INTERPOLATION_FRACTION if config.follow_motion and not alpha else 0.0

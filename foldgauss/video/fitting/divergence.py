@@ -33,7 +33,7 @@ MAX_BACKOFFS = 6
 MAX_TIME_MOVE = 15.0
 #: The least scale that a leaf's moves are measured in: where all start alike, as opacities do, their own spread is 0.
 MIN_SCALE = {"loc": 0.3}  # of the frame; 1 for logits, logarithms, colors and folds
-#: All frames must have been seen at a size before their errors are compared.
+#: All frames must have been seen before their errors are compared.
 PASSES, MIN_STEPS = 2, 20
 
 
@@ -52,7 +52,7 @@ class FitDiverged(ArithmeticError):
 class Guard:
     """Watches the steps of a fit. All that it decides by is in the state, so that resuming changes nothing.
 
-    Errors are those of the same frames at the same size, each as it was last seen. A single frame raises no alarm,
+    Errors are those of the same frames, each as it was last seen. A single frame raises no alarm,
     neither by being much harder than the others nor by being worse for a few steps: the worst one is left out. Where
     errors may rise for other reasons, only finiteness is tested: where Gaussians are added and pruned, and over the
     random backgrounds of frames with alpha.
@@ -60,7 +60,7 @@ class Guard:
 
     def __init__(self, state: FitState, config: FitConfig, steps_per_pass: int, *, alpha: bool):
         self.config, self.steps_per_pass = config, steps_per_pass
-        self.comparable = config.growth is None and config.economy is None and not alpha
+        self.comparable = config.growth is None and not alpha
         fault = _find_nonfinite(state, config)
         if fault:
             cure = "Start a new fit instead of resuming this state."

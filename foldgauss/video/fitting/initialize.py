@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Callable, Sequence
 
 import cv2
-import jax
 import numpy as np
 import scipy
 from jaxtyping import Float, Float32, UInt8
@@ -14,8 +13,8 @@ from foldgauss._runtime.threads import run_tasks
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.fitting.growth import PUBLISHED_UNIT
 from foldgauss.video.fitting.path_coordinates import PathCoordinates, prefers_path
-from foldgauss.video.models.shared_paths import SharedPaths, leave_paths
-from foldgauss.video.models.splats import SH_C0, STATIC_LOG_TIME_SCALE, TAU_MAX, FoldedSplats
+from foldgauss.video.models.shared_paths import SharedPaths
+from foldgauss.video.models.splats import SH_C0, TAU_MAX, FoldedSplats
 from foldgauss.video.motion.optical_flow import Motion, Tracks, fit_folds
 
 #: Logarithm of the ratio of the longer axis of a start on a straight edge to the geometric mean of both; the width, in
@@ -38,9 +37,6 @@ TRACK_FRACTIONS, MIN_FRAMES = (0.25, 1.2), 0.9
 UNTRACKED_FRAMES = 0.42
 #: Where the fold misses the track by more than this many pixels, sigma_t is multiplied by this, so often at most.
 MISS, SHORTENING, SHORTENINGS = 0.7, 0.6, 4
-#: A pixel is constant whose color changes by less than this (of 1, root mean square over the channels) in any of so
-#: many frames.
-CONSTANT, CONSTANT_FRAMES = 0.03, 64
 #: Gaussians alive in a frame, for each pixel, below which those that follow a path live longer than a fold alone
 #: could follow their track. With more of them, they reproduce what differs from frame to frame, such as motion blur,
 #: less well. (40 frames of bus, 180x320, 800 steps, as long as possible and as a fold alone: 15,000 Gaussians 33.9 and
@@ -73,16 +69,14 @@ def initialize(
     motion: Motion | None = None,
     paths: SharedPaths | None = None,
     opacity: float = START_OPACITY,
-    with_static: bool = False,
 ) -> FoldedSplats:
     """Initial splats for `frames`, uint8 (num_frames, height, width, 3), at `times` (default: evenly spaced).
 
     Positions are drawn by image gradient within each frame, m_t is that frame's time, sizes follow from the local
     density of starts, colors from the pixel. With `motion`, folds follow the optical flow, and sigma_t is drawn as a
-    fraction of the length of the track; without, folds are at rest and sigma_t is log-uniform. With `with_static`,
-    starts whose pixel never changes are static Gaussians, behind the others. Where one of `paths`, the camera's and
-    those of objects, describes the motion better than a fold alone, starts follow it. `num_gaussians` may be a function
-    of their mean lifetime in frames.
+    fraction of the length of the track; without, folds are at rest and sigma_t is log-uniform. Where one of `paths`,
+    the camera's and those of objects, describes the motion better than a fold alone, starts follow it. `num_gaussians`
+    may be a function of their mean lifetime in frames.
     """
     rng = make_generator(Stream.INITIALIZATION, seed=seed)
     num_frames = len(frames)
@@ -101,13 +95,10 @@ def initialize(
         home = np.sort(rng.choice(num_frames, num_gaussians, p=chance))
     position, density = draw_positions(home, density_of, rng)
     splats, spread = make(home, position, longer)
-    static = find_constant(frames, home, position) if with_static else np.zeros(num_gaussians, bool)
-    splats, spread = make_static(splats, static), np.where(static, np.exp(STATIC_LOG_TIME_SCALE), spread)
     alive = count_alive(times[home], spread, times)[home]
     scale = SCALE_FACTOR / np.sqrt(alive * density) / max(frames.shape[1:3])
     # The order in depth is that of `home`, so that the Gaussians alive at a time lie side by side in memory: steps take
-    # a third less time than in random order, for 0.2 dB after as many steps. Static Gaussians are behind.
-    order = np.argsort(static, kind="stable")
+    # a third less time than in random order, for 0.2 dB after as many steps.
     angle, coherence = sample_orientations(frames, home, position)
     log_scale = np.log(scale)[:, None] + ELONGATION * coherence[:, None] * [1, -1]
     if paths is not None:
@@ -116,9 +107,7 @@ def initialize(
             angle += np.where(splats.path_index == number, coordinates.turns(home), 0)
         angle = (angle - np.pi / 2) % np.pi + np.pi / 2
     shape = {"log_scale": np.float32(log_scale), "angle_logit": np.float32(_logit(angle / (2 * np.pi)))}
-    splats = dataclasses.replace(splats, **shape)
-    ordered = jax.tree.map(lambda leaf: leaf[order] if leaf.ndim else leaf, dataclasses.replace(splats, paths=None))
-    return dataclasses.replace(ordered, paths=paths)
+    return dataclasses.replace(splats, **shape)
 
 
 def measure_lifetime(frames: UInt8[np.ndarray, "num_frames height width 3"], motion: Motion, degree: int) -> float:
@@ -244,28 +233,6 @@ def make_splats(
     }
     splats = FoldedSplats(**{name: np.float32(leaf) for name, leaf in leaves.items()}, envelope=envelope)
     return splats if paths is None else dataclasses.replace(splats, path_index=follows, paths=paths), spread
-
-
-def find_constant(frames: np.ndarray, home: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Whether the color of a pixel is the same in all frames (or a sample of them), up to noise: bool (num,)."""
-    height, width = frames.shape[1:3]
-    column, row = np.floor(position).astype(np.int64).clip(0, [width - 1, height - 1]).T
-    own, largest = frames[home, row, column].astype(np.float32), np.zeros(len(home), np.float32)
-    for k in np.unique(np.linspace(0, len(frames) - 1, CONSTANT_FRAMES).round().astype(int)):
-        change = frames[k, row, column] - own
-        largest = np.maximum(largest, (change * change).mean(1))
-    return largest < (255 * CONSTANT) ** 2
-
-
-def make_static(splats: FoldedSplats, which: np.ndarray) -> FoldedSplats:
-    """The splats with those of `which` made static: at rest throughout the clip."""
-    splats = leave_paths(splats, which)
-    return dataclasses.replace(
-        splats,
-        time_loc_logit=np.where(which, np.float32(0), splats.time_loc_logit),
-        log_time_scale=np.where(which, STATIC_LOG_TIME_SCALE, splats.log_time_scale),
-        coefficients=np.where(which[:, None, None], np.float32(0), splats.coefficients),
-    )
 
 
 def follow_tracks(

@@ -16,18 +16,11 @@ import numpy as np
 from foldgauss._runtime import notebook_hooks
 from foldgauss._runtime.checks import invalid, is_integer, is_within
 from foldgauss._runtime.threads import check_not_forked
-from foldgauss.video.fitting.budget import (
-    StepPlanner,
-    TimeLeft,
-    find_limit,
-    measure_progress,
-    next_level,
-    starts_level,
-)
+from foldgauss.video.fitting.budget import StepPlanner, TimeLeft, find_limit, measure_progress
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, planned_steps
 from foldgauss.video.fitting.divergence import Guard
 from foldgauss.video.fitting.initialize import START_OPACITY, SUMMED_OPACITY, initialize, initialize_uniform
-from foldgauss.video.fitting.pruning.relocation import is_relocation_due, relocates
+from foldgauss.video.fitting.relocation import is_relocation_due, relocates
 from foldgauss.video.fitting.state import FitState, envelope_of, mean_psnr, running_psnr, to_model
 from foldgauss.video.fitting.steppers.engines import choose_engine, make_stepper
 from foldgauss.video.fitting.steppers.protocol import StepResult
@@ -51,8 +44,7 @@ class FitInfo(NamedTuple):
     num_alive: int  #: Gaussians that took part in this step
     seconds: float  #: spent fitting so far
     seconds_left: float  #: estimated from the speed so far
-    stopped_by: str | None  #: at the last step, which budget ended the fit: "steps", "minutes", "target_psnr" or
-    #: "smallest_at_psnr"
+    stopped_by: str | None  #: at the last step, which budget ended the fit: "steps", "minutes" or "target_psnr"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,14 +120,12 @@ def fit_steps(
     check_not_forked()
     check_frames(frames)
     _check_alpha(frames, config)
-    engine = choose_engine(frames, config, state)
+    engine = choose_engine(frames, config)
     _warm_up(frames, config, engine)
     find_motion = motion_finder(frames, motion)
     state = _start(frames, config, None, find_motion, clock) if state is None else state
     stepper = make_stepper(engine, frames, config, state, find_motion)
-    levels = stepper.levels
-    planner = StepPlanner(config, levels, len(frames))
-    time_left = TimeLeft(state, config, levels)
+    planner, time_left = StepPlanner(config), TimeLeft(state, config)
     guard = Guard(state, config, stepper.steps_per_pass, alpha=frames.shape[3] == 4)
     if state.step == 0 and guard.comparable and config.initialization == "clip":
         begun = clock()
@@ -146,12 +136,8 @@ def fit_steps(
         yield state, _make_info(state, config, time_left, StepResult(math.nan, 0), stopped_by)
     while not stopped_by:
         begun = clock()
-        level = next_level(state, config, levels)
-        result = stepper.step(state, measure_progress(state, config), level)
-        new_level = starts_level(state, config, levels, level)
+        result = stepper.step(state, measure_progress(state, config))
         state.step += 1
-        if new_level or not state.plan:  # without a plan yet, levels take turns
-            guard.restart(state)
         fault = guard.find_fault(state, result)
         if fault:
             guard.back_off(state, fault)
@@ -163,14 +149,10 @@ def fit_steps(
                 guard.replace_good(state)
         if state.growing and state.plan:
             stepper.grow(state)
-        if config.economy is not None and state.plan:
-            stepper.prune(state)
         state.seconds += clock() - begun
-        planner.update(state, level)
+        planner.update(state)
         begun = clock()
         stopped_by = find_limit(state, config, frames)
-        if stopped_by == "smallest_at_psnr":
-            stepper.trim(state)
         if stopped_by:
             guard.finish(state)
         state.seconds += clock() - begun
@@ -180,7 +162,7 @@ def fit_steps(
 def _make_info(
     state: FitState, config: FitConfig, time_left: TimeLeft, result: StepResult, stopped_by: str | None
 ) -> FitInfo:
-    done = 1.0 if stopped_by else min(measure_progress(state, config), 0.999)  # a target PSNR may take overtime
+    done = 1.0 if stopped_by else measure_progress(state, config)
     return FitInfo(
         step=state.step,
         progress=done,
@@ -196,8 +178,7 @@ def _make_info(
 
 def _warm_up(frames: np.ndarray, config: FitConfig, engine: str) -> None:
     """Compile or load the kernels, on a corner of the clip, before any clock runs: the first time takes 20 s."""
-    evaluates = config.target_psnr is not None or (config.economy is not None and config.economy.psnr is not None)
-    if engine != "cpu" and not evaluates and not relocates(config):
+    if engine != "cpu" and config.target_psnr is None and not relocates(config):
         return
     tiny = dataclasses.replace(config, num_gaussians=8, max_gaussians=None, max_size_mb=None, steps=1, minutes=None)
     tiny = dataclasses.replace(tiny, interpolation_fraction=0.0)
@@ -210,7 +191,7 @@ def _warm_up(frames: np.ndarray, config: FitConfig, engine: str) -> None:
         maps = np.tile(np.eye(2, 3, dtype=np.float32), (len(corner), 1, 1, 1))
         state = FitState.create(rows, state.time_logits, path_maps=maps)
         make_stepper("cpu", corner, tiny, state, motion_finder(corner)).step(state, 0.0)
-    if evaluates:
+    if config.target_psnr is not None:
         mean_psnr(state, tiny, corner)
 
 
@@ -250,7 +231,7 @@ def _start(
 def start_from(model: VideoModel, config: FitConfig, steps: int, progress: float = 0.0) -> FitState:
     """State from which `fit_steps` continues a fitted model: the last `steps` of a plan, a fraction of which is done.
 
-    Learning rates, resolution and loss are those of the schedule from `progress`, in [0, 1), to its end. Arrays are
+    Learning rates and loss are those of the schedule from `progress`, in [0, 1), to its end. Arrays are
     copied, moments start at zero, and no Gaussians are added. Raises ValueError for a model that `config` could not
     have fitted, and for other arguments out of range.
 
@@ -291,7 +272,7 @@ def _initialize(frames: np.ndarray, config: FitConfig, logits: np.ndarray, motio
         return initialize_uniform(choose_num(), frames.shape[1:3], envelope=envelope_of(config), **shape)
     times = np.asarray(FrameTimes(logits).times())
     opacity = SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY
-    clip = {"times": times, "motion": motion, "opacity": opacity, "with_static": config.economy is not None}
+    clip = {"times": times, "motion": motion, "opacity": opacity}
     clip["paths"] = _find_paths(motion, times) if config.follow_camera else None
     return initialize(frames, lambda life: choose_num(lifetime=life), envelope=envelope_of(config), **clip, **shape)
 

@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 from foldgauss._runtime.checks import invalid, is_integer
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.fitting.config import FitConfig, LearningRates
-from foldgauss.video.fitting.initialize import START_OPACITY, SUMMED_OPACITY, initialize, make_static
+from foldgauss.video.fitting.initialize import START_OPACITY, SUMMED_OPACITY, initialize
 from foldgauss.video.fitting.loop import check_frames, fit_steps, start_from, to_model
 from foldgauss.video.models.background import BLACK
 from foldgauss.video.models.frame_times import FrameTimes, check_rate
@@ -79,7 +79,7 @@ def independent_frames(
     **Shapes:** `frames` uint8 (num_frames, height, width, 3), or with alpha (..., 4), as for `fit`. Frames get
     `num_parameters` // 9 Gaussians in equal parts, the first ones what is left over.
 
-    `config` is that of each frame's fit: starts, loss, coarse levels, rates (see `RATE_FACTOR`), compositing. Its
+    `config` is that of each frame's fit: starts, loss, rates (see `RATE_FACTOR`), compositing. Its
     `steps` are of each frame (default `DEFAULT_STEPS`); its `minutes` are for all, divided evenly by measured speed.
     Settings about time (`degree`, `power`, `floor`, `learn_frame_times`, `follow_motion`, `follow_camera`,
     `scale_rates_by_duration`, `scale_rates_by_size`) have no meaning here and are ignored. `on_frame` is called with
@@ -121,7 +121,7 @@ def independent_frames(
 
 def _check_config(config: FitConfig) -> None:
     """Raise ValueError for settings that have no meaning for frames with a given number of Gaussians."""
-    for name in ("num_gaussians", "max_gaussians", "max_size_mb", "target_psnr", "growth", "economy"):
+    for name in ("num_gaussians", "max_gaussians", "max_size_mb", "target_psnr", "growth"):
         value = getattr(config, name)
         if value is not None:
             raise invalid(
@@ -160,13 +160,13 @@ class _StepBudget:
 def _fit_frame(
     frame: np.ndarray, num: int, config: FitConfig, steps: int, k: int, fps: float
 ) -> tuple[VideoModel, float]:
-    """Frame k as `num` static Gaussians, and the seconds that it took."""
+    """Frame k as `num` Gaussians, and the seconds that it took."""
     begun, single = time.perf_counter(), np.ascontiguousarray(frame[None])
     opacity = SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY
     envelope = TimeLikelihood(power=np.float32(0), floor=np.float32(0))
     colors = np.ascontiguousarray(single[..., :3])
     how = {"degree": 0, "envelope": envelope, "seed": config.seed + k, "opacity": opacity}
-    splats = make_static(initialize(colors, num, **how), np.ones(num, bool))
+    splats = initialize(colors, num, **how)
     size = tuple(int(length) for length in frame.shape[:2])
     at_start = VideoModel(splats, FrameTimes.uniform(1), size, float(fps), config.options, config.compositing)
     config = dataclasses.replace(config, num_gaussians=num, seed=config.seed + k)

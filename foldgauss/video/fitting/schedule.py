@@ -1,7 +1,6 @@
-"""What each step of a fit uses: its views of the clip, the resolution of its frames, and its learning rates."""
+"""What each step of a fit uses: its views of the clip, and its learning rates."""
 
 import math
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -12,12 +11,10 @@ from foldgauss.video.models.row_layout import columns
 
 #: Frames whose errors tell how good the start is.
 NUM_START_FRAMES = 16
-#: Frames are not made smaller than this many pixels along their shorter side: less shows too little detail to learn.
-MIN_SIDE = 120
 #: Learning rates are divided by this whenever a diverged fit backs off.
 BACKOFF_FACTOR = 4.0
-#: The factor on the learning rates when they have cooled down; and in overtime, when a fit must still learn.
-COLD, OVERTIME_FACTOR = 0.02, 0.25
+#: The factor on the learning rates when they have cooled down.
+COLD = 0.02
 
 
 # ------------------------------------------------------------------------------------------------------ views
@@ -29,11 +26,8 @@ def num_views(config: FitConfig, num_frames: int) -> int:
 
 
 def fraction_in_turn(config: FitConfig) -> float:
-    """The fraction of the views that visit all frames in turn; the others are drawn by error.
-
-    With a mean PSNR to reach all of them do: the frames' losses have weights for it (`weigh_frames`).
-    """
-    return 1.0 if config.economy is not None and config.economy.psnr is not None else 1 - config.error_fraction
+    """The fraction of the views that visit all frames in turn; the others are drawn by error."""
+    return 1 - config.error_fraction
 
 
 def steps_per_pass(config: FitConfig, num_frames: int) -> int:
@@ -107,74 +101,13 @@ class RateSchedule:
 
     def _decay(self, progress: float) -> float:
         config = self.config
-        decay = config.final_rate**progress if config.final_rate > 0 else max(1 - progress, 0.0)
-        if max(1 - progress, 0.0) < config.cooldown_fraction:
-            left = (1 - progress) / config.cooldown_fraction
-            decay *= COLD + (1 - COLD) * left if left >= 0 else OVERTIME_FACTOR
+        decay = config.final_rate**progress if config.final_rate > 0 else 1 - progress
+        if 1 - progress < config.cooldown_fraction:
+            decay *= COLD + (1 - COLD) * ((1 - progress) / config.cooldown_fraction)
         return decay
 
 
-# ------------------------------------------------------------------------------------------ coarse to fine
-
-
-class Level(NamedTuple):
-    """A part of the plan, and the resolution of the frames in it.
-
-    Coarse levels come first: a step there costs a fraction, and large structures place the Gaussians that are far off.
-    """
-
-    fraction: float  # of the plan
-    size: tuple[int, int]  # height, width
-
-
-def plan_levels(config: FitConfig, size: tuple[int, int]) -> list[Level]:
-    """The levels of a fit to frames of `size`, coarse to fine; the last is `size` itself.
-
-    A level too small for its frames (`MIN_SIDE`) gives its fraction to the next finer one. With `target_psnr` there is
-    only one: a PSNR at a smaller size says nothing about the clip's own, and the fit must be able to end.
-    """
-    if config.target_psnr is not None:
-        return [Level(1.0, tuple(size))]
-    levels, pending = [], 0.0
-    for factor, fraction in ((4, config.quarter_fraction), (2, config.half_fraction)):
-        pending += fraction
-        small = tuple(max(round(length / factor), 1) for length in size)
-        if pending and min(small) >= MIN_SIDE:
-            levels.append(Level(pending, small))
-            pending = 0.0
-    return [*levels, Level(1.0 - sum(level.fraction for level in levels), tuple(size))]
-
-
-def find_level(levels: list[Level], progress: float) -> int:
-    """The index of the level that a step belongs to, by the fraction of the plan that is done."""
-    end = 0.0
-    for index, level in enumerate(levels[:-1]):
-        end += level.fraction
-        if progress < end:
-            return index
-    return len(levels) - 1
-
-
-def work_after(levels: list[Level], progress: float) -> float:
-    """The work of a fit that is left at `progress`; 1 is that of a whole fit at the last level.
-
-    The time of a step is taken to be proportional to its frames' area.
-    """
-    end, left = 1.0, 0.0
-    for level in reversed(levels):
-        left += relative_area(levels, level) * min(max(end - progress, 0.0), level.fraction)
-        end -= level.fraction
-    return left
-
-
-def relative_area(levels: list[Level], level: Level) -> float:
-    """The area of a level's frames, relative to that of the last level."""
-    return math.prod(level.size) / math.prod(levels[-1].size)
-
-
-def shrink_frame(frame: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """A frame, uint8 (height, width, channels), at a level's size: the mean over each pixel's area."""
-    return frame if frame.shape[:2] == size else cv2.resize(frame, size[::-1], interpolation=cv2.INTER_AREA)
+# ------------------------------------------------------------------------------------------------- targets
 
 
 def to_planes(frame: np.ndarray, background: np.ndarray) -> np.ndarray:

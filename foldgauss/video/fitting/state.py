@@ -20,7 +20,6 @@ from jaxtyping import Float, Float32, Int
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.fitting.adam import FRAME_TIME_ADAM, RateUnits, adam_step, sparse_adam
-from foldgauss.video.fitting.codebook import Codebook
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.models.frame_times import FrameTimes
@@ -43,16 +42,13 @@ class Sizes(NamedTuple):
     width: int  # of a row
     num_frames: int
     growing: bool = False  # whether there are gradient statistics
-    colors: int = 0  # entries of the codebooks
-    shapes: int = 0
     paths: int = 0  # shared paths
 
 
 class StateArray(abc.ABC):
-    """The metadata of a field of arrays. `on_device` tells whether a fit on a device keeps it there."""
+    """The metadata of a field of arrays."""
 
     per_gaussian: ClassVar[bool] = False  #: whether every leaf has one row for each Gaussian
-    on_device: ClassVar[bool] = True
 
     @abc.abstractmethod
     def spec(self, sizes: Sizes) -> Any:
@@ -108,29 +104,6 @@ class StatisticsArray(StateArray):
 
     def extend(self, value: GradientStatistics | None, sizes: Sizes) -> GradientStatistics | None:
         return jax.tree.map(lambda leaf: np.zeros(len(leaf) + sizes.num_gaussians, leaf.dtype), value)
-
-
-@dataclasses.dataclass(frozen=True)
-class CodebookArray(StateArray):
-    """A `Codebook` of values of `width` numbers, whose entries `Sizes` has under `name`; new Gaussians end sharing."""
-
-    name: str
-    width: int
-    on_device: ClassVar[bool] = False
-
-    def spec(self, sizes: Sizes) -> Codebook:
-        entries = getattr(sizes, self.name)
-        index, counts = (
-            jax.ShapeDtypeStruct((num,), np.int32) for num in (sizes.num_gaussians if entries else 0, entries)
-        )
-        moments = jax.ShapeDtypeStruct((entries, self.width), np.float32)
-        return Codebook(index, moments, moments, counts)
-
-    def keep(self, value: Codebook, index: np.ndarray) -> Codebook:
-        return value.keep(index)
-
-    def extend(self, value: Codebook, sizes: Sizes) -> Codebook:
-        return Codebook.create(None, self.width)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -200,9 +173,6 @@ class FitState:
     first: np.ndarray = field(metadata=_stored(_ROW))  # Adam's moments
     second: np.ndarray = field(metadata=_stored(_ROW))
     counts: np.ndarray = field(metadata=_stored(PerGaussian(np.int32)))  # steps each Gaussian has taken
-    newborn: np.ndarray = field(metadata=_stored(PerGaussian(np.bool_)))  # born in the last round of pruning
-    colors: Codebook = field(metadata=_stored(CodebookArray("colors", 3)))
-    shapes: Codebook = field(metadata=_stored(CodebookArray("shapes", 2)))  # of the two standard deviations
     frame_errors: np.ndarray = field(metadata=_stored(PerFrame()))  # mean squared error when last seen, 0 before
     time_logits: np.ndarray = field(metadata=_stored(PerFrame(intervals=True)))
     time_moments: optax.OptState = field(metadata=_stored(PerFrame(intervals=True, moments=True)))
@@ -266,8 +236,7 @@ class FitState:
 
     @property
     def sizes(self) -> Sizes:
-        entries = len(self.colors.counts), len(self.shapes.counts)
-        return Sizes(*self.rows.shape, len(self.frame_errors), self.growing, *entries, self.path_maps.shape[1])
+        return Sizes(*self.rows.shape, len(self.frame_errors), self.growing, self.path_maps.shape[1])
 
     def is_finite(self, name: str) -> bool:
         """Whether all values of an array are finite, by their sum: a third of the time of testing each."""
@@ -278,14 +247,14 @@ class FitState:
 
     # ---------------------------------------------------------------------------------- which Gaussians there are
 
-    def keep(self, index: np.ndarray, **changed: Any) -> None:
-        """Drop all Gaussians but those of `index`, or reorder them; `changed` fields are already cut."""
+    def keep(self, index: np.ndarray) -> None:
+        """Drop all Gaussians but those of `index`, or reorder them."""
         for name, kind in self.array_fields().items():
-            setattr(self, name, changed[name] if name in changed else kind.keep(getattr(self, name), index))
+            setattr(self, name, kind.keep(getattr(self, name), index))
 
-    def extend(self, rows: np.ndarray, **born: np.ndarray) -> None:
-        """Add Gaussians at the end: their rows and fields `born`; in all other fields they are as at a start."""
-        sizes, born = Sizes(*rows.shape, len(self.frame_errors)), born | {"rows": rows}
+    def extend(self, rows: np.ndarray) -> None:
+        """Add Gaussians at the end: their rows; in all other fields they are as at a start."""
+        sizes, born = Sizes(*rows.shape, len(self.frame_errors)), {"rows": rows}
         for name, kind in self.array_fields().items():
             value = getattr(self, name)
             new = np.concatenate([value, born[name]]) if name in born else kind.extend(value, sizes)
@@ -326,11 +295,9 @@ class FitState:
         return self.held is not None and not self.__dict__.keys().isdisjoint(ARRAYS)
 
 
-#: The names of the arrays of a `FitState`; those that a device keeps, as a pytree.
+#: The names of the arrays of a `FitState`; the arrays as a pytree, as a device keeps them.
 ARRAYS = tuple(FitState.array_fields())
-DeviceArrays = collections.namedtuple(
-    "DeviceArrays", [name for name, kind in FitState.array_fields().items() if kind.on_device]
-)
+DeviceArrays = collections.namedtuple("DeviceArrays", ARRAYS)
 
 
 # ------------------------------------------------------------------------------------ what follows from a state
@@ -385,18 +352,13 @@ def measure_relative_size(state: FitState, config: FitConfig) -> float:
     return math.exp(min(mean, 0.0)) / unit if unit and math.isfinite(mean) else 1.0
 
 
-def update_rows(
-    state: FitState, grad: np.ndarray, touched: np.ndarray, rates: np.ndarray, *, degree: int, units: RateUnits
-) -> bool:
-    """A step of Adam on the rows `touched` and on the values that they share, in place; `grad` becomes zero there.
+def update_rows(state: FitState, grad: np.ndarray, touched: np.ndarray, rates: np.ndarray, *, units: RateUnits) -> bool:
+    """A step of Adam on the rows `touched`, in place; `grad` becomes zero there.
 
     Returns whether these rows are finite.
 
     `grad` is float32 (num, width), `rates` and `units` are those of `sparse_adam`.
     """
-    for name, codebook in (("color_dc", state.colors), ("log_scale", state.shapes)):
-        at = columns(degree)[name]
-        codebook.step(state.rows[:, at], grad[:, at], touched, rates[at])
     moments = state.first, state.second, state.counts
     return sparse_adam(state.rows, grad, *moments, touched, rates, units=units)
 

@@ -23,9 +23,6 @@ SH_C0 = 0.28209479177387814
 TIME_CUTOFF = 0.01
 #: The same as a bound on |tau| = |t - m_t| / sigma_t: 3.03.
 TAU_MAX = float(np.sqrt(-2 * np.log(TIME_CUTOFF)))
-#: log sigma_t of a Gaussian that is alive throughout the clip: with m_t = 0.5, |tau| is at most 1/2048, and an envelope
-#: of power <= 2 is 1 to within 3e-7.
-STATIC_LOG_TIME_SCALE = np.float32(np.log(1024))
 #: Opacity of the splat of a mixture's heaviest component; 1 would have an infinite logit.
 PEAK_OPACITY = 0.99
 

@@ -10,17 +10,8 @@ from foldgauss.render import cpu
 from foldgauss.video.fitting.adam import update_frame_times
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.densify import grow
-from foldgauss.video.fitting.pruning.description_length import weigh_frames
-from foldgauss.video.fitting.pruning.pruner import Pruner
-from foldgauss.video.fitting.pruning.relocation import relocate
-from foldgauss.video.fitting.schedule import (
-    RateSchedule,
-    choose_start_frames,
-    plan_levels,
-    shrink_frame,
-    steps_per_pass,
-    to_planes,
-)
+from foldgauss.video.fitting.relocation import relocate
+from foldgauss.video.fitting.schedule import RateSchedule, choose_start_frames, steps_per_pass, to_planes
 from foldgauss.video.fitting.state import (
     FitState,
     frame_times,
@@ -57,30 +48,24 @@ class CpuStepper:
         self.find_motion = find_motion = motion_finder(frames) if find_motion is None else find_motion
         self.background = np.zeros(3, np.float32)  # for frames with alpha another one in every step
         self.num_frames, height, width, _ = frames.shape
-        self.levels, self.rates = plan_levels(config, (height, width)), RateSchedule(config)
-        self.steps_per_pass = steps_per_pass(config, self.num_frames)
-        whole = ConditioningSpec(
+        self.rates, self.steps_per_pass = RateSchedule(config), steps_per_pass(config, self.num_frames)
+        self.spec = ConditioningSpec(
             config.degree, config.power, config.floor, (height, width), scale_cutoff=config.scale_cutoff
         )
-        smaller = (dataclasses.replace(whole, size=level.size, aspect=height / width) for level in self.levels[:-1])
-        self.shapes = [*smaller, whole]
         self.interpolation = make_interpolated(frames, config, find_motion)
-        if config.economy is not None:
-            coarse = 1 - self.levels[-1].fraction
-            self.pruner = Pruner(frames, config, self.shapes[-1], coarse, find_motion)
         self.adopt(state)
 
     def adopt(self, state: FitState) -> None:
         self.grad = np.zeros_like(state.rows)
-        self.window = find_windows(state.rows, self.shapes[-1])
+        self.window = find_windows(state.rows, self.spec)
 
-    def step(self, state: FitState, progress: float, level: int = -1) -> StepResult:
+    def step(self, state: FitState, progress: float) -> StepResult:
         config, num_frames = self.config, self.num_frames
         if self.frames.shape[3] == 4:
             self.background = random_background(config.seed, state.step)
         times = np.asarray(frame_times(state.time_logits))
         by_time, by_path = np.zeros_like(times), np.zeros(state.path_maps.shape)
-        shape = dataclasses.replace(self.shapes[level], paths=paths_of(state, times))
+        spec = dataclasses.replace(self.spec, paths=paths_of(state, times))
         losses, alive, visited = [], [], set()
         squared = progress >= 1 - config.l2_fraction
         screen = None if state.statistics is None else np.full(len(state.rows), -1, np.float32)
@@ -90,7 +75,7 @@ class CpuStepper:
             t = times[k] if fraction is None else (1 - fraction) * times[k] + fraction * times[k + 1]
             settings = {"squared": squared, "mirrored": mirrored, "screen": screen, "fraction": fraction}
             own_path = by_path[k] if fraction is None else None
-            loss, done, d_time = self._differentiate(state, k, t, shape, own_path, **settings)
+            loss, done, d_time = self._differentiate(state, k, t, spec, own_path, **settings)
             if fraction is None:
                 by_time[k] += d_time  # a batch may hold a frame twice
                 visited.add(k)
@@ -108,8 +93,8 @@ class CpuStepper:
             touched = np.arange(len(state.rows))
         relative_size = measure_relative_size(state, config) if by_path.size else 1.0
         rates, time_rate = self.rates.at(progress, state.backoffs)
-        finite = update_rows(state, self.grad, touched, rates, degree=config.degree, units=config.rate_units)
-        update_windows(state.rows, touched, self.window, shape)
+        finite = update_rows(state, self.grad, touched, rates, units=config.rate_units)
+        update_windows(state.rows, touched, self.window, spec)
         if config.learn_frame_times and num_frames > 2:
             updated = update_frame_times(state.time_logits, state.time_moments, by_time, time_rate)
             state.time_logits, state.time_moments = updated
@@ -119,35 +104,28 @@ class CpuStepper:
         return StepResult(float(np.mean(losses)), num_alive, finite)
 
     def measure_start(self, state: FitState) -> dict[int, float]:
-        shape, errors = dataclasses.replace(self.shapes[-1], paths=paths_of(state)), {}
+        spec, errors = dataclasses.replace(self.spec, paths=paths_of(state)), {}
         times = np.asarray(frame_times(state.time_logits))
         for k in choose_start_frames(self.num_frames):
-            image = self._render(condition(state.rows, self.window, times[k], shape), shape).image
+            image = self._render(condition(state.rows, self.window, times[k], spec)).image
             errors[int(k)] = float(np.mean(np.square(image - to_planes(self.frames[k], self.background))))
         return errors
 
     def grow(self, state: FitState) -> None:
-        if grow(state, self.config, self.shapes[-1].size):
+        if grow(state, self.config, self.spec.size):
             self.adopt(state)
 
     def relocate(self, state: FitState) -> None:
         motion = self.find_motion() if self.config.follow_motion else None
-        relocate(state, self.frames, self.config, self.shapes[-1], motion)
+        relocate(state, self.frames, self.config, self.spec, motion)
         self.adopt(state)
-
-    def prune(self, state: FitState) -> None:
-        if self.pruner.prune(state):
-            self.adopt(state)
-
-    def trim(self, state: FitState) -> None:
-        self.pruner.trim(state)
 
     def _differentiate(
         self,
         state: FitState,
         k: int,
         t: np.float32,
-        shape: ConditioningSpec,
+        spec: ConditioningSpec,
         by_path: np.ndarray | None,
         *,
         squared: bool,
@@ -161,49 +139,42 @@ class CpuStepper:
         screen gradients of this step, is raised.
         """
         if fraction is None:
-            target = to_planes(shrink_frame(self.frames[k], shape.size), self.background)
+            target = to_planes(self.frames[k], self.background)
         else:
-            target = np.ascontiguousarray(np.moveaxis(self.interpolation.interpolate(k, fraction, shape.size), -1, 0))
+            target = np.ascontiguousarray(np.moveaxis(self.interpolation.interpolate(k, fraction), -1, 0))
         rows = state.rows
-        done = condition(rows, self.window, t, shape)
+        done = condition(rows, self.window, t, spec)
         mean, factor = done.mean, done.factor
         if mirrored:
             for plane in target:
                 cv2.flip(plane, 1, dst=plane)
             mean, factor = np.empty_like(mean), np.empty_like(factor)
-            mirror(done.mean, done.factor, shape.size[1], out=(mean, factor))
-        trace = self._render(dataclasses.replace(done, mean=mean, factor=factor), shape)
+            mirror(done.mean, done.factor, spec.size[1], out=(mean, factor))
+        trace = self._render(dataclasses.replace(done, mean=mean, factor=factor))
         if squared:
             loss = squared_loss(trace.image, target)
         else:
             loss = image_loss(trace.image, target, ssim_fraction=self.config.ssim_fraction)
-        weight = 1.0
         if fraction is None:
             state.frame_errors[k] = loss.mean_squared_error
-            weight = self._weight(state.frame_errors, k)
         gradient = loss.gradient
-        gradient *= np.float32(weight / self.config.batch_size)
+        gradient *= np.float32(1 / self.config.batch_size)
         gradient *= border_weights(*gradient.shape[1:], self.config.border_weight)
         gradients = cpu.backward(trace, gradient)
         if mirrored:
             mirror(*gradients[:2], 0, out=gradients[:2])
         if screen is not None:
             cpu.raise_screen_gradients(screen, trace, gradients[0], done.alive)
-        return loss, done, backpropagate(rows, done, gradients, shape, self.grad, by_path)
+        return loss, done, backpropagate(rows, done, gradients, spec, self.grad, by_path)
 
-    def _weight(self, errors: np.ndarray, k: int) -> float:
-        """The weight of frame k's loss. For a mean PSNR, each dB of each frame counts the same."""
-        wanted = self.config.economy is not None and self.config.economy.psnr is not None
-        return float(weigh_frames(errors)[k]) if wanted else 1.0
-
-    def _render(self, done: ConditionedSplats, shape: ConditioningSpec) -> cpu.Trace:
+    def _render(self, done: ConditionedSplats) -> cpu.Trace:
         return cpu.forward(
             done.mean,
             done.factor,
             done.opacity,
             done.color,
             self.background,
-            shape.size,
+            self.spec.size,
             compositing=self.config.compositing,
             options=self.config.options,
         )

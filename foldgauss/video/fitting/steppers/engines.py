@@ -16,19 +16,19 @@ from foldgauss.video.fitting.steppers.protocol import Stepper
 from foldgauss.video.motion.optical_flow import Motion
 
 
-def choose_engine(frames: np.ndarray, config: FitConfig, state: FitState | None = None) -> str:
-    """The engine of a fit to `frames`, resumed from `state`: "cpu", "xla" or "pallas".
+def choose_engine(frames: np.ndarray, config: FitConfig) -> str:
+    """The engine of a fit to `frames`: "cpu", "xla" or "pallas".
 
-    Raises ValueError for an engine that does not support one of the settings.
+    Raises ValueError for an engine that does not support the frames or the constants of the renderer.
     """
     if config.engine == "cpu" or (config.engine == "auto" and default_platform() == "cpu"):
         return "cpu"
-    unsupported = _find_unsupported(frames, config, state)
+    has_alpha = frames.shape[3] == 4
     if config.engine == "auto":
-        return "cpu" if unsupported else "pallas" if pallas.is_preferred(config.options) else "xla"
-    if unsupported:
+        return "cpu" if has_alpha else "pallas" if pallas.is_preferred(config.options) else "xla"
+    if has_alpha:
         cure = "Give engine='cpu', which supports all settings."
-        raise invalid("engine", expected=f"'cpu' with {unsupported}", got=repr(config.engine), cure=cure)
+        raise invalid("engine", expected="'cpu' with frames that have alpha", got=repr(config.engine), cure=cure)
     if config.engine == "pallas":
         pallas.check_options(config.options)
     return config.engine
@@ -47,14 +47,3 @@ def describe_device() -> str:
     """The name of the device that JAX engines compute on, as "NVIDIA H200"."""
     first, *others = jax.local_devices()
     return f"{len(others) + 1} times {first.device_kind}" if others else first.device_kind
-
-
-def _find_unsupported(frames: np.ndarray, config: FitConfig, state: FitState | None) -> str:
-    """A setting that the JAX engines do not support, in words; empty where there is none."""
-    if config.economy is not None:
-        return "an economy"
-    if frames.shape[3] == 4:
-        return "frames that have alpha"
-    if state is not None and (len(state.colors.index) or len(state.shapes.index)):
-        return "a state whose Gaussians share values"
-    return ""

@@ -37,9 +37,9 @@ class InterpolatedFrames:
         chosen, fraction = rng.random() < self.chance, rng.uniform(MARGIN, 1 - MARGIN)
         return fraction if chosen else None
 
-    def interpolate(self, k: int, fraction: float, size: tuple[int, int]) -> Float32[np.ndarray, "height width 3"]:
+    def interpolate(self, k: int, fraction: float) -> Float32[np.ndarray, "height width 3"]:
         """The image at a fraction of the way from frame k to the next; values about [0, 1]."""
-        return self.motion.interpolate(self.frames, k, fraction, size).image * np.float32(1 / 255)
+        return self.motion.interpolate(self.frames, k, fraction, self.frames.shape[1:3]).image * np.float32(1 / 255)
 
 
 def choose_targets(
@@ -64,30 +64,30 @@ class Prefetcher:
         """At most `most` images are kept, by default two for each thread: a process that ends waits for them."""
         self.interpolation, self._most = interpolation, 2 * num_threads() if most is None else most
         self._pool = ThreadPoolExecutor(num_threads(), thread_name_prefix="foldgauss-interpolation")
-        self._images: dict[tuple[int, int, tuple[int, int]], Future] = {}  # by step, frame and size
+        self._images: dict[tuple[int, int], Future] = {}  # by step and frame
 
     @property
     def num_prepared(self) -> int:
         """Number of images that are kept, made or being made."""
         return len(self._images)
 
-    def prepare(self, step: int, progress: float, frames: Iterable[int], size: tuple[int, int]) -> bool:
+    def prepare(self, step: int, progress: float, frames: Iterable[int]) -> bool:
         """Start to make the images that a step needs if these are its frames; False if no more are kept."""
         for k in frames:
             fraction = self.interpolation.choose(step, progress, k)
-            if fraction is not None and (step, k, size) not in self._images:
+            if fraction is not None and (step, k) not in self._images:
                 if len(self._images) >= self._most:
                     return False
-                future = self._pool.submit(self.interpolation.interpolate, k, fraction, size)
-                self._images[step, k, size] = future
+                future = self._pool.submit(self.interpolation.interpolate, k, fraction)
+                self._images[step, k] = future
         return True
 
-    def interpolate(self, step: int, k: int, fraction: float, size: tuple[int, int]) -> np.ndarray:
+    def interpolate(self, step: int, k: int, fraction: float) -> np.ndarray:
         """`InterpolatedFrames.interpolate` of a frame of a step, which was prepared or is made now."""
-        future = self._images.get((step, k, size))
-        return self.interpolation.interpolate(k, fraction, size) if future is None else future.result()
+        future = self._images.get((step, k))
+        return self.interpolation.interpolate(k, fraction) if future is None else future.result()
 
-    def drop(self, step: float) -> None:
+    def drop(self, step: int) -> None:
         """Forget the images of this step and of those before it."""
         for key in [key for key in self._images if key[0] <= step]:
             self._images.pop(key).cancel()

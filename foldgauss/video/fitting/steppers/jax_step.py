@@ -69,7 +69,6 @@ class Program:
     capacity: int
     num_frames: int
     size: tuple[int, int]  # of the images
-    aspect: float  # of the frames: height / width
     degree: int
     power: float
     floor: float
@@ -315,7 +314,7 @@ def _splats(program: Program, rows, maps, t, alive, mirrored) -> Splats2D:
     splats = unpack(rows, program.degree, _envelope(program)).at(t)
     if program.num_paths:
         splats = move_splats(splats, rows[:, -1].astype(jnp.int32), maps)
-    splats = splats.to_pixels(program.size, aspect=program.aspect)
+    splats = splats.to_pixels(program.size)
     # The opposite camera sees left for right.
     sign = jnp.where(mirrored, jnp.float32([-1, 1]), jnp.float32([1, 1]))
     offset = jnp.where(mirrored, jnp.float32([program.size[1], 0]), jnp.float32([0, 0]))

@@ -4,7 +4,6 @@ After each step only `jax_step.Report` is fetched, some hundred numbers. Arrays 
 state, and for densification and relocation, which run on the host.
 """
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -13,15 +12,8 @@ import numpy as np
 
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, most_gaussians
 from foldgauss.video.fitting.densify import grow
-from foldgauss.video.fitting.pruning.relocation import relocate
-from foldgauss.video.fitting.schedule import (
-    RateSchedule,
-    choose_start_frames,
-    find_views_in_turn,
-    plan_levels,
-    shrink_frame,
-    steps_per_pass,
-)
+from foldgauss.video.fitting.relocation import relocate
+from foldgauss.video.fitting.schedule import RateSchedule, choose_start_frames, find_views_in_turn, steps_per_pass
 from foldgauss.video.fitting.state import DeviceArrays, FitState, Sizes, frame_times
 from foldgauss.video.fitting.steppers.interpolated_frames import Prefetcher, choose_targets, make_interpolated
 from foldgauss.video.fitting.steppers.jax_step import (
@@ -54,7 +46,7 @@ class HeldArrays:
 
     def fetch(self, name: str) -> Any:
         kind = _FIELDS[name]
-        if not kind.on_device or (name == "statistics" and not self.growing):
+        if name == "statistics" and not self.growing:
             return kind.build(Sizes(self.num, 0, 0))
         if self.report is not None and name in Report._fields:
             return np.array(getattr(self.report, name))
@@ -77,8 +69,7 @@ class HeldArrays:
 class JaxStepper:
     """A `Stepper` on JAX's default device, or on several where the batch can be divided evenly.
 
-    The programs of all levels are compiled when it is made, before any clock runs, and the frames are kept on the
-    device at the sizes of all levels, as bytes.
+    The program is compiled when it is made, before any clock runs, and the frames are kept on the device, as bytes.
     """
 
     def __init__(
@@ -93,16 +84,14 @@ class JaxStepper:
         self.find_motion = motion_finder(frames) if find_motion is None else find_motion
         self.num_frames, *size = frames.shape[:3]
         self.size = tuple(size)
-        self.levels, self.rates = plan_levels(config, self.size), RateSchedule(config)
-        self.steps_per_pass = steps_per_pass(config, self.num_frames)
+        self.rates, self.steps_per_pass = RateSchedule(config), steps_per_pass(config, self.num_frames)
         self.interpolation = make_interpolated(frames, config, self.find_motion)
         self.prefetcher = None if self.interpolation is None else Prefetcher(self.interpolation)
-        self._prepared, self._prepared_size = 0, self.size  # steps, and the size of their images
-        self._no_targets: dict[tuple[int, int], jax.Array] = {}  # by size
+        self._prepared = 0  # steps
+        self._no_targets: jax.Array | None = None
         self.capacity = 0
         self.adopt(state)
-        place = replicated(self.programs[-1])
-        self.images = [jax.device_put(_shrink_clip(frames, level.size), place) for level in self.levels]
+        self.images = jax.device_put(frames, replicated(self.program))
 
     def adopt(self, state: FitState) -> None:
         """Move a state's arrays to the device, padded to the capacity."""
@@ -111,11 +100,10 @@ class JaxStepper:
         capacity = self._choose_capacity(num)
         if capacity != self.capacity:
             self.capacity = capacity
-            self.programs = [self._program(level.size) for level in self.levels]
-            for program in self.programs:
-                compile_step(program)
+            self.program = self._make_program()
+            compile_step(self.program)
             if state.step == 0 and self.config.initialization == "clip":
-                compile_error(self.programs[-1])
+                compile_error(self.program)
         # Where growth has ended there are statistics nevertheless: without, steps would be compiled anew.
         sizes = Sizes(num, width, self.num_frames, growing=self.config.growth is not None)
 
@@ -128,16 +116,15 @@ class JaxStepper:
 
         arrays = DeviceArrays(*map(padded, DeviceArrays._fields))
         # Copied, since arrays that are donated must be the device's own.
-        arrays = jax.tree.map(lambda leaf: leaf.copy(), jax.device_put(arrays, replicated(self.programs[-1])))
+        arrays = jax.tree.map(lambda leaf: leaf.copy(), jax.device_put(arrays, replicated(self.program)))
         state.hold(HeldArrays(arrays, num, growing, None))
 
-    def step(self, state: FitState, progress: float, level: int = -1) -> StepResult:
+    def step(self, state: FitState, progress: float) -> StepResult:
         if state.changed:  # by an observer of the fit
             state.fetch_all()
             self.adopt(state)
         held, config = state.held, self.config
         rates, time_rate = self.rates.at(progress, state.backoffs)
-        size = self.levels[level].size
         views, fractions = choose_targets(self.interpolation, config, self.num_frames, state, progress)
         control = Control(
             views=views.astype(np.int32),
@@ -146,41 +133,38 @@ class JaxStepper:
             rates=rates,
             time_rate=time_rate,
             path_rate=self.rates.of_paths(progress, state.backoffs),
-            interpolated=self._interpolate(views, fractions, state.step, size),
+            interpolated=self._interpolate(views, fractions, state.step),
         )
-        self._prepare(state, progress, size)
-        arrays, report = compile_step(self.programs[level])(held.arrays, self.images[level], control)
+        self._prepare(state, progress)
+        arrays, report = compile_step(self.program)(held.arrays, self.images, control)
         report = jax.device_get(report)
         state.hold(HeldArrays(arrays, held.num, held.growing, report))
         return StepResult(float(report.loss), int(report.num_alive), state.is_finite("rows"))
 
-    def _interpolate(
-        self, views: np.ndarray, chosen: list[float | None], step: int, size: tuple[int, int]
-    ) -> InterpolatedViews | None:
-        """The interpolated targets of a step, of `size`; None if the fit has none at all."""
+    def _interpolate(self, views: np.ndarray, chosen: list[float | None], step: int) -> InterpolatedViews | None:
+        """The interpolated targets of a step; None if the fit has none at all."""
         if self.interpolation is None:
             return None
         fractions = np.full(len(views), -1.0, np.float32)
-        targets = np.zeros((len(views), *size, 3), np.float32)
+        targets = np.zeros((len(views), *self.size, 3), np.float32)
         for n, (k, fraction) in enumerate(zip(views % self.num_frames, chosen, strict=True)):
             if fraction is not None:
-                fractions[n], targets[n] = fraction, self.prefetcher.interpolate(step, int(k), fraction, size)
+                fractions[n], targets[n] = fraction, self.prefetcher.interpolate(step, int(k), fraction)
         if (fractions < 0).all():  # the device has zeros already
-            if size not in self._no_targets:
-                self._no_targets[size] = jax.device_put(targets, replicated(self.programs[-1]))
-            targets = self._no_targets[size]
+            if self._no_targets is None:
+                self._no_targets = jax.device_put(targets, replicated(self.program))
+            targets = self._no_targets
         return InterpolatedViews(fractions, targets)
 
-    def _prepare(self, state: FitState, progress: float, size: tuple[int, int]) -> None:
+    def _prepare(self, state: FitState, progress: float) -> None:
         """Have the interpolated frames of the next steps prepared."""
         if self.prefetcher is None:
             return
-        self.prefetcher.drop(state.step if size == self._prepared_size else math.inf)
-        first = max(state.step + 1, self._prepared if size == self._prepared_size else 0)
-        self._prepared, self._prepared_size = first, size
-        for step in range(first, state.step + 1 + STEPS_AHEAD):
+        self.prefetcher.drop(state.step)
+        self._prepared = max(state.step + 1, self._prepared)
+        for step in range(self._prepared, state.step + 1 + STEPS_AHEAD):
             views, drawn = find_views_in_turn(self.config, self.num_frames, step)
-            if not self.prefetcher.prepare(step, progress, (views[~drawn] % self.num_frames).tolist(), size):
+            if not self.prefetcher.prepare(step, progress, (views[~drawn] % self.num_frames).tolist()):
                 break
             self._prepared = step + 1
 
@@ -204,16 +188,10 @@ class JaxStepper:
         relocate(state, self.frames, config, spec, self.find_motion() if config.follow_motion else None)
         self.adopt(state)
 
-    def prune(self, state: FitState) -> None:
-        """Nothing: fits with an economy run on the CPU, see `engines.choose_engine`."""
-
-    def trim(self, state: FitState) -> None:
-        """Nothing, as `prune`."""
-
     def measure_start(self, state: FitState) -> dict[int, float]:
         arrays, num = state.held.arrays, np.int32(state.held.num)
         times = np.asarray(frame_times(state.time_logits))
-        error = compile_error(self.programs[-1])
+        error = compile_error(self.program)
         chosen = choose_start_frames(self.num_frames)
         return {int(k): float(error(arrays.rows, arrays.path_maps[k], num, times[k], self.frames[k])) for k in chosen}
 
@@ -230,14 +208,13 @@ class JaxStepper:
             capacity *= 2
         return min(capacity, most)
 
-    def _program(self, size: tuple[int, int]) -> Program:
+    def _make_program(self) -> Program:
         config, devices = self.config, len(jax.local_devices())
         divisors = [n for n in range(1, min(devices, config.batch_size) + 1) if config.batch_size % n == 0]
         return Program(
             capacity=self.capacity,
             num_frames=self.num_frames,
-            size=size,
-            aspect=self.size[0] / self.size[1],
+            size=self.size,
             degree=config.degree,
             power=config.power,
             floor=config.floor,
@@ -263,8 +240,3 @@ def _pad(array: np.ndarray, capacity: int) -> np.ndarray:
     out = np.zeros((capacity, *array.shape[1:]), array.dtype)
     out[: len(array)] = array
     return out
-
-
-def _shrink_clip(frames: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """All frames at a level's size."""
-    return frames if frames.shape[1:3] == size else np.stack([shrink_frame(frame, size) for frame in frames])

@@ -2,7 +2,6 @@
 
 from typing import NamedTuple, Protocol
 
-from foldgauss.video.fitting.schedule import Level
 from foldgauss.video.fitting.state import FitState
 
 
@@ -17,11 +16,10 @@ class StepResult(NamedTuple):
 class Stepper(Protocol):
     """Computes the steps of a fit, and adds and prunes Gaussians between them. Methods change the state in place."""
 
-    levels: list[Level]
     steps_per_pass: int
 
-    def step(self, state: FitState, progress: float, level: int = -1) -> StepResult:
-        """One step with frames of a level, at a fraction of the plan. The step counter is the caller's."""
+    def step(self, state: FitState, progress: float) -> StepResult:
+        """One step at a fraction of the plan. The step counter is the caller's."""
 
     def grow(self, state: FitState) -> None:
         """Densification, pruning and resets of `Growth` that are due at the state's step."""
@@ -29,14 +27,8 @@ class Stepper(Protocol):
     def relocate(self, state: FitState) -> None:
         """Move the Gaussians that matter least to the largest errors."""
 
-    def prune(self, state: FitState) -> None:
-        """The round of pruning of `Economy` that is due at the state's step, if any."""
-
-    def trim(self, state: FitState) -> None:
-        """At the end, prune what the PSNR asked for does not need."""
-
     def adopt(self, state: FitState) -> None:
         """Prepare for a state whose arrays were replaced."""
 
     def measure_start(self, state: FitState) -> dict[int, float]:
-        """Mean squared errors of some frames at full size, by frame."""
+        """Mean squared errors of some frames, by frame."""

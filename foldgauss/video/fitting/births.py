@@ -5,7 +5,7 @@ import math
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss.render import cpu
@@ -15,9 +15,7 @@ from foldgauss.video.fitting.initialize import (
     START_OPACITY,
     SUMMED_OPACITY,
     draw_positions,
-    find_constant,
     make_splats,
-    make_static,
 )
 from foldgauss.video.fitting.schedule import to_planes
 from foldgauss.video.fitting.state import FitState, envelope_of, frame_times, paths_of
@@ -38,13 +36,10 @@ def make_newborns(
     config: FitConfig,
     spec: ConditioningSpec,
     motion: Motion | None,
-    *,
-    with_static: bool,
 ) -> Float32[np.ndarray, "num width"]:
     """Packed rows of `num` Gaussians, at frames and positions drawn by squared error, with the colors of the clip.
 
-    `errors` are the squared errors of the frames, up to a common factor; `spec` is that of whole frames. With
-    `with_static`, Gaussians whose pixel never changes are static.
+    `errors` are the squared errors of the frames, up to a common factor; `spec` is that of whole frames.
     """
     rng = make_generator(Stream.BIRTH, state.step, seed=config.seed)
     times, window, paths = np.asarray(frame_times(state.time_logits)), find_windows(state.rows, spec), paths_of(state)
@@ -52,7 +47,7 @@ def make_newborns(
     home = np.sort(rng.choice(len(frames), num, p=errors / errors.sum()))
 
     def density_of(k: int) -> np.ndarray:
-        squares = _measure_squares(state.rows, window, times[k], *make_target(frames, k, config), spec, config)
+        squares = _measure_squares(state.rows, window, times[k], *_make_target(frames, k, config), spec, config)
         smooth = cv2.GaussianBlur(squares.astype(np.float64), (0, 0), 1.0) + 1e-12
         return smooth / smooth.sum()
 
@@ -60,7 +55,7 @@ def make_newborns(
     opacity = SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY
     shape = config.degree, envelope_of(config)
     splats, _ = make_splats(colors, home, position, times, *shape, motion, rng, opacity, paths)
-    rows = pack(make_static(splats, find_constant(colors, home, position)) if with_static else splats)
+    rows = pack(splats)
     alive = float(np.mean([((window[:, 0] < t) & (t < window[:, 1])).sum() for t in times]))  # in a frame
     size, at = frames.shape[1:3], columns(config.degree)["log_scale"]
     apart = math.sqrt(math.prod(size) / max(alive, 1.0)) / max(size)
@@ -69,7 +64,7 @@ def make_newborns(
     return rows
 
 
-def make_target(
+def _make_target(
     frames: UInt8[np.ndarray, "num_frames height width channels"], k: int, config: FitConfig
 ) -> tuple[Float32[np.ndarray, "3 height width"], Float[np.ndarray, "3"]]:
     """Frame k and the background: with alpha, a random color that is always the same for the frame."""
@@ -91,9 +86,3 @@ def _measure_squares(
     leaves = done.mean, done.factor, done.opacity, done.color, background
     image = cpu.forward(*leaves, spec.size, compositing=config.compositing, options=config.options).image
     return ((image - target) ** 2).sum(0)
-
-
-def shuffle_into(num_old: int, num_new: int, rng: np.random.Generator) -> Int[np.ndarray, "all"]:
-    """A random order of old rows followed by new ones, in which the old rows keep theirs."""
-    place = np.concatenate([np.arange(num_old) + 0.5, rng.uniform(0, num_old, num_new)])
-    return np.argsort(place, kind="stable")

@@ -9,9 +9,9 @@ import scipy
 from jaxtyping import Float, Float32
 
 from foldgauss.video.fitting.adam import BETA2
+from foldgauss.video.fitting.births import make_newborns
 from foldgauss.video.fitting.budget import measure_progress
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.pruning.births import make_newborns
 from foldgauss.video.fitting.schedule import steps_per_pass
 from foldgauss.video.fitting.state import FitState, frame_times
 from foldgauss.video.models.conditioning import ConditioningSpec, find_windows
@@ -25,12 +25,11 @@ _MIN_COUNT = 5
 
 
 def relocates(config: FitConfig) -> bool:
-    """Whether a fit relocates Gaussians: densification and economy add Gaussians themselves.
+    """Whether a fit relocates Gaussians: densification adds Gaussians itself.
 
     Where Adam updates all Gaussians in every step, its moments do not tell which ones matter.
     """
-    adds = config.growth is not None or config.economy is not None
-    return config.relocated_fraction > 0 and not adds and config.sparse_updates
+    return config.relocated_fraction > 0 and config.growth is None and config.sparse_updates
 
 
 def is_relocation_due(state: FitState, config: FitConfig) -> bool:
@@ -57,8 +56,7 @@ def relocate(
         return
     stay = np.ones(len(state.rows), bool)
     stay[np.argsort(influence, kind="stable")[:num]] = False
-    errors = state.frame_errors.astype(float)
-    new = make_newborns(num, state, frames, errors, config, spec, motion, with_static=False)
+    new = make_newborns(num, state, frames, state.frame_errors.astype(float), config, spec, motion)
     state.keep(np.flatnonzero(stay))
     at = columns(config.degree)["time_loc_logit"].start  # depth: among those of their time, which are in its order
     place = np.searchsorted(np.sort(state.rows[:, at]), new[:, at])
@@ -73,9 +71,8 @@ def measure_influence(
     """How much the frames depend on each Gaussian, up to a common factor; infinite where that is not known.
 
     Adam's second moment of the opacity is the mean square of dL/do over the frames where the Gaussian is alive. The
-    signs of the errors in it are about random, so o^2 times it estimates what the Gaussian adds to a frame, as
-    `PruningScores.second_order` does, without another pass over the frames. Gaussians with few steps are
-    not judged; those alive in no frame have none.
+    signs of the errors in it are about random, so o^2 times it estimates what the Gaussian adds to a frame, without
+    another pass over the frames. Gaussians with few steps are not judged; those alive in no frame have none.
     """
     at = columns(degree)["opacity_logit"].start
     opacity = scipy.special.expit(state.rows[:, at].astype(float))
