@@ -21,7 +21,6 @@ COMMANDS = {
     "frames": ["render", "MODEL", "--out"],
     "e.json": ["evaluate", "MODEL", "CLIP", "--json"],
     "c.fgz": ["compress", "MODEL", "--passes", "0", "--out"],
-    "h.safetensors": ["compress", "MODEL", "--float16", "--out"],
     "e.safetensors": ["edit", "MODEL", "SCRIPT", "--out"],
     "m.ply": ["export", "MODEL", "--format", "ply", "--out"],
     "meshes": ["export", "MODEL", "--format", "obj", "--out"],

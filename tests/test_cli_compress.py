@@ -193,14 +193,6 @@ def test_edited_models_are_refused(work, tmp_path, capsys):
     assert not (tmp_path / "e.fgz").exists()
 
 
-@pytest.mark.parametrize(("option", "value"), [("--passes", 3), ("--max-loss-db", 0.5)])
-def test_options_of_compact_files_are_refused_for_others(work, tmp_path, capsys, option, value):
-    arguments = "--float16", "--out", tmp_path / "half.safetensors", option, value
-    assert run("compress", work / "model.safetensors", *arguments) == 2
-    assert f"--float16: expected no {option}, got both" in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
-
-
 def test_the_wrong_clip_is_refused(work, tmp_path, capsys, monkeypatch):
     """Fitted anew to it, the model would be lost; one that a decoder changed by a little is taken."""
     monkeypatch.chdir(tmp_path)

@@ -171,7 +171,7 @@ def here(work, tmp_path, monkeypatch):
         ("render beach.safetensors --times 0.5", "beach.png"),
         ("render beach.safetensors --format webp", "beach-frames"),
         ("edit holiday.safetensors night.toml", "holiday.night.safetensors"),
-        ("compress holiday.safetensors --float16", "holiday.float16.safetensors"),
+        ("compress holiday.safetensors", "holiday.fgz"),
         ("export holiday.safetensors --format ply", "holiday.ply"),
         ("export holiday.safetensors --format ply3dgs", "holiday-3dgs"),
         ("export holiday.safetensors --format ply3dgs --times 0.5", "holiday.3dgs.ply"),
@@ -209,7 +209,6 @@ def test_imports_are_named_after_inputs(here, capsys):
     [
         "render holiday.safetensors --out holiday.safetensors",
         "edit holiday.safetensors night.toml --out holiday.safetensors",
-        "compress holiday.safetensors --float16 --out holiday.safetensors",
         "export holiday.safetensors --format ply --out holiday.safetensors",
         "evaluate holiday.safetensors holiday.mp4 --json holiday.safetensors",
         "evaluate holiday.safetensors holiday.mp4 --json holiday.mp4",

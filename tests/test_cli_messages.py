@@ -110,7 +110,6 @@ WRITING = {
     "edited.safetensors": ["edit", "MODEL", "SCRIPT", "--out", "OUT"],
     "edited.mp4": ["edit", "MODEL", "SCRIPT", "--out", "OUT"],
     "m.fgz": ["compress", "MODEL", "--out", "OUT"],
-    "half.safetensors": ["compress", "MODEL", "--float16", "--out", "OUT"],
     "p.html": ["export", "MODEL", "--format", "html", "--out", "OUT"],
     "m.ply": ["export", "MODEL", "--format", "ply", "--out", "OUT"],
     "scenes": ["export", "MODEL", "--format", "ply3dgs", "--out", "OUT"],

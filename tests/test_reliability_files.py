@@ -116,7 +116,6 @@ OUTPUTS = {
     "frames": ["render", "MODEL", "--out"],
     "e.json": ["evaluate", "MODEL", "CLIP", "--json"],
     "c.fgz": ["compress", "MODEL", "--passes", "0", "--out"],
-    "h.safetensors": ["compress", "MODEL", "--float16", "--out"],
     "e.safetensors": ["edit", "MODEL", "SCRIPT", "--out"],
     "m.ply": ["export", "MODEL", "--format", "ply", "--out"],
     "scenes": ["export", "MODEL", "--format", "ply3dgs", "--out"],

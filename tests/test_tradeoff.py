@@ -1,7 +1,6 @@
 """Speed against accuracy: fronts, knees, plans, and `foldgauss tradeoff` as a user meets it."""
 
 import csv
-import dataclasses
 import errno
 import json
 import math
@@ -21,12 +20,10 @@ from commands import run
 from foldgauss.analysis.plot import Panel, plot_tradeoff
 from foldgauss.cli.measuring import tradeoff as command
 from foldgauss.cli.measuring import tradeoff_record as kept
-from foldgauss.io import load_video_model, read_video, save_video_model, write_video
+from foldgauss.io import load_video_model, read_video, write_video
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.jobs import runner
 from foldgauss.video import FitConfig, evaluate, tradeoff
-from foldgauss.video.fitting.loop import start, to_model
-from foldgauss.video.models.splats import STATIC_LOG_TIME_SCALE
 from foldgauss.video.motion.optical_flow import Motion
 from foldgauss.video.tradeoff import (
     AXES,
@@ -38,7 +35,6 @@ from foldgauss.video.tradeoff import (
     knee,
     pareto_front,
     plan_points,
-    to_half_precision,
 )
 
 SIZE, FRAMES = (24, 32), 6
@@ -183,42 +179,6 @@ def test_axes_by_name():
             check_axes(wrong)
 
 
-def test_half_precision_is_kept_and_widened(tmp_path):
-    rng = np.random.default_rng(0)
-    state = start(rng.integers(0, 256, (3, 16, 16, 3), np.uint8), config := FitConfig(num_gaussians=20))
-    state.rows += 0.01 * rng.standard_normal(state.rows.shape).astype(np.float32)
-    model = to_model(state, config, (16, 16), 25.0)
-    save_video_model(tmp_path / "whole.safetensors", model)
-    save_video_model(tmp_path / "half.safetensors", to_half_precision(model))
-    again = load_video_model(tmp_path / "half.safetensors")
-    for name in ("loc", "coefficients", "color_dc"):
-        leaf = np.asarray(getattr(again.splats, name))
-        assert leaf.dtype == np.float32
-        np.testing.assert_array_equal(leaf, np.asarray(getattr(model.splats, name)).astype(np.float16))
-    np.testing.assert_array_equal(again.frame_times.logits, model.frame_times.logits)
-    saved = [(tmp_path / f"{name}.safetensors").stat().st_size for name in ("whole", "half")]
-    assert saved[0] - saved[1] == pytest.approx(2 * 20 * 17, abs=16)  # but for the header
-    # What is not stored stays exact: powers that are 0, and who lasts.
-    leaves = {
-        name: np.array(getattr(model.splats, name)) for name in ("coefficients", "log_time_scale", "time_loc_logit")
-    }
-    leaves["coefficients"][:, 1:] = 0
-    leaves["log_time_scale"][:5], leaves["time_loc_logit"][:5] = STATIC_LOG_TIME_SCALE, 0
-    lean = dataclasses.replace(model, splats=dataclasses.replace(model.splats, **leaves))
-    save_video_model(tmp_path / "lean.safetensors", to_half_precision(lean))
-    again = load_video_model(tmp_path / "lean.safetensors")
-    assert (again.splats.degrees == 1).all()
-    np.testing.assert_array_equal(again.splats.static, lean.splats.static)
-    assert again.splats.static.sum() == 5
-    # A leaf with a number beyond 16 bits keeps its 32.
-    leaves["coefficients"][3, 0, 0] = 1e5
-    steep = dataclasses.replace(model, splats=dataclasses.replace(model.splats, **leaves))
-    save_video_model(tmp_path / "steep.safetensors", to_half_precision(steep))
-    again = load_video_model(tmp_path / "steep.safetensors")
-    np.testing.assert_array_equal(again.splats.coefficients, leaves["coefficients"])
-    np.testing.assert_array_equal(again.splats.loc, np.asarray(model.splats.loc).astype(np.float16))
-
-
 def test_plot():
     pyplot = pytest.importorskip("matplotlib.pyplot", reason="matplotlib is an optional extra")
     pyplot.switch_backend("Agg")
@@ -268,8 +228,7 @@ def test_everything_is_there(done, clip):
     assert rows["degree 0"]["floats"] == base.num_parameters - 6 * base.num_gaussians
     assert rows["cutoff radius 2, played"]["psnr"] != rows["base"]["psnr"]
     assert rows["cutoff radius 2, played"]["seconds"] == rows["base"]["seconds"]
-    saved = rows["base"]["bytes"] - rows["precision float16"]["bytes"]
-    assert saved == pytest.approx(2 * base.num_parameters, rel=0.02)  # what a file has besides is small
+    assert rows["precision compact"]["bytes"] < rows["base"]["bytes"]
 
 
 def test_commands_reproduce_their_points(done, tmp_path, monkeypatch):
@@ -277,7 +236,7 @@ def test_commands_reproduce_their_points(done, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     rows = {name_of(row): row for row in record_of(done)["points"]}
     chosen = ["batch 2", "cutoff stop 0.1, fitted", "cutoff alpha 1/32, played"]
-    for name in [*chosen, "precision float16", "precision compact"]:
+    for name in [*chosen, "precision compact"]:
         words = shlex.split(rows[name]["command"])
         assert words[0] == "foldgauss"
         more = ["--json", "scores.json", "--overwrite"] if words[1] == "evaluate" else []
@@ -407,12 +366,12 @@ def test_a_point_that_fails_is_left_out(clip, tmp_path, capsys, monkeypatch):
         assert run("tradeoff", clip, "--out", tmp_path / "r", "--axes", "precision", *QUICK) == 0
     assert "precision compact is left out: max_loss_db: out of reach" in " ".join(capsys.readouterr().err.split())
     record = record_of(tmp_path / "r")
-    assert [name_of(row) for row in record["points"]] == ["base", "precision float16"]
+    assert [name_of(row) for row in record["points"]] == ["base"]
     assert set(record["left_out"]) == {"precision compact", "precision compact, finetuned"}
     quick = command.compress
     monkeypatch.setattr(command, "compress", lambda *given, **more: quick(*given, **more | {"passes": 0}))
     assert run("tradeoff", clip, "--out", tmp_path / "r", "--axes", "precision", *QUICK) == 0  # tried again
-    assert len(record_of(tmp_path / "r")["points"]) == 4
+    assert len(record_of(tmp_path / "r")["points"]) == 3
     assert record_of(tmp_path / "r")["left_out"] == {}
 
 
@@ -577,19 +536,3 @@ def test_render_with_other_constants(done, tmp_path):
         assert run("render", done / "base.safetensors", "--out", path, "--times", 0.5, *options) == 0
     pictures = [cv2.imread(str(tmp_path / f"{name}.png")).astype(int) for name in ("own", "fast")]
     assert np.abs(pictures[0] - pictures[1]).max() > 5
-
-
-@pytest.mark.parametrize(
-    ("options", "told"),
-    [
-        (["--out", "m.fgz"], "--out: expected a name for the model"),
-        ([], ""),
-    ],
-)
-def test_compress_to_16_bits_without_the_clip(done, tmp_path, monkeypatch, capsys, options, told):
-    monkeypatch.chdir(tmp_path)
-    assert run("compress", done / "base.safetensors", "--float16", *options) == (2 if told else 0)
-    assert told in " ".join(capsys.readouterr().err.split())
-    if not told:
-        assert [path.name for path in tmp_path.iterdir()] == ["base.float16.safetensors"]
-        assert "mean_psnr" not in read_metadata("base.float16.safetensors")

@@ -14,17 +14,16 @@ from foldgauss.render import RenderOptions
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.models.renderer import VideoRenderer
-from foldgauss.video.models.sparse_storage import to_stored
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
-#: How parameters are stored: as they are, rounded to 16 bits, or in a compact file (`foldgauss.video.compress`) with
-#: this many passes of fine-tuning and a loss of at most `MAX_LOSS_DB`.
-FLOAT32, FLOAT16 = "float32", "float16"
+#: How parameters are stored: as they are, or in a compact file (`foldgauss.video.compress`) with this many passes of
+#: fine-tuning and a loss of at most `MAX_LOSS_DB`.
+FLOAT32 = "float32"
 PASSES: Mapping[str, int] = MappingProxyType({"compact": 0, "compact, finetuned": 4})
 MAX_LOSS_DB = 0.2
 #: Cost of compression in steps of a fit per frame, as measured.
-_COMPRESSION_STEPS = {FLOAT32: 0.0, FLOAT16: 0.0, "compact": 4.0, "compact, finetuned": 18.0}
+_COMPRESSION_STEPS = {FLOAT32: 0.0, "compact": 4.0, "compact, finetuned": 18.0}
 #: Fewer steps do not show what a setting is worth.
 LEAST_STEPS = 200
 #: A point of the front is better than all cheaper ones by more than this, in dB.
@@ -94,7 +93,7 @@ AXES: Mapping[str, tuple[Variant, ...]] = MappingProxyType(
             Variant("4", fit={"batch_size": 4}, scale={"steps": 1 / 4}),
         ),
         "cutoff": _cutoffs(),
-        "precision": tuple(Variant(stored, stored=stored) for stored in (FLOAT16, *PASSES)),
+        "precision": tuple(Variant(stored, stored=stored) for stored in PASSES),
         "power": (Variant("0", fit={"power": 0.0}), Variant("2", fit={"power": 2.0})),
         "compositing": (Variant("sum", fit={"compositing": "sum"}, work=0.85),),
         "ssim": (Variant("0", fit={"ssim_fraction": 0.0}, work=0.85), Variant("0.5", fit={"ssim_fraction": 0.5})),
@@ -242,24 +241,6 @@ def knee(cost: Sequence[float], quality: Sequence[float]) -> int | None:
     above = (y - y[0]) / (y[-1] - y[0]) - (x - x[0]) / (x[-1] - x[0])
     best = int(np.argmax(above))
     return best if above[best] > 1e-9 else None
-
-
-def to_half_precision(model: VideoModel) -> VideoModel:
-    """The model with 16-bit parameters, for a file of about half the size.
-
-    Its splats are in stored form (`to_stored`) with NumPy float16 leaves, which the reader of model files converts back
-    to float32. Frame times, the envelope, and leaves with values beyond 65,504 stay in float32.
-    """
-    splats, short = to_stored(model.splats), {}
-    for field in dataclasses.fields(splats):
-        leaf = getattr(splats, field.name)
-        if field.name == "envelope" or getattr(leaf, "dtype", None) != np.float32:
-            continue
-        with np.errstate(over="ignore"):
-            half = np.asarray(leaf).astype(np.float16)
-        if np.isfinite(half).all():
-            short[field.name] = half
-    return dataclasses.replace(model, splats=dataclasses.replace(splats, **short))
 
 
 def measure_frame_seconds(*models: VideoModel | EditedVideo) -> list[float]:

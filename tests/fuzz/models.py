@@ -32,7 +32,6 @@ from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.fitting.state import FitState
 from foldgauss.video.models.shared_paths import SharedPaths
-from foldgauss.video.models.splats import OPAQUE_LOGIT, STATIC_LOG_TIME_SCALE
 from foldgauss.video.selection.selectors import Selection
 
 from .branches import ONLY
@@ -40,10 +39,8 @@ from .mutate import by_chance, json_changed, json_text_changed
 from .target import CONSTANT, Target, chance
 
 
-def tiny_model(
-    num: int = 3, degree: int = 1, *, plain: bool = True, shared: bool = False, frames: int = 3, seed: int = 0
-) -> VideoModel:
-    """Some Gaussians; not `plain`: with all that the stored form leaves out or shares; `shared`: of one color."""
+def tiny_model(num: int = 3, degree: int = 1, *, frames: int = 3, seed: int = 0) -> VideoModel:
+    """Some Gaussians, of which every other one is at rest where there are many."""
     rng = np.random.default_rng(seed)
 
     def normal(*shape: int) -> np.ndarray:
@@ -53,14 +50,8 @@ def tiny_model(
         "loc": normal(2), "log_scale": normal(2) - 2, "angle_logit": normal(), "time_loc_logit": normal(),
         "log_time_scale": normal(), "coefficients": normal(degree, 2), "opacity_logit": normal(), "color_dc": normal(3),
     }  # fmt: skip
-    if shared:
-        leaves["color_dc"][:] = leaves["color_dc"][0]
-    if not plain:
-        lasting = np.arange(num) % 2 == 0
-        leaves["coefficients"][lasting] = 0
-        leaves["time_loc_logit"][lasting], leaves["log_time_scale"][lasting] = 0, STATIC_LOG_TIME_SCALE
-        leaves["opacity_logit"][: num // 2] = OPAQUE_LOGIT
-        leaves["color_dc"][:], leaves["log_scale"][: num - 1] = leaves["color_dc"][0], leaves["log_scale"][0]
+    if num > 8:
+        leaves["coefficients"][::2] = 0
     splats = FoldedSplats(**leaves, envelope=TimeLikelihood(np.float32(2), np.float32(0)))
     return VideoModel(splats, FrameTimes.uniform(frames), (4, 6), 25.0, RenderOptions(), "over")
 
@@ -142,8 +133,7 @@ def resized(data: bytes, random: Random) -> bytes:
         for name, one in header.items():
             if name != "__metadata__":
                 shape = [new if n == old else n for n in one["shape"]]
-                size = {"F": 4, "I": 4, "U": 1, "B": 1}[one["dtype"][0]] if one["dtype"] != "F16" else 2
-                num = size
+                num = {"F": 4, "I": 4, "U": 1, "B": 1}[one["dtype"][0]]
                 for n in shape:
                     num *= n
                 entries[name] = {"dtype": one["dtype"], "shape": shape, "data_offsets": [start, start + num]}
@@ -156,30 +146,7 @@ def resized(data: bytes, random: Random) -> bytes:
     return sealed(entries, (tensors * (room // max(1, len(tensors)) + 1))[:room] if tensors else bytes(room))
 
 
-def halved(data: bytes, random: Random) -> bytes:
-    """Some tensors of single precision kept in half."""
-    parts = unsealed(data)
-    if parts is None:
-        return by_chance(data, random)
-    header, tensors = parts
-    try:
-        entries, kept, start = {"__metadata__": header.get("__metadata__", {})}, [], 0
-        for name, one in header.items():
-            if name == "__metadata__":
-                continue
-            own, kind = tensors[slice(*one["data_offsets"])], one["dtype"]
-            if kind == "F32" and random.randrange(2):
-                with np.errstate(all="ignore"):
-                    own, kind = np.frombuffer(own, "<f4").astype("<f2").tobytes(), "F16"
-            entries[name] = {"dtype": kind, "shape": one["shape"], "data_offsets": [start, start + len(own)]}
-            kept.append(own)
-            start += len(own)
-    except (KeyError, TypeError, ValueError, AttributeError, RecursionError):
-        return by_chance(data, random)
-    return sealed(entries, b"".join(kept))
-
-
-_MODEL_MUTATIONS = (facts_changed, table_changed, resized, halved)
+_MODEL_MUTATIONS = (facts_changed, table_changed, resized)
 #: `_array_leaves` refuses models that are saved; what is loaded comes with the shapes of a skeleton.
 _MODEL_FILE = {
     "foldgauss.io.models.model_file": (
@@ -200,13 +167,12 @@ def _edited():
 
 
 def _video_seeds() -> list[bytes]:
-    models = [tiny_model(), tiny_model(degree=0, frames=1), tiny_model(16, 3, plain=False), _edited()]
+    models = [tiny_model(), tiny_model(degree=0, frames=1), tiny_model(16, 3), _edited()]
     models.append(dataclasses.replace(_edited(), camera=None))
-    models.append(tiny_model(16, 1, shared=True))
     joined = [
         (0, tiny_model(seed=2)),
         (2, dataclasses.replace(_edited(), camera=None)),
-        (5, tiny_model(8, 3, plain=False)),
+        (5, tiny_model(8, 3)),
     ]
     models += [SegmentedVideo.from_models(joined), SegmentedVideo.from_models([(0, tiny_model(degree=0, frames=1))])]
     return [
@@ -243,9 +209,6 @@ VIDEO = Target(
         "foldgauss.io.models.segmented": (
             "join_segments", "save_segmented", "is_segmented", "_source", "_unfit", "load",
         ),
-        "foldgauss.video.models.sparse_storage": (
-            "to_stored", "stored_counts", "clear_absent_moments", "_is_regular", "_by_kind", "_by_index", "_num_bytes",
-        ),
     },
     tensors_from,
     lambda size: 2 * CONSTANT + 400 * size,
@@ -267,7 +230,7 @@ def _checkpoint_seeds() -> list[bytes]:
     kept, state = [], None
     for statistics in (None, GradientStatistics(floats(num), floats(num), counts)):
         state = FitState.create(
-            floats(num, width), np.zeros(num, np.uint8), floats(2), counts=counts, first=floats(num, width),
+            floats(num, width), floats(2), counts=counts, first=floats(num, width),
             second=floats(num, width), frame_errors=floats(3), statistics=statistics,
             step=5, plan=100, seconds=1.5, last_finite=state, start_errors=((0, 0.1),),
         )  # fmt: skip
@@ -285,7 +248,7 @@ CHECKPOINT = Target(
     | {
         "foldgauss.io.models.video_model": (
             "save_video_model", "check_model_name", "load_video_model", "read_metadata", "read_origin",
-            "_is_range", "_with_splats", "_describe_video", "_video_skeleton", "_describe_edited",
+            "_is_range", "_check_video", "_describe_video", "_video_skeleton", "_describe_edited",
             "_describe_layer", "_describe_camera", "_edited_skeleton", "_layer_skeleton", "_camera_skeleton",
         ),
         "foldgauss.io.models.checkpoint": ("save_checkpoint", "_describe"),
@@ -345,14 +308,14 @@ def _quantised() -> tuple:
     found = []
     for model, cells in (
         (tiny_model(), (0, 0, 0)),
-        (tiny_model(16, 3, plain=False), (1, 1, 1)),
+        (tiny_model(16, 3), (1, 1, 1)),
         (tiny_model(4, 0, frames=1), (1, 0, 1)),
         (_on_paths(tiny_model(8, 1), (0.0, 0.5, 1.0)), (1, 0, 1)),
         (_on_paths(tiny_model(8, 1), (-0.5, 2.0)), (1, 0, 1)),
     ):
         described = compute_columns(model)
-        names = column_names(model.degree, described.info.shared)
-        rules = {name: Rule(0.5 if name == "time" else 0.0, -6.0, (0.1,)) for name in names if not is_integral(name)}
+        names = (name for name in column_names(model.degree) if not is_integral(name))
+        rules = {name: Rule(0.5 if name == "time" else 0.0, -6.0, (0.1,)) for name in names}
         described = dataclasses.replace(described, info=dataclasses.replace(described.info, cells=cells))
         found.append(quantize(described, np.arange(model.num_gaussians, dtype=np.int32) % 4, rules))
     return tuple(found)

@@ -216,7 +216,6 @@ CLAIMS = {
     "compact: frames": ("compact", lambda: _compact(num_frames=HUGE)),
     "compact: cells": ("compact", lambda: _compact(cells=[24, 24, 24])),
     "compact: degree": ("compact", lambda: _compact(degree=HUGE)),
-    "compact: colors": ("compact", lambda: _compact(shared=HUGE)),
     "compact: paths": ("compact", lambda: _compact(4, {"num_paths": HUGE})),
     "compact: most paths": ("compact", lambda: _compact(4, {"num_paths": 255, "num_knots": 2**15})),
     "compact: knots": ("compact", lambda: _compact(4, {"num_knots": HUGE})),

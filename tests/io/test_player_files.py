@@ -40,30 +40,14 @@ from foldgauss.render import Camera, Gaussians3D, RenderOptions, project, render
 from foldgauss.video.models.renderer import VideoRenderer
 
 
-def thinned():
-    """A model whose file leaves out parameters: static and opaque Gaussians, shared colors, several degrees."""
-    model = soft_model(options=RenderOptions())
-    leaves = {
-        name: np.array(getattr(model.splats, name)) for name in ("time_loc_logit", "log_time_scale", "opacity_logit")
-    }
-    leaves["time_loc_logit"][::2], leaves["log_time_scale"][::2] = 0, np.log(np.float32(1024))
-    leaves["opacity_logit"][::3] = 8
-    color, coefficients = np.array(model.splats.color_dc), np.array(model.splats.coefficients)
-    color[:] = color[np.arange(NUM) % 4]
-    coefficients[::2] = 0
-    splats = dataclasses.replace(model.splats, **leaves, color_dc=color, coefficients=coefficients)
-    return dataclasses.replace(model, splats=splats)
-
-
 def test_the_empty_page_opens_any_model(opened, compact, tmp_path):
     bare = opened(None, fresh=True)
     assert bare.page.locator("#notice-open").is_visible()
     assert not bare.page.locator("#transport").is_visible()  # there is nothing to play
     model = soft_model(options=RenderOptions(), seed=3)
     save_video_model(tmp_path / "plain.safetensors", model)
-    save_video_model(tmp_path / "thin.safetensors", thinned())
     export(model, "ply", tmp_path / "vegas.ply")
-    for path in (tmp_path / "plain.safetensors", compact, tmp_path / "thin.safetensors", tmp_path / "vegas.ply"):
+    for path in (tmp_path / "plain.safetensors", compact, tmp_path / "vegas.ply"):
         bare.page.evaluate("window.foldgauss.seek = null")
         drop(bare, path)
         bare.until(f"foldgauss.seek && document.title === '{path.stem}'")

@@ -28,29 +28,16 @@ from foldgauss.io.models.model_file import read_header
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.video import FrameTimes, SegmentedVideo, Selection, edit, layers
 from foldgauss.video.models.renderer import VideoRenderer
-from foldgauss.video.models.splats import OPAQUE_LOGIT, STATIC_LOG_TIME_SCALE
-from foldgauss.video.tradeoff import to_half_precision
 
 FIRSTS, LENGTHS = (0, 4, 13), (7, 9, 5)
-
-
-def ragged(model):
-    """With kinds, shared colors and shapes: stored in another form than it has in memory."""
-    splats, lasting = model.splats, np.arange(NUM) % 2 == 0
-    leaves = {name: np.array(getattr(splats, name)) for name in ("time_loc_logit", "log_time_scale", "coefficients")}
-    leaves["time_loc_logit"][lasting], leaves["log_time_scale"][lasting] = 0, STATIC_LOG_TIME_SCALE
-    leaves["coefficients"][:, 1:] = 0
-    leaves["opacity_logit"] = np.where(lasting, OPAQUE_LOGIT, np.asarray(splats.opacity_logit))
-    leaves["color_dc"] = np.asarray(splats.color_dc)[np.arange(NUM) % 3]
-    return dataclasses.replace(model, splats=dataclasses.replace(splats, **leaves))
 
 
 def models():
     plain, other, last = (soft_model(seed=k, num_frames=num) for k, num in enumerate(LENGTHS))
     logits = 0.3 * np.random.default_rng(0).standard_normal(8).astype(np.float32)
-    edited = edit(ragged(other)).select(np.arange(NUM) < 12).move((0.1, 0.0), times=(0.2, 0.7)).video()
+    edited = edit(other).select(np.arange(NUM) < 12).move((0.1, 0.0), times=(0.2, 0.7)).video()
     edited = layers(edited, dataclasses.replace(soft_model(seed=9, num_frames=9), frame_times=FrameTimes(logits)))
-    return [plain, edited, ragged(last)]
+    return [plain, edited, last]
 
 
 @pytest.fixture(scope="module")
@@ -122,15 +109,6 @@ def test_saved_again_it_has_the_same_bytes(work, tmp_path):
     save_video_model(tmp_path / "made.safetensors", in_memory)
     for one, other in zip(load_video_model(tmp_path / "made.safetensors").segments, video.segments, strict=True):
         same(one.model, other.model)
-
-
-def test_halves_are_kept_as_halves(tmp_path):
-    save_video_model(tmp_path / "half.safetensors", to_half_precision(soft_model()))
-    join_segments(tmp_path / "long.safetensors", [(0, tmp_path / "half.safetensors")])
-    kinds = {spec["dtype"] for spec in read_header(tmp_path / "long.safetensors")["tensors"].values()}
-    assert "F16" in kinds
-    half = load_video_model(tmp_path / "half.safetensors")
-    same(load_video_model(tmp_path / "long.safetensors").segments[0].model, half)
 
 
 def test_more_than_ten_segments_keep_their_order(tmp_path):
@@ -359,7 +337,7 @@ def test_facts_that_make_no_sense_are_refused_of_one_segment_too(name, value, wo
     "change",
     [
         setting("segments", 2, "header", "envelope", to="Other"),
-        setting("segments", 2, "header", "stored", to={"powers": 3}),
+        setting("segments", 2, "header", "degree", to=4),
         lambda header, outer: outer.update({"segments.2.splats.more": outer.pop("segments.2.splats.angle_logit")}),
     ],
 )

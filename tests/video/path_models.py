@@ -10,7 +10,6 @@ from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions
 from foldgauss.video import FoldedSplats, FrameTimes, VideoModel
 from foldgauss.video.models.shared_paths import SharedPaths
-from foldgauss.video.models.splats import STATIC_LOG_TIME_SCALE
 
 SCENE_SIZE, SCENE_FRAMES, SCENE_FPS = (96, 160), 12, 12.0
 #: A third of the Gaussians, of the object and of the background, on each of two paths, and a third on none.
@@ -62,7 +61,7 @@ def scene(frame_times=None, num=1500, wide=2.0, scales=(0.01, 0.05), compositing
         "log_scale": np.log(rng.uniform(*scales, (num, 2))),
         "angle_logit": rng.normal(size=num),
         "time_loc_logit": np.zeros(num),
-        "log_time_scale": np.full(num, STATIC_LOG_TIME_SCALE),
+        "log_time_scale": np.full(num, np.log(1024)),
         "coefficients": np.zeros((num, 1, 2)),
         "opacity_logit": np.full(num, logit(0.98)),
         "color_dc": rng.normal(size=(num, 3)),

@@ -18,7 +18,6 @@ from foldgauss.video.fitting.adam import (
 )
 from foldgauss.video.models.frame_times import FrameTimes, make_time_logits
 from foldgauss.video.models.row_layout import columns
-from foldgauss.video.models.sparse_storage import OPAQUE_BIT, STATIC_BIT
 
 
 @pytest.mark.parametrize("width", [11, 17, 25])
@@ -95,7 +94,7 @@ def test_all_implementations_take_the_same_steps():
     """The rule in NumPy, its twins in Numba and JAX, and optax, over several steps."""
     rng, num, width = np.random.default_rng(0), 60, 17
     rows = rng.normal(size=(num, width)).astype(np.float32)
-    rates, kinds = rng.uniform(1e-3, 1e-1, width).astype(np.float32), np.full(num, 3, np.uint8)
+    rates = rng.uniform(1e-3, 1e-1, width).astype(np.float32)
     zeros = np.zeros_like(rows), np.zeros_like(rows), np.zeros(num, np.int32)
     own, sparse, masked = ([rows.copy(), *(part.copy() for part in zeros)] for _ in range(3))
     by_optax, moments = rows.copy(), FRAME_TIME_ADAM.init(rows)
@@ -105,7 +104,7 @@ def test_all_implementations_take_the_same_steps():
         change, *own[1:3] = adam_step(grad, *own[1:], rates)
         own[0] -= change.astype(np.float32)
         sparse_adam(sparse[0], grad.copy(), *sparse[1:], np.arange(num), rates)
-        masked = masked_adam(masked[0], grad, *masked[1:], np.ones(num, bool), rates, kinds=kinds, units=RateUnits())
+        masked = masked_adam(masked[0], grad, *masked[1:], np.ones(num, bool), rates, units=RateUnits())
         with jax.numpy_dtype_promotion("standard"):
             update, moments = FRAME_TIME_ADAM.update(grad, moments)
         by_optax -= rates * np.asarray(update)
@@ -117,20 +116,17 @@ def test_all_implementations_take_the_same_steps():
 
 @pytest.mark.parametrize("units", [RateUnits(), RateUnits(0.06, 0.01)])
 def test_masked_adam_matches_sparse_adam(units):
-    """Rows of all kinds, after any number of steps; those that took no part stay to the bit."""
+    """After any number of steps; rows that took no part stay to the bit."""
     rng, num, width = np.random.default_rng(0), 400, 17
     rows, grad, first = (rng.normal(size=(num, width)).astype(np.float32) for _ in range(3))
     second = (rng.normal(size=(num, width)) ** 2).astype(np.float32)
     counts = rng.integers(0, 30_000, num).astype(np.int32)
     counts[:50] = np.arange(50)
-    kinds = rng.integers(0, 4, num).astype(np.uint8) + STATIC_BIT * rng.integers(0, 2, num).astype(np.uint8)
-    kinds |= (OPAQUE_BIT * rng.integers(0, 2, num)).astype(np.uint8)
     touched, rates = rng.random(num) < 0.7, rng.random(width).astype(np.float32)
     arrays = rows, grad, first, second, counts
-    how = {"kinds": kinds, "units": units}
-    own = jax.jit(lambda *arrays: masked_adam(*arrays, touched, rates, **how))(*arrays)
+    own = jax.jit(lambda *arrays: masked_adam(*arrays, touched, rates, units=units))(*arrays)
     judge = [array.copy() for array in arrays]
-    sparse_adam(*judge, np.flatnonzero(touched), rates, **how)
+    sparse_adam(*judge, np.flatnonzero(touched), rates, units=units)
     for one, other, before in zip(own, (judge[0], *judge[2:]), (rows, *arrays[2:]), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
         np.testing.assert_array_equal(np.asarray(one)[~touched], before[~touched])

@@ -257,7 +257,7 @@ def run(config, kept=None):
     numbers = []
     for state, info in fit_steps(FRAMES, config, kept):
         numbers.append(info.num_gaussians)
-        parts = (state.rows, state.first, state.second, state.counts, state.kinds)
+        parts = (state.rows, state.first, state.second, state.counts)
         assert len({len(part) for part in parts}) == 1
     return numbers, state
 

@@ -25,7 +25,6 @@ from foldgauss.video.models.shared_paths import MAX_PATHS, SharedPaths
 from foldgauss.video.segmented.flatten import flatten_video
 from foldgauss.video.segmented.segmented_video import Segment
 from foldgauss.video.selection.contributions import Contributions
-from foldgauss.video.tradeoff import to_half_precision
 
 MODEL = path_model()
 
@@ -142,13 +141,6 @@ def test_files_of_edited_videos_segments_and_selections(tmp_path):
     np.testing.assert_array_equal(load_selection(path, MODEL).mask, OBJECT)
     with pytest.raises(ValueError, match="a selection of this model"):
         load_selection(path, path_model(seed=8))
-
-
-def test_half_precision_keeps_paths(tmp_path):
-    half = to_half_precision(MODEL)
-    again = load_video_model(save_video_model(tmp_path / "half.safetensors", half)).splats
-    np.testing.assert_array_equal(again.paths.matrices, MODEL.splats.paths.matrices)
-    np.testing.assert_array_equal(again.path_index, INDEX)
 
 
 def test_frames_for_other_programs_are_those_of_the_model(tmp_path):

@@ -28,6 +28,7 @@ def test_parameters_are_counted_as_stored(made):
     assert [model.num_gaussians for model in made.models] == [41, 41, 40, 40, 40]
     for model in made.models:
         assert model.degree == 0
+        assert model.num_parameters == 11 * model.num_gaussians
 
 
 def test_result_evaluates_like_a_video_model(made):

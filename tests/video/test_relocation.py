@@ -16,7 +16,6 @@ from foldgauss.video.fitting.state import frame_times
 from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
 from foldgauss.video.models.conditioning import ConditioningSpec, condition
 from foldgauss.video.models.row_layout import columns
-from foldgauss.video.models.sparse_storage import OPAQUE_BIT
 from foldgauss.video.motion.optical_flow import motion_finder
 
 FRAMES = moving_blobs()
@@ -76,12 +75,9 @@ def test_new_gaussians_are_where_errors_are():
 
 
 def test_only_gaussians_that_can_be_judged_move():
-    """Of 20, half; opaque ones and those with few steps stay."""
+    """Of 20, half; those with few steps stay."""
     state = fitted_state()
-    opacity = columns(CONFIG.degree)["opacity_logit"].start
-    state.kinds[:240] |= OPAQUE_BIT
-    state.rows[:240, opacity] = 30
-    state.counts[240:280] = 4
+    state.counts[:280] = 4
     before = state.rows.copy()
     relocate(state, FRAMES, dataclasses.replace(CONFIG, relocated_fraction=0.5), SPEC, None)
     kept = {row.tobytes() for row in state.rows}

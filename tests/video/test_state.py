@@ -105,9 +105,9 @@ def test_keep_cuts_every_per_gaussian_array():
 
 def test_extend_fills_every_per_gaussian_array():
     state, before = make_state(), make_state()
-    rows, kinds = np.full((2, WIDTH), 5, np.float32), np.full(2, 3, np.uint8)
-    state.extend(rows, kinds)
-    given = {"rows": rows, "kinds": kinds}
+    rows = np.full((2, WIDTH), 5, np.float32)
+    state.extend(rows)
+    given = {"rows": rows}
     for name, kind in FitState.array_fields().items():
         if isinstance(kind, PerGaussian):
             new = given.get(name, kind.build(Sizes(2, WIDTH, FRAMES)))
@@ -125,12 +125,12 @@ class Extended(FitState):
 
 def test_a_new_array_is_added_in_one_place():
     rows, logits = np.zeros((3, WIDTH), np.float32), np.zeros(FRAMES - 1, np.float32)
-    state = Extended.create(rows, np.zeros(3, np.uint8), logits)
+    state = Extended.create(rows, logits)
     assert state.birthday.shape == (3, 2, WIDTH)
     assert state.birthday.dtype == np.int16
     state.birthday[1] = 7
     state.keep(np.array([1, 2]))
-    state.extend(rows[:1], np.zeros(1, np.uint8))
+    state.extend(rows[:1])
     assert state.birthday[:, 0, 0].tolist() == [7, -1, -1]
     state.last_finite = state.copy()
     state.birthday[:] = 0

@@ -108,7 +108,6 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
                 "Smaller still, at a loss of half a dB",
                 "foldgauss compress holiday.safetensors holiday.mp4 --max-loss-db 0.5",
             ),
-            Example("Half the bytes, at once", "foldgauss compress holiday.safetensors --float16"),
         ),
         "export": (
             Example("As a web page with a player, holiday.html", "foldgauss export holiday.safetensors --format html"),

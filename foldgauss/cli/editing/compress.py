@@ -2,7 +2,6 @@
 
 import math
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,28 +14,21 @@ from foldgauss.cli.app.completion import complete_clips
 from foldgauss.cli.shared.arguments import FittedFrames, ModelFile, Overwrite
 from foldgauss.cli.shared.clips import is_other_clip, read_fitted_clip, refuse_segments
 from foldgauss.cli.shared.outputs import refuse_existing, refuse_inputs, write_result
-from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import print_figures
 from foldgauss.io._atomic import check_writable, resolve
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.compact import COMPACT_SUFFIX, check_compact_name, save_compact
 from foldgauss.io.models.video_model import (
     CLIP_NOTES,
-    MODEL_SUFFIX,
-    check_model_name,
     keep_origin,
     load_video_model,
     read_origin,
-    save_video_model,
 )
-from foldgauss.jobs.runner import mean_scores
 from foldgauss.video.compression.search import Compressed, compress
-from foldgauss.video.models.metrics import Evaluation, evaluate
+from foldgauss.video.models.metrics import evaluate
 from foldgauss.video.models.video_model import VideoModel
-from foldgauss.video.tradeoff import to_half_precision
 
 MAX_LOSS_DB, PASSES = 0.2, 48
-Score = Callable[[VideoModel], Evaluation]
 #: Passes over the frames in all, in units of --passes.
 USUAL_PASSES = 5
 #: Fine-tuning that is better than the model by more dB than this causes a warning.
@@ -65,10 +57,6 @@ def compress_command(
         ),
     ] = PASSES,
     frames: FittedFrames = None,
-    float16: Annotated[
-        bool,
-        typer.Option("--float16", help=f"Only round to 16 bits, into a {MODEL_SUFFIX} file of about half the size."),
-    ] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Write a model as a compact file, a fraction of its size.
@@ -76,17 +64,13 @@ def compress_command(
     It can be rendered, evaluated, edited and exported like any model. It loses at most --max-loss-db of PSNR; without
     VIDEO, this is an estimate. See docs/compress.md.
     """
-    suffix = f".float16{MODEL_SUFFIX}" if float16 else COMPACT_SUFFIX
-    target = Path(f"{resolve(model_path).stem}{suffix}") if out_path is None else out_path
+    target = Path(f"{resolve(model_path).stem}{COMPACT_SUFFIX}") if out_path is None else out_path
     try:
-        check_model_name(target, "--out") if float16 else check_compact_name(target, "--out")
+        check_compact_name(target, "--out")
     except ValueError as error:
         raise WrongUse(str(error)) from error
     if not is_within(max_loss_db, "(0, 60]"):
         raise wrong_use("--max-loss-db", expected="a loss in (0, 60] dB", got=max_loss_db)
-    if float16 and (passes != PASSES or max_loss_db != MAX_LOSS_DB):
-        name = "--passes" if passes != PASSES else "--max-loss-db"
-        raise wrong_use("--float16", expected=f"no {name}", got="both; parameters are only rounded")
     if frames is not None and video is None:
         raise wrong_use("--frames", expected="a VIDEO to take them from", got="none")
     if passes not in (0, PASSES) and video is None:
@@ -104,10 +88,7 @@ def compress_command(
         cure = "Give that clip, or none: there is no fine-tuning then."
         got = f"{str(video)!r}, another clip"
         raise wrong_use("VIDEO", expected="the clip that the model was fitted to", got=got, cure=cure)
-    if float16:
-        target, figures = _write_float16(target, model, about, clip)
-    else:
-        target, figures = _write_compressed(target, model, about, clip, max_loss_db, passes)
+    target, figures = _write_compressed(target, model, about, clip, max_loss_db, passes)
     before, after = model_path.stat().st_size, target.stat().st_size
     figures |= {
         "bytes_before": before,
@@ -125,34 +106,6 @@ def save_compressed(target: Path, made: Compressed, about: dict[str, Any], *, kn
     about = keep_origin(about, *CLIP_NOTES, "frames_digest", "seed")
     about |= {"mean_psnr": round(made.psnr - made.loss_db, 3)} if known else {}
     return save_compact(target, made.quantized, metadata=about | {"loss_db": round(made.loss_db, 4)})
-
-
-def save_float16(target: Path, model: VideoModel, about: dict[str, Any], score: Score | None) -> Evaluation | None:
-    """Write a model with 16-bit parameters and, if `score` is given, the scores of the rounded model."""
-    about = {name: value for name, value in about.items() if not name.startswith("mean_")}
-    small = to_half_precision(model)
-    save_video_model(target, small, metadata=about)
-    if score is None:
-        return None
-    scores = score(load_video_model(target))
-    save_video_model(target, small, metadata=about | mean_scores(scores))
-    return scores
-
-
-def _write_float16(
-    target: Path, model: VideoModel, about: dict[str, Any], clip: Clip | None
-) -> tuple[Path, dict[str, Any]]:
-    def score(model: VideoModel) -> Evaluation:
-        return evaluate_with_progress(model, clip.frames)
-
-    before = None if clip is None else score(model)
-
-    def write(path: Path) -> tuple[Path, Evaluation | None]:
-        return path, save_float16(path, model, about, None if clip is None else score)
-
-    target, scores = write_result(target, write)
-    lost = {} if scores is None else {"loss_db": before.mean_psnr - scores.mean_psnr}
-    return target, lost | {"num_gaussians": model.num_gaussians}
 
 
 def _write_compressed(

@@ -1,7 +1,6 @@
 """The command `tradeoff`."""
 
 import dataclasses
-import functools
 import math
 import os
 import time
@@ -19,7 +18,7 @@ from foldgauss._runtime.checks import check_one_of, is_within
 from foldgauss._runtime.machine import load_average
 from foldgauss.cli.app.application import Stopped, WrongUse, app, err, name_option, out, warn, wrong_use
 from foldgauss.cli.app.completion import complete_choice, complete_list
-from foldgauss.cli.editing.compress import save_compressed, save_float16
+from foldgauss.cli.editing.compress import save_compressed
 from foldgauss.cli.measuring.tradeoff_record import (
     BASE,
     CLOCKS,
@@ -47,7 +46,7 @@ from foldgauss.io._atomic import OutputError, atomic_path
 from foldgauss.io._lock import lock_output
 from foldgauss.io.media.clip import DEINTERLACE, Clip
 from foldgauss.io.media.video_reading import read_video
-from foldgauss.io.models.video_model import load_video_model, read_metadata, save_video_model
+from foldgauss.io.models.video_model import load_video_model, save_video_model
 from foldgauss.io.provenance import fingerprint
 from foldgauss.jobs.runner import describe_fit, fit_metadata, mean_scores
 from foldgauss.video.compression.search import compress
@@ -60,7 +59,6 @@ from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.motion.optical_flow import Motion
 from foldgauss.video.tradeoff import (
     AXES,
-    FLOAT16,
     LEAST_STEPS,
     MAX_LOSS_DB,
     PASSES,
@@ -317,10 +315,6 @@ class _Run:
         if point.played is not None:
             shown = dataclasses.replace(model, options=point.played)
             return shown, evaluate(shown, self.clip.frames), fitted
-        if point.stored == FLOAT16:
-            score = functools.partial(evaluate, frames=self.clip.frames)
-            scores = save_float16(path, model, read_metadata(self.folder / BASE), score)
-            return load_video_model(path), scores, fitted
         begun = _Spent.now()
         compressed = compress(
             model,

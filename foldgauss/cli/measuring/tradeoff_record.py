@@ -25,7 +25,7 @@ from foldgauss.io.figures import write_tradeoff
 from foldgauss.io.media.clip import AS_STORED, Reading
 from foldgauss.render import RenderOptions
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.tradeoff import FLOAT16, FLOAT32, MAX_LOSS_DB, PASSES, Point, Skipped, knee, pareto_front
+from foldgauss.video.tradeoff import FLOAT32, MAX_LOSS_DB, PASSES, Point, Skipped, knee, pareto_front
 
 RECORD, ROWS, PLOT, BASE = "tradeoff.json", "tradeoff.csv", "tradeoff.png", "base.safetensors"
 FILES = {RECORD, ROWS, PLOT, BASE}
@@ -164,10 +164,8 @@ class Commands:
             constants = _changed(point.played, point.config.options, RENDER_OPTIONS)
             return shlex.join(["foldgauss", "evaluate", str(base), str(self.video), *constants])
         if point.stored != FLOAT32:
-            how = ["--float16"] if point.stored == FLOAT16 else ["--passes", str(PASSES[point.stored])]
-            how += [] if point.stored == FLOAT16 else ["--max-loss-db", f"{MAX_LOSS_DB:g}"]
-            suffix = ".safetensors" if point.stored == FLOAT16 else ".fgz"
-            words = ["compress", str(base), str(self.video), *how, "--out", f"{name}{suffix}"]
+            how = ["--passes", str(PASSES[point.stored]), "--max-loss-db", f"{MAX_LOSS_DB:g}"]
+            words = ["compress", str(base), str(self.video), *how, "--out", f"{name}.fgz"]
             return shlex.join(["foldgauss", *words])
         words = ["fit", str(self.video), "--out", f"{name}.safetensors"]
         words += [] if self.size is None else ["--size", self.size]

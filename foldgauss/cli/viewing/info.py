@@ -13,7 +13,6 @@ from foldgauss.cli.shared.clips import Video
 from foldgauss.io.models.compact import is_compact
 from foldgauss.io.models.video_model import load_video_model, read_frame_seconds, read_origin
 from foldgauss.video.editing.edited_video import EditedVideo, as_edited
-from foldgauss.video.models.sparse_storage import stored_counts, to_stored
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
@@ -37,10 +36,10 @@ def info(model_path: ModelFile) -> None:
         "Gaussians": f"{model.num_gaussians:,}",
         "fold": f"polynomial of degree {model.degree}",
         **_describe_paths(model),
-        **_describe_savings(model),
+        **_describe_degrees(model),
         "envelope": f"time likelihood, power {' and '.join(powers)} (paper's text 1, its code 2)",
         "frame times": _describe_times(np.asarray(model.frame_times.times())),
-        "parameters stored": f"{model.num_parameters:,}",
+        "parameters": f"{model.num_parameters:,}",
         "file": _describe_size(model_path, model),
     }
     if isinstance(model, EditedVideo):
@@ -70,7 +69,7 @@ def _print_segments(model_path: Path, model: SegmentedVideo, about: dict) -> Non
         "segments": f"{len(model.segments):,}{joints}",
         "Gaussians": f"{model.num_gaussians:,} in all",
         "fold": f"polynomial of degree {model.degree}",
-        "parameters stored": f"{model.num_parameters:,}",
+        "parameters": f"{model.num_parameters:,}",
         "file": _describe_size(model_path, model),
     }
     _print_facts(model_path, figures, about)
@@ -126,26 +125,14 @@ def _describe_edits(model: EditedVideo) -> str:
     return ", ".join(layers) + "; those baked into the parameters are not counted"
 
 
-def _describe_savings(model: VideoModel | EditedVideo) -> dict[str, str]:
-    """Parameters that some Gaussians do not have or share, by name."""
+def _describe_degrees(model: VideoModel | EditedVideo) -> dict[str, str]:
+    """How many Gaussians have folds of each degree, where some have a lower one than the model."""
     parts = [layer.model.splats for layer in as_edited(model).layers]
+    if all((splats.degrees == splats.degree).all() for splats in parts):
+        return {}
     degrees = np.concatenate([splats.degrees for splats in parts])
-    found = {}
-    if any((splats.degrees < splats.degree).any() for splats in parts):
-        counts = zip(*np.unique(degrees, return_counts=True), strict=True)
-        found["degrees"] = ", ".join(f"{degree} of {count:,} Gaussians" for degree, count in counts)
-    if static := sum(int(splats.static.sum()) for splats in parts):
-        found["static"] = f"{static:,} of {len(degrees):,} Gaussians, throughout the clip"
-    if opaque := sum(int(splats.opaque.sum()) for splats in parts):
-        found["opaque"] = f"{opaque:,} of {len(degrees):,} Gaussians, without transmittance"
-    counted = [(splats.num_gaussians, stored_counts(to_stored(splats))) for splats in parts]
-    for what, name in (("colors", "colors"), ("shapes", "shapes")):
-        # If most Gaussians have their own values, equal ones are a coincidence, as of rounded values.
-        few = [(num, counts[what]) for num, counts in counted if 2 * counts.get(what, num) <= num]
-        shared = [f"{count:,}, shared by {num:,} Gaussians" for num, count in few]
-        if shared:
-            found[name] = ", ".join(shared)
-    return found
+    counts = zip(*np.unique(degrees, return_counts=True), strict=True)
+    return {"degrees": ", ".join(f"{degree} of {count:,} Gaussians" for degree, count in counts)}
 
 
 def _describe_times(times: np.ndarray) -> str:

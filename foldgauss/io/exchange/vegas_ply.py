@@ -22,7 +22,7 @@ from foldgauss.render.splats import check_size
 from foldgauss.video.fitting.config import PUBLISHED_SCALE_CUTOFF
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.polynomial_folds import without_paths
-from foldgauss.video.models.splats import STATIC_LOG_TIME_SCALE, FoldedSplats
+from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
@@ -149,9 +149,8 @@ def _warn_of_error(error: Float[np.ndarray, " num"], degree: int) -> None:
 def _convert_time_scale(
     log_time_scale: Float[np.ndarray, " num"], power: float | Float[np.ndarray, "*#num"], other: float
 ) -> Float[np.ndarray, " num"]:
-    """log sigma_t that gives an envelope of power `other` the same values; static Gaussians keep the value 1."""
-    other_scale = log_time_scale + 0.5 * np.log(other / power)
-    return np.where(log_time_scale == STATIC_LOG_TIME_SCALE, log_time_scale, other_scale)
+    """log sigma_t that gives an envelope of power `other` the same values."""
+    return log_time_scale + 0.5 * np.log(other / power)
 
 
 def _vegas_unit(size: Size) -> float:

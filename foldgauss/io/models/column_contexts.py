@@ -3,8 +3,6 @@
 Encoder and decoder derive them, column by column, from the columns before.
 """
 
-import dataclasses
-
 import numpy as np
 from jaxtyping import Float, Int, Int32, UInt8
 
@@ -41,22 +39,19 @@ class ColumnContexts:
     def describe_next(self, name: str) -> Column:
         """What is known of the next column before its values."""
         decoder = self._decoder
-        rows = decoder.rows(name)
         if name == "cell":
-            return Column.without_contexts(rows)
+            return Column.without_contexts(self._info.num_gaussians)
         halves = decoder.half_exponents(name)
         known = {"origin": decoder.origin(name), "step": compute_steps(halves, name)}
-        if name in COLORS and self._info.shared:
-            return dataclasses.replace(Column.without_contexts(rows), near=np.arange(-1, rows - 1)[:, None], **known)
         power = trajectory_power(name)
-        near = self._nearest if power or name in ("angle", "shade", *COLORS) else self._in_cell
-        scale = np.ones(rows)
+        near = self._nearest if power or name in ("angle", *COLORS) else self._in_cell
+        scale = np.ones(self._info.num_gaussians)
         for _ in range(power):  # not a power, whose last bit libraries do not agree on
             scale = scale * self._half
         contexts = self._contexts(name, power, halves)
         return Column(present=decoder.has(name), contexts=contexts, scale=scale, near=near, **known)
 
-    def add(self, name: str, numbers: Int32[np.ndarray, " rows"]) -> None:
+    def add(self, name: str, numbers: Int32[np.ndarray, " num"]) -> None:
         """Record the column's values."""
         decoder, info = self._decoder, self._info
         self.columns[name] = numbers
@@ -77,8 +72,6 @@ class ColumnContexts:
         q, first = self.columns, (halves >> 1) & 31
         if name == "class":
             second = 0
-        elif name == "without":
-            second = q["class"] & 31
         elif power:
             first = first + 32 * (q["degree"] == power)
             # The preceding value of the other axis, and this axis's of the power below.
@@ -91,7 +84,7 @@ class ColumnContexts:
         elif name == "green":
             second = 16 * quantize_magnitude(q["luma"]) + quantize_magnitude(q["blue"])
         else:
-            second = (q["class"] & 31) + 32 * (q["without"] & 1)
+            second = q["class"] & 31
         return np.stack(np.broadcast_arrays(first, second), 1).astype(np.uint8)
 
 

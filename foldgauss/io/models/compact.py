@@ -33,7 +33,6 @@ from foldgauss.video.compression.quantize import (
     FEATURES,
     LARGEST,
     MAX_CELL_BITS,
-    MAX_SHARED,
     CompactInfo,
     Quantized,
     Rule,
@@ -41,7 +40,7 @@ from foldgauss.video.compression.quantize import (
     is_integral,
 )
 from foldgauss.video.compression.quantized_paths import MAX_PATH_BITS, PathsInfo
-from foldgauss.video.compression.quantized_times import MAX_TIME_BITS, TIME_BITS
+from foldgauss.video.compression.quantized_times import MAX_TIME_BITS
 from foldgauss.video.fitting.config import MAX_DEGREE
 from foldgauss.video.models.shared_paths import MAX_PATHS
 from foldgauss.video.models.video_model import VideoModel
@@ -49,14 +48,11 @@ from foldgauss.video.models.video_model import VideoModel
 COMPACT_SUFFIX = ".fgz"
 #: As in PNG: a byte that is not ASCII, line ends of both kinds, which a transfer as text would change, an end of file.
 MAGIC = b"\x8bFGZ\r\n\x1a\n"
-#: The second one is the first one with `time_bits`, which readers of the first one would ignore.
-VERSIONS = 2, 3
+VERSION = 4
 #: Magic, version, length of the header, checksum of all that follows.
 _FIXED = len(MAGIC) + 12
 #: Limit of numbers per byte, so that a small file cannot claim much memory; files are padded with spaces. Clips need 1.
 _MOST_PER_BYTE = 32
-#: A file may have so many in any case: earlier versions padded alike Gaussians to fewer bytes.
-_ALWAYS_ALLOWED = 1 << 18
 _SIDE = 1 << 20  # largest side of an image: a decoder holds it in memory
 
 
@@ -101,8 +97,6 @@ def pack_compact(quantized: Quantized, metadata: dict | None = None) -> bytes:
         "metadata": to_json_types(metadata or {}),
     }
     num_values = info.num_gaussians * len(descriptions) + header["num_frames"] + _count_path_numbers(info)
-    if info.time_bits == TIME_BITS:
-        del header["time_bits"]
     if info.paths is None:
         del header["paths"]
     else:
@@ -113,7 +107,7 @@ def pack_compact(quantized: Quantized, metadata: dict | None = None) -> bytes:
     data = b"".join(streams)
     text += b" " * (-(-num_values // _MOST_PER_BYTE) - len(text) - len(data))
     body = text + data
-    numbers = (VERSIONS["time_bits" in header], len(text), zlib.crc32(body))
+    numbers = (VERSION, len(text), zlib.crc32(body))
     return MAGIC + b"".join(number.to_bytes(4, "little") for number in numbers) + body
 
 
@@ -202,13 +196,10 @@ def _read_header(path: Path, data: bytes) -> tuple[dict, bytes]:
     if len(data) < _FIXED:
         raise _unreadable(path, f"one cut off after {len(data)} bytes")
     version, length, checksum = (int.from_bytes(data[k : k + 4], "little") for k in range(len(MAGIC), _FIXED, 4))
-    if version not in VERSIONS:
-        expected = f"a compact model of version {VERSIONS[0]} or {VERSIONS[1]}, which this program reads"
-        got, cure = (
-            f"version {version} in",
-            "Compress the model again." if version < VERSIONS[0] else "Update foldgauss.",
-        )
-        raise model_file_error("path", expected=expected, got=f"{got} {str(path)!r}", cure=cure)
+    if version != VERSION:
+        expected = f"a compact model of version {VERSION}, which this program reads"
+        cure = "Compress the model again." if version < VERSION else "Update foldgauss."
+        raise model_file_error("path", expected=expected, got=f"version {version} in {str(path)!r}", cure=cure)
     body = data[_FIXED:]
     if length > len(body) or zlib.crc32(body) != checksum:
         raise _unreadable(path, "one that is cut off or damaged (its checksum is another)")
@@ -230,8 +221,8 @@ def _decode(header: dict, body: bytes, whole_length: int) -> Quantized:
     num, num_frames = info.num_gaussians, header["num_frames"]
     _check(is_integer(num_frames, 1), "num_frames", num_frames)
     names = info.column_names
-    most = max(_MOST_PER_BYTE * whole_length, _ALWAYS_ALLOWED)
-    _check(num * len(names) + num_frames + _count_path_numbers(info) <= most, "num_gaussians", num)
+    num_values = num * len(names) + num_frames + _count_path_numbers(info)
+    _check(num_values <= _MOST_PER_BYTE * whole_length, "num_gaussians", num)
     descriptions = header["columns"]
     _check(isinstance(descriptions, list) and len(descriptions) == len(names), "columns", "others")
     of_paths = [header["paths"][name] for name in ("knots", "maps")] if info.paths else [0, 0]
@@ -242,8 +233,7 @@ def _decode(header: dict, body: bytes, whole_length: int) -> Quantized:
     rules = {name: _parse_rule(name, numbers) for name, numbers in described.items() if not is_integral(name)}
     _check(not any(described[name] for name in names if is_integral(name)), "rule", "none")
     contexts, streams = ColumnContexts(rules, info), io.BytesIO(body)
-    most = {"without": 3, "degree": info.degree, "shade": info.shared - 1}  # of the columns that are used as indices
-    most["path"] = info.paths.num_paths if info.paths else 0
+    most = {"degree": info.degree, "path": info.paths.num_paths if info.paths else 0}  # used as indices
     for name, length in zip(names, lengths[:-1], strict=True):
         numbers = range_coder.decode(streams.read(length), contexts.describe_next(name))
         if name == "cell":
@@ -272,22 +262,20 @@ def _decode_paths(about: PathsInfo, knots: bytes, maps: bytes) -> dict[str, np.n
 
 
 def _parse_info(header: dict) -> CompactInfo:
-    size, degree, cells, shared, num = (header[key] for key in ("size", "degree", "cells", "shared", "num_gaussians"))
+    size, degree, cells, num = (header[key] for key in ("size", "degree", "cells", "num_gaussians"))
     _check(isinstance(size, list) and len(size) == 2, "size", size)
     _check(all(is_integer(side, 1) and side <= _SIDE for side in size), "size", size)
     _check(is_integer(num, 1), "num_gaussians", num)
     _check(is_integer(degree, 0) and degree <= MAX_DEGREE, "degree", degree)
     _check(isinstance(cells, list) and len(cells) == 3 and all(is_integer(n, 0) for n in cells), "cells", cells)
     _check(sum(cells) <= MAX_CELL_BITS and 1 << max(sum(cells), 2 * max(cells[:2])) <= num, "cells", cells)
-    _check(is_integer(shared, 0) and shared <= min(num, MAX_SHARED), "shared", shared)
     bounds = {"power": "[0, 1e30]", "floor": "[0, 1)", "reach": "(0, 100]", "fps": "(0, 1e9]", "scale_cutoff": "[0, 1]"}
     for name, interval in bounds.items():
         _check(is_within(header[name], interval), name, header[name])
     check_one_of("compositing", header["compositing"], COMPOSITINGS)
-    time_bits = header.get("time_bits", TIME_BITS)
+    time_bits = header["time_bits"]
     _check(is_integer(time_bits, 0) and time_bits <= MAX_TIME_BITS, "time_bits", time_bits)
-    names = {field.name for field in dataclasses.fields(CompactInfo)} - {"paths", "time_bits"}
-    known = {name: header[name] for name in names} | {"time_bits": time_bits}
+    known = {field.name: header[field.name] for field in dataclasses.fields(CompactInfo) if field.name != "paths"}
     made = {"size": tuple(size), "cells": tuple(cells), "options": RenderOptions(**header["options"])}
     made["paths"] = _parse_paths(header["paths"], header["num_frames"]) if "paths" in header else None
     return CompactInfo(**known | made)

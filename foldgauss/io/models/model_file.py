@@ -53,16 +53,14 @@ class Kind:
     the same pytree with a `jax.ShapeDtypeStruct` for every array leaf. The dict is not trusted, so `from_header` must
     not allocate memory in proportion to its values.
 
-    `to_stored` converts a model to the pytree that is stored and described by the header; `from_stored` is its inverse
-    and raises ValueError for leaves whose values are inconsistent.
+    `check` raises ValueError for a model whose leaves have inconsistent values.
     """
 
     name: str
     model_type: type
     to_header: Callable[[Any], dict]
     from_header: Callable[[dict], Any]
-    to_stored: Callable[[Any], Any] = lambda model: model
-    from_stored: Callable[[Any], Any] = lambda model: model
+    check: Callable[[Any], None] = lambda model: None
 
 
 _KINDS: dict[str, Kind] = {}
@@ -93,7 +91,6 @@ def save_model(path: PathLike, model: Any, *, metadata: dict | None = None) -> P
     if kind is None:
         expected, cure = "one of the registered types " + ", ".join(sorted(_KINDS)), "Register it with register_model."
         raise model_file_error("model", expected=expected, got=type(model).__name__, cure=cure)
-    model = kind.to_stored(model)
     arrays = {key: _to_numpy(key, leaf) for key, leaf in _array_leaves(model).items()}
     header = kind.to_header(model)
     _check_described(kind, model, to_json("header", header))
@@ -206,9 +203,8 @@ def to_json_types(value: Any) -> Any:
 def load_model(path: PathLike) -> Any:
     """Read the model that `save_model` wrote, equal to the bit. Nothing in the file is executed.
 
-    Leaves are JAX arrays, except 64-bit ones without JAX's x64 mode, which stay NumPy arrays; those stored in half
-    precision are converted to the header's type. Memory: at most twice the file's size, plus the skeleton and what
-    `from_stored` adds.
+    Leaves are JAX arrays, except 64-bit ones without JAX's x64 mode, which stay NumPy arrays. Memory: at most twice the
+    file's size, plus the skeleton.
 
     Raises `FileNotFoundError` for a missing file, `ModelFileError` for one of another kind or version, a
     damaged one, or one whose tensors differ from what its header describes.
@@ -225,10 +221,11 @@ def load_part(path: Path, about: dict, prefix: str = "") -> Any:
     check_not_forked()
     filled = _read_leaves(skeleton, path, prefix)
     try:
-        return kind.from_stored(filled)
+        kind.check(filled)
     except ValueError as error:
         got = f"others in {str(path)!r} ({one_line(error)})"
         raise model_file_error("path", expected="tensors that fit each other", got=got) from error
+    return filled
 
 
 def match_kind(path: Path, about: dict) -> tuple[Kind, Any]:
@@ -325,10 +322,10 @@ def _get_specs(leaves: dict[str, Any]) -> dict[str, dict]:
 
 
 def _check_tensors(kept: dict[str, dict], described: dict[str, dict], where: str) -> None:
-    """Raise unless the tensors have the keys, shapes and types that the header describes, or half the precision."""
+    """Raise unless the tensors have the keys, shapes and types that the header describes."""
     for key in sorted(kept.keys() | described.keys()):
         have, want = kept.get(key), described.get(key)
-        if have != want and not (want and want["dtype"] == "F32" and have == want | {"dtype": "F16"}):
+        if have != want:
             raise model_file_error(f"tensor {key!r} of {where!r}", expected=_spec_text(want), got=_spec_text(have))
 
 
@@ -343,7 +340,6 @@ def _read_leaves(skeleton: Any, path: Path, prefix: str) -> Any:
             array = file.get_tensor(prefix + key)
             if array.dtype == np.bool_ and array.size and array.view(np.uint8).max() > 1:
                 raise model_file_error(key, expected="booleans 0 or 1", got=f"the byte {array.view(np.uint8).max()}")
-            array = array.astype(leaf.dtype) if array.dtype == np.float16 else array
             if jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype:
                 return jax.device_put(array)  # jnp.asarray compiles, and keeps, a program for every shape
             return np.array(array)

@@ -196,7 +196,7 @@ def _segment(entry: dict, tensors: dict[str, dict], load: Any) -> Segment:
         num_frames=int(timeline["num_frames"]),
         num_gaussians=sum(int(model["num_gaussians"]) for model in models.values()),
         degree=max(int(model["degree"]) for model in models.values()),
-        num_parameters=sum(_num_parameters(spec) for key, spec in tensors.items() if key.startswith(tuple(models))),
+        num_parameters=_num_parameters({k: spec for k, spec in tensors.items() if k.startswith(tuple(models))}),
         size=(int(height), int(width)),
         fps=float(timeline["fps"]),
         options=RenderOptions(**timeline["options"]),
@@ -206,7 +206,7 @@ def _segment(entry: dict, tensors: dict[str, dict], load: Any) -> Segment:
     )
 
 
-def _num_parameters(spec: dict) -> int:
-    """As `VideoModel.num_parameters` counts a leaf."""
-    count = math.prod(spec["shape"])
-    return -(-count * int(spec["dtype"][1:]) // 32) if spec["dtype"].startswith("U") else count
+def _num_parameters(tensors: dict[str, dict]) -> int:
+    """As `VideoModel.num_parameters`: all but the envelope and the numbers of the paths."""
+    counted = (spec for key, spec in tensors.items() if spec["dtype"] == "F32" and ".envelope." not in key)
+    return sum(math.prod(spec["shape"]) for spec in counted)

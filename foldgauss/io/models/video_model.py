@@ -28,12 +28,11 @@ from foldgauss.io.models.model_file import (
 from foldgauss.io.models.segmented import PARTS, SEGMENTED, load_segmented, save_segmented
 from foldgauss.render import COMPOSITINGS, Camera, RenderOptions
 from foldgauss.video.editing.chain import Edit
-from foldgauss.video.editing.edited_video import EditedVideo, Layer
+from foldgauss.video.editing.edited_video import EditedVideo, Layer, as_edited
 from foldgauss.video.editing.overlays import describe_overlay, restore_overlay
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.row_layout import columns, unpack
-from foldgauss.video.models.shared_paths import MAX_PATHS, SharedPaths
-from foldgauss.video.models.sparse_storage import from_stored, stored_counts, stored_skeleton, to_stored
+from foldgauss.video.models.shared_paths import MAX_PATHS, SharedPaths, check_paths
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
@@ -168,15 +167,12 @@ def read_header_of_kind(path: PathLike, *kinds: str) -> dict:
     return about
 
 
-def _with_splats(video: VideoModel | EditedVideo, change: Callable[[Any], Any]) -> VideoModel | EditedVideo:
-    if isinstance(video, VideoModel):
-        return dataclasses.replace(video, splats=change(video.splats))
-    layers = [dataclasses.replace(layer, model=_with_splats(layer.model, change)) for layer in video.layers]
-    return dataclasses.replace(video, layers=tuple(layers))
+def _check_video(video: VideoModel | EditedVideo) -> None:
+    for layer in as_edited(video).layers:
+        check_paths(layer.model.splats)
 
 
 def _describe_video(model: VideoModel) -> dict:
-    counts = stored_counts(model.splats)
     about = {
         "num_gaussians": model.splats.num_gaussians,
         "degree": model.splats.degree,
@@ -190,7 +186,7 @@ def _describe_video(model: VideoModel) -> dict:
     }
     if model.splats.paths is not None:
         about["paths"] = list(model.splats.paths.times.shape)
-    return about | {"stored": counts} if counts else about
+    return about
 
 
 def _video_skeleton(header: dict) -> VideoModel:
@@ -222,8 +218,7 @@ def _video_skeleton(header: dict) -> VideoModel:
             scale_cutoff=float(header.get("scale_cutoff", 0.0)),
         )
 
-    model = jax.eval_shape(build)  # traced, not computed: nothing is allocated
-    return dataclasses.replace(model, splats=stored_skeleton(model.splats, **header.get("stored", {})))
+    return jax.eval_shape(build)  # traced, not computed: nothing is allocated
 
 
 def _describe_edited(video: EditedVideo) -> dict:
@@ -273,9 +268,5 @@ def _camera_skeleton(header: dict | None) -> Camera | None:
     return jax.eval_shape(partial(Camera, aspect=header["aspect"]), **leaves)
 
 
-_FORMS = {
-    "to_stored": partial(_with_splats, change=to_stored),
-    "from_stored": partial(_with_splats, change=from_stored),
-}
-register_model(Kind(VIDEO, VideoModel, to_header=_describe_video, from_header=_video_skeleton, **_FORMS))
-register_model(Kind(EDITED, EditedVideo, to_header=_describe_edited, from_header=_edited_skeleton, **_FORMS))
+register_model(Kind(VIDEO, VideoModel, to_header=_describe_video, from_header=_video_skeleton, check=_check_video))
+register_model(Kind(EDITED, EditedVideo, to_header=_describe_edited, from_header=_edited_skeleton, check=_check_video))

@@ -3,22 +3,20 @@
 
 const FEATURES = ["class", "size", "stretch", "duration", "opacity"];
 const COLORS = ["luma", "blue", "green"];
-const WHOLE = ["cell", "class", "without", "degree", "path", "shade"];
+const WHOLE = ["cell", "class", "degree", "path"];
 const AXES = [
   [0.5773502691896258, 0.5773502691896258, 0.5773502691896258],
   [-0.7071067811865476, 0.0, 0.7071067811865476],
   [-0.408248290463863, 0.8164965809277261, -0.408248290463863],
 ];
 const WIDEST = { time: 0.125, angle: 0.125, size: 0.35, stretch: 0.5, duration: 0.5, opacity: 1.0 };
-const MAGIC = [0x8b, 0x46, 0x47, 0x5a, 0x0d, 0x0a, 0x1a, 0x0a];
+const MAGIC = [0x8b, 0x46, 0x47, 0x5a, 0x0d, 0x0a, 0x1a, 0x0a], VERSION = 4;
 const NODES = 130, CONTEXTS = 256, MODELS = 3, MEMORY = 400, LARGEST_BITS = 30, FARTHEST = 120;
 const WEIGHT = 29491, RATE = 6, MARGIN = 32;
 const KNOTS = [
   22, 36, 60, 98, 162, 267, 439, 720, 1179, 1921, 3108, 4971, 7812, 11955, 17625, 24743, 32768,
   40793, 47911, 53581, 57724, 60565, 62428, 63615, 64357, 64816, 65097, 65269, 65374, 65438, 65476, 65500, 65514,
 ];
-// Columns that a bit of `without` makes absent: the bit, the value used instead, and the value used as a feature.
-const ABSENT = { duration: [1, Math.fround(6.931471824645996), 0], time: [1, 0.5, 0], opacity: [2, 8, 4] };
 const LN2 = 0.6931471805599453, SQRT2 = 1.4142135623730951;
 const NEIGHBORS = 4, CANDIDATES = 16, TIME = 0.3;
 
@@ -230,14 +228,14 @@ function findNearest(x, y, time, bits) {
 }
 
 /** The names of a file's columns in order. */
-function columnNames({ degree, shared, paths }) {
+function columnNames({ degree, paths }) {
   const path = Array.from({ length: 2 * degree + 2 }, (_, k) => "xy"[k % 2] + (k >> 1));
-  return [...WHOLE.slice(0, paths ? 5 : 4), ...FEATURES.slice(1), "time", ...path, "angle", ...(shared ? ["shade"] : []), ...COLORS];
+  return [...WHOLE.slice(0, paths ? 4 : 3), ...FEATURES.slice(1), "time", ...path, "angle", ...COLORS];
 }
 
 /** The values of all columns. */
 function decodeColumns(header, streamOf, onColumn) {
-  const num = header.num_gaussians, { shared, cells, paths } = header, q = {}, v = {}, features = [];
+  const num = header.num_gaussians, { cells, paths } = header, q = {}, v = {}, features = [];
   const [height, width] = header.size, longer = Math.max(height, width);
   const sides = [...(paths?.sides ?? [width / longer, height / longer]), 1], middles = [...(paths?.middle ?? [0, 0]), 0.5];
   const half = new Float64Array(num), one = () => 1;
@@ -245,15 +243,13 @@ function decodeColumns(header, streamOf, onColumn) {
   const names = columnNames(header);
   names.forEach((name, column) => {
     const [length, origin, exponent, ...slopes] = header.columns[column];
-    const common = shared > 0 && COLORS.includes(name), rows = common ? shared : num;
     const k = /^[xy]\d+$/.test(name) ? Number(name.slice(1)) : -1, axis = ["x0", "y0", "time"].indexOf(name);
-    const has = k > 0 ? (i) => q.degree[i] >= k
-      : name in ABSENT ? (i) => (q.without[i] & ABSENT[name][0]) === 0 : () => true;
-    const halves = new Int32Array(rows), steps = new Float64Array(rows).fill(1), from = new Float64Array(rows);
+    const has = k > 0 ? (i) => q.degree[i] >= k : () => true;
+    const halves = new Int32Array(num), steps = new Float64Array(num).fill(1), from = new Float64Array(num);
     if (!WHOLE.includes(name))
-      for (let i = 0; i < rows; i++) {
+      for (let i = 0; i < num; i++) {
         let total = exponent;
-        if (!common) for (let j = 0; j < slopes.length; j++) total = total + slopes[j] * features[j][i];
+        for (let j = 0; j < slopes.length; j++) total = total + slopes[j] * features[j][i];
         halves[i] = clip(Math.floor(2 * total + 0.5), -FARTHEST, FARTHEST);
         const step = power(halves[i]);
         steps[i] = name in WIDEST ? Math.min(step, WIDEST[name]) : step;
@@ -265,7 +261,6 @@ function decodeColumns(header, streamOf, onColumn) {
       }
     const contexts = (i) => {
       const first = (halves[i] >> 1) & 31, own = name === "class" ? 0 : q.class[i] & 31;
-      if (name === "class" || name === "without") return [first, own];
       if (k > 0) {
         const top = first + (q.degree[i] === k ? 32 : 0), size = (other) => magnitudeClass(Math.abs(q[other][i]));
         const low = k > 1 ? size(name[0] + (k - 1)) : q.degree[i];
@@ -274,12 +269,11 @@ function decodeColumns(header, streamOf, onColumn) {
       }
       if (name === "blue") return [first, 16 * magnitudeClass(Math.abs(q.luma[i]))];
       if (name === "green") return [first, 16 * magnitudeClass(Math.abs(q.luma[i])) + magnitudeClass(Math.abs(q.blue[i]))];
-      return [first, own + 32 * (q.without[i] & 1)];
+      return [first, own];
     };
-    let known = { ...emptyColumn(rows), origin: (i) => from[i], step: (i) => steps[i] };
-    if (common) known = { ...known, near: Int32Array.from({ length: rows }, (_, i) => i - 1), width: 1 };
-    else if (name !== "cell") {
-      const near = k > 0 || ["angle", "shade", ...COLORS].includes(name) ? nearest : inCell;
+    let known = { ...emptyColumn(num), origin: (i) => from[i], step: (i) => steps[i] };
+    if (name !== "cell") {
+      const near = k > 0 || ["angle", ...COLORS].includes(name) ? nearest : inCell;
       const scale = k > 0 ? (i) => { let s = half[i]; for (let n = 1; n < k; n++) s = s * half[i]; return s; } : one;
       known = { ...known, has, contexts, scale, near, width: NEIGHBORS };
     }
@@ -291,11 +285,9 @@ function decodeColumns(header, streamOf, onColumn) {
       inCell = findLatestInCell(numbers, 2 ** (cells[0] + cells[1] + cells[2]));
     }
     q[name] = numbers;
-    const value = (v[name] = new Float64Array(rows));
-    for (let i = 0; i < rows; i++) value[i] = from[i] + numbers[i] * steps[i];
-    for (let i = 0; i < rows; i++) if (!has(i)) value[i] = name in ABSENT ? ABSENT[name][1] : 0;
-    if (FEATURES.includes(name))
-      features.push(name in ABSENT ? value.map((own, i) => (has(i) ? own : ABSENT[name][2])) : value);
+    const value = (v[name] = new Float64Array(num));
+    for (let i = 0; i < num; i++) value[i] = has(i) ? from[i] + numbers[i] * steps[i] : 0;
+    if (FEATURES.includes(name)) features.push(value);
     if (name === "y0") {
       const middle = new Float64Array(num);
       for (let i = 0; i < num; i++) [middle[i], half[i]] = spanOf(inClip(v.time[i]), v.duration[i], header.reach);
@@ -303,7 +295,6 @@ function decodeColumns(header, streamOf, onColumn) {
       nearest = findNearest(across(v.x0, 0), across(v.y0, 1), middle.map((own) => (TIME * own) / side), Math.max(cells[0], cells[1]) + 1);
     }
   });
-  if (shared) for (const name of COLORS) v[name] = Float64Array.from(q.shade, (own) => v[name][own]);
   return v;
 }
 
@@ -335,14 +326,14 @@ function decodePaths({ paths }, stream, logits) {
 export function decode(buffer, onColumn = () => {}) {
   const bytes = new Uint8Array(buffer), fixed = new DataView(buffer);
   if (bytes.length < 20 || MAGIC.some((own, k) => bytes[k] !== own)) throw new Error("not a compact model");
-  if (![2, 3].includes(fixed.getUint32(8, true))) throw new Error("a compact model of another version");
+  if (fixed.getUint32(8, true) !== VERSION) throw new Error("a compact model of another version");
   let start = 20 + fixed.getUint32(12, true);
   const header = JSON.parse(new TextDecoder().decode(bytes.subarray(20, start)));
   const num = header.num_gaussians, degree = header.degree;
   const stream = (length) => bytes.subarray(start, (start += length));
   const v = decodeColumns(header, stream, onColumn);
   const intervals = decodeColumn(stream(header.intervals), emptyColumn(header.num_frames - 1));
-  const step = 2 ** -(header.time_bits ?? 10);
+  const step = 2 ** -header.time_bits;
   const logits = Float64Array.from(intervals, (q) => q * step);
   const leaves = {
     loc: new Float32Array(2 * num), log_scale: new Float32Array(2 * num), angle_logit: new Float32Array(num),

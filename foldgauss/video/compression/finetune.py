@@ -13,7 +13,6 @@ from foldgauss.video.fitting.state import FitState, update_rows
 from foldgauss.video.models.conditioning import backpropagate, condition, update_windows
 from foldgauss.video.models.prepared import PreparedModel
 from foldgauss.video.models.row_layout import columns, unpack
-from foldgauss.video.models.sparse_storage import find_kinds
 from foldgauss.video.models.video_model import VideoModel
 
 #: Learning rates decay exponentially between these fractions of a fit's first ones: the model is near its optimum.
@@ -34,18 +33,21 @@ def finetune_model(
 ) -> VideoModel:
     """The model after `passes` over its frames in random order: Adam with the fit's rates, mean squared error.
 
-    Frame times do not change, nor do those leaves of `FoldedSplats` of the Gaussians that `fixed` marks.
+    Frame times do not change, nor do those leaves of `FoldedSplats` of the Gaussians that `fixed` marks. The degree of
+    each Gaussian's fold does not rise.
     `target(k, step)` returns what frame k is compared with. Deterministic.
     """
     prepared = PreparedModel(model, model.size)
     rows, window, spec = prepared.rows, prepared.window, prepared.spec
     rates, config = np.zeros(rows.shape[1], np.float32), FitConfig()
     free = np.ones(rows.shape, np.float32)
+    powers = np.repeat(np.arange(1, model.degree + 1), 2)
+    free[:, columns(model.degree)["coefficients"]] = powers <= model.splats.degrees[:, None]
     for name, place in columns(model.degree).items():
         rates[place] = getattr(config.rates, name)
         if fixed:
-            free[:, place] = ~fixed[name][:, None]
-    state = FitState.create(rows, find_kinds(rows, model.degree), model.frame_times.logits)
+            free[:, place] *= ~fixed[name][:, None]
+    state = FitState.create(rows, model.frame_times.logits)
     grad, times = np.zeros_like(rows), np.asarray(model.frame_times.times())
     steps = passes * model.num_frames
     for step in range(steps):
@@ -61,8 +63,7 @@ def finetune_model(
         trace = cpu.forward(*leaves, model.size, compositing=model.compositing, options=model.options)
         by_image = (trace.image - wanted) * np.float32(2 / wanted.size)
         backpropagate(rows, done, cpu.backward(trace, by_image), spec, grad)
-        if fixed:
-            grad[done.alive] *= free[done.alive]  # Adam does not move what never had a gradient
+        grad[done.alive] *= free[done.alive]  # Adam does not move what never had a gradient
         rate = np.float32(FIRST_RATE * (LAST_RATE / FIRST_RATE) ** (step / steps))
         update_rows(state, grad, done.alive, rates * rate, units=config.rate_units)
         update_windows(rows, done.alive, window, spec)

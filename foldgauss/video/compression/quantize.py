@@ -4,9 +4,8 @@ Each Gaussian is described by *columns*, parameters whose errors affect the imag
 and half difference of the logarithms of its standard deviations, the longer axis first), duration, opacity, time, angle
 modulo half a turn, color along fixed axes, and its trajectory, m_s + f(m_t - t), over the span of time in which it is
 visible, as Legendre polynomials. A column's step follows from earlier columns by a rule stated in the file, so that
-Gaussians that are hardly visible get coarse steps and need few bits. Absent parameters are stored in no column: powers
-above the trajectory's own degree, times of static Gaussians, opacities of opaque ones; and shared colors are stored
-once.
+Gaussians that are hardly visible get coarse steps and need few bits. Powers above a trajectory's own degree are not
+stored.
 
 A model with shared paths (`SharedPaths`) has a column of their numbers; their maps are rounded in steps of model space
 too fine to be seen.
@@ -26,32 +25,24 @@ from foldgauss._runtime.checks import invalid
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions
 from foldgauss.video.compression.quantized_paths import PathsInfo, decode_paths, describe_paths, round_paths
-from foldgauss.video.compression.quantized_times import TIME_BITS, choose_time_bits, round_times
+from foldgauss.video.compression.quantized_times import choose_time_bits, round_times
 from foldgauss.video.fitting.config import MAX_DEGREE
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.row_layout import shift_path
 from foldgauss.video.models.shared_paths import SharedPaths, check_paths
-from foldgauss.video.models.splats import OPAQUE_LOGIT, STATIC_LOG_TIME_SCALE, TAU_MAX, FoldedSplats
+from foldgauss.video.models.splats import TAU_MAX, FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
 
 #: Largest absolute value of a column's integers that the range coder accepts.
 LARGEST = 2**30 - 1
 #: Columns from which the steps of others may be computed.
 FEATURES = ("class", "size", "stretch", "duration", "opacity")
-#: Columns of plain integers: the cell of space and time, the class (how visible), absent parameters, the degree
-#: of the trajectory.
-#: So are `path`, the number of the shared path, and `shade`, that of the shared color.
-INTEGER_COLUMNS = ("cell", "class", "without", "degree")
+#: Columns of plain integers: the cell of space and time, the class (how visible), the degree of the trajectory.
+#: So is `path`, the number of the shared path.
+INTEGER_COLUMNS = ("cell", "class", "degree")
 COLORS = ("luma", "blue", "green")
-#: Columns that a bit of `without` makes absent: the bit, the value used instead, and the value used as a feature
-#: (sigma_t = 1, the clip's length; an opacity of 0.98).
-ABSENT = {
-    "duration": (1, float(STATIC_LOG_TIME_SCALE), 0.0),
-    "time": (1, 0.5, 0.0),
-    "opacity": (2, float(OPAQUE_LOGIT), 4.0),
-}
-#: Most colors that are stored as shared, and most bits of a cell.
-MAX_SHARED, MAX_CELL_BITS = 4096, 24
+#: Most bits of a cell.
+MAX_CELL_BITS = 24
 #: Orthonormal color axes, as rows: brightness, blue against red, green against both.
 AXES = np.array(
     [
@@ -70,8 +61,8 @@ _MAX_EXPONENT = 120
 _MAX_STEP = {"time": 0.125, "angle": 0.125, "size": 0.35, "stretch": 0.5, "duration": 0.5, "opacity": 1.0}
 
 
-def column_names(degree: int, shared: int = 0, num_paths: int = 0) -> tuple[str, ...]:
-    """The columns of a model in order; `shared` is the number of shared colors, 0 if they are not shared."""
+def column_names(degree: int, num_paths: int = 0) -> tuple[str, ...]:
+    """The columns of a model in order."""
     trajectory = tuple(f"{axis}{k}" for k in range(degree + 1) for axis in "xy")
     return (
         *INTEGER_COLUMNS,
@@ -80,7 +71,6 @@ def column_names(degree: int, shared: int = 0, num_paths: int = 0) -> tuple[str,
         "time",
         *trajectory,
         "angle",
-        *(("shade",) if shared else ()),
         *COLORS,
     )
 
@@ -92,7 +82,7 @@ def trajectory_power(name: str) -> int:
 
 def is_integral(name: str) -> bool:
     """Whether a column holds plain integers, without a rule."""
-    return name in (*INTEGER_COLUMNS, "path", "shade")
+    return name in (*INTEGER_COLUMNS, "path")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,15 +116,13 @@ def compute_steps(halves: Int32[np.ndarray, " num"], name: str = "") -> Float[np
 class CompactInfo:
     """Constants of the model, stored in the header.
 
-    `cells`: binary logarithms of the numbers of cells along x, y and time. `shared`: the number of shared colors; 0 if
-    each Gaussian has its own. `reach`: half-width of a trajectory's span of time, in sigma_t. The step of the frame
-    times' logits is 2^-`time_bits`.
+    `cells`: binary logarithms of the numbers of cells along x, y and time. `reach`: half-width of a trajectory's span
+    of time, in sigma_t. The step of the frame times' logits is 2^-`time_bits`.
     """
 
     num_gaussians: int
     degree: int
     cells: tuple[int, int, int]
-    shared: int
     power: float
     floor: float
     reach: float
@@ -143,8 +131,8 @@ class CompactInfo:
     options: RenderOptions
     compositing: str
     scale_cutoff: float
+    time_bits: int
     paths: PathsInfo | None = None
-    time_bits: int = TIME_BITS
 
     @property
     def time_step(self) -> float:
@@ -152,7 +140,7 @@ class CompactInfo:
 
     @property
     def column_names(self) -> tuple[str, ...]:
-        return column_names(self.degree, self.shared, 0 if self.paths is None else self.paths.num_paths)
+        return column_names(self.degree, 0 if self.paths is None else self.paths.num_paths)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -187,39 +175,29 @@ class ColumnDecoder:
         self._features: list[np.ndarray] = []
         self.values: dict[str, np.ndarray] = {}
 
-    def has(self, name: str) -> Bool[np.ndarray, "rows"]:
+    def has(self, name: str) -> Bool[np.ndarray, " num"]:
         """Which Gaussians have a value in the next column; the others' integer is 0."""
-        if name in ABSENT:
-            return (self.values["without"].astype(np.int32) & ABSENT[name][0]) == 0
         if power := trajectory_power(name):
             return self.values["degree"] >= power
-        return np.ones(self.rows(name), bool)
+        return np.ones(self._info.num_gaussians, bool)
 
-    def rows(self, name: str) -> int:
-        return self._info.shared if name in COLORS and self._info.shared else self._info.num_gaussians
-
-    def half_exponents(self, name: str) -> Int32[np.ndarray, "rows"]:
+    def half_exponents(self, name: str) -> Int32[np.ndarray, " num"]:
         """2 log2 step of the next column."""
         if is_integral(name):
-            return np.zeros(self.rows(name), np.int32)
-        features = [] if name in COLORS and self._info.shared else self._features
-        return self._rules[name].half_exponents(features, self.rows(name))
+            return np.zeros(self._info.num_gaussians, np.int32)
+        return self._rules[name].half_exponents(self._features, self._info.num_gaussians)
 
-    def origin(self, name: str) -> Float[np.ndarray, "rows"]:
+    def origin(self, name: str) -> Float[np.ndarray, " num"]:
         """Values of integer 0 in the next column: the cell's center, if cells divide that axis."""
         axis = {"x0": 0, "y0": 1, "time": 2}.get(name)
         if axis is not None and self._info.cells[axis]:
             return cell_centers(self.values["cell"].astype(np.int64), self._info)[axis]
-        return np.full(self.rows(name), 0.0 if is_integral(name) else self._rules[name].origin)
+        return np.full(self._info.num_gaussians, 0.0 if is_integral(name) else self._rules[name].origin)
 
-    def add(self, name: str, numbers: Int32[np.ndarray, "rows"], halves: Int32[np.ndarray, "rows"]) -> None:
+    def add(self, name: str, numbers: Int32[np.ndarray, " num"], halves: Int32[np.ndarray, " num"]) -> None:
         value = self.origin(name) + numbers * compute_steps(halves, name)
-        feature = value
-        if name in ABSENT:
-            _, instead, counts_as = ABSENT[name]
-            value, feature = (np.where(self.has(name), value, other) for other in (instead, counts_as))
         if name in FEATURES:
-            self._features.append(feature)
+            self._features.append(value)
         if trajectory_power(name):
             value = np.where(self.has(name), value, 0.0)
         self.values[name] = value
@@ -230,10 +208,7 @@ def decode_values(quantized: Quantized) -> dict[str, Float[np.ndarray, " num"]]:
     info, decoder = quantized.info, ColumnDecoder(quantized.rules, quantized.info)
     for name in info.column_names:
         decoder.add(name, quantized.columns[name], decoder.half_exponents(name))
-    values = decoder.values
-    if info.shared:
-        values |= {name: values[name][quantized.columns["shade"]] for name in COLORS}
-    return values
+    return decoder.values
 
 
 # ------------------------------------------------------------------------------------------ cells
@@ -295,7 +270,7 @@ def dequantize(quantized: Quantized) -> VideoModel:
     color = np.stack([luma * AXES[0, c] + blue * AXES[1, c] + green * AXES[2, c] for c in range(3)], 1)
 
     def single(array: np.ndarray) -> np.ndarray:
-        return array.astype(np.float32) + np.float32(0)  # +0 instead of -0: absent parameters are +0
+        return array.astype(np.float32) + np.float32(0)  # +0 instead of -0
 
     splats = FoldedSplats(
         loc=single(polynomials[:, 0]),
@@ -394,25 +369,17 @@ class ExactColumns:
     info: CompactInfo
     swapped: Bool[np.ndarray, " num"]
     turn: Float[np.ndarray, " num"]
-    without: Int32[np.ndarray, " num"]
-    shade: Int32[np.ndarray, " num"] | None
     values: dict[str, Float[np.ndarray, " num"]]
     polynomials: Float[np.ndarray, "num degree+1 2"]
     logits: Float[np.ndarray, " intervals"]
     path: Int32[np.ndarray, " num"] | None = None
     paths: SharedPaths | None = None
 
-    def has(self, name: str) -> Bool[np.ndarray, " num"]:
-        """Which Gaussians have a value in a column other than the trajectory's."""
-        return (self.without & ABSENT.get(name, (0,))[0]) == 0
-
 
 def compute_columns(model: VideoModel) -> ExactColumns:
     """The columns of a model, float64. Raises ValueError for a model that the format cannot hold."""
     info = _make_info(model)
-    splats, shade = model.splats, index_colors(model)
-    if shade is not None:
-        info = dataclasses.replace(info, shared=int(shade.max()) + 1)
+    splats = model.splats
 
     def leaf(name: str) -> np.ndarray:
         return np.asarray(getattr(splats, name), np.float64)
@@ -430,24 +397,13 @@ def compute_columns(model: VideoModel) -> ExactColumns:
     }
     values |= dict(zip(("luma", "blue", "green"), (leaf("color_dc") @ AXES.T).T, strict=True))
     polynomials = np.concatenate([leaf("loc")[:, None], leaf("coefficients")], 1)
-    own = swapped, turn, splats.static + 2 * splats.opaque.astype(np.int32), shade
-    exact = ExactColumns(info, *own, values, polynomials, np.asarray(model.frame_times.logits, np.float64))
+    logits = np.asarray(model.frame_times.logits, np.float64)
+    exact = ExactColumns(info, swapped, turn, values, polynomials, logits)
     if splats.paths is None:
         return exact
     check_paths(splats)
     info = dataclasses.replace(info, paths=describe_paths(model))
     return dataclasses.replace(exact, info=info, path=np.asarray(splats.path_index, np.int32), paths=splats.paths)
-
-
-def index_colors(model: VideoModel) -> Int32[np.ndarray, " num"] | None:
-    """Each Gaussian's index among the distinct colors, dark ones first; None if few Gaussians share one."""
-    color = np.asarray(model.splats.color_dc, np.float64)
-    found, index = np.unique(color, axis=0, return_inverse=True)
-    if 2 * len(found) > len(color) or len(found) > MAX_SHARED:
-        return None
-    rank = np.empty(len(found), np.int32)
-    rank[np.argsort(found @ AXES[0], kind="stable")] = np.arange(len(found))
-    return rank[index.ravel()]
 
 
 def _sigmoid(x: np.ndarray) -> np.ndarray:
@@ -471,7 +427,6 @@ def _make_info(model: VideoModel) -> CompactInfo:
         num_gaussians=model.num_gaussians,
         degree=model.degree,
         cells=choose_cell_bits(model.num_gaussians, model.size),
-        shared=0,
         power=power,
         floor=float(floor[0]),
         reach=reach,
@@ -519,10 +474,7 @@ def quantize(
     info = exact.info
     if cells is None:
         cells = find_cells(exact)
-    values = exact.values | {"class": classes, "cell": cells, "without": exact.without, "path": exact.path}
-    if info.shared:
-        first = np.unique(exact.shade, return_index=True)[1]
-        values |= {name: values[name][first] for name in COLORS} | {"shade": exact.shade}
+    values = exact.values | {"class": classes, "cell": cells, "path": exact.path}
     # The trajectory's degree is known only after rounding it.
     whole = {"degree": np.full(info.num_gaussians, info.degree, np.int32)}
     columns, saved = _round_columns(info.column_names, values | whole, exact, rules)
@@ -560,7 +512,7 @@ def unrounded_trajectories(quantized: Quantized, exact: ExactColumns) -> Float[n
 
 def _round_columns(
     names: tuple[str, ...], values: dict[str, np.ndarray], exact: ExactColumns, rules: dict[str, Rule]
-) -> tuple[dict[str, Int32[np.ndarray, " rows"]], Float[np.ndarray, "degree+1 num"]]:
+) -> tuple[dict[str, Int32[np.ndarray, " num"]], Float[np.ndarray, "degree+1 num"]]:
     """The integers of all columns, and the squared error, in steps, that the trajectory's powers save."""
     decoder, columns = ColumnDecoder(rules, exact.info), {}
     saved = np.zeros((exact.info.degree + 1, exact.info.num_gaussians))
@@ -569,7 +521,7 @@ def _round_columns(
             values = values | _compute_trajectories(exact, decoder.values)
         halves = decoder.half_exponents(name)
         origin, steps = decoder.origin(name), compute_steps(halves, name)
-        scaled = np.where(decoder.has(name), (values[name] - origin) / steps, 0)
+        scaled = (values[name] - origin) / steps
         numbers = np.rint(scaled)
         if name == "angle":  # kept in its half turn, so that quantizing a decoded model changes nothing
             low, high = (np.ceil((end - origin) / steps) for end in (0.25, 0.75))

@@ -9,7 +9,6 @@ compensate for those that are.
 
 import dataclasses
 import math
-import warnings
 from collections.abc import Callable
 
 import numpy as np
@@ -20,7 +19,6 @@ from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.checks import invalid, is_integer, is_within
 from foldgauss.video.compression.finetune import finetune_model
 from foldgauss.video.compression.quantize import (
-    ABSENT,
     AXES,
     COLORS,
     FEATURES,
@@ -138,9 +136,8 @@ def compress(
 
     `frames`: the clip, uint8 (num_frames, *model.size, 3), or with alpha (..., 4): the loss is measured against it.
     Without it, the loss is that against a clip at `psnr` dB (default: `ASSUMED_PSNR`) from the model's own images.
-    Frames beyond `EXACT_PSNR`, 58.9 dB, count as that. Gaussians are reordered; absent parameters
-    (`FoldedSplats.degrees`, `static`, `opaque`) stay absent, and shared colors stay shared. Shared paths stay as they
-    are, to about a fiftieth of a pixel.
+    Frames beyond `EXACT_PSNR`, 58.9 dB, count as that. Gaussians are reordered. Shared paths stay as they are, to about
+    a fiftieth of a pixel.
 
     With the clip, fine-tuning compensates for losses and allows coarser steps. Each of five stages of pruning is
     followed by `passes / 2` passes over the clip. Each try of a coarseness of the steps takes another 5/8 `passes`
@@ -385,8 +382,6 @@ def _round_in_stages(
     quantized, exact = quantizer.quantize(coarseness), quantizer.exact
     num, rng = exact.info.num_gaussians, make_generator(Stream.ROUNDING_ORDER)
     ranks = dict.fromkeys(_GROUPS, rng.permutation(num) / num)
-    if exact.shade is not None:  # Gaussians that share a color are rounded together
-        ranks[COLOR] = (rng.permutation(exact.info.shared) / exact.info.shared)[exact.shade]
     fixed = {group: np.zeros(num, bool) for group in _GROUPS}
     for group, rounded, fraction in stages:
         fixed[group] = ranks[group] < rounded
@@ -500,39 +495,30 @@ class _Quantizer:
         """Regress log-sensitivities on the features; a Gaussian's class is the mean residual of its columns."""
         first = FEATURES[1:]
         raw = np.stack([self.exact.values[name] for name in first], 1)
-        for name in set(first) & set(ABSENT):
-            raw[~self.exact.has(name), first.index(name)] = ABSENT[name][2]
         # Outliers are clipped: a line through the bulk would extrapolate their steps without bound.
         features = np.clip(raw, *np.quantile(raw[self._seen], [0.001, 0.999], axis=0))
         levels = {name: 0.5 * np.log2(np.maximum(sensitivity[name], _MIN_SENSITIVITY)) for name in self._names}
         design = np.concatenate([np.ones((len(features), 1)), features], 1)
         self._fits, rest = {}, []
         for name in self._names:
-            fit, seen = np.zeros(design.shape[1]), self._seen & self.exact.has(name)
-            shows = seen & (sensitivity[name] > _MIN_SENSITIVITY)  # others, as in black frames, would tilt the lines
+            fit = np.zeros(design.shape[1])
+            shows = self._seen & (
+                sensitivity[name] > _MIN_SENSITIVITY
+            )  # others, as in black frames, would tilt the lines
             if name in first or shows.sum() < _FEW:
-                fit[0] = levels[name][seen].mean() if seen.any() else 0.0
+                fit[0] = levels[name][self._seen].mean()
             else:
                 fit = np.linalg.lstsq(design[shows], levels[name][shows], rcond=None)[0]
             self._fits[name] = fit
-            rest.append(np.where(seen, np.clip(levels[name] - design @ fit, -6, 6), np.nan))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # of Gaussians that are not visible
-            self._classes = np.rint(np.nan_to_num(np.nanmean(rest, axis=0), nan=-6.0)).astype(np.int32)
+            rest.append(np.clip(levels[name] - design @ fit, -6, 6))
+        self._classes = np.rint(np.where(self._seen, np.mean(rest, axis=0), -6.0)).astype(np.int32)
         self._match_errors(sensitivity, np.concatenate([np.ones((len(raw), 1)), raw], 1))
 
     def _match_errors(self, sensitivity: dict[str, Float[np.ndarray, " num"]], design: np.ndarray) -> None:
         """Shift the fits so that all columns add the same error: by mean, not typical, sensitivity times step^2."""
         for name, fit in self._fits.items():
-            seen = self._seen & self.exact.has(name)
-            if not seen.any():
-                continue
-            predicted = np.clip((design @ fit + self._classes)[seen], -30, 30)
-            fit[0] += 0.5 * np.log2(np.mean(sensitivity[name][seen] * 4.0**-predicted) + 1e-30)
-        if self.exact.info.shared:
-            for name in COLORS:  # a shared color is as sensitive as all of its Gaussians together
-                summed = np.bincount(self.exact.shade, sensitivity[name])
-                self._fits[name] = np.array([0.5 * np.log2(np.mean(summed) + 1e-30)])
+            predicted = np.clip((design @ fit + self._classes)[self._seen], -30, 30)
+            fit[0] += 0.5 * np.log2(np.mean(sensitivity[name][self._seen] * 4.0**-predicted) + 1e-30)
 
     def keep(self, coarseness: float) -> Bool[np.ndarray, " num"]:
         """The Gaussians that are worth their bits at such steps; at least one."""
@@ -547,17 +533,13 @@ class _Quantizer:
         """
         kept = np.ones(len(self._removal), bool) if kept is None else kept
         exact = _select_rows(self.exact, kept)
-        rules, shared = {}, exact.info.shared
+        rules = {}
         for name in self._names:
             exponent, *slopes = np.round(self._fits[name], 4).tolist()
             given = exact.values.get(name)
-            if name in ABSENT:
-                given = given[exact.has(name)]
             # Stretch is not negative: its origin is 0.
-            origin = 0.0 if given is None or not given.size or name == "stretch" else round(float(np.median(given)), 4)
+            origin = 0.0 if given is None or name == "stretch" else round(float(np.median(given)), 4)
             slopes = (-1.0,) if name in FEATURES else (-1.0, *(-slope for slope in slopes))
-            if name in COLORS and shared:
-                slopes = ()
             rules[name] = Rule(origin, round(coarseness - exponent, 4), slopes)
         return quantize(exact, self._classes[kept], rules)
 
@@ -567,10 +549,6 @@ def _select_rows(exact: ExactColumns, kept: Bool[np.ndarray, " num"]) -> ExactCo
     num = int(kept.sum())
     info = dataclasses.replace(exact.info, num_gaussians=num, cells=choose_cell_bits(num, exact.info.size))
     values = {name: value[kept] for name, value in exact.values.items()}
-    shade = exact.shade
-    if shade is not None:
-        used, shade = np.unique(shade[kept], return_inverse=True)
-        info, shade = dataclasses.replace(info, shared=len(used)), shade.ravel().astype(np.int32)
     path = None if exact.path is None else exact.path[kept]
-    own = exact.swapped[kept], exact.turn[kept], exact.without[kept], shade, values, exact.polynomials[kept]
+    own = exact.swapped[kept], exact.turn[kept], values, exact.polynomials[kept]
     return ExactColumns(info, *own, exact.logits, path, exact.paths)

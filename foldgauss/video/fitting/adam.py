@@ -18,21 +18,18 @@ import jax.numpy as jnp
 import numba as nb
 import numpy as np
 import optax
-from jaxtyping import Array, Bool, Float, Int, UInt8
+from jaxtyping import Array, Float, Int
 
 from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.video.models.frame_times import CUT_RATIO, FrameTimes
 from foldgauss.video.models.row_layout import columns
-from foldgauss.video.models.sparse_storage import DEGREE_MASK, OPAQUE_BIT, STATIC_BIT
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15  # epsilon as in the published 3DGS
 #: 1 / (1 - beta^n) for both betas, by the number n of steps; beyond the table it is 1 in float32. (Computing the powers
 #: for each row took a third of a step's optimizer.)
 BIAS_CORRECTIONS = np.ones((20_000, 2), np.float32)
 BIAS_CORRECTIONS[1:] = 1 / (1 - np.array([BETA1, BETA2]) ** np.arange(1, len(BIAS_CORRECTIONS))[:, None])
-#: The unit of time of static Gaussians, which have no sigma_t: the standard deviation of all times of a clip.
-STATIC_TIME_SCALE = 0.29
 FRAME_TIME_ADAM = optax.scale_by_adam(BETA1, BETA2, EPSILON)
 
 _CHUNK = 2048  # rows per task
@@ -71,12 +68,11 @@ def adam_step(
 
 
 @kernel
-def _update(start, stop, touched, rows, grad, first, second, counts, kinds, bits, rates, units, at, corrections):
+def _update(start, stop, touched, rows, grad, first, second, counts, rates, units, at, corrections):
     beta1, beta2 = _f(BETA1), _f(BETA2)
     own = rates.copy()
-    loc, scale, spread, time, opacity, fold = at
+    loc, scale, spread, time, fold = at
     width = _u(fold + 2 * ((rows.shape[1] - fold) // 2))  # without the column of paths, which is not trained
-    static_bit, opaque_bit, degrees = bits
     total = 0.0
     for k in range(start, stop):
         i = touched[k]
@@ -84,19 +80,12 @@ def _update(start, stop, touched, rows, grad, first, second, counts, kinds, bits
         taken = min(counts[i], len(corrections) - 1)
         correction1, correction2 = corrections[taken, 0], corrections[taken, 1]
         row, g, m, v = rows[i], grad[i], first[i], second[i]
-        static, powers = kinds[i] & static_bit, kinds[i] & degrees
-        if static:
-            g[time], g[spread] = _f(0.0), _f(0.0)
-        if kinds[i] & opaque_bit:
-            g[opacity] = _f(0.0)
-        for c in range(fold + 2 * powers, width):
-            g[c] = _f(0.0)
         size, short = _f(1.0), _f(1.0)
         if units.size > _f(0.0):
             size = math.exp(_f(0.5) * (row[scale] + row[scale + 1])) / units.size
             own[loc], own[loc + 1] = rates[loc] * size, rates[loc + 1] * size
         if units.time > _f(0.0):
-            wide = (_f(STATIC_TIME_SCALE) if static else math.exp(row[spread])) / units.time
+            wide = math.exp(row[spread]) / units.time
             own[time] = rates[time] * wide
             short = _f(1.0) / wide
         power = size
@@ -122,30 +111,25 @@ def sparse_adam(
     touched: np.ndarray,
     rates: np.ndarray,
     *,
-    kinds: np.ndarray | None = None,
     units: RateUnits = ABSOLUTE,
 ) -> bool:
     """One step on the rows `touched`, in place; their gradients are set to zero. Returns whether they are finite.
 
     `rows`, `grad` and the moments `first`, `second`: float32 (num, width); `counts`: int32 (num,), steps taken by each
-    row; `rates`: float32 (width,), learning rates by column. `kinds` uint8 (num,): which parameters each Gaussian has
-    (default: all); the others stay. `units`: how rates are scaled by each Gaussian's duration and size.
+    row; `rates`: float32 (width,), learning rates by column. `units`: how rates are scaled by each Gaussian's duration
+    and size.
     """
     place = columns(0)  # the fold comes last, so its degree does not shift these
-    names = ("loc", "log_scale", "log_time_scale", "time_loc_logit", "opacity_logit", "coefficients")
+    names = ("loc", "log_scale", "log_time_scale", "time_loc_logit", "coefficients")
     at = tuple(place[name].start for name in names)
     num = len(touched)
-    if kinds is None:
-        kinds = np.full(len(rows), (rows.shape[1] - at[-1]) // 2, np.uint8)
-    moments, bits = (first, second, counts), (STATIC_BIT, OPAQUE_BIT, DEGREE_MASK)
     units = RateUnits(*np.float32(units))
-
     sums = np.zeros(-(-num // _CHUNK))
 
     def work(start: int) -> None:
         stop = min(start + _CHUNK, num)
-        arrays = touched, rows, grad, *moments, kinds
-        sums[start // _CHUNK] = _update(start, stop, *arrays, bits, rates, units, at, BIAS_CORRECTIONS)
+        arrays = touched, rows, grad, first, second, counts
+        sums[start // _CHUNK] = _update(start, stop, *arrays, rates, units, at, BIAS_CORRECTIONS)
 
     run_tasks(work, range(0, num, _CHUNK))
     return math.isfinite(sums.sum())
@@ -154,33 +138,21 @@ def sparse_adam(
 # ------------------------------------------------------------------------------------- rows of Gaussians, JAX
 
 
-def masked_adam(rows, grad, first, second, counts, touched, rates, *, kinds, units: RateUnits):
+def masked_adam(rows, grad, first, second, counts, touched, rates, *, units: RateUnits):
     """`sparse_adam` in JAX: rows, moments and counts after a step on the rows where `touched`, bool (num,), is true."""
     degree = (rows.shape[1] - columns(0)["coefficients"].start) // 2
-    grad = jnp.where(_has_parameter(kinds, degree, rows.shape[1]), grad, jnp.zeros_like(grad))
     counts = counts + touched.astype(counts.dtype)
     corrections = jnp.asarray(BIAS_CORRECTIONS)[jnp.minimum(counts, len(BIAS_CORRECTIONS) - 1)]
     beta1, beta2, one = np.float32(BETA1), np.float32(BETA2), np.float32(1)
     mean = beta1 * first + (one - beta1) * grad
     square = beta2 * second + (one - beta2) * grad * grad
-    own = rates[None, :] * _rate_factors(rows, kinds, degree, units)
+    own = rates[None, :] * _rate_factors(rows, degree, units)
     moved = rows - own * mean * corrections[:, :1] / (jnp.sqrt(square * corrections[:, 1:]) + np.float32(EPSILON))
     chosen = touched[:, None]
     return jnp.where(chosen, moved, rows), jnp.where(chosen, mean, first), jnp.where(chosen, square, second), counts
 
 
-def _has_parameter(kinds: UInt8[Array, " num"], degree: int, width: int) -> Bool[Array, "num width"]:
-    """Which parameters each Gaussian has; columns after the fold are none."""
-    place = columns(degree)
-    kinds = kinds.astype(jnp.int32)[:, None]
-    column = np.arange(width, dtype=np.int32)[None, :]
-    of_time = (column == place["time_loc_logit"].start) | (column == place["log_time_scale"].start)
-    absent = of_time & ((kinds & STATIC_BIT) > 0)
-    absent |= (column == place["opacity_logit"].start) & ((kinds & OPAQUE_BIT) > 0)
-    return ~(absent | (column >= place["coefficients"].start + 2 * (kinds & DEGREE_MASK)))
-
-
-def _rate_factors(rows, kinds, degree: int, units: RateUnits) -> Float[Array, "num width"]:
+def _rate_factors(rows, degree: int, units: RateUnits) -> Float[Array, "num width"]:
     """The factors by which each Gaussian's size and duration scale its learning rates, see `config.LearningRates`."""
     place, (of_size, of_time) = columns(degree), np.zeros((2, rows.shape[1]), np.float32)
     of_size[place["loc"]] = of_size[place["coefficients"]] = 1
@@ -189,9 +161,7 @@ def _rate_factors(rows, kinds, degree: int, units: RateUnits) -> Float[Array, "n
     if units.size > 0:
         size = rows[:, place["log_scale"]].mean(axis=1) - np.float32(math.log(units.size))
     if units.time > 0:
-        static = (kinds.astype(jnp.int32) & STATIC_BIT) > 0
-        time = jnp.where(static, np.float32(math.log(STATIC_TIME_SCALE)), rows[:, place["log_time_scale"].start])
-        time = time - np.float32(math.log(units.time))
+        time = rows[:, place["log_time_scale"].start] - np.float32(math.log(units.time))
     return jnp.exp(size[:, None] * of_size[None] + time[:, None] * of_time[None])
 
 

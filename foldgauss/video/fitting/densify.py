@@ -14,7 +14,6 @@ from foldgauss.video.fitting.config import FitConfig, most_gaussians
 from foldgauss.video.fitting.growth import GradientStatistics, Growth
 from foldgauss.video.fitting.state import FitState
 from foldgauss.video.models.row_layout import columns
-from foldgauss.video.models.sparse_storage import find_kinds
 
 #: The published code renders, and so measures, a splat within this many standard deviations.
 _RADIUS = 3.0
@@ -39,7 +38,7 @@ def grow(state: FitState, config: FitConfig, size: tuple[int, int]) -> bool:
             seed=config.seed,
         )
         state.keep(stay)
-        state.extend(rows=born, kinds=find_kinds(born, config.degree))
+        state.extend(born)
     if growth.resets_at(state.step):
         reset_opacities(state.rows, state.first, state.second, growth, config.degree)
     if state.step + 1 >= growth.until_step:

@@ -27,7 +27,6 @@ from foldgauss.video.fitting.steppers.protocol import StepResult
 from foldgauss.video.models.frame_times import FrameTimes, check_rate, make_time_logits
 from foldgauss.video.models.row_layout import pack
 from foldgauss.video.models.shared_paths import SharedPaths
-from foldgauss.video.models.sparse_storage import find_initial_kinds, find_kinds
 from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.motion.optical_flow import Motion, motion_finder
@@ -190,7 +189,7 @@ def _warm_up(frames: np.ndarray, config: FitConfig, engine: str) -> None:
     if engine == "cpu" and config.follow_camera:
         rows = np.pad(state.rows, ((0, 0), (0, 1)), constant_values=1)
         maps = np.tile(np.eye(2, 3, dtype=np.float32), (len(corner), 1, 1, 1))
-        state = FitState.create(rows, state.kinds, state.time_logits, path_maps=maps)
+        state = FitState.create(rows, state.time_logits, path_maps=maps)
         make_stepper("cpu", corner, tiny, state, motion_finder(corner)).step(state, 0.0)
     if config.target_psnr is not None:
         mean_psnr(state, tiny, corner)
@@ -221,7 +220,6 @@ def _start(
     rows = pack(splats)
     return FitState.create(
         rows,
-        find_initial_kinds(rows, config.degree),
         logits,
         **_path_fields(splats, logits),
         growing=config.growth is not None,
@@ -246,8 +244,7 @@ def start_from(model: VideoModel, config: FitConfig, steps: int, progress: float
     _check_config(model, config)
     rows, logits = pack(model.splats), np.array(model.frame_times.logits, np.float32)
     done = round(steps * progress / (1 - progress))
-    kinds = find_kinds(rows, config.degree)
-    return FitState.create(rows, kinds, logits, step=done, plan=done + steps, **_path_fields(model.splats, logits))
+    return FitState.create(rows, logits, step=done, plan=done + steps, **_path_fields(model.splats, logits))
 
 
 def _check_config(model: VideoModel, config: FitConfig) -> None:

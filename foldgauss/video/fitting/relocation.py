@@ -6,7 +6,7 @@ The number of Gaussians stays the same. Source: relocation of dead Gaussians in 
 
 import numpy as np
 import scipy
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float, Float32
 
 from foldgauss.video.fitting.adam import BETA2
 from foldgauss.video.fitting.births import make_newborns
@@ -16,7 +16,6 @@ from foldgauss.video.fitting.schedule import steps_per_pass
 from foldgauss.video.fitting.state import FitState, frame_times
 from foldgauss.video.models.conditioning import ConditioningSpec, find_windows
 from foldgauss.video.models.row_layout import columns
-from foldgauss.video.models.sparse_storage import find_initial_kinds, is_opaque
 from foldgauss.video.motion.optical_flow import Motion
 
 #: The fractions of the plan after which Gaussians are relocated.
@@ -48,8 +47,7 @@ def relocate(
 ) -> None:
     """Move the fraction `config.relocated_fraction` of the Gaussians that can be judged; their moments start at zero.
 
-    Frames and pixels of the new ones are drawn by squared error, and they have the degree of the fit. `spec` is that of
-    whole frames.
+    Frames and pixels of the new ones are drawn by squared error. `spec` is that of whole frames.
     """
     times = np.asarray(frame_times(state.time_logits))
     influence = measure_influence(state, find_windows(state.rows, spec), times, config.degree)
@@ -59,18 +57,12 @@ def relocate(
     stay = np.ones(len(state.rows), bool)
     stay[np.argsort(influence, kind="stable")[:num]] = False
     new = make_newborns(num, state, frames, state.frame_errors.astype(float), config, spec, motion)
-    kinds = find_initial_kinds(new, config.degree)
     state.keep(np.flatnonzero(stay))
-    place = _find_places(state, new, config)
+    at = columns(config.degree)["time_loc_logit"].start  # depth: among those of their time, which are in its order
+    place = np.searchsorted(np.sort(state.rows[:, at]), new[:, at])
     order = np.argsort(np.concatenate([np.arange(len(state.rows)) + 0.5, place]), kind="stable")
-    state.extend(new, kinds)
+    state.extend(new)
     state.keep(order)
-
-
-def _find_places(state: FitState, new: np.ndarray, config: FitConfig) -> Int[np.ndarray, " new"]:
-    """Where new Gaussians lie in depth: among those of their time, which are in its order."""
-    at = columns(config.degree)["time_loc_logit"].start
-    return np.searchsorted(np.sort(state.rows[:, at]), new[:, at])
 
 
 def measure_influence(
@@ -80,8 +72,7 @@ def measure_influence(
 
     Adam's second moment of the opacity is the mean square of dL/do over the frames where the Gaussian is alive. The
     signs of the errors in it are about random, so o^2 times it estimates what the Gaussian adds to a frame, without
-    another pass over the frames. Gaussians with few steps and opaque ones
-    are not judged; those alive in no frame have none.
+    another pass over the frames. Gaussians with few steps are not judged; those alive in no frame have none.
     """
     at = columns(degree)["opacity_logit"].start
     opacity = scipy.special.expit(state.rows[:, at].astype(float))
@@ -89,5 +80,4 @@ def measure_influence(
     life = np.searchsorted(times, window[:, 1]) - np.searchsorted(times, window[:, 0])
     influence = life * square / np.maximum(1 - opacity, 1e-6) ** 2  # dL/do = dL/dlogit / (o (1 - o))
     influence[(state.counts < _MIN_COUNT) & (life > 0)] = np.inf
-    influence[is_opaque(state.kinds)] = np.inf
     return influence

@@ -173,7 +173,6 @@ class FitState:
     first: np.ndarray = field(metadata=_stored(_ROW))  # Adam's moments
     second: np.ndarray = field(metadata=_stored(_ROW))
     counts: np.ndarray = field(metadata=_stored(PerGaussian(np.int32)))  # steps each Gaussian has taken
-    kinds: np.ndarray = field(metadata=_stored(PerGaussian(np.uint8)))  # its parameters, see `sparse_storage`
     frame_errors: np.ndarray = field(metadata=_stored(PerFrame()))  # mean squared error when last seen, 0 before
     time_logits: np.ndarray = field(metadata=_stored(PerFrame(intervals=True)))
     time_moments: optax.OptState = field(metadata=_stored(PerFrame(intervals=True, moments=True)))
@@ -211,13 +210,11 @@ class FitState:
         return {one.name: one.metadata["decode"] for one in dataclasses.fields(cls) if "decode" in one.metadata}
 
     @classmethod
-    def create(
-        cls, rows: np.ndarray, kinds: np.ndarray, time_logits: np.ndarray, *, growing: bool = False, **fields: Any
-    ) -> "FitState":
+    def create(cls, rows: np.ndarray, time_logits: np.ndarray, *, growing: bool = False, **fields: Any) -> "FitState":
         """A state with these Gaussians and frame times; all other arrays as a fit starts with, but for `fields`."""
         paths = fields["path_maps"].shape[1] if "path_maps" in fields else 0
         sizes = Sizes(*rows.shape, len(time_logits) + 1, growing, paths=paths)
-        fields |= {"rows": rows, "kinds": kinds, "time_logits": time_logits}
+        fields |= {"rows": rows, "time_logits": time_logits}
         arrays = {name: kind.build(sizes) for name, kind in cls.array_fields().items() if name not in fields}
         return cls(**arrays, **fields)
 
@@ -255,9 +252,9 @@ class FitState:
         for name, kind in self.array_fields().items():
             setattr(self, name, kind.keep(getattr(self, name), index))
 
-    def extend(self, rows: np.ndarray, kinds: np.ndarray) -> None:
-        """Add Gaussians at the end: their rows and kinds; in all other fields they are as at a start."""
-        sizes, born = Sizes(*rows.shape, len(self.frame_errors)), {"rows": rows, "kinds": kinds}
+    def extend(self, rows: np.ndarray) -> None:
+        """Add Gaussians at the end: their rows; in all other fields they are as at a start."""
+        sizes, born = Sizes(*rows.shape, len(self.frame_errors)), {"rows": rows}
         for name, kind in self.array_fields().items():
             value = getattr(self, name)
             new = np.concatenate([value, born[name]]) if name in born else kind.extend(value, sizes)
@@ -363,7 +360,7 @@ def update_rows(state: FitState, grad: np.ndarray, touched: np.ndarray, rates: n
     `grad` is float32 (num, width), `rates` and `units` are those of `sparse_adam`.
     """
     moments = state.first, state.second, state.counts
-    return sparse_adam(state.rows, grad, *moments, touched, rates, kinds=state.kinds, units=units)
+    return sparse_adam(state.rows, grad, *moments, touched, rates, units=units)
 
 
 def running_psnr(state: FitState) -> float:

@@ -2,5 +2,5 @@
 
 `video_model.VideoModel` is the entry point. `splats.FoldedSplats` holds the parameters, `frame_times` maps frames to
 times, `conditioning` is the fast CPU form of conditioning on a time, `renderer.VideoRenderer` renders frames,
-`metrics.evaluate` scores them, and `sparse_storage` defines what a file stores.
+`metrics.evaluate` scores them.
 """

@@ -23,11 +23,6 @@ SH_C0 = 0.28209479177387814
 TIME_CUTOFF = 0.01
 #: The same as a bound on |tau| = |t - m_t| / sigma_t: 3.03.
 TAU_MAX = float(np.sqrt(-2 * np.log(TIME_CUTOFF)))
-#: log sigma_t of a static Gaussian, which is alive throughout the clip: with m_t = 0.5, |tau| is at most 1/2048, and an
-#: envelope of power <= 2 is 1 to within 3e-7. Neither parameter is stored.
-STATIC_LOG_TIME_SCALE = np.float32(np.log(1024))
-#: Opacity logit of an opaque Gaussian (opacity 0.9997). It is not stored.
-OPAQUE_LOGIT = np.float32(8)
 #: Opacity of the splat of a mixture's heaviest component; 1 would have an infinite logit.
 PEAK_OPACITY = 0.99
 
@@ -76,9 +71,9 @@ class FoldedSplats(eqx.Module):
 
     @property
     def degrees(self) -> Int[np.ndarray, " num"]:
-        """Each Gaussian's last power whose coefficients are not both +0: higher powers are not stored."""
-        kept = _has_bits(self.coefficients).any(axis=2)
-        return (kept * np.arange(1, self.degree + 1)).max(axis=1, initial=0)
+        """Each Gaussian's last power whose coefficients are not both 0."""
+        nonzero = (np.asarray(self.coefficients) != 0).any(axis=2)
+        return (nonzero * np.arange(1, self.degree + 1)).max(axis=1, initial=0)
 
     def take(self, which: Bool[np.ndarray, " num"] | Int[np.ndarray, " num_new"]) -> "FoldedSplats":
         """The Gaussians of a mask or at these indices, in their order; all paths stay. Indices may repeat."""
@@ -88,16 +83,6 @@ class FoldedSplats(eqx.Module):
             return jnp.asarray(np.asarray(leaf)[which]) if np.shape(leaf)[:1] == (num,) else leaf
 
         return dataclasses.replace(jax.tree.map(index, dataclasses.replace(self, paths=None)), paths=self.paths)
-
-    @property
-    def static(self) -> Bool[np.ndarray, " num"]:
-        """Which Gaussians have m_t = 0.5 and log sigma_t = `STATIC_LOG_TIME_SCALE` exactly: neither is stored."""
-        return (np.asarray(self.log_time_scale) == STATIC_LOG_TIME_SCALE) & ~_has_bits(self.time_loc_logit)
-
-    @property
-    def opaque(self) -> Bool[np.ndarray, " num"]:
-        """Which Gaussians have an opacity logit of `OPAQUE_LOGIT` exactly: it is not stored."""
-        return np.asarray(self.opacity_logit) == OPAQUE_LOGIT
 
     def gaussians(self) -> FoldedGaussian:
         """The batch of Folded-Gaussians in the frame, batch shape (num,), event shape (3,).
@@ -201,12 +186,6 @@ class FoldedSplats(eqx.Module):
         color = jnp.maximum(0.5 + SH_C0 * self.color_dc, 0.0)
         splats = Splats2D(conditional.loc, conditional.scale_tril, opacity, color)
         return splats if self.paths is None else move_splats(splats, self.path_index, self.paths.at(t))
-
-
-def _has_bits(leaf: Array) -> Bool[np.ndarray, "..."]:
-    """Where values differ from +0 in their bits; -0 does."""
-    leaf = np.asarray(leaf)
-    return (leaf != 0) | np.signbit(leaf)
 
 
 def rotated_scale_tril(scale: Float[Array, "num 2"], angle: Float[Array, " num"]) -> Float[Array, "num 2 2"]:

@@ -5,7 +5,6 @@ import math
 from collections.abc import Iterator
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -20,9 +19,10 @@ from foldgauss.video.models.background import BLACK, Background, check_backgroun
 from foldgauss.video.models.frame_times import FrameTimes, snap_to_shots
 from foldgauss.video.models.prepared import PreparedModel
 from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer
-from foldgauss.video.models.sparse_storage import to_stored
 from foldgauss.video.models.splats import FoldedSplats
 
+#: Parameters of a Gaussian, without those of its fold.
+PARAMETERS = 11
 #: Advice in errors where a segmented video was given and one model is needed.
 ONE_SEGMENT = "Take one segment's own: video.segments[k].model."
 
@@ -113,9 +113,10 @@ class VideoModel(eqx.Module):
 
     @property
     def num_parameters(self) -> int:
-        """The parameters that a file stores, see `StoredSplats`; four bytes of kinds or indices count as one."""
-        leaves = map(np.asarray, jax.tree.leaves(dataclasses.replace(self, splats=to_stored(self.splats))))
-        return sum(-(-leaf.nbytes // 4) if leaf.dtype.kind == "u" else leaf.size for leaf in leaves)
+        """11 + 2 degree for each Gaussian, the frame times, and the knots of shared paths with their maps."""
+        paths = self.splats.paths
+        shared = 0 if paths is None else paths.times.size + paths.matrices.size
+        return self.num_gaussians * (PARAMETERS + 2 * self.degree) + self.num_frames - 1 + shared
 
     def with_options(self, options: RenderOptions) -> "VideoModel":
         """The same model, rendered with other options."""

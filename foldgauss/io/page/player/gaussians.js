@@ -6,7 +6,7 @@ export const TEXTURE_WIDTH = 2048;
 export const SH_C0 = 0.28209479177387814;
 const ENDLESS = 1e30; // a time before or after all others
 const TAU_MAX = Math.sqrt(-2 * Math.log(0.01)); // beyond, a Gaussian is not rendered
-/** log sigma_t of Gaussians without a time of their own, as STATIC_LOG_TIME_SCALE in foldgauss.video.models.splats. */
+/** log sigma_t of Gaussians that stand still throughout the clip. */
 export const STATIC = Math.fround(Math.log(1024));
 
 export const sigmoid = (x) => 1 / (1 + Math.exp(-x));

@@ -98,8 +98,8 @@ export function withColor(states, color) {
 }
 
 /**
- * Show time t of [0, 1] at about + shift + stretch (t - about); before and after, the selection stands still. Of Gaussians
- * without a time of their own only the shared path has one.
+ * Show time t of [0, 1] at about + shift + stretch (t - about); before and after, the selection stands still. Of
+ * Gaussians that stand still already only the shared path has times.
  */
 export function applyRetiming(state, shift, stretch, about) {
   const { degree } = state.model, windows = state.model.windows.slice(), moved = (t) => about + shift + stretch * (t - about);
@@ -119,7 +119,7 @@ export function applyRetiming(state, shift, stretch, about) {
 
 const isStatic = (leaves, i) => leaves.log_time_scale[i] === STATIC;
 
-/** Hold the selected Gaussians as they are at a time: those alive then become static, the others are removed. */
+/** Hold the selected Gaussians as they are at a time: those alive then stand still throughout, the others are removed. */
 export function applyFreeze(state, time) {
   const t = Math.fround(time), { windows } = state.model, kept = [];
   for (let i = 0; i < state.model.num; i++)

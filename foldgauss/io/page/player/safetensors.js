@@ -1,14 +1,8 @@
 // Model files of foldgauss, safetensors with a header of their own: see foldgauss.io.models.model_file and docs/format.md.
-import { STATIC } from "./gaussians.js";
 import { withoutUnused } from "./paths.js";
 
 const FORMAT = "foldgauss-model", VERSION = "1";
-const ARRAYS = { F32: Float32Array, U8: Uint8Array, U16: Uint16Array, U32: Uint32Array, F16: Uint16Array };
-/** Kinds of Gaussians: the bits of leaves that are left out, the degree, and the values of those; see sparse_storage.py. */
-const STATIC_BIT = 128, OPAQUE_BIT = 64, DEGREE_MASK = 63;
-const ABSENT = {
-  time_loc_logit: [STATIC_BIT, 0], log_time_scale: [STATIC_BIT, STATIC], opacity_logit: [OPAQUE_BIT, 8],
-};
+const ARRAYS = { F32: Float32Array, U8: Uint8Array };
 const MOST_PATHS = 255;
 const EARLY = 1e-6; // of the clip: rounding of times
 const DAMAGED = "The file is damaged or cut short. Copy it again.";
@@ -20,19 +14,15 @@ export function readSafetensors(buffer) {
   if (about.kind === "edited") throw new Error("This is an edited video whose edits no folded model holds. Render it with foldgauss render, or open the model and the edit script.");
   if (about.kind !== "video") throw new Error(`This is a ${JSON.stringify(about.kind)}, not a model. Open the file that foldgauss fit wrote.`);
   const header = JSON.parse(about.header), { num_gaussians: num, degree } = header;
-  const dense = (name) => tensor(`splats.${name}`), envelope = (name) => oneOf(tensor(`splats.envelope.${name}`), name);
-  let leaves = {};
-  for (const name of ["loc", "log_scale", "angle_logit", "time_loc_logit", "log_time_scale", "coefficients", "opacity_logit", "color_dc"]) leaves[name] = dense(name);
-  const { powers, colors, shapes } = header.stored ?? {};
-  if (powers !== undefined) leaves = { ...leaves, ...unpackKinds(leaves, dense("kinds"), num, degree) };
-  if (colors !== undefined) leaves.color_dc = rows(leaves.color_dc, dense("color_index"), 3);
-  if (shapes !== undefined) leaves.log_scale = rows(leaves.log_scale, dense("shape_index"), 2);
+  const leaf = (name) => tensor(`splats.${name}`), envelope = (name) => oneOf(tensor(`splats.envelope.${name}`), name);
+  const leaves = {};
+  for (const name of ["loc", "log_scale", "angle_logit", "time_loc_logit", "log_time_scale", "coefficients", "opacity_logit", "color_dc"]) leaves[name] = leaf(name);
   leaves.frame_times = tensor("frame_times.logits");
   const widths = { loc: 2, log_scale: 2, coefficients: 2 * degree, color_dc: 3 }, [numPaths, knots] = header.paths ?? [0, 0];
-  if (numPaths) Object.assign(leaves, { path_index: dense("path_index"), path_times: dense("paths.times"), path_matrices: dense("paths.matrices") });
+  if (numPaths) Object.assign(leaves, { path_index: leaf("path_index"), path_times: leaf("paths.times"), path_matrices: leaf("paths.matrices") });
   const lengths = { frame_times: header.num_frames - 1, path_times: numPaths * knots, path_matrices: 6 * numPaths * knots };
-  for (const [name, leaf] of Object.entries(leaves))
-    if (leaf.length !== (lengths[name] ?? num * (widths[name] ?? 1))) throw new Error(DAMAGED);
+  for (const [name, own] of Object.entries(leaves))
+    if (own.length !== (lengths[name] ?? num * (widths[name] ?? 1))) throw new Error(DAMAGED);
   const paths = numPaths ? { num_paths: numPaths, num_knots: knots } : null;
   return { header: { compositing: "over", scale_cutoff: 0, ...header, metadata: readMetadata(about), paths, power: envelope("power"), floor: envelope("floor") }, leaves };
 }
@@ -61,16 +51,9 @@ function readTensors(buffer) {
   const tensor = (name) => {
     const { dtype, data_offsets: [from, to] = [] } = entries[name] ?? {}, kind = ARRAYS[dtype];
     if (!kind || !(from >= 0 && to >= from && start + to <= buffer.byteLength)) throw new Error(DAMAGED);
-    const own = new kind(buffer.slice(start + from, start + to));
-    return dtype === "F16" ? Float32Array.from(own, fromHalf) : own;
+    return new kind(buffer.slice(start + from, start + to));
   };
   return { about, tensor };
-}
-
-function fromHalf(bits) {
-  const sign = bits & 0x8000 ? -1 : 1, exponent = (bits >> 10) & 31, fraction = bits & 1023;
-  if (exponent === 31) return fraction ? NaN : sign * Infinity;
-  return sign * (exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : (2 ** -14 * fraction) / 1024);
 }
 
 /** The value of an envelope's parameter, which the player has for all Gaussians together. */
@@ -79,26 +62,7 @@ function oneOf(values, name) {
   return values[0];
 }
 
-/** Leaves of which Gaussians of some kinds have none, at full length. */
-function unpackKinds(leaves, kinds, num, degree) {
-  const full = { coefficients: new Float32Array(2 * degree * num) };
-  for (const [name, [bit, value]] of Object.entries(ABSENT)) {
-    let next = 0;
-    full[name] = Float32Array.from(kinds, (kind) => (kind & bit ? value : leaves[name][next++] ?? NaN));
-  }
-  let next = 0;
-  for (let i = 0; i < num; i++) for (let k = 0; k < 2 * Math.min(kinds[i] & DEGREE_MASK, degree); k++) full.coefficients[2 * degree * i + k] = leaves.coefficients[next++] ?? NaN;
-  return full;
-}
-
-/** The rows that indices name. */
-function rows(table, index, width) {
-  const found = new Float32Array(width * index.length);
-  for (let i = 0; i < index.length; i++) for (let c = 0; c < width; c++) found[width * i + c] = table[width * index[i] + c] ?? NaN;
-  return found;
-}
-
-/** A model as a file that foldgauss opens: float32, all leaves dense. Throws an Error for display where none can hold it. */
+/** A model as a file that foldgauss opens. Throws an Error for display where none can hold it. */
 export function writeSafetensors(model, metadata) {
   const { header, num, degree, leaves, intervals, windows } = model, { paths, index } = withoutUnused(model);
   const { held, time_loc: times } = leaves, isStill = (own, i) => (windows[2 * i] < held[2 * i] && held[2 * i] > EARLY) || (windows[2 * i + 1] > held[2 * i + 1] && held[2 * i + 1] < 1 - EARLY);

@@ -1,6 +1,4 @@
 // PLY files of the published VeGaS code: the twin of foldgauss.io.exchange.vegas_ply.read_vegas_ply, where the formulas are.
-import { STATIC } from "./gaussians.js";
-
 export const FIELD_OF_VIEW = 0.6911112; // radians, of the front camera
 const POWER = 2, SCALE_CUTOFF = 1e-4; // of the published code
 export const OPTIONS = { low_pass: 0.3, alpha_cutoff: 1 / 255, alpha_ceiling: 0.99, transmittance_stop: 1e-4, tile_size: null, list_capacity: null, support_radius: null };
@@ -22,7 +20,7 @@ export function readVegas({ elements: { vertex, time }, note }, given) {
   const leaves = {
     loc: pairs(vertex.x, vertex.z, mapped), log_scale: pairs(vertex.scale_0, vertex.scale_2, (own) => own + Math.log(unit)),
     angle_logit: Float32Array.from(vertex.rot_0), time_loc_logit: Float32Array.from(vertex.m_0),
-    log_time_scale: Float32Array.from(vertex.sigma_0, (own) => (own === STATIC ? own : own + 0.5 * Math.log(power / POWER))),
+    log_time_scale: Float32Array.from(vertex.sigma_0, (own) => own + 0.5 * Math.log(power / POWER)),
     coefficients, opacity_logit: Float32Array.from(vertex.opacity), color_dc: color, frame_times: Float32Array.from(weightsOf(time)),
   };
   const header = {
