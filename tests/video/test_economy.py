@@ -6,6 +6,16 @@ import functools
 import jax
 import numpy as np
 import pytest
+from foldgauss.video.models.sparse_storage import (
+    OPAQUE_BIT,
+    STATIC_BIT,
+    clear_absent_moments,
+    count_parameters,
+    find_kinds,
+    get_degrees,
+    is_opaque,
+    is_static,
+)
 from scenes_of_motion import SIZE, cut, disc, noise, still
 
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
@@ -23,16 +33,6 @@ from foldgauss.video.fitting.pruning.scores import PruningScores, measure_scores
 from foldgauss.video.fitting.schedule import plan_levels
 from foldgauss.video.models.conditioning import ConditioningSpec, condition, find_windows
 from foldgauss.video.models.row_layout import columns, pack
-from foldgauss.video.models.sparse_storage import (
-    OPAQUE_BIT,
-    STATIC_BIT,
-    clear_absent_moments,
-    count_parameters,
-    find_kinds,
-    get_degrees,
-    is_opaque,
-    is_static,
-)
 from foldgauss.video.models.splats import OPAQUE_LOGIT
 from foldgauss.video.selection.contributions import Contributions
 
