@@ -11,6 +11,7 @@ from foldgauss.io._atomic import describe_missing
 from foldgauss.io.media.clip import AS_STORED, Reading
 from foldgauss.io.media.image_files import IMAGE_SUFFIXES, image_paths, natural_sort_key
 from foldgauss.io.media.video_writing import ANIMATION_SUFFIXES
+from foldgauss.io.models.compact import COMPACT_SUFFIX
 from foldgauss.io.models.video_model import MODEL_SUFFIX
 from foldgauss.jobs.job import FitJob
 from foldgauss.video.fitting.config import FitConfig
@@ -68,6 +69,8 @@ def make_jobs(
 ) -> list[FitJob]:
     """A job for each clip; models go to the folder `out` under the clips' names, with suffix where stems are equal.
 
+    They are compact files where `config` asks for compact models.
+
     Checkpoints and records go to the folder `RECORDS` in `out`, which must exist.
     """
     out, config = Path(out).absolute(), FitConfig() if config is None else config
@@ -76,7 +79,7 @@ def make_jobs(
         job = FitJob(
             clip.name,
             str(clip.absolute()),
-            str(out / f"{stem}{MODEL_SUFFIX}"),
+            str(out / f"{stem}{COMPACT_SUFFIX if config.is_compact else MODEL_SUFFIX}"),
             config,
             size,
             frames,

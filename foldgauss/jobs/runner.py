@@ -17,6 +17,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 
 from foldgauss import __version__
+from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.machine import waiting_seconds
 from foldgauss.io._atomic import OutputError, atomic_path, write_or_keep
 from foldgauss.io._lock import lock_output
@@ -25,14 +26,16 @@ from foldgauss.io.media.frame_index import FrameIndex
 from foldgauss.io.media.indexed_reader import read_indexed
 from foldgauss.io.media.video_reading import read_video
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
+from foldgauss.io.models.compact import COMPACT_SUFFIX, save_compact
 from foldgauss.io.models.video_model import save_video_model
 from foldgauss.io.provenance import describe_reading, describe_source, fingerprint
 from foldgauss.jobs.job import FitJob, file_digest, read_record
 from foldgauss.jobs.warning_capture import WarningCapture
+from foldgauss.video.compression.quantize import Quantized
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.divergence import FitDiverged
-from foldgauss.video.fitting.loop import FitInfo, fit_steps
-from foldgauss.video.fitting.state import FitState, to_model
+from foldgauss.video.fitting.loop import FitInfo, finish, fit_steps
+from foldgauss.video.fitting.state import FitState
 from foldgauss.video.models.metrics import Evaluation, evaluate
 from foldgauss.video.models.video_model import VideoModel
 
@@ -42,6 +45,8 @@ CHECKPOINT_SECONDS, REPORT_SECONDS = 30.0, 1.0
 WAIT_SECONDS = 60.0
 #: A fraction of the processor time that its threads asked for, below which a fit by minutes warns.
 LEAST_PROCESSOR_FRACTION = 0.5
+#: How many dB a model may be below the PSNR that was asked for without a warning.
+TOLERATED_DB = 0.05
 #: Number of clip shapes whose compiled programs are kept.
 MAX_SHAPES = 8
 
@@ -94,7 +99,10 @@ class Checkpoint:
 
 @dataclasses.dataclass(frozen=True)
 class FitRun:
-    """A finished fit of a job: its frames, its model, the last state and the `info` of the last step."""
+    """A finished fit of a job: its frames, its model, the last state and the `info` of the last step.
+
+    `quantized` is the compact model, where one was asked for.
+    """
 
     job: FitJob
     clip: Clip
@@ -102,6 +110,7 @@ class FitRun:
     state: FitState
     info: FitInfo
     checkpoint: Checkpoint
+    quantized: Quantized | None = None
 
     def save_checkpoint(self) -> None:
         """Save the last state, so that the fit need not be repeated if its model cannot be written."""
@@ -112,7 +121,10 @@ class FitRun:
         metadata = fit_metadata(self.clip, self.job.config.seed, self.job.frames) | self.job.metadata
         metadata |= describe_fit(self.job.config, self.state)
         metadata |= {} if scores is None else mean_scores(scores)
-        save_video_model(self.job.target, self.model, metadata=metadata)
+        if Path(self.job.target).suffix.lower() == COMPACT_SUFFIX:
+            save_compact(self.job.target, self.quantized, metadata=metadata)
+        else:
+            save_video_model(self.job.target, self.model, metadata=metadata)
 
     def save_to(self, path: Path, scores: Evaluation | None = None) -> "FitRun":
         """Write the model to `path`; returns the run with that as its target."""
@@ -136,6 +148,9 @@ def run_fit(
     Raises `Stopped` if the observer stops the fit, `FitDiverged` as `fit_steps`, ValueError and OSError for frames that
     cannot be read or fitted, and for a checkpoint that is required.
     """
+    if Path(job.target).suffix.lower() == COMPACT_SUFFIX and not job.config.is_compact:
+        cure = "Give a quality, a size or a PSNR."
+        raise invalid("config", expected=f"one of a compact model for {job.target}", got="others", cure=cure)
     clip = read_clip(job)
     _COMPILED.add(clip.frames.shape)
     checkpoint = Checkpoint(job.checkpoint, job.config, fingerprint(clip), on_checkpoint_error)
@@ -145,7 +160,8 @@ def run_fit(
         steps = _replacing(checkpoint, steps)
     with observer(clip, state) as observe:
         state, info = run_steps(steps, observe, checkpoint, job.checkpoint_seconds)
-    return FitRun(job, clip, to_model(state, job.config, clip.size, clip.fps), state, info, checkpoint)
+    model, quantized = finish(state, clip.frames, job.config, clip.fps)
+    return FitRun(job, clip, model, state, info, checkpoint, quantized)
 
 
 def run_steps(
@@ -211,13 +227,20 @@ def describe_fit(config: FitConfig, state: FitState) -> dict[str, Any]:
     A fit by `minutes` depends on the load of the machine. Its metadata also hold the seconds of the clock, of the
     processors, and of waiting for processors.
     """
-    budgets = {name: getattr(config, name) for name in ("steps", "minutes", "target_psnr")}
+    budgets = {name: getattr(config, name) for name in ("steps", "minutes", "quality", "size_mb", "psnr")}
     about = {"version": __version__, "steps": state.step}
     about["budget"] = {name: value for name, value in budgets.items() if value is not None}
     if config.minutes is not None:
         about |= {"fit_seconds": round(state.seconds, 2)}
         about |= {name: round(getattr(state, name), 2) for name in ("processor_seconds", "waiting_seconds")}
     return about
+
+
+def missed_psnr(config: FitConfig, psnr: float) -> list[str]:
+    """A warning that the model of a fit is worse than it was asked to be, if it is."""
+    if config.psnr is None or psnr >= config.psnr - TOLERATED_DB:
+        return []
+    return [f"expected {config.psnr:g} dB, got {psnr:.2f}."]
 
 
 def mean_scores(scores: Evaluation) -> dict[str, float]:

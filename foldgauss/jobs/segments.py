@@ -183,7 +183,7 @@ def plan_long_fit(
     """Index a clip and plan its segments, or continue the plan that exists, unless `restart`.
 
     Segments end at scene cuts near their length, `segment_seconds`; otherwise they share `overlap` frames with the
-    next. `config` is that of each segment; its `max_size_mb` is divided among them by their frames. `clip`, `size`,
+    next. `config` is that of each segment; its `size_mb` is divided among them by their frames. `clip`, `size`,
     `frames` and the options of `reading` as in `read_video`. Memory grows with the clip by some tens of bytes per frame
     only.
 
@@ -265,11 +265,11 @@ def _make_jobs(
 
 
 def _divide_size(config: FitConfig, spans: Sequence[tuple[int, int]]) -> list[FitConfig]:
-    """The configuration of each segment: `max_size_mb` in proportion to its frames; shared frames count twice."""
-    if config.max_size_mb is None:
+    """The configuration of each segment: `size_mb` in proportion to its frames; shared frames count twice."""
+    if config.size_mb is None:
         return [config] * len(spans)
     lengths = [stop - first for first, stop in spans]
-    return [dataclasses.replace(config, max_size_mb=config.max_size_mb * one / sum(lengths)) for one in lengths]
+    return [dataclasses.replace(config, size_mb=config.size_mb * one / sum(lengths)) for one in lengths]
 
 
 def _limit_overlap(overlap: int, length: int) -> int:

@@ -5,12 +5,12 @@ In reading order: `models` (the model, and rendering it), `motion` (optical flow
 `segmented` (long videos in segments), `compression` (`compress`) and `tradeoff` (speed against accuracy).
 """
 
-from foldgauss.video.compression.search import Compressed, compress
 from foldgauss.video.editing.chain import Edit, edit
 from foldgauss.video.editing.clock import Clock
 from foldgauss.video.editing.edited_video import EditedVideo, Layer
 from foldgauss.video.editing.overlays import SelectedGaussians
 from foldgauss.video.editing.span import Span
+from foldgauss.video.fitting.compress import Compressed, compress
 from foldgauss.video.fitting.config import FitConfig, LearningRates
 from foldgauss.video.fitting.divergence import DivergenceWarning, FitDiverged
 from foldgauss.video.fitting.growth import Growth

@@ -406,7 +406,7 @@ COMPACT = Target(
     (ModelFileError,),
     {
         "foldgauss.io.models.compact": ("save_compact", "check_compact_name", "pack_compact"),
-        "foldgauss.io.models.column_contexts": (),
+        "foldgauss.video.compression.column_contexts": (),
         "foldgauss.io.models.video_model": (
             ONLY,
             "load_video_model",
@@ -414,7 +414,7 @@ COMPACT = Target(
             "read_origin",
             "_is_range",
         ),
-        "foldgauss.io.models.range_coder": ("encode",),
+        "foldgauss.video.compression.range_coder": ("encode",),
     },
     _compact_body,
     lambda size: 4 * CONSTANT + 2_000 * size,  # a byte may hold 32 numbers: the format's own limit

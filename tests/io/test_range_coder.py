@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from foldgauss.io.models import range_coder as coder
+from foldgauss.video.compression import range_coder as coder
 
 
 def columns():

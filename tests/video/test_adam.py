@@ -104,7 +104,9 @@ def test_all_implementations_take_the_same_steps():
         change, *own[1:3] = adam_step(grad, *own[1:], rates)
         own[0] -= change.astype(np.float32)
         sparse_adam(sparse[0], grad.copy(), *sparse[1:], np.arange(num), rates)
-        masked = masked_adam(masked[0], grad, *masked[1:], np.ones(num, bool), rates, units=RateUnits())
+        masked = masked_adam(
+            masked[0], grad, *masked[1:], np.ones(num, bool), rates, rounded=np.zeros(num, np.uint8), units=RateUnits()
+        )
         with jax.numpy_dtype_promotion("standard"):
             update, moments = FRAME_TIME_ADAM.update(grad, moments)
         by_optax -= rates * np.asarray(update)
@@ -124,9 +126,10 @@ def test_masked_adam_matches_sparse_adam(units):
     counts[:50] = np.arange(50)
     touched, rates = rng.random(num) < 0.7, rng.random(width).astype(np.float32)
     arrays = rows, grad, first, second, counts
-    own = jax.jit(lambda *arrays: masked_adam(*arrays, touched, rates, units=units))(*arrays)
+    rounded = rng.integers(0, 8, num).astype(np.uint8)
+    own = jax.jit(lambda *arrays: masked_adam(*arrays, touched, rates, rounded=rounded, units=units))(*arrays)
     judge = [array.copy() for array in arrays]
-    sparse_adam(*judge, np.flatnonzero(touched), rates, units=units)
+    sparse_adam(*judge, np.flatnonzero(touched), rates, rounded=rounded, units=units)
     for one, other, before in zip(own, (judge[0], *judge[2:]), (rows, *arrays[2:]), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
         np.testing.assert_array_equal(np.asarray(one)[~touched], before[~touched])

@@ -19,17 +19,16 @@ from foldgauss.cli.shared.tables import print_figures, summarize_scores, write_j
 from foldgauss.io.datasets import sample_clip
 from foldgauss.io.media.video_reading import read_video
 from foldgauss.io.media.video_writing import write_image, write_video
-from foldgauss.io.models.video_model import save_video_model
+from foldgauss.io.models.compact import save_compact
 from foldgauss.io.provenance import describe_source
 from foldgauss.jobs.runner import describe_fit, mean_scores, run_steps
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.loop import fit_steps
-from foldgauss.video.fitting.state import to_model
+from foldgauss.video.fitting.loop import finish, fit_steps
 
 SIZE, FRAMES = (160, 320), (0, 24)
 RECORD = "metrics.json"
-FILES = {"model.safetensors", "reconstruction.mp4", "comparison.png", RECORD}
-CONFIG = FitConfig(num_gaussians=40_000, steps=1500)
+FILES = {"model.fgz", "reconstruction.mp4", "comparison.png", RECORD}
+CONFIG = FitConfig(num_gaussians=40_000, steps=1500, quality=80)
 
 
 @app.command()
@@ -46,7 +45,7 @@ def demo(
     out.print(f"Bunny, frames 0 to {FRAMES[1] - 1}, 160x320, on {num_threads()} threads")
     with display_progress(choose_display(), err) as show, stop_on_signals(show) as observe:
         state, info = run_steps(fit_steps(clip.frames, CONFIG), observe)
-    model = to_model(state, CONFIG, clip.size, clip.fps)
+    model, quantized = finish(state, clip.frames, CONFIG, clip.fps)
     images: list[np.ndarray] = []
     scores = evaluate_with_progress(model, clip.frames, images.append)
     figures = summarize_scores(model, scores) | summarize_fit(info)
@@ -59,7 +58,7 @@ def demo(
     def write(folder: Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / RECORD, figures | frames)  # first: the next demo may then replace this one, however it ends
-        saved = save_video_model(folder / "model.safetensors", model, metadata=metadata)
+        saved = save_compact(folder / "model.fgz", quantized, metadata=metadata)
         write_video(folder / "reconstruction.mp4", images, clip.fps)
         write_image(folder / "comparison.png", sheet)
         figures["file_bytes"] = saved.stat().st_size
@@ -71,7 +70,7 @@ def demo(
     for name, what in (
         ("comparison.png", "original, reconstruction and error side by side"),
         ("reconstruction.mp4", "the rendered model, for any player (H.264)"),
-        ("model.safetensors", "the model: try `foldgauss render` with --upsample 4"),
+        ("model.fgz", "the model: try `foldgauss render` with --upsample 4"),
         (RECORD, "the figures above, and those of each frame"),
     ):
         out.print(f"  {out_dir / name}  {what}", soft_wrap=True)

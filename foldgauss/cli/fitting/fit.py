@@ -1,5 +1,6 @@
 """The command `fit`."""
 
+import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -43,12 +44,13 @@ from foldgauss.io._atomic import OutputError, check_writable, resolve, write_or_
 from foldgauss.io._lock import lock_output
 from foldgauss.io.history import HistoryFile, read_history, write_curves
 from foldgauss.io.media.clip import DEINTERLACE, Clip
+from foldgauss.io.models.compact import COMPACT_SUFFIX
 from foldgauss.io.models.video_model import MODEL_SUFFIX, check_model_name
 from foldgauss.jobs.job import FitJob
-from foldgauss.jobs.runner import FitRun, busy_processors, run_fit
+from foldgauss.jobs.runner import FitRun, busy_processors, missed_psnr, run_fit
 from foldgauss.jobs.runner import Stopped as FitStopped
 from foldgauss.jobs.segments import read_segment_seconds
-from foldgauss.video.fitting.config import FitConfig, planned_steps
+from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig, planned_steps
 from foldgauss.video.fitting.divergence import FitDiverged
 from foldgauss.video.fitting.loop import FitInfo
 from foldgauss.video.fitting.state import FitState, running_psnr
@@ -63,7 +65,12 @@ def fit(
     config: FitConfig,
     out_path: Annotated[
         Path | None,
-        typer.Option("--out", metavar="MODEL", help="Model file [default: the clip's name, in this folder]."),
+        typer.Option(
+            "--out",
+            metavar="MODEL",
+            help=f"FILE{COMPACT_SUFFIX}, or FILE{MODEL_SUFFIX} with parameters as float32 [default: the clip's name, "
+            f"{COMPACT_SUFFIX}, in this folder].",
+        ),
     ] = None,
     size: Size = None,
     frames: Frames = None,
@@ -101,12 +108,9 @@ def fit(
     A stopped fit has a checkpoint and continues with --resume. Long clips are fitted in segments, in parallel with
     workers.
     """
-    target = name_after(video, MODEL_SUFFIX) if out_path is None else out_path
+    in_segments = not (segment_seconds is None and workers is None and scheduler is None)
+    target, config = _choose_target(video, out_path, config, in_segments)
     refuse_inputs(target, {"clip": video})
-    try:
-        check_model_name(target, "out")
-    except ValueError as error:
-        raise WrongUse(name_option(str(error))) from error
     job = FitJob(
         video.name,
         str(video),
@@ -122,7 +126,7 @@ def fit(
     context.with_resource(lock_output(target, own=(job.checkpoint,)))
     refuse_existing(target, overwrite)
     begun = read_segment_seconds(target) is not None and not job.checkpoint.exists() and (resume or not overwrite)
-    if begun or not (segment_seconds is None and workers is None and scheduler is None):
+    if begun or in_segments:
         for option, path in (("--history", history), ("--preview", preview)):
             if path is not None:
                 raise WrongUse(f"{option}: expected a fit in one piece, got one in segments. Leave it out.")
@@ -161,10 +165,33 @@ def fit(
     except OSError as error:
         warn(f"{target} is written, but its scores could not be added: {error}")
     job.checkpoint.unlink(missing_ok=True)
+    for text in missed_psnr(config, scores.mean_psnr):
+        warn(f"--psnr: {text} Give more --minutes or --steps, or more --gaussians at the start.")
     for text in busy_processors(run):
         warn(f"--minutes: {text}")
     figures = summarize_scores(run.model, scores) | summarize_fit(run.info) | {"stopped_by": run.info.stopped_by}
     _print_results(run, display, figures | {"file_bytes": target.stat().st_size})
+
+
+def _choose_target(video: Path, out_path: Path | None, config: FitConfig, in_segments: bool) -> tuple[Path, FitConfig]:
+    """The file to write, and the settings: the default quality for a compact file of which nothing else is asked."""
+    if out_path is None:
+        joined = name_after(video, MODEL_SUFFIX)
+        unfinished = read_segment_seconds(joined) is not None
+        out_path = joined if in_segments or unfinished else name_after(video, COMPACT_SUFFIX)
+    if out_path.suffix.lower() == COMPACT_SUFFIX:
+        if in_segments:
+            cure = "Segments are joined in such a file."
+            raise wrong_use("--out", expected=f"a name ending in {MODEL_SUFFIX}", got=out_path, cure=cure)
+        return out_path, config if config.is_compact else dataclasses.replace(config, quality=DEFAULT_QUALITY)
+    try:
+        check_model_name(out_path, "out")
+    except ValueError as error:
+        raise WrongUse(name_option(str(error))) from error
+    if config.size_mb is not None:
+        cure = f"Compact files end in {COMPACT_SUFFIX}."
+        raise wrong_use("--size-mb", expected="a compact file", got=out_path, cure=cure)
+    return out_path, config
 
 
 def summarize_fit(info: FitInfo) -> dict[str, float]:

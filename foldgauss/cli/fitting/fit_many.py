@@ -1,5 +1,6 @@
 """The command `fit-many`."""
 
+import dataclasses
 import os
 import time
 from pathlib import Path
@@ -42,7 +43,7 @@ from foldgauss.io.media.clip import DEINTERLACE
 from foldgauss.jobs import FitJob, Outcome, find_clips, make_jobs
 from foldgauss.jobs.clips import RECORDS
 from foldgauss.jobs.job import read_record, read_request, write_request
-from foldgauss.video.fitting.config import FitConfig
+from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig
 
 SUMMARY = "summary.json"
 #: Seconds between two writes of the summary: there may be thousands of clips.
@@ -90,11 +91,13 @@ def fit_many(
     quiet: Quiet = False,
     log_json: LogJson = False,
 ) -> None:
-    """Fit a model to each clip of a folder, and list those that fail.
+    """Fit a compact model to each clip of a folder, and list those that fail.
 
     Models go to DIR under the clips' names, results to DIR/summary.json. Given again, the command continues with what
     is left, from checkpoints of stopped fits. The exit code is 1 if a clip failed.
     """
+    if not config.is_compact:
+        config = dataclasses.replace(config, quality=DEFAULT_QUALITY)
     display = choose_display(quiet, log_json)
     options = WorkerOptions(workers, scheduler, threads)
     found = find_clips(folder)

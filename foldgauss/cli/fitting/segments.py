@@ -94,9 +94,11 @@ def plan_gaussians(config: FitConfig, num_frames: int, *size: int, threads: int 
 
 
 def describe_budgets(config: FitConfig, steps: int | None) -> str:
-    """The budgets of a fit that are set, as "3,000 steps or 35 dB"."""
-    budgets = {"{:,} steps": steps, "{:g} minutes": config.minutes, "{:g} dB": config.target_psnr}
-    return " or ".join(text.format(value) for text, value in budgets.items() if value is not None)
+    """The budgets of a fit that are set, and what is asked of a compact model, as "3,000 steps, quality 50"."""
+    budgets = {"{:,} steps": steps, "{:g} minutes": config.minutes}
+    goals = {"quality {:g}": config.quality, "{:g} MB at most": config.size_mb, "{:g} dB": config.psnr}
+    texts = ([text.format(value) for text, value in of.items() if value is not None] for of in (budgets, goals))
+    return ", ".join(filter(None, map(" or ".join, texts)))
 
 
 def _join_with_progress(fit: LongFit, outcomes: list[Outcome], display: Display) -> JoinedFit:

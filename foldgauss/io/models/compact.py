@@ -14,12 +14,9 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Int
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.io._atomic import PathLike, atomic_path, check_path
-from foldgauss.io.models import range_coder
-from foldgauss.io.models.column_contexts import ColumnContexts
 from foldgauss.io.models.model_file import (
     HEADER_ERRORS,
     ModelFileError,
@@ -29,6 +26,8 @@ from foldgauss.io.models.model_file import (
     to_json_types,
 )
 from foldgauss.render import COMPOSITINGS, RenderOptions
+from foldgauss.video.compression import range_coder
+from foldgauss.video.compression.column_contexts import ColumnContexts
 from foldgauss.video.compression.quantize import (
     FEATURES,
     LARGEST,
@@ -41,7 +40,8 @@ from foldgauss.video.compression.quantize import (
 )
 from foldgauss.video.compression.quantized_paths import MAX_PATH_BITS, PathsInfo
 from foldgauss.video.compression.quantized_times import MAX_TIME_BITS
-from foldgauss.video.fitting.config import MAX_DEGREE
+from foldgauss.video.compression.streams import PATH_STREAMS, describe_maps, encode_streams, last_cell, path_identities
+from foldgauss.video.models.row_layout import MAX_DEGREE
 from foldgauss.video.models.shared_paths import MAX_PATHS
 from foldgauss.video.models.video_model import VideoModel
 
@@ -77,72 +77,33 @@ def check_compact_name(path: Path, parameter: str = "path") -> None:
 
 def pack_compact(quantized: Quantized, metadata: dict | None = None) -> bytes:
     """The bytes of the file."""
-    info, contexts = quantized.info, ColumnContexts(quantized.rules, quantized.info)
-    streams, descriptions = [], []
+    info, streams, descriptions = quantized.info, encode_streams(quantized), []
     for name in info.column_names:
-        numbers = coded = quantized.columns[name]
-        if name == "cell":  # from each to the next, around the end
-            coded = np.diff(numbers, prepend=0) & _last_cell(info)
-        streams.append(range_coder.encode(coded, contexts.describe_next(name)))
-        contexts.add(name, numbers)
         rule = quantized.rules.get(name)
         own = [] if is_integral(name) else [rule.origin, rule.exponent, *rule.slopes]
-        descriptions.append([len(streams[-1]), *own])
-    intervals = quantized.intervals
-    streams.append(range_coder.encode(intervals, range_coder.Column.without_contexts(len(intervals))))
+        descriptions.append([len(streams[name]), *own])
     header = dataclasses.asdict(info) | {
-        "num_frames": len(intervals) + 1,
+        "num_frames": len(quantized.intervals) + 1,
         "columns": descriptions,
-        "intervals": len(streams[-1]),
+        "intervals": len(streams["intervals"]),
         "metadata": to_json_types(metadata or {}),
     }
     num_values = info.num_gaussians * len(descriptions) + header["num_frames"] + _count_path_numbers(info)
     if info.paths is None:
         del header["paths"]
     else:
-        parts = _pack_paths(quantized)
-        header["paths"] |= {name: len(part) for name, part in parts.items()}
-        streams.extend(parts.values())
+        header["paths"] |= {name: len(streams[name]) for name in PATH_STREAMS}
     text = to_json("header", header).encode()
-    data = b"".join(streams)
+    data = b"".join(streams.values())
     text += b" " * (-(-num_values // _MOST_PER_BYTE) - len(text) - len(data))
     body = text + data
     numbers = (VERSION, len(text), zlib.crc32(body))
     return MAGIC + b"".join(number.to_bytes(4, "little") for number in numbers) + body
 
 
-def _last_cell(info: CompactInfo) -> int:
-    return (1 << sum(info.cells)) - 1
-
-
 def _count_path_numbers(info: CompactInfo) -> int:
     own = info.paths
     return 0 if own is None else own.num_paths * own.num_knots * (6 if own.at_frames else 7)
-
-
-def _pack_paths(quantized: Quantized) -> dict[str, bytes]:
-    """The streams of knots, which is empty if they are at the frames, and maps: both as differences in time."""
-    knots, maps = b"", quantized.maps
-    if quantized.knots is not None:
-        coded = np.diff(quantized.knots, axis=1, prepend=0)
-        knots = range_coder.encode(coded.ravel(), range_coder.Column.without_contexts(coded.size))
-    coded = np.diff(maps, axis=1, prepend=_identities(quantized.info.paths))
-    return {"knots": knots, "maps": range_coder.encode(coded.ravel(), _describe_maps(quantized.info.paths))}
-
-
-def _identities(about: PathsInfo) -> Int[np.ndarray, "paths 1 2 3"]:
-    return np.tile(np.eye(2, 3, dtype=np.int64) << about.bits, (about.num_paths, 1, 1, 1))
-
-
-def _describe_maps(about: PathsInfo) -> range_coder.Column:
-    """Contexts: which of a map's six numbers it is, and the same number of the knot before."""
-    num = 6 * about.num_paths * about.num_knots
-    place = np.arange(num, dtype=np.int32)
-    near = np.where(place // 6 % about.num_knots > 0, place - 6, -1)
-    contexts = np.stack([place % 6, np.zeros_like(place)], 1).astype(np.uint8)
-    return dataclasses.replace(
-        range_coder.Column.without_contexts(num), contexts=contexts, near=near.astype(np.int32)[:, None]
-    )
 
 
 # ---------------------------------------------------------------------------------------------- reading
@@ -237,7 +198,7 @@ def _decode(header: dict, body: bytes, whole_length: int) -> Quantized:
     for name, length in zip(names, lengths[:-1], strict=True):
         numbers = range_coder.decode(streams.read(length), contexts.describe_next(name))
         if name == "cell":
-            numbers = (np.cumsum(numbers, dtype=np.int64) & _last_cell(info)).astype(np.int32)
+            numbers = (np.cumsum(numbers, dtype=np.int64) & last_cell(info)).astype(np.int32)
         if name in most:
             _check(numbers.min() >= 0 and numbers.max() <= most[name], name, "numbers out of range")
         contexts.add(name, numbers)
@@ -248,8 +209,8 @@ def _decode(header: dict, body: bytes, whole_length: int) -> Quantized:
 
 def _decode_paths(about: PathsInfo, knots: bytes, maps: bytes) -> dict[str, np.ndarray]:
     shape = about.num_paths, about.num_knots
-    coded = range_coder.decode(maps, _describe_maps(about)).reshape(*shape, 2, 3)
-    made = {"maps": np.cumsum(coded, axis=1, dtype=np.int64) + _identities(about)}
+    coded = range_coder.decode(maps, describe_maps(about)).reshape(*shape, 2, 3)
+    made = {"maps": np.cumsum(coded, axis=1, dtype=np.int64) + path_identities(about)}
     if about.at_frames:
         _check(not knots, "knots", "some")
     else:

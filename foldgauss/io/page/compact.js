@@ -256,7 +256,8 @@ function decodeColumns(header, streamOf, onColumn) {
         from[i] = origin;
         if (axis >= 0 && cells[axis] > 0) {
           const index = along(q.cell[i], cells, axis);
-          from[i] = middles[axis] + ((index + 0.5) / 2 ** cells[axis] - 0.5) * sides[axis];
+          const center = middles[axis] + ((index + 0.5) / 2 ** cells[axis] - 0.5) * sides[axis];
+          from[i] = Math.floor(center / steps[i] + 0.5) * steps[i];
         }
       }
     const contexts = (i) => {

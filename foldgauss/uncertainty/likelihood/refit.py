@@ -215,7 +215,7 @@ def iter_refits(
     `video`: the clip that `model` was fitted to with `config`. `start`: "model" continues from it with the learning
     rates of the end of the schedule (`START_AT`), the default for pixels and order; "scratch" is a whole fit with
     another seed, the only option for frames. `steps` of each: by default those of `config`, or of the end of its
-    schedule; `config.minutes` and `target_psnr` are ignored.
+    schedule; `config.minutes` and a compact model that it asks for are ignored.
 
     Source: Kuensch 1989 (blocks), Wu 1986 (residuals kept in place), Efron and Tibshirani 1993, chapters 9 and 17.
     Raises ValueError for a video that is not the model's, a config that could not have fitted it, and settings out of
@@ -286,7 +286,8 @@ def _fix_steps(config: FitConfig, num_frames: int, start: str, steps: int | None
         steps = planned_steps(dataclasses.replace(config, minutes=None), num_frames)
         steps = steps if start == "scratch" else max(1, round((1 - START_AT) * steps))
     cooldown = max(config.cooldown_fraction, COOLDOWN_FRACTION)
-    return dataclasses.replace(config, steps=steps, minutes=None, target_psnr=None, cooldown_fraction=cooldown)
+    float32 = {"quality": None, "size_mb": None, "psnr": None}
+    return dataclasses.replace(config, steps=steps, minutes=None, cooldown_fraction=cooldown, **float32)
 
 
 def resample_frames(

@@ -26,9 +26,8 @@ from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions
 from foldgauss.video.compression.quantized_paths import PathsInfo, decode_paths, describe_paths, round_paths
 from foldgauss.video.compression.quantized_times import choose_time_bits, round_times
-from foldgauss.video.fitting.config import MAX_DEGREE
 from foldgauss.video.models.frame_times import FrameTimes
-from foldgauss.video.models.row_layout import shift_path
+from foldgauss.video.models.row_layout import MAX_DEGREE, shift_path
 from foldgauss.video.models.shared_paths import SharedPaths, check_paths
 from foldgauss.video.models.splats import TAU_MAX, FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
@@ -158,12 +157,6 @@ class Quantized:
     knots: Int32[np.ndarray, "paths knots"] | None = None
 
 
-def estimate_bits(quantized: Quantized) -> float:
-    """About how many bits the Gaussians take, without regard to contexts: to compare versions of the same model."""
-    columns = quantized.columns | {"cell": np.diff(quantized.columns["cell"], prepend=0)}
-    return sum(float(np.log2(1 + np.abs(numbers)).sum()) + len(numbers) for numbers in columns.values())
-
-
 # ------------------------------------------------------------------------------------------ decoding
 
 
@@ -187,15 +180,21 @@ class ColumnDecoder:
             return np.zeros(self._info.num_gaussians, np.int32)
         return self._rules[name].half_exponents(self._features, self._info.num_gaussians)
 
-    def origin(self, name: str) -> Float[np.ndarray, " num"]:
-        """Values of integer 0 in the next column: the cell's center, if cells divide that axis."""
+    def origin(self, name: str, steps: Float[np.ndarray, " num"]) -> Float[np.ndarray, " num"]:
+        """Values of integer 0 in the next column: the cell's center, if cells divide that axis.
+
+        The center is rounded to a multiple of the step, so that values that are rounded already stay what they are,
+        whichever cell they are in.
+        """
         axis = {"x0": 0, "y0": 1, "time": 2}.get(name)
         if axis is not None and self._info.cells[axis]:
-            return cell_centers(self.values["cell"].astype(np.int64), self._info)[axis]
+            center = cell_centers(self.values["cell"].astype(np.int64), self._info)[axis]
+            return np.floor(center / steps + 0.5) * steps
         return np.full(self._info.num_gaussians, 0.0 if is_integral(name) else self._rules[name].origin)
 
     def add(self, name: str, numbers: Int32[np.ndarray, " num"], halves: Int32[np.ndarray, " num"]) -> None:
-        value = self.origin(name) + numbers * compute_steps(halves, name)
+        steps = compute_steps(halves, name)
+        value = self.origin(name, steps) + numbers * steps
         if name in FEATURES:
             self._features.append(value)
         if trajectory_power(name):
@@ -501,15 +500,6 @@ def _choose_degrees(saved: Float[np.ndarray, "degree+1 num"]) -> Int32[np.ndarra
     return worth.max(axis=0, initial=0).astype(np.int32)
 
 
-def unrounded_trajectories(quantized: Quantized, exact: ExactColumns) -> Float[np.ndarray, "num degree+1 2"]:
-    """Trajectories before rounding, in powers of u = decoded m_t - t, truncated to the stored degrees."""
-    info, values = quantized.info, decode_values(quantized)
-    columns = _compute_trajectories(exact, values)
-    polynomials = np.stack([np.stack([columns[f"{axis}{k}"] for axis in "xy"], 1) for k in range(info.degree + 1)], 1)
-    polynomials[np.arange(info.degree + 1) > quantized.columns["degree"][:, None]] = 0
-    return trajectory_matrix(clamp_unit(values["time"]), values["duration"], info) @ polynomials
-
-
 def _round_columns(
     names: tuple[str, ...], values: dict[str, np.ndarray], exact: ExactColumns, rules: dict[str, Rule]
 ) -> tuple[dict[str, Int32[np.ndarray, " num"]], Float[np.ndarray, "degree+1 num"]]:
@@ -520,7 +510,8 @@ def _round_columns(
         if name == "x0":
             values = values | _compute_trajectories(exact, decoder.values)
         halves = decoder.half_exponents(name)
-        origin, steps = decoder.origin(name), compute_steps(halves, name)
+        steps = compute_steps(halves, name)
+        origin = decoder.origin(name, steps)
         scaled = (values[name] - origin) / steps
         numbers = np.rint(scaled)
         if name == "angle":  # kept in its half turn, so that quantizing a decoded model changes nothing

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, Int
 from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.video.models.frame_times import CUT_RATIO, FrameTimes
-from foldgauss.video.models.row_layout import columns
+from foldgauss.video.models.row_layout import columns, group_bits
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15  # epsilon as in the published 3DGS
 #: 1 / (1 - beta^n) for both betas, by the number n of steps; beyond the table it is 1 in float32. (Computing the powers
@@ -68,7 +68,7 @@ def adam_step(
 
 
 @kernel
-def _update(start, stop, touched, rows, grad, first, second, counts, rates, units, at, corrections):
+def _update(start, stop, touched, rows, grad, first, second, counts, rounded, bits, rates, units, at, corrections):
     beta1, beta2 = _f(BETA1), _f(BETA2)
     own = rates.copy()
     loc, scale, spread, time, fold = at
@@ -92,6 +92,10 @@ def _update(start, stop, touched, rows, grad, first, second, counts, rates, unit
         for c in range(fold, width, 2):
             power *= short
             own[c], own[c + 1] = rates[c] * power, rates[c + 1] * power
+        if rounded[i]:
+            for c in range(width):
+                if rounded[i] & bits[c]:
+                    g[c] = _f(0.0)
         for c in range(width):
             gradient = g[c]
             g[c] = _f(0.0)
@@ -111,24 +115,28 @@ def sparse_adam(
     touched: np.ndarray,
     rates: np.ndarray,
     *,
+    rounded: np.ndarray | None = None,
     units: RateUnits = ABSOLUTE,
 ) -> bool:
     """One step on the rows `touched`, in place; their gradients are set to zero. Returns whether they are finite.
 
     `rows`, `grad` and the moments `first`, `second`: float32 (num, width); `counts`: int32 (num,), steps taken by each
-    row; `rates`: float32 (width,), learning rates by column. `units`: how rates are scaled by each Gaussian's duration
-    and size.
+    row; `rates`: float32 (width,), learning rates by column. `rounded`, uint8 (num,): bits of the groups of leaves
+    (`row_layout.GROUPS`) whose gradients are ignored. `units`: how rates are scaled by each Gaussian's duration and
+    size.
     """
     place = columns(0)  # the fold comes last, so its degree does not shift these
     names = ("loc", "log_scale", "log_time_scale", "time_loc_logit", "coefficients")
     at = tuple(place[name].start for name in names)
     num = len(touched)
     units = RateUnits(*np.float32(units))
+    rounded = np.zeros(len(rows), np.uint8) if rounded is None else rounded
+    bits = group_bits((rows.shape[1] - at[-1]) // 2)
     sums = np.zeros(-(-num // _CHUNK))
 
     def work(start: int) -> None:
         stop = min(start + _CHUNK, num)
-        arrays = touched, rows, grad, first, second, counts
+        arrays = touched, rows, grad, first, second, counts, rounded, bits
         sums[start // _CHUNK] = _update(start, stop, *arrays, rates, units, at, BIAS_CORRECTIONS)
 
     run_tasks(work, range(0, num, _CHUNK))
@@ -138,9 +146,12 @@ def sparse_adam(
 # ------------------------------------------------------------------------------------- rows of Gaussians, JAX
 
 
-def masked_adam(rows, grad, first, second, counts, touched, rates, *, units: RateUnits):
+def masked_adam(rows, grad, first, second, counts, touched, rates, *, rounded, units: RateUnits):
     """`sparse_adam` in JAX: rows, moments and counts after a step on the rows where `touched`, bool (num,), is true."""
     degree = (rows.shape[1] - columns(0)["coefficients"].start) // 2
+    bits = np.zeros(rows.shape[1], np.uint8)
+    bits[: columns(degree)["coefficients"].stop] = group_bits(degree)
+    grad = jnp.where((rounded[:, None] & bits[None]) > 0, np.float32(0), grad)
     counts = counts + touched.astype(counts.dtype)
     corrections = jnp.asarray(BIAS_CORRECTIONS)[jnp.minimum(counts, len(BIAS_CORRECTIONS) - 1)]
     beta1, beta2, one = np.float32(BETA1), np.float32(BETA2), np.float32(1)

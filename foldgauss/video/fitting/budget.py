@@ -2,14 +2,9 @@
 
 import math
 
-import numpy as np
-
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.schedule import steps_per_pass
-from foldgauss.video.fitting.state import FitState, mean_psnr
+from foldgauss.video.fitting.state import FitState
 
-#: A fit to a target PSNR evaluates all frames once in so many passes, which takes a tenth of its time.
-PASSES_PER_EVALUATION = 4
 #: The speed is measured after so many steps, in which kernels are compiled or loaded, over at least so many.
 WARM_UP, MIN_STEPS = 5, 10
 #: The fractions of the time or of the plan, whichever is first, at which the number of steps is planned, by the speed
@@ -93,25 +88,11 @@ def measure_progress(state: FitState, config: FitConfig, step: int | None = None
     return done + (1 - done) * (step - start) / max(plan - start, 1)
 
 
-def find_limit(state: FitState, config: FitConfig, frames: np.ndarray) -> str | None:
-    """The budget that ends the fit now: "steps", "minutes" or "target_psnr"."""
-    if config.target_psnr is not None and _reaches_target(state, config, frames):
-        return "target_psnr"
-    # Minutes are planned by the speed with the Gaussians at the start, and by that of steps alone: where Gaussians are
-    # added, or frames evaluated between steps, the clock decides.
-    by_clock = config.growth is not None or config.target_psnr is not None
-    if by_clock and config.minutes is not None and state.seconds >= 60 * config.minutes:
+def find_limit(state: FitState, config: FitConfig) -> str | None:
+    """The budget that ends the fit now: "steps" or "minutes"."""
+    # Minutes are planned by the speed with the Gaussians at the start: where Gaussians are added, the clock decides.
+    if config.growth is not None and config.minutes is not None and state.seconds >= 60 * config.minutes:
         return "minutes"
     if not state.plan or state.step < state.plan:
         return None
     return "minutes" if config.minutes is not None and state.plan != config.steps else "steps"
-
-
-def _reaches_target(state: FitState, config: FitConfig, frames: np.ndarray) -> bool:
-    """Whether the mean PSNR over all frames is `target_psnr`, evaluated once in `PASSES_PER_EVALUATION` passes.
-
-    The running PSNR does not tell: it lags, is that of the mean error, and with alpha over random backgrounds.
-    """
-    steps = steps_per_pass(config, len(frames))
-    due = state.step > 0 and state.step % (PASSES_PER_EVALUATION * steps) == 0
-    return due and bool(np.isfinite(state.rows).all()) and mean_psnr(state, config, frames) >= config.target_psnr

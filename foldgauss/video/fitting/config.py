@@ -1,6 +1,7 @@
 """The configuration of a fit, its presets, and the defaults that depend on the clip."""
 
 import dataclasses
+import math
 from dataclasses import field
 from typing import Any
 
@@ -10,6 +11,7 @@ from foldgauss._runtime.threads import num_threads
 from foldgauss.render import COMPOSITINGS, RenderOptions
 from foldgauss.video.fitting.adam import RateUnits
 from foldgauss.video.fitting.growth import EXTENT, PUBLISHED_STEPS, PUBLISHED_UNIT, Growth
+from foldgauss.video.models.row_layout import MAX_DEGREE
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,8 +50,6 @@ class LearningRates:
 UNIT_TIME, UNIT_SIZE = 0.06, 0.005
 #: Their state takes about 3 GB at degree 3; the paper's largest fit ends with 1.8 million.
 MAX_GAUSSIANS = 10_000_000
-#: Beyond this degree, float32 cannot tell the powers of u and their gradients apart; compact files hold no more either.
-MAX_DEGREE = 15
 #: A low-pass filter of 0.1 px^2 fits finer detail than the usual 0.3.
 FINE = RenderOptions(low_pass=0.1)
 #: How Gaussians are initialized; which learning rates decay.
@@ -116,10 +116,11 @@ MODEL, BUDGET, OPTIMIZATION = "model", "budget", "optimization"
 class FitConfig:
     """The configuration of a fit; `FitConfig.preset` returns named ones.
 
-    `steps`, `minutes` and `target_psnr` are budgets: the fit ends at the first that is reached. Minutes are converted
-    into steps by the measured speed, and corrected until the end; with `growth` once. With it or a target PSNR the
-    clock ends a fit that is late. The target PSNR is checked every four passes over the frames. With
-    neither steps nor minutes, the fit takes `DEFAULT_STEPS`, or more for long clips.
+    `steps` and `minutes` are budgets: the fit ends at the first that is reached. Minutes are converted into steps by
+    the measured speed, and corrected until the end; with `growth` once, and then the clock ends a fit that is late.
+    With neither, the fit takes `DEFAULT_STEPS`, or more for long clips.
+
+    `quality`, `size_mb` and `psnr` ask for a compact model, see `rate`; with several, the smallest of the models.
 
     With `two_cameras`, half of the views of a pass are those of an opposite camera: the mirrored frame, and the splats
     seen from behind. Flat Gaussians in one plane look mirrored from there, in the same order, so the gradients equal
@@ -168,22 +169,31 @@ class FitConfig:
         default=None,
         metadata=setting("Time to fit, in minutes", bounds="(0, inf)", option="--minutes", group=BUDGET),
     )
-    target_psnr: float | None = field(
+    quality: float | None = field(
         default=None,
         metadata=setting(
-            "Stop once the mean PSNR over all frames reaches this, in dB",
-            bounds="(0, inf)",
-            option="--target-psnr",
+            "Quality of a compact model, from 0 to 100",
+            "Ten more halve the steps of rounding, and a bit has to save a quarter of the squared error. See `rate`.",
+            bounds="[0, 100]",
+            unset="parameters are not rounded",
+            option="--quality",
             group=BUDGET,
         ),
     )
-    max_size_mb: float | None = field(
+    size_mb: float | None = field(
         default=None,
         metadata=setting(
-            "Largest model file, in 10^6 bytes; limits the number of Gaussians",
-            bounds="(0, inf)",
-            option="--max-size-mb",
-            group=MODEL,
+            "Largest compact file, in 10^6 bytes", bounds="(0, inf)", unset="no limit", option="--size-mb", group=BUDGET
+        ),
+    )
+    psnr: float | None = field(
+        default=None,
+        metadata=setting(
+            "The smallest compact model with this mean PSNR over all frames, in dB",
+            bounds="(0, 100]",
+            unset="not a goal",
+            option="--psnr",
+            group=BUDGET,
         ),
     )
     batch_size: int = field(
@@ -374,6 +384,11 @@ class FitConfig:
             raise invalid("follow_motion", expected="False with initialization 'uniform'", got=True)
 
     @property
+    def is_compact(self) -> bool:
+        """Whether a compact model is asked for."""
+        return any(goal is not None for goal in (self.quality, self.size_mb, self.psnr))
+
+    @property
     def rate_units(self) -> RateUnits:
         """The units in which `rates` are stated."""
         by_time, by_size = self.scale_rates_by_duration, self.scale_rates_by_size
@@ -405,8 +420,6 @@ class FitConfig:
         return cls(**(chosen | changes))
 
 
-#: Bytes reserved for the header of a model file.
-HEADER_BYTES = 4096
 #: Steps if neither steps nor minutes are given: this many, and at least so many visits to every frame.
 DEFAULT_STEPS, DEFAULT_VISITS = 3000, 20
 #: Time of a core for each pixel of a step, in microseconds, by which steps and minutes are compared.
@@ -423,6 +436,13 @@ TYPICAL_LIFETIME, SHORTEST_LIFETIME = 35.0, 2.0
 ALIVE, ALIVE_POWER, ALIVE_PIXEL_POWER = 0.378, 0.55, 0.95
 #: More Gaussians than this in each pixel gain nothing, however much time there is.
 MOST_PER_PIXEL = 1.6
+
+
+#: The quality of compact models that `foldgauss fit` has by default, and about the PSNR of usual clips with it, in dB.
+DEFAULT_QUALITY, USUAL_PSNR = 50.0, 37.0
+#: Gaussians per pixel of a clip with which a fit of the default quality starts, some four times as many as it keeps;
+#: their binary logarithm grows by this for each unit of quality, and for each dB. And how many for each 10^6 bytes.
+DENSITY_AT_QUALITY, DENSITY_OF_QUALITY, DENSITY_OF_PSNR, GAUSSIANS_PER_MB = 0.028, 0.08, 0.32, 400_000
 
 
 def default_num_gaussians(
@@ -455,7 +475,19 @@ def default_num_gaussians(
     alive = min(ALIVE * time**ALIVE_POWER * area**ALIVE_PIXEL_POWER, MOST_PER_PIXEL * area)
     by_life = alive * num_frames / lifetime
     by_size = 3 * pixels / (PARAMETER_BYTES * parameters_per_gaussian(config.degree))
-    return max(round(min(by_time, by_life, by_size)), 1)
+    return max(round(min(by_time, by_life, by_size, _most_for_rate(config, pixels))), 1)
+
+
+def _most_for_rate(config: FitConfig, pixels: int) -> float:
+    """A few times as many Gaussians as a compact model usually keeps, whose number depends on the clip."""
+    limits = [math.inf]
+    if config.quality is not None:
+        limits.append(pixels * DENSITY_AT_QUALITY * 2 ** (DENSITY_OF_QUALITY * (config.quality - DEFAULT_QUALITY)))
+    if config.psnr is not None:
+        limits.append(pixels * DENSITY_AT_QUALITY * 2 ** (DENSITY_OF_PSNR * (config.psnr - USUAL_PSNR)))
+    if config.size_mb is not None:
+        limits.append(GAUSSIANS_PER_MB * config.size_mb)
+    return min(limits)
 
 
 def parameters_per_gaussian(degree: int) -> int:
@@ -468,25 +500,17 @@ def bytes_per_gaussian(degree: int) -> int:
 
 
 def chosen_num_gaussians(config: FitConfig, num_frames: int, height: int, width: int, **known: float | None) -> int:
-    """Number of Gaussians at the start, at most `most_gaussians`. Raises ValueError as that does.
+    """Number of Gaussians at the start, at most `most_gaussians`.
 
     `known`: `lifetime` and `threads`, see `default_num_gaussians`.
     """
     num = config.num_gaussians or default_num_gaussians(config, num_frames, height, width, **known)
-    return min(num, most_gaussians(config, num_frames))
+    return min(num, most_gaussians(config))
 
 
-def most_gaussians(config: FitConfig, num_frames: int) -> int:
-    """The limit set by `max_gaussians` and `max_size_mb`. Raises ValueError if not even one Gaussian fits."""
-    most = config.max_gaussians or MAX_GAUSSIANS
-    if config.max_size_mb is None:
-        return most
-    each = bytes_per_gaussian(config.degree)
-    room = int((1e6 * config.max_size_mb - HEADER_BYTES - 4 * num_frames) // each)
-    if room < 1:
-        least = (HEADER_BYTES + 4 * num_frames + each) / 1e6
-        raise invalid("max_size_mb", expected=f"at least {least:.3f} for this clip", got=config.max_size_mb)
-    return min(most, room)
+def most_gaussians(config: FitConfig) -> int:
+    """The limit set by `max_gaussians`."""
+    return config.max_gaussians or MAX_GAUSSIANS
 
 
 def planned_steps(config: FitConfig, num_frames: int) -> int | None:

@@ -33,7 +33,7 @@ def grow(state: FitState, config: FitConfig, size: tuple[int, int]) -> bool:
             growth,
             degree=config.degree,
             pixels=pixels_per_unit(size),
-            max_num=most_gaussians(config, len(state.frame_errors)),
+            max_num=most_gaussians(config),
             step=state.step,
             seed=config.seed,
         )

@@ -58,6 +58,10 @@ EVEN_FRAMES = 0.2
 UNIFORM_TIME_SCALES, UNIFORM_FOLD, UNIFORM_OPACITY, UNIFORM_COLOR, NEIGHBORS = (0.01, 1.0), 1.0, 0.1, 127 / 255, 3
 
 
+#: The backdrop's standard deviations, in units of the frame's longer side, its sigma_t and its opacity.
+BACKDROP_SCALE, BACKDROP_TIME_SCALE, BACKDROP_OPACITY = 2.0, 4.0, 0.9975
+
+
 def initialize(
     frames: np.ndarray,
     num_gaussians: int | Callable[[float], int],
@@ -108,6 +112,28 @@ def initialize(
         angle = (angle - np.pi / 2) % np.pi + np.pi / 2
     shape = {"log_scale": np.float32(log_scale), "angle_logit": np.float32(_logit(angle / (2 * np.pi)))}
     return dataclasses.replace(splats, **shape)
+
+
+def with_backdrop(splats: FoldedSplats, frames: UInt8[np.ndarray, "num_frames height width 3"]) -> FoldedSplats:
+    """The splats with a backdrop in place of the last one: opaque, far wider than the frame, in the clip's mean color.
+
+    What other Gaussians do not cover would be black.
+    """
+    color = frames.reshape(-1, 3).mean(0) / 255
+    leaves = {
+        "loc": 0.0,
+        "log_scale": np.log(BACKDROP_SCALE),
+        "angle_logit": 0.0,
+        "time_loc_logit": 0.0,
+        "log_time_scale": np.log(BACKDROP_TIME_SCALE),
+        "coefficients": 0.0,
+        "opacity_logit": _logit(BACKDROP_OPACITY),
+        "color_dc": (color - 0.5) / SH_C0,
+    } | ({} if splats.paths is None else {"path_index": 0})
+    made = {name: np.array(getattr(splats, name)) for name in leaves}
+    for name, value in leaves.items():
+        made[name][-1] = value
+    return dataclasses.replace(splats, **made)
 
 
 def measure_lifetime(frames: UInt8[np.ndarray, "num_frames height width 3"], motion: Motion, degree: int) -> float:

@@ -16,12 +16,21 @@ import numpy as np
 from foldgauss._runtime import notebook_hooks
 from foldgauss._runtime.checks import invalid, is_integer, is_within
 from foldgauss._runtime.threads import check_not_forked
+from foldgauss.video.compression.quantize import Quantized, dequantize
+from foldgauss.video.compression.quantizer import find_order
 from foldgauss.video.fitting.budget import StepPlanner, TimeLeft, find_limit, measure_progress
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, planned_steps
 from foldgauss.video.fitting.divergence import Guard
-from foldgauss.video.fitting.initialize import START_OPACITY, SUMMED_OPACITY, initialize, initialize_uniform
+from foldgauss.video.fitting.initialize import (
+    START_OPACITY,
+    SUMMED_OPACITY,
+    initialize,
+    initialize_uniform,
+    with_backdrop,
+)
+from foldgauss.video.fitting.rate import RateControl, count_bytes, count_past
 from foldgauss.video.fitting.relocation import is_relocation_due, relocates
-from foldgauss.video.fitting.state import FitState, envelope_of, mean_psnr, running_psnr, to_model
+from foldgauss.video.fitting.state import FitState, envelope_of, running_psnr, to_model
 from foldgauss.video.fitting.steppers.engines import choose_engine, make_stepper
 from foldgauss.video.fitting.steppers.protocol import StepResult
 from foldgauss.video.models.frame_times import FrameTimes, check_rate, make_time_logits
@@ -44,15 +53,19 @@ class FitInfo(NamedTuple):
     num_alive: int  #: Gaussians that took part in this step
     seconds: float  #: spent fitting so far
     seconds_left: float  #: estimated from the speed so far
-    stopped_by: str | None  #: at the last step, which budget ended the fit: "steps", "minutes" or "target_psnr"
+    stopped_by: str | None  #: at the last step, which budget ended the fit: "steps" or "minutes"
 
 
 @dataclasses.dataclass(frozen=True)
 class FitResult:
-    """The result of `fit`: the `model`, and as `history` the `FitInfo` of every `every`-th step and the last one."""
+    """The result of `fit`: the `model`, and as `history` the `FitInfo` of every `every`-th step and the last one.
+
+    `quantized` is the compact model, where one was asked for: `model` is what it decodes to.
+    """
 
     model: VideoModel
     history: list[FitInfo]
+    quantized: Quantized | None = None
 
     def __repr__(self) -> str:
         model, last = self.model, self.history[-1] if self.history else None
@@ -98,7 +111,16 @@ def fit(
             observe(state, info)
         if info.step % every == 0 or info.progress >= 1:
             history.append(info)
-    return FitResult(to_model(state, config, frames.shape[1:3], fps), history)
+    model, quantized = finish(state, frames, config, fps)
+    return FitResult(model, history, quantized)
+
+
+def finish(state: FitState, frames: np.ndarray, config: FitConfig, fps: float) -> tuple[VideoModel, Quantized | None]:
+    """The model of a fit to `frames` after its last step, and the compact one where the settings ask for it."""
+    if not config.is_compact:
+        return to_model(state, config, frames.shape[1:3], fps), None
+    quantized = RateControl(frames, config).finish(state, fps)
+    return dequantize(quantized), quantized
 
 
 def fit_steps(
@@ -125,13 +147,14 @@ def fit_steps(
     find_motion = motion_finder(frames, motion)
     state = _start(frames, config, None, find_motion, clock) if state is None else state
     stepper = make_stepper(engine, frames, config, state, find_motion)
+    rate = RateControl(frames, config) if config.is_compact else None
     planner, time_left = StepPlanner(config), TimeLeft(state, config)
     guard = Guard(state, config, stepper.steps_per_pass, alpha=frames.shape[3] == 4)
     if state.step == 0 and guard.comparable and config.initialization == "clip":
         begun = clock()
         state.start_errors = tuple(stepper.measure_start(state).items())
         state.seconds += clock() - begun
-    stopped_by = find_limit(state, config, frames)
+    stopped_by = find_limit(state, config)
     if stopped_by:  # a resumed state that needs no more steps
         yield state, _make_info(state, config, time_left, StepResult(math.nan, 0), stopped_by)
     while not stopped_by:
@@ -144,6 +167,9 @@ def fit_steps(
             stepper.adopt(state)
         else:
             guard.keep_good(state)
+            if rate is not None and state.plan and rate.act(state, measure_progress(state, config)):
+                stepper.adopt(state)
+                guard.replace_good(state)
             if is_relocation_due(state, config) and guard.is_converging(state):
                 stepper.relocate(state)
                 guard.replace_good(state)
@@ -152,7 +178,7 @@ def fit_steps(
         state.seconds += clock() - begun
         planner.update(state)
         begun = clock()
-        stopped_by = find_limit(state, config, frames)
+        stopped_by = find_limit(state, config)
         if stopped_by:
             guard.finish(state)
         state.seconds += clock() - begun
@@ -178,9 +204,9 @@ def _make_info(
 
 def _warm_up(frames: np.ndarray, config: FitConfig, engine: str) -> None:
     """Compile or load the kernels, on a corner of the clip, before any clock runs: the first time takes 20 s."""
-    if engine != "cpu" and config.target_psnr is None and not relocates(config):
+    if engine != "cpu" and not config.is_compact and not relocates(config):
         return
-    tiny = dataclasses.replace(config, num_gaussians=8, max_gaussians=None, max_size_mb=None, steps=1, minutes=None)
+    tiny = dataclasses.replace(config, num_gaussians=8, max_gaussians=None, steps=1, minutes=None)
     tiny = dataclasses.replace(tiny, interpolation_fraction=0.0)
     corner = np.ascontiguousarray(frames[:2, :32, :32])
     state = start(corner, dataclasses.replace(tiny, follow_motion=False))
@@ -191,8 +217,9 @@ def _warm_up(frames: np.ndarray, config: FitConfig, engine: str) -> None:
         maps = np.tile(np.eye(2, 3, dtype=np.float32), (len(corner), 1, 1, 1))
         state = FitState.create(rows, state.time_logits, path_maps=maps)
         make_stepper("cpu", corner, tiny, state, motion_finder(corner)).step(state, 0.0)
-    if config.target_psnr is not None:
-        mean_psnr(state, tiny, corner)
+    if config.is_compact:
+        find_order(to_model(state, tiny, corner.shape[1:3], 25.0), 0.0)
+        count_bytes(RateControl(corner, tiny).finish(state))
 
 
 # ------------------------------------------------------------------------------------------------ starts
@@ -210,13 +237,15 @@ def _start(
     find_motion: Callable[[], Motion],
     clock: Callable[[], float],
 ) -> FitState:
-    frames = np.ascontiguousarray(frames[..., :3])  # with alpha: as seen over black
+    has_alpha, frames = frames.shape[3] == 4, np.ascontiguousarray(frames[..., :3])  # as seen over black
     begun, num_frames = clock(), len(frames)
     motion = find_motion() if config.follow_motion else None
     if logits is None:
         logits = make_time_logits(num_frames, motion.cuts if motion is not None else [])
     logits = np.array(logits, np.float32)
     splats = _initialize(frames, config, logits, motion)
+    if config.is_compact and config.compositing == "over" and not has_alpha and config.initialization == "clip":
+        splats = with_backdrop(splats, frames)
     rows = pack(splats)
     return FitState.create(
         rows,
@@ -244,7 +273,8 @@ def start_from(model: VideoModel, config: FitConfig, steps: int, progress: float
     _check_config(model, config)
     rows, logits = pack(model.splats), np.array(model.frame_times.logits, np.float32)
     done = round(steps * progress / (1 - progress))
-    return FitState.create(rows, logits, step=done, plan=done + steps, **_path_fields(model.splats, logits))
+    fields = {"rate_actions": count_past(progress)} | _path_fields(model.splats, logits)
+    return FitState.create(rows, logits, step=done, plan=done + steps, **fields)
 
 
 def _check_config(model: VideoModel, config: FitConfig) -> None:
@@ -273,13 +303,13 @@ def _initialize(frames: np.ndarray, config: FitConfig, logits: np.ndarray, motio
     times = np.asarray(FrameTimes(logits).times())
     opacity = SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY
     clip = {"times": times, "motion": motion, "opacity": opacity}
-    clip["paths"] = _find_paths(motion, times) if config.follow_camera else None
+    clip["paths"] = _find_paths(motion, times, config) if config.follow_camera else None
     return initialize(frames, lambda life: choose_num(lifetime=life), envelope=envelope_of(config), **clip, **shape)
 
 
-def _find_paths(motion: Motion | None, times: np.ndarray) -> SharedPaths | None:
-    """The path of the camera and that of an object, unless they move steadily."""
-    maps = None if motion is None else find_shared_motions(motion)
+def _find_paths(motion: Motion | None, times: np.ndarray, config: FitConfig) -> SharedPaths | None:
+    """The path of the camera and that of an object; unless they move steadily, where that takes no bits."""
+    maps = None if motion is None else find_shared_motions(motion, steady=config.is_compact)
     return None if maps is None else SharedPaths(np.tile(np.float32(times), (len(maps), 1)), np.float32(maps))
 
 

@@ -121,7 +121,7 @@ def independent_frames(
 
 def _check_config(config: FitConfig) -> None:
     """Raise ValueError for settings that have no meaning for frames with a given number of Gaussians."""
-    for name in ("num_gaussians", "max_gaussians", "max_size_mb", "target_psnr", "growth"):
+    for name in ("num_gaussians", "max_gaussians", "quality", "size_mb", "psnr", "growth"):
         value = getattr(config, name)
         if value is not None:
             raise invalid(

@@ -135,9 +135,14 @@ def _decode_errors(pairs: Any) -> tuple[tuple[int, float], ...]:
     return tuple((int(frame), float(error)) for frame, error in pairs)
 
 
+def _decode_rules(rows: Any) -> tuple[tuple[str, float, float, tuple[float, ...]], ...]:
+    return tuple((str(name), float(origin), float(exponent), tuple(slopes)) for name, origin, exponent, slopes in rows)
+
+
 #: The metadata of fields that are no arrays: `decode` restores them from JSON.
 _COUNT, _NUMBER = ({"static": True, "decode": kind} for kind in (int, float))
 _ERRORS = {"static": True, "decode": _decode_errors}
+_RULES = {"static": True, "decode": _decode_rules}
 _ROW = PerGaussian(np.float32, ("width",))
 
 
@@ -173,6 +178,8 @@ class FitState:
     first: np.ndarray = field(metadata=_stored(_ROW))  # Adam's moments
     second: np.ndarray = field(metadata=_stored(_ROW))
     counts: np.ndarray = field(metadata=_stored(PerGaussian(np.int32)))  # steps each Gaussian has taken
+    rounded: np.ndarray = field(metadata=_stored(PerGaussian(np.uint8)))  # the groups of leaves that are, see `rate`
+    classes: np.ndarray = field(metadata=_stored(PerGaussian(np.int8)))  # how visible, by which steps are chosen
     frame_errors: np.ndarray = field(metadata=_stored(PerFrame()))  # mean squared error when last seen, 0 before
     time_logits: np.ndarray = field(metadata=_stored(PerFrame(intervals=True)))
     time_moments: optax.OptState = field(metadata=_stored(PerFrame(intervals=True, moments=True)))
@@ -187,6 +194,8 @@ class FitState:
     plan: int = field(default=0, metadata=_COUNT)  # steps of the whole fit; 0 until minutes have been planned
     planned_step: int = field(default=0, metadata=_COUNT)  # where the plan was last changed, and the fraction of the
     planned_progress: float = field(default=0.0, metadata=_NUMBER)  # fit that was over there
+    rate_actions: int = field(default=0, metadata=_COUNT)  # actions of `rate` that are done
+    rules: tuple[tuple, ...] = field(default=(), metadata=_RULES)  # by which parameters are rounded, once any are
     seconds: float = field(default=0.0, metadata=_NUMBER)
     processor_seconds: float = field(default=0.0, metadata=_NUMBER)  # of all threads, where `jobs` runs the fit
     waiting_seconds: float = field(default=0.0, metadata=_NUMBER)  # likewise; see `_runtime.machine`
@@ -360,7 +369,7 @@ def update_rows(state: FitState, grad: np.ndarray, touched: np.ndarray, rates: n
     `grad` is float32 (num, width), `rates` and `units` are those of `sparse_adam`.
     """
     moments = state.first, state.second, state.counts
-    return sparse_adam(state.rows, grad, *moments, touched, rates, units=units)
+    return sparse_adam(state.rows, grad, *moments, touched, rates, rounded=state.rounded, units=units)
 
 
 def running_psnr(state: FitState) -> float:

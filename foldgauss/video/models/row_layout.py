@@ -8,12 +8,18 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.models.splats import FoldedSplats
 
+#: Beyond this degree, float32 cannot tell the powers of u and their gradients apart; compact files hold no more either.
+MAX_DEGREE = 15
+#: Leaves of `FoldedSplats` that compact models round together, and the bit of each such group.
+SHAPE = ("log_scale", "angle_logit", "time_loc_logit", "log_time_scale", "opacity_logit")
+TRAJECTORY, COLOR = ("loc", "coefficients"), ("color_dc",)
+GROUPS = {SHAPE: 1, TRAJECTORY: 2, COLOR: 4}
 #: Fields of `FoldedSplats` that are not in `columns`.
 _OTHERS = ("envelope", "path_index", "paths")
 
@@ -32,6 +38,16 @@ def columns(degree: int) -> dict[str, slice]:
         stop = start + widths.get(name, 1)
         place[name], start = slice(start, stop), stop
     return place
+
+
+def group_bits(degree: int) -> UInt8[np.ndarray, " width"]:
+    """The bit of the group (`GROUPS`) of each column of a row."""
+    place = columns(degree)
+    bits = np.zeros(place["coefficients"].stop, np.uint8)
+    for group, bit in GROUPS.items():
+        for name in group:
+            bits[place[name]] = bit
+    return bits
 
 
 def pack(splats: FoldedSplats) -> np.ndarray:

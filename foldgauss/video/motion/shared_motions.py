@@ -50,20 +50,20 @@ ROUNDS, WIDER = 4, 3.0
 FEWEST, AGREEING = 8, 6
 
 
-def find_shared_motions(motion: Motion) -> Float[np.ndarray, "paths frames 2 3"] | None:
+def find_shared_motions(motion: Motion, *, steady: bool = False) -> Float[np.ndarray, "paths frames 2 3"] | None:
     """The maps from coordinates that follow the camera to each frame, then those of objects, in model space.
 
-    Those that move steadily are left out; None if all do. In the middle frame of each shot coordinates are the frame's,
-    and so they are in shots whose camera moves steadily. Where a motion is unknown between two frames, it is taken to
-    be the camera's, and that of the camera to be none. An object is what moves as a whole, in another way than the
-    camera: also a background that is nearer or farther.
+    Those that move steadily are left out, unless `steady` asks for that of the camera; None if all are. In the middle
+    frame of each shot coordinates are the frame's, and so they are in shots whose camera moves steadily. Where a motion
+    is unknown between two frames, it is taken to be the camera's, and that of the camera to be none. An object is what
+    moves as a whole, in another way than the camera: also a background that is nearer or farther.
 
     Source: Fischler and Bolles 1981 (RANSAC), one motion after another; tracks decide which points belong to which.
     """
     clip = _Clip.of(motion)
     steps = clip.find_camera_steps()
     camera = _fill_unknown(steps)
-    path = clip.chain_within_limits(clip.keep_unsteady(steps))
+    path = clip.chain_within_limits(camera if steady else clip.keep_unsteady(steps))
     found = [path] if path is not None and (path != np.eye(3)).any() else []
     found += _find_objects(clip, camera, smooth=None if found else SMOOTH)
     return np.stack(found)[:, :, :2] if found else None

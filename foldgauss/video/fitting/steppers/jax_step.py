@@ -160,7 +160,7 @@ def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames he
     moments, before = (arrays.first, arrays.second, arrays.counts), arrays.rows
     rates = jnp.pad(control.rates, (0, program.width - program.num_trained))
     rows, first, second, counts = masked_adam(
-        arrays.rows, seen.by_rows, *moments, touched, rates, units=program.rate_units
+        arrays.rows, seen.by_rows, *moments, touched, rates, rounded=arrays.rounded, units=program.rate_units
     )
     logits, time_moments = arrays.time_logits, arrays.time_moments
     if program.learns_times:

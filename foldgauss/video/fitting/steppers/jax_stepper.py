@@ -199,9 +199,9 @@ class JaxStepper:
         """Rows of the arrays: a function of the number of Gaussians, so that a resumed fit has the same."""
         config = self.config
         if config.growth is None:
-            return num
-        most = max(most_gaussians(config, self.num_frames), num)
-        if config.max_gaussians is not None or config.max_size_mb is not None:
+            return max(num, self.capacity)  # Gaussians that are not worth their bits are dropped
+        most = max(most_gaussians(config), num)
+        if config.max_gaussians is not None:
             return most
         capacity = CAPACITY_FACTOR * chosen_num_gaussians(config, self.num_frames, *self.size)
         while capacity < num:

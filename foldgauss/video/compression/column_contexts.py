@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Float, Int, Int32, UInt8
 
 from foldgauss._runtime.kernels import exact_kernel
-from foldgauss.io.models.range_coder import Column
 from foldgauss.video.compression.quantize import (
     COLORS,
     ColumnDecoder,
@@ -18,6 +17,7 @@ from foldgauss.video.compression.quantize import (
     trajectory_power,
     trajectory_span,
 )
+from foldgauss.video.compression.range_coder import Column
 
 #: Neighbors that predict a value; candidates for them in each grid square; weight of time in their distance.
 NEIGHBORS, CANDIDATES, TIME_WEIGHT = 4, 16, 0.3
@@ -42,7 +42,8 @@ class ColumnContexts:
         if name == "cell":
             return Column.without_contexts(self._info.num_gaussians)
         halves = decoder.half_exponents(name)
-        known = {"origin": decoder.origin(name), "step": compute_steps(halves, name)}
+        steps = compute_steps(halves, name)
+        known = {"origin": decoder.origin(name, steps), "step": steps}
         power = trajectory_power(name)
         near = self._nearest if power or name in ("angle", *COLORS) else self._in_cell
         scale = np.ones(self._info.num_gaussians)

@@ -1,0 +1,167 @@
+"""Steps of quantization from the sensitivity of the images, and what each Gaussian is worth.
+
+By rate-distortion theory a squared error is least, for so many bits, where every parameter adds the same. So each
+parameter's step follows the sensitivity of the images to it (`estimate_sensitivities`), times a common factor
+2^coarseness. The same factor is the price of a bit (`bit_price`), and a Gaussian that adds less error by its removal
+than its bits cost is dropped.
+"""
+
+import dataclasses
+import math
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Int32, UInt8
+
+from foldgauss._runtime.checks import invalid
+from foldgauss.video.compression.quantize import (
+    FEATURES,
+    ExactColumns,
+    Quantized,
+    Rule,
+    choose_cell_bits,
+    clamp_unit,
+    column_names,
+    compute_columns,
+    decode_values,
+    dequantize,
+    find_cells,
+    is_integral,
+    quantize,
+)
+from foldgauss.video.compression.sensitivity import estimate_sensitivities
+from foldgauss.video.compression.sort_order import find_overlaps, sort_by_cell
+from foldgauss.video.models.row_layout import GROUPS, shift_path
+from foldgauss.video.models.splats import SH_C0, FoldedSplats
+from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.selection.contributions import Contributions
+
+#: A Gaussian is dropped if that adds less squared error than so many bits cost, which is about what it takes.
+BITS_PER_GAUSSIAN = 100.0
+#: Least number of Gaussians from which steps are regressed on features.
+_FEW = 100
+_MIN_SENSITIVITY = 1e-4  # below, a Gaussian is not visible
+_MIN_TRANSMITTANCE = 0.03  # below, a Gaussian counts as opaque
+
+
+def bit_price(coarseness: float) -> float:
+    """The squared error, in levels of 8 bits summed over the clip, that a bit is worth at such steps.
+
+    A step s adds s^2 / 12, and half of it takes one bit more: the price is -d(s^2 / 12) / d(bits).
+    """
+    return math.log(2) / 6 * 4.0**coarseness
+
+
+class Quantizer:
+    """Quantizes a model by rules that are fixed but for the coarseness."""
+
+    def __init__(self, model: VideoModel):
+        self.exact = compute_columns(model)
+        sensitivity, best = estimate_sensitivities(Contributions(model), self.exact)
+        self._names = [name for name in column_names(self.exact.info.degree) if not is_integral(name)]
+        self._seen = best > 0
+        if not self._seen.any():
+            cure = "No frame shows anything."
+            raise invalid("model", expected="visible Gaussians", got="none", cure=cure)
+        self._fit(sensitivity)
+        opacity = 1 / (1 + np.exp(-self.exact.values["opacity"]))
+        # Removal: a change of the logit by -1 / (1 - opacity), if the image were linear in the logit.
+        loss = sensitivity["opacity"] / np.maximum(1 - opacity, _MIN_TRANSMITTANCE) ** 2
+        # Opaque ones are insensitive to the logit: assume that they differ by a tenth of the range from what they hide.
+        opaque = np.where(opacity > 1 - _MIN_TRANSMITTANCE, sensitivity["luma"] * (0.1 / SH_C0) ** 2, 0)
+        self.removal = np.where(self._seen, np.maximum(loss, opaque), 0)
+
+    def _fit(self, sensitivity: dict[str, Float[np.ndarray, " num"]]) -> None:
+        """Regress log-sensitivities on the features; a Gaussian's class is the mean residual of its columns."""
+        first = FEATURES[1:]
+        raw = np.stack([self.exact.values[name] for name in first], 1)
+        # Outliers are clipped: a line through the bulk would extrapolate their steps without bound.
+        features = np.clip(raw, *np.quantile(raw[self._seen], [0.001, 0.999], axis=0))
+        levels = {name: 0.5 * np.log2(np.maximum(sensitivity[name], _MIN_SENSITIVITY)) for name in self._names}
+        design = np.concatenate([np.ones((len(features), 1)), features], 1)
+        self._fits, rest = {}, []
+        for name in self._names:
+            fit = np.zeros(design.shape[1])
+            # Others, as in black frames, would tilt the lines.
+            shows = self._seen & (sensitivity[name] > _MIN_SENSITIVITY)
+            if name in first or shows.sum() < _FEW:
+                fit[0] = levels[name][self._seen].mean()
+            else:
+                fit = np.linalg.lstsq(design[shows], levels[name][shows], rcond=None)[0]
+            self._fits[name] = fit
+            rest.append(np.clip(levels[name] - design @ fit, -6, 6))
+        self.classes = np.rint(np.where(self._seen, np.mean(rest, axis=0), -6.0)).astype(np.int32)
+        self._match_errors(sensitivity, np.concatenate([np.ones((len(raw), 1)), raw], 1))
+
+    def _match_errors(self, sensitivity: dict[str, Float[np.ndarray, " num"]], design: np.ndarray) -> None:
+        """Shift the fits so that all columns add the same error: by mean, not typical, sensitivity times step^2."""
+        for name, fit in self._fits.items():
+            predicted = np.clip((design @ fit + self.classes)[self._seen], -30, 30)
+            fit[0] += 0.5 * np.log2(np.mean(sensitivity[name][self._seen] * 4.0**-predicted) + 1e-30)
+
+    def are_worth(self, coarseness: float, fraction: float = 1.0) -> Bool[np.ndarray, " num"]:
+        """The Gaussians that are worth this `fraction` of the price of their bits at such steps; at least one."""
+        kept = self.removal > fraction * BITS_PER_GAUSSIAN * bit_price(coarseness)
+        kept[np.argmax(self.removal)] = True
+        return kept
+
+    def make_rules(self, coarseness: float) -> dict[str, Rule]:
+        """The rules with steps times 2^coarseness.
+
+        A parameter's squared error, summed over the clip, is about 4^coarseness / 12, in levels of 8 bits.
+        """
+        rules = {}
+        for name in self._names:
+            exponent, *slopes = np.round(self._fits[name], 4).tolist()
+            given = self.exact.values.get(name)
+            # Stretch is not negative: its origin is 0.
+            origin = 0.0 if given is None or name == "stretch" else round(float(np.median(given)), 4)
+            slopes = (-1.0,) if name in FEATURES else (-1.0, *(-slope for slope in slopes))
+            rules[name] = Rule(origin, round(coarseness - exponent, 4), slopes)
+        return rules
+
+    def quantize(self, coarseness: float, kept: Bool[np.ndarray, " num"] | None = None) -> Quantized:
+        """The Gaussians `kept` (None: all) with the rules of `make_rules`."""
+        kept = np.ones(len(self.removal), bool) if kept is None else kept
+        return quantize(select_rows(self.exact, kept), self.classes[kept], self.make_rules(coarseness))
+
+
+def select_rows(exact: ExactColumns, kept: Bool[np.ndarray, " num"]) -> ExactColumns:
+    """Some of a model's Gaussians, in their order."""
+    num = int(kept.sum())
+    info = dataclasses.replace(exact.info, num_gaussians=num, cells=choose_cell_bits(num, exact.info.size))
+    values = {name: value[kept] for name, value in exact.values.items()}
+    path = None if exact.path is None else exact.path[kept]
+    own = exact.swapped[kept], exact.turn[kept], values, exact.polynomials[kept]
+    return ExactColumns(info, *own, exact.logits, path, exact.paths)
+
+
+def find_order(model: VideoModel, budget: float) -> Int[np.ndarray, " num"]:
+    """An order of the Gaussians, by cell, that needs fewer bits; see `sort_by_cell` for the `budget` of errors."""
+    cells = find_cells(compute_columns(model))
+    if model.compositing == "sum":  # any order gives the same image
+        return np.argsort(cells, kind="stable")
+    return sort_by_cell(cells, find_overlaps(Contributions(model)), budget)
+
+
+def round_groups(
+    model: VideoModel,
+    classes: Int32[np.ndarray, " num"],
+    rules: dict[str, Rule],
+    rounded: UInt8[np.ndarray, " num"],
+) -> FoldedSplats:
+    """The splats with the groups of leaves that the bits of `rounded` mark (`GROUPS`) rounded by the rules.
+
+    Values that are rounded already stay as they are. Trajectories that are not rounded yet stay the same curves in time
+    where m_t is.
+    """
+    exact = compute_columns(model)
+    quantized = quantize(exact, classes, rules)
+    decoded, v = dequantize(quantized).splats, exact.values
+    is_rounded = {name: (rounded & bit) > 0 for group, bit in GROUPS.items() for name in group}
+    time = clamp_unit(np.where(is_rounded["time_loc_logit"], decode_values(quantized)["time"], v["time"]))
+    polynomials = shift_path(exact.polynomials, time - v["time"])
+    leaves = {"loc": polynomials[:, 0], "coefficients": polynomials[:, 1:]}
+    for name, which in is_rounded.items():
+        own = leaves.get(name, np.asarray(getattr(model.splats, name)))
+        leaves[name] = np.float32(np.where(which.reshape(-1, *[1] * (own.ndim - 1)), getattr(decoded, name), own))
+    return dataclasses.replace(model.splats, **leaves)

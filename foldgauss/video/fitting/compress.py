@@ -1,0 +1,104 @@
+"""A model made compact: the last part of a fit, started from the model."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from foldgauss._runtime.checks import invalid
+from foldgauss.video.compression.quantize import Quantized, dequantize
+from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig, planned_steps
+from foldgauss.video.fitting.loop import FitInfo, check_frames, finish, fit_steps, start_from
+from foldgauss.video.fitting.rate import COMPRESSION_START, RateControl
+from foldgauss.video.fitting.state import FitState
+from foldgauss.video.models.metrics import check_frames as check_frames_of
+from foldgauss.video.models.renderer import VideoRenderer
+from foldgauss.video.models.video_model import VideoModel, check_model
+
+#: The quality without a clip, where nothing compensates for rounding.
+ROUNDING_QUALITY = 80.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Compressed:
+    """A model's compact form: `quantized`, which `save_compact` writes, and the `model` that it decodes to."""
+
+    quantized: Quantized
+    model: VideoModel
+
+
+def compress(
+    model: VideoModel,
+    frames: np.ndarray | None = None,
+    *,
+    quality: float | None = None,
+    size_mb: float | None = None,
+    psnr: float | None = None,
+    steps: int | None = None,
+    minutes: float | None = None,
+    observers: Iterable[Callable[[FitState, FitInfo], None]] = (),
+) -> Compressed:
+    """Make a model compact: drop Gaussians that are not worth their bits, and round the parameters of the others.
+
+    `frames`: the clip, uint8 (num_frames, *model.size, 3), or with alpha (..., 4), to which the model is fitted further
+    meanwhile. `quality`, `size_mb` and `psnr` are those of `FitConfig`; without any, the quality is `DEFAULT_QUALITY`,
+    or `ROUNDING_QUALITY` without the clip. `steps` and `minutes` are budgets (default: two thirds of the steps of a
+    fit). `observers` are called after every step, as by `fit`. Gaussians are reordered. Shared paths remain, to about
+    a fiftieth of a pixel.
+
+    Without the clip, parameters are only rounded, and there is no `psnr`, nor a budget.
+
+    Raises ValueError for anything but a `VideoModel` (bake edits first), for NaN or infinities, several envelopes, a
+    degree above 15, and frames that do not fit.
+
+    Example: `save_compact("clip.fgz", compress(model, clip.frames, quality=60).quantized)`.
+    """
+    check_model(model)
+    config = _make_config(model, quality=quality, size_mb=size_mb, psnr=psnr, steps=steps, minutes=minutes)
+    if frames is None:
+        for name, value in (("psnr", psnr), ("steps", steps), ("minutes", minutes)):
+            if value is not None:
+                raise invalid(name, expected="None without the clip", got=value, cure="Give the clip's frames.")
+        return _round_only(model, config)
+    check_frames_of(model, frames)
+    check_frames(frames)
+    if not config.is_compact:
+        config = dataclasses.replace(config, quality=DEFAULT_QUALITY)
+    budget = planned_steps(dataclasses.replace(config, minutes=None), len(frames))
+    state = start_from(model, config, steps or math.ceil((1 - COMPRESSION_START) * budget), COMPRESSION_START)
+    for state, info in fit_steps(frames, dataclasses.replace(config, steps=None), state):  # noqa: B020
+        for observe in observers:
+            observe(state, info)
+    made, quantized = finish(state, frames, config, model.fps)
+    return Compressed(quantized, made)
+
+
+def _make_config(model: VideoModel, **goals: float | None) -> FitConfig:
+    """The settings with which the model may be fitted further."""
+    envelope = model.splats.envelope
+    power, floor = (np.unique(np.asarray(getattr(envelope, name))) for name in ("power", "floor"))
+    if power.size != 1 or floor.size != 1:
+        cure = "Save it as .safetensors, which holds one envelope per Gaussian."
+        raise invalid("model.splats.envelope", expected="one for all Gaussians", got="several", cure=cure)
+    return FitConfig(
+        degree=model.degree,
+        power=float(power[0]),
+        floor=float(floor[0]),
+        compositing=model.compositing,
+        options=model.options,
+        scale_cutoff=model.scale_cutoff,
+        relocated_fraction=0.0,
+        interpolation_fraction=0.0,
+        **goals,
+    )
+
+
+def _round_only(model: VideoModel, config: FitConfig) -> Compressed:
+    if not config.is_compact:
+        config = dataclasses.replace(config, quality=ROUNDING_QUALITY)
+    control = RateControl(np.stack(list(VideoRenderer(model).frames())), config)
+    state = start_from(model, config, 1)
+    control.round_only(state)
+    quantized = control.finish(state, model.fps)
+    return Compressed(quantized, dequantize(quantized))
