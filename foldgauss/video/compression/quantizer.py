@@ -104,6 +104,12 @@ class Quantizer:
         kept[np.argmax(self.removal)] = True
         return kept
 
+    def coarseness_for(self, num: float, fraction: float = 1.0) -> float:
+        """The coarseness at which about `num` Gaussians are worth this fraction of the price of their bits."""
+        place = min(max(round(num), 1), len(self.removal))
+        least = max(float(np.sort(self.removal)[-place]), _MIN_SENSITIVITY)
+        return 0.5 * math.log2(least / (fraction * BITS_PER_GAUSSIAN * bit_price(0.0)))
+
     def make_rules(self, coarseness: float) -> dict[str, Rule]:
         """The rules with steps times 2^coarseness.
 

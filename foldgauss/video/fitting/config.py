@@ -269,7 +269,9 @@ class FitConfig:
     l2_fraction: float = field(
         default=0.3,
         metadata=setting(
-            "Fraction of the steps, at the end, whose loss is the squared error, which PSNR measures", bounds="[0, 1]"
+            "Fraction of the steps, at the end, whose loss is the squared error, which PSNR measures",
+            "For a compact model all have it.",
+            bounds="[0, 1]",
         ),
     )
     border_weight: float = field(
@@ -389,6 +391,11 @@ class FitConfig:
         return any(goal is not None for goal in (self.quality, self.size_mb, self.psnr))
 
     @property
+    def squared_from(self) -> float:
+        """The fraction of the plan from which the loss is the squared error; for a compact model it always is."""
+        return 0.0 if self.is_compact else 1 - self.l2_fraction
+
+    @property
     def rate_units(self) -> RateUnits:
         """The units in which `rates` are stated."""
         by_time, by_size = self.scale_rates_by_duration, self.scale_rates_by_size
@@ -440,9 +447,9 @@ MOST_PER_PIXEL = 1.6
 
 #: The quality of compact models that `foldgauss fit` has by default, and about the PSNR of usual clips with it, in dB.
 DEFAULT_QUALITY, USUAL_PSNR = 50.0, 37.0
-#: Gaussians per pixel of a clip with which a fit of the default quality starts, some four times as many as it keeps;
+#: Gaussians per pixel of a clip with which a fit of the default quality starts, some three times as many as it keeps;
 #: their binary logarithm grows by this for each unit of quality, and for each dB. And how many for each 10^6 bytes.
-DENSITY_AT_QUALITY, DENSITY_OF_QUALITY, DENSITY_OF_PSNR, GAUSSIANS_PER_MB = 0.028, 0.08, 0.32, 400_000
+DENSITY_AT_QUALITY, DENSITY_OF_QUALITY, DENSITY_OF_PSNR, GAUSSIANS_PER_MB = 0.012, 0.08, 0.32, 300_000
 
 
 def default_num_gaussians(
@@ -484,7 +491,7 @@ def _most_for_rate(config: FitConfig, pixels: int) -> float:
     if config.quality is not None:
         limits.append(pixels * DENSITY_AT_QUALITY * 2 ** (DENSITY_OF_QUALITY * (config.quality - DEFAULT_QUALITY)))
     if config.psnr is not None:
-        limits.append(pixels * DENSITY_AT_QUALITY * 2 ** (DENSITY_OF_PSNR * (config.psnr - USUAL_PSNR)))
+        limits.append(3 * pixels * DENSITY_AT_QUALITY * 2 ** (DENSITY_OF_PSNR * (config.psnr - USUAL_PSNR)))
     if config.size_mb is not None:
         limits.append(GAUSSIANS_PER_MB * config.size_mb)
     return min(limits)

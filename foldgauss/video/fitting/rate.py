@@ -9,7 +9,7 @@ compact file. Two actions reduce it while the others adapt, at stated fractions 
   then colors. A step of rounding is as coarse as $\lambda$ makes it worth, see `compression.quantizer`.
 
 `FitConfig.quality` states $\lambda$. A largest file and a least PSNR determine it during the fit, by the sizes that the
-coder finds for the Gaussians at hand, and by the images that they give. Source for the steps: the theory of
+coder finds for the Gaussians at hand, and by the PSNR so far. Source for the steps: the theory of
 rate and distortion at high resolution (Gish and Pierce 1968); for the order: `docs/compress.md`.
 """
 
@@ -24,7 +24,7 @@ from foldgauss.video.compression.quantize import Quantized, Rule, compute_column
 from foldgauss.video.compression.quantizer import Quantizer, find_order, round_groups, select_rows
 from foldgauss.video.compression.streams import encode_streams
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.state import FitState, to_model
+from foldgauss.video.fitting.state import FitState, running_psnr, to_model
 from foldgauss.video.models.background import BLACK, composite
 from foldgauss.video.models.metrics import psnr as psnr_of
 from foldgauss.video.models.renderer import VideoRenderer
@@ -38,10 +38,16 @@ HEADER_BYTES = 4096
 #: Fraction of the largest file that the fit aims at; the Gaussians that are worth least are dropped in the end if the
 #: file is larger nevertheless.
 _AIM = 0.98
-#: Frames that a PSNR is estimated from, and by how much it may be missed when the coarseness is chosen, dB.
-_TRIED_FRAMES, _TOLERANCE_DB = 12, 0.03
-#: Tries of the coarseness, at most, its first change, and the binary logarithm by which a size may be missed.
-_TRIES, _FIRST_CHANGE, _TOLERANCE_LOG2 = 6, 0.5, 0.015
+#: Tries of the coarseness for a size, at most; the binary logarithm by which the size may be missed, and by which it
+#: changes for each unit of coarseness.
+_TRIES, _TOLERANCE_LOG2, _SLOPE_LOG2 = 6, 0.02, 0.8
+#: By how many dB the PSNR changes for twice the number of Gaussians, and for each unit of coarseness; the most units
+#: that it is changed by; and by how much the fit aims at more than it was asked for, which is given up in the end.
+_DB_PER_DOUBLING, _DB_PER_UNIT, _MOST_CHANGE, _MARGIN_DB = 1.8, 0.8, 2.0, 0.1
+#: The coarseness that the search for a size starts with.
+USUAL_COARSENESS = 6.0
+#: The least fraction of the Gaussians that remains: each is judged as if the others remained.
+_LEAST_KEPT = 0.45
 #: Squared error that sorting may add, as a fraction of the model's own, with so many passes over the frames to come.
 #: Fewer compensate for less of it.
 _ORDERING, _PASSES = 1.0, 40.0
@@ -53,28 +59,31 @@ class Action(NamedTuple):
     """What is done once a fraction of the plan is over: "drop", "sort", or the group of leaves to round.
 
     `extent`: the fraction of the price of a bit at which Gaussians are dropped, or of the Gaussians that are rounded.
-    `gain`: by how many dB the PSNR rises from then to the end, about, compared with that of everything rounded.
+    `gain`: about how many dB the running PSNR rises from then to the end, rather too few. `growth`: how much larger the
+    file will be, about, than one made then.
     """
 
     progress: float
     what: str | tuple[str, ...]
     extent: float = 1.0
     gain: float = 0.0
+    growth: float = 1.0
 
 
 ACTIONS = (
-    Action(0.1, "drop", 0.04, 5.0),
-    Action(0.2, "drop", 0.16, 3.8),
-    Action(0.3, "drop", 0.36, 3.1),
-    Action(0.4, "drop", 0.64, 2.6),
-    Action(0.5, "drop", 1.0, 2.2),
-    Action(0.5, "sort"),
-    Action(0.6, SHAPE, 0.4, 1.6),
-    Action(0.71, SHAPE, 0.75),
-    Action(0.82, SHAPE, 1.0),
-    Action(0.89, TRAJECTORY, 0.5),
-    Action(0.95, TRAJECTORY, 1.0),
-    Action(0.98, COLOR, 0.5),
+    Action(0.1, "drop", 0.04, 2.5, growth=3.5),
+    Action(0.2, "drop", 0.16, 1.8, growth=2.2),
+    Action(0.3, "drop", 0.36, 1.4, growth=1.3),
+    Action(0.42, "drop", 0.64, 1.2),
+    Action(0.55, "drop", 1.0, 1.0),
+    Action(0.55, "sort"),
+    Action(0.7, SHAPE, 0.4, 0.8),
+    Action(0.78, SHAPE, 0.75),
+    Action(0.84, "drop", 1.0, 0.3),
+    Action(0.86, SHAPE, 1.0),
+    Action(0.91, TRAJECTORY, 0.5),
+    Action(0.96, TRAJECTORY, 1.0),
+    Action(0.985, COLOR, 0.5),
 )
 #: The fraction of a plan from which a model that is already fitted becomes compact.
 COMPRESSION_START = 0.35
@@ -85,7 +94,6 @@ class RateControl:
 
     def __init__(self, frames: np.ndarray, config: FitConfig):
         self.frames, self.config = frames, config
-        self.sampled = np.unique(np.linspace(0, len(frames) - 1, _TRIED_FRAMES).round().astype(int))
 
     def act(self, state: FitState, progress: float) -> bool:
         """Take the actions that are due; whether arrays of the state were replaced."""
@@ -107,16 +115,16 @@ class RateControl:
 
     def round_only(self, state: FitState) -> None:
         """Drop what is not worth its bits, and sort where that hardly changes the images, without any training."""
-        self._drop(state, Action(0.0, "drop"))
+        self._drop(state, Action(1.0, "drop"))
         model = self._model(state)
         levels = sum(float(frame.astype(np.float64).var()) for frame in self.frames) * self.frames[0].size
         state.keep(find_order(model, _ORDERING_UNTRAINED * levels / 255**2))
-        self._choose_rules(state, gain=0.0)
+        self._choose_rules(state, ACTIONS[-1])
 
     def finish(self, state: FitState, fps: float = 25.0) -> Quantized:
         """The compact model of a fit at its end."""
         if not state.rules:
-            self._choose_rules(state, gain=0.0)
+            self._choose_rules(state, ACTIONS[-1])
         exact = compute_columns(self._model(state, fps))
         classes, rules = state.classes.astype(np.int32), _decode_rules(state)
         whole = quantize(exact, classes, rules)
@@ -130,8 +138,8 @@ class RateControl:
             return quantize(select_rows(exact, kept), classes[kept], rules)
 
         most, dropped = len(worst_first) - 1, 0
-        if self.config.psnr is not None and self._psnr(whole, all_frames=True) > self.config.psnr:
-            dropped = _last(lambda num: self._psnr(without(num), all_frames=True) >= self.config.psnr, most)
+        if self.config.psnr is not None and self._psnr(whole) > self.config.psnr:
+            dropped = _last(lambda num: self._psnr(without(num)) >= self.config.psnr, most)
         if self.config.size_mb is not None and count_bytes(without(dropped)) > 1e6 * self.config.size_mb:
             dropped = 1 + _last(lambda num: count_bytes(without(num)) > 1e6 * self.config.size_mb, most)
         return without(dropped) if dropped else whole
@@ -141,13 +149,17 @@ class RateControl:
 
     def _drop(self, state: FitState, action: Action) -> None:
         quantizer = Quantizer(self._model(state))
-        coarseness = self._choose_coarseness(quantizer, action.gain, drops=True)
-        state.keep(np.flatnonzero(quantizer.are_worth(coarseness, action.extent)))
+        coarseness = self._choose_coarseness(state, quantizer, action)
+        state.coarseness = state.coarseness if state.rules else coarseness
+        kept = quantizer.are_worth(coarseness, action.extent)
+        least = math.ceil(_LEAST_KEPT * len(kept))
+        kept[np.argsort(quantizer.removal, kind="stable")[-least:]] = True
+        state.keep(np.flatnonzero(kept))
 
     def _round(self, state: FitState, action: Action) -> None:
         """Round a fraction of the Gaussians; those that are rounded already are among them."""
         if not state.rules:
-            self._choose_rules(state, action.gain)
+            self._choose_rules(state, action)
         num, bit = state.num_gaussians, GROUPS[action.what]
         rank = make_generator(Stream.ROUNDING_ORDER, seed=self.config.seed).permutation(num) / num
         rounded = state.rounded | np.where(rank < action.extent, np.uint8(bit), np.uint8(0))
@@ -160,39 +172,50 @@ class RateControl:
                 moments[:, at] = np.where(newly, np.float32(0), moments[:, at])
         state.rows, state.first, state.second, state.rounded = rows, first, second, rounded
 
-    def _choose_rules(self, state: FitState, gain: float) -> None:
+    def _choose_rules(self, state: FitState, action: Action) -> None:
         quantizer = Quantizer(self._model(state))
-        rules = quantizer.make_rules(self._choose_coarseness(quantizer, gain, drops=False))
+        state.coarseness = self._choose_coarseness(state, quantizer, action)
+        rules = quantizer.make_rules(state.coarseness)
         state.rules = tuple((name, rule.origin, rule.exponent, rule.slopes) for name, rule in rules.items())
         state.classes = quantizer.classes.astype(np.int8)
 
-    def _choose_coarseness(self, quantizer: Quantizer, gain: float, *, drops: bool) -> float:
-        """The coarsest of what quality, size and PSNR ask for, where those not worth their bits are dropped or not."""
+    def _choose_coarseness(self, state: FitState, quantizer: Quantizer, action: Action) -> float:
+        """The coarsest that quality, size and PSNR ask for."""
         config, wanted = self.config, []
-
-        def quantized(coarseness: float) -> Quantized:
-            return quantizer.quantize(coarseness, quantizer.are_worth(coarseness) if drops else None)
-
         if config.quality is not None:
-            wanted.append(COARSEST + (FINEST - COARSEST) * config.quality / 100)
-        guess = wanted[0] if wanted else (COARSEST + FINEST) / 2
-        if config.size_mb is not None:
-            target = math.log2(max(_AIM * 1e6 * config.size_mb - HEADER_BYTES, 64))
-            wanted.append(_solve(lambda c: math.log2(count_bytes(quantized(c))) - target, guess, _TOLERANCE_LOG2))
+            wanted.append(coarseness_of(config.quality))
         if config.psnr is not None:
-            target = config.psnr - gain
-            wanted.append(_solve(lambda c: self._psnr(quantized(c)) - target, guess, _TOLERANCE_DB))
-        return max(wanted)
+            ahead = running_psnr(state) + action.gain - config.psnr - _MARGIN_DB
+            if action.what == "drop":
+                num = len(quantizer.removal) * 2 ** (-ahead / _DB_PER_DOUBLING)
+                wanted.append(quantizer.coarseness_for(num, action.extent))
+            else:
+                change = min(max(ahead / _DB_PER_UNIT, -_MOST_CHANGE), _MOST_CHANGE)
+                wanted.append((state.coarseness or USUAL_COARSENESS) + change)
+        if config.size_mb is not None:
+            room = _AIM * 1e6 * config.size_mb / action.growth - HEADER_BYTES
 
-    def _psnr(self, quantized: Quantized, *, all_frames: bool = False) -> float:
-        """Mean PSNR, dB, of sampled frames or of all."""
-        model, which = dequantize(quantized), np.arange(len(self.frames)) if all_frames else self.sampled
-        images = VideoRenderer(model).frames(np.asarray(model.frame_times.times())[which])
-        return float(np.mean([psnr_of(self._target(k), image) for k, image in zip(which, images, strict=True)]))
+            def excess(coarseness: float) -> float:
+                kept = quantizer.are_worth(coarseness) if action.what == "drop" else None
+                return math.log2(count_bytes(quantizer.quantize(coarseness, kept)) / max(room, 64.0))
+
+            wanted.append(_solve(excess, state.coarseness or USUAL_COARSENESS))
+        return min(max(*wanted, FINEST), COARSEST)
+
+    def _psnr(self, quantized: Quantized) -> float:
+        """Mean PSNR over all frames, dB."""
+        images = VideoRenderer(dequantize(quantized)).frames()
+        targets = map(self._target, range(len(self.frames)))
+        return float(np.mean([psnr_of(*pair) for pair in zip(targets, images, strict=True)]))
 
     def _target(self, k: int) -> np.ndarray:
         frame = self.frames[k]
         return frame if frame.shape[-1] == 3 else composite(frame, np.float32(BLACK))
+
+
+def coarseness_of(quality: float) -> float:
+    """The binary logarithm of the factor of all steps at a quality."""
+    return COARSEST + (FINEST - COARSEST) * quality / 100
 
 
 def count_bytes(quantized: Quantized) -> int:
@@ -209,22 +232,20 @@ def _decode_rules(state: FitState) -> dict[str, Rule]:
     return {name: Rule(*numbers) for name, *numbers in state.rules}
 
 
-def _solve(excess: Callable[[float], float], guess: float, tolerance: float) -> float:
-    """Where a decreasing function of the coarseness is 0, by secants within what is known; not below `FINEST`."""
-    low, high = (FINEST, math.inf), (COARSEST, -math.inf)  # coarseness and excess
-    at = guess
+def _solve(excess: Callable[[float], float], guess: float) -> float:
+    """The coarseness at which a size, as a binary logarithm, is not exceeded, by secants within what is known."""
+    low, high, at = (FINEST, math.inf), (COARSEST, -math.inf), guess  # coarseness and excess
     for _ in range(_TRIES):
         now = excess(at)
-        if abs(now) <= tolerance:
-            return at
         low, high = ((at, now), high) if now > 0 else (low, (at, now))
+        if -_TOLERANCE_LOG2 <= now <= 0:
+            return at
         if math.isfinite(low[1]) and math.isfinite(high[1]):
             fraction = low[1] / (low[1] - high[1])
             at = low[0] + min(max(fraction, 0.1), 0.9) * (high[0] - low[0])
         else:
-            slope = 1.0 if tolerance == _TOLERANCE_LOG2 else 2.5
-            at = min(max(at + now / slope, FINEST), COARSEST)
-    return low[0] if math.isfinite(low[1]) else at
+            at = min(max(at + now / _SLOPE_LOG2, FINEST), COARSEST)
+    return high[0]
 
 
 def _last(holds: Callable[[int], bool], most: int) -> int:

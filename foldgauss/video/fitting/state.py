@@ -195,6 +195,7 @@ class FitState:
     planned_step: int = field(default=0, metadata=_COUNT)  # where the plan was last changed, and the fraction of the
     planned_progress: float = field(default=0.0, metadata=_NUMBER)  # fit that was over there
     rate_actions: int = field(default=0, metadata=_COUNT)  # actions of `rate` that are done
+    coarseness: float = field(default=0.0, metadata=_NUMBER)  # of the steps of rounding; 0 before it is chosen
     rules: tuple[tuple, ...] = field(default=(), metadata=_RULES)  # by which parameters are rounded, once any are
     seconds: float = field(default=0.0, metadata=_NUMBER)
     processor_seconds: float = field(default=0.0, metadata=_NUMBER)  # of all threads, where `jobs` runs the fit

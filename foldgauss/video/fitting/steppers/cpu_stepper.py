@@ -67,7 +67,7 @@ class CpuStepper:
         by_time, by_path = np.zeros_like(times), np.zeros(state.path_maps.shape)
         spec = dataclasses.replace(self.spec, paths=paths_of(state, times))
         losses, alive, visited = [], [], set()
-        squared = progress >= 1 - config.l2_fraction
+        squared = progress >= config.squared_from
         screen = None if state.statistics is None else np.full(len(state.rows), -1, np.float32)
         views, fractions = choose_targets(self.interpolation, config, num_frames, state, progress)
         for view, fraction in zip(views.tolist(), fractions, strict=True):

@@ -129,7 +129,7 @@ class JaxStepper:
         control = Control(
             views=views.astype(np.int32),
             num=np.int32(held.num),
-            squared=np.bool_(progress >= 1 - config.l2_fraction),
+            squared=np.bool_(progress >= config.squared_from),
             rates=rates,
             time_rate=time_rate,
             path_rate=self.rates.of_paths(progress, state.backoffs),
