@@ -380,7 +380,7 @@ THINGS = {
 GIVEN = {
     "README.md": ("holiday.mp4", "masks", "film.mp4", "holidays"),
     "docs/commands.md": ("holiday.mp4",),
-    "docs/compress.md": ("holiday.mp4", "holiday.safetensors"),
+    "docs/compress.md": ("holiday.mp4",),
     "docs/editing.md": ("holiday.mp4", "holiday.safetensors", "edits.toml"),
     "docs/fit.md": ("holiday.mp4", "DAVIS", "folder/of/images"),
     "docs/format.md": ("holiday.mp4", "holiday.safetensors"),

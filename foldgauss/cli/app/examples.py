@@ -22,13 +22,15 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
             Example("Install shell completion", "foldgauss --install-completion"),
         ),
         "fit": (
-            Example("All defaults, into holiday.safetensors", "foldgauss fit holiday.mp4"),
+            Example("All defaults, into holiday.fgz", "foldgauss fit holiday.mp4"),
             Example("A quick draft of the first half second", "foldgauss fit holiday.mp4 --preset draft --frames 0:12"),
             Example(
                 "Five minutes, at 160x320 pixels",
                 "foldgauss fit holiday.mp4 --size 160x320 --minutes 5",
             ),
-            Example("A small file", "foldgauss fit holiday.mp4 --max-size-mb 2"),
+            Example("A file of a given size", "foldgauss fit holiday.mp4 --size-mb 2"),
+            Example("Closer to the clip", "foldgauss fit holiday.mp4 --quality 70 --out finer.fgz"),
+            Example("With float32 parameters", "foldgauss fit holiday.mp4 --out holiday.safetensors"),
             Example("Frames as images; resume a stopped fit", "foldgauss fit frames/ --resume"),
             Example(
                 "For slow motion above all",
@@ -51,43 +53,43 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
         ),
         "demo": (Example("Fit, render and evaluate the clip Bunny", "foldgauss demo --out first-look"),),
         "render": (
-            Example("As a video, holiday.mp4", "foldgauss render holiday.safetensors"),
+            Example("As a video, holiday.mp4", "foldgauss render holiday.fgz"),
             Example(
                 "Four times as many frames, four times the frame rate",
-                "foldgauss render holiday.safetensors --upsample 4",
+                "foldgauss render holiday.fgz --upsample 4",
             ),
             Example(
                 "Slow motion as an animation",
-                "foldgauss render holiday.safetensors --speed 0.25 --out slow.gif",
+                "foldgauss render holiday.fgz --speed 0.25 --out slow.gif",
             ),
             Example(
                 "One image at twice the size",
-                "foldgauss render holiday.safetensors --times 0.5 --size 320x640 --out one.png",
+                "foldgauss render holiday.fgz --times 0.5 --size 320x640 --out one.png",
             ),
-            Example("Lossless frames, in a folder", "foldgauss render holiday.safetensors --out frames"),
+            Example("Lossless frames, in a folder", "foldgauss render holiday.fgz --out frames"),
         ),
         "stabilize": (
-            Example("As a smooth pan, into holiday.stable.mp4", "foldgauss stabilize holiday.safetensors"),
+            Example("As a smooth pan, into holiday.stable.mp4", "foldgauss stabilize holiday.fgz"),
             Example(
                 "As from a tripod, borders filled from other frames",
-                "foldgauss stabilize holiday.safetensors --fixed --border fill",
+                "foldgauss stabilize holiday.fgz --fixed --border fill",
             ),
         ),
         "player": (Example("The page without a model, to be hosted", "foldgauss player --out site"),),
         "view": (
-            Example("Play it in the browser", "foldgauss view holiday.safetensors"),
-            Example("Next to the clip", "foldgauss view holiday.safetensors --original holiday.mp4"),
+            Example("Play it in the browser", "foldgauss view holiday.fgz"),
+            Example("Next to the clip", "foldgauss view holiday.fgz --original holiday.mp4"),
         ),
         "plate": (
-            Example("Without the moving object, into holiday.plate.mp4", "foldgauss plate holiday.safetensors"),
-            Example("And its masks", "foldgauss plate holiday.safetensors --out empty.mp4 --save-masks masks"),
-            Example("With masks of your own", "foldgauss plate holiday.safetensors --out mine.mp4 --masks masks"),
+            Example("Without the moving object, into holiday.plate.mp4", "foldgauss plate holiday.fgz"),
+            Example("And its masks", "foldgauss plate holiday.fgz --out empty.mp4 --save-masks masks"),
+            Example("With masks of your own", "foldgauss plate holiday.fgz --out mine.mp4 --masks masks"),
         ),
         "evaluate": (
-            Example("PSNR and SSIM of every frame", "foldgauss evaluate holiday.safetensors holiday.mp4"),
-            Example("As JSON", "foldgauss evaluate holiday.safetensors holiday.mp4 --json holiday.json"),
+            Example("PSNR and SSIM of every frame", "foldgauss evaluate holiday.fgz holiday.mp4"),
+            Example("As JSON", "foldgauss evaluate holiday.fgz holiday.mp4 --json holiday.json"),
         ),
-        "info": (Example("Show the contents of the file", "foldgauss info holiday.safetensors"),),
+        "info": (Example("Show the contents of the file", "foldgauss info holiday.fgz"),),
         "segment": (
             Example("The fourth, into holiday.3.safetensors", "foldgauss segment holiday.safetensors 3"),
             Example("With a name of your own", "foldgauss segment holiday.safetensors 0 --out beginning.safetensors"),
@@ -95,30 +97,30 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
         "edit": (
             Example(
                 "With the script night.toml, into holiday.night.safetensors",
-                "foldgauss edit holiday.safetensors night.toml",
+                "foldgauss edit holiday.fgz night.toml",
             ),
             Example(
-                "Render the edited video directly", "foldgauss edit holiday.safetensors night.toml --out night.mp4"
+                "Render the edited video directly", "foldgauss edit holiday.fgz night.toml --out night.mp4"
             ),
         ),
         "compress": (
             Example("Into holiday.fgz, without the clip", "foldgauss compress holiday.safetensors"),
             Example("Smaller, with the clip", "foldgauss compress holiday.safetensors holiday.mp4"),
             Example(
-                "Smaller still, at a loss of half a dB",
-                "foldgauss compress holiday.safetensors holiday.mp4 --max-loss-db 0.5",
+                "With a quality",
+                "foldgauss compress holiday.safetensors holiday.mp4 --quality 60",
             ),
         ),
         "export": (
-            Example("As a web page with a player, holiday.html", "foldgauss export holiday.safetensors --format html"),
-            Example("For VeGaS, into holiday.ply", "foldgauss export holiday.safetensors --format ply"),
+            Example("As a web page with a player, holiday.html", "foldgauss export holiday.fgz --format html"),
+            Example("For VeGaS, into holiday.ply", "foldgauss export holiday.fgz --format ply"),
             Example(
                 "One frame for a viewer of 3DGS scenes",
-                "foldgauss export holiday.safetensors --format ply3dgs --times 0.5 --out one.ply",
+                "foldgauss export holiday.fgz --format ply3dgs --times 0.5 --out one.ply",
             ),
             Example(
                 "Every frame as triangles, to edit elsewhere",
-                "foldgauss export holiday.safetensors --format obj --out mesh",
+                "foldgauss export holiday.fgz --format obj --out mesh",
             ),
         ),
         "import": (
@@ -126,24 +128,24 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
             Example("Frames edited as triangles, into mesh.mp4", "foldgauss import mesh/ --fps 24"),
         ),
         "figure": (
-            Example("Interpolation between two frames", "foldgauss figure interpolation holiday.safetensors"),
+            Example("Interpolation between two frames", "foldgauss figure interpolation holiday.fgz"),
             Example(
                 "Frames, reconstructions and errors",
-                "foldgauss figure reconstruction holiday.safetensors holiday.mp4",
+                "foldgauss figure reconstruction holiday.fgz holiday.mp4",
             ),
         ),
         "figure interpolation": (
-            Example("Near the middle of the clip", "foldgauss figure interpolation holiday.safetensors"),
+            Example("Near the middle of the clip", "foldgauss figure interpolation holiday.fgz"),
             Example(
                 "After frames 12 and 40",
-                "foldgauss figure interpolation holiday.safetensors --at 12,40 --width 320",
+                "foldgauss figure interpolation holiday.fgz --at 12,40 --width 320",
             ),
         ),
         "figure reconstruction": (
-            Example("Three frames, evenly spaced", "foldgauss figure reconstruction holiday.safetensors holiday.mp4"),
+            Example("Three frames, evenly spaced", "foldgauss figure reconstruction holiday.fgz holiday.mp4"),
             Example(
                 "Chosen frames",
-                "foldgauss figure reconstruction holiday.safetensors holiday.mp4 --at 0,30",
+                "foldgauss figure reconstruction holiday.fgz holiday.mp4 --at 0,30",
             ),
         ),
         "uncertainty": (

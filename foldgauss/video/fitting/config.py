@@ -173,9 +173,9 @@ class FitConfig:
         default=None,
         metadata=setting(
             "Quality of a compact model, from 0 to 100",
-            "Ten more halve the steps of rounding, and a bit has to save a quarter of the squared error. See `rate`.",
+            "Ten more halve the steps of rounding, and a bit has to save only a quarter of the squared error.",
             bounds="[0, 100]",
-            unset="parameters are not rounded",
+            unset="50 for a compact file; without any of these three, parameters are not rounded",
             option="--quality",
             group=BUDGET,
         ),

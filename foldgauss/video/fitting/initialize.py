@@ -58,8 +58,9 @@ EVEN_FRAMES = 0.2
 UNIFORM_TIME_SCALES, UNIFORM_FOLD, UNIFORM_OPACITY, UNIFORM_COLOR, NEIGHBORS = (0.01, 1.0), 1.0, 0.1, 127 / 255, 3
 
 
-#: The backdrop's standard deviations, in units of the frame's longer side, its sigma_t and its opacity.
-BACKDROP_SCALE, BACKDROP_TIME_SCALE, BACKDROP_OPACITY = 2.0, 4.0, 0.9975
+#: The backdrop's center and standard deviations, in units of the frame's longer side, its sigma_t and its opacity. The
+#: center is far from the frame, where no region of an edit selects it.
+BACKDROP_PLACE, BACKDROP_SCALE, BACKDROP_TIME_SCALE, BACKDROP_OPACITY = (0.0, 10.0), 50.0, 4.0, 0.9975
 
 
 def initialize(
@@ -121,7 +122,7 @@ def with_backdrop(splats: FoldedSplats, frames: UInt8[np.ndarray, "num_frames he
     """
     color = frames.reshape(-1, 3).mean(0) / 255
     leaves = {
-        "loc": 0.0,
+        "loc": BACKDROP_PLACE,
         "log_scale": np.log(BACKDROP_SCALE),
         "angle_logit": 0.0,
         "time_loc_logit": 0.0,

@@ -196,9 +196,12 @@ class PreparedStabilizedVideo:
         to_output = self._to_pixels @ self._video.map_at(t)
         if not self._video.borders_visible:
             return _apply(to_output @ self._to_model, splats)
-        parts = [_apply(to_output, self._seen(splats))]
+        seen = self._seen(splats)
+        wide = _are_wide(seen)
+        parts = [_apply(to_output, _choose(seen, ~wide))]
         if self._video.fill:
             parts += self._beyond_borders(t, to_output)
+        parts.append(_apply(to_output, _choose(seen, wide)))
         leaves = [(part.mean, part.factor, part.opacity, part.color) for part in parts]
         return Splats2D(*map(np.concatenate, zip(*leaves, strict=True)))
 
@@ -210,7 +213,7 @@ class PreparedStabilizedVideo:
             to_frame = video.path.matrices[j] @ here  # from the image at t
             splats = _apply(np.linalg.inv(to_frame), self._seen(self._prepared.splats(float(video.path.times[j]))))
             inside = [(np.abs(_move_points(other, splats.mean)) < self._half - OVERLAP).all(1) for other in in_front]
-            parts.append(_apply(to_output, _choose(splats, ~np.any(inside, axis=0))))
+            parts.append(_apply(to_output, _choose(splats, ~np.any(inside, axis=0) & ~_are_wide(splats))))
             in_front.append(to_frame)
         return parts
 
@@ -219,6 +222,11 @@ class PreparedStabilizedVideo:
         splats = _apply(self._to_model, splats)
         reach = UNSEEN * np.linalg.norm(splats.factor, axis=(1, 2))
         return _choose(splats, (np.abs(splats.mean) < self._half + reach[:, None]).all(1))
+
+
+def _are_wide(splats: Splats2D) -> Bool[np.ndarray, " num"]:
+    """Which splats in model space are wider than a frame, as a backdrop: they would hide what other frames show."""
+    return np.linalg.norm(splats.factor, axis=(1, 2)) > 1
 
 
 def _choose(splats: Splats2D, which: Bool[np.ndarray, " num"]) -> Splats2D:
