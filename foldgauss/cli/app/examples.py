@@ -99,9 +99,7 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
                 "With the script night.toml, into holiday.night.safetensors",
                 "foldgauss edit holiday.fgz night.toml",
             ),
-            Example(
-                "Render the edited video directly", "foldgauss edit holiday.fgz night.toml --out night.mp4"
-            ),
+            Example("Render the edited video directly", "foldgauss edit holiday.fgz night.toml --out night.mp4"),
         ),
         "compress": (
             Example("Into holiday.fgz, without the clip", "foldgauss compress holiday.safetensors"),

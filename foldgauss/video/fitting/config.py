@@ -445,11 +445,12 @@ ALIVE, ALIVE_POWER, ALIVE_PIXEL_POWER = 0.378, 0.55, 0.95
 MOST_PER_PIXEL = 1.6
 
 
-#: The quality of compact models that `foldgauss fit` has by default, and about the PSNR of usual clips with it, in dB.
-DEFAULT_QUALITY, USUAL_PSNR = 50.0, 37.0
-#: Gaussians per pixel of a clip with which a fit of the default quality starts, some three times as many as it keeps;
-#: their binary logarithm grows by this for each unit of quality, and for each dB. And how many for each 10^6 bytes.
-DENSITY_AT_QUALITY, DENSITY_OF_QUALITY, DENSITY_OF_PSNR, GAUSSIANS_PER_MB = 0.012, 0.08, 0.32, 300_000
+#: The quality of compact models that `foldgauss fit` has by default.
+DEFAULT_QUALITY = 70.0
+#: Gaussians per pixel of a clip with which a fit of quality 50 starts, some three times as many as it keeps; their
+#: binary logarithm grows by this for each unit of quality. The PSNR of usual clips at that quality, dB, and the growth
+#: for each dB. How many Gaussians there are for each 10^6 bytes.
+START_DENSITY, DENSITY_PER_QUALITY, PSNR_AT_50, DENSITY_PER_DB, GAUSSIANS_PER_MB = 0.012, 0.08, 35.0, 0.32, 300_000
 
 
 def default_num_gaussians(
@@ -489,9 +490,9 @@ def _most_for_rate(config: FitConfig, pixels: int) -> float:
     """A few times as many Gaussians as a compact model usually keeps, whose number depends on the clip."""
     limits = [math.inf]
     if config.quality is not None:
-        limits.append(pixels * DENSITY_AT_QUALITY * 2 ** (DENSITY_OF_QUALITY * (config.quality - DEFAULT_QUALITY)))
-    if config.psnr is not None:
-        limits.append(3 * pixels * DENSITY_AT_QUALITY * 2 ** (DENSITY_OF_PSNR * (config.psnr - USUAL_PSNR)))
+        limits.append(pixels * START_DENSITY * 2 ** (DENSITY_PER_QUALITY * (config.quality - 50)))
+    if config.psnr is not None:  # at what quality is not known yet, so more than twice as many
+        limits.append(2.5 * pixels * START_DENSITY * 2 ** (DENSITY_PER_DB * (config.psnr - PSNR_AT_50)))
     if config.size_mb is not None:
         limits.append(GAUSSIANS_PER_MB * config.size_mb)
     return min(limits)

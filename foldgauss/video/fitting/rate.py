@@ -34,7 +34,7 @@ from foldgauss.video.models.video_model import VideoModel
 #: Coarseness, the binary logarithm of the factor of all steps, at quality 0 and 100; between them it is linear.
 COARSEST, FINEST = 11.0, 1.0
 #: Bytes of a file beside its streams: its header, and what is known of the clip.
-HEADER_BYTES = 4096
+HEADER_BYTES = 3000
 #: Fraction of the largest file that the fit aims at; the Gaussians that are worth least are dropped in the end if the
 #: file is larger nevertheless.
 _AIM = 0.98
@@ -139,9 +139,9 @@ class RateControl:
 
         most, dropped = len(worst_first) - 1, 0
         if self.config.psnr is not None and self._psnr(whole) > self.config.psnr:
-            dropped = _last(lambda num: self._psnr(without(num)) >= self.config.psnr, most)
+            dropped = _bracket(lambda num: self._psnr(without(num)) >= self.config.psnr, most)[0]
         if self.config.size_mb is not None and count_bytes(without(dropped)) > 1e6 * self.config.size_mb:
-            dropped = 1 + _last(lambda num: count_bytes(without(num)) > 1e6 * self.config.size_mb, most)
+            dropped = min(_bracket(lambda num: count_bytes(without(num)) > 1e6 * self.config.size_mb, most)[1], most)
         return without(dropped) if dropped else whole
 
     def _model(self, state: FitState, fps: float = 25.0) -> VideoModel:
@@ -248,10 +248,10 @@ def _solve(excess: Callable[[float], float], guess: float) -> float:
     return high[0]
 
 
-def _last(holds: Callable[[int], bool], most: int) -> int:
-    """The largest number up to `most` for which a condition holds that holds up to some number; 0 if for none."""
+def _bracket(holds: Callable[[int], bool], most: int) -> tuple[int, int]:
+    """Two numbers around the one up to which a condition holds, about `most` / 200 apart; it holds for the lower one."""
     low, high = 0, most + 1
-    while high - low > max(low // 200, 1):
+    while high - low > max(most // 200, 1):
         middle = (low + high) // 2
         low, high = (middle, high) if holds(middle) else (low, middle)
-    return low
+    return low, high
