@@ -6,11 +6,10 @@ import sqlite3
 
 import numpy as np
 import pytest
-from soft_models import on_paths, soft_model
 
-from benchmarks import compress, defaults, step
+from benchmarks import defaults, step
 from benchmarks._clips import folder_sources, sample_sources
-from foldgauss.io import Clip, write_video
+from foldgauss.io import write_video
 from foldgauss.video import FitConfig
 
 SIZE, NUM_FRAMES = (40, 64), 8
@@ -303,13 +302,3 @@ class TestStep:
             assert set(record) == {*step.PARTS, "total"}
             assert all(seconds > 0 for part, seconds in record.items() if part != "other")
         assert step.figures_of(records, naive=1.0, num_alive=num_alive)["total_ms"] > 0
-
-
-def test_compressed_models_may_have_shared_paths():
-    """Those without the Gaussians that add least keep the paths of the others."""
-    model = on_paths(soft_model())
-    model.splats.opacity_logit[:10] = -30  # invisible
-    frames = np.stack(list(model.frames()))
-    small = compress.pruned(model, Clip(frames, model.fps, "frames", len(frames)))
-    assert 20 < small.num_gaussians <= 30
-    np.testing.assert_array_equal(small.splats.paths.matrices, model.splats.paths.matrices)
