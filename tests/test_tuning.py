@@ -302,3 +302,19 @@ class TestStep:
             assert set(record) == {*step.PARTS, "total"}
             assert all(seconds > 0 for part, seconds in record.items() if part != "other")
         assert step.figures_of(records, naive=1.0, num_alive=num_alive)["total_ms"] > 0
+
+
+def test_rates_of_several_qualities(folder, tmp_path, capsys, monkeypatch):
+    rates = pytest.importorskip("benchmarks.rate_distortion", reason="its figure needs the extra 'plot'")
+    codec = rates.CODECS[rates.REFERENCE]._replace(factors=(12, 42))
+    monkeypatch.setattr(rates, "CODECS", {rates.REFERENCE: codec})
+    paths = {name: tmp_path / f"rates.{name}" for name in ("json", "png")}
+    options = ["--only", "slow", "--minutes", "0.02", "--qualities", "30", "80", "--figure", str(paths["png"])]
+    rates.main(["--clips", str(folder), *options, "--json", str(paths["json"])])
+    assert "foldgauss" in printed(capsys)
+    kept = json.loads(paths["json"].read_text())
+    coarse, fine = (kept["runs"][f"slow, foldgauss, quality {quality}"] for quality in (30, 80))
+    assert coarse["minutes"] == fine["minutes"] == 0.02
+    assert all(coarse[name] < fine[name] for name in ("bytes", "psnr", "gaussians"))
+    assert kept["bd_rates"].keys() == {"slow"}
+    assert paths["png"].exists()
