@@ -20,7 +20,7 @@ COMMANDS = {
     "v.mp4": ["render", "MODEL", "--out"],
     "frames": ["render", "MODEL", "--out"],
     "e.json": ["evaluate", "MODEL", "CLIP", "--json"],
-    "c.fgz": ["compress", "MODEL", "--passes", "0", "--out"],
+    "c.fgz": ["compress", "MODEL", "--out"],
     "e.safetensors": ["edit", "MODEL", "SCRIPT", "--out"],
     "m.ply": ["export", "MODEL", "--format", "ply", "--out"],
     "meshes": ["export", "MODEL", "--format", "obj", "--out"],

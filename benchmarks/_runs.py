@@ -16,7 +16,8 @@ from benchmarks._common import console, describe_machine
 from foldgauss._runtime.threads import num_threads
 from foldgauss.io import Clip, save_video_model
 from foldgauss.io._atomic import atomic_path
-from foldgauss.video import FitConfig, VideoModel, fit_steps, psnr, ssim
+from foldgauss.video import FitConfig, FitResult, VideoModel, fit_steps, psnr, ssim
+from foldgauss.video.fitting.loop import finish
 from foldgauss.video.fitting.state import to_model
 
 Run = dict[str, Any]
@@ -101,6 +102,14 @@ def fitted(clip: Clip, config: FitConfig, *, with_ssim: bool = True, cpu_time: b
     run |= {"gaussians": model.num_gaussians, "floats": model.num_parameters, "steps": last.step}
     run |= size_on_disk(model, clip)
     return model, run | {"frames_seen": last.step * config.batch_size, "seconds": last.seconds}
+
+
+def fit_by_processor(frames: np.ndarray, config: FitConfig, fps: float) -> FitResult:
+    """A fit whose minutes are those of the processor; its history is the last step."""
+    for state, info in fit_steps(frames, config, clock=time.process_time):
+        last = info
+    model, quantized = finish(state, frames, config, fps)
+    return FitResult(model, [last], quantized)
 
 
 def size_on_disk(model: VideoModel, clip: Clip) -> Run:

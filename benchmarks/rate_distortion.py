@@ -1,19 +1,18 @@
 """Rate and distortion: compact files beside video codecs.
 
-    python -m benchmarks.rate_distortion --clips FOLDER [--only NAME ...] [--frames N] [--minutes M] [--passes P]
-                                         [--gaussians N ...] [--json FILE] [--figure FILE]
+    python -m benchmarks.rate_distortion --clips FOLDER [--only NAME ...] [--frames N] [--minutes M]
+                                         [--qualities Q ...] [--json FILE] [--figure FILE]
 
 The first N frames of the subfolders of FOLDER, folders of images each, at their own size. `foldgauss`: fits of M
-minutes of one core with several numbers of Gaussians, compressed with P passes for a loss of at most 0.3 dB. Codecs:
-FFmpeg's encoders through PyAV at several constant rate factors, tuned for PSNR, whole Matroska files. x264 and x265
-store 4:4:4, as chroma subsampling would limit their PSNR of RGB; SVT-AV1 has 4:2:0 only. Figures of quality are means
-over the decoded 8-bit frames:
+minutes of one core with several qualities. Codecs: FFmpeg's encoders through PyAV at several constant rate factors,
+tuned for PSNR, whole Matroska files. x264 and x265 store 4:4:4, as chroma subsampling would limit their PSNR of RGB;
+SVT-AV1 has 4:2:0 only. Figures of quality are means over the decoded 8-bit frames:
 
 - PSNR of RGB;
 - PSNR of YUV, weighted 6:1:1, of BT.601 luma and of chroma averaged over 2x2 pixels, so that 4:2:0 costs nothing;
 - MS-SSIM of luma (Wang, Simoncelli and Bovik 2003).
 
-Seconds are of the processor, to encode (to fit and compress) and to decode all frames (to render them).
+Seconds are of the processor, to encode (to fit) and to decode all frames (to render them).
 
 BD-rate (Bjontegaard 2001, VCEG-M33): how many more bytes a coder takes at equal quality than x264 medium, by piecewise
 cubic interpolation of log bytes. The range of quality is that of the compact files, as far as both coders cover it. It
@@ -40,19 +39,16 @@ from skimage.color import rgb2ycbcr
 from benchmarks import _common
 from benchmarks._clips import ClipSource, folder_sources
 from benchmarks._common import console
-from benchmarks._runs import Run, Runs
-from benchmarks.interpolation import fit_model
+from benchmarks._runs import Run, Runs, fit_by_processor
 from foldgauss._runtime.threads import set_num_threads
 from foldgauss.io import load_video_model, read_video, save_compact
 from foldgauss.io.media.decoder import CONVERSION
 from foldgauss.io.media.encoder import open_with_own_priority
-from foldgauss.video import FitConfig, compress, psnr
+from foldgauss.video import FitConfig, psnr
 
 NUM_FRAMES = 50
-GAUSSIANS = (12_000, 40_000, 120_000)
-LOSS_DB = 0.3
+QUALITIES = (20.0, 35.0, 50.0, 65.0)
 MINUTES = 3.0
-PASSES = 16
 OURS = "foldgauss"
 REFERENCE = "x264 medium"
 #: Weights of the five scales, finest first, and constants of SSIM for 8 bits: Wang, Simoncelli and Bovik 2003.
@@ -79,7 +75,7 @@ CODECS = {
     "SVT-AV1 3": Codec("libsvtav1", "yuv420p", {"preset": "3"}, (10, 20, 30, 40, 50, 60)),
 }
 #: Figures of quality, and how the table calls them.
-QUALITIES = {"psnr": "PSNR (dB)", "psnr_yuv": "YUV 6:1:1 (dB)", "ms_ssim": "MS-SSIM"}
+MEASURES = {"psnr": "PSNR (dB)", "psnr_yuv": "YUV 6:1:1 (dB)", "ms_ssim": "MS-SSIM"}
 
 
 def psnr_yuv(first: np.ndarray, second: np.ndarray) -> float:
@@ -143,19 +139,18 @@ def run_codec(frames: np.ndarray, fps: float, codec: Codec, factor: int) -> Run:
         return score(frames, clip.frames, path.stat().st_size, encode_s, decode_s)
 
 
-def run_foldgauss(frames: np.ndarray, fps: float, config: FitConfig, passes: int) -> Run:
+def run_foldgauss(frames: np.ndarray, fps: float, config: FitConfig) -> Run:
     with tempfile.TemporaryDirectory() as folder:
 
-        def encode() -> tuple[Path, int]:
-            model = fit_model(frames, config, fps, cpu_time=True)
-            made = compress(model, frames, max_loss_db=LOSS_DB, passes=passes)
-            return save_compact(Path(folder) / "clip.fgz", made.quantized)
+        def encode() -> Path:
+            fitted = fit_by_processor(frames, config, fps)
+            return save_compact(Path(folder) / "clip.fgz", fitted.quantized)
 
         path, encode_s = timed(encode)
         model = load_video_model(path)
         decoded, decode_s = timed(lambda: np.stack(list(model.frames())))
-        size = {"gaussians": model.num_gaussians, "floats": model.num_parameters}
-        return score(frames, decoded, path.stat().st_size, encode_s, decode_s) | size
+        run = score(frames, decoded, path.stat().st_size, encode_s, decode_s)
+        return run | {"gaussians": model.num_gaussians, "minutes": config.minutes}
 
 
 def bd_rate(
@@ -183,27 +178,28 @@ def measure(source: ClipSource, runs: Runs, options: argparse.Namespace) -> dict
         for factor in codec.factors:
             run = lambda codec=codec, factor=factor: run_codec(frames, clip.fps, codec, factor)  # noqa: E731
             by_coder[name].append(runs.get(f"{source.name}, {name}, {factor}", run))
-    for num in options.gaussians:
-        config = FitConfig(num_gaussians=num, minutes=options.minutes)
-        run = lambda config=config: run_foldgauss(frames, clip.fps, config, options.passes)  # noqa: E731
-        by_coder[OURS].append(runs.get(f"{source.name}, {OURS}, {num}", run))
+    for quality in options.qualities:
+        config = FitConfig(quality=quality, minutes=options.minutes)
+        run = lambda config=config: run_foldgauss(frames, clip.fps, config)  # noqa: E731
+        by_coder[OURS].append(runs.get(f"{source.name}, {OURS}, quality {quality:g}", run))
     return dict(by_coder)
 
 
 def show(clip: str, by_coder: dict[str, list[Run]]) -> dict[str, dict[str, tuple[float, float, float] | None]]:
     """Print the runs of a clip and the BD-rates, which are returned by coder and quality."""
-    columns = ("bytes", "bits per pixel", *QUALITIES.values(), "encode (s)", "decode (s)")
+    columns = ("Gaussians", "bytes", "bits per pixel", *MEASURES.values(), "encode (s)", "decode (s)")
     table = _common.table(clip, "coder", *columns)
     forms = {"bytes": ",", "bits_per_pixel": ".3f", "psnr": ".2f", "psnr_yuv": ".2f", "ms_ssim": ".4f"}
     forms |= {"encode_s": ".1f", "decode_s": ".2f"}
     for name, made in by_coder.items():
         for run in made:
-            table.add_row(name, *(format(run[figure], form) for figure, form in forms.items()))
+            num = f"{run['gaussians']:,}" if name == OURS else ""
+            table.add_row(name, num, *(format(run[figure], form) for figure, form in forms.items()))
     console.print(table)
     names = [name for name in by_coder if name != REFERENCE]
     base, ours = by_coder[REFERENCE], by_coder[OURS]
-    rates = {name: {q: bd_rate(base, by_coder[name], q, ours) for q in QUALITIES} for name in names}
-    table = _common.table(f"{clip}: BD-rate to {REFERENCE}, and its range of quality", "coder", *QUALITIES.values())
+    rates = {name: {q: bd_rate(base, by_coder[name], q, ours) for q in MEASURES} for name in names}
+    table = _common.table(f"{clip}: BD-rate to {REFERENCE}, and its range of quality", "coder", *MEASURES.values())
     for name, by_quality in rates.items():
         shown = (
             "none" if rate is None else f"{rate[0]:+.0%} ({rate[1]:.4g} to {rate[2]:.4g})"
@@ -236,8 +232,7 @@ def main(arguments: list[str] | None = None) -> None:
     sources = [one for one in folder_sources(options.clips) if options.only is None or one.name in options.only]
     sources = [one._replace(frames=options.frames) for one in sources]
     set_num_threads(1)
-    setting = {"processor_minutes": options.minutes, "passes": options.passes, "frames": options.frames}
-    runs = Runs(options.json, setting)
+    runs = Runs(options.json, {"processor_minutes": options.minutes, "frames": options.frames})
     results = {one.name: measure(one, runs, options) for one in sources}
     rates = {clip: show(clip, by_coder) for clip, by_coder in results.items()}
     runs.write(bd_rates=rates)
@@ -250,9 +245,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--clips", type=Path, metavar="FOLDER", required=True, help="its subfolders are the clips")
     parser.add_argument("--only", nargs="+", metavar="NAME", help="[all]")
     parser.add_argument("--frames", type=_common.whole, default=NUM_FRAMES, help=f"[{NUM_FRAMES}]")
-    parser.add_argument("--gaussians", type=_common.whole, nargs="+", default=GAUSSIANS, help="at most, for each fit")
+    parser.add_argument("--qualities", type=float, nargs="+", default=QUALITIES, metavar="Q", help="[20 35 50 65]")
     parser.add_argument("--minutes", type=float, default=MINUTES, help=f"of the processor, for each fit [{MINUTES:g}]")
-    parser.add_argument("--passes", type=_common.whole, default=PASSES, help=f"of fine-tuning [{PASSES}]")
     parser.add_argument("--figure", type=Path, metavar="FILE", help="draw PSNR over bits per pixel")
     return parser
 

@@ -23,7 +23,7 @@ from foldgauss.cli.measuring import tradeoff_record as kept
 from foldgauss.io import load_video_model, read_video, write_video
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.jobs import runner
-from foldgauss.video import FitConfig, evaluate, tradeoff
+from foldgauss.video import FitConfig, FitDiverged, evaluate, tradeoff
 from foldgauss.video.motion.optical_flow import Motion
 from foldgauss.video.tradeoff import (
     AXES,
@@ -139,7 +139,10 @@ def test_each_variant_changes_one_setting_and_has_a_command():
     shown = dict(zip((point.name for point in made), lines, strict=True))
     assert shown["power 2"].split()[-2:] == ["--power", "2.0"]
     assert shown["time 250 steps"].split()[-2:] == ["--steps", "250"]
+    assert shown["quality 50"].split()[-2:] == ["--quality", "50.0"]
     assert shown["cutoff radius 2, fitted"].endswith("--support-radius 2.0")
+    outputs = {name: Path(shlex.split(line)[4]).suffix for name, line in shown.items() if line.split()[1] == "fit"}
+    assert {name for name, suffix in outputs.items() if suffix == ".fgz"} == {f"quality {q}" for q in (30, 50, 70, 90)}
     assert shown["cutoff radius 2, played"] == (
         "foldgauss evaluate out/base.safetensors 'my clip.mp4' --support-radius 2.0"
     )
@@ -164,11 +167,11 @@ def test_variants_that_do_not_apply_are_skipped(where, axis, why):
 def test_steps_fill_the_time(seconds):
     made, _ = plan_points(BASE, tuple(AXES), 132)
     pace = Throughput(start=0.5, step=0.03, evaluation=0.1)
-    steps = estimate_steps(seconds, made, pace, 132)
-    assert estimate_seconds(made, steps, pace, 132) <= seconds < estimate_seconds(made, steps + 1, pace, 132)
+    steps = estimate_steps(seconds, made, pace)
+    assert estimate_seconds(made, steps, pace) <= seconds < estimate_seconds(made, steps + 1, pace)
     # Points of the base's model cost no fit.
     played = [point for point in made if point.played is None]
-    saved = estimate_seconds(made, steps, pace, 132) - estimate_seconds(played, steps, pace, 132)
+    saved = estimate_seconds(made, steps, pace) - estimate_seconds(played, steps, pace)
     assert saved == pytest.approx((len(made) - len(played)) * pace.evaluation)
 
 
@@ -228,7 +231,8 @@ def test_everything_is_there(done, clip):
     assert rows["degree 0"]["floats"] == base.num_parameters - 6 * base.num_gaussians
     assert rows["cutoff radius 2, played"]["psnr"] != rows["base"]["psnr"]
     assert rows["cutoff radius 2, played"]["seconds"] == rows["base"]["seconds"]
-    assert rows["precision compact"]["bytes"] < rows["base"]["bytes"]
+    assert rows["quality 30"]["bytes"] < rows["quality 90"]["bytes"] < rows["base"]["bytes"]
+    assert rows["quality 30"]["gaussians"] < rows["quality 90"]["gaussians"]
 
 
 def test_commands_reproduce_their_points(done, tmp_path, monkeypatch):
@@ -236,7 +240,7 @@ def test_commands_reproduce_their_points(done, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     rows = {name_of(row): row for row in record_of(done)["points"]}
     chosen = ["batch 2", "cutoff stop 0.1, fitted", "cutoff alpha 1/32, played"]
-    for name in [*chosen, "precision compact"]:
+    for name in [*chosen, "quality 50"]:
         words = shlex.split(rows[name]["command"])
         assert words[0] == "foldgauss"
         more = ["--json", "scores.json", "--overwrite"] if words[1] == "evaluate" else []
@@ -358,20 +362,22 @@ def test_stopped_by_hand(clip, tmp_path, capsys, monkeypatch):
 
 
 def test_a_point_that_fails_is_left_out(clip, tmp_path, capsys, monkeypatch):
-    def failing(*given, **more):
-        raise ValueError("max_loss_db: out of reach")
+    steps = command.fit_steps
+
+    def failing(frames, config, **known):
+        if config.quality is not None:
+            raise FitDiverged("the loss is NaN", None)
+        return steps(frames, config, **known)
 
     with monkeypatch.context() as broken:
-        broken.setattr(command, "compress", failing)
-        assert run("tradeoff", clip, "--out", tmp_path / "r", "--axes", "precision", *QUICK) == 0
-    assert "precision compact is left out: max_loss_db: out of reach" in " ".join(capsys.readouterr().err.split())
+        broken.setattr(command, "fit_steps", failing)
+        assert run("tradeoff", clip, "--out", tmp_path / "r", "--axes", "quality", *QUICK) == 0
+    assert "quality 30 is left out: the loss is NaN" in " ".join(capsys.readouterr().err.split())
     record = record_of(tmp_path / "r")
     assert [name_of(row) for row in record["points"]] == ["base"]
-    assert set(record["left_out"]) == {"precision compact", "precision compact, finetuned"}
-    quick = command.compress
-    monkeypatch.setattr(command, "compress", lambda *given, **more: quick(*given, **more | {"passes": 0}))
-    assert run("tradeoff", clip, "--out", tmp_path / "r", "--axes", "precision", *QUICK) == 0  # tried again
-    assert len(record_of(tmp_path / "r")["points"]) == 3
+    assert set(record["left_out"]) == {f"quality {quality}" for quality in (30, 50, 70, 90)}
+    assert run("tradeoff", clip, "--out", tmp_path / "r", "--axes", "quality", *QUICK) == 0  # tried again
+    assert len(record_of(tmp_path / "r")["points"]) == 5
     assert record_of(tmp_path / "r")["left_out"] == {}
 
 

@@ -6,11 +6,10 @@ import sqlite3
 
 import numpy as np
 import pytest
-from soft_models import on_paths, soft_model
 
-from benchmarks import compress, defaults, step
+from benchmarks import defaults, step
 from benchmarks._clips import folder_sources, sample_sources
-from foldgauss.io import Clip, write_video
+from foldgauss.io import write_video
 from foldgauss.video import FitConfig
 
 SIZE, NUM_FRAMES = (40, 64), 8
@@ -305,11 +304,17 @@ class TestStep:
         assert step.figures_of(records, naive=1.0, num_alive=num_alive)["total_ms"] > 0
 
 
-def test_compressed_models_may_have_shared_paths():
-    """Those without the Gaussians that add least keep the paths of the others."""
-    model = on_paths(soft_model())
-    model.splats.opacity_logit[:10] = -30  # invisible
-    frames = np.stack(list(model.frames()))
-    small = compress.pruned(model, Clip(frames, model.fps, "frames", len(frames)))
-    assert 20 < small.num_gaussians <= 30
-    np.testing.assert_array_equal(small.splats.paths.matrices, model.splats.paths.matrices)
+def test_rates_of_several_qualities(folder, tmp_path, capsys, monkeypatch):
+    rates = pytest.importorskip("benchmarks.rate_distortion", reason="its figure needs the extra 'plot'")
+    codec = rates.CODECS[rates.REFERENCE]._replace(factors=(12, 42))
+    monkeypatch.setattr(rates, "CODECS", {rates.REFERENCE: codec})
+    paths = {name: tmp_path / f"rates.{name}" for name in ("json", "png")}
+    options = ["--only", "slow", "--minutes", "0.02", "--qualities", "30", "80", "--figure", str(paths["png"])]
+    rates.main(["--clips", str(folder), *options, "--json", str(paths["json"])])
+    assert "foldgauss" in printed(capsys)
+    kept = json.loads(paths["json"].read_text())
+    coarse, fine = (kept["runs"][f"slow, foldgauss, quality {quality}"] for quality in (30, 80))
+    assert coarse["minutes"] == fine["minutes"] == 0.02
+    assert all(coarse[name] < fine[name] for name in ("bytes", "psnr", "gaussians"))
+    assert kept["bd_rates"].keys() == {"slow"}
+    assert paths["png"].exists()

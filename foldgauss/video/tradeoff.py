@@ -17,13 +17,6 @@ from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
-#: How parameters are stored: as they are, or in a compact file (`foldgauss.video.compress`) with this many passes of
-#: fine-tuning and a loss of at most `MAX_LOSS_DB`.
-FLOAT32 = "float32"
-PASSES: Mapping[str, int] = MappingProxyType({"compact": 0, "compact, finetuned": 4})
-MAX_LOSS_DB = 0.2
-#: Cost of compression in steps of a fit per frame, as measured.
-_COMPRESSION_STEPS = {FLOAT32: 0.0, "compact": 4.0, "compact, finetuned": 18.0}
 #: Fewer steps do not show what a setting is worth.
 LEAST_STEPS = 200
 #: A point of the front is better than all cheaper ones by more than this, in dB.
@@ -41,8 +34,8 @@ class Variant:
     """One setting of an axis, as its differences from the base.
 
     `fit`: fields of `FitConfig`; `scale`: fields to multiply; `options`: fields of `RenderOptions`, for fit and
-    rendering, or if `played` for rendering only; `stored`: how parameters are stored. `work`: estimated cost in fits of
-    the base on two cores, for planning. `value` is its name, with scaled fields in braces.
+    rendering, or if `played` for rendering only. `work`: estimated cost in fits of the base on two cores, for planning.
+    `value` is its name, with scaled fields in braces.
     """
 
     value: str
@@ -50,7 +43,6 @@ class Variant:
     scale: Mapping[str, float] = dataclasses.field(default_factory=dict)
     options: Mapping[str, float] = dataclasses.field(default_factory=dict)
     played: bool = False
-    stored: str = FLOAT32
     work: float = 1.0
 
 
@@ -93,7 +85,10 @@ AXES: Mapping[str, tuple[Variant, ...]] = MappingProxyType(
             Variant("4", fit={"batch_size": 4}, scale={"steps": 1 / 4}),
         ),
         "cutoff": _cutoffs(),
-        "precision": tuple(Variant(stored, stored=stored) for stored in PASSES),
+        "quality": tuple(
+            Variant(f"{quality}", fit={"quality": quality}, work=work)
+            for quality, work in ((30, 0.8), (50, 1.1), (70, 1.4), (90, 1.6))
+        ),
         "power": (Variant("0", fit={"power": 0.0}), Variant("2", fit={"power": 2.0})),
         "compositing": (Variant("sum", fit={"compositing": "sum"}, work=0.85),),
         "ssim": (Variant("0", fit={"ssim_fraction": 0.0}, work=0.85), Variant("0.5", fit={"ssim_fraction": 0.5})),
@@ -103,23 +98,17 @@ AXES: Mapping[str, tuple[Variant, ...]] = MappingProxyType(
 
 @dataclasses.dataclass(frozen=True)
 class Point:
-    """A setting to measure: `config` is fitted, rendered with `played` if given, and stored as `stored`."""
+    """A setting to measure: `config` is fitted; or the base's model is rendered with `played`, if given."""
 
     axis: str
     value: str
     config: FitConfig
     played: RenderOptions | None = None
-    stored: str = FLOAT32
     work: float = 1.0
 
     @property
     def name(self) -> str:
         return f"{self.axis} {self.value}".rstrip()
-
-    @property
-    def reuses_base(self) -> bool:
-        """Whether this is the base's model, rendered or stored in another way."""
-        return self.played is not None or self.stored != FLOAT32
 
 
 class Skipped(NamedTuple):
@@ -164,7 +153,7 @@ def _apply(variant: Variant, axis: str, base: FitConfig) -> Point:
     fitted = base.options if variant.played else options
     config = dataclasses.replace(base, **variant.fit, **scaled, options=fitted)
     played = options if variant.played else None
-    return Point(axis, variant.value.format(**scaled), config, played, variant.stored, variant.work)
+    return Point(axis, variant.value.format(**scaled), config, played, variant.work)
 
 
 def _why_skipped(point: Point, base: FitConfig, num_frames: int, has_alpha: bool) -> str:
@@ -172,9 +161,7 @@ def _why_skipped(point: Point, base: FitConfig, num_frames: int, has_alpha: bool
         return "sums have no alpha, but the frames do"
     if point.config.batch_size > num_frames:
         return f"there are {num_frames} frames"
-    if point.reuses_base:
-        return ""
-    return "it changes nothing" if point.config == base else ""
+    return "it changes nothing" if point.played is None and point.config == base else ""
 
 
 class Throughput(NamedTuple):
@@ -185,24 +172,23 @@ class Throughput(NamedTuple):
     evaluation: float
 
 
-def estimate_seconds(points: Sequence[Point], steps: int, throughput: Throughput, num_frames: int) -> float:
+def estimate_seconds(points: Sequence[Point], steps: int, throughput: Throughput) -> float:
     """Estimated time to measure the points if the base has this many steps."""
-    fixed, each = _costs(points, throughput, num_frames)
+    fixed, each = _costs(points, throughput)
     return fixed + each * steps
 
 
-def estimate_steps(seconds: float, points: Sequence[Point], throughput: Throughput, num_frames: int) -> int:
+def estimate_steps(seconds: float, points: Sequence[Point], throughput: Throughput) -> int:
     """Steps of the base so that measuring the points takes this many seconds; below 1 if there is no time."""
-    fixed, each = _costs(points, throughput, num_frames)
+    fixed, each = _costs(points, throughput)
     return math.floor((seconds - fixed) / each)
 
 
-def _costs(points: Sequence[Point], throughput: Throughput, num_frames: int) -> tuple[float, float]:
+def _costs(points: Sequence[Point], throughput: Throughput) -> tuple[float, float]:
     """Seconds independent of steps, and seconds per step of the base."""
-    fits = [point for point in points if not point.reuses_base]
-    compression = sum(_COMPRESSION_STEPS[point.stored] for point in points) * num_frames * throughput.step
+    fits = [point for point in points if point.played is None]
     return (
-        len(fits) * throughput.start + len(points) * throughput.evaluation + compression,
+        len(fits) * throughput.start + len(points) * throughput.evaluation,
         sum(point.work for point in fits) * throughput.step,
     )
 

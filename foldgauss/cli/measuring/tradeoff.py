@@ -1,7 +1,6 @@
 """The command `tradeoff`."""
 
 import dataclasses
-import math
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -18,7 +17,6 @@ from foldgauss._runtime.checks import check_one_of, is_within
 from foldgauss._runtime.machine import load_average
 from foldgauss.cli.app.application import Stopped, WrongUse, app, err, name_option, out, warn, wrong_use
 from foldgauss.cli.app.completion import complete_choice, complete_list
-from foldgauss.cli.editing.compress import save_compressed
 from foldgauss.cli.measuring.tradeoff_record import (
     BASE,
     CLOCKS,
@@ -28,6 +26,7 @@ from foldgauss.cli.measuring.tradeoff_record import (
     Record,
     changed_settings,
     report,
+    suffix_of,
 )
 from foldgauss.cli.shared.arguments import (
     Deinterlace,
@@ -42,26 +41,25 @@ from foldgauss.cli.shared.arguments import (
 from foldgauss.cli.shared.log_lines import show_status
 from foldgauss.cli.shared.outputs import make_folder, name_after, refuse_foreign
 from foldgauss.cli.shared.rendering import TIME_LEFT
-from foldgauss.io._atomic import OutputError, atomic_path
+from foldgauss.io._atomic import OutputError
 from foldgauss.io._lock import lock_output
 from foldgauss.io.media.clip import DEINTERLACE, Clip
 from foldgauss.io.media.video_reading import read_video
+from foldgauss.io.models.compact import save_compact
 from foldgauss.io.models.video_model import load_video_model, save_video_model
 from foldgauss.io.provenance import fingerprint
 from foldgauss.jobs.runner import describe_fit, fit_metadata, mean_scores
-from foldgauss.video.compression.search import compress
 from foldgauss.video.fitting.config import TYPICAL_LIFETIME, FitConfig, chosen_num_gaussians, planned_steps
+from foldgauss.video.fitting.divergence import FitDiverged
 from foldgauss.video.fitting.initialize import measure_lifetime
-from foldgauss.video.fitting.loop import FitInfo, fit_steps
-from foldgauss.video.fitting.state import FitState, to_model
+from foldgauss.video.fitting.loop import FitInfo, finish, fit_steps
+from foldgauss.video.fitting.state import FitState
 from foldgauss.video.models.metrics import Evaluation, evaluate
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.motion.optical_flow import Motion
 from foldgauss.video.tradeoff import (
     AXES,
     LEAST_STEPS,
-    MAX_LOSS_DB,
-    PASSES,
     Point,
     Skipped,
     Throughput,
@@ -178,10 +176,10 @@ class _Run:
                 throughput = self._measure_throughput(dataclasses.replace(wanted, num_gaussians=num, steps=PILOT_STEPS))
             base = dataclasses.replace(wanted, num_gaussians=num, steps=full)
             points, _ = plan_points(base, axes, self.clip.num_frames, has_alpha=self.clip.has_alpha)
-            allowed = estimate_steps(60 * minutes / MARGIN, points, throughput, self.clip.num_frames)
+            allowed = estimate_steps(60 * minutes / MARGIN, points, throughput)
             least = max(LEAST_STEPS, self.clip.num_frames)  # so that the base sees every frame
             chosen = min(max(allowed, least), full) if steps is None else steps
-            expected = MARGIN * estimate_seconds(points, chosen, throughput, self.clip.num_frames) / 60
+            expected = MARGIN * estimate_seconds(points, chosen, throughput) / 60
             self.record.plan |= {"num_gaussians": num, "steps": chosen}
             self.record.plan |= {"expected_minutes": round(expected, 2), "pace": throughput._asdict()}
             self._print_plan(len(points), chosen, expected)
@@ -227,7 +225,7 @@ class _Run:
         steps = list(self._fit(config, lambda info: None))
         state, last = steps[-1]
         first = steps[0][1]
-        model = to_model(state, config, self.clip.size, self.clip.fps)
+        model, _ = finish(state, self.clip.frames, config, self.clip.fps)
         begun = time.perf_counter()
         evaluate(model, self.clip.frames)
         measure_frame_rate(model)
@@ -258,7 +256,7 @@ class _Run:
                 show(point.name)
                 try:
                     row = self._measure_point(point, base, lambda text, point=point: show(f"{point.name}: {text}"))
-                except ValueError as error:  # a diverged fit, or a loss that cannot be reached
+                except (ValueError, FitDiverged) as error:
                     if point.axis == "base":
                         raise
                     failed.append(Skipped(point.name, str(error)))
@@ -278,14 +276,12 @@ class _Run:
         return failed
 
     def _measure_point(self, point: Point, base: FitConfig, show: Report) -> dict[str, Any]:
-        with atomic_path(self.folder / BASE) if point.axis == "base" else _temporary_file(self.folder, point) as path:
-            if point.reuses_base:
-                shown, scores, spent = self._measure_variant(self._load_base(base, show), point, path, show)
-            else:
-                shown, spent, about = self._fit_model(point.config, show)
-                scores = evaluate(shown, self.clip.frames)
-                save_video_model(path, shown, metadata=about | mean_scores(scores))
-            num_bytes = (self.folder / BASE if point.played is not None else path).stat().st_size
+        if point.played is None:
+            shown, scores, spent, num_bytes = self._fit_model(point, show)
+        else:
+            shown = dataclasses.replace(self._load_base(base, show), options=point.played)
+            scores, row = evaluate(shown, self.clip.frames), self.record.rows["base"]
+            spent, num_bytes = _Spent(row["seconds"], row["cpu_seconds"]), row["bytes"]
         show("playing")
         if point.axis == "base":
             rate = measure_frame_rate(shown)
@@ -307,38 +303,18 @@ class _Run:
             "command": self.commands.format_point(point),
         }
 
-    def _measure_variant(
-        self, model: VideoModel, point: Point, path: Path, show: Report
-    ) -> tuple[VideoModel, Evaluation, "_Spent"]:
-        """The model of the base, rendered or stored differently; its scores, and the time of fit and compression."""
-        fitted = _Spent(self.record.rows["base"]["seconds"], self.record.rows["base"]["cpu_seconds"])
-        if point.played is not None:
-            shown = dataclasses.replace(model, options=point.played)
-            return shown, evaluate(shown, self.clip.frames), fitted
-        begun = _Spent.now()
-        compressed = compress(
-            model,
-            self.clip.frames,
-            max_loss_db=MAX_LOSS_DB,
-            passes=PASSES[point.stored],
-            on_step=lambda what, loss: show(what if math.isnan(loss) else f"{what}, {loss:.3f} dB lost"),
-        )
-        spent = fitted.plus(_Spent.since(begun))
-        save_compressed(path, compressed, self.about)
-        return compressed.model, evaluate(compressed.model, self.clip.frames), spent
-
     def _load_base(self, base: FitConfig, show: Report) -> VideoModel:
         """Load the model of the base, which is fitted again if its file is missing."""
         path = self.folder / BASE
         if not path.exists():
-            model, _, about = self._fit_model(base, show)
-            save_video_model(path, model, metadata=about | mean_scores(evaluate(model, self.clip.frames)))
+            self._fit_model(Point("base", "", base), show)
         if self._kept is None:
             self._kept = load_video_model(path)
         return self._kept
 
-    def _fit_model(self, config: FitConfig, show: Report) -> tuple[VideoModel, "_Spent", dict[str, Any]]:
-        """The model, what it took, and the metadata of its file."""
+    def _fit_model(self, point: Point, show: Report) -> tuple[VideoModel, Evaluation, "_Spent", int]:
+        """The model, its scores, what it took, and the bytes of its file; only the file of the base is kept."""
+        config = point.config
         if not self._warm:
             list(self._fit(dataclasses.replace(config, steps=2), lambda info: None))
             self._warm = True
@@ -355,8 +331,21 @@ class _Run:
         if config.follow_motion:  # which `fit` includes in its time
             spent = spent.plus(_Spent(**self.record.plan["motion"]))
         show("evaluating")
-        model = to_model(state, config, self.clip.size, self.clip.fps)
-        return model, spent, self.about | describe_fit(config, state)
+        ended = _Spent.now()
+        model, quantized = finish(state, self.clip.frames, config, self.clip.fps)
+        spent = spent.plus(_Spent.since(ended))
+        scores = evaluate(model, self.clip.frames)
+        about = self.about | describe_fit(config, state) | mean_scores(scores)
+        path = self.folder / (BASE if point.axis == "base" else f".measured{suffix_of(config)}")
+        try:
+            if quantized is None:
+                save_video_model(path, model, metadata=about)
+            else:
+                save_compact(path, quantized, metadata=about)
+            return model, scores, spent, path.stat().st_size
+        finally:
+            if point.axis != "base":
+                path.unlink(missing_ok=True)
 
 
 class _Spent(NamedTuple):
@@ -376,17 +365,6 @@ class _Spent(NamedTuple):
 
     def plus(self, other: "_Spent") -> "_Spent":
         return _Spent(self.wall + other.wall, self.cpu + other.cpu)
-
-
-@contextmanager
-def _temporary_file(folder: Path, point: Point) -> Iterator[Path]:
-    """A path for a file that is written to measure its size, and removed afterwards."""
-    suffix = ".fgz" if point.stored in PASSES else ".safetensors"
-    path = folder / f".measured{suffix}"
-    try:
-        yield path
-    finally:
-        path.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -23,9 +23,11 @@ from foldgauss.cli.shared.tables import write_json
 from foldgauss.io._atomic import atomic_path, write_or_keep
 from foldgauss.io.figures import write_tradeoff
 from foldgauss.io.media.clip import AS_STORED, Reading
+from foldgauss.io.models.compact import COMPACT_SUFFIX
+from foldgauss.io.models.video_model import MODEL_SUFFIX
 from foldgauss.render import RenderOptions
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.tradeoff import FLOAT32, MAX_LOSS_DB, PASSES, Point, Skipped, knee, pareto_front
+from foldgauss.video.tradeoff import Point, Skipped, knee, pareto_front
 
 RECORD, ROWS, PLOT, BASE = "tradeoff.json", "tradeoff.csv", "tradeoff.png", "base.safetensors"
 FILES = {RECORD, ROWS, PLOT, BASE}
@@ -147,6 +149,11 @@ def _check_rest(kept: dict[str, Any]) -> None:
         raise ValueError(f"machine: 'cores' should be a number > 0, not {short_repr(kept['machine'].get('cores'))}")
 
 
+def suffix_of(config: FitConfig) -> str:
+    """The extension of the file of a fit's model."""
+    return COMPACT_SUFFIX if config.is_compact else MODEL_SUFFIX
+
+
 @dataclasses.dataclass(frozen=True)
 class Commands:
     """The command lines that reproduce points, to be run from the current folder."""
@@ -158,16 +165,12 @@ class Commands:
     reading: Reading = AS_STORED
 
     def format_point(self, point: Point) -> str:
-        """The command that fits the model of `point`, or converts or evaluates that of the base."""
-        name, base = point.name.replace(", ", "-").replace(" ", "-").replace("/", "_"), self.folder / BASE
+        """The command that fits the model of `point`, or evaluates that of the base."""
         if point.played is not None:
             constants = _changed(point.played, point.config.options, RENDER_OPTIONS)
-            return shlex.join(["foldgauss", "evaluate", str(base), str(self.video), *constants])
-        if point.stored != FLOAT32:
-            how = ["--passes", str(PASSES[point.stored]), "--max-loss-db", f"{MAX_LOSS_DB:g}"]
-            words = ["compress", str(base), str(self.video), *how, "--out", f"{name}.fgz"]
-            return shlex.join(["foldgauss", *words])
-        words = ["fit", str(self.video), "--out", f"{name}.safetensors"]
+            return shlex.join(["foldgauss", "evaluate", str(self.folder / BASE), str(self.video), *constants])
+        name = point.name.replace(", ", "-").replace(" ", "-").replace("/", "_")
+        words = ["fit", str(self.video), "--out", f"{name}{suffix_of(point.config)}"]
         words += [] if self.size is None else ["--size", self.size]
         words += [] if self.frames is None else ["--frames", self.frames]
         words += [f"--{name}={value}" for name, value in self.reading.changed.items()]
@@ -198,12 +201,11 @@ def changed_settings(point: Point, base: FitConfig) -> dict[str, Any]:
     }
     options = point.config.options if point.played is None else point.played
     word = "fitted" if point.played is None else "played"
-    changed |= {
+    return changed | {
         f"{field.name} ({word})": getattr(options, field.name)
         for field in dataclasses.fields(options)
         if getattr(options, field.name) != getattr(base.options, field.name)
     }
-    return changed | ({} if point.stored == FLOAT32 else {"stored": point.stored})
 
 
 def report(record: Record, made: list[Point], skipped: list[Skipped], clock: str) -> None:
