@@ -11,7 +11,7 @@ const AXES = [
 ];
 const WIDEST = { time: 0.125, angle: 0.125, size: 0.35, stretch: 0.5, duration: 0.5, opacity: 1.0 };
 const MAGIC = [0x8b, 0x46, 0x47, 0x5a, 0x0d, 0x0a, 0x1a, 0x0a], VERSION = 4;
-const NODES = 130, CONTEXTS = 256, MODELS = 3, MEMORY = 400, LARGEST_BITS = 30, FARTHEST = 120;
+const NODES = 130, CONTEXTS = 256, MODELS = 3, MEMORY = 400, LARGEST_BITS = 30, FARTHEST = 120, FINEST = -48;
 const WEIGHT = 29491, RATE = 6, MARGIN = 32;
 const KNOTS = [
   22, 36, 60, 98, 162, 267, 439, 720, 1179, 1921, 3108, 4971, 7812, 11955, 17625, 24743, 32768,
@@ -250,7 +250,7 @@ function decodeColumns(header, streamOf, onColumn) {
       for (let i = 0; i < num; i++) {
         let total = exponent;
         for (let j = 0; j < slopes.length; j++) total = total + slopes[j] * features[j][i];
-        halves[i] = clip(Math.floor(2 * total + 0.5), -FARTHEST, FARTHEST);
+        halves[i] = clip(Math.floor(2 * total + 0.5), FINEST, FARTHEST);
         const step = power(halves[i]);
         steps[i] = name in WIDEST ? Math.min(step, WIDEST[name]) : step;
         from[i] = origin;

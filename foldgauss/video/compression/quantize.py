@@ -56,6 +56,8 @@ _LN2, _SQRT2 = 0.6931471805599453, 1.4142135623730951
 POWER_WORTH = 0.9
 #: Largest absolute exponent of sqrt(2) of a step.
 _MAX_EXPONENT = 120
+#: The exponent of sqrt(2) of the finest step, which float32 tells apart at 1: finer ones would leave less range.
+FINEST_STEP = -48
 #: Largest steps; those of time and angle (turns) keep their logits finite.
 _MAX_STEP = {"time": 0.125, "angle": 0.125, "size": 0.35, "stretch": 0.5, "duration": 0.5, "opacity": 1.0}
 
@@ -102,7 +104,7 @@ class Rule:
         total = np.full(num, self.exponent)
         for slope, feature in zip(self.slopes, features, strict=False):
             total = total + slope * feature
-        return np.clip(np.floor(2 * total + 0.5), -_MAX_EXPONENT, _MAX_EXPONENT).astype(np.int32)
+        return np.clip(np.floor(2 * total + 0.5), FINEST_STEP, _MAX_EXPONENT).astype(np.int32)
 
 
 def compute_steps(halves: Int32[np.ndarray, " num"], name: str = "") -> Float[np.ndarray, " num"]:
@@ -517,13 +519,10 @@ def _round_columns(
         if name == "angle":  # kept in its half turn, so that quantizing a decoded model changes nothing
             low, high = (np.ceil((end - origin) / steps) for end in (0.25, 0.75))
             numbers = np.minimum(np.maximum(numbers, low), high - 1)
-        if not (np.abs(numbers) <= LARGEST).all():
-            worst = int(np.argmax(~(np.abs(numbers) <= LARGEST)))
-            got = f"{name} {values[name][worst]:g} of Gaussian {worst}"
-            raise invalid(
-                "model", expected="parameters within the range of their steps", got=got, cure="Remove it first."
-            )
-        columns[name] = numbers.astype(np.int32)
+        if not np.isfinite(numbers).all():
+            got = f"another {name} of Gaussian {int(np.argmin(np.isfinite(numbers)))}"
+            raise invalid("model", expected="finite numbers", got=got, cure="Remove it first.")
+        columns[name] = np.clip(numbers, -LARGEST, LARGEST).astype(np.int32)
         decoder.add(name, columns[name], halves)
         if trajectory_power(name):
             saved[trajectory_power(name)] += scaled**2 - (scaled - numbers) ** 2

@@ -77,7 +77,7 @@ class Quantizer:
         # Outliers are clipped: a line through the bulk would extrapolate their steps without bound.
         features = np.clip(raw, *np.quantile(raw[self._seen], [0.001, 0.999], axis=0))
         levels = {name: 0.5 * np.log2(np.maximum(sensitivity[name], _MIN_SENSITIVITY)) for name in self._names}
-        design = np.concatenate([np.ones((len(features), 1)), features], 1)
+        design, whole = (np.concatenate([np.ones((len(one), 1)), one], 1) for one in (features, raw))
         self._fits, rest = {}, []
         for name in self._names:
             fit = np.zeros(design.shape[1])
@@ -88,9 +88,11 @@ class Quantizer:
             else:
                 fit = np.linalg.lstsq(design[shows], levels[name][shows], rcond=None)[0]
             self._fits[name] = fit
-            rest.append(np.clip(levels[name] - design @ fit, -6, 6))
-        self.classes = np.rint(np.where(self._seen, np.mean(rest, axis=0), -6.0)).astype(np.int32)
-        self._match_errors(sensitivity, np.concatenate([np.ones((len(raw), 1)), raw], 1))
+            rest.append(levels[name] - whole @ fit)
+        # Of usual Gaussians at most 6. Beyond, the class makes up for the line where a Gaussian is unlike the others.
+        classes = np.where(np.all(raw == features, axis=1), np.clip(rest, -6, 6), np.clip(rest, -60, 60)).mean(0)
+        self.classes = np.rint(np.where(self._seen, classes, -6.0)).astype(np.int32)
+        self._match_errors(sensitivity, whole)
 
     def _match_errors(self, sensitivity: dict[str, Float[np.ndarray, " num"]], design: np.ndarray) -> None:
         """Shift the fits so that all columns add the same error: by mean, not typical, sensitivity times step^2."""

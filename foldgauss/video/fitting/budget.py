@@ -25,6 +25,12 @@ class StepPlanner:
     def __init__(self, config: FitConfig):
         self.config, self.count, self.seconds = config, -WARM_UP, 0.0  # steps since the last plan, and their time
         self.before = 0.0  # the state's seconds after the step before
+        self.reserved = 0.0  # seconds that actions between steps will take
+
+    def skip(self, seconds: float, reserved: float) -> None:
+        """An action between two steps took `seconds`, which are none of a step; later ones will take `reserved`."""
+        self.before += seconds
+        self.reserved = reserved
 
     def update(self, state: FitState) -> None:
         """Plan the steps of the whole fit, if it is time, after a step."""
@@ -41,7 +47,7 @@ class StepPlanner:
             self.seconds += passed
         if not self._is_due(state, budget):
             return
-        left = (budget - state.seconds) * self.count / self.seconds / SLOWDOWN
+        left = max(budget - state.seconds - self.reserved, 0.0) * self.count / self.seconds / SLOWDOWN
         if state.plan:
             state.planned_step, state.planned_progress = state.step, measure_progress(state, config)
         state.plan = min(state.step + max(int(left), 0), config.steps or math.inf)

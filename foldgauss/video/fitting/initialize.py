@@ -60,7 +60,7 @@ UNIFORM_TIME_SCALES, UNIFORM_FOLD, UNIFORM_OPACITY, UNIFORM_COLOR, NEIGHBORS = (
 
 #: The backdrop's center and standard deviations, in units of the frame's longer side, its sigma_t and its opacity. The
 #: center is far from the frame, where no region of an edit selects it.
-BACKDROP_PLACE, BACKDROP_SCALE, BACKDROP_TIME_SCALE, BACKDROP_OPACITY = (0.0, 10.0), 50.0, 4.0, 0.9975
+BACKDROP_PLACE, BACKDROP_SCALE, BACKDROP_TIME_SCALE, BACKDROP_OPACITY = (0.0, 4.0), 16.0, 4.0, 0.9975
 
 
 def initialize(

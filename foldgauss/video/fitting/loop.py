@@ -167,9 +167,11 @@ def fit_steps(
             stepper.adopt(state)
         else:
             guard.keep_good(state)
+            before = clock()
             if rate is not None and state.plan and rate.act(state, measure_progress(state, config)):
                 stepper.adopt(state)
                 guard.replace_good(state)
+                planner.skip(clock() - before, rate.reserve(state, clock() - before))
             if is_relocation_due(state, config) and guard.is_converging(state):
                 stepper.relocate(state)
                 guard.replace_good(state)

@@ -93,7 +93,7 @@ class RateControl:
     """Makes the Gaussians of a running fit worth their bits."""
 
     def __init__(self, frames: np.ndarray, config: FitConfig):
-        self.frames, self.config = frames, config
+        self.frames, self.config, self.longest = frames, config, 0.0
 
     def act(self, state: FitState, progress: float) -> bool:
         """Take the actions that are due; whether arrays of the state were replaced."""
@@ -112,6 +112,12 @@ class RateControl:
                 self._round(state, action)
             state.rate_actions += 1
         return state.rate_actions > before
+
+    def reserve(self, state: FitState, seconds: float) -> float:
+        """Seconds that later actions will take, if the last ones took `seconds`: those that measure Gaussians."""
+        self.longest = max(self.longest, seconds)
+        left = [action for action in ACTIONS[state.rate_actions :] if action.what == "drop"]
+        return self.longest * (len(left) + (not state.rules))
 
     def round_only(self, state: FitState) -> None:
         """Drop what is not worth its bits, and sort where that hardly changes the images, without any training."""
@@ -249,7 +255,7 @@ def _solve(excess: Callable[[float], float], guess: float) -> float:
 
 
 def _bracket(holds: Callable[[int], bool], most: int) -> tuple[int, int]:
-    """Two numbers around the one up to which a condition holds, about `most` / 200 apart; it holds for the lower one."""
+    """Two numbers, some `most` / 200 apart, around the one up to which a condition holds; it holds for the lower."""
     low, high = 0, most + 1
     while high - low > max(most // 200, 1):
         middle = (low + high) // 2
