@@ -59,7 +59,7 @@ TARGETS = {
     "video/models/frame_times": ["video/test_frame_times"],
     "video/fitting/adam": ["video/test_adam"],
     "io/models/compact": ["io/test_compact"],
-    "io/models/range_coder": ["io/test_range_coder"],
+    "video/compression/range_coder": ["io/test_range_coder"],
 }
 _COMPARISONS = {
     ast.Lt: ast.LtE,

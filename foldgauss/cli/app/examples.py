@@ -29,7 +29,7 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
                 "foldgauss fit holiday.mp4 --size 160x320 --minutes 5",
             ),
             Example("A file of a given size", "foldgauss fit holiday.mp4 --size-mb 2"),
-            Example("Closer to the clip", "foldgauss fit holiday.mp4 --quality 70 --out finer.fgz"),
+            Example("Closer to the clip", "foldgauss fit holiday.mp4 --quality 85 --out finer.fgz"),
             Example("With float32 parameters", "foldgauss fit holiday.mp4 --out holiday.safetensors"),
             Example("Frames as images; resume a stopped fit", "foldgauss fit frames/ --resume"),
             Example(

@@ -175,7 +175,7 @@ class FitConfig:
             "Quality of a compact model, from 0 to 100",
             "Ten more halve the steps of rounding, and a bit has to save only a quarter of the squared error.",
             bounds="[0, 100]",
-            unset="50 for a compact file; without any of these three, parameters are not rounded",
+            unset="70 for a compact file; without any of these three, parameters are not rounded",
             option="--quality",
             group=BUDGET,
         ),
