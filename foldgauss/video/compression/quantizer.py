@@ -1,9 +1,9 @@
 """Steps of quantization from the sensitivity of the images, and what each Gaussian is worth.
 
-By rate-distortion theory a squared error is least, for so many bits, where every parameter adds the same. So each
-parameter's step follows the sensitivity of the images to it (`estimate_sensitivities`), times a common factor
-2^coarseness. The same factor is the price of a bit (`bit_price`), and a Gaussian that adds less error by its removal
-than its bits cost is dropped.
+For a given number of bits, the squared error is least where every parameter adds the same (theory of rate and
+distortion). The step of each parameter therefore follows from the sensitivity of the images to it
+(`estimate_sensitivities`). A common factor, 2^coarseness, scales all steps and sets the price of a bit (`bit_price`). A
+Gaussian is dropped if its removal adds less error than its bits cost.
 """
 
 import dataclasses
@@ -35,7 +35,7 @@ from foldgauss.video.models.splats import SH_C0, FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.selection.contributions import Contributions
 
-#: A Gaussian is dropped if that adds less squared error than so many bits cost, which is about what it takes.
+#: The bits whose price a Gaussian has to be worth: about as many as it takes in a file.
 BITS_PER_GAUSSIAN = 100.0
 #: Least number of Gaussians from which steps are regressed on features.
 _FEW = 100

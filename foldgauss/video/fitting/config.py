@@ -447,10 +447,16 @@ MOST_PER_PIXEL = 1.6
 
 #: The quality of compact models that `foldgauss fit` has by default.
 DEFAULT_QUALITY = 70.0
-#: Gaussians per pixel of a clip with which a fit of quality 50 starts, some three times as many as it keeps; their
-#: binary logarithm grows by this for each unit of quality. The PSNR of usual clips at that quality, dB, and the growth
-#: for each dB. How many Gaussians there are for each 10^6 bytes.
-START_DENSITY, DENSITY_PER_QUALITY, PSNR_AT_50, DENSITY_PER_DB, GAUSSIANS_PER_MB = 0.012, 0.08, 35.0, 0.32, 300_000
+#: Gaussians per pixel of a clip with which a fit of quality 50 starts: some three times as many as it keeps.
+START_DENSITY = 0.012
+#: Growth of the binary logarithm of that number for each unit of quality.
+DENSITY_PER_QUALITY = 0.08
+#: The PSNR of usual clips at quality 50, in dB.
+PSNR_AT_50 = 35.0
+#: Growth of the binary logarithm of that number for each dB of the PSNR that is asked for.
+DENSITY_PER_DB = 0.32
+#: Gaussians that a fit starts with for each 10^6 bytes of the largest file: some three times as many as it keeps.
+GAUSSIANS_PER_MB = 300_000
 
 
 def default_num_gaussians(

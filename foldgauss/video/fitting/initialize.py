@@ -58,9 +58,14 @@ EVEN_FRAMES = 0.2
 UNIFORM_TIME_SCALES, UNIFORM_FOLD, UNIFORM_OPACITY, UNIFORM_COLOR, NEIGHBORS = (0.01, 1.0), 1.0, 0.1, 127 / 255, 3
 
 
-#: The backdrop's center and standard deviations, in units of the frame's longer side, its sigma_t and its opacity. The
-#: center is far from the frame, where no region of an edit selects it.
-BACKDROP_PLACE, BACKDROP_SCALE, BACKDROP_TIME_SCALE, BACKDROP_OPACITY = (0.0, 4.0), 16.0, 4.0, 0.9975
+#: The center of the backdrop, in units of the frame's longer side: far from the frame, where no region selects it.
+BACKDROP_PLACE = (0.0, 4.0)
+#: Its standard deviations, in the same units: so wide that it is even within the frame.
+BACKDROP_SCALE = 16.0
+#: Its sigma_t, in units of the clip's length: so long that it is even in time.
+BACKDROP_TIME_SCALE = 4.0
+#: Its opacity: nearly opaque, with a finite logit.
+BACKDROP_OPACITY = 0.9975
 
 
 def initialize(

@@ -31,26 +31,37 @@ from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.row_layout import COLOR, GROUPS, SHAPE, TRAJECTORY, columns, pack
 from foldgauss.video.models.video_model import VideoModel
 
-#: Coarseness, the binary logarithm of the factor of all steps, at quality 0 and 100; between them it is linear.
-COARSEST, FINEST = 11.0, 1.0
+#: Coarseness, the binary logarithm of the factor of all steps, at quality 0. Up to quality 100 it is linear.
+COARSEST = 11.0
+#: The same at quality 100.
+FINEST = 1.0
 #: Bytes of a file beside its streams: its header, and what is known of the clip.
 HEADER_BYTES = 3000
 #: Fraction of the largest file that the fit aims at; the Gaussians that are worth least are dropped in the end if the
 #: file is larger nevertheless.
 _AIM = 0.98
-#: Tries of the coarseness for a size, at most; the binary logarithm by which the size may be missed, and by which it
-#: changes for each unit of coarseness.
-_TRIES, _TOLERANCE_LOG2, _SLOPE_LOG2 = 6, 0.02, 0.8
-#: By how many dB the PSNR changes for twice the number of Gaussians, and for each unit of coarseness; the most units
-#: that it is changed by; and by how much the fit aims at more than it was asked for, which is given up in the end.
-_DB_PER_DOUBLING, _DB_PER_UNIT, _MOST_CHANGE, _MARGIN_DB = 1.8, 0.8, 2.0, 0.1
+#: Tries of the coarseness for a size, at most: each codes all Gaussians.
+_TRIES = 6
+#: The binary logarithm by which a file may be smaller than asked for: it changes by more until the end of the fit.
+_TOLERANCE_LOG2 = 0.02
+#: By how much the binary logarithm of a size falls for each unit of coarseness, as measured.
+_SLOPE_LOG2 = 0.8
+#: By how many dB the PSNR rises for twice the number of Gaussians, as measured.
+_DB_PER_DOUBLING = 1.8
+#: By how many dB it falls for each unit of coarseness with a given number of Gaussians, as measured.
+_DB_PER_UNIT = 0.8
+#: The most units by which a PSNR changes the coarseness once the Gaussians are chosen.
+_MOST_CHANGE = 2.0
+#: By how many dB the fit aims at more than it was asked for: what is too much is given up in the end.
+_MARGIN_DB = 0.1
 #: The coarseness that the search for a size starts with.
 USUAL_COARSENESS = 6.0
 #: The least fraction of the Gaussians that remains: each is judged as if the others remained.
 _LEAST_KEPT = 0.45
-#: Squared error that sorting may add, as a fraction of the model's own, with so many passes over the frames to come.
-#: Fewer compensate for less of it.
-_ORDERING, _PASSES = 1.0, 40.0
+#: Squared error that sorting may add, as a fraction of the model's own, which many passes compensate for.
+_ORDERING = 1.0
+#: Passes over the frames to come with which it may add as much; fewer compensate for less.
+_PASSES = 40.0
 #: The same without any, as a fraction of the variance of the images.
 _ORDERING_UNTRAINED = 1e-5
 
