@@ -148,12 +148,17 @@ def fit(
         ):
             yield observer
 
-    run = run_fit(
-        job,
-        observe,
-        resume="required" if resume else "never",
-        on_checkpoint_error=lambda error, step: warn(f"no checkpoint at step {step}: {error}"),
-    )
+    try:
+        run = run_fit(
+            job,
+            observe,
+            resume="required" if resume else "never",
+            on_checkpoint_error=lambda error, step: warn(f"no checkpoint at step {step}: {error}"),
+        )
+    except ValueError as error:
+        if str(error).startswith("size_mb:"):
+            raise WrongUse(name_option(str(error))) from error
+        raise
     run = _save_model(run)
     target = Path(run.job.target)
     with _keep_state_on_interrupt(run):

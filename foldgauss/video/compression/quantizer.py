@@ -39,6 +39,9 @@ from foldgauss.video.selection.contributions import Contributions
 BITS_PER_GAUSSIAN = 100.0
 #: Least number of Gaussians from which steps are regressed on features.
 _FEW = 100
+#: Negative binary logarithm of a step, at coarseness 0, that a regression may extrapolate to: with finer ones integers
+#: are out of range.
+_MOST_BITS = 26.0
 _MIN_SENSITIVITY = 1e-4  # below, a Gaussian is not visible
 _MIN_TRANSMITTANCE = 0.03  # below, a Gaussian counts as opaque
 
@@ -90,7 +93,13 @@ class Quantizer:
             self._fits[name] = fit
             rest.append(np.clip(levels[name] - design @ fit, -6, 6))
         self.classes = np.rint(np.where(self._seen, np.mean(rest, axis=0), -6.0)).astype(np.int32)
-        self._match_errors(sensitivity, np.concatenate([np.ones((len(raw), 1)), raw], 1))
+        design = np.concatenate([np.ones((len(raw), 1)), raw], 1)
+        self._match_errors(sensitivity, design)
+        steep = [name for name, fit in self._fits.items() if (design @ fit + self.classes).max() > _MOST_BITS]
+        for name in steep:
+            self._fits[name][:] = levels[name][self._seen].mean(), *np.zeros(len(first))
+        if steep:
+            self._match_errors(sensitivity, design)
 
     def _match_errors(self, sensitivity: dict[str, Float[np.ndarray, " num"]], design: np.ndarray) -> None:
         """Shift the fits so that all columns add the same error: by mean, not typical, sensitivity times step^2."""

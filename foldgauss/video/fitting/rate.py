@@ -20,7 +20,16 @@ from typing import NamedTuple
 import numpy as np
 
 from foldgauss._numerics.random_streams import Stream, make_generator
-from foldgauss.video.compression.quantize import Quantized, Rule, compute_columns, dequantize, quantize
+from foldgauss._runtime.checks import invalid
+from foldgauss.video.compression.quantize import (
+    Quantized,
+    Rule,
+    column_names,
+    compute_columns,
+    dequantize,
+    is_integral,
+    quantize,
+)
 from foldgauss.video.compression.quantizer import Quantizer, find_order, round_groups, select_rows
 from foldgauss.video.compression.streams import encode_streams
 from foldgauss.video.fitting.config import FitConfig
@@ -87,6 +96,16 @@ class RateControl:
         self.frames, self.config = frames, config
         self.sampled = np.unique(np.linspace(0, len(frames) - 1, _TRIED_FRAMES).round().astype(int))
 
+    def check_size(self, state: FitState) -> None:
+        """Raise ValueError if a file of a single Gaussian is larger than the settings allow."""
+        if self.config.size_mb is None:
+            return
+        exact, one = compute_columns(self._model(state)), np.arange(state.num_gaussians) == 0
+        rules = {name: Rule(0.0, COARSEST) for name in column_names(self.config.degree) if not is_integral(name)}
+        least = count_bytes(quantize(select_rows(exact, one), np.zeros(1, np.int32), rules)) / 1e6
+        if least > self.config.size_mb:
+            raise invalid("size_mb", expected=f"at least {least:.4f} for this clip", got=self.config.size_mb)
+
     def act(self, state: FitState, progress: float) -> bool:
         """Take the actions that are due; whether arrays of the state were replaced."""
         before = state.rate_actions
@@ -131,9 +150,9 @@ class RateControl:
 
         most, dropped = len(worst_first) - 1, 0
         if self.config.psnr is not None and self._psnr(whole, all_frames=True) > self.config.psnr:
-            dropped = _last(lambda num: self._psnr(without(num), all_frames=True) >= self.config.psnr, most)
+            dropped = _last(lambda num: self._psnr(without(num), all_frames=True) >= self.config.psnr, most)[0]
         if self.config.size_mb is not None and count_bytes(without(dropped)) > 1e6 * self.config.size_mb:
-            dropped = 1 + _last(lambda num: count_bytes(without(num)) > 1e6 * self.config.size_mb, most)
+            dropped = min(_last(lambda num: count_bytes(without(num)) > 1e6 * self.config.size_mb, most)[1], most)
         return without(dropped) if dropped else whole
 
     def _model(self, state: FitState, fps: float = 25.0) -> VideoModel:
@@ -178,7 +197,8 @@ class RateControl:
         guess = wanted[0] if wanted else (COARSEST + FINEST) / 2
         if config.size_mb is not None:
             target = math.log2(max(_AIM * 1e6 * config.size_mb - HEADER_BYTES, 64))
-            wanted.append(_solve(lambda c: math.log2(count_bytes(quantized(c))) - target, guess, _TOLERANCE_LOG2))
+            excess = lambda c: math.log2(count_bytes(quantized(c)) - HEADER_BYTES) - target  # noqa: E731
+            wanted.append(_solve(excess, guess, _TOLERANCE_LOG2))
         if config.psnr is not None:
             target = config.psnr - gain
             wanted.append(_solve(lambda c: self._psnr(quantized(c)) - target, guess, _TOLERANCE_DB))
@@ -227,10 +247,14 @@ def _solve(excess: Callable[[float], float], guess: float, tolerance: float) -> 
     return low[0] if math.isfinite(low[1]) else at
 
 
-def _last(holds: Callable[[int], bool], most: int) -> int:
-    """The largest number up to `most` for which a condition holds that holds up to some number; 0 if for none."""
+def _last(holds: Callable[[int], bool], most: int) -> tuple[int, int]:
+    """The last number up to `most` for which a condition holds that holds up to some number, and one after it.
+
+    To half a percent: it holds for the first of both, unless that is 0, and not for the second, unless that is beyond
+    `most`.
+    """
     low, high = 0, most + 1
     while high - low > max(low // 200, 1):
         middle = (low + high) // 2
         low, high = (middle, high) if holds(middle) else (low, middle)
-    return low
+    return low, high
