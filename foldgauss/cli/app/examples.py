@@ -22,13 +22,13 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
             Example("Install shell completion", "foldgauss --install-completion"),
         ),
         "fit": (
-            Example("All defaults, into holiday.safetensors", "foldgauss fit holiday.mp4"),
+            Example("All defaults, into holiday.fgz", "foldgauss fit holiday.mp4"),
             Example("A quick draft of the first half second", "foldgauss fit holiday.mp4 --preset draft --frames 0:12"),
             Example(
                 "Five minutes, at 160x320 pixels",
                 "foldgauss fit holiday.mp4 --size 160x320 --minutes 5",
             ),
-            Example("A small file", "foldgauss fit holiday.mp4 --max-size-mb 2"),
+            Example("A small file", "foldgauss fit holiday.mp4 --size-mb 2"),
             Example("Frames as images; resume a stopped fit", "foldgauss fit frames/ --resume"),
             Example(
                 "For slow motion above all",
@@ -105,8 +105,8 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
             Example("Into holiday.fgz, without the clip", "foldgauss compress holiday.safetensors"),
             Example("Smaller, with the clip", "foldgauss compress holiday.safetensors holiday.mp4"),
             Example(
-                "Smaller still, at a loss of half a dB",
-                "foldgauss compress holiday.safetensors holiday.mp4 --max-loss-db 0.5",
+                "Smaller still, at a lower quality",
+                "foldgauss compress holiday.safetensors holiday.mp4 --quality 40",
             ),
         ),
         "export": (
