@@ -164,7 +164,9 @@ def test_a_compact_job_stopped_or_killed_goes_on_to_the_same_bits(clip, tmp_path
 
 
 def test_a_compact_file_needs_a_goal(clip, tmp_path):
-    with pytest.raises(ValueError, match="config: expected one of a compact model .* Give a quality, a size or a PSNR"):
+    with pytest.raises(
+        ValueError, match=r"config: expected one of a compact model .* Give a quality, a size or a PSNR"
+    ):
         fit_job(job_of(clip, tmp_path, "model.fgz"))
 
 

@@ -33,7 +33,6 @@ from foldgauss.video.fitting.config import (
     planned_steps,
 )
 from foldgauss.video.fitting.loop import check_frames, start, start_from, to_model
-from foldgauss.video.fitting.schedule import steps_per_pass
 from foldgauss.video.fitting.steppers import cpu_stepper, interpolated_frames
 from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
 from foldgauss.video.fitting.steppers.loss import border_weights

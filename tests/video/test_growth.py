@@ -9,7 +9,7 @@ from clips import moving_blobs
 
 from foldgauss.video import FitConfig, fit_steps
 from foldgauss.video.fitting.budget import StepPlanner
-from foldgauss.video.fitting.config import chosen_num_gaussians, most_gaussians
+from foldgauss.video.fitting.config import chosen_num_gaussians
 from foldgauss.video.fitting.densify import densify, reset_opacities
 from foldgauss.video.fitting.growth import EXTENT, PUBLISHED_STEPS, Growth
 from foldgauss.video.fitting.loop import start, to_model

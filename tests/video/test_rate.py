@@ -215,7 +215,7 @@ def test_the_size_is_never_exceeded(tmp_path, size_mb):
 
 def test_a_size_below_that_of_one_gaussian_is_refused_at_the_start():
     config = dataclasses.replace(CONFIG, quality=None, size_mb=0.001)
-    with pytest.raises(ValueError, match="size_mb: expected at least 0.004. for this clip, got 0.001"):
+    with pytest.raises(ValueError, match=r"size_mb: expected at least 0\.004. for this clip, got 0.001"):
         next(fit_steps(FRAMES, config))
 
 
