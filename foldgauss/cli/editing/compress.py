@@ -52,9 +52,10 @@ def compress_command(
     frames: FittedFrames = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Write a model as a compact file, a fraction of its size, as `fit` does from the start.
+    """Write a model as a compact file, a fraction of its size.
 
-    It can be rendered, evaluated, edited and exported like any model. See docs/compress.md.
+    `fit` writes such a file from the start. It can be rendered, evaluated, edited and exported like any model. See
+    docs/compress.md.
     """
     target = Path(f"{resolve(model_path).stem}{COMPACT_SUFFIX}") if out_path is None else out_path
     try:

@@ -108,6 +108,8 @@ def fit(
     A stopped fit has a checkpoint and continues with --resume. Long clips are fitted in segments, in parallel with
     workers.
     """
+    if out_path is not None:
+        refuse_inputs(out_path, {"clip": video})
     in_segments = not (segment_seconds is None and workers is None and scheduler is None)
     target, config = _choose_target(video, out_path, config, in_segments)
     refuse_inputs(target, {"clip": video})
