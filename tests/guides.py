@@ -71,7 +71,7 @@ CHEAPER = {
     "fit": ["--steps", STEPS],
     "tradeoff": ["--steps", STEPS],
     "uncertainty": ["--steps", 100],
-    "compress": ["--passes", 1],
+    "compress": ["--minutes", 0.02],
 }
 #: The page whose `foldgauss demo` takes all its steps; on others it takes `STEPS`.
 WHOLE_DEMO = "README.md"
@@ -158,10 +158,10 @@ def _run_command(words: list[str], where: str) -> None:
 def _foldgauss(words: list[str], where: str) -> None:
     words = _alone(words)
     more = CHEAPER.get(words[0], [])
-    if words[0] == "compress" and words[2:3] != [] and words[2].startswith("-"):
-        more = []  # without a clip there are no passes
+    if words[0] == "compress" and (len(words) < 3 or words[2].startswith("-")):
+        more = []  # without a clip there are no steps
     given = {word.partition("=")[0] for word in words}
-    if not given & {"--steps", "--minutes", "--only"} and not (words[0] == "compress" and "--passes" in given):
+    if not given & {"--steps", "--minutes", "--only"}:
         words = [*words, *more]
     if "--minutes" in given and words[0] in ("fit", "tradeoff"):
         at = words.index("--minutes")

@@ -164,10 +164,12 @@ def test_a_variable_frame_rate_is_kept(tmp_path, capsys):
     assert "4.39 per second on average" in told
     assert "frame_seconds" not in told
     assert run("compress", model, "--out", tmp_path / "m.fgz") == 0
+    assert run("fit", tmp_path / "clip.mp4", "--out", tmp_path / "f.fgz", *QUICK) == 0
     read = {}
     for name, own, *options in (
         ("as-fitted", model),
         ("compact", tmp_path / "m.fgz"),
+        ("fitted-compact", tmp_path / "f.fgz"),
         ("twice", model, "--upsample", 2),
         ("slow", model, "--upsample", 2, "--fps", 5),
         ("even", model, "--fps", 30),
@@ -179,7 +181,11 @@ def test_a_variable_frame_rate_is_kept(tmp_path, capsys):
         assert run("render", own, "--out", tmp_path / f"{name}.mp4", *options) == 0
         read[name] = read_video(tmp_path / f"{name}.mp4")
     between, slower = np.interp(np.arange(11) / 2, np.arange(6), times), 2 * 5 / times[-1] / 5  # at 5 a second
-    for name, expected in (("as-fitted", times), ("compact", times), ("twice", between), ("slow", slower * between)):
+    for name, expected in (
+        *((name, times) for name in ("as-fitted", "compact", "fitted-compact")),
+        ("twice", between),
+        ("slow", slower * between),
+    ):
         np.testing.assert_allclose(read[name].times, expected, atol=1e-4)
         assert read[name].duration == pytest.approx(slower * end if name == "slow" else end, abs=1e-4)
     for name, frames in (("even", 41), ("half", 41), ("back", 32), ("slower", 28), ("held", 11)):
@@ -221,7 +227,7 @@ def test_how_a_clip_was_read_is_kept(tmp_path, capsys):
         assert "--original: expected the clip that the model was fitted to, clip read with" in capsys.readouterr().err
     assert {"reading"} <= set(CLIP_NOTES)  # which edit and compress keep
     assert run("fit-many", tmp_path / "clips", "--out", tmp_path / "models", "--levels", 4080, *few) == 0
-    assert read_metadata(tmp_path / "models" / "clip.safetensors")["reading"] == {"levels": 4080}
+    assert read_metadata(tmp_path / "models" / "clip.fgz")["reading"] == {"levels": 4080}
     for option, value in (("--levels", 0), ("--levels", 65536), ("--deinterlace", "yes")):
         capsys.readouterr()
         assert run("fit", clip, "--out", tmp_path / "a.safetensors", option, value) == 2
@@ -286,13 +292,14 @@ def test_remapping_beyond_the_end_is_said(work, tmp_path, capsys):
 def test_frames_size_and_default_name(work, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert run("fit", work / "clip.mp4", "--frames", "1:5", "--size", "24x32", *QUICK) == 0
-    model = load_video_model(tmp_path / "clip.safetensors")
+    model = load_video_model(tmp_path / "clip.fgz")
     assert (model.num_frames, model.size) == (4, (24, 32))
+    assert read_metadata(tmp_path / "clip.fgz")["budget"] == {"steps": 30, "quality": 50}
     # The frames it was fitted to are remembered.
     capsys.readouterr()
-    assert run("evaluate", "clip.safetensors", work / "clip.mp4") == 0
+    assert run("evaluate", "clip.fgz", work / "clip.mp4") == 0
     assert "warning" not in capsys.readouterr().err
-    assert run("evaluate", "clip.safetensors", work / "clip.mp4", "--frames", "0:3") == 2
+    assert run("evaluate", "clip.fgz", work / "clip.mp4", "--frames", "0:3") == 2
 
 
 def test_folder_of_images_in_natural_order(tmp_path):
@@ -393,6 +400,7 @@ def broken_inputs(tmp_path, work):
     later = tmp_path / "later.safetensors"
     later.write_bytes((work / "model.safetensors").read_bytes().replace(b'"version":"1"', b'"version":"9"'))
     clip, model, out = work / "clip.mp4", work / "model.safetensors", tmp_path / "out.safetensors"
+    small = tmp_path / "out.fgz"
     return {
         "missing file": (["fit", tmp_path / "none.mp4", "--out", out], 2, "missing"),
         "not a video": (["fit", text, "--out", out], 1, "notes.mp4"),
@@ -427,8 +435,11 @@ def broken_inputs(tmp_path, work):
         "no cap": (["fit", clip, "--out", out, "--max-gaussians", "0"], 2, "--max-gaussians"),
         "no gaussians": (["fit", clip, "--out", out, "--gaussians", "0"], 2, "--gaussians"),
         "no time": (["fit", clip, "--out", out, "--minutes", "0"], 2, "minutes"),
-        "no quality": (["fit", clip, "--out", out, "--target-psnr", "-3"], 2, "--target-psnr"),
-        "no room": (["fit", clip, "--out", out, "--max-size-mb", "0.001"], 2, "--max-size-mb.*at least"),
+        "no quality": (["fit", clip, "--quality", "-3"], 2, "--quality"),
+        "no psnr": (["fit", clip, "--out", out, "--psnr", "-3"], 2, "--psnr"),
+        "no room": (["fit", clip, "--out", small, "--size-mb", "0.001", *QUICK], 2, "--size-mb.*at least"),
+        "size of float32": (["fit", clip, "--out", out, "--size-mb", "1"], 2, "--size-mb.*compact.*m?.fgz"),
+        "compact segments": (["fit", clip, "--out", small, "--segment-seconds", "1"], 2, "--out.*safetensors"),
         "out is a video": (["fit", clip, "--out", tmp_path / "m.mp4"], 2, "--out: .* as m.safetensors"),
         "out is something": (["fit", clip, "--out", tmp_path / "m.bin"], 2, "--out: .* as m.safetensors"),
         "nothing to resume": (["fit", clip, "--out", out, "--resume"], 2, "stopped fit"),
@@ -532,10 +543,10 @@ def test_demo_without_the_samples(tmp_path, monkeypatch, capsys):
 
 def test_demo_end_to_end(tmp_path, monkeypatch, capsys):
     """The real clip, fewer frames and steps."""
-    monkeypatch.setattr(demonstration, "CONFIG", fitting.FitConfig(num_gaussians=2000, steps=40))
+    monkeypatch.setattr(demonstration, "CONFIG", fitting.FitConfig(num_gaussians=2000, steps=40, quality=80))
     monkeypatch.setattr(demonstration, "FRAMES", (0, 6))
     assert run("demo", "--out", tmp_path) == 0
-    names = {"model.safetensors", "reconstruction.mp4", "comparison.png", "metrics.json"}
+    names = {"model.fgz", "reconstruction.mp4", "comparison.png", "metrics.json"}
     assert {path.name for path in tmp_path.iterdir()} == names
     figures = json.loads((tmp_path / "metrics.json").read_text())
     assert figures["mean_psnr"] > 22
@@ -545,28 +556,28 @@ def test_demo_end_to_end(tmp_path, monkeypatch, capsys):
 
 
 def test_demo_leaves_folders_of_others_alone(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(demonstration, "CONFIG", fitting.FitConfig(num_gaussians=500, steps=3))
+    monkeypatch.setattr(demonstration, "CONFIG", fitting.FitConfig(num_gaussians=500, steps=3, quality=80))
     monkeypatch.setattr(demonstration, "FRAMES", (0, 6))
-    (tmp_path / "model.safetensors").write_bytes(b"mine")
+    (tmp_path / "model.fgz").write_bytes(b"mine")
     for record in (None, b"\xff", b"[]", b'{"psnr": [], "ssim": []}'):  # none, and none of a demo
         if record is not None:
             (tmp_path / "metrics.json").write_bytes(record)
         assert run("demo", "--out", tmp_path) == 2
         assert "in it, but no metrics.json of a demo. Choose another folder." in capsys.readouterr().err
-    assert (tmp_path / "model.safetensors").read_bytes() == b"mine"
+    assert (tmp_path / "model.fgz").read_bytes() == b"mine"
     (tmp_path / "metrics.json").write_text('{"fit_seconds": 1.0, "psnr": [], "ssim": []}')
     (tmp_path / "notes.txt").write_text("mine")
     assert run("demo", "--out", tmp_path) == 2
     assert "notes.txt" in capsys.readouterr().err
-    assert (tmp_path / "model.safetensors").read_bytes() == b"mine"
+    assert (tmp_path / "model.fgz").read_bytes() == b"mine"
     (tmp_path / "notes.txt").rename(tmp_path / ".hidden")
     assert run("demo", "--out", tmp_path) == 0
-    assert load_video_model(tmp_path / "model.safetensors").num_frames == 6
+    assert load_video_model(tmp_path / "model.fgz").num_frames == 6
     assert run("demo", "--out", tmp_path / ".hidden") == 1  # a file
 
 
 def test_a_demo_that_was_stopped_is_replaced_by_the_next(tmp_path, monkeypatch):
-    monkeypatch.setattr(demonstration, "CONFIG", fitting.FitConfig(num_gaussians=500, steps=3))
+    monkeypatch.setattr(demonstration, "CONFIG", fitting.FitConfig(num_gaussians=500, steps=3, quality=80))
     monkeypatch.setattr(demonstration, "FRAMES", (0, 6))
 
     def stopped(*given):
@@ -575,10 +586,10 @@ def test_a_demo_that_was_stopped_is_replaced_by_the_next(tmp_path, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr(demonstration, "write_video", stopped)
         assert run("demo", "--out", tmp_path) == 1
-    assert (tmp_path / "model.safetensors").exists()
+    assert (tmp_path / "model.fgz").exists()
     assert run("demo", "--out", tmp_path) == 0
     figures = json.loads((tmp_path / "metrics.json").read_text())
-    assert figures["file_bytes"] == (tmp_path / "model.safetensors").stat().st_size
+    assert figures["file_bytes"] == (tmp_path / "model.fgz").stat().st_size
 
 
 @pytest.mark.slow

@@ -237,8 +237,8 @@ def test_many_clips_make_a_model_each_and_failures_are_listed(clips, tmp_path, c
     assert "3 models in" in told.out
     assert "1 failed" in told.out
     assert "failed: broken.mp4: path: expected a video file" in told.err
-    models = sorted(out.glob("*.safetensors"))
-    assert [path.name for path in models] == ["clip0.safetensors", "clip1.safetensors", "frames.safetensors"]
+    models = sorted(out.glob("*.fgz"))
+    assert [path.name for path in models] == ["clip0.fgz", "clip1.fgz", "frames.fgz"]
     for path, source in zip(models, ("clip0.mp4", "clip1.mp4", "frames"), strict=True):
         model = load_video_model(path)
         assert isinstance(model, VideoModel)
@@ -251,7 +251,7 @@ def test_many_clips_given_again_do_what_is_left(clips, tmp_path, capsys, monkeyp
     own, out = tmp_path / "clips", tmp_path / "models"
     shutil.copytree(clips, own)
     assert run("fit-many", own, "--out", out, *QUICK, "--quiet") == 1
-    stamps = {path.name: path.stat().st_mtime_ns for path in out.glob("*.safetensors")}
+    stamps = {path.name: path.stat().st_mtime_ns for path in out.glob("*.fgz")}
     assert run("fit-many", own, "--out", out, *QUICK[:-1], "2") == 2  # not in place of others
     assert "with other settings" in capsys.readouterr().err
     shutil.copyfile(own / "clip0.mp4", own / "broken.mp4")  # mended
@@ -260,7 +260,7 @@ def test_many_clips_given_again_do_what_is_left(clips, tmp_path, capsys, monkeyp
     assert all((out / name).stat().st_mtime_ns == stamp for name, stamp in stamps.items())
     assert summary_of(out)["failed"] == 0
     assert run("fit-many", own, "--out", out, *QUICK[:-1], "2", "--overwrite", "--quiet") == 0
-    assert {load_video_model(path).degree for path in out.glob("*.safetensors")} == {2}
+    assert {load_video_model(path).degree for path in out.glob("*.fgz")} == {2}
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")
@@ -270,10 +270,10 @@ def test_many_clips_stopped_in_one_go_on_there(clips, tmp_path, capsys, monkeypa
         Stopping(patch, "clip1.mp4")
         assert run("fit-many", clips, "--out", out, *QUICK) == 1
     assert "stopped by SIGTERM; 1 of 4 clips are done" in capsys.readouterr().err
-    assert (out / "records" / "clip1.safetensors.checkpoint").exists()
+    assert (out / "records" / "clip1.fgz.checkpoint").exists()
     assert run("fit-many", clips, "--out", out, *QUICK, "--quiet") == 1
     assert run("fit-many", clips, "--out", other, *QUICK, "--quiet") == 1
-    for path in other.glob("*.safetensors"):
+    for path in other.glob("*.fgz"):
         assert (out / path.name).read_bytes() == path.read_bytes()
 
 
@@ -286,20 +286,20 @@ def test_many_clips_begun_anew_and_stopped_go_on(clips, tmp_path, capsys, monkey
     assert "Give the command again without --overwrite to continue." in capsys.readouterr().err
     assert run("fit-many", clips, "--out", out, *QUICK) == 2  # what is kept is of other settings
     assert "exists, with other settings" in capsys.readouterr().err
-    kept = out / "records" / "clip1.safetensors.checkpoint"
-    before, stamp = kept.read_bytes(), (out / "clip0.safetensors").stat().st_mtime_ns
+    kept = out / "records" / "clip1.fgz.checkpoint"
+    before, stamp = kept.read_bytes(), (out / "clip0.fgz").stat().st_mtime_ns
     assert run("fit-many", clips, "--out", out, *other[:-1], "3") == 2
     assert kept.read_bytes() == before
     assert run("fit-many", clips, "--out", out, *other) == 1
     assert "4 clips, 1 of them done already" in capsys.readouterr().out
-    assert (out / "clip0.safetensors").stat().st_mtime_ns == stamp
-    assert {load_video_model(path).degree for path in out.glob("*.safetensors")} == {2}
+    assert (out / "clip0.fgz").stat().st_mtime_ns == stamp
+    assert {load_video_model(path).degree for path in out.glob("*.fgz")} == {2}
 
 
 def test_a_checkpoint_of_other_settings_is_not_thrown_away(clips, tmp_path, capsys, monkeypatch):
     out = tmp_path / "models"
     stopped(monkeypatch, "clip0.mp4", "fit-many", clips, "--out", out, *QUICK)
-    kept = out / "records" / "clip0.safetensors.checkpoint"
+    kept = out / "records" / "clip0.fgz.checkpoint"
     before = kept.read_bytes()
     capsys.readouterr()
     assert run("fit-many", clips, "--out", out, *QUICK[:-1], "2") == 2
@@ -323,7 +323,7 @@ def test_a_summary_that_cannot_be_written_stops_nothing(clips, tmp_path, capsys,
     assert run("fit-many", clips, "--out", tmp_path / "models", *QUICK) == 1
     assert "3 models in" in (told := capsys.readouterr()).out
     assert "warning: path: expected free space" in told.err
-    assert len(list((tmp_path / "models").glob("*.safetensors"))) == 3
+    assert len(list((tmp_path / "models").glob("*.fgz"))) == 3
 
 
 def test_names_hold_no_pictures(capsys):

@@ -212,10 +212,12 @@ def test_a_fit_stops_at_once_before_its_first_step(number, clip, tmp_path, monke
 def test_errors_name_the_option(clip, tmp_path, capsys):
     for given, says in (
         (["--gaussians", "0"], "--gaussians: expected a whole number >= 1"),
-        (["--target-psnr", "-1"], "--target-psnr: expected a number in (0, inf)"),
+        (["--psnr", "-1"], "--psnr: expected a number in (0, 100]"),
+        (["--quality", "101"], "--quality: expected a number in [0, 100]"),
         (["--preset", "best"], "--preset: expected one of"),
         (["--out", tmp_path / "m.mp4"], "--out: expected a name for the model, as "),
-        (["--max-size-mb", "0.001"], "--max-size-mb: expected at least"),
+        (["--size-mb", "0.001", *QUICK, "--out", tmp_path / "m.fgz"], "--size-mb: expected at least"),
+        (["--size-mb", "1", "--out", tmp_path / "m.safetensors"], "--size-mb: expected a compact file, got"),
         (["--frames", "1:1"], "--frames: expected"),
     ):
         assert run("fit", clip, *given) == 2, given

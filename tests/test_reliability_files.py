@@ -115,13 +115,14 @@ OUTPUTS = {
     "p.png": ["render", "MODEL", "--times", "0.5", "--out"],
     "frames": ["render", "MODEL", "--out"],
     "e.json": ["evaluate", "MODEL", "CLIP", "--json"],
-    "c.fgz": ["compress", "MODEL", "--passes", "0", "--out"],
+    "c.fgz": ["compress", "MODEL", "--out"],
     "e.safetensors": ["edit", "MODEL", "SCRIPT", "--out"],
     "m.ply": ["export", "MODEL", "--format", "ply", "--out"],
     "scenes": ["export", "MODEL", "--format", "ply3dgs", "--out"],
     "meshes": ["export", "MODEL", "--format", "obj", "--out"],
     "page.html": ["export", "MODEL", "--format", "html", "--out"],
     "m.safetensors": ["fit", "CLIP", *SMALL, "--out"],
+    "f.fgz": ["fit", "CLIP", *SMALL, "--out"],
 }
 
 
@@ -427,6 +428,7 @@ WRITING = {
     "m.html": lambda model, clip: ["export", model, "--format", "html"],
     "mesh": lambda model, clip: ["export", model, "--format", "obj"],
     "m.safetensors": lambda model, clip: ["fit", clip, *SMALL],
+    "f.fgz": lambda model, clip: ["fit", clip, *SMALL],
 }
 
 

@@ -575,7 +575,8 @@ MADE = """
             "paper": FitConfig.preset("paper", steps=60, **paper),
             "batches": change(usual, batch_size=3, two_cameras=True, interpolation_fraction=0.3),
             "sum": change(usual, compositing="sum"),
-            "target": change(usual, target_psnr=30.0),
+            "quality": change(usual, quality=60),
+            "size": change(usual, size_mb=0.03),
             "fixed times": change(
                 usual, learn_frame_times=False, degree=7, scale_rates_by_duration=False, sparse_updates=False
             ),
@@ -597,7 +598,7 @@ MADE = """
     if long:
         for engine in ("cpu", "xla", "reference"):
             say(engine, np.asarray(shown.render(0.4, (200, 300), engine=engine)).tobytes())
-        made = compress(shown, frames, max_loss_db=0.5, passes=1)
+        made = compress(shown, frames, quality=60, steps=20)
         say("fgz", save_compact(folder / "model.fgz", made.quantized).read_bytes())
         from foldgauss.estimator import FoldedGaussianMixture
         rng = np.random.default_rng(0)

@@ -26,7 +26,7 @@ from foldgauss.io.media.frame_index import FrameIndex
 from foldgauss.io.media.indexed_reader import read_indexed
 from foldgauss.io.media.video_reading import read_video
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
-from foldgauss.io.models.compact import COMPACT_SUFFIX, save_compact
+from foldgauss.io.models.compact import COMPACT_SUFFIX, leave_room, save_compact
 from foldgauss.io.models.video_model import save_video_model
 from foldgauss.io.provenance import describe_reading, describe_source, fingerprint
 from foldgauss.jobs.job import FitJob, file_digest, read_record
@@ -118,9 +118,7 @@ class FitRun:
 
     def save(self, scores: Evaluation | None = None) -> None:
         """Write the model, with its mean scores once they are measured."""
-        metadata = fit_metadata(self.clip, self.job.config.seed, self.job.frames) | self.job.metadata
-        metadata |= describe_fit(self.job.config, self.state)
-        metadata |= {} if scores is None else mean_scores(scores)
+        metadata = _make_metadata(self.job, self.clip, self.state) | ({} if scores is None else mean_scores(scores))
         if Path(self.job.target).suffix.lower() == COMPACT_SUFFIX:
             save_compact(self.job.target, self.quantized, metadata=metadata)
         else:
@@ -160,7 +158,8 @@ def run_fit(
         steps = _replacing(checkpoint, steps)
     with observer(clip, state) as observe:
         state, info = run_steps(steps, observe, checkpoint, job.checkpoint_seconds)
-    model, quantized = finish(state, clip.frames, job.config, clip.fps)
+    room = leave_room(job.config.size_mb, _make_metadata(job, clip, state))
+    model, quantized = finish(state, clip.frames, dataclasses.replace(job.config, size_mb=room), clip.fps)
     return FitRun(job, clip, model, state, info, checkpoint, quantized)
 
 
@@ -212,6 +211,10 @@ def read_clip(job: FitJob) -> Clip:
     index = FrameIndex.load(job.index)
     clip = read_indexed(index, *index.span(*job.frames), size=job.size)
     return clip if job.fps is None else dataclasses.replace(clip, fps=job.fps)
+
+
+def _make_metadata(job: FitJob, clip: Clip, state: FitState) -> dict[str, Any]:
+    return fit_metadata(clip, job.config.seed, job.frames) | job.metadata | describe_fit(job.config, state)
 
 
 def fit_metadata(clip: Clip, seed: int, frames: tuple[int | None, int | None] | None) -> dict[str, Any]:
@@ -370,6 +373,7 @@ def _fit_and_record(job: FitJob, report: Report) -> dict[str, Any]:
             *(clip.notes if job.index is None else ()),
             *dict.fromkeys(caught),
             *busy_processors(run),
+            *(f"psnr: {text}" for text in missed_psnr(job.config, scores.mean_psnr)),
         ],
     }
     with atomic_path(job.record) as temporary:

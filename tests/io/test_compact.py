@@ -1,11 +1,9 @@
-"""Compact files: within the loss they state, the same bits everywhere, and nothing breaks on bad ones."""
+"""Compact files: the same bits everywhere, and nothing breaks on bad ones."""
 
 import dataclasses
-import itertools
 import json
 import shutil
 import subprocess
-import sys
 import zlib
 from pathlib import Path
 
@@ -17,12 +15,11 @@ from soft_models import SIZE, on_paths, soft_model
 
 import foldgauss.io.page
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.io import ModelFileError, datasets, load_compact, load_video_model, save_compact, save_video_model
+from foldgauss.io import ModelFileError, load_compact, load_video_model, save_compact, save_video_model
 from foldgauss.io.models.compact import MAGIC, VERSION, is_compact, pack_compact
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.render import RenderOptions
-from foldgauss.video import FitConfig, compress, fit, layers
-from foldgauss.video.compression.finetune import finetune_model
+from foldgauss.video import FitConfig, compress, layers
 from foldgauss.video.compression.quantize import (
     AXES,
     Rule,
@@ -31,19 +28,20 @@ from foldgauss.video.compression.quantize import (
     column_names,
     compute_columns,
     dequantize,
-    estimate_bits,
     is_integral,
     legendre,
     quantize,
     trajectory_matrix,
     trajectory_span,
-    unrounded_trajectories,
 )
 from foldgauss.video.compression.quantized_times import TIME_BITS
+from foldgauss.video.compression.quantizer import find_order
+from foldgauss.video.compression.sensitivity import estimate_sensitivities
 from foldgauss.video.models.metrics import evaluate
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.row_layout import shift_path
 from foldgauss.video.models.shared_paths import SharedPaths
+from foldgauss.video.selection.contributions import Contributions
 
 
 def clip_of(model, noise=6.0):
@@ -161,14 +159,6 @@ def test_degrees_are_kept(tmp_path):
         np.testing.assert_allclose(image(again, t), image(model, t), atol=2e-3)
 
 
-def test_degrees_do_not_rise_with_fine_tuning():
-    model = of_degrees(soft_model(degree=3, options=RenderOptions()))
-    loss = sys.modules["foldgauss.video.compression.search"]._Loss(model, clip_of(model), None)
-    again = finetune_model(model, loss.target, 2)
-    np.testing.assert_array_equal(again.splats.degrees, model.splats.degrees)
-    assert not np.array_equal(again.splats.coefficients, model.splats.coefficients)
-
-
 @pytest.mark.parametrize("told", ["faint", "coarse"])
 def test_file_with_few_gaussians_left_can_be_read(tmp_path, told):
     """Cells are counted anew, for those that stay."""
@@ -177,7 +167,7 @@ def test_file_with_few_gaussians_left_can_be_read(tmp_path, told):
         opacity = np.asarray(model.splats.opacity_logit).copy()
         opacity[np.arange(len(opacity)) % 10 > 0] = -12
         model = eqx.tree_at(lambda m: m.splats.opacity_logit, model, opacity)
-    made = compress(model, max_loss_db=0.2 if told == "faint" else 40)
+    made = compress(model, quality=100 if told == "faint" else 0)
     assert made.model.num_gaussians < model.num_gaussians / 4
     same(load_video_model(save_compact(tmp_path / "m.fgz", made.quantized)), made.model)
 
@@ -191,8 +181,6 @@ def test_power_that_saves_little_is_dropped():
     degrees = dequantize(coarse).splats.degrees
     np.testing.assert_array_equal(degrees, coarse.columns["degree"])
     assert 0 < (degrees < 3).sum() < len(degrees)
-    place = unrounded_trajectories(coarse, compute_columns(model))
-    np.testing.assert_array_equal((place[:, 1:] != 0).any(2), np.arange(3) < degrees[:, None])
 
 
 def test_low_degrees_save_bytes():
@@ -270,30 +258,18 @@ def test_shared_paths_need_few_bytes():
     assert two - one < 800 + 0.5 * len(index) / 8
 
 
-@pytest.mark.parametrize("passes", [0, 2])
-def test_models_with_shared_paths_are_compressed(tmp_path, passes):
+@pytest.mark.parametrize("how", [{}, {"steps": 30}], ids=["alone", "clip"])
+def test_models_with_shared_paths_are_compressed(tmp_path, how):
     model = on_paths(soft_model(degree=3, options=RenderOptions()))
     clip = clip_of(model)
-    made = compress(model, clip, passes=passes)
+    made = compress(model, clip if how else None, quality=90, **how)
     again = load_video_model(save_compact(tmp_path / "m.fgz", made.quantized))
     same(again, made.model)
-    before, after = evaluate(model, clip).mean_psnr, evaluate(again, clip).mean_psnr
-    assert before - after == pytest.approx(made.loss_db, abs=1e-9)
-    assert made.loss_db <= 0.2
-
-
-def test_paths_are_shared_by_the_gaussians_that_are_left():
-    search = sys.modules["foldgauss.video.compression.search"]
-    model = on_paths(only(soft_model(options=RenderOptions()), np.array([3, 20])))  # as many Gaussians as paths
-    taken = search._take(model, np.array([1]))
-    np.testing.assert_array_equal(taken.splats.path_index, model.splats.path_index[1:])
-    same(taken.splats.paths, model.splats.paths)
+    assert evaluate(model, clip).mean_psnr - evaluate(again, clip).mean_psnr < 0.5
 
 
 def test_sensitivity_is_that_to_parameters_before_the_path():
     """A path that doubles all sizes makes positions matter more, by about the factor of the image's area."""
-    sensitivity = sys.modules["foldgauss.video.compression.sensitivity"]
-    search = sys.modules["foldgauss.video.compression.search"]
     model = soft_model(degree=1, options=RenderOptions())
     half = np.float32([[[[0.5, 0, 0], [0, 0.5, 0]]]])
     splats = dataclasses.replace(
@@ -305,7 +281,7 @@ def test_sensitivity_is_that_to_parameters_before_the_path():
         paths=SharedPaths(np.zeros((1, 1), np.float32), half),
     )
     found = [
-        sensitivity.estimate_sensitivities(search.Contributions(one), compute_columns(one))[0]
+        estimate_sensitivities(Contributions(one), compute_columns(one))[0]
         for one in (model, dataclasses.replace(model, splats=splats))
     ]
     for name in found[0]:
@@ -355,34 +331,19 @@ def test_wrong_paths_are_refused(tmp_path):
             load_compact(path)
 
 
-# ------------------------------------------------------------------------------------ stated loss
+# ------------------------------------------------------------------------------------ fewer bits
 
 
-@pytest.mark.parametrize("max_loss_db", [0.05, pytest.param(0.5, marks=pytest.mark.slow)])
-def test_loss_is_the_one_stated(max_loss_db):
+def test_a_lower_quality_makes_a_smaller_file():
     model = soft_model(options=RenderOptions())
-    clip = clip_of(model)
-    tries = []
-    made = compress(model, clip, max_loss_db=max_loss_db, on_step=lambda *one: tries.append(one))
-    before, after = evaluate(model, clip).mean_psnr, evaluate(made.model, clip).mean_psnr
-    assert made.psnr == pytest.approx(before)
-    assert made.loss_db == pytest.approx(before - after, abs=1e-9)
-    assert made.loss_db <= max_loss_db
-    assert made.measured_by == "clip"
-    assert len(tries) > 5
-
-
-def test_loss_without_the_clip_is_that_of_an_independent_error():
-    model = soft_model(options=RenderOptions())
-    clip = clip_of(model)
-    known = compress(model, max_loss_db=0.3, psnr=evaluate(model, clip).mean_psnr)
-    assert known.measured_by == "model"
-    assert evaluate(model, clip).mean_psnr - evaluate(known.model, clip).mean_psnr == pytest.approx(0.3, abs=0.15)
+    sizes = [len(pack_compact(compress(model, quality=quality).quantized)) for quality in (100, 70, 40)]
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[-1] < 0.85 * sizes[0]
 
 
 @pytest.mark.parametrize("how", ["opaque", "alpha", "sum"])
-def test_fine_tuning_makes_smaller_files(how):
-    """A model that is not at its best: what is gained pays for coarser steps, within the loss allowed."""
+def test_a_clip_makes_better_models(how):
+    """A model that is not at its best is fitted further while its parameters are rounded."""
     best = soft_model(options=RenderOptions(), compositing="sum" if how == "sum" else "over")
     if how == "sum":  # where they add up to no more than white
         best = eqx.tree_at(lambda m: m.splats.opacity_logit, best, best.splats.opacity_logit - np.float32(2.5))
@@ -394,196 +355,22 @@ def test_fine_tuning_makes_smaller_files(how):
         over_white = np.stack(list(best.frames(background=(1.0, 1.0, 1.0)))).astype(float)
         alpha = 255 - (over_white - pictures(best)).mean(-1, keepdims=True)
         clip = np.concatenate([np.minimum(clip, alpha), alpha], -1).round().astype(np.uint8)
-    plain, mended = (compress(model, clip, max_loss_db=0.2, passes=passes) for passes in (0, 30))
-    assert len(pack_compact(mended.quantized)) < 0.95 * len(pack_compact(plain.quantized))
-    lost = evaluate(model, clip).mean_psnr - evaluate(mended.model, clip).mean_psnr
-    assert lost == pytest.approx(mended.loss_db, abs=1e-9)
-    assert lost <= 0.2
-
-
-def test_gaussians_that_few_passes_cannot_make_up_for_are_not_dropped():
-    """A stage of pruning that loses more than the following ones could gain is undone."""
-    frames, losses = datasets.ball(24).clip.frames, []
-    model = fit(frames, FitConfig(num_gaussians=200, steps=300, seed=1)).model
-
-    def note(what: str, loss_db: float) -> None:
-        if what == "dropped":
-            losses.append(loss_db)
-
-    made = compress(model, frames, max_loss_db=0.5, passes=8, on_step=note)
-    worst = int(np.argmax(losses))
-    assert losses[worst] > 0.5
-    assert worst < len(losses) - 1
-    assert max(losses[worst + 1 :]) <= 0.5
-    assert made.loss_db <= 0.5
-    assert made.num_dropped > 120
-
-
-def test_a_greater_loss_makes_a_smaller_file():
-    model = soft_model(options=RenderOptions())
-    sizes = [len(pack_compact(compress(model, max_loss_db=loss).quantized)) for loss in (0.02, 0.2, 2.0)]
-    assert sizes == sorted(sizes, reverse=True)
-    assert sizes[-1] < 0.85 * sizes[0]
-
-
-def test_invisible_gaussians_are_dropped():
-    model = soft_model(options=RenderOptions())
-    hidden = eqx.tree_at(
-        lambda m: m.splats.opacity_logit,
-        model,
-        np.where(np.arange(40) < 5, np.float32(-20), model.splats.opacity_logit),
+    plain, fitted = (
+        compress(model, frames, quality=80, **more) for frames, more in ((None, {}), (clip, {"steps": 200}))
     )
-    assert compress(hidden, max_loss_db=0.1).num_dropped >= 5
+    assert evaluate(fitted.model, clip).mean_psnr > evaluate(plain.model, clip).mean_psnr + 0.5
+    assert len(pack_compact(fitted.quantized)) < 1.1 * len(pack_compact(plain.quantized))
 
 
-def test_dropping_uses_the_loss_that_it_may_cost():
-    search = sys.modules["foldgauss.video.compression.search"]
-    model = crowd(soft_model(options=RenderOptions()))
-    loss, quantizer = search._Loss(model, clip_of(model), None), search._Quantizer(model)
-    kept = [search._drop(model, quantizer, loss, -8.0, most) for most in (0.1, 1.0, 5.0)]
-    lost = [loss(one, loss.all_frames) for one in kept]
-    assert lost[0] <= 0.1
-    assert 0.1 < lost[1] <= 1.0 < lost[2] <= 5.0
-    assert model.num_gaussians > kept[0].num_gaussians > kept[1].num_gaussians > kept[2].num_gaussians
-
-
-@pytest.mark.parametrize(("last", "kept"), [([0.15], "01234"), ([0.5, 0.15], "01235"), ([0.5, 0.5], "0123")])
-def test_a_last_stage_that_loses_too_much_is_repeated_without_dropping(monkeypatch, last, kept):
-    module = sys.modules["foldgauss.video.compression.search"]
-    losses = iter([0.0, 0.05, 0.1, 0.12, *last])
-
-    class Loss:
-        error, all_frames = 1.0, None
-
-        def __call__(self, model, which):
-            return next(losses)
-
-    monkeypatch.setattr(module, "_drop", lambda model, *limits: f"less of {model}")
-    monkeypatch.setattr(module, "_Sorting", lambda model: lambda budget: model)
-    monkeypatch.setattr(module, "_Quantizer", lambda model: None)
-    tuned = []
-
-    def finetune(model, fraction, what, seed):
-        tuned.append(model)
-        return str(seed)
-
-    found = module._drop_in_stages("model", None, 0.0, Loss(), 0.2, 1.0, finetune, lambda what, loss_db: None)
-    assert "".join(found) == "model" + kept
-    assert tuned == ["less of model", *(f"less of {k}" for k in range(4)), "3"][: 4 + len(last)]
-
-
-@pytest.mark.parametrize(("left", "coarseness", "chosen"), [(30, 5.0, 40), (30, 1.0, 30), (15, 5.0, 15)])
-def test_few_dropped_gaussians_are_kept_where_that_is_smaller(monkeypatch, left, coarseness, chosen):
-    """All 40 Gaussians with steps of 2^`coarseness` against `left` of them with steps of 2^2."""
-    search = sys.modules["foldgauss.video.compression.search"]
-    model = soft_model(degree=3, options=RenderOptions())
-    pruned = search._take(model, np.arange(left))
-
-    def search_coarseness(quantizer, *limits):
-        whole = len(quantizer.exact.values["time"]) == 40
-        quantized = quantizer.quantize(coarseness if whole else 2.0)
-        return search._Try(0.0, quantized, dequantize(quantized), 0.1)
-
-    monkeypatch.setattr(search, "_drop_in_stages", lambda *given: [model, pruned])
-    monkeypatch.setattr(search, "_search_coarseness", search_coarseness)
-    assert compress(model, clip_of(model), max_loss_db=0.3).model.num_gaussians == chosen
-
-
-def test_estimated_bits_rank_files():
-    """Steps twice as coarse, and a third fewer Gaussians."""
-    model = crowd(soft_model(degree=3, options=RenderOptions()), copies=60)
-    search = sys.modules["foldgauss.video.compression.search"]
-    quantizer = search._Quantizer(model)
-    kept = np.arange(model.num_gaussians) % 3 > 0
-    files = [quantizer.quantize(2.0), quantizer.quantize(3.0), quantizer.quantize(2.0, kept)]
-    ratios = [
-        [count(one) / count(files[0]) for one in files[1:]]
-        for count in (estimate_bits, lambda one: len(pack_compact(one)))
-    ]
-    np.testing.assert_allclose(*ratios, atol=0.08)
-
-
-def test_order_found_before_fine_tuning_shortens_the_column_of_cells():
+def test_the_order_found_shortens_the_column_of_cells():
     """Nine in ten steps go on in a sweep; in the model's own order half of them go back."""
     model = crowd(soft_model(degree=3, options=RenderOptions()))
-    back = [
-        (np.diff(one.columns["cell"]) < 0).mean() for one in (fine(model), compress(model, clip_of(model)).quantized)
-    ]
+    order = find_order(model, np.inf)
+    assert sorted(order) == list(range(model.num_gaussians))
+    sweep = only(model, order)
+    back = [(np.diff(fine(one).columns["cell"]) < 0).mean() for one in (model, sweep)]
     assert back[0] > 0.4
     assert back[1] < 0.15
-
-
-@pytest.mark.parametrize("change", [lambda model: model, of_degrees, on_paths])
-def test_what_is_rounded_stays_while_the_rest_is_fitted(monkeypatch, change):
-    """From the stage of rounding on that fixes them, integers do not change; others do."""
-    module = sys.modules["foldgauss.video.compression.search"]
-    model = change(crowd(soft_model(degree=3, options=RenderOptions())))
-    quantizer, loss = module._Quantizer(model), module._Loss(model, clip_of(model), None)
-    made, fixed = [], []
-
-    def recorded(*given):
-        made.append(quantize(*given))
-        return made[-1]
-
-    def finetune(model, fraction, what, **how):
-        fixed.append(how["fixed"])
-        return finetune_model(model, loss.target, 1, **how)
-
-    monkeypatch.setattr(module, "quantize", recorded)
-    done = module._round_in_stages(quantizer, 1.0, finetune, module._ROUNDING)
-    assert done is made[-1]
-    assert len(fixed) == len(made) - 1 == len(module._ROUNDING)
-    groups = {
-        "log_scale": ("size", "stretch", "duration", "opacity", "time", "angle"),
-        "loc": ("cell", "degree", *(f"{axis}{k}" for axis in "xy" for k in range(4))),
-        "color_dc": ("luma", "blue", "green"),
-    }
-    for leaf, names in groups.items():
-        fractions = [step[leaf].mean() for step in fixed]
-        assert all((after[leaf] >= before[leaf]).all() for before, after in itertools.pairwise(fixed))
-        assert 0.3 < fractions[-1] < 0.7 if leaf == "color_dc" else fractions[-1] == 1
-        for name in names:
-            moves = 0
-            for before, after, step in zip(made[:-1], made[1:], fixed, strict=True):
-                was, now = (one.columns[name] for one in (before, after))
-                np.testing.assert_array_equal(now[step[leaf]], was[step[leaf]])
-                moves += int((now != was).sum())
-            assert moves or name in ("cell", "degree")
-
-
-def test_rounding_in_stages_loses_less():
-    """Than rounding all shapes, then all paths, then all colors; and that less than rounding at once."""
-    module = sys.modules["foldgauss.video.compression.search"]
-    model = crowd(soft_model(degree=3, options=RenderOptions()), seed=2)
-    loss, plan = module._Loss(model, clip_of(model), None), module._Quantizer(model)
-
-    def finetune(model, fraction, what, **how):
-        return finetune_model(model, loss.target, round(40 * fraction), **how)
-
-    def measure(stages):
-        return loss(dequantize(module._round_in_stages(plan, 4.0, finetune, stages)), loss.all_frames)
-
-    by_shares = measure(module._ROUNDING)
-    by_groups = measure(((module.SHAPE, 1.0, 0.4), (module.TRAJECTORY, 1.0, 0.225)))
-    at_once = loss(dequantize(plan.quantize(4.0)), loss.all_frames)
-    assert by_shares < by_groups < at_once
-
-
-@pytest.mark.parametrize(("passes", "max_loss"), [(4, 0.2), (16, 0.2), (48, 0.05)])
-def test_few_passes_and_small_losses_make_smaller_files_too(passes, max_loss):
-    """Than rounding alone: reordering costs no more than such a fine-tuning compensates for."""
-    model = crowd(soft_model(degree=3, options=RenderOptions()))
-    clip = clip_of(model, 20.0)
-    alone, made = (compress(model, clip, max_loss_db=max_loss, passes=number) for number in (0, passes))
-    assert len(pack_compact(made.quantized)) < 0.75 * len(pack_compact(alone.quantized))
-
-
-def test_loss_out_of_reach(monkeypatch):
-    """Where even the finest steps lose more."""
-    module = sys.modules["foldgauss.video.compression.search"]  # its name in the package is the function's
-    monkeypatch.setattr(module._Loss, "__call__", lambda *one: 0.3)
-    with pytest.raises(ValueError, match=r"^max_loss_db: expected at least .* Allow a greater loss"):
-        compress(soft_model())
 
 
 # ------------------------------------------------------------------------------------ exactness
@@ -599,12 +386,25 @@ def test_equal_numbers_are_equal_files_and_equal_models(tmp_path):
     assert read_metadata(path) == {"clip": "x", "bad": None}
 
 
-def test_a_decoded_model_by_the_same_rules_is_the_same_file():
+@pytest.mark.parametrize("change", [lambda model: model, crowd, of_degrees])
+def test_a_decoded_model_by_the_same_rules_is_the_same_file(change):
     """Quantising is a projection: what was rounded is not rounded further."""
-    quantized = compress(soft_model(options=RenderOptions()), max_loss_db=0.5).quantized
+    quantized = compress(change(soft_model(options=RenderOptions()))).quantized
     columns = quantized.columns
     again = quantize(compute_columns(dequantize(quantized)), columns["class"], quantized.rules, columns["cell"])
     assert pack_compact(again) == pack_compact(quantized)
+
+
+def test_values_on_the_grid_are_so_in_any_cell():
+    """The origin of x0, y0 and time is a multiple of the step, whichever cell it is that of."""
+    model = crowd(soft_model(degree=2, options=RenderOptions()))
+    quantized = fine(model, -6.3)
+    assert min(quantized.info.cells) > 0
+    decoded = compute_columns(dequantize(quantized))
+    cells = np.random.default_rng(3).permutation(quantized.columns["cell"])
+    again = quantize(decoded, quantized.columns["class"], quantized.rules, cells)
+    assert (again.columns["x0"] != quantized.columns["x0"]).any()
+    same(dequantize(again), dequantize(quantized))
 
 
 def test_logarithm_matches_numpy():
@@ -669,7 +469,7 @@ def test_the_decoder_for_browsers_gives_the_same_bits(tmp_path, how):
         model = on_paths(model, at_frames=how != "paths at other times")
     if how == "crowd of degrees":
         model = of_degrees(model)
-    path = save_compact(tmp_path / "m.fgz", compress(model, passes=0).quantized)
+    path = save_compact(tmp_path / "m.fgz", compress(model, quality=90).quantized)
     decoder = Path(foldgauss.io.page.__file__).with_name("compact.js")
     (tmp_path / "decoder.mjs").write_bytes(decoder.read_bytes())
     (tmp_path / "run.mjs").write_text(
@@ -705,7 +505,7 @@ def only(model, keep):
 
 def test_one_gaussian(tmp_path):
     model = only(soft_model(options=RenderOptions()), np.array([20]))
-    made = compress(model, clip_of(model))
+    made = compress(model, clip_of(model), quality=90, steps=20)
     path = save_compact(tmp_path / "m.fgz", made.quantized)
     same(load_video_model(path), made.model)
     assert path.stat().st_size < 2500
@@ -737,9 +537,9 @@ def test_extremes_of_values(leaf, value):
     changed = np.asarray(getattr(model.splats, leaf)).copy()
     changed[5] = value
     model = eqx.tree_at(lambda m: getattr(m.splats, leaf), model, changed)
-    made = compress(model, clip_of(model), max_loss_db=0.3)
-    assert made.loss_db <= 0.3
-    assert all(np.isfinite(one).all() for one in jax.tree.leaves(made.model))
+    for made in (compress(model, quality=90), compress(model, clip_of(model), quality=90, steps=20)):
+        assert all(np.isfinite(one).all() for one in jax.tree.leaves(made.model))
+        assert evaluate(made.model, clip_of(model)).mean_psnr > evaluate(model, clip_of(model)).mean_psnr - 3
 
 
 def test_nan_and_infinities_are_rejected():
@@ -758,15 +558,15 @@ def test_models_that_the_format_cannot_hold_are_rejected():
         compress(powers)
     with pytest.raises(ValueError, match=r"model: expected a VideoModel, got EditedVideo"):
         compress(layers(model, model))
-    with pytest.raises(ValueError, match=r"model.degree: expected at most 15"):
+    with pytest.raises(ValueError, match=r"degree: expected at most 15"):
         compress(soft_model(degree=16))
     with pytest.raises(ValueError, match=r"degree: expected .* 15"):
         FitConfig(degree=16)
     with pytest.raises(ValueError, match=r"frames: expected uint8"):
         compress(model, np.zeros((2, *SIZE, 3), np.uint8))
-    for wrong in (0.0, -1, np.nan, "a"):
-        with pytest.raises(ValueError, match=r"max_loss_db: expected a loss"):
-            compress(model, max_loss_db=wrong)
+    for wrong in (-1, 101, np.nan, "a"):
+        with pytest.raises(ValueError, match=r"quality: expected a number in \[0, 100\]"):
+            compress(model, quality=wrong)
     dark = eqx.tree_at(lambda m: m.splats.opacity_logit, model, np.full(model.num_gaussians, -90.0, np.float32))
     with pytest.raises(ValueError, match=r"model: expected visible Gaussians"):
         compress(dark)

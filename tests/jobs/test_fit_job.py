@@ -19,6 +19,7 @@ import foldgauss.jobs.runner as fitting
 from foldgauss.io import index_video, load_video_model
 from foldgauss.io._atomic import OutputError
 from foldgauss.io._lock import lock_output
+from foldgauss.io.models.video_model import read_metadata
 from foldgauss.jobs import FitJob, Stopped, fit_job
 from foldgauss.jobs.job import read_record
 from foldgauss.jobs.runner import busy_processors
@@ -135,6 +136,45 @@ def test_a_job_killed_at_any_write_goes_on_to_the_same_bits(done, clip, tmp_path
     fit_job(job)
     assert kills == 3
     assert Path(job.target).read_bytes() == Path(done[0].target).read_bytes()
+
+
+@pytest.mark.parametrize("goal", [{"quality": 60.0}, {"size_mb": 0.006}], ids=str)
+def test_a_compact_job_stopped_or_killed_goes_on_to_the_same_bits(clip, tmp_path, monkeypatch, goal):
+    monkeypatch.setattr(fitting, "REPORT_SECONDS", 0.0)
+    (tmp_path / "whole").mkdir()
+    config = dataclasses.replace(CONFIG, **goal)
+    whole, job = (job_of(clip, place, "model.fgz", config=config) for place in (tmp_path / "whole", tmp_path))
+    record = fit_job(whole)
+    assert record["file_bytes"] == os.path.getsize(whole.target) <= 6000
+    assert load_video_model(whole.target).num_gaussians == record["num_gaussians"]
+    budget = read_metadata(whole.target)["budget"]
+    assert budget == {"steps": CONFIG.steps} | goal
+    stopped_after(job, 9)
+    with monkeypatch.context() as patch:
+
+        def dies(*given, **named):
+            raise KeyboardInterrupt
+
+        patch.setattr(fitting, "save_compact", dies)
+        with pytest.raises(KeyboardInterrupt):
+            fit_job(job)
+    assert fit_job(job)["psnr"] == record["psnr"]
+    assert Path(job.target).read_bytes() == Path(whole.target).read_bytes()
+    assert not job.checkpoint.exists()
+
+
+def test_a_compact_file_needs_a_goal(clip, tmp_path):
+    with pytest.raises(
+        ValueError, match=r"config: expected one of a compact model .* Give a quality, a size or a PSNR"
+    ):
+        fit_job(job_of(clip, tmp_path, "model.fgz"))
+
+
+@pytest.mark.parametrize(("psnr", "num"), [(99.0, 1), (5.0, 0)])
+def test_a_psnr_out_of_reach_is_noted(clip, tmp_path, psnr, num):
+    job = job_of(clip, tmp_path, "model.fgz", config=dataclasses.replace(CONFIG, psnr=psnr))
+    told = [text for text in fit_job(job)["warnings"] if text.startswith("psnr: expected 99 dB, got ")]
+    assert len(told) == num
 
 
 @pytest.mark.parametrize("damage", ["cut", "other"])

@@ -168,9 +168,9 @@ def test_a_short_clip_is_an_ordinary_model(tmp_path):
 
 
 def test_file_sizes_are_shared_out_by_frames(clip, tmp_path):
-    config = dataclasses.replace(CONFIG, max_size_mb=3.4)
+    config = dataclasses.replace(CONFIG, size_mb=3.4)
     fit = plan_long_fit(clip, tmp_path / "long.safetensors", config, **ASKED)
-    lengths, shares = [stop - first for first, stop in fit.spans], [job.config.max_size_mb for job in fit.jobs]
+    lengths, shares = [stop - first for first, stop in fit.spans], [job.config.size_mb for job in fit.jobs]
     assert sum(shares) == pytest.approx(3.4)  # of the one file, though some frames are in two segments
     assert shares == pytest.approx([3.4 * one / sum(lengths) for one in lengths])
 

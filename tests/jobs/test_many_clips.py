@@ -77,6 +77,10 @@ def test_settings_reach_each_job(tmp_path):
     made(tmp_path, "one.mp4", "two.mp4")
     config = FitConfig(steps=7)
     jobs = make_jobs(find_clips(tmp_path).clips, tmp_path, config, size=(8, 8), frames=(0, 3), checkpoint_seconds=2.0)
+    assert {Path(job.target).name for job in jobs} == {"one.safetensors", "two.safetensors"}
+    for goal in ({"quality": 50.0}, {"size_mb": 1.0}, {"psnr": 30.0}):  # which ask for compact models
+        jobs_of_goal = make_jobs(find_clips(tmp_path).clips, tmp_path, FitConfig(**goal))
+        assert {Path(job.target).name for job in jobs_of_goal} == {"one.fgz", "two.fgz"}
     assert {(job.config.steps, job.size, job.frames, job.checkpoint_seconds) for job in jobs} == {
         (7, (8, 8), (0, 3), 2.0)
     }

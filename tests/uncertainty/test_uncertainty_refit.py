@@ -187,12 +187,12 @@ def test_every_method_works(model, frames, how):
 
 
 def test_default_steps_are_the_end_of_the_schedule(model, frames):
-    config, steps = dataclasses.replace(CONFIG, steps=100, minutes=5.0, target_psnr=10.0), []
+    config, steps = dataclasses.replace(CONFIG, steps=100, minutes=5.0, quality=10.0), []
     original = dataclasses.replace(CONFIG, steps=30)
     for each in (config, original):
         how = {"replicates": 1, "method": "order", "steps": None if each is config else 30}
         steps.append(next(iter_refits(model, frames, each, **how)).times)
-    np.testing.assert_array_equal(*steps)  # 30% of 100 steps, independent of minutes and target
+    np.testing.assert_array_equal(*steps)  # 30% of 100 steps, independent of minutes and quality
 
 
 @pytest.mark.slow

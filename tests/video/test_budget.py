@@ -1,4 +1,4 @@
-"""Budgets of a fit: minutes planned as steps by the measured speed, target PSNRs, and the PSNR while it runs."""
+"""Budgets of a fit: minutes planned as steps by the measured speed, and the PSNR while it runs."""
 
 import dataclasses
 
@@ -62,13 +62,6 @@ def test_the_time_left_is_that_of_the_steps_left():
     assert estimates[: budget.WARM_UP] == [np.inf] * budget.WARM_UP
     np.testing.assert_allclose(estimates[budget.WARM_UP :], 0.5 * np.arange(54, -1, -1), atol=1e-9)
     assert budget.TimeLeft(state, TIMED).estimate(state, 0.5) == 100 - state.seconds
-
-
-def test_target_psnr_is_evaluated_every_four_passes():
-    frames = moving_blobs()
-    config = dataclasses.replace(CONFIG, steps=400, target_psnr=5.0, error_fraction=0)
-    *_, (_, last) = fit_steps(frames, config)
-    assert (last.stopped_by, last.step) == ("target_psnr", 4 * len(frames))
 
 
 def test_running_psnr_is_that_of_the_frames_as_last_seen():

@@ -582,12 +582,10 @@ def test_diverging_fit_backs_off():
     assert np.isfinite(caught.value.state.rows).all()
 
 
-def test_minutes_targets_and_plans():
+def test_minutes_are_planned():
     by_clock = dataclasses.replace(CONFIG, steps=None, minutes=0.02)
     *_, (_, info) = fit_steps(FRAMES, by_clock)
     assert info.stopped_by == "minutes"
-    *_, (_, info) = fit_steps(FRAMES, dataclasses.replace(CONFIG, target_psnr=22.0))
-    assert info.stopped_by == "target_psnr"
 
 
 def test_capacity_doubles_where_it_is_not_enough():
@@ -600,6 +598,8 @@ def test_capacity_doubles_where_it_is_not_enough():
     assert stepper._choose_capacity(60) == 250
     stepper.config = CONFIG
     assert stepper._choose_capacity(123) == 123
+    stepper.config = dataclasses.replace(CONFIG, quality=50)  # whose Gaussians become fewer
+    assert [stepper._choose_capacity(num) for num in (1, 123, 110, 105, 64)] == [1, 128, 128, 108, 64]
 
 
 def test_the_command(tmp_path, capsys):

@@ -13,11 +13,11 @@ from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.video import FitConfig, evaluate, fit, fit_steps
 from foldgauss.video.fitting import loop
 from foldgauss.video.fitting.loop import start, start_from
-from foldgauss.video.fitting.path_coordinates import PathCoordinates, prefers_path
 from foldgauss.video.fitting.state import paths_of, to_model
 from foldgauss.video.models.shared_paths import SharedPaths, leave_paths
 from foldgauss.video.motion.camera_path import fit_affine
 from foldgauss.video.motion.optical_flow import Motion
+from foldgauss.video.motion.path_coordinates import PathCoordinates, prefers_path
 from foldgauss.video.motion.shared_motions import FARTHEST, _are_larger, _Clip, find_shared_motions
 
 CONFIG = FitConfig(num_gaussians=1500, steps=300, degree=2)
@@ -119,7 +119,7 @@ def test_maps_are_learned(monkeypatch):
     """From maps that are wrong by half a pixel."""
     found = find_shared_motions(Motion.from_frames(FRAMES))[:1]
     wrong = found + np.random.default_rng(0).normal(size=(12, 2, 3)) * [0, 0, 0.5 / 160]
-    monkeypatch.setattr(loop, "find_shared_motions", lambda motion: wrong)
+    monkeypatch.setattr(loop, "find_shared_motions", lambda motion, steady: wrong)
     held = dataclasses.replace(CONFIG, rates=dataclasses.replace(CONFIG.rates, paths=0.0))
     learned, fixed = (fit(FRAMES, config).model for config in (CONFIG, held))
     assert evaluate(learned, FRAMES).mean_psnr > evaluate(fixed, FRAMES).mean_psnr + 1

@@ -101,8 +101,9 @@ def test_minutes_end_the_fits():
     ("change", "named"),
     [
         ({"num_gaussians": 5}, "num_gaussians"),
-        ({"max_size_mb": 1.0}, "max_size_mb"),
-        ({"target_psnr": 30.0}, "target_psnr"),
+        ({"quality": 50.0}, "quality"),
+        ({"size_mb": 1.0}, "size_mb"),
+        ({"psnr": 30.0}, "psnr"),
         ({"growth": Growth()}, "growth"),
         ({"interpolation_fraction": 0.1}, "interpolation_fraction"),
         ({"initialization": "uniform", "follow_motion": False}, "initialization"),

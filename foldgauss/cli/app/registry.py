@@ -16,7 +16,9 @@ class Command(NamedTuple):
 COMMANDS: Mapping[str, Command] = MappingProxyType(
     {
         "fit": Command("fitting.fit", "Fit a model to a clip; the first of its budgets ends the fit."),
-        "fit-many": Command("fitting.fit_many", "Fit a model to each clip of a folder, and list those that fail."),
+        "fit-many": Command(
+            "fitting.fit_many", "Fit a compact model to each clip of a folder, and list those that fail."
+        ),
         "view": Command("viewing.view", "Play and edit a model in the browser, until Ctrl-C."),
         "player": Command(
             "viewing.player", "Write the player without a model, as a static site: one page that opens model files."

@@ -15,11 +15,11 @@ from foldgauss.cli.shared.outputs import refuse_existing, refuse_inputs, write_r
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import print_figures
 from foldgauss.io._atomic import check_writable, resolve
-from foldgauss.io.models.compact import COMPACT_SUFFIX, check_compact_name, save_compact
+from foldgauss.io.models.compact import COMPACT_SUFFIX, check_compact_name, leave_room, save_compact
 from foldgauss.io.models.video_model import CLIP_NOTES, keep_origin, load_video_model, read_origin
-from foldgauss.jobs.runner import mean_scores
+from foldgauss.jobs.runner import mean_scores, missed_psnr
 from foldgauss.video.fitting.compress import Compressed, compress
-from foldgauss.video.fitting.config import DEFAULT_QUALITY
+from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig
 from foldgauss.video.fitting.loop import FitInfo
 from foldgauss.video.fitting.state import FitState
 from foldgauss.video.models.metrics import evaluate
@@ -52,9 +52,10 @@ def compress_command(
     frames: FittedFrames = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Write a model as a compact file, a fraction of its size, as `fit` does from the start.
+    """Write a model as a compact file, a fraction of its size.
 
-    It can be rendered, evaluated, edited and exported like any model. See docs/compress.md.
+    `fit` writes such a file from the start. It can be rendered, evaluated, edited and exported like any model. See
+    docs/compress.md.
     """
     target = Path(f"{resolve(model_path).stem}{COMPACT_SUFFIX}") if out_path is None else out_path
     try:
@@ -76,9 +77,9 @@ def compress_command(
         cure = "Give that clip, or none: parameters are only rounded then."
         got = f"{str(video)!r}, another clip"
         raise wrong_use("VIDEO", expected="the clip that the model was fitted to", got=got, cure=cure)
-    goals = {"quality": quality, "size_mb": size_mb, "psnr": psnr, "minutes": minutes}
-    made = _compress_with_progress(model, None if clip is None else clip.frames, goals)
     about = keep_origin(about, *CLIP_NOTES, "frames_digest", "seed")
+    goals = {"quality": quality, "size_mb": leave_room(size_mb, about), "psnr": psnr, "minutes": minutes}
+    made = _compress_with_progress(model, None if clip is None else clip.frames, goals)
     figures: dict[str, Any] = {"num_gaussians": made.model.num_gaussians}
     figures["num_dropped"] = model.num_gaussians - made.model.num_gaussians
     if clip is not None:
@@ -96,6 +97,9 @@ def compress_command(
     bits = 8 * sizes[1] / (model.num_frames * model.size[0] * model.size[1])
     figures |= {"bytes_before": sizes[0], "file_bytes": sizes[1], "ratio": sizes[0] / sizes[1], "bits_per_pixel": bits}
     print_figures(str(target), figures)
+    if clip is not None:
+        for text in missed_psnr(FitConfig(psnr=psnr), after.mean_psnr):
+            warn(f"--psnr: {text} Give more --minutes, or fit a better model.")
     if sizes[1] >= sizes[0]:
         warn(f"{target} is no smaller than {model_path}.")
 

@@ -108,6 +108,8 @@ def fit(
     A stopped fit has a checkpoint and continues with --resume. Long clips are fitted in segments, in parallel with
     workers.
     """
+    if out_path is not None:
+        refuse_inputs(out_path, {"clip": video})
     in_segments = not (segment_seconds is None and workers is None and scheduler is None)
     target, config = _choose_target(video, out_path, config, in_segments)
     refuse_inputs(target, {"clip": video})
@@ -148,12 +150,17 @@ def fit(
         ):
             yield observer
 
-    run = run_fit(
-        job,
-        observe,
-        resume="required" if resume else "never",
-        on_checkpoint_error=lambda error, step: warn(f"no checkpoint at step {step}: {error}"),
-    )
+    try:
+        run = run_fit(
+            job,
+            observe,
+            resume="required" if resume else "never",
+            on_checkpoint_error=lambda error, step: warn(f"no checkpoint at step {step}: {error}"),
+        )
+    except ValueError as error:
+        if str(error).startswith("size_mb:"):
+            raise WrongUse(name_option(str(error))) from error
+        raise
     run = _save_model(run)
     target = Path(run.job.target)
     with _keep_state_on_interrupt(run):

@@ -44,7 +44,6 @@ _LABELS = {
     "steps": ("steps", "{:,}"),
     "stopped_by": ("stopped by", "{}"),
     "loss_db": ("loss", "{:.3f} dB"),
-    "estimated_loss_db": ("loss, estimated", "{:.3f} dB"),
     "num_dropped": ("Gaussians removed", "{:,}"),
     "bytes_before": ("before", "{:,} bytes"),
     "file_bytes": ("model file", "{:,} bytes"),

@@ -53,6 +53,8 @@ VERSION = 4
 _FIXED = len(MAGIC) + 12
 #: Limit of numbers per byte, so that a small file cannot claim much memory; files are padded with spaces. Clips need 1.
 _MOST_PER_BYTE = 32
+#: Bytes of metadata that sizes of files are planned for, see `video.fitting.rate.HEADER_BYTES`.
+_METADATA_BYTES = 1000
 _SIDE = 1 << 20  # largest side of an image: a decoder holds it in memory
 
 
@@ -67,6 +69,12 @@ def save_compact(path: PathLike, quantized: Quantized, *, metadata: dict | None 
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
     return path
+
+
+def leave_room(size_mb: float | None, metadata: dict) -> float | None:
+    """The size of a file, in 10^6 bytes, without its metadata where these are longer than usual."""
+    excess = len(to_json("metadata", to_json_types(metadata))) - _METADATA_BYTES
+    return size_mb if size_mb is None or excess <= 0 else max(size_mb - 1e-6 * excess, 1e-6)
 
 
 def check_compact_name(path: Path, parameter: str = "path") -> None:

@@ -99,6 +99,7 @@ def _round_only(model: VideoModel, config: FitConfig) -> Compressed:
         config = dataclasses.replace(config, quality=ROUNDING_QUALITY)
     control = RateControl(np.stack(list(VideoRenderer(model).frames())), config)
     state = start_from(model, config, 1)
+    control.check_size(state)
     control.round_only(state)
     quantized = control.finish(state, model.fps)
     return Compressed(quantized, dequantize(quantized))

@@ -12,10 +12,10 @@ from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.fitting.growth import PUBLISHED_UNIT
-from foldgauss.video.fitting.path_coordinates import PathCoordinates, prefers_path
 from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.models.splats import SH_C0, TAU_MAX, FoldedSplats
 from foldgauss.video.motion.optical_flow import Motion, Tracks, fit_folds
+from foldgauss.video.motion.path_coordinates import PathCoordinates, prefers_path
 
 #: Logarithm of the ratio of the longer axis of a start on a straight edge to the geometric mean of both; the width, in
 #: pixels, of the window in which edges are measured.

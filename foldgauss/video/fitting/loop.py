@@ -19,7 +19,7 @@ from foldgauss._runtime.threads import check_not_forked
 from foldgauss.video.compression.quantize import Quantized, dequantize
 from foldgauss.video.compression.quantizer import find_order
 from foldgauss.video.fitting.budget import StepPlanner, TimeLeft, find_limit, measure_progress
-from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, planned_steps
+from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig, chosen_num_gaussians, planned_steps
 from foldgauss.video.fitting.divergence import Guard
 from foldgauss.video.fitting.initialize import (
     START_OPACITY,
@@ -150,6 +150,8 @@ def fit_steps(
     rate = RateControl(frames, config) if config.is_compact else None
     planner, time_left = StepPlanner(config), TimeLeft(state, config)
     guard = Guard(state, config, stepper.steps_per_pass, alpha=frames.shape[3] == 4)
+    if rate is not None:
+        rate.check_size(state)
     if state.step == 0 and guard.comparable and config.initialization == "clip":
         begun = clock()
         state.start_errors = tuple(stepper.measure_start(state).items())
@@ -170,6 +172,7 @@ def fit_steps(
             before = clock()
             if rate is not None and state.plan and rate.act(state, measure_progress(state, config)):
                 stepper.adopt(state)
+                state.start_errors = ()  # those of more Gaussians
                 guard.replace_good(state)
                 planner.skip(clock() - before, rate.reserve(state, clock() - before))
             if is_relocation_due(state, config) and guard.is_converging(state):
@@ -210,6 +213,8 @@ def _warm_up(frames: np.ndarray, config: FitConfig, engine: str) -> None:
         return
     tiny = dataclasses.replace(config, num_gaussians=8, max_gaussians=None, steps=1, minutes=None)
     tiny = dataclasses.replace(tiny, interpolation_fraction=0.0)
+    if config.is_compact:
+        tiny = dataclasses.replace(tiny, quality=DEFAULT_QUALITY, size_mb=None, psnr=None)
     corner = np.ascontiguousarray(frames[:2, :32, :32])
     state = start(corner, dataclasses.replace(tiny, follow_motion=False))
     for progress in (0.0, 1.0) if engine == "cpu" else ():  # with either loss

@@ -20,7 +20,16 @@ from typing import NamedTuple
 import numpy as np
 
 from foldgauss._numerics.random_streams import Stream, make_generator
-from foldgauss.video.compression.quantize import Quantized, Rule, compute_columns, dequantize, quantize
+from foldgauss._runtime.checks import invalid
+from foldgauss.video.compression.quantize import (
+    Quantized,
+    Rule,
+    column_names,
+    compute_columns,
+    dequantize,
+    is_integral,
+    quantize,
+)
 from foldgauss.video.compression.quantizer import Quantizer, find_order, round_groups, select_rows
 from foldgauss.video.compression.streams import encode_streams
 from foldgauss.video.fitting.config import FitConfig
@@ -105,6 +114,16 @@ class RateControl:
 
     def __init__(self, frames: np.ndarray, config: FitConfig):
         self.frames, self.config, self.longest = frames, config, 0.0
+
+    def check_size(self, state: FitState) -> None:
+        """Raise ValueError if a file of a single Gaussian is larger than the settings allow."""
+        if self.config.size_mb is None:
+            return
+        exact, one = compute_columns(self._model(state)), np.arange(state.num_gaussians) == 0
+        rules = {name: Rule(0.0, COARSEST) for name in column_names(self.config.degree) if not is_integral(name)}
+        least = count_bytes(quantize(select_rows(exact, one), np.zeros(1, np.int32), rules)) / 1e6
+        if least > self.config.size_mb:
+            raise invalid("size_mb", expected=f"at least {least:.4f} for this clip", got=self.config.size_mb)
 
     def act(self, state: FitState, progress: float) -> bool:
         """Take the actions that are due; whether arrays of the state were replaced."""
@@ -210,11 +229,11 @@ class RateControl:
                 change = min(max(ahead / _DB_PER_UNIT, -_MOST_CHANGE), _MOST_CHANGE)
                 wanted.append((state.coarseness or USUAL_COARSENESS) + change)
         if config.size_mb is not None:
-            room = _AIM * 1e6 * config.size_mb / action.growth - HEADER_BYTES
+            room = _AIM * 1e6 * config.size_mb / action.growth
 
             def excess(coarseness: float) -> float:
                 kept = quantizer.are_worth(coarseness) if action.what == "drop" else None
-                return math.log2(count_bytes(quantizer.quantize(coarseness, kept)) / max(room, 64.0))
+                return math.log2(count_bytes(quantizer.quantize(coarseness, kept)) / room)
 
             wanted.append(_solve(excess, state.coarseness or USUAL_COARSENESS))
         return min(max(*wanted, FINEST), COARSEST)

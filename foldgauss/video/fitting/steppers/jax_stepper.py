@@ -4,6 +4,7 @@ After each step only `jax_step.Report` is fetched, some hundred numbers. Arrays 
 state, and for densification and relocation, which run on the host.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -32,6 +33,8 @@ from foldgauss.video.motion.optical_flow import Motion, motion_finder
 #: A fit whose growth has no limit that it could reach has capacity for so many times the Gaussians of its start; where
 #: that is not enough it doubles, and steps are compiled anew.
 CAPACITY_FACTOR = 2
+#: Capacities of compact fits for each doubling of the number of Gaussians.
+CAPACITY_STEPS = 4
 #: Interpolated frames are prepared so many steps ahead: one takes some tenths of a second, a step on a GPU some ms.
 STEPS_AHEAD = 64
 _FIELDS = FitState.array_fields()
@@ -199,7 +202,10 @@ class JaxStepper:
         """Rows of the arrays: a function of the number of Gaussians, so that a resumed fit has the same."""
         config = self.config
         if config.growth is None:
-            return max(num, self.capacity)  # Gaussians that are not worth their bits are dropped
+            if not config.is_compact:
+                return num
+            # Gaussians that are not worth their bits are dropped: not each time a program for another number.
+            return math.ceil(2 ** (math.ceil(CAPACITY_STEPS * math.log2(num)) / CAPACITY_STEPS))
         most = max(most_gaussians(config), num)
         if config.max_gaussians is not None:
             return most

@@ -1,0 +1,132 @@
+"""Compact models by `foldgauss fit`, as a user meets them."""
+
+import os
+import re
+import signal
+
+import jax
+import numpy as np
+import pytest
+from commands import run
+
+from foldgauss.io import load_video_model, write_video
+from foldgauss.io.datasets import ball
+from foldgauss.io.models.compact import is_compact
+from foldgauss.io.models.video_model import read_metadata
+from foldgauss.jobs import runner
+
+QUICK = ["--gaussians", "200", "--steps", "60"]
+FRAMES = ball(8, size=(48, 64)).clip.frames
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    """Lossless, so that the frames are the same whatever codecs there are."""
+    return write_video(tmp_path_factory.mktemp("clip") / "ball", FRAMES, 12.0)
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def test_the_default_is_a_compact_file(clip, tmp_path, capsys):
+    assert run("fit", clip, *QUICK) == 0
+    told = capsys.readouterr()
+    assert "60 steps, quality 50" in told.out
+    assert [path.name for path in tmp_path.iterdir()] == ["ball.fgz"]
+    assert is_compact("ball.fgz")
+    about = read_metadata("ball.fgz")
+    assert about["budget"] == {"steps": 60, "quality": 50}
+    model = load_video_model("ball.fgz")
+    assert model.num_gaussians < 200
+    assert run("evaluate", "ball.fgz", clip) == 0
+    assert f"{about['mean_psnr']:.2f}" in capsys.readouterr().out
+    assert run("fit", clip, *QUICK) == 2  # it exists
+
+
+def test_quality_decides_the_size(clip):
+    sizes = []
+    for quality in (20, 80):
+        assert run("fit", clip, *QUICK, "--quality", quality, "--out", f"{quality}.fgz") == 0
+        sizes.append(os.path.getsize(f"{quality}.fgz"))
+    assert sizes[0] < sizes[1]
+    assert read_metadata("20.fgz")["mean_psnr"] < read_metadata("80.fgz")["mean_psnr"]
+
+
+@pytest.mark.parametrize("size_mb", [0.005, 0.007])
+def test_the_file_is_no_larger_than_asked_for(clip, size_mb):
+    assert run("fit", clip, *QUICK, "--size-mb", size_mb) == 0
+    assert os.path.getsize("ball.fgz") <= 1e6 * size_mb
+    assert read_metadata("ball.fgz")["budget"] == {"steps": 60, "size_mb": size_mb}
+
+
+def test_the_times_of_many_frames_count_as_well(tmp_path):
+    """A clip whose frames are not evenly spaced has the second of each in its file."""
+    times = np.cumsum(np.arange(201) % 3) / 30 + np.arange(201) / 30
+    path = write_video(tmp_path / "uneven.mp4", FRAMES[np.abs(np.arange(200) % 14 - 7)], 5.0, times=times)
+    assert run("fit", path, "--gaussians", 300, "--steps", 60, "--size-mb", 0.0085) == 0
+    assert len(read_metadata("uneven.fgz")["frame_seconds"]) == 201
+    assert os.path.getsize("uneven.fgz") <= 8500
+
+
+def test_a_psnr_out_of_reach_is_told(clip, capsys):
+    assert run("fit", clip, *QUICK, "--psnr", 90) == 0
+    told = " ".join(capsys.readouterr().err.split())
+    assert re.search(r"warning: --psnr: expected 90 dB, got \d+\.\d\d\. Give more --minutes or --steps", told)
+    assert run("fit", clip, *QUICK, "--psnr", 15, "--overwrite") == 0
+    assert "--psnr" not in capsys.readouterr().err
+    assert read_metadata("ball.fgz")["mean_psnr"] >= 15
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--size-mb", "1", "--out", "m.safetensors"], "--size-mb: expected a compact file, got"),
+        (["--size-mb", "0.001"], "--size-mb: expected at least 0.00"),
+        (["--quality", "101"], "--quality: expected a number in [0, 100]"),
+        (["--psnr", "0"], "--psnr: expected a number in (0, 100]"),
+        (["--out", "m.fgz", "--segment-seconds", "1"], "--out: expected a name ending in .safetensors"),
+        (["--out", "m.mp4"], "--out: expected a name for the model"),
+    ],
+    ids=str,
+)
+def test_wrong_use(clip, tmp_path, capsys, options, told):
+    assert run("fit", clip, *QUICK, *options) == 2
+    assert told in " ".join(capsys.readouterr().err.split())
+    assert not list(tmp_path.iterdir())
+
+
+def test_float32_parameters_on_demand(clip):
+    """Without a goal they are not rounded; with a quality the file holds what the compact one decodes to."""
+    assert run("fit", clip, *QUICK, "--out", "plain.safetensors") == 0
+    assert load_video_model("plain.safetensors").num_gaussians == 200
+    assert read_metadata("plain.safetensors")["budget"] == {"steps": 60}
+    assert run("fit", clip, *QUICK, "--quality", 50, "--out", "decoded.safetensors") == 0
+    assert run("fit", clip, *QUICK) == 0
+    one, other = (jax.tree.leaves(load_video_model(name)) for name in ("decoded.safetensors", "ball.fgz"))
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")
+@pytest.mark.parametrize("step", [20, 40, 57])
+def test_stopped_and_resumed(clip, tmp_path, monkeypatch, capsys, step):
+    """Before and between the steps of rounding: the file equals that of a fit that was never stopped."""
+    steps = runner.fit_steps
+
+    def stepping(*arguments):
+        for state, info in steps(*arguments):
+            if info.step == step:
+                os.kill(os.getpid(), signal.SIGTERM)
+            yield state, info
+
+    with monkeypatch.context() as patch:
+        patch.setattr(runner, "fit_steps", stepping)
+        assert run("fit", clip, *QUICK) == 1
+    assert "--resume" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["ball.fgz.checkpoint"]
+    assert run("fit", clip, *QUICK, "--quality", 60, "--resume") == 2  # not with another goal
+    assert run("fit", clip, *QUICK, "--resume") == 0
+    assert run("fit", clip, *QUICK, "--out", "whole.fgz") == 0
+    assert (tmp_path / "ball.fgz").read_bytes() == (tmp_path / "whole.fgz").read_bytes()

@@ -1,0 +1,491 @@
+"""Compact fits: what is rounded stays, goals are kept, resumed fits are the same, and nothing crashes at the edges."""
+
+import dataclasses
+import itertools
+import math
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from clips import moving_blobs
+from soft_models import on_paths, soft_model
+
+from foldgauss.io import load_compact, load_video_model, save_compact
+from foldgauss.io.datasets import ball
+from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
+from foldgauss.render import RenderOptions
+from foldgauss.video import FitConfig, Growth, compress, evaluate, fit, fit_steps, start_from
+from foldgauss.video.compression.quantize import Rule
+from foldgauss.video.compression.quantizer import Quantizer, bit_price, round_groups
+from foldgauss.video.fitting.compress import ROUNDING_QUALITY
+from foldgauss.video.fitting.config import DEFAULT_QUALITY
+from foldgauss.video.fitting.loop import finish, start
+from foldgauss.video.fitting.rate import ACTIONS, HEADER_BYTES, RateControl, _last, count_bytes, count_past
+from foldgauss.video.fitting.state import FitState, to_model
+from foldgauss.video.models.row_layout import COLOR, GROUPS, SHAPE, TRAJECTORY, columns, group_bits
+
+FRAMES = ball(8, size=(48, 64)).clip.frames
+CONFIG = FitConfig(num_gaussians=200, steps=100, quality=60, seed=1)
+ALL = sum(GROUPS.values())
+#: Metadata as large as the command writes.
+ABOUT = {"clip": "a" * 100, "version": "0.1", "steps": 100, "budget": {"steps": 100}, "digest": "0" * 64}
+
+
+def with_alpha(frames):
+    """Its left half; the right one is clear."""
+    alpha = np.zeros((*frames.shape[:3], 1), np.uint8)
+    alpha[:, :, : frames.shape[2] // 2] = 255
+    return np.concatenate([frames * (alpha > 0), alpha], -1)
+
+
+def same(one, other):
+    assert jax.tree.structure(one) == jax.tree.structure(other)
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        assert np.asarray(a).dtype == np.asarray(b).dtype
+        np.testing.assert_array_equal(a, b)
+
+
+def same_states(one, other):
+    for name in FitState.array_fields():
+        for a, b in zip(jax.tree.leaves(getattr(one, name)), jax.tree.leaves(getattr(other, name)), strict=True):
+            np.testing.assert_array_equal(a, b, err_msg=name)
+    assert (one.step, one.plan, one.rate_actions, one.rules) == (
+        other.step,
+        other.plan,
+        other.rate_actions,
+        other.rules,
+    )
+
+
+def states_of(frames, config, state=None):
+    """A copy of the state after every step, by step."""
+    return {info.step: state.copy() for state, info in fit_steps(frames, config, state)}
+
+
+def model_of(state, config=CONFIG):
+    return to_model(state, config, FRAMES.shape[1:3], 25.0)
+
+
+def rules_of(state):
+    return {name: Rule(*numbers) for name, *numbers in state.rules}
+
+
+def round_all(state, config=CONFIG):
+    """The splats of a state with all groups rounded."""
+    every = np.full(state.num_gaussians, ALL, np.uint8)
+    return round_groups(model_of(state, config), state.classes.astype(np.int32), rules_of(state), every)
+
+
+def save(quantized, folder, metadata=None):
+    return save_compact(folder / "m.fgz", quantized, metadata=metadata)
+
+
+@pytest.fixture(scope="module")
+def states():
+    return states_of(FRAMES, CONFIG)
+
+
+@pytest.fixture(scope="module")
+def by_quality():
+    return {quality: fit(FRAMES, dataclasses.replace(CONFIG, quality=quality)) for quality in (30, 60, 100)}
+
+
+# ------------------------------------------------------------------------------------ the model is that of its file
+
+
+@pytest.mark.parametrize("quality", [30, 100])
+def test_the_model_is_what_its_file_decodes_to(by_quality, tmp_path, quality):
+    made = by_quality[quality]
+    path = save(made.quantized, tmp_path)
+    same(load_video_model(path), made.model)
+    assert load_compact(path).info == made.quantized.info
+
+
+def test_a_fit_without_a_goal_is_not_compact():
+    made = fit(FRAMES, dataclasses.replace(CONFIG, quality=None, steps=5))
+    assert made.quantized is None
+    assert made.model.num_gaussians == CONFIG.num_gaussians
+
+
+def test_what_is_rounded_stays_when_rounded_again(states):
+    """The parameters that bits mark lie on the grid, before the last step and after all of them are rounded."""
+    state = states[CONFIG.steps]
+    again = round_groups(model_of(state), state.classes.astype(np.int32), rules_of(state), state.rounded)
+    for group, bit in GROUPS.items():
+        marked = (state.rounded & bit) > 0
+        assert marked.mean() > 0.3
+        for name in group:
+            now, was = (np.asarray(getattr(one, name)) for one in (again, model_of(state).splats))
+            np.testing.assert_array_equal(now[marked], was[marked], err_msg=name)
+    splats = round_all(state)
+    model = dataclasses.replace(model_of(state), splats=splats)
+    every = np.full(state.num_gaussians, ALL, np.uint8)
+    same(round_groups(model, state.classes.astype(np.int32), rules_of(state), every), splats)
+
+
+def test_the_last_rounding_changes_only_what_was_not_rounded(states):
+    state = states[CONFIG.steps]
+    made, quantized = finish(state, FRAMES, CONFIG, 25.0)
+    assert quantized.info.num_gaussians == state.num_gaussians  # by quality, nothing is dropped in the end
+    for group, bit in GROUPS.items():
+        marked = (state.rounded & bit) > 0
+        for name in group:
+            now, was = (np.asarray(getattr(one, name)) for one in (made.splats, model_of(state).splats))
+            np.testing.assert_array_equal(now[marked], was[marked], err_msg=name)
+
+
+# ------------------------------------------------------------------------------------ rounding, step by step
+
+
+@pytest.mark.parametrize("engine", ["cpu", "xla"])
+def test_rounded_parameters_do_not_move_and_others_do(engine):
+    config = dataclasses.replace(CONFIG, engine=engine, relocated_fraction=0.0, steps=100 if engine == "cpu" else 20)
+    kept = states_of(FRAMES, config)
+    bits = group_bits(config.degree)
+    first = next(step for step, state in kept.items() if state.rules)
+    assert first / config.steps == next(action.progress for action in ACTIONS if action.what == SHAPE)
+    seen = 0
+    for before, after in itertools.pairwise(kept[step] for step in range(first, config.steps + 1)):
+        assert (after.rounded & before.rounded == before.rounded).all()
+        fixed = (before.rounded[:, None] & bits[None]) > 0
+        rows = [state.rows[:, : len(bits)] for state in (before, after)]
+        np.testing.assert_array_equal(rows[0][fixed], rows[1][fixed])
+        moved = rows[0] != rows[1]
+        assert not moved[fixed].any()
+        loose = ~fixed & (after.counts > before.counts)[:, None]
+        assert moved[loose].mean() > 0.5
+        seen += 1
+    assert seen == config.steps - first
+
+
+def test_groups_are_rounded_in_turn(states):
+    """Shapes first, then trajectories, then colors, in the fractions of `ACTIONS`."""
+    for action in ACTIONS:
+        if isinstance(action.what, str):
+            continue
+        state = states[math.ceil(action.progress * CONFIG.steps)]
+        marked = (state.rounded & GROUPS[action.what]) > 0
+        assert marked.mean() == pytest.approx(action.extent, abs=0.01)
+    early = states[math.ceil(0.55 * CONFIG.steps)]
+    assert not early.rounded.any()
+    assert not early.rules
+    middle = states[math.ceil(0.85 * CONFIG.steps)].rounded
+    assert not (middle & (GROUPS[TRAJECTORY] | GROUPS[COLOR])).any()
+
+
+def test_moments_of_what_is_rounded_are_zero(states):
+    state = states[CONFIG.steps]
+    for group, bit in GROUPS.items():
+        marked = (state.rounded & bit) > 0
+        for name in group:
+            at = columns(CONFIG.degree)[name]
+            assert not state.first[marked, at].any()
+            assert not state.second[marked, at].any()
+
+
+def test_actions_of_the_part_that_is_over_are_left_out():
+    assert count_past(0.0) == 0
+    assert count_past(0.1) == 0
+    assert count_past(0.35) == 3
+    assert count_past(1.0) == len(ACTIONS)
+
+
+# ------------------------------------------------------------------------------------ goals
+
+
+def test_higher_quality_is_a_better_and_larger_model(by_quality):
+    scores = [evaluate(made.model, FRAMES).mean_psnr for made in by_quality.values()]
+    sizes = [count_bytes(made.quantized) - HEADER_BYTES for made in by_quality.values()]
+    numbers = [made.model.num_gaussians for made in by_quality.values()]
+    assert scores == sorted(scores)
+    assert sizes == sorted(sizes)
+    assert numbers == sorted(numbers)
+    assert scores[-1] > scores[0] + 1
+    assert sizes[-1] > 2 * sizes[0]
+
+
+@pytest.mark.parametrize("size_mb", [0.0046, 0.006, 0.008, 0.02])
+def test_the_size_is_never_exceeded(tmp_path, size_mb):
+    made = fit(FRAMES, dataclasses.replace(CONFIG, quality=None, size_mb=size_mb))
+    path = save(made.quantized, tmp_path, ABOUT)
+    assert path.stat().st_size <= 1e6 * size_mb
+    same(load_video_model(path), made.model)
+
+
+def test_a_size_below_that_of_one_gaussian_is_refused_at_the_start():
+    config = dataclasses.replace(CONFIG, quality=None, size_mb=0.001)
+    with pytest.raises(ValueError, match=r"size_mb: expected at least 0\.004. for this clip, got 0.001"):
+        next(fit_steps(FRAMES, config))
+
+
+def test_the_last_number_is_found_to_half_a_percent():
+    for wanted in (0, 1, 7, 100, 1234, 5000):
+        last, after = _last(lambda num, wanted=wanted: num <= wanted, 5000)
+        assert last <= wanted < after <= max(last + 1, 1.006 * last)
+
+
+def test_a_larger_size_is_used_for_a_better_model():
+    sizes = 0.0055, 0.0075
+    made = [fit(FRAMES, dataclasses.replace(CONFIG, quality=None, size_mb=size)) for size in sizes]
+    scores = [evaluate(one.model, FRAMES).mean_psnr for one in made]
+    assert scores[0] < scores[1]
+    for one, size in zip(made, sizes, strict=True):
+        assert 0.8 * (1e6 * size - HEADER_BYTES) < count_bytes(one.quantized) - HEADER_BYTES
+
+
+def test_a_psnr_within_reach_is_reached_by_a_smaller_file(by_quality):
+    best = evaluate(by_quality[100].model, FRAMES).mean_psnr
+    wanted = best - 3
+    made = fit(FRAMES, dataclasses.replace(CONFIG, quality=None, psnr=wanted))
+    assert evaluate(made.model, FRAMES).mean_psnr >= wanted
+    assert count_bytes(made.quantized) < count_bytes(by_quality[100].quantized)
+
+
+def test_the_smallest_of_two_goals_wins(by_quality):
+    """A low quality with much room, and a high one with little."""
+    roomy = fit(FRAMES, dataclasses.replace(CONFIG, quality=30, size_mb=1.0))
+    same(roomy.model, by_quality[30].model)
+    tight = fit(FRAMES, dataclasses.replace(CONFIG, quality=100, size_mb=0.006))
+    assert count_bytes(tight.quantized) <= 6000 < count_bytes(by_quality[100].quantized)
+    low = evaluate(by_quality[30].model, FRAMES).mean_psnr
+    modest = fit(FRAMES, dataclasses.replace(CONFIG, quality=100, psnr=low))
+    assert count_bytes(modest.quantized) < count_bytes(by_quality[100].quantized)
+
+
+# ------------------------------------------------------------------------------------ dropping
+
+
+def test_a_gaussian_that_adds_nothing_is_dropped():
+    """Faint ones, those outside of the frame, and those behind an opaque one."""
+    model = soft_model(options=RenderOptions())
+    opacity, loc = np.array(model.splats.opacity_logit), np.array(model.splats.loc)
+    opacity[:5] = np.log(1e-4)
+    loc[5:10] = 9.0
+    model = eqx.tree_at(lambda m: (m.splats.opacity_logit, m.splats.loc), model, (opacity, loc))
+    made = compress(model, quality=100)
+    assert made.model.num_gaussians <= model.num_gaussians - 10
+    assert np.abs(np.asarray(made.model.splats.loc)).max() < 5
+    assert (np.asarray(made.model.splats.opacity_logit) > np.log(1e-3)).all()
+    assert evaluate(made.model, np.stack(list(model.frames()))).mean_psnr > 40
+
+
+def test_a_gaussian_is_kept_where_its_removal_costs_more_than_its_bits():
+    quantizer = Quantizer(soft_model(options=RenderOptions()))
+    assert bit_price(3.0) == pytest.approx(4 * bit_price(2.0))
+    kept = [quantizer.are_worth(coarseness) for coarseness in (2.0, 6.0, 9.0, 99.0)]
+    for more, fewer in itertools.pairwise(kept):
+        assert (more | ~fewer).all()
+    assert kept[0].sum() > kept[2].sum() > kept[3].sum() == 1
+    assert kept[3][np.argmax(quantizer.removal)]
+    assert (quantizer.are_worth(6.0, 0.04) | ~kept[1]).all()
+
+
+def test_gaussians_that_are_not_worth_their_bits_are_dropped_in_the_first_half(states):
+    numbers = [state.num_gaussians for state in states.values()]
+    assert numbers == sorted(numbers, reverse=True)
+    assert numbers[-1] < CONFIG.num_gaussians
+    half = states[math.ceil(0.5 * CONFIG.steps)]
+    assert half.num_gaussians == numbers[-1]
+    assert half.rate_actions == count_past(0.501)
+
+
+# ------------------------------------------------------------------------------------ resumed
+
+
+@pytest.mark.parametrize("step", [5, 30, 50, 65, 75, 90, 97, 99])
+def test_a_killed_and_resumed_fit_has_the_same_bits(states, tmp_path, step):
+    """From a file of the state: before anything is dropped, and between roundings."""
+    path, source = tmp_path / "m.checkpoint", {"digest": "x"}
+    steps = fit_steps(FRAMES, CONFIG)
+    for state, info in steps:
+        if info.step == step:
+            save_checkpoint(path, state, config=CONFIG, source=source)
+            break
+    steps.close()
+    resumed = load_checkpoint(path, config=CONFIG, source=source)
+    for again, _ in fit_steps(FRAMES, CONFIG, resumed):
+        pass
+    whole = states[CONFIG.steps]
+    same_states(again, whole)
+    same(finish(again, FRAMES, CONFIG, 25.0)[0], finish(whole, FRAMES, CONFIG, 25.0)[0])
+
+
+@pytest.mark.parametrize(
+    "goal",
+    [{"size_mb": 0.006}, {"psnr": 28.0}, {"quality": 60, "compositing": "sum"}, {"quality": 60, "engine": "xla"}],
+    ids=str,
+)
+def test_other_goals_resume_likewise(tmp_path, goal):
+    config, path = dataclasses.replace(CONFIG, **({"quality": None, "steps": 50} | goal)), tmp_path / "m.checkpoint"
+    for state, info in fit_steps(FRAMES, config):
+        if info.step == 33:
+            save_checkpoint(path, state, config=config, source={})
+    for again, _ in fit_steps(FRAMES, config, load_checkpoint(path, config=config, source={})):
+        pass
+    same_states(again, state)
+
+
+# ------------------------------------------------------------------------------------ nothing crashes
+
+GROWING = FitConfig.preset(
+    "paper", num_gaussians=100, steps=120, degree=3, initialization="clip", growth=Growth(prune_radius=20.0), quality=60
+)
+EDGES = {
+    "alpha": (with_alpha(FRAMES), CONFIG),
+    "sum": (FRAMES, dataclasses.replace(CONFIG, compositing="sum")),
+    "growth": (FRAMES, GROWING),
+    "uniform growth": (FRAMES, FitConfig.preset("paper", num_gaussians=100, steps=60, quality=50)),
+    "xla": (FRAMES, dataclasses.replace(CONFIG, engine="xla")),
+    "xla, growth": (FRAMES, dataclasses.replace(GROWING, engine="xla", steps=60)),
+    "one frame": (FRAMES[:1], CONFIG),
+    "two frames": (FRAMES[:2], CONFIG),
+    "one step": (FRAMES, dataclasses.replace(CONFIG, steps=1)),
+    "two steps": (FRAMES, dataclasses.replace(CONFIG, steps=2)),
+    "one Gaussian": (FRAMES, dataclasses.replace(CONFIG, num_gaussians=1)),
+    "two Gaussians": (FRAMES, dataclasses.replace(CONFIG, num_gaussians=2)),
+    "degree 0": (FRAMES, dataclasses.replace(CONFIG, degree=0)),
+    "degree 7": (FRAMES, dataclasses.replace(CONFIG, degree=7)),
+    "no paths": (FRAMES, dataclasses.replace(CONFIG, follow_camera=False)),
+    "at rest": (FRAMES, dataclasses.replace(CONFIG, follow_motion=False)),
+    "fixed times": (FRAMES, dataclasses.replace(CONFIG, learn_frame_times=False, sparse_updates=False)),
+    "minutes": (FRAMES, dataclasses.replace(CONFIG, steps=None, minutes=0.01)),
+    "black": (np.zeros_like(FRAMES), CONFIG),
+    "clear": (np.zeros((4, 24, 32, 4), np.uint8), CONFIG),
+    "quality 0": (FRAMES, dataclasses.replace(CONFIG, quality=0)),
+    "tiny size": (FRAMES, dataclasses.replace(CONFIG, quality=None, size_mb=0.0044)),
+    "out of reach": (FRAMES, dataclasses.replace(CONFIG, quality=None, psnr=99.0)),
+    "any psnr": (FRAMES, dataclasses.replace(CONFIG, quality=None, psnr=1.0)),
+    "1x1": (moving_blobs(3, 1, 1), CONFIG),
+}
+
+
+@pytest.mark.parametrize("name", EDGES)
+def test_every_kind_of_fit_gives_a_file(tmp_path, name):
+    frames, config = EDGES[name]
+    made = fit(frames, config)
+    again = load_video_model(save(made.quantized, tmp_path))
+    same(again, made.model)
+    assert again.num_gaussians >= 1
+    assert (again.num_frames, again.size) == (len(frames), frames.shape[1:3])
+    assert np.isfinite(evaluate(again, frames).psnr).all()
+    assert all(math.isfinite(info.loss) for info in made.history)
+
+
+def test_a_fit_with_paths_keeps_them(tmp_path):
+    """A camera that moves: some Gaussians follow it, in the file, too."""
+    rng = np.random.default_rng(0)
+    wide = np.kron(rng.integers(40, 216, (20, 30, 3)), np.ones((4, 4, 1))).astype(np.uint8)
+    frames = np.stack([wide[8 : 8 + 48, at : at + 64] for at in (0, 3, 9, 11, 18, 20, 29, 33)])
+    made = fit(frames, CONFIG)
+    assert made.model.splats.paths is not None
+    assert (np.asarray(made.model.splats.path_index) > 0).any()
+    same(load_video_model(save(made.quantized, tmp_path)), made.model)
+
+
+# ------------------------------------------------------------------------------------ a model made compact
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    return fit(FRAMES, dataclasses.replace(CONFIG, quality=None, steps=200)).model
+
+
+def test_compress_without_a_clip(fitted, tmp_path):
+    """The pictures stay about what they were; at a lower quality less so, in a smaller file."""
+    shown = np.stack(list(fitted.frames()))
+    made = [compress(fitted, quality=quality) for quality in (None, 50)]
+    scores = [evaluate(one.model, shown).mean_psnr for one in made]
+    assert scores[0] > 38
+    assert scores[0] > scores[1]
+    assert count_bytes(made[0].quantized) > count_bytes(made[1].quantized)
+    same(compress(fitted, quality=ROUNDING_QUALITY).model, made[0].model)
+    same(load_video_model(save(made[0].quantized, tmp_path)), made[0].model)
+
+
+def test_compress_with_a_clip(fitted, tmp_path):
+    """Fitted further meanwhile: a better model than without the clip, in a file that is no larger."""
+    seen = []
+    how = {"quality": 60, "steps": 100}
+    made = compress(fitted, FRAMES, **how, observers=[lambda state, info: seen.append(info.step)])
+    assert len(seen) == 100
+    same(load_video_model(save(made.quantized, tmp_path)), made.model)
+    alone = compress(fitted, quality=60)
+    better = evaluate(made.model, FRAMES).mean_psnr - evaluate(alone.model, FRAMES).mean_psnr
+    assert better > 0.5
+    assert count_bytes(made.quantized) < count_bytes(alone.quantized)
+    assert made.model.fps == fitted.fps
+
+
+def test_compress_has_a_default_quality_with_a_clip(fitted):
+    plain, stated = (compress(fitted, FRAMES, steps=10, quality=quality) for quality in (None, DEFAULT_QUALITY))
+    same(plain.model, stated.model)
+
+
+@pytest.mark.parametrize("frames", [None, FRAMES], ids=["alone", "clip"])
+def test_compress_to_a_size(fitted, tmp_path, frames):
+    how = {} if frames is None else {"steps": 40}
+    made = compress(fitted, frames, size_mb=0.006, **how)
+    path = save(made.quantized, tmp_path, ABOUT)
+    assert path.stat().st_size <= 6000
+    same(load_video_model(path), made.model)
+
+
+def test_compress_to_a_psnr(fitted):
+    made = compress(fitted, FRAMES, psnr=25.0, steps=60)
+    assert evaluate(made.model, FRAMES).mean_psnr >= 25
+    assert count_bytes(made.quantized) < count_bytes(compress(fitted, FRAMES, quality=100, steps=60).quantized)
+
+
+@pytest.mark.parametrize("given", [{"psnr": 30.0}, {"steps": 5}, {"minutes": 1.0}], ids=str)
+def test_what_needs_a_clip_is_refused_without_one(fitted, given):
+    (name,) = given
+    with pytest.raises(ValueError, match=f"{name}: expected None without the clip.*Give the clip's frames"):
+        compress(fitted, **given)
+
+
+@pytest.mark.parametrize("given", [{"quality": 101}, {"size_mb": 0}, {"psnr": -1.0}, {"steps": 0}], ids=str)
+def test_goals_out_of_range_are_refused(fitted, given):
+    (name,) = given
+    with pytest.raises(ValueError, match=f"{name}: expected"):
+        compress(fitted, FRAMES, **given)
+
+
+def test_a_compact_model_can_be_compressed_again(fitted, by_quality):
+    made = compress(by_quality[60].model, FRAMES, quality=60, steps=20)
+    assert made.model.num_gaussians <= by_quality[60].model.num_gaussians
+    assert compress(by_quality[60].model).model.num_gaussians >= 1
+
+
+@pytest.mark.parametrize("frames", [None, "clip"], ids=["alone", "clip"])
+def test_models_with_paths_are_compressed(tmp_path, frames):
+    model = on_paths(soft_model(options=RenderOptions()))
+    clip = None if frames is None else np.stack(list(model.frames()))
+    made = compress(model, clip, quality=80, **({} if clip is None else {"steps": 20}))
+    assert made.model.splats.paths is not None
+    same(load_video_model(save(made.quantized, tmp_path)), made.model)
+
+
+def test_the_state_given_is_the_one_that_is_made_compact(fitted):
+    """`start_from` with a goal leaves the actions of the part that is over out."""
+    config = dataclasses.replace(CONFIG, relocated_fraction=0.0)
+    state = start_from(fitted, config, 30, 0.8)
+    assert state.rate_actions == count_past(0.8)
+    for state, _ in fit_steps(FRAMES, config, state):  # noqa: B020
+        pass
+    assert state.num_gaussians == fitted.num_gaussians
+    assert finish(state, FRAMES, config, 25.0)[1].info.num_gaussians == fitted.num_gaussians
+
+
+def test_a_backdrop_is_behind_all_others():
+    rows = start(FRAMES, CONFIG).rows
+    plain = start(FRAMES, dataclasses.replace(CONFIG, quality=None)).rows
+    np.testing.assert_array_equal(rows[:-1], plain[:-1])
+    place = columns(CONFIG.degree)
+    assert rows[-1, place["opacity_logit"]] > 5
+    assert (rows[-1, place["log_scale"]] > 0).all()
+
+
+def test_sampled_frames_span_the_clip():
+    control = RateControl(moving_blobs(30, 8, 8), CONFIG)
+    assert (control.sampled[0], control.sampled[-1], len(control.sampled)) == (0, 29, 12)
