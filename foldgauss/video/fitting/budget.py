@@ -47,7 +47,8 @@ class StepPlanner:
             self.seconds += passed
         if not self._is_due(state, budget):
             return
-        left = max(budget - state.seconds - self.reserved, 0.0) * self.count / self.seconds / SLOWDOWN
+        seconds = max(budget - state.seconds - self.reserved, (budget - state.seconds) / 2)
+        left = seconds * self.count / self.seconds / SLOWDOWN
         if state.plan:
             state.planned_step, state.planned_progress = state.step, measure_progress(state, config)
         state.plan = min(state.step + max(int(left), 0), config.steps or math.inf)

@@ -13,11 +13,13 @@ coder finds for the Gaussians at hand, and by the PSNR so far. Source for the st
 rate and distortion at high resolution (Gish and Pierce 1968); for the order: `docs/compress.md`.
 """
 
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Int
 
 from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.checks import invalid
@@ -57,10 +59,14 @@ _TOLERANCE_LOG2 = 0.02
 _SLOPE_LOG2 = 0.8
 #: By how many dB the PSNR rises for twice the number of Gaussians, as measured.
 _DB_PER_DOUBLING = 1.8
-#: By how many dB it falls for each unit of coarseness with a given number of Gaussians, as measured.
-_DB_PER_UNIT = 0.8
-#: The most units by which a PSNR changes the coarseness once the Gaussians are chosen.
-_MOST_CHANGE = 2.0
+#: The fraction of the error of rounding that remains after the rest of the fit, rather too much.
+_LEFT_OF_ROUNDING = 0.5
+#: How finely the coarseness is searched for a PSNR.
+_TOLERANCE = 0.1
+#: Frames that a PSNR is estimated by.
+_SAMPLED_FRAMES = 12
+#: The most by which steps are coarser than the price of a bit that the Gaussians were chosen by.
+_MOST_CHANGE = 1.0
 #: By how many dB the fit aims at more than it was asked for: what is too much is given up in the end.
 _MARGIN_DB = 0.1
 #: The coarseness that the search for a size starts with.
@@ -79,27 +85,28 @@ class Action(NamedTuple):
     """What is done once a fraction of the plan is over: "drop", "sort", or the group of leaves to round.
 
     `extent`: the fraction of the price of a bit at which Gaussians are dropped, or of the Gaussians that are rounded.
-    `gain`: about how many dB the running PSNR rises from then to the end, rather too few. `growth`: how much larger the
-    file will be, about, than one made then.
+    `gain`: about how many dB the running PSNR rises from then to the end, rather too few; `regain`: by how many dB an
+    image without what was dropped rises. `growth`: how much larger the file will be, about, than one made then.
     """
 
     progress: float
     what: str | tuple[str, ...]
     extent: float = 1.0
     gain: float = 0.0
+    regain: float = 0.0
     growth: float = 1.0
 
 
 ACTIONS = (
-    Action(0.1, "drop", 0.04, 2.5, growth=3.5),
-    Action(0.2, "drop", 0.16, 1.8, growth=2.2),
-    Action(0.3, "drop", 0.36, 1.4, growth=1.3),
-    Action(0.42, "drop", 0.64, 1.2),
-    Action(0.55, "drop", 1.0, 1.0),
+    Action(0.1, "drop", 0.04, 2.5, 10.0, growth=3.5),
+    Action(0.2, "drop", 0.16, 1.8, 7.0, growth=2.2),
+    Action(0.3, "drop", 0.36, 1.4, 5.0, growth=1.3),
+    Action(0.42, "drop", 0.64, 1.2, 3.5),
+    Action(0.55, "drop", 1.0, 1.0, 2.5),
     Action(0.55, "sort"),
     Action(0.7, SHAPE, 0.4, 0.8),
     Action(0.78, SHAPE, 0.75),
-    Action(0.84, "drop", 1.0, 0.3),
+    Action(0.84, "drop", 1.0, 0.3, 0.5),
     Action(0.86, SHAPE, 1.0),
     Action(0.91, TRAJECTORY, 0.5),
     Action(0.96, TRAJECTORY, 1.0),
@@ -114,6 +121,7 @@ class RateControl:
 
     def __init__(self, frames: np.ndarray, config: FitConfig):
         self.frames, self.config, self.longest = frames, config, 0.0
+        self.sampled = np.unique(np.linspace(0, len(frames) - 1, _SAMPLED_FRAMES).round().astype(int))
 
     def check_size(self, state: FitState) -> None:
         """Raise ValueError if a file of a single Gaussian is larger than the settings allow."""
@@ -151,7 +159,9 @@ class RateControl:
 
     def round_only(self, state: FitState) -> None:
         """Drop what is not worth its bits, and sort where that hardly changes the images, without any training."""
-        self._drop(state, Action(1.0, "drop"))
+        quantizer = Quantizer(self._model(state))
+        coarseness = self._choose_coarseness(state, quantizer, Action(1.0, "drop"))
+        state.keep(np.flatnonzero(quantizer.are_worth(coarseness)))
         model = self._model(state)
         levels = sum(float(frame.astype(np.float64).var()) for frame in self.frames) * self.frames[0].size
         state.keep(find_order(model, _ORDERING_UNTRAINED * levels / 255**2))
@@ -174,8 +184,10 @@ class RateControl:
             return quantize(select_rows(exact, kept), classes[kept], rules)
 
         most, dropped = len(worst_first) - 1, 0
-        if self.config.psnr is not None and self._psnr(whole) > self.config.psnr:
-            dropped = _bracket(lambda num: self._psnr(without(num)) >= self.config.psnr, most)[0]
+        frames = np.arange(len(self.frames))
+        if self.config.psnr is not None and self._psnr(dequantize(whole), frames) > self.config.psnr:
+            reaches = lambda num: self._psnr(dequantize(without(num)), frames) >= self.config.psnr  # noqa: E731
+            dropped = _bracket(reaches, most)[0]
         if self.config.size_mb is not None and count_bytes(without(dropped)) > 1e6 * self.config.size_mb:
             dropped = min(_bracket(lambda num: count_bytes(without(num)) > 1e6 * self.config.size_mb, most)[1], most)
         return without(dropped) if dropped else whole
@@ -221,13 +233,7 @@ class RateControl:
         if config.quality is not None:
             wanted.append(coarseness_of(config.quality))
         if config.psnr is not None:
-            ahead = running_psnr(state) + action.gain - config.psnr - _MARGIN_DB
-            if action.what == "drop":
-                num = len(quantizer.removal) * 2 ** (-ahead / _DB_PER_DOUBLING)
-                wanted.append(quantizer.coarseness_for(num, action.extent))
-            else:
-                change = min(max(ahead / _DB_PER_UNIT, -_MOST_CHANGE), _MOST_CHANGE)
-                wanted.append((state.coarseness or USUAL_COARSENESS) + change)
+            wanted.append(self._solve_psnr(state, quantizer, action))
         if config.size_mb is not None:
             room = _AIM * 1e6 * config.size_mb / action.growth
 
@@ -238,11 +244,41 @@ class RateControl:
             wanted.append(_solve(excess, state.coarseness or USUAL_COARSENESS))
         return min(max(*wanted, FINEST), COARSEST)
 
-    def _psnr(self, quantized: Quantized) -> float:
-        """Mean PSNR over all frames, dB."""
-        images = VideoRenderer(dequantize(quantized)).frames()
-        targets = map(self._target, range(len(self.frames)))
-        return float(np.mean([psnr_of(*pair) for pair in zip(targets, images, strict=True)]))
+    def _solve_psnr(self, state: FitState, quantizer: Quantizer, action: Action) -> float:
+        """The coarseness for the PSNR that is asked for, by some frames without what is dropped, or rounded."""
+        aim, now = self.config.psnr + _MARGIN_DB, running_psnr(state)
+        if action.what == "drop":
+            ahead = now + action.gain - aim
+            most = quantizer.coarseness_for(
+                len(quantizer.removal) * 2 ** (-ahead / _DB_PER_DOUBLING), fraction=action.extent
+            )
+            model = self._model(state)
+
+            def reached(coarseness: float) -> float:
+                kept = quantizer.are_worth(coarseness, action.extent)
+                return (
+                    self._psnr(dataclasses.replace(model, splats=model.splats.take(kept)), self.sampled) + action.regain
+                )
+        else:
+            most = state.coarseness + _MOST_CHANGE if state.coarseness else COARSEST
+
+            def reached(coarseness: float) -> float:
+                rounded = self._psnr(dequantize(quantizer.quantize(coarseness)), self.sampled)
+                left, more = (10 ** (-0.1 * db) for db in (now + action.gain, now))
+                return -10 * math.log10(left + _LEFT_OF_ROUNDING * max(10 ** (-0.1 * rounded) - more, 0.0))
+
+        low, high = FINEST, min(max(most, FINEST), COARSEST)
+        if reached(high) >= aim:
+            return high
+        while high - low > _TOLERANCE:
+            middle = (low + high) / 2
+            low, high = (middle, high) if reached(middle) >= aim else (low, middle)
+        return low
+
+    def _psnr(self, model: VideoModel, which: Int[np.ndarray, " some"]) -> float:
+        """Mean PSNR of the frames `which`, dB."""
+        images = VideoRenderer(model).frames(np.asarray(model.frame_times.times())[which])
+        return float(np.mean([psnr_of(self._target(k), image) for k, image in zip(which, images, strict=True)]))
 
     def _target(self, k: int) -> np.ndarray:
         frame = self.frames[k]
