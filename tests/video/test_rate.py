@@ -50,12 +50,8 @@ def same_states(one, other):
     for name in FitState.array_fields():
         for a, b in zip(jax.tree.leaves(getattr(one, name)), jax.tree.leaves(getattr(other, name)), strict=True):
             np.testing.assert_array_equal(a, b, err_msg=name)
-    assert (one.step, one.plan, one.rate_actions, one.rules) == (
-        other.step,
-        other.plan,
-        other.rate_actions,
-        other.rules,
-    )
+    for name in ("step", "plan", "rate_actions", "rules"):
+        assert getattr(one, name) == getattr(other, name), name
 
 
 def states_of(frames, config, state=None):
