@@ -33,11 +33,11 @@ def here(tmp_path, monkeypatch):
 def test_the_default_is_a_compact_file(clip, tmp_path, capsys):
     assert run("fit", clip, *QUICK) == 0
     told = capsys.readouterr()
-    assert "60 steps, quality 50" in told.out
+    assert "60 steps, quality 70" in told.out
     assert [path.name for path in tmp_path.iterdir()] == ["ball.fgz"]
     assert is_compact("ball.fgz")
     about = read_metadata("ball.fgz")
-    assert about["budget"] == {"steps": 60, "quality": 50}
+    assert about["budget"] == {"steps": 60, "quality": 70}
     model = load_video_model("ball.fgz")
     assert model.num_gaussians < 200
     assert run("evaluate", "ball.fgz", clip) == 0
@@ -102,7 +102,7 @@ def test_float32_parameters_on_demand(clip):
     assert run("fit", clip, *QUICK, "--out", "plain.safetensors") == 0
     assert load_video_model("plain.safetensors").num_gaussians == 200
     assert read_metadata("plain.safetensors")["budget"] == {"steps": 60}
-    assert run("fit", clip, *QUICK, "--quality", 50, "--out", "decoded.safetensors") == 0
+    assert run("fit", clip, *QUICK, "--quality", 70, "--out", "decoded.safetensors") == 0
     assert run("fit", clip, *QUICK) == 0
     one, other = (jax.tree.leaves(load_video_model(name)) for name in ("decoded.safetensors", "ball.fgz"))
     for a, b in zip(one, other, strict=True):

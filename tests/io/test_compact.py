@@ -612,11 +612,11 @@ def test_damaged_everywhere(tmp_path, good):
         refused(tmp_path, bytes(data), "compact model")
 
 
-@pytest.mark.parametrize(("version", "cure"), [(5, "Update foldgauss"), (3, "Compress the model again")])
+@pytest.mark.parametrize(("version", "cure"), [(6, "Update foldgauss"), (4, "Compress the model again")])
 def test_another_version_is_rejected(tmp_path, good, version, cure):
     data = bytearray(good)
     data[len(MAGIC)] = version
-    refused(tmp_path, bytes(data), f"expected a compact model of version 4, .* got version {version} .* {cure}")
+    refused(tmp_path, bytes(data), f"expected a compact model of version 5, .* got version {version} .* {cure}")
 
 
 def test_changed_by_a_transfer_as_text(tmp_path, good):

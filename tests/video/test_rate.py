@@ -21,7 +21,7 @@ from foldgauss.video.compression.quantizer import Quantizer, bit_price, round_gr
 from foldgauss.video.fitting.compress import ROUNDING_QUALITY
 from foldgauss.video.fitting.config import DEFAULT_QUALITY
 from foldgauss.video.fitting.loop import finish, start
-from foldgauss.video.fitting.rate import ACTIONS, HEADER_BYTES, RateControl, _last, count_bytes, count_past
+from foldgauss.video.fitting.rate import ACTIONS, HEADER_BYTES, RateControl, _bracket, count_bytes, count_past
 from foldgauss.video.fitting.state import FitState, to_model
 from foldgauss.video.models.row_layout import COLOR, GROUPS, SHAPE, TRAJECTORY, columns, group_bits
 
@@ -143,6 +143,8 @@ def test_rounded_parameters_do_not_move_and_others_do(engine):
     assert first / config.steps == next(action.progress for action in ACTIONS if action.what == SHAPE)
     seen = 0
     for before, after in itertools.pairwise(kept[step] for step in range(first, config.steps + 1)):
+        if after.num_gaussians < before.num_gaussians:  # some were dropped
+            continue
         assert (after.rounded & before.rounded == before.rounded).all()
         fixed = (before.rounded[:, None] & bits[None]) > 0
         rows = [state.rows[:, : len(bits)] for state in (before, after)]
@@ -152,7 +154,7 @@ def test_rounded_parameters_do_not_move_and_others_do(engine):
         loose = ~fixed & (after.counts > before.counts)[:, None]
         assert moved[loose].mean() > 0.5
         seen += 1
-    assert seen == config.steps - first
+    assert seen == config.steps - first - (kept[first].num_gaussians > kept[config.steps].num_gaussians)
 
 
 def test_groups_are_rounded_in_turn(states):
@@ -211,18 +213,18 @@ def test_the_size_is_never_exceeded(tmp_path, size_mb):
 
 def test_a_size_below_that_of_one_gaussian_is_refused_at_the_start():
     config = dataclasses.replace(CONFIG, quality=None, size_mb=0.001)
-    with pytest.raises(ValueError, match=r"size_mb: expected at least 0\.004. for this clip, got 0.001"):
+    with pytest.raises(ValueError, match=r"size_mb: expected at least 0\.003. for this clip, got 0.001"):
         next(fit_steps(FRAMES, config))
 
 
-def test_the_last_number_is_found_to_half_a_percent():
+def test_the_last_number_is_found_to_half_a_percent_of_all():
     for wanted in (0, 1, 7, 100, 1234, 5000):
-        last, after = _last(lambda num, wanted=wanted: num <= wanted, 5000)
-        assert last <= wanted < after <= max(last + 1, 1.006 * last)
+        last, after = _bracket(lambda num, wanted=wanted: num <= wanted, 5000)
+        assert last <= wanted < after <= last + 25
 
 
 def test_a_larger_size_is_used_for_a_better_model():
-    sizes = 0.0055, 0.0075
+    sizes = 0.0045, 0.009
     made = [fit(FRAMES, dataclasses.replace(CONFIG, quality=None, size_mb=size)) for size in sizes]
     scores = [evaluate(one.model, FRAMES).mean_psnr for one in made]
     assert scores[0] < scores[1]
@@ -277,13 +279,13 @@ def test_a_gaussian_is_kept_where_its_removal_costs_more_than_its_bits():
     assert (quantizer.are_worth(6.0, 0.04) | ~kept[1]).all()
 
 
-def test_gaussians_that_are_not_worth_their_bits_are_dropped_in_the_first_half(states):
+def test_gaussians_that_are_not_worth_their_bits_are_dropped_before_all_are_rounded(states):
     numbers = [state.num_gaussians for state in states.values()]
     assert numbers == sorted(numbers, reverse=True)
     assert numbers[-1] < CONFIG.num_gaussians
-    half = states[math.ceil(0.5 * CONFIG.steps)]
-    assert half.num_gaussians == numbers[-1]
-    assert half.rate_actions == count_past(0.501)
+    late = states[math.ceil(0.85 * CONFIG.steps)]
+    assert late.num_gaussians == numbers[-1]
+    assert late.rate_actions == count_past(0.851)
 
 
 # ------------------------------------------------------------------------------------ resumed
@@ -408,7 +410,7 @@ def test_compress_with_a_clip(fitted, tmp_path):
     same(load_video_model(save(made.quantized, tmp_path)), made.model)
     alone = compress(fitted, quality=60)
     better = evaluate(made.model, FRAMES).mean_psnr - evaluate(alone.model, FRAMES).mean_psnr
-    assert better > 0.5
+    assert better > 0.3  # rounding alone keeps what it cannot make up for
     assert count_bytes(made.quantized) < count_bytes(alone.quantized)
     assert made.model.fps == fitted.fps
 
@@ -465,8 +467,8 @@ def test_models_with_paths_are_compressed(tmp_path, frames):
 def test_the_state_given_is_the_one_that_is_made_compact(fitted):
     """`start_from` with a goal leaves the actions of the part that is over out."""
     config = dataclasses.replace(CONFIG, relocated_fraction=0.0)
-    state = start_from(fitted, config, 30, 0.8)
-    assert state.rate_actions == count_past(0.8)
+    state = start_from(fitted, config, 30, 0.85)
+    assert state.rate_actions == count_past(0.85)
     for state, _ in fit_steps(FRAMES, config, state):  # noqa: B020
         pass
     assert state.num_gaussians == fitted.num_gaussians

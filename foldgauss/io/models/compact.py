@@ -48,7 +48,7 @@ from foldgauss.video.models.video_model import VideoModel
 COMPACT_SUFFIX = ".fgz"
 #: As in PNG: a byte that is not ASCII, line ends of both kinds, which a transfer as text would change, an end of file.
 MAGIC = b"\x8bFGZ\r\n\x1a\n"
-VERSION = 4
+VERSION = 5
 #: Magic, version, length of the header, checksum of all that follows.
 _FIXED = len(MAGIC) + 12
 #: Limit of numbers per byte, so that a small file cannot claim much memory; files are padded with spaces. Clips need 1.

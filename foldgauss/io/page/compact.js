@@ -10,7 +10,7 @@ const AXES = [
   [-0.408248290463863, 0.8164965809277261, -0.408248290463863],
 ];
 const WIDEST = { time: 0.125, angle: 0.125, size: 0.35, stretch: 0.5, duration: 0.5, opacity: 1.0 };
-const MAGIC = [0x8b, 0x46, 0x47, 0x5a, 0x0d, 0x0a, 0x1a, 0x0a], VERSION = 4;
+const MAGIC = [0x8b, 0x46, 0x47, 0x5a, 0x0d, 0x0a, 0x1a, 0x0a], VERSION = 5;
 const NODES = 130, CONTEXTS = 256, MODELS = 3, MEMORY = 400, LARGEST_BITS = 30, FARTHEST = 120, FINEST = -48;
 const WEIGHT = 29491, RATE = 6, MARGIN = 32;
 const KNOTS = [

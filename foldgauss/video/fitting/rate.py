@@ -32,7 +32,14 @@ from foldgauss.video.compression.quantize import (
     is_integral,
     quantize,
 )
-from foldgauss.video.compression.quantizer import Quantizer, find_order, round_groups, select_rows
+from foldgauss.video.compression.quantizer import (
+    BITS_PER_GAUSSIAN,
+    Quantizer,
+    bit_price,
+    find_order,
+    round_groups,
+    select_rows,
+)
 from foldgauss.video.compression.streams import encode_streams
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.state import FitState, running_psnr, to_model
@@ -60,7 +67,7 @@ _SLOPE_LOG2 = 0.8
 #: By how many dB the PSNR rises for twice the number of Gaussians, as measured.
 _DB_PER_DOUBLING = 1.8
 #: The fraction of the error of rounding that remains after the rest of the fit, rather too much.
-_LEFT_OF_ROUNDING = 0.5
+_LEFT_OF_ROUNDING = 0.8
 #: How finely the coarseness is searched for a PSNR.
 _TOLERANCE = 0.1
 #: Frames that a PSNR is estimated by.
@@ -77,7 +84,9 @@ _LEAST_KEPT = 0.45
 _ORDERING = 1.0
 #: Passes over the frames to come with which it may add as much; fewer compensate for less.
 _PASSES = 40.0
-#: The same without any, as a fraction of the variance of the images.
+#: The least fraction of the price of a bit at which Gaussians are dropped where nothing makes up for them.
+_LEAST_FRACTION = 1e-4
+#: Squared error that sorting may add without training, as a fraction of the variance of the images.
 _ORDERING_UNTRAINED = 1e-5
 
 
@@ -86,7 +95,7 @@ class Action(NamedTuple):
 
     `extent`: the fraction of the price of a bit at which Gaussians are dropped, or of the Gaussians that are rounded.
     `gain`: about how many dB the running PSNR rises from then to the end, rather too few; `regain`: by how many dB an
-    image without what was dropped rises. `growth`: how much larger the file will be, about, than one made then.
+    image without what was dropped rises.
     """
 
     progress: float
@@ -94,19 +103,18 @@ class Action(NamedTuple):
     extent: float = 1.0
     gain: float = 0.0
     regain: float = 0.0
-    growth: float = 1.0
 
 
 ACTIONS = (
-    Action(0.1, "drop", 0.04, 2.5, 10.0, growth=3.5),
-    Action(0.2, "drop", 0.16, 1.8, 7.0, growth=2.2),
-    Action(0.3, "drop", 0.36, 1.4, 5.0, growth=1.3),
-    Action(0.42, "drop", 0.64, 1.2, 3.5),
-    Action(0.55, "drop", 1.0, 1.0, 2.5),
+    Action(0.1, "drop", 0.04, 1.5, 6.0),
+    Action(0.2, "drop", 0.16, 1.0, 4.0),
+    Action(0.3, "drop", 0.36, 0.7, 3.0),
+    Action(0.42, "drop", 0.64, 0.5, 2.0),
+    Action(0.55, "drop", 1.0, 0.4, 1.2),
     Action(0.55, "sort"),
-    Action(0.7, SHAPE, 0.4, 0.8),
+    Action(0.7, SHAPE, 0.4, 0.3),
     Action(0.78, SHAPE, 0.75),
-    Action(0.84, "drop", 1.0, 0.3, 0.5),
+    Action(0.84, "drop", 1.0, 0.0, 0.1),
     Action(0.86, SHAPE, 1.0),
     Action(0.91, TRAJECTORY, 0.5),
     Action(0.96, TRAJECTORY, 1.0),
@@ -161,7 +169,16 @@ class RateControl:
         """Drop what is not worth its bits, and sort where that hardly changes the images, without any training."""
         quantizer = Quantizer(self._model(state))
         coarseness = self._choose_coarseness(state, quantizer, Action(1.0, "drop"))
-        state.keep(np.flatnonzero(quantizer.are_worth(coarseness)))
+        model, fraction = self._model(state), 1.0
+        # Each is judged as if the others stayed, and nothing makes up for what is missing: fewer, where it costs more.
+        while True:
+            kept = quantizer.are_worth(coarseness, fraction)
+            fewer = dataclasses.replace(model, splats=model.splats.take(kept))
+            added = 10 ** (-0.1 * self._psnr(fewer, np.arange(len(self.frames)))) * 255**2 * self.frames[..., :3].size
+            if added <= (~kept).sum() * BITS_PER_GAUSSIAN * bit_price(coarseness) or fraction < _LEAST_FRACTION:
+                break
+            fraction /= 2
+        state.keep(np.flatnonzero(kept))
         model = self._model(state)
         levels = sum(float(frame.astype(np.float64).var()) for frame in self.frames) * self.frames[0].size
         state.keep(find_order(model, _ORDERING_UNTRAINED * levels / 255**2))
@@ -235,7 +252,7 @@ class RateControl:
         if config.psnr is not None:
             wanted.append(self._solve_psnr(state, quantizer, action))
         if config.size_mb is not None:
-            room = _AIM * 1e6 * config.size_mb / action.growth
+            room = _AIM * 1e6 * config.size_mb
 
             def excess(coarseness: float) -> float:
                 kept = quantizer.are_worth(coarseness) if action.what == "drop" else None
