@@ -59,7 +59,7 @@ HEADER_BYTES = 3000
 #: file is larger nevertheless.
 _AIM = 0.98
 #: Tries of the coarseness for a size, at most: each codes all Gaussians.
-_TRIES = 6
+_TRIES = 8
 #: The binary logarithm by which a file may be smaller than asked for: it changes by more until the end of the fit.
 _TOLERANCE_LOG2 = 0.02
 #: By how much the binary logarithm of a size falls for each unit of coarseness, as measured.
@@ -76,6 +76,8 @@ _SAMPLED_FRAMES = 12
 _MOST_CHANGE = 1.0
 #: By how many dB the fit aims at more than it was asked for: what is too much is given up in the end.
 _MARGIN_DB = 0.1
+#: Bits of a Gaussian in a file whose number of Gaussians suits its steps, as measured.
+USUAL_BITS = 85.0
 #: The coarseness that the search for a size starts with.
 USUAL_COARSENESS = 6.0
 #: The least fraction of the Gaussians that remains: each is judged as if the others remained.
@@ -252,14 +254,19 @@ class RateControl:
         if config.psnr is not None:
             wanted.append(self._solve_psnr(state, quantizer, action))
         if config.size_mb is not None:
-            room = _AIM * 1e6 * config.size_mb
-
-            def excess(coarseness: float) -> float:
-                kept = quantizer.are_worth(coarseness) if action.what == "drop" else None
-                return math.log2(count_bytes(quantizer.quantize(coarseness, kept)) / room)
-
-            wanted.append(_solve(excess, state.coarseness or USUAL_COARSENESS))
+            wanted.append(self._solve_size(state, quantizer, action))
         return min(max(*wanted, FINEST), COARSEST)
+
+    def _solve_size(self, state: FitState, quantizer: Quantizer, action: Action) -> float:
+        """The coarseness for the largest file: by the number of Gaussians that it holds, and for rounding by coding."""
+        room = _AIM * 1e6 * self.config.size_mb
+        if action.what == "drop":  # at first more than it holds
+            num = 8 * max(room - HEADER_BYTES, 0.0) / USUAL_BITS / math.sqrt(action.extent)
+            return quantizer.coarseness_for(num, action.extent)
+        streams = max(room - HEADER_BYTES, 64.0)
+        num_bytes = lambda coarseness: count_bytes(quantizer.quantize(coarseness)) - HEADER_BYTES  # noqa: E731
+        excess = lambda coarseness: math.log2(num_bytes(coarseness) / streams)  # noqa: E731
+        return _solve(excess, state.coarseness or USUAL_COARSENESS)
 
     def _solve_psnr(self, state: FitState, quantizer: Quantizer, action: Action) -> float:
         """The coarseness for the PSNR that is asked for, by some frames without what is dropped, or rounded."""
@@ -322,19 +329,16 @@ def _decode_rules(state: FitState) -> dict[str, Rule]:
 
 
 def _solve(excess: Callable[[float], float], guess: float) -> float:
-    """The coarseness at which a size, as a binary logarithm, is not exceeded, by secants within what is known."""
-    low, high, at = (FINEST, math.inf), (COARSEST, -math.inf), guess  # coarseness and excess
-    for _ in range(_TRIES):
+    """The coarseness at which a size, as a binary logarithm, is not exceeded: near the guess, then by bisection."""
+    low, high, at = FINEST, COARSEST, min(max(guess, FINEST), COARSEST)
+    for number in range(_TRIES):
         now = excess(at)
-        low, high = ((at, now), high) if now > 0 else (low, (at, now))
-        if -_TOLERANCE_LOG2 <= now <= 0:
+        low, high = (at, high) if now > 0 else (low, at)
+        if -_TOLERANCE_LOG2 <= now <= 0 or (now <= 0 and at == FINEST):
             return at
-        if math.isfinite(low[1]) and math.isfinite(high[1]):
-            fraction = low[1] / (low[1] - high[1])
-            at = low[0] + min(max(fraction, 0.1), 0.9) * (high[0] - low[0])
-        else:
-            at = min(max(at + now / _SLOPE_LOG2, FINEST), COARSEST)
-    return high[0]
+        nearby = at + now / _SLOPE_LOG2
+        at = min(max(nearby, low), high) if number == 0 else (low + high) / 2
+    return high
 
 
 def _bracket(holds: Callable[[int], bool], most: int) -> tuple[int, int]:
