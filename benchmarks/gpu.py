@@ -33,7 +33,8 @@ from foldgauss.io import read_video
 from foldgauss.io.datasets import sample_clip
 from foldgauss.render import RenderOptions, Splats2D, cpu, pallas, render, tiles, xla
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.loop import fit_steps, mean_psnr, to_model
+from foldgauss.video.fitting.loop import fit_steps
+from foldgauss.video.fitting.state import mean_psnr, to_model
 from foldgauss.video.models.video_model import VideoModel
 
 ENGINES = {"xla": xla.TILE_SIZE, "pallas": pallas.TILE_SIZE}  # with the sides of their tiles

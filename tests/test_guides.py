@@ -154,7 +154,7 @@ def _mixture(names, folder):
 
 
 def _quickstart(names, folder):
-    made = {"foldgauss-demo", "holiday.safetensors", "look.png", "slow.mp4", "short.safetensors"}
+    made = {"foldgauss-demo", "holiday.fgz", "look.png", "slow.mp4", "short.safetensors"}
     assert made <= {path.name for path in folder.iterdir()}
     assert names["picture"].shape == (*guides.SIZE, 3)
 
