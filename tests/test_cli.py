@@ -294,7 +294,7 @@ def test_frames_size_and_default_name(work, tmp_path, monkeypatch, capsys):
     assert run("fit", work / "clip.mp4", "--frames", "1:5", "--size", "24x32", *QUICK) == 0
     model = load_video_model(tmp_path / "clip.fgz")
     assert (model.num_frames, model.size) == (4, (24, 32))
-    assert read_metadata(tmp_path / "clip.fgz")["budget"] == {"steps": 30, "quality": 50}
+    assert read_metadata(tmp_path / "clip.fgz")["budget"] == {"steps": 30, "quality": 70.0}
     # The frames it was fitted to are remembered.
     capsys.readouterr()
     assert run("evaluate", "clip.fgz", work / "clip.mp4") == 0

@@ -23,7 +23,6 @@ class Stream(enum.IntEnum):
     TRACK = 12
     ROUNDING_ORDER = 13
     SENSITIVITY_PROBE = 14
-    FINE_TUNING_ORDER = 15
     SKETCH = 16
     COLOR_PROBE = 17
     REFIT = 18

@@ -18,7 +18,7 @@ from foldgauss.io._atomic import check_writable, resolve
 from foldgauss.io.models.compact import COMPACT_SUFFIX, check_compact_name, leave_room, save_compact
 from foldgauss.io.models.video_model import CLIP_NOTES, keep_origin, load_video_model, read_origin
 from foldgauss.jobs.runner import mean_scores, missed_psnr
-from foldgauss.video.fitting.compress import Compressed, compress
+from foldgauss.video.fitting.compress import ROUNDING_QUALITY, Compressed, compress
 from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig
 from foldgauss.video.fitting.loop import FitInfo
 from foldgauss.video.fitting.state import FitState
@@ -35,13 +35,17 @@ def compress_command(
     video: Annotated[
         Path | None,
         typer.Argument(
-            help="The clip it was fitted to. Without it, parameters are only rounded.",
+            help="The clip it was fitted to. Without it, nothing makes up for what is dropped and rounded.",
             autocompletion=complete_clips,
         ),
     ] = None,
     quality: Annotated[
         float | None,
-        typer.Option(help=f"Quality, from 0 to 100 [default: {DEFAULT_QUALITY:g}].", min=0.0, max=100.0),
+        typer.Option(
+            help=f"Quality, from 0 to 100 [default: {DEFAULT_QUALITY:g}; without VIDEO {ROUNDING_QUALITY:g}].",
+            min=0.0,
+            max=100.0,
+        ),
     ] = None,
     size_mb: Annotated[float | None, typer.Option("--size-mb", help="Largest file, in 10^6 bytes.")] = None,
     psnr: Annotated[float | None, typer.Option(help="The smallest file with this mean PSNR, in dB.")] = None,
@@ -74,7 +78,7 @@ def compress_command(
         raise wrong_use("MODEL", expected="a plain model", got="one with edits", cure=cure)
     clip = None if video is None else read_fitted_clip(model, model_path, video, frames)
     if clip is not None and is_other_clip(model_path, clip, lambda: evaluate(model, clip.frames).mean_psnr):
-        cure = "Give that clip, or none: parameters are only rounded then."
+        cure = "Give that clip, or none."
         got = f"{str(video)!r}, another clip"
         raise wrong_use("VIDEO", expected="the clip that the model was fitted to", got=got, cure=cure)
     about = keep_origin(about, *CLIP_NOTES, "frames_digest", "seed")

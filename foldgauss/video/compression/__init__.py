@@ -1,5 +1,5 @@
-"""Compression of a model to a small file, within a stated loss of PSNR.
+"""Compact models: integers and the way back, and what each Gaussian is worth.
 
-`search.compress` is the entry point. It quantizes the parameters (`quantize`) with steps chosen by `sensitivity`,
-reorders the Gaussians (`sort_order`) and fine-tunes the parameters that are not rounded yet (`finetune`).
+`quantize` maps a model to integers, `streams` encodes them (`range_coder`, `column_contexts`). `quantizer` chooses the
+steps by `sensitivity` and judges Gaussians; `sort_order` sorts them. `fitting.rate` uses all of it during a fit.
 """

@@ -10,7 +10,7 @@ import dataclasses
 import math
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int32, UInt8
+from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 
 from foldgauss._runtime.checks import invalid
 from foldgauss.video.compression.quantize import (
@@ -37,6 +37,11 @@ from foldgauss.video.selection.contributions import Contributions
 
 #: The bits whose price a Gaussian has to be worth: about as many as it takes in a file.
 BITS_PER_GAUSSIAN = 100.0
+#: The background of clips without alpha.
+BLACK = np.zeros(3, np.float32)
+#: The background by which Gaussians of clips with alpha are judged: one that no color equals, since they may be shown
+#: over any.
+BEYOND_BLACK = np.full(3, -0.5, np.float32)
 #: Least number of Gaussians from which steps are regressed on features.
 _FEW = 100
 _MIN_SENSITIVITY = 1e-4  # below, a Gaussian is not visible
@@ -54,9 +59,10 @@ def bit_price(coarseness: float) -> float:
 class Quantizer:
     """Quantizes a model by rules that are fixed but for the coarseness."""
 
-    def __init__(self, model: VideoModel):
+    def __init__(self, model: VideoModel, background: Float32[np.ndarray, "3"] = BLACK):
+        """`background` is what images are composited over: what equals it seems to be worth nothing."""
         self.exact = compute_columns(model)
-        sensitivity, best = estimate_sensitivities(Contributions(model), self.exact)
+        sensitivity, best = estimate_sensitivities(Contributions(model, background), self.exact)
         self._names = [name for name in column_names(self.exact.info.degree) if not is_integral(name)]
         self._seen = best > 0
         if not self._seen.any():

@@ -47,7 +47,7 @@ def compress(
     fit). `observers` are called after every step, as by `fit`. Gaussians are reordered. Shared paths remain, to about
     a fiftieth of a pixel.
 
-    Without the clip, parameters are only rounded, and there is no `psnr`, nor a budget.
+    Without the clip, nothing makes up for what is dropped and rounded, and there is no `psnr`, nor a budget.
 
     Raises ValueError for anything but a `VideoModel` (bake edits first), for NaN or infinities, several envelopes, a
     degree above 15, and frames that do not fit.
@@ -67,7 +67,8 @@ def compress(
         config = dataclasses.replace(config, quality=DEFAULT_QUALITY)
     budget = planned_steps(dataclasses.replace(config, minutes=None), len(frames))
     state = start_from(model, config, steps or math.ceil((1 - COMPRESSION_START) * budget), COMPRESSION_START)
-    for state, info in fit_steps(frames, dataclasses.replace(config, steps=None), state):  # noqa: B020
+    config = dataclasses.replace(config, steps=state.plan if steps else None)
+    for state, info in fit_steps(frames, config, state):  # noqa: B020
         for observe in observers:
             observe(state, info)
     made, quantized = finish(state, frames, config, model.fps)

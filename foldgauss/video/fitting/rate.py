@@ -3,14 +3,14 @@ r"""Rate: a fit whose result is a compact model, the least of squared error plus
 The objective is $D + \lambda R$: D the squared error in levels of 8 bits, summed over the clip, R the bits of the
 compact file. Two actions reduce it while the others adapt, at stated fractions of the plan (`ACTIONS`):
 
-* In the first half Gaussians are dropped whose removal adds less squared error than $\lambda$ times their bits, and the
-  others are sorted by cells of space and time, which saves bits.
-* From then on the parameters of ever more Gaussians are rounded and no longer trained: shapes first, then trajectories,
-  then colors. A step of rounding is as coarse as $\lambda$ makes it worth, see `compression.quantizer`.
+* Gaussians are dropped whose removal adds less squared error than $\lambda$ times their bits, and the others are sorted
+  by cells of space and time, which saves bits.
+* In the last part the parameters of ever more Gaussians are rounded and no longer trained: shapes first, then
+  trajectories, then colors. A step of rounding is as coarse as $\lambda$ makes it worth, see `compression.quantizer`.
 
-`FitConfig.quality` states $\lambda$. A largest file and a least PSNR determine it during the fit, by the sizes that the
-coder finds for the Gaussians at hand, and by the PSNR so far. Source for the steps: the theory of
-rate and distortion at high resolution (Gish and Pierce 1968); for the order: `docs/compress.md`.
+`FitConfig.quality` states $\lambda$. A largest file and a least PSNR determine it during the fit, by the number of
+Gaussians that the file holds, the sizes that the coder finds, and the PSNR of some frames. Source for the steps: the
+theory of rate and distortion at high resolution (Gish and Pierce 1968); for the order: `docs/compress.md`.
 """
 
 import dataclasses
@@ -33,6 +33,7 @@ from foldgauss.video.compression.quantize import (
     quantize,
 )
 from foldgauss.video.compression.quantizer import (
+    BEYOND_BLACK,
     BITS_PER_GAUSSIAN,
     Quantizer,
     bit_price,
@@ -131,6 +132,7 @@ class RateControl:
 
     def __init__(self, frames: np.ndarray, config: FitConfig):
         self.frames, self.config, self.longest = frames, config, 0.0
+        self.background = BEYOND_BLACK if frames.shape[-1] == 4 else np.float32(BLACK)
         self.sampled = np.unique(np.linspace(0, len(frames) - 1, _SAMPLED_FRAMES).round().astype(int))
 
     def check_size(self, state: FitState) -> None:
@@ -169,7 +171,7 @@ class RateControl:
 
     def round_only(self, state: FitState) -> None:
         """Drop what is not worth its bits, and sort where that hardly changes the images, without any training."""
-        quantizer = Quantizer(self._model(state))
+        quantizer = Quantizer(self._model(state), self.background)
         coarseness = self._choose_coarseness(state, quantizer, Action(1.0, "drop"))
         model, fraction = self._model(state), 1.0
         # Each is judged as if the others stayed, and nothing makes up for what is missing: fewer, where it costs more.
@@ -177,7 +179,11 @@ class RateControl:
             kept = quantizer.are_worth(coarseness, fraction)
             fewer = dataclasses.replace(model, splats=model.splats.take(kept))
             added = 10 ** (-0.1 * self._psnr(fewer, np.arange(len(self.frames)))) * 255**2 * self.frames[..., :3].size
-            if added <= (~kept).sum() * BITS_PER_GAUSSIAN * bit_price(coarseness) or fraction < _LEAST_FRACTION:
+            if (
+                kept.all()
+                or added <= (~kept).sum() * BITS_PER_GAUSSIAN * bit_price(coarseness)
+                or fraction < _LEAST_FRACTION
+            ):
                 break
             fraction /= 2
         state.keep(np.flatnonzero(kept))
@@ -195,7 +201,7 @@ class RateControl:
         whole = quantize(exact, classes, rules)
         if self.config.size_mb is None and self.config.psnr is None:
             return whole
-        worst_first = np.argsort(Quantizer(dequantize(whole)).removal, kind="stable")
+        worst_first = np.argsort(Quantizer(dequantize(whole), self.background).removal, kind="stable")
 
         def without(num: int) -> Quantized:
             kept = np.ones(len(worst_first), bool)
@@ -215,7 +221,7 @@ class RateControl:
         return to_model(state, self.config, self.frames.shape[1:3], fps)
 
     def _drop(self, state: FitState, action: Action) -> None:
-        quantizer = Quantizer(self._model(state))
+        quantizer = Quantizer(self._model(state), self.background)
         coarseness = self._choose_coarseness(state, quantizer, action)
         state.coarseness = state.coarseness if state.rules else coarseness
         kept = quantizer.are_worth(coarseness, action.extent)
@@ -240,7 +246,7 @@ class RateControl:
         state.rows, state.first, state.second, state.rounded = rows, first, second, rounded
 
     def _choose_rules(self, state: FitState, action: Action) -> None:
-        quantizer = Quantizer(self._model(state))
+        quantizer = Quantizer(self._model(state), self.background)
         state.coarseness = self._choose_coarseness(state, quantizer, action)
         rules = quantizer.make_rules(state.coarseness)
         state.rules = tuple((name, rule.origin, rule.exponent, rule.slopes) for name, rule in rules.items())

@@ -27,12 +27,14 @@ _BLACK = np.zeros(3, np.float32)
 class Contributions:
     """A model prepared to compute, at any time and at its own size, what each Gaussian adds to the image.
 
+    `background`, (3,), is what traces are composited over.
+
     **Raises:** ValueError for anything but a `VideoModel`, for NaN or infinities, and for several envelopes.
     """
 
-    def __init__(self, model: VideoModel):
+    def __init__(self, model: VideoModel, background: Float32[np.ndarray, "3"] = _BLACK):
         check_model(model)
-        self.model, self.size = model, model.size
+        self.model, self.size, self.background = model, model.size, background
         self.prepared = PreparedModel(model, model.size)
         self.times = np.asarray(model.frame_times.times())
 
@@ -90,11 +92,11 @@ class FrameContributions:
 
     @functools.cached_property
     def trace(self) -> cpu.Trace:
-        return self._forward(self.splats.color)
+        return self._forward(self.splats.color, self.source.background)
 
     @property
     def image(self) -> Float32[np.ndarray, "3 height width"]:
-        """The rendered image over black."""
+        """The rendered image over the background."""
         return self.trace.image
 
     @functools.cached_property
@@ -104,15 +106,15 @@ class FrameContributions:
 
     def render(self, values: Float[np.ndarray, "num_alive channels"]) -> Float32[np.ndarray, "channels height width"]:
         """A v: the image of up to three values per Gaussian in place of its color."""
-        return self._forward(_pad_to_three(values, 1)).image[: values.shape[1]]
+        return self._forward(_pad_to_three(values, 1), _BLACK).image[: values.shape[1]]
 
     def gather(self, images: Float[np.ndarray, "channels height width"]) -> Float32[np.ndarray, "num_alive channels"]:
         """A^T y: up to three images times the weights, summed over pixels."""
         return cpu.backward(self.trace, _pad_to_three(images, 0))[3][:, : len(images)]
 
-    def _forward(self, color: Float32[np.ndarray, "num_alive 3"]) -> cpu.Trace:
+    def _forward(self, color: Float32[np.ndarray, "num_alive 3"], background: Float32[np.ndarray, "3"]) -> cpu.Trace:
         splats, model = self.splats, self.source.model
-        leaves = splats.mean, splats.factor, splats.opacity, color, _BLACK
+        leaves = splats.mean, splats.factor, splats.opacity, color, background
         return cpu.forward(*leaves, self.source.size, compositing=model.compositing, options=model.options)
 
 
