@@ -183,7 +183,7 @@ def plan_long_fit(
     """Index a clip and plan its segments, or continue the plan that exists, unless `restart`.
 
     Segments end at scene cuts near their length, `segment_seconds`; otherwise they share `overlap` frames with the
-    next. `config` is that of each segment; its `size_mb` is divided among them in proportion to their frames. `clip`,
+    next. Each segment has the settings `config`, and a part of `size_mb` in proportion to its frames. `clip`,
     `size`, `frames` and the options of `reading` as in `read_video`. Memory grows with the clip by some tens of bytes
     per frame only.
 

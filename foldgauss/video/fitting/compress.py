@@ -42,7 +42,7 @@ def compress(
     """Make a model compact: drop Gaussians that are not worth their bits, and round the parameters of the others.
 
     `frames`: the clip, uint8 (num_frames, *model.size, 3), or with alpha (..., 4), to which the model is fitted further
-    meanwhile. `quality`, `size_mb` and `psnr` are those of `FitConfig`; without any, the quality is `DEFAULT_QUALITY`,
+    meanwhile. `FitConfig` explains `quality`, `size_mb` and `psnr`. Without any, the quality is `DEFAULT_QUALITY`,
     or `ROUNDING_QUALITY` without the clip. `steps` and `minutes` are budgets (default: two thirds of the steps of a
     fit). `observers` are called after every step, as by `fit`. Gaussians are reordered. Shared paths remain, to about
     a fiftieth of a pixel.

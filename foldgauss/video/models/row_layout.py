@@ -16,9 +16,13 @@ from foldgauss.video.models.splats import FoldedSplats
 
 #: Beyond this degree, float32 cannot tell the powers of u and their gradients apart; compact files hold no more either.
 MAX_DEGREE = 15
-#: Leaves of `FoldedSplats` that compact models round together, and the bit of each such group.
+#: Leaves of `FoldedSplats` that compact models round together, and first.
 SHAPE = ("log_scale", "angle_logit", "time_loc_logit", "log_time_scale", "opacity_logit")
-TRAJECTORY, COLOR = ("loc", "coefficients"), ("color_dc",)
+#: They are rounded after the shapes, since the span of time of a trajectory follows from the duration.
+TRAJECTORY = ("loc", "coefficients")
+#: They are rounded last: colors make up for errors of all others.
+COLOR = ("color_dc",)
+#: The bit of each of these groups.
 GROUPS = {SHAPE: 1, TRAJECTORY: 2, COLOR: 4}
 #: Fields of `FoldedSplats` that are not in `columns`.
 _OTHERS = ("envelope", "path_index", "paths")
