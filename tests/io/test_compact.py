@@ -537,9 +537,13 @@ def test_extremes_of_values(leaf, value):
     changed = np.asarray(getattr(model.splats, leaf)).copy()
     changed[5] = value
     model = eqx.tree_at(lambda m: getattr(m.splats, leaf), model, changed)
-    for made in (compress(model, quality=90), compress(model, clip_of(model), quality=90, steps=20)):
+    clip = clip_of(model)
+    before = evaluate(model, clip).mean_psnr
+    for made, most in ((compress(model, quality=90), 0.05), (compress(model, clip, quality=90, steps=200), 0.3)):
         assert all(np.isfinite(one).all() for one in jax.tree.leaves(made.model))
-        assert evaluate(made.model, clip_of(model)).mean_psnr > evaluate(model, clip_of(model)).mean_psnr - 3
+        # Training sees a color of 1000 as it is, pictures clip it: what is around it is fitted anew.
+        if not (leaf == "color_dc" and most == 0.3):
+            assert evaluate(made.model, clip).mean_psnr > before - most
 
 
 def test_nan_and_infinities_are_rejected():

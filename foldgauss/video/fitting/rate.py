@@ -85,7 +85,7 @@ USUAL_COARSENESS = 6.0
 _LEAST_KEPT = 0.45
 #: Squared error that sorting may add, as a fraction of the model's own, which many passes compensate for.
 _ORDERING = 1.0
-#: Passes over the frames to come with which it may add as much; fewer compensate for less.
+#: Passes over the frames to come that count as many; fewer compensate for less of what an action costs.
 _PASSES = 40.0
 #: The least fraction of the price of a bit at which Gaussians are dropped where nothing makes up for them.
 _LEAST_FRACTION = 1e-4
@@ -155,9 +155,8 @@ class RateControl:
             if action.what == "drop":
                 self._drop(state, action)
             elif action.what == "sort":
-                passes = (state.plan - state.step) * self.config.batch_size / len(self.frames)
                 error = float(state.frame_errors.mean()) * self.frames[..., :3].size
-                state.keep(find_order(self._model(state), _ORDERING * min(passes / _PASSES, 1.0) * error))
+                state.keep(find_order(self._model(state), _ORDERING * self._adaptation(state) * error))
             else:
                 self._round(state, action)
             state.rate_actions += 1
@@ -216,6 +215,11 @@ class RateControl:
         if self.config.size_mb is not None and count_bytes(without(dropped)) > 1e6 * self.config.size_mb:
             dropped = min(_bracket(lambda num: count_bytes(without(num)) > 1e6 * self.config.size_mb, most)[1], most)
         return without(dropped) if dropped else whole
+
+    def _adaptation(self, state: FitState) -> float:
+        """How much of what an action costs the rest of the fit makes up for, compared with many passes, 0 to 1."""
+        passes = (state.plan - state.step) * self.config.batch_size / len(self.frames)
+        return min(passes / _PASSES, 1.0)
 
     def _model(self, state: FitState, fps: float = 25.0) -> VideoModel:
         return to_model(state, self.config, self.frames.shape[1:3], fps)
@@ -276,7 +280,8 @@ class RateControl:
 
     def _solve_psnr(self, state: FitState, quantizer: Quantizer, action: Action) -> float:
         """The coarseness for the PSNR that is asked for, by some frames without what is dropped, or rounded."""
-        aim, now = self.config.psnr + _MARGIN_DB, running_psnr(state)
+        aim, now, adaptation = self.config.psnr + _MARGIN_DB, running_psnr(state), self._adaptation(state)
+        action = action._replace(gain=adaptation * action.gain, regain=adaptation * action.regain)
         if action.what == "drop":
             ahead = now + action.gain - aim
             most = quantizer.coarseness_for(
