@@ -200,7 +200,7 @@ def _uncertainty(names, folder):
 
 
 def _compress(names, folder):
-    assert names["made"].model.num_gaussians == names["made"].quantized.info.num_gaussians
+    assert names["made"].model.num_gaussians == names["made"].quantized.num_gaussians
     sizes = {path.name: path.stat().st_size for path in folder.iterdir()}
     assert sizes["holiday.fgz"] < sizes["holiday.safetensors"]
 

@@ -35,7 +35,7 @@ from foldgauss.video.compression.quantize import (
     trajectory_span,
 )
 from foldgauss.video.compression.quantized_times import TIME_BITS
-from foldgauss.video.compression.quantizer import find_order
+from foldgauss.video.compression.chunks import arrange
 from foldgauss.video.compression.sensitivity import estimate_sensitivities
 from foldgauss.video.models.metrics import evaluate
 from foldgauss.video.models.renderer import VideoRenderer
@@ -365,7 +365,7 @@ def test_a_clip_makes_better_models(how):
 def test_the_order_found_shortens_the_column_of_cells():
     """Nine in ten steps go on in a sweep; in the model's own order half of them go back."""
     model = crowd(soft_model(degree=3, options=RenderOptions()))
-    order = find_order(model, np.inf)
+    order, _ = arrange(model, np.inf, layered=False)
     assert sorted(order) == list(range(model.num_gaussians))
     sweep = only(model, order)
     back = [(np.diff(fine(one).columns["cell"]) < 0).mean() for one in (model, sweep)]

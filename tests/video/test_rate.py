@@ -123,7 +123,7 @@ def test_what_is_rounded_stays_when_rounded_again(states):
 def test_the_last_rounding_changes_only_what_was_not_rounded(states):
     state = states[CONFIG.steps]
     made, quantized = finish(state, FRAMES, CONFIG, 25.0)
-    assert quantized.info.num_gaussians == state.num_gaussians  # by quality, nothing is dropped in the end
+    assert quantized.num_gaussians == state.num_gaussians  # by quality, nothing is dropped in the end
     for group, bit in GROUPS.items():
         marked = (state.rounded & bit) > 0
         for name in group:
@@ -472,7 +472,7 @@ def test_the_state_given_is_the_one_that_is_made_compact(fitted):
     for state, _ in fit_steps(FRAMES, config, state):  # noqa: B020
         pass
     assert state.num_gaussians == fitted.num_gaussians
-    assert finish(state, FRAMES, config, 25.0)[1].info.num_gaussians == fitted.num_gaussians
+    assert finish(state, FRAMES, config, 25.0)[1].num_gaussians == fitted.num_gaussians
 
 
 def test_a_backdrop_is_behind_all_others():

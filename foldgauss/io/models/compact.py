@@ -1,16 +1,19 @@
 """Compact model files, .fgz: quantized, entropy-coded, checked, and decoded to the same bits everywhere.
 
-The layout is in docs/format.md. Files are not trusted: a checksum detects damage, counts are checked
-against the size of the file, and invalid content raises only `ModelFileError`.
+The layout is in docs/format.md. Files are not trusted: checksums detect damage, counts are checked
+against the size of the file, and invalid content raises only `ModelFileError`. A chunk that is damaged or has not
+arrived is left out, with a warning.
 """
 
 import dataclasses
 import io
 import json
+import math
 import os
+import warnings
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import jax
 import numpy as np
@@ -27,20 +30,29 @@ from foldgauss.io.models.model_file import (
 )
 from foldgauss.render import COMPOSITINGS, RenderOptions
 from foldgauss.video.compression import range_coder
+from foldgauss.video.compression.chunks import visible_spans
 from foldgauss.video.compression.column_contexts import ColumnContexts
 from foldgauss.video.compression.quantize import (
     FEATURES,
     LARGEST,
     MAX_CELL_BITS,
+    Chunk,
     CompactInfo,
     Quantized,
     Rule,
+    decode_values,
     dequantize,
     is_integral,
 )
 from foldgauss.video.compression.quantized_paths import MAX_PATH_BITS, PathsInfo
 from foldgauss.video.compression.quantized_times import MAX_TIME_BITS
-from foldgauss.video.compression.streams import PATH_STREAMS, describe_maps, encode_streams, last_cell, path_identities
+from foldgauss.video.compression.streams import (
+    describe_maps,
+    encode_chunk,
+    encode_motion,
+    last_cell,
+    path_identities,
+)
 from foldgauss.video.models.row_layout import MAX_DEGREE
 from foldgauss.video.models.shared_paths import MAX_PATHS
 from foldgauss.video.models.video_model import VideoModel
@@ -48,10 +60,11 @@ from foldgauss.video.models.video_model import VideoModel
 COMPACT_SUFFIX = ".fgz"
 #: As in PNG: a byte that is not ASCII, line ends of both kinds, which a transfer as text would change, an end of file.
 MAGIC = b"\x8bFGZ\r\n\x1a\n"
-VERSION = 5
-#: Magic, version, length of the header, checksum of all that follows.
+VERSION = 6
+#: Magic, version, length of the header, checksum of the header.
 _FIXED = len(MAGIC) + 12
-#: Limit of numbers per byte, so that a small file cannot claim much memory; files are padded with spaces. Clips need 1.
+#: Limit of numbers per byte of a block and the header, so that a small file cannot claim much memory; headers are
+#: padded with spaces. Clips need 1.
 _MOST_PER_BYTE = 32
 #: Bytes of metadata that sizes of files are planned for, see `video.fitting.rate.HEADER_BYTES`.
 _METADATA_BYTES = 1000
@@ -85,28 +98,39 @@ def check_compact_name(path: Path, parameter: str = "path") -> None:
 
 def pack_compact(quantized: Quantized, metadata: dict | None = None) -> bytes:
     """The bytes of the file."""
-    info, streams, descriptions = quantized.info, encode_streams(quantized), []
-    for name in info.column_names:
+    info, names = quantized.info, quantized.info.column_names
+    header = dataclasses.asdict(info) | {"num_frames": len(quantized.intervals) + 1, "rules": []}
+    for name in names:
         rule = quantized.rules.get(name)
-        own = [] if is_integral(name) else [rule.origin, rule.exponent, *rule.slopes]
-        descriptions.append([len(streams[name]), *own])
-    header = dataclasses.asdict(info) | {
-        "num_frames": len(quantized.intervals) + 1,
-        "columns": descriptions,
-        "intervals": len(streams["intervals"]),
-        "metadata": to_json_types(metadata or {}),
-    }
-    num_values = info.num_gaussians * len(descriptions) + header["num_frames"] + _count_path_numbers(info)
+        header["rules"].append([] if is_integral(name) else [rule.origin, rule.exponent, *rule.slopes])
     if info.paths is None:
         del header["paths"]
-    else:
-        header["paths"] |= {name: len(streams[name]) for name in PATH_STREAMS}
-    text = to_json("header", header).encode()
-    data = b"".join(streams.values())
-    text += b" " * (-(-num_values // _MOST_PER_BYTE) - len(text) - len(data))
-    body = text + data
-    numbers = (VERSION, len(text), zlib.crc32(body))
-    return MAGIC + b"".join(number.to_bytes(4, "little") for number in numbers) + body
+    motion, parts, counts = encode_motion(quantized), [], [header["num_frames"] + _count_path_numbers(info)]
+    header["motion"] = _describe_streams(motion)
+    header["chunks"] = []
+    for chunk in quantized.chunks:
+        streams = encode_chunk(chunk, quantized.rules, info)
+        own = {"num_gaussians": chunk.num, "cells": chunk.cells, "visible": _find_visible_span(quantized, chunk)}
+        header["chunks"].append(own | _describe_streams(streams))
+        parts.append(b"".join(streams))
+        counts.append(chunk.num * len(names))
+    header["metadata"] = to_json_types(metadata or {})
+    text, blocks = to_json("header", header).encode(), [b"".join(motion), *parts]
+    missing = [-(-count // _MOST_PER_BYTE) - len(block) for count, block in zip(counts, blocks, strict=True)]
+    text += b" " * (max(missing) - len(text))
+    numbers = (VERSION, len(text), zlib.crc32(text))
+    return MAGIC + b"".join(number.to_bytes(4, "little") for number in numbers) + text + b"".join(blocks)
+
+
+def _describe_streams(streams: list[bytes]) -> dict[str, Any]:
+    return {"streams": [len(stream) for stream in streams], "crc": zlib.crc32(b"".join(streams))}
+
+
+def _find_visible_span(quantized: Quantized, chunk: Chunk) -> list[float]:
+    """Times, in [0, 1], before and after which nothing of a chunk is visible."""
+    values = decode_values(dataclasses.replace(quantized, chunks=(chunk,)))
+    first, last = visible_spans(values["time"], values["duration"])
+    return [math.floor(1e4 * first.min()) / 1e4, math.ceil(1e4 * last.max()) / 1e4]
 
 
 def _count_path_numbers(info: CompactInfo) -> int:
@@ -128,19 +152,27 @@ def is_compact(path: PathLike) -> bool:
         return False
 
 
-def load_compact(path: PathLike) -> Quantized:
+def load_compact(path: PathLike, *, visible: tuple[float, float] = (0.0, 1.0)) -> Quantized:
     """The quantized model in a compact file, for `foldgauss.video.compression.quantize.dequantize`.
 
-    Raises `ModelFileError` for a file that is damaged, cut off, of a later version or of another kind.
+    `visible`: the first and the last time that the model is needed for, in [0, 1]; chunks of which nothing is visible
+    then are not read, and their Gaussians are missing.
+
+    A chunk that is damaged or cut off is left out, with a warning. Raises `ModelFileError` for a file of which no chunk
+    can be read, of another version or of another kind, ValueError for other times.
     """
     path = check_path(path)
-    data = path.read_bytes()
-    header, body = _read_header(path, data)
-    try:
-        return _decode(header, body, len(data))
-    except HEADER_ERRORS as error:
-        got = f"one that does not fit together ({type(error).__name__}: {one_line(error)})"
-        raise _unreadable(path, got) from error
+    if not (len(visible) == 2 and all(is_within(t, "[0, 1]") for t in visible) and visible[0] <= visible[1]):
+        raise invalid("visible", expected="the first and the last time, in [0, 1]", got=visible)
+    with open(path, "rb") as file:
+        header = _read_header(path, file)
+        try:
+            return _decode(path, header, file, visible)
+        except HEADER_ERRORS as error:
+            if isinstance(error, ModelFileError):
+                raise
+            got = f"one that does not fit together ({type(error).__name__}: {one_line(error)})"
+            raise _unreadable(path, got) from error
 
 
 def load_compact_model(path: Path) -> VideoModel:
@@ -154,11 +186,13 @@ def load_compact_model(path: Path) -> VideoModel:
 
 def compact_metadata(path: Path) -> dict:
     """The `metadata` that `save_compact` stored. Raises as `load_compact`."""
-    return _read_header(path, path.read_bytes())[0]["metadata"]
+    with open(path, "rb") as file:
+        return _read_header(path, file)["metadata"]
 
 
-def _read_header(path: Path, data: bytes) -> tuple[dict, bytes]:
-    """The header and the bytes after it, once the checksum is verified."""
+def _read_header(path: Path, file: BinaryIO) -> dict:
+    """The header, once its checksum is verified; `file` is then at the first stream."""
+    data = file.read(_FIXED)
     if not data.startswith(MAGIC):
         got = "one that a transfer as text has changed" if data.startswith(MAGIC[:4]) else "a file of another kind"
         raise _unreadable(path, got)
@@ -169,50 +203,86 @@ def _read_header(path: Path, data: bytes) -> tuple[dict, bytes]:
         expected = f"a compact model of version {VERSION}, which this program reads"
         cure = "Compress the model again." if version < VERSION else "Update foldgauss."
         raise model_file_error("path", expected=expected, got=f"version {version} in {str(path)!r}", cure=cure)
-    body = data[_FIXED:]
-    if length > len(body) or zlib.crc32(body) != checksum:
-        raise _unreadable(path, "one that is cut off or damaged (its checksum is another)")
+    text = file.read(length)
+    if length > len(text) or zlib.crc32(text) != checksum:
+        raise _unreadable(path, "one that is cut off or damaged (the checksum of its header is another)")
     try:
-        header = json.loads(body[:length], parse_constant=_reject_constant)
+        header = json.loads(text, parse_constant=_reject_constant)
         if not isinstance(header, dict) or not isinstance(header["metadata"], dict):
             raise ValueError("it is not an object")
     except (ValueError, KeyError, RecursionError) as error:
         raise _unreadable(path, "one whose header is not JSON of a model") from error
-    return header, body[length:]
+    return header | {"header_bytes": length}
 
 
 def _reject_constant(name: str) -> None:
     raise ValueError(f"{name} is not valid JSON")
 
 
-def _decode(header: dict, body: bytes, whole_length: int) -> Quantized:
-    info = _parse_info(header)
-    num, num_frames = info.num_gaussians, header["num_frames"]
+def _decode(path: Path, header: dict, file: BinaryIO, visible: tuple[float, float]) -> Quantized:
+    info, num_frames = _parse_info(header), header["num_frames"]
     _check(is_integer(num_frames, 1), "num_frames", num_frames)
-    names = info.column_names
-    num_values = num * len(names) + num_frames + _count_path_numbers(info)
-    _check(num_values <= _MOST_PER_BYTE * whole_length, "num_gaussians", num)
-    descriptions = header["columns"]
-    _check(isinstance(descriptions, list) and len(descriptions) == len(names), "columns", "others")
-    of_paths = [header["paths"][name] for name in ("knots", "maps")] if info.paths else [0, 0]
-    lengths = [own[0] for own in descriptions] + [header["intervals"]]
-    right = all(is_integer(own, 1) for own in lengths) and all(is_integer(own, 0) for own in of_paths)
-    _check(right and sum(lengths + of_paths) == len(body), "bytes", "others")
-    described = dict(zip(names, (own[1:] for own in descriptions), strict=True))
+    num_values = num_frames + _count_path_numbers(info)
+    motion = _read_streams(file, header["motion"], 1 if info.paths is None else 3, num_values, header["header_bytes"])
+    if motion is None:
+        raise _unreadable(path, "one whose frame times are cut off or damaged")
+    intervals = range_coder.decode(motion[0], range_coder.Column.without_contexts(num_frames - 1))
+    paths = {} if info.paths is None else _decode_paths(info.paths, *motion[1:])
+    described = header["rules"]
+    _check(isinstance(described, list) and len(described) == len(info.column_names), "rules", "others")
+    described = dict(zip(info.column_names, described, strict=True))
     rules = {name: _parse_rule(name, numbers) for name, numbers in described.items() if not is_integral(name)}
-    _check(not any(described[name] for name in names if is_integral(name)), "rule", "none")
-    contexts, streams = ColumnContexts(rules, info), io.BytesIO(body)
+    _check(not any(described[name] for name in described if is_integral(name)), "rule", "some")
+    chunks, missing = [], []
+    _check(isinstance(header["chunks"], list) and header["chunks"], "chunks", "none")
+    for number, own in enumerate(header["chunks"]):
+        num, (first, last) = own["num_gaussians"], own["visible"]
+        _check(is_integer(num, 1), "num_gaussians", num)
+        if first > visible[1] or last < visible[0]:
+            file.seek(sum(own["streams"]), os.SEEK_CUR)
+            continue
+        num_values = num * len(described)
+        streams = _read_streams(file, own, len(described), num_values, header["header_bytes"])
+        if streams is None:
+            missing.append(number)
+        else:
+            chunks.append(_decode_chunk(streams, rules, info, _parse_cells(own["cells"], num), num))
+    if missing:
+        lost, total = (sum(header["chunks"][k]["num_gaussians"] for k in some) for some in (missing, range(number + 1)))
+        text = f"{len(missing)} of its {number + 1} chunks are cut off or damaged"
+        if not chunks:
+            raise _unreadable(path, f"one that has none left: {text}")
+        text = f"{str(path)!r}: {text}; {lost:,} of {total:,} Gaussians are missing. Copy it again."
+        warnings.warn(text, stacklevel=3)
+    _check(chunks, "visible", visible)
+    return Quantized(info, rules, tuple(chunks), intervals, **paths)
+
+
+def _read_streams(file: BinaryIO, own: dict, num: int, num_values: int, header_bytes: int) -> list[bytes] | None:
+    """The streams of a block, which are next in the file; None where they are cut off or damaged."""
+    lengths = own["streams"]
+    right = isinstance(lengths, list) and len(lengths) == num and all(is_integer(one, 0) for one in lengths)
+    _check(right and num_values <= _MOST_PER_BYTE * (sum(lengths) + header_bytes), "streams", "others")
+    data = file.read(sum(lengths))
+    if len(data) < sum(lengths) or zlib.crc32(data) != own["crc"]:
+        return None
+    streams = io.BytesIO(data)
+    return [streams.read(length) for length in lengths]
+
+
+def _decode_chunk(
+    streams: list[bytes], rules: dict[str, Rule], info: CompactInfo, cells: tuple[int, int, int], num: int
+) -> Chunk:
+    contexts = ColumnContexts(rules, info, cells, num)
     most = {"degree": info.degree, "path": info.paths.num_paths if info.paths else 0}  # used as indices
-    for name, length in zip(names, lengths[:-1], strict=True):
-        numbers = range_coder.decode(streams.read(length), contexts.describe_next(name))
+    for name, stream in zip(info.column_names, streams, strict=True):
+        numbers = range_coder.decode(stream, contexts.describe_next(name))
         if name == "cell":
-            numbers = (np.cumsum(numbers, dtype=np.int64) & last_cell(info)).astype(np.int32)
+            numbers = (np.cumsum(numbers, dtype=np.int64) & last_cell(cells)).astype(np.int32)
         if name in most:
             _check(numbers.min() >= 0 and numbers.max() <= most[name], name, "numbers out of range")
         contexts.add(name, numbers)
-    intervals = range_coder.decode(streams.read(lengths[-1]), range_coder.Column.without_contexts(num_frames - 1))
-    paths = _decode_paths(info.paths, *map(streams.read, of_paths)) if info.paths else {}
-    return Quantized(info, rules, contexts.columns, intervals, **paths)
+    return Chunk(cells, contexts.columns)
 
 
 def _decode_paths(about: PathsInfo, knots: bytes, maps: bytes) -> dict[str, np.ndarray]:
@@ -231,13 +301,10 @@ def _decode_paths(about: PathsInfo, knots: bytes, maps: bytes) -> dict[str, np.n
 
 
 def _parse_info(header: dict) -> CompactInfo:
-    size, degree, cells, num = (header[key] for key in ("size", "degree", "cells", "num_gaussians"))
+    size, degree = header["size"], header["degree"]
     _check(isinstance(size, list) and len(size) == 2, "size", size)
     _check(all(is_integer(side, 1) and side <= _SIDE for side in size), "size", size)
-    _check(is_integer(num, 1), "num_gaussians", num)
     _check(is_integer(degree, 0) and degree <= MAX_DEGREE, "degree", degree)
-    _check(isinstance(cells, list) and len(cells) == 3 and all(is_integer(n, 0) for n in cells), "cells", cells)
-    _check(sum(cells) <= MAX_CELL_BITS and 1 << max(sum(cells), 2 * max(cells[:2])) <= num, "cells", cells)
     bounds = {"power": "[0, 1e30]", "floor": "[0, 1)", "reach": "(0, 100]", "fps": "(0, 1e9]", "scale_cutoff": "[0, 1]"}
     for name, interval in bounds.items():
         _check(is_within(header[name], interval), name, header[name])
@@ -245,9 +312,15 @@ def _parse_info(header: dict) -> CompactInfo:
     time_bits = header["time_bits"]
     _check(is_integer(time_bits, 0) and time_bits <= MAX_TIME_BITS, "time_bits", time_bits)
     known = {field.name: header[field.name] for field in dataclasses.fields(CompactInfo) if field.name != "paths"}
-    made = {"size": tuple(size), "cells": tuple(cells), "options": RenderOptions(**header["options"])}
+    made = {"size": tuple(size), "options": RenderOptions(**header["options"])}
     made["paths"] = _parse_paths(header["paths"], header["num_frames"]) if "paths" in header else None
     return CompactInfo(**known | made)
+
+
+def _parse_cells(cells: list, num: int) -> tuple[int, int, int]:
+    _check(isinstance(cells, list) and len(cells) == 3 and all(is_integer(n, 0) for n in cells), "cells", cells)
+    _check(sum(cells) <= MAX_CELL_BITS and 1 << max(sum(cells), 2 * max(cells[:2])) <= num, "cells", cells)
+    return tuple(cells)
 
 
 def _parse_paths(own: dict, num_frames: int) -> PathsInfo:

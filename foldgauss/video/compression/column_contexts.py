@@ -25,28 +25,29 @@ _MAGNITUDE_BOUNDS = np.array([0.5, 1.5] + [3.0 * 2**k for k in range(13)])
 
 
 class ColumnContexts:
-    """The contexts of a file's columns in turn: `describe_next` gives a column's, then `add` takes its values.
+    """The contexts of a chunk's columns in turn: `describe_next` gives a column's, then `add` takes its values.
 
     `columns` has the values of those that were added.
     """
 
-    def __init__(self, rules: dict[str, Rule], info: CompactInfo):
-        self._info, self._decoder = info, ColumnDecoder(rules, info)
+    def __init__(self, rules: dict[str, Rule], info: CompactInfo, cells: tuple[int, int, int], num: int):
+        self._info, self._cells, self._num = info, cells, num
+        self._decoder = ColumnDecoder(rules, info, cells, num)
         self.columns: dict[str, np.ndarray] = {}
-        self._in_cell = self._nearest = np.zeros((info.num_gaussians, 0), np.int32)
-        self._half = np.ones(info.num_gaussians)
+        self._in_cell = self._nearest = np.zeros((num, 0), np.int32)
+        self._half = np.ones(num)
 
     def describe_next(self, name: str) -> Column:
         """What is known of the next column before its values."""
         decoder = self._decoder
         if name == "cell":
-            return Column.without_contexts(self._info.num_gaussians)
+            return Column.without_contexts(self._num)
         halves = decoder.half_exponents(name)
         steps = compute_steps(halves, name)
         known = {"origin": decoder.origin(name, steps), "step": steps}
         power = trajectory_power(name)
         near = self._nearest if power or name in ("angle", *COLORS) else self._in_cell
-        scale = np.ones(self._info.num_gaussians)
+        scale = np.ones(self._num)
         for _ in range(power):  # not a power, whose last bit libraries do not agree on
             scale = scale * self._half
         contexts = self._contexts(name, power, halves)
@@ -58,7 +59,7 @@ class ColumnContexts:
         self.columns[name] = numbers
         decoder.add(name, numbers, decoder.half_exponents(name))
         if name == "cell":
-            self._in_cell = find_latest_in_cell(numbers, 1 << sum(info.cells))
+            self._in_cell = find_latest_in_cell(numbers, 1 << sum(self._cells))
         if name == "y0":
             v = decoder.values
             middle, self._half = trajectory_span(clamp_unit(v["time"]), v["duration"], info.reach)
@@ -66,7 +67,7 @@ class ColumnContexts:
             if info.paths is not None:  # within the rectangle of the cells
                 (x, y), longer = info.paths.middle, max(info.paths.sides)
                 at = (at[0] - x) / longer, (at[1] - y) / longer, at[2] / longer
-            self._nearest = find_nearest(*at, max(info.cells[:2]) + 1)
+            self._nearest = find_nearest(*at, max(self._cells[:2]) + 1)
 
     def _contexts(self, name: str, power: int, halves: np.ndarray) -> UInt8[np.ndarray, "num 2"]:
         """The first and the second context of each value."""

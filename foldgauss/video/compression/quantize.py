@@ -117,13 +117,11 @@ def compute_steps(halves: Int32[np.ndarray, " num"], name: str = "") -> Float[np
 class CompactInfo:
     """Constants of the model, stored in the header.
 
-    `cells`: binary logarithms of the numbers of cells along x, y and time. `reach`: half-width of a trajectory's span
-    of time, in sigma_t. The step of the frame times' logits is 2^-`time_bits`.
+    `reach`: half-width of a trajectory's span of time, in sigma_t. The step of the frame times' logits is
+    2^-`time_bits`.
     """
 
-    num_gaussians: int
     degree: int
-    cells: tuple[int, int, int]
     power: float
     floor: float
     reach: float
@@ -145,28 +143,54 @@ class CompactInfo:
 
 
 @dataclasses.dataclass(frozen=True)
+class Chunk:
+    """Some of a model's Gaussians, which are decoded by themselves.
+
+    `cells`: binary logarithms of the numbers of cells along x, y and time.
+    """
+
+    cells: tuple[int, int, int]
+    columns: dict[str, Int32[np.ndarray, " num"]]
+
+    @property
+    def num(self) -> int:
+        return len(self.columns["class"])
+
+
+@dataclasses.dataclass(frozen=True)
 class Quantized:
     """A model as integers: equal integers are equal models, to the bit.
 
-    Of shared paths, `maps` and, unless they are at the frames, `knots`, the times of the maps.
+    `chunks` are in the order of the file: the Gaussians of each are in front of those of the chunks before. Of shared
+    paths, `maps` and, unless they are at the frames, `knots`, the times of the maps.
     """
 
     info: CompactInfo
     rules: dict[str, Rule]
-    columns: dict[str, Int32[np.ndarray, " num"]]
+    chunks: tuple[Chunk, ...]
     intervals: Int32[np.ndarray, " intervals"]
     maps: Int32[np.ndarray, "paths knots 2 3"] | None = None
     knots: Int32[np.ndarray, "paths knots"] | None = None
+
+    @property
+    def num_gaussians(self) -> int:
+        return sum(chunk.num for chunk in self.chunks)
+
+    @property
+    def columns(self) -> dict[str, Int32[np.ndarray, " num"]]:
+        """The integers of all Gaussians, in the order of the model."""
+        parts = [chunk.columns for chunk in reversed(self.chunks)]
+        return {name: np.concatenate([part[name] for part in parts]) for name in self.info.column_names}
 
 
 # ------------------------------------------------------------------------------------------ decoding
 
 
 class ColumnDecoder:
-    """Decodes columns one after another, in order: a column's steps may depend on the values before."""
+    """Decodes a chunk's columns one after another, in order: a column's steps may depend on the values before."""
 
-    def __init__(self, rules: dict[str, Rule], info: CompactInfo):
-        self._rules, self._info = rules, info
+    def __init__(self, rules: dict[str, Rule], info: CompactInfo, cells: tuple[int, int, int], num: int):
+        self._rules, self._info, self._cells, self._num = rules, info, cells, num
         self._features: list[np.ndarray] = []
         self.values: dict[str, np.ndarray] = {}
 
@@ -174,13 +198,13 @@ class ColumnDecoder:
         """Which Gaussians have a value in the next column; the others' integer is 0."""
         if power := trajectory_power(name):
             return self.values["degree"] >= power
-        return np.ones(self._info.num_gaussians, bool)
+        return np.ones(self._num, bool)
 
     def half_exponents(self, name: str) -> Int32[np.ndarray, " num"]:
         """2 log2 step of the next column."""
         if is_integral(name):
-            return np.zeros(self._info.num_gaussians, np.int32)
-        return self._rules[name].half_exponents(self._features, self._info.num_gaussians)
+            return np.zeros(self._num, np.int32)
+        return self._rules[name].half_exponents(self._features, self._num)
 
     def origin(self, name: str, steps: Float[np.ndarray, " num"]) -> Float[np.ndarray, " num"]:
         """Values of integer 0 in the next column: the cell's center, if cells divide that axis.
@@ -189,10 +213,10 @@ class ColumnDecoder:
         whichever cell they are in.
         """
         axis = {"x0": 0, "y0": 1, "time": 2}.get(name)
-        if axis is not None and self._info.cells[axis]:
-            center = cell_centers(self.values["cell"].astype(np.int64), self._info)[axis]
+        if axis is not None and self._cells[axis]:
+            center = cell_centers(self.values["cell"].astype(np.int64), self._info, self._cells)[axis]
             return np.floor(center / steps + 0.5) * steps
-        return np.full(self._info.num_gaussians, 0.0 if is_integral(name) else self._rules[name].origin)
+        return np.full(self._num, 0.0 if is_integral(name) else self._rules[name].origin)
 
     def add(self, name: str, numbers: Int32[np.ndarray, " num"], halves: Int32[np.ndarray, " num"]) -> None:
         steps = compute_steps(halves, name)
@@ -205,11 +229,14 @@ class ColumnDecoder:
 
 
 def decode_values(quantized: Quantized) -> dict[str, Float[np.ndarray, " num"]]:
-    """The values of all columns, for each Gaussian."""
-    info, decoder = quantized.info, ColumnDecoder(quantized.rules, quantized.info)
-    for name in info.column_names:
-        decoder.add(name, quantized.columns[name], decoder.half_exponents(name))
-    return decoder.values
+    """The values of all columns, for each Gaussian in the order of the model."""
+    info, parts = quantized.info, []
+    for chunk in reversed(quantized.chunks):
+        decoder = ColumnDecoder(quantized.rules, info, chunk.cells, chunk.num)
+        for name in info.column_names:
+            decoder.add(name, chunk.columns[name], decoder.half_exponents(name))
+        parts.append(decoder.values)
+    return {name: np.concatenate([part[name] for part in parts]) for name in info.column_names}
 
 
 # ------------------------------------------------------------------------------------------ cells
@@ -226,32 +253,38 @@ def _extents(info: CompactInfo) -> tuple[tuple[float, float], ...]:
 
 
 def locate_cells(
-    x: Float[np.ndarray, " num"], y: Float[np.ndarray, " num"], time: Float[np.ndarray, " num"], info: CompactInfo
+    x: Float[np.ndarray, " num"],
+    y: Float[np.ndarray, " num"],
+    time: Float[np.ndarray, " num"],
+    info: CompactInfo,
+    cells: tuple[int, int, int],
 ) -> Int32[np.ndarray, " num"]:
     """Indices of the cells of these positions or of the nearest ones: bits of x, y, time in turns, lowest first."""
     out, bit = np.zeros(len(x), np.int64), 0
     along = []
-    for value, (middle, side), bits in zip((x, y, time), _extents(info), info.cells, strict=True):
+    for value, (middle, side), bits in zip((x, y, time), _extents(info), cells, strict=True):
         index = np.floor(((value - middle) / side + 0.5) * 2**bits)
         along.append(np.clip(index, 0, 2**bits - 1).astype(np.int64))
-    for k in range(max(info.cells)):
-        for index, bits in zip(along, info.cells, strict=True):
+    for k in range(max(cells)):
+        for index, bits in zip(along, cells, strict=True):
             if k < bits:
                 out |= ((index >> k) & 1) << bit
                 bit += 1
     return out.astype(np.int32)
 
 
-def cell_centers(cell: Int[np.ndarray, " num"], info: CompactInfo) -> list[Float[np.ndarray, " num"]]:
+def cell_centers(
+    cell: Int[np.ndarray, " num"], info: CompactInfo, cells: tuple[int, int, int]
+) -> list[Float[np.ndarray, " num"]]:
     """The centers of cells along x, y and time."""
     along, bit = [np.zeros(len(cell), np.int64) for _ in range(3)], 0
-    for k in range(max(info.cells)):
-        for axis, bits in enumerate(info.cells):
+    for k in range(max(cells)):
+        for axis, bits in enumerate(cells):
             if k < bits:
                 along[axis] |= ((cell >> bit) & 1) << k
                 bit += 1
     out = []
-    for index, (middle, side), bits in zip(along, _extents(info), info.cells, strict=True):
+    for index, (middle, side), bits in zip(along, _extents(info), cells, strict=True):
         out.append(middle + ((index + 0.5) / 2**bits - 0.5) * side)
     return out
 
@@ -286,7 +319,7 @@ def dequantize(quantized: Quantized) -> VideoModel:
     )
     if info.paths is not None:
         knots, maps = decode_paths(info.paths, quantized.maps, quantized.knots, quantized.intervals * info.time_step)
-        index = quantized.columns["path"].astype(np.uint8)
+        index = v["path"].astype(np.uint8)
         splats = dataclasses.replace(splats, path_index=index, paths=SharedPaths(single(knots), single(maps)))
     times = FrameTimes(single(quantized.intervals * info.time_step))
     shared = (info.size, info.fps, info.options, info.compositing, info.scale_cutoff)
@@ -340,12 +373,12 @@ def _monomials(
     """Trajectories in powers of u = m_t - t: row 0 is m_s, row k is c_k."""
     degree, table = info.degree, legendre(info.degree)
     middle, half = trajectory_span(time, v["duration"], info.reach)
-    out = np.empty((info.num_gaussians, degree + 1, 2))
+    out = np.empty((len(time), degree + 1, 2))
     at, scale = (time - middle) / half, -1.0 / half
     for axis in range(2):
         powers = []  # of w = (t - middle) / half
         for j in range(degree + 1):
-            total = np.zeros(info.num_gaussians)
+            total = np.zeros(len(time))
             for k in range(j, degree + 1, 2):
                 total = total + table[k, j] * v[f"{'xy'[axis]}{k}"]
             powers.append(total)
@@ -353,7 +386,7 @@ def _monomials(
         for j in range(degree):
             for k in range(degree - 1, j - 1, -1):
                 powers[k] = powers[k] + at * powers[k + 1]
-        factor = np.ones(info.num_gaussians)
+        factor = np.ones(len(time))
         for k in range(degree + 1):
             out[:, k, axis] = powers[k] * factor
             factor = factor * scale
@@ -425,9 +458,7 @@ def _make_info(model: VideoModel) -> CompactInfo:
     power = float(power[0])
     reach = min(TAU_MAX, math.sqrt(12 / max(power, 0.1)))
     return CompactInfo(
-        num_gaussians=model.num_gaussians,
         degree=model.degree,
-        cells=choose_cell_bits(model.num_gaussians, model.size),
         power=power,
         floor=float(floor[0]),
         reach=reach,
@@ -454,7 +485,6 @@ def trajectory_matrix(
 ) -> Float[np.ndarray, "num degree+1 degree+1"]:
     """M with (m_s, c_1, ..) = M (trajectory's columns), by decoding unit vectors."""
     num, degree = len(time), info.degree
-    info = dataclasses.replace(info, num_gaussians=num)
     out = np.empty((num, degree + 1, degree + 1))
     for k in range(degree + 1):
         unit = {f"{axis}{j}": np.full(num, float(j == k)) for j in range(degree + 1) for axis in "xy"}
@@ -466,34 +496,64 @@ def quantize(
     exact: ExactColumns,
     classes: Int32[np.ndarray, " num"],
     rules: dict[str, Rule],
-    cells: Int32[np.ndarray, " num"] | None = None,
+    chunks: Int[np.ndarray, " num"] | None = None,
 ) -> Quantized:
     """Round every column by its rule; errors of earlier columns are corrected by later ones.
 
-    `cells`: the cells whose centers positions are relative to (default: those that they are in).
+    `chunks`: the number of each Gaussian's chunk, which does not increase from front to back (default: a single one).
     """
     info = exact.info
+    if chunks is None:
+        chunks = np.zeros(len(classes), np.int8)
+    made = []
+    for number in np.unique(chunks):
+        part = chunks == number
+        made.append(quantize_chunk(select_rows(exact, part), classes[part], rules))
+    logits = exact.logits - exact.logits.max(initial=-np.inf)
+    intervals = round_times(logits, info.time_bits, LARGEST)
+    paths = {} if info.paths is None else round_paths(info.paths, exact.paths, LARGEST)
+    return Quantized(info, rules, tuple(made), intervals, **paths)
+
+
+def quantize_chunk(
+    exact: ExactColumns,
+    classes: Int32[np.ndarray, " num"],
+    rules: dict[str, Rule],
+    cells: Int32[np.ndarray, " num"] | None = None,
+) -> Chunk:
+    """Round the columns of one chunk.
+
+    `cells`: the cells whose centers positions are relative to (default: those that they are in).
+    """
+    info, num = exact.info, len(classes)
+    bits = choose_cell_bits(num, info.size)
     if cells is None:
         cells = find_cells(exact)
     values = exact.values | {"class": classes, "cell": cells, "path": exact.path}
     # The trajectory's degree is known only after rounding it.
-    whole = {"degree": np.full(info.num_gaussians, info.degree, np.int32)}
-    columns, saved = _round_columns(info.column_names, values | whole, exact, rules)
+    whole = {"degree": np.full(num, info.degree, np.int32)}
+    columns, saved = _round_columns(values | whole, exact, ColumnDecoder(rules, info, bits, num))
     columns["degree"] = degrees = _choose_degrees(saved)
     for k in range(1, info.degree + 1):
         for axis in "xy":
             columns[f"{axis}{k}"] = np.where(degrees >= k, columns[f"{axis}{k}"], 0).astype(np.int32)
-    logits = exact.logits - exact.logits.max(initial=-np.inf)
-    intervals = round_times(logits, info.time_bits, LARGEST)
-    paths = {} if info.paths is None else round_paths(info.paths, exact.paths, LARGEST)
-    return Quantized(info, rules, columns, intervals, **paths)
+    return Chunk(bits, columns)
+
+
+def select_rows(exact: ExactColumns, kept: Bool[np.ndarray, " num"]) -> ExactColumns:
+    """Some of a model's Gaussians, in their order."""
+    values = {name: value[kept] for name, value in exact.values.items()}
+    path = None if exact.path is None else exact.path[kept]
+    own = exact.swapped[kept], exact.turn[kept], values, exact.polynomials[kept]
+    return ExactColumns(exact.info, *own, exact.logits, path, exact.paths)
 
 
 def find_cells(exact: ExactColumns) -> Int32[np.ndarray, " num"]:
     """The cell of each Gaussian, from the middle of its trajectory."""
     values = exact.values
     columns = _compute_trajectories(exact, values)
-    return locate_cells(columns["x0"], columns["y0"], clamp_unit(values["time"]), exact.info)
+    cells = choose_cell_bits(len(exact.turn), exact.info.size)
+    return locate_cells(columns["x0"], columns["y0"], clamp_unit(values["time"]), exact.info, cells)
 
 
 def _choose_degrees(saved: Float[np.ndarray, "degree+1 num"]) -> Int32[np.ndarray, " num"]:
@@ -503,12 +563,11 @@ def _choose_degrees(saved: Float[np.ndarray, "degree+1 num"]) -> Int32[np.ndarra
 
 
 def _round_columns(
-    names: tuple[str, ...], values: dict[str, np.ndarray], exact: ExactColumns, rules: dict[str, Rule]
+    values: dict[str, np.ndarray], exact: ExactColumns, decoder: ColumnDecoder
 ) -> tuple[dict[str, Int32[np.ndarray, " num"]], Float[np.ndarray, "degree+1 num"]]:
     """The integers of all columns, and the squared error, in steps, that the trajectory's powers save."""
-    decoder, columns = ColumnDecoder(rules, exact.info), {}
-    saved = np.zeros((exact.info.degree + 1, exact.info.num_gaussians))
-    for name in names:
+    columns, saved = {}, np.zeros((exact.info.degree + 1, len(exact.turn)))
+    for name in exact.info.column_names:
         if name == "x0":
             values = values | _compute_trajectories(exact, decoder.values)
         halves = decoder.half_exponents(name)

@@ -15,21 +15,17 @@ from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 from foldgauss._runtime.checks import invalid
 from foldgauss.video.compression.quantize import (
     FEATURES,
-    ExactColumns,
     Quantized,
     Rule,
-    choose_cell_bits,
     clamp_unit,
     column_names,
     compute_columns,
     decode_values,
     dequantize,
-    find_cells,
     is_integral,
     quantize,
 )
 from foldgauss.video.compression.sensitivity import estimate_sensitivities
-from foldgauss.video.compression.sort_order import find_overlaps, sort_by_cell
 from foldgauss.video.models.row_layout import GROUPS, shift_path
 from foldgauss.video.models.splats import SH_C0, FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
@@ -133,28 +129,9 @@ class Quantizer:
             rules[name] = Rule(origin, round(coarseness - exponent, 4), slopes)
         return rules
 
-    def quantize(self, coarseness: float, kept: Bool[np.ndarray, " num"] | None = None) -> Quantized:
-        """The Gaussians `kept` (None: all) with the rules of `make_rules`."""
-        kept = np.ones(len(self.removal), bool) if kept is None else kept
-        return quantize(select_rows(self.exact, kept), self.classes[kept], self.make_rules(coarseness))
-
-
-def select_rows(exact: ExactColumns, kept: Bool[np.ndarray, " num"]) -> ExactColumns:
-    """Some of a model's Gaussians, in their order."""
-    num = int(kept.sum())
-    info = dataclasses.replace(exact.info, num_gaussians=num, cells=choose_cell_bits(num, exact.info.size))
-    values = {name: value[kept] for name, value in exact.values.items()}
-    path = None if exact.path is None else exact.path[kept]
-    own = exact.swapped[kept], exact.turn[kept], values, exact.polynomials[kept]
-    return ExactColumns(info, *own, exact.logits, path, exact.paths)
-
-
-def find_order(model: VideoModel, budget: float) -> Int[np.ndarray, " num"]:
-    """An order of the Gaussians, by cell, that needs fewer bits; see `sort_by_cell` for the `budget` of errors."""
-    cells = find_cells(compute_columns(model))
-    if model.compositing == "sum":  # any order gives the same image
-        return np.argsort(cells, kind="stable")
-    return sort_by_cell(cells, find_overlaps(Contributions(model)), budget)
+    def quantize(self, coarseness: float, chunks: Int[np.ndarray, " num"] | None = None) -> Quantized:
+        """The model with the rules of `make_rules`, in these chunks (None: a single one)."""
+        return quantize(self.exact, self.classes, self.make_rules(coarseness), chunks)
 
 
 def round_groups(

@@ -1,4 +1,4 @@
-"""The streams of bytes that a compact file consists of, beside its header: columns, frame times, and shared paths."""
+"""The streams of bytes that a compact file consists of, beside its header: frame times, shared paths, and columns."""
 
 import dataclasses
 
@@ -7,34 +7,36 @@ from jaxtyping import Int
 
 from foldgauss.video.compression import range_coder
 from foldgauss.video.compression.column_contexts import ColumnContexts
-from foldgauss.video.compression.quantize import CompactInfo, Quantized
+from foldgauss.video.compression.quantize import Chunk, CompactInfo, Quantized, Rule
 from foldgauss.video.compression.quantized_paths import PathsInfo
 
-#: The streams of shared paths.
-PATH_STREAMS = "knots", "maps"
 
-
-def encode_streams(quantized: Quantized) -> dict[str, bytes]:
-    """The streams by name, in the order of the file: columns, "intervals", and of shared paths "knots" and "maps"."""
-    info, contexts, streams = quantized.info, ColumnContexts(quantized.rules, quantized.info), {}
-    for name in info.column_names:
-        numbers = coded = quantized.columns[name]
-        if name == "cell":  # from each to the next, around the end
-            coded = np.diff(numbers, prepend=0) & last_cell(info)
-        streams[name] = range_coder.encode(coded, contexts.describe_next(name))
-        contexts.add(name, numbers)
-    streams["intervals"] = _encode_plainly(quantized.intervals)
-    if info.paths is None:
+def encode_motion(quantized: Quantized) -> list[bytes]:
+    """The streams of what all chunks need: the intervals of the frame times, and of shared paths the knots and maps."""
+    about, streams = quantized.info.paths, [_encode_plainly(quantized.intervals)]
+    if about is None:
         return streams
     # Empty if knots are at the frames. Both are differences in time.
     knots = b"" if quantized.knots is None else _encode_plainly(np.diff(quantized.knots, axis=1, prepend=0).ravel())
-    coded = np.diff(quantized.maps, axis=1, prepend=path_identities(info.paths))
-    return streams | {"knots": knots, "maps": range_coder.encode(coded.ravel(), describe_maps(info.paths))}
+    coded = np.diff(quantized.maps, axis=1, prepend=path_identities(about))
+    return [*streams, knots, range_coder.encode(coded.ravel(), describe_maps(about))]
 
 
-def last_cell(info: CompactInfo) -> int:
+def encode_chunk(chunk: Chunk, rules: dict[str, Rule], info: CompactInfo) -> list[bytes]:
+    """The streams of a chunk's columns, in their order."""
+    contexts, streams = ColumnContexts(rules, info, chunk.cells, chunk.num), []
+    for name in info.column_names:
+        numbers = coded = chunk.columns[name]
+        if name == "cell":  # from each to the next, around the end
+            coded = np.diff(numbers, prepend=0) & last_cell(chunk.cells)
+        streams.append(range_coder.encode(coded, contexts.describe_next(name)))
+        contexts.add(name, numbers)
+    return streams
+
+
+def last_cell(cells: tuple[int, int, int]) -> int:
     """The largest number of a cell."""
-    return (1 << sum(info.cells)) - 1
+    return (1 << sum(cells)) - 1
 
 
 def path_identities(about: PathsInfo) -> Int[np.ndarray, "paths 1 2 3"]:

@@ -16,8 +16,8 @@ import numpy as np
 from foldgauss._runtime import notebook_hooks
 from foldgauss._runtime.checks import invalid, is_integer, is_within
 from foldgauss._runtime.threads import check_not_forked
+from foldgauss.video.compression.chunks import arrange
 from foldgauss.video.compression.quantize import Quantized, dequantize
-from foldgauss.video.compression.quantizer import find_order
 from foldgauss.video.fitting.budget import StepPlanner, TimeLeft, find_limit, measure_progress
 from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig, chosen_num_gaussians, planned_steps
 from foldgauss.video.fitting.divergence import Guard
@@ -225,7 +225,7 @@ def _warm_up(frames: np.ndarray, config: FitConfig, engine: str) -> None:
         state = FitState.create(rows, state.time_logits, path_maps=maps)
         make_stepper("cpu", corner, tiny, state, motion_finder(corner)).step(state, 0.0)
     if config.is_compact:
-        find_order(to_model(state, tiny, corner.shape[1:3], 25.0), 0.0)
+        arrange(to_model(state, tiny, corner.shape[1:3], 25.0), 0.0)
         count_bytes(RateControl(corner, tiny).finish(state))
 
 

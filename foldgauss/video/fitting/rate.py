@@ -23,6 +23,7 @@ from jaxtyping import Int
 
 from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.checks import invalid
+from foldgauss.video.compression.chunks import arrange
 from foldgauss.video.compression.quantize import (
     Quantized,
     Rule,
@@ -31,17 +32,16 @@ from foldgauss.video.compression.quantize import (
     dequantize,
     is_integral,
     quantize,
+    select_rows,
 )
 from foldgauss.video.compression.quantizer import (
     BEYOND_BLACK,
     BITS_PER_GAUSSIAN,
     Quantizer,
     bit_price,
-    find_order,
     round_groups,
-    select_rows,
 )
-from foldgauss.video.compression.streams import encode_streams
+from foldgauss.video.compression.streams import encode_chunk, encode_motion
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.state import FitState, running_psnr, to_model
 from foldgauss.video.models.background import BLACK, composite
@@ -54,8 +54,9 @@ from foldgauss.video.models.video_model import VideoModel
 COARSEST = 11.0
 #: The same at quality 100.
 FINEST = 1.0
-#: Bytes of a file beside its streams: its header, and what is known of the clip.
+#: Bytes of a file beside its streams: its header, and what is known of the clip; and for each chunk.
 HEADER_BYTES = 3000
+BYTES_PER_CHUNK = 200
 #: Fraction of the largest file that the fit aims at; the Gaussians that are worth least are dropped in the end if the
 #: file is larger nevertheless.
 _AIM = 0.98
@@ -156,7 +157,7 @@ class RateControl:
                 self._drop(state, action)
             elif action.what == "sort":
                 error = float(state.frame_errors.mean()) * self.frames[..., :3].size
-                state.keep(find_order(self._model(state), _ORDERING * self._adaptation(state) * error))
+                self._arrange(state, _ORDERING * self._adaptation(state) * error)
             else:
                 self._round(state, action)
             state.rate_actions += 1
@@ -186,9 +187,8 @@ class RateControl:
                 break
             fraction /= 2
         state.keep(np.flatnonzero(kept))
-        model = self._model(state)
         levels = sum(float(frame.astype(np.float64).var()) for frame in self.frames) * self.frames[0].size
-        state.keep(find_order(model, _ORDERING_UNTRAINED * levels / 255**2))
+        self._arrange(state, _ORDERING_UNTRAINED * levels / 255**2, layered=False)
         self._choose_rules(state, ACTIONS[-1])
 
     def finish(self, state: FitState, fps: float = 25.0) -> Quantized:
@@ -197,7 +197,7 @@ class RateControl:
             self._choose_rules(state, ACTIONS[-1])
         exact = compute_columns(self._model(state, fps))
         classes, rules = state.classes.astype(np.int32), _decode_rules(state)
-        whole = quantize(exact, classes, rules)
+        whole = quantize(exact, classes, rules, state.chunks)
         if self.config.size_mb is None and self.config.psnr is None:
             return whole
         worst_first = np.argsort(Quantizer(dequantize(whole), self.background).removal, kind="stable")
@@ -205,7 +205,7 @@ class RateControl:
         def without(num: int) -> Quantized:
             kept = np.ones(len(worst_first), bool)
             kept[worst_first[:num]] = False
-            return quantize(select_rows(exact, kept), classes[kept], rules)
+            return quantize(select_rows(exact, kept), classes[kept], rules, state.chunks[kept])
 
         most, dropped = len(worst_first) - 1, 0
         frames = np.arange(len(self.frames))
@@ -223,6 +223,11 @@ class RateControl:
 
     def _model(self, state: FitState, fps: float = 25.0) -> VideoModel:
         return to_model(state, self.config, self.frames.shape[1:3], fps)
+
+    def _arrange(self, state: FitState, budget: float, *, layered: bool = True) -> None:
+        order, chunks = arrange(self._model(state), budget, layered=layered)
+        state.keep(order)
+        state.chunks = chunks.astype(np.uint16)
 
     def _drop(self, state: FitState, action: Action) -> None:
         quantizer = Quantizer(self._model(state), self.background)
@@ -274,7 +279,7 @@ class RateControl:
             num = 8 * max(room - HEADER_BYTES, 0.0) / USUAL_BITS / math.sqrt(action.extent)
             return quantizer.coarseness_for(num, action.extent)
         streams = max(room - HEADER_BYTES, 64.0)
-        num_bytes = lambda coarseness: count_bytes(quantizer.quantize(coarseness)) - HEADER_BYTES  # noqa: E731
+        num_bytes = lambda coarseness: count_bytes(quantizer.quantize(coarseness, state.chunks)) - HEADER_BYTES  # noqa: E731
         excess = lambda coarseness: math.log2(num_bytes(coarseness) / streams)  # noqa: E731
         return _solve(excess, state.coarseness or USUAL_COARSENESS)
 
@@ -327,7 +332,10 @@ def coarseness_of(quality: float) -> float:
 
 def count_bytes(quantized: Quantized) -> int:
     """The bytes of a file, with `HEADER_BYTES` for its header."""
-    return HEADER_BYTES + sum(map(len, encode_streams(quantized).values()))
+    streams, info = encode_motion(quantized), quantized.info
+    for chunk in quantized.chunks:
+        streams += encode_chunk(chunk, quantized.rules, info)
+    return HEADER_BYTES + BYTES_PER_CHUNK * len(quantized.chunks) + sum(map(len, streams))
 
 
 def count_past(progress: float) -> int:

@@ -180,6 +180,7 @@ class FitState:
     counts: np.ndarray = field(metadata=_stored(PerGaussian(np.int32)))  # steps each Gaussian has taken
     rounded: np.ndarray = field(metadata=_stored(PerGaussian(np.uint8)))  # the groups of leaves that are, see `rate`
     classes: np.ndarray = field(metadata=_stored(PerGaussian(np.int8)))  # how visible, by which steps are chosen
+    chunks: np.ndarray = field(metadata=_stored(PerGaussian(np.uint16)))  # of the file; they decrease
     frame_errors: np.ndarray = field(metadata=_stored(PerFrame()))  # mean squared error when last seen, 0 before
     time_logits: np.ndarray = field(metadata=_stored(PerFrame(intervals=True)))
     time_moments: optax.OptState = field(metadata=_stored(PerFrame(intervals=True, moments=True)))

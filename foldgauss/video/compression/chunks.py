@@ -1,0 +1,92 @@
+"""The order of a model's Gaussians in a compact file, and the chunks that they are divided into.
+
+A chunk is decoded by itself. The first holds the Gaussians that are largest in space and time, which show a coarse
+clip. A layer of smaller ones in front of it, and a layer of the smallest, are divided in time: a chunk of those that
+are visible around the middle of an interval, and the same again for those before and those after. A reader needs no
+chunk for a time at which none of its Gaussians is visible.
+"""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from foldgauss.video.compression.quantize import compute_columns, find_cells
+from foldgauss.video.compression.sort_order import find_overlaps, sort_by_cell
+from foldgauss.video.models.splats import TAU_MAX
+from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.selection.contributions import Contributions
+
+#: The fractions of the Gaussians after which a layer ends: the first is about a tenth of a file.
+LAYERS = (0.08, 0.4)
+#: Least number of Gaussians of a file for each of its chunks. A chunk takes some 800 bytes more than if it were a part
+#: of another, since its coder starts anew: at most 3% of the file.
+LEAST = 2500
+
+
+def arrange(
+    model: VideoModel, budget: float, *, layered: bool = True
+) -> tuple[Int[np.ndarray, " num"], Int[np.ndarray, " num"]]:
+    """An order of the Gaussians that needs few bits, and in this order the number of the chunk of each.
+
+    Within a chunk they are sorted by cell; see `sort_by_cell` for the `budget` of errors. Layers change the images:
+    the large ones go behind the small ones. Without layers there is one chunk.
+    """
+    exact = compute_columns(model)
+    chunks = np.zeros(model.num_gaussians, np.int64)
+    if layered:
+        first, last = visible_spans(exact.values["time"], exact.values["duration"])
+        volume = 2 * exact.values["size"] + np.log(last - first)
+        chunks = divide(volume, first, last)
+    cells = find_cells(exact)
+    if model.compositing == "sum":  # any order gives the same image
+        order = np.lexsort((cells, -chunks))
+        return order, chunks[order]
+    front, back, cost = find_overlaps(Contributions(model))
+    parts = []
+    for number in range(chunks.max(), -1, -1):
+        rows = np.flatnonzero(chunks == number)
+        within = (chunks[front] == number) & (chunks[back] == number)
+        place = np.zeros(len(chunks), np.int64)
+        place[rows] = np.arange(len(rows))
+        overlaps = place[front[within]], place[back[within]], cost[within]
+        parts.append(rows[sort_by_cell(cells[rows], overlaps, budget * len(rows) / len(chunks))])
+    order = np.concatenate(parts)
+    return order, chunks[order]
+
+
+def visible_spans(
+    time: Float[np.ndarray, " num"], duration: Float[np.ndarray, " num"]
+) -> tuple[Float[np.ndarray, " num"], Float[np.ndarray, " num"]]:
+    """The first and the last time, in [0, 1], at which each Gaussian is visible, at most; the first is smaller."""
+    reach = TAU_MAX * np.exp(np.minimum(duration, 1.0))
+    first, last = np.clip(time - reach, 0.0, 1.0), np.clip(time + reach, 0.0, 1.0)
+    return first, np.maximum(last, first + 1e-9)
+
+
+def divide(
+    volume: Float[np.ndarray, " num"], first: Float[np.ndarray, " num"], last: Float[np.ndarray, " num"]
+) -> Int[np.ndarray, " num"]:
+    """The number of each Gaussian's chunk, in the order of the file, by volumes and visible spans."""
+    num, out = len(volume), np.zeros(len(volume), np.int64)
+    ends = [round(fraction * num) for fraction in LAYERS[: max(num // LEAST - 1, 0)]]
+    layers = np.split(np.argsort(-volume, kind="stable"), ends)
+    groups = [layers[0], *(group for layer in layers[1:] for group in _divide_in_time(layer, first, last, 0.0, 1.0))]
+    for number, group in enumerate(groups):
+        out[group] = number
+    return out
+
+
+def _divide_in_time(
+    rows: Int[np.ndarray, " some"],
+    first: Float[np.ndarray, " num"],
+    last: Float[np.ndarray, " num"],
+    low: float,
+    high: float,
+) -> list[Int[np.ndarray, " few"]]:
+    """Those visible around the middle of an interval of time, then those before and those after, divided alike."""
+    middle = (low + high) / 2
+    before, after = rows[last[rows] < middle], rows[first[rows] > middle]
+    around = rows[(last[rows] >= middle) & (first[rows] <= middle)]
+    if min(map(len, (before, around, after))) < LEAST:
+        return [rows]
+    halves = _divide_in_time(before, first, last, low, middle), _divide_in_time(after, first, last, middle, high)
+    return [around, *halves[0], *halves[1]]
