@@ -20,6 +20,7 @@ from foldgauss.io.models.compact import MAGIC, VERSION, is_compact, pack_compact
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, compress, layers
+from foldgauss.video.compression.chunks import arrange
 from foldgauss.video.compression.quantize import (
     AXES,
     Rule,
@@ -35,7 +36,6 @@ from foldgauss.video.compression.quantize import (
     trajectory_span,
 )
 from foldgauss.video.compression.quantized_times import TIME_BITS
-from foldgauss.video.compression.chunks import arrange
 from foldgauss.video.compression.sensitivity import estimate_sensitivities
 from foldgauss.video.models.metrics import evaluate
 from foldgauss.video.models.renderer import VideoRenderer
