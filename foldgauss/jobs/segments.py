@@ -20,7 +20,7 @@ from foldgauss.io.media.clip import AS_STORED, Reading
 from foldgauss.io.media.frame_index import FrameIndex, index_video
 from foldgauss.io.media.indexed_reader import read_indexed
 from foldgauss.io.models.segmented import join_segments
-from foldgauss.io.models.video_model import keep_origin, load_video_model, read_metadata
+from foldgauss.io.models.video_model import MODEL_SUFFIX, keep_origin, load_video_model, read_metadata
 from foldgauss.io.provenance import describe_reading
 from foldgauss.jobs.job import FitJob, file_digest
 from foldgauss.video.fitting.config import FitConfig
@@ -29,6 +29,8 @@ from foldgauss.video.segmented.segmented_video import Segment, SegmentedVideo, p
 
 #: Default length of a segment, and number of frames that neighbors share.
 SEGMENT_SECONDS, OVERLAP = 10.0, 8
+#: What a joined file has of each segment beside its own file, in 10^6 bytes, at most: its properties and metadata.
+_MB_PER_SEGMENT = 0.004
 #: Number of frames on either side of an overlap that it is compared with.
 BESIDE = 8
 _PLAN, _INDEX = "plan.json", "index.npz"
@@ -216,6 +218,7 @@ def plan_long_fit(
         spans = plan_segments(index.num_frames, index.cuts, length=length, overlap=_limit_overlap(overlap, length))
     else:
         spans = plan["spans"]
+    configs = _divide_size(config, spans)
     if restart and folder.is_dir():
         shutil.rmtree(folder)  # only once the clip has been read
     _make_folder(folder)
@@ -228,7 +231,15 @@ def plan_long_fit(
     metadata = {"clip": clip.name, "seed": config.seed, "frames": frames, "clip_digest": index.digest}
     metadata |= describe_reading(index)
     jobs = _make_jobs(
-        clip, folder, config, index, spans, size, checkpoint_seconds, 0 if frames is None else frames[0] or 0
+        clip,
+        folder,
+        target.suffix or MODEL_SUFFIX,
+        configs,
+        index,
+        spans,
+        size,
+        checkpoint_seconds,
+        0 if frames is None else frames[0] or 0,
     )
     return LongFit(target, folder, index, tuple(spans), jobs, metadata)
 
@@ -236,21 +247,22 @@ def plan_long_fit(
 def _make_jobs(
     clip: Path,
     folder: Path,
-    config: FitConfig,
+    suffix: str,
+    configs: Sequence[FitConfig],
     index: FrameIndex,
     spans: Sequence[tuple[int, int]],
     size: tuple[int, int] | None,
     checkpoint_seconds: float | None,
     begin: int,
 ) -> tuple[FitJob, ...]:
-    """A job for each segment of the clip, whose first frame has the number `begin`."""
+    """A job for each segment of the clip, whose first frame has the number `begin`; `suffix` of the models' names."""
     jobs = []
-    for number, (span, own) in enumerate(zip(spans, _divide_size(config, spans), strict=True)):
+    for number, (span, own) in enumerate(zip(spans, configs, strict=True)):
         low, high = index.span(*span)  # as `read_video` counts, where damaged frames are missing
         job = FitJob(
             name=f"segment {number}",
             clip=str(clip),
-            target=str(folder / f"segment-{number:04d}.safetensors"),
+            target=str(folder / f"segment-{number:04d}{suffix}"),
             config=own,
             size=size,
             frames=span,
@@ -269,7 +281,11 @@ def _divide_size(config: FitConfig, spans: Sequence[tuple[int, int]]) -> list[Fi
     if config.size_mb is None:
         return [config] * len(spans)
     lengths = [stop - first for first, stop in spans]
-    return [dataclasses.replace(config, size_mb=config.size_mb * one / sum(lengths)) for one in lengths]
+    size_mb = config.size_mb - _MB_PER_SEGMENT * len(spans) * (len(spans) > 1)
+    if size_mb <= 0:
+        expected = f"more than {config.size_mb - size_mb:g} for {len(spans)} segments"
+        raise invalid("size_mb", expected=expected, got=config.size_mb)
+    return [dataclasses.replace(config, size_mb=size_mb * one / sum(lengths)) for one in lengths]
 
 
 def _limit_overlap(overlap: int, length: int) -> int:

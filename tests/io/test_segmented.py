@@ -1,5 +1,6 @@
 """Segments in one file: the bits of the files that they came from, read when they are wanted."""
 
+import base64
 import dataclasses
 import json
 import os
@@ -19,6 +20,7 @@ from foldgauss.io import (
     load_video_model,
     read_pseudomesh,
     read_vegas_ply,
+    save_compact,
     save_selection,
     save_video_model,
 )
@@ -26,6 +28,7 @@ from foldgauss.io.models import segmented
 from foldgauss.io.models.compact import MAGIC
 from foldgauss.io.models.model_file import read_header
 from foldgauss.io.models.video_model import read_metadata
+from foldgauss.io.page.player_page import quantize_finely
 from foldgauss.video import FrameTimes, SegmentedVideo, Selection, edit, layers
 from foldgauss.video.models.renderer import VideoRenderer
 
@@ -194,7 +197,7 @@ def test_what_is_no_ordinary_model_is_refused(work, tmp_path):
     (tmp_path / "noise.safetensors").write_bytes(os.urandom(500))
     for name, message in (
         (work / "long.safetensors", r"got one of kind 'segmented-video'.*Join the files that it was made of"),
-        (tmp_path / "small.fgz", "got a compact one.*before they are compressed"),
+        (tmp_path / "small.fgz", "got one cut off after 8 bytes"),
         (tmp_path / "some.selection", "got one of kind"),
         (tmp_path / "noise.safetensors", "expected a foldgauss-model file"),
     ):
@@ -398,3 +401,41 @@ def test_a_page_that_cannot_be_says_of_which_segment(work):
     for model in (work / "long.safetensors", load_video_model(work / "long.safetensors")):
         with pytest.raises(ValueError, match=r"segment 1: .*edits that no folded model represents"):
             html_page(model)
+
+
+# ------------------------------------------------------------------------------------ compact segments
+
+
+def test_compact_segments_are_stored_as_their_files(tmp_path):
+    """Beside others: the bytes of the file, the model that it decodes to, and its page."""
+    whole = models()
+    path = tmp_path / "a.safetensors"
+    save_video_model(path, whole[0])
+    compact = [
+        save_compact(tmp_path / f"{k}.fgz", quantize_finely(soft_model(seed=k, num_frames=n)))
+        for k, n in ((1, 9), (2, 5))
+    ]
+    long = join_segments(
+        tmp_path / "long.fgz", list(zip(FIRSTS, [path, *compact], strict=True)), metadata={"clip": "x"}
+    )
+    assert segmented.is_segmented(long)
+    video = load_video_model(long)
+    assert [segment.num_frames for segment in video.segments] == list(LENGTHS)
+    assert video.num_gaussians == 3 * NUM
+    for segment, file in zip(video.segments[1:], compact, strict=True):
+        same(segment.model, load_video_model(file))
+        assert segment.num_parameters == segment.model.num_parameters
+    assert [segmented.read_segment_file(long, k) for k in range(3)] == [None, *(file.read_bytes() for file in compact)]
+    for file in compact:
+        assert base64.b64encode(file.read_bytes()).decode() in html_page(long)
+    assert long.stat().st_size < 4000 * 3 + sum(file.stat().st_size for file in (path, *compact))
+
+
+def test_a_damaged_compact_segment_is_told(tmp_path):
+    file = save_compact(tmp_path / "m.fgz", quantize_finely(soft_model(num_frames=7)))
+    long = join_segments(tmp_path / "long.fgz", [(0, file)])
+    data = bytearray(long.read_bytes())
+    data[-1] ^= 1
+    long.write_bytes(data)
+    with pytest.raises(ModelFileError, match="1 of its 1 chunks are cut off or damaged"):
+        _ = load_video_model(long).segments[0].model

@@ -111,7 +111,7 @@ def fit(
     if out_path is not None:
         refuse_inputs(out_path, {"clip": video})
     in_segments = not (segment_seconds is None and workers is None and scheduler is None)
-    target, config = _choose_target(video, out_path, config, in_segments, overwrite and not resume)
+    target, config = _choose_target(video, out_path, config)
     refuse_inputs(target, {"clip": video})
     job = FitJob(
         video.name,
@@ -180,18 +180,11 @@ def fit(
     _print_results(run, display, figures | {"file_bytes": target.stat().st_size})
 
 
-def _choose_target(
-    video: Path, out_path: Path | None, config: FitConfig, in_segments: bool, overwrite: bool
-) -> tuple[Path, FitConfig]:
+def _choose_target(video: Path, out_path: Path | None, config: FitConfig) -> tuple[Path, FitConfig]:
     """The file to write, and the settings: the default quality for a compact file of which nothing else is asked."""
     if out_path is None:
-        joined = name_after(video, MODEL_SUFFIX)
-        unfinished = read_segment_seconds(joined) is not None and not overwrite
-        out_path = joined if in_segments or unfinished else name_after(video, COMPACT_SUFFIX)
+        out_path = name_after(video, COMPACT_SUFFIX)
     if out_path.suffix.lower() == COMPACT_SUFFIX:
-        if in_segments:
-            cure = "Segments are joined in such a file."
-            raise wrong_use("--out", expected=f"a name ending in {MODEL_SUFFIX}", got=out_path, cure=cure)
         return out_path, config if config.is_compact else dataclasses.replace(config, quality=DEFAULT_QUALITY)
     try:
         check_model_name(out_path, "out")

@@ -165,20 +165,27 @@ def load_compact(path: PathLike, *, visible: tuple[float, float] = (0.0, 1.0)) -
     if not (len(visible) == 2 and all(is_within(t, "[0, 1]") for t in visible) and visible[0] <= visible[1]):
         raise invalid("visible", expected="the first and the last time, in [0, 1]", got=visible)
     with open(path, "rb") as file:
-        header = _read_header(path, file)
-        try:
-            return _decode(path, header, file, visible)
-        except HEADER_ERRORS as error:
-            if isinstance(error, ModelFileError):
-                raise
-            got = f"one that does not fit together ({type(error).__name__}: {one_line(error)})"
-            raise _unreadable(path, got) from error
+        return _read(path, file, visible)
 
 
-def load_compact_model(path: Path) -> VideoModel:
-    """The model in a compact file. Raises as `load_compact`, also for values beyond float32."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        model = dequantize(load_compact(path))
+def _read(path: Path, file: BinaryIO, visible: tuple[float, float]) -> Quantized:
+    header = _read_header(path, file)
+    try:
+        return _decode(path, header, file, visible)
+    except HEADER_ERRORS as error:
+        if isinstance(error, ModelFileError):
+            raise
+        got = f"one that does not fit together ({type(error).__name__}: {one_line(error)})"
+        raise _unreadable(path, got) from error
+
+
+def load_compact_model(path: Path, data: bytes | None = None) -> VideoModel:
+    """The model in a compact file, or in the `data` of one that is a part of the file.
+
+    Raises as `load_compact`, also for values beyond float32.
+    """
+    with np.errstate(over="ignore", invalid="ignore"), open(path, "rb") if data is None else io.BytesIO(data) as file:
+        model = dequantize(_read(path, file, (0.0, 1.0)))
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model)):
         raise _unreadable(path, "one with values beyond float32")
     return model

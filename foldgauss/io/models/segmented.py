@@ -1,5 +1,6 @@
 """Models of a clip's segments in one file, each loaded on access. The layout is in docs/formats.md."""
 
+import dataclasses
 import math
 import re
 import tempfile
@@ -13,7 +14,7 @@ import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within, short_repr
 from foldgauss.io._atomic import PathLike, check_path, check_writable
-from foldgauss.io.models.compact import is_compact
+from foldgauss.io.models.compact import compact_metadata, is_compact, load_compact_model
 from foldgauss.io.models.model_file import (
     ModelFileError,
     load_model,
@@ -32,8 +33,10 @@ from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import MAX_PREPARED, Segment, SegmentedVideo
 
 SEGMENTED = "segmented-video"
-#: Kinds of models that may be a segment, see `foldgauss.io.models.video_model`.
-PARTS = ("video", "edited-video")
+#: Kinds of models that may be a segment, see `foldgauss.io.models.video_model`: the last one is a compact file.
+PARTS = ("video", "edited-video", "compact")
+#: The tensor of a compact segment, which has the bytes of its file, and the properties that its header holds.
+_FILE, _FACTS = "file", ("num_gaussians", "num_frames", "degree", "num_parameters", "size", "fps", "compositing")
 _KEY = re.compile(r"segments\.(0|[1-9][0-9]{0,8})\.(.+)", re.DOTALL)
 #: Upper limit of a degree in a header, which is not trusted.
 _MAX_DEGREE = 1 << 20
@@ -42,12 +45,12 @@ _MAX_DEGREE = 1 << 20
 def join_segments(path: PathLike, sources: Sequence[tuple[int, PathLike]], *, metadata: dict | None = None) -> Path:
     """Write the models of a clip's segments into one file, whole or not at all; returns the path.
 
-    `sources` has (number of its first frame in the whole clip, model file) of each segment, in order. Their tensors are
-    copied one by one, to the bit, and their metadata kept; `metadata` are the whole file's. See `SegmentedVideo` for
-    what goes together.
+    `sources` has (number of its first frame in the whole clip, model file) of each segment, in order. Their tensors, or
+    the bytes of compact files, are copied one by one, and their metadata kept; `metadata` are the whole file's. See
+    `SegmentedVideo` for what goes together.
 
     Raises ValueError as `SegmentedVideo`; `FileNotFoundError`; `ModelFileError` for a file that is no ordinary model,
-    such as a compact one, or one that has segments itself; `OutputError` where the path cannot be written.
+    such as one that has segments itself; `OutputError` where the path cannot be written.
 
     Example: `join_segments("long.safetensors", [(0, "a.safetensors"), (95, "b.safetensors")])`
     """
@@ -55,15 +58,17 @@ def join_segments(path: PathLike, sources: Sequence[tuple[int, PathLike]], *, me
     files, entries, specs, segments = [], [], {}, []
     for number, source in enumerate(sources):
         first, file = _source(number, source)
-        about = read_header(file)
+        load = partial(load_compact_model if is_compact(file) else load_model, file)
+        about = _describe_compact(file, load()) if is_compact(file) else read_header(file)
         if about["kind"] not in PARTS:
             raise _unfit(file, f"one of kind {about['kind']!r}", "Join the files that it was made of.")
-        match_kind(file, about)
+        if about["kind"] != PARTS[-1]:
+            match_kind(file, about)
         files.append(file)
         entries.append({"first": first} | {name: about[name] for name in ("kind", "header", "metadata")})
         specs |= {f"segments.{number}.{key}": spec for key, spec in about["tensors"].items()}
         try:
-            segments.append(_segment(entries[-1], about["tensors"], partial(load_model, file)))
+            segments.append(_segment(entries[-1], about["tensors"], load))
         except (KeyError, TypeError, ValueError) as error:
             raise _unfit(file, f"one with {error}", "Fit it again.") from error
     SegmentedVideo(segments)  # raises ValueError unless they fit together
@@ -71,6 +76,12 @@ def join_segments(path: PathLike, sources: Sequence[tuple[int, PathLike]], *, me
 
     def tensors(keys: list[str]) -> Iterator[np.ndarray]:
         for number, some in groupby(keys, lambda key: int(_KEY.fullmatch(key)[1])):
+            if entries[number]["kind"] == PARTS[-1]:
+                array = np.fromfile(files[number], np.uint8)
+                if [len(array)] != specs[next(some)]["shape"]:
+                    raise _unfit(files[number], "one that has changed meanwhile", "Join them again.")
+                yield array
+                continue
             with open_tensors(files[number]) as file:
                 for key in some:
                     array = file.get_tensor(_KEY.fullmatch(key)[2])
@@ -105,10 +116,14 @@ def _source(number: int, source: object) -> tuple[int, Path]:
         raise invalid(f"sources[{number}]", expected=expected, got=short_repr(source)) from None
     if not is_integer(first, 0):
         raise invalid(f"sources[{number}]", expected="the number of its first frame first", got=short_repr(first))
-    file = check_path(file, "path, sources")
-    if is_compact(file):
-        raise _unfit(file, "a compact one", "Join the models before they are compressed.")
-    return int(first), file
+    return int(first), check_path(file, "path, sources")
+
+
+def _describe_compact(file: Path, model: VideoModel) -> dict[str, Any]:
+    """A compact file as `read_header` describes others."""
+    header = {name: getattr(model, name) for name in _FACTS} | {"options": dataclasses.asdict(model.options)}
+    tensors = {_FILE: {"dtype": "U8", "shape": [file.stat().st_size]}}
+    return {"kind": PARTS[-1], "header": header, "metadata": compact_metadata(file), "tensors": tensors}
 
 
 def _unfit(file: Path, got: str, cure: str) -> ModelFileError:
@@ -150,9 +165,18 @@ def _segments(path: Path, about: dict) -> list[Segment]:
         if _stamp(path) != stamp:
             expected, got = "the file as it was opened", f"a changed {str(path)!r}"
             raise model_file_error("path", expected=expected, got=got, cure="Load it again.")
+        if entries[number]["kind"] == PARTS[-1]:
+            return load_compact_model(path, read_segment_file(path, number))
         return load_part(path, entries[number] | {"tensors": own[number]}, f"segments.{number}.")
 
     return [_segment(entry, own[number], partial(load, number)) for number, entry in enumerate(entries)]
+
+
+def read_segment_file(path: Path, number: int) -> bytes | None:
+    """The bytes of a segment's compact file; None where it is no compact one."""
+    with open_tensors(path) as file:
+        key = f"segments.{number}.{_FILE}"
+        return file.get_tensor(key).tobytes() if key in file.keys() else None  # noqa: SIM118 - it is not a dict
 
 
 def _stamp(path: Path) -> tuple[int, ...]:
@@ -171,16 +195,19 @@ def _segment(entry: dict, tensors: dict[str, dict], load: Any) -> Segment:
     if not isinstance(entry["metadata"], dict):
         raise TypeError("metadata that are no dict")
     header = entry["header"]
-    if entry["kind"] == PARTS[0]:
+    is_file = entry["kind"] == PARTS[-1]
+    if is_file and (tensors.keys() != {_FILE} or tensors[_FILE]["dtype"] != "U8"):
+        raise ValueError("other tensors than a compact file")
+    if entry["kind"] in (PARTS[0], PARTS[-1]):
         models, lead = {"": header}, ""
     else:
         models = {f"layers.{number}.model.": layer["model"] for number, layer in enumerate(header["layers"])}
         lead = list(models)[header["timeline"]]
     for prefix, model in models.items():
-        num = tensors[f"{prefix}splats.loc"]["shape"][0]
+        num = model["num_gaussians"] if is_file else tensors[f"{prefix}splats.loc"]["shape"][0]
         if not (is_integer(model["num_gaussians"], 1) and model["num_gaussians"] == num):
             raise ValueError("another number of Gaussians than are stored")
-        num_frames = tensors[f"{prefix}frame_times.logits"]["shape"][0] + 1
+        num_frames = model["num_frames"] if is_file else tensors[f"{prefix}frame_times.logits"]["shape"][0] + 1
         if not (is_integer(model["num_frames"], 1) and model["num_frames"] == num_frames):
             raise ValueError("another number of frames than are stored")
         if not is_integer(model["degree"], 0) or model["degree"] > _MAX_DEGREE:
@@ -196,7 +223,7 @@ def _segment(entry: dict, tensors: dict[str, dict], load: Any) -> Segment:
         num_frames=int(timeline["num_frames"]),
         num_gaussians=sum(int(model["num_gaussians"]) for model in models.values()),
         degree=max(int(model["degree"]) for model in models.values()),
-        num_parameters=_num_parameters({k: spec for k, spec in tensors.items() if k.startswith(tuple(models))}),
+        num_parameters=header["num_parameters"] if is_file else _num_parameters(tensors, tuple(models)),
         size=(int(height), int(width)),
         fps=float(timeline["fps"]),
         options=RenderOptions(**timeline["options"]),
@@ -206,7 +233,8 @@ def _segment(entry: dict, tensors: dict[str, dict], load: Any) -> Segment:
     )
 
 
-def _num_parameters(tensors: dict[str, dict]) -> int:
+def _num_parameters(tensors: dict[str, dict], models: tuple[str, ...]) -> int:
     """As `VideoModel.num_parameters`: all but the envelope and the numbers of the paths."""
-    counted = (spec for key, spec in tensors.items() if spec["dtype"] == "F32" and ".envelope." not in key)
+    own = ((key, spec) for key, spec in tensors.items() if key.startswith(models) and spec["dtype"] == "F32")
+    counted = (spec for key, spec in own if ".envelope." not in key)
     return sum(math.prod(spec["shape"]) for spec in counted)

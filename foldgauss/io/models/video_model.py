@@ -39,7 +39,7 @@ from foldgauss.video.segmented.segmented_video import SegmentedVideo
 MODEL_SUFFIX = ".safetensors"
 #: Metadata of which frames of which clip a model shows, and when the clip shows them.
 CLIP_NOTES = ("clip", "frames", "frame_seconds", "first_second", "reading", "stretched")
-VIDEO, EDITED = PARTS
+VIDEO, EDITED, _ = PARTS
 
 
 def save_video_model(

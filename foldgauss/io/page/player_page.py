@@ -22,6 +22,7 @@ from foldgauss._runtime.checks import invalid, is_integer, short_repr
 from foldgauss.io._atomic import PathLike, atomic_path, check_path
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.compact import is_compact, pack_compact
+from foldgauss.io.models.segmented import read_segment_file
 from foldgauss.io.models.selections import format_indices
 from foldgauss.io.models.video_model import keep_origin, load_video_model, read_frame_seconds, read_origin
 from foldgauss.video.compression.quantize import (
@@ -205,6 +206,9 @@ def _encode_model(model: Model, loaded: Loaded, metadata: dict) -> Iterator[str]
         spans = [{name: int(getattr(segment, name)) for name in names} for segment in loaded.segments]
         yield f'<script type="application/json" id="segments">{json.dumps(spans)}</script>'
         for number, segment in enumerate(loaded.segments):
+            if number and loaded is not model and (data := read_segment_file(model, number)) is not None:
+                yield _block(f"model-{number}", data)
+                continue
             edited = segment.model
             try:
                 plain = flatten_video(edited)
