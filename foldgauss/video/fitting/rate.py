@@ -15,6 +15,7 @@ theory of rate and distortion at high resolution (Gish and Pierce 1968); for the
 
 import dataclasses
 import math
+import time
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -69,7 +70,7 @@ _SLOPE_LOG2 = 0.8
 #: By how many dB the PSNR rises for twice the number of Gaussians, as measured.
 _DB_PER_DOUBLING = 1.8
 #: The fraction of the error of rounding that remains after the rest of the fit, rather too much.
-_LEFT_OF_ROUNDING = 0.8
+_LEFT_OF_ROUNDING = 0.6
 #: How finely the coarseness is searched for a PSNR.
 _TOLERANCE = 0.1
 #: Frames that a PSNR is estimated by.
@@ -90,6 +91,8 @@ _ORDERING = 1.0
 _PASSES = 40.0
 #: The least fraction of the price of a bit at which Gaussians are dropped where nothing makes up for them.
 _LEAST_FRACTION = 1e-4
+#: Tries of the number of Gaussians that are dropped in the end.
+_TRIALS = 9
 #: Squared error that sorting may add without training, as a fraction of the variance of the images.
 _ORDERING_UNTRAINED = 1e-5
 
@@ -114,11 +117,11 @@ ACTIONS = (
     Action(0.2, "drop", 0.16, 1.0, 4.0),
     Action(0.3, "drop", 0.36, 0.7, 3.0),
     Action(0.42, "drop", 0.64, 0.5, 2.0),
-    Action(0.55, "drop", 1.0, 0.4, 1.2),
+    Action(0.55, "drop", 1.0, 0.4, 1.7),
     Action(0.55, "sort"),
     Action(0.7, SHAPE, 0.4, 0.3),
     Action(0.78, SHAPE, 0.75),
-    Action(0.84, "drop", 1.0, 0.0, 0.1),
+    Action(0.84, "drop", 1.0, 0.0, 0.5),
     Action(0.86, SHAPE, 1.0),
     Action(0.91, TRAJECTORY, 0.5),
     Action(0.96, TRAJECTORY, 1.0),
@@ -132,7 +135,8 @@ class RateControl:
     """Makes the Gaussians of a running fit worth their bits."""
 
     def __init__(self, frames: np.ndarray, config: FitConfig):
-        self.frames, self.config, self.longest = frames, config, 0.0
+        self.frames, self.config = frames, config
+        self.longest = self.trimming = 0.0
         self.background = BEYOND_BLACK if frames.shape[-1] == 4 else np.float32(BLACK)
         self.sampled = np.unique(np.linspace(0, len(frames) - 1, _SAMPLED_FRAMES).round().astype(int))
 
@@ -164,10 +168,13 @@ class RateControl:
         return state.rate_actions > before
 
     def reserve(self, state: FitState, seconds: float) -> float:
-        """Seconds that later actions will take, if the last ones took `seconds`: those that measure Gaussians."""
+        """Seconds that later actions will take, if the last ones took `seconds`: those that measure Gaussians.
+
+        What is dropped in the end is among them.
+        """
         self.longest = max(self.longest, seconds)
         left = [action for action in ACTIONS[state.rate_actions :] if action.what == "drop"]
-        return self.longest * (len(left) + (not state.rules))
+        return self.longest * (len(left) + (not state.rules)) + self.trimming
 
     def round_only(self, state: FitState) -> None:
         """Drop what is not worth its bits, and sort where that hardly changes the images, without any training."""
@@ -279,8 +286,13 @@ class RateControl:
             num = 8 * max(room - HEADER_BYTES, 0.0) / USUAL_BITS / math.sqrt(action.extent)
             return quantizer.coarseness_for(num, action.extent)
         streams = max(room - HEADER_BYTES, 64.0)
-        num_bytes = lambda coarseness: count_bytes(quantizer.quantize(coarseness, state.chunks)) - HEADER_BYTES  # noqa: E731
-        excess = lambda coarseness: math.log2(num_bytes(coarseness) / streams)  # noqa: E731
+
+        def excess(coarseness: float) -> float:
+            begun = time.perf_counter()
+            num_bytes = count_bytes(quantizer.quantize(coarseness, state.chunks)) - HEADER_BYTES
+            self.trimming = _TRIALS * (time.perf_counter() - begun)
+            return math.log2(num_bytes / streams)
+
         return _solve(excess, state.coarseness or USUAL_COARSENESS)
 
     def _solve_psnr(self, state: FitState, quantizer: Quantizer, action: Action) -> float:
@@ -317,8 +329,12 @@ class RateControl:
 
     def _psnr(self, model: VideoModel, which: Int[np.ndarray, " some"]) -> float:
         """Mean PSNR of the frames `which`, dB."""
+        begun = time.perf_counter()
         images = VideoRenderer(model).frames(np.asarray(model.frame_times.times())[which])
-        return float(np.mean([psnr_of(self._target(k), image) for k, image in zip(which, images, strict=True)]))
+        found = float(np.mean([psnr_of(self._target(k), image) for k, image in zip(which, images, strict=True)]))
+        each = (time.perf_counter() - begun) / len(which)
+        self.trimming = _TRIALS * each * len(self.frames)
+        return found
 
     def _target(self, k: int) -> np.ndarray:
         frame = self.frames[k]
