@@ -77,7 +77,7 @@ export class Files {
     const { canUndo, isCurrent } = this.storage.attach(`${fingerprintOf(player.base)}-${segments.total}-${segments.spans.length}`, history, (steps) => editing.check(steps, segments.held));
     if (canUndo) toast("The edit is as you left it.");
     if (this.isOfPage && element("script")) this.readFromDisk(canUndo && isCurrent);
-    if (lost) toast(`${lost} of its ${chunks} chunks are damaged or missing, and the rest is shown. Copy the file again.`, LONG);
+    if (lost) toast(`${lost} of its ${chunks} chunks ${lost > 1 ? "are" : "is"} damaged or missing, and the rest is shown. Copy the file again.`, LONG);
   }
 
   /**

@@ -22,7 +22,7 @@ const ALL = { loaded: 1, lost: 0, chunks: 1, fraction: 1, bytes: 0, coming: [] }
 export async function load(source, post, wish) {
   try {
     const file = await openSource(source), start = await file.read(0, START);
-    if (isCompact(start)) return await loadChunks(file, headerBytes(start), post, wish);
+    if (source.url || isCompact(start)) return await loadChunks(file, headerBytes(start), post, wish);
     const { buffer } = await file.read(0, Infinity);
     post({ model: prepare(readModel(buffer, source.given)), arrived: { ...ALL, bytes: file.received } });
   } catch (error) {
