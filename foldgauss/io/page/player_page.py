@@ -160,8 +160,8 @@ def html_page(
     `original`: the clip's frames, of the model's number and size, shown beside it; as WebP of `quality`, 1 to 100.
     `moving`: find the object that moves, which takes about a second per frame; a button of the page selects it.
     `save_to`: of a page that a local server serves; it may then make requests to that server, and to nothing else.
-    `linked`: the name of a compact file beside the page, with the model, which is then not in the page. The page may make
-    requests to its own server. Not for videos in segments.
+    `linked`: the name of a compact file beside the page, with the model, which is then not in the page, and which the
+    page may ask its own server for. Not for videos in segments.
 
     Raises ValueError for edits that no folded model holds, several envelopes or a degree above 15, in a segment, too,
     for frames that do not fit, and for `linked` segments; its subclass `NothingMoves`; errors of reading as
