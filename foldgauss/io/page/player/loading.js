@@ -16,8 +16,8 @@ const ALL = { loaded: 1, lost: 0, chunks: 1, fraction: 1, bytes: 0, coming: [] }
 /**
  * Decode a source, {data, url, given}, see `openSource` and `readModel`. `post` is called with {fraction}, as far as the
  * first image is decoded; with {model, arrived}, a model in which Gaussians to come are invisible; with {part, arrived}
- * for what is to be placed in it, {arrived} for a chunk that is damaged or missing; or with {error}. `wish`: {time,
- * stopped}, the time shown, and whether to stop, which may change at any time.
+ * for what is to be placed in it, null for a chunk that is damaged or missing; or with {error}. `wish`: {time, stopped},
+ * the time shown, and whether to stop, which may change at any time.
  */
 export async function load(source, post, wish) {
   try {
@@ -31,37 +31,42 @@ export async function load(source, post, wish) {
 }
 
 async function loadChunks(file, length, post, wish) {
-  const header = readHeader(await file.read(0, length)), { motion, chunks } = header;
-  const shared = decodeMotion(header, await file.read(motion.start, motion.stop)), left = [...chunks];
+  const header = readHeader(await file.read(0, length)), { motion, chunks } = header, left = [...chunks];
+  const shared = decodeMotion(header, await file.read(motion.start, motion.stop));
   check(header, shared);
-  let model = prepare({ header, leaves: { ...emptyLeaves(header), ...shared } }), loaded = 0, lost = 0, done = 0, isShown = false;
+  let model = prepare({ header, leaves: { ...emptyLeaves(header), ...shared } }), loaded = 0, lost = 0, done = 0;
   const next = () => {
     if (!left.length) return null;
-    const number = file.inOrder || left.length === chunks.length ? 0 : mostWanted(left, wish.time);
-    const [chunk] = left.splice(number, 1);
+    const isFirst = left.length === chunks.length, [chunk] = left.splice(isFirst || file.inOrder ? 0 : mostWanted(left, wish.time), 1);
     return { chunk, bytes: file.read(chunk.start, chunk.stop).catch(() => null) };
   };
   for (let own = next(), following; own && !wish.stopped; own = following) {
-    const { chunk } = own, bytes = await own.bytes, part = { first: chunk.first };
+    const { chunk } = own, bytes = await own.bytes;
     following = next(); // is read meanwhile
-    try {
-      const leaves = decodeChunk(header, chunk, bytes, (fraction) => isShown || post({ fraction }));
-      check(header, leaves);
-      Object.assign(part, prepareRows(header, leaves, chunk.num_gaussians));
-      loaded++;
-    } catch {
-      lost++;
-      if (lost === chunks.length) throw new Error("The file is damaged or cut short: no part of it can be shown. Copy it again.");
-    }
+    const part = decodePart(header, chunk, bytes, (fraction) => model && post({ fraction }));
+    if (part) loaded++;
+    else if (++lost === chunks.length) throw new Error("The file is damaged or cut short: no part of it can be shown. Copy it again.");
     done += chunk.num_gaussians;
-    const coming = [following?.chunk, ...left].filter(Boolean).map(({ visible }) => visible);
+    const coming = [...(following ? [following.chunk] : []), ...left].map(({ visible }) => visible);
     const arrived = { loaded, lost, chunks: chunks.length, fraction: done / header.num_gaussians, size: chunks.at(-1).stop, coming, bytes: file.received };
-    if (part.values && !isShown) place(model, part);
-    if (isShown) post({ part: part.values && part, arrived });
-    else if (part.values) post({ model, arrived });
-    isShown ||= Boolean(part.values);
-    if (isShown) model = null; // it may have been handed over
+    if (!model) post({ part, arrived });
+    else if (part) {
+      place(model, part);
+      post({ model, arrived });
+      model = null; // it is the page's now
+    }
     await new Promise((goOn) => setTimeout(goOn)); // for messages, and for the page
+  }
+}
+
+/** What is to be placed in the model for a chunk; null if it is damaged or missing. */
+function decodePart(header, chunk, bytes, onProgress) {
+  try {
+    const leaves = decodeChunk(header, chunk, bytes, onProgress);
+    check(header, leaves);
+    return { first: chunk.first, ...prepareRows(header, leaves, chunk.num_gaussians) };
+  } catch {
+    return null;
   }
 }
 
@@ -119,7 +124,7 @@ export class Decoder {
     return loaded + lost === chunks;
   }
 
-  /** Decode a model; `onProgress` is called with the fraction decoded, and afterwards `onPart` with each part, or without one for a chunk that is lost. */
+  /** Decode a model; `onProgress` is called with the fraction decoded, and afterwards `onPart` with each part, null for a chunk that is lost. */
   decode(number, onProgress) {
     const source = this.sources[number];
     return new Promise((resolve, reject) => {

@@ -142,7 +142,7 @@ export class Segments {
     job.then((model) => this.job === job && this.accept(next, model)).catch((error) => this.job === job && this.failed(error));
   }
 
-  /** Take a part of the single model, none for a chunk that is lost. */
+  /** Take a part of the single model, null for a chunk that is lost. */
   take(part) {
     if (part) place(this.held.get(0).base, part);
     this.work();
