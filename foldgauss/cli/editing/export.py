@@ -38,7 +38,7 @@ from foldgauss.io.models.video_model import (
     load_video_model,
     save_video_model,
 )
-from foldgauss.io.page.player_page import HTML_SUFFIX, QUALITY, write_html
+from foldgauss.io.page.player_page import HTML_SUFFIX, QUALITY, linked_file, write_html
 from foldgauss.video.editing.edited_video import EditedVideo
 
 _NAMES = {"ply": "VeGaS video", "ply3dgs": "3DGS scenes", "obj": "triangles", "html": "player"}
@@ -66,6 +66,9 @@ def export_command(
     times: Times = None,
     original: Original = None,
     original_quality: OriginalQuality = QUALITY,
+    linked: Annotated[
+        bool, typer.Option("--linked", help="html: the model in a .fgz beside the page, read in parts over HTTP.")
+    ] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Write a model for other programs, or as a web page.
@@ -96,20 +99,25 @@ def export_command(
         raise wrong_use("--out", expected=f"a name ending in {HTML_SUFFIX}", got=out_path)
     if file_format != "html" and original is not None:
         raise wrong_use("--original", expected="--format html", got=file_format)
+    if file_format != "html" and linked:
+        raise wrong_use("--linked", expected="--format html", got=file_format)
     if file_format == "html" and times is not None:
         raise wrong_use("--times", expected="another format", got="html", cure="A page shows all times.")
     if not out_path.is_dir():
         refuse_existing(out_path, overwrite)
+    file = linked_file(out_path, model_path) if linked else None
+    if file is not None and not (file.exists() and file.samefile(model_path)):
+        refuse_existing(file, overwrite)
     model = load_video_model(model_path)
     if file_format == "html":
         check_writable(out_path)
         frames = None if original is None else read_fitted_clip(model, model_path, original, None, name="--original")
         with show_status("Writing the page"):
-            out_path = write_result(
-                out_path, lambda path: write_html(path, model_path, original=frames, quality=original_quality)
-            )
+            options = {"original": frames, "quality": original_quality, "linked": linked}
+            out_path = write_result(out_path, lambda path: write_html(path, model_path, **options))
         size = out_path.stat().st_size / 1e6
-        out.print(f"{out_path}: a page of {size:.1f} MB, {model.num_gaussians:,} Gaussians", soft_wrap=True)
+        beside = f", which reads {linked_file(out_path, model_path)}" if linked else ""
+        out.print(f"{out_path}: a page of {size:.1f} MB{beside}, {model.num_gaussians:,} Gaussians", soft_wrap=True)
         return
     if file_format == "ply" and isinstance(model, EditedVideo):
         cure = "Its frames can be exported as ply3dgs or obj."

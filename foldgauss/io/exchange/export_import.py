@@ -12,7 +12,7 @@ from foldgauss.io.exchange.ply_file import format_error
 from foldgauss.io.exchange.pseudomesh import write_pseudomesh
 from foldgauss.io.exchange.vegas_ply import read_vegas_ply, write_vegas_ply
 from foldgauss.io.media.clip import Size
-from foldgauss.io.page.player_page import HTML_SUFFIX, Frames, write_html
+from foldgauss.io.page.player_page import HTML_SUFFIX, Frames, linked_file, write_html
 from foldgauss.video.editing.chain import Edit
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.video_model import VideoModel
@@ -35,6 +35,7 @@ def export(
     original: Frames | None = None,
     quality: int | None = None,
     title: str | None = None,
+    linked: bool | None = None,
     overwrite: bool = False,
     on_frame: Callable[[], object] = lambda: None,
 ) -> Path:
@@ -48,7 +49,7 @@ def export(
     - `html`: one page for browsers, which renders the Gaussians at any time (`write_html`)
 
     `times` in [0, 1], one or several (default: the model's frame times), for the formats of frames; `depth_step`,
-    `axes` and `sh_degree` for `ply3dgs`; `original`, `quality` and `title` for `html`. An existing output
+    `axes` and `sh_degree` for `ply3dgs`; `original`, `quality`, `title` and `linked` for `html`. An existing output
     is refused unless `overwrite`. `on_frame` is called after each frame of a folder.
 
     **Raises:** ValueError for an unknown format, an option of another format, and as the function;
@@ -63,7 +64,7 @@ def export(
     check_one_of("format", format, FORMATS)
     out = check_path(out, "model, format, out")
     of_scenes = _without_none(depth_step=depth_step, axes=axes, sh_degree=sh_degree)
-    of_pages = _without_none(original=original, quality=quality, title=title)
+    of_pages = _without_none(original=original, quality=quality, title=title, linked=linked)
     unknown = [*(of_scenes if format != "ply3dgs" else ()), *(of_pages if format != "html" else ())]
     unknown += ["times"] if format in ("ply", "html") and times is not None else []
     if unknown:
@@ -75,7 +76,8 @@ def export(
         return write_vegas_ply(out, model)
     if format == "html":
         if out.suffix.lower() == HTML_SUFFIX:
-            _check_new(out, overwrite)
+            for path in (out, linked_file(out, model)) if linked else (out,):
+                _check_new(path, overwrite)
         return write_html(out, model, **of_pages)
     if format == "obj":
         if out.suffix.lower() == ".obj" and not out.is_dir():

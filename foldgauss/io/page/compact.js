@@ -1,5 +1,6 @@
 // Decoder of compact model files (.fgz), see docs/format.md. It repeats the operations of
 // foldgauss.video.compression.quantize.dequantize in their order, for the same bits. No dependency on a browser.
+// `decode` takes a whole file. To read one in parts: `headerBytes`, `readHeader`, `decodeMotion`, then `decodeChunk`.
 
 const FEATURES = ["class", "size", "stretch", "duration", "opacity"];
 const COLORS = ["luma", "blue", "green"];
@@ -10,15 +11,23 @@ const AXES = [
   [-0.408248290463863, 0.8164965809277261, -0.408248290463863],
 ];
 const WIDEST = { time: 0.125, angle: 0.125, size: 0.35, stretch: 0.5, duration: 0.5, opacity: 1.0 };
-const MAGIC = [0x8b, 0x46, 0x47, 0x5a, 0x0d, 0x0a, 0x1a, 0x0a], VERSION = 5;
+const MAGIC = [0x8b, 0x46, 0x47, 0x5a, 0x0d, 0x0a, 0x1a, 0x0a], VERSION = 6, FIXED = 20;
 const NODES = 130, CONTEXTS = 256, MODELS = 3, MEMORY = 400, LARGEST_BITS = 30, FARTHEST = 120, FINEST = -48;
 const WEIGHT = 29491, RATE = 6, MARGIN = 32;
 const KNOTS = [
   22, 36, 60, 98, 162, 267, 439, 720, 1179, 1921, 3108, 4971, 7812, 11955, 17625, 24743, 32768,
   40793, 47911, 53581, 57724, 60565, 62428, 63615, 64357, 64816, 65097, 65269, 65374, 65438, 65476, 65500, 65514,
 ];
+const DAMAGED = "The file is damaged. Copy it again, or compress again.";
 const LN2 = 0.6931471805599453, SQRT2 = 1.4142135623730951;
 const NEIGHBORS = 4, CANDIDATES = 16, TIME = 0.3;
+/** Limits of headers, so that a small file cannot claim much memory. */
+const MOST_PER_BYTE = 32, MOST_DEGREE = 15, MOST_CELL_BITS = 24;
+/** Numbers per Gaussian of each leaf; only a model with shared paths has `path_index`. */
+const WIDTHS = {
+  loc: () => 2, log_scale: () => 2, angle_logit: () => 1, time_loc_logit: () => 1, log_time_scale: () => 1,
+  coefficients: (degree) => 2 * degree, opacity_logit: () => 1, color_dc: () => 3, path_index: () => 1,
+};
 
 const LOGISTIC = Int32Array.from({ length: 4096 }, (_, place) => {
   const k = place >> 7, part = place & 127;
@@ -111,7 +120,7 @@ export function decodeColumn(data, column) {
     if (!adaptiveBit(0)) {
       const negative = adaptiveBit(1);
       let exponent = 0;
-      while (adaptiveBit(2 + exponent)) if (++exponent >= LARGEST_BITS) throw new Error("a column is damaged");
+      while (adaptiveBit(2 + exponent)) if (++exponent >= LARGEST_BITS) throw new Error(DAMAGED);
       let magnitude = 1, leading = 1;
       for (let b = 0; b < exponent; b++) {
         let one;
@@ -125,7 +134,7 @@ export function decodeColumn(data, column) {
     }
     seen[i] = (column.origin(i) + values[i] * column.step(i)) / column.scale(i);
   }
-  if (next !== data.length + 3) throw new Error("a column is damaged");
+  if (next !== data.length + 3) throw new Error(DAMAGED);
   return values;
 }
 
@@ -233,16 +242,16 @@ function columnNames({ degree, paths }) {
   return [...WHOLE.slice(0, paths ? 4 : 3), ...FEATURES.slice(1), "time", ...path, "angle", ...COLORS];
 }
 
-/** The values of all columns. */
-function decodeColumns(header, streamOf, onColumn) {
-  const num = header.num_gaussians, { cells, paths } = header, q = {}, v = {}, features = [];
+/** The values of all columns of a chunk. */
+function decodeColumns(header, { num_gaussians: num, cells }, streams, onColumn) {
+  const { paths } = header, q = {}, v = {}, features = [], most = { degree: header.degree, path: paths?.num_paths };
   const [height, width] = header.size, longer = Math.max(height, width);
   const sides = [...(paths?.sides ?? [width / longer, height / longer]), 1], middles = [...(paths?.middle ?? [0, 0]), 0.5];
   const half = new Float64Array(num), one = () => 1;
   let inCell, nearest;
   const names = columnNames(header);
   names.forEach((name, column) => {
-    const [length, origin, exponent, ...slopes] = header.columns[column];
+    const [origin, exponent, ...slopes] = header.rules[column];
     const k = /^[xy]\d+$/.test(name) ? Number(name.slice(1)) : -1, axis = ["x0", "y0", "time"].indexOf(name);
     const has = k > 0 ? (i) => q.degree[i] >= k : () => true;
     const halves = new Int32Array(num), steps = new Float64Array(num).fill(1), from = new Float64Array(num);
@@ -278,8 +287,9 @@ function decodeColumns(header, streamOf, onColumn) {
       const scale = k > 0 ? (i) => { let s = half[i]; for (let n = 1; n < k; n++) s = s * half[i]; return s; } : one;
       known = { ...known, has, contexts, scale, near, width: NEIGHBORS };
     }
-    const numbers = decodeColumn(streamOf(length), known);
+    const numbers = decodeColumn(streams[column], known);
     onColumn((column + 1) / names.length);
+    if (name in most && numbers.some((own) => own < 0 || own > most[name])) throw new Error(DAMAGED);
     if (name === "cell") {
       let here = 0;
       for (let i = 0; i < num; i++) numbers[i] = here = (here + numbers[i]) & (2 ** (cells[0] + cells[1] + cells[2]) - 1);
@@ -300,7 +310,7 @@ function decodeColumns(header, streamOf, onColumn) {
 }
 
 /** Shared paths: the times of their knots, and their maps. */
-function decodePaths({ paths }, stream, logits) {
+function decodePaths({ paths }, [knotBytes, mapBytes], logits) {
   const { num_paths: num, num_knots: knots, bits } = paths, total = num * knots;
   const times = new Float32Array(total), matrices = new Float32Array(6 * total);
   const before = (i, width) => (Math.floor(i / width) % knots > 0 ? i - width : -1);
@@ -309,40 +319,114 @@ function decodePaths({ paths }, stream, logits) {
     for (const own of logits) sums.push(sums.at(-1) + exp(own - largest));
     for (let i = 0; i < total; i++) times[i] = i % knots ? sums[i % knots] / sums.at(-1) : 0;
   } else {
-    const numbers = Array.from(decodeColumn(stream(paths.knots), emptyColumn(total)));
+    const numbers = Array.from(decodeColumn(knotBytes, emptyColumn(total)));
     for (let i = 0; i < total; i++) times[i] = (numbers[i] += numbers[before(i, 1)] ?? 0) * 2 ** -24;
   }
   const near = Int32Array.from({ length: 6 * total }, (_, i) => before(i, 6)), contexts = (i) => [i % 6, 0];
-  const numbers = Array.from(decodeColumn(stream(paths.maps), { ...emptyColumn(6 * total), contexts, near, width: 1 }));
+  const numbers = Array.from(decodeColumn(mapBytes, { ...emptyColumn(6 * total), contexts, near, width: 1 }));
   for (let i = 0; i < 6 * total; i++)
     matrices[i] = (numbers[i] += numbers[near[i]] ?? (i % 6 === 0 || i % 6 === 4 ? 2 ** bits : 0)) * 2 ** -bits;
   return { path_times: times, path_matrices: matrices };
 }
 
+const CRC = Uint32Array.from({ length: 256 }, (_, n) => {
+  for (let k = 0; k < 8; k++) n = n & 1 ? (n >>> 1) ^ 0xedb88320 : n >>> 1;
+  return n;
+});
+
+function crc32(bytes) {
+  let sum = 0xffffffff;
+  for (let k = 0; k < bytes.length; k++) sum = CRC[(sum ^ bytes[k]) & 255] ^ (sum >>> 8);
+  return (sum ^ 0xffffffff) >>> 0;
+}
+
+/** The number of bytes up to the end of the header, from the first 20. Throws an Error for another file. */
+export function headerBytes(bytes) {
+  if (bytes.length < FIXED || MAGIC.some((own, k) => bytes[k] !== own)) throw new Error("This is not a compact model, or one that a transfer has damaged.");
+  const fixed = new DataView(bytes.buffer, bytes.byteOffset), version = fixed.getUint32(8, true);
+  if (version !== VERSION) throw new Error(`This compact model has version ${version}; the page reads version ${VERSION}. ${version < VERSION ? "Compress the model again." : "Write the page with the newer foldgauss."}`);
+  return FIXED + fixed.getUint32(12, true);
+}
+
 /**
- * {header, leaves}: the file's header, and Float32Arrays named and laid out as in FoldedSplats, and frame_times; with
- * shared paths, `path_index` (Uint8Array), `path_times` and `path_matrices`, too.
- * `onColumn` is called with the fraction of columns decoded.
+ * The header, from the bytes up to its end. Added are `num_gaussians` of all chunks; to motion and chunks `start` and
+ * `stop`, their bytes in the file; and to chunks `first`, the number in the model of their first Gaussian.
+ */
+export function readHeader(bytes) {
+  const end = headerBytes(bytes), text = bytes.subarray(FIXED, end);
+  const sum = new DataView(bytes.buffer, bytes.byteOffset).getUint32(16, true);
+  if (bytes.length < end || crc32(text) !== sum) throw new Error(DAMAGED);
+  const header = JSON.parse(new TextDecoder().decode(text)), { degree, num_frames: frames, paths, motion, chunks } = header;
+  if (!(Number.isInteger(degree) && degree >= 0 && degree <= MOST_DEGREE && chunks.length)) throw new Error(DAMAGED);
+  let at = end, first = 0;
+  for (const own of [motion, ...chunks]) [own.start, own.stop] = [at, (at += own.streams.reduce((all, one) => all + one, 0))];
+  for (const own of [...chunks].reverse()) [own.first, first] = [first, first + own.num_gaussians];
+  const ofPaths = paths ? paths.num_paths * paths.num_knots * (paths.at_frames ? 6 : 7) : 0, { length } = columnNames(header);
+  const counts = [frames + ofPaths, ...chunks.map((own) => own.num_gaussians * length)];
+  const fit = [motion, ...chunks].every(({ start, stop }, k) => counts[k] > 0 && counts[k] <= MOST_PER_BYTE * (stop - start + end - FIXED));
+  if (!fit || !chunks.every(haveRoom)) throw new Error(DAMAGED);
+  return Object.assign(header, { num_gaussians: first });
+}
+
+/** Whether a chunk has no more cells than Gaussians. */
+function haveRoom({ cells: [x, y, time], num_gaussians: num }) {
+  return x + y + time <= MOST_CELL_BITS && 2 ** Math.max(x + y + time, 2 * x, 2 * y) <= num;
+}
+
+/** The streams of a block, from its bytes. */
+function streamsOf(block, bytes) {
+  if (bytes.length !== block.stop - block.start || crc32(bytes) !== block.crc) throw new Error(DAMAGED);
+  let at = 0;
+  return block.streams.map((length) => bytes.subarray(at, (at += length)));
+}
+
+/** The leaves that all chunks share, from the bytes of the block of motion: see `decode`. */
+export function decodeMotion(header, bytes) {
+  const [times, ...ofPaths] = streamsOf(header.motion, bytes), step = 2 ** -header.time_bits;
+  const logits = Float64Array.from(decodeColumn(times, emptyColumn(header.num_frames - 1)), (q) => q * step);
+  return withoutNegativeZeros({ frame_times: Float32Array.from(logits), ...(header.paths ? decodePaths(header, ofPaths, logits) : {}) });
+}
+
+/** Leaves of `num` Gaussians. */
+function makeLeaves({ degree, paths }, num) {
+  const names = Object.keys(WIDTHS).filter((name) => paths || name !== "path_index");
+  return Object.fromEntries(names.map((name) => [name, new (name === "path_index" ? Uint8Array : Float32Array)(num * WIDTHS[name](degree))]));
+}
+
+/** Leaves of all of a model's Gaussians before any has arrived: each is there at the end of the clip for no time, and without opacity. */
+export function emptyLeaves(header) {
+  const leaves = makeLeaves(header, header.num_gaussians);
+  leaves.time_loc_logit.fill(1000);
+  leaves.log_time_scale.fill(-1000);
+  leaves.opacity_logit.fill(-1000);
+  return leaves;
+}
+
+/**
+ * {header, leaves, lost}: the file's header, and Float32Arrays named and laid out as in FoldedSplats, and frame_times;
+ * with shared paths, `path_index` (Uint8Array), `path_times` and `path_matrices`, too. `lost`: the chunks that are damaged
+ * or missing, whose Gaussians are those of `emptyLeaves`. `onColumn` is called with the fraction of columns decoded.
  */
 export function decode(buffer, onColumn = () => {}) {
-  const bytes = new Uint8Array(buffer), fixed = new DataView(buffer);
-  if (bytes.length < 20 || MAGIC.some((own, k) => bytes[k] !== own)) throw new Error("not a compact model");
-  if (fixed.getUint32(8, true) !== VERSION) throw new Error("a compact model of another version");
-  let start = 20 + fixed.getUint32(12, true);
-  const header = JSON.parse(new TextDecoder().decode(bytes.subarray(20, start)));
-  const num = header.num_gaussians, degree = header.degree;
-  const stream = (length) => bytes.subarray(start, (start += length));
-  const v = decodeColumns(header, stream, onColumn);
-  const intervals = decodeColumn(stream(header.intervals), emptyColumn(header.num_frames - 1));
-  const step = 2 ** -header.time_bits;
-  const logits = Float64Array.from(intervals, (q) => q * step);
-  const leaves = {
-    loc: new Float32Array(2 * num), log_scale: new Float32Array(2 * num), angle_logit: new Float32Array(num),
-    time_loc_logit: new Float32Array(num), log_time_scale: new Float32Array(num),
-    coefficients: new Float32Array(2 * num * degree), opacity_logit: new Float32Array(num),
-    color_dc: new Float32Array(3 * num), frame_times: Float32Array.from(logits),
-  };
-  if (header.paths) Object.assign(leaves, { path_index: Uint8Array.from(v.path) }, decodePaths(header, stream, logits));
+  const bytes = new Uint8Array(buffer), header = readHeader(bytes), { motion, chunks, degree } = header, lost = [];
+  const leaves = { ...emptyLeaves(header), ...decodeMotion(header, bytes.subarray(motion.start, motion.stop)) };
+  chunks.forEach((chunk, number) => {
+    try {
+      const part = decodeChunk(header, chunk, bytes.subarray(chunk.start, chunk.stop), (fraction) => onColumn((number + fraction) / chunks.length));
+      for (const [name, own] of Object.entries(part)) leaves[name].set(own, chunk.first * WIDTHS[name](degree));
+    } catch {
+      lost.push(number);
+    }
+  });
+  if (lost.length === chunks.length) throw new Error(DAMAGED);
+  return { header, leaves, lost };
+}
+
+/** The leaves of a chunk's Gaussians, from its bytes. Throws an Error if it is damaged. */
+export function decodeChunk(header, chunk, bytes, onColumn = () => {}) {
+  const num = chunk.num_gaussians, { degree } = header, v = decodeColumns(header, chunk, streamsOf(chunk, bytes), onColumn);
+  const leaves = makeLeaves(header, num);
+  leaves.path_index?.set(v.path);
   const table = legendre(degree), powers = new Float64Array(degree + 1);
   for (let i = 0; i < num; i++) {
     const time = inClip(v.time[i]);
@@ -371,6 +455,10 @@ export function decode(buffer, onColumn = () => {}) {
       }
     }
   }
-  for (const leaf of Object.values(leaves)) for (let k = 0; k < leaf.length; k++) leaf[k] = leaf[k] + 0; // no -0
-  return { header, leaves };
+  return withoutNegativeZeros(leaves);
+}
+
+function withoutNegativeZeros(leaves) {
+  for (const leaf of Object.values(leaves)) for (let k = 0; k < leaf.length; k++) leaf[k] = leaf[k] + 0;
+  return leaves;
 }

@@ -1,6 +1,7 @@
 """A model as one HTML page with a player that renders the folded Gaussians at any time in a browser.
 
-The page is self-contained: it holds the model as a compact file (one per segment) and makes no network requests.
+The page is self-contained: it holds the model as a compact file (one per segment) and makes no network requests. Only a
+linked one reads the compact file beside it.
 Its sources are the files in `player/`; `compact.js` decodes the models there. See docs/player.md.
 """
 
@@ -9,7 +10,9 @@ import dataclasses
 import hashlib
 import html
 import json
+import os
 import re
+import urllib.parse
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,7 +24,7 @@ from jaxtyping import UInt8
 from foldgauss._runtime.checks import invalid, is_integer, short_repr
 from foldgauss.io._atomic import PathLike, atomic_path, check_path
 from foldgauss.io.media.clip import Clip
-from foldgauss.io.models.compact import is_compact, pack_compact
+from foldgauss.io.models.compact import COMPACT_SUFFIX, is_compact, pack_compact
 from foldgauss.io.models.segmented import read_segment_file
 from foldgauss.io.models.selections import format_indices
 from foldgauss.io.models.video_model import keep_origin, load_video_model, read_frame_seconds, read_origin
@@ -71,8 +74,12 @@ def write_html(
     original: Frames | None = None,
     quality: int = QUALITY,
     title: str | None = None,
+    linked: bool = False,
 ) -> Path:
     """Write the page of `html_page` to a file that ends in .html; what exists is replaced. Warns of one beyond 50 MB.
+
+    `linked`: the page reads the model from a compact file in its folder, in parts, so that it must be served over HTTP.
+    A compact model that is there already is that file. Any other is written to the page's name with .fgz.
 
     Raises as `html_page`, ValueError for another name, `OutputError` where it cannot be written.
 
@@ -81,11 +88,24 @@ def write_html(
     path = check_path(path, "path, model")
     if path.suffix.lower() != HTML_SUFFIX:
         raise invalid("path", expected=f"a name ending in {HTML_SUFFIX}", got=repr(str(path)))
-    page = html_page(model, original=original, quality=quality, title=path.stem if title is None else title)
+    file = linked_file(path, model) if linked else None
+    title, name = path.stem if title is None else title, None if file is None else file.name
+    page = html_page(model, original=original, quality=quality, title=title, linked=name)
     warn_of_size(page, original is not None)
+    if file is not None and not (isinstance(model, PathLike) and file.exists() and file.samefile(model)):
+        loaded, _, metadata = _load(model)
+        with atomic_path(file) as temporary:
+            temporary.write_bytes(_pack(model, loaded, metadata))
     with atomic_path(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
     return path
+
+
+def linked_file(path: Path, model: Model) -> Path:
+    """The compact file that a page with this path reads its model from."""
+    if isinstance(model, PathLike) and is_compact(model) and Path(model).parent.resolve() == path.parent.resolve():
+        return Path(model)
+    return path.with_suffix(COMPACT_SUFFIX)
 
 
 def warn_of_size(page: str, has_original: bool) -> None:
@@ -132,6 +152,7 @@ def html_page(
     title: str | None = None,
     moving: bool = False,
     save_to: SaveTarget | None = None,
+    linked: str | None = None,
 ) -> str:
     """The page as text.
 
@@ -140,9 +161,12 @@ def html_page(
     `original`: the clip's frames, of the model's number and size, shown beside it; as WebP of `quality`, 1 to 100.
     `moving`: find the object that moves, which takes about a second per frame; a button of the page selects it.
     `save_to`: of a page that a local server serves; it may then make requests to that server, and to nothing else.
+    `linked`: the name of a compact file beside the page, with the model, which is then not in the page, and which the
+    page may ask its own server for. Not for videos in segments.
 
     Raises ValueError for edits that no folded model holds, several envelopes or a degree above 15, in a segment, too,
-    and for frames that do not fit; its subclass `NothingMoves`; errors of reading as `load_video_model`.
+    for frames that do not fit, and for `linked` segments; its subclass `NothingMoves`; errors of reading as
+    `load_video_model`.
 
     Example: `html_page(model, title="holiday")`.
     """
@@ -150,8 +174,9 @@ def html_page(
         raise invalid("quality", expected="a whole number from 1 to 100", got=quality)
     plain, name, metadata = _load(model)
     pictures = [] if original is None else list(_encode_original(original, plain, quality))
-    blocks = [*_encode_model(model, plain, metadata), *([_encode_moving(plain)] if moving else []), *pictures]
-    return _assemble(blocks, name if title is None else title, save_to)
+    models = _encode_model(model, plain, metadata) if linked is None else [_link(plain, linked)]
+    blocks = [*models, *([_encode_moving(plain)] if moving else []), *pictures]
+    return _assemble(blocks, name if title is None else title, save_to, connects=linked is not None)
 
 
 def empty_page() -> str:
@@ -215,10 +240,23 @@ def _encode_model(model: Model, loaded: Loaded, metadata: dict) -> Iterator[str]
             except ValueError as error:
                 raise ValueError(f"segment {number}: {error}") from error
             yield _block(f"model-{number}", pack_compact(quantize_finely(plain), {} if number else metadata))
-    elif loaded is not model and is_compact(model):
-        yield _block("model", Path(model).read_bytes())
     else:
-        yield _block("model", pack_compact(quantize_finely(flatten_video(loaded)), metadata))
+        yield _block("model", _pack(model, loaded, metadata))
+
+
+def _pack(model: Model, loaded: VideoModel | EditedVideo, metadata: dict) -> bytes:
+    """The compact file of a single model; one that is compact already is not changed."""
+    if loaded is not model and is_compact(model):
+        return Path(model).read_bytes()
+    return pack_compact(quantize_finely(flatten_video(loaded)), metadata)
+
+
+def _link(loaded: Loaded, name: str) -> str:
+    """The page's block of a model in a file beside it."""
+    if isinstance(loaded, SegmentedVideo):
+        raise invalid("linked", expected="a single model", got="one in segments", cure="Leave linked out.")
+    url = urllib.parse.quote(os.fsencode(name), safe="")
+    return f'<script type="application/octet-stream" id="model" data-url="{url}"></script>'
 
 
 def _encode_moving(model: Loaded) -> str:
@@ -285,10 +323,10 @@ def _encode_original(original: Frames, model: Loaded, quality: int) -> Iterator[
 # ------------------------------------------------------------------------------------------------ the page
 
 
-def _assemble(blocks: list[str], title: str, save_to: SaveTarget | None = None) -> str:
+def _assemble(blocks: list[str], title: str, save_to: SaveTarget | None = None, *, connects: bool = False) -> str:
     script, style = bundle_script("main.js"), (_SOURCES / "player.css").read_text(encoding="utf-8")
     parts = {
-        "policy": _policy(script, style, connects=save_to is not None),
+        "policy": _policy(script, style, connects=connects or save_to is not None),
         "title": html.escape(title.encode("utf-8", "replace").decode()),  # names of files need not be UTF-8
         "style": style,
         "data": "\n".join([*blocks, *(save_to.blocks() if save_to else ())]),

@@ -67,10 +67,8 @@ _TRIES = 8
 _TOLERANCE_LOG2 = 0.02
 #: By how much the binary logarithm of a size falls for each unit of coarseness, as measured.
 _SLOPE_LOG2 = 0.8
-#: By how many dB the PSNR rises for twice the number of Gaussians, as measured.
-_DB_PER_DOUBLING = 1.8
-#: The fraction of the error of rounding that remains after the rest of the fit, rather too much.
-_LEFT_OF_ROUNDING = 0.6
+#: The fraction of the error of dropping, and of rounding, that remains after the rest of the fit, as measured.
+_LEFT_OF_DROPPING, _LEFT_OF_ROUNDING = 0.2, 0.6
 #: How finely the coarseness is searched for a PSNR.
 _TOLERANCE = 0.1
 #: Frames that a PSNR is estimated by.
@@ -101,27 +99,26 @@ class Action(NamedTuple):
     """What is done once a fraction of the plan is over: "drop", "sort", or the group of leaves to round.
 
     `extent`: the fraction of the price of a bit at which Gaussians are dropped, or of the Gaussians that are rounded.
-    `gain`: about how many dB the running PSNR rises from then to the end, rather too few; `regain`: by how many dB an
-    image without what was dropped rises.
+    `gain`: about how many dB the running PSNR rises from then to the end of the fit, rounding included, if nothing is
+    dropped any more; rather too few.
     """
 
     progress: float
     what: str | tuple[str, ...]
     extent: float = 1.0
     gain: float = 0.0
-    regain: float = 0.0
 
 
 ACTIONS = (
-    Action(0.1, "drop", 0.04, 1.5, 6.0),
-    Action(0.2, "drop", 0.16, 1.0, 4.0),
-    Action(0.3, "drop", 0.36, 0.7, 3.0),
-    Action(0.42, "drop", 0.64, 0.5, 2.0),
-    Action(0.55, "drop", 1.0, 0.4, 1.7),
+    Action(0.1, "drop", 0.04, 4.0),
+    Action(0.2, "drop", 0.16, 3.0),
+    Action(0.3, "drop", 0.36, 2.1),
+    Action(0.42, "drop", 0.64, 1.3),
+    Action(0.55, "drop", 1.0, 0.7),
     Action(0.55, "sort"),
-    Action(0.7, SHAPE, 0.4, 0.3),
+    Action(0.7, SHAPE, 0.4, 0.4),
     Action(0.78, SHAPE, 0.75),
-    Action(0.84, "drop", 1.0, 0.0, 0.5),
+    Action(0.84, "drop", 1.0, -0.35),
     Action(0.86, SHAPE, 1.0),
     Action(0.91, TRAJECTORY, 0.5),
     Action(0.96, TRAJECTORY, 1.0),
@@ -296,30 +293,29 @@ class RateControl:
         return _solve(excess, state.coarseness or USUAL_COARSENESS)
 
     def _solve_psnr(self, state: FitState, quantizer: Quantizer, action: Action) -> float:
-        """The coarseness for the PSNR that is asked for, by some frames without what is dropped, or rounded."""
+        """The coarseness for the PSNR that is asked for, by some frames without what is dropped, or rounded.
+
+        The rest of the fit makes up for a part of the error that this adds, and reduces the other error.
+        """
         aim, now, adaptation = self.config.psnr + _MARGIN_DB, running_psnr(state), self._adaptation(state)
-        action = action._replace(gain=adaptation * action.gain, regain=adaptation * action.regain)
-        if action.what == "drop":
-            ahead = now + action.gain - aim
-            most = quantizer.coarseness_for(
-                len(quantizer.removal) * 2 ** (-ahead / _DB_PER_DOUBLING), fraction=action.extent
-            )
-            model = self._model(state)
+        is_converged = not state.coarseness and state.rate_actions > 0  # a model that was given
+        left = 10 ** (-0.1 * (now + (0.0 if is_converged else adaptation * action.gain)))
+        remaining = 1 - adaptation * (1 - (_LEFT_OF_DROPPING if action.what == "drop" else _LEFT_OF_ROUNDING))
+        model = self._model(state)
 
-            def reached(coarseness: float) -> float:
-                kept = quantizer.are_worth(coarseness, action.extent)
-                return (
-                    self._psnr(dataclasses.replace(model, splats=model.splats.take(kept)), self.sampled) + action.regain
+        def reached(coarseness: float) -> float:
+            if action.what == "drop":
+                changed = dataclasses.replace(
+                    model, splats=model.splats.take(quantizer.are_worth(coarseness, action.extent))
                 )
-        else:
-            most = state.coarseness + _MOST_CHANGE if state.coarseness else COARSEST
+            else:
+                changed = dequantize(quantizer.quantize(coarseness))
+            more = 10 ** (-0.1 * self._psnr(changed, self.sampled)) - 10 ** (-0.1 * now)
+            return -10 * math.log10(left + remaining * max(more, 0.0))
 
-            def reached(coarseness: float) -> float:
-                rounded = self._psnr(dequantize(quantizer.quantize(coarseness)), self.sampled)
-                left, more = (10 ** (-0.1 * db) for db in (now + action.gain, now))
-                return -10 * math.log10(left + _LEFT_OF_ROUNDING * max(10 ** (-0.1 * rounded) - more, 0.0))
-
-        low, high = FINEST, min(max(most, FINEST), COARSEST)
+        low, high = FINEST, COARSEST
+        if action.what != "drop" and state.coarseness:
+            high = min(state.coarseness + _MOST_CHANGE, COARSEST)
         if reached(high) >= aim:
             return high
         while high - low > _TOLERANCE:

@@ -1,10 +1,12 @@
 // Opening models and scripts, and saving the edit: downloads, and the disk if the page comes from `foldgauss view`.
 import { element, on, put, toast } from "./elements.js";
-import { Decoder, bytesOf } from "./loading.js";
+import { fingerprintOf } from "./gaussians.js";
+import { Decoder, UNFINISHED } from "./loading.js";
 import { writeSafetensors } from "./safetensors.js";
 import { readScript, writeScript } from "./script.js";
 import { Segments } from "./segments.js";
 import { openDialog } from "./shell.js";
+import { bytesOf } from "./sources.js";
 import { withoutUnseen } from "./state.js";
 import { Storage } from "./storage.js";
 
@@ -56,24 +58,26 @@ export class Files {
     element("chooser").click();
   }
 
-  /** Describe a model that was opened, and take up its edit where it was left. */
+  /** Describe a model that was opened, and once all of it has arrived take up its edit where it was left. */
   attach(title) {
     this.title = title;
-    const { player, server } = this, { editing, segments } = player, { fingerprint } = player.base;
+    const { player, server } = this, { editing, segments } = player, { isWhole, arrived: { lost, chunks } } = segments.decoder;
+    for (const one of document.querySelectorAll(".with-edit")) one.hidden = !isWhole;
+    if (!isWhole) return;
     const { history } = editing, changed = history.onChange;
     history.onChange = () => {
       this.storage.changed();
       changed();
     };
-    for (const one of document.querySelectorAll(".with-edit")) one.hidden = false;
     element("save-disk").hidden = element("save-about").hidden = !server || !this.isOfPage;
     element("select-moving").hidden = !this.isOfPage || !element("moving");
     if (server) put("save-about", `As ${server.script}`);
     element("download-model").disabled = segments.spans.length > 1;
     this.storage.version = server && this.isOfPage ? element("script")?.dataset.version ?? NO_SCRIPT : undefined;
-    const { canUndo, isCurrent } = this.storage.attach(`${fingerprint}-${segments.total}-${segments.spans.length}`, history, (steps) => editing.check(steps, segments.held));
+    const { canUndo, isCurrent } = this.storage.attach(`${fingerprintOf(player.base)}-${segments.total}-${segments.spans.length}`, history, (steps) => editing.check(steps, segments.held));
     if (canUndo) toast("The edit is as you left it.");
     if (this.isOfPage && element("script")) this.readFromDisk(canUndo && isCurrent);
+    if (lost) toast(`${lost} of its ${chunks} chunks ${lost > 1 ? "are" : "is"} damaged or missing, and the rest is shown. Copy the file again.`, LONG);
   }
 
   /**
@@ -100,7 +104,7 @@ export class Files {
     if (!file) return;
     element("files").close();
     if (/\.toml$/i.test(file.name)) return this.readScript(await file.text(), file.name);
-    await this.openModel(await file.arrayBuffer(), file.name);
+    await this.openModel(file, file.name);
   }
 
   async openModel(data, name, given) {
@@ -132,8 +136,8 @@ export class Files {
   /** Apply a script; whether that was possible. */
   readScript(text, name) {
     const { player } = this;
-    if (!player.segments) {
-      toast("Open the model first, then its script.", LONG);
+    if (!player.segments?.decoder.isWhole) {
+      toast(player.segments ? UNFINISHED : "Open the model first, then its script.", LONG);
       return false;
     }
     try {
@@ -158,6 +162,7 @@ export class Files {
 
   /** To the disk if there is a way, else as a download. */
   save() {
+    if (!this.player.segments.decoder.isWhole) return toast(UNFINISHED, LONG);
     if (this.server && this.isOfPage && !element("save-disk").disabled) return this.saveToDisk();
     return this.downloadScript();
   }

@@ -1,5 +1,4 @@
 // Files that the player opens, told apart by their first bytes: compact models, model files and PLY files of VeGaS and 3DGS.
-import { decode } from "./compact.js";
 import { readPly } from "./ply.js";
 import { readSafetensors } from "./safetensors.js";
 import { isScene, readScene } from "./scene.js";
@@ -15,11 +14,13 @@ const OTHERS = [
   [/^\s*<!doctype html/i, "a page of the player", "Open it in a tab of its own."],
 ];
 
-/** A file's {header, leaves}, as of `decode`. `given`: {size, fps} where the file holds none. Throws an Error for display. */
-export function readModel(buffer, given = {}, onProgress = () => {}) {
+/** Whether a file that begins with these bytes is a compact model. */
+export const isCompact = (bytes) => COMPACT.every((own, k) => bytes[k] === own);
+
+/** The {header, leaves} of a file that is not compact, as of `decode`. `given`: {size, fps} where the file holds none. Throws an Error for display. */
+export function readModel(buffer, given = {}) {
   const bytes = new Uint8Array(buffer), start = String.fromCharCode(...bytes.subarray(0, 32));
   if (!bytes.length) throw new Error("The file is empty.");
-  if (COMPACT.every((own, k) => bytes[k] === own)) return checked(decode(buffer, onProgress));
   if (/^ply\r?\n/.test(start)) return checked(readPlyModel(buffer, given));
   if (start[8] === "{") return checked(readSafetensors(buffer));
   const known = OTHERS.find(([pattern]) => pattern.test(start));
@@ -35,12 +36,16 @@ function readPlyModel(buffer, given) {
   throw new Error("This PLY file is neither a video of VeGaS, which has m_0, nor a 3DGS scene, which has f_dc_0, opacity, scale_2 and rot_3. It may be a mesh or a point cloud.");
 }
 
-/** Refuse values that cannot be rendered. */
 function checked({ header, leaves }) {
   if (!(header.num_gaussians > 0)) throw new Error("The model has no Gaussians.");
+  check(header, leaves);
+  return { header, leaves };
+}
+
+/** Refuse values that cannot be rendered. */
+export function check(header, leaves) {
   for (const [name, leaf] of Object.entries(leaves))
     for (let k = 0; k < leaf.length; k++)
       if (!Number.isFinite(leaf[k])) throw new Error(`The file is damaged: ${name} has a value that is not finite. Copy or fit it again.`);
   if (leaves.path_index?.some((path) => path > header.paths.num_paths)) throw new Error("The file is damaged: path_index has the number of a path that is not there. Copy or fit it again.");
-  return { header, leaves };
 }

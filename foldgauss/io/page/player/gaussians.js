@@ -25,15 +25,28 @@ export const WIDTHS = {
  * m_t, sigma_t; 1: two standard deviations, cosine and sine of the first one's angle; 2: red, green, blue, opacity; 3 and
  * on: the path's coefficients, two powers each; the last one: the number of its shared path, and `held`.
  */
-export function prepare({ header, leaves: { time_loc_logit: logits, frame_times: intervals, path_times, path_matrices, path_index, ...rest } }) {
-  const num = header.num_gaussians, { degree } = header, paths = pathsOf(header, { path_times, path_matrices });
-  const texels = 4 + Math.ceil(degree / 2), rows = Math.ceil((num * texels) / TEXTURE_WIDTH);
+export function prepare({ header, leaves: { frame_times: intervals, path_times, path_matrices, ...own } }) {
+  const num = header.num_gaussians, { degree } = header, texels = texelsOf(degree), rows = Math.ceil((num * texels) / TEXTURE_WIDTH);
+  const paths = pathsOf(header, { path_times, path_matrices }), times = frameTimes(intervals);
+  return { header, num, degree, texels, rows, times, paths, intervals, ...prepareRows(header, own, num, 4 * TEXTURE_WIDTH * rows) };
+}
+
+const texelsOf = (degree) => 4 + Math.ceil(degree / 2);
+
+/** What `prepare` makes of the leaves of some Gaussians: their leaves, windows of time, and `length` values, their texels. */
+export function prepareRows(header, { time_loc_logit: logits, path_index, ...rest }, num, length = 4 * num * texelsOf(header.degree)) {
+  const texels = texelsOf(header.degree), values = new Float32Array(length);
   const leaves = { ...rest, time_loc: Float64Array.from(logits, sigmoid), held: Float32Array.from({ length: 2 * num }, (_, k) => (k % 2 ? ENDLESS : -ENDLESS)) };
-  if (paths) leaves.path_index = Uint32Array.from(path_index);
-  const values = new Float32Array(4 * TEXTURE_WIDTH * rows), times = frameTimes(intervals);
-  for (let i = 0; i < num; i++) fillTexels(values, i, leaves, texels, degree);
-  const windows = makeWindows(header, num, 4 * texels, values);
-  return { header, num, degree, texels, rows, values, times, windows, leaves, paths, intervals, fingerprint: fingerprint(values, num) };
+  if (header.paths) leaves.path_index = Uint32Array.from(path_index);
+  for (let i = 0; i < num; i++) fillTexels(values, i, leaves, texels, header.degree);
+  return { values, windows: makeWindows(header, num, 4 * texels, values), leaves };
+}
+
+/** Put a part, {first, ...} of `prepareRows`, into a model: its Gaussians from number `first` on. */
+export function place({ degree, texels, values, windows, leaves }, part) {
+  values.set(part.values, 4 * texels * part.first);
+  windows.set(part.windows, 2 * part.first);
+  for (const [name, own] of Object.entries(part.leaves)) leaves[name].set(own, WIDTHS[name](degree) * part.first);
 }
 
 /** Write the texels of Gaussian `i`. */
@@ -72,7 +85,7 @@ function makeWindows(header, num, width, values) {
 }
 
 /** A short name of a model by its values, for what the browser keeps: FNV-1a over their bits. */
-function fingerprint(values, num) {
+export function fingerprintOf({ values, num }) {
   const words = new Uint32Array(values.buffer);
   let sum = 0x811c9dc5, other = num;
   for (let k = 0; k < words.length; k++) {

@@ -31,13 +31,13 @@ function hooks(player, controls) {
     pixels: (width, height) => player.pixels(width, height),
     get stats() {
       const { alive, rate, position, time, playing, speed, loop, mode, view, segments, editing, lead } = player;
-      const { history } = editing, [height, width] = player.base.header.size, { total } = segments, { tools } = controls;
+      const { history } = editing, [height, width] = player.base.header.size, { total, decoder: { arrived } } = segments, { tools } = controls;
       const decoded = [...segments.held.keys()].sort((a, b) => a - b), textures = player.renderer.held.size;
       return {
         alive, total, rate, position, time, playing, speed, loop, mode, zoom: view.zoom, width, height, textures, decoded,
         numFrames: player.timeline.last + 1, segment: lead.number, segments: segments.spans.length, missing: segments.missing,
         editing: player.highlighting, tool: tools.name, how: tools.how, picked: editing.count(lead.number, lead.base),
-        steps: history.current, undoable: history.done, redoable: history.steps.length - history.done, loadSeconds: player.loadSeconds,
+        loaded: arrived.loaded, chunks: arrived.chunks, bytesRead: arrived.bytes, steps: history.current, undoable: history.done, redoable: history.steps.length - history.done, loadSeconds: player.loadSeconds,
       };
     },
   };
@@ -56,7 +56,9 @@ async function start() {
   restoreOnLoss(canvas, player);
 
   const show = (segments, title, originals) => {
+    if (player.segments !== segments) player.segments?.decoder.stop();
     player.open(segments, originals);
+    segments.onWhole = () => files.attach(title);
     segments.onError = (error) => {
       player.pause();
       notify(error.message);

@@ -1,5 +1,5 @@
 // The original's frames, in the page's data blocks, decoded on demand.
-import { bytesOf } from "./loading.js";
+import { bytesOf } from "./sources.js";
 
 const KEPT = 24, AHEAD = 4;
 

@@ -1,6 +1,7 @@
 // The editor's panel: tools, and edits of the selection by buttons, sliders and numbers.
 import { element, fill, on, press, pressOne, put, toast } from "./elements.js";
 import { isAlike } from "./editing.js";
+import { UNFINISHED } from "./loading.js";
 import { filled, totalOf, totalOfStep } from "./totals.js";
 
 const BUTTONS = {
@@ -78,6 +79,7 @@ export class Panel {
   }
 
   toggle(open = !this.player.highlighting) {
+    if (open && !this.player.segments.decoder.isWhole) return toast(UNFINISHED, 8000);
     this.tools.cancel();
     this.player.highlighting = open;
     element("cursor").hidden = true;

@@ -28,12 +28,17 @@ export class Player {
     this.originals = originals ?? new Originals([], () => {});
     this.originals.onReady = () => this.invalidate();
     this.mode = "model";
+    this.highlighting &&= segments.decoder.isWhole; // what has not arrived cannot be edited
     this.editing = new Editing(segments.counts);
     this.editing.onChange = () => this.changed();
     this.seen = this.lead = null;
     this.goTo(0);
     this.view = new View(this.base.header.size, this.view?.area);
     segments.check = (model) => this.renderer.check(model);
+    segments.onPart = (part) => {
+      if (part) this.renderer.update(this.base, part);
+      this.changed();
+    };
     segments.onReady = () => {
       this.goTo(this.position);
       this.changed();

@@ -130,6 +130,16 @@ export class Renderer {
     return made;
   }
 
+  /** Upload the texels again of a part that was placed in a model; see `place`. */
+  update({ values, texels }, part) {
+    const { gl } = this, first = Math.floor((part.first * texels) / TEXTURE_WIDTH);
+    const rows = Math.ceil((part.first * texels + part.values.length / 4) / TEXTURE_WIDTH) - first;
+    if (!this.held.has(values)) return;
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, this.held.get(values));
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, first, TEXTURE_WIDTH, rows, gl.RGBA, gl.FLOAT, values.subarray(4 * TEXTURE_WIDTH * first));
+  }
+
   /** Upload the maps of shared paths at a time, two texels each. */
   takeMaps({ paths }, time) {
     const { gl } = this, count = paths?.count ?? 0, rows = Math.max(Math.ceil((2 * count) / TEXTURE_WIDTH), 1);

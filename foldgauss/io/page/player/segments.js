@@ -1,4 +1,5 @@
 // The clip's segments: their weights at each position, and their models, decoded on demand. A single model is one segment.
+import { place } from "./gaussians.js";
 import { Timeline } from "./timeline.js";
 
 /** Most Gaussians held decoded, some two hundred bytes each, besides the visible segments and their neighbors. */
@@ -38,7 +39,8 @@ export class Segments {
     this.held = new Map();
     this.waiting = []; // promises to settle when the visible segments are decoded
     this.check = () => {}; // throws if a model cannot be rendered
-    this.onReady = this.onError = () => {};
+    this.onReady = this.onError = this.onPart = this.onWhole = () => {};
+    decoder.onPart = (part) => this.take(part);
     const own = this.hold(0, lead), numFrames = this.spans.at(-1).first + this.spans.at(-1).num_frames;
     const times = () => Array.from({ length: numFrames }, (_, k) => k / Math.max(numFrames - 1, 1));
     this.timeline = spans ? new Timeline(times(), lead.header.fps, lead.header.metadata?.frame_seconds) : own.timeline;
@@ -68,6 +70,7 @@ export class Segments {
   /** Set the position and decode the visible segments first, then the next, then as many as may be held. */
   goTo(position) {
     this.position = position;
+    if (!this.even) this.decoder.tell((this.time = this.timeline.timeAt(position)));
     this.seen = weights(this.spans, position).map(([number]) => number);
     const wanted = this.order(this.seen);
     for (const number of this.held.keys()) if (!wanted.includes(number)) this.held.delete(number);
@@ -111,16 +114,21 @@ export class Segments {
     return this.spans.map((span) => span.num_gaussians);
   }
 
-  /** Fulfilled when the visible segments are decoded. */
+  /** Whether what is visible is decoded. */
+  get isReady() {
+    return this.missing === undefined && !this.decoder.lacks(this.time);
+  }
+
+  /** Fulfilled when what is visible is decoded. */
   ready() {
     if (this.error) return Promise.reject(this.error);
-    if (this.missing === undefined) return Promise.resolve();
+    if (this.isReady) return Promise.resolve();
     return new Promise((resolve, reject) => this.waiting.push({ resolve, reject }));
   }
 
   /** Decode the next segment wanted, one at a time; a visible one interrupts one that is not. */
   work() {
-    if (this.missing === undefined) for (const { resolve } of this.waiting.splice(0)) resolve();
+    if (this.isReady) for (const { resolve } of this.waiting.splice(0)) resolve();
     if (this.missing === undefined && !this.begun) return;
     const next = this.wanted.find((number) => !this.held.has(number));
     if (this.error || (next !== undefined && next === this.decoding)) return;
@@ -129,9 +137,17 @@ export class Segments {
       this.decoder.stop();
     }
     this.decoding = next;
-    if (next === undefined) return this.decoder.stop();
+    if (next === undefined) return this.decoder.isWhole && this.decoder.stop();
     const job = (this.job = this.decoder.decode(next, () => {}));
     job.then((model) => this.job === job && this.accept(next, model)).catch((error) => this.job === job && this.failed(error));
+  }
+
+  /** Take a part of the single model, null for a chunk that is lost. */
+  take(part) {
+    if (part) place(this.held.get(0).base, part);
+    this.work();
+    this.onPart(part);
+    if (this.decoder.isWhole) this.onWhole();
   }
 
   accept(number, model) {

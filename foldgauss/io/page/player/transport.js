@@ -70,7 +70,8 @@ export class Transport {
   updateStats() {
     const { player } = this, quarter = Math.floor(performance.now() / 250), number = (value) => value.toLocaleString("en");
     const rate = player.playing && player.rate > 2 ? ` · ${player.rate} fps` : "";
-    if (!player.playing || this.shownAt !== quarter) put("stats", `${number(player.alive)} of ${number(player.segments.total)} Gaussians${rate}`);
+    const { decoder } = player.segments, loading = decoder.isWhole ? "" : `Loading ${Math.floor(100 * decoder.arrived.fraction)}% · `;
+    if (!player.playing || this.shownAt !== quarter) put("stats", `${loading}${number(player.alive)} of ${number(player.segments.total)} Gaussians${rate}`);
     this.shownAt = quarter;
   }
 }
