@@ -118,8 +118,9 @@ ACTIONS = (
     Action(0.55, "sort"),
     Action(0.7, SHAPE, 0.4, 0.4),
     Action(0.78, SHAPE, 0.75),
-    Action(0.84, "drop", 1.0, -0.35),
+    Action(0.84, "drop", 1.0, -0.5),
     Action(0.86, SHAPE, 1.0),
+    Action(0.86, "sort"),  # again: when Gaussians are visible does not change from now on
     Action(0.91, TRAJECTORY, 0.5),
     Action(0.96, TRAJECTORY, 1.0),
     Action(0.985, COLOR, 0.5),
