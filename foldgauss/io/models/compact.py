@@ -177,8 +177,9 @@ def load_compact(path: PathLike, *, visible: tuple[float, float] = (0.0, 1.0)) -
 
 
 def load_compact_model(path: Path) -> VideoModel:
-    """The model in a compact file. Raises as `load_compact`, also for values beyond float32; warnings name the caller's
-    caller.
+    """The model in a compact file. Raises as `load_compact`, also for values beyond float32.
+
+    Warnings point at the caller of the function that calls this one, `load_video_model`.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         model = dequantize(_load(path, (0.0, 1.0), stacklevel=4))
@@ -274,15 +275,18 @@ def _decode(path: Path, header: dict, file: BinaryIO, visible: tuple[float, floa
             missing.append(own["num_gaussians"])
         else:
             chunks.append(_decode_chunk(streams, rules, info, own))
-    note = ""
-    if missing:
-        total = sum(own["num_gaussians"] for own in header["chunks"])
-        note = f"{len(missing)} of its {len(header['chunks'])} chunks {'is' if len(missing) == 1 else 'are'}"
-        note = f"{note} cut off or damaged; {sum(missing):,} of {total:,} Gaussians are missing"
+    lost = _describe_missing(header["chunks"], missing)
     if not chunks:
-        raise _unreadable(path, f"one without a chunk that can be read ({note})")
-    note = note and f"{str(path)!r}: {note}. Copy it again."
+        raise _unreadable(path, f"one without a chunk that can be read ({lost})")
+    note = f"{str(path)!r}: {lost}. Copy it again." if missing else ""
     return Quantized(info, rules, tuple(chunks), intervals, **paths), note
+
+
+def _describe_missing(chunks: list[dict], missing: list[int]) -> str:
+    """`missing`: the numbers of Gaussians of the chunks that cannot be read."""
+    total = sum(own["num_gaussians"] for own in chunks)
+    how = f"{len(missing)} of its {len(chunks)} chunks {'is' if len(missing) == 1 else 'are'} cut off or damaged"
+    return f"{how}; {sum(missing):,} of {total:,} Gaussians are missing"
 
 
 def _check_blocks(header: dict, info: CompactInfo) -> None:
