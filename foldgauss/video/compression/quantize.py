@@ -67,15 +67,8 @@ _MAX_STEP = {"time": 0.125, "angle": 0.125, "size": 0.35, "stretch": 0.5, "durat
 def column_names(degree: int, num_paths: int = 0) -> tuple[str, ...]:
     """The columns of a model in order."""
     trajectory = tuple(f"{axis}{k}" for k in range(degree + 1) for axis in "xy")
-    return (
-        *INTEGER_COLUMNS,
-        *(("path",) if num_paths else ()),
-        *FEATURES[1:],
-        "time",
-        *trajectory,
-        "angle",
-        *COLORS,
-    )
+    path = ("path",) if num_paths else ()
+    return (*INTEGER_COLUMNS, *path, *FEATURES[1:], "time", *trajectory, "angle", *COLORS)
 
 
 def trajectory_power(name: str) -> int:
