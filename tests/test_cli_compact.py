@@ -3,17 +3,20 @@
 import os
 import re
 import signal
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 from commands import run
 
-from foldgauss.io import load_video_model, write_video
+from foldgauss.io import load_video_model, save_compact, write_video
 from foldgauss.io.datasets import ball
 from foldgauss.io.models.compact import is_compact
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.jobs import runner
+from foldgauss.video import FitConfig, fit
+from foldgauss.video.compression.quantize import Rule, compute_columns, is_integral, quantize
 
 QUICK = ["--gaussians", "200", "--steps", "60"]
 FRAMES = ball(8, size=(48, 64)).clip.frames
@@ -139,3 +142,26 @@ def test_stopped_and_resumed(clip, tmp_path, monkeypatch, capsys, step):
     assert run("fit", clip, *QUICK, "--resume") == 0
     assert run("fit", clip, *QUICK, "--out", "whole.fgz") == 0
     assert (tmp_path / "ball.fgz").read_bytes() == (tmp_path / "whole.fgz").read_bytes()
+
+
+@pytest.mark.filterwarnings("default:.*chunks is cut off")
+def test_a_file_that_is_cut_off_is_shown_with_a_warning(clip, capsys):
+    """`info` tells the chunks; of a file that is cut off after the first two it also warns, in one line."""
+    exact = compute_columns(fit(FRAMES, FitConfig(num_gaussians=90, steps=9), fps=12.0).model)
+    rules = {name: Rule(0.0, -9.0) for name in exact.info.column_names if not is_integral(name)}
+    save_compact("whole.fgz", quantize(exact, np.zeros(90, np.int32), rules, np.arange(90)[::-1] // 30))
+    assert run("info", "whole.fgz") == 0
+    told = capsys.readouterr()
+    assert re.search(r"chunks +│ 3; the first is \d\d% of the file", told.out)
+    assert told.err == ""
+    data = Path("whole.fgz").read_bytes()
+    Path("cut.fgz").write_bytes(data[:-1])
+    note = "warning: 'cut.fgz': 1 of its 3 chunks is cut off or damaged; 30 of 90 Gaussians are missing. Copy it again."
+    for command in (["info", "cut.fgz"], ["evaluate", "cut.fgz", clip]):
+        assert run(*command) == 0
+        told = capsys.readouterr()
+        assert told.err.splitlines() == [note]
+    Path("cut.fgz").write_bytes(data[:200])
+    assert run("info", "cut.fgz") == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: path: expected a compact model, got one")

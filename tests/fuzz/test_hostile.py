@@ -141,15 +141,22 @@ def _safetensors_header() -> bytes:
     return HUGE.to_bytes(8, "little") + TARGETS["model"].seeds()[0][8:]
 
 
-def _compact(seed: int = 0, paths: dict | None = None, **facts) -> bytes:
+def _compact(seed: int = 0, paths: dict | None = None, chunk: dict | None = None, **facts) -> bytes:
     data = TARGETS["compact"].seeds()[seed]
     length = int.from_bytes(data[12:16], "little")
     header = json.loads(data[20 : 20 + length]) | facts
     if paths is not None:
         header["paths"] |= paths
+    if chunk is not None:
+        header["chunks"][0] |= chunk
     header = json.dumps(header).encode()
     fixed = data[:12] + len(header).to_bytes(4, "little") + bytes(4)
     return models.compact_resealed(fixed + header + data[20 + length :])
+
+
+def _chunk_of(num: int) -> dict:
+    """A description that claims some Gaussians for no byte of its own."""
+    return {"num_gaussians": num, "cells": [0, 0, 0], "visible": [0, 1], "streams": [0] * 16, "crc": 0}
 
 
 def _ply(seed: int, old: bytes, new: bytes) -> bytes:
@@ -212,9 +219,13 @@ CLAIMS = {
         "selection",
         lambda: TARGETS["selection"].seeds()[0].replace(b'num_gaussians\\": 3', b'num_gaussians\\": 9'),
     ),
-    "compact: Gaussians": ("compact", lambda: _compact(num_gaussians=HUGE)),
+    "compact: Gaussians": ("compact", lambda: _compact(chunk={"num_gaussians": HUGE})),
+    "compact: streams": ("compact", lambda: _compact(chunk={"num_gaussians": 2**25, "streams": [2**30] * 16})),
+    "compact: header": ("compact", lambda: TARGETS["compact"].seeds()[0][:12] + b"\xff" * 8),
+    "compact: chunks": ("compact", lambda: _compact(chunks=[_chunk_of(2000)] * 1000)),
+    "compact: more chunks": ("compact", lambda: _compact(chunks=[_chunk_of(1)] * 1025)),
     "compact: frames": ("compact", lambda: _compact(num_frames=HUGE)),
-    "compact: cells": ("compact", lambda: _compact(cells=[24, 24, 24])),
+    "compact: cells": ("compact", lambda: _compact(chunk={"cells": [24, 24, 24]})),
     "compact: degree": ("compact", lambda: _compact(degree=HUGE)),
     "compact: paths": ("compact", lambda: _compact(4, {"num_paths": HUGE})),
     "compact: most paths": ("compact", lambda: _compact(4, {"num_paths": 255, "num_knots": 2**15})),

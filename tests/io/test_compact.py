@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 import subprocess
 import zlib
@@ -14,13 +15,14 @@ import pytest
 from soft_models import SIZE, on_paths, soft_model
 
 import foldgauss.io.page
+import foldgauss.video.compression.chunks as chunks_module
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import ModelFileError, load_compact, load_video_model, save_compact, save_video_model
 from foldgauss.io.models.compact import MAGIC, VERSION, is_compact, pack_compact
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, compress, layers
-from foldgauss.video.compression.chunks import arrange
+from foldgauss.video.compression.chunks import LEAST, arrange, divide
 from foldgauss.video.compression.quantize import (
     AXES,
     Rule,
@@ -32,6 +34,7 @@ from foldgauss.video.compression.quantize import (
     is_integral,
     legendre,
     quantize,
+    quantize_chunk,
     trajectory_matrix,
     trajectory_span,
 )
@@ -51,10 +54,22 @@ def clip_of(model, noise=6.0):
     return np.clip(np.rint(pictures + noise * rng.normal(size=pictures.shape)), 0, 255).astype(np.uint8)
 
 
-def fine(model, exponent=-22.0):
+def fine(model, exponent=-22.0, chunks=None):
     """Quantized by even steps of 2^exponent."""
     rules = {name: Rule(0.0, exponent) for name in column_names(model.degree) if not is_integral(name)}
-    return quantize(compute_columns(model), np.zeros(model.num_gaussians, np.int32), rules)
+    return quantize(compute_columns(model), np.zeros(model.num_gaussians, np.int32), rules, chunks)
+
+
+def cells_of(quantized):
+    """Binary logarithms of the numbers of cells, of a model in a single chunk."""
+    (chunk,) = quantized.chunks
+    return chunk.cells
+
+
+def with_columns(quantized, **columns):
+    """With other integers in its single chunk."""
+    (chunk,) = quantized.chunks
+    return dataclasses.replace(quantized, chunks=(dataclasses.replace(chunk, columns=chunk.columns | columns),))
 
 
 def same(one, other):
@@ -228,13 +243,13 @@ def test_cells_divide_the_positions_on_paths(tmp_path):
     where = np.asarray(model.splats.loc) * np.float32([6, 1]) + np.float32([3, 0])
     model = eqx.tree_at(lambda m: m.splats.loc, model, where)
     quantized = fine(model, -10.0)
-    assert quantized.info.cells[0] > 2
-    assert len(np.unique(quantized.columns["cell"])) > 0.4 * 2 ** sum(quantized.info.cells)
+    assert cells_of(quantized)[0] > 2
+    assert len(np.unique(quantized.columns["cell"])) > 0.4 * 2 ** sum(cells_of(quantized))
     within = dataclasses.replace(quantized.info.paths, middle=(0.0, 0.0), sides=(1.0, 0.625))
     exact = compute_columns(model)
     exact = dataclasses.replace(exact, info=dataclasses.replace(exact.info, paths=within))
     by_frame = quantize(exact, quantized.columns["class"], quantized.rules)
-    assert len(np.unique(by_frame.columns["cell"])) < 0.4 * 2 ** sum(quantized.info.cells)
+    assert len(np.unique(by_frame.columns["cell"])) < 0.4 * 2 ** sum(cells_of(quantized))
     np.testing.assert_allclose(dequantize(by_frame).splats.loc, where, atol=2e-3)
     same(load_video_model(save_compact(tmp_path / "m.fgz", by_frame)), dequantize(by_frame))
 
@@ -316,9 +331,7 @@ def test_wrong_paths_are_refused(tmp_path):
     index, maps = np.full_like(quantized.columns["path"], 3), np.full_like(quantized.maps, 2**30)
     maps[:, 0] = 2**29  # each step is within the range
     files = {
-        "path: .* got numbers out of range": dataclasses.replace(
-            quantized, columns=quantized.columns | {"path": index}
-        ),
+        "path: .* got numbers out of range": with_columns(quantized, path=index),
         "maps: .* got numbers out of range": dataclasses.replace(quantized, maps=maps),
         "bits": with_paths(quantized, bits=29),
         "at_frames": with_paths(quantized, at_frames=1),
@@ -373,6 +386,243 @@ def test_the_order_found_shortens_the_column_of_cells():
     assert back[1] < 0.15
 
 
+# ------------------------------------------------------------------------------------ chunks
+
+
+def thirds(model):
+    """Numbers of three chunks, the front one first, which decrease."""
+    return 2 - 3 * np.arange(model.num_gaussians) // model.num_gaussians
+
+
+def short_lived(model, num_chunks=3):
+    """Each chunk visible in a part of the clip only, but the first, which is visible throughout; and their numbers."""
+    chunks = num_chunks - 1 - num_chunks * np.arange(model.num_gaussians) // model.num_gaussians
+    middle = (chunks - 0.5) / (num_chunks - 1)
+    place = np.where(chunks == 0, 0.0, np.log(middle.clip(1e-3) / (1 - middle.clip(1e-3)))).astype(np.float32)
+    duration = np.where(chunks == 0, 0.0, np.log(0.2 / (num_chunks - 1) / 3)).astype(np.float32)
+    leaves = lambda m: (m.splats.time_loc_logit, m.splats.log_time_scale)  # noqa: E731
+    return eqx.tree_at(leaves, model, (place, duration)), chunks
+
+
+def blocks_of(data):
+    """The first byte of motion and of each chunk, and the end."""
+    header, body = parts_of(data)
+    sizes = [sum(own["streams"]) for own in (header["motion"], *header["chunks"])]
+    return [int(x) for x in len(data) - len(body) + np.cumsum([0, *sizes])]
+
+
+def flipped(data, place):
+    return data[:place] + bytes([data[place] ^ 16]) + data[place + 1 :]
+
+
+CUT_OFF = r"m.fgz'?: (\d) of its 3 chunks (?:is|are) cut off or damaged; (\d+) of 402 Gaussians are missing"
+
+
+@pytest.fixture(scope="module")
+def chunked():
+    """A model of 402 Gaussians in three chunks, and its file."""
+    model = only(crowd(soft_model(degree=2, options=RenderOptions()), 11), np.arange(402))
+    model, chunks = short_lived(model)
+    quantized = fine(model, -12.0, chunks)
+    return quantized, pack_compact(quantized, {"clip": "x"})
+
+
+@pytest.mark.parametrize("how", [{"degree": 2}, {"degree": 0}, {"num_frames": 1}, {"compositing": "sum"}, "paths"])
+def test_chunks_do_not_change_the_model(tmp_path, how):
+    model = crowd(soft_model(**({} if how == "paths" else how)), 5)
+    model = on_paths(model) if how == "paths" else model
+    one, several = fine(model, -9.0), fine(model, -9.0, thirds(model))
+    assert [chunk.num for chunk in several.chunks] == [66, 67, 67]
+    path = save_compact(tmp_path / "m.fgz", several)
+    same(load_video_model(path), dequantize(one))
+    assert pack_compact(load_compact(path)) == path.read_bytes()
+
+
+def test_each_gaussian_can_be_a_chunk(tmp_path):
+    model = soft_model()
+    several = fine(model, -9.0, np.arange(model.num_gaussians)[::-1].astype(np.uint16))
+    same(load_video_model(save_compact(tmp_path / "m.fgz", several)), dequantize(fine(model, -9.0)))
+
+
+def test_chunks_must_be_in_order_and_few():
+    model = crowd(soft_model(), 30)
+    with pytest.raises(ValueError, match="chunks: expected numbers that do not increase"):
+        fine(model, -9.0, np.arange(1200, dtype=np.uint16) // 400)
+    with pytest.raises(ValueError, match="chunks: expected at most 1024 of them, got 1200"):
+        fine(model, -9.0, np.arange(1200)[::-1])
+
+
+def test_only_visible_chunks_are_read(tmp_path, chunked):
+    """The bytes of the others may be anything. Images are the same at all times for which the model was read."""
+    quantized, data = chunked
+    path, model, ends = tmp_path / "m.fgz", dequantize(quantized), blocks_of(data)
+    spans = [own["visible"] for own in parts_of(data)[0]["chunks"]]
+    assert spans[0] == [0, 1]
+    assert spans[1][1] < spans[2][0]
+    for number, visible in ((1, (0.0, spans[1][1])), (1, (0.2, 0.2)), (2, (spans[2][0], 1.0)), (2, (0.7, 0.8))):
+        other = 3 - number
+        start, end = ends[other + 1 : other + 3]
+        path.write_bytes(data[:start] + bytes(end - start) + data[end:])
+        own = load_compact(path, visible=visible)
+        assert [chunk.num for chunk in own.chunks] == [134, 134]
+        for t in np.linspace(*visible, 3):
+            np.testing.assert_array_equal(image(dequantize(own), t), image(model, t))
+        with pytest.warns(UserWarning, match=CUT_OFF):
+            load_compact(path)
+    between = (spans[1][1] + 0.001, spans[2][0] - 0.001)
+    assert load_compact(path, visible=between).num_gaussians == 134
+
+
+def test_the_first_chunk_is_read_even_if_nothing_is_visible(tmp_path):
+    model = soft_model()
+    early = np.full(model.num_gaussians, -5.0, np.float32)
+    leaves = lambda m: (m.splats.time_loc_logit, m.splats.log_time_scale)  # noqa: E731
+    path = save_compact(tmp_path / "m.fgz", fine(eqx.tree_at(leaves, model, (early, early))))
+    assert load_compact(path, visible=(0.5, 0.6)).num_gaussians == 40
+
+
+@pytest.mark.parametrize("time", [0.93, 0.999999])
+def test_spans_hold_what_is_visible_at_times_that_coarse_steps_move(tmp_path, time):
+    """A decoded time may lie beyond the clip; the model has it within."""
+    model = soft_model(degree=1)
+    names = [name for name in column_names(1) if not is_integral(name)]
+    rules = {name: Rule(1.05 if name == "time" else 0.0, -12.0) for name in names}
+    where = np.full(model.num_gaussians, np.log(time / (1 - time)), np.float32)
+    leaves = lambda m: (m.splats.time_loc_logit, m.splats.log_time_scale)  # noqa: E731
+    model = eqx.tree_at(leaves, model, (where, np.full_like(where, -4.0)))
+    rules["time"] = Rule(1.05, 0.0)
+    quantized = quantize(compute_columns(model), np.zeros(40, np.int32), rules)
+    (first, last), splats = parts_of(pack_compact(quantized))[0]["chunks"][0]["visible"], dequantize(quantized).splats
+    at = 1 / (1 + np.exp(-np.asarray(splats.time_loc_logit, float)))
+    reach = np.sqrt(-2 * np.log(0.01)) * np.exp(np.asarray(splats.log_time_scale, float))
+    assert first <= (at - reach).min() < first + 3e-4
+    assert last >= min((at + reach).max(), 1) > last - 3e-4
+
+
+@pytest.mark.parametrize("visible", [(0.5, 0.2), (0.0, 1.5), (0.5,), 0.5, "ab", (np.nan, 1.0), None])
+def test_times_to_be_read_are_checked(tmp_path, good, visible):
+    path = tmp_path / "m.fgz"
+    path.write_bytes(good)
+    with pytest.raises(ValueError, match=r"visible: expected the first and the last time, in \[0, 1\], got"):
+        load_compact(path, visible=visible)
+
+
+def test_a_file_cut_off_after_a_chunk_is_a_smaller_model(tmp_path, chunked):
+    quantized, data = chunked
+    path, ends = tmp_path / "m.fgz", blocks_of(data)
+    for length, num in ((ends[2], 1), (ends[2] + 1, 1), (ends[3] - 1, 1), (ends[3], 2), (len(data) - 1, 2)):
+        path.write_bytes(data[:length])
+        with pytest.warns(UserWarning, match=CUT_OFF) as caught:
+            model = load_video_model(path)
+        (note,) = caught
+        assert note.filename == __file__
+        assert re.search(CUT_OFF, str(note.message)).groups() == (str(3 - num), str(134 * (3 - num)))
+        same(model, dequantize(dataclasses.replace(quantized, chunks=quantized.chunks[:num])))
+
+
+def test_a_damaged_chunk_is_left_out(tmp_path, chunked):
+    quantized, data = chunked
+    path, ends = tmp_path / "m.fgz", blocks_of(data)
+    for number in range(3):
+        path.write_bytes(flipped(data, ends[number + 1] + 50))
+        with pytest.warns(UserWarning, match=CUT_OFF) as caught:
+            own = load_compact(path)
+        assert [(note.filename, "134 of 402" in str(note.message)) for note in caught] == [(__file__, True)]
+        left = quantized.chunks[:number] + quantized.chunks[number + 1 :]
+        same(dequantize(own), dequantize(dataclasses.replace(quantized, chunks=left)))
+
+
+def test_a_file_without_header_motion_or_any_chunk_is_rejected(tmp_path, chunked):
+    _, data = chunked
+    ends = blocks_of(data)
+    refused(tmp_path, flipped(data, 60), "the checksum of its header")
+    refused(tmp_path, flipped(data, ends[0]), "frame times are cut off or damaged")
+    refused(tmp_path, data[: ends[2] - 1], "3 of its 3 chunks are cut off or damaged; 402 of 402 Gaussians are missing")
+    for start in ends[1:-1]:
+        data = flipped(data, start + 3)
+    refused(tmp_path, data, "one without a chunk that can be read .3 of its 3 chunks are cut off or damaged")
+
+
+def test_chunks_together_claim_no_more_than_the_file_holds(tmp_path):
+    """Each of them may use up what the header has for all of them, but not all of them."""
+    num = 2000
+    described = compute_columns(only(soft_model(degree=0), np.full(num, 20)))
+    rules = {
+        name: Rule(float(described.values.get(name, [0.0])[0]), 3.0)
+        for name in column_names(0)
+        if not is_integral(name)
+    }
+    data = pack_compact(quantize(described, np.zeros(num, np.int32), rules, np.arange(num)[::-1] // 100))
+    path = tmp_path / "m.fgz"
+    path.write_bytes(data)
+    assert load_video_model(path).num_gaussians == num
+    room = 40_000 * len(column_names(0)) // 32  # bytes
+
+    def copied(copies):
+        def change(header):
+            header["chunks"] = [header["chunks"][0] | {"num_gaussians": 40_000}] * copies
+
+        return resealed(data, change, spaces=room)
+
+    refused(tmp_path, copied(1), "damaged")
+    refused(tmp_path, copied(2), "num_gaussians: expected .* got 40000")
+
+
+def test_divide_by_size_and_by_time():
+    rng = np.random.default_rng(0)
+    num = 20 * LEAST
+    volume, first = rng.normal(size=num), rng.uniform(0, 0.95, num)
+    last = first + rng.choice([0.01, 0.04, 0.6], num)
+    numbers = divide(volume, first, last)
+    num_chunks = numbers.max() + 1
+    assert sorted(set(numbers)) == list(range(num_chunks))
+    assert num_chunks > 4
+    assert (numbers == 0).sum() == round(0.08 * num)
+    assert volume[numbers == 0].min() > volume[numbers > 0].max()
+    assert np.bincount(numbers)[1:].min() >= LEAST
+    layers = np.searchsorted([0.08 * num, 0.4 * num], np.argsort(np.argsort(-volume)), side="right")
+    assert all(len(set(layers[numbers == number])) == 1 for number in range(num_chunks))
+    for layer in (1, 2):
+        around, before = sorted(set(numbers[layers == layer]))[:2]
+        assert (first[numbers == around] <= 0.5).all()
+        assert (last[numbers == around] >= 0.5).all()
+        assert (last[numbers == before] < 0.5).all()
+        assert first[numbers == max(numbers[layers == layer])].min() > 0.5
+
+
+@pytest.mark.parametrize("num", [1, 2, 2 * LEAST - 1])
+def test_few_gaussians_are_one_chunk(num):
+    first = np.linspace(0, 0.9, num)
+    assert not divide(np.arange(num, dtype=float), first, first + 0.05).any()
+
+
+def test_many_gaussians_are_within_the_limit_of_chunks(monkeypatch):
+    monkeypatch.setattr(chunks_module, "LEAST", 2)
+    rng, num = np.random.default_rng(0), 20_000
+    first = rng.uniform(0, 1, num)
+    last = np.minimum(first + 10 ** rng.uniform(-5, 0, num), 1)
+    assert 50 < divide(rng.normal(size=num), first, last).max() < 512
+    monkeypatch.setattr(chunks_module, "_MOST", num)
+    assert divide(rng.normal(size=num), first, last).max() > 1024
+
+
+@pytest.mark.parametrize("compositing", ["over", "sum"])
+def test_large_gaussians_are_behind_in_the_first_chunk(monkeypatch, compositing):
+    monkeypatch.setattr(chunks_module, "LEAST", 100)
+    model = crowd(soft_model(degree=1, options=RenderOptions(), compositing=compositing), 20)
+    order, chunks = arrange(model, np.inf)
+    assert sorted(order) == list(range(800))
+    assert chunks.max() >= 2
+    assert (np.diff(chunks) <= 0).all()
+    values = compute_columns(model).values
+    volume = 2 * values["size"][order] + np.log(np.minimum(np.exp(values["duration"][order]), 1))
+    assert volume[chunks == 0].mean() > volume[chunks > 0].mean() + 0.5
+    assert (chunks == 0).sum() == 64
+    made = fine(only(model, order), -9.0, chunks)
+    for chunk in made.chunks if compositing == "sum" else ():  # sorted by the cells of the chunk itself
+        assert (np.diff(chunk.columns["cell"]) >= 0).all()
+
+
 # ------------------------------------------------------------------------------------ exactness
 
 
@@ -391,18 +641,20 @@ def test_a_decoded_model_by_the_same_rules_is_the_same_file(change):
     """Quantising is a projection: what was rounded is not rounded further."""
     quantized = compress(change(soft_model(options=RenderOptions()))).quantized
     columns = quantized.columns
-    again = quantize(compute_columns(dequantize(quantized)), columns["class"], quantized.rules, columns["cell"])
-    assert pack_compact(again) == pack_compact(quantized)
+    exact = compute_columns(dequantize(quantized))
+    again = quantize_chunk(exact, columns["class"], quantized.rules, columns["cell"])
+    assert pack_compact(dataclasses.replace(quantized, chunks=(again,))) == pack_compact(quantized)
 
 
 def test_values_on_the_grid_are_so_in_any_cell():
     """The origin of x0, y0 and time is a multiple of the step, whichever cell it is that of."""
     model = crowd(soft_model(degree=2, options=RenderOptions()))
     quantized = fine(model, -6.3)
-    assert min(quantized.info.cells) > 0
+    assert min(cells_of(quantized)) > 0
     decoded = compute_columns(dequantize(quantized))
     cells = np.random.default_rng(3).permutation(quantized.columns["cell"])
-    again = quantize(decoded, quantized.columns["class"], quantized.rules, cells)
+    again = quantize_chunk(decoded, quantized.columns["class"], quantized.rules, cells)
+    again = dataclasses.replace(quantized, chunks=(again,))
     assert (again.columns["x0"] != quantized.columns["x0"]).any()
     same(dequantize(again), dequantize(quantized))
 
@@ -455,6 +707,8 @@ def test_paths_are_legendre_series_over_the_span():
         "paths of a crowd",
         "cuts",
         "cuts and paths",
+        "chunks",
+        "chunks of a crowd on paths",
     ],
 )
 def test_the_decoder_for_browsers_gives_the_same_bits(tmp_path, how):
@@ -469,7 +723,12 @@ def test_the_decoder_for_browsers_gives_the_same_bits(tmp_path, how):
         model = on_paths(model, at_frames=how != "paths at other times")
     if how == "crowd of degrees":
         model = of_degrees(model)
-    path = save_compact(tmp_path / "m.fgz", compress(model, quality=90).quantized)
+    quantized = compress(model, quality=90).quantized
+    if isinstance(how, str) and "chunks" in how:
+        quantized = quantize(
+            compute_columns(model), np.zeros(model.num_gaussians, np.int32), quantized.rules, thirds(model)
+        )
+    path = save_compact(tmp_path / "m.fgz", quantized)
     decoder = Path(foldgauss.io.page.__file__).with_name("compact.js")
     (tmp_path / "decoder.mjs").write_bytes(decoder.read_bytes())
     (tmp_path / "run.mjs").write_text(
@@ -584,16 +843,24 @@ def good():
     return pack_compact(fine(soft_model(), -12.0), {"clip": "x"})
 
 
-def resealed(data, change=lambda header: None, cut=None, spaces=0):
-    """The file with another header, spaces after it, and the checksum it then has: what a stranger may send."""
+def parts_of(data):
+    """The header and the bytes after it."""
     start = len(MAGIC) + 12
-    length = int.from_bytes(data[len(MAGIC) + 4 : len(MAGIC) + 8], "little")
-    header = json.loads(data[start : start + length])
+    end = start + int.from_bytes(data[len(MAGIC) + 4 : len(MAGIC) + 8], "little")
+    return json.loads(data[start:end]), data[end:]
+
+
+def resealed(data, change=lambda header: None, cut=None, spaces=0):
+    """The file with another header, spaces after it, and the checksums it then has: what a stranger may send."""
+    header, body = parts_of(data)
+    body, end = body[:cut], 0
+    for own in (header["motion"], *header["chunks"]):
+        start, end = end, end + sum(own["streams"])
+        own["crc"] = zlib.crc32(body[start:end])
     change(header)
     text = json.dumps(header).encode() + b" " * spaces
-    body = text + data[start + length :][:cut]
-    numbers = (VERSION, len(text), zlib.crc32(body))
-    return MAGIC + b"".join(number.to_bytes(4, "little") for number in numbers) + body
+    numbers = (VERSION, len(text), zlib.crc32(text))
+    return MAGIC + b"".join(number.to_bytes(4, "little") for number in numbers) + text + body
 
 
 def refused(tmp_path, data, match):
@@ -616,11 +883,11 @@ def test_damaged_everywhere(tmp_path, good):
         refused(tmp_path, bytes(data), "compact model")
 
 
-@pytest.mark.parametrize(("version", "cure"), [(6, "Update foldgauss"), (4, "Compress the model again")])
+@pytest.mark.parametrize(("version", "cure"), [(7, "Update foldgauss"), (5, "Compress the model again")])
 def test_another_version_is_rejected(tmp_path, good, version, cure):
     data = bytearray(good)
     data[len(MAGIC)] = version
-    refused(tmp_path, bytes(data), f"expected a compact model of version 5, .* got version {version} .* {cure}")
+    refused(tmp_path, bytes(data), f"expected a compact model of version 6, .* got version {version} .* {cure}")
 
 
 def test_changed_by_a_transfer_as_text(tmp_path, good):
@@ -649,8 +916,20 @@ def test_changed_by_a_transfer_as_text(tmp_path, good):
         ("compositing", "under"),
         ("options", {"low_pass": -1}),
         ("options", {"unknown": 1}),
-        ("columns", []),
-        ("columns", 5),
+        ("rules", []),
+        ("rules", 5),
+        ("chunks", []),
+        ("chunks", 5),
+        ("chunks", [5]),
+        ("streams", []),
+        ("streams", 5),
+        ("streams", [10**30] * 24),
+        ("visible", [0.5]),
+        ("visible", ["a", "b"]),
+        ("visible", {"0": 0, "1": 1}),
+        ("visible", [0.6, 0.4]),
+        ("visible", [0, 1.5]),
+        ("visible", 5),
         ("cells", [0, 0]),
         ("cells", [0, 0, -1]),
         ("cells", [30, 30, 30]),
@@ -658,7 +937,8 @@ def test_changed_by_a_transfer_as_text(tmp_path, good):
         ("cells", [5, 0, 0]),
         ("cells", [0, 3, 0]),
         ("cells", 5),
-        ("intervals", 0),
+        ("motion", 0),
+        ("motion", {"streams": [0, 0], "crc": 0}),
         ("metadata", 5),
         ("scale_cutoff", True),
         ("time_bits", 25),
@@ -668,14 +948,16 @@ def test_changed_by_a_transfer_as_text(tmp_path, good):
 )
 def test_forged_header_is_rejected(tmp_path, good, key, value):
     def change(header):
-        header[key] = value
+        where = header if key in header else header["chunks"][0]
+        assert key in where
+        where[key] = value
 
     refused(tmp_path, resealed(good, change), "compact model")
 
 
 @pytest.mark.parametrize("cells", [[0, 0], [0, 0, -1], {"a": 0, "b": 0, "c": 0}])
 def test_the_error_names_the_entry(tmp_path, good, cells):
-    refused(tmp_path, resealed(good, lambda header: header.update(cells=cells)), "cells: expected")
+    refused(tmp_path, resealed(good, lambda header: header["chunks"][0].update(cells=cells)), "cells: expected")
 
 
 def test_largest_sizes_and_degrees_are_read(tmp_path):
@@ -691,26 +973,27 @@ def test_largest_sizes_and_degrees_are_read(tmp_path):
 
 
 def test_forged_columns_are_rejected(tmp_path, good):
-    def changed(own):
-        return lambda header: header["columns"].__setitem__(5, own)
+    header, _ = parts_of(good)
+    rule, length = header["rules"][5], header["chunks"][0]["streams"][5]
 
-    whole = json.loads(good[20 : 20 + int.from_bytes(good[12:16], "little")])["columns"][5]
-    for own in (
-        [10**9, *whole[1:]],
-        [-1, *whole[1:]],
-        [*whole, *[1.0] * 9],
-        [whole[0], 0.0, 1e300],
-        [whole[0], 0.0],
-        [whole[0]],
-        [],
-        5,
-        {"bytes": whole[0]},
-    ):
-        refused(tmp_path, resealed(good, changed(own)), "compact model")
-    refused(tmp_path, resealed(good, lambda header: header["columns"][0].append(0.0)), "compact model")
+    def ruled(own):
+        return lambda header: header["rules"].__setitem__(5, own)
+
+    def as_long_as(own):
+        return lambda header: header["chunks"][0]["streams"].__setitem__(5, own)
+
+    for own in ([*rule, *[1.0] * 9], [0.0, 1e300], [0.0], [], 5, {"origin": 0.0}):
+        refused(tmp_path, resealed(good, ruled(own)), "compact model")
+    for own in (10**9, 10**30, -1, length + 0.5, str(length), [length], None):
+        refused(tmp_path, resealed(good, as_long_as(own)), "compact model")
+    refused(tmp_path, resealed(good, lambda header: header["rules"][0].append(0.0)), "compact model")
     refused(tmp_path, resealed(good, cut=-3), "compact model")
-    for key in json.loads(good[20 : 20 + int.from_bytes(good[12:16], "little")]):
+    for key in header:
         refused(tmp_path, resealed(good, lambda header, key=key: header.pop(key)), "compact model")
+    for key in header["chunks"][0]:
+        refused(tmp_path, resealed(good, lambda header, key=key: header["chunks"][0].pop(key)), "compact model")
+    for key in header["motion"]:
+        refused(tmp_path, resealed(good, lambda header, key=key: header["motion"].pop(key)), "compact model")
 
 
 def test_forged_streams_are_rejected(tmp_path, good):
@@ -732,10 +1015,9 @@ def test_forged_streams_are_rejected(tmp_path, good):
 @pytest.mark.parametrize("number", [4, -1])
 def test_forged_degrees_are_rejected(tmp_path, number):
     quantized = fine(of_degrees(soft_model(degree=3)), -12.0)
-    columns = quantized.columns | {"degree": quantized.columns["degree"].copy()}
-    columns["degree"][7] = number
-    data = pack_compact(dataclasses.replace(quantized, columns=columns))
-    refused(tmp_path, data, "compact model")
+    degree = quantized.columns["degree"].copy()
+    degree[7] = number
+    refused(tmp_path, pack_compact(with_columns(quantized, degree=degree)), "compact model")
 
 
 def test_file_has_a_byte_for_every_32_numbers(tmp_path):
@@ -750,10 +1032,12 @@ def test_file_has_a_byte_for_every_32_numbers(tmp_path):
     assert num_bytes <= path.stat().st_size < num_bytes + 30
     assert load_video_model(path).num_gaussians == num
     data = path.read_bytes()
-    spaces = num_bytes - len(resealed(data))
+    header, _ = parts_of(data)
+    own = header["chunks"][0]["streams"]
+    spaces = -(-num * len(own) // 32) - sum(own) - len(json.dumps(header))
     path.write_bytes(resealed(data, spaces=spaces))
     assert load_video_model(path).num_gaussians == num
-    refused(tmp_path, resealed(data, spaces=spaces - 1), "num_gaussians")
+    refused(tmp_path, resealed(data, spaces=spaces - 1), "num_gaussians: expected .* got 10000")
 
 
 def test_names(tmp_path):

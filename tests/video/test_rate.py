@@ -14,8 +14,10 @@ from soft_models import on_paths, soft_model
 from foldgauss.io import load_compact, load_video_model, save_compact
 from foldgauss.io.datasets import ball
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
+from foldgauss.io.models.compact import pack_compact
 from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, Growth, compress, evaluate, fit, fit_steps, start_from
+from foldgauss.video.compression import chunks
 from foldgauss.video.compression.quantize import Rule
 from foldgauss.video.compression.quantizer import Quantizer, bit_price, round_groups
 from foldgauss.video.fitting.compress import ROUNDING_QUALITY
@@ -322,6 +324,34 @@ def test_other_goals_resume_likewise(tmp_path, goal):
     for again, _ in fit_steps(FRAMES, config, load_checkpoint(path, config=config, source={})):
         pass
     same_states(again, state)
+
+
+@pytest.fixture
+def many_chunks(monkeypatch):
+    """Few Gaussians are already divided into chunks."""
+    monkeypatch.setattr(chunks, "LEAST", 10)
+
+
+@pytest.mark.parametrize("goal", [{"quality": 80}, {"quality": 80, "compositing": "sum"}, {"size_mb": 0.012}], ids=str)
+def test_a_fit_in_chunks_is_its_file_and_resumes_to_the_same_bytes(tmp_path, many_chunks, goal):
+    config = dataclasses.replace(CONFIG, **({"quality": None, "num_gaussians": 400, "steps": 60} | goal))
+    path = tmp_path / "m.checkpoint"
+    for state, info in fit_steps(FRAMES, config):
+        if info.step == 45:  # sorted, and some of it rounded
+            save_checkpoint(path, state, config=config, source={})
+            np.testing.assert_array_equal(load_checkpoint(path, config=config, source={}).chunks, state.chunks)
+    for again, _ in fit_steps(FRAMES, config, load_checkpoint(path, config=config, source={})):
+        pass
+    same_states(again, state)
+    model, quantized = finish(state, FRAMES, config, 25.0)
+    assert len(quantized.chunks) >= 4
+    _, counts = np.unique(state.chunks, return_counts=True)
+    if "quality" in goal:
+        assert [chunk.num for chunk in quantized.chunks] == counts.tolist()
+    packed = pack_compact(quantized, ABOUT)
+    assert pack_compact(finish(again, FRAMES, config, 25.0)[1], ABOUT) == packed
+    assert len(packed) <= 1e6 * goal.get("size_mb", 1.0)
+    same(load_video_model(save(quantized, tmp_path)), model)
 
 
 # ------------------------------------------------------------------------------------ nothing crashes

@@ -74,6 +74,18 @@ def test_new_gaussians_are_where_errors_are():
     assert not state.second[new].any()
 
 
+def test_new_gaussians_are_in_the_chunk_of_those_behind_them():
+    """Where a long step leads past both the sorting into chunks and the relocation."""
+    state = fitted_state()
+    state.chunks = np.repeat(np.array([7, 3, 0], np.uint16), 100)
+    relocate(state, FRAMES, dataclasses.replace(CONFIG, relocated_fraction=0.1), SPEC, None)
+    new = np.flatnonzero(state.counts == 0)
+    assert len(new) == 30
+    assert state.chunks.dtype == np.uint16
+    assert (state.chunks[1:] <= state.chunks[:-1]).all()
+    assert len(set(state.chunks[new])) == 3
+
+
 def test_only_gaussians_that_can_be_judged_move():
     """Of 20, half; those with few steps stay."""
     state = fitted_state()

@@ -10,7 +10,7 @@ from foldgauss._runtime.checks import is_within
 from foldgauss.cli.app.application import app, out
 from foldgauss.cli.shared.arguments import ModelFile
 from foldgauss.cli.shared.clips import Video
-from foldgauss.io.models.compact import is_compact
+from foldgauss.io.models.compact import is_compact, measure_chunks
 from foldgauss.io.models.video_model import load_video_model, read_frame_seconds, read_origin
 from foldgauss.video.editing.edited_video import EditedVideo, as_edited
 from foldgauss.video.models.video_model import VideoModel
@@ -41,6 +41,7 @@ def info(model_path: ModelFile) -> None:
         "frame times": _describe_times(np.asarray(model.frame_times.times())),
         "parameters": f"{model.num_parameters:,}",
         "file": _describe_size(model_path, model),
+        **_describe_chunks(model_path),
     }
     if isinstance(model, EditedVideo):
         figures["edits"] = _describe_edits(model)
@@ -145,6 +146,12 @@ def _describe_size(path: Path, model: Video) -> str:
     num_bytes, num_pixels = path.stat().st_size, model.num_frames * model.size[0] * model.size[1]
     kind = "compact, " if is_compact(path) else ""
     return f"{kind}{num_bytes:,} bytes, {8 * num_bytes / num_pixels:.3f} bits per pixel of the frames"
+
+
+def _describe_chunks(path: Path) -> dict[str, str]:
+    """The chunks of a compact file that has several."""
+    sizes, whole = measure_chunks(path) if is_compact(path) else ([], 0)
+    return {"chunks": f"{len(sizes):,}; the first is {sizes[0] / whole:.0%} of the file"} if len(sizes) > 1 else {}
 
 
 def _shorten(value: object) -> str:

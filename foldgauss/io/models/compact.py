@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 import jax
 import numpy as np
 
-from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within, short_repr
 from foldgauss.io._atomic import PathLike, atomic_path, check_path
 from foldgauss.io.models.model_file import (
     HEADER_ERRORS,
@@ -36,6 +36,7 @@ from foldgauss.video.compression.quantize import (
     FEATURES,
     LARGEST,
     MAX_CELL_BITS,
+    MAX_CHUNKS,
     Chunk,
     CompactInfo,
     Quantized,
@@ -63,11 +64,12 @@ MAGIC = b"\x8bFGZ\r\n\x1a\n"
 VERSION = 6
 #: Magic, version, length of the header, checksum of the header.
 _FIXED = len(MAGIC) + 12
-#: Limit of numbers per byte of a block and the header, so that a small file cannot claim much memory; headers are
-#: padded with spaces. Clips need 1.
+#: Limit of numbers per byte of a block, so that a small file cannot claim much memory. Clips need 1. What blocks lack,
+#: all together, the header has: it is padded with spaces.
 _MOST_PER_BYTE = 32
 #: Bytes of metadata that sizes of files are planned for, see `video.fitting.rate.HEADER_BYTES`.
 _METADATA_BYTES = 1000
+_ROUNDING = 1e-6  # by which the times of a model, float32, may differ from those computed here
 _SIDE = 1 << 20  # largest side of an image: a decoder holds it in memory
 
 
@@ -116,8 +118,8 @@ def pack_compact(quantized: Quantized, metadata: dict | None = None) -> bytes:
         counts.append(chunk.num * len(names))
     header["metadata"] = to_json_types(metadata or {})
     text, blocks = to_json("header", header).encode(), [b"".join(motion), *parts]
-    missing = [-(-count // _MOST_PER_BYTE) - len(block) for count, block in zip(counts, blocks, strict=True)]
-    text += b" " * (max(missing) - len(text))
+    lacking = sum(_count_lacking(count, len(block)) for count, block in zip(counts, blocks, strict=True))
+    text += b" " * (lacking - len(text))
     numbers = (VERSION, len(text), zlib.crc32(text))
     return MAGIC + b"".join(number.to_bytes(4, "little") for number in numbers) + text + b"".join(blocks)
 
@@ -126,11 +128,17 @@ def _describe_streams(streams: list[bytes]) -> dict[str, Any]:
     return {"streams": [len(stream) for stream in streams], "crc": zlib.crc32(b"".join(streams))}
 
 
+def _count_lacking(num_values: int, num_bytes: int) -> int:
+    """The bytes that the header has instead of a block that is shorter than its numbers need."""
+    return max(-(-num_values // _MOST_PER_BYTE) - num_bytes, 0)
+
+
 def _find_visible_span(quantized: Quantized, chunk: Chunk) -> list[float]:
     """Times, in [0, 1], before and after which nothing of a chunk is visible."""
     values = decode_values(dataclasses.replace(quantized, chunks=(chunk,)))
     first, last = visible_spans(values["time"], values["duration"])
-    return [math.floor(1e4 * first.min()) / 1e4, math.ceil(1e4 * last.max()) / 1e4]
+    low, high = first.min() - _ROUNDING, last.max() + _ROUNDING
+    return [max(math.floor(1e4 * low) / 1e4, 0.0), min(math.ceil(1e4 * high) / 1e4, 1.0)]
 
 
 def _count_path_numbers(info: CompactInfo) -> int:
@@ -155,46 +163,59 @@ def is_compact(path: PathLike) -> bool:
 def load_compact(path: PathLike, *, visible: tuple[float, float] = (0.0, 1.0)) -> Quantized:
     """The quantized model in a compact file, for `foldgauss.video.compression.quantize.dequantize`.
 
-    `visible`: the first and the last time that the model is needed for, in [0, 1]; chunks of which nothing is visible
-    then are not read, and their Gaussians are missing.
+    `visible`: the first and the last time that the model is needed for, in [0, 1]. Chunks of which nothing is visible
+    then are not read, and their Gaussians are missing; but the first chunk is always read.
 
     A chunk that is damaged or cut off is left out, with a warning. Raises `ModelFileError` for a file of which no chunk
     can be read, of another version or of another kind, ValueError for other times.
     """
     path = check_path(path)
-    if not (len(visible) == 2 and all(is_within(t, "[0, 1]") for t in visible) and visible[0] <= visible[1]):
-        raise invalid("visible", expected="the first and the last time, in [0, 1]", got=visible)
-    with open(path, "rb") as file:
-        return _read(path, file, visible)
-
-
-def _read(path: Path, file: BinaryIO, visible: tuple[float, float]) -> Quantized:
-    header = _read_header(path, file)
-    try:
-        return _decode(path, header, file, visible)
-    except HEADER_ERRORS as error:
-        if isinstance(error, ModelFileError):
-            raise
-        got = f"one that does not fit together ({type(error).__name__}: {one_line(error)})"
-        raise _unreadable(path, got) from error
+    right = isinstance(visible, tuple | list) and len(visible) == 2 and all(is_within(t, "[0, 1]") for t in visible)
+    if not right or visible[0] > visible[1]:
+        raise invalid("visible", expected="the first and the last time, in [0, 1]", got=short_repr(visible))
+    return _load(path, visible, stacklevel=3)
 
 
 def load_compact_model(path: Path, data: bytes | None = None) -> VideoModel:
-    """The model in a compact file, or in the `data` of one that is a part of the file.
+    """The model in a compact file, or in `data`, the bytes of one that is a part of a file.
 
-    Raises as `load_compact`, also for values beyond float32.
+    Raises as `load_compact`, also for values beyond float32. Warnings point at the caller of the function that calls
+    this one, `load_video_model`.
     """
-    with np.errstate(over="ignore", invalid="ignore"), open(path, "rb") if data is None else io.BytesIO(data) as file:
-        model = dequantize(_read(path, file, (0.0, 1.0)))
+    with np.errstate(over="ignore", invalid="ignore"):
+        model = dequantize(_load(path, (0.0, 1.0), data, stacklevel=4))
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model)):
         raise _unreadable(path, "one with values beyond float32")
     return model
+
+
+def _load(path: Path, visible: tuple[float, float], data: bytes | None = None, *, stacklevel: int) -> Quantized:
+    with open(path, "rb") if data is None else io.BytesIO(data) as file:
+        header = _read_header(path, file)
+        try:
+            quantized, note = _decode(path, header, file, visible)
+        except HEADER_ERRORS as error:
+            if isinstance(error, ModelFileError):
+                raise
+            got = f"one that does not fit together ({type(error).__name__}: {one_line(error)})"
+            raise _unreadable(path, got) from error
+    if note:
+        warnings.warn(note, stacklevel=stacklevel)
+    return quantized
 
 
 def compact_metadata(path: Path) -> dict:
     """The `metadata` that `save_compact` stored. Raises as `load_compact`."""
     with open(path, "rb") as file:
         return _read_header(path, file)["metadata"]
+
+
+def measure_chunks(path: Path) -> tuple[list[int], int]:
+    """The bytes of each chunk, and those of the whole file, as its header states them: it may be cut off."""
+    with open(path, "rb") as file:
+        header = _read_header(path, file)
+    sizes = [sum(own["streams"]) for own in header["chunks"]]
+    return sizes, _FIXED + header["header_bytes"] + sum(header["motion"]["streams"]) + sum(sizes)
 
 
 def _read_header(path: Path, file: BinaryIO) -> dict:
@@ -210,7 +231,7 @@ def _read_header(path: Path, file: BinaryIO) -> dict:
         expected = f"a compact model of version {VERSION}, which this program reads"
         cure = "Compress the model again." if version < VERSION else "Update foldgauss."
         raise model_file_error("path", expected=expected, got=f"version {version} in {str(path)!r}", cure=cure)
-    text = file.read(length)
+    text = file.read(min(length, _count_bytes(file)))
     if length > len(text) or zlib.crc32(text) != checksum:
         raise _unreadable(path, "one that is cut off or damaged (the checksum of its header is another)")
     try:
@@ -222,65 +243,98 @@ def _read_header(path: Path, file: BinaryIO) -> dict:
     return header | {"header_bytes": length}
 
 
+def _count_bytes(file: BinaryIO) -> int:
+    """The size of a file: to read more claims memory."""
+    here = file.tell()
+    size = file.seek(0, os.SEEK_END)
+    file.seek(here)
+    return size
+
+
 def _reject_constant(name: str) -> None:
     raise ValueError(f"{name} is not valid JSON")
 
 
-def _decode(path: Path, header: dict, file: BinaryIO, visible: tuple[float, float]) -> Quantized:
+def _decode(path: Path, header: dict, file: BinaryIO, visible: tuple[float, float]) -> tuple[Quantized, str]:
+    """The model without the chunks that are not visible or cannot be read; and a warning of the latter, or ""."""
     info, num_frames = _parse_info(header), header["num_frames"]
     _check(is_integer(num_frames, 1), "num_frames", num_frames)
-    num_values = num_frames + _count_path_numbers(info)
-    motion = _read_streams(file, header["motion"], 1 if info.paths is None else 3, num_values, header["header_bytes"])
+    _check_blocks(header, info)
+    start = _FIXED + header["header_bytes"]
+    motion = _read_streams(file, header["motion"], start)
     if motion is None:
         raise _unreadable(path, "one whose frame times are cut off or damaged")
     intervals = range_coder.decode(motion[0], range_coder.Column.without_contexts(num_frames - 1))
     paths = {} if info.paths is None else _decode_paths(info.paths, *motion[1:])
-    described = header["rules"]
-    _check(isinstance(described, list) and len(described) == len(info.column_names), "rules", "others")
-    described = dict(zip(info.column_names, described, strict=True))
-    rules = {name: _parse_rule(name, numbers) for name, numbers in described.items() if not is_integral(name)}
-    _check(not any(described[name] for name in described if is_integral(name)), "rule", "some")
-    chunks, missing = [], []
-    _check(isinstance(header["chunks"], list) and header["chunks"], "chunks", "none")
-    for number, own in enumerate(header["chunks"]):
-        num, (first, last) = own["num_gaussians"], own["visible"]
-        _check(is_integer(num, 1), "num_gaussians", num)
-        if first > visible[1] or last < visible[0]:
-            file.seek(sum(own["streams"]), os.SEEK_CUR)
-            continue
-        num_values = num * len(described)
-        streams = _read_streams(file, own, len(described), num_values, header["header_bytes"])
+    rules = _parse_rules(header["rules"], info)
+    chunks, missing, after = [], [], header["motion"]
+    for own in header["chunks"]:
+        start, after = start + sum(after["streams"]), own
+        if chunks or missing:  # the first one is always read
+            first, last = own["visible"]
+            if first > visible[1] or last < visible[0]:
+                continue
+        streams = _read_streams(file, own, start)
         if streams is None:
-            missing.append(number)
+            missing.append(own["num_gaussians"])
         else:
-            chunks.append(_decode_chunk(streams, rules, info, _parse_cells(own["cells"], num), num))
-    if missing:
-        lost, total = (sum(header["chunks"][k]["num_gaussians"] for k in some) for some in (missing, range(number + 1)))
-        text = f"{len(missing)} of its {number + 1} chunks are cut off or damaged"
-        if not chunks:
-            raise _unreadable(path, f"one that has none left: {text}")
-        text = f"{str(path)!r}: {text}; {lost:,} of {total:,} Gaussians are missing. Copy it again."
-        warnings.warn(text, stacklevel=3)
-    _check(chunks, "visible", visible)
-    return Quantized(info, rules, tuple(chunks), intervals, **paths)
+            chunks.append(_decode_chunk(streams, rules, info, own))
+    lost = _describe_missing(header["chunks"], missing)
+    if not chunks:
+        raise _unreadable(path, f"one without a chunk that can be read ({lost})")
+    note = f"{str(path)!r}: {lost}. Copy it again." if missing else ""
+    return Quantized(info, rules, tuple(chunks), intervals, **paths), note
 
 
-def _read_streams(file: BinaryIO, own: dict, num: int, num_values: int, header_bytes: int) -> list[bytes] | None:
-    """The streams of a block, which are next in the file; None where they are cut off or damaged."""
+def _describe_missing(chunks: list[dict], missing: list[int]) -> str:
+    """`missing`: the numbers of Gaussians of the chunks that cannot be read."""
+    total = sum(own["num_gaussians"] for own in chunks)
+    how = f"{len(missing)} of its {len(chunks)} chunks {'is' if len(missing) == 1 else 'are'} cut off or damaged"
+    return f"{how}; {sum(missing):,} of {total:,} Gaussians are missing"
+
+
+def _check_blocks(header: dict, info: CompactInfo) -> None:
+    """Raise ValueError unless the header describes blocks that can be, before any memory is claimed for them."""
+    chunks, num_frames = header["chunks"], header["num_frames"]
+    _check(isinstance(chunks, list) and 1 <= len(chunks) <= MAX_CHUNKS, "chunks", short_repr(chunks))
+    count = num_frames + _count_path_numbers(info)
+    room = header["header_bytes"] - _check_streams(header["motion"], 1 if info.paths is None else 3, count)
+    _check(room >= 0, "num_frames", num_frames)
+    num_columns = len(info.column_names)
+    for own in chunks:
+        num, visible = own["num_gaussians"], own["visible"]
+        _check(is_integer(num, 1), "num_gaussians", short_repr(num))
+        room -= _check_streams(own, num_columns, num * num_columns)
+        _check(room >= 0, "num_gaussians", num)
+        right = isinstance(visible, list) and len(visible) == 2 and all(is_within(t, "[0, 1]") for t in visible)
+        _check(right and visible[0] <= visible[1], "visible", short_repr(visible))
+        _parse_cells(own["cells"], num)
+
+
+def _check_streams(own: dict, num: int, num_values: int) -> int:
+    """Check the numbers of bytes of a block's streams; returns how many bytes the header has to have instead."""
     lengths = own["streams"]
     right = isinstance(lengths, list) and len(lengths) == num and all(is_integer(one, 0) for one in lengths)
-    _check(right and num_values <= _MOST_PER_BYTE * (sum(lengths) + header_bytes), "streams", "others")
-    data = file.read(sum(lengths))
-    if len(data) < sum(lengths) or zlib.crc32(data) != own["crc"]:
+    _check(right, "streams", short_repr(lengths))
+    return _count_lacking(num_values, sum(lengths))
+
+
+def _read_streams(file: BinaryIO, own: dict, start: int) -> list[bytes] | None:
+    """The streams of the block that begins at the byte `start`; None where they are cut off or damaged."""
+    size = sum(own["streams"])
+    if start + size > _count_bytes(file):
+        return None
+    file.seek(start)
+    data = file.read(size)
+    if len(data) < size or zlib.crc32(data) != own["crc"]:
         return None
     streams = io.BytesIO(data)
-    return [streams.read(length) for length in lengths]
+    return [streams.read(length) for length in own["streams"]]
 
 
-def _decode_chunk(
-    streams: list[bytes], rules: dict[str, Rule], info: CompactInfo, cells: tuple[int, int, int], num: int
-) -> Chunk:
-    contexts = ColumnContexts(rules, info, cells, num)
+def _decode_chunk(streams: list[bytes], rules: dict[str, Rule], info: CompactInfo, own: dict) -> Chunk:
+    cells = _parse_cells(own["cells"], own["num_gaussians"])
+    contexts = ColumnContexts(rules, info, cells, own["num_gaussians"])
     most = {"degree": info.degree, "path": info.paths.num_paths if info.paths else 0}  # used as indices
     for name, stream in zip(info.column_names, streams, strict=True):
         numbers = range_coder.decode(stream, contexts.describe_next(name))
@@ -340,6 +394,14 @@ def _parse_paths(own: dict, num_frames: int) -> PathsInfo:
         right = isinstance(own[name], list) and len(own[name]) == 2 and all(is_within(x, interval) for x in own[name])
         _check(right, name, own[name])
     return PathsInfo(num_paths, num_knots, at_frames, bits, tuple(own["middle"]), tuple(own["sides"]))
+
+
+def _parse_rules(described: list, info: CompactInfo) -> dict[str, Rule]:
+    names = info.column_names
+    _check(isinstance(described, list) and len(described) == len(names), "rules", short_repr(described))
+    described = dict(zip(names, described, strict=True))
+    _check(not any(described[name] for name in names if is_integral(name)), "rules", "some of columns of integers")
+    return {name: _parse_rule(name, described[name]) for name in names if not is_integral(name)}
 
 
 def _parse_rule(name: str, numbers: list) -> Rule:

@@ -9,7 +9,7 @@ chunk for a time at which none of its Gaussians is visible.
 import numpy as np
 from jaxtyping import Float, Int
 
-from foldgauss.video.compression.quantize import compute_columns, find_cells
+from foldgauss.video.compression.quantize import MAX_CHUNKS, clamp_unit, compute_columns, find_cells, select_rows
 from foldgauss.video.compression.sort_order import find_overlaps, sort_by_cell
 from foldgauss.video.models.splats import TAU_MAX
 from foldgauss.video.models.video_model import VideoModel
@@ -20,6 +20,8 @@ LAYERS = (0.08, 0.4)
 #: Least number of Gaussians of a file for each of its chunks. A chunk takes some 800 bytes more than if it were a part
 #: of another, since its coder starts anew: at most 3% of the file.
 LEAST = 2500
+#: Most chunks, so that large models stay within the format's `MAX_CHUNKS`.
+_MOST = MAX_CHUNKS // 2
 
 
 def arrange(
@@ -36,7 +38,9 @@ def arrange(
         first, last = visible_spans(exact.values["time"], exact.values["duration"])
         volume = 2 * exact.values["size"] + np.log(last - first)
         chunks = divide(volume, first, last)
-    cells = find_cells(exact)
+    cells = np.zeros(len(chunks), np.int32)
+    for number in np.unique(chunks):  # a chunk of fewer Gaussians has fewer cells
+        cells[chunks == number] = find_cells(select_rows(exact, chunks == number))
     if model.compositing == "sum":  # any order gives the same image
         order = np.lexsort((cells, -chunks))
         return order, chunks[order]
@@ -57,7 +61,7 @@ def visible_spans(
     time: Float[np.ndarray, " num"], duration: Float[np.ndarray, " num"]
 ) -> tuple[Float[np.ndarray, " num"], Float[np.ndarray, " num"]]:
     """The first and the last time, in [0, 1], at which each Gaussian is visible, at most; the first is smaller."""
-    reach = TAU_MAX * np.exp(np.minimum(duration, 1.0))
+    time, reach = clamp_unit(time), TAU_MAX * np.exp(np.minimum(duration, 1.0))
     first, last = np.clip(time - reach, 0.0, 1.0), np.clip(time + reach, 0.0, 1.0)
     return first, np.maximum(last, first + 1e-9)
 
@@ -69,7 +73,10 @@ def divide(
     num, out = len(volume), np.zeros(len(volume), np.int64)
     ends = [round(fraction * num) for fraction in LAYERS[: max(num // LEAST - 1, 0)]]
     layers = np.split(np.argsort(-volume, kind="stable"), ends)
-    groups = [layers[0], *(group for layer in layers[1:] for group in _divide_in_time(layer, first, last, 0.0, 1.0))]
+    least = max(LEAST, num // _MOST)
+    groups = [layers[0]]
+    for layer in layers[1:]:
+        groups += _divide_in_time(layer, first, last, (0.0, 1.0), least)
     for number, group in enumerate(groups):
         out[group] = number
     return out
@@ -79,14 +86,18 @@ def _divide_in_time(
     rows: Int[np.ndarray, " some"],
     first: Float[np.ndarray, " num"],
     last: Float[np.ndarray, " num"],
-    low: float,
-    high: float,
+    interval: tuple[float, float],
+    least: int,
 ) -> list[Int[np.ndarray, " few"]]:
-    """Those visible around the middle of an interval of time, then those before and those after, divided alike."""
+    """Those visible around the middle of an interval of time, then those before and those after, divided alike.
+
+    A part with fewer than `least` Gaussians is not divided off.
+    """
+    low, high = interval
     middle = (low + high) / 2
     before, after = rows[last[rows] < middle], rows[first[rows] > middle]
     around = rows[(last[rows] >= middle) & (first[rows] <= middle)]
-    if min(map(len, (before, around, after))) < LEAST:
+    if min(map(len, (before, around, after))) < least:
         return [rows]
-    halves = _divide_in_time(before, first, last, low, middle), _divide_in_time(after, first, last, middle, high)
-    return [around, *halves[0], *halves[1]]
+    earlier = _divide_in_time(before, first, last, (low, middle), least)
+    return [around, *earlier, *_divide_in_time(after, first, last, (middle, high), least)]

@@ -42,6 +42,8 @@ INTEGER_COLUMNS = ("cell", "class", "degree")
 COLORS = ("luma", "blue", "green")
 #: Most bits of a cell.
 MAX_CELL_BITS = 24
+#: Most chunks of a model: to decode a chunk takes milliseconds, even one of a single Gaussian.
+MAX_CHUNKS = 1024
 #: Orthonormal color axes, as rows: brightness, blue against red, green against both.
 AXES = np.array(
     [
@@ -65,15 +67,8 @@ _MAX_STEP = {"time": 0.125, "angle": 0.125, "size": 0.35, "stretch": 0.5, "durat
 def column_names(degree: int, num_paths: int = 0) -> tuple[str, ...]:
     """The columns of a model in order."""
     trajectory = tuple(f"{axis}{k}" for k in range(degree + 1) for axis in "xy")
-    return (
-        *INTEGER_COLUMNS,
-        *(("path",) if num_paths else ()),
-        *FEATURES[1:],
-        "time",
-        *trajectory,
-        "angle",
-        *COLORS,
-    )
+    path = ("path",) if num_paths else ()
+    return (*INTEGER_COLUMNS, *path, *FEATURES[1:], "time", *trajectory, "angle", *COLORS)
 
 
 def trajectory_power(name: str) -> int:
@@ -505,8 +500,12 @@ def quantize(
     info = exact.info
     if chunks is None:
         chunks = np.zeros(len(classes), np.int8)
-    made = []
-    for number in np.unique(chunks):
+    if (chunks[1:] > chunks[:-1]).any():  # the file would have another order
+        raise invalid("chunks", expected="numbers that do not increase from front to back", got="others")
+    made, numbers = [], np.unique(chunks)
+    if len(numbers) > MAX_CHUNKS:
+        raise invalid("chunks", expected=f"at most {MAX_CHUNKS} of them", got=len(numbers))
+    for number in numbers:
         part = chunks == number
         made.append(quantize_chunk(select_rows(exact, part), classes[part], rules))
     logits = exact.logits - exact.logits.max(initial=-np.inf)

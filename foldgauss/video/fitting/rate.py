@@ -55,9 +55,10 @@ from foldgauss.video.models.video_model import VideoModel
 COARSEST = 11.0
 #: The same at quality 100.
 FINEST = 1.0
-#: Bytes of a file beside its streams: its header, and what is known of the clip; and for each chunk.
+#: Bytes of a file beside its streams: its header, and what is known of the clip.
 HEADER_BYTES = 3000
-BYTES_PER_CHUNK = 200
+#: Bytes of the header for each chunk, and for the length of each of its streams.
+BYTES_PER_CHUNK, BYTES_PER_STREAM = 110, 8
 #: Fraction of the largest file that the fit aims at; the Gaussians that are worth least are dropped in the end if the
 #: file is larger nevertheless.
 _AIM = 0.98
@@ -344,11 +345,12 @@ def coarseness_of(quality: float) -> float:
 
 
 def count_bytes(quantized: Quantized) -> int:
-    """The bytes of a file, with `HEADER_BYTES` for its header."""
+    """The bytes of a file, rather too many: its header is not made."""
     streams, info = encode_motion(quantized), quantized.info
     for chunk in quantized.chunks:
         streams += encode_chunk(chunk, quantized.rules, info)
-    return HEADER_BYTES + BYTES_PER_CHUNK * len(quantized.chunks) + sum(map(len, streams))
+    per_chunk = BYTES_PER_CHUNK + BYTES_PER_STREAM * len(info.column_names)
+    return HEADER_BYTES + per_chunk * len(quantized.chunks) + sum(map(len, streams))
 
 
 def count_past(progress: float) -> int:

@@ -78,6 +78,8 @@ def relocate(
     order = np.argsort(np.concatenate([np.arange(len(state.rows)) + 0.5, place]), kind="stable")
     state.extend(new)
     state.keep(order)
+    # A newborn is in the chunk of the one behind it: chunks stay together. They differ only where a long step is taken.
+    state.chunks = np.maximum.accumulate(state.chunks[::-1])[::-1]
 
 
 def measure_influence(
