@@ -22,7 +22,7 @@ from foldgauss.io.models.compact import MAGIC, VERSION, is_compact, pack_compact
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, compress, layers
-from foldgauss.video.compression.chunks import LEAST, arrange, divide
+from foldgauss.video.compression.chunks import LEAST, arrange, divide, divide_anew, find_layers, visible_spans
 from foldgauss.video.compression.quantize import (
     AXES,
     Rule,
@@ -573,7 +573,7 @@ def test_divide_by_size_and_by_time():
     num = 20 * LEAST
     volume, first = rng.normal(size=num), rng.uniform(0, 0.95, num)
     last = first + rng.choice([0.01, 0.04, 0.6], num)
-    numbers = divide(volume, first, last)
+    numbers = np.unique(divide(find_layers(volume), first, last), return_inverse=True)[1]
     num_chunks = numbers.max() + 1
     assert sorted(set(numbers)) == list(range(num_chunks))
     assert num_chunks > 4
@@ -590,10 +590,37 @@ def test_divide_by_size_and_by_time():
         assert first[numbers == max(numbers[layers == layer])].min() > 0.5
 
 
+def test_chunks_follow_visible_spans_that_have_changed(monkeypatch):
+    """Gaussians that live longer than before move to the chunk around; the others stay in their order."""
+    monkeypatch.setattr(chunks_module, "LEAST", 50)
+    model = crowd(soft_model(degree=1, options=RenderOptions()), 20)
+    model = only(model, np.argsort(np.asarray(model.splats.time_loc_logit), kind="stable"))
+    short = np.full(model.num_gaussians, -5.0, np.float32)
+    short[::3] = 0
+    model = eqx.tree_at(lambda m: m.splats.log_time_scale, model, short)
+    order, chunks = arrange(model, 0.0)
+    model = only(model, order)
+    assert len(np.unique(chunks)) > 4
+    np.testing.assert_array_equal(divide_anew(model, chunks)[0], np.arange(len(order)))
+    longer = np.asarray(model.splats.log_time_scale).copy()
+    longer[7::40] = 0
+    model = eqx.tree_at(lambda m: m.splats.log_time_scale, model, longer)
+    order, anew = divide_anew(model, chunks)
+    moved = order != np.arange(len(order))
+    assert moved.any()
+    assert (np.diff(anew) <= 0).all()
+    stayed = np.isin(order, np.flatnonzero(np.arange(len(order)) % 40 != 7))
+    np.testing.assert_array_equal(np.sort(order[stayed]), order[stayed])
+    spans = visible_spans(compute_columns(model).values["time"][order], longer[order])
+    for number in np.unique(anew)[2:]:  # a chunk before or after the middle
+        within = anew == number
+        assert not (spans[0][within].min() < 0.5 < spans[1][within].max()) or number % 1024 == 0
+
+
 @pytest.mark.parametrize("num", [1, 2, 2 * LEAST - 1])
 def test_few_gaussians_are_one_chunk(num):
     first = np.linspace(0, 0.9, num)
-    assert not divide(np.arange(num, dtype=float), first, first + 0.05).any()
+    assert not divide(find_layers(np.arange(num, dtype=float)), first, first + 0.05).any()
 
 
 def test_many_gaussians_are_within_the_limit_of_chunks(monkeypatch):
@@ -601,9 +628,10 @@ def test_many_gaussians_are_within_the_limit_of_chunks(monkeypatch):
     rng, num = np.random.default_rng(0), 20_000
     first = rng.uniform(0, 1, num)
     last = np.minimum(first + 10 ** rng.uniform(-5, 0, num), 1)
-    assert 50 < divide(rng.normal(size=num), first, last).max() < 512
+    layers = find_layers(rng.normal(size=num))
+    assert 50 < len(np.unique(divide(layers, first, last))) < 512
     monkeypatch.setattr(chunks_module, "_MOST", num)
-    assert divide(rng.normal(size=num), first, last).max() > 1024
+    assert len(np.unique(divide(layers, first, last))) > 1024
 
 
 @pytest.mark.parametrize("compositing", ["over", "sum"])

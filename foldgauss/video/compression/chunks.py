@@ -20,8 +20,8 @@ LAYERS = (0.08, 0.4)
 #: Least number of Gaussians of a file for each of its chunks. A chunk takes some 800 bytes more than if it were a part
 #: of another, since its coder starts anew: at most 3% of the file.
 LEAST = 2500
-#: Most chunks, so that large models stay within the format's `MAX_CHUNKS`.
-_MOST = MAX_CHUNKS // 2
+#: Most chunks, so that large models stay within the format's `MAX_CHUNKS`; and of a layer.
+_MOST, _STRIDE = MAX_CHUNKS // 2, MAX_CHUNKS
 
 
 def arrange(
@@ -36,8 +36,7 @@ def arrange(
     chunks = np.zeros(model.num_gaussians, np.int64)
     if layered:
         first, last = visible_spans(exact.values["time"], exact.values["duration"])
-        volume = 2 * exact.values["size"] + np.log(last - first)
-        chunks = divide(volume, first, last)
+        chunks = divide(find_layers(2 * exact.values["size"] + np.log(last - first)), first, last)
     cells = np.zeros(len(chunks), np.int32)
     for number in np.unique(chunks):  # a chunk of fewer Gaussians has fewer cells
         cells[chunks == number] = find_cells(select_rows(exact, chunks == number))
@@ -46,7 +45,7 @@ def arrange(
         return order, chunks[order]
     front, back, cost = find_overlaps(Contributions(model))
     parts = []
-    for number in range(chunks.max(), -1, -1):
+    for number in np.unique(chunks)[::-1]:
         rows = np.flatnonzero(chunks == number)
         within = (chunks[front] == number) & (chunks[back] == number)
         place = np.zeros(len(chunks), np.int64)
@@ -54,6 +53,14 @@ def arrange(
         overlaps = place[front[within]], place[back[within]], cost[within]
         parts.append(rows[sort_by_cell(cells[rows], overlaps, budget * len(rows) / len(chunks))])
     order = np.concatenate(parts)
+    return order, chunks[order]
+
+
+def divide_anew(model: VideoModel, chunks: Int[np.ndarray, " num"]) -> tuple[Int[np.ndarray, " num"], ...]:
+    """As `arrange`, from an order that it gave, where only the visible spans have changed: few Gaussians move."""
+    values = compute_columns(model).values
+    chunks = divide(chunks.astype(np.int64) // _STRIDE, *visible_spans(values["time"], values["duration"]))
+    order = np.argsort(-chunks, kind="stable")
     return order, chunks[order]
 
 
@@ -66,19 +73,25 @@ def visible_spans(
     return first, np.maximum(last, first + 1e-9)
 
 
-def divide(
-    volume: Float[np.ndarray, " num"], first: Float[np.ndarray, " num"], last: Float[np.ndarray, " num"]
-) -> Int[np.ndarray, " num"]:
-    """The number of each Gaussian's chunk, in the order of the file, by volumes and visible spans."""
-    num, out = len(volume), np.zeros(len(volume), np.int64)
+def find_layers(volume: Float[np.ndarray, " num"]) -> Int[np.ndarray, " num"]:
+    """The layer of each Gaussian by its volume, 0 for the largest."""
+    num = len(volume)
     ends = [round(fraction * num) for fraction in LAYERS[: max(num // LEAST - 1, 0)]]
-    layers = np.split(np.argsort(-volume, kind="stable"), ends)
-    least = max(LEAST, num // _MOST)
-    groups = [layers[0]]
-    for layer in layers[1:]:
-        groups += _divide_in_time(layer, first, last, (0.0, 1.0), least)
-    for number, group in enumerate(groups):
-        out[group] = number
+    rank = np.empty(num, np.int64)
+    rank[np.argsort(-volume, kind="stable")] = np.arange(num)
+    return np.searchsorted(ends, rank, side="right")
+
+
+def divide(
+    layer: Int[np.ndarray, " num"], first: Float[np.ndarray, " num"], last: Float[np.ndarray, " num"]
+) -> Int[np.ndarray, " num"]:
+    """The number of each Gaussian's chunk, in the order of the file: `_STRIDE` times its layer and more."""
+    out, least = np.zeros(len(layer), np.int64), max(LEAST, len(layer) // _MOST)
+    for number in np.unique(layer):
+        rows = np.flatnonzero(layer == number)
+        groups = _divide_in_time(rows, first, last, (0.0, 1.0), least) if number else [rows]
+        for place, group in enumerate(groups):
+            out[group] = number * _STRIDE + place
     return out
 
 

@@ -24,7 +24,7 @@ from jaxtyping import Int
 
 from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.checks import invalid
-from foldgauss.video.compression.chunks import arrange
+from foldgauss.video.compression.chunks import arrange, divide_anew
 from foldgauss.video.compression.quantize import (
     Quantized,
     Rule,
@@ -97,7 +97,7 @@ _ORDERING_UNTRAINED = 1e-5
 
 
 class Action(NamedTuple):
-    """What is done once a fraction of the plan is over: "drop", "sort", or the group of leaves to round.
+    """What is done after a fraction of the plan: "drop", "sort", "divide" into chunks, or the group of leaves to round.
 
     `extent`: the fraction of the price of a bit at which Gaussians are dropped, or of the Gaussians that are rounded.
     `gain`: about how many dB the running PSNR rises from then to the end of the fit, rounding included, if nothing is
@@ -121,7 +121,7 @@ ACTIONS = (
     Action(0.78, SHAPE, 0.75),
     Action(0.84, "drop", 1.0, -0.5),
     Action(0.86, SHAPE, 1.0),
-    Action(0.86, "sort"),  # again: when Gaussians are visible does not change from now on
+    Action(0.86, "divide"),  # when Gaussians are visible does not change from now on
     Action(0.91, TRAJECTORY, 0.5),
     Action(0.96, TRAJECTORY, 1.0),
     Action(0.985, COLOR, 0.5),
@@ -158,9 +158,12 @@ class RateControl:
             action = ACTIONS[state.rate_actions]
             if action.what == "drop":
                 self._drop(state, action)
+            elif action.what == "divide":
+                self._keep_in_chunks(state, *divide_anew(self._model(state), state.chunks))
             elif action.what == "sort":
                 error = float(state.frame_errors.mean()) * self.frames[..., :3].size
-                self._arrange(state, _ORDERING * self._adaptation(state) * error)
+                budget = _ORDERING * self._adaptation(state) * error
+                self._keep_in_chunks(state, *arrange(self._model(state), budget))
             else:
                 self._round(state, action)
             state.rate_actions += 1
@@ -194,7 +197,8 @@ class RateControl:
             fraction /= 2
         state.keep(np.flatnonzero(kept))
         levels = sum(float(frame.astype(np.float64).var()) for frame in self.frames) * self.frames[0].size
-        self._arrange(state, _ORDERING_UNTRAINED * levels / 255**2, layered=False)
+        budget = _ORDERING_UNTRAINED * levels / 255**2
+        self._keep_in_chunks(state, *arrange(self._model(state), budget, layered=False))
         self._choose_rules(state, ACTIONS[-1])
 
     def finish(self, state: FitState, fps: float = 25.0) -> Quantized:
@@ -230,8 +234,7 @@ class RateControl:
     def _model(self, state: FitState, fps: float = 25.0) -> VideoModel:
         return to_model(state, self.config, self.frames.shape[1:3], fps)
 
-    def _arrange(self, state: FitState, budget: float, *, layered: bool = True) -> None:
-        order, chunks = arrange(self._model(state), budget, layered=layered)
+    def _keep_in_chunks(self, state: FitState, order: np.ndarray, chunks: np.ndarray) -> None:
         state.keep(order)
         state.chunks = chunks.astype(np.uint16)
 
