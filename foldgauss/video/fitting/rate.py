@@ -68,8 +68,9 @@ _TRIES = 8
 _TOLERANCE_LOG2 = 0.02
 #: By how much the binary logarithm of a size falls for each unit of coarseness, as measured.
 _SLOPE_LOG2 = 0.8
-#: The fraction of the error of dropping, and of rounding, that remains after the rest of the fit, as measured.
-_LEFT_OF_DROPPING, _LEFT_OF_ROUNDING = 0.2, 0.6
+#: The fraction of the error of dropping that remains after the rest of the fit, as measured; and of rounding, or of
+#: dropping where shapes are rounded.
+_LEFT_OF_DROPPING, _LEFT_OF_ROUNDING = 0.3, 0.6
 #: How finely the coarseness is searched for a PSNR.
 _TOLERANCE = 0.1
 #: Frames that a PSNR is estimated by.
@@ -119,7 +120,7 @@ ACTIONS = (
     Action(0.55, "sort"),
     Action(0.7, SHAPE, 0.4, 0.4),
     Action(0.78, SHAPE, 0.75),
-    Action(0.84, "drop", 1.0, -0.5),
+    Action(0.84, "drop", 1.0),
     Action(0.86, SHAPE, 1.0),
     Action(0.86, "divide"),  # when Gaussians are visible does not change from now on
     Action(0.91, TRAJECTORY, 0.5),
@@ -305,7 +306,9 @@ class RateControl:
         aim, now, adaptation = self.config.psnr + _MARGIN_DB, running_psnr(state), self._adaptation(state)
         is_converged = not state.coarseness and state.rate_actions > 0  # a model that was given
         left = 10 ** (-0.1 * (now + (0.0 if is_converged else adaptation * action.gain)))
-        remaining = 1 - adaptation * (1 - (_LEFT_OF_DROPPING if action.what == "drop" else _LEFT_OF_ROUNDING))
+        remaining = 1 - adaptation * (
+            1 - (_LEFT_OF_ROUNDING if state.rules or action.what != "drop" else _LEFT_OF_DROPPING)
+        )
         model = self._model(state)
 
         def reached(coarseness: float) -> float:
