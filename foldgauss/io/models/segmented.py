@@ -35,8 +35,10 @@ from foldgauss.video.segmented.segmented_video import MAX_PREPARED, Segment, Seg
 SEGMENTED = "segmented-video"
 #: Kinds of models that may be a segment, see `foldgauss.io.models.video_model`: the last one is a compact file.
 PARTS = ("video", "edited-video", "compact")
-#: The tensor of a compact segment, which has the bytes of its file, and the properties that its header holds.
-_FILE, _FACTS = "file", ("num_gaussians", "num_frames", "degree", "num_parameters", "size", "fps", "compositing")
+#: The tensor of a compact segment, which has the bytes of its file.
+_FILE = "file"
+#: The properties of a compact segment's model that the header holds.
+_FACTS = ("num_gaussians", "num_frames", "degree", "num_parameters", "size", "fps", "compositing")
 _KEY = re.compile(r"segments\.(0|[1-9][0-9]{0,8})\.(.+)", re.DOTALL)
 #: Upper limit of a degree in a header, which is not trusted.
 _MAX_DEGREE = 1 << 20

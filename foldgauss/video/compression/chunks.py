@@ -20,8 +20,10 @@ LAYERS = (0.08, 0.4)
 #: Least number of Gaussians of a file for each of its chunks. A chunk takes some 800 bytes more than if it were a part
 #: of another, since its coder starts anew: at most 3% of the file.
 LEAST = 2500
-#: Most chunks, so that large models stay within the format's `MAX_CHUNKS`; and of a layer.
-_MOST, _STRIDE = MAX_CHUNKS // 2, MAX_CHUNKS
+#: Most chunks, so that large models stay within the format's `MAX_CHUNKS`.
+_MOST = MAX_CHUNKS // 2
+#: From a layer to the next, numbers of chunks grow by this.
+_STRIDE = MAX_CHUNKS
 
 
 def arrange(

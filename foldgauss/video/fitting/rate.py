@@ -57,8 +57,10 @@ COARSEST = 11.0
 FINEST = 1.0
 #: Bytes of a file beside its streams: its header, and what is known of the clip.
 HEADER_BYTES = 3000
-#: Bytes of the header for each chunk, and for the length of each of its streams.
-BYTES_PER_CHUNK, BYTES_PER_STREAM = 110, 8
+#: Bytes of the header for each chunk.
+BYTES_PER_CHUNK = 110
+#: Bytes of the header for the length of a stream.
+BYTES_PER_STREAM = 8
 #: Fraction of the largest file that the fit aims at; the Gaussians that are worth least are dropped in the end if the
 #: file is larger nevertheless.
 _AIM = 0.98
@@ -68,9 +70,10 @@ _TRIES = 8
 _TOLERANCE_LOG2 = 0.02
 #: By how much the binary logarithm of a size falls for each unit of coarseness, as measured.
 _SLOPE_LOG2 = 0.8
-#: The fraction of the error of dropping that remains after the rest of the fit, as measured; and of rounding, or of
-#: dropping where shapes are rounded.
-_LEFT_OF_DROPPING, _LEFT_OF_ROUNDING = 0.3, 0.6
+#: The fraction of the error of dropping that remains after the rest of the fit, as measured.
+_LEFT_OF_DROPPING = 0.3
+#: That of the error of rounding, or of dropping where shapes are rounded.
+_LEFT_OF_ROUNDING = 0.6
 #: How finely the coarseness is searched for a PSNR.
 _TOLERANCE = 0.1
 #: Frames that a PSNR is estimated by.
@@ -306,9 +309,8 @@ class RateControl:
         aim, now, adaptation = self.config.psnr + _MARGIN_DB, running_psnr(state), self._adaptation(state)
         is_converged = not state.coarseness and state.rate_actions > 0  # a model that was given
         left = 10 ** (-0.1 * (now + (0.0 if is_converged else adaptation * action.gain)))
-        remaining = 1 - adaptation * (
-            1 - (_LEFT_OF_ROUNDING if state.rules or action.what != "drop" else _LEFT_OF_DROPPING)
-        )
+        remaining = _LEFT_OF_ROUNDING if state.rules or action.what != "drop" else _LEFT_OF_DROPPING
+        remaining = 1 - adaptation * (1 - remaining)
         model = self._model(state)
 
         def reached(coarseness: float) -> float:
