@@ -439,7 +439,6 @@ def broken_inputs(tmp_path, work):
         "no psnr": (["fit", clip, "--out", out, "--psnr", "-3"], 2, "--psnr"),
         "no room": (["fit", clip, "--out", small, "--size-mb", "0.001", *QUICK], 2, "--size-mb.*at least"),
         "size of float32": (["fit", clip, "--out", out, "--size-mb", "1"], 2, "--size-mb.*compact.*m?.fgz"),
-        "compact segments": (["fit", clip, "--out", small, "--segment-seconds", "1"], 2, "--out.*safetensors"),
         "out is a video": (["fit", clip, "--out", tmp_path / "m.mp4"], 2, "--out: .* as m.safetensors"),
         "out is something": (["fit", clip, "--out", tmp_path / "m.bin"], 2, "--out: .* as m.safetensors"),
         "nothing to resume": (["fit", clip, "--out", out, "--resume"], 2, "stopped fit"),

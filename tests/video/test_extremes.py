@@ -296,14 +296,18 @@ def test_ssim_of_small_pictures(size):
 
 
 def test_exact_frames_cost_the_others_no_bits():
-    """Half of the frames are black: the others are about as good as alone, in a file that is hardly larger."""
-    blobs, how = moving_blobs(3, *SIZE), {"num_gaussians": 500, "quality": 80}
-    both = fit(np.concatenate([blobs, constant(0, 3)]), FitConfig(steps=400, **how))
-    alone = fit(blobs, FitConfig(steps=200, **how))  # each frame is shown as often
-    scores = evaluate(both.model, np.concatenate([blobs, constant(0, 3)])).psnr
-    assert min(scores[3:]) > 40
-    assert np.mean(scores[:3]) > evaluate(alone.model, blobs).mean_psnr - 2
-    assert len(pack_compact(both.quantized)) < 2 * len(pack_compact(alone.quantized))
+    """Half of the frames are black: the others are about as good as alone, in files that are hardly larger."""
+    blobs, scores = moving_blobs(3, *SIZE), []
+    frames = np.concatenate([blobs, constant(0, 3)])
+    for seed in range(3):  # with few Gaussians a frame may be worse by chance
+        how = {"num_gaussians": 500, "quality": 80, "seed": seed}
+        both = fit(frames, FitConfig(steps=400, **how))
+        alone = fit(blobs, FitConfig(steps=200, **how))  # each frame is shown as often
+        found = evaluate(both.model, frames).psnr
+        assert min(found[3:]) > 40
+        scores.append(np.mean(found[:3]) - evaluate(alone.model, blobs).mean_psnr)
+        assert len(pack_compact(both.quantized)) < 2 * len(pack_compact(alone.quantized))
+    assert np.mean(scores) > -2
 
 
 @pytest.mark.parametrize(

@@ -329,7 +329,7 @@ def test_other_goals_resume_likewise(tmp_path, goal):
 @pytest.fixture
 def many_chunks(monkeypatch):
     """Few Gaussians are already divided into chunks."""
-    monkeypatch.setattr(chunks, "LEAST", 10)
+    monkeypatch.setattr(chunks, "LEAST", 5)
 
 
 @pytest.mark.parametrize("goal", [{"quality": 80}, {"quality": 80, "compositing": "sum"}, {"size_mb": 0.012}], ids=str)
