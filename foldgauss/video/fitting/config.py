@@ -458,6 +458,9 @@ DENSITY_PER_QUALITY = 0.08
 PSNR_AT_50 = 35.0
 #: Growth of the binary logarithm of that number for each dB of the PSNR that is asked for.
 DENSITY_PER_DB = 0.32
+#: Gaussians per pixel of a clip for each microsecond of x, see `default_num_gaussians`, with which a fit of a compact
+#: model starts at most: those that do not converge are not worth their bits.
+START_PER_TIME = 7e-4
 #: Gaussians that a fit starts with for each 10^6 bytes of the largest file: some three times as many as it keeps.
 GAUSSIANS_PER_MB = 300_000
 
@@ -492,12 +495,12 @@ def default_num_gaussians(
     alive = min(ALIVE * time**ALIVE_POWER * area**ALIVE_PIXEL_POWER, MOST_PER_PIXEL * area)
     by_life = alive * num_frames / lifetime
     by_size = 3 * pixels / (PARAMETER_BYTES * parameters_per_gaussian(config.degree))
-    return max(round(min(by_time, by_life, by_size, _most_for_rate(config, pixels))), 1)
+    return max(round(min(by_time, by_life, by_size, _most_for_rate(config, pixels, time))), 1)
 
 
-def _most_for_rate(config: FitConfig, pixels: int) -> float:
+def _most_for_rate(config: FitConfig, pixels: int, time: float) -> float:
     """A few times as many Gaussians as a compact model usually keeps, whose number depends on the clip."""
-    limits = [math.inf]
+    limits = [START_PER_TIME * time * pixels if config.is_compact else math.inf]
     if config.quality is not None:
         limits.append(pixels * START_DENSITY * 2 ** (DENSITY_PER_QUALITY * (config.quality - 50)))
     if config.psnr is not None:  # at what quality is not known yet, so more than twice as many
