@@ -98,7 +98,7 @@ def test_a_psnr_out_of_reach_is_told(clip, capsys):
         (["--size-mb", "0.001"], "--size-mb: expected at least 0.00"),
         (["--quality", "101"], "--quality: expected a number in [0, 100]"),
         (["--psnr", "0"], "--psnr: expected a number in (0, 100]"),
-        (["--size-mb", "0.003", "--segment-seconds", "0.2"], "--size-mb: expected more than 0.008 for 2 segments"),
+        (["--size-mb", "0.003", "--segment-seconds", "0.2"], "--size-mb: expected more than 0.008"),
         (["--out", "m.mp4"], "--out: expected a name for the model"),
     ],
     ids=str,

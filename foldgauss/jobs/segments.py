@@ -218,7 +218,11 @@ def plan_long_fit(
         spans = plan_segments(index.num_frames, index.cuts, length=length, overlap=_limit_overlap(overlap, length))
     else:
         spans = plan["spans"]
-    configs = _divide_size(config, spans)
+    if frames is not None and frames[1] is not None:  # the range may end beyond the clip
+        frames = frames[0], min(frames[1], (frames[0] or 0) + index.num_declared)
+    metadata = {"clip": clip.name, "seed": config.seed, "frames": frames, "clip_digest": index.digest}
+    metadata |= describe_reading(index)
+    configs = _divide_size(config, spans, metadata)
     if restart and folder.is_dir():
         shutil.rmtree(folder)  # only once the clip has been read
     _make_folder(folder)
@@ -226,10 +230,6 @@ def plan_long_fit(
     kept = {"clip": str(clip), "digest": index.digest, "stamp": _stamp(clip), "asked": request, "spans": spans}
     with atomic_path(folder / _PLAN) as temporary:
         temporary.write_text(json.dumps(kept) + "\n")
-    if frames is not None and frames[1] is not None:  # the range may end beyond the clip
-        frames = frames[0], min(frames[1], (frames[0] or 0) + index.num_declared)
-    metadata = {"clip": clip.name, "seed": config.seed, "frames": frames, "clip_digest": index.digest}
-    metadata |= describe_reading(index)
     jobs = _make_jobs(
         clip,
         folder,
@@ -276,14 +276,18 @@ def _make_jobs(
     return tuple(jobs)
 
 
-def _divide_size(config: FitConfig, spans: Sequence[tuple[int, int]]) -> list[FitConfig]:
-    """The configuration of each segment: `size_mb` in proportion to its frames; shared frames count twice."""
+def _divide_size(config: FitConfig, spans: Sequence[tuple[int, int]], metadata: Mapping[str, Any]) -> list[FitConfig]:
+    """The configuration of each segment: `size_mb` in proportion to its frames; shared frames count twice.
+
+    Room is left for the `metadata` of the clip, which may have a number for each frame, and those of the segments.
+    """
     if config.size_mb is None:
         return [config] * len(spans)
     lengths = [stop - first for first, stop in spans]
-    size_mb = config.size_mb - _MB_PER_SEGMENT * len(spans) * (len(spans) > 1)
+    beside = _MB_PER_SEGMENT * len(spans) + 2.5e-6 * len(json.dumps(metadata))
+    size_mb = config.size_mb - beside * (len(spans) > 1)
     if size_mb <= 0:
-        expected = f"more than {config.size_mb - size_mb:g} for {len(spans)} segments"
+        expected = f"more than {beside:.4f} for {len(spans)} segments"
         raise invalid("size_mb", expected=expected, got=config.size_mb)
     return [dataclasses.replace(config, size_mb=size_mb * one / sum(lengths)) for one in lengths]
 

@@ -188,10 +188,10 @@ def test_a_file_from_the_disk_comes_in_chunks(opened, film, whole, tmp_path):
 
 def test_a_linked_page_on_the_disk_says_what_to_do(browser, tmp_path):
     page = Opened(browser, export(soft_model(options=RenderOptions()), "html", tmp_path / "clip.html", linked=True))
-    page.page.get_by_text("drop clip.fgz onto the page, or serve the folder").wait_for()
-    drop(page, tmp_path / "clip.fgz")
+    page.page.get_by_text("drop clip.page.fgz onto the page, or serve the folder").wait_for()
+    drop(page, tmp_path / "clip.page.fgz")
     page.until("foldgauss.stats")
-    assert_shows(page, load_video_model(tmp_path / "clip.fgz"))
+    assert_shows(page, load_video_model(tmp_path / "clip.page.fgz"))
     page.close()
 
 
@@ -203,14 +203,14 @@ def test_the_file_of_a_linked_page_stands_beside_it(film, tmp_path, capsys):
     assert page == html_page(path, linked="film.fgz", title="page")
     (tmp_path / "site").mkdir()
     assert run("export", path, "--format", "html", "--linked", "--out", tmp_path / "site" / "clip.html") == 0
-    assert (tmp_path / "site" / "clip.fgz").read_bytes() == path.read_bytes()
+    assert (tmp_path / "site" / "clip.page.fgz").read_bytes() == path.read_bytes()
     assert sorted(own.name for own in tmp_path.iterdir()) == ["film.fgz", "page.html", "site"]
     other = save_video_model(tmp_path / "site" / "other.safetensors", soft_model())
     assert run("export", other, "--format", "html", "--linked", "--out", tmp_path / "site" / "other.html") == 0
-    assert load_video_model(tmp_path / "site" / "other.fgz").num_gaussians == soft_model().num_gaussians
+    assert load_video_model(tmp_path / "site" / "other.page.fgz").num_gaussians == soft_model().num_gaussians
     (tmp_path / "site" / "other.html").unlink()
     assert run("export", other, "--format", "html", "--linked", "--out", tmp_path / "site" / "other.html") == 2
-    assert "other.fgz exists" in capsys.readouterr().err.replace("\n", "")
+    assert "other.page.fgz exists" in capsys.readouterr().err.replace("\n", "")
     assert run("export", other, "--format", "ply", "--linked") == 2
     segments = SegmentedVideo.from_models([(0, soft_model()), (7, soft_model())])
     with pytest.raises(ValueError, match="linked: expected a single model"):

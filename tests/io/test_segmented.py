@@ -1,6 +1,5 @@
 """Segments in one file: the bits of the files that they came from, read when they are wanted."""
 
-import base64
 import dataclasses
 import json
 import os
@@ -425,10 +424,21 @@ def test_compact_segments_are_stored_as_their_files(tmp_path):
     for segment, file in zip(video.segments[1:], compact, strict=True):
         same(segment.model, load_video_model(file))
         assert segment.num_parameters == segment.model.num_parameters
-    assert [segmented.read_segment_file(long, k) for k in range(3)] == [None, *(file.read_bytes() for file in compact)]
     for file in compact:
-        assert base64.b64encode(file.read_bytes()).decode() in html_page(long)
+        assert file.read_bytes() in long.read_bytes()
+    assert html_page(long).count('id="model-') == 3
     assert long.stat().st_size < 4000 * 3 + sum(file.stat().st_size for file in (path, *compact))
+
+
+def test_odd_facts_of_a_compact_segment_are_refused(tmp_path):
+    file = save_compact(tmp_path / "m.fgz", quantize_finely(soft_model(num_frames=7)))
+    long = join_segments(tmp_path / "long.fgz", [(0, file)])
+    data = long.read_bytes()
+    for before, after in ((b'num_parameters\\":', b'num_parameters\\":-'), (b"U8", b"I8")):
+        assert before in data
+        long.write_bytes(data.replace(before, after))
+        with pytest.raises(ModelFileError):
+            load_video_model(long)
 
 
 def test_a_damaged_compact_segment_is_told(tmp_path):

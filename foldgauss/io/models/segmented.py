@@ -168,17 +168,16 @@ def _segments(path: Path, about: dict) -> list[Segment]:
             expected, got = "the file as it was opened", f"a changed {str(path)!r}"
             raise model_file_error("path", expected=expected, got=got, cure="Load it again.")
         if entries[number]["kind"] == PARTS[-1]:
-            return load_compact_model(path, read_segment_file(path, number))
+            return load_compact_model(path, _read_file(path, number))
         return load_part(path, entries[number] | {"tensors": own[number]}, f"segments.{number}.")
 
     return [_segment(entry, own[number], partial(load, number)) for number, entry in enumerate(entries)]
 
 
-def read_segment_file(path: Path, number: int) -> bytes | None:
-    """The bytes of a segment's compact file; None where it is no compact one."""
+def _read_file(path: Path, number: int) -> bytes:
+    """The bytes of a compact segment's file."""
     with open_tensors(path) as file:
-        key = f"segments.{number}.{_FILE}"
-        return file.get_tensor(key).tobytes() if key in file.keys() else None  # noqa: SIM118 - it is not a dict
+        return file.get_tensor(f"segments.{number}.{_FILE}").tobytes()
 
 
 def _stamp(path: Path) -> tuple[int, ...]:
@@ -200,6 +199,8 @@ def _segment(entry: dict, tensors: dict[str, dict], load: Any) -> Segment:
     is_file = entry["kind"] == PARTS[-1]
     if is_file and (tensors.keys() != {_FILE} or tensors[_FILE]["dtype"] != "U8"):
         raise ValueError("other tensors than a compact file")
+    if is_file and not is_integer(header["num_parameters"], 0):
+        raise ValueError("a number of parameters that no model has")
     if entry["kind"] in (PARTS[0], PARTS[-1]):
         models, lead = {"": header}, ""
     else:

@@ -22,7 +22,7 @@ const DAMAGED = "The file is damaged. Copy it again, or compress again.";
 const LN2 = 0.6931471805599453, SQRT2 = 1.4142135623730951;
 const NEIGHBORS = 4, CANDIDATES = 16, TIME = 0.3;
 /** Limits of headers, so that a small file cannot claim much memory. */
-const MOST_PER_BYTE = 32, MOST_DEGREE = 15, MOST_CELL_BITS = 24;
+const MOST_PER_BYTE = 32, MOST_DEGREE = 15, MOST_CELL_BITS = 24, MOST_CHUNKS = 1024;
 /** Numbers per Gaussian of each leaf; only a model with shared paths has `path_index`. */
 const WIDTHS = {
   loc: () => 2, log_scale: () => 2, angle_logit: () => 1, time_loc_logit: () => 1, log_time_scale: () => 1,
@@ -357,14 +357,16 @@ export function readHeader(bytes) {
   const sum = new DataView(bytes.buffer, bytes.byteOffset).getUint32(16, true);
   if (bytes.length < end || crc32(text) !== sum) throw new Error(DAMAGED);
   const header = JSON.parse(new TextDecoder().decode(text)), { degree, num_frames: frames, paths, motion, chunks } = header;
-  if (!(Number.isInteger(degree) && degree >= 0 && degree <= MOST_DEGREE && chunks.length)) throw new Error(DAMAGED);
+  const blocks = [motion, ...chunks], whole = [degree, frames, ...chunks.map((own) => own.num_gaussians), ...blocks.flatMap((own) => own.streams)];
+  const areCounts = whole.every((own) => Number.isSafeInteger(own) && own >= 0);
+  if (!(areCounts && degree <= MOST_DEGREE && chunks.length > 0 && chunks.length <= MOST_CHUNKS)) throw new Error(DAMAGED);
   let at = end, first = 0;
-  for (const own of [motion, ...chunks]) [own.start, own.stop] = [at, (at += own.streams.reduce((all, one) => all + one, 0))];
+  for (const own of blocks) [own.start, own.stop] = [at, (at += own.streams.reduce((all, one) => all + one, 0))];
   for (const own of [...chunks].reverse()) [own.first, first] = [first, first + own.num_gaussians];
   const ofPaths = paths ? paths.num_paths * paths.num_knots * (paths.at_frames ? 6 : 7) : 0, { length } = columnNames(header);
   const counts = [frames + ofPaths, ...chunks.map((own) => own.num_gaussians * length)];
-  const fit = [motion, ...chunks].every(({ start, stop }, k) => counts[k] > 0 && counts[k] <= MOST_PER_BYTE * (stop - start + end - FIXED));
-  if (!fit || !chunks.every(haveRoom)) throw new Error(DAMAGED);
+  const lacking = blocks.reduce((sum, { start, stop }, k) => sum + Math.max(Math.ceil(counts[k] / MOST_PER_BYTE) - (stop - start), 0), 0);
+  if (lacking > end - FIXED || counts.includes(0) || !chunks.every(haveRoom)) throw new Error(DAMAGED);
   return Object.assign(header, { num_gaussians: first });
 }
 

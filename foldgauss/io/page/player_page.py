@@ -25,7 +25,6 @@ from foldgauss._runtime.checks import invalid, is_integer, short_repr
 from foldgauss.io._atomic import PathLike, atomic_path, check_path
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.compact import COMPACT_SUFFIX, is_compact, pack_compact
-from foldgauss.io.models.segmented import read_segment_file
 from foldgauss.io.models.selections import format_indices
 from foldgauss.io.models.video_model import keep_origin, load_video_model, read_frame_seconds, read_origin
 from foldgauss.video.compression.quantize import (
@@ -79,7 +78,7 @@ def write_html(
     """Write the page of `html_page` to a file that ends in .html; what exists is replaced. Warns of one beyond 50 MB.
 
     `linked`: the page reads the model from a compact file in its folder, in parts, so that it must be served over HTTP.
-    A compact model that is there already is that file. Any other is written to the page's name with .fgz.
+    A compact model that is there already is that file. Any other is written to the page's name with .page.fgz.
 
     Raises as `html_page`, ValueError for another name, `OutputError` where it cannot be written.
 
@@ -105,7 +104,7 @@ def linked_file(path: Path, model: Model) -> Path:
     """The compact file that a page with this path reads its model from."""
     if isinstance(model, PathLike) and is_compact(model) and Path(model).parent.resolve() == path.parent.resolve():
         return Path(model)
-    return path.with_suffix(COMPACT_SUFFIX)
+    return path.with_name(f"{path.stem}.page{COMPACT_SUFFIX}")  # of no model that someone keeps
 
 
 def warn_of_size(page: str, has_original: bool) -> None:
@@ -231,9 +230,6 @@ def _encode_model(model: Model, loaded: Loaded, metadata: dict) -> Iterator[str]
         spans = [{name: int(getattr(segment, name)) for name in names} for segment in loaded.segments]
         yield f'<script type="application/json" id="segments">{json.dumps(spans)}</script>'
         for number, segment in enumerate(loaded.segments):
-            if number and loaded is not model and (data := read_segment_file(model, number)) is not None:
-                yield _block(f"model-{number}", data)
-                continue
             edited = segment.model
             try:
                 plain = flatten_video(edited)

@@ -139,7 +139,8 @@ class RateControl:
 
     def __init__(self, frames: np.ndarray, config: FitConfig):
         self.frames, self.config = frames, config
-        self.longest = self.trimming = 0.0
+        self.longest = 0.0
+        self.trimming = {"psnr": 0.0, "size_mb": 0.0}  # seconds that the last dropping takes for each
         self.background = BEYOND_BLACK if frames.shape[-1] == 4 else np.float32(BLACK)
         self.sampled = np.unique(np.linspace(0, len(frames) - 1, _SAMPLED_FRAMES).round().astype(int))
 
@@ -180,7 +181,7 @@ class RateControl:
         """
         self.longest = max(self.longest, seconds)
         left = [action for action in ACTIONS[state.rate_actions :] if action.what == "drop"]
-        return self.longest * (len(left) + (not state.rules)) + self.trimming
+        return self.longest * (len(left) + (not state.rules)) + sum(self.trimming.values())
 
     def round_only(self, state: FitState) -> None:
         """Drop what is not worth its bits, and sort where that hardly changes the images, without any training."""
@@ -203,12 +204,12 @@ class RateControl:
         levels = sum(float(frame.astype(np.float64).var()) for frame in self.frames) * self.frames[0].size
         budget = _ORDERING_UNTRAINED * levels / 255**2
         self._keep_in_chunks(state, *arrange(self._model(state), budget, layered=False))
-        self._choose_rules(state, ACTIONS[-1])
+        self._choose_rules(state, Action(1.0, COLOR))
 
     def finish(self, state: FitState, fps: float = 25.0) -> Quantized:
         """The compact model of a fit at its end."""
         if not state.rules:
-            self._choose_rules(state, ACTIONS[-1])
+            self._choose_rules(state, Action(1.0, COLOR))
         exact = compute_columns(self._model(state, fps))
         classes, rules = state.classes.astype(np.int32), _decode_rules(state)
         whole = quantize(exact, classes, rules, state.chunks)
@@ -296,7 +297,7 @@ class RateControl:
         def excess(coarseness: float) -> float:
             begun = time.perf_counter()
             num_bytes = count_bytes(quantizer.quantize(coarseness, state.chunks)) - HEADER_BYTES
-            self.trimming = _TRIALS * (time.perf_counter() - begun)
+            self.trimming["size_mb"] = _TRIALS * (time.perf_counter() - begun)
             return math.log2(num_bytes / streams)
 
         return _solve(excess, state.coarseness or USUAL_COARSENESS)
@@ -307,6 +308,7 @@ class RateControl:
         The rest of the fit makes up for a part of the error that this adds, and reduces the other error.
         """
         aim, now, adaptation = self.config.psnr + _MARGIN_DB, running_psnr(state), self._adaptation(state)
+        adaptation = adaptation if action.progress < 1 else 0.0  # the fit may end before its plan
         is_converged = not state.coarseness and state.rate_actions > 0  # a model that was given
         left = 10 ** (-0.1 * (now + (0.0 if is_converged else adaptation * action.gain)))
         remaining = _LEFT_OF_ROUNDING if state.rules or action.what != "drop" else _LEFT_OF_DROPPING
@@ -339,7 +341,7 @@ class RateControl:
         images = VideoRenderer(model).frames(np.asarray(model.frame_times.times())[which])
         found = float(np.mean([psnr_of(self._target(k), image) for k, image in zip(which, images, strict=True)]))
         each = (time.perf_counter() - begun) / len(which)
-        self.trimming = _TRIALS * each * len(self.frames)
+        self.trimming["psnr"] = _TRIALS * each * len(self.frames)
         return found
 
     def _target(self, k: int) -> np.ndarray:

@@ -86,7 +86,9 @@ async function start() {
   if (!sources.length) return welcome();
   files.isOfPage = true;
   const frames = [...document.querySelectorAll('script[id^="frame-"]')];
-  show(new Segments(await loading, spansOfPage(), decoder), element("title").textContent, new Originals(frames, () => {}));
+  const lead = await loading;
+  if (player.segments) return decoder.stop(); // another model was opened meanwhile
+  show(new Segments(lead, spansOfPage(), decoder), element("title").textContent, new Originals(frames, () => {}));
 }
 
 if (typeof document === "undefined") serve(self);

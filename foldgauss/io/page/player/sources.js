@@ -28,7 +28,7 @@ function receive(file, buffer) {
 }
 
 async function openAddress(url) {
-  const name = decodeURIComponent(url.split("/").at(-1));
+  const name = nameOf(url);
   if (url.startsWith("file:")) throw new Error(`A page on the disk cannot read the file beside it: drop ${name} onto the page, or serve the folder over HTTP (python -m http.server).`);
   const ask = (start, stop) => fetch(url, { headers: { Range: `bytes=${start}-${stop - 1}` } });
   const first = await ask(0, FIRST).catch(() => ({ status: "nothing" }));
@@ -42,6 +42,16 @@ async function openAddress(url) {
     return join(head.subarray(start), receive(file, await answer.arrayBuffer()));
   };
   return Object.assign(file, { read });
+}
+
+/** The name of a file, as its address has it where it is no UTF-8. */
+function nameOf(url) {
+  const name = url.split("/").at(-1);
+  try {
+    return decodeURIComponent(name);
+  } catch {
+    return name;
+  }
 }
 
 /** Of a server without ranges: what has arrived is kept. */
