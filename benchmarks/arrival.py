@@ -3,10 +3,9 @@
     python -m benchmarks.arrival MODEL.fgz CLIP [--json FILE] [--figure FILE]
 
 Each row is the file cut off after a chunk, as `load_video_model` reads it. `seek`: the bytes of the header and of the
-chunks that a reader needs for the frame in the middle of the clip. `one chunk`: the same model in a single chunk.
+chunks that a reader needs for one time, on average over the clip. `one chunk`: the same model in a single chunk.
 """
 
-import argparse
 import json
 import tempfile
 import warnings
@@ -31,11 +30,12 @@ def measure(path: Path, frames: np.ndarray) -> dict[str, Any]:
     begin = 20 + int.from_bytes(data[12:16], "little")
     header, rows = json.loads(data[20:begin]), []
     end = begin + sum(header["motion"]["streams"])
-    seek, num = end, 0
+    times = np.linspace(0, 1, len(frames))
+    seek, num = float(end), 0
     for chunk in header["chunks"]:
         size = sum(chunk["streams"])
         end, num = end + size, num + chunk["num_gaussians"]
-        seek += size * (chunk["visible"][0] <= 0.5 <= chunk["visible"][1])
+        seek += size * np.mean((chunk["visible"][0] <= times) & (times <= chunk["visible"][1]))
         model = _load_cut(data[:end])
         found = np.mean([psnr(frame, image) for frame, image in zip(frames, model.frames(), strict=True)])
         rows.append({"bytes": end, "fraction": end / len(data), "num_gaussians": num, "psnr": float(found)})
@@ -45,7 +45,7 @@ def measure(path: Path, frames: np.ndarray) -> dict[str, Any]:
         "model": path.name,
         "prefixes": rows,
         "bytes": len(data),
-        "seek_bytes": seek,
+        "seek_bytes": round(seek),
         "one_chunk_bytes": len(pack_compact(one, read_metadata(path))),
     }
 
@@ -68,24 +68,23 @@ def draw(found: dict[str, Any], path: Path) -> None:
     figure.savefig(path, dpi=150)
 
 
-def main(argv: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main(arguments: list[str] | None = None) -> None:
+    parser = _common.parser(__doc__)
     parser.add_argument("model", type=Path)
     parser.add_argument("clip", type=Path)
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--figure", type=Path)
-    args = parser.parse_args(argv)
-    frames = read_video(args.clip, size=load_video_model(args.model).size).frames
-    found = measure(args.model, frames)
+    parser.add_argument("--figure", type=Path, metavar="FILE", help="draw PSNR against bytes")
+    options = _common.parse(parser, arguments)
+    found = measure(options.model, read_video(options.clip, size=load_video_model(options.model).size).frames)
+    table = _common.table(found["model"], "cut off after", "of the file", "Gaussians", "PSNR (dB)")
     for row in found["prefixes"]:
-        console.print("{bytes:10,} bytes {fraction:7.1%} {num_gaussians:9,} Gaussians {psnr:6.2f} dB".format(**row))
-    cost = found["bytes"] / found["one_chunk_bytes"] - 1
-    console.print(f"one chunk: {found['one_chunk_bytes']:,} bytes; the chunks cost {cost:.1%}")
-    console.print(f"seek to the middle: {found['seek_bytes'] / found['bytes']:.1%} of the bytes")
-    if args.json:
-        _common.write_json(args.json, found)
-    if args.figure:
-        draw(found, args.figure)
+        row = f"{row['bytes']:,}", f"{row['fraction']:.1%}", f"{row['num_gaussians']:,}", f"{row['psnr']:.2f}"
+        table.add_row(*row)
+    console.print(table)
+    cost, seek = found["bytes"] / found["one_chunk_bytes"] - 1, found["seek_bytes"] / found["bytes"]
+    figures = {"bytes that the chunks cost, of those of one chunk": cost, "bytes for a time, of the file": seek}
+    _common.finish(options.json, figures, _common.describe_machine(), **found)
+    if options.figure:
+        draw(found, options.figure)
 
 
 if __name__ == "__main__":
