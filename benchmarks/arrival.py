@@ -81,7 +81,7 @@ def main(arguments: list[str] | None = None) -> None:
         table.add_row(*row)
     console.print(table)
     cost, seek = found["bytes"] / found["one_chunk_bytes"] - 1, found["seek_bytes"] / found["bytes"]
-    figures = {"bytes that the chunks cost, of those of one chunk": cost, "bytes for a time, of the file": seek}
+    figures = {"overhead of chunks": cost, "fraction of the file for one time": seek}
     _common.finish(options.json, figures, _common.describe_machine(), **found)
     if options.figure:
         draw(found, options.figure)

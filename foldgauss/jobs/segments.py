@@ -279,7 +279,7 @@ def _make_jobs(
 def _divide_size(config: FitConfig, spans: Sequence[tuple[int, int]], metadata: Mapping[str, Any]) -> list[FitConfig]:
     """The configuration of each segment: `size_mb` in proportion to its frames; shared frames count twice.
 
-    Room is left for the `metadata` of the clip, which may have a number for each frame, and those of the segments.
+    Room is left for the `metadata` of the clip and of its segments, which may have a number for each frame.
     """
     if config.size_mb is None:
         return [config] * len(spans)

@@ -211,7 +211,7 @@ def compact_metadata(path: Path) -> dict:
 
 
 def measure_chunks(path: Path) -> tuple[list[int], int]:
-    """The bytes of each chunk, and those of the whole file, as its header states them: it may be cut off."""
+    """Sizes of the chunks and of the file in bytes, as the header states them. The file itself may be cut off."""
     with open(path, "rb") as file:
         header = _read_header(path, file)
     sizes = [sum(own["streams"]) for own in header["chunks"]]

@@ -33,8 +33,14 @@ from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import MAX_PREPARED, Segment, SegmentedVideo
 
 SEGMENTED = "segmented-video"
-#: Kinds of models that may be a segment, see `foldgauss.io.models.video_model`: the last one is a compact file.
-PARTS = ("video", "edited-video", "compact")
+#: A model, see `foldgauss.io.models.video_model`.
+VIDEO = "video"
+#: A model with edits that are applied when it is rendered.
+EDITED = "edited-video"
+#: A compact file, whose bytes are a tensor.
+COMPACT = "compact"
+#: Kinds of models that may be a segment.
+PARTS = (VIDEO, EDITED, COMPACT)
 #: The tensor of a compact segment, which has the bytes of its file.
 _FILE = "file"
 #: The properties of a compact segment's model that the header holds.
@@ -64,7 +70,7 @@ def join_segments(path: PathLike, sources: Sequence[tuple[int, PathLike]], *, me
         about = _describe_compact(file, load()) if is_compact(file) else read_header(file)
         if about["kind"] not in PARTS:
             raise _unfit(file, f"one of kind {about['kind']!r}", "Join the files that it was made of.")
-        if about["kind"] != PARTS[-1]:
+        if about["kind"] != COMPACT:
             match_kind(file, about)
         files.append(file)
         entries.append({"first": first} | {name: about[name] for name in ("kind", "header", "metadata")})
@@ -78,7 +84,7 @@ def join_segments(path: PathLike, sources: Sequence[tuple[int, PathLike]], *, me
 
     def tensors(keys: list[str]) -> Iterator[np.ndarray]:
         for number, some in groupby(keys, lambda key: int(_KEY.fullmatch(key)[1])):
-            if entries[number]["kind"] == PARTS[-1]:
+            if entries[number]["kind"] == COMPACT:
                 array = np.fromfile(files[number], np.uint8)
                 if [len(array)] != specs[next(some)]["shape"]:
                     raise _unfit(files[number], "one that has changed meanwhile", "Join them again.")
@@ -125,7 +131,7 @@ def _describe_compact(file: Path, model: VideoModel) -> dict[str, Any]:
     """A compact file as `read_header` describes others."""
     header = {name: getattr(model, name) for name in _FACTS} | {"options": dataclasses.asdict(model.options)}
     tensors = {_FILE: {"dtype": "U8", "shape": [file.stat().st_size]}}
-    return {"kind": PARTS[-1], "header": header, "metadata": compact_metadata(file), "tensors": tensors}
+    return {"kind": COMPACT, "header": header, "metadata": compact_metadata(file), "tensors": tensors}
 
 
 def _unfit(file: Path, got: str, cure: str) -> ModelFileError:
@@ -167,7 +173,7 @@ def _segments(path: Path, about: dict) -> list[Segment]:
         if _stamp(path) != stamp:
             expected, got = "the file as it was opened", f"a changed {str(path)!r}"
             raise model_file_error("path", expected=expected, got=got, cure="Load it again.")
-        if entries[number]["kind"] == PARTS[-1]:
+        if entries[number]["kind"] == COMPACT:
             return load_compact_model(path, _read_file(path, number))
         return load_part(path, entries[number] | {"tensors": own[number]}, f"segments.{number}.")
 
@@ -196,12 +202,12 @@ def _segment(entry: dict, tensors: dict[str, dict], load: Any) -> Segment:
     if not isinstance(entry["metadata"], dict):
         raise TypeError("metadata that are no dict")
     header = entry["header"]
-    is_file = entry["kind"] == PARTS[-1]
+    is_file = entry["kind"] == COMPACT
     if is_file and (tensors.keys() != {_FILE} or tensors[_FILE]["dtype"] != "U8"):
         raise ValueError("other tensors than a compact file")
     if is_file and not is_integer(header["num_parameters"], 0):
         raise ValueError("a number of parameters that no model has")
-    if entry["kind"] in (PARTS[0], PARTS[-1]):
+    if entry["kind"] in (VIDEO, COMPACT):
         models, lead = {"": header}, ""
     else:
         models = {f"layers.{number}.model.": layer["model"] for number, layer in enumerate(header["layers"])}

@@ -25,7 +25,7 @@ from foldgauss.io.models.model_file import (
     register_model,
     save_model,
 )
-from foldgauss.io.models.segmented import PARTS, SEGMENTED, load_segmented, save_segmented
+from foldgauss.io.models.segmented import EDITED, SEGMENTED, VIDEO, load_segmented, save_segmented
 from foldgauss.render import COMPOSITINGS, Camera, RenderOptions
 from foldgauss.video.editing.chain import Edit
 from foldgauss.video.editing.edited_video import EditedVideo, Layer, as_edited
@@ -39,7 +39,6 @@ from foldgauss.video.segmented.segmented_video import SegmentedVideo
 MODEL_SUFFIX = ".safetensors"
 #: Metadata of which frames of which clip a model shows, and when the clip shows them.
 CLIP_NOTES = ("clip", "frames", "frame_seconds", "first_second", "reading", "stretched")
-VIDEO, EDITED, _ = PARTS
 
 
 def save_video_model(

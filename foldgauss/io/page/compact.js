@@ -407,7 +407,7 @@ export function emptyLeaves(header) {
 /**
  * {header, leaves, lost}: the file's header, and Float32Arrays named and laid out as in FoldedSplats, and frame_times;
  * with shared paths, `path_index` (Uint8Array), `path_times` and `path_matrices`, too. `lost`: the chunks that are damaged
- * or missing, whose Gaussians are those of `emptyLeaves`. `onColumn` is called with the fraction of columns decoded.
+ * or missing. Their Gaussians are invisible, see `emptyLeaves`. `onColumn` is called with the fraction of columns decoded.
  */
 export function decode(buffer, onColumn = () => {}) {
   const bytes = new Uint8Array(buffer), header = readHeader(bytes), { motion, chunks, degree } = header, lost = [];

@@ -156,8 +156,8 @@ class Chunk:
 class Quantized:
     """A model as integers: equal integers are equal models, to the bit.
 
-    `chunks` are in the order of the file: the Gaussians of each are in front of those of the chunks before. Of shared
-    paths, `maps` and, unless they are at the frames, `knots`, the times of the maps.
+    `chunks` are in the order of the file, from back to front. `maps` are those of shared paths. `knots` are the times
+    of the maps, unless these are at the frames.
     """
 
     info: CompactInfo

@@ -1,6 +1,6 @@
 // A model file's bytes, read in parts: of a block of the page or a file on the disk by slices, of an address by ranges.
 
-/** Bytes of the first request to a server: those of the header, of motion, and often of the first chunk. */
+/** Bytes of the first request to a server. They hold the header, the block of motion, and often the first chunk. */
 const FIRST = 65536;
 
 export function bytesOf(text) {
