@@ -19,7 +19,7 @@ from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, Growth, compress, evaluate, fit, fit_steps, start_from
 from foldgauss.video.compression import chunks
 from foldgauss.video.compression.quantize import Rule
-from foldgauss.video.compression.quantizer import Quantizer, bit_price, round_groups
+from foldgauss.video.compression.quantizer import Worth, bit_price, round_groups
 from foldgauss.video.fitting.compress import ROUNDING_QUALITY
 from foldgauss.video.fitting.config import DEFAULT_QUALITY
 from foldgauss.video.fitting.loop import finish, start
@@ -271,14 +271,14 @@ def test_a_gaussian_that_adds_nothing_is_dropped():
 
 
 def test_a_gaussian_is_kept_where_its_removal_costs_more_than_its_bits():
-    quantizer = Quantizer(soft_model(options=RenderOptions()))
+    worth = Worth(soft_model(options=RenderOptions()))
     assert bit_price(3.0) == pytest.approx(4 * bit_price(2.0))
-    kept = [quantizer.are_worth(coarseness) for coarseness in (2.0, 6.0, 9.0, 99.0)]
+    kept = [worth.are_worth(coarseness) for coarseness in (2.0, 6.0, 9.0, 99.0)]
     for more, fewer in itertools.pairwise(kept):
         assert (more | ~fewer).all()
     assert kept[0].sum() > kept[2].sum() > kept[3].sum() == 1
-    assert kept[3][np.argmax(quantizer.removal)]
-    assert (quantizer.are_worth(6.0, 0.04) | ~kept[1]).all()
+    assert kept[3][np.argmax(worth.removal)]
+    assert (worth.are_worth(6.0, 0.04) | ~kept[1]).all()
 
 
 def test_gaussians_that_are_not_worth_their_bits_are_dropped_before_all_are_rounded(states):

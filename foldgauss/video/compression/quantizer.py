@@ -25,9 +25,9 @@ from foldgauss.video.compression.quantize import (
     is_integral,
     quantize,
 )
-from foldgauss.video.compression.sensitivity import estimate_sensitivities
+from foldgauss.video.compression.sensitivity import estimate_removal, estimate_sensitivities
 from foldgauss.video.models.row_layout import GROUPS, shift_path
-from foldgauss.video.models.splats import SH_C0, FoldedSplats
+from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.selection.contributions import Contributions
 
@@ -41,7 +41,6 @@ BEYOND_BLACK = np.full(3, -0.5, np.float32)
 #: Least number of Gaussians from which steps are regressed on features.
 _FEW = 100
 _MIN_SENSITIVITY = 1e-4  # below, a Gaussian is not visible
-_MIN_TRANSMITTANCE = 0.03  # below, a Gaussian counts as opaque
 
 
 def bit_price(coarseness: float) -> float:
@@ -52,25 +51,38 @@ def bit_price(coarseness: float) -> float:
     return math.log(2) / 6 * 4.0**coarseness
 
 
+class Worth:
+    """What each Gaussian adds to the images, beside the price of its bits."""
+
+    def __init__(self, model: VideoModel, background: Float32[np.ndarray, "3"] = BLACK):
+        """`background` is what images are composited over: what equals it seems to be worth nothing."""
+        self.removal = estimate_removal(Contributions(model, background))
+
+    def are_worth(self, coarseness: float, fraction: float = 1.0) -> Bool[np.ndarray, " num"]:
+        """The Gaussians that are worth this `fraction` of the price of their bits at such steps; at least one."""
+        kept = self.removal > fraction * BITS_PER_GAUSSIAN * bit_price(coarseness)
+        kept[np.argmax(self.removal)] = True
+        return kept
+
+    def coarseness_for(self, num: float, fraction: float = 1.0) -> float:
+        """The coarseness at which about `num` Gaussians are worth this fraction of the price of their bits."""
+        place = min(max(round(num), 1), len(self.removal))
+        least = max(float(np.sort(self.removal)[-place]), _MIN_SENSITIVITY)
+        return 0.5 * math.log2(least / (fraction * BITS_PER_GAUSSIAN * bit_price(0.0)))
+
+
 class Quantizer:
     """Quantizes a model by rules that are fixed but for the coarseness."""
 
     def __init__(self, model: VideoModel, background: Float32[np.ndarray, "3"] = BLACK):
-        """`background` is what images are composited over: what equals it seems to be worth nothing."""
+        """`background` is what images are composited over: they do not tell what equals it from nothing."""
         self.exact = compute_columns(model)
-        sensitivity, best = estimate_sensitivities(Contributions(model, background), self.exact)
+        sensitivity, self._seen = estimate_sensitivities(Contributions(model, background), self.exact)
         self._names = [name for name in column_names(self.exact.info.degree) if not is_integral(name)]
-        self._seen = best > 0
         if not self._seen.any():
             cure = "No frame shows anything."
             raise invalid("model", expected="visible Gaussians", got="none", cure=cure)
         self._fit(sensitivity)
-        opacity = 1 / (1 + np.exp(-self.exact.values["opacity"]))
-        # Removal: a change of the logit by -1 / (1 - opacity), if the image were linear in the logit.
-        loss = sensitivity["opacity"] / np.maximum(1 - opacity, _MIN_TRANSMITTANCE) ** 2
-        # Opaque ones are insensitive to the logit: assume that they differ by a tenth of the range from what they hide.
-        opaque = np.where(opacity > 1 - _MIN_TRANSMITTANCE, sensitivity["luma"] * (0.1 / SH_C0) ** 2, 0)
-        self.removal = np.where(self._seen, np.maximum(loss, opaque), 0)
 
     def _fit(self, sensitivity: dict[str, Float[np.ndarray, " num"]]) -> None:
         """Regress log-sensitivities on the features; a Gaussian's class is the mean residual of its columns."""
@@ -101,18 +113,6 @@ class Quantizer:
         for name, fit in self._fits.items():
             predicted = np.clip((design @ fit + self.classes)[self._seen], -30, 30)
             fit[0] += 0.5 * np.log2(np.mean(sensitivity[name][self._seen] * 4.0**-predicted) + 1e-30)
-
-    def are_worth(self, coarseness: float, fraction: float = 1.0) -> Bool[np.ndarray, " num"]:
-        """The Gaussians that are worth this `fraction` of the price of their bits at such steps; at least one."""
-        kept = self.removal > fraction * BITS_PER_GAUSSIAN * bit_price(coarseness)
-        kept[np.argmax(self.removal)] = True
-        return kept
-
-    def coarseness_for(self, num: float, fraction: float = 1.0) -> float:
-        """The coarseness at which about `num` Gaussians are worth this fraction of the price of their bits."""
-        place = min(max(round(num), 1), len(self.removal))
-        least = max(float(np.sort(self.removal)[-place]), _MIN_SENSITIVITY)
-        return 0.5 * math.log2(least / (fraction * BITS_PER_GAUSSIAN * bit_price(0.0)))
 
     def make_rules(self, coarseness: float) -> dict[str, Rule]:
         """The rules with steps times 2^coarseness.

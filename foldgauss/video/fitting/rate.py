@@ -39,6 +39,7 @@ from foldgauss.video.compression.quantizer import (
     BEYOND_BLACK,
     BITS_PER_GAUSSIAN,
     Quantizer,
+    Worth,
     bit_price,
     round_groups,
 )
@@ -185,12 +186,12 @@ class RateControl:
 
     def round_only(self, state: FitState) -> None:
         """Drop what is not worth its bits, and sort where that hardly changes the images, without any training."""
-        quantizer = Quantizer(self._model(state), self.background)
-        coarseness = self._choose_coarseness(state, quantizer, Action(1.0, "drop"))
+        worth = Worth(self._model(state), self.background)
+        coarseness = self._choose_coarseness(state, worth, Action(1.0, "drop"))
         model, fraction = self._model(state), 1.0
         # Each is judged as if the others stayed, and nothing makes up for what is missing: fewer, where it costs more.
         while True:
-            kept = quantizer.are_worth(coarseness, fraction)
+            kept = worth.are_worth(coarseness, fraction)
             fewer = dataclasses.replace(model, splats=model.splats.take(kept))
             added = 10 ** (-0.1 * self._psnr(fewer, np.arange(len(self.frames)))) * 255**2 * self.frames[..., :3].size
             if (
@@ -215,7 +216,7 @@ class RateControl:
         whole = quantize(exact, classes, rules, state.chunks)
         if self.config.size_mb is None and self.config.psnr is None:
             return whole
-        worst_first = np.argsort(Quantizer(dequantize(whole), self.background).removal, kind="stable")
+        worst_first = np.argsort(Worth(dequantize(whole), self.background).removal, kind="stable")
 
         def without(num: int) -> Quantized:
             kept = np.ones(len(worst_first), bool)
@@ -244,12 +245,12 @@ class RateControl:
         state.chunks = chunks.astype(np.uint16)
 
     def _drop(self, state: FitState, action: Action) -> None:
-        quantizer = Quantizer(self._model(state), self.background)
-        coarseness = self._choose_coarseness(state, quantizer, action)
+        worth = Worth(self._model(state), self.background)
+        coarseness = self._choose_coarseness(state, worth, action)
         state.coarseness = state.coarseness if state.rules else coarseness
-        kept = quantizer.are_worth(coarseness, action.extent)
+        kept = worth.are_worth(coarseness, action.extent)
         least = math.ceil(_LEAST_KEPT * len(kept))
-        kept[np.argsort(quantizer.removal, kind="stable")[-least:]] = True
+        kept[np.argsort(worth.removal, kind="stable")[-least:]] = True
         state.keep(np.flatnonzero(kept))
 
     def _round(self, state: FitState, action: Action) -> None:
@@ -275,34 +276,34 @@ class RateControl:
         state.rules = tuple((name, rule.origin, rule.exponent, rule.slopes) for name, rule in rules.items())
         state.classes = quantizer.classes.astype(np.int8)
 
-    def _choose_coarseness(self, state: FitState, quantizer: Quantizer, action: Action) -> float:
-        """The coarsest that quality, size and PSNR ask for."""
+    def _choose_coarseness(self, state: FitState, measured: Worth | Quantizer, action: Action) -> float:
+        """The coarsest that quality, size and PSNR ask for; `measured`: a `Worth` to drop by, or a quantizer."""
         config, wanted = self.config, []
         if config.quality is not None:
             wanted.append(coarseness_of(config.quality))
         if config.psnr is not None:
-            wanted.append(self._solve_psnr(state, quantizer, action))
+            wanted.append(self._solve_psnr(state, measured, action))
         if config.size_mb is not None:
-            wanted.append(self._solve_size(state, quantizer, action))
+            wanted.append(self._solve_size(state, measured, action))
         return min(max(*wanted, FINEST), COARSEST)
 
-    def _solve_size(self, state: FitState, quantizer: Quantizer, action: Action) -> float:
+    def _solve_size(self, state: FitState, measured: Worth | Quantizer, action: Action) -> float:
         """The coarseness for the largest file: by the number of Gaussians that it holds, and for rounding by coding."""
         room = _AIM * 1e6 * self.config.size_mb
         if action.what == "drop":  # at first more than it holds
             num = 8 * max(room - HEADER_BYTES, 0.0) / USUAL_BITS / math.sqrt(action.extent)
-            return quantizer.coarseness_for(num, action.extent)
+            return measured.coarseness_for(num, action.extent)
         streams = max(room - HEADER_BYTES, 64.0)
 
         def excess(coarseness: float) -> float:
             begun = time.perf_counter()
-            num_bytes = count_bytes(quantizer.quantize(coarseness, state.chunks)) - HEADER_BYTES
+            num_bytes = count_bytes(measured.quantize(coarseness, state.chunks)) - HEADER_BYTES
             self.trimming["size_mb"] = _TRIALS * (time.perf_counter() - begun)
             return math.log2(num_bytes / streams)
 
         return _solve(excess, state.coarseness or USUAL_COARSENESS)
 
-    def _solve_psnr(self, state: FitState, quantizer: Quantizer, action: Action) -> float:
+    def _solve_psnr(self, state: FitState, measured: Worth | Quantizer, action: Action) -> float:
         """The coarseness for the PSNR that is asked for, by some frames without what is dropped, or rounded.
 
         The rest of the fit makes up for a part of the error that this adds, and reduces the other error.
@@ -318,10 +319,10 @@ class RateControl:
         def reached(coarseness: float) -> float:
             if action.what == "drop":
                 changed = dataclasses.replace(
-                    model, splats=model.splats.take(quantizer.are_worth(coarseness, action.extent))
+                    model, splats=model.splats.take(measured.are_worth(coarseness, action.extent))
                 )
             else:
-                changed = dequantize(quantizer.quantize(coarseness))
+                changed = dequantize(measured.quantize(coarseness))
             more = 10 ** (-0.1 * self._psnr(changed, self.sampled)) - 10 ** (-0.1 * now)
             return -10 * math.log10(left + remaining * max(more, 0.0))
 
