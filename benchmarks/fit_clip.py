@@ -97,12 +97,12 @@ def measure(options: argparse.Namespace) -> tuple[dict, dict, list[dict]]:
     scores = evaluate(model, clip.frames)
     num, steps = model.splats.num_gaussians, kept[-1].step
     height, width = clip.size
-    what = f"{clip.num_frames} frames of {height}x{width}, {num:,} Gaussians, degree {config.degree}"
+    what = f"{clip.num_frames} frames of {height}x{width}, {num:,} Gaussians, degree {config.fold_degree}"
     show(kept, scores, seconds, f"{options.clip}: {what}")
     figures = {"psnr": scores.mean_psnr, "ssim": scores.mean_ssim, "gaussians": num, "minutes": seconds / 60}
     figures |= {"steps": steps, "worst_frame_psnr": min(scores.psnr), "ms_per_step": 1e3 * kept[-1].seconds / steps}
     setting = {"clip": Path(options.clip).name, "size": clip.size, "num_frames": clip.num_frames}
-    setting |= {"num_gaussians": num, "degree": config.degree, "seed": config.seed}
+    setting |= {"num_gaussians": num, "degree": config.fold_degree, "seed": config.seed}
     setting |= {"preset": options.preset, "set": dict(options.set or ())}
     course = [{"seconds": info.seconds, "step": info.step, "psnr": info.psnr} for info in kept]
     return figures, setting, course

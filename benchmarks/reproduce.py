@@ -199,7 +199,7 @@ def plot_curves(folder: Path, names: Iterable[str], path: Path) -> None:
 
 def start_in_box(clip: Clip, config: FitConfig, factor: float) -> FitState:
     """The state before the first step, with distances between the Gaussians and their sizes `factor` times as large."""
-    state, place = start(clip.frames, config), columns(config.degree)
+    state, place = start(clip.frames, config), columns(config.fold_degree)
     state.rows[:, place["loc"]] *= np.float32(factor)
     state.rows[:, place["log_scale"]] += np.float32(math.log(factor))
     return state

@@ -122,7 +122,7 @@ def measure(frames: np.ndarray, config: FitConfig, num_steps: int) -> tuple[list
 
 def naive_adam(state: FitState, config: FitConfig, rounds: int) -> float:
     """Median seconds of optax's Adam on the whole model."""
-    splats = jax.device_put(unpack(state.rows, config.degree, TimeLikelihood(power=np.float32(config.power))))
+    splats = jax.device_put(unpack(state.rows, config.fold_degree, TimeLikelihood(power=np.float32(config.power))))
     rule = optax.adam(1e-3, eps=1e-15)
 
     @jax.jit

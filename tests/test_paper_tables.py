@@ -391,13 +391,14 @@ class TestReproduce:
         begun = []
 
         def steps(frames, config, state):
-            begun.append(None if state is None else (state.step, unpack(state.rows, config.degree, TimeLikelihood())))
+            rows = None if state is None else unpack(state.rows, config.fold_degree, TimeLikelihood())
+            begun.append(None if rows is None else (state.step, rows))
             yield from fit_steps(frames, config, state)
 
         monkeypatch.setattr(reproduce, "fit_steps", steps)
         reproduce.run_to_end(clip, name, config, tmp_path)
         reproduce.run_to_end(clip, "as published", config, tmp_path)
-        plain = unpack(start(clip.frames, config).rows, config.degree, TimeLikelihood())
+        plain = unpack(start(clip.frames, config).rows, config.fold_degree, TimeLikelihood())
         (step, splats), other = begun
         assert (step, other) == (0, None)
         np.testing.assert_allclose(splats.loc, 1.1 * plain.loc, rtol=1e-6)

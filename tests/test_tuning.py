@@ -174,7 +174,8 @@ class TestTune:
 
         def fit_candidate(candidate):
             made.append(candidate.config)
-            psnr = 30 - np.log2(candidate.config.rates.loc / FitConfig().rates.loc / 2) ** 2 + candidate.config.degree
+            own = candidate.config
+            psnr = 30 - np.log2(own.rates.loc / FitConfig().rates.loc / 2) ** 2 + own.fold_degree
             return {"psnr": psnr, "worst_psnr": psnr - 2, "gaussians": 100, "steps": 50, "cpu_seconds": 1.0}
 
         monkeypatch.setattr(tune, "fit_candidate", fit_candidate)

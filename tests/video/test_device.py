@@ -108,7 +108,7 @@ def compare_steps(config: FitConfig, progress: float, outside: int = 0):
     """By the CPU and by XLA; the first Gaussians `outside` the picture."""
     here, there = warm_state(config), warm_state(config)
     for state in (here, there):
-        state.rows[:outside, columns(config.degree)["loc"]] = 5.0
+        state.rows[:outside, columns(config.fold_degree)["loc"]] = 5.0
     figures = CpuStepper(FRAMES, config, here).step(here, progress)
     stepper = JaxStepper(FRAMES, config, there, "xla")
     own = stepper.step(there, progress)
@@ -439,7 +439,7 @@ def test_only_arrays_that_are_read_are_fetched(monkeypatch):
 def test_assigned_arrays_are_used():
     steps = fit_steps(FRAMES, CONFIG)
     state, _ = next(steps)
-    place = columns(CONFIG.degree)["loc"]
+    place = columns(CONFIG.fold_degree)["loc"]
     rows = state.rows
     rows[:, place] += 3.0  # a copy: nobody knows of that
     next(steps)

@@ -53,7 +53,7 @@ def _fit_with(change, config: FitConfig = CONFIG, at: int = 100) -> float:
 )
 def test_nonfinite_parameter_is_named_and_repaired(slowed, leaf, value):
     def spoil(state):
-        state.rows[17, columns(CONFIG.degree)[leaf]] = value
+        state.rows[17, columns(CONFIG.fold_degree)[leaf]] = value
 
     with pytest.warns(DivergenceWarning, match=rf"step 101: .*no finite {leaf} in 1 Gaussians, the first of them 17"):
         got = _fit_with(spoil)
@@ -72,7 +72,7 @@ def test_stop_raises_with_the_last_finite_state():
     config = dataclasses.replace(CONFIG, on_divergence="stop")
 
     def spoil(state):
-        state.rows[:, columns(CONFIG.degree)["log_scale"]] = np.nan
+        state.rows[:, columns(CONFIG.fold_degree)["log_scale"]] = np.nan
 
     with pytest.raises(FitDiverged, match=r"no finite log_scale in 200 Gaussians.*of step 120") as error:
         _fit_with(spoil, config, at=130)
@@ -94,7 +94,7 @@ def test_too_high_rates_are_lowered_until_the_fit_converges(begun, leaf):
 
 def test_exploding_folds_are_named_and_undone():
     def explode(state):
-        state.rows[:, columns(CONFIG.degree)["coefficients"]] *= 1e6
+        state.rows[:, columns(CONFIG.fold_degree)["coefficients"]] *= 1e6
 
     def slow_down(state):  # the same rates from here on, without the explosion
         state.backoffs += 1

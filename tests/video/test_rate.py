@@ -140,7 +140,7 @@ def test_the_last_rounding_changes_only_what_was_not_rounded(states):
 def test_rounded_parameters_do_not_move_and_others_do(engine):
     config = dataclasses.replace(CONFIG, engine=engine, relocated_fraction=0.0, steps=100 if engine == "cpu" else 20)
     kept = states_of(FRAMES, config)
-    bits = group_bits(config.degree)
+    bits = group_bits(config.fold_degree)
     first = next(step for step, state in kept.items() if state.rules)
     assert first / config.steps == next(action.progress for action in ACTIONS if action.what == SHAPE)
     seen = 0
@@ -179,7 +179,7 @@ def test_moments_of_what_is_rounded_are_zero(states):
     for group, bit in GROUPS.items():
         marked = (state.rounded & bit) > 0
         for name in group:
-            at = columns(CONFIG.degree)[name]
+            at = columns(CONFIG.fold_degree)[name]
             assert not state.first[marked, at].any()
             assert not state.second[marked, at].any()
 
@@ -509,7 +509,7 @@ def test_a_backdrop_is_behind_all_others():
     rows = start(FRAMES, CONFIG).rows
     plain = start(FRAMES, dataclasses.replace(CONFIG, quality=None)).rows
     np.testing.assert_array_equal(rows[:-1], plain[:-1])
-    place = columns(CONFIG.degree)
+    place = columns(CONFIG.fold_degree)
     assert rows[-1, place["opacity_logit"]] > 5
     assert (rows[-1, place["log_scale"]] > 0).all()
 

@@ -20,7 +20,7 @@ from foldgauss.video.motion.optical_flow import motion_finder
 
 FRAMES = moving_blobs()
 CONFIG = FitConfig(num_gaussians=300, steps=120)
-SPEC = ConditioningSpec(CONFIG.degree, CONFIG.power, CONFIG.floor, FRAMES.shape[1:3])
+SPEC = ConditioningSpec(CONFIG.fold_degree, CONFIG.power, CONFIG.floor, FRAMES.shape[1:3])
 
 
 def fitted_state(step: int = 40, config: FitConfig = CONFIG):
@@ -43,8 +43,8 @@ def test_gaussians_of_little_influence_are_invisible():
     """The tenth of least influence changes the images at most a tenth as much as the tenth of most influence."""
     state = fitted_state()
     window, times = CpuStepper(FRAMES, CONFIG, state).window, np.asarray(frame_times(state.time_logits))
-    order, changed = np.argsort(measure_influence(state, window, times, CONFIG.degree)), []
-    opacity = columns(CONFIG.degree)["opacity_logit"].start
+    order, changed = np.argsort(measure_influence(state, window, times, CONFIG.fold_degree)), []
+    opacity = columns(CONFIG.fold_degree)["opacity_logit"].start
     for which in (order[:30], order[-30:]):
         hidden = state.rows.copy()
         hidden[which, opacity] = -30
@@ -63,7 +63,7 @@ def test_new_gaussians_are_where_errors_are():
     assert state.num_gaussians == CONFIG.num_gaussians
     new = state.counts == 0
     assert new.sum() == 30
-    at = columns(CONFIG.degree)["time_loc_logit"].start
+    at = columns(CONFIG.fold_degree)["time_loc_logit"].start
     home = 1 / (1 + np.exp(-state.rows[new, at]))
     np.testing.assert_allclose(home, np.asarray(frame_times(state.time_logits))[4], atol=0.01)
     kept = [row.tobytes() for row in state.rows[~new]]
@@ -98,7 +98,7 @@ def test_only_gaussians_that_can_be_judged_move():
 
 
 def test_gaussians_alive_in_no_frame_move_first():
-    state, at = fitted_state(), columns(CONFIG.degree)
+    state, at = fitted_state(), columns(CONFIG.fold_degree)
     between = [3, 77, 150]
     state.rows[between, at["log_time_scale"].start] = np.log(1e-4)
     state.rows[between, at["time_loc_logit"].start] = 0  # t = 0.5 lies between two frames
@@ -110,7 +110,7 @@ def test_gaussians_alive_in_no_frame_move_first():
 
 
 def test_new_gaussians_lie_among_those_of_their_time():
-    state, at = fitted_state(), columns(CONFIG.degree)
+    state, at = fitted_state(), columns(CONFIG.fold_degree)
     state.frame_errors[:] = 1e-12
     state.frame_errors[5] = 0.1
     relocate(state, FRAMES, dataclasses.replace(CONFIG, relocated_fraction=0.2), SPEC, None)

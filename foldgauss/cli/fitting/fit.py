@@ -313,7 +313,7 @@ def _print_plan(clip: Clip, config: FitConfig, display: Display) -> None:
         )
     if display == "json":
         about = {"clip": clip.source, "num_frames": clip.num_frames, "height": height, "width": width}
-        print_json("start", about | {"most_gaussians": num, "degree": config.degree, "threads": num_threads()})
+        print_json("start", about | {"most_gaussians": num, "degree": config.fold_degree, "threads": num_threads()})
     if display in ("json", "quiet"):
         return
     plan = describe_budgets(config, steps)
@@ -321,8 +321,8 @@ def _print_plan(clip: Clip, config: FitConfig, display: Display) -> None:
     computed = f"{num_threads()} threads" if engine == "cpu" else f"engine {engine} on {describe_device()}"
     out.print(
         f"{clip.source}: {format_count(clip.num_frames, 'frame')} of {height}x{width}"
-        f"{' with alpha' if clip.has_alpha else ''}, {at_most}{num:,} Gaussians of degree {config.degree}{growing}, "
-        f"{plan}, {computed}",
+        f"{' with alpha' if clip.has_alpha else ''}, {at_most}{num:,} Gaussians of degree {config.fold_degree}"
+        f"{growing}, {plan}, {computed}",
         soft_wrap=True,
     )
 

@@ -120,7 +120,7 @@ def _summarize(fit: LongFit, joined: JoinedFit, outcomes: list[Outcome], config:
         "height": height,
         "width": width,
         "num_gaussians": sum(record["num_gaussians"] for record in records),
-        "degree": config.degree,
+        "degree": config.fold_degree,
         "fit_seconds": round(sum(record["seconds"] for record in records), 2),
     }
     peaks = [record["peak_bytes"] for record in records]
@@ -179,6 +179,6 @@ def _print_plan(fit: LongFit, config: FitConfig, display: Display, video: Path, 
     out.print(
         f"{video}: {format_count(index.num_frames, 'frame')} of {size[0]}x{size[1]} in "
         f"{format_count(len(lengths), 'segment')} of {span} frame{'' if span == '1' else 's'}{where}, each with "
-        f"{at_most}{num:,} Gaussians of degree {config.degree} and {plan}, by {options}",
+        f"{at_most}{num:,} Gaussians of degree {config.fold_degree} and {plan}, by {options}",
         soft_wrap=True,
     )

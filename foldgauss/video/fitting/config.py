@@ -75,7 +75,7 @@ PUBLISHED_SCALE_CUTOFF = 1e-4
 #: The fields that each preset changes, see `FitConfig.preset`.
 PRESETS: dict[str, dict[str, Any]] = {
     "standard": {},
-    "draft": {"num_gaussians": 10_000, "degree": 2, "steps": 800},
+    "draft": {"num_gaussians": 10_000, "steps": 800},
     "paper": {
         "num_gaussians": 500_000,
         "degree": 7,
@@ -151,9 +151,15 @@ class FitConfig:
             group=MODEL,
         ),
     )
-    degree: int = field(
-        default=3,
-        metadata=setting("Degree of the fold polynomial", most=MAX_DEGREE, option="--degree", group=MODEL),
+    degree: int | None = field(
+        default=None,
+        metadata=setting(
+            "Degree of the fold polynomial",
+            most=MAX_DEGREE,
+            unset="3; 1 for a compact model, where higher powers are rarely worth their bits",
+            option="--degree",
+            group=MODEL,
+        ),
     )
     steps: int | None = field(
         default=None,
@@ -391,6 +397,11 @@ class FitConfig:
         return any(goal is not None for goal in (self.quality, self.size_mb, self.psnr))
 
     @property
+    def fold_degree(self) -> int:
+        """`degree`, or the default."""
+        return (1 if self.is_compact else 3) if self.degree is None else self.degree
+
+    @property
     def squared_from(self) -> float:
         """The fraction of the plan from which the loss is the squared error; for a compact model early."""
         return COMPACT_SQUARED_FROM if self.is_compact else 1 - self.l2_fraction
@@ -406,7 +417,7 @@ class FitConfig:
         """A named configuration with `changes` to its fields; `minutes` without `steps` replace the preset's steps.
 
         * "standard": `FitConfig()`.
-        * "draft": a first impression in a fraction of the time: 10,000 Gaussians of degree 2, 800 steps.
+        * "draft": a first impression in a fraction of the time: 10,000 Gaussians, 800 steps.
         * "paper": the published configuration. 500,000 Gaussians, initialized uniformly, that grow (`Growth`), degree
           7, batches of 3, 30,000 steps, 0.8 L1 + 0.2 D-SSIM, two opposite cameras, the published learning rates, of
           which only that of positions decays (to 1/100), Adam updates of all Gaussians, the published rasterizer's
@@ -494,7 +505,7 @@ def default_num_gaussians(
     by_time = DENSITY * time**DENSITY_POWER * lifetime**LIFETIME_POWER * pixels
     alive = min(ALIVE * time**ALIVE_POWER * area**ALIVE_PIXEL_POWER, MOST_PER_PIXEL * area)
     by_life = alive * num_frames / lifetime
-    by_size = 3 * pixels / (PARAMETER_BYTES * parameters_per_gaussian(config.degree))
+    by_size = 3 * pixels / (PARAMETER_BYTES * parameters_per_gaussian(config.fold_degree))
     return max(round(min(by_time, by_life, by_size, _most_for_rate(config, pixels, time))), 1)
 
 

@@ -31,7 +31,7 @@ def grow(state: FitState, config: FitConfig, size: tuple[int, int]) -> bool:
             state.rows,
             state.statistics,
             growth,
-            degree=config.degree,
+            degree=config.fold_degree,
             pixels=pixels_per_unit(size),
             max_num=most_gaussians(config),
             step=state.step,
@@ -40,7 +40,7 @@ def grow(state: FitState, config: FitConfig, size: tuple[int, int]) -> bool:
         state.keep(stay)
         state.extend(born)
     if growth.resets_at(state.step):
-        reset_opacities(state.rows, state.first, state.second, growth, config.degree)
+        reset_opacities(state.rows, state.first, state.second, growth, config.fold_degree)
     if state.step + 1 >= growth.until_step:
         state.statistics = None
     return grows

@@ -182,7 +182,7 @@ class Guard:
             moved = {
                 name: float(np.median(np.abs(rows[:, at] - before[:, at])))
                 / max(float(before[:, at].std()), MIN_SCALE.get(name, 1.0))
-                for name, at in columns(self.config.degree).items()
+                for name, at in columns(self.config.fold_degree).items()
                 if at.stop > at.start
             }
         moved["frame times"] = _time_move(state)
@@ -213,7 +213,7 @@ def _find_nonfinite(state: FitState, config: FitConfig) -> str:
     """The leaves with NaN or infinities, and how many Gaussians have them; empty if there are none."""
     found = []
     rows = state.rows
-    for name, at in columns(config.degree).items():
+    for name, at in columns(config.fold_degree).items():
         bad = np.flatnonzero(~np.isfinite(rows[:, at]).all(1))
         if len(bad):
             found.append(f"no finite {name} in {len(bad):,} Gaussians, the first of them {bad[0]}")

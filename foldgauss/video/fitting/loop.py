@@ -288,7 +288,7 @@ def _check_config(model: VideoModel, config: FitConfig) -> None:
     """Raise ValueError unless a fit with `config` could have produced the model."""
     envelope = model.splats.envelope
     pairs = {
-        "degree": (config.degree, model.degree),
+        "degree": (config.fold_degree, model.degree),
         "power": (np.float32(config.power), np.float32(envelope.power)),
         "floor": (np.float32(config.floor), np.float32(envelope.floor)),
         "compositing": (config.compositing, model.compositing),
@@ -303,7 +303,7 @@ def _check_config(model: VideoModel, config: FitConfig) -> None:
 
 def _initialize(frames: np.ndarray, config: FitConfig, logits: np.ndarray, motion: Motion | None) -> FoldedSplats:
     """The splats at the start."""
-    shape = {"degree": config.degree, "seed": config.seed}
+    shape = {"degree": config.fold_degree, "seed": config.seed}
     choose_num = functools.partial(chosen_num_gaussians, config, *frames.shape[:3])
     if config.initialization == "uniform":
         return initialize_uniform(choose_num(), frames.shape[1:3], envelope=envelope_of(config), **shape)

@@ -150,7 +150,7 @@ class RateControl:
         if self.config.size_mb is None:
             return
         exact, one = compute_columns(self._model(state)), np.arange(state.num_gaussians) == 0
-        rules = {name: Rule(0.0, COARSEST) for name in column_names(self.config.degree) if not is_integral(name)}
+        rules = {name: Rule(0.0, COARSEST) for name in column_names(self.config.fold_degree) if not is_integral(name)}
         least = count_bytes(quantize(select_rows(exact, one), np.zeros(1, np.int32), rules)) / 1e6
         if least > self.config.size_mb:
             raise invalid("size_mb", expected=f"at least {least:.4f} for this clip", got=self.config.size_mb)
@@ -264,7 +264,7 @@ class RateControl:
         rows, first, second = pack(splats), state.first.copy(), state.second.copy()
         newly = (rounded != state.rounded)[:, None]
         for name in action.what:  # Adam does not move what has neither a gradient nor moments
-            at = columns(self.config.degree)[name]
+            at = columns(self.config.fold_degree)[name]
             for moments in (first, second):
                 moments[:, at] = np.where(newly, np.float32(0), moments[:, at])
         state.rows, state.first, state.second, state.rounded = rows, first, second, rounded

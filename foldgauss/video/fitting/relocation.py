@@ -65,7 +65,7 @@ def relocate(
     Frames and pixels of the new ones are drawn by squared error. `spec` is that of whole frames.
     """
     times = np.asarray(frame_times(state.time_logits))
-    influence = measure_influence(state, find_windows(state.rows, spec), times, config.degree)
+    influence = measure_influence(state, find_windows(state.rows, spec), times, config.fold_degree)
     num = round(config.relocated_fraction * np.isfinite(influence).sum())
     if num == 0:
         return
@@ -73,7 +73,7 @@ def relocate(
     stay[np.argsort(influence, kind="stable")[:num]] = False
     new = make_newborns(num, state, frames, state.frame_errors.astype(float), config, spec, motion)
     state.keep(np.flatnonzero(stay))
-    at = columns(config.degree)["time_loc_logit"].start  # depth: among those of their time, which are in its order
+    at = columns(config.fold_degree)["time_loc_logit"].start  # depth: among those of their time, which are in its order
     place = np.searchsorted(np.sort(state.rows[:, at]), new[:, at])
     order = np.argsort(np.concatenate([np.arange(len(state.rows)) + 0.5, place]), kind="stable")
     state.extend(new)
@@ -125,11 +125,11 @@ def make_newborns(
 
     position, _ = draw_positions(home, density_of, rng)
     opacity = SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY
-    shape = config.degree, envelope_of(config)
+    shape = config.fold_degree, envelope_of(config)
     splats, _ = make_splats(colors, home, position, times, *shape, motion, rng, opacity, paths)
     rows = pack(splats)
     alive = float(np.mean([((window[:, 0] < t) & (t < window[:, 1])).sum() for t in times]))  # in a frame
-    size, at = frames.shape[1:3], columns(config.degree)["log_scale"]
+    size, at = frames.shape[1:3], columns(config.fold_degree)["log_scale"]
     apart = math.sqrt(math.prod(size) / max(alive, 1.0)) / max(size)
     larger = 0.0 if paths is None else rows[:, at] + np.log(max(size))  # by the path's zoom
     rows[:, at] = np.log(SMALLER * SCALE_FACTOR * apart) + larger

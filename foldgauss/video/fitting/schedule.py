@@ -81,10 +81,10 @@ class RateSchedule:
     """Adam's learning rates by column of a row, and that of the frame times, as they decay."""
 
     def __init__(self, config: FitConfig):
-        width = columns(config.degree)["coefficients"].stop
+        width = columns(config.fold_degree)["coefficients"].stop
         self.config, self.first = config, np.empty(width, np.float32)
         self.decayed = np.ones(width, bool)
-        for name, place in columns(config.degree).items():
+        for name, place in columns(config.fold_degree).items():
             self.first[place] = getattr(config.rates, name)
             self.decayed[place] = config.decayed in ("all", name)
 

@@ -317,7 +317,7 @@ DeviceArrays = collections.namedtuple("DeviceArrays", ARRAYS)
 def to_model(state: FitState, config: FitConfig, size: tuple[int, int], fps: float) -> VideoModel:
     """The model as it stands in `state` (arrays are copied)."""
     return VideoModel(
-        splats=unpack(state.rows, config.degree, envelope_of(config), paths_of(state)),
+        splats=unpack(state.rows, config.fold_degree, envelope_of(config), paths_of(state)),
         frame_times=FrameTimes(state.time_logits.copy()),
         size=tuple(int(n) for n in size),
         fps=float(fps),
@@ -359,7 +359,7 @@ def measure_relative_size(state: FitState, config: FitConfig) -> float:
     Their geometric mean, of every `SIZE_STRIDE`-th, at most that of the frame.
     """
     unit = config.rate_units.size
-    mean = float(state.rows[::SIZE_STRIDE, columns(config.degree)["log_scale"]].mean(dtype=np.float64))
+    mean = float(state.rows[::SIZE_STRIDE, columns(config.fold_degree)["log_scale"]].mean(dtype=np.float64))
     return math.exp(min(mean, 0.0)) / unit if unit and math.isfinite(mean) else 1.0
 
 

@@ -50,7 +50,7 @@ class CpuStepper:
         self.num_frames, height, width, _ = frames.shape
         self.rates, self.steps_per_pass = RateSchedule(config), steps_per_pass(config, self.num_frames)
         self.spec = ConditioningSpec(
-            config.degree, config.power, config.floor, (height, width), scale_cutoff=config.scale_cutoff
+            config.fold_degree, config.power, config.floor, (height, width), scale_cutoff=config.scale_cutoff
         )
         self.interpolation = make_interpolated(frames, config, find_motion)
         self.adopt(state)
@@ -82,7 +82,7 @@ class CpuStepper:
             losses.append(loss.value)
             alive.append(done.alive)
         if state.statistics is not None:
-            state.statistics.add(screen, self.grad[:, columns(config.degree)["time_loc_logit"]][:, 0])
+            state.statistics.add(screen, self.grad[:, columns(config.fold_degree)["time_loc_logit"]][:, 0])
         touched = alive[0]
         if len(alive) > 1:  # np.unique sorts: a tenth of a step
             marked = np.zeros(len(state.rows), bool)

@@ -185,7 +185,7 @@ class JaxStepper:
         """On the host."""
         config, (height, width) = self.config, self.size
         spec = ConditioningSpec(
-            config.degree, config.power, config.floor, (height, width), scale_cutoff=config.scale_cutoff
+            config.fold_degree, config.power, config.floor, (height, width), scale_cutoff=config.scale_cutoff
         )
         state.fetch_all()
         relocate(state, self.frames, config, spec, self.find_motion() if config.follow_motion else None)
@@ -221,7 +221,7 @@ class JaxStepper:
             capacity=self.capacity,
             num_frames=self.num_frames,
             size=self.size,
-            degree=config.degree,
+            degree=config.fold_degree,
             power=config.power,
             floor=config.floor,
             scale_cutoff=config.scale_cutoff,
