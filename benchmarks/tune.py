@@ -84,7 +84,8 @@ class Candidate(NamedTuple):
 
 
 def default_parameters() -> dict[str, float]:
-    return {name: 1.0 if name in RATES else getattr(FitConfig(), name) for name in SPACE}
+    default = FitConfig(degree=FitConfig().fold_degree)
+    return {name: 1.0 if name in RATES else getattr(default, name) for name in SPACE}
 
 
 def configuration(parameters: dict[str, float], cpu_seconds: float, gaussians: int | None) -> FitConfig:

@@ -301,8 +301,8 @@ def test_exact_frames_cost_the_others_no_bits():
     frames = np.concatenate([blobs, constant(0, 3)])
     for seed in range(3):  # with few Gaussians a frame may be worse by chance
         how = {"num_gaussians": 500, "quality": 80, "seed": seed}
-        both = fit(frames, FitConfig(steps=400, **how))
-        alone = fit(blobs, FitConfig(steps=200, **how))  # each frame is shown as often
+        both = fit(frames, FitConfig(steps=1200, **how))
+        alone = fit(blobs, FitConfig(steps=600, **how))  # each frame is shown as often
         found = evaluate(both.model, frames).psnr
         assert min(found[3:]) > 40
         scores.append(np.mean(found[:3]) - evaluate(alone.model, blobs).mean_psnr)

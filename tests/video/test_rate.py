@@ -496,7 +496,7 @@ def test_models_with_paths_are_compressed(tmp_path, frames):
 
 def test_the_state_given_is_the_one_that_is_made_compact(fitted):
     """`start_from` with a goal leaves the actions of the part that is over out."""
-    config = dataclasses.replace(CONFIG, relocated_fraction=0.0)
+    config = dataclasses.replace(CONFIG, degree=fitted.degree, relocated_fraction=0.0)
     state = start_from(fitted, config, 30, 0.85)
     assert state.rate_actions == count_past(0.85)
     for state, _ in fit_steps(FRAMES, config, state):  # noqa: B020
@@ -507,7 +507,7 @@ def test_the_state_given_is_the_one_that_is_made_compact(fitted):
 
 def test_a_backdrop_is_behind_all_others():
     rows = start(FRAMES, CONFIG).rows
-    plain = start(FRAMES, dataclasses.replace(CONFIG, quality=None)).rows
+    plain = start(FRAMES, dataclasses.replace(CONFIG, quality=None, degree=CONFIG.fold_degree)).rows
     np.testing.assert_array_equal(rows[:-1], plain[:-1])
     place = columns(CONFIG.fold_degree)
     assert rows[-1, place["opacity_logit"]] > 5

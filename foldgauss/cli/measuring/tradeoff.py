@@ -196,7 +196,7 @@ class _Run:
         lifetime = TYPICAL_LIFETIME
         if wanted.num_gaussians is None and wanted.follow_motion:
             frames = np.ascontiguousarray(self.clip.frames[..., :3])
-            lifetime = measure_lifetime(frames, self._find_motion(), wanted.degree)
+            lifetime = measure_lifetime(frames, self._find_motion(), wanted.fold_degree)
         return chosen_num_gaussians(wanted, self.clip.num_frames, *self.clip.size, lifetime=lifetime)
 
     def _print_plan(self, num_points: int, steps: int, expected: float) -> None:
