@@ -64,6 +64,7 @@ SPACE: dict[str, BaseDistribution] = {
     "relocated_fraction": FloatDistribution(0.0, 0.15),
     "degree": IntDistribution(1, 3),
 }
+DEFAULT = FitConfig(degree=FitConfig().fold_degree)
 TRIALS, NAME = 50, "foldgauss"
 #: States of trials that count: those of a diverging fit are pruned.
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
@@ -84,8 +85,7 @@ class Candidate(NamedTuple):
 
 
 def default_parameters() -> dict[str, float]:
-    default = FitConfig(degree=FitConfig().fold_degree)
-    return {name: 1.0 if name in RATES else getattr(default, name) for name in SPACE}
+    return {name: 1.0 if name in RATES else getattr(DEFAULT, name) for name in SPACE}
 
 
 def configuration(parameters: dict[str, float], cpu_seconds: float, gaussians: int | None) -> FitConfig:
@@ -250,7 +250,7 @@ def show_clips(best: FrozenTrial, default: FrozenTrial) -> None:
 def show_settings(best: FrozenTrial) -> None:
     table = _common.table(f"Settings of trial {best.number}", "setting", "default", "best")
     for name, value in best.params.items():
-        default = getattr(LearningRates() if name in RATES else FitConfig(), name)
+        default = getattr(LearningRates() if name in RATES else DEFAULT, name)
         table.add_row(name, f"{default:.3g}", f"{default * value if name in RATES else value:.3g}")
     console.print(table)
 

@@ -1,5 +1,6 @@
 """The benchmarks by which defaults are judged and searched: what is kept, continued and said, on tiny clips."""
 
+import dataclasses
 import json
 import re
 import sqlite3
@@ -190,14 +191,14 @@ class TestTune:
         assert parameters.keys() == tune.SPACE.keys()
         for name, value in parameters.items():
             assert tune.SPACE[name].low <= value <= tune.SPACE[name].high
-        assert tune.configuration(parameters, 30.0, None) == FitConfig(minutes=0.5)
+        assert tune.configuration(parameters, 30.0, None) == dataclasses.replace(tune.DEFAULT, minutes=0.5)
         assert tune.configuration({"loc": 2.0}, 60, 9).rates.loc == 2 * FitConfig().rates.loc
 
     def test_the_first_trial_is_the_default(self, tune, fits, folder, tmp_path, capsys):
         path = tmp_path / "t.json"
         tune.main(self.command(folder, None, "--trials", "12", "--json", str(path)))
         assert len(fits) == 2 * 12
-        assert fits[0] == fits[1] == FitConfig(minutes=1 / 60)
+        assert fits[0] == fits[1] == dataclasses.replace(tune.DEFAULT, minutes=1 / 60)
         kept = json.loads(path.read_text())
         assert kept["figures"]["psnr_default"] == pytest.approx(32.0)
         best = max(trial["psnr"] for trial in kept["trials"])
@@ -257,7 +258,11 @@ class TestTune:
         monkeypatch.setattr(
             tune,
             "fit_candidate",
-            lambda candidate: run if candidate.config == FitConfig(minutes=1 / 60) else {"diverged": "at step 7"},
+            lambda candidate: (
+                run
+                if candidate.config == dataclasses.replace(tune.DEFAULT, minutes=1 / 60)
+                else {"diverged": "at step 7"}
+            ),
         )
         tune.main(self.command(folder, None, "--trials", "3"))
         shown = printed(capsys)
