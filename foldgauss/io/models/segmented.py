@@ -174,7 +174,8 @@ def _segments(path: Path, about: dict) -> list[Segment]:
             expected, got = "the file as it was opened", f"a changed {str(path)!r}"
             raise model_file_error("path", expected=expected, got=got, cure="Load it again.")
         if entries[number]["kind"] == COMPACT:
-            return load_compact_model(path, _read_file(path, number))
+            named = path.with_name(f"{path.name}, segment {number + 1}")  # for messages
+            return load_compact_model(named, _read_file(path, number))
         return load_part(path, entries[number] | {"tensors": own[number]}, f"segments.{number}.")
 
     return [_segment(entry, own[number], partial(load, number)) for number, entry in enumerate(entries)]
