@@ -68,11 +68,11 @@ class Codec(NamedTuple):
 
 X265 = {"tune": "psnr", "x265-params": "log-level=none"}
 CODECS = {
-    "x264 medium": Codec("libx264", "yuv444p", {"preset": "medium", "tune": "psnr"}, (12, 18, 24, 30, 36, 42)),
-    "x264 veryslow": Codec("libx264", "yuv444p", {"preset": "veryslow", "tune": "psnr"}, (12, 18, 24, 30, 36, 42)),
-    "x265 medium": Codec("libx265", "yuv444p", {"preset": "medium", **X265}, (12, 18, 24, 30, 36, 42)),
-    "SVT-AV1 6": Codec("libsvtav1", "yuv420p", {"preset": "6"}, (10, 20, 30, 40, 50, 60)),
-    "SVT-AV1 3": Codec("libsvtav1", "yuv420p", {"preset": "3"}, (10, 20, 30, 40, 50, 60)),
+    "x264 medium": Codec("libx264", "yuv444p", {"preset": "medium", "tune": "psnr"}, (12, 18, 24, 30, 36, 42, 48)),
+    "x264 veryslow": Codec("libx264", "yuv444p", {"preset": "veryslow", "tune": "psnr"}, (12, 18, 24, 30, 36, 42, 48)),
+    "x265 medium": Codec("libx265", "yuv444p", {"preset": "medium", **X265}, (12, 18, 24, 30, 36, 42, 48)),
+    "SVT-AV1 6": Codec("libsvtav1", "yuv420p", {"preset": "6"}, (10, 20, 30, 40, 50, 60, 63)),
+    "SVT-AV1 3": Codec("libsvtav1", "yuv420p", {"preset": "3"}, (10, 20, 30, 40, 50, 60, 63)),
 }
 #: Figures of quality, and how the table calls them.
 MEASURES = {"psnr": "PSNR (dB)", "psnr_yuv": "YUV 6:1:1 (dB)", "ms_ssim": "MS-SSIM"}

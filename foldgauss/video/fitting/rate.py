@@ -84,7 +84,7 @@ _MOST_CHANGE = 1.0
 #: By how many dB the fit aims at more than it was asked for: what is too much is given up in the end.
 _MARGIN_DB = 0.1
 #: Bits of a Gaussian in a file whose number of Gaussians suits its steps, as measured.
-USUAL_BITS = 85.0
+USUAL_BITS = 75.0
 #: The coarseness that the search for a size starts with.
 USUAL_COARSENESS = 6.0
 #: The least fraction of the Gaussians that remains: each is judged as if the others remained.
