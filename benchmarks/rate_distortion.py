@@ -1,10 +1,10 @@
 """Rate and distortion: compact files beside video codecs.
 
     python -m benchmarks.rate_distortion --clips FOLDER [--only NAME ...] [--frames N] [--minutes M]
-                                         [--qualities Q ...] [--json FILE] [--figure FILE]
+                                         [--qualities Q ...] [--sizes-mb S ...] [--json FILE] [--figure FILE]
 
 The first N frames of the subfolders of FOLDER, folders of images each, at their own size. `foldgauss`: fits of M
-minutes of one core with several qualities. Codecs: FFmpeg's encoders through PyAV at several constant rate factors,
+minutes of one core with several qualities, and with several sizes of the file. Codecs: FFmpeg's encoders through PyAV at several constant rate factors,
 tuned for PSNR, whole Matroska files. x264 and x265 store 4:4:4, as chroma subsampling would limit their PSNR of RGB;
 SVT-AV1 has 4:2:0 only. Figures of quality are means over the decoded 8-bit frames:
 
@@ -178,10 +178,11 @@ def measure(source: ClipSource, runs: Runs, options: argparse.Namespace) -> dict
         for factor in codec.factors:
             run = lambda codec=codec, factor=factor: run_codec(frames, clip.fps, codec, factor)  # noqa: E731
             by_coder[name].append(runs.get(f"{source.name}, {name}, {factor}", run))
-    for quality in options.qualities:
-        config = FitConfig(quality=quality, minutes=options.minutes)
+    aims = [("quality", value) for value in options.qualities] + [("size_mb", value) for value in options.sizes_mb]
+    for aim, value in aims:
+        config = FitConfig(**{aim: value}, minutes=options.minutes)
         run = lambda config=config: run_foldgauss(frames, clip.fps, config)  # noqa: E731
-        by_coder[OURS].append(runs.get(f"{source.name}, {OURS}, quality {quality:g}", run))
+        by_coder[OURS].append(runs.get(f"{source.name}, {OURS}, {aim} {value:g}", run))
     return dict(by_coder)
 
 
@@ -245,7 +246,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--clips", type=Path, metavar="FOLDER", required=True, help="its subfolders are the clips")
     parser.add_argument("--only", nargs="+", metavar="NAME", help="[all]")
     parser.add_argument("--frames", type=_common.whole, default=NUM_FRAMES, help=f"[{NUM_FRAMES}]")
-    parser.add_argument("--qualities", type=float, nargs="+", default=QUALITIES, metavar="Q", help="[20 35 50 65]")
+    parser.add_argument("--qualities", type=float, nargs="*", default=QUALITIES, metavar="Q", help="[20 35 50 65]")
+    parser.add_argument("--sizes-mb", type=float, nargs="*", default=(), metavar="S", help="[none]")
     parser.add_argument("--minutes", type=float, default=MINUTES, help=f"of the processor, for each fit [{MINUTES:g}]")
     parser.add_argument("--figure", type=Path, metavar="FILE", help="draw PSNR over bits per pixel")
     return parser
