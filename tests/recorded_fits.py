@@ -16,18 +16,24 @@ import jax
 import numpy as np
 from threadpoolctl import threadpool_info
 
-from foldgauss.video import FitConfig, Growth, compress, evaluate, fit
+from foldgauss.video import FitConfig, Growth, Views, compress, evaluate, fit
 
 SIZE, NUM_FRAMES = (32, 48), 5
 #: The default when the bits were recorded; of the radius in pixels nothing is pruned by default now.
 GROWTH = Growth(prune_radius=20.0)
 CONFIGS = {
-    "plain": FitConfig(num_gaussians=120, steps=60, seed=2, interpolation_fraction=0.0),
+    "plain": FitConfig(num_gaussians=120, steps=60, seed=2, views=Views(interpolation_fraction=0.0)),
     "growing": FitConfig.preset(
-        "paper", num_gaussians=80, steps=120, seed=2, degree=3, growth=GROWTH, final_rate=1.0, initialization="clip"
+        "paper",
+        num_gaussians=80,
+        steps=120,
+        seed=2,
+        degree=3,
+        **{"strategy.growth": GROWTH, "rates.final": 1.0},
+        initialization="static",
     ),
-    "published": FitConfig.preset("paper", num_gaussians=200, steps=150, growth=GROWTH),
-    "compact": FitConfig(num_gaussians=120, steps=60, seed=2, interpolation_fraction=0.0, quality=60),
+    "published": FitConfig.preset("paper", num_gaussians=200, steps=150, **{"strategy.growth": GROWTH}),
+    "compact": FitConfig(num_gaussians=120, steps=60, seed=2, views=Views(interpolation_fraction=0.0), quality=60),
 }
 
 

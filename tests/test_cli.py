@@ -741,7 +741,9 @@ def test_presets(work, tmp_path, monkeypatch):
     assert seen[-1] == fitting.FitConfig.preset("paper", num_gaussians=300, max_gaussians=310, steps=60, degree=2)
     assert load_video_model(model).splats.num_gaussians <= 310
     assert run(*common, "--preset", "draft", "--steps", "9", "--batch-size", "2", "--power", "1", "--seed", "4") == 0
-    assert seen[-1] == fitting.FitConfig.preset("draft", num_gaussians=300, steps=9, batch_size=2, power=1.0, seed=4)
+    assert seen[-1] == fitting.FitConfig.preset(
+        "draft", num_gaussians=300, steps=9, **{"views.batch_size": 2}, power=1.0, seed=4
+    )
     assert run(*common, "--steps", "9") == 0
     assert seen[-1] == fitting.FitConfig(num_gaussians=300, steps=9)
     assert run(*common, "--steps", "9", "--max-gaussians", "200") == 0

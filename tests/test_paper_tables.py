@@ -133,7 +133,9 @@ def fake_fits(monkeypatch, module, psnr_of=lambda config: 30.0, seconds=6.0):
 class TestPresets:
     def test_time_and_numbers_are_those_of_paper(self, clip, tmp_path, monkeypatch, capsys):
         monkeypatch.setattr(presets, "seconds_per_step", lambda *given: 0.5)
-        configs = fake_fits(monkeypatch, presets, lambda config: 30.0 if config.growth else 32.5, seconds=100.0)
+        configs = fake_fits(
+            monkeypatch, presets, lambda config: 30.0 if config.strategy.growth else 32.5, seconds=100.0
+        )
         command = ["--clip", str(clip), "--size", "24x32", "--minutes", "2", "--json", str(tmp_path / "p.json")]
         presets.main(command)
         paper, standard, equal = configs

@@ -559,7 +559,7 @@ MADE = """
     from pathlib import Path
     import jax, numpy as np
     from foldgauss.io import save_compact, save_video_model, write_image
-    from foldgauss.video import FitConfig, compress, fit
+    from foldgauss.video import FitConfig, LearningRates, Strategy, Views, compress, fit
     folder, long = Path(sys.argv[1]), sys.argv[2] == "long"
     y, x = np.mgrid[:96, :128]
     discs = np.stack([np.exp(-((x - at) ** 2 + (y - 48) ** 2) / 200) for at in (30, 45, 60, 75, 90)])[..., None]
@@ -567,20 +567,23 @@ MADE = """
     clear = np.concatenate([frames, np.full((*frames.shape[:3], 1), 255, np.uint8)], -1)
     clear[:, :, :40] = 0
     usual = FitConfig(num_gaussians=5000, steps=60 if long else 10)
-    change = dataclasses.replace
+    change = FitConfig.replace
     configs = {"default": usual}
     if long:
-        paper = {"initialization": "clip", "num_gaussians": 3000, "max_gaussians": 6000}
+        paper = {"initialization": "static", "num_gaussians": 3000, "max_gaussians": 6000}
         configs |= {
             "paper": FitConfig.preset("paper", steps=60, **paper),
-            "batches": change(usual, batch_size=3, two_cameras=True, interpolation_fraction=0.3),
+            "batches": change(usual, views=Views(batch_size=3, two_cameras=True, interpolation_fraction=0.3)),
             "sum": change(usual, compositing="sum"),
             "quality": change(usual, quality=60),
             "size": change(usual, size_mb=0.03),
             "fixed times": change(
-                usual, learn_frame_times=False, degree=7, scale_rates_by_duration=False, sparse_updates=False
+                usual,
+                degree=7,
+                rates=LearningRates(frame_times=0.0, by_duration=False),
+                strategy=Strategy(sparse_updates=False),
             ),
-            "uniform": change(usual, initialization="uniform", follow_motion=False),
+            "uniform": change(usual, initialization="uniform"),
         }
 
     def say(name, made):

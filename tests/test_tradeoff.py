@@ -304,7 +304,7 @@ def test_motion_is_found_once_and_counted_in_every_fit(clip, tmp_path, monkeypat
         return of(frames)
 
     def watched(frames, config, **known):
-        given.extend([known.get("motion")] if config.follow_motion else [])
+        given.extend([known.get("motion")] if config.follows_motion else [])
         return steps(frames, config, **known)
 
     monkeypatch.setattr(Motion, "from_frames", slow)
@@ -517,7 +517,7 @@ def test_options_of_fit_reach_the_fit(clip, tmp_path, monkeypatch):
     target = tmp_path / "m.safetensors"
     assert run("fit", clip, "--out", target, "--gaussians", 50, "--steps", 2, *options, "--quiet") == 0
     (config,) = seen
-    assert (config.ssim_fraction, config.error_fraction) == (0.3, 0.1)
+    assert (config.loss.ssim_fraction, config.views.error_fraction) == (0.3, 0.1)
     options = load_video_model(target).options
     assert (options.alpha_cutoff, options.support_radius, options.transmittance_stop) == (0.01, 2.0, 0.02)
     assert options.low_pass == FitConfig().options.low_pass

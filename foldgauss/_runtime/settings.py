@@ -8,6 +8,7 @@
 import dataclasses
 import types
 import typing
+from collections.abc import Iterator
 from typing import Any
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
@@ -51,6 +52,33 @@ def type_of(field: dataclasses.Field) -> type:
     return next(kind for kind in typing.get_args(field.type) if kind is not types.NoneType)
 
 
+def walk(settings: Any) -> Iterator[tuple[str, dataclasses.Field, Any]]:
+    """Name, field and value of each setting; those of settings within settings by names such as "views.batch_size".
+
+    `settings`: an instance, or the class, whose values are the defaults.
+    """
+    for field in dataclasses.fields(settings):
+        value = field.default if isinstance(settings, type) else getattr(settings, field.name)
+        if dataclasses.is_dataclass(value) and all(_KEY in own.metadata for own in dataclasses.fields(value)):
+            yield from ((f"{field.name}.{name}", own, part) for name, own, part in walk(value))
+        else:
+            yield field.name, field, value
+
+
+def settings_by_name(settings: Any) -> dict[str, Any]:
+    """The values of `walk`, by their names."""
+    return {name: value for name, _, value in walk(settings)}
+
+
+def replace_settings(settings: Any, changes: dict[str, Any]) -> Any:
+    """`settings` with other values, by the names of `walk`."""
+    own = {name: value for name, value in changes.items() if "." not in name}
+    for part in {name.partition(".")[0] for name in changes if "." in name}:
+        inner = {name.partition(".")[2]: value for name, value in changes.items() if name.startswith(f"{part}.")}
+        own[part] = replace_settings(own.get(part, getattr(settings, part)), inner)
+    return dataclasses.replace(settings, **own)
+
+
 def check_settings(settings: Any, prefix: str = "") -> None:
     """Raise ValueError for a value that its field's metadata or type forbids; NumPy scalars become Python numbers.
 
@@ -86,10 +114,10 @@ def _checked_value(name: str, value: Any, kind: type, valid: Setting) -> Any:
 def markdown_table(settings: type) -> str:
     """The fields of a settings dataclass as a table in Markdown."""
     rows = ["| field | default | meaning | option |", "|---|---|---|---|"]
-    for field in dataclasses.fields(settings):
-        about, is_plain = setting_of(field), isinstance(field.default, int | float | str | None)
-        default = f"`{field.default!r}`" if is_plain else f"`{type(field.default).__name__}(...)`"
+    for name, field, value in walk(settings):
+        about, is_plain = setting_of(field), isinstance(value, int | float | str | None)
+        default = f"`{value!r}`" if is_plain else f"`{type(value).__name__}(...)`"
         default += f": {about.unset}" if about.unset else ""
         option = f"`{about.option}`" if about.option else ""
-        rows.append(f"| `{field.name}` | {default} | {f'{about.help}. {about.details}'.rstrip()} | {option} |")
+        rows.append(f"| `{name}` | {default} | {f'{about.help}. {about.details}'.rstrip()} | {option} |")
     return "\n".join(rows)

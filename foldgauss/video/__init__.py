@@ -11,11 +11,10 @@ from foldgauss.video.editing.edited_video import EditedVideo, Layer
 from foldgauss.video.editing.overlays import SelectedGaussians
 from foldgauss.video.editing.span import Span
 from foldgauss.video.fitting.compress import Compressed, compress
-from foldgauss.video.fitting.config import FitConfig, LearningRates
+from foldgauss.video.fitting.config import FitConfig, LearningRates, Loss, Strategy, Views
 from foldgauss.video.fitting.divergence import DivergenceWarning, FitDiverged
 from foldgauss.video.fitting.growth import Growth
 from foldgauss.video.fitting.loop import FitInfo, FitResult, FitState, fit, fit_steps, start_from
-from foldgauss.video.fitting.per_frame_baseline import IndependentFrames, independent_frames
 from foldgauss.video.models.density import density_image
 from foldgauss.video.models.frame_times import (
     FrameTimes,
@@ -69,9 +68,9 @@ __all__ = [
     "FoldedSplats",
     "FrameTimes",
     "Growth",
-    "IndependentFrames",
     "Layer",
     "LearningRates",
+    "Loss",
     "NothingMoves",
     "Segment",
     "SegmentedEdit",
@@ -82,7 +81,9 @@ __all__ = [
     "SharedPaths",
     "Span",
     "StabilizedVideo",
+    "Strategy",
     "VideoModel",
+    "Views",
     "by_box",
     "by_click",
     "by_color",
@@ -101,7 +102,6 @@ __all__ = [
     "find_moving_object",
     "fit",
     "fit_steps",
-    "independent_frames",
     "influence",
     "interpolate_frames",
     "interpolated_times",

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.settings import replace_settings
 from foldgauss.render import RenderOptions
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.fitting.config import FitConfig
@@ -81,8 +82,8 @@ AXES: Mapping[str, tuple[Variant, ...]] = MappingProxyType(
         ),
         # Fewer steps with a larger batch: the number of frames seen is the same.
         "batch": (
-            Variant("2", fit={"batch_size": 2}, scale={"steps": 1 / 2}),
-            Variant("4", fit={"batch_size": 4}, scale={"steps": 1 / 4}),
+            Variant("2", fit={"views.batch_size": 2}, scale={"steps": 1 / 2}),
+            Variant("4", fit={"views.batch_size": 4}, scale={"steps": 1 / 4}),
         ),
         "cutoff": _cutoffs(),
         "quality": tuple(
@@ -91,7 +92,10 @@ AXES: Mapping[str, tuple[Variant, ...]] = MappingProxyType(
         ),
         "power": (Variant("0", fit={"power": 0.0}), Variant("2", fit={"power": 2.0})),
         "compositing": (Variant("sum", fit={"compositing": "sum"}, work=0.85),),
-        "ssim": (Variant("0", fit={"ssim_fraction": 0.0}, work=0.85), Variant("0.5", fit={"ssim_fraction": 0.5})),
+        "ssim": (
+            Variant("0", fit={"loss.ssim_fraction": 0.0}, work=0.85),
+            Variant("0.5", fit={"loss.ssim_fraction": 0.5}),
+        ),
     }
 )
 
@@ -151,7 +155,7 @@ def _apply(variant: Variant, axis: str, base: FitConfig) -> Point:
     scaled = {name: max(round(factor * getattr(base, name)), 1) for name, factor in variant.scale.items()}
     options = dataclasses.replace(base.options, **variant.options)
     fitted = base.options if variant.played else options
-    config = dataclasses.replace(base, **variant.fit, **scaled, options=fitted)
+    config = replace_settings(base, variant.fit | scaled | {"options": fitted})
     played = options if variant.played else None
     return Point(axis, variant.value.format(**scaled), config, played, variant.work)
 
@@ -159,7 +163,7 @@ def _apply(variant: Variant, axis: str, base: FitConfig) -> Point:
 def _why_skipped(point: Point, base: FitConfig, num_frames: int, has_alpha: bool) -> str:
     if has_alpha and point.config.compositing == "sum":
         return "sums have no alpha, but the frames do"
-    if point.config.batch_size > num_frames:
+    if point.config.views.batch_size > num_frames:
         return f"there are {num_frames} frames"
     return "it changes nothing" if point.played is None and point.config == base else ""
 

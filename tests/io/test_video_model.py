@@ -80,7 +80,7 @@ def test_checkpoint_keeps_what_growth_is_decided_by(tmp_path, monkeypatch):
     """Kept between two births: the second is decided by the gradients of before, too."""
     monkeypatch.setattr(Growth, "for_plan", lambda self, plan: self)
     growth = Growth(from_step=1, until_step=25, every=10, screen_gradient=2e-3, time_gradient=5e-3)
-    config = dataclasses.replace(CONFIG, steps=30, growth=growth)
+    config = CONFIG.replace(steps=30, **{"strategy.growth": growth})
     path, numbers = tmp_path / "c", []
     for state, info in fit_steps(frames(), config):
         numbers.append(info.num_gaussians)
@@ -95,8 +95,8 @@ def test_checkpoint_keeps_what_growth_is_decided_by(tmp_path, monkeypatch):
     same(whole, to_model(state, config, (24, 32), 25.0))
     save_checkpoint(path, state, config=config, source=SOURCE)  # growth is over
     assert load_checkpoint(path, config=config, source=SOURCE).statistics is None
-    with pytest.raises(ValueError, match="resume: expected growth="):
-        load_checkpoint(path, config=dataclasses.replace(config, growth=None), source=SOURCE)
+    with pytest.raises(ValueError, match="resume: expected strategy="):
+        load_checkpoint(path, config=config.replace(**{"strategy.growth": None}), source=SOURCE)
 
 
 def test_checkpoint_of_another_fit_is_refused(tmp_path):

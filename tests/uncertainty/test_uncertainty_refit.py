@@ -9,9 +9,9 @@ import scipy.stats
 from foldgauss.uncertainty import RefitTimes, iter_refits, likelihood_profiles, refit_frame_times
 from foldgauss.uncertainty.likelihood.refit import Refit, merge_logits, resample_blocks, resample_frames
 from foldgauss.uncertainty.likelihood.residuals import Residuals
-from foldgauss.video import FitConfig, FrameTimes, LearningRates, fit
+from foldgauss.video import FitConfig, FrameTimes, LearningRates, Views, fit
 
-CONFIG = FitConfig(num_gaussians=150, steps=200, degree=2, interpolation_fraction=0.0)
+CONFIG = FitConfig(num_gaussians=150, steps=200, degree=2, views=Views(interpolation_fraction=0.0))
 #: Learning rates with which only the frame times are fitted.
 HELD = LearningRates(0, 0, 0, 0, 0, 0, 0, 0, frame_times=4e-3)
 
@@ -320,8 +320,8 @@ def test_videos_of_other_models_are_refused(model, frames):
 
 
 def test_configs_that_do_not_fit(model, frames):
-    with pytest.raises(ValueError, match="learn_frame_times"):
-        ended(model, frames, dataclasses.replace(CONFIG, learn_frame_times=False))
+    with pytest.raises(ValueError, match=r"rates\.frame_times"):
+        ended(model, frames, CONFIG.replace(**{"rates.frame_times": 0.0}))
     with pytest.raises(ValueError, match="ends by the clock"):
         ended(model, frames, dataclasses.replace(CONFIG, steps=None, minutes=1.0), steps=None)
     for start in ("model", "scratch"):

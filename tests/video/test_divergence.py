@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from clips import moving_blobs
 
-from foldgauss.video import DivergenceWarning, FitConfig, FitDiverged, LearningRates, evaluate, fit, fit_steps
+from foldgauss.video import DivergenceWarning, FitConfig, FitDiverged, LearningRates, Views, evaluate, fit, fit_steps
+from foldgauss.video.fitting import divergence
 from foldgauss.video.fitting.divergence import MAX_BACKOFFS, Guard
 from foldgauss.video.fitting.state import running_psnr, to_model
 from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
@@ -16,7 +17,12 @@ from foldgauss.video.models.row_layout import columns
 
 CLIP = moving_blobs()
 CONFIG = FitConfig(
-    num_gaussians=200, steps=240, seed=1, cooldown_fraction=0, interpolation_fraction=0.0, follow_camera=False
+    num_gaussians=200,
+    steps=240,
+    seed=1,
+    rates=LearningRates(cooldown=0),
+    views=Views(interpolation_fraction=0.0),
+    follow_camera=False,
 )
 RATES = LearningRates()
 
@@ -44,7 +50,7 @@ def _fit_with(change, config: FitConfig = CONFIG, at: int = 100) -> float:
             change(state)
     assert np.isfinite(state.rows).all()
     assert info.step == config.steps
-    return evaluate(to_model(state, config, CLIP.shape[1:3], 25.0), CLIP).mean_psnr
+    return evaluate(to_model(state, CONFIG, CLIP.shape[1:3], 25.0), CLIP).mean_psnr
 
 
 @pytest.mark.parametrize(
@@ -68,19 +74,19 @@ def test_nonfinite_frame_times_are_named():
         _fit_with(spoil)
 
 
-def test_stop_raises_with_the_last_finite_state():
-    config = dataclasses.replace(CONFIG, on_divergence="stop")
+def test_a_fit_that_may_not_back_off_any_more_raises_with_the_last_finite_state(monkeypatch):
+    monkeypatch.setattr(divergence, "MAX_BACKOFFS", 0)
 
     def spoil(state):
         state.rows[:, columns(CONFIG.fold_degree)["log_scale"]] = np.nan
 
     with pytest.raises(FitDiverged, match=r"no finite log_scale in 200 Gaussians.*of step 120") as error:
-        _fit_with(spoil, config, at=130)
+        _fit_with(spoil, at=130)
     state = error.value.state
     assert state.step == 130  # as was told last: what watched goes on from there
     assert running_psnr(state) > 20
     assert np.isfinite(state.rows).all()
-    assert evaluate(to_model(state, config, CLIP.shape[1:3], 25.0), CLIP).mean_psnr > 20
+    assert evaluate(to_model(state, CONFIG, CLIP.shape[1:3], 25.0), CLIP).mean_psnr > 20
 
 
 # Of the others a thousand times as much is borne: they come to an end of what they can do.
@@ -88,7 +94,7 @@ def test_stop_raises_with_the_last_finite_state():
 def test_too_high_rates_are_lowered_until_the_fit_converges(begun, leaf):
     rates = dataclasses.replace(RATES, **{leaf: 1000 * getattr(RATES, leaf)})
     with pytest.warns(DivergenceWarning, match=r"worse than they were|worse than at the start|no finite"):
-        model = fit(CLIP, dataclasses.replace(CONFIG, rates=rates, final_rate=0.07)).model
+        model = fit(CLIP, CONFIG.replace(rates=rates, **{"rates.final": 0.07})).model
     assert evaluate(model, CLIP).mean_psnr > begun
 
 
@@ -183,7 +189,8 @@ def test_guard_changes_no_bit(monkeypatch):
 
 
 def test_opacity_resets_raise_no_warning():
-    config = FitConfig.preset("paper", initialization="clip", num_gaussians=200, max_gaussians=400, steps=300, degree=2)
+    small = {"num_gaussians": 200, "max_gaussians": 400, "steps": 300, "degree": 2}
+    config = FitConfig.preset("paper", initialization="static", **small)
     with warnings.catch_warnings():
         warnings.simplefilter("error", DivergenceWarning)
         fit(CLIP, config)

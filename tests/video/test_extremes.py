@@ -92,9 +92,9 @@ SETTINGS = {
     "sum": {"compositing": "sum"},
     "degree 0": {"degree": 0},
     "degree 7": {"degree": 7},
-    "two cameras, batches": {"two_cameras": True, "batch_size": 3, "steps": 30},
-    "between, psnr": {"interpolation_fraction": 0.5, "psnr": 99.0, "steps": 30},
-    "at rest": {"follow_motion": False},
+    "two cameras, batches": {"views.two_cameras": True, "views.batch_size": 3, "steps": 30},
+    "between, psnr": {"views.interpolation_fraction": 0.5, "psnr": 99.0, "steps": 30},
+    "at rest": {"initialization": "static"},
 }
 
 
@@ -137,7 +137,7 @@ def test_a_short_fit_and_its_file(tmp_path, name):
 )
 def test_every_setting_at_the_extremes(name, setting):
     frames, least = CLIPS[name]
-    config = FitConfig(**({"num_gaussians": 300, "steps": 60} | SETTINGS[setting]))
+    config = FitConfig().replace(**({"num_gaussians": 300, "steps": 60} | SETTINGS[setting]))
     result = fit(frames, config)
     assert check_whole(result.model, result.history, frames).mean_psnr > 0.4 * least
 
@@ -276,7 +276,7 @@ def test_starts_are_spread_as_by_the_whole_matrix():
 def test_every_stretch_of_a_long_clip_has_starts():
     """By chance alone, with one start in ten frames, one stretch of 60 in four hundred has none."""
     frames = moving_blobs(10, 16, 16)[np.arange(2000) % 10]
-    config = FitConfig(num_gaussians=200, steps=1, follow_motion=False)
+    config = FitConfig(num_gaussians=200, steps=1, initialization="static")
     model = to_model(start(frames, config), config, (16, 16), 25.0)
     own = np.sort(1 / (1 + np.exp(-model.splats.time_loc_logit)))
     assert np.diff(own, prepend=0, append=1).max() < 25 / 2000
@@ -302,8 +302,8 @@ def test_exact_frames_cost_the_others_no_bits(degree, steps):
     frames = np.concatenate([blobs, constant(0, 3)])
     for seed in range(3):  # with few Gaussians a frame may be worse by chance
         how = {"num_gaussians": 500, "quality": 80, "seed": seed, "degree": degree}
-        both = fit(frames, FitConfig(steps=2 * steps, **how))
-        alone = fit(blobs, FitConfig(steps=steps, **how))  # each frame is shown as often
+        both = fit(frames, FitConfig().replace(steps=2 * steps, **how))
+        alone = fit(blobs, FitConfig().replace(steps=steps, **how))  # each frame is shown as often
         found = evaluate(both.model, frames).psnr
         assert min(found[3:]) > 40
         scores.append(np.mean(found[:3]) - evaluate(alone.model, blobs).mean_psnr)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from clips import moving_blobs
 
-from foldgauss.video import FitConfig, fit_steps
+from foldgauss.video import FitConfig, Loss, Strategy, Views, fit_steps
 from foldgauss.video.fitting.budget import StepPlanner
 from foldgauss.video.fitting.config import chosen_num_gaussians
 from foldgauss.video.fitting.densify import densify, reset_opacities
@@ -243,7 +243,7 @@ QUICK = Growth(
     prune_scale=10.0,
     reset_every=20,
 )
-CONFIG = FitConfig(num_gaussians=150, steps=60, degree=2, batch_size=2, growth=QUICK)
+CONFIG = FitConfig(num_gaussians=150, steps=60, degree=2, views=Views(batch_size=2), strategy=Strategy(growth=QUICK))
 
 
 @pytest.fixture
@@ -278,9 +278,9 @@ def test_fit_grows_on_schedule():
 def test_either_gradient_alone_densifies(criterion):
     off = {"screen_gradient": 1e9, "time_gradient": 1e9, "reset_every": 1000}
     growth = dataclasses.replace(QUICK, **off)
-    assert max(run(dataclasses.replace(CONFIG, growth=growth))[0]) == 150
+    assert max(run(CONFIG.replace(**{"strategy.growth": growth}))[0]) == 150
     on = dataclasses.replace(growth, **{criterion: 1e-5})
-    assert max(run(dataclasses.replace(CONFIG, growth=on))[0]) > 200
+    assert max(run(CONFIG.replace(**{"strategy.growth": on}))[0]) > 200
 
 
 @pytest.mark.usefixtures("unscaled")
@@ -333,7 +333,12 @@ def test_fit_resets_opacities_on_schedule():
 def test_screen_gradient_is_in_units_of_half_the_image():
     """Against finite differences: the loss as one Gaussian's mean moves by a share of half the picture."""
     config = FitConfig(
-        num_gaussians=1, degree=0, seed=3, ssim_fraction=0.0, border_weight=1.0, growth=Growth(), follow_motion=False
+        num_gaussians=1,
+        degree=0,
+        seed=3,
+        loss=Loss(ssim_fraction=0.0, border_weight=1.0),
+        strategy=Strategy(growth=Growth()),
+        initialization="static",
     )
     frames = moving_blobs(2, 24, 40)
 
@@ -376,7 +381,7 @@ def test_resuming_keeps_the_bits(stop):
 
 
 def test_gaussians_outside_the_image_are_not_seen():
-    config = dataclasses.replace(CONFIG, growth=Growth(), initialization="uniform", follow_motion=False)
+    config = CONFIG.replace(**{"strategy.growth": Growth()}, initialization="uniform")
     state = start(FRAMES, config)
     state.rows[:, PLACE["coefficients"]] = 0
     state.rows[:, PLACE["log_time_scale"]] = 1.0
@@ -387,13 +392,13 @@ def test_gaussians_outside_the_image_are_not_seen():
 
 
 def test_without_growth_there_are_no_statistics():
-    assert start(FRAMES, dataclasses.replace(CONFIG, growth=None)).statistics is None
+    assert start(FRAMES, CONFIG.replace(**{"strategy.growth": None})).statistics is None
 
 
 def test_growth_waits_for_the_plan():
     """By minutes, the pace is measured first; the schedule is that of the plan."""
     growth = dataclasses.replace(QUICK, from_step=0, every=1, until_step=PUBLISHED_STEPS, reset_every=PUBLISHED_STEPS)
-    config = dataclasses.replace(CONFIG, steps=None, minutes=0.02, growth=growth)
+    config = CONFIG.replace(steps=None, minutes=0.02, **{"strategy.growth": growth})
     without = 0
     for state, info in fit_steps(FRAMES, config):
         without += not state.plan

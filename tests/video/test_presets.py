@@ -10,7 +10,7 @@ from clips import moving_blobs
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, cpu, project
-from foldgauss.video import FitConfig, evaluate, fit, fit_steps
+from foldgauss.video import FitConfig, LearningRates, Views, evaluate, fit, fit_steps
 from foldgauss.video.fitting.config import PRESETS, chosen_num_gaussians, planned_steps
 from foldgauss.video.fitting.growth import Growth
 from foldgauss.video.fitting.initialize import initialize_uniform
@@ -57,19 +57,19 @@ def test_a_draft_is_smaller_than_the_standard():
 
 def test_the_published_numbers():
     paper = FitConfig.preset("paper")
-    assert (paper.num_gaussians, paper.degree, paper.batch_size, paper.steps) == (500_000, 7, 3, 30_000)
-    assert (paper.power, paper.ssim_fraction, paper.l2_fraction, paper.floor) == (2.0, 0.2, 0.0, 0.0)
-    assert paper.border_weight == 1
+    assert (paper.num_gaussians, paper.degree, paper.views.batch_size, paper.steps) == (500_000, 7, 3, 30_000)
+    assert (paper.power, paper.loss.ssim_fraction, paper.loss.l2_fraction, paper.floor) == (2.0, 0.2, 0.0, 0.0)
+    assert paper.loss.border_weight == 1
     assert paper.options == RenderOptions()
-    assert paper.scale_cutoff == pytest.approx(1e-4 / (2 * TAN))
-    assert paper.growth == Growth()
+    assert paper.strategy.scale_cutoff == pytest.approx(1e-4 / (2 * TAN))
+    assert paper.strategy.growth == Growth()
     rates = paper.rates
     # A published length is half a frame's width per tan; ours the whole: 1 / (2 tan).
     assert rates.loc == pytest.approx(1.6e-4 * 1.1 / (2 * TAN))
     assert rates.coefficients == pytest.approx(1e-3 / (2 * TAN))
     assert (rates.color_dc, rates.opacity_logit, rates.log_scale) == (2.5e-3, 2.5e-2, 5e-3)
     assert {rates.angle_logit, rates.time_loc_logit, rates.log_time_scale, rates.frame_times} == {1e-3}
-    assert paper.growth.clone_below == pytest.approx(0.011 / (2 * TAN))
+    assert paper.strategy.growth.clone_below == pytest.approx(0.011 / (2 * TAN))
 
 
 # -------------------------------------------------------------------------------------------------- starts
@@ -118,7 +118,7 @@ def test_uniform_starts_depend_on_the_seed():
 
 
 def test_the_config_chooses_the_starts():
-    config = FitConfig(num_gaussians=50, initialization="uniform", follow_motion=False)
+    config = FitConfig(num_gaussians=50, initialization="uniform")
     rows = start(FRAMES, config).rows
     np.testing.assert_array_equal(rows[:, columns(3)["loc"]], uniform(50).loc)
 
@@ -177,7 +177,7 @@ def test_both_views_give_the_same_gradients():
 
 
 def test_a_pass_sees_every_frame_from_both_sides():
-    config = FitConfig(num_gaussians=20, two_cameras=True, batch_size=2, error_fraction=0)
+    config = FitConfig(num_gaussians=20, views=Views(two_cameras=True, batch_size=2, error_fraction=0))
     errors = np.ones(4)
     passes = [np.concatenate([choose_views(config, 4, 4 * k + i, errors) for i in range(4)]) for k in range(2)]
     assert sorted(passes[0]) == sorted(passes[1]) == list(range(8))
@@ -188,7 +188,7 @@ def test_mirrored_views_are_learned():
     """An uneven clip is learned from both sides: were a target or a gradient not mirrored, it would not be."""
     config = FitConfig(num_gaussians=400, steps=200)
     one, two = (
-        evaluate(fit(FRAMES, dataclasses.replace(config, two_cameras=two)).model, FRAMES).mean_psnr
+        evaluate(fit(FRAMES, config.replace(**{"views.two_cameras": two})).model, FRAMES).mean_psnr
         for two in (False, True)
     )
     assert two > 28
@@ -199,9 +199,11 @@ def test_mirrored_views_are_learned():
 
 
 def test_dense_updates_move_all_gaussians():
-    short = {"num_gaussians": 300, "steps": 12, "rates": PRESETS["paper"]["rates"], "relocated_fraction": 0}
+    short = {"num_gaussians": 300, "steps": 12, "rates": PRESETS["paper"]["rates"], "strategy.relocated_fraction": 0}
     for sparse_updates in (True, False):
-        for state, info in fit_steps(FRAMES, FitConfig(sparse_updates=sparse_updates, **short)):
+        for state, info in fit_steps(
+            FRAMES, FitConfig().replace(**{"strategy.sparse_updates": sparse_updates}, **short)
+        ):
             assert info.num_alive <= 300
         assert (state.counts.min() < 12) == sparse_updates
         assert state.counts.max() <= 12
@@ -210,7 +212,12 @@ def test_dense_updates_move_all_gaussians():
 @pytest.mark.parametrize("decayed", ["all", "loc"])
 def test_decayed_selects_the_rates(decayed):
     """Where the last step's rate is 0, only what does not fall still moves."""
-    config = FitConfig(num_gaussians=300, steps=20, batch_size=4, final_rate=0.0, decayed=decayed, error_fraction=0)
+    config = FitConfig(
+        num_gaussians=300,
+        steps=20,
+        views=Views(batch_size=4, error_fraction=0),
+        rates=LearningRates(final=0.0, decayed=decayed),
+    )
     state = start(FRAMES, config)
     stepper, before = CpuStepper(FRAMES, config, state), state.rows.copy()
     times = state.time_logits.copy()
@@ -245,15 +252,14 @@ def test_a_small_fit_by_the_paper():
     [
         ({"max_gaussians": 0}, "max_gaussians"),
         ({"max_gaussians": 10**12}, "max_gaussians"),
-        ({"initialization": "random"}, "initialization: expected one of 'clip', 'uniform'"),
-        ({"initialization": "uniform"}, "follow_motion: expected False"),
-        ({"decayed": "none"}, "decayed: expected one of"),
-        ({"two_cameras": 2}, "two_cameras"),
-        ({"sparse_updates": None}, "sparse_updates"),
-        ({"growth": True}, "growth: expected a Growth"),
+        ({"initialization": "random"}, "initialization: expected one of 'flow', 'static', 'uniform'"),
+        ({"rates.decayed": "none"}, "decayed: expected one of"),
+        ({"views.two_cameras": 2}, "two_cameras"),
+        ({"strategy.sparse_updates": None}, "sparse_updates"),
+        ({"strategy.growth": True}, "growth: expected a Growth"),
     ],
     ids=str,
 )
 def test_bad_settings(changes, message):
     with pytest.raises(ValueError, match=message):
-        FitConfig(**changes)
+        FitConfig().replace(**changes)

@@ -139,7 +139,7 @@ def test_the_last_rounding_changes_only_what_was_not_rounded(states):
 @pytest.mark.parametrize("engine", ["cpu", "xla"])
 def test_rounded_parameters_do_not_move_and_others_do(fitted, engine):
     """On "xla" in the last part of a fit, with two numbers of Gaussians: it compiles for each."""
-    config, state = dataclasses.replace(CONFIG, engine=engine, relocated_fraction=0.0), None
+    config, state = CONFIG.replace(engine=engine, **{"strategy.relocated_fraction": 0.0}), None
     if engine == "xla":
         config = dataclasses.replace(config, degree=fitted.degree, steps=20)
         state = start_from(fitted, config, 8, 0.6)
@@ -321,7 +321,7 @@ def test_a_killed_and_resumed_fit_has_the_same_bits(states, tmp_path, step):
     ids=str,
 )
 def test_other_goals_resume_likewise(tmp_path, goal):
-    config, path = dataclasses.replace(CONFIG, **({"quality": None, "steps": 50} | goal)), tmp_path / "m.checkpoint"
+    config, path = CONFIG.replace(**({"quality": None, "steps": 50} | goal)), tmp_path / "m.checkpoint"
     for state, info in fit_steps(FRAMES, config):
         if info.step == 33:
             save_checkpoint(path, state, config=config, source={})
@@ -338,7 +338,7 @@ def many_chunks(monkeypatch):
 
 @pytest.mark.parametrize("goal", [{"quality": 80}, {"quality": 80, "compositing": "sum"}, {"size_mb": 0.012}], ids=str)
 def test_a_fit_in_chunks_is_its_file_and_resumes_to_the_same_bytes(tmp_path, many_chunks, goal):
-    config = dataclasses.replace(CONFIG, **({"quality": None, "num_gaussians": 400, "steps": 60} | goal))
+    config = CONFIG.replace(**({"quality": None, "num_gaussians": 400, "steps": 60} | goal))
     path = tmp_path / "m.checkpoint"
     for state, info in fit_steps(FRAMES, config):
         if info.step == 45:  # sorted, and some of it rounded
@@ -361,7 +361,13 @@ def test_a_fit_in_chunks_is_its_file_and_resumes_to_the_same_bytes(tmp_path, man
 # ------------------------------------------------------------------------------------ nothing crashes
 
 GROWING = FitConfig.preset(
-    "paper", num_gaussians=100, steps=120, degree=3, initialization="clip", growth=Growth(prune_radius=20.0), quality=60
+    "paper",
+    num_gaussians=100,
+    steps=120,
+    degree=3,
+    initialization="static",
+    **{"strategy.growth": Growth(prune_radius=20.0)},
+    quality=60,
 )
 EDGES = {
     "alpha": (with_alpha(FRAMES), CONFIG),
@@ -379,8 +385,8 @@ EDGES = {
     "degree 0": (FRAMES, dataclasses.replace(CONFIG, degree=0)),
     "degree 7": (FRAMES, dataclasses.replace(CONFIG, degree=7)),
     "no paths": (FRAMES, dataclasses.replace(CONFIG, follow_camera=False)),
-    "at rest": (FRAMES, dataclasses.replace(CONFIG, follow_motion=False)),
-    "fixed times": (FRAMES, dataclasses.replace(CONFIG, learn_frame_times=False, sparse_updates=False)),
+    "at rest": (FRAMES, dataclasses.replace(CONFIG, initialization="static")),
+    "fixed times": (FRAMES, CONFIG.replace(**{"rates.frame_times": 0.0, "strategy.sparse_updates": False})),
     "minutes": (FRAMES, dataclasses.replace(CONFIG, steps=None, minutes=0.01)),
     "black": (np.zeros_like(FRAMES), CONFIG),
     "clear": (np.zeros((4, 24, 32, 4), np.uint8), CONFIG),
@@ -500,7 +506,7 @@ def test_models_with_paths_are_compressed(tmp_path, frames):
 
 def test_the_state_given_is_the_one_that_is_made_compact(fitted):
     """`start_from` with a goal leaves the actions of the part that is over out."""
-    config = dataclasses.replace(CONFIG, degree=fitted.degree, relocated_fraction=0.0)
+    config = CONFIG.replace(degree=fitted.degree, **{"strategy.relocated_fraction": 0.0})
     state = start_from(fitted, config, 30, 0.85)
     assert state.rate_actions == count_past(0.85)
     for state, _ in fit_steps(FRAMES, config, state):  # noqa: B020

@@ -8,7 +8,7 @@ import pytest
 from clips import moving_blobs
 
 from foldgauss.render import cpu
-from foldgauss.video import FitConfig, Growth, LearningRates, evaluate, fit, fit_steps
+from foldgauss.video import FitConfig, Growth, LearningRates, Strategy, Views, evaluate, fit, fit_steps
 from foldgauss.video.fitting.loop import start
 from foldgauss.video.fitting.relocation import RELOCATED_AT, measure_influence, relocate
 from foldgauss.video.fitting.schedule import COLD, RateSchedule, choose_views, steps_per_pass
@@ -24,7 +24,7 @@ SPEC = ConditioningSpec(CONFIG.fold_degree, CONFIG.power, CONFIG.floor, FRAMES.s
 
 
 def fitted_state(step: int = 40, config: FitConfig = CONFIG):
-    for state, info in fit_steps(FRAMES, dataclasses.replace(config, relocated_fraction=0)):
+    for state, info in fit_steps(FRAMES, config.replace(**{"strategy.relocated_fraction": 0})):
         if info.step == step:
             return state
     raise AssertionError
@@ -59,7 +59,7 @@ def test_new_gaussians_are_where_errors_are():
     before = state.copy()
     state.frame_errors[:] = 1e-12
     state.frame_errors[4] = 0.1
-    relocate(state, FRAMES, dataclasses.replace(CONFIG, relocated_fraction=0.1), SPEC, motion_finder(FRAMES)())
+    relocate(state, FRAMES, CONFIG.replace(**{"strategy.relocated_fraction": 0.1}), SPEC, motion_finder(FRAMES)())
     assert state.num_gaussians == CONFIG.num_gaussians
     new = state.counts == 0
     assert new.sum() == 30
@@ -78,7 +78,7 @@ def test_new_gaussians_are_in_the_chunk_of_those_behind_them():
     """Where a long step leads past both the sorting into chunks and the relocation."""
     state = fitted_state()
     state.chunks = np.repeat(np.array([7, 3, 0], np.uint16), 100)
-    relocate(state, FRAMES, dataclasses.replace(CONFIG, relocated_fraction=0.1), SPEC, None)
+    relocate(state, FRAMES, CONFIG.replace(**{"strategy.relocated_fraction": 0.1}), SPEC, None)
     new = np.flatnonzero(state.counts == 0)
     assert len(new) == 30
     assert state.chunks.dtype == np.uint16
@@ -91,7 +91,7 @@ def test_only_gaussians_that_can_be_judged_move():
     state = fitted_state()
     state.counts[:280] = 4
     before = state.rows.copy()
-    relocate(state, FRAMES, dataclasses.replace(CONFIG, relocated_fraction=0.5), SPEC, None)
+    relocate(state, FRAMES, CONFIG.replace(**{"strategy.relocated_fraction": 0.5}), SPEC, None)
     kept = {row.tobytes() for row in state.rows}
     assert all(row.tobytes() in kept for row in before[:280])
     assert sum(row.tobytes() in kept for row in before) == 290
@@ -104,7 +104,7 @@ def test_gaussians_alive_in_no_frame_move_first():
     state.rows[between, at["time_loc_logit"].start] = 0  # t = 0.5 lies between two frames
     state.counts[between] = 0
     before = state.rows[between].copy()
-    relocate(state, FRAMES, dataclasses.replace(CONFIG, relocated_fraction=0.01), SPEC, None)
+    relocate(state, FRAMES, CONFIG.replace(**{"strategy.relocated_fraction": 0.01}), SPEC, None)
     kept = {row.tobytes() for row in state.rows}
     assert not any(row.tobytes() in kept for row in before)
 
@@ -113,7 +113,7 @@ def test_new_gaussians_lie_among_those_of_their_time():
     state, at = fitted_state(), columns(CONFIG.fold_degree)
     state.frame_errors[:] = 1e-12
     state.frame_errors[5] = 0.1
-    relocate(state, FRAMES, dataclasses.replace(CONFIG, relocated_fraction=0.2), SPEC, None)
+    relocate(state, FRAMES, CONFIG.replace(**{"strategy.relocated_fraction": 0.2}), SPEC, None)
     new = np.flatnonzero(state.counts == 0)
     assert len(new) == 60
     times = np.sort(state.rows[state.counts > 0, at["time_loc_logit"].start])
@@ -126,20 +126,20 @@ def test_new_gaussians_lie_among_those_of_their_time():
     ("changes", "times"),
     [
         ({}, 3),
-        ({"relocated_fraction": 0.0}, 0),
+        ({"strategy.relocated_fraction": 0.0}, 0),
         ({"steps": 20}, 1),  # a pass takes 9 steps
-        ({"sparse_updates": False}, 0),
-        pytest.param({"two_cameras": True, "batch_size": 2}, 3, marks=pytest.mark.slow),
-        ({"interpolation_fraction": 0.5}, 3),
+        ({"strategy.sparse_updates": False}, 0),
+        pytest.param({"views.two_cameras": True, "views.batch_size": 2}, 3, marks=pytest.mark.slow),
+        ({"views.interpolation_fraction": 0.5}, 3),
         pytest.param({"compositing": "sum"}, 3, marks=pytest.mark.slow),
-        ({"growth": Growth()}, 0),
+        ({"strategy.growth": Growth()}, 0),
         ({"rates": LearningRates(color_dc=1e5)}, 0),  # it diverges
     ],
 )
 @pytest.mark.filterwarnings("ignore::foldgauss.video.DivergenceWarning")
 def test_when_gaussians_are_relocated(changes, times, monkeypatch):
     """At the stated fractions of the plan, after a pass at least, in fits that converge."""
-    config, steps, whole = dataclasses.replace(CONFIG, **changes), [], CpuStepper.relocate
+    config, steps, whole = CONFIG.replace(**changes), [], CpuStepper.relocate
     spy = lambda self, state: steps.append(state.step) or whole(self, state)  # noqa: E731
     monkeypatch.setattr(CpuStepper, "relocate", spy)
     model = fit(FRAMES, config).model
@@ -184,7 +184,9 @@ def test_relocation_finds_what_the_start_missed():
     frames[4, 8:40, 14:50] = rng.integers(0, 255, (4, 3, 3)).astype(np.uint8).repeat(8, 0).repeat(12, 1)
     worst = {}
     for fraction in (0.0, 0.1):
-        config = FitConfig(num_gaussians=150, steps=600, relocated_fraction=fraction, error_fraction=0)
+        config = FitConfig(
+            num_gaussians=150, steps=600, strategy=Strategy(relocated_fraction=fraction), views=Views(error_fraction=0)
+        )
         worst[fraction] = min(evaluate(fit(frames, config).model, frames).psnr)
     assert worst[0.1] > worst[0.0] + 1
 
@@ -199,7 +201,7 @@ def all_views(config: FitConfig, errors: np.ndarray, steps: int) -> np.ndarray:
 @pytest.mark.parametrize("batch_size", [1, 3])
 def test_views_are_drawn_by_error(batch_size):
     """Shares of views: 0.7 / 5 for each frame in turn, and 0.3 in proportion to the errors, within 4 sigma."""
-    config, errors = FitConfig(num_gaussians=20, batch_size=batch_size), np.array([1, 2, 3, 4, 90.0])
+    config, errors = FitConfig(num_gaussians=20, views=Views(batch_size=batch_size)), np.array([1, 2, 3, 4, 90.0])
     views = all_views(config, errors, 4000 // batch_size)
     by_error = errors / errors.sum()
     got = np.bincount(views, minlength=5) / len(views)
@@ -212,7 +214,9 @@ def test_views_are_drawn_by_error(batch_size):
 @pytest.mark.parametrize("batch_size", [1, 3])
 def test_every_pass_sees_all_views(fraction, two_cameras, batch_size):
     """In any `steps_per_pass` steps from a pass's beginning, whatever the errors."""
-    config = FitConfig(num_gaussians=20, error_fraction=fraction, two_cameras=two_cameras, batch_size=batch_size)
+    config = FitConfig(
+        num_gaussians=20, views=Views(error_fraction=fraction, two_cameras=two_cameras, batch_size=batch_size)
+    )
     errors, length = np.array([1e-9] * 6 + [1.0]), steps_per_pass(config, 7)
     views = all_views(config, errors, length)
     assert set(views) == set(range(14 if two_cameras else 7))
@@ -220,7 +224,7 @@ def test_every_pass_sees_all_views(fraction, two_cameras, batch_size):
 
 
 def test_views_by_error_are_of_both_cameras():
-    config = FitConfig(num_gaussians=20, two_cameras=True, error_fraction=0.9)
+    config = FitConfig(num_gaussians=20, views=Views(two_cameras=True, error_fraction=0.9))
     counts = np.bincount(all_views(config, np.array([1e-9, 1.0]), 400), minlength=4)
     assert min(counts[1], counts[3]) > 120
     assert max(counts[0], counts[2]) < 30
@@ -228,7 +232,7 @@ def test_views_by_error_are_of_both_cameras():
 
 @pytest.mark.parametrize("unknown", [0.0, np.inf, np.nan])
 def test_frames_without_an_error_count_as_average(unknown):
-    config = FitConfig(num_gaussians=20, error_fraction=0.9)
+    config = FitConfig(num_gaussians=20, views=Views(error_fraction=0.9))
     views = all_views(config, np.array([unknown, 1.0, 3.0, unknown]), 2000)
     got = np.bincount(views, minlength=4) / len(views)
     np.testing.assert_allclose(got, 0.025 + 0.9 * np.array([2, 1, 3, 2]) / 8, atol=0.04)
@@ -240,7 +244,7 @@ def test_frames_without_an_error_count_as_average(unknown):
 
 def test_rates_cool_down():
     """As without a cooldown until it begins, continuous there, and almost 0 at the end."""
-    warm, cool = (RateSchedule(FitConfig(final_rate=0.25, cooldown_fraction=part)) for part in (0.0, 0.2))
+    warm, cool = (RateSchedule(FitConfig(rates=LearningRates(final=0.25, cooldown=part))) for part in (0.0, 0.2))
     for progress in (0.0, 0.5, 0.7999):
         np.testing.assert_allclose(cool.at(progress, 0)[0], warm.at(progress, 0)[0], rtol=1e-6)
     np.testing.assert_allclose(cool.at(0.9, 0)[0], (COLD + 0.5 * (1 - COLD)) * warm.at(0.9, 0)[0], rtol=1e-5)
@@ -249,5 +253,5 @@ def test_rates_cool_down():
 
 def test_the_published_recipe_has_none_of_it():
     config = FitConfig.preset("paper")
-    assert (config.cooldown_fraction, config.error_fraction, config.relocated_fraction) == (0, 0, 0)
+    assert (config.rates.cooldown, config.views.error_fraction, config.strategy.relocated_fraction) == (0, 0, 0)
     assert start(FRAMES, dataclasses.replace(config, num_gaussians=50)).num_gaussians == 50

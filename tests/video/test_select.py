@@ -16,6 +16,7 @@ from foldgauss.video import (
     FitConfig,
     FrameTimes,
     Selection,
+    Views,
     by_box,
     by_click,
     by_color,
@@ -465,7 +466,7 @@ def test_bad_models():
 @pytest.fixture(scope="module")
 def fitted():
     frames, labels = textured_clip()
-    return fit(frames, FitConfig(num_gaussians=3000, steps=600, error_fraction=0, seed=2)).model, labels
+    return fit(frames, FitConfig(num_gaussians=3000, steps=600, views=Views(error_fraction=0), seed=2)).model, labels
 
 
 def overlap(model, selection, masks):

@@ -306,10 +306,10 @@ def _print_plan(clip: Clip, config: FitConfig, display: Display) -> None:
         warn(f"{clip.source}: {text}")
     num, at_most = plan_gaussians(config, clip.num_frames, height, width)
     steps = planned_steps(config, clip.num_frames)
-    if steps is not None and steps * config.batch_size < clip.num_frames:
+    if steps is not None and steps * config.views.batch_size < clip.num_frames:
         warn(
-            f"--steps: {steps:,} steps use {steps * config.batch_size:,} of {clip.num_frames:,} frames; the others "
-            "keep their initial Gaussians, which look faint."
+            f"--steps: {steps:,} steps use {steps * config.views.batch_size:,} of {clip.num_frames:,} frames; the "
+            "others keep their initial Gaussians, which look faint."
         )
     if display == "json":
         about = {"clip": clip.source, "num_frames": clip.num_frames, "height": height, "width": width}
@@ -317,7 +317,7 @@ def _print_plan(clip: Clip, config: FitConfig, display: Display) -> None:
     if display in ("json", "quiet"):
         return
     plan = describe_budgets(config, steps)
-    growing = "" if config.growth is None else " at the start"
+    growing = "" if config.strategy.growth is None else " at the start"
     computed = f"{num_threads()} threads" if engine == "cpu" else f"engine {engine} on {describe_device()}"
     out.print(
         f"{clip.source}: {format_count(clip.num_frames, 'frame')} of {height}x{width}"

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from foldgauss._runtime.settings import setting_of, type_of
+from foldgauss._runtime.settings import setting_of, settings_by_name, type_of, walk
 from foldgauss.cli.app.application import WrongUse, err, name_option
 from foldgauss.cli.app.completion import complete_choice
 from foldgauss.cli.fitting.progress import Display
@@ -71,15 +71,15 @@ Threads = Annotated[
 ]
 
 
-def _fields() -> dict[str, dataclasses.Field]:
-    """The fields of `FitConfig` that have an option, by the option's name as a parameter."""
-    fields = [field for field in dataclasses.fields(FitConfig) if setting_of(field).option]
-    names = (setting_of(field).option.split("/")[0] for field in fields)
-    return {name.removeprefix("--").replace("-", "_"): field for name, field in zip(names, fields, strict=True)}
+def _parameter(option: str) -> str:
+    """The name of an option as a parameter."""
+    return option.split("/")[0].removeprefix("--").replace("-", "_")
 
 
-#: Options of `FitConfig`.
-CONFIG_FIELDS = _fields()
+#: The settings that have an option, by their names.
+CONFIG_FIELDS = {name: field for name, field, _ in walk(FitConfig) if setting_of(field).option}
+#: Their names by those of their options as parameters.
+_NAMES = {_parameter(setting_of(field).option): name for name, field in CONFIG_FIELDS.items()}
 _CONSTANTS = {
     "alpha_cutoff": AlphaCutoff,
     "support_radius": SupportRadius,
@@ -93,7 +93,7 @@ def config_from_options(preset: str, **options: Any) -> FitConfig:
     Raises WrongUse for values that are not valid.
     """
     given = {name: value for name, value in options.items() if value is not None}
-    changes = {field.name: given[name] for name, field in CONFIG_FIELDS.items() if name in given}
+    changes = {name: given[parameter] for parameter, name in _NAMES.items() if parameter in given}
     try:
         config = FitConfig.preset(preset, **changes)
     except ValueError as error:
@@ -110,7 +110,7 @@ def fit_options(command: Callable[..., None]) -> Callable[..., None]:
     """
     options = [
         inspect.Parameter("preset", _KIND, default="standard", annotation=Preset),
-        *(_option(name, field) for name, field in CONFIG_FIELDS.items()),
+        *(_option(parameter, name) for parameter, name in _NAMES.items()),
         *(inspect.Parameter(name, _KIND, default=None, annotation=kind) for name, kind in _CONSTANTS.items()),
     ]
     own = list(inspect.signature(command).parameters.values())
@@ -130,23 +130,24 @@ def fit_options(command: Callable[..., None]) -> Callable[..., None]:
 _KIND = inspect.Parameter.POSITIONAL_OR_KEYWORD
 
 
-def _option(name: str, field: dataclasses.Field) -> inspect.Parameter:
+def _option(parameter: str, name: str) -> inspect.Parameter:
     """The parameter of a command for one setting."""
+    field = CONFIG_FIELDS[name]
     about = setting_of(field)
     option = typer.Option(
         about.option,
-        help=f"{about.help}{_default(field)}.",
+        help=f"{about.help}{_default(name, field)}.",
         rich_help_panel=PANELS[about.group],
         autocompletion=complete_choice(about.choices) if about.choices else None,
     )
-    return inspect.Parameter(name, _KIND, default=None, annotation=Annotated[type_of(field) | None, option])
+    return inspect.Parameter(parameter, _KIND, default=None, annotation=Annotated[type_of(field) | None, option])
 
 
-def _default(field: dataclasses.Field) -> str:
+def _default(name: str, field: dataclasses.Field) -> str:
     """The default in brackets, followed by those of presets that change it; nothing for None without a meaning."""
     default = setting_of(field).unset if field.default is None else _text(field.default)
-    presets = {name: _text(values[field.name]) for name, values in PRESETS.items() if field.name in values}
-    changed = [f"{name}: {value}" for name, value in presets.items() if value != default]
+    presets = {preset: _text(settings_by_name(FitConfig(**changes))[name]) for preset, changes in PRESETS.items()}
+    changed = [f"{preset}: {value}" for preset, value in presets.items() if value not in (default, "None")]
     return f" [default: {'; '.join([default, *changed])}]" if default else ""
 
 

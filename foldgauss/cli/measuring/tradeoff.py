@@ -194,7 +194,7 @@ class _Run:
     def _choose_number(self, wanted: FitConfig) -> int:
         """The number of Gaussians that a fit with `wanted` begins with."""
         lifetime = TYPICAL_LIFETIME
-        if wanted.num_gaussians is None and wanted.follow_motion:
+        if wanted.num_gaussians is None and wanted.follows_motion:
             frames = np.ascontiguousarray(self.clip.frames[..., :3])
             lifetime = measure_lifetime(frames, self._find_motion(), wanted.fold_degree)
         return chosen_num_gaussians(wanted, self.clip.num_frames, *self.clip.size, lifetime=lifetime)
@@ -319,7 +319,7 @@ class _Run:
             list(self._fit(dataclasses.replace(config, steps=2), lambda info: None))
             self._warm = True
         # Compile kernels on a corner of the clip: FitInfo.seconds excludes compilation, and CPU seconds must, too.
-        tiny = dataclasses.replace(config, num_gaussians=8, steps=1, follow_motion=False)
+        tiny = dataclasses.replace(config, num_gaussians=8, steps=1, initialization="static")
         list(fit_steps(self.clip.frames[:2, :32, :32].copy(), tiny))
         self._find_motion()  # outside the measured time
         begun = time.process_time()
@@ -328,7 +328,7 @@ class _Run:
         ):
             pass
         spent = _Spent(info.seconds, time.process_time() - begun)
-        if config.follow_motion:  # which `fit` includes in its time
+        if config.follows_motion:  # which `fit` includes in its time
             spent = spent.plus(_Spent(**self.record.plan["motion"]))
         show("evaluating")
         ended = _Spent.now()

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from foldgauss._runtime.checks import is_integer, is_within, short_repr
 from foldgauss._runtime.machine import describe_machine
-from foldgauss._runtime.settings import setting_of
+from foldgauss._runtime.settings import setting_of, settings_by_name
 from foldgauss.analysis.plot import Panel
 from foldgauss.cli.app.application import WrongUse, out, warn
 from foldgauss.cli.fitting.options import CONFIG_FIELDS
@@ -32,7 +32,7 @@ from foldgauss.video.tradeoff import Point, Skipped, knee, pareto_front
 RECORD, ROWS, PLOT, BASE = "tradeoff.json", "tradeoff.csv", "tradeoff.png", "base.safetensors"
 FILES = {RECORD, ROWS, PLOT, BASE}
 #: Options of `fit` by field of `FitConfig`, and of `fit` and `evaluate` by constant of `RenderOptions`.
-FIT_OPTIONS = {field.name: setting_of(field).option for field in CONFIG_FIELDS.values()}
+FIT_OPTIONS = {name: setting_of(field).option for name, field in CONFIG_FIELDS.items()}
 RENDER_OPTIONS = {
     name: f"--{name.replace('_', '-')}" for name in ("alpha_cutoff", "support_radius", "transmittance_stop")
 }
@@ -182,9 +182,9 @@ class Commands:
 
 def _changed(now: FitConfig | RenderOptions, before: FitConfig | RenderOptions, options: dict[str, str]) -> list[str]:
     """Options for all fields that differ."""
-    names = [field.name for field in dataclasses.fields(now) if field.name != "options"]
-    changed = [name for name in names if getattr(now, name) != getattr(before, name)]
-    return list(itertools.chain.from_iterable(_words(name, getattr(now, name), options) for name in changed))
+    values, others = settings_by_name(now), settings_by_name(before)
+    changed = [name for name in values if name != "options" and values[name] != others[name]]
+    return list(itertools.chain.from_iterable(_words(name, values[name], options) for name in changed))
 
 
 def _words(name: str, value: Any, options: dict[str, str]) -> list[str]:
@@ -194,10 +194,11 @@ def _words(name: str, value: Any, options: dict[str, str]) -> list[str]:
 
 def changed_settings(point: Point, base: FitConfig) -> dict[str, Any]:
     """Every setting that differs from the base."""
+    before = settings_by_name(base)
     changed = {
-        field.name: getattr(point.config, field.name)
-        for field in dataclasses.fields(base)
-        if field.name != "options" and getattr(point.config, field.name) != getattr(base, field.name)
+        name: value
+        for name, value in settings_by_name(point.config).items()
+        if name != "options" and value != before[name]
     }
     options = point.config.options if point.played is None else point.played
     word = "fitted" if point.played is None else "played"

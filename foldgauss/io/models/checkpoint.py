@@ -14,8 +14,6 @@ from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.state import FitState, Sizes
 
 CHECKPOINT = "fit-checkpoint"
-#: The one setting that may differ where a fit is resumed: no step depends on it unless the fit diverges.
-FREE = "on_divergence"
 
 
 def save_checkpoint(path: PathLike, state: FitState, *, config: FitConfig, source: dict) -> Path:
@@ -30,7 +28,6 @@ def load_checkpoint(path: PathLike, *, config: FitConfig, source: dict) -> FitSt
     for part, now in (("config", dataclasses.asdict(config)), ("source", source)):
         before = kept.get(part)
         before = before if isinstance(before, dict) else {}
-        now, before = ({name: value for name, value in one.items() if name != FREE} for one in (now, before))
         changed = sorted(name for name in now.keys() | before.keys() if now.get(name) != before.get(name))
         cure = f"Resume {str(path)!r} with the options it was started with, or start a new fit with --overwrite."
         if part == "config" and now.keys() != before.keys():

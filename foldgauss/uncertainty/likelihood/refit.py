@@ -30,7 +30,7 @@ from foldgauss.video.models.video_model import VideoModel
 METHODS, STARTS, PLACES = ("pixels", "frames", "order"), ("model", "scratch"), ("kept", "moved")
 #: A refit that starts at the model repeats the schedule from this fraction on, with its last learning rates and loss.
 START_AT = 0.7
-#: The least `FitConfig.cooldown_fraction` of refits: the spread is that of the estimate, not of its last steps.
+#: The least `LearningRates.cooldown` of refits: the spread is that of the estimate, not of its last steps.
 COOLDOWN_FRACTION = 0.2
 #: Grid search for the time of a left-out frame: points per grid, and number of ever finer grids.
 GRID_POINTS, GRID_ROUNDS = 33, 3
@@ -277,17 +277,19 @@ def _check_video(model: VideoModel, video: np.ndarray, method: str) -> Residuals
 
 def _fix_steps(config: FitConfig, num_frames: int, start: str, steps: int | None) -> FitConfig:
     """The config with the fixed number of steps of a refit."""
-    if not config.learn_frame_times:
-        raise invalid("config.learn_frame_times", expected="True", got=False, cure="Fixed frame times have no spread.")
+    if not config.learns_frame_times:
+        raise invalid(
+            "config.rates.frame_times", expected="a number > 0", got=0, cure="Fixed frame times have no spread."
+        )
     if steps is None:
         if config.steps is None and config.minutes is not None:
             cure = "A fit that ends by the clock cannot be repeated."
             raise invalid("steps", expected="a number for a config with minutes alone", got=None, cure=cure)
         steps = planned_steps(dataclasses.replace(config, minutes=None), num_frames)
         steps = steps if start == "scratch" else max(1, round((1 - START_AT) * steps))
-    cooldown = max(config.cooldown_fraction, COOLDOWN_FRACTION)
+    rates = dataclasses.replace(config.rates, cooldown=max(config.rates.cooldown, COOLDOWN_FRACTION))
     float32 = {"quality": None, "size_mb": None, "psnr": None}
-    return dataclasses.replace(config, steps=steps, minutes=None, cooldown_fraction=cooldown, **float32)
+    return dataclasses.replace(config, steps=steps, minutes=None, rates=rates, **float32)
 
 
 def resample_frames(

@@ -36,7 +36,7 @@ class StepPlanner:
         """Plan the steps of the whole fit, if it is time, after a step."""
         config, passed = self.config, state.seconds - self.before
         self.before = state.seconds
-        if config.minutes is None or (state.plan and (config.growth is not None or state.step >= state.plan)):
+        if config.minutes is None or (state.plan and (config.strategy.growth is not None or state.step >= state.plan)):
             return
         budget = 60 * config.minutes
         if not state.plan and (state.step == config.steps or state.seconds >= budget):
@@ -98,7 +98,7 @@ def measure_progress(state: FitState, config: FitConfig, step: int | None = None
 def find_limit(state: FitState, config: FitConfig) -> str | None:
     """The budget that ends the fit now: "steps" or "minutes"."""
     # Minutes are planned by the speed with the Gaussians at the start: where Gaussians are added, the clock decides.
-    if config.growth is not None and config.minutes is not None and state.seconds >= 60 * config.minutes:
+    if config.strategy.growth is not None and config.minutes is not None and state.seconds >= 60 * config.minutes:
         return "minutes"
     if not state.plan or state.step < state.plan:
         return None

@@ -8,7 +8,7 @@ import numpy as np
 
 from foldgauss._runtime.checks import invalid
 from foldgauss.video.compression.quantize import Quantized, dequantize
-from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig, planned_steps
+from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig, Strategy, Views, planned_steps
 from foldgauss.video.fitting.loop import FitInfo, check_frames, finish, fit_steps, start_from
 from foldgauss.video.fitting.rate import COMPRESSION_START, RateControl
 from foldgauss.video.fitting.state import FitState
@@ -88,9 +88,8 @@ def _make_config(model: VideoModel, **goals: float | None) -> FitConfig:
         floor=float(floor[0]),
         compositing=model.compositing,
         options=model.options,
-        scale_cutoff=model.scale_cutoff,
-        relocated_fraction=0.0,
-        interpolation_fraction=0.0,
+        strategy=Strategy(relocated_fraction=0.0, scale_cutoff=model.scale_cutoff),
+        views=Views(interpolation_fraction=0.0),
         **goals,
     )
 

@@ -5,59 +5,199 @@ import math
 from dataclasses import field
 from typing import Any
 
-from foldgauss._runtime.checks import check_one_of, invalid, is_within
-from foldgauss._runtime.settings import check_settings, setting
+from foldgauss._runtime.checks import check_one_of, invalid
+from foldgauss._runtime.settings import check_settings, replace_settings, setting, walk
 from foldgauss._runtime.threads import num_threads
 from foldgauss.render import COMPOSITINGS, RenderOptions
 from foldgauss.video.fitting.adam import RateUnits
 from foldgauss.video.fitting.growth import EXTENT, PUBLISHED_STEPS, PUBLISHED_UNIT, Growth
 from foldgauss.video.models.row_layout import MAX_DEGREE
 
+#: Groups of settings, which are the panels of `foldgauss fit --help`.
+MODEL, BUDGET, OPTIMIZATION = "model", "budget", "optimization"
+#: The sigma_t, and the size in units of the frame's longer side, at which the learning rates of positions, folds and
+#: m_t are stated.
+UNIT_TIME = 0.06
+UNIT_SIZE = 0.005
+#: The most Gaussians of a fit. Their state takes about 3 GB at degree 3; the paper's largest fit ends with 1.8 million.
+MAX_GAUSSIANS = 10_000_000
+#: The default of `Views.interpolation_fraction`.
+INTERPOLATION_FRACTION = 0.1
+#: How Gaussians are initialized: from the clip, with paths along the optical flow or static ones, or uniformly.
+INITIALIZATIONS = ("flow", "static", "uniform")
+#: Which learning rates decay.
+DECAYED = ("all", "loc")
+#: Engines that compute the steps of a fit, named as those of `render`.
+FIT_ENGINES = ("auto", "cpu", "xla", "pallas")
+
+
+def _rate(leaf: str, default: float) -> Any:
+    return field(default=default, metadata=setting(f"Of {leaf}", bounds="[0, inf)"))
+
 
 @dataclasses.dataclass(frozen=True)
 class LearningRates:
-    """Learning rates of Adam at the first step, by leaf, in model space (the frame's longer side is 1).
+    """Learning rates of Adam at the first step, by leaf, in model space (the frame's longer side is 1); their schedule.
 
-    `frame_times` is that of the times of frames, `paths` that of the maps of shared paths.
-
-    With `FitConfig.scale_rates_by_size` the unit of length is each Gaussian's own size s, the geometric mean of its
-    standard deviations: the learning rates of m_s and c_k are `loc` and `coefficients` times s / UNIT_SIZE.
-    With `FitConfig.scale_rates_by_duration` the unit of time is its own duration: the learning rate of c_k is
-    `coefficients` times (UNIT_TIME / sigma_t)^k, that of m_t is `time_loc_logit` sigma_t / UNIT_TIME. That of a path is
-    `paths` times s / UNIT_SIZE, with s the mean size of the Gaussians.
+    With `by_size` the unit of length is each Gaussian's own size s, the geometric mean of its standard deviations: the
+    learning rates of m_s and c_k are `loc` and `coefficients` times s / UNIT_SIZE.
+    With `by_duration` the unit of time is its own duration: the learning rate of c_k is `coefficients` times
+    (UNIT_TIME / sigma_t)^k, that of m_t is `time_loc_logit` sigma_t / UNIT_TIME. That of a path is `paths` times
+    s / UNIT_SIZE, with s the mean size of the Gaussians.
     A step then moves small and large, short and long Gaussians by the same fraction of their sizes and durations.
     """
 
-    loc: float = 3.5e-4
-    coefficients: float = 2e-3
-    log_scale: float = 0.03
-    angle_logit: float = 0.03
-    opacity_logit: float = 0.075
-    color_dc: float = 0.03
-    time_loc_logit: float = 0.02
-    log_time_scale: float = 0.05
-    frame_times: float = 3e-3
-    paths: float = 7e-4
+    loc: float = _rate("m_s", 3.5e-4)
+    coefficients: float = _rate("the fold's coefficients c_k", 2e-3)
+    log_scale: float = _rate("the logarithms of the standard deviations in space", 0.03)
+    angle_logit: float = _rate("the angle, before its sigmoid", 0.03)
+    opacity_logit: float = _rate("the opacity, before its sigmoid", 0.075)
+    color_dc: float = _rate("the color", 0.03)
+    time_loc_logit: float = _rate("m_t, before its sigmoid", 0.02)
+    log_time_scale: float = _rate("log sigma_t", 0.05)
+    frame_times: float = _rate("the times of the frames, which stay as they start if it is 0", 3e-3)
+    paths: float = _rate("the maps of shared paths", 7e-4)
+    final: float = field(
+        default=0.2,
+        metadata=setting("Learning rates decay exponentially to this fraction of these values", bounds="[0, 1]"),
+    )
+    cooldown: float = field(
+        default=0.2,
+        metadata=setting(
+            "Fraction of the steps, at the end, in which learning rates also decrease linearly, to 2%",
+            "Averages out the noise of single frames in the gradients.",
+            bounds="[0, 1]",
+        ),
+    )
+    decayed: str = field(
+        default="all", metadata=setting("Which learning rates decay: all, or that of positions", choices=DECAYED)
+    )
+    by_duration: bool = field(default=True, metadata=setting("Learning rates are in units of each Gaussian's duration"))
+    by_size: bool = field(default=True, metadata=setting("Learning rates are in units of each Gaussian's size"))
 
     def __post_init__(self) -> None:
-        for name, value in dataclasses.asdict(self).items():
-            if not is_within(value, "[0, inf)"):
-                raise invalid(f"rates.{name}", expected="a finite number >= 0", got=value)
+        check_settings(self, "rates.")
+
+    @property
+    def units(self) -> RateUnits:
+        """The units in which the learning rates are stated."""
+        return RateUnits(UNIT_TIME if self.by_duration else 0.0, UNIT_SIZE if self.by_size else 0.0)
 
 
-#: The sigma_t, and the size in units of the frame's longer side, at which the learning rates of positions, folds and
-#: m_t are stated.
-UNIT_TIME, UNIT_SIZE = 0.06, 0.005
-#: Their state takes about 3 GB at degree 3; the paper's largest fit ends with 1.8 million.
-MAX_GAUSSIANS = 10_000_000
+@dataclasses.dataclass(frozen=True)
+class Loss:
+    """The loss of an image: first L1 and D-SSIM (Kerbl et al. 2023, eq. 7), then the squared error."""
+
+    ssim_fraction: float = field(
+        default=0.2,
+        metadata=setting(
+            "Fraction of D-SSIM in the first loss, the rest is L1",
+            bounds="[0, 1]",
+            option="--ssim-fraction",
+            group=OPTIMIZATION,
+        ),
+    )
+    l2_fraction: float = field(
+        default=0.3,
+        metadata=setting(
+            "Fraction of the steps, at the end, whose loss is the squared error, which PSNR measures",
+            "For a compact model the squared error begins earlier.",
+            bounds="[0, 1]",
+        ),
+    )
+    border_weight: float = field(
+        default=4.0,
+        metadata=setting("Factor of the gradient at the outermost pixels, covered from one side", bounds="[1, inf)"),
+    )
+
+    def __post_init__(self) -> None:
+        check_settings(self, "loss.")
+
+
+@dataclasses.dataclass(frozen=True)
+class Views:
+    """The images that each step is fitted to.
+
+    With `two_cameras`, half of the views of a pass are those of an opposite camera: the mirrored frame, and the splats
+    seen from behind. Flat Gaussians in one plane look mirrored from there, in the same order, so the gradients equal
+    those of the front view up to rounding, and a pass takes twice as long. It exists for fidelity to the paper.
+    """
+
+    batch_size: int = field(
+        default=1, metadata=setting("Frames per step", least=1, option="--batch-size", group=OPTIMIZATION)
+    )
+    error_fraction: float = field(
+        default=0.3,
+        metadata=setting(
+            "Fraction of the views that are chosen in proportion to the squared errors of the frames",
+            "In between, all frames are visited in turn. Improves the worst frames.",
+            bounds="[0, 1)",
+        ),
+    )
+    interpolation_fraction: float | None = field(
+        default=None,
+        metadata=setting(
+            "Of the steps before interpolation ends, the fraction that fits frames interpolated by optical flow",
+            "Improves the times between frames, for slow motion. Interpolation ends at `interpolation_end`. Views that "
+            "are drawn by error (`error_fraction`) are never interpolated, which limits the fraction.",
+            bounds="[0, 1)",
+            unset=f"{INTERPOLATION_FRACTION:g}; 0 with alpha or no optical flow",
+            option="--interpolation-fraction",
+            group=OPTIMIZATION,
+        ),
+    )
+    interpolation_end: float = field(
+        default=0.5,
+        metadata=setting(
+            "Fraction of the steps after which no interpolated frames are fitted any more",
+            "With more, times between frames improve further, at the cost of the frames: the last steps recover them.",
+            bounds="[0, 1]",
+            option="--interpolation-end",
+            group=OPTIMIZATION,
+        ),
+    )
+    two_cameras: bool = field(
+        default=False, metadata=setting("Also fit the mirrored frames, as seen by an opposite camera")
+    )
+
+    def __post_init__(self) -> None:
+        check_settings(self, "views.")
+
+
+@dataclasses.dataclass(frozen=True)
+class Strategy:
+    """Which Gaussians there are, and which of them a step changes and renders."""
+
+    growth: Growth | None = field(
+        default=None, metadata=setting("Densification", unset="the number of Gaussians stays the same")
+    )
+    relocated_fraction: float = field(
+        default=0.05,
+        metadata=setting(
+            "Fraction of the Gaussians moved, three times, from the smallest contributions to the largest errors",
+            "Ignored with `growth`, which adds Gaussians itself, and without `sparse_updates`.",
+            bounds="[0, 0.5]",
+        ),
+    )
+    sparse_updates: bool = field(
+        default=True,
+        metadata=setting("Adam updates the Gaussians alive in the batch; otherwise all of them, as published"),
+    )
+    scale_cutoff: float = field(
+        default=0.0,
+        metadata=setting(
+            "Gaussians are rendered only where both standard deviations exceed this, in model units",
+            "These are shrunk by the envelope. The published code has 1e-4 of its units, 0.18 px of 640x1280.",
+            bounds="[0, 1)",
+        ),
+    )
+
+    def __post_init__(self) -> None:
+        check_settings(self, "strategy.")
+
+
 #: A low-pass filter of 0.1 px^2 fits finer detail than the usual 0.3.
 FINE = RenderOptions(low_pass=0.1)
-#: How Gaussians are initialized; which learning rates decay.
-INITIALIZATIONS, DECAYED = ("clip", "uniform"), ("all", "loc")
-#: Engines that compute the steps of a fit, named as those of `render`.
-FIT_ENGINES = ("auto", "cpu", "xla", "pallas")
-#: What a diverging fit does, see `divergence`.
-ON_DIVERGENCE = ("back-off", "stop")
 #: The published learning rates in our unit of length; published positions learn in units of the scene's extent.
 PUBLISHED_RATES = LearningRates(
     loc=1.6e-4 * EXTENT,
@@ -69,6 +209,11 @@ PUBLISHED_RATES = LearningRates(
     time_loc_logit=1e-3,
     log_time_scale=1e-3,
     frame_times=1e-3,
+    final=0.01,
+    cooldown=0.0,
+    decayed="loc",
+    by_duration=False,
+    by_size=False,
 )
 #: Standard deviations, in its units, above which the published code renders a Gaussian.
 PUBLISHED_SCALE_CUTOFF = 1e-4
@@ -80,36 +225,21 @@ PRESETS: dict[str, dict[str, Any]] = {
         "num_gaussians": 500_000,
         "degree": 7,
         "steps": PUBLISHED_STEPS,
-        "batch_size": 3,
         "power": 2.0,
-        "ssim_fraction": 0.2,
         "initialization": "uniform",
-        "follow_motion": False,
         "follow_camera": False,
-        "scale_rates_by_duration": False,
-        "scale_rates_by_size": False,
-        "sparse_updates": False,
-        "l2_fraction": 0.0,
-        "border_weight": 1.0,
+        "views": Views(batch_size=3, error_fraction=0.0, interpolation_fraction=0.0, two_cameras=True),
+        "loss": Loss(l2_fraction=0.0, border_weight=1.0),
         "rates": PUBLISHED_RATES,
-        "final_rate": 0.01,
-        "cooldown_fraction": 0.0,
-        "decayed": "loc",
-        "error_fraction": 0.0,
-        "relocated_fraction": 0.0,
-        "interpolation_fraction": 0.0,
-        "two_cameras": True,
-        "growth": Growth(),
-        "scale_cutoff": PUBLISHED_SCALE_CUTOFF * PUBLISHED_UNIT,
+        "strategy": Strategy(
+            growth=Growth(),
+            relocated_fraction=0.0,
+            sparse_updates=False,
+            scale_cutoff=PUBLISHED_SCALE_CUTOFF * PUBLISHED_UNIT,
+        ),
         "options": RenderOptions.standard(),
     },
 }
-
-
-#: The default of `FitConfig.interpolation_fraction`.
-INTERPOLATION_FRACTION = 0.1
-#: Groups of settings, which are the panels of `foldgauss fit --help`.
-MODEL, BUDGET, OPTIMIZATION = "model", "budget", "optimization"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,10 +251,6 @@ class FitConfig:
     With neither, the fit takes `DEFAULT_STEPS`, or more for long clips.
 
     `quality`, `size_mb` and `psnr` ask for a compact model, see `rate`; with several, the smallest of the models.
-
-    With `two_cameras`, half of the views of a pass are those of an opposite camera: the mirrored frame, and the splats
-    seen from behind. Flat Gaussians in one plane look mirrored from there, in the same order, so the gradients equal
-    those of the front view up to rounding, and a pass takes twice as long. It exists for fidelity to the paper.
 
     Documentation, valid values and command-line options of the fields are their metadata, see `_runtime.settings`.
     """
@@ -202,9 +328,6 @@ class FitConfig:
             group=BUDGET,
         ),
     )
-    batch_size: int = field(
-        default=1, metadata=setting("Frames per step", least=1, option="--batch-size", group=OPTIMIZATION)
-    )
     power: float = field(
         default=1.0,
         metadata=setting(
@@ -215,43 +338,21 @@ class FitConfig:
         ),
     )
     floor: float = field(default=0.0, metadata=setting("Floor of the envelope a(t)", bounds="[0, 1)", group=MODEL))
-    scale_cutoff: float = field(
-        default=0.0,
-        metadata=setting(
-            "Gaussians are rendered only where both standard deviations exceed this, in model units",
-            "These are shrunk by the envelope. The published code has 1e-4 of its units, 0.18 px of 640x1280.",
-            bounds="[0, 1)",
-            group=MODEL,
-        ),
-    )
-    ssim_fraction: float = field(
-        default=0.2,
-        metadata=setting(
-            "Fraction of D-SSIM in the loss, the rest is L1",
-            bounds="[0, 1]",
-            option="--ssim-fraction",
-            group=OPTIMIZATION,
-        ),
-    )
     seed: int = field(
         default=0,
         metadata=setting(
             "Random seed of the initialization and of the order of frames", option="--seed", group=OPTIMIZATION
         ),
     )
-    learn_frame_times: bool = field(default=True, metadata=setting("Optimize the frame times", group=MODEL))
     initialization: str = field(
-        default="clip",
+        default="flow",
         metadata=setting(
-            "Initial Gaussians are sampled from the detail and colors of the clip, or uniformly over frame and time",
+            "Initial Gaussians are sampled from the detail and colors of the clip, with paths along the optical flow "
+            "of their shot (flow) or without (static), or uniformly over frame and time",
             "See `initialize_uniform`.",
             choices=INITIALIZATIONS,
             group=OPTIMIZATION,
         ),
-    )
-    follow_motion: bool = field(
-        default=True,
-        metadata=setting("Initial paths follow the optical flow within each shot; otherwise they are static"),
     )
     follow_camera: bool = field(
         default=True,
@@ -259,101 +360,15 @@ class FitConfig:
             "Gaussians may follow the motion of the camera, or that of the largest moving object, each with a fold of "
             "its own in addition",
             "A Gaussian does so where its track is then longer or its fold smaller. None does where these move "
-            "steadily, nor without `follow_motion`.",
+            "steadily, nor with another `initialization` than flow.",
             option="--follow-camera/--no-follow-camera",
             group=MODEL,
         ),
     )
-    scale_rates_by_duration: bool = field(
-        default=True,
-        metadata=setting("Learning rates are in units of each Gaussian's duration", "See `LearningRates`."),
-    )
-    scale_rates_by_size: bool = field(
-        default=True,
-        metadata=setting("Learning rates are in units of each Gaussian's size", "See `LearningRates`."),
-    )
-    l2_fraction: float = field(
-        default=0.3,
-        metadata=setting(
-            "Fraction of the steps, at the end, whose loss is the squared error, which PSNR measures",
-            "For a compact model all have it.",
-            bounds="[0, 1]",
-        ),
-    )
-    border_weight: float = field(
-        default=4.0,
-        metadata=setting("Factor of the gradient at the outermost pixels, covered from one side", bounds="[1, inf)"),
-    )
-    interpolation_fraction: float | None = field(
-        default=None,
-        metadata=setting(
-            "Of the steps before interpolation ends, the fraction that fits frames interpolated by optical flow",
-            "Improves the times between frames, for slow motion. Interpolation ends at `interpolation_end`. Views that "
-            "are drawn by error (`error_fraction`) are never interpolated, which limits the fraction.",
-            bounds="[0, 1)",
-            unset=f"{INTERPOLATION_FRACTION:g}; 0 with alpha or no optical flow",
-            option="--interpolation-fraction",
-            group=OPTIMIZATION,
-        ),
-    )
-    interpolation_end: float = field(
-        default=0.5,
-        metadata=setting(
-            "Fraction of the steps after which no interpolated frames are fitted any more",
-            "With more, times between frames improve further, at the cost of the frames: the last steps recover them.",
-            bounds="[0, 1]",
-            option="--interpolation-end",
-            group=OPTIMIZATION,
-        ),
-    )
-    error_fraction: float = field(
-        default=0.3,
-        metadata=setting(
-            "Fraction of the views that are chosen in proportion to the squared errors of the frames",
-            "In between, all frames are visited in turn. Improves the worst frames.",
-            bounds="[0, 1)",
-            option="--error-fraction",
-            group=OPTIMIZATION,
-        ),
-    )
-    relocated_fraction: float = field(
-        default=0.05,
-        metadata=setting(
-            "Fraction of the Gaussians moved, three times, from the smallest contributions to the largest errors",
-            "Ignored with `growth`, which adds Gaussians itself, and without `sparse_updates`.",
-            bounds="[0, 0.5]",
-            option="--relocated-fraction",
-            group=OPTIMIZATION,
-        ),
-    )
-    sparse_updates: bool = field(
-        default=True,
-        metadata=setting("Adam updates the Gaussians alive in the batch; otherwise all of them, as published"),
-    )
-    rates: LearningRates = field(default=LearningRates(), metadata=setting("Learning rates at the first step"))
-    final_rate: float = field(
-        default=0.2,
-        metadata=setting(
-            "Learning rates decay exponentially to this fraction of their initial values", bounds="[0, 1]"
-        ),
-    )
-    cooldown_fraction: float = field(
-        default=0.2,
-        metadata=setting(
-            "Fraction of the steps, at the end, in which learning rates also decrease linearly, to 2%",
-            "Averages out the noise of single frames in the gradients.",
-            bounds="[0, 1]",
-        ),
-    )
-    decayed: str = field(
-        default="all", metadata=setting("Which learning rates decay: all, or that of positions", choices=DECAYED)
-    )
-    two_cameras: bool = field(
-        default=False, metadata=setting("Also fit the mirrored frames, as seen by an opposite camera")
-    )
-    growth: Growth | None = field(
-        default=None, metadata=setting("Densification", unset="the number of Gaussians stays the same")
-    )
+    views: Views = field(default=Views(), metadata=setting("The images that each step is fitted to"))
+    loss: Loss = field(default=Loss(), metadata=setting("The loss of an image"))
+    rates: LearningRates = field(default=LearningRates(), metadata=setting("Learning rates and their schedule"))
+    strategy: Strategy = field(default=Strategy(), metadata=setting("Which Gaussians there are"))
     compositing: str = field(
         default="over",
         metadata=setting(
@@ -365,16 +380,6 @@ class FitConfig:
         ),
     )
     options: RenderOptions = field(default=FINE, metadata=setting("Constants of the renderer", group=MODEL))
-    on_divergence: str = field(
-        default="back-off",
-        metadata=setting(
-            "What a diverging fit does: back-off (to the last finite state, with lower learning rates) or stop",
-            'With "stop" the fit raises `FitDiverged`.',
-            choices=ON_DIVERGENCE,
-            option="--on-divergence",
-            group=OPTIMIZATION,
-        ),
-    )
     engine: str = field(
         default="auto",
         metadata=setting(
@@ -388,8 +393,6 @@ class FitConfig:
 
     def __post_init__(self) -> None:
         check_settings(self)
-        if self.initialization == "uniform" and self.follow_motion:
-            raise invalid("follow_motion", expected="False with initialization 'uniform'", got=True)
 
     @property
     def is_compact(self) -> bool:
@@ -404,17 +407,22 @@ class FitConfig:
     @property
     def squared_from(self) -> float:
         """The fraction of the plan from which the loss is the squared error; for a compact model early."""
-        return COMPACT_SQUARED_FROM if self.is_compact else 1 - self.l2_fraction
+        return COMPACT_SQUARED_FROM if self.is_compact else 1 - self.loss.l2_fraction
 
     @property
-    def rate_units(self) -> RateUnits:
-        """The units in which `rates` are stated."""
-        by_time, by_size = self.scale_rates_by_duration, self.scale_rates_by_size
-        return RateUnits(UNIT_TIME if by_time else 0.0, UNIT_SIZE if by_size else 0.0)
+    def follows_motion(self) -> bool:
+        """Whether initial paths follow the optical flow."""
+        return self.initialization == "flow"
+
+    @property
+    def learns_frame_times(self) -> bool:
+        return self.rates.frame_times > 0
 
     @classmethod
     def preset(cls, name: str, **changes: Any) -> "FitConfig":
-        """A named configuration with `changes` to its fields; `minutes` without `steps` replace the preset's steps.
+        """A named configuration with `changes`; `minutes` without `steps` replace the preset's steps.
+
+        Changes are those of `replace`.
 
         * "standard": `FitConfig()`.
         * "draft": a first impression in a fraction of the time: 10,000 Gaussians, 800 steps.
@@ -423,19 +431,27 @@ class FitConfig:
           which only that of positions decays (to 1/100), Adam updates of all Gaussians, the published rasterizer's
           constants. Other numbers of steps scale the growth schedule in proportion, but not the learning rates, so fits
           of a few thousand steps stop early. As in the published code a Gaussian is rendered only where both standard
-          deviations, multiplied by the envelope, exceed 1e-4 of its units (`scale_cutoff`).
+          deviations, multiplied by the envelope, exceed 1e-4 of its units (`strategy.scale_cutoff`).
           Source: VeGaS, "Implementation Details", and constants of its published code.
 
         Raises ValueError for an unknown name or change. Example: `FitConfig.preset("paper", steps=3000)`.
         """
         check_one_of("preset", name, tuple(PRESETS))
-        unknown = changes.keys() - {field.name for field in dataclasses.fields(cls)}
-        if unknown:
-            raise invalid("changes", expected="fields of FitConfig", got=", ".join(sorted(unknown)))
         chosen = dict(PRESETS[name])
         if changes.get("minutes") is not None:
             chosen["steps"] = None
-        return cls(**(chosen | changes))
+        return cls(**chosen).replace(**changes)
+
+    def replace(self, **changes: Any) -> "FitConfig":
+        """This configuration with other values of some fields, also of those within a field, by names with a dot.
+
+        Raises ValueError for an unknown name or value. Example: `config.replace(steps=300, **{"views.batch_size": 2})`.
+        """
+        known = {name for name, _, _ in walk(self)} | {field.name for field in dataclasses.fields(self)}
+        unknown = changes.keys() - known
+        if unknown:
+            raise invalid("changes", expected="fields of FitConfig", got=", ".join(sorted(unknown)))
+        return replace_settings(self, changes)
 
 
 #: Steps if neither steps nor minutes are given: this many, and at least so many visits to every frame.
@@ -498,7 +514,7 @@ def default_num_gaussians(
     pixels = num_frames * area
     steps, budgets = planned_steps(config, num_frames), []  # in microseconds for each pixel of all frames
     if steps is not None:
-        budgets.append(PIXEL_TIME * steps * config.batch_size / num_frames)
+        budgets.append(PIXEL_TIME * steps * config.views.batch_size / num_frames)
     if config.minutes is not None:
         budgets.append(60e6 * config.minutes * (threads or num_threads()) / pixels)
     time = min(budgets)
@@ -548,7 +564,7 @@ def planned_steps(config: FitConfig, num_frames: int) -> int | None:
     """Steps of the whole fit; None where only the time limits it."""
     if config.minutes is not None:
         return config.steps
-    return config.steps or max(DEFAULT_STEPS, -(-DEFAULT_VISITS * num_frames // config.batch_size))
+    return config.steps or max(DEFAULT_STEPS, -(-DEFAULT_VISITS * num_frames // config.views.batch_size))
 
 
 def chosen_interpolation(config: FitConfig, *, alpha: bool) -> float:
@@ -556,6 +572,6 @@ def chosen_interpolation(config: FitConfig, *, alpha: bool) -> float:
 
     By default none do where optical flow is not used or does not tell what is there (behind alpha).
     """
-    if config.interpolation_fraction is not None:
-        return config.interpolation_fraction
-    return INTERPOLATION_FRACTION if config.follow_motion and not alpha else 0.0
+    if config.views.interpolation_fraction is not None:
+        return config.views.interpolation_fraction
+    return INTERPOLATION_FRACTION if config.follows_motion and not alpha else 0.0

@@ -24,7 +24,7 @@ def grow(state: FitState, config: FitConfig, size: tuple[int, int]) -> bool:
 
     `size`: (height, width) of the frames. Returns whether the number of Gaussians may have changed.
     """
-    growth = config.growth.for_plan(state.plan)
+    growth = config.strategy.growth.for_plan(state.plan)
     grows = growth.grows_at(state.step)
     if grows:
         stay, born = densify(

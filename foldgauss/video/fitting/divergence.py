@@ -60,7 +60,7 @@ class Guard:
 
     def __init__(self, state: FitState, config: FitConfig, steps_per_pass: int, *, alpha: bool):
         self.config, self.steps_per_pass = config, steps_per_pass
-        self.comparable = config.growth is None and not alpha
+        self.comparable = config.strategy.growth is None and not alpha
         fault = _find_nonfinite(state, config)
         if fault:
             cure = "Start a new fit instead of resuming this state."
@@ -136,19 +136,16 @@ class Guard:
     def back_off(self, state: FitState, fault: str) -> None:
         """Restore the arrays of the last finite state and lower the learning rates. The count of steps goes on.
 
-        Raises FitDiverged if the fit is to stop, or has backed off `MAX_BACKOFFS` times. Its state is then that before
-        the step, but for the arrays.
+        Raises FitDiverged if the fit has backed off `MAX_BACKOFFS` times. Its state is then that before the step, but
+        for the arrays.
         """
         step, kept = state.step, state.last_finite
         state.restore()
         message = f"the fit diverged at step {step}: {fault}."
-        exhausted = state.backoffs >= MAX_BACKOFFS
-        if self.config.on_divergence == "stop" or exhausted:
+        if state.backoffs >= MAX_BACKOFFS:
             state.step = step - 1
-            cure = "Lower the learning rates, or give on_divergence='back-off', which finds them."
-            if exhausted:
-                lowest = f"{BACKOFF_FACTOR**-MAX_BACKOFFS:.1g} of those given"
-                cure = f"It did so even with learning rates {lowest}: lower these, or check the frames."
+            lowest = f"{BACKOFF_FACTOR**-MAX_BACKOFFS:.1g} of those given"
+            cure = f"It did so even with learning rates {lowest}: lower these, or check the frames."
             raise FitDiverged(f"{message} The state is that of step {kept.step}. {cure}", state)
         state.backoffs += 1
         self.restart(state)

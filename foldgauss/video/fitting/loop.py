@@ -95,9 +95,9 @@ def fit(
 
     `fps`: frames per second. `observers` are called with (state, info) after every step: progress bars, checkpoints.
     `every`: the history keeps every so many steps, and the last. Raises ValueError for frames or settings that cannot
-    be fitted, and `FitDiverged` as `config.on_divergence` has it; otherwise a fit that diverges warns by
-    `DivergenceWarning` and goes on from its last finite state. No budget includes the compilation of kernels, some 20 s
-    when they are used for the first time. Without `minutes` the bits are the same for any number of threads.
+    be fitted. A fit that diverges warns by `DivergenceWarning` and goes on from its last finite state with lower
+    learning rates; it raises `FitDiverged` where that does not help. No budget includes the compilation of kernels,
+    some 20 s when they are used for the first time. Without `minutes` the bits are the same for any number of threads.
 
     Example: `fit(frames, FitConfig(steps=1000)).model.render(0.5)`. Source: VeGaS, section 4.
     """
@@ -152,7 +152,7 @@ def fit_steps(
     guard = Guard(state, config, stepper.steps_per_pass, alpha=frames.shape[3] == 4)
     if rate is not None:
         rate.check_size(state)
-    if state.step == 0 and guard.comparable and config.initialization == "clip":
+    if state.step == 0 and guard.comparable and config.initialization != "uniform":
         begun = clock()
         state.start_errors = tuple(stepper.measure_start(state).items())
         state.seconds += clock() - begun
@@ -211,12 +211,12 @@ def _warm_up(frames: np.ndarray, config: FitConfig, engine: str) -> None:
     """Compile or load the kernels, on a corner of the clip, before any clock runs: the first time takes 20 s."""
     if engine != "cpu" and not config.is_compact and not relocates(config):
         return
-    tiny = dataclasses.replace(config, num_gaussians=8, max_gaussians=None, steps=1, minutes=None)
-    tiny = dataclasses.replace(tiny, interpolation_fraction=0.0)
+    views = dataclasses.replace(config.views, interpolation_fraction=0.0)
+    tiny = dataclasses.replace(config, num_gaussians=8, max_gaussians=None, steps=1, minutes=None, views=views)
     if config.is_compact:
         tiny = dataclasses.replace(tiny, quality=DEFAULT_QUALITY, size_mb=None, psnr=None)
     corner = np.ascontiguousarray(frames[:2, :32, :32])
-    state = start(corner, dataclasses.replace(tiny, follow_motion=False))
+    state = start(corner, dataclasses.replace(tiny, initialization="static"))
     for progress in (0.0, 1.0) if engine == "cpu" else ():  # with either loss
         make_stepper("cpu", corner, tiny, state, motion_finder(corner)).step(state, progress)
     if engine == "cpu" and config.follow_camera:
@@ -246,19 +246,19 @@ def _start(
 ) -> FitState:
     has_alpha, frames = frames.shape[3] == 4, np.ascontiguousarray(frames[..., :3])  # as seen over black
     begun, num_frames = clock(), len(frames)
-    motion = find_motion() if config.follow_motion else None
+    motion = find_motion() if config.follows_motion else None
     if logits is None:
         logits = make_time_logits(num_frames, motion.cuts if motion is not None else [])
     logits = np.array(logits, np.float32)
     splats = _initialize(frames, config, logits, motion)
-    if config.is_compact and config.compositing == "over" and not has_alpha and config.initialization == "clip":
+    if config.is_compact and config.compositing == "over" and not has_alpha and config.initialization != "uniform":
         splats = with_backdrop(splats, frames)
     rows = pack(splats)
     return FitState.create(
         rows,
         logits,
         **_path_fields(splats, logits),
-        growing=config.growth is not None,
+        growing=config.strategy.growth is not None,
         plan=0 if config.minutes is not None else planned_steps(config, num_frames),
         seconds=clock() - begun,
     )
@@ -293,7 +293,7 @@ def _check_config(model: VideoModel, config: FitConfig) -> None:
         "floor": (np.float32(config.floor), np.float32(envelope.floor)),
         "compositing": (config.compositing, model.compositing),
         "options": (config.options, model.options),
-        "scale_cutoff": (config.scale_cutoff, model.scale_cutoff),
+        "strategy.scale_cutoff": (config.strategy.scale_cutoff, model.scale_cutoff),
     }
     for name, (got, expected) in pairs.items():
         if not np.all(got == expected):
@@ -364,7 +364,7 @@ def _check_alpha(frames: np.ndarray, config: FitConfig) -> None:
     if config.compositing == "sum":
         cure = "Sums are never opaque: drop the alpha, or give 'over'."
         raise invalid("compositing", expected="'over' for frames with alpha", got="'sum'", cure=cure)
-    if config.interpolation_fraction:
+    if config.views.interpolation_fraction:
         cure = "Leave it out: optical flow does not determine what is behind."
-        got = config.interpolation_fraction
+        got = config.views.interpolation_fraction
         raise invalid("interpolation_fraction", expected="0 for frames with alpha", got=got, cure=cure)

@@ -234,7 +234,7 @@ class RateControl:
 
     def _adaptation(self, state: FitState) -> float:
         """How much of what an action costs the rest of the fit makes up for, compared with many passes, 0 to 1."""
-        passes = (state.plan - state.step) * self.config.batch_size / len(self.frames)
+        passes = (state.plan - state.step) * self.config.views.batch_size / len(self.frames)
         return min(passes / _PASSES, 1.0)
 
     def _model(self, state: FitState, fps: float = 25.0) -> VideoModel:

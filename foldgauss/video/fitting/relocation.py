@@ -44,7 +44,8 @@ def relocates(config: FitConfig) -> bool:
 
     Where Adam updates all Gaussians in every step, its moments do not tell which ones matter.
     """
-    return config.relocated_fraction > 0 and config.growth is None and config.sparse_updates
+    strategy = config.strategy
+    return strategy.relocated_fraction > 0 and strategy.growth is None and strategy.sparse_updates
 
 
 def is_relocation_due(state: FitState, config: FitConfig) -> bool:
@@ -60,13 +61,13 @@ def is_relocation_due(state: FitState, config: FitConfig) -> bool:
 def relocate(
     state: FitState, frames: np.ndarray, config: FitConfig, spec: ConditioningSpec, motion: Motion | None
 ) -> None:
-    """Move the fraction `config.relocated_fraction` of the Gaussians that can be judged; their moments start at zero.
+    """Move the fraction `relocated_fraction` of the Gaussians that can be judged; their moments start at zero.
 
     Frames and pixels of the new ones are drawn by squared error. `spec` is that of whole frames.
     """
     times = np.asarray(frame_times(state.time_logits))
     influence = measure_influence(state, find_windows(state.rows, spec), times, config.fold_degree)
-    num = round(config.relocated_fraction * np.isfinite(influence).sum())
+    num = round(config.strategy.relocated_fraction * np.isfinite(influence).sum())
     if num == 0:
         return
     stay = np.ones(len(state.rows), bool)

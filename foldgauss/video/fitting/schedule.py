@@ -22,17 +22,17 @@ COLD = 0.02
 
 def num_views(config: FitConfig, num_frames: int) -> int:
     """Views of a pass: every frame, then with two cameras every frame mirrored."""
-    return 2 * num_frames if config.two_cameras else num_frames
+    return 2 * num_frames if config.views.two_cameras else num_frames
 
 
 def fraction_in_turn(config: FitConfig) -> float:
     """The fraction of the views that visit all frames in turn; the others are drawn by error."""
-    return 1 - config.error_fraction
+    return 1 - config.views.error_fraction
 
 
 def steps_per_pass(config: FitConfig, num_frames: int) -> int:
     """Steps in which every view is seen at least once."""
-    return math.ceil(num_views(config, num_frames) / (config.batch_size * fraction_in_turn(config)))
+    return math.ceil(num_views(config, num_frames) / (config.views.batch_size * fraction_in_turn(config)))
 
 
 def choose_views(config: FitConfig, num_frames: int, step: int, errors: np.ndarray) -> np.ndarray:
@@ -52,7 +52,7 @@ def choose_views(config: FitConfig, num_frames: int, step: int, errors: np.ndarr
 def find_views_in_turn(config: FitConfig, num_frames: int, step: int) -> tuple[np.ndarray, np.ndarray]:
     """The views of a step if none were drawn by error, and which are drawn (they are the next ones in turn here)."""
     num, in_turn = num_views(config, num_frames), fraction_in_turn(config)
-    positions = np.arange(step * config.batch_size, (step + 1) * config.batch_size)
+    positions = np.arange(step * config.views.batch_size, (step + 1) * config.views.batch_size)
     taken = np.floor(positions * in_turn).astype(int)
     views = np.array([_shuffle(config, num, k // num)[k % num] for k in taken])
     return views, np.floor((positions + 1) * in_turn).astype(int) == taken
@@ -86,13 +86,13 @@ class RateSchedule:
         self.decayed = np.ones(width, bool)
         for name, place in columns(config.fold_degree).items():
             self.first[place] = getattr(config.rates, name)
-            self.decayed[place] = config.decayed in ("all", name)
+            self.decayed[place] = config.rates.decayed in ("all", name)
 
     def at(self, progress: float, backoffs: int) -> tuple[np.ndarray, np.float32]:
         """The rates of rows, float32 (width,), and of frame times, at a fraction of the plan and after back-offs."""
         config, decay, slower = self.config, self._decay(progress), BACKOFF_FACTOR**-backoffs
         rows = np.where(self.decayed, self.first * np.float32(decay), self.first) * np.float32(slower)
-        times = config.rates.frame_times * (decay if config.decayed == "all" else 1.0) * slower
+        times = config.rates.frame_times * (decay if config.rates.decayed == "all" else 1.0) * slower
         return rows, np.float32(times)
 
     def of_paths(self, progress: float, backoffs: int) -> np.float32:
@@ -101,9 +101,9 @@ class RateSchedule:
 
     def _decay(self, progress: float) -> float:
         config = self.config
-        decay = config.final_rate**progress if config.final_rate > 0 else 1 - progress
-        if 1 - progress < config.cooldown_fraction:
-            decay *= COLD + (1 - COLD) * ((1 - progress) / config.cooldown_fraction)
+        decay = config.rates.final**progress if config.rates.final > 0 else 1 - progress
+        if 1 - progress < config.rates.cooldown:
+            decay *= COLD + (1 - COLD) * ((1 - progress) / config.rates.cooldown)
         return decay
 
 

@@ -323,7 +323,7 @@ def to_model(state: FitState, config: FitConfig, size: tuple[int, int], fps: flo
         fps=float(fps),
         options=config.options,
         compositing=config.compositing,
-        scale_cutoff=config.scale_cutoff,
+        scale_cutoff=config.strategy.scale_cutoff,
     )
 
 
@@ -358,7 +358,7 @@ def measure_relative_size(state: FitState, config: FitConfig) -> float:
 
     Their geometric mean, of every `SIZE_STRIDE`-th, at most that of the frame.
     """
-    unit = config.rate_units.size
+    unit = config.rates.units.size
     mean = float(state.rows[::SIZE_STRIDE, columns(config.fold_degree)["log_scale"]].mean(dtype=np.float64))
     return math.exp(min(mean, 0.0)) / unit if unit and math.isfinite(mean) else 1.0
 

@@ -50,7 +50,7 @@ class CpuStepper:
         self.num_frames, height, width, _ = frames.shape
         self.rates, self.steps_per_pass = RateSchedule(config), steps_per_pass(config, self.num_frames)
         self.spec = ConditioningSpec(
-            config.fold_degree, config.power, config.floor, (height, width), scale_cutoff=config.scale_cutoff
+            config.fold_degree, config.power, config.floor, (height, width), scale_cutoff=config.strategy.scale_cutoff
         )
         self.interpolation = make_interpolated(frames, config, find_motion)
         self.adopt(state)
@@ -89,13 +89,13 @@ class CpuStepper:
             marked[np.concatenate(alive)] = True
             touched = np.flatnonzero(marked).astype(np.int32)
         num_alive = len(touched)
-        if not config.sparse_updates:
+        if not config.strategy.sparse_updates:
             touched = np.arange(len(state.rows))
         relative_size = measure_relative_size(state, config) if by_path.size else 1.0
         rates, time_rate = self.rates.at(progress, state.backoffs)
-        finite = update_rows(state, self.grad, touched, rates, units=config.rate_units)
+        finite = update_rows(state, self.grad, touched, rates, units=config.rates.units)
         update_windows(state.rows, touched, self.window, spec)
-        if config.learn_frame_times and num_frames > 2:
+        if config.learns_frame_times and num_frames > 2:
             updated = update_frame_times(state.time_logits, state.time_moments, by_time, time_rate)
             state.time_logits, state.time_moments = updated
         if by_path.size and visited:
@@ -116,7 +116,7 @@ class CpuStepper:
             self.adopt(state)
 
     def relocate(self, state: FitState) -> None:
-        motion = self.find_motion() if self.config.follow_motion else None
+        motion = self.find_motion() if self.config.follows_motion else None
         relocate(state, self.frames, self.config, self.spec, motion)
         self.adopt(state)
 
@@ -154,12 +154,12 @@ class CpuStepper:
         if squared:
             loss = squared_loss(trace.image, target)
         else:
-            loss = image_loss(trace.image, target, ssim_fraction=self.config.ssim_fraction)
+            loss = image_loss(trace.image, target, ssim_fraction=self.config.loss.ssim_fraction)
         if fraction is None:
             state.frame_errors[k] = loss.mean_squared_error
         gradient = loss.gradient
-        gradient *= np.float32(1 / self.config.batch_size)
-        gradient *= border_weights(*gradient.shape[1:], self.config.border_weight)
+        gradient *= np.float32(1 / self.config.views.batch_size)
+        gradient *= border_weights(*gradient.shape[1:], self.config.loss.border_weight)
         gradients = cpu.backward(trace, gradient)
         if mirrored:
             mirror(*gradients[:2], 0, out=gradients[:2])

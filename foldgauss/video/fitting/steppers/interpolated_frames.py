@@ -1,7 +1,7 @@
 """Training images between frames: which steps have one, and what the optical flow predicts there.
 
 Without them, what a fit shows between two frames is not determined: Gaussians that are visible in one frame only add
-what that frame lacks, and are wrong half way to the next. Only the steps before `FitConfig.interpolation_end` have
+what that frame lacks, and are wrong half way to the next. Only the steps before `Views.interpolation_end` have
 interpolated frames; the others recover the quality at the frames, and lose a part only of what was gained between.
 """
 
@@ -31,7 +31,7 @@ class InterpolatedFrames:
 
     def choose(self, step: int, progress: float, k: int) -> float | None:
         """At which fraction of the way from frame k to the next the time of a step lies; None for the frame itself."""
-        if progress >= self.config.interpolation_end or k in self.left_out or not step:
+        if progress >= self.config.views.interpolation_end or k in self.left_out or not step:
             return None
         rng = make_generator(Stream.INTERPOLATED_FRAME, step, k, seed=self.config.seed)
         chosen, fraction = rng.random() < self.chance, rng.uniform(MARGIN, 1 - MARGIN)

@@ -105,10 +105,10 @@ class JaxStepper:
             self.capacity = capacity
             self.program = self._make_program()
             compile_step(self.program)
-            if state.step == 0 and self.config.initialization == "clip":
+            if state.step == 0 and self.config.initialization != "uniform":
                 compile_error(self.program)
         # Where growth has ended there are statistics nevertheless: without, steps would be compiled anew.
-        sizes = Sizes(num, width, self.num_frames, growing=self.config.growth is not None)
+        sizes = Sizes(num, width, self.num_frames, growing=self.config.strategy.growth is not None)
 
         def padded(name: str) -> Any:
             kind = _FIELDS[name]
@@ -173,7 +173,7 @@ class JaxStepper:
 
     def grow(self, state: FitState) -> None:
         """Densification on the host, where any is due."""
-        growth = self.config.growth.for_plan(state.plan)
+        growth = self.config.strategy.growth.for_plan(state.plan)
         if growth.changes_at(state.step):
             state.fetch_all()
             grow(state, self.config, self.size)
@@ -185,10 +185,10 @@ class JaxStepper:
         """On the host."""
         config, (height, width) = self.config, self.size
         spec = ConditioningSpec(
-            config.fold_degree, config.power, config.floor, (height, width), scale_cutoff=config.scale_cutoff
+            config.fold_degree, config.power, config.floor, (height, width), scale_cutoff=config.strategy.scale_cutoff
         )
         state.fetch_all()
-        relocate(state, self.frames, config, spec, self.find_motion() if config.follow_motion else None)
+        relocate(state, self.frames, config, spec, self.find_motion() if config.follows_motion else None)
         self.adopt(state)
 
     def measure_start(self, state: FitState) -> dict[int, float]:
@@ -201,7 +201,7 @@ class JaxStepper:
     def _choose_capacity(self, num: int) -> int:
         """Rows of the arrays: a function of the number of Gaussians, so that a resumed fit has the same."""
         config = self.config
-        if config.growth is None:
+        if config.strategy.growth is None:
             if not config.is_compact:
                 return num
             # Gaussians that are not worth their bits are dropped: not each time a program for another number.
@@ -216,7 +216,7 @@ class JaxStepper:
 
     def _make_program(self) -> Program:
         config, devices = self.config, len(jax.local_devices())
-        divisors = [n for n in range(1, min(devices, config.batch_size) + 1) if config.batch_size % n == 0]
+        divisors = [n for n in range(1, min(devices, config.views.batch_size) + 1) if config.views.batch_size % n == 0]
         return Program(
             capacity=self.capacity,
             num_frames=self.num_frames,
@@ -224,17 +224,17 @@ class JaxStepper:
             degree=config.fold_degree,
             power=config.power,
             floor=config.floor,
-            scale_cutoff=config.scale_cutoff,
+            scale_cutoff=config.strategy.scale_cutoff,
             compositing=config.compositing,
             options=config.options,
             engine=self.engine,
-            ssim_fraction=config.ssim_fraction,
-            border_weight=config.border_weight,
-            batch_size=config.batch_size,
-            sparse_updates=config.sparse_updates,
-            rate_units=config.rate_units,
-            learns_times=config.learn_frame_times and self.num_frames > 2,
-            grows=config.growth is not None,
+            ssim_fraction=config.loss.ssim_fraction,
+            border_weight=config.loss.border_weight,
+            batch_size=config.views.batch_size,
+            sparse_updates=config.strategy.sparse_updates,
+            rate_units=config.rates.units,
+            learns_times=config.learns_frame_times and self.num_frames > 2,
+            grows=config.strategy.growth is not None,
             interpolates=self.interpolation is not None,
             num_devices=max(divisors),
             num_paths=self.num_paths,
