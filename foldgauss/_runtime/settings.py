@@ -5,6 +5,7 @@
 `check_settings` validates by this metadata, commands generate their options from it, and the API page its table.
 """
 
+import collections
 import dataclasses
 import types
 import typing
@@ -71,11 +72,22 @@ def settings_by_name(settings: Any) -> dict[str, Any]:
 
 
 def replace_settings(settings: Any, changes: dict[str, Any]) -> Any:
-    """`settings` with other values, by the names of `walk`."""
-    own = {name: value for name, value in changes.items() if "." not in name}
-    for part in {name.partition(".")[0] for name in changes if "." in name}:
-        inner = {name.partition(".")[2]: value for name, value in changes.items() if name.startswith(f"{part}.")}
-        own[part] = replace_settings(own.get(part, getattr(settings, part)), inner)
+    """`settings` with other values, by names such as "steps" and "views.batch_size".
+
+    A value for settings within settings comes before those for parts of it. Raises ValueError for unknown names.
+    """
+    own, inner = {}, collections.defaultdict(dict)
+    for name, value in changes.items():
+        first, _, rest = name.partition(".")
+        if first not in getattr(settings, "__dataclass_fields__", ()):
+            got = f"{name}, which {type(settings).__name__} has not"
+            raise invalid("changes", expected="names of settings", got=got)
+        if rest:
+            inner[first][rest] = value
+        else:
+            own[first] = value
+    for first, parts in inner.items():
+        own[first] = replace_settings(own.get(first, getattr(settings, first)), parts)
     return dataclasses.replace(settings, **own)
 
 

@@ -5,8 +5,8 @@ import math
 from dataclasses import field
 from typing import Any
 
-from foldgauss._runtime.checks import check_one_of, invalid
-from foldgauss._runtime.settings import check_settings, replace_settings, setting, walk
+from foldgauss._runtime.checks import check_one_of
+from foldgauss._runtime.settings import check_settings, replace_settings, setting
 from foldgauss._runtime.threads import num_threads
 from foldgauss.render import COMPOSITINGS, RenderOptions
 from foldgauss.video.fitting.adam import RateUnits
@@ -132,6 +132,8 @@ class Views:
             "Fraction of the views that are chosen in proportion to the squared errors of the frames",
             "In between, all frames are visited in turn. Improves the worst frames.",
             bounds="[0, 1)",
+            option="--error-fraction",
+            group=OPTIMIZATION,
         ),
     )
     interpolation_fraction: float | None = field(
@@ -447,10 +449,6 @@ class FitConfig:
 
         Raises ValueError for an unknown name or value. Example: `config.replace(steps=300, **{"views.batch_size": 2})`.
         """
-        known = {name for name, _, _ in walk(self)} | {field.name for field in dataclasses.fields(self)}
-        unknown = changes.keys() - known
-        if unknown:
-            raise invalid("changes", expected="fields of FitConfig", got=", ".join(sorted(unknown)))
         return replace_settings(self, changes)
 
 
