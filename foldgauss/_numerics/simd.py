@@ -16,7 +16,8 @@ from numba.extending import intrinsic, models, overload, register_model
 from foldgauss._runtime.kernels import inline
 
 LANES = 16
-_FLOATS, _INTS = ir.VectorType(ir.FloatType(), LANES), ir.VectorType(ir.IntType(32), LANES)
+_FLOATS = ir.VectorType(ir.FloatType(), LANES)
+_INTS = ir.VectorType(ir.IntType(32), LANES)
 
 
 class _Vector(types.Type):
@@ -27,7 +28,8 @@ class _Mask(types.Type):
     """16 bits."""
 
 
-VECTOR, MASK = _Vector("floats16"), _Mask("bits16")
+VECTOR = _Vector("floats16")
+MASK = _Mask("bits16")
 
 
 @register_model(_Vector)

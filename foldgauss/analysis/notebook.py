@@ -15,11 +15,22 @@ from foldgauss.analysis.plot import plot_density, plot_history
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: The largest numbers of components and of space coordinates plotted; points of the grid along each axis.
-_MAX_COMPONENTS, _MAX_SPACES, _GRID = 48, 3, 120
-#: Half ranges: of time in time_scales, of space in standard deviations, and of paths in time_scales.
-_TIME_RANGE, _SPACE_RANGE, _PATH_RANGE = 2.6, 3.0, 1.5
-_DPI, _WIDTH, _HEIGHT = 80, 3.6, 2.8
+#: The largest number of components plotted.
+_MAX_COMPONENTS = 48
+#: The largest number of space coordinates plotted.
+_MAX_SPACES = 3
+#: Points of the grid along each axis.
+_GRID = 120
+#: Half the range of time, in time_scales.
+_TIME_RANGE = 2.6
+#: Half the range of space, in standard deviations.
+_SPACE_RANGE = 3.0
+#: Half the range of paths, in time_scales.
+_PATH_RANGE = 1.5
+#: Of the images, in pixels per inch, and their size in inches.
+_DPI = 80
+_WIDTH = 3.6
+_HEIGHT = 2.8
 _RED = "#d1242f"
 
 

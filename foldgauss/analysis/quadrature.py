@@ -71,7 +71,10 @@ _BASE = np.r_[-REACH, -1e3, -1e2, -40.0, -20.0, np.linspace(-10, 10, 41), 20.0, 
 _TAIL = np.geomspace(10, REACH, 150)
 SEARCH_GRID = np.r_[-_TAIL[::-1], np.linspace(-10, 10, 401)[1:-1], _TAIL]
 _LADDER = 20.0 * 4.0 ** -np.arange(13)  # distances of panel edges around each peak
-_ROUNDS, _SPLITS = 24, 16  # halvings, and panels halved in each
+#: Rounds of halving.
+_ROUNDS = 24
+#: Panels halved in each round.
+_SPLITS = 16
 _HALF_LOG_2PI = 0.5 * float(np.log(2 * np.pi))
 _GOLDEN = float((np.sqrt(5) - 1) / 2)
 

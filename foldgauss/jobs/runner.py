@@ -39,8 +39,10 @@ from foldgauss.video.fitting.state import FitState
 from foldgauss.video.models.metrics import Evaluation, evaluate
 from foldgauss.video.models.video_model import VideoModel
 
-#: Seconds between two checkpoints of a running fit, and between two reports of its progress.
-CHECKPOINT_SECONDS, REPORT_SECONDS = 30.0, 1.0
+#: Seconds between two checkpoints of a running fit.
+CHECKPOINT_SECONDS = 30.0
+#: Seconds between two reports of its progress.
+REPORT_SECONDS = 1.0
 #: Seconds that a job waits for another one of the same target: a worker that is believed dead may be about to finish.
 WAIT_SECONDS = 60.0
 #: A fraction of the processor time that its threads asked for, below which a fit by minutes warns.

@@ -27,13 +27,16 @@ from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.models.metrics import psnr, ssim
 from foldgauss.video.segmented.segmented_video import Segment, SegmentedVideo, plan_segments
 
-#: Default length of a segment, and number of frames that neighbors share.
-SEGMENT_SECONDS, OVERLAP = 10.0, 8
+#: Default length of a segment.
+SEGMENT_SECONDS = 10.0
+#: Number of frames that neighboring segments share.
+OVERLAP = 8
 #: What a joined file has of each segment beside its own file, in 10^6 bytes, at most: its properties and metadata.
 _MB_PER_SEGMENT = 0.004
 #: Number of frames on either side of an overlap that it is compared with.
 BESIDE = 8
-_PLAN, _INDEX = "plan.json", "index.npz"
+_PLAN = "plan.json"
+_INDEX = "index.npz"
 #: How the names of unfinished files in the folder begin, and of all of a fit.
 _UNFINISHED = (".segment-", f".{Path(_PLAN).stem}.", f".{Path(_INDEX).stem}.")
 _OWN = ("segment-", _PLAN, _INDEX, *_UNFINISHED)

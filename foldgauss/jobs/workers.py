@@ -28,15 +28,18 @@ from foldgauss.jobs.runner import Progress, Report, Stopped, fit_job
 if TYPE_CHECKING:
     from distributed import Client
 
-#: dask returns a job once so many of its workers have died; it is given up after so many such rounds without a new
-#: checkpoint.
-DEATHS, ROUNDS = 3, 3
+#: dask returns a job once so many of its workers have died.
+DEATHS = 3
+#: A job is given up after so many returns without a new checkpoint.
+ROUNDS = 3
 #: Seconds that workers have to write their checkpoints once they are asked to stop.
 GRACE_SECONDS = 60.0
 #: The addresses that dask accepts.
 _ADDRESS = re.compile(r"((tcp|tls|ucx|ucxx|ws|wss)://)?[^/\s]+:[0-9]{1,5}/?")
-#: Seconds without workers after which a warning is issued, and after which the jobs are given up.
-WARN_SECONDS, NO_WORKERS_SECONDS = 10.0, 120.0
+#: Seconds without workers after which a warning is issued.
+WARN_SECONDS = 10.0
+#: Seconds without workers after which the jobs are given up.
+NO_WORKERS_SECONDS = 120.0
 #: Seconds that a scheduler has to answer.
 CONNECT_SECONDS = 10.0
 #: Seconds that workers of this machine may be missing before others are started; doubled each time.

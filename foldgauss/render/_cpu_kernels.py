@@ -29,35 +29,52 @@ from foldgauss._runtime.kernels import exact_kernel, inline, kernel
 TILE = 16
 PIXELS = TILE * TILE
 _SHIFT = 4  # log2(TILE)
-#: A tile is CELLS x CELLS cells of CELL x CELL pixels; the pixels of a cell are one vector. The cost of a splat is the
-#: number of cells that it meets: compact shapes meet a third fewer square cells than rows of 16 pixels.
-CELL, CELLS = 4, 4
+#: Side of a cell in pixels; the pixels of a cell are one vector.
+CELL = 4
+#: Side of a tile in cells. The cost of a splat is the number of cells that it meets: compact shapes meet a third fewer
+#: square cells than rows of 16 pixels.
+CELLS = 4
 assert CELL * CELL == LANES
-#: A splat is rendered if its standard deviations along x at fixed y, and along y at fixed x, exceed about 1e-6 px, and
-#: its overall ones are at most 1e9 px: a thinner one practically never meets a pixel center, and the determinant of a
-#: wider one does not fit into float32. Within these bounds nothing here overflows.
-WIDEST, THINNEST = 1e-9, 1e6
+#: Reciprocal of the largest standard deviation rendered, 1e9 px: the determinant of a wider splat does not fit into
+#: float32.
+WIDEST = 1e-9
+#: Reciprocal of the smallest one rendered, along x at fixed y and along y at fixed x, 1e-6 px: a thinner splat
+#: practically never meets a pixel center. Within these bounds nothing here overflows.
+THINNEST = 1e6
 #: Ellipses are enlarged a little for binning, so that the alpha test alone decides about a pixel.
 SLACK = np.float32(1e-3)
 
-_f, _i, _u = nb.float32, nb.int32, nb.uint64
+_f = nb.float32
+_i = nb.int32
+_u = nb.uint64
 
 # Columns of the per-splat geometry. The exponent is kept in powers of two, log2 of the opacity included:
 # alpha = 2^(LOG - (P dx + Q dy)^2 - (R dy)^2). Offsets are whitened before they are squared: the three terms of the
 # usual conic cancel for thin, slanted splats. A pixel counts where the exponent is at least LEAST; that ellipse extends
 # furthest to the right on the line dy = TURN, to the left on -TURN.
-_X, _Y, _P, _Q, _R, _LOG, _LEAST, _TURN = range(8)
-# A tile is composited in blocks of splats, whose parameters are stored column by column: those above, then the colors.
-# Between blocks the tile ends early if all its pixels are opaque.
-BLOCK, _COLOR = 64, 8
+_X = 0
+_Y = 1
+_P = 2
+_Q = 3
+_R = 4
+_LOG = 5
+_LEAST = 6
+_TURN = 7
+# A tile is composited in blocks of so many splats, whose parameters are stored column by column: those above, then the
+# colors. Between blocks the tile ends early if all its pixels are opaque.
+BLOCK = 64
+# The first column of colors.
+_COLOR = 8
 # Sums of a gradient slot: of dL/dalpha * alpha times 1, v, w, v^2, v w, w^2, where v = P dx + Q dy and w = R dy (in
 # whitened coordinates the moments of thin splats do not cancel either), then the colors'; padded to whole vectors.
 _MOMENTS = 6
 #: Channels that are kept in registers; further ones go through memory.
 FEW = 4
-# Planes of the scratch: the transmittance; then, forward, the colors; backward, the color from behind (times the
-# incoming gradient) and the incoming gradients.
-_BEHIND, _G = PIXELS, 2 * PIXELS
+# Planes of the scratch: the transmittance; then, forward, the colors; backward, from here on the color from behind
+# (times the incoming gradient),
+_BEHIND = PIXELS
+# and the incoming gradients.
+_G = 2 * PIXELS
 # What the backward pass stores for each cell of a splat: a vector of alphas and a vector of weights.
 _STORED = 2 * LANES
 

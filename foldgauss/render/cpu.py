@@ -27,12 +27,16 @@ from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import _cpu_kernels as kernels
 from foldgauss.render.splats import RenderOptions, check_size
 
-TILE, PIXELS = kernels.TILE, kernels.PIXELS
+TILE = kernels.TILE
+PIXELS = kernels.PIXELS
 SPLATS_PER_TASK = 8192
 STANDARD = RenderOptions()
-#: Estimated nanoseconds to composite one entry of a row of tiles and to write one pixel. Images that take less than the
-#: third in total are rendered by a single thread, since starting another costs more than it saves.
-ENTRY_NS, PIXEL_NS, SINGLE_TASK_NS = 80, 1.5, 4e5
+#: Estimated nanoseconds to composite one entry of a row of tiles.
+ENTRY_NS = 80
+#: Estimated nanoseconds to write one pixel.
+PIXEL_NS = 1.5
+#: Images that take less in total are rendered by a single thread: starting another costs more than it saves.
+SINGLE_TASK_NS = 4e5
 
 
 class SplatVisibility(NamedTuple):

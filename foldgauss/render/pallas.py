@@ -52,11 +52,17 @@ try:  # deprecated since JAX 0.11; the compiler Mosaic GPU supports no loads of 
 except ImportError:
     CompilerParams = None
 
-#: Sides of tiles, in px; powers of two, as a program's arrays must be. With 16 each thread of a warp holds 8 pixels, so
-#: that sums over a tile are mostly sums within threads. In images of fewer than `FEW_TILES` of these smaller
-#: ones are faster, as measured.
-TILES, TILE_SIZE, WARPS = (8, 16, 32), 16, 1
-SMALL_TILE_SIZE, FEW_TILES = 8, 1024
+#: Sides of tiles that may be chosen, in px; powers of two, as a program's arrays must be.
+TILES = (8, 16, 32)
+#: Side of a tile in px. Each thread of a warp then holds 8 pixels, so that sums over a tile are mostly sums within
+#: threads.
+TILE_SIZE = 16
+#: Warps of a program.
+WARPS = 1
+#: Side of a tile in images of few tiles, where smaller ones are faster.
+SMALL_TILE_SIZE = 8
+#: Images of fewer tiles than this have small ones.
+FEW_TILES = 1024
 #: Entries between two tests whether all pixels are finished.
 CHUNK = 16
 #: The largest alpha ceiling: the backward pass divides by 1 - alpha.

@@ -10,9 +10,10 @@ from jaxtyping import Array, Float
 
 from foldgauss._runtime.checks import invalid
 
-#: Bounds of the support radius in standard deviations: below the first a splat is no longer Gaussian; the square of the
-#: second is still far from float32's maximum.
-SMALLEST_RADIUS, LARGEST_RADIUS = 0.1, 1e6
+#: Least support radius in standard deviations: below it a splat is no longer Gaussian.
+SMALLEST_RADIUS = 0.1
+#: Largest support radius in standard deviations: its square is still far from float32's maximum.
+LARGEST_RADIUS = 1e6
 #: Engine "xla" counts (tile, splat) pairs up to one more than this, so that the sum of two counts fits into int32.
 LARGEST_CAPACITY = 2**30 - 2
 

@@ -19,9 +19,12 @@ from foldgauss._runtime.checks import invalid
 from foldgauss.render.footprint import compute_whitener, covariance, squared_reach
 from foldgauss.render.splats import LARGEST_CAPACITY, RenderOptions
 
-#: Slots per splat, or per tile if there are few splats, where the splats' sizes are unknown (inside `jit`), and the
-#: maximum of one round.
-SLOTS_PER_SPLAT, SLOTS_PER_TILE, MAX_SLOTS = 16, 16, 1 << 22
+#: Slots per splat where the splats' sizes are unknown (inside `jit`).
+SLOTS_PER_SPLAT = 16
+#: Slots per tile there, if there are few splats.
+SLOTS_PER_TILE = 16
+#: The most slots of one round.
+MAX_SLOTS = 1 << 22
 #: Rounds at whose start the backward pass stores the transmittance; of more rounds, every n-th.
 STORED_ROUNDS = 8
 #: Ellipses are enlarged a little for binning, so that the alpha test alone decides about a pixel.
@@ -29,7 +32,13 @@ SLACK = 1e-3
 #: Sums of slots saturate here, above any capacity.
 _SATURATED = LARGEST_CAPACITY + 1
 # Rows of a splat's fields, followed by its colors.
-X, Y, P, Q, R, OPACITY, COLOR = range(7)
+X = 0
+Y = 1
+P = 2
+Q = 3
+R = 4
+OPACITY = 5
+COLOR = 6
 # Rows of a splat's gradient sums, followed by its colors': of dL/dalpha * alpha times 1, v, w, v^2, v w, w^2, where
 # v = p dx + q dy and w = r dy.
 MOMENTS = 6

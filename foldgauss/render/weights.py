@@ -11,7 +11,8 @@ from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import _cpu_kernels as kernels
 from foldgauss.render.cpu import TILE, Trace
 
-_f, _i = nb.float32, nb.int64
+_f = nb.float32
+_i = nb.int64
 _LN2 = math.log(2)
 #: Columns of the geometry, passed as an argument: see `kernel`.
 _COLUMNS = (kernels._X, kernels._Y, kernels._P, kernels._Q, kernels._R, kernels._LOG, kernels._LEAST)

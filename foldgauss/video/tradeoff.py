@@ -22,8 +22,10 @@ from foldgauss.video.segmented.segmented_video import SegmentedVideo
 LEAST_STEPS = 200
 #: A point of the front is better than all cheaper ones by more than this, in dB.
 LEAST_GAIN = 0.01
-#: Frames that are timed, at most; and rounds, of which the fastest counts: other processes share the cores.
-_TIMED_FRAMES, _ROUNDS = 24, 8
+#: Frames that are timed, at most.
+_TIMED_FRAMES = 24
+#: Rounds of timing, of which the fastest counts: other processes share the cores.
+_ROUNDS = 8
 #: Segments that are timed.
 _TIMED_SEGMENTS = 3
 #: Seconds after which no third round starts.

@@ -29,8 +29,12 @@ _MAX_POINTS = 20_000
 _MAX_PERMUTED = 2**20
 #: Starts of k-means, of which the best is taken: one alone ends in a poor optimum in a fifth of all draws.
 _KMEANS_STARTS = 4
-#: Curves tried for each component, points that they are tried on, and steps in which each grows along the points.
-_CURVES, _CURVE_POINTS, _GROWTH_STEPS = 12, 2_000, 8
+#: Curves tried for each component.
+_CURVES = 12
+#: Points that curves are tried on.
+_CURVE_POINTS = 2_000
+#: Steps in which each curve grows along the points.
+_GROWTH_STEPS = 8
 
 
 def initialize(

@@ -19,8 +19,12 @@ from foldgauss.video.compression.quantize import (
 )
 from foldgauss.video.compression.range_coder import Column
 
-#: Neighbors that predict a value; candidates for them in each grid square; weight of time in their distance.
-NEIGHBORS, CANDIDATES, TIME_WEIGHT = 4, 16, 0.3
+#: Neighbors that predict a value.
+NEIGHBORS = 4
+#: Candidates for neighbors in each grid square.
+CANDIDATES = 16
+#: Weight of time in the distance of neighbors.
+TIME_WEIGHT = 0.3
 _MAGNITUDE_BOUNDS = np.array([0.5, 1.5] + [3.0 * 2**k for k in range(13)])
 
 

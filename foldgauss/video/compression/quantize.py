@@ -52,7 +52,8 @@ AXES = np.array(
         [-0.4082482904638630, 0.8164965809277261, -0.4082482904638630],
     ]
 )
-_LN2, _SQRT2 = 0.6931471805599453, 1.4142135623730951
+_LN2 = 0.6931471805599453
+_SQRT2 = 1.4142135623730951
 #: Least squared error, in steps, that the last power of a trajectory must save: its two coefficients need some eight
 #: bits, and with fine steps a bit saves 2 ln 2 / 12.
 POWER_WORTH = 0.9

@@ -13,11 +13,16 @@ from foldgauss._runtime.checks import invalid
 from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.models.video_model import VideoModel
 
-#: Displacement by which rounding the maps may move Gaussians, in pixels of the model's size; the most bits after the
-#: binary point that maps then have; and the step of their times if those are not the frames'.
-PATH_ERROR, MAX_PATH_BITS, KNOT_STEP = 0.02, 28, 2.0**-24
-#: Fraction of Gaussians on either side that may be outside of the cells, and the least extent of these cells.
-_OUTSIDE, _MIN_SIDE = 0.005, 0.01
+#: Displacement by which rounding the maps may move Gaussians, in pixels of the model's size.
+PATH_ERROR = 0.02
+#: The most bits after the binary point that maps have.
+MAX_PATH_BITS = 28
+#: The step of the times of maps if these are not the frames'.
+KNOT_STEP = 2.0**-24
+#: Fraction of Gaussians on either side that may be outside of the cells.
+_OUTSIDE = 0.005
+#: The least extent of the cells.
+_MIN_SIDE = 0.01
 _LN2 = 0.6931471805599453
 
 

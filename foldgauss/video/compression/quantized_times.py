@@ -3,9 +3,13 @@
 import numpy as np
 from jaxtyping import Float, Int32
 
-#: Frame times are rounded to a fraction of 2^-TIME_BITS of each interval, or as much finer as moves no frame by more
-#: than `TIME_ERROR` of the median interval: the interval of a cut is some hundred frames long.
-TIME_BITS, MAX_TIME_BITS, TIME_ERROR = 10, 24, 0.005
+#: Frame times are rounded to a fraction of 2^-TIME_BITS of each interval,
+TIME_BITS = 10
+#: or finer, with at most so many bits,
+MAX_TIME_BITS = 24
+#: so that no frame moves by more than this fraction of the median interval: the interval of a cut is some hundred
+#: frames long.
+TIME_ERROR = 0.005
 
 
 def choose_time_bits(logits: Float[np.ndarray, " intervals"]) -> int:

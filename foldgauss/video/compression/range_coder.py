@@ -22,14 +22,18 @@ from foldgauss._runtime.kernels import exact_kernel
 LARGEST_BITS = 30
 #: Probabilities of one context: zero flag, sign, unary exponent, and 1 + 2 for the leading bits of each exponent.
 NODES = 2 + 32 + 3 * 32
-#: Values of a context, and contexts of an integer.
-CONTEXTS, MODELS = 256, 3
+#: Values of a context.
+CONTEXTS = 256
+#: Contexts of an integer.
+MODELS = 3
 #: Bound on the bytes of an integer's code: 2 + 31 + 30 bits of four bytes each.
 MAX_CODE_BYTES = 256
 #: A probability is the fraction of ones in up to this many bits, and then an exponential mean.
 MEMORY = 400
-#: Initial weights of the mixture, times 65536, and their learning rate, times 2^18.
-WEIGHT, RATE = 29491, 6
+#: Initial weights of the mixture, times 65536.
+WEIGHT = 29491
+#: Learning rate of the weights, times 2^18.
+RATE = 6
 #: Least distance of mixed probabilities from 0 and 1, times 65536.
 MARGIN = 32
 #: Logits are whole multiples of 1/256 from -8 to 8. Knots of the logistic function every half, and lines between them.

@@ -16,12 +16,16 @@ from foldgauss._runtime.kernels import kernel
 from foldgauss.video.models.splats import SH_C0
 from foldgauss.video.selection.contributions import Contributions
 
-#: About how many pixels of a frame are sampled, on a grid, and its least spacing.
-_POINTS, _STRIDE = 4000, 2
-#: Layers of a pixel that are examined, from the front. Least transmittance that is assumed: otherwise a Gaussian behind
-#: many could be swapped with each of them at no cost. Product of alphas and transmittance below which two Gaussians do
-#: not overlap.
-_LAYERS, _MIN_TRANSMITTANCE, _FAINT = 256, 0.2, 0.004
+#: About how many pixels of a frame are sampled, on a grid.
+_POINTS = 4000
+#: The least spacing of that grid, in pixels.
+_STRIDE = 2
+#: Layers of a pixel that are examined, from the front.
+_LAYERS = 256
+#: Least transmittance that is assumed: otherwise a Gaussian behind many could be swapped with each of them at no cost.
+_MIN_TRANSMITTANCE = 0.2
+#: Product of alphas and transmittance below which two Gaussians do not overlap.
+_FAINT = 0.004
 _EMPTY = -1
 
 

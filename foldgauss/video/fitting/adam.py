@@ -25,7 +25,12 @@ from foldgauss._runtime.threads import run_tasks
 from foldgauss.video.models.frame_times import CUT_RATIO, FrameTimes
 from foldgauss.video.models.row_layout import columns, group_bits
 
-BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15  # epsilon as in the published 3DGS
+#: Decay of the first moment.
+BETA1 = 0.9
+#: Decay of the second moment.
+BETA2 = 0.999
+#: As in the published 3DGS.
+EPSILON = 1e-15
 #: 1 / (1 - beta^n) for both betas, by the number n of steps; beyond the table it is 1 in float32. (Computing the powers
 #: for each row took a third of a step's optimizer.)
 BIAS_CORRECTIONS = np.ones((20_000, 2), np.float32)
@@ -33,7 +38,8 @@ BIAS_CORRECTIONS[1:] = 1 / (1 - np.array([BETA1, BETA2]) ** np.arange(1, len(BIA
 FRAME_TIME_ADAM = optax.scale_by_adam(BETA1, BETA2, EPSILON)
 
 _CHUNK = 2048  # rows per task
-_f, _u = nb.float32, nb.uint64
+_f = nb.float32
+_u = nb.uint64
 
 
 class RateUnits(NamedTuple):

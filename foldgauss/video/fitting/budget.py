@@ -5,8 +5,10 @@ import math
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.state import FitState
 
-#: The speed is measured after so many steps, in which kernels are compiled or loaded, over at least so many.
-WARM_UP, MIN_STEPS = 5, 10
+#: The speed is measured after so many steps, in which kernels are compiled or loaded.
+WARM_UP = 5
+#: The speed is measured over at least so many steps.
+MIN_STEPS = 10
 #: The fractions of the time or of the plan, whichever is first, at which the number of steps is planned, by the speed
 #: since the one before.
 PLANNED_AT = (0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 0.9, 0.97)

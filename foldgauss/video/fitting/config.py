@@ -14,7 +14,9 @@ from foldgauss.video.fitting.growth import EXTENT, PUBLISHED_STEPS, PUBLISHED_UN
 from foldgauss.video.models.row_layout import MAX_DEGREE
 
 #: Groups of settings, which are the panels of `foldgauss fit --help`.
-MODEL, BUDGET, OPTIMIZATION = "model", "budget", "optimization"
+MODEL = "model"
+BUDGET = "budget"
+OPTIMIZATION = "optimization"
 #: The sigma_t, and the size in units of the frame's longer side, at which the learning rates of positions, folds and
 #: m_t are stated.
 UNIT_TIME = 0.06
@@ -452,20 +454,31 @@ class FitConfig:
         return replace_settings(self, changes)
 
 
-#: Steps if neither steps nor minutes are given: this many, and at least so many visits to every frame.
-DEFAULT_STEPS, DEFAULT_VISITS = 3000, 20
+#: Least number of steps if neither steps nor minutes are given.
+DEFAULT_STEPS = 3000
+#: Then each frame is visited at least so often.
+DEFAULT_VISITS = 20
 #: Time of a core for each pixel of a step, in microseconds, by which steps and minutes are compared.
 PIXEL_TIME = 0.4
-#: Gaussians per pixel of a clip where a core has one microsecond for each, and where they live for one frame; it grows
-#: by these powers of the time and of the lifetime. Gaussians that live long are seldom needed anew.
-DENSITY, DENSITY_POWER, LIFETIME_POWER = 0.0205, 0.85, -0.6
+#: Gaussians per pixel of a clip where a core has one microsecond for each, and where they live for one frame.
+DENSITY = 0.0205
+#: The power of the time by which that number grows.
+DENSITY_POWER = 0.85
+#: The power of the lifetime: Gaussians that live long are seldom needed anew.
+LIFETIME_POWER = -0.6
 #: A model with parameters of so many bytes is at most as large as the frames as bytes.
 PARAMETER_BYTES = 2
-#: Mean lifetimes in frames: of slow clips (*Bunny* 68, carphone 35), and the shortest, in flicker. DAVIS: 5 to 19.
-TYPICAL_LIFETIME, SHORTEST_LIFETIME = 35.0, 2.0
-#: Gaussians alive in a frame, at most: for a frame of one pixel and one microsecond; it grows by these powers of the
-#: time, likewise, and of the pixels. Where they live long, more of them leave time for too few steps.
-ALIVE, ALIVE_POWER, ALIVE_PIXEL_POWER = 0.378, 0.55, 0.95
+#: Mean lifetime of Gaussians of slow clips, in frames.
+TYPICAL_LIFETIME = 35.0
+#: The shortest mean lifetime, in flicker, in frames.
+SHORTEST_LIFETIME = 2.0
+#: Gaussians alive in a frame, at most, for a frame of one pixel and one microsecond. More of them would leave time for
+#: too few steps.
+ALIVE = 0.378
+#: The power of the time by which that number grows.
+ALIVE_POWER = 0.55
+#: The power of the pixels by which it grows.
+ALIVE_PIXEL_POWER = 0.95
 #: More Gaussians than this in each pixel gain nothing, however much time there is.
 MOST_PER_PIXEL = 1.6
 

@@ -15,17 +15,20 @@ from foldgauss.video.fitting.state import FitState
 from foldgauss.video.fitting.steppers.protocol import StepResult
 from foldgauss.video.models.row_layout import columns
 
-#: Steps between the states that are kept to return to: at least the first, and one for so many Gaussians, so that
-#: copies take a hundredth of the time. (A copy of 40,000 takes 4 ms.)
-KEEP_EVERY, COPIED_PER_STEP = 50, 8000
+#: Steps between the states that are kept to return to, at least.
+KEEP_EVERY = 50
+#: One more step between them for so many Gaussians: copies then take a hundredth of the time.
+COPIED_PER_STEP = 8000
 #: Steps between tests of all parameters; those of the Gaussians alive are tested after every step.
 TEST_EVERY = 10
 #: A mean squared error of so many times the lowest one known is no chance: 6 dB.
 MUCH_WORSE = 4.0
 #: Above 35 dB a fit has not diverged.
 GOOD_ERROR = 3e-4
-#: A fit that after so many passes is worse than its start by this factor, 1 dB, does not converge.
-NOT_BETTER, START_PASSES = 1.25, 6
+#: A fit that is worse than its start by this factor, 1 dB,
+NOT_BETTER = 1.25
+#: after so many passes does not converge.
+START_PASSES = 6
 #: How often a fit backs off, each time by `BACKOFF_FACTOR`: down to 1/4096 of its rates.
 MAX_BACKOFFS = 6
 #: How far a frame time's logit may move from that of the state kept, some `KEEP_EVERY` steps ago: its interval is then
@@ -33,8 +36,10 @@ MAX_BACKOFFS = 6
 MAX_TIME_MOVE = 15.0
 #: The least scale that a leaf's moves are measured in: where all start alike, as opacities do, their own spread is 0.
 MIN_SCALE = {"loc": 0.3}  # of the frame; 1 for logits, logarithms, colors and folds
-#: All frames must have been seen before their errors are compared.
-PASSES, MIN_STEPS = 2, 20
+#: Errors of frames are compared after so many passes: all must have been seen.
+PASSES = 2
+#: Errors of frames are compared after so many steps.
+MIN_STEPS = 20
 
 
 class DivergenceWarning(RuntimeWarning):

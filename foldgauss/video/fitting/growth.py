@@ -20,9 +20,11 @@ PUBLISHED_UNIT = 1 / (2 * math.tan(FIELD_OF_VIEW / 2))
 EXTENT = 1.1 * PUBLISHED_UNIT
 #: Steps of the published fit, which the steps of the schedule are meant for.
 PUBLISHED_STEPS = 30_000
-#: In plans however short, gradients are averaged over at least so many steps; and between resets opacities have the
-#: time to recover: at the published rate, 0.025 a step, the logit of 0.01 needs 184 steps to that of 0.5.
-MIN_EVERY, MIN_RESET_EVERY = 10, 200
+#: In plans however short, gradients are averaged over at least so many steps.
+MIN_EVERY = 10
+#: In plans however short, opacities have so many steps to recover between resets: at the published rate, 0.025 a step,
+#: the logit of 0.01 needs 184 steps to that of 0.5.
+MIN_RESET_EVERY = 200
 CHUNK = 1 << 16  # Gaussians per task
 
 

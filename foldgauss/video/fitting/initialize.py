@@ -17,9 +17,10 @@ from foldgauss.video.models.splats import SH_C0, TAU_MAX, FoldedSplats
 from foldgauss.video.motion.optical_flow import Motion, Tracks, fit_folds
 from foldgauss.video.motion.path_coordinates import PathCoordinates, prefers_path
 
-#: Logarithm of the ratio of the longer axis of a start on a straight edge to the geometric mean of both; the width, in
-#: pixels, of the window in which edges are measured.
-ELONGATION, TENSOR_WIDTH = 0.7, 1.5
+#: Logarithm of the ratio of the longer axis of a start on a straight edge to the geometric mean of both.
+ELONGATION = 0.7
+#: The width, in pixels, of the window in which edges are measured.
+TENSOR_WIDTH = 1.5
 #: Fraction of the starts that is spread evenly, so that flat regions are covered too.
 EVEN_FRACTION = 0.15
 #: Initial standard deviation in units of the distance to the neighbors alive at the same time.
@@ -29,14 +30,20 @@ START_OPACITY = 0.3
 SUMMED_OPACITY = 1 / (2 * np.pi * SCALE_FACTOR**2)
 #: sigma_t of a start at rest is drawn log-uniformly between these, in units of the clip's duration.
 TIME_SCALES = (0.02, 0.4)
-#: sigma_t of a start that follows its track, in units of half the track; and at least, in frames.
-TRACK_FRACTIONS, MIN_FRAMES = (0.25, 1.2), 0.9
+#: sigma_t of a start that follows its track, in units of half the track.
+TRACK_FRACTIONS = (0.25, 1.2)
+#: The least sigma_t of such a start, in frames.
+MIN_FRAMES = 0.9
 #: sigma_t, in frames, of a start that cannot be tracked to either neighbor: with an envelope of power 1 it is then a
 #: quarter as wide there. (Two alternating images, 120 steps: 19.5 dB with 0.6, 22.3 with this; bikes, 80x160: 31.65 and
 #: 31.70.)
 UNTRACKED_FRAMES = 0.42
-#: Where the fold misses the track by more than this many pixels, sigma_t is multiplied by this, so often at most.
-MISS, SHORTENING, SHORTENINGS = 0.7, 0.6, 4
+#: Where the fold misses the track by more than this many pixels, sigma_t is shortened,
+MISS = 0.7
+#: by this factor,
+SHORTENING = 0.6
+#: so often at most.
+SHORTENINGS = 4
 #: Gaussians alive in a frame, for each pixel, below which those that follow a path live longer than a fold alone
 #: could follow their track. With more of them, they reproduce what differs from frame to frame, such as motion blur,
 #: less well. (40 frames of bus, 180x320, 800 steps, as long as possible and as a fold alone: 15,000 Gaussians 33.9 and
@@ -44,18 +51,29 @@ MISS, SHORTENING, SHORTENINGS = 0.7, 0.6, 4
 FEW_ALIVE = 0.35
 CHUNK = 12_000  # tracks held by a thread: some 3 kB each on the way
 AT_ONCE = 8 * CHUNK  # tracks held by all threads
-#: Trial starts per frame, from which follows how long starts are visible: so many sigma_t to either side. In long clips
-#: at most `MAX_PILOTS` in all, since they would take longer than the fit.
-PILOT, CORE, ROUNDS, MAX_PILOTS = 32, 1.5, 50, 40_000
+#: Trial starts per frame, from which follows how long starts are visible.
+PILOT = 32
+#: A start is visible so many sigma_t to either side.
+CORE = 1.5
+#: Rounds of the search for sigma_t.
+ROUNDS = 50
+#: The most trial starts in all: in long clips they would take longer than the fit.
+MAX_PILOTS = 40_000
 #: With fewer starts than this per frame, their frames are drawn at even distances.
 FEW_STARTS = 16
 #: Fraction of the starts that is spread so that all frames are covered equally, however short the tracks there. With
 #: more, the worst frames get better and the mean worse.
 EVEN_FRAMES = 0.2
-#: Uniform starts. VeGaS: sigma_t and fold coefficients lie between these (the latter in published units), opacity is
-#: 0.1, colors are gray: its code stores them in 8 bits. 3DGS: scales are the root mean square distance to so many
-#: neighbors.
-UNIFORM_TIME_SCALES, UNIFORM_FOLD, UNIFORM_OPACITY, UNIFORM_COLOR, NEIGHBORS = (0.01, 1.0), 1.0, 0.1, 127 / 255, 3
+#: Bounds of sigma_t of uniform starts (VeGaS).
+UNIFORM_TIME_SCALES = (0.01, 1.0)
+#: Largest fold coefficient of uniform starts, in published units (VeGaS).
+UNIFORM_FOLD = 1.0
+#: Opacity of uniform starts (VeGaS).
+UNIFORM_OPACITY = 0.1
+#: Color of uniform starts: gray, which the published code stores in 8 bits.
+UNIFORM_COLOR = 127 / 255
+#: The scale of a uniform start is the root mean square distance to so many neighbors (3DGS).
+NEIGHBORS = 3
 
 
 #: The center of the backdrop, in units of the frame's longer side: far from the frame, where no region selects it.

@@ -140,7 +140,8 @@ def _decode_rules(rows: Any) -> tuple[tuple[str, float, float, tuple[float, ...]
 
 
 #: The metadata of fields that are no arrays: `decode` restores them from JSON.
-_COUNT, _NUMBER = ({"static": True, "decode": kind} for kind in (int, float))
+_COUNT = {"static": True, "decode": int}
+_NUMBER = {"static": True, "decode": float}
 _ERRORS = {"static": True, "decode": _decode_errors}
 _RULES = {"static": True, "decode": _decode_rules}
 _ROW = PerGaussian(np.float32, ("width",))

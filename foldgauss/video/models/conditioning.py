@@ -22,7 +22,8 @@ from foldgauss.video.models.splats import SH_C0, TAU_MAX
 
 CHUNK = 4096  # Gaussians per task
 
-_f, _u = nb.float32, nb.uint64
+_f = nb.float32
+_u = nb.uint64
 #: Outputs of conditioning for each Gaussian: mean 2, factor 4, opacity, color 3, kept 3.
 _NUM_OUT = 13
 

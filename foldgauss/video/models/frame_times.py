@@ -14,10 +14,11 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Float32
 from foldgauss._runtime.checks import invalid, is_integer, is_within, short_repr
 from foldgauss._runtime.threads import check_not_forked
 
-#: Length of the gap between two shots, in frames: `GAP` plus `GAP_SHOTS` times the longer shot. A Gaussian in the
-#: middle of a shot has vanished in the next one for sigma_t up to 1.15 shots, whose envelope shrinks it by at most a
-#: tenth at the ends of its own shot.
-GAP, GAP_SHOTS = 8.0, 3.0
+#: Length of the gap between two shots, in frames: this,
+GAP = 8.0
+#: plus this times the longer shot. A Gaussian in the middle of a shot has vanished in the next one for sigma_t up to
+#: 1.15 shots, whose envelope shrinks it by at most a tenth at the ends of its own shot.
+GAP_SHOTS = 3.0
 #: An interval longer than the median one by this factor is a cut. Learned times move neighbors less than that.
 CUT_RATIO = 6.0
 

@@ -24,8 +24,10 @@ def psnr(target: np.ndarray, image: np.ndarray) -> float:
     return float(skimage.metrics.peak_signal_noise_ratio(target, image, data_range=255))
 
 
-#: Side of SSIM's window in pixels, and the distance from its center to its edge.
-SSIM_WINDOW, SSIM_REACH = 11, 5
+#: Side of SSIM's window in pixels.
+SSIM_WINDOW = 11
+#: The distance from the window's center to its edge.
+SSIM_REACH = 5
 #: Pixels of the images that are compared at the same time: SSIM takes 130 bytes for each.
 PIXELS_AT_ONCE = 5_000_000
 

@@ -14,9 +14,10 @@ from foldgauss.video.models.video_model import VideoModel, check_model
 
 #: The highest degree that is tried: that of the published VeGaS code.
 MAX_DEGREE = 7
-#: A Gaussian gets another power only if it misses its path by more than this, in pixels, and with it by less than this
-#: fraction of that.
-NEEDED, GAINED = 0.1, 0.8
+#: A Gaussian gets another power only if it misses its path by more than this, in pixels,
+NEEDED = 0.1
+#: and with it by less than this fraction of that.
+GAINED = 0.8
 #: Times in a Gaussian's life at which its place is fitted, besides those of the frames.
 OWN_TIMES = 9
 #: Added to the diagonal of normal equations whose greatest element is 1.

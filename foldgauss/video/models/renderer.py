@@ -20,7 +20,8 @@ from foldgauss.video.models.background import BLACK, Background, check_backgroun
 
 ROWS = 64  # of pixels per task
 
-_f, _byte = nb.float32, nb.uint8
+_f = nb.float32
+_byte = nb.uint8
 
 
 class PreparedVideo(Protocol):

@@ -16,28 +16,38 @@ from foldgauss.video.motion.optical_flow import both_flows, match_points
 
 _LOG = logging.getLogger(__name__)
 
-#: The longer side, in pixels, of the images that flow is computed on, and the distance of the points in them.
-SIDE, SPACING = 480, 6
-#: A point is used where forward and backward flow agree within this many pixels, and this fraction of the distance.
-#: Another shot begins where less than the last fraction of the points does. (Between frames of two clips it was 0.05
-#: at most, within shots 0.84 at least.)
-MISS, MISS_FRACTION, LEAST_KNOWN = 1.0, 0.1, 0.3
-#: MAGSAC: the largest scale of noise in pixels, and iterations at most.
-NOISE, ITERATIONS = 0.5, 2000
+#: The longer side, in pixels, of the images that flow is computed on.
+SIDE = 480
+#: The distance of the points in these images, in pixels.
+SPACING = 6
+#: A point is used where forward and backward flow agree within this many pixels,
+MISS = 1.0
+#: and this fraction of the distance.
+MISS_FRACTION = 0.1
+#: Another shot begins where a smaller fraction of the points is used.
+LEAST_KNOWN = 0.3
+#: MAGSAC: the largest scale of noise, in pixels.
+NOISE = 0.5
+#: MAGSAC: iterations at most.
+ITERATIONS = 2000
 #: Frames are aligned with one that is further away, so that errors do not add up, while this fraction of the points
 #: follows one homography.
 KEY_INLIERS = 0.35
 #: A homography has 8 parameters, of which a point gives two.
 LEAST_POINTS = 8
-#: A plate is the median of at most so many frames, of those at most so far away.
-PLATE_FRAMES, PLATE_REACH = 14, 40
+#: A plate is the median of at most so many frames,
+PLATE_FRAMES = 14
+#: of those at most so many frames away.
+PLATE_REACH = 40
 #: Holes of a plate are filled from frames in which at least this fraction of a pixel is uncovered.
 UNCOVERED = 250 / 255
 #: Where no frame shows more than this fraction of the removed area, half of that is farther than `MARGIN` from what is
 #: known: wider than the rims that interpolation closes unseen.
 MUCH_UNKNOWN = 0.1
-#: What an object covers is replaced with this margin, and a soft edge of this width; fractions of the longer side.
-MARGIN, SOFT_EDGE = 0.012, 0.004
+#: What an object covers is replaced with this margin, a fraction of the longer side,
+MARGIN = 0.012
+#: and a soft edge of this width, a fraction of it too.
+SOFT_EDGE = 0.004
 
 Frames = UInt8[np.ndarray, "frames height width 3"]
 Masks = Bool[np.ndarray, "frames height width"]

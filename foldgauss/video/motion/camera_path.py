@@ -14,12 +14,18 @@ from foldgauss.video.models.frame_times import is_cut
 from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer
 from foldgauss.video.motion.optical_flow import both_flows, match_points
 
-#: The longer side, in pixels, of the images that flow is computed on, and the distance of the points in them.
-SIDE, SPACING = 480, 6
-#: A point is used where forward and backward flow agree within this many pixels, and this fraction of the distance.
-MISS, MISS_FRACTION = 0.3, 0.05
-#: RANSAC: a point follows the camera within this many pixels; iterations at most.
-INLIER, ITERATIONS = 0.7, 2000
+#: The longer side, in pixels, of the images that flow is computed on.
+SIDE = 480
+#: The distance of the points in these images, in pixels.
+SPACING = 6
+#: A point is used where forward and backward flow agree within this many pixels,
+MISS = 0.3
+#: and this fraction of the distance.
+MISS_FRACTION = 0.05
+#: RANSAC: a point follows the camera within this many pixels.
+INLIER = 0.7
+#: RANSAC: iterations at most.
+ITERATIONS = 2000
 #: The largest zoom from one frame to the next, and its inverse.
 MOST_ZOOM = 2.0
 #: The camera's motion between two frames is unknown where less than this fraction of the points is tracked and agrees.

@@ -30,36 +30,70 @@ _LOG = logging.getLogger(__name__)
 
 #: Motion is measured over so many frames: slow objects need more, fast ones are not found again after many.
 GAPS = (1, 2, 4)
-#: What moves by less than this many pixels, or this multiple of the image's median, is hardly evidence; likewise for
-#: differences from the plate, in levels of 255.
-LEAST_MOTION, LEAST_DIFFERENCE, TIMES_MEDIAN = 0.7, 12.0, 4.0
+#: What moves by less than this many pixels is hardly evidence.
+LEAST_MOTION = 0.7
+#: What differs from the plate by fewer levels of 255 is hardly evidence.
+LEAST_DIFFERENCE = 12.0
+#: Nor is what moves, or differs, by less than this multiple of the image's median.
+TIMES_MEDIAN = 4.0
 #: Evidence of what moves as the background, only faster: it may stand still and be nearer than the background.
 PARALLAX = 0.2
 #: Evidence is motion to this power times difference to the rest. (car-shadow: 0.4 to 0.7 are alike.)
 MOTION_POWER = 0.6
-#: Evidence that may be of an object, that probably is, and that certainly is; relative to the frame's largest, its
-#: percentile `TOP`, which counts as `FAINTEST` at least. An object has `LEAST_EVIDENCE` on average, not relative.
-MAYBE, PROBABLY, CERTAINLY, TOP, FAINTEST, LEAST_EVIDENCE = 0.3, 0.5, 0.8, 99.8, 0.35, 0.4
-#: Votes are passed on to the next frame at this rate: of motion, and of masks. Flow must agree with the flow back
-#: within about so many pixels.
-MOTION_VOTE, MASK_VOTE, VOTE_MISS = 0.6, 0.8, 1.5
-#: A shadow darkens all channels alike: logarithms of ratios differ by less than `HUE`. Their mean is below `SLIGHT`
-#: where borders are sought, below `STRONG` where shadow is cut off below an object, and always above `DARKEST`.
-HUE, SLIGHT, STRONG, DARKEST = 0.12, -0.1, -0.6, -2.2
-#: The smallest piece, a fraction of the image. A piece follows if the fraction `INSIDE` of it is where the object is
-#: expected, or if it covers the fraction `REFOUND` of that. The object is lost in a frame where its area is below the
-#: fraction `LOST` of the usual one; where it is above `MERGED` times that, it touches another object.
-SMALLEST, INSIDE, REFOUND, LOST, MERGED = 3e-4, 0.5, 0.4, 0.1, 2.0
-#: A lost object is sought this many pixels further in each frame, at most this fraction of the longer side away.
-SEARCH, FARTHEST = 6, 0.125
+#: Evidence that may be of an object, relative to the frame's largest.
+MAYBE = 0.3
+#: Evidence that probably is of an object, relative to the frame's largest.
+PROBABLY = 0.5
+#: Evidence that certainly is of an object, relative to the frame's largest.
+CERTAINLY = 0.8
+#: The frame's largest evidence is this percentile of it,
+TOP = 99.8
+#: and at least this.
+FAINTEST = 0.35
+#: An object has so much evidence on average, not relative.
+LEAST_EVIDENCE = 0.4
+#: Votes of motion are passed on to the next frame at this rate.
+MOTION_VOTE = 0.6
+#: Votes of masks are passed on to the next frame at this rate.
+MASK_VOTE = 0.8
+#: There the flow must agree with the flow back within about so many pixels.
+VOTE_MISS = 1.5
+#: A shadow darkens all channels alike: logarithms of ratios differ by less than this.
+HUE = 0.12
+#: Their mean is below this where borders of a shadow are sought,
+SLIGHT = -0.1
+#: below this where shadow is cut off below an object,
+STRONG = -0.6
+#: and always above this.
+DARKEST = -2.2
+#: The smallest piece, a fraction of the image.
+SMALLEST = 3e-4
+#: A piece follows if this fraction of it is where the object is expected,
+INSIDE = 0.5
+#: or if it covers this fraction of that.
+REFOUND = 0.4
+#: The object is lost in a frame where its area is below this fraction of the usual one.
+LOST = 0.1
+#: It touches another object where its area is above this multiple of the usual one.
+MERGED = 2.0
+#: A lost object is sought this many pixels further in each frame,
+SEARCH = 6
+#: at most this fraction of the longer side away.
+FARTHEST = 0.125
 #: Objects are followed from every so many frames.
 SEED_SPACING = 5
-#: Colors are counted in so many bins of each channel, over the frames up to so many away, of the object and of what is
-#: within so many pixels of it.
-BINS, COLOR_REACH, SURROUNDINGS = 64, 10, 60
-#: A color counts from -COLOR_WEIGHT to COLOR_WEIGHT, by the difference of both frequencies over their sum, against log
-#: odds of the votes of at most VOTE_ODDS. An object reaches at most so many pixels beyond votes of -VOTE_ODDS.
-COLOR_WEIGHT, VOTE_ODDS, BEYOND = 4.0, 3.0, 4
+#: Colors are counted in so many bins of each channel,
+BINS = 64
+#: over the frames up to so many away,
+COLOR_REACH = 10
+#: of the object and of what is within so many pixels of it.
+SURROUNDINGS = 60
+#: A color counts up to this, for or against an object, by the difference of both frequencies over their sum.
+COLOR_WEIGHT = 4.0
+#: The largest log odds of votes.
+VOTE_ODDS = 3.0
+#: An object reaches at most so many pixels beyond votes of -VOTE_ODDS.
+BEYOND = 4
 #: A motion cannot be told from a camera's in fewer frames.
 LEAST_FRAMES = 3
 #: So many shots without an object are logged one by one.

@@ -22,11 +22,14 @@ LONGEST = 36
 #: object, or the point is occluded.
 COLOR_CHANGE = 0.06
 #: It also ends where forward and backward flow disagree by more than this many pixels of the image that the flow was
-#: computed on, and this fraction of the distance.
-MISS, MISS_FRACTION = 0.5, 0.2
-#: The longer side, in pixels, of the images that flow is computed on, and of the flow maps: motion is smoother than
-#: images.
-FLOW_SIDE, KEPT_SIDE = 640, 320
+#: computed on,
+MISS = 0.5
+#: and this fraction of the distance.
+MISS_FRACTION = 0.2
+#: The longer side, in pixels, of the images that flow is computed on.
+FLOW_SIDE = 640
+#: The longer side of the flow maps: motion is smoother than images.
+KEPT_SIDE = 320
 #: What moves by fewer pixels between two frames stands still.
 STILL = 0.1
 #: Fixed-point iterations of the flow at a time between two frames.
@@ -38,19 +41,28 @@ STRAIGHT = 0.1
 #: images that flow is computed on: at edges of what moves, the flow at the pixel is often that of the other side.
 ASIDE = 8
 #: Two frames, moved, are compared by squared differences of colors (of 255), averaged with a Gaussian weight of this
-#: width in pixels. A pixel that one of them lacks counts as this difference.
-COMPARED_WIDTH, LACKING = 7 / 3, 30.0
-#: Motions weigh about the same if these differ by less than this and this fraction of the least.
-ALIKE, ALIKE_FRACTION = 20.0, 0.5
-#: The maps of long clips are smaller, so that they take no more bytes than this, or than this fraction of the frames.
-MAP_BYTES, MAP_FRACTION, BYTES_PER_CELL = 256e6, 0.25, 11
+#: width in pixels.
+COMPARED_WIDTH = 7 / 3
+#: A pixel that one of them lacks counts as this difference.
+LACKING = 30.0
+#: Motions weigh about the same if these differ by less than this,
+ALIKE = 20.0
+#: and this fraction of the least.
+ALIKE_FRACTION = 0.5
+#: The maps of long clips are smaller, so that they take no more bytes than this,
+MAP_BYTES = 256e6
+#: or than this fraction of the frames.
+MAP_FRACTION = 0.25
+#: Bytes of a cell of the maps.
+BYTES_PER_CELL = 11
 #: With fewer points than this per frame on average, the points of all frames are sampled at once.
 FEW_POINTS = 16
 #: There is a cut between two frames where less than this fraction of the points can be tracked.
 CUT_FRACTION = 0.15
-#: There certainly is none where this fraction can be tracked by a fast flow between images with a longer side of so
-#: many pixels. (At 183 cuts in and between three clips, some of them made fast, dark or noisy, it was 0.27 at most.)
-FAST_SIDE, SURE_FRACTION = 160, 0.5
+#: The longer side, in pixels, of images for the fast flow that rules out a cut.
+FAST_SIDE = 160
+#: There certainly is no cut where this fraction can be tracked by it.
+SURE_FRACTION = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -455,10 +467,10 @@ def _gather(stack, index, scaled) -> np.ndarray:
 RIDGES = np.array([0.03, 0.12, 0.48])
 #: Width of the window in which a fold has to follow its track, in units of sigma_t: where the Gaussian is visible.
 WINDOW = 1.2
-#: A power is used only if the fold without it misses by more than this many pixels, and with it by less than this
-#: fraction of that: beyond its track a cubic leaves the frame. (Bunny, 80x160, 15,000 Gaussians, 2,000 steps: always
-#: cubic 35.6 dB, as needed 35.9; bikes 29.25 and 29.26, always linear 28.8.)
-NEEDED, GAINED = 0.3, 0.8
+#: A power is used only if the fold without it misses by more than this many pixels,
+NEEDED = 0.3
+#: and with it by less than this fraction of that: beyond its track a cubic leaves the frame.
+GAINED = 0.8
 CHUNK = 1024  # tracks per task
 
 

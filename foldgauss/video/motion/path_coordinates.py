@@ -8,10 +8,11 @@ from jaxtyping import Bool, Float, Float32, Int
 from foldgauss.video.models.shared_paths import SharedPaths, invert_maps
 from foldgauss.video.motion.optical_flow import LONGEST, Tracks
 
-#: A start follows a path if a fold follows its track for longer in these coordinates, by this factor, than in others;
-#: where both are alike, if it moves less: at all, in those of the first path, and by the second factor in those of
-#: others. (Else the background would be divided among paths that are nearly the same.)
-LONGER, SMALLER = 1.1, 0.5
+#: A start follows a path if a fold follows its track for longer in these coordinates, by this factor, than in others.
+LONGER = 1.1
+#: Where both are alike, it follows the first path if it moves less in its coordinates, and another if it moves less by
+#: this factor. (Else the background would be divided among paths that are nearly the same.)
+SMALLER = 0.5
 
 
 @dataclasses.dataclass(frozen=True)

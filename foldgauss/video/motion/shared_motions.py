@@ -14,8 +14,10 @@ from foldgauss.video.motion.optical_flow import Motion
 #: The camera's maps are estimated from every so many cells of the flow's maps.
 SPACING = 4
 #: A point tells how something moves where the image has at least this slope, in levels of 255 per cell of the flow's
-#: maps: elsewhere flow is interpolated. At least this fraction of the points must.
-TEXTURE, LEAST_TEXTURED = 2.0, 0.1
+#: maps: elsewhere flow is interpolated.
+TEXTURE = 2.0
+#: At least this fraction of the points must.
+LEAST_TEXTURED = 0.1
 #: RANSAC, in pixels: flow is less exact than this in small frames.
 LEAST_INLIER = 0.3
 #: Gaussians follow the camera in shots in which it is unsteadier than this: the mean of the fourth differences of its
@@ -30,12 +32,19 @@ LEAST_UNSTEADY = 0.03
 #: tenth longer. (Bunny: 2.9e-4, as good as without at equal steps.)
 SMOOTH = 1.1e-3
 #: The largest zoom (as its logarithm) and the largest distance, in units of the frame's longer side, between a frame
-#: and the one in whose coordinates Gaussians are placed. Where the motion goes farther, it is forgotten by these
-#: fractions in each frame; then Gaussians' own folds take over its slow part.
-FARTHEST, FORGOTTEN = (1.0, 4.0), (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
-#: Objects are found from tracks of points on a grid of every so many cells, in every so many frames, so many frames
-#: long at most to either side; at most so many tracks.
-TRACK_SPACING, TRACK_GAP, TRACK_REACH, MAX_TRACKS = 6, 4, 12, 20_000
+#: and the one in whose coordinates Gaussians are placed.
+FARTHEST = (1.0, 4.0)
+#: Where the motion goes farther, it is forgotten by these fractions in each frame; then Gaussians' own folds take over
+#: its slow part.
+FORGOTTEN = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
+#: Objects are found from tracks of points on a grid of every so many cells,
+TRACK_SPACING = 6
+#: in every so many frames,
+TRACK_GAP = 4
+#: so many frames long at most to either side;
+TRACK_REACH = 12
+#: at most so many tracks.
+MAX_TRACKS = 20_000
 #: Motions besides that of the camera.
 MAX_OBJECTS = 1
 #: An object's path follows at least this fraction of all tracks, of those that the paths before it do not.
@@ -44,10 +53,14 @@ LEAST_FOLLOWED = 0.02
 #: those of the coordinates that follow the path: pixels in the middle of each shot.
 STRAY = 1.5
 #: An object's motion is estimated so many times: from the tracks that no path follows yet, and then from those of them
-#: that stray less from it than from the others, and by at most this multiple of `STRAY`.
-ROUNDS, WIDER = 4, 3.0
-#: The fewest tracks that tell an object's motion between two frames, and those of them that must agree.
-FEWEST, AGREEING = 8, 6
+#: that stray less from it than from the others,
+ROUNDS = 4
+#: and by at most this multiple of `STRAY`.
+WIDER = 3.0
+#: The fewest tracks that tell an object's motion between two frames.
+FEWEST = 8
+#: Those of them that must agree.
+AGREEING = 6
 
 
 def find_shared_motions(motion: Motion, *, steady: bool = False) -> Float[np.ndarray, "paths frames 2 3"] | None:

@@ -12,10 +12,11 @@ from foldgauss.video.models.frame_times import is_cut
 from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer
 from foldgauss.video.motion.optical_flow import Motion, both_flows, fit_size
 
-#: Weight of the prediction by optical flow where both frames agree, and their mean squared difference at which it is
-#: half of that. Its errors and those of the video's own image are different, so an average is better than each, or as
-#: good. (Every second frame of six clips hidden: better than a weight of 0.5 by 0.02 to 0.39 dB.)
-FLOW_WEIGHT, HALVING_DIFFERENCE = 0.75, 4000.0
+#: Weight of the prediction by optical flow where both frames agree. Its errors and those of the video's own image are
+#: different, so an average is better than each, or as good.
+FLOW_WEIGHT = 0.75
+#: Mean squared difference of the frames at which the weight is half of that.
+HALVING_DIFFERENCE = 4000.0
 #: So near to a frame, in intervals, its own image is shown.
 NEAR = 1e-3
 #: A frame repeats the one before if less than this fraction of the motion beside the two is between them.

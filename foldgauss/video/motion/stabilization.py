@@ -24,9 +24,10 @@ SMOOTHING = 1.0
 MAX_SMOOTHING = 100_000
 #: Largest zoom of a cropped video.
 MAX_ZOOM = 2.0
-#: Beyond the border frames at these distances are shown, the nearest in front; they begin inside the border by this
-#: fraction of the longer side.
-FILL_DISTANCES, OVERLAP = (1, 2, 4, 8, 16, 32, 64), 0.004
+#: Beyond the border frames at these distances are shown, the nearest in front.
+FILL_DISTANCES = (1, 2, 4, 8, 16, 32, 64)
+#: They begin inside the border by this fraction of the longer side.
+OVERLAP = 0.004
 #: Gaussians farther outside a frame than so many standard deviations are not seen in it, and were never compared with
 #: the clip.
 UNSEEN = 3.0

@@ -48,8 +48,10 @@ _LOG = logging.getLogger(__name__)
 
 #: Fraction of a Gaussian's contribution that must lie inside a mask.
 THRESHOLD = 0.5
-#: Defaults in Delta E: a shade; and more for clicks, where links between neighbors limit the set, too.
-COLOR_TOLERANCE, CLICK_TOLERANCE = 10.0, 15.0
+#: Default tolerance in Delta E: a shade.
+COLOR_TOLERANCE = 10.0
+#: That of clicks, in Delta E: links between neighbors limit the set, too.
+CLICK_TOLERANCE = 15.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

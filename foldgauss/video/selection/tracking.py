@@ -14,10 +14,16 @@ from foldgauss.video.selection.contributions import Contributions, FrameContribu
 #: A frame is ignored for a Gaussian whose weights there sum to less than this fraction of the sum in its best frame: it
 #: is occluded, or about to appear or vanish.
 CLEAR = 0.5
-#: Neighbors that vote on a label, and neighbors that may be linked.
-VOTERS, NEIGHBORS = 16, 8
-#: One unit of difference: of position and of motion per frame, in longer sides of the frame; of color, in Delta E.
-PLACE, MOTION, COLOR = 0.03, 0.004, 10.0
+#: Neighbors that vote on a label.
+VOTERS = 16
+#: Neighbors that may be linked.
+NEIGHBORS = 8
+#: One unit of difference of position, in longer sides of the frame.
+PLACE = 0.03
+#: One unit of difference of motion per frame, in longer sides of the frame.
+MOTION = 0.004
+#: One unit of difference of color, in Delta E.
+COLOR = 10.0
 #: Neighbors touch if their centers are within this many times the sum of their standard deviations, plus a pixel.
 #: Those at the start of a fit are 0.4 such sums apart.
 REACH = 1.5
@@ -25,7 +31,9 @@ REACH = 1.5
 MOTION_FRACTION = 0.1
 #: Most frames that a set is grown through; a Gaussian lives for several frames, and links them.
 GROWN_FRAMES = 48
-UNKNOWN, OUT, IN = -1, 0, 1
+UNKNOWN = -1
+OUT = 0
+IN = 1
 
 
 class Observations(NamedTuple):

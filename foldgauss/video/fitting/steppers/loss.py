@@ -21,17 +21,26 @@ from foldgauss._runtime.threads import run_tasks
 
 RADIUS = 5  # 11 taps
 SIGMA = 1.5
-C1, C2 = 0.01**2, 0.03**2  # Wang et al. 2004: (K1 L)^2 and (K2 L)^2 with L = 1
+#: Wang et al. 2004: (K1 L)^2 with L = 1.
+C1 = 0.01**2
+#: Wang et al. 2004: (K2 L)^2 with L = 1.
+C2 = 0.03**2
 #: Rows per task: enough that the 5 rows of halo above and below cost little, few enough to stay in the cache.
 STRIP = 54
 
 _taps = [math.exp(-0.5 * (k / SIGMA) ** 2) for k in range(RADIUS + 1)]
 #: Weights of the tap in the middle and of those 1 to RADIUS pixels away.
 TAPS = tuple(np.float32(tap / (2 * sum(_taps) - _taps[0])) for tap in _taps)
-_W0, _W1, _W2, _W3, _W4, _W5 = TAPS
+_W0 = TAPS[0]
+_W1 = TAPS[1]
+_W2 = TAPS[2]
+_W3 = TAPS[3]
+_W4 = TAPS[4]
+_W5 = TAPS[5]
 _ALL_TAPS = np.array((*TAPS[:0:-1], *TAPS))
 
-_f, _u = nb.float32, nb.uint64
+_f = nb.float32
+_u = nb.uint64
 
 
 class ImageLoss(NamedTuple):
