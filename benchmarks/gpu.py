@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import _common
-from benchmarks._common import Scene, Task, console, interleaved, random_scene
+from benchmarks._common import Scene, Task, interleaved, random_scene
 from benchmarks.rasterizer import num_boxes
 from foldgauss.io import read_video
 from foldgauss.io.datasets import sample_clip
@@ -98,7 +98,7 @@ def _waited(function, *arrays):
 
 def measure_engines(scenes: list[tuple[int, tuple[int, int]]], rounds: int) -> dict[str, float]:
     figures, device = {}, jax.devices()[0].device_kind
-    table = _common.table("Engines", "scene", "engine", "pass", "ms", "ns/pair", "floor (ms)", "by floor")
+    rows = []
     for num, size in scenes:
         scene = random_scene(num, size)
         pairs = cpu.forward(*scene.leaves, size).num_pairs
@@ -110,14 +110,15 @@ def measure_engines(scenes: list[tuple[int, tuple[int, int]]], rounds: int) -> d
             engine, what = task.split()
             median, floor = statistics.median(own), least.get(what)
             figures |= {f"{name}_{engine}_{what}_ms": 1e3 * median, f"{name}_{engine}_{what}_ns": 1e9 * median / pairs}
-            row = [name, engine, what, f"{1e3 * median:.3f}", f"{1e9 * median / pairs:.4f}"]
             if floor is not None:
                 figures[f"{name}_{what}_floor_ms"] = floor
-            table.add_row(*row, *(["", ""] if floor is None else [f"{floor:.3f}", f"{1e3 * median / floor:.1f}"]))
+            beside = ("", "") if floor is None else (f"{floor:.3f}", f"{1e3 * median / floor:.1f}")
+            rows.append((name, engine, what, f"{1e3 * median:.3f}", f"{1e9 * median / pairs:.4f}", *beside))
         for what in ("forward", "both"):
             ratio = figures[f"{name}_xla_{what}_ms"] / figures[f"{name}_pallas_{what}_ms"]
             figures[f"{name}_xla_over_pallas_{what}"] = ratio
-    console.print(table)
+    columns = "scene", "engine", "pass", "ms", "ns/pair", "floor (ms)", "by floor"
+    _common.print_table("Engines", columns, rows)
     return figures
 
 
@@ -183,7 +184,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = _common.parse(made, arguments)
     if jax.default_backend() == "cpu" and not (options.anyway and options.tiny):
         made.error("expected a GPU that JAX sees, got none. --anyway --tiny tells whether this runs, on a processor.")
-    _common.finish(options.json, measured(options), facts())
+    _common.finish(options.json, measured(options), facts=facts())
 
 
 def measured(options: argparse.Namespace) -> dict[str, float]:
@@ -210,11 +211,7 @@ def measured(options: argparse.Namespace) -> dict[str, float]:
 
 def facts() -> dict[str, object]:
     devices = jax.local_devices()
-    return _common.describe_machine() | {
-        "device": devices[0].device_kind,
-        "devices": len(devices),
-        "jax": jax.__version__,
-    }
+    return {"device": devices[0].device_kind, "devices": len(devices)}
 
 
 if __name__ == "__main__":
