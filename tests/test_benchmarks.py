@@ -1,12 +1,14 @@
 """The benchmarks that the documentation cites: each starts, long ones continue, and the paper's figures are quoted."""
 
 import dataclasses
-import importlib
 import json
+import re
+import shlex
 import statistics
 from pathlib import Path
 
 import cv2
+import guides
 import numpy as np
 import pytest
 
@@ -21,6 +23,7 @@ from foldgauss.video.fitting.loop import start
 from foldgauss.video.models.row_layout import unpack
 
 SIZE, NUM_FRAMES = (24, 32), 6
+TEXT = "\n".join((guides.ROOT / page).read_text() for page in guides.PAGES if page != "CHANGELOG.md")
 COMMANDS = sorted(path.stem for path in Path(benchmarks.__file__).parent.glob("[a-z]*.py"))
 
 
@@ -41,13 +44,14 @@ def clip(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_every_benchmark_explains_itself(name, capsys):
+def test_every_benchmark_is_cited_by_commands_that_it_takes(name):
+    """In the documentation, inline or in a block."""
     pytest.importorskip("matplotlib", reason="figures need the extra 'plot'")
-    module = importlib.import_module(f"benchmarks.{name}")
-    with pytest.raises(SystemExit) as done:
-        module.main(["--help"])
-    assert done.value.code == 0
-    assert f"python -m benchmarks.{name}" in capsys.readouterr().out
+    command = rf"python -m benchmarks\.{name}\b"
+    found = re.findall(f"(?<=`){command}[^`]*|^{command}.*", TEXT, re.MULTILINE)
+    assert found
+    for cited in found:
+        guides.check_benchmark(shlex.split(cited, comments=True)[1:], cited)
 
 
 # ------------------------------------------------------------------------------------------------ finished runs
