@@ -18,15 +18,18 @@ from foldgauss.io._atomic import atomic_path, check_writable
 
 console = Console(width=140)
 
-#: Opacities and standard deviations (px) of the random scenes, as in the design's section 6: about 4.4
-#: bounding-box tiles per splat.
-OPACITIES, SIGMAS = (0.05, 1.0), (1.0, 6.0)
+#: Range of the opacities of the random scenes.
+OPACITIES = (0.05, 1.0)
+#: Range of their standard deviations, in pixels: about 4.4 bounding-box tiles per splat.
+SIGMAS = (1.0, 6.0)
 SEED = 0
 #: Seconds of rest before each timed call: XLA goes on working on threads of its own after a large result is
 #: ready, which was seen to slow the next 10 ms of another engine by half.
 PAUSE = 0.05
-#: Calls of a task in one turn, the first not counted; and seconds that a turn lasts at least.
-BURST, TURN = 4, 0.1
+#: Calls of a task in one turn, of which the first is not counted.
+BURST = 4
+#: Seconds that a turn lasts at least.
+TURN = 0.1
 
 
 class Task(NamedTuple):

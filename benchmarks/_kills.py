@@ -17,7 +17,8 @@ from foldgauss.io.datasets import bunny
 from foldgauss.io.models.model_file import ModelFileError, load_model, read_header
 from foldgauss.io.models.video_model import load_video_model, read_metadata, save_video_model
 
-FRAMES, SIZE = (0, 12), (80, 160)
+FRAMES = (0, 12)
+SIZE = (80, 160)
 #: Fits by name: what is kept of them differs. Frame times are learned in all. Checkpoints are of 2 to 4 MB.
 FITS = {
     "plain": ["--gaussians", "20000", "--steps", "400"],
@@ -30,8 +31,8 @@ FITS = {
 EVERY = 0.2
 #: Where kills are aimed at, in turn: at any time, into the writing of a checkpoint, into that of the model.
 AIMS = ("time", "checkpoint", "time", "checkpoint", "time", "model")
-#: In the writing of a file: most while bytes go out, else between that and its name.
-MOMENTS, WEIGHTS = ("bytes", "written", "flushed", "named"), (0.55, 0.15, 0.15, 0.15)
+#: Moments in the writing of a file, and their probabilities: most while bytes go out, else between that and its name.
+MOMENTS = {"bytes": 0.55, "written": 0.15, "flushed": 0.15, "named": 0.15}
 #: A checkpoint has at least so many times the bytes of the model: parameters, and two moments of each.
 CHECKPOINT_BYTES = 3
 
@@ -118,7 +119,7 @@ def _aimed(aim: str, rng: np.random.Generator, whole: Uninterrupted) -> tuple[di
     size, most, ending = len(whole.before_scores), 2, ".safetensors"  # without its scores, and with them
     if aim == "checkpoint":
         size, most, ending = CHECKPOINT_BYTES * size, max(whole.num_checkpoints // 2, 1), ".checkpoint"
-    plan = {"ending": ending, "moment": str(rng.choice(MOMENTS, p=WEIGHTS))}
+    plan = {"ending": ending, "moment": str(rng.choice(list(MOMENTS), p=list(MOMENTS.values())))}
     return plan | {"number": int(rng.integers(1, most + 1)), "count": int(rng.integers(1, size))}, None
 
 

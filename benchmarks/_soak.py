@@ -17,10 +17,16 @@ from foldgauss.io.models.video_model import load_video_model, save_video_model
 from foldgauss.video import FitConfig, evaluate
 from foldgauss.video.fitting.loop import fit_steps, to_model
 
-#: Frames and size of the clip, Gaussians and steps of each short fit.
-FRAMES, SIZE, GAUSSIANS, STEPS = (0, 16), (80, 160), 3000, 240
-#: Seconds of the long fit in each cycle; and between two looks at the memory.
-LONG, LOOK = 12.0, 2.0
+FRAMES = (0, 16)
+SIZE = (80, 160)
+#: Gaussians of all fits.
+GAUSSIANS = 3000
+#: Steps of each short fit.
+STEPS = 240
+#: Seconds of the long fit in each cycle.
+LONG = 12.0
+#: Seconds between two looks at the memory.
+LOOK = 2.0
 #: Of the soak, its beginning: what is compiled and cached in the first cycles is no growth.
 WARM_UP = 0.25
 MIB = 2**20

@@ -29,8 +29,13 @@ from foldgauss.io.datasets import davis
 from foldgauss.video import FitConfig
 from foldgauss.video.fitting.config import PRESETS
 
-MINUTES, CROP = 10.0, (960, 1920)
-SMALL, FULL = ("480p",), ("Full-Resolution", "1080p")  # names of folders: DAVIS 2017, DAVIS 2016
+MINUTES = 10.0
+#: Window of the second table.
+CROP = (960, 1920)
+#: Names of the folders of small frames.
+SMALL = ("480p",)
+#: Names of the folders of full frames: DAVIS 2017, DAVIS 2016.
+FULL = ("Full-Resolution", "1080p")
 
 
 @dataclasses.dataclass(frozen=True)

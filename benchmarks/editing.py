@@ -72,9 +72,14 @@ PAST = {(0, 205): 12, (205, 384): 20}
 WITHIN = 0.7
 #: A mask is grown by so many pixels before it is said what is seen beside it.
 BESIDE = 5
-CYAN, MAGENTA = (0.0, 220.0, 255.0), (255.0, 0.0, 255.0)
-#: A sheet's file is made smaller until it is within.
-SHEET_BYTES, SHEET_WIDTH, COLORS = 400_000, 1280, 200
+CYAN = (0.0, 220.0, 255.0)
+MAGENTA = (255.0, 0.0, 255.0)
+#: A sheet's file is made smaller until it has at most so many bytes.
+SHEET_BYTES = 400_000
+#: Width of a sheet at most, in pixels.
+SHEET_WIDTH = 1280
+#: Colors of a sheet.
+COLORS = 200
 
 Video = VideoModel | EditedVideo
 

@@ -23,7 +23,8 @@ from foldgauss.video import FitConfig, independent_frames
 
 SIZES = {"bunny": (160, 320), "bikes": None, "carphone": None}
 MINUTES = 3.0
-FOLDED, ALONE = "folded", "independent frames"
+FOLDED = "folded"
+ALONE = "independent frames"
 
 
 def of_frames(clip: Clip, num_parameters: int, config: FitConfig) -> Run:

@@ -30,7 +30,8 @@ from foldgauss.video import FitConfig
 MINUTES = 2.0
 #: Fraction of the frames that are left out, and of the rest that are shown twice.
 FRACTION = 0.15
-FIXED, LEARNED = "fixed", "learned"
+FIXED = "fixed"
+LEARNED = "learned"
 
 
 def uneven(num_frames: int, fraction: float, seed: int) -> np.ndarray:

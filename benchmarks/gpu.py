@@ -41,7 +41,11 @@ ENGINES = {"xla": xla.TILE_SIZE, "pallas": pallas.TILE_SIZE}  # with the sides o
 PARTS = ("engines", "quality", "playback")
 SCENES = [(num, size) for num in (100_000, 500_000) for size in ((640, 1280), (1080, 1920))]
 TINY_SCENES = [(200, (24, 40))]
-SIZE, FRAMES, MINUTES, GAUSSIANS, BATCH = (640, 1280), (0, 132), 10.0, 620_000, 1
+SIZE = (640, 1280)
+FRAMES = (0, 132)
+MINUTES = 10.0
+GAUSSIANS = 620_000
+BATCH = 1
 LOOKS = 10  # of a fit, evenly spaced in time; each renders all frames on the CPU
 #: Peak float32 operations and exponentials a second, and bytes a second, by the device's name. NVIDIA's data sheets;
 #: exponentials: 16 a cycle on each of 132 multiprocessors at 1.83 GHz.
@@ -52,9 +56,11 @@ OPERATIONS = {"forward": 23, "both": 23 + 23 + 30}
 EXPONENTIALS = {"forward": 1, "both": 2}
 #: Bytes of a splat's leaves (10 numbers) and fields (9); of a slot of the lists: its key is sorted in four passes, each
 #: of which reads and writes it, and its fields are gathered (9 numbers read, written and read again).
-SPLAT_BYTES, SLOT_BYTES = 4 * (10 + 9), 4 * (2 * 4 + 3 * 9)
+SPLAT_BYTES = 4 * (10 + 9)
+SLOT_BYTES = 4 * (2 * 4 + 3 * 9)
 #: With gradients, also: the sums of a slot written and read (9 numbers), those of a splat written (10).
-SPLAT_BYTES_BACK, SLOT_BYTES_BACK = 4 * (9 + 10), 4 * 2 * 9
+SPLAT_BYTES_BACK = 4 * (9 + 10)
+SLOT_BYTES_BACK = 4 * 2 * 9
 
 
 def floors(num: int, size: tuple[int, int], pairs: int, device: str) -> dict[str, float]:

@@ -27,8 +27,10 @@ TASKS = {
 }
 TYPED = {"_FOLDGAUSS_COMPLETE": "complete_bash", "COMP_WORDS": "foldgauss re", "COMP_CWORD": "1"}
 FIRST = "import jax"
-#: Of the processor's time, and of what it holds.
-LIMIT, HELD = 1.5, ("import foldgauss", "from foldgauss import *")
+#: Largest ratio to the processor's time of `import jax`.
+LIMIT = 1.5
+#: Tasks that the limit holds for.
+HELD = ("import foldgauss", "from foldgauss import *")
 
 
 def seconds_of(name: str) -> tuple[float, float]:

@@ -39,7 +39,9 @@ from foldgauss.video.models.metrics import psnr, ssim
 from foldgauss.video.motion import slow_motion
 from foldgauss.video.motion.optical_flow import Motion
 
-CLIPS, SIZE, MINUTES = ("bunny", "bikes"), (160, 320), 5.0
+CLIPS = ("bunny", "bikes")
+SIZE = (160, 320)
+MINUTES = 5.0
 
 
 def mean_of_two(one: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -61,10 +61,13 @@ TOLERANCE = 1e-4
 #: Fraction of the pixels that may exceed it: where a splat is at the very cutoff (alpha 1/255), rounding decides
 #: whether an engine draws it.
 CUTOFF_FRACTION = 1e-5
-#: Lines: numbers of splats at one size; sizes at one number of splats, whose deviations grow with the width. (In much
+#: Numbers of splats of the first line, at the size `LINE_SIZE`.
+LINE_SPLATS = (25_000, 50_000, 100_000, 200_000, 400_000)
+LINE_SIZE = (640, 1280)
+#: Widths of the pictures of the second line, of `LINE_NUM` splats, whose deviations grow with the width. (In much
 #: smaller pictures the splats are smaller than a tile, and what is visited no longer follows their area.)
-LINE_SPLATS, LINE_SIZE = (25_000, 50_000, 100_000, 200_000, 400_000), (640, 1280)
-LINE_WIDTHS, LINE_NUM = (640, 960, 1280, 1920, 2560), 50_000
+LINE_WIDTHS = (640, 960, 1280, 1920, 2560)
+LINE_NUM = 50_000
 XLA_TILE = 8  # pixels along a side of what the engine lists by
 
 

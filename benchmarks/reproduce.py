@@ -51,8 +51,9 @@ from foldgauss.video.fitting.state import FitState, to_model
 from foldgauss.video.models.row_layout import columns
 
 FULL = (640, 1280)
-#: Steps between two points of a curve, and seconds between two checkpoints.
-EVERY, CHECKPOINT_SECONDS = 100, 120.0
+#: Steps between two points of a curve.
+EVERY = 100
+CHECKPOINT_SECONDS = 120.0
 
 #: What each fit changes in the preset, or in its `Growth`; the largest questions first. `rates` is a factor of all
 #: learning rates, `extent` one of what is in units of the scene's extent (the learning rate of positions and two

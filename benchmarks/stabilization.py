@@ -22,10 +22,16 @@ from foldgauss.io.datasets import sample_clip
 from foldgauss.video import FitConfig, VideoModel, estimate_camera_path, fit, stabilize
 from foldgauss.video.motion.stabilization import BORDERS
 
-SIZE, WINDOW = (320, 640), (240, 480)
-#: Standard deviation of the shake, in pixels, and of its rotation, in radians; frames of the Gaussian that makes it
-#: continuous, as that of a hand; and pixels of the pan in each frame.
-SHAKE, TURN, HAND, PAN = 6.0, 0.01, 2.0, 0.8
+SIZE = (320, 640)
+WINDOW = (240, 480)
+#: Standard deviation of the shake, in pixels.
+SHAKE = 6.0
+#: Standard deviation of its rotation, in radians.
+TURN = 0.01
+#: Frames of the Gaussian that makes the shake continuous, as that of a hand.
+HAND = 2.0
+#: Pixels of the pan in each frame.
+PAN = 0.8
 #: Frames of the Gaussian whose result is the intended path.
 INTENDED = 4.0
 
