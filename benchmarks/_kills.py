@@ -98,7 +98,8 @@ def run(
         if code:
             step = _check_files(target, kept, step)
             found = {path.name for path in place.iterdir() if HIDDEN.fullmatch(path.name)}
-            rows.append({"fit": name, "aim": aim, "step": step, "in_write": sorted(found - hidden)})
+            in_write = sorted(Path(new).suffix for new in found - hidden)
+            rows.append({"fit": name, "aim": aim, "step": step, "in_write": in_write})
             hidden |= found
             tell(f"{name} {len(rows)}: {rows[-1]}")
         if code == 0 or (target.exists() and not kept.exists()):
