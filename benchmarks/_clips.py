@@ -32,6 +32,11 @@ class ClipSource(NamedTuple):
         return {"name": self.name, "size": self.size, "frames": self.frames, **known}
 
 
+def clip_path(name: str) -> Path:
+    """The file of a sample clip, or a path as it is given."""
+    return sample_clip(name) if name in SAMPLE_SIZES else Path(name)
+
+
 def sample_sources(names: Iterable[str]) -> list[ClipSource]:
     return [ClipSource(name, sample_clip(name), SAMPLE_SIZES[name]) for name in names]
 
@@ -44,11 +49,7 @@ def folder_sources(folder: Path) -> list[ClipSource]:
     places = sorted(entry for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith("."))
     if not places:
         raise SystemExit(f"--clips: expected a folder whose subfolders are clips, {folder} has no subfolder.")
-    lacking = [f"{place.name} has {len(image_paths(place))}" for place in places if not _is_clip(place)]
+    lacking = [f"{place.name} has {num}" for place in places if (num := len(image_paths(place))) < MIN_FRAMES]
     if lacking:
         raise SystemExit(f"--clips: expected at least {MIN_FRAMES} images in each of {folder}: {', '.join(lacking)}.")
     return [ClipSource(place.name, place) for place in places]
-
-
-def _is_clip(place: Path) -> bool:
-    return len(image_paths(place)) >= MIN_FRAMES

@@ -1,9 +1,11 @@
-"""What the benchmarks share: arguments, scenes, timing side by side, and the file of figures."""
+"""Shared by the benchmarks: arguments, random scenes, timing in turn, tables, and the file of figures."""
 
 import argparse
+import ast
 import json
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,15 +18,18 @@ from foldgauss.io._atomic import atomic_path, check_writable
 
 console = Console(width=140)
 
-#: Opacities and standard deviations (px) of the random scenes, as in the design's section 6: about 4.4
-#: bounding-box tiles per splat.
-OPACITIES, SIGMAS = (0.05, 1.0), (1.0, 6.0)
+#: Range of the opacities of the random scenes.
+OPACITIES = (0.05, 1.0)
+#: Range of their standard deviations, in pixels: about 4.4 bounding-box tiles per splat.
+SIGMAS = (1.0, 6.0)
 SEED = 0
 #: Seconds of rest before each timed call: XLA goes on working on threads of its own after a large result is
 #: ready, which was seen to slow the next 10 ms of another engine by half.
 PAUSE = 0.05
-#: Calls of a task in one turn, the first not counted; and seconds that a turn lasts at least.
-BURST, TURN = 4, 0.1
+#: Calls of a task in one turn, of which the first is not counted.
+BURST = 4
+#: Seconds that a turn lasts at least.
+TURN = 0.1
 
 
 class Task(NamedTuple):
@@ -37,7 +42,6 @@ class Task(NamedTuple):
 class Scene(NamedTuple):
     """Random splats in pixels: what `foldgauss.render.cpu.forward` takes, and a gradient to send back."""
 
-    name: str
     size: tuple[int, int]
     leaves: tuple[np.ndarray, ...]  # mean, factor, opacity, color, background
     grad_image: np.ndarray  # (3, height, width)
@@ -47,7 +51,7 @@ class Scene(NamedTuple):
         return len(self.leaves[0])
 
 
-def random_scene(num: int, size: tuple[int, int], name: str = "", seed: int = SEED) -> Scene:
+def random_scene(num: int, size: tuple[int, int], seed: int = SEED) -> Scene:
     """`num` splats: means and angles uniform, axes log-uniform in `SIGMAS`, opacity in `OPACITIES`."""
     rng = np.random.default_rng(seed)
     height, width = size
@@ -62,7 +66,7 @@ def random_scene(num: int, size: tuple[int, int], name: str = "", seed: int = SE
         np.zeros(3),
     )
     single = tuple(np.ascontiguousarray(leaf, np.float32) for leaf in leaves)
-    return Scene(name, size, single, rng.normal(size=(3, height, width)).astype(np.float32))
+    return Scene(size, single, rng.normal(size=(3, height, width)).astype(np.float32))
 
 
 def interleaved(tasks: dict[str, Task], rounds: int, warmup: int = 1) -> dict[str, list[float]]:
@@ -98,6 +102,23 @@ def parser(doc: str) -> argparse.ArgumentParser:
     return made
 
 
+def fit_parser(doc: str, minutes: float) -> argparse.ArgumentParser:
+    """A parser for fits: of which frames, with how many Gaussians, and for how long."""
+    made = parser(doc)
+    made.add_argument("--frames", type=frame_range, metavar="A:B", help="frames A <= i < B [all]")
+    made.add_argument("--gaussians", type=whole, help="[chosen by the fit]")
+    length = made.add_mutually_exclusive_group()
+    length.add_argument("--minutes", type=positive, default=minutes, help=f"of each fit [{minutes:g}]")
+    length.add_argument("--steps", type=whole, help="of each fit, instead of minutes")
+    made.add_argument("--seed", type=int, default=0, help="[0]")
+    return made
+
+
+def budget(options: argparse.Namespace) -> dict[str, float]:
+    """The arguments of `FitConfig` for the length that `fit_parser` asks for."""
+    return {"steps": options.steps} if options.steps else {"minutes": options.minutes}
+
+
 def parse(made: argparse.ArgumentParser, arguments: list[str] | None) -> argparse.Namespace:
     """Parse, and find out before the work whether the figures can be written."""
     options = made.parse_args(arguments)
@@ -116,27 +137,52 @@ def whole(text: str) -> int:
     return int(text)
 
 
-def size(text: str) -> tuple[int, int]:
+def positive(text: str) -> float:
+    """argparse type: a finite number > 0."""
+    value = float(text)
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"expected a number > 0, got {text!r}")
+    return value
+
+
+def parse_size(text: str) -> tuple[int, int]:
     """argparse type: HxW."""
     height, _, width = text.lower().partition("x")
     return whole(height), whole(width)
 
 
-def table(title: str, *columns: str) -> Table:
-    """An empty table: the first column is text, the others are numbers."""
+def frame_range(text: str) -> tuple[int | None, int | None]:
+    """argparse type: A:B, of which either may be missing."""
+    first, colon, last = text.partition(":")
+    if not colon or any(part and not part.isdecimal() for part in (first, last)):
+        raise argparse.ArgumentTypeError(f"expected A:B with whole numbers >= 0, got {text!r}")
+    return (int(first) if first else None), (int(last) if last else None)
+
+
+def setting(text: str) -> tuple[str, object]:
+    """argparse type: NAME=VALUE, a field of `FitConfig` and a Python literal."""
+    name, equals, value = text.partition("=")
+    if not equals:
+        raise argparse.ArgumentTypeError(f"expected NAME=VALUE, got {text!r}")
+    return name, ast.literal_eval(value)
+
+
+def print_table(title: str, columns: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
+    """The first column is text, the others are numbers."""
     made = Table(title=title, title_justify="left")
     for k, column in enumerate(columns):
         made.add_column(column, justify="left" if k == 0 else "right", no_wrap=k == 0)
-    return made
+    for row in rows:
+        made.add_row(*map(str, row))
+    console.print(made)
 
 
-def finish(path: Path | None, figures: dict[str, float], facts: dict[str, object], **more: object) -> None:
+def finish(path: Path | None, figures: dict[str, float], **more: object) -> None:
     """Print the figures and the machine, and write them to `path`, whole or not at all."""
     figures = {name: float(value) for name, value in figures.items()}
-    shown = table("Figures", "name", "value")
-    for name, value in figures.items():
-        shown.add_row(name, f"{value:.4g}" if abs(value) < 1000 else f"{value:,.0f}")
-    console.print(shown)
+    shown = ((name, f"{value:.4g}" if abs(value) < 1000 else f"{value:,.0f}") for name, value in figures.items())
+    print_table("Figures", ("name", "value"), shown)
+    facts = describe_machine() | more.pop("facts", {})
     console.print("machine: " + ", ".join(f"{name} {value}" for name, value in facts.items()), style="dim")
     if path is not None:
         with atomic_path(path) as temporary:

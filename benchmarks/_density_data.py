@@ -18,8 +18,10 @@ POINTS = 2000
 SEED = 0
 #: Samples of a block of the electrocardiogram, at 360 Hz: 44 ms, so that no QRS complex lies in one block.
 BLOCK = 16
-#: R peaks are the maxima that stand out by this much, and lie this many samples apart.
-PEAK, APART = 150, 100
+#: R peaks are the maxima that stand out by this much.
+PEAK = 150
+#: Samples between two R peaks at least.
+APART = 100
 #: A year of fewer weeks does not determine its own trend.
 LEAST_WEEKS = 40
 

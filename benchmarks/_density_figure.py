@@ -14,12 +14,16 @@ from foldgauss.io._atomic import atomic_path
 
 __all__ = ["draw"]
 
-BLUE, RED, GREY = "#2b5c8a", "#c2452d", "#5a5f66"
+BLUE = "#2b5c8a"
+RED = "#c2452d"
+GREY = "#5a5f66"
 DPI = 110
 #: Methods whose densities are drawn, each beside the points.
 DRAWN = ("GaussianMixture", "KernelDensity", "flow", OURS)
-#: Points of the grid along each axis, and the margin beyond the points as a fraction of their range.
-GRID, MARGIN = 160, 0.06
+#: Points of the grid along each axis.
+GRID = 160
+#: Margin beyond the points, as a fraction of their range.
+MARGIN = 0.06
 #: Square roots of densities are drawn, so that tails show; above this quantile of all methods' they saturate.
 BRIGHTEST = 0.995
 

@@ -76,8 +76,11 @@ def _kernel_density(x: Rows, seed: int, effort: Effort) -> Fitted:
 
 # --- a normalising flow -----------------------------------------------------------------------------------------
 
-_LAYERS, _WIDTH, _KNOTS, _INTERVAL = 4, 32, 8, 4.0
-_LEARNING_RATE, _BATCH, _VALIDATION, _PATIENCE = 3e-3, 100, 0.15, 30
+#: Fraction of the rows that decide when training stops, after so many epochs without a better one.
+_VALIDATION = 0.15
+_PATIENCE = 30
+#: Interval of the splines.
+_INTERVAL = 4.0
 
 
 def _flow(x: Rows, seed: int, effort: Effort) -> Fitted:
@@ -95,18 +98,18 @@ def _flow(x: Rows, seed: int, effort: Effort) -> Fitted:
     start = masked_autoregressive_flow(
         build,
         base_dist=Normal(jnp.zeros(x.shape[1])),
-        transformer=RationalQuadraticSpline(knots=_KNOTS, interval=_INTERVAL),
-        flow_layers=_LAYERS,
-        nn_width=_WIDTH,
+        transformer=RationalQuadraticSpline(knots=8, interval=_INTERVAL),
+        flow_layers=4,
+        nn_width=32,
     )
     flow, losses = fit_to_data(
         train,
         start,
         jnp.asarray(x, jnp.float32),
-        learning_rate=_LEARNING_RATE,
+        learning_rate=3e-3,
         max_epochs=effort.epochs,
         max_patience=_PATIENCE,
-        batch_size=min(_BATCH, len(x) // 2),
+        batch_size=min(100, len(x) // 2),
         val_prop=_VALIDATION,
         show_progress=False,
     )

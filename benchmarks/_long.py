@@ -1,80 +1,69 @@
-"""A long clip through the commands: what each takes at most, and whether a fit's progress is true."""
+"""A long clip through the commands: the largest memory of each, and the progress that a fit reports."""
 
 import json
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 
-from benchmarks.memory import MEASURED
+from foldgauss.io import read_video
+from foldgauss.io.datasets import sample_clip
 
 #: Bytes beside the frames that a command may take: the interpreter, JAX, compiled kernels, one frame's work. A fit
 #: has its Gaussians and their moments beside.
 BASE = 700 * 2**20
 #: Of the frames' bytes: a fit holds them, and their motion in a quarter; evaluation holds them, drawing one at a time.
-SHARES = {"fit": 1.25, "evaluate": 1.0, "render": 0.0}
+FRACTIONS = {"fit": 1.25, "evaluate": 1.0, "render": 0.0}
+#: Runs the command that follows, and prints its largest resident set in bytes at the end. It is a process of its own:
+#: on Linux the largest of a process is never below that of the one that started it, and other children count as well.
+MEASURED = [
+    *(sys.executable, "-c"),
+    "import resource, subprocess, sys; status = subprocess.run(sys.argv[1:]).returncode; "
+    "unit = 1 if sys.platform == 'darwin' else 1024; "
+    "print(); print(unit * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss); sys.exit(status)",
+]
 
 
 class Ran(NamedTuple):
-    """A command: seconds, largest resident set in bytes, and its lines of JSON with the seconds at which they came."""
+    """A command: seconds, largest resident set in bytes, and its lines of JSON."""
 
     seconds: float
     peak: int
-    lines: list[tuple[float, dict[str, Any]]]
+    lines: list[dict[str, Any]]
+
+
+def write_clip(path: Path, num: int, size: tuple[int, int]) -> None:
+    """`num` frames of Bunny to and fro, moved by some pixels at each turn, in a quick codec."""
+    frames = read_video(sample_clip("bunny"), size=size).frames
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 25.0, size[::-1])
+    for k in range(num):
+        turn, place = divmod(k, len(frames))
+        own = frames[place if turn % 2 == 0 else len(frames) - 1 - place]
+        writer.write(np.ascontiguousarray(np.roll(own, 3 * turn, axis=1)[..., ::-1]))
+    writer.release()
 
 
 def run(words: list[str]) -> Ran:
-    """The command in a process of its own. Raises CalledProcessError with what it said."""
-    begun, lines, line = time.monotonic(), [], ""
-    command = [*MEASURED, sys.executable, "-m", "foldgauss", *words]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        said = []
-        reader = threading.Thread(target=lambda: said.append(process.stderr.read()), daemon=True)
-        reader.start()
-        for line in process.stdout:
-            if line.startswith("{"):
-                lines.append((time.monotonic() - begun, json.loads(line)))
-        reader.join()
-    if process.returncode:
-        raise subprocess.CalledProcessError(process.returncode, command, stderr=said[0])
-    return Ran(time.monotonic() - begun, int(line), lines)
+    """The command in a process of its own. Raises CalledProcessError where it fails."""
+    begun, command = time.monotonic(), [*MEASURED, sys.executable, "-m", "foldgauss", *words]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    lines = done.stdout.splitlines()
+    told = [json.loads(line) for line in lines if line.startswith("{")]
+    return Ran(time.monotonic() - begun, int(lines[-1]), told)
 
 
 def bound(command: str, frame_bytes: int, num_gaussians: int) -> int:
-    """Bytes that `command` may take at most: a share of the frames' bytes, and what does not grow with them.
+    """Bytes that `command` may take at most: a fraction of the frames' bytes, and what does not grow with them.
 
     A fit's Gaussians of degree 3 have 17 numbers each, in four copies (two moments, the gradient), and as much again
     while pictures are drawn.
     """
     own = 8 * 17 * 4 * num_gaussians if command == "fit" else 0
-    return int(SHARES[command] * frame_bytes) + BASE + own
-
-
-def progress(lines: list[tuple[float, dict[str, Any]]]) -> dict[str, float]:
-    """How true a fit's lines of progress were.
-
-    `backwards`: how often the share done fell. `last`: the last one. `off_by`: the largest difference between the share
-    of the steps done and that of the fit's own time. `left_off_by`: of the time left that was told from a fifth of the
-    fit on, the median error as a share of the whole time.
-    """
-    told = [line for _, line in lines if line["event"] == "progress"]
-    done, seconds = (np.array([line[name] for line in told], float) for name in ("progress", "seconds"))
-    left = np.array([np.inf if line["seconds_left"] is None else line["seconds_left"] for line in told], float)
-    begun, over = seconds[0], seconds[-1]
-    passed = (seconds - begun) / (over - begun)
-    late = (passed >= 0.2) & np.isfinite(left)
-    wrong = np.abs(left - (over - seconds))[late] / (over - begun)
-    return {
-        "progress_lines": len(told),
-        "progress_backwards": int((np.diff(done) < 0).sum()),
-        "progress_last": float(done[-1]),
-        "progress_off_by": float(np.abs(done - passed).max()),
-        "left_off_by": float(np.median(wrong)) if late.any() else np.nan,
-    }
+    return int(FRACTIONS[command] * frame_bytes) + BASE + own
 
 
 def long_clip(clip: Path, folder: Path, gaussians: int, steps: int) -> dict[str, Ran]:

@@ -17,10 +17,16 @@ from foldgauss.io.models.video_model import load_video_model, save_video_model
 from foldgauss.video import FitConfig, evaluate
 from foldgauss.video.fitting.loop import fit_steps, to_model
 
-#: Frames and size of the clip, Gaussians and steps of each short fit.
-FRAMES, SIZE, GAUSSIANS, STEPS = (0, 16), (80, 160), 3000, 240
-#: Seconds of the long fit in each cycle; and between two looks at the memory.
-LONG, LOOK = 12.0, 2.0
+FRAMES = (0, 16)
+SIZE = (80, 160)
+#: Gaussians of all fits.
+GAUSSIANS = 3000
+#: Steps of each short fit.
+STEPS = 240
+#: Seconds of the long fit in each cycle.
+LONG = 12.0
+#: Seconds between two looks at the memory.
+LOOK = 2.0
 #: Of the soak, its beginning: what is compiled and cached in the first cycles is no growth.
 WARM_UP = 0.25
 MIB = 2**20
@@ -32,15 +38,6 @@ class Sample(NamedTuple):
     seconds: float
     resident: int
     anonymous: int
-
-
-class Trend(NamedTuple):
-    """A line through the memory after the warm-up: MiB an hour, the ends of its 95% interval, and the MiB it is at."""
-
-    slope: float
-    low: float
-    high: float
-    level: float
 
 
 def memory() -> tuple[int, int]:
@@ -91,12 +88,10 @@ def soak(minutes: float, folder: Path, tell: Callable[[str], None] = print) -> l
 
 def _kind(number: int) -> FitConfig:
     """Plain and growing fits in turn, each with a seed of its own."""
-    common = {"num_gaussians": GAUSSIANS, "steps": STEPS, "seed": number}
-    kinds = (
-        FitConfig(**common),
-        FitConfig.preset("paper", **common | {"num_gaussians": 1000}, degree=3, max_gaussians=GAUSSIANS),
-    )
-    return kinds[number % len(kinds)]
+    if number % 2:
+        growing = {"num_gaussians": 1000, "max_gaussians": GAUSSIANS, "degree": 3}
+        return FitConfig.preset("paper", **growing, steps=STEPS, seed=number)
+    return FitConfig(num_gaussians=GAUSSIANS, steps=STEPS, seed=number)
 
 
 def _short(clip: Clip, config: FitConfig, folder: Path) -> str:
@@ -125,17 +120,8 @@ def by_cycle(samples: list[Sample], cycles: list[tuple[float, float]], field: st
     return means
 
 
-def trend(points: list[tuple[float, float]], warm_up: float = WARM_UP) -> Trend:
-    """A least-squares line through `points` (hours, MiB), but for the first share `warm_up` of the time.
-
-    Neighbors are alike, so they tell less than as many independent ones: the error is that of
-    n (1 - r) / (1 + r) points, r being the correlation of neighboring residuals where that is above 0.
-    """
-    hours, mib = np.array([point for point in points if point[0] >= warm_up * points[-1][0]]).T
+def trend(points: list[tuple[float, float]]) -> tuple[float, float, float]:
+    """MiB an hour of a line through `points` (hours, MiB) after the warm-up, its standard error, and the mean MiB."""
+    hours, mib = np.array([point for point in points if point[0] >= WARM_UP * points[-1][0]]).T
     line = stats.linregress(hours, mib)
-    rest = mib - line.intercept - line.slope * hours
-    alike = max(float(np.corrcoef(rest[:-1], rest[1:])[0, 1]), 0.0) if np.ptp(rest) > 0 else 0.0
-    num = len(hours) * (1 - alike) / (1 + alike)
-    error = line.stderr * np.sqrt(max(len(hours) - 2, 1) / max(num - 2, 1))
-    reach = stats.t.ppf(0.975, max(num - 2, 1)) * error
-    return Trend(float(line.slope), float(line.slope - reach), float(line.slope + reach), float(mib.mean()))
+    return line.slope, line.stderr, mib.mean()

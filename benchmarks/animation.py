@@ -22,11 +22,14 @@ from foldgauss.io._atomic import atomic_path
 from foldgauss.io.datasets import bunny
 from foldgauss.video import EditedVideo, FitConfig, VideoModel, by_mask, edit, layers
 
-FRAMES, SIZE = (34, 58), (360, 640)
+FRAMES = (34, 58)
+SIZE = (360, 640)
 #: The first frame shown: copies are delayed, and before the first frame of the model there is no time.
 FIRST = 4
-#: Times of the slow panels for each frame, and milliseconds that each is shown.
-SLOWDOWN, MILLISECONDS = 4, 40
+#: Times of the slow panels for each frame.
+SLOWDOWN = 4
+#: Time that each picture is shown.
+MILLISECONDS = 40
 QUALITY = 45
 
 # fmt: off
@@ -88,12 +91,19 @@ RIGHT_EAR = {
     23: [(206, 42), (208, 31), (215, 27), (222, 33), (225, 42)],
 }
 # fmt: on
-#: Pixels that the outline of the body, and those of the ears, may be off, inward and outward.
-BODY_OFF, EARS_OFF = (9, 8), (4, 4)
-#: The cave behind the rabbit is darker than this, of 255; the rabbit is only below this row.
-DARK, DARK_ROWS = 24, 270
-#: Fractions of what a Gaussian of a copy adds that lie in the masks, and in the masks grown by `GROWN` pixels.
-WITHIN, WITHIN_GROWN, GROWN = 0.7, 0.97, 3
+#: Pixels that the outline of the body may be off, inward and outward.
+BODY_OFF = (9, 8)
+#: The same for the outlines of the ears.
+EARS_OFF = (4, 4)
+#: The cave behind the rabbit is darker than this, of 255.
+DARK = 24
+#: The cave is above this row.
+DARK_ROWS = 270
+#: Fraction of the contribution of a Gaussian of a copy that lies in the masks.
+WITHIN = 0.7
+#: Fraction that lies in the masks grown by `GROWN` pixels.
+WITHIN_GROWN = 0.97
+GROWN = 3
 
 
 class Copy(NamedTuple):

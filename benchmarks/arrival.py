@@ -1,6 +1,6 @@
 """A compact file as it arrives: PSNR against bytes, chunk by chunk, and what the chunks cost.
 
-    python -m benchmarks.arrival MODEL.fgz CLIP [--json FILE] [--figure FILE]
+    python -m benchmarks.arrival MODEL.fgz CLIP [--json FILE]
 
 Each row is the file cut off after a chunk, as `load_video_model` reads it. `seek`: the bytes of the header and of the
 chunks that a reader needs for one time, on average over the clip. `one chunk`: the same model in a single chunk.
@@ -12,11 +12,9 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 
 from benchmarks import _common
-from benchmarks._common import console
 from foldgauss.io import load_compact, load_video_model, read_video
 from foldgauss.io.models.compact import pack_compact
 from foldgauss.io.models.video_model import read_metadata
@@ -58,33 +56,18 @@ def _load_cut(data: bytes) -> VideoModel:
         return load_video_model(file.name)
 
 
-def draw(found: dict[str, Any], path: Path) -> None:
-    """PSNR against bytes."""
-    figure, axes = plt.subplots(figsize=(5.2, 3.4), layout="constrained")
-    rows = found["prefixes"]
-    axes.plot([row["bytes"] / 1e3 for row in rows], [row["psnr"] for row in rows], "o-")
-    axes.set(xlabel="kB of the file", ylabel="PSNR (dB)", title=found["model"])
-    axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=150)
-
-
 def main(arguments: list[str] | None = None) -> None:
     parser = _common.parser(__doc__)
     parser.add_argument("model", type=Path)
     parser.add_argument("clip", type=Path)
-    parser.add_argument("--figure", type=Path, metavar="FILE", help="draw PSNR against bytes")
     options = _common.parse(parser, arguments)
     found = measure(options.model, read_video(options.clip, size=load_video_model(options.model).size).frames)
-    table = _common.table(found["model"], "cut off after", "of the file", "Gaussians", "PSNR (dB)")
-    for row in found["prefixes"]:
-        row = f"{row['bytes']:,}", f"{row['fraction']:.1%}", f"{row['num_gaussians']:,}", f"{row['psnr']:.2f}"
-        table.add_row(*row)
-    console.print(table)
+    forms = {"bytes": ",", "fraction": ".1%", "num_gaussians": ",", "psnr": ".2f"}
+    rows = ([format(row[name], form) for name, form in forms.items()] for row in found["prefixes"])
+    _common.print_table(found["model"], ("cut off after", "of the file", "Gaussians", "PSNR (dB)"), rows)
     cost, seek = found["bytes"] / found["one_chunk_bytes"] - 1, found["seek_bytes"] / found["bytes"]
     figures = {"overhead of chunks": cost, "fraction of the file for one time": seek}
-    _common.finish(options.json, figures, _common.describe_machine(), **found)
-    if options.figure:
-        draw(found, options.figure)
+    _common.finish(options.json, figures, **found)
 
 
 if __name__ == "__main__":

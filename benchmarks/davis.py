@@ -18,18 +18,24 @@ it.
 
 import argparse
 import dataclasses
+import functools
 import statistics
 from pathlib import Path
 
-from benchmarks import _common, fit_clip, presets
+from benchmarks import _common
 from benchmarks._common import console
 from benchmarks._runs import Run, Runs, fitted
 from foldgauss.io.datasets import davis
 from foldgauss.video import FitConfig
 from foldgauss.video.fitting.config import PRESETS
 
-MINUTES, CROP = 10.0, (960, 1920)
-SMALL, FULL = ("480p",), ("Full-Resolution", "1080p")  # names of folders: DAVIS 2017, DAVIS 2016
+MINUTES = 10.0
+#: Window of the second table.
+CROP = (960, 1920)
+#: Names of the folders of small frames.
+SMALL = ("480p",)
+#: Names of the folders of full frames: DAVIS 2017, DAVIS 2016.
+FULL = ("Full-Resolution", "1080p")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,7 +112,7 @@ def folder_of(root: Path, names: tuple[str, ...], sequence: str) -> str | None:
 
 def measure(table: Table, wanted: set[str], options: argparse.Namespace, runs: Runs) -> dict[tuple[str, str], Run]:
     """Runs by part and sequence; those missing are named."""
-    made, missing = {}, []
+    made, missing, crop = {}, [], options.crop if table.cropped else None
     for part, (names, _) in table.parts.items():
         for sequence in (name for name in table.sequences if name in wanted):
             folder = folder_of(options.root, names, sequence)
@@ -114,24 +120,21 @@ def measure(table: Table, wanted: set[str], options: argparse.Namespace, runs: R
                 missing.append(f"{names[0]}/{sequence}")
                 continue
             # By what is fitted, so that a sequence which stands in both tables with one window is fitted once.
-            name = f"{folder}/{sequence}" + (", window {}x{}".format(*options.crop) if table.cropped else "")
-            make = lambda where=(sequence, folder): _run(table, *where, options)  # noqa: E731
-            made[part, sequence] = runs.get(name, make)
+            name = f"{folder}/{sequence}" + (", window {}x{}".format(*crop) if crop else "")
+            made[part, sequence] = runs.get(name, functools.partial(_run, sequence, folder, crop, options))
     if missing:
         console.print(f"{table.label}: not there, left out: {', '.join(missing)}", soft_wrap=True)
     return made
 
 
-def _run(table: Table, sequence: str, folder: str, options: argparse.Namespace) -> Run:
-    crop = options.crop if table.cropped else None
+def _run(sequence: str, folder: str, crop: tuple[int, int] | None, options: argparse.Namespace) -> Run:
     clip = davis(options.root, sequence, folder, frames=options.frames, center_crop=crop).clip
     return fitted(clip, configuration(options))[1] | {"frames": clip.num_frames, "size": clip.size}
 
 
 def configuration(options: argparse.Namespace) -> FitConfig:
-    budget = {"steps": options.steps} if options.steps else {"minutes": options.minutes}
     number = {"num_gaussians": options.gaussians} if options.gaussians else {}
-    return FitConfig.preset(options.preset, **budget, **number, seed=options.seed)
+    return FitConfig.preset(options.preset, **_common.budget(options), **number, seed=options.seed)
 
 
 def rows(table: Table, made: dict[tuple[str, str], Run]) -> dict[str, dict[str, tuple[float, float | None]]]:
@@ -160,19 +163,15 @@ def _mean(pairs) -> tuple[float, float | None]:
 def show(table: Table, made: dict[tuple[str, str], Run]) -> dict[str, float]:
     """Print it, a line per sequence; returns our averages."""
     every = rows(table, made)
-    there = [name for name in table.sequences if any(sequence == name for _, sequence in made)]
-    shown = _common.table(f"{table.label}: PSNR in dB, SSIM", "sequence", *every)
-    for name in there:
-        shown.add_row(name, *(_cell(row.get(name)) for row in every.values()))
-    shown.add_section()
-    average = "average" if len(there) == len(table.sequences) else f"average of these {len(there)}"
-    shown.add_row(average, *(_cell(row["average"]) for row in every.values()))
-    console.print(shown)
+    lines = [*next(iter(every.values()))]
+    shown = ((name, *(_cell(row.get(name)) for row in every.values())) for name in lines)
+    _common.print_table(f"{table.label}: PSNR in dB, SSIM", ("sequence", *every), shown)
     figures = {}
     for part in (part for part in table.parts if f"here, {part}" in every):
-        psnr, ssim = every[f"here, {part}"]["average"]
+        own = every[f"here, {part}"]
+        psnr, ssim = own["average"]
         figures |= {f"psnr_{table.label}_{part}": psnr, f"ssim_{table.label}_{part}": ssim}
-        beside = [every[table.parts[part][1]][name][0] for name in every[f"here, {part}"] if name != "average"]
+        beside = [every[table.parts[part][1]][name][0] for name in own if name != "average"]
         figures[f"above_paper_{table.label}_{part}"] = psnr - statistics.fmean(beside)
     return figures
 
@@ -185,55 +184,26 @@ def _cell(pair: tuple[float, float | None] | None) -> str:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    parser = _parser()
+    parser = _common.fit_parser(__doc__, MINUTES)
+    parser.add_argument("--root", type=Path, required=True, metavar="DIR", help="DAVIS, as unpacked")
+    parser.add_argument("--sequences", type=lambda text: set(text.split(",")), metavar="NAME,NAME,..", help="[all]")
+    parser.add_argument("--table", type=int, choices=tuple(TABLES), action="append", help="[both]")
+    parser.add_argument("--preset", choices=tuple(PRESETS), default="standard", help="[standard]")
+    parser.add_argument("--crop", type=_common.parse_size, default=CROP, metavar="HxW", help="of table 2 [960x1920]")
     options = _common.parse(parser, arguments)
     chosen = [TABLES[number] for number in sorted(set(options.table or TABLES))]
     known = {name for table in chosen for name in table.sequences}
-    wanted = set(options.sequences or known)
+    wanted = options.sequences or known
     if wanted - known:
-        parser.error(
-            f"--sequences: expected some of {', '.join(sorted(known))}, got {', '.join(sorted(wanted - known))}"
-        )
-    options.root = options.root.expanduser()
+        parser.error(f"--sequences: expected some of {sorted(known)}, got {sorted(wanted - known)}")
     if not (options.root / "JPEGImages").is_dir():
         parser.error(f"--root: expected a folder with JPEGImages in it, got {options.root}")
-    kept = ("preset", "gaussians", "steps", "minutes", "frames", "seed")
-    setting = {name: getattr(options, name) for name in kept}
-    try:
-        runs = Runs(options.json, setting | {"minutes": None if options.steps else options.minutes})
-    except ValueError as error:
-        parser.error(str(error))
-    figures = {}
+    setting = {name: getattr(options, name) for name in ("preset", "gaussians", "frames", "seed")}
+    runs, figures = Runs(options.json, setting | _common.budget(options)), {}
     for table in chosen:
-        made = measure(table, wanted, options, runs)
-        if made:
+        if made := measure(table, wanted, options, runs):
             figures |= show(table, made)
-    if options.frames is not None:
-        console.print(f"Frames {options.frames} only: the paper's figures are of whole sequences.")
-    if not figures:
-        parser.error(f"--root: expected any of {', '.join(sorted(wanted))} in {options.root / 'JPEGImages'}, got none")
-    _common.finish(None, figures, _common.describe_machine())
-    runs.write(figures=figures)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _common.parser(__doc__)
-    parser.add_argument("--root", type=Path, required=True, metavar="DIR", help="DAVIS, as unpacked")
-    parser.add_argument("--sequences", type=_names, metavar="NAME,NAME,..", help="only these [all]")
-    parser.add_argument("--table", type=int, choices=tuple(TABLES), action="append", help="[both]")
-    length = parser.add_mutually_exclusive_group()
-    length.add_argument("--minutes", type=presets.minutes, default=MINUTES, help=f"of each fit [{MINUTES:g}]")
-    length.add_argument("--steps", type=_common.whole, help="of each fit, instead of minutes")
-    parser.add_argument("--preset", choices=tuple(PRESETS), default="standard", help="[standard]")
-    parser.add_argument("--gaussians", type=_common.whole, help="[the preset's]")
-    parser.add_argument("--frames", type=fit_clip._frames, metavar="A:B", help="for a try: frames A <= i < B [all]")
-    parser.add_argument("--crop", type=_common.size, default=CROP, metavar="HxW", help="window of table 2 [960x1920]")
-    parser.add_argument("--seed", type=int, default=0, help="[0]")
-    return parser
-
-
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(name.strip().lower() for name in text.split(",") if name.strip())
+    runs.finish(figures)
 
 
 if __name__ == "__main__":

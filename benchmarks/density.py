@@ -33,6 +33,8 @@ from benchmarks._runs import Run, Runs
 
 #: Random halves of each set.
 SPLITS = 10
+#: What is said of each set, beside the methods near the best.
+VERDICTS = "ours_near_the_best", "ours_at_the_fewest_parameters"
 
 
 class Row(NamedTuple):
@@ -128,14 +130,19 @@ def judge(rows: list[Row]) -> dict[str, Any]:
 
 
 def _show(rows: list[Row]) -> None:
-    columns = ("held out (nats/point)", "below the best", "parameters", "CPU (s)", "failed")
-    shown = _common.table(rows[0].data, "method", *columns)
-    for row in rows:
-        below = "best" if row.below == 0 and row.below_error == 0 else f"{row.below:+.3f} ± {row.below_error:.3f}"
-        held_out = f"{row.mean:.3f} ± {row.error:.3f}"
-        cells = (held_out, below, f"{row.parameters:,.0f}", f"{row.seconds:.1f}", f"{row.failed} of {row.splits}")
-        shown.add_row(row.method, *cells)
-    console.print(shown)
+    columns = ("method", "held out (nats/point)", "below the best", "parameters", "CPU (s)", "failed")
+    cells = (
+        (
+            row.method,
+            f"{row.mean:.3f} ± {row.error:.3f}",
+            f"{row.below:+.3f} ± {row.below_error:.3f}",
+            f"{row.parameters:,.0f}",
+            f"{row.seconds:.1f}",
+            f"{row.failed} of {row.splits}",
+        )
+        for row in rows
+    )
+    _common.print_table(rows[0].data, columns, cells)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -165,13 +172,8 @@ def main(arguments: list[str] | None = None) -> None:
     judged = {data: judge(rows) for data, rows in tables.items()}
     for data, verdict in judged.items():
         console.print(f"{data}: best or within one standard error of it: {', '.join(verdict['near_the_best'])}")
-    num_near = sum(verdict["ours_near_the_best"] for verdict in judged.values())
-    num_fewest = sum(verdict["ours_at_the_fewest_parameters"] for verdict in judged.values())
-    console.print(
-        f"{OURS}: best or within one standard error on {num_near} of {len(judged)} sets, "
-        f"on {num_fewest} of them at the fewest parameters of all that are"
-    )
-    runs.write(table=[row._asdict() for rows in tables.values() for row in rows], judged=judged)
+    figures = {f"sets, {kind}": sum(verdict[kind] for verdict in judged.values()) for kind in VERDICTS}
+    runs.finish(figures, table=[row._asdict() for rows in tables.values() for row in rows], judged=judged)
     if options.figure is not None:
         from benchmarks import _density_figure  # needs matplotlib
 

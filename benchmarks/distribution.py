@@ -1,10 +1,12 @@
-"""Log-density and samples at a million points, beside numpyro's and TFP's multivariate normal; folds on top.
+"""Log-density and samples at a million points, beside numpyro's multivariate normal; folds on top; errors of float32.
 
     python -m benchmarks.distribution [--points N] [--rounds N] [--json FILE]
 
-d = 3, f = 0 and a = 1 is the case all of them can do. Peers are measured where they import (`pip install numpyro`).
-Every ratio is of two medians from the same run, in turn; ratios above 1 mean that foldgauss is faster. First calls are
-those of this process, with their compilation: seconds, of the processor too, and memory maps where /proc shows them.
+d = 3, f = 0 and a = 1 is the case that both can do; numpyro is measured where it is installed. Every ratio is of two
+medians from the same run, in turn. First calls are those of this process, with their compilation: seconds, of the
+processor too, and memory maps where /proc shows them. Errors of float32 are the largest differences to float64 of
+log-densities and of the gradient of their sum by every parameter (degree 3, envelope of power 1), relative to
+1 + |value|; `benchmarks.numerics` has those at the extremes.
 """
 
 import importlib.util
@@ -15,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import _common as common
+from benchmarks import _common
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import Constant, TimeLikelihood
 from foldgauss.fold import FourierFold, PolynomialFold, SplineFold
@@ -32,7 +34,7 @@ def _ours(fold=None, envelope=None) -> FoldedGaussian:
 
 def _distributions() -> dict[str, FoldedGaussian]:
     """The plain Gaussian, then one thing on top at a time."""
-    rng = np.random.default_rng(common.SEED)
+    rng = np.random.default_rng(_common.SEED)
     rows = lambda n: rng.normal(size=(n, 2)).astype(np.float32) * 0.1  # noqa: E731
     return {
         "foldgauss": _ours(),
@@ -45,50 +47,35 @@ def _distributions() -> dict[str, FoldedGaussian]:
     }
 
 
-def _peers() -> dict[str, object]:
-    """name -> (distribution, its sample(key, shape))."""
-    peers = {}
-    if importlib.util.find_spec("numpyro"):
-        import numpyro.distributions as numpyro
-
-        peers["numpyro"] = numpyro.MultivariateNormal(LOC, scale_tril=TRIL)
-    if importlib.util.find_spec("tensorflow_probability"):
-        try:
-            from tensorflow_probability.substrates import jax as tfp
-
-            peers["tfp"] = tfp.distributions.MultivariateNormalTriL(LOC, TRIL)
-        except Exception as error:  # it breaks with each new JAX; say so, and go on without it
-            common.console.print(f"TFP does not import: {error!r}", style="yellow")
-    return peers
-
-
-def _tasks(points: int) -> dict[str, common.Task]:
-    key = jax.random.key(common.SEED)
+def _tasks(points: int) -> dict[str, _common.Task]:
+    key = jax.random.key(_common.SEED)
     x = jax.block_until_ready(_ours().sample(key, (points,)))
     tasks = {}
     for name, dist in _distributions().items():
         log_prob = jax.jit(lambda dist, x: dist.log_prob(x))
         sample = jax.jit(lambda dist, key: dist.sample(key, (points,)))
-        tasks[f"log_prob: {name}"] = common.Task(lambda f=log_prob, d=dist: jax.block_until_ready(f(d, x)))
-        tasks[f"sample: {name}"] = common.Task(lambda f=sample, d=dist: jax.block_until_ready(f(d, key)))
+        tasks[f"log_prob: {name}"] = _common.Task(lambda f=log_prob, d=dist: jax.block_until_ready(f(d, x)))
+        tasks[f"sample: {name}"] = _common.Task(lambda f=sample, d=dist: jax.block_until_ready(f(d, key)))
     grad = jax.jit(jax.grad(lambda dist, x: dist.log_prob(x).sum()))
     last = _distributions()["degree 3, envelope"]
-    tasks["gradient: degree 3, envelope"] = common.Task(lambda: jax.block_until_ready(grad(last, x)))
-    for name, peer in _peers().items():
-        log_prob = jax.jit(lambda x, peer=peer: peer.log_prob(x))
-        sample = jax.jit(lambda key, peer=peer: peer.sample(**_sample_arguments(peer, key, points)))
+    tasks["gradient: degree 3, envelope"] = _common.Task(lambda: jax.block_until_ready(grad(last, x)))
+    if importlib.util.find_spec("numpyro"):
+        from numpyro.distributions import MultivariateNormal
+
+        peer = MultivariateNormal(LOC, scale_tril=TRIL)
+        log_prob, sample = jax.jit(peer.log_prob), jax.jit(lambda key: peer.sample(key, (points,)))
         np.testing.assert_allclose(log_prob(x), _ours().log_prob(x), rtol=1e-4, atol=1e-4)  # the same density
-        tasks[f"log_prob: {name}"] = common.Task(lambda f=log_prob: jax.block_until_ready(f(x)))
-        tasks[f"sample: {name}"] = common.Task(lambda f=sample: jax.block_until_ready(f(key)))
+        tasks["log_prob: numpyro"] = _common.Task(lambda: jax.block_until_ready(log_prob(x)))
+        tasks["sample: numpyro"] = _common.Task(lambda: jax.block_until_ready(sample(key)))
     read = jax.jit(lambda x: x[:, 0] + x[:, 1] * x[:, 2])  # what reading x and writing one number a point costs
-    tasks["memory floor"] = common.Task(lambda: jax.block_until_ready(read(x)))
+    tasks["memory floor"] = _common.Task(lambda: jax.block_until_ready(read(x)))
     return tasks
 
 
 def _first_calls() -> dict[str, float]:
     """Figures of eager first calls at 1,000 points, and of integrals over time for a second number of points."""
-    dist, x = _distributions()["degree 3, envelope"], np.random.default_rng(common.SEED).normal(size=(1000, 3)) * 0.3
-    x, key, space = x.astype(np.float32), jax.random.key(common.SEED), dist.marginal((0, 1))
+    dist, x = _distributions()["degree 3, envelope"], np.random.default_rng(_common.SEED).normal(size=(1000, 3)) * 0.3
+    x, key, space = x.astype(np.float32), jax.random.key(_common.SEED), dist.marginal((0, 1))
     calls = {
         "log_prob": lambda: dist.log_prob(x),
         "sample": lambda: dist.sample(key, (1000,)),
@@ -114,33 +101,38 @@ def _num_maps() -> int:
     return maps.read_text().count("\n") if maps.exists() else 0
 
 
-def _sample_arguments(peer, key, points: int) -> dict[str, object]:
-    numpyros = type(peer).__module__.startswith("numpyro")
-    return {"key": key, "sample_shape": (points,)} if numpyros else {"seed": key, "sample_shape": (points,)}
-
-
-def _figures(median: dict[str, float]) -> dict[str, float]:
-    figures = {f"{name} (ms)": 1e3 * seconds for name, seconds in median.items()}
-    for kind in ("log_prob", "sample"):
-        own = median[f"{kind}: foldgauss"]
-        for peer in ("numpyro", "tfp"):
-            if f"{kind}: {peer}" in median:
-                figures[f"{kind}: speed against {peer}"] = median[f"{kind}: {peer}"] / own
-        for name in list(_distributions())[1:]:
-            figures[f"{kind}: cost of {name}"] = median[f"{kind}: {name}"] / own
-    return figures
+def _errors(points: int) -> dict[str, float]:
+    """Largest errors of float32, relative to 1 + |value|."""
+    rng, results = np.random.default_rng(_common.SEED), {}
+    rows, x = 0.1 * rng.normal(size=(3, 2)), 0.4 * rng.normal(size=(points, 3)).astype(np.float32)
+    narrow = _ours(PolynomialFold(rows.astype(np.float32)), TimeLikelihood(1.0))
+    with jax.enable_x64(True):
+        for dtype in (np.float32, np.float64):
+            dist, y = jax.tree.map(lambda leaf, dtype=dtype: jnp.asarray(leaf, dtype), (narrow, x))
+            gradients = jax.jit(jax.grad(lambda dist, y: dist.log_prob(y).sum()))(dist, y)
+            results["log_prob", dtype] = np.asarray(dist.log_prob(y), np.float64)
+            leaves = [np.ravel(leaf) for leaf in jax.tree.leaves(gradients)]
+            results["gradient", dtype] = np.concatenate(leaves).astype(np.float64)
+    errors = {}
+    for what in ("log_prob", "gradient"):
+        own, truth = results[what, np.float32], results[what, np.float64]
+        errors[f"{what}: error of float32"] = (np.abs(own - truth) / (1 + np.abs(truth))).max()
+    return errors
 
 
 def main(arguments: list[str] | None = None) -> None:
-    made = common.parser(__doc__)
-    made.add_argument("--points", type=common.whole, default=1_000_000)
-    made.add_argument("--rounds", type=common.whole, default=7)
-    options = common.parse(made, arguments)
+    made = _common.parser(__doc__)
+    made.add_argument("--points", type=_common.whole, default=1_000_000)
+    made.add_argument("--rounds", type=_common.whole, default=7)
+    options = _common.parse(made, arguments)
     jnp.zeros(1).block_until_ready()
-    first = _first_calls()
-    seconds = common.interleaved(_tasks(options.points), options.rounds)
-    figures = first | _figures({name: float(np.median(times)) for name, times in seconds.items()})
-    common.finish(options.json, figures, common.machine(), points=options.points)
+    figures = _first_calls()
+    for name, seconds in _common.interleaved(_tasks(options.points), options.rounds).items():
+        kind, median = name.partition(":")[0], float(np.median(seconds))
+        figures[f"{name} (ms)"] = 1e3 * median
+        if kind != name and "gradient" not in name:
+            figures[f"{name}, relative to foldgauss"] = 1e3 * median / figures[f"{kind}: foldgauss (ms)"]
+    _common.finish(options.json, figures | _errors(options.points), points=options.points)
 
 
 if __name__ == "__main__":

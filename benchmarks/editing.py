@@ -32,7 +32,6 @@ import numpy as np
 from PIL import Image
 
 from benchmarks import _common
-from benchmarks._common import console
 from foldgauss.io import load_video_model, save_video_model
 from foldgauss.io.datasets import bikes
 from foldgauss.video import (
@@ -73,9 +72,14 @@ PAST = {(0, 205): 12, (205, 384): 20}
 WITHIN = 0.7
 #: A mask is grown by so many pixels before it is said what is seen beside it.
 BESIDE = 5
-CYAN, MAGENTA = (0.0, 220.0, 255.0), (255.0, 0.0, 255.0)
-#: A sheet's file is made smaller until it is within.
-SHEET_BYTES, SHEET_WIDTH, COLORS = 400_000, 1280, 200
+CYAN = (0.0, 220.0, 255.0)
+MAGENTA = (255.0, 0.0, 255.0)
+#: A sheet's file is made smaller until it has at most so many bytes.
+SHEET_BYTES = 400_000
+#: Width of a sheet at most, in pixels.
+SHEET_WIDTH = 1280
+#: Colors of a sheet.
+COLORS = 200
 
 Video = VideoModel | EditedVideo
 
@@ -329,16 +333,11 @@ def main(arguments: list[str] | None = None) -> None:
         found[name], rows = measured(scene, fitted(scene, config, options.models))
         if options.sheets is not None:
             write_sheet(options.sheets / f"editing-{name}.png", sheet(rows))
-    show(found)
+    names = next(iter(found.values()))
+    rows = ((name, *(f"{figures[name]:,.4g}" for figures in found.values())) for name in names)
+    _common.print_table("Objects edited", ("figure", *found), rows)
     figures = {f"{clip}_{name}": value for clip, own in found.items() for name, value in own.items()}
-    _common.finish(options.json, figures, _common.describe_machine(), gaussians=options.gaussians, steps=options.steps)
-
-
-def show(found: dict[str, dict[str, float]]) -> None:
-    table = _common.table("Objects edited", "figure", *found)
-    for name in next(iter(found.values())):
-        table.add_row(name, *(f"{figures[name]:,.4g}" for figures in found.values()))
-    console.print(table)
+    _common.finish(options.json, figures, gaussians=options.gaussians, steps=options.steps)
 
 
 if __name__ == "__main__":

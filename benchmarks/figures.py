@@ -35,7 +35,9 @@ from foldgauss.uncertainty import FrameTimePosterior, frame_time_posterior, incr
 from foldgauss.uncertainty.diagnostics.plots import plot_increments
 from foldgauss.video import FitConfig, VideoModel, fit
 
-BLUE, RED, GREY = "#2b5c8a", "#c2452d", "#5a5f66"
+BLUE = "#2b5c8a"
+RED = "#c2452d"
+GREY = "#5a5f66"
 DPI = 140
 #: The clip is dark: it is shown so many times as bright.
 BRIGHTNESS = 1.6

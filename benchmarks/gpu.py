@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import _common
-from benchmarks._common import Scene, Task, console, interleaved, random_scene
+from benchmarks._common import Scene, Task, interleaved, random_scene
 from benchmarks.rasterizer import num_boxes
 from foldgauss.io import read_video
 from foldgauss.io.datasets import sample_clip
@@ -41,7 +41,11 @@ ENGINES = {"xla": xla.TILE_SIZE, "pallas": pallas.TILE_SIZE}  # with the sides o
 PARTS = ("engines", "quality", "playback")
 SCENES = [(num, size) for num in (100_000, 500_000) for size in ((640, 1280), (1080, 1920))]
 TINY_SCENES = [(200, (24, 40))]
-SIZE, FRAMES, MINUTES, GAUSSIANS, BATCH = (640, 1280), (0, 132), 10.0, 620_000, 1
+SIZE = (640, 1280)
+FRAMES = (0, 132)
+MINUTES = 10.0
+GAUSSIANS = 620_000
+BATCH = 1
 LOOKS = 10  # of a fit, evenly spaced in time; each renders all frames on the CPU
 #: Peak float32 operations and exponentials a second, and bytes a second, by the device's name. NVIDIA's data sheets;
 #: exponentials: 16 a cycle on each of 132 multiprocessors at 1.83 GHz.
@@ -52,9 +56,11 @@ OPERATIONS = {"forward": 23, "both": 23 + 23 + 30}
 EXPONENTIALS = {"forward": 1, "both": 2}
 #: Bytes of a splat's leaves (10 numbers) and fields (9); of a slot of the lists: its key is sorted in four passes, each
 #: of which reads and writes it, and its fields are gathered (9 numbers read, written and read again).
-SPLAT_BYTES, SLOT_BYTES = 4 * (10 + 9), 4 * (2 * 4 + 3 * 9)
+SPLAT_BYTES = 4 * (10 + 9)
+SLOT_BYTES = 4 * (2 * 4 + 3 * 9)
 #: With gradients, also: the sums of a slot written and read (9 numbers), those of a splat written (10).
-SPLAT_BYTES_BACK, SLOT_BYTES_BACK = 4 * (9 + 10), 4 * 2 * 9
+SPLAT_BYTES_BACK = 4 * (9 + 10)
+SLOT_BYTES_BACK = 4 * 2 * 9
 
 
 def floors(num: int, size: tuple[int, int], pairs: int, device: str) -> dict[str, float]:
@@ -98,7 +104,7 @@ def _waited(function, *arrays):
 
 def measure_engines(scenes: list[tuple[int, tuple[int, int]]], rounds: int) -> dict[str, float]:
     figures, device = {}, jax.devices()[0].device_kind
-    table = _common.table("Engines", "scene", "engine", "pass", "ms", "ns/pair", "floor (ms)", "by floor")
+    rows = []
     for num, size in scenes:
         scene = random_scene(num, size)
         pairs = cpu.forward(*scene.leaves, size).num_pairs
@@ -110,14 +116,15 @@ def measure_engines(scenes: list[tuple[int, tuple[int, int]]], rounds: int) -> d
             engine, what = task.split()
             median, floor = statistics.median(own), least.get(what)
             figures |= {f"{name}_{engine}_{what}_ms": 1e3 * median, f"{name}_{engine}_{what}_ns": 1e9 * median / pairs}
-            row = [name, engine, what, f"{1e3 * median:.3f}", f"{1e9 * median / pairs:.4f}"]
             if floor is not None:
                 figures[f"{name}_{what}_floor_ms"] = floor
-            table.add_row(*row, *(["", ""] if floor is None else [f"{floor:.3f}", f"{1e3 * median / floor:.1f}"]))
+            beside = ("", "") if floor is None else (f"{floor:.3f}", f"{1e3 * median / floor:.1f}")
+            rows.append((name, engine, what, f"{1e3 * median:.3f}", f"{1e9 * median / pairs:.4f}", *beside))
         for what in ("forward", "both"):
             ratio = figures[f"{name}_xla_{what}_ms"] / figures[f"{name}_pallas_{what}_ms"]
             figures[f"{name}_xla_over_pallas_{what}"] = ratio
-    console.print(table)
+    columns = "scene", "engine", "pass", "ms", "ns/pair", "floor (ms)", "by floor"
+    _common.print_table("Engines", columns, rows)
     return figures
 
 
@@ -183,7 +190,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = _common.parse(made, arguments)
     if jax.default_backend() == "cpu" and not (options.anyway and options.tiny):
         made.error("expected a GPU that JAX sees, got none. --anyway --tiny tells whether this runs, on a processor.")
-    _common.finish(options.json, measured(options), facts())
+    _common.finish(options.json, measured(options), facts=facts())
 
 
 def measured(options: argparse.Namespace) -> dict[str, float]:
@@ -210,11 +217,7 @@ def measured(options: argparse.Namespace) -> dict[str, float]:
 
 def facts() -> dict[str, object]:
     devices = jax.local_devices()
-    return _common.describe_machine() | {
-        "device": devices[0].device_kind,
-        "devices": len(devices),
-        "jax": jax.__version__,
-    }
+    return {"device": devices[0].device_kind, "devices": len(devices)}
 
 
 if __name__ == "__main__":

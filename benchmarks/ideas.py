@@ -18,19 +18,19 @@ With --json each fit that is done is kept there, and the same command continues 
 
 import argparse
 import dataclasses
+import functools
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks import _common
-from benchmarks._clips import SAMPLE_SIZES
-from benchmarks._common import console
-from benchmarks._runs import Run, Runs
-from benchmarks.presets import minutes as positive
-from benchmarks.tune import Candidate, fit_candidate, processes, sources_of
+from benchmarks._clips import SAMPLE_SIZES, folder_sources, sample_sources
+from benchmarks._runs import Run, Runs, fit_by_clock, scores, warm_up
+from foldgauss._runtime.threads import set_num_threads
+from foldgauss.io import Clip
 from foldgauss.render import RenderOptions
-from foldgauss.video import FitConfig, LearningRates
+from foldgauss.video import FitConfig, FitDiverged, LearningRates
 
 DEFAULT = "default"
 
@@ -80,18 +80,33 @@ def config_of(name: str, cpu_seconds: float, seed: int, chosen: int | None) -> F
     return FitConfig(minutes=cpu_seconds / 60, num_gaussians=num, seed=seed, **changes)
 
 
+def fit_row(clip: Clip, config: FitConfig) -> Run:
+    """The quality of a fit, or only that it diverged."""
+    warm_up(clip.num_frames)
+    try:
+        result = fit_by_clock(clip.frames, config, clip.fps)
+    except FitDiverged as error:
+        return {"diverged": str(error)}
+    last = result.history[-1]
+    run = {"gaussians": result.model.num_gaussians, "steps": last.step, "cpu_seconds": last.seconds}
+    return scores(result.model, clip.frames) | run
+
+
 def measure(options: argparse.Namespace, runs: Runs) -> dict[str, dict[str, list[Run]]]:
     """The runs of every seed by clip and row, the default first."""
     found: dict[str, dict[str, list[Run]]] = {}
-    with processes(1):
-        for source in sources_of(options):
-            rows = found[source.name] = {name: [] for name in (DEFAULT, *options.only)}
-            for seed in range(options.seeds):
-                for name in rows:
-                    chosen = rows[DEFAULT][seed]["gaussians"] if name != DEFAULT else None
-                    candidate = Candidate(source, config_of(name, options.cpu_seconds, seed, chosen))
-                    label = f"{source.name}, seed {seed}, {name}"
-                    rows[name].append(runs.get(label, lambda candidate=candidate: fit_candidate(candidate)))
+    sources = sample_sources(options.samples) + (folder_sources(options.clips) if options.clips else [])
+    if not sources:
+        raise SystemExit("No clips: give --clips FOLDER, or --samples with some of " + ", ".join(SAMPLE_SIZES) + ".")
+    for source in sources:
+        clip = source._replace(size=options.size or source.size, frames=options.frames).read()
+        rows = found[source.name] = {name: [] for name in (DEFAULT, *options.only)}
+        for seed in range(options.seeds):
+            for name in rows:
+                chosen = rows[DEFAULT][seed]["gaussians"] if name != DEFAULT else None
+                config = config_of(name, options.cpu_seconds, seed, chosen)
+                fit_it = functools.partial(fit_row, clip, config)
+                rows[name].append(runs.get(f"{source.name}, seed {seed}, {name}", fit_it))
     return found
 
 
@@ -103,44 +118,36 @@ def means(runs: list[Run]) -> tuple[float, float]:
 def show(clip: str, rows: dict[str, list[Run]], options: argparse.Namespace) -> dict[str, float]:
     """Print a clip's table, best first; returns its figures."""
     default, worst = means(rows[DEFAULT])
-    title = f"{clip}: {options.cpu_seconds:g} s of one core, {options.seeds} seed(s)"
-    table = _common.table(title, "changed", "PSNR, dB", "gain", "worst frame", "gain", "Gaussians", "steps")
+    shown = []
     for name, runs in sorted(rows.items(), key=lambda row: -np.nan_to_num(means(row[1])[0])):
         psnr, lowest = means(runs)
-        gains = f"{psnr - default:+.2f}", f"{lowest - worst:+.2f}"
         counts = (f"{np.mean([run.get(key, np.nan) for run in runs]):,.0f}" for key in ("gaussians", "steps"))
-        table.add_row(name, f"{psnr:.2f}", gains[0], f"{lowest:.2f}", gains[1], *counts)
-    console.print(table)
+        quality = f"{psnr:.2f}", f"{psnr - default:+.2f}", f"{lowest:.2f}", f"{lowest - worst:+.2f}"
+        shown.append((name, *quality, *counts))
+    title = f"{clip}: {options.cpu_seconds:g} s of one core, {options.seeds} seed(s)"
+    columns = "changed", "PSNR, dB", "gain", "worst frame", "gain", "Gaussians", "steps"
+    _common.print_table(title, columns, shown)
     figures = {f"{clip}_{name}_gain": means(runs)[0] - default for name, runs in rows.items() if name != DEFAULT}
     return {f"{clip}_{DEFAULT}_psnr": default} | figures
 
 
 def main(arguments: list[str] | None = None) -> None:
-    parser = _parser()
+    parser = _common.parser(__doc__)
+    parser.add_argument("--cpu-seconds", type=_common.positive, required=True, metavar="S", help="of each fit")
+    parser.add_argument("--clips", type=Path, metavar="FOLDER", help="whose subfolders of images are the clips")
+    parser.add_argument("--samples", nargs="+", choices=tuple(SAMPLE_SIZES), default=[], help="sample clips [none]")
+    names = tuple(VARIANTS)
+    parser.add_argument("--only", nargs="+", choices=names, default=names, metavar="NAME", help=f"[{', '.join(names)}]")
+    parser.add_argument("--size", type=_common.parse_size, metavar="HxW", help="of all clips [each its own]")
+    parser.add_argument("--frames", type=_common.whole, metavar="N", help="only the first N of each clip [all]")
+    parser.add_argument("--seeds", type=_common.whole, default=1, help="[1]")
     options = _common.parse(parser, arguments)
-    setting = {name: getattr(options, name) for name in ("cpu_seconds", "size", "frames")}
-    try:
-        runs = Runs(options.json, setting)
-    except ValueError as error:
-        parser.error(str(error))
+    set_num_threads(1)
+    runs = Runs(options.json, {name: getattr(options, name) for name in ("cpu_seconds", "size", "frames")})
     figures = {}
     for clip, rows in measure(options, runs).items():
         figures |= show(clip, rows, options)
-    _common.finish(None, figures, _common.describe_machine())
-    runs.write(figures=figures)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _common.parser(__doc__)
-    parser.add_argument("--cpu-seconds", type=positive, required=True, metavar="S", help="CPU time of each fit")
-    parser.add_argument("--clips", type=Path, metavar="FOLDER", help="whose subfolders of images are the clips")
-    parser.add_argument("--samples", nargs="+", choices=tuple(SAMPLE_SIZES), help="sample clips [none]")
-    names = tuple(VARIANTS)
-    parser.add_argument("--only", nargs="+", choices=names, default=names, metavar="NAME", help=f"[{', '.join(names)}]")
-    parser.add_argument("--size", type=_common.size, metavar="HxW", help="of all clips [each its own]")
-    parser.add_argument("--frames", type=_common.whole, metavar="N", help="only the first N of each clip [all]")
-    parser.add_argument("--seeds", type=_common.whole, default=1, help="[1]")
-    return parser
+    runs.finish(figures)
 
 
 if __name__ == "__main__":

@@ -27,8 +27,10 @@ TASKS = {
 }
 TYPED = {"_FOLDGAUSS_COMPLETE": "complete_bash", "COMP_WORDS": "foldgauss re", "COMP_CWORD": "1"}
 FIRST = "import jax"
-#: Of the processor's time, and of what it holds.
-LIMIT, HELD = 1.5, ("import foldgauss", "from foldgauss import *")
+#: Largest ratio to the processor's time of `import jax`.
+LIMIT = 1.5
+#: Tasks that the limit holds for.
+HELD = ("import foldgauss", "from foldgauss import *")
 
 
 def seconds_of(name: str) -> tuple[float, float]:
@@ -76,14 +78,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--rounds", type=_common.whole, default=9, help="of all tasks in turn [9]")
     options = _common.parse(parser, arguments)
     figures = measured(options.rounds)
-    table = _common.table("Imports", "", "s", "s of processor", "by import jax", "of processor")
-    for name, of in figures.items():
-        table.add_row(name, *(f"{of[key]:.2f}" for key in ("seconds", "processor_seconds", "ratio", "processor_ratio")))
-    _common.console.print(table)
+    kinds = ("seconds", "processor_seconds", "ratio", "processor_ratio")
+    rows = ((name, *(f"{of[kind]:.2f}" for kind in kinds)) for name, of in figures.items())
+    _common.print_table("Imports", ("", "s", "s of processor", "by import jax", "of processor"), rows)
     kept = all(figures[name]["processor_ratio"] <= LIMIT for name in HELD)
     _common.console.print(f"{' and '.join(HELD)}: at most {LIMIT} of import jax: {'yes' if kept else 'NO'}")
     flat = {f"{name}: {key}": value for name, of in figures.items() for key, value in of.items()}
-    _common.finish(options.json, flat, _common.describe_machine(), rounds=options.rounds, limit=LIMIT, kept=kept)
+    _common.finish(options.json, flat, rounds=options.rounds, limit=LIMIT, kept=kept)
 
 
 if __name__ == "__main__":

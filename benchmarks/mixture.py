@@ -1,13 +1,10 @@
-"""Mixtures beside scikit-learn's: whole fits, log-densities, and what bending brings.
+"""Speed of mixtures beside scikit-learn's: whole fits, and log-densities. `benchmarks.density` measures quality.
 
-    python -m benchmarks.mixture [--points [N ...]] [--components K] [--iterations I] [--rounds N] [--skip-bending]
-                                 [--json FILE]
+    python -m benchmarks.mixture [--points N ...] [--components K] [--iterations I] [--rounds N] [--json FILE]
 
-Speed: d = 3, full covariances, a linear fold and a = 1, the model that both have. Both start at the same parameters,
-make the same number of iterations of EM, and compute in the same dtype. Ratios above 1 mean that foldgauss is faster;
-they are of medians of rounds in which the two take turns. Bending: mixtures chosen by BIC or by cross-validation
-(tracks kept whole), the mean log-density of points held out, and its difference to scikit-learn's by the same rule (±
-one standard error, a track being one draw).
+d = 3, full covariances, a linear fold and a = 1, the model that both have. Both start at the same parameters, make the
+same number of iterations of EM, and compute in the same dtype. Ratios above 1 mean that foldgauss is faster; they are
+of medians of rounds in which the two take turns.
 """
 
 import time
@@ -17,7 +14,7 @@ import numpy as np
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.mixture import GaussianMixture
 
-from benchmarks import _bending, _common
+from benchmarks import _common
 from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
 
 DIM = 3
@@ -68,58 +65,30 @@ def time_fits(num: int, components: int, iterations: int, rounds: int) -> dict[s
 
 def show_fits(num: int, components: int, iterations: int, figures: dict[str, float]) -> dict[str, float]:
     """Print the seconds, and return the ratios."""
-    title = f"{num:,} points, {components} components, {iterations} iterations"
-    columns = ("task, dtype", "foldgauss (s)", "scikit-learn (s)", "ratio", "mean log-density", "scikit-learn's")
-    table, ratios = _common.table(title, *columns), {}
+    rows, ratios = [], {}
     for dtype in (dtype.__name__ for dtype in DTYPES):
-        densities = [figures[f"{who}, mean log-density, {dtype}, {num}"] for who in ("foldgauss", "sklearn")]
+        densities = (figures[f"{who}, mean log-density, {dtype}, {num}"] for who in ("foldgauss", "sklearn"))
+        beside = [f"{value:.4f}" for value in densities]
         for task in ("fit", "score"):
             ours, theirs = (figures[f"{who}, {task} (s), {dtype}, {num}"] for who in ("foldgauss", "sklearn"))
             ratios[f"{task}_over_sklearn_{dtype} {num}"] = theirs / ours
-            shown = (f"{ours:.2f}", f"{theirs:.2f}", f"{theirs / ours:.1f}", *(f"{value:.4f}" for value in densities))
-            table.add_row(f"{task}, {dtype}", *shown)
-    _common.console.print(table)
+            rows.append((f"{task}, {dtype}", f"{ours:.2f}", f"{theirs:.2f}", f"{theirs / ours:.1f}", *beside))
+    columns = "task, dtype", "foldgauss (s)", "scikit-learn (s)", "ratio", "mean log-density", "scikit-learn's"
+    _common.print_table(f"{num:,} points, {components} components, {iterations} iterations", columns, rows)
     return ratios
-
-
-def _bends() -> dict[str, float]:
-    problems = {
-        "crossing, normal times": lambda: _bending.curves("normal"),
-        "crossing, uniform times": lambda: _bending.curves("uniform"),
-        "feature tracks": _bending.tracks,
-    }
-    columns = ("data", "mixture, chosen by", "components", "parameters", "held out (nats/point)", "over scikit-learn's")
-    shown = _common.table("Data that bend", *columns)
-    figures = {}
-    for name, compared in problems.items():
-        sides, groups = compared()
-        for who, side in sides.items():
-            rival = sides["scikit-learn, CV" if "CV" in who else "scikit-learn, BIC"]
-            gain, error = side.over(rival, groups)
-            told = "" if side is rival else f"{gain:+.3f} ± {error:.3f}"
-            shown.add_row(name, who, f"{side.components}", f"{side.parameters}", f"{side.held_out:.3f}", told)
-            figures |= {f"{name}, {who}: held out": side.held_out, f"{name}, {who}: parameters": side.parameters}
-    _common.console.print(shown)
-    return figures
 
 
 def main(arguments: list[str] | None = None) -> None:
     made = _common.parser(__doc__)
-    made.add_argument("--points", type=_common.whole, nargs="*", default=[1_000_000], help="none: bending alone")
+    made.add_argument("--points", type=_common.whole, nargs="+", default=[1_000_000])
     made.add_argument("--components", type=_common.whole, default=COMPONENTS)
     made.add_argument("--iterations", type=_common.whole, default=ITERATIONS)
     made.add_argument("--rounds", type=_common.whole, default=3)
-    made.add_argument("--skip-bending", action="store_true", help="speed alone")
-    options = _common.parse(made, arguments)
-    figures = {}
+    options, figures = _common.parse(made, arguments), {}
     for num in options.points:
         figures |= time_fits(num, options.components, options.iterations, options.rounds)
         figures |= show_fits(num, options.components, options.iterations, figures)
-    if not options.skip_bending:
-        figures |= _bends()
-    _common.finish(
-        options.json, figures, _common.describe_machine(), points=options.points, components=options.components
-    )
+    _common.finish(options.json, figures, points=options.points, components=options.components)
 
 
 if __name__ == "__main__":

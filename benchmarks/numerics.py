@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import _common as common
+from benchmarks import _common
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.fold import PolynomialFold
@@ -215,24 +215,15 @@ def extended(loc, tril, time_loc, time_scale, coefficients, power, floor, x) -> 
 
 
 def main(arguments: list[str] | None = None) -> None:
-    options = common.parse(common.parser(__doc__), arguments)
-    figures: dict[str, float] = {}
+    options, figures = _common.parse(_common.parser(__doc__), arguments), {}
     for dtype in (np.float32, np.float64):
         name = np.dtype(dtype).name
-        shown, columns = None, None
-        for case in cases(dtype):
-            row = excess_bits(case, dtype)
-            columns = columns or list(row)
-            shown = shown or common.table(f"{name}: excess wrong bits", "case", *columns)
-            shown.add_row(
-                case.name, *(f"{value:.1f}" if isinstance(value, float) else str(value) for value in row.values())
-            )
-            figures[f"{name}, {case.name}: excess wrong bits"] = row["excess"]
-            figures[f"{name}, {case.name}: gradient's excess wrong bits"] = row["gradient's excess"]
-            figures[f"{name}, {case.name}: NaN"] = row["NaN"]
-        common.console.print(shown)
-    figures["worst excess wrong bits"] = max(v for k, v in figures.items() if k.endswith("bits"))
-    common.finish(options.json, figures, common.machine())
+        rows = {case.name: excess_bits(case, dtype) for case in cases(dtype)}
+        columns = list(next(iter(rows.values())))
+        cells = ((case, *(f"{value:.4g}" for value in row.values())) for case, row in rows.items())
+        _common.print_table(f"{name}: excess wrong bits", ("case", *columns), cells)
+        figures |= {f"{name}, {case}: {what}": row[what] for case, row in rows.items() for what in columns}
+    _common.finish(options.json, figures)
 
 
 if __name__ == "__main__":

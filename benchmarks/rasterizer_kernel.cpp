@@ -1,10 +1,6 @@
 // The CPU engine's loops in C++, serial: what a compiler makes of the same work. `benchmarks/rasterizer.py` compiles it
-// on the spot and calls it through ctypes. Tiles are 16x16; everything is float.
-//
-//   plain  every pixel of every listed pair, the textbook loop, a row of a tile as one vector: no tile is left early,
-//          nothing is skipped
-//   exact  what the engine does with the same lists: cells of 4x4 pixels, one vector each, only those that a splat
-//          reaches and that have light left, a tile left once dark
+// on the spot and calls it through ctypes. Tiles are 16x16; everything is float. As in the engine, cells of 4x4 pixels are
+// one vector each; only those are visited that a splat reaches and that have light left, and a tile is left once dark.
 //
 // Columns of `geometry` and of the blocks are those of `foldgauss/render/_cpu_kernels.py`:
 // alpha = 2^(LOG - (P dx + Q dy)^2 - (R dy)^2), drawn where the exponent is at least LEAST.
@@ -22,7 +18,6 @@ typedef float Row __attribute__((vector_size(64)));  // 16 pixels; g++ splits it
 typedef int32_t Whole __attribute__((vector_size(64)));
 const Row CELL_X = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
 const Row CELL_Y = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
-const Row COLUMN = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
 
 // 2^x for -126 < x <= 0, as the engine.
 inline Row power_of_two(Row x) {
@@ -79,14 +74,13 @@ struct Tile {
 };
 
 // One vector of pixels of one splat: its share of the light, and its colours.
-inline void blend_pixels(Row power, float least, const float *own, int stride, float ceiling, float finished, Row &light,
-                         Row *color, int step) {
+inline void blend_pixels(Row power, float least, const float *own, float ceiling, float finished, Row &light, Row *color) {
     Row alpha = power_of_two(power);
     alpha = alpha < ceiling ? alpha : Row{} + ceiling;
     alpha = power >= least ? alpha : Row{};
     const Row weight = alpha * (light > finished ? light : Row{});
     light -= weight;
-    for (int c = 0; c < CHANNELS; ++c) color[c * step] += weight * own[c * stride];
+    for (int c = 0; c < CHANNELS; ++c) color[c] += weight * own[c * BLOCK];
 }
 
 // Right edge of the ellipse (p dx + q dy)^2 + (r dy)^2 = level on the line dy.
@@ -139,8 +133,7 @@ void blend_block(int num, const float *block, const int *first, const int *end, 
             const Row across = block[P * BLOCK + e] * CELL_X + (block[Q * BLOCK + e] * CELL_Y + shear[e]);
             const Row along = block[R * BLOCK + e] * CELL_Y + rise[e];
             const Row power = block[LOG * BLOCK + e] - along * along - across * across;
-            blend_pixels(power, block[LEAST * BLOCK + e], block + 8 * BLOCK + e, BLOCK, ceiling, finished, light, color,
-                         1);
+            blend_pixels(power, block[LEAST * BLOCK + e], block + COLUMNS * BLOCK + e, ceiling, finished, light, color);
         }
         tile.light[cell] = light;
         for (int c = 0; c < CHANNELS; ++c) tile.color[c][cell] = color[c];
@@ -152,27 +145,6 @@ void blend_block(int num, const float *block, const int *first, const int *end, 
 extern "C" {
 
 // Tiles row by row; tile t lists splats listed[start[t]] .. listed[start[t + 1]], front to back.
-void plain(int height, int width, const int64_t *start, const int32_t *listed, const float *geometry,
-           const float *colors, const float *background, float ceiling, float finished, float *image, float *light) {
-    const int across = (width + TILE - 1) / TILE, down = (height + TILE - 1) / TILE;
-    Tile tile;
-    for (int t = 0; t < across * down; ++t) {
-        const int left = t % across * TILE, top = t / across * TILE;
-        tile.clear();
-        for (int64_t k = start[t]; k < start[t + 1]; ++k) {
-            const float *own = geometry + int64_t(listed[k]) * COLUMNS, *rgb = colors + int64_t(listed[k]) * CHANNELS;
-            const float x = own[X] - left - 0.5f, y = own[Y] - top - 0.5f;
-            const float p = own[P], q = own[Q], r = own[R], log = own[LOG], least = own[LEAST];
-            for (int row = 0; row < TILE; ++row) {
-                const float dy = row - y;
-                const Row across = p * COLUMN + (q * dy - p * x), power = log - r * dy * r * dy - across * across;
-                blend_pixels(power, least, rgb, 1, ceiling, finished, tile.light[row], &tile.color[0][row], TILE);
-            }
-        }
-        tile.write(background, image, light, top, left, height, width);
-    }
-}
-
 void exact(int height, int width, const int64_t *start, const int32_t *listed, const float *geometry,
            const float *colors, const float *background, float ceiling, float finished, float *image, float *light) {
     const int across = (width + TILE - 1) / TILE, down = (height + TILE - 1) / TILE;

@@ -4,9 +4,9 @@
                                          [--qualities Q ...] [--sizes-mb S ...] [--json FILE] [--figure FILE]
 
 The first N frames of the subfolders of FOLDER, folders of images each, at their own size. `foldgauss`: fits of M
-minutes of one core with several qualities, and with several sizes of the file. Codecs: FFmpeg's encoders through PyAV at several constant rate factors,
-tuned for PSNR, whole Matroska files. x264 and x265 store 4:4:4, as chroma subsampling would limit their PSNR of RGB;
-SVT-AV1 has 4:2:0 only. Figures of quality are means over the decoded 8-bit frames:
+minutes of one core with several qualities, and with several sizes of the file. Codecs: FFmpeg's encoders through PyAV
+at several constant rate factors, tuned for PSNR, whole Matroska files. x264 and x265 store 4:4:4, as chroma subsampling
+would limit their PSNR of RGB; SVT-AV1 has 4:2:0 only. Figures of quality are means over the decoded 8-bit frames:
 
 - PSNR of RGB;
 - PSNR of YUV, weighted 6:1:1, of BT.601 luma and of chroma averaged over 2x2 pixels, so that 4:2:0 costs nothing;
@@ -38,8 +38,7 @@ from skimage.color import rgb2ycbcr
 
 from benchmarks import _common
 from benchmarks._clips import ClipSource, folder_sources
-from benchmarks._common import console
-from benchmarks._runs import Run, Runs, fit_by_processor
+from benchmarks._runs import Run, Runs, fit_by_clock
 from foldgauss._runtime.threads import set_num_threads
 from foldgauss.io import load_video_model, read_video, save_compact
 from foldgauss.io.media.decoder import CONVERSION
@@ -143,7 +142,7 @@ def run_foldgauss(frames: np.ndarray, fps: float, config: FitConfig) -> Run:
     with tempfile.TemporaryDirectory() as folder:
 
         def encode() -> Path:
-            fitted = fit_by_processor(frames, config, fps)
+            fitted = fit_by_clock(frames, config, fps)
             return save_compact(Path(folder) / "clip.fgz", fitted.quantized)
 
         path, encode_s = timed(encode)
@@ -188,26 +187,27 @@ def measure(source: ClipSource, runs: Runs, options: argparse.Namespace) -> dict
 
 def show(clip: str, by_coder: dict[str, list[Run]]) -> dict[str, dict[str, tuple[float, float, float] | None]]:
     """Print the runs of a clip and the BD-rates, which are returned by coder and quality."""
-    columns = ("Gaussians", "bytes", "bits per pixel", *MEASURES.values(), "encode (s)", "decode (s)")
-    table = _common.table(clip, "coder", *columns)
+    columns = ("coder", "Gaussians", "bytes", "bits per pixel", *MEASURES.values(), "encode (s)", "decode (s)")
     forms = {"bytes": ",", "bits_per_pixel": ".3f", "psnr": ".2f", "psnr_yuv": ".2f", "ms_ssim": ".4f"}
     forms |= {"encode_s": ".1f", "decode_s": ".2f"}
-    for name, made in by_coder.items():
-        for run in made:
-            num = f"{run['gaussians']:,}" if name == OURS else ""
-            table.add_row(name, num, *(format(run[figure], form) for figure, form in forms.items()))
-    console.print(table)
-    names = [name for name in by_coder if name != REFERENCE]
+    rows = (
+        (name, run.get("gaussians", ""), *(format(run[figure], form) for figure, form in forms.items()))
+        for name, made in by_coder.items()
+        for run in made
+    )
+    _common.print_table(clip, columns, rows)
     base, ours = by_coder[REFERENCE], by_coder[OURS]
+    names = [name for name in by_coder if name != REFERENCE]
     rates = {name: {q: bd_rate(base, by_coder[name], q, ours) for q in MEASURES} for name in names}
-    table = _common.table(f"{clip}: BD-rate to {REFERENCE}, and its range of quality", "coder", *MEASURES.values())
-    for name, by_quality in rates.items():
-        shown = (
-            "none" if rate is None else f"{rate[0]:+.0%} ({rate[1]:.4g} to {rate[2]:.4g})"
-            for rate in by_quality.values()
+    shown = (
+        (
+            name,
+            *("none" if rate is None else "{:+.0%} ({:.4g} to {:.4g})".format(*rate) for rate in by_quality.values()),
         )
-        table.add_row(name, *shown)
-    console.print(table)
+        for name, by_quality in rates.items()
+    )
+    title = f"{clip}: BD-rate to {REFERENCE}, and its range of quality"
+    _common.print_table(title, ("coder", *MEASURES.values()), shown)
     return rates
 
 
@@ -229,19 +229,6 @@ def draw(results: dict[str, dict[str, list[Run]]], path: Path) -> None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    options = _common.parse(_parser(), arguments)
-    sources = [one for one in folder_sources(options.clips) if options.only is None or one.name in options.only]
-    sources = [one._replace(frames=options.frames) for one in sources]
-    set_num_threads(1)
-    runs = Runs(options.json, {"processor_minutes": options.minutes, "frames": options.frames})
-    results = {one.name: measure(one, runs, options) for one in sources}
-    rates = {clip: show(clip, by_coder) for clip, by_coder in results.items()}
-    runs.write(bd_rates=rates)
-    if options.figure:
-        draw(results, options.figure)
-
-
-def _parser() -> argparse.ArgumentParser:
     parser = _common.parser(__doc__)
     parser.add_argument("--clips", type=Path, metavar="FOLDER", required=True, help="its subfolders are the clips")
     parser.add_argument("--only", nargs="+", metavar="NAME", help="[all]")
@@ -250,7 +237,16 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--sizes-mb", type=float, nargs="*", default=(), metavar="S", help="[none]")
     parser.add_argument("--minutes", type=float, default=MINUTES, help=f"of the processor, for each fit [{MINUTES:g}]")
     parser.add_argument("--figure", type=Path, metavar="FILE", help="draw PSNR over bits per pixel")
-    return parser
+    options = _common.parse(parser, arguments)
+    sources = [one for one in folder_sources(options.clips) if options.only is None or one.name in options.only]
+    sources = [one._replace(frames=options.frames) for one in sources]
+    set_num_threads(1)
+    runs = Runs(options.json, {"processor_minutes": options.minutes, "frames": options.frames})
+    results = {one.name: measure(one, runs, options) for one in sources}
+    rates = {clip: show(clip, by_coder) for clip, by_coder in results.items()}
+    runs.finish({}, bd_rates=rates)
+    if options.figure:
+        draw(results, options.figure)
 
 
 if __name__ == "__main__":

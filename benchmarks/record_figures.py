@@ -23,9 +23,14 @@ from benchmarks.reproduce import PAPER_STARTS
 from foldgauss.io._atomic import atomic_path
 
 RECORDS = Path(__file__).parent / "records"
-BLUE, ORANGE, GREEN, GREY = "#2b5c8a", "#d1662b", "#3f8f5b", "#6b7178"
-#: Inches, and pixels for each of them.
-WIDTH, DPI = 5.0, 200
+BLUE = "#2b5c8a"
+ORANGE = "#d1662b"
+GREEN = "#3f8f5b"
+GREY = "#6b7178"
+#: Inches.
+WIDTH = 5.0
+#: Pixels for each inch.
+DPI = 200
 STYLE = {
     "font.size": 10.5,
     "axes.spines.top": False,

@@ -23,7 +23,6 @@ over all its runs. With --default a fit of the defaults follows, with at most as
 with, for as long as that took (processor time of all threads together).
 """
 
-import argparse
 import csv
 import dataclasses
 import math
@@ -34,13 +33,14 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import _common, fit_clip
+from benchmarks import _common
 from benchmarks._common import console
 from benchmarks._runs import Run, Runs, fitted, scaled, scores, size_on_disk
 from foldgauss._runtime.threads import num_threads
 from foldgauss.io import Clip, read_video
 from foldgauss.io._atomic import atomic_path
-from foldgauss.io.datasets import bunny, sample_clip
+from foldgauss.io.datasets import sample_clip
+from foldgauss.io.figures import write_figure
 from foldgauss.io.provenance import fingerprint
 from foldgauss.jobs.runner import Checkpoint, run_steps
 from foldgauss.video import FitConfig, Growth, LearningRates, fit_steps
@@ -51,8 +51,9 @@ from foldgauss.video.fitting.state import FitState, to_model
 from foldgauss.video.models.row_layout import columns
 
 FULL = (640, 1280)
-#: Steps between two points of a curve, and seconds between two checkpoints.
-EVERY, CHECKPOINT_SECONDS = 100, 120.0
+#: Steps between two points of a curve.
+EVERY = 100
+CHECKPOINT_SECONDS = 120.0
 
 #: What each fit changes in the preset, or in its `Growth`; the largest questions first. `rates` is a factor of all
 #: learning rates, `extent` one of what is in units of the scene's extent (the learning rate of positions and two
@@ -176,25 +177,19 @@ def curve_path(folder: Path, name: str) -> Path:
 
 def plot_curves(folder: Path, names: Iterable[str], path: Path) -> None:
     """PSNR and number of Gaussians against steps, of the fits whose curves `folder` holds."""
-    import matplotlib
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
+    def draw(figure: Any) -> None:
+        quality, numbers = figure.subplots(1, 2)
+        for name in names:
+            if curve_path(folder, name).exists():
+                steps, psnr, num, _ = np.array(read_curve(curve_path(folder, name))).T
+                quality.plot(steps / 1000, psnr, label=name, lw=1)
+                numbers.plot(steps / 1000, num / 1e6, label=name, lw=1)
+        quality.set(xlabel="thousands of steps", ylabel="running PSNR (dB)")
+        numbers.set(xlabel="thousands of steps", ylabel="millions of Gaussians", ylim=(0, None))
+        numbers.legend(fontsize=7)
 
-    figure, axes = pyplot.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
-    for name in names:
-        if curve_path(folder, name).exists():
-            steps, psnr, num, _ = zip(*read_curve(curve_path(folder, name)), strict=True)
-            thousands = [step / 1000 for step in steps]
-            axes[0].plot(thousands, psnr, label=name, lw=1)
-            axes[1].plot(thousands, [one / 1e6 for one in num], label=name, lw=1)
-    axes[0].set(xlabel="thousands of steps", ylabel="running PSNR (dB)")
-    axes[1].set(xlabel="thousands of steps", ylabel="millions of Gaussians", ylim=(0, None))
-    for ax in axes:
-        ax.grid(alpha=0.3)
-    axes[1].legend(fontsize=7)
-    figure.savefig(path, dpi=150)
-    pyplot.close(figure)
+    write_figure(path, draw, (9, 3.6))
 
 
 def start_in_box(clip: Clip, config: FitConfig, factor: float) -> FitState:
@@ -237,43 +232,43 @@ def run_default(clip: Clip, config: FitConfig) -> Run:
 
 def show(runs: dict[str, Run], title: str, *, beside_paper: bool) -> None:
     """Print the fits, with differences to the first, for *Bunny* beside what the paper reports for `FULL`."""
-    columns = "fit", "PSNR, dB", "", "worst frame", "SSIM", "Gaussians", "CPU hours", "paper: PSNR", "", "million"
-    table = _common.table(title, *columns)
-    first = next(iter(runs))
+    columns = "fit", "PSNR, dB", "", "worst frame", "SSIM", "Gaussians", "CPU hours", "paper: PSNR", "million"
+    first, rows = next(iter(runs.values())), []
     for name, run in runs.items():
-        gain = f"{run['psnr'] - runs[first]['psnr']:+.2f}"
+        gain = f"{run['psnr'] - first['psnr']:+.2f}"
         figures = f"{run['psnr']:.2f}", gain, f"{run['worst_psnr']:.2f}", f"{run['ssim']:.4f}"
-        theirs, reference = (published(name), published(first)) if beside_paper else (None, None)
-        beside = ("", "", "")
-        if theirs is not None:
-            beside = f"{theirs[0]}", "" if reference is None else f"{theirs[0] - reference[0]:+.2f}", f"{theirs[1]}"
-        table.add_row(name, *figures, f"{run['gaussians']:,}", f"{run['cpu_hours']:.2f}", *beside)
-    console.print(table)
-
-
-def read_clip(options: argparse.Namespace) -> Clip:
-    if options.crop or options.clip:
-        size = None if options.crop else options.size
-        path = options.clip or sample_clip("bunny")
-        return read_video(path, frames=options.frames, center_crop=options.crop, size=size)
-    return bunny(size=options.size, frames=options.frames)
+        theirs = published(name) if beside_paper else None
+        rows.append((name, *figures, f"{run['gaussians']:,}", f"{run['cpu_hours']:.2f}", *(theirs or ("", ""))))
+    _common.print_table(title, columns, rows)
 
 
 def main(arguments: list[str] | None = None) -> None:
-    parser = _parser()
+    parser = _common.parser(__doc__)
+    parser.add_argument("--clip", type=Path, metavar="PATH", help="instead of Bunny")
+    parser.add_argument("--folder", type=Path, required=True, help="of checkpoints and curves")
+    shown = parser.add_mutually_exclusive_group()
+    shown.add_argument("--size", type=_common.parse_size, metavar="HxW", default=FULL, help="[640x1280]")
+    shown.add_argument("--crop", type=_common.parse_size, metavar="HxW", help="the central window, not resized")
+    parser.add_argument("--frames", type=_common.frame_range, metavar="A:B", help="frames A <= i < B [all]")
+    parser.add_argument("--steps", type=_common.whole, default=PUBLISHED_STEPS, help=f"[{PUBLISHED_STEPS:,}]")
+    names = tuple(VARIANTS | CELLS)
+    chosen = parser.add_mutually_exclusive_group()
+    chosen.add_argument("--tables", action="store_true", help="the cells of the paper's tables, not the variants")
+    chosen.add_argument("--only", nargs="+", choices=names, metavar="NAME", help=f"these of {'; '.join(names)}")
+    parser.add_argument("--seed", type=int, default=0, help="[0]")
+    parser.add_argument("--engine", choices=FIT_ENGINES, default="auto", help="that computes the steps [auto]")
+    parser.add_argument("--default", action="store_true", help="beside the first fit, at equal number and time")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the curves here (PNG)")
     options = _common.parse(parser, arguments)
-    clip = read_clip(options)
+    path, size = options.clip or sample_clip("bunny"), None if options.crop else options.size
+    clip = read_video(path, frames=options.frames, center_crop=options.crop, size=size)
     setting = {"size": clip.size, "frames": clip.num_frames, "steps": options.steps, "seed": options.seed}
     if options.crop:
         setting["cropped"] = True
     if options.clip:
         setting["clip"] = options.clip.stem
-    try:
-        options.folder.mkdir(parents=True, exist_ok=True)
-        runs = Runs(options.json, setting)
-    except (ValueError, OSError) as error:
-        parser.error(str(error))
-    done = {}
+    options.folder.mkdir(parents=True, exist_ok=True)
+    runs, done = Runs(options.json, setting), {}
     for name in options.only or (CELLS if options.tables else VARIANTS):
         config = config_of(name, clip.size, options.steps, options.seed)
         config = dataclasses.replace(config, engine=options.engine)
@@ -287,29 +282,7 @@ def main(arguments: list[str] | None = None) -> None:
     show(done, title + (", not resized" if options.crop else ""), beside_paper=options.clip is None)
     if options.plot:
         plot_curves(options.folder, done, options.plot)
-    figures = {f"psnr, {name}": run["psnr"] for name, run in done.items()}
-    _common.finish(None, figures, _common.describe_machine())
-    runs.write(figures=figures)
-
-
-def _parser():
-    parser = _common.parser(__doc__)
-    parser.add_argument("--clip", type=Path, metavar="PATH", help="instead of Bunny")
-    parser.add_argument("--folder", type=Path, required=True, help="of checkpoints and curves")
-    shown = parser.add_mutually_exclusive_group()
-    shown.add_argument("--size", type=_common.size, metavar="HxW", default=FULL, help="[640x1280]")
-    shown.add_argument("--crop", type=_common.size, metavar="HxW", help="the central window, not resized")
-    parser.add_argument("--frames", type=fit_clip._frames, metavar="A:B", help="frames A <= i < B [all]")
-    parser.add_argument("--steps", type=_common.whole, default=PUBLISHED_STEPS, help=f"[{PUBLISHED_STEPS:,}]")
-    names = tuple(VARIANTS | CELLS)
-    chosen = parser.add_mutually_exclusive_group()
-    chosen.add_argument("--tables", action="store_true", help="the cells of the paper's tables, not the variants")
-    chosen.add_argument("--only", nargs="+", choices=names, metavar="NAME", help=f"these of {'; '.join(names)}")
-    parser.add_argument("--seed", type=int, default=0, help="[0]")
-    parser.add_argument("--engine", choices=FIT_ENGINES, default="auto", help="that computes the steps [auto]")
-    parser.add_argument("--default", action="store_true", help="beside the first fit, at equal number and time")
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the curves here (PNG)")
-    return parser
+    runs.finish({f"psnr, {name}": run["psnr"] for name, run in done.items()})
 
 
 if __name__ == "__main__":

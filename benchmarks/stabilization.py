@@ -1,6 +1,6 @@
 """Stabilization: how much jitter of the camera is left in what `stabilize` renders.
 
-    python -m benchmarks.stabilization [--json FILE] [--model FILE.safetensors ...] [--minutes M] [--sheet FILE]
+    python -m benchmarks.stabilization [--json FILE] [--model FILE.safetensors ...] [--minutes M]
 
 Without --model: *Bunny*, seen through a window of 240x480 that pans and shakes over its frames of 320x640, is fitted
 for M minutes (1). Jitter is the root mean square of the camera's path after a Gaussian of 4 frames is subtracted, in
@@ -8,7 +8,6 @@ pixels: of its horizontal and vertical motion, and of its rotation at half the w
 Shi and Tomasi's corners and Lucas and Kanade's flow, of which `stabilize` uses neither.
 """
 
-import argparse
 import itertools
 from pathlib import Path
 
@@ -18,18 +17,23 @@ from scipy.ndimage import gaussian_filter1d
 
 from benchmarks import _common
 from benchmarks._common import console
-from foldgauss.io import load_video_model, read_video, write_image
+from foldgauss.io import load_video_model, read_video
 from foldgauss.io.datasets import sample_clip
 from foldgauss.video import FitConfig, VideoModel, estimate_camera_path, fit, stabilize
 from foldgauss.video.motion.stabilization import BORDERS
 
-SIZE, WINDOW = (320, 640), (240, 480)
-#: Standard deviation of the shake, in pixels, and of its rotation, in radians; frames of the Gaussian that makes it
-#: continuous, as that of a hand; and pixels of the pan in each frame.
-SHAKE, TURN, HAND, PAN = 6.0, 0.01, 2.0, 0.8
+SIZE = (320, 640)
+WINDOW = (240, 480)
+#: Standard deviation of the shake, in pixels.
+SHAKE = 6.0
+#: Standard deviation of its rotation, in radians.
+TURN = 0.01
+#: Frames of the Gaussian that makes the shake continuous, as that of a hand.
+HAND = 2.0
+#: Pixels of the pan in each frame.
+PAN = 0.8
 #: Frames of the Gaussian whose result is the intended path.
 INTENDED = 4.0
-SHOWN = 5
 
 
 def shaken_bunny(seed: int = 0) -> np.ndarray:
@@ -68,7 +72,7 @@ def measure_jitter(frames: list[np.ndarray]) -> float:
     return float(np.sqrt((rest[ends:-ends] ** 2).sum(1).mean()))
 
 
-def measure(name: str, model: VideoModel, sheet: Path | None) -> dict[str, float]:
+def measure(name: str, model: VideoModel) -> dict[str, float]:
     path = estimate_camera_path(model)
     videos = {"as fitted": model}
     for border in BORDERS:
@@ -77,38 +81,24 @@ def measure(name: str, model: VideoModel, sheet: Path | None) -> dict[str, float
         except ValueError as error:
             console.print(f"{name}, {border}: {error}")
     videos["fixed, fill"] = stabilize(model, fixed=True, border="fill", path=path)
-    images = {how: list(video.frames()) for how, video in videos.items()}
-    jitter = {how: measure_jitter(frames) for how, frames in images.items()}
-    table = _common.table(f"{name}: {model.num_frames} frames", "camera", "jitter, px", "less by", "zoom")
-    for how, value in jitter.items():
-        zoom = f"{videos[how].zoom:.2f}" if how != "as fitted" else ""
-        table.add_row(how, f"{value:.2f}", f"{jitter['as fitted'] / value:.1f}x", zoom)
-    console.print(table)
-    if sheet is not None:
-        shown = np.linspace(0, model.num_frames - 1, SHOWN).round().astype(int)
-        rows = [np.concatenate([frames[k] for k in shown], 1) for frames in images.values()]
-        write_image(sheet.with_stem(f"{sheet.stem}-{name}"), np.concatenate(rows))
+    jitter = {how: measure_jitter(list(video.frames())) for how, video in videos.items()}
+    rows = ((how, f"{value:.2f}", f"{jitter['as fitted'] / value:.1f}x") for how, value in jitter.items())
+    _common.print_table(f"{name}: {model.num_frames} frames", ("camera", "jitter, px", "less by"), rows)
     return {f"{how}: jitter of {name}": value for how, value in jitter.items()}
 
 
 def main(arguments: list[str] | None = None) -> None:
-    options = _common.parse(_parser(), arguments)
-    figures = {}
+    parser = _common.parser(__doc__)
+    parser.add_argument("--model", type=Path, nargs="+", metavar="FILE", help="models instead of the shaken Bunny")
+    parser.add_argument("--minutes", type=_common.positive, default=1.0, metavar="M", help="of the fit [1]")
+    options, figures = _common.parse(parser, arguments), {}
     if options.model:
         models = {path.stem: load_video_model(path) for path in options.model}
     else:
         models = {"bunny": fit(shaken_bunny(), FitConfig(minutes=options.minutes), fps=25.0).model}
     for name, model in models.items():
-        figures |= measure(name, model, options.sheet)
-    _common.finish(options.json, figures, _common.describe_machine(), setting={"minutes": options.minutes})
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _common.parser(__doc__)
-    parser.add_argument("--model", type=Path, nargs="+", metavar="FILE", help="models instead of the shaken Bunny")
-    parser.add_argument("--minutes", type=float, default=1.0, metavar="M", help="of the fit [1]")
-    parser.add_argument("--sheet", type=Path, metavar="FILE", help="pictures go here, one for each clip (PNG)")
-    return parser
+        figures |= measure(name, model)
+    _common.finish(options.json, figures, setting={"minutes": options.minutes})
 
 
 if __name__ == "__main__":

@@ -17,9 +17,7 @@ from pathlib import Path
 
 from benchmarks import _common
 from benchmarks._clips import ClipSource, sample_sources
-from benchmarks._runs import Run, Runs, fit_by_processor, scores
-from benchmarks.presets import minutes as positive
-from benchmarks.tune import prepare_process
+from benchmarks._runs import Run, Runs, fit_by_clock, scores, warm_up
 from foldgauss._runtime.threads import set_num_threads
 from foldgauss.io import save_compact, save_video_model
 from foldgauss.video import FitConfig
@@ -39,46 +37,40 @@ def configurations(budgets: list[float]) -> dict[str, FitConfig]:
 def fit_clip(source: ClipSource, config: FitConfig, path: Path) -> Run:
     """A fit, kept in `path`: its quality, its CPU time, and the bytes of its file."""
     clip = source.read()
-    prepare_process(clip.num_frames)
-    fitted = fit_by_processor(clip.frames, config, clip.fps)
-    if fitted.quantized is None:
-        save_video_model(path, fitted.model)
+    warm_up(clip.num_frames)
+    result = fit_by_clock(clip.frames, config, clip.fps)
+    if result.quantized is None:
+        save_video_model(path, result.model)
     else:
-        save_compact(path, fitted.quantized)
-    last, num = fitted.history[-1], fitted.model.num_gaussians
-    run = scores(fitted.model, clip.frames, with_ssim=False) | {"gaussians": num, "steps": last.step}
-    return run | {"cpu_seconds": last.seconds, "bytes": path.stat().st_size}
+        save_compact(path, result.quantized)
+    last = result.history[-1]
+    run = {"gaussians": result.model.num_gaussians, "steps": last.step, "cpu_seconds": last.seconds}
+    return scores(result.model, clip.frames) | run | {"bytes": path.stat().st_size}
 
 
 def main(arguments: list[str] | None = None) -> None:
     parser = _common.parser(__doc__)
     parser.add_argument("--models", type=Path, required=True, metavar="FOLDER", help="keep the models there")
-    parser.add_argument("--budgets", nargs="+", type=positive, default=BUDGETS, metavar="S", help="CPU seconds")
+    parser.add_argument("--budgets", nargs="+", type=_common.positive, default=BUDGETS, metavar="S", help="CPU seconds")
     options = _common.parse(parser, arguments)
     options.models.mkdir(parents=True, exist_ok=True)
     sources = [one._replace(size=SIZES[one.name], frames=NUM_FRAMES) for one in sample_sources(SIZES)]
     runs = Runs(options.json, {"clips": [source.describe() for source in sources]})
     set_num_threads(1)
-    try:
-        for name, config in configurations(options.budgets).items():
-            for source in sources:
-                path = options.models / f"{source.name}-{name.replace(' ', '')}.safetensors"
-                compact = dataclasses.replace(config, quality=DEFAULT_QUALITY)
-                runs.get(f"{source.name}, {name}", partial(fit_clip, source, config, path))
-                small = partial(fit_clip, source, compact, path.with_suffix(".fgz"))
-                runs.get(f"{source.name}, {name}, compact", small)
-    finally:
-        set_num_threads(None)
-    show(runs)
-
-
-def show(runs: Runs) -> None:
-    columns = "CPU seconds", "PSNR, dB", "worst frame", "Gaussians", "MB"
-    table = _common.table("Quality against time and bytes", "clip, setting", *columns)
-    for name, run in runs.done.items():
-        numbers = f"{run['cpu_seconds']:.0f}", f"{run['psnr']:.2f}", f"{run['worst_psnr']:.2f}"
-        table.add_row(name, *numbers, f"{run['gaussians']:,}", f"{run['bytes'] / 1e6:.3f}")
-    _common.console.print(table)
+    for name, config in configurations(options.budgets).items():
+        compact = dataclasses.replace(config, quality=DEFAULT_QUALITY)
+        for source in sources:
+            path = options.models / f"{source.name}-{name.replace(' ', '')}.safetensors"
+            runs.get(f"{source.name}, {name}", partial(fit_clip, source, config, path))
+            small = partial(fit_clip, source, compact, path.with_suffix(".fgz"))
+            runs.get(f"{source.name}, {name}, compact", small)
+    columns = "clip, setting", "CPU seconds", "PSNR, dB", "worst frame", "Gaussians", "MB"
+    forms = {"cpu_seconds": ".0f", "psnr": ".2f", "worst_psnr": ".2f", "gaussians": ","}
+    rows = (
+        (name, *(format(run[figure], form) for figure, form in forms.items()), f"{run['bytes'] / 1e6:.3f}")
+        for name, run in runs.done.items()
+    )
+    _common.print_table("Quality against time and bytes", columns, rows)
 
 
 if __name__ == "__main__":

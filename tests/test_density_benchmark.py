@@ -110,10 +110,3 @@ def test_the_best_is_judged_by_paired_differences():
     judged = density.judge(rows)
     assert judged["near_the_best"] == ["GaussianMixture", "foldgauss"]
     assert judged["ours_at_the_fewest_parameters"]
-
-
-@pytest.mark.slow
-def test_the_figure_is_drawn(tmp_path):
-    pytest.importorskip("matplotlib", reason="needs the extra plot")
-    run(tmp_path / "density.json", "--splits", "1", "--figure", str(tmp_path / "density.png"))
-    assert (tmp_path / "density.png").stat().st_size > 5000

@@ -1,6 +1,6 @@
 """Mutation testing: does the quick suite notice small mistakes in the core modules?
 
-    python -m benchmarks.mutants [--num N] [--seed S] [--workers W] [--only MODULE ...] [--json FILE]
+    python -m tests.mutants [--num N] [--seed S] [--workers W] [--only MODULE ...] [--json FILE]
 
 A mutant is one changed operator, comparison, constant, condition or argument. N of them (300) are drawn with a seed,
 evenly over the modules of `TARGETS`, and each runs the test files of its module (`-m "not slow"`, until the first
@@ -12,7 +12,6 @@ to try it again. Survivors are listed with their lines: each is either equivalen
 that were found to be equivalent (no test of behavior can see them) are in `REVIEWED` with the reason, by their lines.
 """
 
-import argparse
 import ast
 import json
 import os
@@ -37,7 +36,7 @@ ROOT = Path(__file__).parent.parent
 #: CPython 3.11's parser counts its recursion wrongly where several threads parse at once.
 _PARSING = Lock()
 #: Equivalent mutants: for each module, the mutated line and the reason.
-REVIEWED = Path(__file__).parent / "records" / "mutants-equivalent.json"
+REVIEWED = ROOT / "benchmarks" / "records" / "mutants-equivalent.json"
 #: The modules, and the test files of each, those that take the least time first.
 TARGETS = {
     "distribution": [
@@ -191,7 +190,7 @@ class Checkout:
         shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(".git", "site"))
         env = dict(os.environ, PYTHONPATH=str(folder), PYTHONDONTWRITEBYTECODE="1", PYTHONWARNINGS="ignore")
         env.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder.parent / "jax"))  # what one mutant compiled is there
-        command = [sys.executable, "benchmarks/_forked_pytest.py"]
+        command = [sys.executable, "tests/forked_pytest.py"]
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
         self._process = subprocess.Popen(command, cwd=folder, env=env, **pipes)
 
@@ -228,7 +227,12 @@ def try_mutant(mutant: Mutant, checkout: Checkout, killers: Iterable[str] = ()) 
 
 
 def main(arguments: list[str] | None = None) -> None:
-    options = _common.parse(_parser(), arguments)
+    parser = _common.parser(__doc__)
+    parser.add_argument("--num", type=_common.whole, default=300, metavar="N", help="[300]")
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="[0]")
+    parser.add_argument("--workers", type=_common.whole, default=1, metavar="W", help="[1]")
+    parser.add_argument("--only", nargs="+", choices=list(TARGETS), metavar="MODULE", help="[all]")
+    options = _common.parse(parser, arguments)
     modules = list(TARGETS) if options.only is None else options.only
     mutants = draw(options.num, options.seed, modules)
     runs = Runs(options.json, {"seed": options.seed})
@@ -264,31 +268,21 @@ def show(rows: dict[str, Run]) -> None:
         for name, row in rows.items()
         if not row["killed"] and (reason := reviewed.get(row["module"], {}).get(row["mutated"]))
     }
-    columns = "mutants", "killed", "equivalent", "survived", "killed of those that are not equivalent"
-    table = _common.table("Mutants", "module", *columns)
-    figures = {}
+    columns = "module", "mutants", "killed", "equivalent", "survived", "killed of those that are not equivalent"
+    shown, figures = [], {}
     for module in [*dict.fromkeys(row["module"] for row in rows.values()), "all"]:
         own = {name: row for name, row in rows.items() if module in (row["module"], "all")}
         killed, equivalent = sum(row["killed"] for row in own.values()), len(own.keys() & reasons)
         figures |= {f"mutants_{module}": len(own), f"killed_{module}": killed, f"equivalent_{module}": equivalent}
-        counts = len(own), killed, equivalent, len(own) - killed - equivalent
-        table.add_row(module, *map(str, counts), f"{killed / max(len(own) - equivalent, 1):.1%}")
-    console.print(table)
+        survived, part = len(own) - killed - equivalent, killed / max(len(own) - equivalent, 1)
+        shown.append((module, len(own), killed, equivalent, survived, f"{part:.1%}"))
+    _common.print_table("Mutants", columns, shown)
     for name, row in rows.items():
         if not row["killed"]:
             told = f"equivalent: {reasons[name]}" if name in reasons else "survived"
             lines = f"{name}: {told}\n  - {row['code']}\n  + {row['mutated']}"
             console.print(lines, soft_wrap=True, highlight=False, markup=False)
-    _common.finish(None, figures, _common.describe_machine())
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _common.parser(__doc__)
-    parser.add_argument("--num", type=_common.whole, default=300, metavar="N", help="[300]")
-    parser.add_argument("--seed", type=int, default=0, metavar="S", help="[0]")
-    parser.add_argument("--workers", type=_common.whole, default=1, metavar="W", help="[1]")
-    parser.add_argument("--only", nargs="+", choices=list(TARGETS), metavar="MODULE", help="[all]")
-    return parser
+    _common.finish(None, figures)
 
 
 if __name__ == "__main__":
