@@ -100,7 +100,7 @@ def fitted(clip: Clip, config: FitConfig, *, cpu_time: bool = False) -> tuple[Vi
     model, last = result.model, result.history[-1]
     run = scores(model, clip.frames) | size_on_disk(model, clip)
     run |= {"gaussians": model.num_gaussians, "floats": model.num_parameters, "steps": last.step}
-    return model, run | {"frames_seen": last.step * config.batch_size, "seconds": last.seconds}
+    return model, run | {"frames_seen": last.step * config.views.batch_size, "seconds": last.seconds}
 
 
 @functools.cache

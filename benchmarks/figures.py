@@ -33,7 +33,7 @@ from foldgauss.io.datasets import bunny
 from foldgauss.render import Camera, Gaussians3D, project, render
 from foldgauss.uncertainty import FrameTimePosterior, frame_time_posterior, increment_intervals, irregularities
 from foldgauss.uncertainty.diagnostics.plots import plot_increments
-from foldgauss.video import FitConfig, VideoModel, fit
+from foldgauss.video import FitConfig, VideoModel, Views, fit
 
 BLUE = "#2b5c8a"
 RED = "#c2452d"
@@ -43,7 +43,7 @@ DPI = 140
 BRIGHTNESS = 1.6
 #: The frame that is shown.
 SHOWN = 5
-CONFIG = FitConfig(num_gaussians=20_000, steps=3_000, interpolation_fraction=0.5, interpolation_end=1.0)
+CONFIG = FitConfig(num_gaussians=20_000, steps=3_000, views=Views(interpolation_fraction=0.5, interpolation_end=1.0))
 #: Inches of README's examples: text is readable on a screen of 360 pixels.
 EXAMPLE_SIZE = 5.0, 3.2
 HALO = {"path_effects": [patheffects.withStroke(linewidth=3, foreground="white")]}

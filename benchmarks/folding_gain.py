@@ -4,34 +4,71 @@
                                       [--minutes M | --steps N] [--longer F] [--gaussians N] [--seed S]
 
 Without options: *bunny* at 160x320, *bikes* and *carphone* at their own sizes, 3 minutes for each of the two fits, some
-20 minutes in all. The default fit first; then `independent_frames` with as many numbers (a Gaussian of one frame takes
-9: it has no time, no sigma_t and no fold) in as many seconds of fitting. With --json each fit that is done is kept
-there, and the same command continues after it. With --steps both see every frame equally often instead: a try, not a
-fair match, since a step of a few hundred Gaussians costs less. `--longer F` adds the control with F times the time or
-steps.
+20 minutes in all. The default fit first; then one fit for each frame, with as many numbers in all (a Gaussian of one
+frame takes 9: it has no time, no sigma_t and no fold) in as many seconds of fitting. With --json each fit that is done
+is kept there, and the same command continues after it. With --steps both see every frame equally often instead: a try,
+not a fair match, since a step of a few hundred Gaussians costs less. `--longer F` adds the control with F times the
+time or steps.
 
 PSNR and SSIM are of 8-bit pictures, mean over all frames.
 """
 
 import dataclasses
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
 
 from benchmarks import _common
 from benchmarks._clips import clip_path
 from benchmarks._runs import Run, Runs, fitted, scores
 from foldgauss.io import Clip, read_video
-from foldgauss.video import FitConfig, independent_frames
+from foldgauss.video import FitConfig, LearningRates, VideoModel, fit
 
 SIZES = {"bunny": (160, 320), "bikes": None, "carphone": None}
 MINUTES = 3.0
 FOLDED = "folded"
 ALONE = "independent frames"
+#: Parameters of a Gaussian without time: position 2, scales 2, angle, opacity, color 3.
+PARAMETERS = 9
+#: Factor of the learning rates, which are meant for Gaussians that many frames act on (notes/experiments.md).
+RATE_FACTOR = 4.0
+#: That of positions.
+LOC_RATE_FACTOR = 8.0
+
+
+class Frames(NamedTuple):
+    """A model of one frame for each frame."""
+
+    models: list[VideoModel]
+
+    def frames(self) -> Iterator[np.ndarray]:
+        for model in self.models:
+            yield from model.frames()
 
 
 def of_frames(clip: Clip, num_parameters: int, config: FitConfig) -> Run:
-    """The control's quality and what it took."""
-    made = independent_frames(clip.frames, num_parameters, config, fps=clip.fps)
-    run = scores(made, clip.frames) | {"gaussians": made.num_gaussians, "floats": made.num_parameters}
-    return run | {"steps": made.steps, "frames_seen": made.steps * config.batch_size, "seconds": made.seconds}
+    """The control's quality and what it took.
+
+    The first frames get the Gaussians that equal numbers leave over; minutes are divided evenly among the frames left.
+    """
+    each, more = divmod(num_parameters // PARAMETERS, clip.num_frames)
+    rates = {"loc": LOC_RATE_FACTOR, "log_scale": RATE_FACTOR, "angle_logit": RATE_FACTOR, "opacity_logit": RATE_FACTOR}
+    rates |= {"color_dc": RATE_FACTOR}
+    scaled = {name: factor * getattr(config.rates, name) for name, factor in rates.items()}
+    alone = {"degree": 0, "power": 0.0, "initialization": "static"}
+    alone |= {"rates": LearningRates(**scaled, frame_times=0.0, by_duration=False, by_size=False)}
+    models, steps, seconds = [], 0, 0.0
+    for k in range(clip.num_frames):
+        left = None if config.minutes is None else (config.minutes - seconds / 60) / (clip.num_frames - k)
+        own = {"num_gaussians": each + (k < more), "seed": config.seed + k, "minutes": left and max(left, 1e-3)}
+        result = fit(clip.frames[k : k + 1], dataclasses.replace(config, **alone, **own), fps=clip.fps)
+        models.append(result.model)
+        steps += result.history[-1].step
+        seconds += result.history[-1].seconds
+    num = sum(model.num_gaussians for model in models)
+    run = scores(Frames(models), clip.frames) | {"gaussians": num, "floats": PARAMETERS * num}
+    return run | {"steps": steps, "frames_seen": steps * config.views.batch_size, "seconds": seconds}
 
 
 def measure(name: str, clip: Clip, config: FitConfig, runs: Runs, longer: float | None = None) -> dict[str, Run]:

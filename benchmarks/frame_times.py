@@ -4,9 +4,10 @@
                                      [--frames A:B] [--gaussians N] [--minutes M | --steps N] [--seed S]
 
 Without options: *carphone*, of which 15% of the frames are left out and 15% of the rest shown twice, at random; 2
-minutes for each of two fits that do not follow the camera, alike but for `learn_frame_times`. The true time of a frame
-is its place in the clip as it was, in frame intervals; the first and the last frame stay, since a model's times begin
-at 0 and end at 1. (*Bunny* has doubled frames of its own, of which this would know nothing.)
+minutes for each of two fits that do not follow the camera, alike but for the learning rate of the frame times, which is
+0 in one. The true time of a frame is its place in the clip as it was, in frame intervals; the first and the last frame
+stay, since a model's times begin at 0 and end at 1. (*Bunny* has doubled frames of its own, of which this would know
+nothing.)
 
 Beside the PSNR of both stand, for the learned times, the root mean square of their errors, against that of even ones;
 the correlation of learned with true deviations from even times; and that of learned with true steps from frame to
@@ -96,7 +97,7 @@ def main(arguments: list[str] | None = None) -> None:
     config = FitConfig(num_gaussians=options.gaussians, seed=options.seed, follow_camera=False, **budget)
     made = {}
     for name in (FIXED, LEARNED):
-        own = dataclasses.replace(config, learn_frame_times=name == LEARNED)
+        own = config if name == LEARNED else config.replace(**{"rates.frame_times": 0})
         made[name] = runs.get(name, lambda own=own: run(clip, own))
     times = np.asarray(made[LEARNED]["times"])
     forms = {"psnr": ".2f", "worst_psnr": ".2f", "ssim": ".4f", "steps": ","}

@@ -205,8 +205,8 @@ def measured(options: argparse.Namespace) -> dict[str, float]:
             if options.tiny:
                 config = FitConfig(num_gaussians=60, steps=4, engine=engine)
             else:
-                how = {"minutes": options.minutes, "batch_size": options.batch_size}
-                config = FitConfig(num_gaussians=options.gaussians, engine=engine, **how)
+                how = {"minutes": options.minutes, "views.batch_size": options.batch_size}
+                config = FitConfig().replace(num_gaussians=options.gaussians, engine=engine, **how)
             found, model = measure_quality(frames, config, options.looks)
             figures |= {f"quality_{engine}_{name}": value for name, value in found.items()}
         if "playback" in options.only:

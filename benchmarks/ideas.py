@@ -42,11 +42,11 @@ def scaled_rates(factor: float) -> LearningRates:
 
 #: The fields of `FitConfig` that each row changes; `gaussians` is a factor on the number that the default chose.
 VARIANTS: dict[str, dict[str, Any]] = {
-    "starts at rest": {"follow_motion": False},
+    "starts at rest": {"initialization": "static"},
     "camera not followed": {"follow_camera": False},
-    "rates not by duration": {"scale_rates_by_duration": False},
-    "rates not by size": {"scale_rates_by_size": False},
-    "frame times fixed": {"learn_frame_times": False},
+    "rates not by duration": {"rates.by_duration": False},
+    "rates not by size": {"rates.by_size": False},
+    "frame times fixed": {"rates.frame_times": 0.0},
     "low pass 0.3 px^2": {"options": RenderOptions()},
     "Gaussians x0.5": {"gaussians": 0.5},
     "Gaussians x0.7": {"gaussians": 0.7},
@@ -55,20 +55,20 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "Gaussians x3": {"gaussians": 3.0},
     "rates x0.7": {"rates": scaled_rates(0.7)},
     "rates x1.4": {"rates": scaled_rates(1.4)},
-    "final rate 0.1": {"final_rate": 0.1},
-    "final rate 0.4": {"final_rate": 0.4},
-    "cooldown 0.5": {"cooldown_fraction": 0.5},
+    "final rate 0.1": {"rates.final": 0.1},
+    "final rate 0.4": {"rates.final": 0.4},
+    "cooldown 0.5": {"rates.cooldown": 0.5},
     "degree 1": {"degree": 1},
     "degree 2": {"degree": 2},
-    "no squared error": {"l2_fraction": 0.0},
-    "squared error 0.6": {"l2_fraction": 0.6},
-    "D-SSIM 0": {"ssim_fraction": 0.0},
-    "D-SSIM 0.1": {"ssim_fraction": 0.1},
-    "views by error 0": {"error_fraction": 0.0},
-    "views by error 0.6": {"error_fraction": 0.6},
-    "relocated 0": {"relocated_fraction": 0.0},
-    "relocated 0.1": {"relocated_fraction": 0.1},
-    "2 frames a step": {"batch_size": 2},
+    "no squared error": {"loss.l2_fraction": 0.0},
+    "squared error 0.6": {"loss.l2_fraction": 0.6},
+    "D-SSIM 0": {"loss.ssim_fraction": 0.0},
+    "D-SSIM 0.1": {"loss.ssim_fraction": 0.1},
+    "views by error 0": {"views.error_fraction": 0.0},
+    "views by error 0.6": {"views.error_fraction": 0.6},
+    "relocated 0": {"strategy.relocated_fraction": 0.0},
+    "relocated 0.1": {"strategy.relocated_fraction": 0.1},
+    "2 frames a step": {"views.batch_size": 2},
 }
 
 
@@ -77,7 +77,7 @@ def config_of(name: str, cpu_seconds: float, seed: int, chosen: int | None) -> F
     changes = dict(VARIANTS.get(name, {}))
     factor = changes.pop("gaussians", None)
     num = None if factor is None else round(factor * chosen)
-    return FitConfig(minutes=cpu_seconds / 60, num_gaussians=num, seed=seed, **changes)
+    return FitConfig(minutes=cpu_seconds / 60, num_gaussians=num, seed=seed).replace(**changes)
 
 
 def fit_row(clip: Clip, config: FitConfig) -> Run:

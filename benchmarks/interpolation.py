@@ -19,7 +19,6 @@ frames. With `--cpu-time` minutes are those of the processor, on one thread, so 
 comparable.
 """
 
-import dataclasses
 import itertools
 import time
 from pathlib import Path
@@ -71,7 +70,7 @@ def interpolated_half_way(frames: np.ndarray) -> list[np.ndarray]:
 
 def measure_cost(clip: Clip, config: FitConfig, clock: Clock) -> dict[str, float]:
     """PSNR at the frames of a fit to all of them, with `config` and without interpolated frames."""
-    plain = dataclasses.replace(config, interpolation_fraction=0.0)
+    plain = config.replace(**{"views.interpolation_fraction": 0.0})
     models = (fit_by_clock(clip.frames, chosen, clip.fps, clock).model for chosen in (config, plain))
     learned, alone = (scores(model, clip.frames)["psnr"] for model in models)
     return {"all frames, with interpolated ones": learned, "all frames, without": alone, "cost": alone - learned}
@@ -119,7 +118,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--weight", type=float, action="append", default=[], metavar="W", help="may be given again")
     options = _common.parse(parser, arguments)
     budget, changes = _common.budget(options), dict(options.set)
-    config = FitConfig(num_gaussians=options.gaussians, seed=options.seed, **budget | changes)
+    config = FitConfig(num_gaussians=options.gaussians, seed=options.seed, **budget).replace(**changes)
     clock = time.process_time if options.cpu_time else time.perf_counter
     if options.cpu_time:
         set_num_threads(1)

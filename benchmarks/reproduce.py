@@ -36,6 +36,7 @@ import numpy as np
 from benchmarks import _common
 from benchmarks._common import console
 from benchmarks._runs import Run, Runs, fitted, scaled, scores, size_on_disk
+from foldgauss._runtime.settings import settings_by_name
 from foldgauss._runtime.threads import num_threads
 from foldgauss.io import Clip, read_video
 from foldgauss.io._atomic import atomic_path
@@ -43,8 +44,8 @@ from foldgauss.io.datasets import sample_clip
 from foldgauss.io.figures import write_figure
 from foldgauss.io.provenance import fingerprint
 from foldgauss.jobs.runner import Checkpoint, run_steps
-from foldgauss.video import FitConfig, Growth, LearningRates, fit_steps
-from foldgauss.video.fitting.config import FIT_ENGINES, PRESETS
+from foldgauss.video import FitConfig, fit_steps
+from foldgauss.video.fitting.config import FIT_ENGINES
 from foldgauss.video.fitting.growth import PUBLISHED_STEPS
 from foldgauss.video.fitting.loop import start
 from foldgauss.video.fitting.state import FitState, to_model
@@ -61,24 +62,24 @@ CHECKPOINT_SECONDS = 120.0
 VARIANTS: dict[str, dict[str, Any]] = {
     "as published": {},
     "power of the text": {"power": 1.0},
-    "batch 1": {"batch_size": 1},
+    "batch 1": {"views.batch_size": 1},
     "degree 1": {"degree": 1},
     "degree 3": {"degree": 3},
-    "one camera": {"two_cameras": False},
-    "start from the clip": {"initialization": "clip"},
+    "one camera": {"views.two_cameras": False},
+    "start from the clip": {"initialization": "static"},
     "start in a box of 1.1 frames": {"box": 1.1},
     "extent of 1 unit": {"extent": 1 / 1.1},
-    "time gradient not used": {"growth": {"time_gradient": 1e9}},
-    "time gradient x0.25": {"growth": {"time_gradient": 5e-5}},
-    "time gradient splits": {"growth": {"clone_below_time": 1e-9}},
-    "half of the gradients": {"growth": {"screen_gradient": 1e-4, "time_gradient": 1e-4}},
-    "opacity 0.005 pruned": {"growth": {"prune_opacity": 0.005}},
-    "radius above 20 px pruned": {"growth": {"prune_radius": 20.0}},
-    "wide Gaussians kept": {"growth": {"prune_scale": 1e9}},
-    "thin Gaussians drawn": {"scale_cutoff": 0.0},
-    "no resets": {"growth": {"reset_every": 10**9}},
+    "time gradient not used": {"strategy.growth.time_gradient": 1e9},
+    "time gradient x0.25": {"strategy.growth.time_gradient": 5e-5},
+    "time gradient splits": {"strategy.growth.clone_below_time": 1e-9},
+    "half of the gradients": {"strategy.growth.screen_gradient": 1e-4, "strategy.growth.time_gradient": 1e-4},
+    "opacity 0.005 pruned": {"strategy.growth.prune_opacity": 0.005},
+    "radius above 20 px pruned": {"strategy.growth.prune_radius": 20.0},
+    "wide Gaussians kept": {"strategy.growth.prune_scale": 1e9},
+    "thin Gaussians drawn": {"strategy.scale_cutoff": 0.0},
+    "no resets": {"strategy.growth.reset_every": 10**9},
     "rates x2": {"rates": 2.0},
-    "positions learn to the end": {"final_rate": 1.0},
+    "positions learn to the end": {"rates.final": 1.0},
 }
 
 #: table:bs-pol: by batch size and, in this order, degrees: PSNR in dB and number of Gaussians at the end, in millions.
@@ -125,22 +126,18 @@ def config_of(name: str, size: tuple[int, int], steps: int, seed: int) -> FitCon
     """
     zoom = max(FULL) / max(size)
     if name in CELLS:
-        changes = dict(zip(("num_gaussians", "batch_size", "degree"), CELLS[name], strict=True))
+        changes = dict(zip(("num_gaussians", "views.batch_size", "degree"), CELLS[name], strict=True))
     else:
         changes = {setting: value for setting, value in VARIANTS[name].items() if setting != "box"}
-    preset = PRESETS["paper"]
-    growth = dataclasses.replace(Growth(), **changes.pop("growth", {}))
-    lengths = "screen_gradient", "time_gradient", "clone_below", "prune_scale"
-    extent = changes.pop("extent", 1.0)
-    zooms = dict.fromkeys(lengths, zoom) | dict.fromkeys(("clone_below", "prune_scale"), extent * zoom)
-    changes["growth"] = dataclasses.replace(growth, **{name: by * getattr(growth, name) for name, by in zooms.items()})
-    factor = changes.pop("rates", 1.0)
-    factors = {"loc": extent * factor * zoom, "coefficients": factor * zoom}
-    rates = dataclasses.asdict(preset["rates"])
-    changes["rates"] = LearningRates(**{rate: factors.get(rate, factor) * value for rate, value in rates.items()})
-    changes["scale_cutoff"] = zoom * changes.get("scale_cutoff", preset["scale_cutoff"])
-    changes["num_gaussians"] = scaled(changes.get("num_gaussians", preset["num_gaussians"]), size)
-    return FitConfig.preset("paper", **changes, steps=steps, seed=seed)
+    extent, factor = changes.pop("extent", 1.0), changes.pop("rates", 1.0)
+    config = FitConfig.preset("paper", **changes, steps=steps, seed=seed)
+    factors = {f"rates.{leaf}": factor for leaf in columns(0)} | {"rates.frame_times": factor}
+    factors |= {"rates.loc": extent * factor * zoom, "rates.coefficients": factor * zoom, "strategy.scale_cutoff": zoom}
+    factors |= {f"strategy.growth.{length}": zoom for length in ("screen_gradient", "time_gradient")}
+    factors |= {f"strategy.growth.{length}": extent * zoom for length in ("clone_below", "prune_scale")}
+    values = settings_by_name(config)
+    scaled_values = {setting: by * values[setting] for setting, by in factors.items()}
+    return config.replace(**scaled_values, num_gaussians=scaled(config.num_gaussians, size))
 
 
 class Curve:

@@ -15,7 +15,6 @@
 """
 
 import argparse
-import dataclasses
 import time
 import warnings
 from pathlib import Path
@@ -211,7 +210,7 @@ def retimed(seed: int) -> dict[str, float]:
     fresh = drawn(model, truth, SCENE_SCALE, rng)
     # Maps of shared paths at each frame would absorb the information of its time.
     config = FitConfig(num_gaussians=FIT_GAUSSIANS, steps=FIT_STEPS, seed=seed, follow_camera=False)
-    fitted = fit(uniform, dataclasses.replace(config, learn_frame_times=False)).model
+    fitted = fit(uniform, config.replace(**{"rates.frame_times": 0.0})).model
     others = (drawn(model, truth, SCENE_SCALE, rng) for _ in range(FRESH_CLIPS))
     found["fitted to a uniform clip"] = np.mean([measured(fitted, clip, truth, "score") for clip in others], axis=0)
     found["fitted to the clip itself"] = measured(fit(fresh, config).model, fresh, truth, "score")
