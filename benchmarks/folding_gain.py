@@ -42,9 +42,17 @@ class Frames(NamedTuple):
 
     models: list[VideoModel]
 
-    def frames(self) -> Iterator[np.ndarray]:
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.models[0].size
+
+    @property
+    def num_frames(self) -> int:
+        return len(self.models)
+
+    def frames(self, background: tuple[float, float, float]) -> Iterator[np.ndarray]:
         for model in self.models:
-            yield from model.frames()
+            yield from model.frames(background=background)
 
 
 def of_frames(clip: Clip, num_parameters: int, config: FitConfig) -> Run:

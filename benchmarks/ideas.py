@@ -17,7 +17,6 @@ With --json each fit that is done is kept there, and the same command continues 
 """
 
 import argparse
-import dataclasses
 import functools
 from pathlib import Path
 from typing import Any
@@ -31,13 +30,14 @@ from foldgauss._runtime.threads import set_num_threads
 from foldgauss.io import Clip
 from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, FitDiverged, LearningRates
+from foldgauss.video.models.row_layout import columns
 
 DEFAULT = "default"
 
 
-def scaled_rates(factor: float) -> LearningRates:
-    rates = dataclasses.asdict(LearningRates())
-    return LearningRates(**{name: factor * value for name, value in rates.items()})
+def scaled_rates(factor: float) -> dict[str, float]:
+    leaves = (*columns(0), "frame_times", "paths")
+    return {f"rates.{leaf}": factor * getattr(LearningRates(), leaf) for leaf in leaves}
 
 
 #: The fields of `FitConfig` that each row changes; `gaussians` is a factor on the number that the default chose.
@@ -53,8 +53,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "Gaussians x1.5": {"gaussians": 1.5},
     "Gaussians x2": {"gaussians": 2.0},
     "Gaussians x3": {"gaussians": 3.0},
-    "rates x0.7": {"rates": scaled_rates(0.7)},
-    "rates x1.4": {"rates": scaled_rates(1.4)},
+    "rates x0.7": scaled_rates(0.7),
+    "rates x1.4": scaled_rates(1.4),
     "final rate 0.1": {"rates.final": 0.1},
     "final rate 0.4": {"rates.final": 0.4},
     "cooldown 0.5": {"rates.cooldown": 0.5},
