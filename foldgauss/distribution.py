@@ -28,7 +28,6 @@ from foldgauss._numerics.batch import (
     ranked_leaves,
 )
 from foldgauss._numerics.factor import check_loc, check_rest, marginal_tril, normalize_indices, resolve_scale_tril
-from foldgauss._numerics.safe_grad import evaluate_with_safe_grad
 from foldgauss._numerics.triangular import join_columns, multiply_lower, solve_lower, split_columns
 from foldgauss._runtime import notebook_hooks
 from foldgauss._runtime.checks import invalid
@@ -179,26 +178,12 @@ class FoldedGaussian(BatchModule):
 
     @compile_eager
     def _log_prob(self, value: Array) -> Array:
-        leaves, structure = jax.tree.flatten(self)
-
-        def scaled_log_prob(root, s, t, *leaves):
-            return jax.tree.unflatten(structure, leaves)._scaled_log_prob(root, s, t)
-
-        return evaluate_with_safe_grad(
-            scaled_log_prob,
-            value[..., :-1],
-            value[..., -1],
-            *leaves,
-            closed=self.fold.is_closed and self.envelope.is_closed,
-        )
-
-    def _scaled_log_prob(self, root: Array | None, s: Array, t: Array) -> Float[Array, "*#batch"]:
-        """root^2 log FN((s, t)), as `Gaussian.scaled_log_prob`."""
-        log_time = self.time_marginal.scaled_log_prob(root, t)
+        s, t = value[..., :-1], value[..., -1]
+        log_time = self.time_marginal.log_prob(t)
         overflow = jnp.isinf(self.condition_time(t).loc).any(-1)
         # Double where: at times where the fold overflows, gradients are taken at f(0) instead.
         near, time_loc = align([(t, 0), (self.time_loc, 0)], overflow.ndim)
-        log_space = self.condition_time(jnp.where(overflow, time_loc, near)).scaled_log_prob(root, s)
+        log_space = self.condition_time(jnp.where(overflow, time_loc, near)).log_prob(s)
         unreachable = overflow | jnp.isneginf(log_space) | jnp.isneginf(log_time)
         return jnp.where(unreachable, -jnp.inf, log_space + log_time)
 

@@ -9,6 +9,7 @@ likelihood itself is unbounded where power (d-1) > 2. There `envelope="time_like
 1e-3, which bounds both.
 """
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import ClassVar
@@ -19,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from foldgauss._numerics.batch import BatchModule, concrete_value
+from foldgauss._numerics.batch import BatchModule, concrete_value, divide, steepest
 from foldgauss._numerics.pointwise import call_elementwise, split_parameters
 from foldgauss._runtime.checks import check_signature, invalid, short_repr
 
@@ -199,7 +200,7 @@ def _bounded_tau(offset: Float[Array, "*batch"], time_scale: Float[Array, "*batc
     bound = float(np.sqrt(jnp.finfo(offset.dtype).max)) * 1e-2
     far = jnp.abs(offset) > bound * time_scale
     # Double where: an overflowing quotient would give 0 * inf in the gradient of the branch not taken.
-    near = jnp.where(far, 0, offset) / jnp.where(far, 1, time_scale)
+    near = divide(jnp.where(far, 0, offset), jnp.where(far, 1, time_scale))
     return jnp.where(far, jnp.copysign(bound, offset).astype(offset.dtype), near)
 
 
@@ -217,10 +218,8 @@ def _log_floored_jvp(primals, tangents):
     (q, floor), (q_dot, floor_dot) = primals, tangents
     log_a = _log_floored(q, floor)
     by_q = -jnp.exp(jnp.log1p(-floor) - q - log_a)
-    # In two factors: the product may exceed the range of the dtype where the density's derivative does not
-    # (see `foldgauss._numerics.safe_grad`).
-    half = jnp.exp(jnp.minimum(-0.5 * log_a, 0.85 * float(np.log(jnp.finfo(q.dtype).max))))
-    return log_a, by_q * q_dot - jnp.expm1(-q) * half * (half * floor_dot)
+    by_floor = -jnp.expm1(-q) * jnp.exp(jnp.minimum(-log_a, math.log(steepest(q.dtype))))
+    return log_a, by_q * q_dot + by_floor * floor_dot
 
 
 def _float_array(x: ArrayLike) -> Float[Array, "..."]:

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from foldgauss._numerics.batch import steepest
 from foldgauss.distribution import FoldedGaussian, Gaussian, Normal
 from foldgauss.envelope import AbstractEnvelope, CallableEnvelope, Constant, TimeLikelihood, plain_envelope
 from foldgauss.fold import CallableFold, FourierFold, PolynomialFold, SharedPathFold, SplineFold, ZeroFold
@@ -256,7 +257,7 @@ def test_samples_have_pathwise_gradients():
 # --- gradients and extremes -------------------------------------------------------------------------------
 
 
-# Forward mode takes long to compile; in the quick suite test_distribution_moments.py and test_safe_grad.py use it.
+# Forward mode takes long to compile; in the quick suite test_distribution_moments.py uses it.
 @pytest.mark.parametrize(
     ("dim", "forward"),
     [(2, False), pytest.param(2, True, marks=pytest.mark.slow), pytest.param(10, False, marks=pytest.mark.slow)],
@@ -323,12 +324,41 @@ def test_float32_agrees_with_float64_where_the_plain_form_is_nan():
         np.testing.assert_allclose(single, double, rtol=5e-5)
 
 
-def test_gradient_saturates_at_the_largest_number():
+def test_gradient_is_clipped_where_it_overflows():
     at = Gaussian(jnp.zeros(2), jnp.eye(2), log_scale=-49.0)
     # 1e-3 e^98 is beyond float32, the density is not.
     log_prob, grad = jax.jit(jax.value_and_grad(Gaussian.log_prob, argnums=1))(at, jnp.array([1e-3, -1e-4]))
     assert np.isfinite(log_prob)
-    np.testing.assert_array_equal(grad, [-np.finfo(np.float32).max, np.finfo(np.float32).max])
+    limit = np.float32(steepest(jnp.float32))
+    np.testing.assert_allclose(grad, [-limit, limit], rtol=1e-6)
+
+
+def test_far_points_do_not_spoil_a_networks_gradient():
+    network = CallableFold(eqx.nn.MLP("scalar", 1, 4, 1, key=jax.random.key(0)))
+    dist = FoldedGaussian([0.0], [[1.0]], time_loc=0.0, time_scale=1.0, fold=network)
+    t = np.array([0.3, 14.0], np.float32)
+    s = np.asarray(jax.jit(lambda dist: dist.condition_time(t).loc)(dist)) + np.array([[0.1], [1e-9]], np.float32)
+    x = np.concatenate([s, t[:, None]], -1)
+    for leaf in jax.tree.leaves(jax.jit(jax.grad(lambda d, x: d.log_prob(x).sum()))(dist, x)):
+        assert np.isfinite(leaf).all()
+
+
+@pytest.mark.slow  # it compiles for long
+def test_parameters_that_a_users_function_closes_over_have_gradients():
+    x = jnp.array([0.3, -0.2, 0.9])
+
+    def log_prob(slope, u_scale, x):
+        fold = lambda u: slope * (u * u_scale)  # noqa: E731
+        return FoldedGaussian(jnp.zeros(2), jnp.eye(2), time_loc=0.5, time_scale=0.3, fold=fold).log_prob(x)
+
+    def polynomial(slope, u_scale, x):
+        fold = PolynomialFold(slope[None] * u_scale)
+        return FoldedGaussian(jnp.zeros(2), jnp.eye(2), time_loc=0.5, time_scale=0.3, fold=fold).log_prob(x)
+
+    slopes = jnp.array([[0.5, -1.0], [2.0, 0.1]])
+    for order in (jax.grad, lambda f: jax.hessian(f)):
+        both = [jax.jit(jax.vmap(order(f), in_axes=(0, None, None)))(slopes, 1.1, x) for f in (log_prob, polynomial)]
+        np.testing.assert_allclose(*both, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("fold", [None, pytest.param(ZeroFold(2), marks=pytest.mark.slow)])

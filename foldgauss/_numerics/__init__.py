@@ -1,6 +1,6 @@
 """Numerics that are independent of any model.
 
 `batch` aligns, broadcasts and checks modules with batch dimensions; `factor` and `triangular` compute Cholesky factors
-and triangular solves; `regression.weighted_regression` fits polynomials; `safe_grad.evaluate_with_safe_grad` gives
-finite derivatives of log-densities; `pointwise` calls functions elementwise; `simd` has vectors for Numba kernels.
+and triangular solves; `regression.weighted_regression` fits polynomials; `pointwise` calls functions elementwise;
+`simd` has vectors for Numba kernels.
 """

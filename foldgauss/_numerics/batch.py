@@ -304,3 +304,23 @@ def _map_flat(function: Callable, structure, flat: list[Array]):
     fill = [lax.stop_gradient(jnp.broadcast_to(x[-1:], (-size % _CHUNK, *x.shape[1:]))) for x in flat]
     full = [jnp.concatenate(pair) for pair in zip(flat, fill, strict=True)]
     return jax.tree.map(lambda x: x[:size], lax.map(one, full, batch_size=_CHUNK))
+
+
+def steepest(dtype) -> float:
+    """The largest number to the power 0.85, 6e32 in float32: parts of derivatives of log-densities are clipped to it.
+
+    Products of them with other derivatives then rarely overflow.
+    """
+    return float(jnp.finfo(dtype).max) ** 0.85
+
+
+@jax.custom_jvp
+def divide(x: Array, scale: Array) -> Array:
+    """x / scale, whose derivative does not divide by scale^2, which underflows."""
+    return x / scale
+
+
+@divide.defjvp
+def _divide_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    quotient = divide(*primals)
+    return quotient, divide(tangents[0] - quotient * tangents[1], primals[1])

@@ -1,6 +1,6 @@
 """Log-densities of many points under many components, in one loop over pairs that XLA vectorizes.
 
-Derivatives are those of the distributions' own `log_prob`, which have a larger range (`_numerics.safe_grad`).
+Derivatives are those of the distributions' own `log_prob`, which have a larger range.
 """
 
 import functools
