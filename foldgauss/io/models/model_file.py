@@ -14,7 +14,6 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from foldgauss._runtime.checks import invalid
-from foldgauss._runtime.threads import check_not_forked
 from foldgauss.io._atomic import PathLike, atomic_path, missing_error
 
 FORMAT = "foldgauss-model"
@@ -218,7 +217,6 @@ def load_part(path: Path, about: dict, prefix: str = "") -> Any:
     Raises `ModelFileError` as `load_model`.
     """
     kind, skeleton = match_kind(path, about)
-    check_not_forked()
     filled = _read_leaves(skeleton, path, prefix)
     try:
         kind.check(filled)
