@@ -24,7 +24,7 @@ COMMANDS = {
     "e.safetensors": ["edit", "MODEL", "SCRIPT", "--out"],
     "m.ply": ["export", "MODEL", "--format", "ply", "--out"],
     "meshes": ["export", "MODEL", "--format", "obj", "--out"],
-    "page.html": ["export", "MODEL", "--format", "html", "--out"],
+    "page.html": ["view", "MODEL", "--out"],
 }
 #: Commands that fill a folder, file by file, and go on when called again: which of its files they are killed in.
 FOLDERS = {

@@ -116,7 +116,7 @@ def test_notes_of_another_kind_are_none(work, tmp_path, capsys, odd):
     assert not odd.keys() & read_metadata(made).keys() - {"mean_psnr"}
     assert run("evaluate", path, work / "clip") == 0
     assert run("info", path) == 0
-    assert run("export", path, "--format", "html", "--out", tmp_path / "m.html") == 0
+    assert run("view", path, "--out", tmp_path / "m.html") == 0
     assert "Traceback" not in capsys.readouterr().err
 
 

@@ -335,9 +335,10 @@ def test_names_are_shown_as_they_are(monkeypatch):
     """In a bar, too, brackets are no commands for a color."""
     console = Console(file=io.StringIO(), force_terminal=True, width=120)
     monkeypatch.setattr(_jobs_view, "err", console)
-    with _jobs_view._open_view("clips", 2, "bar") as view:
+    view = _jobs_view._View("clips", 2, "bar")
+    with view.bar:
         view.update(Progress("[red]one.mp4", 0.5, 30.0, 3, 40, 1.0, 1.0))
-        view.bars.refresh()
+        view.bar.refresh()
     assert "[red]one.mp4" in console.file.getvalue()
 
 

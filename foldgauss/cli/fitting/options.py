@@ -4,15 +4,19 @@ import dataclasses
 import functools
 import inspect
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from importlib.util import find_spec
 from typing import Annotated, Any
 
 import typer
 
+from foldgauss._runtime.checks import ParameterError
 from foldgauss._runtime.settings import setting_of, type_of
-from foldgauss.cli.app.application import WrongUse, err, name_option
+from foldgauss._runtime.threads import available_cores
 from foldgauss.cli.app.completion import complete_choice
-from foldgauss.cli.fitting.progress import Display
 from foldgauss.cli.shared.arguments import AlphaCutoff, SupportRadius, TransmittanceStop, override_constants
+from foldgauss.cli.shared.tables import format_count
+from foldgauss.jobs import WorkerPool, local_workers, running_cluster
 from foldgauss.video.fitting.config import BUDGET, MODEL, OPTIMIZATION, PRESETS, FitConfig
 
 #: Panels of `fit --help`, by group of settings.
@@ -42,6 +46,7 @@ SegmentSeconds = Annotated[
 CheckpointSeconds = Annotated[
     float | None,
     typer.Option(
+        metavar="S",
         help="Seconds between two checkpoints, the most that a kill loses [default: 30].",
         rich_help_panel=PROGRESS,
         min=0.0,
@@ -50,6 +55,7 @@ CheckpointSeconds = Annotated[
 Workers = Annotated[
     int | None,
     typer.Option(
+        metavar="N",
         help="Number of parallel processes on this machine (needs the extra `distributed`).",
         rich_help_panel=WORKERS,
         min=1,
@@ -66,20 +72,16 @@ Scheduler = Annotated[
 Threads = Annotated[
     int | None,
     typer.Option(
-        help="Threads per worker on this machine [default: an equal part of the cores].", rich_help_panel=WORKERS, min=1
+        metavar="N",
+        help="Threads per worker on this machine [default: an equal part of the cores].",
+        rich_help_panel=WORKERS,
+        min=1,
     ),
 ]
 
 
-def _fields() -> dict[str, dataclasses.Field]:
-    """The fields of `FitConfig` that have an option, by the option's name as a parameter."""
-    fields = [field for field in dataclasses.fields(FitConfig) if setting_of(field).option]
-    names = (setting_of(field).option.split("/")[0] for field in fields)
-    return {name.removeprefix("--").replace("-", "_"): field for name, field in zip(names, fields, strict=True)}
-
-
-#: Options of `FitConfig`.
-CONFIG_FIELDS = _fields()
+#: The fields of `FitConfig` that have an option.
+CONFIG_FIELDS = [field for field in dataclasses.fields(FitConfig) if setting_of(field).option]
 _CONSTANTS = {
     "alpha_cutoff": AlphaCutoff,
     "support_radius": SupportRadius,
@@ -87,18 +89,47 @@ _CONSTANTS = {
 }
 
 
-def config_from_options(preset: str, **options: Any) -> FitConfig:
-    """The configuration that options, by the names of their parameters, come to; None leaves the preset's value.
+@dataclasses.dataclass(frozen=True)
+class WorkerOptions:
+    """What runs jobs: `workers` of this machine with `threads` each, those of a `scheduler`, or this process.
 
-    Raises WrongUse for values that are not valid.
+    Raises ParameterError for options that exclude each other.
     """
-    given = {name: value for name, value in options.items() if value is not None}
-    changes = {field.name: given[name] for name, field in CONFIG_FIELDS.items() if name in given}
-    try:
-        config = FitConfig.preset(preset, **changes)
-    except ValueError as error:
-        raise WrongUse(name_option(str(error))) from error
-    constants = (options[name] for name in _CONSTANTS)
+
+    workers: int | None
+    scheduler: str | None
+    threads: int | None
+
+    def __post_init__(self) -> None:
+        if self.scheduler is not None and (self.workers is not None or self.threads is not None):
+            other = "--workers" if self.workers is not None else "--threads"
+            raise ParameterError(other, "expected no --scheduler, which has workers of its own. Leave one out.")
+        if self.threads is not None and self.workers is None:
+            raise ParameterError("--threads", "expected --workers too. For this process: FOLDGAUSS_NUM_THREADS.")
+        if (self.workers is not None or self.scheduler is not None) and find_spec("distributed") is None:
+            option = "--workers" if self.scheduler is None else "--scheduler"
+            raise ParameterError(option, "needs dask.distributed: pip install 'foldgauss[distributed]'.")
+        if self.workers is not None and self.threads is None:
+            object.__setattr__(self, "threads", max(1, available_cores() // self.workers))
+
+    def __str__(self) -> str:
+        if self.scheduler is not None:
+            return f"the workers of {self.scheduler}"
+        if self.workers is None:
+            return "this process"
+        return f"{format_count(self.workers, 'worker')} of {format_count(self.threads, 'thread')}"
+
+    def open_pool(self) -> AbstractContextManager[WorkerPool | None]:
+        """The workers; None for this process."""
+        if self.scheduler is not None:
+            return running_cluster(self.scheduler)
+        return nullcontext() if self.workers is None else local_workers(self.workers, threads=self.threads)
+
+
+def config_from_options(preset: str, **options: Any) -> FitConfig:
+    """The configuration that options, by the names of settings, come to; None leaves the preset's value."""
+    constants = [options.pop(name) for name in _CONSTANTS]
+    config = FitConfig.preset(preset, **{name: value for name, value in options.items() if value is not None})
     return dataclasses.replace(config, options=override_constants(config.options, *constants))
 
 
@@ -110,7 +141,7 @@ def fit_options(command: Callable[..., None]) -> Callable[..., None]:
     """
     options = [
         inspect.Parameter("preset", _KIND, default="standard", annotation=Preset),
-        *(_option(name, field) for name, field in CONFIG_FIELDS.items()),
+        *map(_option, CONFIG_FIELDS),
         *(inspect.Parameter(name, _KIND, default=None, annotation=kind) for name, kind in _CONSTANTS.items()),
     ]
     own = list(inspect.signature(command).parameters.values())
@@ -130,7 +161,7 @@ def fit_options(command: Callable[..., None]) -> Callable[..., None]:
 _KIND = inspect.Parameter.POSITIONAL_OR_KEYWORD
 
 
-def _option(name: str, field: dataclasses.Field) -> inspect.Parameter:
+def _option(field: dataclasses.Field) -> inspect.Parameter:
     """The parameter of a command for one setting."""
     about = setting_of(field)
     option = typer.Option(
@@ -139,7 +170,7 @@ def _option(name: str, field: dataclasses.Field) -> inspect.Parameter:
         rich_help_panel=PANELS[about.group],
         autocompletion=complete_choice(about.choices) if about.choices else None,
     )
-    return inspect.Parameter(name, _KIND, default=None, annotation=Annotated[type_of(field) | None, option])
+    return inspect.Parameter(field.name, _KIND, default=None, annotation=Annotated[type_of(field) | None, option])
 
 
 def _default(field: dataclasses.Field) -> str:
@@ -152,12 +183,3 @@ def _default(field: dataclasses.Field) -> str:
 
 def _text(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else f"{value}"
-
-
-def choose_display(quiet: bool = False, log_json: bool = False) -> Display:
-    """How progress is displayed: as the options say, otherwise a bar on a terminal and lines in a log."""
-    if quiet and log_json:
-        raise WrongUse("--quiet: expected one of --quiet and --log-json, got both. Leave one out.")
-    if quiet or log_json:
-        return "quiet" if quiet else "json"
-    return "bar" if err.is_terminal else "lines"

@@ -7,14 +7,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from foldgauss.cli.app.application import Stopped, WrongUse, err, name_option, out, warn
+from foldgauss._runtime.checks import invalid
+from foldgauss.cli.app.application import Stopped, err, out, warn
 from foldgauss.cli.fitting.job_progress import emit_json, run_jobs
-from foldgauss.cli.fitting.progress import Display
-from foldgauss.cli.fitting.workers import WorkerOptions
-from foldgauss.cli.shared.log_lines import LINE_SECONDS
-from foldgauss.cli.shared.outputs import write_result
+from foldgauss.cli.fitting.options import WorkerOptions
+from foldgauss.cli.shared.fit_progress import Display
+from foldgauss.cli.shared.log_lines import show_status
 from foldgauss.cli.shared.rendering import progress_bar
 from foldgauss.cli.shared.tables import format_count, print_figures
+from foldgauss.io._atomic import write_or_keep
 from foldgauss.io.media.resizing import describe_crop
 from foldgauss.jobs import FitJob, JoinedFit, LongFit, Outcome, plan_long_fit, segments_folder
 from foldgauss.jobs.job import read_record
@@ -35,24 +36,23 @@ def fit_in_segments(
     begun, target = time.monotonic(), Path(job.target)
     folder = segments_folder(target)
     if resume and not folder.is_dir():
-        raise WrongUse(f"--resume: expected a stopped fit in {folder}, got none. Start it without --resume.")
+        raise invalid("--resume", expected=f"a stopped fit in {folder}", got="none", cure="Start it without --resume.")
     restart = overwrite and not resume
     if segment_seconds is None and not restart:
         segment_seconds = read_segment_seconds(target)
-    plan = partial(
-        plan_long_fit,
-        job.clip,
-        target,
-        job.config,
-        size=job.size,
-        frames=job.frames,
-        segment_seconds=SEGMENT_SECONDS if segment_seconds is None else segment_seconds,
-        checkpoint_seconds=job.checkpoint_seconds,
-        reading=job.reading,
-        restart=restart,
-    )
     with options.open_pool() as pool:  # first: workers start while the clip is indexed
-        fit = _plan_with_progress(plan, display)
+        with nullcontext() if display in ("json", "quiet") else show_status("Indexing the clip"):
+            fit = plan_long_fit(
+                job.clip,
+                target,
+                job.config,
+                size=job.size,
+                frames=job.frames,
+                segment_seconds=SEGMENT_SECONDS if segment_seconds is None else segment_seconds,
+                checkpoint_seconds=job.checkpoint_seconds,
+                reading=job.reading,
+                restart=restart,
+            )
         _print_plan(fit, job.config, display, Path(job.clip), options)
         again = f"Give the same command again{' with --resume added' if restart else ''} to continue."
         outcomes = run_jobs(fit.jobs, "segments", display, pool, cure=again)
@@ -68,7 +68,7 @@ def fit_in_segments(
     def join(path: Path) -> JoinedFit:
         return _join_with_progress(dataclasses.replace(fit, target=path), outcomes, display)
 
-    joined = write_result(target, join)
+    joined = write_or_keep(target, join)
     target = joined.path
     fit.clean_up()
     figures = _summarize(fit, joined, outcomes, job.config)
@@ -129,30 +129,6 @@ def _summarize(fit: LongFit, joined: JoinedFit, outcomes: list[Outcome], config:
     if joined.seam_drop is not None:
         figures["seam_drop"] = round(joined.seam_drop, 3)
     return figures
-
-
-def _plan_with_progress(plan: partial[LongFit], display: Display) -> LongFit:
-    """The plan, for which the whole clip is indexed once."""
-    status = err.status("Indexing the clip") if display == "bar" else None
-    count, due = 0, time.monotonic() + LINE_SECONDS
-
-    def on_frame() -> None:
-        nonlocal count, due
-        count += 1
-        if status is not None and count % 25 == 0:
-            status.update(f"Indexing the clip: {count:,} frames")
-        elif display == "lines" and time.monotonic() > due:
-            due = time.monotonic() + LINE_SECONDS
-            err.print(f"indexing the clip: {count:,} frames")
-
-    try:
-        with nullcontext() if status is None else status:
-            return plan(on_frame=on_frame)
-    except ValueError as error:
-        if str(error).startswith(("segment_seconds:", "resume:", "target:")):
-            text = name_option(str(error)).replace("--target:", "--out:", 1).replace("num_gaussians=", "gaussians=")
-            raise WrongUse(text) from error
-        raise
 
 
 def _print_plan(fit: LongFit, config: FitConfig, display: Display, video: Path, options: WorkerOptions) -> None:

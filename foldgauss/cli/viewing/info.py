@@ -7,7 +7,7 @@ import numpy as np
 from rich.table import Table
 
 from foldgauss._runtime.checks import is_within
-from foldgauss.cli.app.application import app, out
+from foldgauss.cli.app.application import command, out
 from foldgauss.cli.shared.arguments import ModelFile
 from foldgauss.cli.shared.clips import Video
 from foldgauss.io.models.compact import is_compact, measure_chunks
@@ -22,7 +22,7 @@ MAX_SEGMENTS = 100
 MAX_PATHS = 3
 
 
-@app.command()
+@command("info")
 def info(model_path: ModelFile) -> None:
     """Show what a model file contains."""
     model = load_video_model(model_path)
