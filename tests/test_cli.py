@@ -547,41 +547,18 @@ def test_demo_end_to_end(tmp_path, monkeypatch, capsys):
     assert "mean PSNR" in capsys.readouterr().out
 
 
-def test_demo_leaves_folders_of_others_alone(tmp_path, monkeypatch, capsys):
+def test_demo_replaces_only_what_it_is_told_to(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(demonstration, "CONFIG", fitting.FitConfig(num_gaussians=500, steps=3, quality=80))
     monkeypatch.setattr(demonstration, "FRAMES", (0, 6))
     (tmp_path / "model.fgz").write_bytes(b"mine")
-    for record in (None, b"\xff", b"[]", b'{"psnr": [], "ssim": []}'):  # none, and none of a demo
-        if record is not None:
-            (tmp_path / "metrics.json").write_bytes(record)
-        assert run("demo", "--out", tmp_path) == 2
-        assert "in it, but no metrics.json of a demo. Choose another folder." in capsys.readouterr().err
-    assert (tmp_path / "model.fgz").read_bytes() == b"mine"
-    (tmp_path / "metrics.json").write_text('{"fit_seconds": 1.0, "psnr": [], "ssim": []}')
     (tmp_path / "notes.txt").write_text("mine")
     assert run("demo", "--out", tmp_path) == 2
-    assert "notes.txt" in capsys.readouterr().err
+    assert "model.fgz exists. Choose another path, or add --overwrite." in capsys.readouterr().err
     assert (tmp_path / "model.fgz").read_bytes() == b"mine"
-    (tmp_path / "notes.txt").rename(tmp_path / ".hidden")
-    assert run("demo", "--out", tmp_path) == 0
+    assert run("demo", "--out", tmp_path, "--overwrite") == 0
     assert load_video_model(tmp_path / "model.fgz").num_frames == 6
-    assert run("demo", "--out", tmp_path / ".hidden") == 1  # a file
-
-
-def test_a_demo_that_was_stopped_is_replaced_by_the_next(tmp_path, monkeypatch):
-    monkeypatch.setattr(demonstration, "CONFIG", fitting.FitConfig(num_gaussians=500, steps=3, quality=80))
-    monkeypatch.setattr(demonstration, "FRAMES", (0, 6))
-
-    def stopped(*given):
-        raise OSError("stopped")
-
-    with monkeypatch.context() as patched:
-        patched.setattr(demonstration, "write_video", stopped)
-        assert run("demo", "--out", tmp_path) == 1
-    assert (tmp_path / "model.fgz").exists()
-    assert run("demo", "--out", tmp_path) == 0
-    figures = json.loads((tmp_path / "metrics.json").read_text())
-    assert figures["file_bytes"] == (tmp_path / "model.fgz").stat().st_size
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+    assert run("demo", "--out", tmp_path / "notes.txt") == 2  # a file
 
 
 @pytest.mark.slow

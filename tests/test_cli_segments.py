@@ -143,7 +143,7 @@ def test_exports(here, capsys, tmp_path):
 
 def test_one_segment_is_taken_out(here, work, tmp_path, capsys):
     assert run("export", here, "--format", "model", "--segment", 1) == 0
-    assert "long.1.safetensors: foldgauss model, 9 frames, 40 Gaussians" in told(capsys)
+    assert "long.1.safetensors: foldgauss (model), 9 frames, 40 Gaussians" in told(capsys)
     assert read_metadata("long.1.safetensors") == {"clip": "clip", "frames": [6, 15], "mean_psnr": 31.5, "seed": 3}
     one = load_video_model("long.1.safetensors")
     np.testing.assert_array_equal(list(one.frames()), list(soft_model(seed=1, num_frames=9).frames()))

@@ -35,7 +35,7 @@ from foldgauss.io.models.video_model import (
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
-_NAMES = {"model": "foldgauss model", "ply": "VeGaS video", "ply3dgs": "3DGS scenes", "obj": "triangles"}
+_NAMES = {"model": "foldgauss", "ply": "VeGaS video", "ply3dgs": "3DGS scenes", "obj": "triangles"}
 
 
 @command("export")
@@ -101,7 +101,7 @@ def export_command(
 
     path = write_or_keep(out_path, write)
     most = "" if file_format in ("model", "ply") else "up to "  # a frame has only its live Gaussians
-    text = f"{_NAMES[file_format]}, {format_count(num_frames, 'frame')}, {most}{model.num_gaussians:,} Gaussians"
+    text = f"{_NAMES[file_format]} ({file_format}), {format_count(num_frames, 'frame')}, {most}{model.num_gaussians:,} Gaussians"
     out.print(f"{path}: {text}{' each' if most and num_frames > 1 else ''}", soft_wrap=True)
 
 

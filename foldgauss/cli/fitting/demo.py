@@ -9,9 +9,10 @@ import typer
 from foldgauss._runtime.threads import num_threads
 from foldgauss.cli.app.application import command, out
 from foldgauss.cli.fitting.fit import stop_on_signals, summarize_fit
+from foldgauss.cli.shared.arguments import Overwrite
 from foldgauss.cli.shared.contact_sheet import make_comparison_sheet
 from foldgauss.cli.shared.fit_progress import choose_display, display_progress
-from foldgauss.cli.shared.outputs import make_folder, refuse_foreign
+from foldgauss.cli.shared.outputs import make_folder, refuse_existing
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import print_figures, summarize_scores, write_json
 from foldgauss.io._atomic import write_or_keep
@@ -26,19 +27,21 @@ from foldgauss.video.fitting.loop import finish, fit_steps
 
 SIZE, FRAMES = (160, 320), (0, 24)
 RECORD = "metrics.json"
-FILES = {"model.fgz", "reconstruction.mp4", "comparison.png", RECORD}
+FILES = ("model.fgz", "reconstruction.mp4", "comparison.png", RECORD)
 CONFIG = FitConfig(num_gaussians=40_000, steps=1500, quality=80)
 
 
 @command("demo")
 def demo(
     out_dir: Annotated[Path, typer.Option("--out", help="Folder for the results.")] = Path("foldgauss-demo"),
+    overwrite: Overwrite = False,
 ) -> None:
     """Fit 24 frames of the clip Bunny and show the results.
 
-    The frames are of 160x320. A later demo replaces the files of an earlier one; a folder with other files is refused.
+    The frames are of 160x320.
     """
-    refuse_foreign(out_dir, FILES, "demo", record=RECORD, known=(out_dir / RECORD).exists())
+    for name in FILES:
+        refuse_existing(out_dir / name, overwrite)
     clip = read_video(sample_clip("bunny"), frames=FRAMES, size=SIZE)
     make_folder(out_dir)
     out.print(f"Bunny, frames 0 to {FRAMES[1] - 1}, 160x320, on {num_threads()} threads")
@@ -56,7 +59,6 @@ def demo(
 
     def write(folder: Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / RECORD, figures | frames)  # first: the next demo may then replace this one, however it ends
         saved = save_compact(folder / "model.fgz", quantized, metadata=metadata)
         write_video(folder / "reconstruction.mp4", images, clip.fps)
         write_image(folder / "comparison.png", sheet)

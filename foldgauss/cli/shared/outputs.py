@@ -39,8 +39,10 @@ def refuse_inputs(path: Path, inputs: Mapping[str, Path | None], option: str = "
             continue
         # os.path: a name that is too long does not exist here; creating the file reports it.
         is_source = os.path.exists(path) and path.samefile(source)
-        into = path.suffix.lower() in IMAGE_SUFFIXES and resolve(path.parent) == resolve(source)
-        if is_source or into or resolve(path) in resolve(source).parents:
+        if path.suffix.lower() in IMAGE_SUFFIXES and resolve(path.parent) == resolve(source):
+            cure = "It would be one of its images."
+            raise invalid(option, expected=f"a place outside the {what}'s folder", got=path, cure=cure)
+        if is_source or resolve(path) in resolve(source).parents:
             cure = "Inputs are never replaced."
             raise invalid(option, expected=f"another path than the {what}", got=path, cure=cure)
 

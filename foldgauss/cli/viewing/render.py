@@ -200,11 +200,9 @@ def render(
     if plate:
         make_plate(model, about, output, image_size, background_color, masks_path, save_masks, inputs)
         return
-    video = (
-        model
-        if camera is None
-        else _stabilize(model, camera, SMOOTHING if smoothing is None else smoothing, border or BORDERS[0])
-    )
+    video = model
+    if camera is not None:
+        video = _stabilize(model, camera, SMOOTHING if smoothing is None else smoothing, border or BORDERS[0])
     draw = partial(interpolate_frames, video) if flow else video.frames
     output.write(partial(draw, shown, image_size, background=background_color), len(shown))
 
