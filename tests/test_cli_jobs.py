@@ -347,7 +347,7 @@ def test_many_clips_in_a_place_of_its_own(clips, tmp_path, capsys, monkeypatch):
     assert run("fit-many", clips, "--out", clips, *QUICK) == 2
     assert "another folder than the clips'" in capsys.readouterr().err
     assert run("fit-many", tmp_path / "none", *QUICK) == 2
-    assert run("fit-many", clips / "clip0.mp4", *QUICK) == 1
+    assert run("fit-many", clips / "clip0.mp4", *QUICK) == 2
     assert "foldgauss fit" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 

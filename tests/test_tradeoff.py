@@ -21,6 +21,7 @@ from foldgauss.analysis.plot import Panel, plot_tradeoff
 from foldgauss.cli.measuring import tradeoff as command
 from foldgauss.cli.measuring import tradeoff_record as kept
 from foldgauss.io import load_video_model, read_video, write_video
+from foldgauss.io.media.clip import AS_STORED
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.jobs import runner
 from foldgauss.video import FitConfig, FitDiverged, evaluate, tradeoff
@@ -128,8 +129,8 @@ def test_each_variant_changes_one_setting_and_has_a_command():
     made, left = plan_points(BASE, tuple(AXES), 132)
     assert left == []
     assert len({point.name for point in made}) == len(made) == 1 + sum(map(len, AXES.values()))
-    commands = kept.Commands(Path("my clip.mp4"), "320x640", "0:132", Path("out"))
-    lines = [commands.format_point(point) for point in made]
+    given = Path("my clip.mp4"), "320x640", "0:132", AS_STORED, Path("out")
+    lines = [kept.format_command(*given, point) for point in made]
     assert len(set(lines)) == len(lines)
     for point, line in zip(made, lines, strict=True):
         changed = kept.changed_settings(point, BASE)

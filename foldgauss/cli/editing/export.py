@@ -101,8 +101,9 @@ def export_command(
 
     path = write_or_keep(out_path, write)
     most = "" if file_format in ("model", "ply") else "up to "  # a frame has only its live Gaussians
-    text = f"{_NAMES[file_format]} ({file_format}), {format_count(num_frames, 'frame')}, {most}{model.num_gaussians:,} Gaussians"
-    out.print(f"{path}: {text}{' each' if most and num_frames > 1 else ''}", soft_wrap=True)
+    count = f"{most}{model.num_gaussians:,} Gaussians{' each' if most and num_frames > 1 else ''}"
+    text = f"{_NAMES[file_format]} ({file_format}), {format_count(num_frames, 'frame')}, {count}"
+    out.print(f"{path}: {text}", soft_wrap=True)
 
 
 def _take_segment(video: Video, about: dict[str, Any], number: int) -> tuple[VideoModel, dict[str, Any]]:

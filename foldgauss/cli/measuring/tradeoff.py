@@ -24,6 +24,7 @@ from foldgauss.cli.measuring.tradeoff_record import (
     changed_settings,
     format_command,
     report,
+    suffix_of,
 )
 from foldgauss.cli.shared.arguments import (
     Deinterlace,
@@ -273,7 +274,7 @@ class _Run:
         status.update(f"{point.name}: evaluating")
         scores = evaluate(model, self.clip.frames)
         about = self.about | describe_fit(config, state) | mean_scores(scores)
-        path = self.record.path.with_name(BASE if point.axis == "base" else f".measured-{BASE}")
+        path = self.record.path.with_name(BASE if point.axis == "base" else f".measured{suffix_of(config)}")
         try:
             if quantized is None:
                 save_video_model(path, model, metadata=about)

@@ -90,6 +90,11 @@ class Record:
         write_or_keep(self.path, lambda path: write_json(path, kept))
 
 
+def suffix_of(config: FitConfig) -> str:
+    """The extension of the file of a fit's model."""
+    return COMPACT_SUFFIX if config.is_compact else MODEL_SUFFIX
+
+
 def format_command(
     video: Path, size: str | None, frames: str | None, reading: Reading, folder: Path, point: Point
 ) -> str:
@@ -98,8 +103,7 @@ def format_command(
         words = ["evaluate", str(folder / BASE), str(video), *_options(point.played, point.config.options)]
         return shlex.join(["foldgauss", *words])
     name = point.name.replace(", ", "-").replace(" ", "-").replace("/", "_")
-    suffix = COMPACT_SUFFIX if point.config.is_compact else MODEL_SUFFIX
-    words = ["fit", str(video), "--out", f"{name}{suffix}"]
+    words = ["fit", str(video), "--out", f"{name}{suffix_of(point.config)}"]
     words += [] if size is None else ["--size", size]
     words += [] if frames is None else ["--frames", frames]
     words += [f"--{name}={value}" for name, value in reading.changed.items()]
