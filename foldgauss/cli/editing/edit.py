@@ -80,8 +80,9 @@ def edit_command(
         edited = script.apply(model, about)
     if as_model:
         about = keep_origin(about, *CLIP_NOTES) | {"edited_by": script_path.name}
-        if isinstance(edited, SegmentedVideo):
-            edited = _drop_scores(model, edited)
+        if isinstance(edited, SegmentedVideo):  # without their scores, which were measured before the edit
+            kept = [(segment, keep_origin(segment.metadata, *CLIP_NOTES)) for segment in edited.segments]
+            edited = SegmentedVideo([dataclasses.replace(segment, metadata=about) for segment, about in kept])
         out_path = write_or_keep(out_path, lambda path: save_video_model(path, edited, metadata=about))
         kind = "a plain model" if isinstance(edited, VideoModel) else "a model with edits"
         if isinstance(edited, SegmentedVideo):
@@ -91,14 +92,3 @@ def edit_command(
     draw = partial(interpolate_frames, edited, np.asarray(edited.frame_times.times()), image_size)
     seconds = read_frame_seconds(about, edited.num_frames)
     dataclasses.replace(output, fps=edited.fps, times=seconds).write(draw, edited.num_frames)
-
-
-def _drop_scores(model: SegmentedVideo, edited: SegmentedVideo) -> SegmentedVideo:
-    """Remove the recorded scores of edited segments, which were measured before the edit."""
-    before = set(map(id, model.segments))
-    segments = []
-    for segment in edited.segments:
-        if id(segment) not in before:
-            segment = dataclasses.replace(segment, metadata=keep_origin(segment.metadata, *CLIP_NOTES))
-        segments.append(segment)
-    return SegmentedVideo(segments)

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +12,7 @@ from foldgauss._runtime.checks import ParameterError, invalid
 from foldgauss._runtime.threads import num_threads
 from foldgauss.cli.app.application import Stopped, command, err, out, warn
 from foldgauss.cli.app.signals import note_signals
+from foldgauss.cli.fitting.job_progress import emit_json
 from foldgauss.cli.fitting.options import (
     PROGRESS,
     CheckpointSeconds,
@@ -24,7 +25,7 @@ from foldgauss.cli.fitting.options import (
     Workers,
     fit_options,
 )
-from foldgauss.cli.fitting.segments import describe_budgets, fit_in_segments, plan_gaussians
+from foldgauss.cli.fitting.segments import describe_plan, fit_in_segments, plan_gaussians
 from foldgauss.cli.shared.arguments import (
     Deinterlace,
     Frames,
@@ -175,7 +176,11 @@ def fit(
     for text in busy_processors(run):
         warn(f"--minutes: {text}")
     figures = summarize_scores(run.model, scores) | summarize_fit(run.info) | {"stopped_by": run.info.stopped_by}
-    _print_results(run, display, figures | {"file_bytes": target.stat().st_size})
+    figures |= {"file_bytes": target.stat().st_size}
+    if display == "json":
+        emit_json("done", {"model": run.job.target} | figures)
+    elif display != "quiet":
+        print_figures(run.job.target, figures)
 
 
 def _choose_target(video: Path, out_path: Path | None, config: FitConfig) -> tuple[Path, FitConfig]:
@@ -290,7 +295,7 @@ def _print_plan(clip: Clip, config: FitConfig, display: Display) -> None:
     height, width = clip.size
     for text in clip.notes:
         warn(f"{clip.source}: {text}")
-    num, at_most = plan_gaussians(config, clip.num_frames, height, width)
+    num = plan_gaussians(config, clip.num_frames, height, width)
     steps = planned_steps(config, clip.num_frames)
     if steps is not None and steps * config.batch_size < clip.num_frames:
         warn(
@@ -302,20 +307,9 @@ def _print_plan(clip: Clip, config: FitConfig, display: Display) -> None:
         print_json("start", about | {"most_gaussians": num, "degree": config.fold_degree, "threads": num_threads()})
     if display in ("json", "quiet"):
         return
-    plan = describe_budgets(config, steps)
-    growing = "" if config.growth is None else " at the start"
     computed = f"{num_threads()} threads" if engine == "cpu" else f"engine {engine} on {describe_device()}"
     out.print(
         f"{clip.source}: {format_count(clip.num_frames, 'frame')} of {height}x{width}"
-        f"{' with alpha' if clip.has_alpha else ''}, {at_most}{num:,} Gaussians of degree {config.fold_degree}"
-        f"{growing}, {plan}, {computed}",
+        f"{' with alpha' if clip.has_alpha else ''}, {describe_plan(config, num, clip.num_frames)}, {computed}",
         soft_wrap=True,
     )
-
-
-def _print_results(run: FitRun, display: Display, figures: dict[str, float]) -> None:
-    if display == "json":
-        with suppress(OSError):  # standard output is closed, but the model is there
-            print_json("done", {"model": run.job.target} | figures)
-    elif display != "quiet":
-        print_figures(run.job.target, figures)

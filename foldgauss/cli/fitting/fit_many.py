@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import time
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -46,8 +45,6 @@ from foldgauss.jobs.job import read_record, read_request, write_request
 from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig
 
 SUMMARY = "summary.json"
-#: Seconds between two writes of the summary: there may be thousands of clips.
-SUMMARY_SECONDS = 5.0
 #: With more clips, the table shows no rows; the summary has all.
 MAX_ROWS = 60
 #: Fields of a record that the summary shows.
@@ -125,17 +122,13 @@ def fit_many(
             names = ", ".join(entry.name for entry in found.others[:3]) + (", ..." if len(found.others) > 3 else "")
             out.print(f"skipped, not clips: {names}", soft_wrap=True)
     ended: dict[str, Outcome] = {}
-    written = -SUMMARY_SECONDS
 
     def on_end(outcome: Outcome) -> None:
-        nonlocal written
         ended[outcome.job.target] = outcome
-        if len(ended) == len(jobs) or time.monotonic() - written > SUMMARY_SECONDS:
-            try:
-                _write_summary(out_dir, jobs, ended)
-            except OSError as error:  # a full disk must not end the fits
-                warn(str(error))
-            written = time.monotonic()
+        try:
+            _write_summary(out_dir, jobs, ended)
+        except OSError as error:  # a full disk must not end the fits
+            warn(str(error))
 
     again = "Give the command again without --overwrite" if overwrite else "Give the same command again"
     with options.open_pool() as pool:

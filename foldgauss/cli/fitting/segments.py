@@ -1,9 +1,9 @@
 """`fit` of a clip in segments, run by workers or by this process."""
 
 import dataclasses
+import itertools
 import time
 from contextlib import nullcontext
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +66,10 @@ def fit_in_segments(
         raise Stopped(f"{len(failed)} of {len(outcomes)} segments failed{others}. {again}")
 
     def join(path: Path) -> JoinedFit:
-        return _join_with_progress(dataclasses.replace(fit, target=path), outcomes, display)
+        records = {outcome.job.name: outcome.record for outcome in outcomes}
+        shared = sum(max(0, before[1] - after[0]) for before, after in itertools.pairwise(fit.spans))
+        with progress_bar("Joining", max(shared, 1), shown=display == "bar" and shared > 0) as advance:
+            return dataclasses.replace(fit, target=path).join(records, on_frame=advance)
 
     joined = write_or_keep(target, join)
     target = joined.path
@@ -84,28 +87,21 @@ def print_failures(failed: list[Outcome]) -> None:
         err.print(f"failed: {outcome.job.name}: {outcome.failure}", style="red", soft_wrap=True)
 
 
-def plan_gaussians(config: FitConfig, num_frames: int, *size: int, threads: int | None = None) -> tuple[int, str]:
-    """The number of Gaussians at the start; and "up to " where it is a bound, as the motion of the clip decides."""
-    choose = partial(chosen_num_gaussians, config, num_frames, *size, threads=threads)
-    if config.initialization == "uniform":
-        return choose(), ""
-    least, most = choose(lifetime=num_frames), choose(lifetime=min(num_frames, SHORTEST_LIFETIME))
-    return most, "up to " if least < most else ""
+def plan_gaussians(config: FitConfig, num_frames: int, *size: int, threads: int | None = None) -> int:
+    """The number of Gaussians at the start; the most, where the motion of the clip decides."""
+    lifetime = min(num_frames, SHORTEST_LIFETIME)
+    return chosen_num_gaussians(config, num_frames, *size, threads=threads, lifetime=lifetime)
 
 
-def describe_budgets(config: FitConfig, steps: int | None) -> str:
-    """The budgets of a fit that are set, and what is asked of a compact model, as "3,000 steps, quality 50"."""
-    budgets = {"{:,} steps": steps, "{:g} minutes": config.minutes}
+def describe_plan(config: FitConfig, num: int, num_frames: int) -> str:
+    """The Gaussians of a fit, its budgets, and its goals, as "40,000 Gaussians of degree 1, 3,000 steps, quality 50"."""
+    budgets = {"{:,} steps": planned_steps(config, num_frames), "{:g} minutes": config.minutes}
     goals = {"quality {:g}": config.quality, "{:g} MB at most": config.size_mb, "{:g} dB": config.psnr}
     texts = ([text.format(value) for text, value in of.items() if value is not None] for of in (budgets, goals))
-    return ", ".join(filter(None, map(" or ".join, texts)))
-
-
-def _join_with_progress(fit: LongFit, outcomes: list[Outcome], display: Display) -> JoinedFit:
-    records = {outcome.job.name: outcome.record for outcome in outcomes}
-    shared = sum(max(0, before[1] - after[0]) for before, after in zip(fit.spans[:-1], fit.spans[1:], strict=True))
-    with progress_bar("Joining", max(shared, 1), shown=display == "bar" and shared > 0) as advance:
-        return fit.join(records, on_frame=advance)
+    at_most = "up to " if config.num_gaussians is None else ""
+    at_start = "" if config.growth is None else " at the start"
+    gaussians = f"{at_most}{num:,} Gaussians of degree {config.fold_degree}{at_start}"
+    return ", ".join(filter(None, [gaussians, *map(" or ".join, texts)]))
 
 
 def _summarize(fit: LongFit, joined: JoinedFit, outcomes: list[Outcome], config: FitConfig) -> dict[str, Any]:
@@ -138,7 +134,7 @@ def _print_plan(fit: LongFit, config: FitConfig, display: Display, video: Path, 
     for note in (*index.notes, *describe_crop([index.size], size)):
         warn(f"{video}: {note}")
     longest = fit.jobs[lengths.index(max(lengths))].config  # with its part of the file's size
-    num, at_most = plan_gaussians(longest, max(lengths), *size, threads=options.threads)
+    num = plan_gaussians(longest, max(lengths), *size, threads=options.threads)
     if display == "json":
         about = {"clip": str(video), "num_frames": index.num_frames, "height": size[0], "width": size[1]}
         emit_json("start", about | {"spans": [list(span) for span in fit.spans], "most_gaussians": num})
@@ -148,13 +144,12 @@ def _print_plan(fit: LongFit, config: FitConfig, display: Display, video: Path, 
     begun = sum(job.checkpoint.exists() for job in fit.jobs)
     if done or begun:
         err.print(f"continuing: {done} of {len(fit.jobs)} segments done, {begun} begun", soft_wrap=True)
-    at_cuts = sum(before[1] == after[0] for before, after in zip(fit.spans[:-1], fit.spans[1:], strict=True))
+    at_cuts = sum(before[1] == after[0] for before, after in itertools.pairwise(fit.spans))
     span = f"{min(lengths)} to {max(lengths)}" if min(lengths) < max(lengths) else f"{lengths[0]}"
     where = f" ({at_cuts} end at cuts)" if at_cuts else ""
-    plan = describe_budgets(config, planned_steps(config, max(lengths)))
     out.print(
         f"{video}: {format_count(index.num_frames, 'frame')} of {size[0]}x{size[1]} in "
         f"{format_count(len(lengths), 'segment')} of {span} frame{'' if span == '1' else 's'}{where}, each with "
-        f"{at_most}{num:,} Gaussians of degree {config.fold_degree} and {plan}, by {options}",
+        f"{describe_plan(config, num, max(lengths))}, by {options}",
         soft_wrap=True,
     )

@@ -15,7 +15,6 @@ from rich.status import Status
 from foldgauss import __version__
 from foldgauss._runtime.checks import check_within
 from foldgauss.cli.app.application import Stopped, command, err, out, warn
-from foldgauss.cli.app.completion import complete_list
 from foldgauss.cli.measuring.tradeoff_record import (
     BASE,
     FILES,
@@ -84,7 +83,6 @@ def tradeoff_command(
         typer.Option(
             metavar="AXIS,AXIS,..",
             help=f"Axes to measure, of {', '.join(AXES)} [default: all].",
-            autocompletion=complete_list(AXES),
         ),
     ] = None,
     minutes: Annotated[
@@ -169,9 +167,6 @@ class _Run:
                 f"{len(points)} points around a base of {chosen:,} steps, about {expected:.1f} minutes",
                 soft_wrap=True,
             )
-            if steps is None and chosen == full and expected < 0.9 * minutes:
-                text = f"note: {full:,} steps are the default for this clip; not all of the minutes are needed."
-                err.print(text, soft_wrap=True)
             if steps is None and expected > 1.02 * minutes:
                 warn(
                     f"--minutes: {minutes:g} are too few for {len(points)} points around a base of {chosen:,} steps, "
@@ -228,13 +223,13 @@ class _Run:
         if point.played is None:
             shown, scores, seconds, num_bytes = self._fit_model(point, status)
         else:
-            shown = dataclasses.replace(self._load_base(base, status), options=point.played)
+            shown = dataclasses.replace(self._load_base(), options=point.played)
             scores, row = evaluate(shown, self.clip.frames), self.record.rows["base"]
             seconds, num_bytes = row["seconds"], row["bytes"]
         if point.axis == "base":
             rate = measure_frame_rate(shown)
         else:  # relative to the base, measured at the same time, under the same load
-            own, others = measure_frame_seconds(shown, self._load_base(base, status))
+            own, others = measure_frame_seconds(shown, self._load_base())
             rate = self.record.rows["base"]["frames_per_second"] * others / own
         return {
             "axis": point.axis,
@@ -249,13 +244,9 @@ class _Run:
             "frames_per_second": round(rate, 2),
         }
 
-    def _load_base(self, base: FitConfig, status: Status) -> VideoModel:
-        """Load the model of the base, which is fitted again if its file is missing."""
-        path = self.record.path.with_name(BASE)
-        if not path.exists():
-            self._fit_model(Point("base", "", base), status)
+    def _load_base(self) -> VideoModel:
         if self._base is None:
-            self._base = load_video_model(path)
+            self._base = load_video_model(self.record.path.with_name(BASE))
         return self._base
 
     def _fit_model(self, point: Point, status: Status) -> tuple[VideoModel, Evaluation, float, int]:

@@ -11,12 +11,11 @@ from foldgauss._runtime.checks import invalid
 from foldgauss.cli.app.application import out, warn
 from foldgauss.cli.shared.arguments import MAX_TIMES, refuse_together
 from foldgauss.cli.shared.clips import Video
+from foldgauss.cli.shared.log_lines import list_frames
 from foldgauss.io.media.frame_rate import MAX_FPS, MIN_FPS
 from foldgauss.video.models.frame_times import interpolated_times, played_positions, remapped_positions, times_at
 from foldgauss.video.motion.slow_motion import even_durations
 
-#: So many repeated frames are printed.
-LISTED_REPEATS = 8
 MAX_UPSAMPLE, MAX_IMAGES = MAX_TIMES, 10 * MAX_TIMES
 MIN_SPEED, MAX_SECONDS = 1e-4, 1e6
 MAX_EVEN_FPS = 50.0  # frames per second, the most of a GIF: a constant rate is not made higher for short intervals
@@ -135,8 +134,7 @@ class Timeline:
         refuse_together("--skip-repeats", others)
         durations, fps = even_durations(video), video.fps
         repeats = np.flatnonzero(durations < 1) + 1
-        numbers = ", ".join(map(str, repeats[:LISTED_REPEATS])) + (", ..." if len(repeats) > LISTED_REPEATS else "")
-        out.print(f"Frames that repeat the one before: {numbers or 'none'}.", soft_wrap=True)
+        out.print(f"Frames that repeat the one before: {list_frames(repeats) or 'none'}.", soft_wrap=True)
         shown = np.full(video.num_frames, 1 / fps) if seconds is None else np.diff(seconds)
         shown[:-1] *= durations
         timeline = dataclasses.replace(self, upsample=None, fps=self.rate(fps, seconds), speed=self.playing_speed(fps))
