@@ -96,7 +96,6 @@ def root(
 
     `foldgauss COMMAND --help` describes a command, with examples.
     """
-    del debug, version  # read by `main` before typer runs, and by the callback
 
 
 @functools.cache

@@ -10,7 +10,9 @@ from foldgauss._runtime.interrupts import raise_on_sigterm
 from foldgauss.cli.app.application import Stopped, err, root_command, warn
 from foldgauss.cli.app.help import WrongUse
 
-WRONG_USE, FAILURE = 2, 1
+#: Exit codes.
+WRONG_USE = 2
+FAILURE = 1
 #: Errors of the system that writing raises: closed pipes, full disks, quotas, limits on files, broken devices.
 OUTPUT_ERRORS = (errno.EPIPE, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EBADF)
 

@@ -84,9 +84,8 @@ def edit_command(
             kept = [(segment, keep_origin(segment.metadata, *CLIP_NOTES)) for segment in edited.segments]
             edited = SegmentedVideo([dataclasses.replace(segment, metadata=about) for segment, about in kept])
         out_path = write_or_keep(out_path, lambda path: save_video_model(path, edited, metadata=about))
-        kind = "a plain model" if isinstance(edited, VideoModel) else "a model with edits"
-        if isinstance(edited, SegmentedVideo):
-            kind = f"a model in {len(edited.segments)} segments"
+        kinds = {VideoModel: "a plain model", SegmentedVideo: "a model in segments"}
+        kind = kinds.get(type(edited), "a model with edits")
         out.print(f"{out_path}: {kind}, {edited.num_gaussians:,} Gaussians", soft_wrap=True)
         return
     draw = partial(interpolate_frames, edited, np.asarray(edited.frame_times.times()), image_size)

@@ -15,7 +15,6 @@ from foldgauss.cli.shared.fit_progress import choose_display, display_progress
 from foldgauss.cli.shared.outputs import make_folder, refuse_existing
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import print_figures, summarize_scores, write_json
-from foldgauss.io._atomic import write_or_keep
 from foldgauss.io.datasets import sample_clip
 from foldgauss.io.media.video_reading import read_video
 from foldgauss.io.media.video_writing import write_image, write_video
@@ -25,7 +24,8 @@ from foldgauss.jobs.runner import describe_fit, mean_scores, run_steps
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.loop import finish, fit_steps
 
-SIZE, FRAMES = (160, 320), (0, 24)
+SIZE = (160, 320)
+FRAMES = (0, 24)
 RECORD = "metrics.json"
 FILES = ("model.fgz", "reconstruction.mp4", "comparison.png", RECORD)
 CONFIG = FitConfig(num_gaussians=40_000, steps=1500, quality=80)
@@ -57,16 +57,11 @@ def demo(
     captions = [f"frame {k}, {scores.psnr[k]:.1f} dB" for k in shown]
     sheet = make_comparison_sheet([clip.frames[k] for k in shown], [images[k] for k in shown], captions)
 
-    def write(folder: Path) -> Path:
-        folder.mkdir(parents=True, exist_ok=True)
-        saved = save_compact(folder / "model.fgz", quantized, metadata=metadata)
-        write_video(folder / "reconstruction.mp4", images, clip.fps)
-        write_image(folder / "comparison.png", sheet)
-        figures["file_bytes"] = saved.stat().st_size
-        write_json(folder / RECORD, figures | frames)
-        return folder
-
-    out_dir = write_or_keep(out_dir, write)
+    saved = save_compact(out_dir / "model.fgz", quantized, metadata=metadata)
+    write_video(out_dir / "reconstruction.mp4", images, clip.fps)
+    write_image(out_dir / "comparison.png", sheet)
+    figures["file_bytes"] = saved.stat().st_size
+    write_json(out_dir / RECORD, figures | frames)
     print_figures("Demo", figures)
     for name, what in (
         ("comparison.png", "original, reconstruction and error side by side"),

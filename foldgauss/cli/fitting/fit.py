@@ -162,10 +162,16 @@ def fit(
     )
     run = _save_model(run)
     target = Path(run.job.target)
-    with _keep_state_on_interrupt(run):
+    try:
         if history is not None:
             _save_curves(curves, history)
         scores = evaluate_with_progress(run.model, run.clip.frames, shown=display in ("bar", "lines"))
+    except KeyboardInterrupt:
+        run.save_checkpoint()  # from which the evaluation can be repeated
+        if run.job.checkpoint.exists():
+            text = f"{run.job.target} is written, without its scores: add --resume --overwrite to measure them."
+            err.print(text, soft_wrap=True)
+        raise
     try:
         run.save(scores)
     except OSError as error:
@@ -267,19 +273,6 @@ def _save_model(run: FitRun) -> FitRun:
             raise
         text = f"The fit is in {run.job.checkpoint}, too: --resume continues it, and writes the model."
         raise OutputError(f"{error} {text}") from error
-
-
-@contextmanager
-def _keep_state_on_interrupt(run: FitRun) -> Iterator[None]:
-    """If the evaluation is interrupted, save the state, from which it can be repeated."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        run.save_checkpoint()
-        if run.job.checkpoint.exists():
-            text = f"{run.job.target} is written, without its scores: add --resume --overwrite to measure them."
-            err.print(text, soft_wrap=True)
-        raise
 
 
 def _save_curves(path: Path, history: Path) -> None:

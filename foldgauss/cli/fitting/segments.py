@@ -94,7 +94,7 @@ def plan_gaussians(config: FitConfig, num_frames: int, *size: int, threads: int 
 
 
 def describe_plan(config: FitConfig, num: int, num_frames: int) -> str:
-    """The Gaussians of a fit, its budgets, and its goals, as "40,000 Gaussians of degree 1, 3,000 steps, quality 50"."""
+    """The Gaussians, budgets and goals of a fit, as "40,000 Gaussians of degree 1, 3,000 steps, quality 50"."""
     budgets = {"{:,} steps": planned_steps(config, num_frames), "{:g} minutes": config.minutes}
     goals = {"quality {:g}": config.quality, "{:g} MB at most": config.size_mb, "{:g} dB": config.psnr}
     texts = ([text.format(value) for text, value in of.items() if value is not None] for of in (budgets, goals))

@@ -66,8 +66,10 @@ from foldgauss.video.tradeoff import (
 )
 
 DEFAULT_MINUTES = 10.0
-#: Steps that measure the throughput, and a margin for variations of it.
-PILOT_STEPS, MARGIN = 40, 1.1
+#: Steps that measure the throughput.
+PILOT_STEPS = 40
+#: Factor of the estimated time, for variations of the throughput.
+MARGIN = 1.1
 
 
 @command("tradeoff")

@@ -26,7 +26,10 @@ from foldgauss.render import RenderOptions
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.tradeoff import Point, Skipped, knee, pareto_front
 
-RECORD, ROWS, PLOT, BASE = "tradeoff.json", "tradeoff.csv", "tradeoff.png", "base.safetensors"
+RECORD = "tradeoff.json"
+ROWS = "tradeoff.csv"
+PLOT = "tradeoff.png"
+BASE = "base.safetensors"
 FILES = {RECORD, ROWS, PLOT, BASE}
 
 

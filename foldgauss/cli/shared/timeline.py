@@ -16,8 +16,12 @@ from foldgauss.io.media.frame_rate import MAX_FPS, MIN_FPS
 from foldgauss.video.models.frame_times import interpolated_times, played_positions, remapped_positions, times_at
 from foldgauss.video.motion.slow_motion import even_durations
 
-MAX_UPSAMPLE, MAX_IMAGES = MAX_TIMES, 10 * MAX_TIMES
-MIN_SPEED, MAX_SECONDS = 1e-4, 1e6
+MAX_UPSAMPLE = MAX_TIMES
+MAX_IMAGES = 10 * MAX_TIMES
+#: The slowest playback, and the inverse of the fastest.
+MIN_SPEED = 1e-4
+#: The longest video that `--remap` makes.
+MAX_SECONDS = 1e6
 MAX_EVEN_FPS = 50.0  # frames per second, the most of a GIF: a constant rate is not made higher for short intervals
 
 Upsample = Annotated[

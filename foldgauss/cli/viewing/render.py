@@ -43,7 +43,8 @@ from foldgauss.video.motion.slow_motion import interpolate_frames
 from foldgauss.video.motion.stabilization import BORDERS, MAX_ZOOM, SMOOTHING, stabilize
 
 #: Panels of `--help`.
-STABILIZED, PLATE, FILE = "Stabilized", "Without an object", "Video files"
+STABILIZED = "Stabilized"
+PLATE = "Without an object"
 #: How `--stabilize` moves the camera.
 CAMERAS = ("smooth", "fixed")
 
