@@ -3,16 +3,35 @@
 import dataclasses
 import errno
 import os
+import pickle
 from pathlib import Path
 
 import numpy as np
 import pytest
 from commands import run
 
+from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.settings import setting_of
+from foldgauss.cli.app.application import load_commands
 from foldgauss.io import load_video_model, save_video_model, write_image, write_video
 from foldgauss.io._atomic import OutputError, write_or_keep
 from foldgauss.io.datasets import waves
 from foldgauss.io.models.video_model import read_metadata
+from foldgauss.video import FitConfig
+
+
+def test_errors_carry_their_parameter_which_commands_name_as_typed():
+    error = invalid("num_gaussians", expected="1", got="0", cure="Add one.")
+    for one in (error, pickle.loads(pickle.dumps(error))):
+        assert (one.parameter, one.problem) == ("num_gaussians", "expected 1, got 0. Add one.")
+        assert str(one) == "num_gaussians: expected 1, got 0. Add one."
+    fit = load_commands("fit")["fit"]
+    for field in dataclasses.fields(FitConfig):
+        if option := setting_of(field).option.split("/")[0]:
+            assert fit._name_as_typed(field.name) == option
+    known = {"video": "VIDEO", "RenderOptions.alpha_cutoff": "--alpha-cutoff", "--steps": "--steps", "path": None}
+    assert {name: fit._name_as_typed(name) for name in known} == known
+
 
 FIT = ["--steps", "3", "--gaussians", "60", "--quiet"]
 

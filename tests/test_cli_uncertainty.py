@@ -216,7 +216,7 @@ def test_wrong_use(work, tmp_path, capsys):
         ([model, clip, "--out", target, "--ensembles", "1"], 2, "--ensembles: expected at least 2"),
         ([model, clip, "--out", target, "--steps", "3"], 2, "--steps: expected at least"),
         ([model, clip, "--out", target, "--frames", "0:2"], 2, "--frames: expected at least 3 frames"),
-        ([model, clip, "--out", clip], 2, "another path than the clip"),
+        ([model, clip, "--out", clip], 2, "a place outside the clip's folder"),
         ([model, clip, "--out", tmp_path / "file"], 2, "--out: expected a folder"),
         ([model, clip, "--out", tmp_path / "bad"], 2, "chains.h5, damaged"),
         ([tmp_path / "none", clip, "--out", target], 2, "missing"),
@@ -245,6 +245,6 @@ def test_a_clip_of_something_else(work, tmp_path, capsys):
     clip.mkdir()
     for k, frame in enumerate(np.random.default_rng(0).integers(0, 255, (12, 40, 64, 3))):
         write_image(clip / f"{k:02}.png", frame.astype(np.uint8))
-    assert run("uncertainty", work / "model.safetensors", clip, "--out", tmp_path / "out") == 1
-    assert "video: expected frames of which the model explains 20%" in capsys.readouterr().err
+    assert run("uncertainty", work / "model.safetensors", clip, "--out", tmp_path / "out") == 2
+    assert "VIDEO: expected frames of which the model explains 20%" in capsys.readouterr().err
     assert os.listdir(tmp_path / "out") == []
