@@ -107,8 +107,6 @@ def completions(words: str, folder: Path, monkeypatch, capsys) -> list[str]:
         ("export m.safetensors --format ply", ["ply", "ply3dgs"]),
         ("render m.safetensors --format ", ["png", "webp"]),
         ("uncertainty m c --noise s", ["score"]),
-        ("tradeoff clip.mp4 --axes ti", ["time"]),
-        ("tradeoff clip.mp4 --axes time,deg", ["time,degree"]),
         ("render ", ["clips/", "one model.safetensors", "small.fgz"]),
         ("render sm", ["small.fgz"]),
         ("fit ", ["clips/", "holiday.mp4"]),

@@ -82,7 +82,7 @@ def test_the_plan_and_the_figures_are_told(long_clip, tmp_path, capsys):
     assert run("fit", long_clip, "--out", tmp_path / "m.safetensors", *SEGMENTS) == 0
     told = capsys.readouterr()
     assert "39 frames of 24x32 in 3 segments of" in told.out
-    assert "each with 40 Gaussians of degree 1 and 12 steps, by this process" in told.out
+    assert "each with 40 Gaussians of degree 1, 12 steps, by this process" in told.out
     assert "PSNR lost where segments meet" in told.out
     assert "1 of 3 segments done: segment 0" in told.err
 

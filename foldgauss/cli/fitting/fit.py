@@ -266,12 +266,12 @@ def _save_model(run: FitRun) -> FitRun:
     """
 
     try:
-        return write_or_keep(Path(run.job.target), run.save_to)
-    except OutputError as error:
+        return run.save_to(Path(run.job.target))
+    except OSError as error:
         run.save_checkpoint()
         if not run.job.checkpoint.exists():
-            raise
-        text = f"The fit is in {run.job.checkpoint}, too: --resume continues it, and writes the model."
+            return write_or_keep(Path(run.job.target), run.save_to)
+        text = f"The fit is kept in {run.job.checkpoint}: --resume continues it, and writes the model."
         raise OutputError(f"{error} {text}") from error
 
 
