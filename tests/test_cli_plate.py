@@ -190,6 +190,7 @@ def test_other_masks_are_refused(model, tmp_path, monkeypatch, capsys, masks, me
         (["--codec", "av1"], "--out: expected at least 64x64 for av1"),
         (["--upsample", "2"], "--plate: expected no --upsample, got both"),
         (["--skip-repeats"], "--plate: expected no --skip-repeats, got both"),
+        (["--background", "none"], "--plate: expected no --background none, got both"),
         (["--out", "x", "--save-masks", "./x"], "--save-masks: expected another folder than --out, got x."),
     ],
 )

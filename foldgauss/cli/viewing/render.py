@@ -172,10 +172,8 @@ def render(
     if camera == "fixed":
         refuse_together("--stabilize fixed", {"--smoothing": smoothing})
     if plate:
-        refuse_together(
-            "--plate", {"--stabilize": camera, "--fps": fps, "--skip-repeats": skip_repeats} | timeline.ways
-        )
-        background_color = background_color or (0.0, 0.0, 0.0)
+        others = {"--stabilize": camera, "--fps": fps, "--skip-repeats": skip_repeats}
+        refuse_together("--plate", others | timeline.ways | {"--background none": background_color is None})
     kind = ".plate" if plate else "" if camera is None else ".stable"
     out_path = _name_output(model_path, timeline, image_format, kind) if out_path is None else out_path
     if image_format is not None:
