@@ -264,7 +264,6 @@ def _save_model(run: FitRun) -> FitRun:
 
     Returns the run with the path of the model as its target.
     """
-
     try:
         return run.save_to(Path(run.job.target))
     except OSError as error:
