@@ -24,12 +24,12 @@ COMMANDS = {
     "e.safetensors": ["edit", "MODEL", "SCRIPT", "--out"],
     "m.ply": ["export", "MODEL", "--format", "ply", "--out"],
     "meshes": ["export", "MODEL", "--format", "obj", "--out"],
-    "page.html": ["export", "MODEL", "--format", "html", "--out"],
+    "page.html": ["view", "MODEL", "--out"],
 }
 #: Commands that fill a folder, file by file, and go on when called again: which of its files they are killed in.
 FOLDERS = {
     "tradeoff": (["tradeoff", "CLIP", "--axes", "degree", "--steps", "12", "--out"], (".json", ".safetensors", ".csv")),
-    "uncertainty": (["uncertainty", "MODEL", "CLIP", "--steps", "400", "--out"], (".npz", ".csv", ".nc", ".png")),
+    "uncertainty": (["uncertainty", "MODEL", "CLIP", "--steps", "400", "--out"], (".csv", ".nc", ".png")),
 }
 #: What files are named in folders that are written whole.
 WITHIN = {"frames": "00000.png", "meshes": "frame_0000.obj"}

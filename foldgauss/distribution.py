@@ -31,7 +31,6 @@ from foldgauss._numerics.factor import check_loc, check_rest, marginal_tril, nor
 from foldgauss._numerics.triangular import join_columns, multiply_lower, solve_lower, split_columns
 from foldgauss._runtime import notebook_hooks
 from foldgauss._runtime.checks import invalid
-from foldgauss._runtime.threads import check_not_forked
 from foldgauss.analysis import interop, moments
 from foldgauss.analysis.conditional import TimeDensity, TimeMixture, conditional_gaussian, time_density, time_mixture
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood, as_envelope, check_peak
@@ -374,7 +373,6 @@ class FoldedGaussian(BatchModule):
 
         **Source:** eq:integral_proof. **Raises:** ValueError on invalid indices.
         """
-        check_not_forked()
         indices = normalize_indices(indices, self.event_shape[0])
         space = tuple(i for i in indices if i != self._time_index)
         if len(space) == len(indices):

@@ -32,7 +32,6 @@ from foldgauss._numerics.piecewise import locate
 from foldgauss._numerics.pointwise import call_elementwise, split_parameters
 from foldgauss._numerics.triangular import join_columns, split_columns
 from foldgauss._runtime.checks import check_signature, invalid, is_integer, short_repr
-from foldgauss._runtime.threads import check_not_forked
 
 __all__ = [
     "AbstractFold",
@@ -91,7 +90,6 @@ class ZeroFold(AbstractFold):
         self.dim = int(dim)
 
     def __call__(self, u: Float[Array, "*batch"]) -> Float[Array, "*batch d-1"]:
-        check_not_forked()
         return jnp.zeros((*jnp.shape(u), self.dim), jnp.result_type(u))
 
 
@@ -129,7 +127,6 @@ class PolynomialFold(AbstractFold):
         return self.coefficients.shape[-2]
 
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
-        check_not_forked()
         u = jnp.asarray(u)
         u, coefficients = _align(u, self.coefficients)
         batch = jnp.broadcast_shapes(u.shape[:-1], coefficients.shape[:-2])
@@ -174,7 +171,6 @@ class SplineFold(AbstractFold):
         self.knots, self.degree = _check_knots(knots, self.coefficients.shape[-2], degree), int(degree)
 
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
-        check_not_forked()
         u, coefficients = _align(jnp.asarray(u), self.coefficients)
         n, k = coefficients.shape[-2], self.degree
         v = jnp.clip(u, self.knots[k], self.knots[n])
@@ -450,7 +446,6 @@ def _with_rank(x: Array, rank: int) -> Array:
 
 def _align(u: Array, rows: Array) -> tuple[Array, Array]:
     """u (*batch, 1) and rows (*batch, n, d-1), of equal batch rank."""
-    check_not_forked()
     rank = max(u.ndim, rows.ndim - 2)
     return _with_rank(u, rank)[..., None], _with_rank(rows, rank + 2)
 

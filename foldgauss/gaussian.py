@@ -41,7 +41,6 @@ from foldgauss._numerics.triangular import (
     solve_upper,
     split_columns,
 )
-from foldgauss._runtime.threads import check_not_forked
 
 __all__ = ["Gaussian", "Normal"]
 
@@ -287,7 +286,6 @@ def condition_on_first(dist: Gaussian, values: Float[Array, "*#batch given"]) ->
 
 
 def _as_gaussian(normal: Normal) -> Gaussian:
-    check_not_forked()
     return Gaussian(normal.loc[..., None], normal.scale[..., None, None], validate_args=False)
 
 

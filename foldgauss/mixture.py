@@ -35,7 +35,6 @@ from foldgauss._numerics.batch import (
 from foldgauss._numerics.factor import normalize_indices
 from foldgauss._runtime import notebook_hooks
 from foldgauss._runtime.checks import invalid
-from foldgauss._runtime.threads import check_not_forked
 from foldgauss.analysis.conditional import TimeDensity, TimeMixture
 from foldgauss.analysis.interop import to_numpyro, to_scipy
 from foldgauss.analysis.mixture_weights import (
@@ -89,7 +88,6 @@ class AbstractMixture(eqx.Module):
     @property
     def log_weights(self) -> Float[Array, "*batch k"]:
         """Normalized log w_k, -inf where a weight is 0."""
-        check_not_forked()
         return jax.nn.log_softmax(self.logits, axis=-1)
 
     @property

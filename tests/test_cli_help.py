@@ -6,7 +6,6 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import typer
@@ -15,9 +14,8 @@ from soft_models import soft_model
 
 from foldgauss import cli
 from foldgauss.cli.app.application import app, load_commands
-from foldgauss.cli.app.examples import EXAMPLES
-from foldgauss.cli.app.registry import COMMANDS
-from foldgauss.cli.fitting import progress
+from foldgauss.cli.app.registry import COMMANDS, EXAMPLES
+from foldgauss.cli.shared import fit_progress
 from foldgauss.cli.shared.rendering import TIME_LEFT
 from foldgauss.io import save_video_model, write_video
 from foldgauss.video.fitting.loop import FitInfo
@@ -27,13 +25,9 @@ WIDTHS = (80, 160)
 
 
 def commands() -> dict[str, object]:
-    """Every command by its name as it is typed, groups too."""
+    """Every command by its name as it is typed, and the application."""
     every = load_commands()
-    found = {"": typer.main.get_command(app)}
-    for name, command in every.items():
-        found[name] = command
-        found |= {f"{name} {inner}": one for inner, one in getattr(command, "commands", {}).items()}
-    return found
+    return {"": typer.main.get_command(app)} | every
 
 
 NAMES = sorted(commands())
@@ -48,7 +42,7 @@ def test_every_command_has_examples_that_parse(name):
         assert " ".join(words[1:]).startswith(name)
         assert len(example.line) < 90, "longer than most terminals are wide"
         command, rest = commands()[""], words[1:]
-        while rest and hasattr(command, "commands") and not rest[0].startswith("-"):
+        if not rest[0].startswith("-"):
             command, rest = command.commands[rest[0]], rest[1:]
         if rest != ["--install-completion"]:
             command.make_context("foldgauss", rest)  # raises for an option that there is not
@@ -106,7 +100,6 @@ def completions(words: str, folder: Path, monkeypatch, capsys) -> list[str]:
     ("words", "expected"),
     [
         ("re", ["render"]),
-        ("figure ", ["interpolation", "reconstruction"]),
         ("fit --preset ", ["standard", "draft", "paper"]),
         ("fit --preset dr", ["draft"]),
         ("fit --compositing ", ["over", "sum"]),
@@ -114,8 +107,6 @@ def completions(words: str, folder: Path, monkeypatch, capsys) -> list[str]:
         ("export m.safetensors --format ply", ["ply", "ply3dgs"]),
         ("render m.safetensors --format ", ["png", "webp"]),
         ("uncertainty m c --noise s", ["score"]),
-        ("tradeoff clip.mp4 --axes ti", ["time"]),
-        ("tradeoff clip.mp4 --axes time,deg", ["time,degree"]),
         ("render ", ["clips/", "one model.safetensors", "small.fgz"]),
         ("render sm", ["small.fgz"]),
         ("fit ", ["clips/", "holiday.mp4"]),
@@ -176,9 +167,8 @@ def here(work, tmp_path, monkeypatch):
         ("export holiday.safetensors --format ply3dgs", "holiday-3dgs"),
         ("export holiday.safetensors --format ply3dgs --times 0.5", "holiday.3dgs.ply"),
         ("export holiday.safetensors --format obj", "holiday-obj"),
-        pytest.param("export holiday.safetensors --format html", "holiday.html", marks=pytest.mark.slow),
-        ("figure interpolation holiday.safetensors", "holiday.interpolation.png"),
-        ("figure reconstruction holiday.safetensors holiday.mp4", "holiday.reconstruction.png"),
+        ("render beach.safetensors --stabilize smooth", "beach.stable.mp4"),
+        ("export beach.safetensors --format obj --times 0.5", "beach-obj"),
     ],
 )
 def test_outputs_are_named_after_inputs(words, made, here, capsys):
@@ -228,9 +218,9 @@ def test_bars_show_the_time_left():
     assert any(isinstance(column, TimeRemainingColumn) for column in TIME_LEFT)
     sources = {path.stem: path.read_text() for path in Path(cli.__file__).parent.rglob("*.py")}
     bars = {name for name, text in sources.items() if "BarColumn(" in text}
-    assert {name for name in bars if "TIME_LEFT" not in sources[name]} == {"progress"}
+    assert {name for name in bars if "TIME_LEFT" not in sources[name]} == {"fit_progress"}
     info = FitInfo(3, 0.5, 0.4, 30.0, 40, 40, 5.0, seconds_left=7.0, stopped_by=None)
-    assert progress._FitColumn().render(SimpleNamespace(fields={"info": info})).rstrip().endswith("7 s left")
+    assert fit_progress.describe_step(info).endswith("7 s left")
 
 
 def test_only_the_commands_asked_for_are_loaded():

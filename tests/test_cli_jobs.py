@@ -82,7 +82,7 @@ def test_the_plan_and_the_figures_are_told(long_clip, tmp_path, capsys):
     assert run("fit", long_clip, "--out", tmp_path / "m.safetensors", *SEGMENTS) == 0
     told = capsys.readouterr()
     assert "39 frames of 24x32 in 3 segments of" in told.out
-    assert "each with 40 Gaussians of degree 1 and 12 steps, by this process" in told.out
+    assert "each with 40 Gaussians of degree 1, 12 steps, by this process" in told.out
     assert "PSNR lost where segments meet" in told.out
     assert "1 of 3 segments done: segment 0" in told.err
 
@@ -335,9 +335,10 @@ def test_names_are_shown_as_they_are(monkeypatch):
     """In a bar, too, brackets are no commands for a color."""
     console = Console(file=io.StringIO(), force_terminal=True, width=120)
     monkeypatch.setattr(_jobs_view, "err", console)
-    with _jobs_view._open_view("clips", 2, "bar") as view:
+    view = _jobs_view._View("clips", 2, "bar")
+    with view.bar:
         view.update(Progress("[red]one.mp4", 0.5, 30.0, 3, 40, 1.0, 1.0))
-        view.bars.refresh()
+        view.bar.refresh()
     assert "[red]one.mp4" in console.file.getvalue()
 
 
@@ -346,7 +347,7 @@ def test_many_clips_in_a_place_of_its_own(clips, tmp_path, capsys, monkeypatch):
     assert run("fit-many", clips, "--out", clips, *QUICK) == 2
     assert "another folder than the clips'" in capsys.readouterr().err
     assert run("fit-many", tmp_path / "none", *QUICK) == 2
-    assert run("fit-many", clips / "clip0.mp4", *QUICK) == 1
+    assert run("fit-many", clips / "clip0.mp4", *QUICK) == 2
     assert "foldgauss fit" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 

@@ -3,19 +3,35 @@
 import dataclasses
 import errno
 import os
+import pickle
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import typer
 from commands import run
 
-from foldgauss.cli.shared.outputs import ask_output
+from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.settings import setting_of
+from foldgauss.cli.app.application import load_commands
 from foldgauss.io import load_video_model, save_video_model, write_image, write_video
 from foldgauss.io._atomic import OutputError, write_or_keep
 from foldgauss.io.datasets import waves
 from foldgauss.io.models.video_model import read_metadata
+from foldgauss.video import FitConfig
+
+
+def test_errors_carry_their_parameter_which_commands_name_as_typed():
+    error = invalid("num_gaussians", expected="1", got="0", cure="Add one.")
+    for one in (error, pickle.loads(pickle.dumps(error))):
+        assert (one.parameter, one.problem) == ("num_gaussians", "expected 1, got 0. Add one.")
+        assert str(one) == "num_gaussians: expected 1, got 0. Add one."
+    fit = load_commands("fit")["fit"]
+    for field in dataclasses.fields(FitConfig):
+        if option := setting_of(field).option.split("/")[0]:
+            assert fit._name_as_typed(field.name) == option
+    known = {"video": "VIDEO", "RenderOptions.alpha_cutoff": "--alpha-cutoff", "--steps": "--steps", "path": None}
+    assert {name: fit._name_as_typed(name) for name in known} == known
+
 
 FIT = ["--steps", "3", "--gaussians", "60", "--quiet"]
 
@@ -80,7 +96,7 @@ def test_a_ply_is_to_be_imported(tmp_path, capsys):
 
 def test_a_page_is_told_of_where_there_is_no_terminal(model, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("foldgauss.cli.shared.log_lines.FIRST_LINE_SECONDS", 0.0)
-    assert run("export", model, "--format", "html", "--out", tmp_path / "new" / "p.html") == 0
+    assert run("view", model, "--out", tmp_path / "new" / "p.html") == 0
     assert "Writing the page" in capsys.readouterr().err
 
 
@@ -104,18 +120,16 @@ WRITING = {
     "v.mp4": ["render", "MODEL", "--out", "OUT"],
     "frames": ["render", "MODEL", "--out", "OUT"],
     "one.png": ["render", "MODEL", "--frame", "1", "--out", "OUT"],
-    "stable.webp": ["stabilize", "MODEL", "--out", "OUT"],
-    "plate.mp4": ["plate", "MODEL", "--masks", "MASK", "--out", "OUT"],
-    "masks": ["plate", "MODEL", "--masks", "MASK", "--out", "plate.mp4", "--save-masks", "OUT"],
+    "stable.webp": ["render", "MODEL", "--stabilize", "smooth", "--out", "OUT"],
+    "plate.mp4": ["render", "MODEL", "--plate", "--masks", "MASK", "--out", "OUT"],
+    "masks": ["render", "MODEL", "--plate", "--masks", "MASK", "--out", "plate.mp4", "--save-masks", "OUT"],
     "edited.safetensors": ["edit", "MODEL", "SCRIPT", "--out", "OUT"],
     "edited.mp4": ["edit", "MODEL", "SCRIPT", "--out", "OUT"],
     "m.fgz": ["compress", "MODEL", "--out", "OUT"],
-    "p.html": ["export", "MODEL", "--format", "html", "--out", "OUT"],
+    "p.html": ["view", "MODEL", "--out", "OUT"],
     "m.ply": ["export", "MODEL", "--format", "ply", "--out", "OUT"],
     "scenes": ["export", "MODEL", "--format", "ply3dgs", "--out", "OUT"],
     "mesh": ["export", "MODEL", "--format", "obj", "--out", "OUT"],
-    "between.png": ["figure", "interpolation", "MODEL", "--out", "OUT"],
-    "rows.png": ["figure", "reconstruction", "MODEL", "CLIP", "--out", "OUT"],
     "s.json": ["evaluate", "MODEL", "CLIP", "--json", "OUT"],
 }
 
@@ -148,8 +162,7 @@ def write_to_full(name, work, full):
 
 
 @pytest.mark.parametrize("name", WRITING)
-def test_a_result_for_a_full_disk_is_kept(name, work, full, monkeypatch, capsys):
-    monkeypatch.setattr("typer.prompt", lambda *words, **options: pytest.fail("asked without a terminal"))
+def test_a_result_for_a_full_disk_is_kept(name, work, full, capsys):
     assert write_to_full(name, work, full) == 1
     (kept,) = full.parent.glob(f"temporary/*/{name}")
     last = capsys.readouterr().err.strip().splitlines()[-1]
@@ -158,52 +171,18 @@ def test_a_result_for_a_full_disk_is_kept(name, work, full, monkeypatch, capsys)
     assert not (full / name).exists()
 
 
-@pytest.mark.parametrize("name", WRITING)
-def test_on_a_terminal_another_place_is_asked_for(name, work, full, monkeypatch, capsys):
-    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
-    monkeypatch.setattr("typer.prompt", lambda *words, **options: str(full.parent))
-    assert write_to_full(name, work, full) == 0
-    assert (full.parent / name).exists()
-    assert "No space left on device" in capsys.readouterr().err
-    assert not any((full.parent / "temporary").iterdir())
-
-
-@pytest.mark.parametrize(
-    ("answer", "path"),
-    [
-        ("", None),
-        ("taken.mp4", None),
-        ("new.MP4", "new.MP4"),
-        ("new", "new/v.mp4"),
-        (".", "v.mp4"),
-        (typer.Abort(), None),
-    ],
-)
-def test_answers_about_another_place(answer, path, tmp_path, monkeypatch):
-    def prompt(*words, **options):
-        if isinstance(answer, Exception):
-            raise answer
-        return answer
-
-    monkeypatch.chdir(tmp_path)
-    Path("taken.mp4").touch()
-    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
-    monkeypatch.setattr("typer.prompt", prompt)
-    assert ask_output(Path("full/v.mp4"), OSError("full")) == (path and Path(path))
-
-
 @pytest.mark.parametrize(
     "words",
     [
         ["info", "PIPE"],
         ["view", "PIPE"],
         ["render", "PIPE"],
-        ["export", "PIPE", "--format", "html"],
+        ["view", "PIPE", "--out", "p.html"],
         ["uncertainty", "PIPE", "CLIP"],
         ["evaluate", "MODEL", "PIPE"],
         ["fit", "PIPE"],
         ["edit", "MODEL", "PIPE"],
-        ["plate", "MODEL", "--masks", "PIPE"],
+        ["render", "MODEL", "--plate", "--masks", "PIPE"],
         ["render", "MODEL", "--sound", "PIPE"],
         ["import", "PIPE"],
     ],
@@ -226,7 +205,7 @@ def test_a_pipe_is_refused_before_it_is_opened(words, work, model, tmp_path, mon
     assert str(pipe) in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("words", [["fit", "LOOP"], ["compress", "LOOP"], ["edit", "MODEL", "LOOP"], ["plate", "LOOP"]])
+@pytest.mark.parametrize("words", [["fit", "LOOP"], ["compress", "LOOP"], ["edit", "MODEL", "LOOP"], ["view", "LOOP"]])
 def test_a_link_to_itself_is_told(words, model, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("loop").symlink_to("loop")
@@ -250,7 +229,7 @@ def test_an_error_of_the_system_is_told_as_others(words, model, capsys):
     assert "error: path: expected one that can be used, got 'xxx" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("words", [["plate", "MODEL", "--masks", "MASK"], ["edit", "MODEL", "SCRIPT"]])
+@pytest.mark.parametrize("words", [["render", "MODEL", "--plate", "--masks", "MASK"], ["edit", "MODEL", "SCRIPT"]])
 def test_a_rate_too_high_for_a_gif_is_told_without_an_option_for_it(words, model, tmp_path, capsys):
     fast = dataclasses.replace(load_video_model(model), fps=60.0)
     inputs = {"MODEL": save_video_model(tmp_path / "fast.safetensors", fast)}

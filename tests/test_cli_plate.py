@@ -1,4 +1,4 @@
-"""`foldgauss plate`, and edit scripts that select by motion."""
+"""`foldgauss render --plate`, and edit scripts that select by motion."""
 
 import shutil
 
@@ -63,7 +63,8 @@ def test_masks_as_stored_are_those_of_the_stretched_clip(command, tmp_path):
             [script, "--out", target] if command == "edit" else ["--masks", tmp_path / f"{name}.png", "--out", target]
         )
         script.write_text(f'[selections.it]\nmask = "{name}.png"\nframe = 2\n[[edits]]\nselect = "it"\ndo = "vanish"\n')
-        assert run(command, tmp_path / "m.safetensors", *words) == 0
+        command_line = ["edit"] if command == "edit" else ["render", "--plate"]
+        assert run(*command_line, tmp_path / "m.safetensors", *words) == 0
         made.append(read_video(target).frames)
     assert (made[0] != np.stack(list(MODEL.frames()))).any()
     np.testing.assert_array_equal(*made)
@@ -81,7 +82,7 @@ def test_scripts_say_where_nothing_moves(model, tmp_path, monkeypatch, capsys):
         parse_edit_script(SCRIPT.replace("true", "false"))
     with pytest.raises(NothingMoves):
         edit(MODEL).select(moving=True)
-    assert run("plate", model, "--out", tmp_path / "images") == 2
+    assert run("render", "--plate", model, "--out", tmp_path / "images") == 2
     told = capsys.readouterr().err
     assert "MODEL: expected an object that moves against the background, got none." in told
     assert "Give masks of the object by --masks, or remove it by foldgauss edit" in told
@@ -90,7 +91,7 @@ def test_scripts_say_where_nothing_moves(model, tmp_path, monkeypatch, capsys):
 
 def test_too_few_frames_are_refused_before_the_search(tmp_path, capsys):
     save_video_model(tmp_path / "m.safetensors", soft_model(num_frames=2))
-    assert run("plate", tmp_path / "m.safetensors", "--out", tmp_path / "images") == 2
+    assert run("render", "--plate", tmp_path / "m.safetensors", "--out", tmp_path / "images") == 2
     told = capsys.readouterr()
     assert "MODEL: expected at least 3 frames, got 2. Fit more frames" in told.err
     assert "Searching" not in told.out
@@ -112,7 +113,7 @@ def test_an_object_without_gaussians_is_told(monkeypatch):
 @pytest.mark.usefixtures("searched")
 def test_the_plate_and_its_masks_are_written(model, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert run("plate", model, "--save-masks", "masks", "--out", "images") == 0
+    assert run("render", "--plate", model, "--save-masks", "masks", "--out", "images") == 0
     told = capsys.readouterr().out
     assert "Motion against the background covers 15.6% to 15.6% of the image, in 7 of 7 frames." in told
     assert "Parts that stand still are not found and stay" in told
@@ -121,18 +122,18 @@ def test_the_plate_and_its_masks_are_written(model, tmp_path, monkeypatch, capsy
     filled, frames = read_video("images").frames, np.stack(list(MODEL.frames()))
     np.testing.assert_array_equal(filled[:, :5], frames[:, :5])
     assert (filled[MASKS] != frames[MASKS]).any()
-    assert run("plate", model, "--sound", write_tone(tmp_path / "tone.wav", 1.0)) == 0
+    assert run("render", "--plate", model, "--sound", write_tone(tmp_path / "tone.wav", 1.0)) == 0
     assert read_video("m.plate.mp4").frames.shape == frames.shape
     assert seconds_heard("m.plate.mp4") == pytest.approx(len(frames) / 25, abs=0.03)
     capsys.readouterr()
     for options in ([], ["--save-masks", "masks", "--out", "p.mp4"], ["--out", "images"]):
-        assert run("plate", model, *options) == 2
+        assert run("render", "--plate", model, *options) == 2
         told = capsys.readouterr()
         assert "exists. Choose another path, or add --overwrite." in told.err
         assert "Searching" not in told.out
     assert not (tmp_path / "p.mp4").exists()
     (tmp_path / "empty").mkdir()
-    assert run("plate", model, "--save-masks", "masks", "--out", "empty", "--overwrite") == 0
+    assert run("render", "--plate", model, "--save-masks", "masks", "--out", "empty", "--overwrite") == 0
 
 
 @pytest.mark.parametrize("form", ["folder", "image", "whole clip"])
@@ -142,7 +143,7 @@ def test_own_masks_are_used_and_stay(model, tmp_path, monkeypatch, capsys, form)
     given = {"folder": MASKS, "image": MASKS[:1], "whole clip": np.concatenate([MASKS, MASKS])}[form]
     write_masks(tmp_path / "masks", given)
     masks = "masks/00000.png" if form == "image" else "masks"
-    assert run("plate", model, "--masks", masks, "--out", "images", "--save-masks", "used") == 0
+    assert run("render", "--plate", model, "--masks", masks, "--out", "images", "--save-masks", "used") == 0
     told = capsys.readouterr()
     assert "Searching" not in told.out
     assert "% of the removed area is shown by no frame" in told.err
@@ -150,7 +151,7 @@ def test_own_masks_are_used_and_stay(model, tmp_path, monkeypatch, capsys, form)
     np.testing.assert_array_equal(read_masks("used"), MASKS)
     np.testing.assert_array_equal(read_masks("masks"), given)
     for options in (["--out", "masks"], ["--save-masks", "masks"]):
-        assert run("plate", model, "--masks", "masks", *options, "--overwrite") == 2
+        assert run("render", "--plate", model, "--masks", "masks", *options, "--overwrite") == 2
         assert f"{options[0]}: expected another path than the masks, got masks." in capsys.readouterr().err
     np.testing.assert_array_equal(read_masks("masks"), given)
 
@@ -171,7 +172,7 @@ def write_masks(folder, masks):
 def test_other_masks_are_refused(model, tmp_path, monkeypatch, capsys, masks, message):
     monkeypatch.chdir(tmp_path)
     write_masks(tmp_path / "masks", masks)
-    assert run("plate", model, "--masks", "masks") == 2
+    assert run("render", "--plate", model, "--masks", "masks") == 2
     assert message in capsys.readouterr().err
 
 
@@ -186,14 +187,17 @@ def test_other_masks_are_refused(model, tmp_path, monkeypatch, capsys, masks, me
         (["--crf", "20", "--out", "x.gif"], "--crf: expected a video file for it, got 'x.gif'."),
         (["--codec", "h264", "--out", "images"], "--codec: expected a video file for it, got 'images'."),
         (["--sound", "none.wav"], "--sound: expected a file, got 'none.wav', which is missing"),
-        (["--codec", "av1"], "frames: expected at least 64x64 for av1"),
+        (["--codec", "av1"], "--out: expected at least 64x64 for av1"),
+        (["--upsample", "2"], "--plate: expected no --upsample, got both"),
+        (["--skip-repeats"], "--plate: expected no --skip-repeats, got both"),
+        (["--background", "none"], "--plate: expected no --background none, got both"),
         (["--out", "x", "--save-masks", "./x"], "--save-masks: expected another folder than --out, got x."),
     ],
 )
 @pytest.mark.usefixtures("searched")
 def test_mistakes_are_told_and_nothing_is_written(model, tmp_path, monkeypatch, capsys, options, message):
     monkeypatch.chdir(tmp_path)
-    assert run("plate", model, *options) == 2
+    assert run("render", "--plate", model, *options) == 2
     told = capsys.readouterr()
     assert message in " ".join(told.err.split())
     assert "Searching" not in told.out
@@ -206,7 +210,7 @@ def test_folders_of_other_files_are_refused_before_the_search(model, tmp_path, m
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("mine")
-    assert run("plate", model, *options, "--overwrite") == 1
+    assert run("render", "--plate", model, *options, "--overwrite") == 1
     told = capsys.readouterr()
     assert "expected an empty folder or one of numbered frames, got 'mine' with 'notes.txt' in it" in told.err
     assert "Searching" not in told.out
@@ -217,7 +221,7 @@ def test_folders_of_other_files_are_refused_before_the_search(model, tmp_path, m
 def test_a_file_in_place_of_a_folder_is_refused_before_the_search(model, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine").write_text("mine")
-    assert run("plate", model, "--out", "mine", "--overwrite") == 1
+    assert run("render", "--plate", model, "--out", "mine", "--overwrite") == 1
     told = capsys.readouterr()
     assert "expected a folder for frames, got the file 'mine'" in told.err
     assert "Searching" not in told.out
@@ -226,18 +230,25 @@ def test_a_file_in_place_of_a_folder_is_refused_before_the_search(model, tmp_pat
 
 INPUTS = {
     "render, sound": ["render", "m.safetensors", "--sound", "in.mp4", "--out", "in.mp4"],
-    "stabilize, sound": ["stabilize", "m.safetensors", "--sound", "in.mp4", "--out", "in.mp4"],
-    "plate, sound": ["plate", "m.safetensors", "--sound", "in.mp4", "--out", "in.mp4"],
-    "plate, masks": ["plate", "m.safetensors", "--masks", "in.mp4", "--out", "in.mp4"],
-    "plate, folder": ["plate", "m.safetensors", "--masks", "in/0.png", "--out", "out.mp4", "--save-masks", "in"],
+    "plate, sound": ["render", "--plate", "m.safetensors", "--sound", "in.mp4", "--out", "in.mp4"],
+    "plate, masks": ["render", "--plate", "m.safetensors", "--masks", "in.mp4", "--out", "in.mp4"],
+    "plate, folder": [
+        "render",
+        "--plate",
+        "m.safetensors",
+        "--masks",
+        "in/0.png",
+        "--out",
+        "out.mp4",
+        "--save-masks",
+        "in",
+    ],
     "edit, sound": ["edit", "m.safetensors", "s.toml", "--sound", "in.mp4", "--out", "in.mp4"],
     "edit, mask": ["edit", "m.safetensors", "s.toml", "--out", "in"],
     "edit, layer": ["edit", "m.safetensors", "s.toml", "--out", "in.safetensors"],
-    "export": ["export", "m.safetensors", "--format", "html", "--original", "in.html", "--out", "in.html"],
+    "view": ["view", "m.safetensors", "--original", "in.html", "--out", "in.html"],
     "compress": ["compress", "m.safetensors", "in.fgz", "--out", "in.fgz"],
     "evaluate": ["evaluate", "m.safetensors", "in.json", "--json", "in.json"],
-    "figure, image": ["figure", "reconstruction", "m.safetensors", "in.png", "--out", "in.png"],
-    "figure, folder": ["figure", "reconstruction", "m.safetensors", "in", "--out", "in/0.png"],
     "fit": ["fit", "in.safetensors", "--out", "in.safetensors"],
 }
 

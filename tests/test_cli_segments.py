@@ -12,7 +12,7 @@ from commands import run
 from soft_models import NUM, soft_model
 
 from foldgauss.cli.viewing import view as viewing
-from foldgauss.io import load_video_model, read_video, save_video_model, write_image
+from foldgauss.io import import_model, load_video_model, read_video, save_video_model, write_image
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.video import Segment, SegmentedVideo, edit, evaluate, interpolate_frames, psnr, times_at
 
@@ -128,27 +128,6 @@ def test_info_tells_the_segments_and_loads_none(here, capsys, monkeypatch):
         assert text in said
 
 
-def test_figures(here, work, tmp_path, capsys):
-    assert run("figure", "interpolation", here, "--at", "5,12") == 0
-    said = told(capsys)
-    assert "warning: --at: there is a cut between frames 12 and 13" in said
-    assert "between frames 5" not in said
-    assert run("figure", "interpolation", here, "--overwrite") == 0
-    assert "from frame 8 to 9" in told(capsys)
-    assert run("figure", "reconstruction", here, work / "clip", "--at", "5,16") == 0
-    clip = read_video(work / "clip", frames=(2, 20))
-    quality = [psnr(clip.frames[k], list(video().frames())[k]) for k in (5, 16)]
-    assert f"frame 5, {quality[0]:.1f} dB; frame 16, {quality[1]:.1f} dB" in told(capsys)
-
-
-def test_the_middle_is_not_taken_at_a_cut(tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    parts = [(0, soft_model(num_frames=5)), (5, soft_model(seed=1, num_frames=5))]
-    save_video_model("cut.safetensors", SegmentedVideo.from_models(parts))
-    assert run("figure", "interpolation", "cut.safetensors") == 0
-    assert "from frame 3 to 4" in told(capsys)
-
-
 def test_exports(here, capsys, tmp_path):
     assert run("export", here, "--format", "ply") == 0
     assert len(list((tmp_path / "long-ply").iterdir())) == 3
@@ -163,28 +142,32 @@ def test_exports(here, capsys, tmp_path):
 
 
 def test_one_segment_is_taken_out(here, work, tmp_path, capsys):
-    assert run("segment", here, 1) == 0
-    assert "long.1.safetensors: segment 1, frames 4:13, 40 Gaussians" in told(capsys)
+    assert run("export", here, "--format", "model", "--segment", 1) == 0
+    assert "long.1.safetensors: foldgauss (model), 9 frames, 40 Gaussians" in told(capsys)
     assert read_metadata("long.1.safetensors") == {"clip": "clip", "frames": [6, 15], "mean_psnr": 31.5, "seed": 3}
     one = load_video_model("long.1.safetensors")
     np.testing.assert_array_equal(list(one.frames()), list(soft_model(seed=1, num_frames=9).frames()))
     assert run("evaluate", "long.1.safetensors", work / "clip") == 0  # its own frames of the clip
     told(capsys)
     for words, message in (
-        ((here, 3), "NUMBER: expected a whole number from 0 to 2, got 3"),
+        ((here, 3), "--segment: expected a whole number from 0 to 2, got 3"),
         (("long.1.safetensors", 0), "MODEL: expected a model in segments, got one without segments"),
         ((here, 1), "overwrite"),
-        ((here, 1, "--out", "one.mp4"), "--out: expected a name for the model"),
+        ((here, 1, "--out", "one.mp4"), "--out: expected a name ending in .safetensors"),
         ((here, 0, "--out", here), "--out"),
+        ((here, 0, "--times", "0.5"), "--times: expected ply3dgs or obj"),
     ):
-        assert run("segment", *words) == 2
+        source, number, *options = words
+        assert run("export", source, "--format", "model", "--segment", number, *options) == 2
         assert message in told(capsys)
+    assert run("export", here, "--format", "ply", "--segment", 2) == 0
+    assert import_model("long.2.ply", size=one.size).num_frames == 5
 
 
 def test_a_page_plays_all_segments(here, work, tmp_path, capsys, monkeypatch):
     out = tmp_path / "long.html"
-    assert run("export", here, "--format", "html", "--original", work / "clip") == 0
-    assert f"long.html: a page of 0.3 MB, {3 * NUM} Gaussians" in told(capsys)
+    assert run("view", here, "--out", out, "--original", work / "clip") == 0
+    assert "long.html: a page of 0.3 MB" in told(capsys)
     page = out.read_text(encoding="utf-8")
     assert page.count('id="model-') == 3
     assert page.count('id="frame-') == NUM_FRAMES
@@ -207,7 +190,7 @@ def test_edit_acts_on_all_segments(here, tmp_path, capsys):
     """Into a model, which is edited again and rendered, and into pictures."""
     (tmp_path / "night.toml").write_text(NIGHT)
     assert run("edit", here, "night.toml") == 0
-    assert f"a model in 3 segments, {3 * NUM} Gaussians" in told(capsys)
+    assert f"a model in segments, {3 * NUM} Gaussians" in told(capsys)
     wanted = edit(video()).recolor(gain=0.5, frames=(4, 14), ease=3).video()
     made = load_video_model(tmp_path / "long.night.safetensors")
     assert isinstance(made, SegmentedVideo)
@@ -237,21 +220,18 @@ def test_what_takes_one_piece_says_how_to_get_one(words, here, work, tmp_path, c
     given = {"MODEL": here, "clip": work / "clip"}
     assert run(*(given.get(word, word) for word in words)) == 2
     said = told(capsys)
-    assert "MODEL: expected a model of one piece, got one of 3 segments. Extract one: foldgauss segment" in said
+    assert "MODEL: expected a model of one piece, got one in segments. Extract one: foldgauss export" in said
     assert sorted(tmp_path.iterdir()) == before
 
 
 def test_what_was_noted_of_quality_is_not_that_of_edited_segments(here, tmp_path):
-    """Segments that an edit leaves alone keep it."""
     noted = [dataclasses.replace(part, metadata={"clip": "clip", "mean_psnr": 30.0}) for part in video().segments]
     save_video_model(tmp_path / "noted.safetensors", SegmentedVideo(noted))
     (tmp_path / "dark.toml").write_text('[[edits]]\ndo = "recolor"\ngain = 0.5\nframe = 0\n')
-    assert (
-        run("edit", tmp_path / "noted.safetensors", tmp_path / "dark.toml", "--out", tmp_path / "dark.safetensors") == 0
-    )
-    first, *others = load_video_model(tmp_path / "dark.safetensors").segments
-    assert first.metadata == {"clip": "clip"}
-    assert all(segment.metadata == {"clip": "clip", "mean_psnr": 30.0} for segment in others)
+    words = ("edit", tmp_path / "noted.safetensors", tmp_path / "dark.toml", "--out", tmp_path / "dark.safetensors")
+    assert run(*words) == 0
+    segments = load_video_model(tmp_path / "dark.safetensors").segments
+    assert [segment.metadata for segment in segments] == 3 * [{"clip": "clip"}]
 
 
 def test_segments_and_edits_keep_uneven_times(tmp_path):
@@ -259,7 +239,7 @@ def test_segments_and_edits_keep_uneven_times(tmp_path):
     whole, seconds = video(), np.cumsum([0, *np.where(np.arange(NUM_FRAMES) % 4, 0.04, 0.3)])
     about = {"frames": [2, 2 + NUM_FRAMES], "frame_seconds": seconds.tolist(), "first_second": 0.5}
     path, script = save_video_model(tmp_path / "long.safetensors", whole, metadata=about), tmp_path / "e.toml"
-    assert run("segment", path, 1, "--out", tmp_path / "one.safetensors") == 0
+    assert run("export", path, "--format", "model", "--segment", 1, "--out", tmp_path / "one.safetensors") == 0
     span = whole.segments[1]
     own = seconds[span.first : span.stop + 1]
     found = read_metadata(tmp_path / "one.safetensors")

@@ -1,4 +1,4 @@
-"""`foldgauss stabilize`."""
+"""`foldgauss render --stabilize`."""
 
 import numpy as np
 import pytest
@@ -11,6 +11,8 @@ from foldgauss.cli.shared.log_lines import print_shots
 from foldgauss.io import load_video_model, read_video, save_video_model
 from foldgauss.video import FitConfig, fit, interpolate_frames, interpolated_times, stabilize, times_at
 
+STABLE = ("--stabilize", "smooth")
+
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory):
@@ -22,7 +24,7 @@ def model(tmp_path_factory):
 def test_a_camera_that_stands_still_stays(model, tmp_path, capsys):
     """Objects move in this clip, the camera does not."""
     images = tmp_path / "images"
-    assert run("stabilize", model, "--out", images, "--border", "keep", "--upsample", "2") == 0
+    assert run("render", model, *STABLE, "--out", images, "--border", "keep", "--upsample", "2") == 0
     assert "23 frames" in capsys.readouterr().out
     frames = read_video(images).frames
     assert frames.shape == (2 * NUM_FRAMES - 1, 40, 64, 3)
@@ -30,35 +32,41 @@ def test_a_camera_that_stands_still_stays(model, tmp_path, capsys):
     times = interpolated_times(np.asarray(video.frame_times.times()), 2)
     np.testing.assert_array_equal(frames, list(interpolate_frames(video, times)))
     assert (
-        run("stabilize", model, "--out", images, "--border", "keep", "--upsample", "2", "--no-flow", "--overwrite") == 0
+        run(
+            "render", model, *STABLE, "--out", images, "--border", "keep", "--upsample", "2", "--no-flow", "--overwrite"
+        )
+        == 0
     )
     np.testing.assert_array_equal(read_video(images).frames, list(video.frames(times)))
 
 
 def test_options_reach_the_video(model, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert run("stabilize", model, "--fixed", "--border", "fill", "--size", "80x128", "--fps", "12.5") == 0
+    assert run("render", model, "--stabilize", "fixed", "--border", "fill", "--size", "80x128", "--fps", "12.5") == 0
     assert read_video(tmp_path / "m.stable.mp4").frames.shape[1:] == (80, 128, 3)
     assert "12.5 frames per second" in capsys.readouterr().out
-    assert run("stabilize", model) == 2  # exists
+    assert run("render", model, *STABLE) == 2  # exists
     assert "exists. Choose another path, or add --overwrite." in capsys.readouterr().err
-    assert run("stabilize", model, "--overwrite", "--smoothing", "0.2") == 0
+    assert run("render", model, *STABLE, "--overwrite", "--smoothing", "0.2") == 0
     assert "Enlarged by 1.0" in capsys.readouterr().out
-    assert run("stabilize", model, "--overwrite", "--smoothing", "0.001") == 0
+    assert run("render", model, *STABLE, "--overwrite", "--smoothing", "0.001") == 0
     assert "Enlarged" not in capsys.readouterr().out  # by 1.00
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--border", "blur"], "--border: expected one of crop, fill, keep, got blur"),
+        (["--border", "blur"], "--border: expected one of 'crop', 'fill', 'keep', got 'blur'"),
+        (["--stabilize", "no"], "--stabilize: expected one of 'smooth', 'fixed', got 'no'"),
         (["--smoothing", "0"], "--smoothing: expected seconds > 0, got 0.0"),
-        (["--fixed", "--smoothing", "0.5"], "--fixed: expected no --smoothing, got both"),
+        (["--stabilize", "fixed", "--smoothing", "1"], "--stabilize fixed: expected no --smoothing, got both"),
+        (["--masks", "x.png"], "--masks: expected --plate too, got --masks alone"),
+        (["--plate"], "--plate: expected no --stabilize, got both"),
         (["--crf", "99"], "--crf: expected"),
-        (["--background", "none"], "frames: expected RGB for h264 in .mp4"),
+        (["--background", "none"], "--out: expected RGB for h264 in .mp4"),
         (["--background", "none", "--out", "x.gif"], "--background: expected a color for .gif, got none"),
         (["--fps", "60", "--out", "x.gif"], "--out: expected at most 50 frames per second in it, got 60 for x.gif"),
-        (["--out", "x.png"], "--out: expected"),
+        (["--out", "x.png"], "--out: expected one image for a .png"),
         (["--size", "0x3"], "--size: expected HxW"),
     ],
 )
@@ -67,7 +75,7 @@ def test_mistakes_are_told_and_nothing_is_written(model, tmp_path, monkeypatch, 
     monkeypatch.setattr(
         "foldgauss.video.motion.stabilization.estimate_camera_path", None
     )  # errors are raised before it is called
-    assert run("stabilize", model, *options) == 2
+    assert run("render", model, *(() if "--stabilize" in options else STABLE), *options) == 2
     assert message in " ".join(capsys.readouterr().err.split())
     assert not list(tmp_path.iterdir())
 
@@ -77,7 +85,7 @@ def test_shots_are_named(tmp_path, capsys):
     rng = np.random.default_rng(0)
     frames = rng.integers(0, 256, (3, 40, 64, 3), np.uint8)
     save_video_model(tmp_path / "m.safetensors", fit(frames, FitConfig(num_gaussians=200, steps=20), fps=5.0).model)
-    assert run("stabilize", tmp_path / "m.safetensors", "--out", tmp_path / "images") == 0
+    assert run("render", tmp_path / "m.safetensors", *STABLE, "--out", tmp_path / "images") == 0
     told = " ".join(capsys.readouterr().err.split())
     assert "shots, each on its own; they begin at frames 0, " in told
     assert "The motion of the camera was not found before frames" in told
@@ -92,18 +100,18 @@ def test_motion_that_was_not_found_is_told_from_cuts(capsys):
     assert "warning" not in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", ["render", "stabilize"])
-def test_repeated_frames_take_less_time(tmp_path, monkeypatch, capsys, command):
+@pytest.mark.parametrize("stabilized", [False, True])
+def test_repeated_frames_take_less_time(tmp_path, monkeypatch, capsys, stabilized):
     model, images = soft_model(), tmp_path / "images"
     monkeypatch.setattr(timeline, "even_durations", lambda video: np.array([1, 1, 0.25, 1, 1, 1]))
     save_video_model(tmp_path / "m.safetensors", model)
-    options = ["--border", "keep"] if command == "stabilize" else []
+    options = [*STABLE, "--border", "keep"] if stabilized else []
     how = ["--skip-repeats", "--upsample", "2", "--no-flow", "--out", images, *options]
-    assert run(command, tmp_path / "m.safetensors", *how) == 0
+    assert run("render", tmp_path / "m.safetensors", *how) == 0
     assert "Frames that repeat the one before: 3." in capsys.readouterr().out
     shown = np.interp(np.arange(13) / 2, [0, 1, 2, 2.25, 3.25, 4.25, 5.25], np.arange(7))
-    video = stabilize(model, border="keep") if command == "stabilize" else model
+    video = stabilize(model, border="keep") if stabilized else model
     wanted = list(video.frames(times_at(np.asarray(model.frame_times.times()), shown)))
     np.testing.assert_allclose(read_video(images).frames, wanted, atol=1)
-    assert run(command, tmp_path / "m.safetensors", *how, "--overwrite", "--sound", tmp_path / "m.safetensors") == 2
+    assert run("render", tmp_path / "m.safetensors", *how, "--overwrite", "--sound", tmp_path / "m.safetensors") == 2
     assert "--skip-repeats: expected no --sound" in capsys.readouterr().err

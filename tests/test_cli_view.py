@@ -1,4 +1,4 @@
-"""`view` and `export --format html`: a page on this machine alone, or in a file."""
+"""`view`: a page on this machine alone, or in a file."""
 
 import base64
 import http.client
@@ -112,7 +112,6 @@ def test_the_server_answers_this_machine_about_its_page_only():
         assert ask()[:2] == (200, b"the page")
         assert ask()[2]["Cache-Control"] == "no-store"
         assert ask(Host=f"localhost:{port}", path="/?again")[0] == 200
-        assert ask("HEAD")[:2] == (200, b"")
         assert ask(Host="evil.example")[0] == 403
         assert ask(path="/etc/passwd")[0] == 404
         assert ask("POST")[0] == 501
@@ -204,20 +203,16 @@ def test_view_saves_beside_the_model(served, work, tmp_path):
     assert "connect-src" not in html_page(model)
 
 
-def test_player_writes_a_page_without_a_model(tmp_path, capsys):
-    out = tmp_path / "site" / "player"
-    assert run("player", "--out", out) == 0
-    assert [path.name for path in out.iterdir()] == ["index.html"]
-    page = (out / "index.html").read_text(encoding="utf-8")
+def test_without_a_model_the_page_opens_files(tmp_path, capsys):
+    out = tmp_path / "site" / "index.html"
+    assert run("view", "--out", out) == 0
+    page = out.read_text(encoding="utf-8")
     assert "default-src 'none'" in page
     assert 'id="model"' not in page
     assert "connect-src" not in page
-    assert run("player", "--out", out) == 2
+    assert run("view", "--out", out) == 2
     assert "--overwrite" in capsys.readouterr().err
-    assert run("player", "--out", out, "--overwrite") == 0
-    capsys.readouterr()
-    assert run("player", "--out", out / "index.html") == 2
-    assert "--out: expected a folder" in capsys.readouterr().err
+    assert run("view", "--out", out, "--overwrite") == 0
 
 
 def test_a_port_that_is_taken_is_told(served, work):
@@ -243,15 +238,15 @@ def test_a_signal_ends_it_well(work, number, code):
     assert (process.returncode, last, told) == (code, "Stopped.\n", "")
 
 
-def test_export_writes_the_page(work, tmp_path, capsys):
+def test_the_page_is_written(work, tmp_path, capsys):
     out = tmp_path / "clip.html"
-    assert run("export", work / "model.safetensors", "--format", "html", "--out", out) == 0
+    assert run("view", work / "model.safetensors", "--out", out) == 0
     assert "a page of 0." in capsys.readouterr().out
     plain = out.read_text(encoding="utf-8")
-    assert run("export", work / "model.safetensors", "--format", "html", "--out", out) == 2
+    assert run("view", work / "model.safetensors", "--out", out) == 2
     assert "--overwrite" in capsys.readouterr().err
     original = ["--original", work / "clip", "--original-quality", 10, "--overwrite"]
-    assert run("export", work / "model.safetensors", "--format", "html", "--out", out, *original) == 0
+    assert run("view", work / "model.safetensors", "--out", out, *original) == 0
     assert out.read_text(encoding="utf-8").count('id="frame-') == plain.count('id="frame-') + NUM_FRAMES
 
 
@@ -269,10 +264,12 @@ def test_wrong_use_is_told(work, tmp_path, capsys):
         return code, told
 
     for arguments, expected, wanted in (
-        (["export", model, "--format", "html", "--out", tmp_path / "clip.htm"], 2, "--out: expected a name ending"),
-        (["export", model, "--format", "html", "--out", out, "--times", "0.5"], 2, "--times: "),
-        (["export", model, "--format", "ply", "--out", tmp_path / "a.ply", "--original", out], 2, "--original: "),
-        (["export", late, "--format", "html", "--out", out], 1, "foldgauss render"),
+        (["view", model, "--out", tmp_path / "clip.htm"], 2, "--out: expected a name ending"),
+        (["view", model, "--out", out, "--moving-object"], 2, "--out: expected no --moving-object, got both"),
+        (["view", model, "--linked"], 2, "--linked: expected --out too"),
+        (["view", "--out", out, "--original", model], 2, "--out without MODEL: expected no --original"),
+        (["view"], 2, "MODEL: expected a model file, or --out"),
+        (["view", late, "--out", out], 1, "foldgauss render"),
         (["view", late, "--no-browser"], 1, "edits that no folded model represents"),
         (["view", tmp_path / "none.fgz"], 2, "none.fgz"),
         (["view", model, "--original", tmp_path / "none.mp4", "--no-browser"], 2, "none.mp4"),

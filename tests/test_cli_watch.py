@@ -4,6 +4,7 @@ import json
 import re
 import signal
 import sys
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from commands import run
 
 from foldgauss.cli.fitting import fit as fitting
-from foldgauss.cli.fitting import progress as _progress
+from foldgauss.cli.shared import fit_progress as _progress
 from foldgauss.io import read_video, write_video
 from foldgauss.io.history import read_history
 from foldgauss.jobs import runner
@@ -172,11 +173,11 @@ def test_lines_in_a_log(clip, tmp_path, monkeypatch, capfd):
 def test_the_clock_rings_first_soon_and_then_now_and_then(monkeypatch):
     now = [100.0]
     monkeypatch.setattr(_progress.time, "monotonic", lambda: now[0])
-    rings, rung = _progress._Timer(30.0, first=10.0), []
+    rung = []
+    observe = _progress._at_intervals(30.0, lambda state, info: rung.append(now[0]), first=10.0)
     for second in range(100, 200):
         now[0] = float(second)
-        if rings():
-            rung.append(second)
+        observe(None, SimpleNamespace(progress=0.5))
     assert rung == [110, 140, 170]
 
 
@@ -229,7 +230,11 @@ def test_places_that_cannot_be_right(clip, tmp_path, capsys):
     for given, code, says in (
         (["--history", tmp_path / "h.txt"], 2, "--history: expected a name ending in .jsonl"),
         (["--preview", tmp_path / "p.jpg"], 2, "--preview: expected a name ending in .png"),
-        (["--preview", tmp_path / "h.png", "--history", tmp_path / "h.jsonl"], 2, "--preview: .*another use"),
+        (
+            ["--preview", tmp_path / "h.png", "--history", tmp_path / "h.jsonl"],
+            2,
+            "--preview: .* of --history",
+        ),
         (["--quiet", "--log-json"], 2, "--quiet: .*both"),
     ):
         assert run("fit", clip, "--out", out, *QUICK, *given) == code, given

@@ -77,7 +77,7 @@ def _readme(names, folder):
 
 
 def _commands(names, folder):
-    made = {"middle.png", "figures.json", "trip.html", "between.png", "frames.png"}
+    made = {"middle.png", "figures.json", "trip.html"}
     assert made <= {path.name for path in folder.iterdir()}
 
 
@@ -154,7 +154,7 @@ def _mixture(names, folder):
 
 
 def _quickstart(names, folder):
-    made = {"foldgauss-demo", "holiday.fgz", "look.png", "slow.mp4", "short.safetensors"}
+    made = {"foldgauss-demo", "holiday.fgz", "slow.mp4", "short.safetensors"}
     assert made <= {path.name for path in folder.iterdir()}
     assert names["picture"].shape == (*guides.SIZE, 3)
 

@@ -14,7 +14,6 @@ from jax import lax
 from jaxtyping import Array, ArrayLike
 
 from foldgauss._runtime.checks import invalid, is_integer, short_repr
-from foldgauss._runtime.threads import check_not_forked
 
 _ModuleT = TypeVar("_ModuleT", bound=eqx.Module)
 
@@ -70,7 +69,6 @@ def broadcast(parts: list[tuple[Array, int]], batch: tuple[int, ...]) -> list[Ar
 
 def ranked_leaves(module: eqx.Module) -> list[tuple[Array, int]]:
     """(leaf, event rank) of every leaf."""
-    check_not_forked()
     return list(zip(jax.tree.leaves(module), module.leaf_ranks, strict=True))
 
 
@@ -113,7 +111,6 @@ def flatten_points(x: Array, batch: tuple[int, ...], event: tuple[int, ...]) -> 
 
 def common_dtype(*inputs: ArrayLike):
     """The float dtype of the arrays among the inputs; Python numbers and lists do not affect it."""
-    check_not_forked()
     dtypes = [x.dtype for x in inputs if hasattr(x, "dtype") and not isinstance(x, float)]
     floats = [dtype for dtype in dtypes if jnp.issubdtype(dtype, jnp.floating)]
     if not floats:
@@ -123,7 +120,6 @@ def common_dtype(*inputs: ArrayLike):
 
 def as_value(x: ArrayLike, dtype) -> Array:
     """A value as an array: float arrays keep their dtype, others get `dtype`."""
-    check_not_forked()
     own = getattr(x, "dtype", None)
     keeps = own is not None and jnp.issubdtype(own, jnp.floating) and not isinstance(x, float)
     return jnp.asarray(x) if keeps else jnp.asarray(x, dtype)
@@ -200,7 +196,6 @@ def compile_eager(function: Callable | None = None, *, static: tuple[str, ...] =
 
     @functools.wraps(function)
     def call(*args, **kwargs):
-        check_not_forked()
         return (compiled if _is_eager((args, kwargs)) else function)(*args, **kwargs)
 
     return call

@@ -35,7 +35,6 @@ class Stream(enum.IntEnum):
     EM_JITTER = 25
     CROSS_VALIDATION = 26
     SYNTHETIC_NOISE = 27
-    DIAGNOSIS = 28
 
 
 def seed_sequence(stream: Stream, *place: int, seed: int = 0) -> np.random.SeedSequence:

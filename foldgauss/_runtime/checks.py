@@ -5,12 +5,27 @@ import math
 import warnings
 from collections.abc import Callable
 from numbers import Integral, Real
+from typing import TypeVar
 
 
-def invalid(parameter: str, *, expected: str, got: object, cure: str = "") -> ValueError:
-    """A ValueError in this package's format, to be raised."""
-    text = f"{parameter}: expected {expected}, got {got}."
-    return ValueError(f"{text} {cure}" if cure else text)
+class ParameterError(ValueError):
+    """An invalid argument: the name of the `parameter`, and the `problem`: what was expected and got."""
+
+    def __init__(self, parameter: str, problem: str):
+        super().__init__(parameter, problem)  # which pickle passes on
+        self.parameter, self.problem = parameter, problem
+
+    def __str__(self) -> str:
+        return f"{self.parameter}: {self.problem}"
+
+
+Error = TypeVar("Error", bound=ParameterError)
+
+
+def invalid(parameter: str, *, expected: str, got: object, cure: str = "", kind: type[Error] = ParameterError) -> Error:
+    """An error in this package's format, to be raised."""
+    text = f"expected {expected}, got {got}."
+    return kind(parameter, f"{text} {cure}" if cure else text)
 
 
 def check_one_of(parameter: str, value: object, choices: tuple[str, ...]) -> None:

@@ -18,7 +18,6 @@ _lock = threading.Lock()
 _pool: ThreadPoolExecutor | None = None
 _num_threads: int | None = None
 _local = threading.local()  # `in_task`: whether this thread runs a task of several
-_forked = False  # whether this process was forked after JAX had started
 
 
 def available_cores() -> int:
@@ -50,19 +49,6 @@ def set_num_threads(count: int | None) -> None:
         _num_threads, _pool = count, None
 
 
-def check_not_forked() -> None:
-    """Raise RuntimeError in a process that was forked from one in which JAX had started.
-
-    JAX's threads do not exist there, so JAX would hang; only the Numba kernels work.
-    """
-    if _forked:
-        raise RuntimeError(
-            f"process {os.getpid()}: expected one with JAX's threads, got one that was forked after JAX had started, "
-            "where it would hang. Start processes by spawn: multiprocessing.get_context('spawn'), or "
-            "ProcessPoolExecutor(mp_context=multiprocessing.get_context('spawn')); or fork before anything is computed."
-        )
-
-
 def _jax_has_started() -> bool:
     """Whether JAX has started its threads, which importing it does not; there is no public API for this."""
     bridge = sys.modules.get("jax._src.xla_bridge")
@@ -73,10 +59,25 @@ def _jax_has_started() -> bool:
 
 
 def _begin_child() -> None:
-    """In a forked child the pool's threads do not exist: reset it, with a new lock."""
-    global _pool, _lock, _forked
+    """In a forked child the threads of the pool and of JAX do not exist: reset the pool, and make JAX raise, not hang.
+
+    Without its caches JAX traces every function anew, and tells the listener, which raises. Only Numba kernels work.
+    """
+    global _pool, _lock
     _pool, _lock = None, threading.Lock()
-    _forked = _forked or _jax_has_started()
+    if _jax_has_started():
+        import jax
+
+        jax.clear_caches()
+        jax.monitoring.register_event_duration_secs_listener(_refuse_jax)
+
+
+def _refuse_jax(event: str, seconds: float, **about: object) -> None:
+    raise RuntimeError(
+        f"process {os.getpid()}: expected one with JAX's threads, got one that was forked after JAX had started, "
+        "where it would hang. Start processes by spawn: multiprocessing.get_context('spawn'), or "
+        "ProcessPoolExecutor(mp_context=multiprocessing.get_context('spawn')); or fork before anything is computed."
+    )
 
 
 if hasattr(os, "register_at_fork"):

@@ -16,7 +16,6 @@ from sklearn.utils import assert_all_finite, check_random_state
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
 
 from foldgauss._runtime.checks import invalid, is_integer
-from foldgauss._runtime.threads import check_not_forked
 from foldgauss.envelope import Constant, TimeLikelihood
 from foldgauss.estimator.chunks import Chunks, is_chunked, open_chunks, summarize_rows
 from foldgauss.estimator.em.components import Parameters
@@ -225,7 +224,6 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
 
     def _check_rows(self, X, sample_weight, reset: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """Rows with time last, and weights, in the dtype of the fit."""
-        check_not_forked()
         check_real("X", X)
         options = {"dtype": [np.float64, np.float32], "ensure_min_samples": 2 if reset else 1, "reset": reset}
         X = validate_data(self, X, ensure_all_finite=sample_weight is None, **options)
@@ -238,7 +236,6 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
 
     def _check_chunks(self, X, sample_weight) -> ChunkedRows:
         """Chunks of rows, after a first pass over them."""
-        check_not_forked()
         chunks = open_chunks(X, sample_weight)
         summary, sizes = summarize_rows(chunks)
         if summary.num_rows < 2:
@@ -502,7 +499,6 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         return sum(total for total, _ in parts) / num, num
 
     def _open_chunks(self, X) -> Chunks:
-        check_not_forked()
         check_is_fitted(self)
         return open_chunks(X, width=self.n_features_in_)
 
@@ -549,7 +545,6 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
             raise invalid("n_samples", expected="a whole number >= 1", got=repr(n_samples))
         check_is_fitted(self)
         seed = check_random_state(self.random_state).randint(np.iinfo(np.int32).max)
-        check_not_forked()
         with enable_dtype(self._params.curve.dtype):
             x, component = self.to_mixture().sample(jax.random.key(seed), (n_samples,), return_component=True)
             x, component = np.asarray(x), np.asarray(component)
@@ -579,7 +574,6 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         return jax.tree.map(lambda z: jnp.asarray(z, jax.dtypes.canonicalize_dtype(z.dtype)), mixture)
 
     def _scaled(self, X) -> np.ndarray:
-        check_not_forked()
         check_is_fitted(self)
         check_real("X", X)
         X = validate_data(self, X, dtype=[np.float64, np.float32], reset=False)

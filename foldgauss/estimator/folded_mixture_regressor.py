@@ -9,7 +9,6 @@ from sklearn.utils import _safe_indexing
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from foldgauss._runtime.checks import invalid
-from foldgauss._runtime.threads import check_not_forked
 from foldgauss.estimator.em.statistics import enable_dtype
 from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
 from foldgauss.estimator.parameter_checks import check_column, check_real
@@ -93,7 +92,6 @@ class FoldedMixtureRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         **Raises:** ValueError on invalid parameters, NaN or infinity, and fewer rows than components. Warns
         (ConvergenceWarning) if EM did not converge, see `mixture_.status_`.
         """
-        check_not_forked()
         check_real("X", X)
         if np.ndim(sample_weight) == 1 and len(sample_weight) == len(y):  # rows of weight 0 may hold NaN
             check_groups(groups, np.ones(len(y), bool))  # before the rows are taken
@@ -131,7 +129,6 @@ class FoldedMixtureRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def _evaluate(self, function, X, *args) -> list[np.ndarray]:
         """The arrays that `function` gives of p(y | x), by blocks of rows."""
-        check_not_forked()
         check_is_fitted(self)
         X = validate_data(self, X, dtype=np.float64, reset=False)
         num, width = X.shape

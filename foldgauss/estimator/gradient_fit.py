@@ -10,7 +10,6 @@ import optax
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree
 
 from foldgauss._runtime.checks import invalid, is_integer
-from foldgauss._runtime.threads import check_not_forked
 from foldgauss.envelope import CallableEnvelope
 from foldgauss.estimator.em.scaling import check_time_resolution
 from foldgauss.estimator.parameter_checks import check_real
@@ -76,7 +75,6 @@ def fit_gradient(
         raise invalid("mixture", expected="one FoldedMixture", got=type(mixture).__name__, cure="No batch of mixtures.")
     if not is_integer(steps, 1):
         raise invalid("steps", expected="a whole number >= 1", got=repr(steps))
-    check_not_forked()
     dtype = mixture.logits.dtype
     check_real("x", x)
     check_time_resolution("x", x, dtype)

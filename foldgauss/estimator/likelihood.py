@@ -20,7 +20,6 @@ from foldgauss._numerics.batch import cast
 from foldgauss._numerics.regression import hermite, hermite_to_powers
 from foldgauss._numerics.triangular import solve_upper_matrix
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer
-from foldgauss._runtime.threads import check_not_forked
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood
 from foldgauss.estimator.em.scaling import check_time_resolution
@@ -534,7 +533,6 @@ def _cross_validate(plan: _Plan, parts) -> Float[Array, " degrees"]:
 
 
 def _check_points(x) -> Float[Array, "n d"]:
-    check_not_forked()
     check_real("x", x)
     check_time_resolution("x", x, jax.dtypes.canonicalize_dtype(getattr(x, "dtype", float)))
     x = jnp.asarray(x)

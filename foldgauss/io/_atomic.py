@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TypeVar
 
-from foldgauss._runtime.checks import invalid, short_repr
+from foldgauss._runtime.checks import ParameterError, invalid, short_repr
 
 PathLike = str | os.PathLike
 Result = TypeVar("Result")
@@ -21,6 +21,10 @@ KEPT = 40
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 #: Outputs that this process has locked, see `_lock.lock_output`.
 OWNED: set[Path] = set()
+
+
+class MissingInput(ParameterError, FileNotFoundError):
+    """An input does not exist."""
 
 
 class OutputError(OSError):
@@ -38,13 +42,12 @@ def check_path(path: object, order: str = "") -> Path:
     return Path(path)
 
 
-def missing_error(path: PathLike, expected: str) -> FileNotFoundError:
+def missing_error(path: PathLike, expected: str) -> MissingInput:
     """The error for an input that does not exist."""
+    got, cure = f"{str(path)!r}, {describe_missing(path)}", "Check the spelling and the current folder."
     if address := re.fullmatch("([A-Za-z][A-Za-z0-9+.-]+):/+(.*)", str(path)):  # of whose slashes Path keeps one
-        got = repr("://".join(address.groups()))
-        return FileNotFoundError(f"path: expected {expected}, got the address {got}. Download it first.")
-    text = f"path: expected {expected}, got {str(path)!r}, {describe_missing(path)}."
-    return FileNotFoundError(f"{text} Check the spelling and the current folder.")
+        got, cure = f"the address {'://'.join(address.groups())!r}", "Download it first."
+    return invalid("path", expected=expected, got=got, cure=cure, kind=MissingInput)
 
 
 def describe_missing(path: PathLike) -> str:
@@ -169,11 +172,10 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def write_or_keep(
-    path: Path, write: Callable[[Path], Result], ask: Callable[[Path, OSError], Path | None] = lambda path, error: None
-) -> Result:
-    """Write the result of a long computation by `write(path)`; if that fails, to the path that `ask` returns; if there
-    is none, or it fails, too, to the folder for temporary files. Returns what `write` does.
+def write_or_keep(path: Path, write: Callable[[Path], Result]) -> Result:
+    """Write the result of a long computation by `write(path)`; if that fails, to the folder for temporary files.
+
+    Returns what `write` does.
 
     Raises `OutputError`, which says where the result is, if it is in the folder for temporary files; and
     `OutputRefused` as `write(path)`.
@@ -184,11 +186,6 @@ def write_or_keep(
         raise
     except OSError as error:
         failure = error
-    if another := ask(path, failure):
-        try:
-            return write(another)
-        except OSError as error:
-            failure = error
     folder, name = None, Path(os.path.abspath(path)).name  # "..", too, has a name of its own
     try:
         folder = Path(tempfile.mkdtemp(prefix="foldgauss-"))
@@ -255,5 +252,5 @@ def check_replaceable(folder: Path, overwrite: bool, *, pattern: str, what: str 
     if names and not overwrite:
         raise OutputRefused(
             f"path: expected a new or empty folder, got {str(folder)!r} with {len(names)} {what}. "
-            "Choose another folder, or allow overwriting."
+            "Choose another folder, or overwrite it."
         )

@@ -11,7 +11,7 @@ import numpy as np
 
 from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_integer
-from foldgauss.io._atomic import PathLike
+from foldgauss.io._atomic import MissingInput, PathLike
 from foldgauss.io.media.clip import Clip, Levels, Range, Size, format_size
 from foldgauss.io.media.image_files import image_paths, read_image
 from foldgauss.io.media.masks import read_labels
@@ -204,9 +204,9 @@ def _davis_folder(root: Path, sequence: str, resolution: str) -> Path:
     """The folder with the frames of a sequence; errors list the available ones."""
     images = root / "JPEGImages"
     if not images.is_dir():
-        raise FileNotFoundError(
-            f"root: expected a folder with JPEGImages in it, got {str(root)!r}. Give the folder DAVIS that the "
-            "archive of the data set unpacks to (https://davischallenge.org)."
+        cure = "Give the folder DAVIS that the archive of the data set unpacks to (https://davischallenge.org)."
+        raise invalid(
+            "root", expected="a folder with JPEGImages in it", got=repr(str(root)), cure=cure, kind=MissingInput
         )
     check_one_of("resolution", resolution, _folders(images))
     sequences = _folders(images / resolution)

@@ -33,8 +33,8 @@ from typing import Any
 
 import numpy as np
 
-from foldgauss._runtime.checks import invalid
-from foldgauss.io._atomic import PathLike, describe_missing, resolve
+from foldgauss._runtime.checks import ParameterError, invalid
+from foldgauss.io._atomic import MissingInput, PathLike, describe_missing, resolve
 from foldgauss.io._toml_lines import key_lines
 from foldgauss.io.media.masks import read_masks
 from foldgauss.io.models.selections import load_selection, parse_indices, parse_ranges
@@ -330,7 +330,8 @@ def read_edit_script(path: PathLike) -> EditScript:
     """
     path = Path(path)
     if not os.path.exists(path):
-        raise FileNotFoundError(f"script: expected a TOML file, got {str(path)!r}, {describe_missing(path)}.")
+        got = f"{str(path)!r}, {describe_missing(path)}"
+        raise invalid("script", expected="a TOML file", got=got, kind=MissingInput)
     if not path.is_file():
         raise EditScriptError(f"{path}: expected a TOML file, got a folder or a device.")
     if path.stat().st_size > MAX_BYTES:
@@ -401,12 +402,11 @@ class _TableContext:
     def __exit__(self, kind, error, trace) -> None:
         if isinstance(error, EditScriptError) or not isinstance(error, ValueError | TypeError | OSError):
             return
-        parameters, colon, rest = " ".join(str(error).split()).partition(":")
-        if not re.fullmatch(r"[a-z_]+(, [a-z_]+)*", parameters):
-            raise self._locate(None, parameters + colon + rest) from error
-        keys = [self.named.get(name, name) for name in parameters.split(", ")]
-        known = next((key for key in keys if self._line(key) is not None), None)
-        raise self._locate(known, f"{', '.join(keys)}{colon}{rest}") from error
+        text, known = str(error), None
+        if isinstance(error, ParameterError):
+            keys = [self.named.get(name, name) for name in error.parameter.split(", ")]
+            text, known = f"{', '.join(keys)}: {error.problem}", next(filter(self._line, keys), None)
+        raise self._locate(known, " ".join(text.split())) from error
 
     def _locate(self, key: str | None, text: str) -> EditScriptError:
         line = self._line(key) or self._line(None)

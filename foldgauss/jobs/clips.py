@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.io._atomic import describe_missing
+from foldgauss.io._atomic import MissingInput, describe_missing
 from foldgauss.io.media.clip import AS_STORED, Reading
 from foldgauss.io.media.image_files import IMAGE_SUFFIXES, image_paths, natural_sort_key
 from foldgauss.io.media.video_writing import ANIMATION_SUFFIXES
@@ -41,7 +41,7 @@ def find_clips(folder: str | os.PathLike) -> FoundClips:
     folder = Path(folder)
     if not folder.exists():
         got = f"{str(folder)!r}, {describe_missing(folder)}"
-        raise FileNotFoundError(f"folder: expected a folder with clips, got {got}.")
+        raise invalid("folder", expected="a folder with clips", got=got, kind=MissingInput)
     if not folder.is_dir():
         cure = f"One clip alone: foldgauss fit {folder}."
         raise invalid("folder", expected="a folder with clips", got=f"the file {str(folder)!r}", cure=cure)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from foldgauss._runtime.checks import check_one_of, invalid
 from foldgauss._runtime.device import default_platform
-from foldgauss._runtime.threads import check_not_forked, run_tasks
+from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import cpu, pallas
 from foldgauss.render.reference import render_reference
 from foldgauss.render.splats import RenderOptions, Splats2D, check_size
@@ -68,7 +68,6 @@ def render(
 
     Source: Kerbl et al. 2023, 3D Gaussian Splatting, eq. 3; VeGaS, section 4.
     """
-    check_not_forked()
     check_one_of("engine", engine, ENGINES)
     check_one_of("compositing", compositing, COMPOSITINGS)
     check_size(size)

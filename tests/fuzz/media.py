@@ -14,17 +14,15 @@ import h5py
 import numpy as np
 from PIL import Image
 
-from foldgauss.cli.measuring.profiles_file import load_profiles, save_profiles
 from foldgauss.io import VideoError, read_masks, read_video, write_video
 from foldgauss.io.media import format_detection
 from foldgauss.io.media.masks import MAX_PIXELS, MAX_PIXELS_PER_BYTE
-from foldgauss.uncertainty import FrameNoise, LikelihoodProfiles, ProfileCurves
 from foldgauss.uncertainty.posterior import draws_file
 from foldgauss.uncertainty.posterior.optional_imports import import_optional
 
 from .branches import ONLY
 from .models import written
-from .mutate import by_chance, png_resealed, png_sized, zip_resealed
+from .mutate import by_chance, png_resealed, png_sized
 from .target import CONSTANT, Target, chance
 
 _NUMBERS = np.array([[0, 1, 1, 2], [0, 0, 2, 255], [3, 1, 0, 0]], np.uint8)
@@ -466,35 +464,4 @@ CHAINS = Target(
 )  # fmt: skip
 
 
-@functools.cache
-def _evidence() -> bytes:
-    times, heights = np.linspace(0, 1, 4), np.array([0.0, -1.0, -0.5, -2.0])
-    curves = ProfileCurves.from_nodes([times, times[:3], times], [heights, heights[:3], heights])
-    profiles = LikelihoodProfiles(
-        curves, FrameNoise(np.full(3, 0.1), np.full(3, 0.5)), np.array([1.0, 0.2]), 12, "splats", ("a",)
-    )
-    return written(lambda path: save_profiles(path, "key", profiles), ".npz")
-
-
-def _read_evidence(path: Path) -> None:
-    profiles = load_profiles(path, "key", 3)
-    if profiles is None:
-        raise ValueError("expected evidence, got none")  # what the command does then: it draws the pictures
-    assert profiles.curves(np.array([[0.0, 0.5, 1.0]])).shape == (1, 3)
-
-
-EVIDENCE = Target(
-    "evidence",
-    ".npz",
-    lambda: [_evidence()],
-    _read_evidence,
-    (ValueError,),
-    {"foldgauss.cli.measuring.profiles_file": ("save_profiles", "is_profiles_file")},
-    lambda data: 4,
-    lambda size: 2 * CONSTANT + 64 * size,
-    (zip_resealed,),
-    past_header=1,
-    share=1.0,
-)
-
-TARGETS = (MASKS, PICTURES, VIDEO, HEADERS, CHAINS, EVIDENCE)
+TARGETS = (MASKS, PICTURES, VIDEO, HEADERS, CHAINS)

@@ -104,7 +104,7 @@ def _outcome(target: Target, path: Path) -> str:
         text = str(error)
         if not any(words in text for words in target.says) or "\n" in text or len(text) > 4000:
             raise Broken(f"an accidental {type(error).__name__}: {text[:300]!r}") from error
-        return type(error).__name__
+        return next(kind.__name__ for kind in target.errors if isinstance(error, kind))
     except _Hang:
         raise Broken(f"hang: {TIME_LIMIT:g} s were not enough") from None
     except Exception as error:

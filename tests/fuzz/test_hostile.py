@@ -18,7 +18,6 @@ import pytest
 from PIL import Image
 
 import foldgauss
-from foldgauss.cli.measuring.profiles_file import load_profiles
 from foldgauss.io import VideoError, html_page, read_history, read_masks, read_video, save_video_model, write_video
 from foldgauss.io.history import HistoryFile
 from foldgauss.uncertainty.posterior import draws_file
@@ -241,9 +240,6 @@ CLAIMS = {
     "masks: pixels": ("masks", lambda: _png(2**31 - 1, 2**31 - 1)),
     "masks: many pixels": ("masks", lambda: _png(2**15, 2**15)),
     "pictures: pixels": ("pictures", lambda: _png(2**31 - 1, 2**31 - 1)),
-    "evidence: numbers": ("evidence", lambda: _npz(f"({HUGE},)")),
-    "evidence: over the top": ("evidence", lambda: _npz(f"({2**33}, {2**33})")),
-    "evidence: bomb": ("evidence", _npz_bomb),
     "hdf5: steps": ("hdf5", lambda: _h5(_huge_chain)),
 }
 
@@ -387,39 +383,6 @@ def test_the_library_never_sees_draws_that_are_damaged(tmp_path, monkeypatch):
             continue
         with pytest.raises(ValueError, match=r"backend: .*damaged"):
             draws_file.DrawsFile(tmp_path / "c.h5", media._FINGERPRINT, media._SHAPE)
-
-
-def _evidence_with(**changed) -> bytes:
-    with np.load(io.BytesIO(media._evidence())) as kept:
-        arrays = dict(kept) | changed
-    out = io.BytesIO()
-    np.savez(out, **arrays)
-    return out.getvalue()
-
-
-@pytest.mark.parametrize(
-    "changed",
-    [
-        {"count": np.full(3, 10**9)},  # compiled code looks up to there
-        {"count": np.full(3, -1)},
-        {"count": np.array([4, 3])},
-        {"nodes": np.zeros((3, 4))},
-        {"nodes": np.zeros((3, 2))},
-        {"values": np.full((3, 4), np.nan)},
-        {"slopes": np.zeros((3, 4), np.float32)},
-        {"scale": np.ones(2)},
-        {"share": np.array(["a", "b", "c"])},
-        {"num_drawn": np.ones(2)},
-    ],
-)
-def test_evidence_that_does_not_fit_is_drawn_anew(changed, tmp_path):
-    path = tmp_path / "e.npz"
-    path.write_bytes(media._evidence())
-    assert load_profiles(path, "key", 3).num_rendered == 12
-    assert load_profiles(path, "other", 3) is None
-    assert load_profiles(path, "key", 4) is None
-    path.write_bytes(_evidence_with(**changed))
-    assert load_profiles(path, "key", 3) is None
 
 
 @pytest.mark.parametrize("side", [2**13, 2**15])  # beyond our limit, and beyond Pillow's

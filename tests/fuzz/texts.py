@@ -10,7 +10,7 @@ from random import Random
 import numpy as np
 from PIL import Image
 
-from foldgauss.cli.app.application import WrongUse
+from foldgauss._runtime.checks import ParameterError
 from foldgauss.cli.measuring.tradeoff_record import COLUMNS, Record
 from foldgauss.io import HistoryFile, read_history, save_selection, save_video_model
 from foldgauss.io.edit_script import EditScriptError, read_edit_script
@@ -348,7 +348,7 @@ def _record() -> bytes:
     kept = {
         "settings": {"a": 1, "b": [1, 2]},
         "machine": {"cpu": "x", "cores": 2},
-        "plan": {"steps": 100, "motion": {"wall": 1.5, "cpu": 2.0}},
+        "plan": {"steps": 100, "num_gaussians": 9, "motion_seconds": 1.5},
         "left_out": {},
         "fronts": {},
     }
@@ -367,8 +367,8 @@ TRADEOFF = Target(
     ".json",
     lambda: [_record()],
     lambda path: Record(path, {"a": 1, "b": [1, 2]}, machine={}),
-    (WrongUse,),
-    {"foldgauss.cli.measuring.tradeoff_record": (ONLY, "Record", "_check_row", "_check_rest")},
+    (ParameterError,),
+    {"foldgauss.cli.measuring.tradeoff_record": (ONLY, "Record")},
     lambda data: 0,
     lambda size: 2 * CONSTANT + 200 * size,
     (record_changed, json_text_changed),

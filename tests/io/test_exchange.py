@@ -91,7 +91,7 @@ def test_wrong_options(tmp_path, model, format, options, text):
 def test_existing_outputs(tmp_path, model, format, name, options):
     path = export(model, format, tmp_path / name, **options)
     before = files(path)
-    with pytest.raises(OutputError, match="overwriting"):
+    with pytest.raises(OutputError, match="overwrite it"):
         export(model, format, path, **options)
     assert files(path) == before
     assert export(model, format, path, overwrite=True, **options) == path

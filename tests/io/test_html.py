@@ -19,7 +19,7 @@ from editor_page import drop
 from soft_models import NUM, OBJECT, SIZE, on_paths, soft_model
 
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.io import OutputError, export, html_page, load_video_model, save_compact, save_video_model, write_html
+from foldgauss.io import export, html_page, load_video_model, save_compact, save_video_model, write_html
 from foldgauss.io.models.video_model import read_origin
 from foldgauss.io.page import player_page
 from foldgauss.io.page.player_page import bundle_script, quantize_finely
@@ -200,8 +200,7 @@ def _two_envelopes(model):
         (lambda m: html_page(m, original=waves(7, *SIZE) / 255), "original: .*float64"),
         (lambda m: write_html("page.htm", m), r"path: expected a name ending in \.html"),
         (lambda m: write_html(m, "page.html"), r"path: expected a path.*\(path, model\)"),
-        (lambda m: export(m, "html", "page.html", times=[0.5]), "times: expected an option of this format"),
-        (lambda m: export(m, "obj", "page", original=waves(7, *SIZE)), "original: expected an option of this format"),
+        (lambda m: export(m, "ply", "page.ply", times=[0.5]), "times: expected an option of this format"),
     ],
 )
 def test_what_no_page_can_hold_is_told(tmp_path, monkeypatch, what, message):
@@ -212,13 +211,10 @@ def test_what_no_page_can_hold_is_told(tmp_path, monkeypatch, what, message):
 
 
 def test_a_page_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
-    path = export(soft_model(), "html", tmp_path / "clip.html", title="a clip")
+    path = write_html(tmp_path / "clip.html", soft_model(), title="a clip")
     before = path.read_text(encoding="utf-8")
     assert before == html_page(soft_model(), title="a clip")
-    with pytest.raises(OutputError, match="exists"):
-        export(soft_model(seed=1), "html", path)
-    assert path.read_text(encoding="utf-8") == before
-    export(soft_model(seed=1), "html", path, overwrite=True)
+    write_html(path, soft_model(seed=1))
     assert path.read_text(encoding="utf-8") != before
     monkeypatch.setattr(player_page, "LARGE", 1000)
     with pytest.warns(UserWarning, match="slow to open. Compress"):

@@ -168,7 +168,7 @@ def test_a_folder_of_another_program(folder):
 
 
 def test_existing_folders(folder, model):
-    with pytest.raises(OutputError, match="overwriting"):
+    with pytest.raises(OutputError, match="overwrite it"):
         write_pseudomesh(folder, model)
     write_pseudomesh(folder, model, [0.5], overwrite=True)
     assert len(list(folder.iterdir())) == 3

@@ -17,7 +17,7 @@ from editor_page import assert_shows, drop
 from soft_models import soft_model
 
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.io import export, html_page, load_video_model, save_compact, save_video_model, write_html
+from foldgauss.io import html_page, load_video_model, save_compact, save_video_model, write_html
 from foldgauss.io.page.player_page import _fine_rules
 from foldgauss.render import RenderOptions
 from foldgauss.video import FoldedSplats, FrameTimes, SegmentedVideo, VideoModel
@@ -187,7 +187,7 @@ def test_a_file_from_the_disk_comes_in_chunks(opened, film, whole, tmp_path):
 
 
 def test_a_linked_page_on_the_disk_says_what_to_do(browser, tmp_path):
-    page = Opened(browser, export(soft_model(options=RenderOptions()), "html", tmp_path / "clip.html", linked=True))
+    page = Opened(browser, write_html(tmp_path / "clip.html", soft_model(options=RenderOptions()), linked=True))
     page.page.get_by_text("drop clip.page.fgz onto the page, or serve the folder").wait_for()
     drop(page, tmp_path / "clip.page.fgz")
     page.until("foldgauss.stats")
@@ -202,16 +202,15 @@ def test_the_file_of_a_linked_page_stands_beside_it(film, tmp_path, capsys):
     assert "connect-src 'self'" in page
     assert page == html_page(path, linked="film.fgz", title="page")
     (tmp_path / "site").mkdir()
-    assert run("export", path, "--format", "html", "--linked", "--out", tmp_path / "site" / "clip.html") == 0
+    assert run("view", path, "--linked", "--out", tmp_path / "site" / "clip.html") == 0
     assert (tmp_path / "site" / "clip.page.fgz").read_bytes() == path.read_bytes()
     assert sorted(own.name for own in tmp_path.iterdir()) == ["film.fgz", "page.html", "site"]
     other = save_video_model(tmp_path / "site" / "other.safetensors", soft_model())
-    assert run("export", other, "--format", "html", "--linked", "--out", tmp_path / "site" / "other.html") == 0
+    assert run("view", other, "--linked", "--out", tmp_path / "site" / "other.html") == 0
     assert load_video_model(tmp_path / "site" / "other.page.fgz").num_gaussians == soft_model().num_gaussians
     (tmp_path / "site" / "other.html").unlink()
-    assert run("export", other, "--format", "html", "--linked", "--out", tmp_path / "site" / "other.html") == 2
+    assert run("view", other, "--linked", "--out", tmp_path / "site" / "other.html") == 2
     assert "other.page.fgz exists" in capsys.readouterr().err.replace("\n", "")
-    assert run("export", other, "--format", "ply", "--linked") == 2
     segments = SegmentedVideo.from_models([(0, soft_model()), (7, soft_model())])
     with pytest.raises(ValueError, match="linked: expected a single model"):
         write_html(tmp_path / "site" / "long.html", segments, linked=True)

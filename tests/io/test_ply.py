@@ -457,7 +457,7 @@ def test_frames_go_to_a_folder(tmp_path):
     t = float(model.frame_times.times()[2])
     one = write_3dgs_ply(tmp_path / "one.ply", model, t)
     assert (folder / "frame_0002.ply").read_bytes() == one.read_bytes()
-    with pytest.raises(OutputError, match="overwriting"):
+    with pytest.raises(OutputError, match="overwrite it"):
         write_3dgs_frames(folder, model)
     write_3dgs_frames(folder, model, [0.5], overwrite=True)
     assert len(list(folder.iterdir())) == 1

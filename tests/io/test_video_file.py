@@ -1037,7 +1037,7 @@ def test_existing_frames_need_overwrite(tmp_path):
     before = sorted(folder.iterdir())
     with pytest.raises(OutputError) as caught:
         write_video(folder, _moving(2), 25)
-    _one_line(caught, "5 frames", "overwriting")
+    _one_line(caught, "5 frames", "overwrite it")
     assert sorted(folder.iterdir()) == before
     write_frames(folder, _moving(2), overwrite=True)
     assert len(list(folder.iterdir())) == 2

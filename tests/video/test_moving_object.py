@@ -193,7 +193,7 @@ def test_plate_tells_of_shots_and_of_what_no_frame_shows(tmp_path, capsys):
     one, other = (named_model(num_frames=num)[0] for num in (6, 4))
     still = edit(other).freeze(2).transform([[0, 1], [-1, 0]], about=(0, 0)).video()
     save_video_model(tmp_path / "m.safetensors", SegmentedVideo.from_models([(0, one), (6, still)]))
-    assert run("plate", tmp_path / "m.safetensors", "--out", tmp_path / "images") == 0
+    assert run("render", "--plate", tmp_path / "m.safetensors", "--out", tmp_path / "images") == 0
     told = capsys.readouterr()
     assert "2 shots, each on its own; they begin at frames 0, 6." in told.err
     assert "No moving object was found in the shot of frames 6:10." in told.out

@@ -2,7 +2,10 @@
 
 import functools
 import importlib
+import importlib.metadata
+import platform
 import re
+from collections.abc import Callable
 from typing import Annotated, Any
 
 import typer
@@ -10,29 +13,22 @@ from rich.console import Console
 from rich.text import Text
 
 from foldgauss import __version__
-from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.interrupts import use_default_signals
-from foldgauss.cli.app.help import App, Command, Group
+from foldgauss._runtime.threads import num_threads
+from foldgauss.cli.app.help import Command, WithExamples
 from foldgauss.cli.app.registry import COMMANDS
 
 #: Control characters other than tab and newline, and those that change the writing direction.
 _CONTROLS = re.compile("[\\x00-\\x08\\x0b-\\x1f\\x7f-\\x9f\\u202a-\\u202e\\u2066-\\u2069]")
-
-
-class WrongUse(ValueError):
-    """The command was called with invalid arguments."""
+#: Packages whose versions `--version` shows, for reports of bugs.
+_SHOWN = ("jax", "jaxlib", "numba", "numpy", "av")
 
 
 class Stopped(Exception):
     """The user stopped a fit or a sampler; the message says how to continue."""
 
 
-def wrong_use(parameter: str, *, expected: str, got: object, cure: str = "") -> WrongUse:
-    """The error of an invalid option or argument, ready to be raised."""
-    return WrongUse(str(invalid(parameter, expected=expected, got=got, cure=cure)))
-
-
-class _Root(Group):
+class _Root(WithExamples, typer.core.TyperGroup):
     """Lists all commands by name and first sentence, and imports a command when it is called.
 
     Importing a command loads JAX, Numba and OpenCV, which takes a second or two: too long for completion.
@@ -58,10 +54,16 @@ class _PlainConsole(Console):
         return super().render_str(_CONTROLS.sub("\N{REPLACEMENT CHARACTER}", text), **options)
 
 
-app = App(cls=_Root, no_args_is_help=True, pretty_exceptions_enable=False)
+# Without markup errors stay on one line; `help` formats what is shown.
+app = typer.Typer(cls=_Root, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 # Without markup and emoji codes, which file names may contain.
 out = _PlainConsole(markup=False, emoji=False, highlight=False)
 err = _PlainConsole(stderr=True, markup=False, emoji=False, highlight=False)
+
+
+def command(name: str) -> Callable:
+    """A decorator that makes a function the command of this name."""
+    return app.command(name, cls=Command)
 
 
 def warn(text: str) -> None:
@@ -71,7 +73,9 @@ def warn(text: str) -> None:
 
 def _show_version(wanted: bool) -> None:
     if wanted:
+        versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in _SHOWN)
         out.print(f"foldgauss {__version__}")
+        out.print(f"Python {platform.python_version()}, {versions}; {num_threads()} threads", soft_wrap=True)
         raise typer.Exit
 
 
@@ -79,14 +83,19 @@ def _show_version(wanted: bool) -> None:
 def root(
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
     version: Annotated[
-        bool, typer.Option("--version", help="Show the version.", is_eager=True, callback=_show_version)
+        bool,
+        typer.Option(
+            "--version",
+            help="Show the versions of foldgauss and of what it computes with.",
+            is_eager=True,
+            callback=_show_version,
+        ),
     ] = False,
 ) -> None:
     """Videos as mixtures of folded Gaussians: fit, render, evaluate, edit.
 
     `foldgauss COMMAND --help` describes a command, with examples.
     """
-    del debug, version  # read by `main` before typer runs, and by the callback
 
 
 @functools.cache
@@ -104,10 +113,3 @@ def load_commands(*names: str) -> dict[str, Any]:
             importlib.import_module(f"foldgauss.cli.{COMMANDS[name].module}")
     commands = typer.main.get_command(app).commands
     return {name: commands[name] for name in known}
-
-
-def name_option(text: str) -> str:
-    """The message of an error about a setting, with the name of its option: num_gaussians becomes --gaussians."""
-    name, colon, rest = text.partition(":")
-    name = name.replace("num_gaussians", "gaussians")
-    return f"--{name.replace('_', '-')}{colon}{rest}"

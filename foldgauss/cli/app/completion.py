@@ -1,4 +1,4 @@
-"""Shell completion of option values: choices, lists of choices, and files by suffix."""
+"""Shell completion of option values: choices, and files by suffix."""
 
 import os
 from collections.abc import Callable, Iterable
@@ -21,17 +21,6 @@ def complete_choice(choices: Iterable[str]) -> Completion:
 
     def complete(incomplete: str) -> list[str]:
         return [name for name in names if name.startswith(incomplete)]
-
-    return complete
-
-
-def complete_list(choices: Iterable[str]) -> Completion:
-    """Completes comma-separated lists of the choices, each at most once."""
-    names = tuple(choices)
-
-    def complete(incomplete: str) -> list[str]:
-        *before, last = incomplete.split(",")
-        return [",".join([*before, name]) for name in names if name.startswith(last) and name not in before]
 
     return complete
 

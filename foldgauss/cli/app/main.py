@@ -7,18 +7,12 @@ import warnings
 
 from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.interrupts import raise_on_sigterm
-from foldgauss.cli.app.application import (
-    Stopped,
-    WrongUse,
-    err,
-    load_commands,
-    name_option,
-    root_command,
-    warn,
-    wrong_use,
-)
+from foldgauss.cli.app.application import Stopped, err, root_command, warn
+from foldgauss.cli.app.help import WrongUse
 
-WRONG_USE, FAILURE = 2, 1
+#: Exit codes.
+WRONG_USE = 2
+FAILURE = 1
 #: Errors of the system that writing raises: closed pipes, full disks, quotas, limits on files, broken devices.
 OUTPUT_ERRORS = (errno.EPIPE, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EBADF)
 
@@ -35,7 +29,7 @@ def _run(arguments: list[str] | None) -> None:
     try:
         if any(not argument or re.fullmatch("--[a-z-]+=", argument) for argument in arguments):
             cure = "Leave it out, or set the shell variable that it stands for."  # a path would be the current folder
-            raise wrong_use("arguments", expected="a value for each", got="an empty one", cure=cure)
+            raise invalid("arguments", expected="a value for each", got="an empty one", cure=cure, kind=WrongUse)
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
             root_command()([argument for argument in arguments if argument != "--debug"], prog_name="foldgauss")
@@ -45,14 +39,10 @@ def _run(arguments: list[str] | None) -> None:
         if isinstance(error, SystemError) and isinstance(error.__cause__, KeyboardInterrupt):
             error = error.__cause__  # Ctrl-C while a compiled kernel returned
         text = " ".join(_describe(error).split()) or type(error).__name__
-        text = text.replace("allow overwriting", "add --overwrite")  # of folders
-        option = name_option(text)
-        if _names_option(text) and option.partition(":")[0] in arguments:
-            text = option
         if not isinstance(error, ValueError | OSError | MemoryError | Stopped | KeyboardInterrupt):
             text = f"{type(error).__name__}: {text[:300]} (--debug shows the traceback)"
         err.print(f"error: {text}", style="red", soft_wrap=True)
-        sys.exit(_exit_code(error))
+        sys.exit(WRONG_USE if isinstance(error, WrongUse | FileNotFoundError) else FAILURE)
 
 
 def _describe(error: BaseException) -> str:
@@ -64,28 +54,10 @@ def _describe(error: BaseException) -> str:
             return f"the system refused: {error.strerror}."
         return f"output: expected one that can be written, got one that cannot ({error.strerror})."
     cure = "Choose another, or change its permissions."
-    return str(
-        invalid("path", expected="one that can be used", got=f"{str(error.filename)!r} ({error.strerror})", cure=cure)
-    )
+    got = f"{str(error.filename)!r} ({error.strerror})"
+    return str(invalid("path", expected="one that can be used", got=got, cure=cure))
 
 
 def _show_warning(message: Warning | str, *where: object) -> None:
     """One line, without the place in the code."""
     warn(" ".join(str(message).split()))
-
-
-def _exit_code(error: BaseException) -> int:
-    """Wrong usage for invalid arguments, failure for files that cannot be read or written."""
-    wrong = isinstance(error, WrongUse | FileNotFoundError) or _names_option(str(error))
-    return WRONG_USE if wrong else FAILURE
-
-
-def _names_option(text: str) -> bool:
-    """Whether an error of a lower layer is about a parameter that is also the name of an option."""
-    if ":" not in text:
-        return False
-    commands = list(load_commands().values())
-    for command in commands:  # with those of groups
-        commands.extend(getattr(command, "commands", {}).values())
-    options = {option for command in commands for parameter in command.params for option in parameter.opts}
-    return name_option(text).partition(":")[0] in options

@@ -1,4 +1,4 @@
-"""The registry of commands: the module of each, which is imported when it is called, and its summary."""
+"""The registry of commands: the module of each, which is imported when it is called, its summary and its examples."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -12,6 +12,13 @@ class Command(NamedTuple):
     summary: str
 
 
+class Example(NamedTuple):
+    """A purpose, and the command line that serves it."""
+
+    purpose: str
+    line: str
+
+
 #: In the order in which users need them.
 COMMANDS: Mapping[str, Command] = MappingProxyType(
     {
@@ -19,30 +26,149 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
         "fit-many": Command(
             "fitting.fit_many", "Fit a compact model to each clip of a folder, and list those that fail."
         ),
-        "view": Command("viewing.view", "Play and edit a model in the browser, until Ctrl-C."),
-        "player": Command(
-            "viewing.player", "Write the player without a model, as a static site: one page that opens model files."
-        ),
-        "render": Command("viewing.render", "Render a model as a video, also between its frames."),
-        "stabilize": Command("viewing.stabilize", "Render a model as a steadier camera would show it."),
-        "plate": Command(
-            "viewing.plate", "Render a model without its moving object, with what other frames show behind it."
+        "view": Command("viewing.view", "Play and edit a model in the browser, or write the page that does."),
+        "render": Command(
+            "viewing.render", "Render a model as a video: also between its frames, stabilized, or without an object."
         ),
         "evaluate": Command("viewing.evaluate", "Compare a model with its clip: PSNR and SSIM of every frame."),
         "info": Command("viewing.info", "Show what a model file contains."),
-        "figure": Command("viewing.figure", "Make a labeled figure of images from a model: PNG."),
         "uncertainty": Command(
             "measuring.uncertainty", "Estimate the uncertainty of the frame times, given the splats."
         ),
-        "segment": Command("editing.edit", "Extract one segment of a model in segments as a model of its own."),
         "edit": Command("editing.edit", "Edit objects or single frames of a model by a script."),
         "compress": Command("editing.compress", "Write a model as a compact file, a fraction of its size."),
         "tradeoff": Command(
             "measuring.tradeoff", "Measure time, size and speed against quality, one setting at a time."
         ),
-        "export": Command("editing.export", "Write a model for other programs, or as a web page."),
+        "export": Command("editing.export", "Write a model for other programs, or a part of it as a model."),
         "import": Command("editing.export", "Read a model of another program, see docs/formats.md."),
-        "doctor": Command("measuring.doctor", "Check the installation: versions, devices, and a small fit."),
         "demo": Command("fitting.demo", "Fit 24 frames of the clip Bunny and show the results."),
+    }
+)
+
+#: Shown in the help, by the name of the command as it is typed; "" is `foldgauss` alone.
+EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
+    {
+        "": (
+            Example("See what it does, on a sample clip", "foldgauss demo"),
+            Example("Fit a model to your own clip", "foldgauss fit holiday.mp4"),
+            Example("Install shell completion", "foldgauss --install-completion"),
+        ),
+        "fit": (
+            Example("All defaults, into holiday.fgz", "foldgauss fit holiday.mp4"),
+            Example("A quick draft of the first half second", "foldgauss fit holiday.mp4 --preset draft --frames 0:12"),
+            Example(
+                "Five minutes, at 160x320 pixels",
+                "foldgauss fit holiday.mp4 --size 160x320 --minutes 5",
+            ),
+            Example("A file of a given size", "foldgauss fit holiday.mp4 --size-mb 2"),
+            Example("Closer to the clip", "foldgauss fit holiday.mp4 --quality 85 --out finer.fgz"),
+            Example("With float32 parameters", "foldgauss fit holiday.mp4 --out holiday.safetensors"),
+            Example("Frames as images; resume a stopped fit", "foldgauss fit frames/ --resume"),
+            Example(
+                "For slow motion above all",
+                "foldgauss fit holiday.mp4 --interpolation-fraction 0.3 --interpolation-end 1",
+            ),
+            Example(
+                "A long clip, in segments of 10 seconds, with four processes", "foldgauss fit film.mp4 --workers 4"
+            ),
+            Example(
+                "The same on a dask cluster whose workers see these folders",
+                "foldgauss fit film.mp4 --scheduler tcp://node1:8786",
+            ),
+        ),
+        "fit-many": (
+            Example("A model per clip, into holidays-models", "foldgauss fit-many holidays/"),
+            Example(
+                "With four processes, at a small size; run it again to continue",
+                "foldgauss fit-many holidays/ --out models --size 160x320 --workers 4",
+            ),
+        ),
+        "demo": (Example("Fit, render and evaluate the clip Bunny", "foldgauss demo --out first-look"),),
+        "render": (
+            Example("As a video, holiday.mp4", "foldgauss render holiday.fgz"),
+            Example(
+                "Four times as many frames, four times the frame rate",
+                "foldgauss render holiday.fgz --upsample 4",
+            ),
+            Example(
+                "Slow motion as an animation",
+                "foldgauss render holiday.fgz --speed 0.25 --out slow.gif",
+            ),
+            Example(
+                "One image at twice the size",
+                "foldgauss render holiday.fgz --times 0.5 --size 320x640 --out one.png",
+            ),
+            Example("Lossless frames, in a folder", "foldgauss render holiday.fgz --out frames"),
+            Example("Stabilized, into holiday.stable.mp4", "foldgauss render holiday.fgz --stabilize smooth"),
+            Example(
+                "As from a tripod, borders filled from other frames",
+                "foldgauss render holiday.fgz --stabilize fixed --border fill",
+            ),
+            Example("Without the moving object, into holiday.plate.mp4", "foldgauss render holiday.fgz --plate"),
+            Example("Without the object of masks of your own", "foldgauss render holiday.fgz --plate --masks masks"),
+        ),
+        "view": (
+            Example("Play it in the browser", "foldgauss view holiday.fgz"),
+            Example("Next to the clip", "foldgauss view holiday.fgz --original holiday.mp4"),
+            Example("As a web page, to be sent or hosted", "foldgauss view holiday.fgz --out holiday.html"),
+            Example("The page without a model, which opens model files", "foldgauss view --out index.html"),
+        ),
+        "evaluate": (
+            Example("PSNR and SSIM of every frame", "foldgauss evaluate holiday.fgz holiday.mp4"),
+            Example("As JSON", "foldgauss evaluate holiday.fgz holiday.mp4 --json holiday.json"),
+        ),
+        "info": (Example("Show the contents of the file", "foldgauss info holiday.fgz"),),
+        "edit": (
+            Example(
+                "With the script night.toml, into holiday.night.safetensors",
+                "foldgauss edit holiday.fgz night.toml",
+            ),
+            Example("Render the edited video directly", "foldgauss edit holiday.fgz night.toml --out night.mp4"),
+        ),
+        "compress": (
+            Example("Into holiday.fgz, without the clip", "foldgauss compress holiday.safetensors"),
+            Example("Smaller, with the clip", "foldgauss compress holiday.safetensors holiday.mp4"),
+            Example(
+                "With a quality",
+                "foldgauss compress holiday.safetensors holiday.mp4 --quality 60",
+            ),
+        ),
+        "export": (
+            Example("For VeGaS, into holiday.ply", "foldgauss export holiday.fgz --format ply"),
+            Example(
+                "One frame for a viewer of 3DGS scenes",
+                "foldgauss export holiday.fgz --format ply3dgs --times 0.5 --out one.ply",
+            ),
+            Example(
+                "Every frame as triangles, to edit elsewhere",
+                "foldgauss export holiday.fgz --format obj --out mesh",
+            ),
+            Example(
+                "The fourth segment as a model, film.3.safetensors",
+                "foldgauss export film.fgz --format model --segment 3",
+            ),
+        ),
+        "import": (
+            Example("A VeGaS model, into video.safetensors", "foldgauss import video.ply"),
+            Example("Frames edited as triangles, into mesh.mp4", "foldgauss import mesh/ --fps 24"),
+        ),
+        "uncertainty": (
+            Example(
+                "Tables and figures into steady-uncertainty, of a model that was fitted with --no-follow-camera",
+                "foldgauss uncertainty steady.safetensors holiday.mp4",
+            ),
+            Example(
+                "Frames 10 to 19 only, with unknown colors",
+                "foldgauss uncertainty steady.safetensors holiday.mp4 --only 10:20 --level colors",
+            ),
+        ),
+        "tradeoff": (
+            Example("In ten minutes, into holiday-tradeoff", "foldgauss tradeoff holiday.mp4"),
+            Example(
+                "Only time and degree, at a small size, in two minutes",
+                "foldgauss tradeoff holiday.mp4 --axes time,degree --size 80x160 --minutes 2",
+            ),
+        ),
     }
 )

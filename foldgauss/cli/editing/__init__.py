@@ -1,1 +1,1 @@
-"""The commands that write models in another form: `edit`, `segment`, `compress`, `export` and `import`."""
+"""The commands that write models in another form: `edit`, `compress`, `export` and `import`."""

@@ -4,24 +4,22 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from foldgauss.cli.app.application import WrongUse, app, err, name_option, warn, wrong_use
+from foldgauss._runtime.checks import invalid
+from foldgauss.cli.app.application import command, warn
 from foldgauss.cli.app.completion import complete_clips
 from foldgauss.cli.shared.arguments import FittedFrames, ModelFile, Overwrite
 from foldgauss.cli.shared.clips import is_other_clip, read_fitted_clip, refuse_segments
-from foldgauss.cli.shared.log_lines import LINE_SECONDS
-from foldgauss.cli.shared.outputs import refuse_existing, refuse_inputs, write_result
+from foldgauss.cli.shared.fit_progress import choose_display, display_progress
+from foldgauss.cli.shared.outputs import check_output
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import print_figures
-from foldgauss.io._atomic import check_writable, resolve
+from foldgauss.io._atomic import resolve, write_or_keep
 from foldgauss.io.models.compact import COMPACT_SUFFIX, check_compact_name, leave_room, save_compact
 from foldgauss.io.models.video_model import CLIP_NOTES, keep_origin, load_video_model, read_origin
 from foldgauss.jobs.runner import mean_scores, missed_psnr
-from foldgauss.video.fitting.compress import ROUNDING_QUALITY, Compressed, compress
+from foldgauss.video.fitting.compress import ROUNDING_QUALITY, compress
 from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig
-from foldgauss.video.fitting.loop import FitInfo
-from foldgauss.video.fitting.state import FitState
 from foldgauss.video.models.metrics import evaluate
 from foldgauss.video.models.video_model import VideoModel
 
@@ -29,7 +27,7 @@ from foldgauss.video.models.video_model import VideoModel
 MAX_GAIN_DB = 1.0
 
 
-@app.command(name="compress")
+@command("compress")
 def compress_command(
     model_path: ModelFile,
     video: Annotated[
@@ -62,28 +60,24 @@ def compress_command(
     docs/compress.md.
     """
     target = Path(f"{resolve(model_path).stem}{COMPACT_SUFFIX}") if out_path is None else out_path
-    try:
-        check_compact_name(target, "--out")
-    except ValueError as error:
-        raise WrongUse(str(error)) from error
+    check_compact_name(target, "--out")
     if frames is not None and video is None:
-        raise wrong_use("--frames", expected="a VIDEO to take them from", got="none")
-    refuse_inputs(target, {"model": model_path, "clip": video})
-    refuse_existing(target, overwrite)
-    check_writable(target)
+        raise invalid("--frames", expected="a VIDEO to take them from", got="none")
+    check_output(target, overwrite, {"model": model_path, "clip": video})
     refuse_segments(model_path)
     model, about = load_video_model(model_path), read_origin(model_path)
     if not isinstance(model, VideoModel):
         cure = "Compress the model before it is edited, and edit that."
-        raise wrong_use("MODEL", expected="a plain model", got="one with edits", cure=cure)
+        raise invalid("MODEL", expected="a plain model", got="one with edits", cure=cure)
     clip = None if video is None else read_fitted_clip(model, model_path, video, frames)
     if clip is not None and is_other_clip(model_path, clip, lambda: evaluate(model, clip.frames).mean_psnr):
         cure = "Give that clip, or none."
         got = f"{str(video)!r}, another clip"
-        raise wrong_use("VIDEO", expected="the clip that the model was fitted to", got=got, cure=cure)
+        raise invalid("VIDEO", expected="the clip that the model was fitted to", got=got, cure=cure)
     about = keep_origin(about, *CLIP_NOTES, "frames_digest", "seed")
     goals = {"quality": quality, "size_mb": leave_room(size_mb, about), "psnr": psnr, "minutes": minutes}
-    made = _compress_with_progress(model, None if clip is None else clip.frames, goals)
+    with display_progress(choose_display(), "Compressing") as show:
+        made = compress(model, None if clip is None else clip.frames, **goals, observers=[show])
     figures: dict[str, Any] = {"num_gaussians": made.model.num_gaussians}
     figures["num_dropped"] = model.num_gaussians - made.model.num_gaussians
     if clip is not None:
@@ -96,7 +90,7 @@ def compress_command(
                 f"the compact model is {-figures['loss_db']:.1f} dB closer to the clip. Either the fit had not "
                 "converged, or the model was edited, and the edits are undone. Without VIDEO they remain."
             )
-    target = write_result(target, lambda path: save_compact(path, made.quantized, metadata=about))
+    target = write_or_keep(target, lambda path: save_compact(path, made.quantized, metadata=about))
     sizes = model_path.stat().st_size, target.stat().st_size
     bits = 8 * sizes[1] / (model.num_frames * model.size[0] * model.size[1])
     figures |= {"bytes_before": sizes[0], "file_bytes": sizes[1], "ratio": sizes[0] / sizes[1], "bits_per_pixel": bits}
@@ -106,22 +100,3 @@ def compress_command(
             warn(f"--psnr: {text} Give more --minutes, or fit a better model.")
     if sizes[1] >= sizes[0]:
         warn(f"{target} is no smaller than {model_path}.")
-
-
-def _compress_with_progress(model: VideoModel, frames: Any, goals: dict[str, float | None]) -> Compressed:
-    columns = SpinnerColumn(), TimeElapsedColumn(), TextColumn("{task.description}")
-    with Progress(*columns, console=err, disable=not err.is_terminal, transient=True) as bar:
-        task, written = bar.add_task("Compressing", total=None), 0.0
-
-        def show(state: FitState, info: FitInfo) -> None:
-            nonlocal written
-            text = f"step {info.step:,}, {info.psnr:.2f} dB, {info.num_gaussians:,} Gaussians, {info.progress:.0%}"
-            bar.update(task, description=f"Compressing: {text}")
-            if not err.is_terminal and info.seconds > written + LINE_SECONDS:
-                written = info.seconds
-                err.print(f"{info.seconds:7.1f} s  {text}", soft_wrap=True)
-
-        try:
-            return compress(model, frames, **goals, observers=[show])
-        except ValueError as error:
-            raise WrongUse(name_option(str(error))) from error

@@ -2,15 +2,17 @@
 
 import dataclasses
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from foldgauss._runtime.checks import ParameterError, invalid
 from foldgauss._runtime.threads import num_threads
-from foldgauss.cli.app.application import Stopped, WrongUse, app, err, name_option, out, warn, wrong_use
+from foldgauss.cli.app.application import Stopped, command, err, out, warn
 from foldgauss.cli.app.signals import note_signals
+from foldgauss.cli.fitting.job_progress import emit_json
 from foldgauss.cli.fitting.options import (
     PROGRESS,
     CheckpointSeconds,
@@ -19,13 +21,11 @@ from foldgauss.cli.fitting.options import (
     Scheduler,
     SegmentSeconds,
     Threads,
+    WorkerOptions,
     Workers,
-    choose_display,
     fit_options,
 )
-from foldgauss.cli.fitting.progress import Display, Observer, display_progress, print_json, save_previews
-from foldgauss.cli.fitting.segments import describe_budgets, fit_in_segments, plan_gaussians
-from foldgauss.cli.fitting.workers import WorkerOptions
+from foldgauss.cli.fitting.segments import describe_plan, fit_in_segments, plan_gaussians
 from foldgauss.cli.shared.arguments import (
     Deinterlace,
     Frames,
@@ -34,16 +34,23 @@ from foldgauss.cli.shared.arguments import (
     Overwrite,
     Size,
     parse_frames,
-    parse_reading,
     parse_size,
 )
-from foldgauss.cli.shared.outputs import ask_output, name_after, refuse_existing, refuse_inputs
+from foldgauss.cli.shared.fit_progress import (
+    Display,
+    Observer,
+    choose_display,
+    display_progress,
+    print_json,
+    save_previews,
+)
+from foldgauss.cli.shared.outputs import check_output, name_after, refuse_existing, refuse_inputs
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import format_count, print_figures, summarize_scores
-from foldgauss.io._atomic import OutputError, check_writable, resolve, write_or_keep
+from foldgauss.io._atomic import OutputError, resolve, write_or_keep
 from foldgauss.io._lock import lock_output
 from foldgauss.io.history import HistoryFile, read_history, write_curves
-from foldgauss.io.media.clip import DEINTERLACE, Clip
+from foldgauss.io.media.clip import DEINTERLACE, Clip, check_reading
 from foldgauss.io.models.compact import COMPACT_SUFFIX
 from foldgauss.io.models.video_model import MODEL_SUFFIX, check_model_name
 from foldgauss.jobs.job import FitJob
@@ -57,13 +64,13 @@ from foldgauss.video.fitting.state import FitState, running_psnr
 from foldgauss.video.fitting.steppers.engines import choose_engine, describe_device
 
 
-@app.command()
+@command("fit")
 @fit_options
 def fit(
     context: typer.Context,
     video: NewClip,
     config: FitConfig,
-    out_path: Annotated[
+    target: Annotated[
         Path | None,
         typer.Option(
             "--out",
@@ -108,11 +115,8 @@ def fit(
     A stopped fit has a checkpoint and continues with --resume. Long clips are fitted in segments, in parallel with
     workers.
     """
-    if out_path is not None:
-        refuse_inputs(out_path, {"clip": video})
     in_segments = not (segment_seconds is None and workers is None and scheduler is None)
-    target, config = _choose_target(video, out_path, config)
-    refuse_inputs(target, {"clip": video})
+    target, config = _choose_target(video, target, config)
     job = FitJob(
         video.name,
         str(video),
@@ -120,7 +124,7 @@ def fit(
         config,
         parse_size(size),
         parse_frames(frames),
-        reading=parse_reading(deinterlace, levels),
+        reading=check_reading(deinterlace, levels),
         checkpoint_seconds=checkpoint_seconds,
     )
     display = choose_display(quiet, log_json)
@@ -131,10 +135,10 @@ def fit(
     if begun or in_segments:
         for option, path in (("--history", history), ("--preview", preview)):
             if path is not None:
-                raise WrongUse(f"{option}: expected a fit in one piece, got one in segments. Leave it out.")
+                raise invalid(option, expected="a fit in one piece", got="one in segments", cure="Leave it out.")
         fit_in_segments(job, display, options, segment_seconds=segment_seconds, resume=resume, overwrite=overwrite)
         return
-    curves = _check_records(target, video, history, preview, overwrite or resume)
+    curves = _check_records(video, history, preview, overwrite or resume)
     _check_checkpoint(job.checkpoint, resume, overwrite)
 
     @contextmanager
@@ -145,28 +149,29 @@ def fit(
             recorded = HistoryFile(history) if state is None else HistoryFile(history, state.step, running_psnr(state))
         previews = None if preview is None else save_previews(preview, clip, config)
         with (
-            display_progress(display, err, history=recorded, preview=previews) as show,
+            display_progress(display, "Fitting", history=recorded, preview=previews) as show,
             stop_on_signals(show, job.checkpoint) as observer,
         ):
             yield observer
 
-    try:
-        run = run_fit(
-            job,
-            observe,
-            resume="required" if resume else "never",
-            on_checkpoint_error=lambda error, step: warn(f"no checkpoint at step {step}: {error}"),
-        )
-    except ValueError as error:
-        if str(error).startswith("size_mb:"):
-            raise WrongUse(name_option(str(error))) from error
-        raise
+    run = run_fit(
+        job,
+        observe,
+        resume="required" if resume else "never",
+        on_checkpoint_error=lambda error, step: warn(f"no checkpoint at step {step}: {error}"),
+    )
     run = _save_model(run)
     target = Path(run.job.target)
-    with _keep_state_on_interrupt(run):
+    try:
         if history is not None:
             _save_curves(curves, history)
         scores = evaluate_with_progress(run.model, run.clip.frames, shown=display in ("bar", "lines"))
+    except KeyboardInterrupt:
+        run.save_checkpoint()  # from which the evaluation can be repeated
+        if run.job.checkpoint.exists():
+            text = f"{run.job.target} is written, without its scores: add --resume --overwrite to measure them."
+            err.print(text, soft_wrap=True)
+        raise
     try:
         run.save(scores)
     except OSError as error:
@@ -177,22 +182,24 @@ def fit(
     for text in busy_processors(run):
         warn(f"--minutes: {text}")
     figures = summarize_scores(run.model, scores) | summarize_fit(run.info) | {"stopped_by": run.info.stopped_by}
-    _print_results(run, display, figures | {"file_bytes": target.stat().st_size})
+    figures |= {"file_bytes": target.stat().st_size}
+    if display == "json":
+        emit_json("done", {"model": run.job.target} | figures)
+    elif display != "quiet":
+        print_figures(run.job.target, figures)
 
 
 def _choose_target(video: Path, out_path: Path | None, config: FitConfig) -> tuple[Path, FitConfig]:
     """The file to write, and the settings: the default quality for a compact file of which nothing else is asked."""
     if out_path is None:
         out_path = name_after(video, COMPACT_SUFFIX)
+    refuse_inputs(out_path, {"clip": video})
     if out_path.suffix.lower() == COMPACT_SUFFIX:
         return out_path, config if config.is_compact else dataclasses.replace(config, quality=DEFAULT_QUALITY)
-    try:
-        check_model_name(out_path, "out")
-    except ValueError as error:
-        raise WrongUse(name_option(str(error))) from error
+    check_model_name(out_path, "--out")
     if config.size_mb is not None:
         cure = f"Compact files end in {COMPACT_SUFFIX}."
-        raise wrong_use("--size-mb", expected="a compact file", got=out_path, cure=cure)
+        raise invalid("--size-mb", expected="a compact file", got=out_path, cure=cure)
     return out_path, config
 
 
@@ -227,25 +234,18 @@ def stop_on_signals(show: Observer, checkpoint: Path | None = None) -> Iterator[
             raise Stopped(f"{error} {hint}") from error
 
 
-def _check_records(target: Path, video: Path, history: Path | None, preview: Path | None, overwrite: bool) -> Path:
+def _check_records(video: Path, history: Path | None, preview: Path | None, overwrite: bool) -> Path:
     """Refuse invalid paths of the history, its curves and the preview; returns that of the curves."""
-    curves = Path() if history is None else history.with_suffix(".png")
-    for option, path, suffix in (("--history", history, ".jsonl"), ("--preview", preview, ".png")):
-        if path is not None and path.suffix != suffix:
-            raise wrong_use(option, expected=f"a name ending in {suffix}", got=path)
-    places = [("--history", history), ("--history", None if history is None else curves), ("--preview", preview)]
-    taken = {resolve(target), resolve(video)}
-    for option, path in places:
+    curves = None if history is None else history.with_suffix(".png")
+    records = ("--history", history, ".jsonl"), ("--history", curves, ".png"), ("--preview", preview, ".png")
+    for option, path, suffix in records:
         if path is None:
             continue
-        if video.is_dir() and resolve(path).parent == resolve(video):
-            cure = "It would be a frame there."
-            raise wrong_use(option, expected="a place outside the clip's folder", got=path, cure=cure)
-        if resolve(path) in taken:
-            raise WrongUse(f"{option}: expected a file of its own, got {path}, which has another use. Choose another.")
-        taken.add(resolve(path))
-        refuse_existing(path, overwrite, option)
-        check_writable(path)
+        if path.suffix != suffix:
+            raise invalid(option, expected=f"a name ending in {suffix}", got=path)
+        check_output(path, overwrite, {"clip": video}, option)
+    if curves is not None and preview is not None and resolve(curves) == resolve(preview):
+        raise invalid("--preview", expected="another file than the curves of --history", got=preview)
     return curves
 
 
@@ -253,9 +253,10 @@ def _check_checkpoint(checkpoint: Path, resume: bool, overwrite: bool) -> None:
     """Refuse a checkpoint that would be lost, and --resume without one."""
     if checkpoint.exists() and not (resume or overwrite):
         cure = "Continue it with --resume, or start over with --overwrite."
-        raise WrongUse(f"--out: a stopped fit has a checkpoint, {checkpoint}. {cure}")
+        raise ParameterError("--out", f"a stopped fit has a checkpoint, {checkpoint}. {cure}")
     if resume and not checkpoint.exists():
-        raise WrongUse(f"--resume: expected a stopped fit in {checkpoint}, got none. Start it without --resume.")
+        expected, cure = f"a stopped fit in {checkpoint}", "Start it without --resume."
+        raise invalid("--resume", expected=expected, got="none", cure=cure)
 
 
 def _save_model(run: FitRun) -> FitRun:
@@ -263,29 +264,14 @@ def _save_model(run: FitRun) -> FitRun:
 
     Returns the run with the path of the model as its target.
     """
-
-    def ask(path: Path, error: OSError) -> Path | None:
-        run.save_checkpoint()
-        another = ask_output(path, error)
-        if another is None and run.job.checkpoint.exists():
-            text = f"The fit is kept in {run.job.checkpoint}: --resume continues it, and writes the model."
-            raise OutputError(f"{error} {text}") from error
-        return another
-
-    return write_or_keep(Path(run.job.target), run.save_to, ask)
-
-
-@contextmanager
-def _keep_state_on_interrupt(run: FitRun) -> Iterator[None]:
-    """If the evaluation is interrupted, save the state, from which it can be repeated."""
     try:
-        yield
-    except KeyboardInterrupt:
+        return run.save_to(Path(run.job.target))
+    except OSError as error:
         run.save_checkpoint()
-        if run.job.checkpoint.exists():
-            text = f"{run.job.target} is written, without its scores: add --resume --overwrite to measure them."
-            err.print(text, soft_wrap=True)
-        raise
+        if not run.job.checkpoint.exists():
+            return write_or_keep(Path(run.job.target), run.save_to)
+        text = f"The fit is kept in {run.job.checkpoint}: --resume continues it, and writes the model."
+        raise OutputError(f"{error} {text}") from error
 
 
 def _save_curves(path: Path, history: Path) -> None:
@@ -297,14 +283,11 @@ def _save_curves(path: Path, history: Path) -> None:
 
 
 def _print_plan(clip: Clip, config: FitConfig, display: Display) -> None:
-    try:
-        engine = choose_engine(clip.frames, config)
-    except ValueError as error:
-        raise WrongUse(name_option(str(error))) from error
+    engine = choose_engine(clip.frames, config)
     height, width = clip.size
     for text in clip.notes:
         warn(f"{clip.source}: {text}")
-    num, at_most = plan_gaussians(config, clip.num_frames, height, width)
+    num = plan_gaussians(config, clip.num_frames, height, width)
     steps = planned_steps(config, clip.num_frames)
     if steps is not None and steps * config.views.batch_size < clip.num_frames:
         warn(
@@ -316,20 +299,9 @@ def _print_plan(clip: Clip, config: FitConfig, display: Display) -> None:
         print_json("start", about | {"most_gaussians": num, "degree": config.fold_degree, "threads": num_threads()})
     if display in ("json", "quiet"):
         return
-    plan = describe_budgets(config, steps)
-    growing = "" if config.strategy.growth is None else " at the start"
     computed = f"{num_threads()} threads" if engine == "cpu" else f"engine {engine} on {describe_device()}"
     out.print(
         f"{clip.source}: {format_count(clip.num_frames, 'frame')} of {height}x{width}"
-        f"{' with alpha' if clip.has_alpha else ''}, {at_most}{num:,} Gaussians of degree {config.fold_degree}"
-        f"{growing}, {plan}, {computed}",
+        f"{' with alpha' if clip.has_alpha else ''}, {describe_plan(config, num, clip.num_frames)}, {computed}",
         soft_wrap=True,
     )
-
-
-def _print_results(run: FitRun, display: Display, figures: dict[str, float]) -> None:
-    if display == "json":
-        with suppress(OSError):  # standard output is closed, but the model is there
-            print_json("done", {"model": run.job.target} | figures)
-    elif display != "quiet":
-        print_figures(run.job.target, figures)

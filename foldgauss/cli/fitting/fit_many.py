@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import time
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,7 +9,8 @@ import typer
 from rich.box import SIMPLE_HEAD
 from rich.table import Column, Table
 
-from foldgauss.cli.app.application import WrongUse, app, name_option, out, warn
+from foldgauss._runtime.checks import ParameterError, invalid
+from foldgauss.cli.app.application import command, out, warn
 from foldgauss.cli.app.completion import complete_files
 from foldgauss.cli.fitting.job_progress import emit_json, run_jobs
 from foldgauss.cli.fitting.options import (
@@ -19,12 +19,11 @@ from foldgauss.cli.fitting.options import (
     Quiet,
     Scheduler,
     Threads,
+    WorkerOptions,
     Workers,
-    choose_display,
     fit_options,
 )
 from foldgauss.cli.fitting.segments import print_failures
-from foldgauss.cli.fitting.workers import WorkerOptions
 from foldgauss.cli.shared.arguments import (
     Deinterlace,
     Frames,
@@ -32,22 +31,20 @@ from foldgauss.cli.shared.arguments import (
     Overwrite,
     Size,
     parse_frames,
-    parse_reading,
     parse_size,
 )
+from foldgauss.cli.shared.fit_progress import choose_display
 from foldgauss.cli.shared.outputs import make_folder
 from foldgauss.cli.shared.tables import format_count, write_json
 from foldgauss.io._atomic import resolve
 from foldgauss.io._lock import lock_output
-from foldgauss.io.media.clip import DEINTERLACE
+from foldgauss.io.media.clip import DEINTERLACE, check_reading
 from foldgauss.jobs import FitJob, Outcome, find_clips, make_jobs
 from foldgauss.jobs.clips import RECORDS
 from foldgauss.jobs.job import read_record, read_request, write_request
 from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig
 
 SUMMARY = "summary.json"
-#: Seconds between two writes of the summary: there may be thousands of clips.
-SUMMARY_SECONDS = 5.0
 #: With more clips, the table shows no rows; the summary has all.
 MAX_ROWS = 60
 #: Fields of a record that the summary shows.
@@ -64,7 +61,7 @@ _FIGURES = (
 )
 
 
-@app.command(name="fit-many")
+@command("fit-many")
 @fit_options
 def fit_many(
     context: typer.Context,
@@ -103,22 +100,19 @@ def fit_many(
     found = find_clips(folder)
     out_dir = Path(f"{resolve(folder).name}-models") if out_dir is None else out_dir
     if out_dir.exists() and resolve(out_dir) == resolve(folder):
-        raise WrongUse(f"--out: expected another folder than the clips', got {out_dir}.")
+        raise invalid("--out", expected="another folder than the clips'", got=out_dir)
     make_folder(out_dir)
     make_folder(out_dir / RECORDS)
     context.with_resource(lock_output(out_dir / SUMMARY, what="fit-many"))
-    try:
-        jobs = make_jobs(
-            found.clips,
-            out_dir,
-            config,
-            size=parse_size(size),
-            frames=parse_frames(frames),
-            checkpoint_seconds=checkpoint_seconds,
-            reading=parse_reading(deinterlace, levels),
-        )
-    except ValueError as error:
-        raise WrongUse(name_option(str(error))) from error
+    jobs = make_jobs(
+        found.clips,
+        out_dir,
+        config,
+        size=parse_size(size),
+        frames=parse_frames(frames),
+        checkpoint_seconds=checkpoint_seconds,
+        reading=check_reading(deinterlace, levels),
+    )
     _prepare_outputs(jobs, overwrite)
     before = sum(read_record(job) is not None for job in jobs)
     if display in ("bar", "lines"):
@@ -128,17 +122,13 @@ def fit_many(
             names = ", ".join(entry.name for entry in found.others[:3]) + (", ..." if len(found.others) > 3 else "")
             out.print(f"skipped, not clips: {names}", soft_wrap=True)
     ended: dict[str, Outcome] = {}
-    written = -SUMMARY_SECONDS
 
     def on_end(outcome: Outcome) -> None:
-        nonlocal written
         ended[outcome.job.target] = outcome
-        if len(ended) == len(jobs) or time.monotonic() - written > SUMMARY_SECONDS:
-            try:
-                _write_summary(out_dir, jobs, ended)
-            except OSError as error:  # a full disk must not end the fits
-                warn(str(error))
-            written = time.monotonic()
+        try:
+            _write_summary(out_dir, jobs, ended)
+        except OSError as error:  # a full disk must not end the fits
+            warn(str(error))
 
     again = "Give the command again without --overwrite" if overwrite else "Give the same command again"
     with options.open_pool() as pool:
@@ -166,10 +156,8 @@ def _prepare_outputs(jobs: list[FitJob], overwrite: bool) -> None:
         for path in (job.target, job.checkpoint):
             mine = before is None and job.checkpoint.exists()
             if os.path.exists(path) and not mine:
-                raise WrongUse(
-                    f"--out: {path} exists, with other settings or of another clip. Remove it, choose another folder, "
-                    "or add --overwrite, which starts over."
-                )
+                cure = "Remove it, choose another folder, or add --overwrite, which starts over."
+                raise ParameterError("--out", f"{path} exists, with other settings or of another clip. {cure}")
     for job in waiting:
         if overwrite:
             job.checkpoint.unlink(missing_ok=True)
@@ -192,25 +180,23 @@ def _row(outcome: Outcome) -> dict[str, Any]:
 
 
 def _print_table(title: str, outcomes: list[Outcome]) -> None:
-    failed = sum(outcome.failure is not None for outcome in outcomes)
-    columns = Column("clip", overflow="fold")
-    table = Table(columns, title=title, box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
-    for name in ("frames", "PSNR (dB)", "SSIM", "Gaussians", "bytes", "seconds"):
-        table.add_column(name, justify="right", no_wrap=True)
-    if len(outcomes) <= MAX_ROWS:
-        for outcome in outcomes:
-            if outcome.failure is not None:
-                table.add_row(outcome.job.name, "failed")
-                continue
-            one = outcome.record
-            frames = f"{one['num_frames']} of {one['size'][0]}x{one['size'][1]}"
-            figures = f"{one['mean_psnr']:.2f}", f"{one['mean_ssim']:.4f}", f"{one['num_gaussians']:,}"
-            rest = f"{one['file_bytes']:,}", f"{one['seconds']:.1f}"
-            table.add_row(outcome.job.name, frames, *figures, *rest)
-        out.print(table)
     done = [outcome.record for outcome in outcomes if outcome.failure is None]
+    columns = [
+        Column(name, justify="right") for name in ("frames", "PSNR (dB)", "SSIM", "Gaussians", "bytes", "seconds")
+    ]
+    table = Table(Column("clip", overflow="fold"), *columns, title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for outcome in outcomes:
+        cells = ["failed"]
+        if (one := outcome.record) is not None:
+            cells = [f"{one['num_frames']} of {one['size'][0]}x{one['size'][1]}", f"{one['mean_psnr']:.2f}"]
+            cells += [f"{one['mean_ssim']:.4f}", f"{one['num_gaussians']:,}", f"{one['file_bytes']:,}"]
+            cells += [f"{one['seconds']:.1f}"]
+        table.add_row(outcome.job.name, *cells)
+    if len(outcomes) <= MAX_ROWS:
+        out.print(table)
     text = f"{format_count(len(done), 'model')} in {title}"
     if done:
         mean, seconds = sum(one["mean_psnr"] for one in done) / len(done), sum(one["seconds"] for one in done)
         text += f", mean PSNR {mean:.2f} dB, {seconds:,.0f} s of fitting"
+    failed = len(outcomes) - len(done)
     out.print(f"{text}; {failed} failed" if failed else text, soft_wrap=True)

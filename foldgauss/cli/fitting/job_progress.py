@@ -1,16 +1,16 @@
-"""Runs jobs and displays their progress: a bar for all and one per running job, lines in a log, or JSON."""
+"""Runs jobs and displays their progress: a bar, lines in a log, or JSON."""
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any
 
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from foldgauss.cli.app.application import Stopped, err
 from foldgauss.cli.app.signals import note_signals
-from foldgauss.cli.fitting.progress import Display, print_json
+from foldgauss.cli.shared.fit_progress import Display, print_json
 from foldgauss.cli.shared.log_lines import FIRST_LINE_SECONDS, LINE_SECONDS
 from foldgauss.cli.shared.rendering import TIME_LEFT
 from foldgauss.jobs import FitJob, Outcome, WorkerPool, run_here, run_on
@@ -41,7 +41,8 @@ def run_jobs(
     After Ctrl-C or SIGTERM, and once checkpoints are written, raises `Stopped`, whose message ends with `cure`.
     """
     ended: dict[str, Outcome] = {}
-    with note_signals() as request, _open_view(noun, len(jobs), display) as view:
+    view = _View(noun, len(jobs), display)
+    with note_signals() as request, view.bar:
         request.stepping = True  # jobs may stop at any moment
 
         def should_stop() -> bool:
@@ -64,111 +65,50 @@ def run_jobs(
 
 
 class _View:
-    """The state of the jobs; it displays nothing itself."""
+    """The state of the jobs, displayed as `display` says."""
 
-    def __init__(self, noun: str, total: int):
-        self.noun, self.total, self.done, self.failed = noun, total, 0, 0
+    def __init__(self, noun: str, total: int, display: Display):
+        self.noun, self.total, self.display, self.done, self.failed = noun, total, display, 0, 0
         self.running: dict[str, JobProgress] = {}
+        self.due = time.monotonic() + FIRST_LINE_SECONDS
+        description = TextColumn("{task.description}", markup=False)  # file names
+        columns = description, BarColumn(bar_width=20), TimeElapsedColumn(), *TIME_LEFT
+        self.bar = Progress(*columns, console=err, disable=display != "bar")
+        self.task = self.bar.add_task(self._describe(), total=total)
 
     def update(self, progress: JobProgress) -> None:
         self.running[progress.name] = progress
+        if self.display == "json":
+            known = progress._asdict().items()
+            emit_json("progress", {name: value for name, value in known if value == value and value != math.inf})
+        elif self.display == "lines" and time.monotonic() >= self.due:
+            self.due = time.monotonic() + LINE_SECONDS
+            err.print(self._describe(), soft_wrap=True)
+        self._update_bar()
 
     def end(self, outcome: Outcome) -> None:
-        self.running.pop(outcome.job.name, None)
+        name = outcome.job.name
+        self.running.pop(name, None)
         self.done += outcome.failure is None
         self.failed += outcome.failure is not None
-
-    @property
-    def completed(self) -> float:
-        return self.done + self.failed + sum(job.fraction for job in self.running.values())
-
-    @property
-    def counts(self) -> str:
-        failed = f", {self.failed} failed" if self.failed else ""
-        return f"{self.done} of {self.total} {self.noun} done{failed}"
-
-
-def _describe(progress: JobProgress) -> str:
-    psnr = f"{progress.psnr:.2f} dB" if math.isfinite(progress.psnr) else ""
-    return f"{progress.step} steps  {psnr}  {progress.num_gaussians:,} Gaussians"
-
-
-class _Bars(_View):
-    """A bar for all jobs, and one for each that runs."""
-
-    def __init__(self, noun: str, total: int, bars: Progress):
-        super().__init__(noun, total)
-        self.bars = bars
-        self.all = bars.add_task(self.counts, total=total, text="")
-        self.tasks: dict[str, TaskID] = {}
-
-    def update(self, progress: JobProgress) -> None:
-        super().update(progress)
-        if progress.name not in self.tasks:
-            self.tasks[progress.name] = self.bars.add_task(f"  {progress.name}", total=1.0, text="")
-        self.bars.update(self.tasks[progress.name], completed=progress.fraction, text=_describe(progress))
-        self._update_all()
-
-    def end(self, outcome: Outcome) -> None:
-        super().end(outcome)
-        if outcome.job.name in self.tasks:
-            self.bars.remove_task(self.tasks.pop(outcome.job.name))
-        self._update_all()
-
-    def _update_all(self) -> None:
-        self.bars.update(self.all, description=self.counts, completed=self.completed)
-
-
-class _Lines(_View):
-    """A line now and then, and one for each job that ends if there are few."""
-
-    def __init__(self, noun: str, total: int):
-        super().__init__(noun, total)
-        self.next = time.monotonic() + FIRST_LINE_SECONDS
-
-    def update(self, progress: JobProgress) -> None:
-        super().update(progress)
-        if time.monotonic() >= self.next:
-            self.next = time.monotonic() + LINE_SECONDS
-            running = (f"{job.name} {job.fraction:.0%} ({job.psnr:.1f} dB)" for job in self.running.values())
-            err.print(f"{self.counts}; {', '.join(running)}", soft_wrap=True)
-
-    def end(self, outcome: Outcome) -> None:
-        super().end(outcome)
-        if self.total <= MAX_LINES:
-            result = "failed" if outcome.failure is not None else f"{outcome.record['mean_psnr']:.2f} dB"
-            err.print(f"{self.counts}: {outcome.job.name}, {result}", soft_wrap=True)
-
-
-class _Json(_View):
-    """Events as lines of JSON."""
-
-    def update(self, progress: JobProgress) -> None:
-        super().update(progress)
-        finite = {name: value for name, value in progress._asdict().items() if value == value and value != math.inf}
-        emit_json("progress", finite)
-
-    def end(self, outcome: Outcome) -> None:
-        super().end(outcome)
-        if outcome.failure is not None:
-            emit_json("failed", {"name": outcome.job.name, "reason": outcome.failure})
-        else:
+        if self.display == "json" and outcome.failure is not None:
+            emit_json("failed", {"name": name, "reason": outcome.failure})
+        elif self.display == "json":
             figures = {name: outcome.record[name] for name in ("mean_psnr", "mean_ssim", "seconds", "steps")}
-            emit_json("ended", {"name": outcome.job.name} | figures)
+            emit_json("ended", {"name": name} | figures)
+        elif self.display == "lines" and self.total <= MAX_LINES:
+            result = "failed" if outcome.failure is not None else f"{outcome.record['mean_psnr']:.2f} dB"
+            err.print(f"{self._counts()}: {name}, {result}", soft_wrap=True)
+        self._update_bar()
 
+    def _update_bar(self) -> None:
+        completed = self.done + self.failed + sum(job.fraction for job in self.running.values())
+        self.bar.update(self.task, completed=completed, description=self._describe())
 
-@contextmanager
-def _open_view(noun: str, total: int, display: Display) -> Iterator[_View]:
-    if display != "bar":
-        kinds = {"lines": _Lines, "json": _Json, "quiet": _View}
-        yield kinds[display](noun, total)
-        return
-    columns = (
-        TextColumn("{task.description}", markup=False),  # file names
-        BarColumn(bar_width=20),
-        TimeElapsedColumn(),
-        *TIME_LEFT,
-        TextColumn("{task.fields[text]}"),
-    )
-    with Progress(*columns, console=err) as bars:
-        yield _Bars(noun, total, bars)
+    def _counts(self) -> str:
+        return f"{self.done} of {self.total} {self.noun} done" + (f", {self.failed} failed" if self.failed else "")
+
+    def _describe(self) -> str:
+        """The counts, and the jobs that run."""
+        running = (f"{job.name} {job.fraction:.0%} ({job.psnr:.1f} dB)" for job in self.running.values())
+        return "; ".join([self._counts(), *([", ".join(running)] if self.running else [])])

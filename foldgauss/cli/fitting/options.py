@@ -4,15 +4,19 @@ import dataclasses
 import functools
 import inspect
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from importlib.util import find_spec
 from typing import Annotated, Any
 
 import typer
 
+from foldgauss._runtime.checks import ParameterError
 from foldgauss._runtime.settings import setting_of, settings_by_name, type_of, walk
-from foldgauss.cli.app.application import WrongUse, err, name_option
+from foldgauss._runtime.threads import available_cores
 from foldgauss.cli.app.completion import complete_choice
-from foldgauss.cli.fitting.progress import Display
 from foldgauss.cli.shared.arguments import AlphaCutoff, SupportRadius, TransmittanceStop, override_constants
+from foldgauss.cli.shared.tables import format_count
+from foldgauss.jobs import WorkerPool, local_workers, running_cluster
 from foldgauss.video.fitting.config import BUDGET, MODEL, OPTIMIZATION, PRESETS, FitConfig
 
 #: Panels of `fit --help`, by group of settings.
@@ -42,6 +46,7 @@ SegmentSeconds = Annotated[
 CheckpointSeconds = Annotated[
     float | None,
     typer.Option(
+        metavar="S",
         help="Seconds between two checkpoints, the most that a kill loses [default: 30].",
         rich_help_panel=PROGRESS,
         min=0.0,
@@ -50,6 +55,7 @@ CheckpointSeconds = Annotated[
 Workers = Annotated[
     int | None,
     typer.Option(
+        metavar="N",
         help="Number of parallel processes on this machine (needs the extra `distributed`).",
         rich_help_panel=WORKERS,
         min=1,
@@ -66,20 +72,17 @@ Scheduler = Annotated[
 Threads = Annotated[
     int | None,
     typer.Option(
-        help="Threads per worker on this machine [default: an equal part of the cores].", rich_help_panel=WORKERS, min=1
+        metavar="N",
+        help="Threads per worker on this machine [default: an equal part of the cores].",
+        rich_help_panel=WORKERS,
+        min=1,
     ),
 ]
 
 
-def _parameter(option: str) -> str:
-    """The name of an option as a parameter."""
-    return option.split("/")[0].removeprefix("--").replace("-", "_")
-
-
-#: The settings that have an option, by their names.
-CONFIG_FIELDS = {name: field for name, field, _ in walk(FitConfig) if setting_of(field).option}
-#: Their names by those of their options as parameters.
-_NAMES = {_parameter(setting_of(field).option): name for name, field in CONFIG_FIELDS.items()}
+#: The settings of a fit that have an option: the field's name, which is that of the command's parameter, the name in
+#: `FitConfig`, and the field.
+SETTINGS = {field.name: (name, field) for name, field, _ in walk(FitConfig) if setting_of(field).option}
 _CONSTANTS = {
     "alpha_cutoff": AlphaCutoff,
     "support_radius": SupportRadius,
@@ -87,18 +90,48 @@ _CONSTANTS = {
 }
 
 
-def config_from_options(preset: str, **options: Any) -> FitConfig:
-    """The configuration that options, by the names of their parameters, come to; None leaves the preset's value.
+@dataclasses.dataclass(frozen=True)
+class WorkerOptions:
+    """What runs jobs: `workers` of this machine with `threads` each, those of a `scheduler`, or this process.
 
-    Raises WrongUse for values that are not valid.
+    Raises ParameterError for options that exclude each other.
     """
-    given = {name: value for name, value in options.items() if value is not None}
-    changes = {name: given[parameter] for parameter, name in _NAMES.items() if parameter in given}
-    try:
-        config = FitConfig.preset(preset, **changes)
-    except ValueError as error:
-        raise WrongUse(name_option(str(error))) from error
-    constants = (options[name] for name in _CONSTANTS)
+
+    workers: int | None
+    scheduler: str | None
+    threads: int | None
+
+    def __post_init__(self) -> None:
+        if self.scheduler is not None and (self.workers is not None or self.threads is not None):
+            other = "--workers" if self.workers is not None else "--threads"
+            raise ParameterError(other, "expected no --scheduler, which has workers of its own. Leave one out.")
+        if self.threads is not None and self.workers is None:
+            raise ParameterError("--threads", "expected --workers too. For this process: FOLDGAUSS_NUM_THREADS.")
+        if (self.workers is not None or self.scheduler is not None) and find_spec("distributed") is None:
+            option = "--workers" if self.scheduler is None else "--scheduler"
+            raise ParameterError(option, "needs dask.distributed: pip install 'foldgauss[distributed]'.")
+        if self.workers is not None and self.threads is None:
+            object.__setattr__(self, "threads", max(1, available_cores() // self.workers))
+
+    def __str__(self) -> str:
+        if self.scheduler is not None:
+            return f"the workers of {self.scheduler}"
+        if self.workers is None:
+            return "this process"
+        return f"{format_count(self.workers, 'worker')} of {format_count(self.threads, 'thread')}"
+
+    def open_pool(self) -> AbstractContextManager[WorkerPool | None]:
+        """The workers; None for this process."""
+        if self.scheduler is not None:
+            return running_cluster(self.scheduler)
+        return nullcontext() if self.workers is None else local_workers(self.workers, threads=self.threads)
+
+
+def config_from_options(preset: str, **options: Any) -> FitConfig:
+    """The configuration that options, by the names of settings, come to; None leaves the preset's value."""
+    constants = [options.pop(name) for name in _CONSTANTS]
+    given = {SETTINGS[parameter][0]: value for parameter, value in options.items() if value is not None}
+    config = FitConfig.preset(preset, **given)
     return dataclasses.replace(config, options=override_constants(config.options, *constants))
 
 
@@ -110,7 +143,7 @@ def fit_options(command: Callable[..., None]) -> Callable[..., None]:
     """
     options = [
         inspect.Parameter("preset", _KIND, default="standard", annotation=Preset),
-        *(_option(parameter, name) for parameter, name in _NAMES.items()),
+        *(_option(name, field) for name, field in SETTINGS.values()),
         *(inspect.Parameter(name, _KIND, default=None, annotation=kind) for name, kind in _CONSTANTS.items()),
     ]
     own = list(inspect.signature(command).parameters.values())
@@ -130,9 +163,8 @@ def fit_options(command: Callable[..., None]) -> Callable[..., None]:
 _KIND = inspect.Parameter.POSITIONAL_OR_KEYWORD
 
 
-def _option(parameter: str, name: str) -> inspect.Parameter:
+def _option(name: str, field: dataclasses.Field) -> inspect.Parameter:
     """The parameter of a command for one setting."""
-    field = CONFIG_FIELDS[name]
     about = setting_of(field)
     option = typer.Option(
         about.option,
@@ -140,7 +172,7 @@ def _option(parameter: str, name: str) -> inspect.Parameter:
         rich_help_panel=PANELS[about.group],
         autocompletion=complete_choice(about.choices) if about.choices else None,
     )
-    return inspect.Parameter(parameter, _KIND, default=None, annotation=Annotated[type_of(field) | None, option])
+    return inspect.Parameter(field.name, _KIND, default=None, annotation=Annotated[type_of(field) | None, option])
 
 
 def _default(name: str, field: dataclasses.Field) -> str:
@@ -153,12 +185,3 @@ def _default(name: str, field: dataclasses.Field) -> str:
 
 def _text(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else f"{value}"
-
-
-def choose_display(quiet: bool = False, log_json: bool = False) -> Display:
-    """How progress is displayed: as the options say, otherwise a bar on a terminal and lines in a log."""
-    if quiet and log_json:
-        raise WrongUse("--quiet: expected one of --quiet and --log-json, got both. Leave one out.")
-    if quiet or log_json:
-        return "quiet" if quiet else "json"
-    return "bar" if err.is_terminal else "lines"

@@ -1,20 +1,21 @@
 """`fit` of a clip in segments, run by workers or by this process."""
 
 import dataclasses
+import itertools
 import time
 from contextlib import nullcontext
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from foldgauss.cli.app.application import Stopped, WrongUse, err, name_option, out, warn
+from foldgauss._runtime.checks import invalid
+from foldgauss.cli.app.application import Stopped, err, out, warn
 from foldgauss.cli.fitting.job_progress import emit_json, run_jobs
-from foldgauss.cli.fitting.progress import Display
-from foldgauss.cli.fitting.workers import WorkerOptions
-from foldgauss.cli.shared.log_lines import LINE_SECONDS
-from foldgauss.cli.shared.outputs import write_result
+from foldgauss.cli.fitting.options import WorkerOptions
+from foldgauss.cli.shared.fit_progress import Display
+from foldgauss.cli.shared.log_lines import show_status
 from foldgauss.cli.shared.rendering import progress_bar
 from foldgauss.cli.shared.tables import format_count, print_figures
+from foldgauss.io._atomic import write_or_keep
 from foldgauss.io.media.resizing import describe_crop
 from foldgauss.jobs import FitJob, JoinedFit, LongFit, Outcome, plan_long_fit, segments_folder
 from foldgauss.jobs.job import read_record
@@ -35,24 +36,23 @@ def fit_in_segments(
     begun, target = time.monotonic(), Path(job.target)
     folder = segments_folder(target)
     if resume and not folder.is_dir():
-        raise WrongUse(f"--resume: expected a stopped fit in {folder}, got none. Start it without --resume.")
+        raise invalid("--resume", expected=f"a stopped fit in {folder}", got="none", cure="Start it without --resume.")
     restart = overwrite and not resume
     if segment_seconds is None and not restart:
         segment_seconds = read_segment_seconds(target)
-    plan = partial(
-        plan_long_fit,
-        job.clip,
-        target,
-        job.config,
-        size=job.size,
-        frames=job.frames,
-        segment_seconds=SEGMENT_SECONDS if segment_seconds is None else segment_seconds,
-        checkpoint_seconds=job.checkpoint_seconds,
-        reading=job.reading,
-        restart=restart,
-    )
     with options.open_pool() as pool:  # first: workers start while the clip is indexed
-        fit = _plan_with_progress(plan, display)
+        with nullcontext() if display in ("json", "quiet") else show_status("Indexing the clip"):
+            fit = plan_long_fit(
+                job.clip,
+                target,
+                job.config,
+                size=job.size,
+                frames=job.frames,
+                segment_seconds=SEGMENT_SECONDS if segment_seconds is None else segment_seconds,
+                checkpoint_seconds=job.checkpoint_seconds,
+                reading=job.reading,
+                restart=restart,
+            )
         _print_plan(fit, job.config, display, Path(job.clip), options)
         again = f"Give the same command again{' with --resume added' if restart else ''} to continue."
         outcomes = run_jobs(fit.jobs, "segments", display, pool, cure=again)
@@ -66,9 +66,12 @@ def fit_in_segments(
         raise Stopped(f"{len(failed)} of {len(outcomes)} segments failed{others}. {again}")
 
     def join(path: Path) -> JoinedFit:
-        return _join_with_progress(dataclasses.replace(fit, target=path), outcomes, display)
+        records = {outcome.job.name: outcome.record for outcome in outcomes}
+        shared = sum(max(0, before[1] - after[0]) for before, after in itertools.pairwise(fit.spans))
+        with progress_bar("Joining", max(shared, 1), shown=display == "bar" and shared > 0) as advance:
+            return dataclasses.replace(fit, target=path).join(records, on_frame=advance)
 
-    joined = write_result(target, join)
+    joined = write_or_keep(target, join)
     target = joined.path
     fit.clean_up()
     figures = _summarize(fit, joined, outcomes, job.config)
@@ -84,28 +87,21 @@ def print_failures(failed: list[Outcome]) -> None:
         err.print(f"failed: {outcome.job.name}: {outcome.failure}", style="red", soft_wrap=True)
 
 
-def plan_gaussians(config: FitConfig, num_frames: int, *size: int, threads: int | None = None) -> tuple[int, str]:
-    """The number of Gaussians at the start; and "up to " where it is a bound, as the motion of the clip decides."""
-    choose = partial(chosen_num_gaussians, config, num_frames, *size, threads=threads)
-    if config.initialization == "uniform":
-        return choose(), ""
-    least, most = choose(lifetime=num_frames), choose(lifetime=min(num_frames, SHORTEST_LIFETIME))
-    return most, "up to " if least < most else ""
+def plan_gaussians(config: FitConfig, num_frames: int, *size: int, threads: int | None = None) -> int:
+    """The number of Gaussians at the start; the most, where the motion of the clip decides."""
+    lifetime = min(num_frames, SHORTEST_LIFETIME)
+    return chosen_num_gaussians(config, num_frames, *size, threads=threads, lifetime=lifetime)
 
 
-def describe_budgets(config: FitConfig, steps: int | None) -> str:
-    """The budgets of a fit that are set, and what is asked of a compact model, as "3,000 steps, quality 50"."""
-    budgets = {"{:,} steps": steps, "{:g} minutes": config.minutes}
+def describe_plan(config: FitConfig, num: int, num_frames: int) -> str:
+    """The Gaussians, budgets and goals of a fit, as "40,000 Gaussians of degree 1, 3,000 steps, quality 50"."""
+    budgets = {"{:,} steps": planned_steps(config, num_frames), "{:g} minutes": config.minutes}
     goals = {"quality {:g}": config.quality, "{:g} MB at most": config.size_mb, "{:g} dB": config.psnr}
     texts = ([text.format(value) for text, value in of.items() if value is not None] for of in (budgets, goals))
-    return ", ".join(filter(None, map(" or ".join, texts)))
-
-
-def _join_with_progress(fit: LongFit, outcomes: list[Outcome], display: Display) -> JoinedFit:
-    records = {outcome.job.name: outcome.record for outcome in outcomes}
-    shared = sum(max(0, before[1] - after[0]) for before, after in zip(fit.spans[:-1], fit.spans[1:], strict=True))
-    with progress_bar("Joining", max(shared, 1), shown=display == "bar" and shared > 0) as advance:
-        return fit.join(records, on_frame=advance)
+    at_most = "up to " if config.num_gaussians is None else ""
+    at_start = "" if config.strategy.growth is None else " at the start"
+    gaussians = f"{at_most}{num:,} Gaussians of degree {config.fold_degree}{at_start}"
+    return ", ".join(filter(None, [gaussians, *map(" or ".join, texts)]))
 
 
 def _summarize(fit: LongFit, joined: JoinedFit, outcomes: list[Outcome], config: FitConfig) -> dict[str, Any]:
@@ -131,30 +127,6 @@ def _summarize(fit: LongFit, joined: JoinedFit, outcomes: list[Outcome], config:
     return figures
 
 
-def _plan_with_progress(plan: partial[LongFit], display: Display) -> LongFit:
-    """The plan, for which the whole clip is indexed once."""
-    status = err.status("Indexing the clip") if display == "bar" else None
-    count, due = 0, time.monotonic() + LINE_SECONDS
-
-    def on_frame() -> None:
-        nonlocal count, due
-        count += 1
-        if status is not None and count % 25 == 0:
-            status.update(f"Indexing the clip: {count:,} frames")
-        elif display == "lines" and time.monotonic() > due:
-            due = time.monotonic() + LINE_SECONDS
-            err.print(f"indexing the clip: {count:,} frames")
-
-    try:
-        with nullcontext() if status is None else status:
-            return plan(on_frame=on_frame)
-    except ValueError as error:
-        if str(error).startswith(("segment_seconds:", "resume:", "target:")):
-            text = name_option(str(error)).replace("--target:", "--out:", 1).replace("num_gaussians=", "gaussians=")
-            raise WrongUse(text) from error
-        raise
-
-
 def _print_plan(fit: LongFit, config: FitConfig, display: Display, video: Path, options: WorkerOptions) -> None:
     index = fit.index
     lengths = [stop - first for first, stop in fit.spans]
@@ -162,7 +134,7 @@ def _print_plan(fit: LongFit, config: FitConfig, display: Display, video: Path, 
     for note in (*index.notes, *describe_crop([index.size], size)):
         warn(f"{video}: {note}")
     longest = fit.jobs[lengths.index(max(lengths))].config  # with its part of the file's size
-    num, at_most = plan_gaussians(longest, max(lengths), *size, threads=options.threads)
+    num = plan_gaussians(longest, max(lengths), *size, threads=options.threads)
     if display == "json":
         about = {"clip": str(video), "num_frames": index.num_frames, "height": size[0], "width": size[1]}
         emit_json("start", about | {"spans": [list(span) for span in fit.spans], "most_gaussians": num})
@@ -172,13 +144,12 @@ def _print_plan(fit: LongFit, config: FitConfig, display: Display, video: Path, 
     begun = sum(job.checkpoint.exists() for job in fit.jobs)
     if done or begun:
         err.print(f"continuing: {done} of {len(fit.jobs)} segments done, {begun} begun", soft_wrap=True)
-    at_cuts = sum(before[1] == after[0] for before, after in zip(fit.spans[:-1], fit.spans[1:], strict=True))
+    at_cuts = sum(before[1] == after[0] for before, after in itertools.pairwise(fit.spans))
     span = f"{min(lengths)} to {max(lengths)}" if min(lengths) < max(lengths) else f"{lengths[0]}"
     where = f" ({at_cuts} end at cuts)" if at_cuts else ""
-    plan = describe_budgets(config, planned_steps(config, max(lengths)))
     out.print(
         f"{video}: {format_count(index.num_frames, 'frame')} of {size[0]}x{size[1]} in "
         f"{format_count(len(lengths), 'segment')} of {span} frame{'' if span == '1' else 's'}{where}, each with "
-        f"{at_most}{num:,} Gaussians of degree {config.fold_degree} and {plan}, by {options}",
+        f"{describe_plan(config, num, max(lengths))}, by {options}",
         soft_wrap=True,
     )

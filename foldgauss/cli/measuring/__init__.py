@@ -1,1 +1,1 @@
-"""The commands that measure: `tradeoff`, `uncertainty` and `doctor`, with the files that they write."""
+"""The commands that measure: `tradeoff` and `uncertainty`."""

@@ -2,15 +2,16 @@
 
 import dataclasses
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import typer
 
-from foldgauss.cli.app.application import WrongUse, name_option, wrong_use
+from foldgauss._runtime.checks import invalid
 from foldgauss.cli.app.completion import complete_choice, complete_clips, complete_models
-from foldgauss.io.media.clip import DEINTERLACE, Reading, check_reading
+from foldgauss.io.media.clip import DEINTERLACE
 from foldgauss.render import RenderOptions
 
 #: Largest number of times, which at usual rates play for an hour.
@@ -41,8 +42,8 @@ Levels = Annotated[
 Deinterlace = Annotated[
     str,
     typer.Option(
-        metavar="frames|fields|refuse",
-        help="An interlaced frame becomes one, or two at twice the rate, one of each field; or is refused.",
+        metavar="HOW",
+        help="Interlaced frames: frames, each becomes one; fields, two at twice the rate; refuse.",
         autocompletion=complete_choice(DEINTERLACE),
     ),
 ]
@@ -81,15 +82,6 @@ TransmittanceStop = Annotated[
         rich_help_panel=RENDERER,
     ),
 ]
-Original = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="CLIP",
-        help="The clip that the model was fitted to, to show next to it in the player.",
-        autocompletion=complete_clips,
-    ),
-]
-OriginalQuality = Annotated[int, typer.Option(help="WebP quality of the clip's frames in the page.", min=1, max=100)]
 
 
 def parse_size(text: str | None) -> tuple[int, int] | None:
@@ -97,7 +89,7 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
         return None
     height, cross, width = text.lower().partition("x")
     if not (cross and height.isdecimal() and width.isdecimal() and int(height) > 0 and int(width) > 0):
-        raise WrongUse(f"--size: expected HxW with both at least 1, as 160x320, got {text!r}.")
+        raise invalid("--size", expected="HxW with both at least 1, as 160x320", got=repr(text))
     return int(height), int(width)
 
 
@@ -106,15 +98,8 @@ def parse_frames(text: str | None) -> tuple[int | None, int | None] | None:
         return None
     first, colon, last = text.partition(":")
     if not colon or any(part and not part.isdecimal() for part in (first, last)):
-        raise WrongUse(f"--frames: expected A:B with whole numbers >= 0, as 0:24, got {text!r}.")
+        raise invalid("--frames", expected="A:B with whole numbers >= 0, as 0:24", got=repr(text))
     return (int(first) if first else None), (int(last) if last else None)
-
-
-def parse_reading(deinterlace: str, levels: int | None) -> Reading:
-    try:
-        return check_reading(deinterlace, levels)
-    except ValueError as error:
-        raise WrongUse(name_option(str(error))) from error
 
 
 def parse_color(text: str) -> tuple[float, float, float] | None:
@@ -123,9 +108,8 @@ def parse_color(text: str) -> tuple[float, float, float] | None:
         return None
     digits = text.removeprefix("#")
     if not re.fullmatch("[0-9a-fA-F]{6}", digits):
-        raise WrongUse(
-            f"--background: expected none, or six hexadecimal digits RRGGBB, as ffffff for white, got {text!r}."
-        )
+        expected = "none, or six hexadecimal digits RRGGBB, as ffffff for white"
+        raise invalid("--background", expected=expected, got=repr(text))
     return tuple(byte / 255 for byte in bytes.fromhex(digits))
 
 
@@ -140,9 +124,9 @@ def parse_times(text: str | None) -> np.ndarray | None:
         else:
             times = np.array([float(part) for part in text.split(",")])
     except ValueError as error:
-        raise wrong_use("--times", expected=expected, got=text) from error
+        raise invalid("--times", expected=expected, got=text) from error
     if not (0 < len(times) <= MAX_TIMES and ((times >= 0) & (times <= 1)).all()):
-        raise wrong_use("--times", expected=expected, got=text)
+        raise invalid("--times", expected=expected, got=text)
     return times
 
 
@@ -152,13 +136,17 @@ def override_constants(
     support_radius: float | None,
     transmittance_stop: float | None,
 ) -> RenderOptions:
-    """`options` with the constants that are not None. Raises WrongUse for one out of its bounds."""
+    """`options` with the constants that are not None."""
     constants = {
         "alpha_cutoff": alpha_cutoff,
         "support_radius": support_radius,
         "transmittance_stop": transmittance_stop,
     }
-    try:
-        return dataclasses.replace(options, **{name: value for name, value in constants.items() if value is not None})
-    except ValueError as error:
-        raise WrongUse(name_option(str(error).removeprefix("RenderOptions."))) from error
+    return dataclasses.replace(options, **{name: value for name, value in constants.items() if value is not None})
+
+
+def refuse_together(option: str, others: Mapping[str, object]) -> None:
+    """Raise where one of the `others`, values by option, is given beside `option`."""
+    for other, value in others.items():
+        if value is not None and value is not False:
+            raise invalid(option, expected=f"no {other}", got="both")

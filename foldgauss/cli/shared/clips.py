@@ -4,7 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from foldgauss.cli.app.application import warn, wrong_use
+from foldgauss._runtime.checks import ParameterError, invalid
+from foldgauss.cli.app.application import warn
 from foldgauss.cli.shared.arguments import parse_frames
 from foldgauss.cli.shared.log_lines import show_status
 from foldgauss.io.media.clip import Clip
@@ -12,7 +13,7 @@ from foldgauss.io.media.frame_index import index_video
 from foldgauss.io.media.lazy_frames import LazyFrames
 from foldgauss.io.media.video_reading import read_video
 from foldgauss.io.models.segmented import is_segmented
-from foldgauss.io.models.video_model import load_video_model, read_origin
+from foldgauss.io.models.video_model import read_origin
 from foldgauss.io.provenance import has_other_frames
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.video_model import VideoModel
@@ -26,11 +27,10 @@ OTHER_CLIP_DB = 3.0
 
 
 def refuse_segments(model_path: Path) -> None:
-    """For commands whose model must not be in segments. Raises WrongUse, and as `load_video_model`."""
+    """For commands whose model must not be in segments."""
     if is_segmented(model_path):
-        got = f"one of {len(load_video_model(model_path).segments):,} segments"
-        cure = f"Extract one: foldgauss segment {model_path} 0."
-        raise wrong_use("MODEL", expected="a model of one piece", got=got, cure=cure)
+        cure = f"Extract one: foldgauss export {model_path} --format model --segment 0."
+        raise invalid("MODEL", expected="a model of one piece", got="one in segments", cure=cure)
 
 
 def read_fitted_clip(
@@ -47,8 +47,8 @@ def read_fitted_clip(
     For a model in segments the frames are `LazyFrames`, since the clip may be larger than memory. `name` is the
     argument or the option that gives the clip. Commands with such an option have no --frames.
 
-    Raises WrongUse, with `same_number`, for another number of frames than the model's, and for a clip to which the
-    recorded range or options of reading do not apply.
+    Raises ParameterError, with `same_number`, for another number of frames than the model's, and for a clip to which
+    the recorded range or options of reading do not apply.
     """
     about = read_origin(model_path)
     kept, reading = about.get("frames"), about.get("reading", {})
@@ -56,22 +56,21 @@ def read_fitted_clip(
     try:
         read = _read_lazily if isinstance(model, SegmentedVideo) else read_video
         clip = read(video, frames=wanted, size=model.size, **reading)
-    except ValueError as error:
-        parameter = str(error).partition(":")[0]
-        if parameter == "frames" and frames is None:
+    except ParameterError as error:
+        if error.parameter == "frames" and frames is None:
             as_fitted, got = f"frames {wanted[0]}:{wanted[1]} of {about.get('clip')}", "which has fewer"
-        elif parameter in reading:
-            as_fitted = f"{about.get('clip')} read with {parameter}={reading[parameter]!r}"
+        elif error.parameter in reading:
+            as_fitted = f"{about.get('clip')} read with {error.parameter}={reading[error.parameter]!r}"
             got = "to which that does not apply"
         else:
             raise
         expected = f"the clip that the model was fitted to, {as_fitted}"
-        raise wrong_use(name, expected=expected, got=f"{str(video)!r}, {got}", cure="Give that clip.") from error
+        raise invalid(name, expected=expected, got=f"{str(video)!r}, {got}", cure="Give that clip.") from error
     for note in clip.notes:
         warn(f"{clip.source}: {note}")
     if same_number and clip.num_frames != model.num_frames:
         by_clip = name.startswith("--") or (frames is None and clip.num_frames < model.num_frames)
-        raise wrong_use(
+        raise invalid(
             name if by_clip else "--frames",
             expected=f"{model.num_frames} frames as in the model",
             got=f"{clip.num_frames} of {clip.source!r}",

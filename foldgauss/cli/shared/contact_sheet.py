@@ -5,7 +5,12 @@ import numpy as np
 
 #: Factor by which errors are magnified: a difference of 255 / 8 = 32 levels shows as full brightness.
 ERROR_GAIN = 8
-_MARGIN, _BAND, _INK, _PAPER = 8, 26, (40, 40, 40), 250
+#: Pixels between images, and height of the band of a title.
+_MARGIN = 8
+_BAND = 26
+#: Colors of text, and of the background.
+_INK = (40, 40, 40)
+_PAPER = 250
 
 
 def make_comparison_sheet(
@@ -15,24 +20,12 @@ def make_comparison_sheet(
 
     Images are uint8 RGB of one size; `captions` stand above the rows. Returns uint8 (height, width, 3).
     """
-    rows, titles = [], []
+    rows = []
     for original, image, caption in zip(originals, reconstructions, captions, strict=True):
-        error = np.abs(original.astype(np.int16) - image)
-        rows.append([original, image, np.clip(error * ERROR_GAIN, 0, 255).astype(np.uint8)])
-        titles.append([f"original, {caption}", "reconstruction", f"error x {ERROR_GAIN}"])
-    return make_contact_sheet(rows, titles)
-
-
-def make_contact_sheet(rows: list[list[np.ndarray]], titles: list[list[str]]) -> np.ndarray:
-    """Rows of images, uint8 RGB of one size, the same number in each row, with a title above each image.
-
-    Returns uint8 (height, width, 3).
-    """
-    lines = [
-        np.concatenate([_add_title(*pair) for pair in zip(row, above, strict=True)], axis=1)
-        for row, above in zip(rows, titles, strict=True)
-    ]
-    return np.pad(np.concatenate(lines), ((0, _MARGIN), (0, _MARGIN), (0, 0)), constant_values=_PAPER)
+        error = np.clip(np.abs(original.astype(np.int16) - image) * ERROR_GAIN, 0, 255).astype(np.uint8)
+        titled = (original, f"original, {caption}"), (image, "reconstruction"), (error, f"error x {ERROR_GAIN}")
+        rows.append(np.concatenate([_add_title(*pair) for pair in titled], axis=1))
+    return np.pad(np.concatenate(rows), ((0, _MARGIN), (0, _MARGIN), (0, 0)), constant_values=_PAPER)
 
 
 def _add_title(image: np.ndarray, title: str) -> np.ndarray:

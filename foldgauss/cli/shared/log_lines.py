@@ -12,8 +12,8 @@ from jaxtyping import Float
 from foldgauss.cli.app.application import err, out, warn
 from foldgauss.video.models.frame_times import is_cut
 
-#: So many starts of shots are printed.
-LISTED_STARTS = 8
+#: So many numbers of frames are printed.
+LISTED_FRAMES = 8
 #: Seconds before the first line of a log, which is early since options may be mistyped.
 FIRST_LINE_SECONDS = 10.0
 #: Seconds between two lines of a log.
@@ -71,14 +71,14 @@ def print_log() -> Iterator[None]:
 def print_shots(starts: tuple[int, ...], times: Float[np.ndarray, " frames"]) -> None:
     """Print where shots begin if there are several, and warn of those that no cut between frame times explains."""
     if len(starts) > 1:
-        err.print(f"{len(starts)} shots, each on its own; they begin at frames {_listed(starts)}.")
+        err.print(f"{len(starts)} shots, each on its own; they begin at frames {list_frames(starts)}.")
     lost = sorted(set(starts[1:]) - set(1 + np.flatnonzero(is_cut(times))))
     if lost:
         warn(
-            f"The motion of the camera was not found before frames {_listed(lost)}, and the model has no cut "
+            f"The motion of the camera was not found before frames {list_frames(lost)}, and the model has no cut "
             "there: the picture may jump. A longer fit shows more to follow, above all where contrast is low."
         )
 
 
-def _listed(frames: Sequence[int]) -> str:
-    return ", ".join(map(str, frames[:LISTED_STARTS])) + (", ..." if len(frames) > LISTED_STARTS else "")
+def list_frames(frames: Sequence[int]) -> str:
+    return ", ".join(map(str, frames[:LISTED_FRAMES])) + (", ..." if len(frames) > LISTED_FRAMES else "")

@@ -7,22 +7,34 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from foldgauss.cli.app.application import out, warn, wrong_use
-from foldgauss.cli.shared.arguments import MAX_TIMES
+from foldgauss._runtime.checks import invalid
+from foldgauss.cli.app.application import out, warn
+from foldgauss.cli.shared.arguments import MAX_TIMES, refuse_together
 from foldgauss.cli.shared.clips import Video
+from foldgauss.cli.shared.log_lines import list_frames
 from foldgauss.io.media.frame_rate import MAX_FPS, MIN_FPS
 from foldgauss.video.models.frame_times import interpolated_times, played_positions, remapped_positions, times_at
 from foldgauss.video.motion.slow_motion import even_durations
 
-#: So many repeated frames are printed.
-LISTED_REPEATS = 8
-MAX_UPSAMPLE, MAX_IMAGES = MAX_TIMES, 10 * MAX_TIMES
-MIN_SPEED, MAX_SECONDS = 1e-4, 1e6
+MAX_UPSAMPLE = MAX_TIMES
+MAX_IMAGES = 10 * MAX_TIMES
+#: The slowest playback, and the inverse of the fastest.
+MIN_SPEED = 1e-4
+#: The longest video that `--remap` makes.
+MAX_SECONDS = 1e6
 MAX_EVEN_FPS = 50.0  # frames per second, the most of a GIF: a constant rate is not made higher for short intervals
 
-Upsample = Annotated[int | None, typer.Option(help="Frames per original interval [default: 1].")]
+Upsample = Annotated[
+    int | None, typer.Option(metavar="K", help="Frames per original interval [default: 1].", min=1, max=MAX_UPSAMPLE)
+]
 Fps = Annotated[
-    float | None, typer.Option(help="Frames per second [default: as the clip; with --upsample K, K times as many].")
+    float | None,
+    typer.Option(
+        metavar="RATE",
+        help="Frames per second [default: as the clip; with --upsample K, K times as many].",
+        min=MIN_FPS,
+        max=MAX_FPS,
+    ),
 ]
 Speed = Annotated[float | None, typer.Option(help="Playback speed: 0.25 is slow motion, -1 backwards.")]
 
@@ -49,24 +61,18 @@ class Timeline:
     frame: int | None = None
 
     def __post_init__(self) -> None:
-        ways = {
-            "upsample": self.upsample,
-            "speed": self.speed,
-            "remap": self.remap,
-            "times": self.chosen,
-            "frame": self.frame,
-        }
-        given = [f"--{name}" for name, value in ways.items() if value is not None]
+        given = [option for option, value in self.ways.items() if value is not None]
         if len(given) > 1:
-            raise wrong_use(given[0], expected="one way to choose times", got=" and ".join(given))
-        if self.upsample is not None and not 1 <= self.upsample <= MAX_UPSAMPLE:
-            expected = f"a whole number from 1 to {MAX_UPSAMPLE:,}"
-            raise wrong_use("--upsample", expected=expected, got=self.upsample)
-        if self.fps is not None and not MIN_FPS <= self.fps <= MAX_FPS:
-            raise wrong_use("--fps", expected=f"a rate in [{MIN_FPS:g}, {MAX_FPS:g}]", got=self.fps)
+            raise invalid(given[0], expected="one way to choose times", got=" and ".join(given))
         if self.speed is not None and not MIN_SPEED <= abs(self.speed) <= 1 / MIN_SPEED:
             expected = f"a number from {MIN_SPEED:g} to {1 / MIN_SPEED:g}, or the same below 0"
-            raise wrong_use("--speed", expected=expected, got=self.speed)
+            raise invalid("--speed", expected=expected, got=self.speed)
+
+    @property
+    def ways(self) -> dict[str, object]:
+        """The values of the options that exclude each other."""
+        ways = {"--upsample": self.upsample, "--speed": self.speed, "--remap": self.remap}
+        return ways | {"--times": self.chosen, "--frame": self.frame}
 
     @property
     def is_single(self) -> bool:
@@ -105,7 +111,7 @@ class Timeline:
         if self.frame is not None:
             num = len(frame_times)
             if not -num <= self.frame < num:
-                raise wrong_use("--frame", expected=f"a frame from {-num} to {num - 1}", got=self.frame)
+                raise invalid("--frame", expected=f"a frame from {-num} to {num - 1}", got=self.frame)
             return frame_times[[self.frame]]
         if self.upsample is not None:
             self._refuse_long("--upsample", (len(frame_times) - 1) * self.upsample)
@@ -129,13 +135,10 @@ class Timeline:
     ) -> tuple["Timeline", np.ndarray]:
         """The timeline at a constant rate, and the clip's seconds with less between a frame and its repetition."""
         others = {"--times": self.chosen, "--frame": self.frame, "--remap": self.remap, "--sound": sound}
-        for name, value in others.items():
-            if value is not None:
-                raise wrong_use("--skip-repeats", expected=f"no {name}", got="both")
+        refuse_together("--skip-repeats", others)
         durations, fps = even_durations(video), video.fps
         repeats = np.flatnonzero(durations < 1) + 1
-        numbers = ", ".join(map(str, repeats[:LISTED_REPEATS])) + (", ..." if len(repeats) > LISTED_REPEATS else "")
-        out.print(f"Frames that repeat the one before: {numbers or 'none'}.", soft_wrap=True)
+        out.print(f"Frames that repeat the one before: {list_frames(repeats) or 'none'}.", soft_wrap=True)
         shown = np.full(video.num_frames, 1 / fps) if seconds is None else np.diff(seconds)
         shown[:-1] *= durations
         timeline = dataclasses.replace(self, upsample=None, fps=self.rate(fps, seconds), speed=self.playing_speed(fps))
@@ -155,7 +158,7 @@ class Timeline:
     def _refuse_long(self, option: str, num_images: float) -> None:
         if num_images > MAX_IMAGES:
             expected = f"at most {MAX_IMAGES:,} images"
-            raise wrong_use(option, expected=expected, got=f"{num_images:,.0f}")
+            raise invalid(option, expected=expected, got=f"{num_images:,.0f}")
 
 
 def _seconds_played(seconds: np.ndarray, rate: float, speed: float) -> np.ndarray:
@@ -182,5 +185,5 @@ def parse_remap(text: str | None) -> list[tuple[float, float]] | None:
         remapped_positions(points, fps=1.0)
     except ValueError as error:
         expected = "seconds shown = seconds of the clip, the former rising from 0, as 0=0,1=1,3=1,4=2"
-        raise wrong_use("--remap", expected=expected, got=text) from error
+        raise invalid("--remap", expected=expected, got=text) from error
     return points

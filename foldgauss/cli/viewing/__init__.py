@@ -1,1 +1,1 @@
-"""The commands that show models: `render`, `evaluate`, `info`, `figure` and `view`."""
+"""The commands that show models: `render`, `evaluate`, `info` and `view`."""

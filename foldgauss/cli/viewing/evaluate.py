@@ -7,7 +7,7 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from foldgauss.cli.app.application import app, out
+from foldgauss.cli.app.application import command, out
 from foldgauss.cli.shared.arguments import (
     AlphaCutoff,
     FittedClip,
@@ -19,17 +19,17 @@ from foldgauss.cli.shared.arguments import (
     override_constants,
 )
 from foldgauss.cli.shared.clips import read_fitted_clip
-from foldgauss.cli.shared.outputs import refuse_existing, refuse_inputs, write_result
+from foldgauss.cli.shared.outputs import check_output
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import print_figures, summarize_scores, write_json
-from foldgauss.io._atomic import check_writable
+from foldgauss.io._atomic import write_or_keep
 from foldgauss.io.models.video_model import load_video_model
 from foldgauss.video.models.metrics import Evaluation
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 from foldgauss.video.tradeoff import measure_frame_rate
 
 
-@app.command(name="evaluate")
+@command("evaluate")
 def evaluate_command(
     model_path: ModelFile,
     video: FittedClip,
@@ -48,9 +48,7 @@ def evaluate_command(
     segments has a row for each segment; --json has every frame.
     """
     if json_path is not None:
-        refuse_inputs(json_path, {"model": model_path, "clip": video}, "--json")
-        refuse_existing(json_path, overwrite, "--json")
-        check_writable(json_path)
+        check_output(json_path, overwrite, {"model": model_path, "clip": video}, "--json")
     model = load_video_model(model_path)
     constants = override_constants(model.options, alpha_cutoff, support_radius, transmittance_stop)
     model = model.with_options(constants)
@@ -67,7 +65,7 @@ def evaluate_command(
     print_figures(str(model_path), figures)
     if json_path is not None:
         figures |= {"psnr": scores.psnr, "ssim": scores.ssim}
-        write_result(json_path, lambda path: write_json(path, figures))
+        write_or_keep(json_path, lambda path: write_json(path, figures))
 
 
 def _print_segments(model: SegmentedVideo, scores: Evaluation) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from rich.table import Table
 
 from foldgauss._runtime.checks import is_within
-from foldgauss.cli.app.application import app, out
+from foldgauss.cli.app.application import command, out
 from foldgauss.cli.shared.arguments import ModelFile
 from foldgauss.cli.shared.clips import Video
 from foldgauss.io.models.compact import is_compact, measure_chunks
@@ -16,13 +16,8 @@ from foldgauss.video.editing.edited_video import EditedVideo, as_edited
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
-#: Number of segments that are listed.
-MAX_SEGMENTS = 100
-#: Number of shared paths whose Gaussians are counted one by one.
-MAX_PATHS = 3
 
-
-@app.command()
+@command("info")
 def info(model_path: ModelFile) -> None:
     """Show what a model file contains."""
     model = load_video_model(model_path)
@@ -76,7 +71,7 @@ def _print_segments(model_path: Path, model: SegmentedVideo, about: dict) -> Non
     _print_facts(model_path, figures, about)
     table = Table("segment", "frames", "begins", "Gaussians", "PSNR (dB)")
     before = None
-    for number, segment in enumerate(model.segments[:MAX_SEGMENTS]):
+    for number, segment in enumerate(model.segments):
         shared = 0 if before is None else before.stop - segment.first
         begins = "" if before is None else f"fading in over {shared:,}" if shared else "at a cut"
         quality = segment.metadata.get("mean_psnr")
@@ -84,8 +79,6 @@ def _print_segments(model_path: Path, model: SegmentedVideo, about: dict) -> Non
         table.add_row(str(number), *row, f"{quality:.2f}" if is_within(quality, "(0, 100]") else "")
         before = segment
     out.print(table)
-    if len(model.segments) > MAX_SEGMENTS:
-        out.print(f"and {len(model.segments) - MAX_SEGMENTS:,} more segments")
 
 
 def _describe_frames(model: Video, about: dict) -> str:
@@ -108,8 +101,6 @@ def _describe_paths(model: VideoModel | EditedVideo) -> dict[str, str]:
     paths = "a shared path" if num == 1 else f"{num:,} shared paths"
     each = f"{'' if len(knots) == 1 else 'up to '}{max(knots):,} knots"
     text = f"{followers.sum():,} of {model.num_gaussians:,} Gaussians follow {paths} of {each}"
-    if 1 < num <= MAX_PATHS:
-        text += ": " + ", ".join(f"{count:,} path {number}" for number, count in enumerate(followers, 1))
     return {"paths": text}
 
 

@@ -59,10 +59,16 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     timeout = 30  # seconds that a request may take to arrive
 
     def do_GET(self) -> None:
-        self._answer_page(send=True)
-
-    def do_HEAD(self) -> None:
-        self._answer_page(send=False)
+        if self.headers.get("Host") not in self.server.own_names:
+            self.send_error(403)
+        elif self.path.partition("?")[0] != "/":
+            self.send_error(404)
+        else:
+            try:
+                page = with_script(self.server.page, self.server.read_script())
+            except OSError as error:
+                return self._answer(500, f"{self.server.script.name}: expected a script, got {error}.")
+            self._answer(200, page, "text/html")
 
     def do_PUT(self) -> None:
         """Save the edit script."""
@@ -110,21 +116,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             return True
         return origin is not None and origin not in self.server.own_origins
 
-    def _answer_page(self, *, send: bool) -> None:
-        if self.headers.get("Host") not in self.server.own_names:
-            self.send_error(403)
-        elif self.path.partition("?")[0] != "/":
-            self.send_error(404)
-        else:
-            try:
-                page = with_script(self.server.page, self.server.read_script())
-            except OSError as error:
-                return self._answer(500, f"{self.server.script.name}: expected a script, got {error}.", send=send)
-            self._answer(200, page, "text/html", send=send)
-
-    def _answer(
-        self, code: int, body: str | bytes, kind: str = "text/plain", *, version: str = "", send: bool = True
-    ) -> None:
+    def _answer(self, code: int, body: str | bytes, kind: str = "text/plain", *, version: str = "") -> None:
         data = body.encode() if isinstance(body, str) else body
         self.send_response(code)
         self.send_header("Content-Type", f"{kind}; charset=utf-8")
@@ -136,9 +128,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         self.send_header("Cross-Origin-Resource-Policy", "same-origin")
         self.send_header("X-Frame-Options", "DENY")
         self.end_headers()
-        if send:
-            with suppress(ConnectionError):  # the tab was closed
-                self.wfile.write(data)
+        with suppress(ConnectionError):  # the tab was closed
+            self.wfile.write(data)
 
     def log_message(self, *message: object) -> None:
         """Do not log to the console."""

@@ -1,12 +1,14 @@
 """The command `render`."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import typer
 
-from foldgauss.cli.app.application import app, wrong_use
+from foldgauss._runtime.checks import check_one_of, invalid
+from foldgauss.cli.app.application import command, out
 from foldgauss.cli.app.completion import complete_choice
 from foldgauss.cli.shared.arguments import (
     AlphaCutoff,
@@ -19,30 +21,35 @@ from foldgauss.cli.shared.arguments import (
     parse_color,
     parse_size,
     parse_times,
+    refuse_together,
 )
-from foldgauss.cli.shared.outputs import (
-    IMAGE_SUFFIX,
-    check_image_path,
-    check_images_output,
-    name_after,
-    refuse_huge,
-)
+from foldgauss.cli.shared.clips import Video
+from foldgauss.cli.shared.log_lines import print_shots
+from foldgauss.cli.shared.outputs import IMAGE_SUFFIX, check_images_output, name_after, refuse_huge
 from foldgauss.cli.shared.rendering import (
     CodecName,
     Crf,
-    Flow,
+    Output,
     PixelFormat,
     SoundFile,
-    VideoOptions,
     choose_sound,
-    render_to_file,
+    progress_bar,
 )
 from foldgauss.cli.shared.timeline import Fps, SkipRepeats, Speed, Timeline, Upsample, parse_remap
+from foldgauss.cli.viewing.plate import make_plate
 from foldgauss.io.media.video_writing import IMAGE_FORMATS, VIDEO_SUFFIXES
 from foldgauss.io.models.video_model import load_video_model, read_frame_seconds, read_origin
+from foldgauss.video.motion.slow_motion import interpolate_frames
+from foldgauss.video.motion.stabilization import BORDERS, MAX_ZOOM, SMOOTHING, stabilize
+
+#: Panels of `--help`.
+STABILIZED = "Stabilized"
+PLATE = "Without an object"
+#: How `--stabilize` moves the camera.
+CAMERAS = ("smooth", "fixed")
 
 
-@app.command()
+@command("render")
 def render(
     model_path: ModelFile,
     out_path: Annotated[
@@ -68,6 +75,12 @@ def render(
     frame: Annotated[
         int | None, typer.Option(metavar="K", help="Frame K alone, at its learned time; -1 is the last.")
     ] = None,
+    flow: Annotated[
+        bool,
+        typer.Option(
+            "--flow/--no-flow", help="Between frames, average with a prediction by optical flow from the frames around."
+        ),
+    ] = True,
     background: Annotated[
         str,
         typer.Option(
@@ -75,6 +88,59 @@ def render(
             help="Background color of a model of a clip with alpha, such as ffffff; none: images with alpha.",
         ),
     ] = "000000",
+    overwrite: Overwrite = False,
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            "--stabilize",
+            metavar="smooth|fixed",
+            help="As a steadier camera would show it; fixed: one that stands still, each shot as its middle frame.",
+            autocompletion=complete_choice(CAMERAS),
+            rich_help_panel=STABILIZED,
+        ),
+    ] = None,
+    smoothing: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            help=f"Standard deviation of the filter that smooths the camera's path [default: {SMOOTHING:g}].",
+            rich_help_panel=STABILIZED,
+        ),
+    ] = None,
+    border: Annotated[
+        str | None,
+        typer.Option(
+            help=f"Where frames end: crop (enlarge, at most {MAX_ZOOM:g}x), fill (by other frames), "
+            "keep (background) [default: crop].",
+            autocompletion=complete_choice(BORDERS),
+            rich_help_panel=STABILIZED,
+        ),
+    ] = None,
+    plate: Annotated[
+        bool,
+        typer.Option(
+            "--plate",
+            help="Without the moving object, with what other frames show behind it.",
+            rich_help_panel=PLATE,
+        ),
+    ] = False,
+    masks_path: Annotated[
+        Path | None,
+        typer.Option(
+            "--masks",
+            help="Masks of what is removed: an image, a folder with one for each frame, or a video "
+            "[default: the object that moves is searched for].",
+            rich_help_panel=PLATE,
+        ),
+    ] = None,
+    save_masks: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Also write the masks that were used here, for edit scripts: PNGs.",
+            rich_help_panel=PLATE,
+        ),
+    ] = None,
     image_format: Annotated[
         str | None,
         typer.Option(
@@ -83,59 +149,77 @@ def render(
             autocompletion=complete_choice(IMAGE_FORMATS),
         ),
     ] = None,
-    alpha_cutoff: AlphaCutoff = None,
-    support_radius: SupportRadius = None,
-    transmittance_stop: TransmittanceStop = None,
     codec: CodecName = None,
     crf: Crf = None,
     pixel_format: PixelFormat = None,
     sound: SoundFile = None,
-    flow: Flow = True,
-    overwrite: Overwrite = False,
+    alpha_cutoff: AlphaCutoff = None,
+    support_radius: SupportRadius = None,
+    transmittance_stop: TransmittanceStop = None,
 ) -> None:
-    """Render a model as a video, also between its frames."""
+    """Render a model as a video: also between its frames, stabilized, or without an object."""
     timeline = Timeline(upsample, fps, speed, parse_remap(remap), parse_times(times), frame)
     image_size, background_color = parse_size(size), parse_color(background)
-    if out_path is None:
-        out_path = _name_output(model_path, timeline, image_format)
-    check_image_path(out_path, single=True)
-    if image_format is not None and (out_path.suffix and not out_path.is_dir()):
-        raise wrong_use("--format", expected="a folder as --out", got=out_path)
-    if image_format is not None and image_format not in IMAGE_FORMATS:
-        raise wrong_use("--format", expected="one of " + ", ".join(IMAGE_FORMATS), got=image_format)
-    check_images_output(out_path, {"model": model_path, "sound": sound}, overwrite)
-    model = load_video_model(model_path)
-    constants = override_constants(model.options, alpha_cutoff, support_radius, transmittance_stop)
-    model = model.with_options(constants)
-    refuse_huge(image_size or model.size)
-    about = read_origin(model_path)
-    options = VideoOptions(codec, crf, pixel_format, choose_sound(sound, timeline, about, model.fps))
-    seconds = read_frame_seconds(about, model.num_frames)
+    if camera is not None:
+        check_one_of("--stabilize", camera, CAMERAS)
+    check_one_of("--border", border or BORDERS[0], BORDERS)
+    needed = {"--smoothing": smoothing, "--border": border} if camera is None else {}
+    needed |= {} if plate else {"--masks": masks_path, "--save-masks": save_masks}
+    for option, value in needed.items():
+        if value is not None:
+            other = "--plate" if "masks" in option else "--stabilize"
+            raise invalid(option, expected=f"{other} too", got=f"{option} alone")
+    if camera == "fixed":
+        refuse_together("--stabilize fixed", {"--smoothing": smoothing})
+    if plate:
+        others = {"--stabilize": camera, "--fps": fps, "--skip-repeats": skip_repeats}
+        refuse_together("--plate", others | timeline.ways | {"--background none": background_color is None})
+    kind = ".plate" if plate else "" if camera is None else ".stable"
+    out_path = _name_output(model_path, timeline, image_format, kind) if out_path is None else out_path
+    if image_format is not None:
+        check_one_of("--format", image_format, IMAGE_FORMATS)
+        if out_path.suffix and not out_path.is_dir():
+            raise invalid("--format", expected="a folder as --out", got=out_path)
+    inputs = {"model": model_path, "masks": masks_path, "sound": sound}
+    check_images_output(out_path, overwrite, inputs, others=() if plate else (IMAGE_SUFFIX,))
+    model, about = load_video_model(model_path), read_origin(model_path)
+    model = model.with_options(override_constants(model.options, alpha_cutoff, support_radius, transmittance_stop))
+    image_size = image_size or model.size
+    refuse_huge(image_size)
+    seconds, sounding = read_frame_seconds(about, model.num_frames), choose_sound(sound, timeline, about, model.fps)
     rate = timeline.rate(model.fps, seconds)
     if skip_repeats:
         timeline, seconds = timeline.without_repeats(model, seconds, sound)
     shown = timeline.times(np.asarray(model.frame_times.times()), model.fps, seconds)
     timeline.warn_of_end(model.num_frames, model.fps, seconds)
-    render_to_file(
-        model,
-        out_path,
-        shown,
-        rate,
-        size=image_size,
-        background=background_color,
-        image_format=image_format or "png",
-        overwrite=overwrite,
-        options=options,
-        flow=flow,
-        stamps=timeline.stamps(model.fps, seconds),
-    )
+    stamps = timeline.stamps(model.fps, seconds)
+    encoding = {"codec": codec, "crf": crf, "pixel_format": pixel_format, "sound": sounding}
+    output = Output(out_path, rate, overwrite, stamps, image_format or "png", **encoding)
+    output.check(image_size, len(shown), background_color)
+    if plate:
+        make_plate(model, about, output, image_size, background_color, masks_path, save_masks, inputs)
+        return
+    video = model
+    if camera is not None:
+        video = _stabilize(model, camera, SMOOTHING if smoothing is None else smoothing, border or BORDERS[0])
+    draw = partial(interpolate_frames, video) if flow else video.frames
+    output.write(partial(draw, shown, image_size, background=background_color), len(shown))
 
 
-def _name_output(model_path: Path, timeline: Timeline, image_format: str | None) -> Path:
+def _stabilize(model: Video, camera: str, smoothing: float, border: str) -> Video:
+    with progress_bar("Estimating the camera's path", model.num_frames) as advance:
+        video = stabilize(model, smoothing=smoothing, fixed=camera == "fixed", border=border, on_frame=advance)
+    print_shots(video.path.starts, video.path.times)
+    if border == "crop" and f"{video.zoom:.2f}" != "1.00":
+        out.print(f"Enlarged by {video.zoom:.2f} to hide the borders.")
+    return video
+
+
+def _name_output(model_path: Path, timeline: Timeline, image_format: str | None, kind: str) -> Path:
     """The default name of the video, image or folder; never that of the clip, which may be in this folder."""
     if image_format is not None:
-        return name_after(model_path, "-frames")
+        return name_after(model_path, f"{kind}-frames")
     suffix = IMAGE_SUFFIX if timeline.is_single else VIDEO_SUFFIXES[0]
-    path = name_after(model_path, suffix)
+    path = name_after(model_path, f"{kind}{suffix}")
     clip = read_origin(model_path).get("clip", path.name)  # if unknown, it may have that name
-    return name_after(model_path, f".rendered{suffix}") if path.name == clip else path
+    return name_after(model_path, f".rendered{suffix}") if path.name == clip and not kind else path

@@ -2,43 +2,115 @@
 
 import webbrowser
 from functools import partial
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from foldgauss.cli.app.application import app, err, out, wrong_use
-from foldgauss.cli.shared.arguments import ModelFile, Original, OriginalQuality
+from foldgauss._runtime.checks import invalid
+from foldgauss.cli.app.application import command, err, out
+from foldgauss.cli.app.completion import complete_clips, complete_models
+from foldgauss.cli.shared.arguments import Overwrite, refuse_together
 from foldgauss.cli.shared.clips import read_fitted_clip
 from foldgauss.cli.shared.log_lines import show_status
+from foldgauss.cli.shared.outputs import check_output, refuse_existing
 from foldgauss.cli.viewing.page_server import PageServer, make_token, script_path
+from foldgauss.io._atomic import atomic_path, write_or_keep
+from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.video_model import load_video_model
-from foldgauss.io.page.player_page import QUALITY, SaveTarget, html_page, warn_of_size
+from foldgauss.io.page.player_page import (
+    HTML_SUFFIX,
+    QUALITY,
+    SaveTarget,
+    empty_page,
+    html_page,
+    linked_file,
+    warn_of_size,
+    write_html,
+)
 from foldgauss.video.motion.moving_object import NothingMoves
 
 
-@app.command(name="view")
+@command("view")
 def view_command(
-    model_path: ModelFile,
-    original: Original = None,
-    original_quality: OriginalQuality = QUALITY,
+    model_path: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="MODEL",
+            help="Model file; without one --out writes a page that opens model files.",
+            autocompletion=complete_models,
+        ),
+    ] = None,
+    out_path: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", metavar="FILE.html", help="Write the page here, to be sent or hosted, and do not serve it."
+        ),
+    ] = None,
+    original: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="CLIP",
+            help="The clip that the model was fitted to, to show next to it.",
+            autocompletion=complete_clips,
+        ),
+    ] = None,
+    original_quality: Annotated[
+        int, typer.Option(help="WebP quality of the clip's frames in the page.", min=1, max=100)
+    ] = QUALITY,
     moving: Annotated[
         bool,
         typer.Option("--moving-object", help="Find the object that moves (0.5 s per frame): a button selects it."),
     ] = False,
+    linked: Annotated[
+        bool, typer.Option("--linked", help="With --out: the model in a .fgz beside the page, read in parts over HTTP.")
+    ] = False,
     port: Annotated[int, typer.Option(help="Serve at this port.", min=0, max=65535, show_default="a free one")] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the browser.")] = True,
+    overwrite: Overwrite = False,
 ) -> None:
-    """Play and edit a model in the browser, until Ctrl-C.
+    """Play and edit a model in the browser, or write the page that does.
 
-    The page is served to this machine only. It saves the edit as MODEL.edit.toml beside the model, and opens what is
-    there. To save the page itself: foldgauss export MODEL --format html.
+    The page is served to this machine only, until Ctrl-C. It saves the edit as MODEL.edit.toml beside the model, and
+    opens what is there. With --out the page is written to a file instead, which makes no requests; see docs/player.md.
     """
-    frames = None
-    if original is not None:
-        frames = read_fitted_clip(load_video_model(model_path), model_path, original, None, name="--original")
+    if out_path is None:
+        if model_path is None:
+            raise invalid("MODEL", expected="a model file, or --out", got="neither")
+        if linked:
+            raise invalid("--linked", expected="--out too", got="--linked alone")
+        _serve(model_path, _read_original(model_path, original), original_quality, moving, port, browser)
+        return
+    if out_path.suffix.lower() != HTML_SUFFIX:
+        raise invalid("--out", expected=f"a name ending in {HTML_SUFFIX}", got=out_path)
+    refuse_together("--out", {"--moving-object": moving, "--port": port or None})
+    check_output(out_path, overwrite, {"model": model_path, "clip": original})
+    if model_path is None:
+        refuse_together("--out without MODEL", {"--original": original, "--linked": linked})
+        with atomic_path(out_path) as temporary:
+            temporary.write_text(empty_page(), encoding="utf-8")
+        out.print(f"{out_path}: a page that opens model files", soft_wrap=True)
+        return
+    beside = linked_file(out_path, model_path) if linked else None
+    if beside is not None and not (beside.exists() and beside.samefile(model_path)):
+        refuse_existing(beside, overwrite)
+    options = {"original": _read_original(model_path, original), "quality": original_quality, "linked": linked}
+    with show_status("Writing the page"):
+        path = write_or_keep(out_path, lambda path: write_html(path, model_path, **options))
+    reads = f", which reads {linked_file(path, model_path)}" if linked else ""
+    out.print(f"{path}: a page of {path.stat().st_size / 1e6:.1f} MB{reads}", soft_wrap=True)
+
+
+def _read_original(model_path: Path, original: Path | None) -> Clip | None:
+    if original is None:
+        return None
+    return read_fitted_clip(load_video_model(model_path), model_path, original, None, name="--original")
+
+
+def _serve(model_path: Path, original: Clip | None, quality: int, moving: bool, port: int, browser: bool) -> None:
     script, token = script_path(model_path), make_token()
     target = SaveTarget(script.name, token)
-    make_page = partial(html_page, model_path, original=frames, quality=original_quality, save_to=target)
+    make_page = partial(html_page, model_path, original=original, quality=quality, save_to=target)
     with show_status("Searching for what moves, writing the page" if moving else "Writing the page"):
         try:
             page = make_page(moving=moving)
@@ -50,7 +122,7 @@ def view_command(
         server = PageServer(page.encode(), port, script=script, token=token)
     except OSError as error:
         cure = "Choose another, or omit the option for a free one."
-        raise wrong_use("--port", expected="a free port", got=f"{port} ({error.strerror})", cure=cure) from error
+        raise invalid("--port", expected="a free port", got=f"{port} ({error.strerror})", cure=cure) from error
     with server:
         out.print(f"{model_path.name}, {len(page) / 1e6:.1f} MB, until Ctrl-C at {server.url}", soft_wrap=True)
         if browser:

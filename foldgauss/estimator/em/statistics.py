@@ -24,7 +24,6 @@ from jaxtyping import Array, Float
 
 from foldgauss._numerics.batch import cast
 from foldgauss._numerics.regression import hermite_columns
-from foldgauss._runtime.threads import check_not_forked
 from foldgauss.envelope import AbstractEnvelope, Constant
 from foldgauss.estimator.chunks import Chunks, Piece
 from foldgauss.estimator.em.components import Densities, Parameters, evaluate_densities
@@ -138,7 +137,6 @@ def sum_over_points(function: Callable, points: Points | Blocks, *arguments):
 
 
 def _sum_part(pieces: Iterable[Piece], size, prepare, dtype, num_components, devices, function, arguments):
-    check_not_forked()
     total, last = None, None
     with enable_dtype(dtype):
         for block in make_blocks(map(prepare, pieces), size, num_components, devices):

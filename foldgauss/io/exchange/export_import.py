@@ -12,15 +12,13 @@ from foldgauss.io.exchange.ply_file import format_error
 from foldgauss.io.exchange.pseudomesh import write_pseudomesh
 from foldgauss.io.exchange.vegas_ply import read_vegas_ply, write_vegas_ply
 from foldgauss.io.media.clip import Size
-from foldgauss.io.page.player_page import HTML_SUFFIX, Frames, linked_file, write_html
 from foldgauss.video.editing.chain import Edit
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
-#: The published VeGaS video in one file; 3DGS scenes, one for each frame; pseudomeshes, two files for each frame;
-#: an HTML page with a player.
-FORMATS = ("ply", "ply3dgs", "obj", "html")
+#: The published VeGaS video in one file; 3DGS scenes, one for each frame; pseudomeshes, two files for each frame.
+FORMATS = ("ply", "ply3dgs", "obj")
 
 
 def export(
@@ -32,10 +30,6 @@ def export(
     depth_step: float | None = None,
     axes: str | None = None,
     sh_degree: int | None = None,
-    original: Frames | None = None,
-    quality: int | None = None,
-    title: str | None = None,
-    linked: bool | None = None,
     overwrite: bool = False,
     on_frame: Callable[[], object] = lambda: None,
 ) -> Path:
@@ -46,11 +40,10 @@ def export(
     - `ply3dgs`: a folder with a 3DGS scene of each frame (`write_3dgs_frames`); or one file, where `out` ends in .ply
       and `times` is one (`write_3dgs_ply`)
     - `obj`: a folder with a pseudomesh of each frame (`write_pseudomesh`)
-    - `html`: one page for browsers, which renders the Gaussians at any time (`write_html`)
 
     `times` in [0, 1], one or several (default: the model's frame times), for the formats of frames; `depth_step`,
-    `axes` and `sh_degree` for `ply3dgs`; `original`, `quality`, `title` and `linked` for `html`. An existing output
-    is refused unless `overwrite`. `on_frame` is called after each frame of a folder.
+    `axes` and `sh_degree` for `ply3dgs`. An existing output is refused unless `overwrite`. `on_frame` is called after
+    each frame of a folder. Pages for browsers: `write_html`.
 
     **Raises:** ValueError for an unknown format, an option of another format, and as the function;
     `OutputError` where the output cannot be written or exists.
@@ -63,10 +56,10 @@ def export(
         raise invalid("model", expected=expected, got=type(model).__name__, cure=cure)
     check_one_of("format", format, FORMATS)
     out = check_path(out, "model, format, out")
-    of_scenes = _without_none(depth_step=depth_step, axes=axes, sh_degree=sh_degree)
-    of_pages = _without_none(original=original, quality=quality, title=title, linked=linked)
-    unknown = [*(of_scenes if format != "ply3dgs" else ()), *(of_pages if format != "html" else ())]
-    unknown += ["times"] if format in ("ply", "html") and times is not None else []
+    options = {"depth_step": depth_step, "axes": axes, "sh_degree": sh_degree}
+    of_scenes = {name: value for name, value in options.items() if value is not None}
+    unknown = [*(of_scenes if format != "ply3dgs" else ())]
+    unknown += ["times"] if format == "ply" and times is not None else []
     if unknown:
         raise invalid(unknown[0], expected="an option of this format", got=f"it for {format!r}", cure="Leave it out.")
     if format == "ply" and isinstance(model, SegmentedVideo):
@@ -74,11 +67,6 @@ def export(
     if format == "ply":
         _check_new(out, overwrite)
         return write_vegas_ply(out, model)
-    if format == "html":
-        if out.suffix.lower() == HTML_SUFFIX:
-            for path in (out, linked_file(out, model)) if linked else (out,):
-                _check_new(path, overwrite)
-        return write_html(out, model, **of_pages)
     if format == "obj":
         if out.suffix.lower() == ".obj" and not out.is_dir():
             cure = "Each frame becomes a file in it: leave the extension out."
@@ -92,10 +80,6 @@ def export(
         raise invalid("times", expected="one for a single file", got=got, cure=cure)
     _check_new(out, overwrite)
     return write_3dgs_ply(out, model, float(np.ravel(times)[0]), **of_scenes)
-
-
-def _without_none(**options: object) -> dict[str, object]:
-    return {name: value for name, value in options.items() if value is not None}
 
 
 def _write_vegas_segments(folder: Path, video: SegmentedVideo, overwrite: bool) -> Path:
@@ -112,7 +96,7 @@ def _check_new(path: Path, overwrite: bool) -> None:
     check_writable(path)
     if path.exists() and not overwrite:
         text = f"path: expected a new file, got {str(path)!r}, which exists."
-        raise OutputRefused(f"{text} Choose another path, or allow overwriting.")
+        raise OutputRefused(f"{text} Choose another path, or overwrite it.")
 
 
 def import_model(path: PathLike, *, size: Size | None = None, fps: float | None = None) -> VideoModel:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import ParameterError, invalid
 from foldgauss.io._atomic import PathLike, atomic_path, check_input
 
 _SIZES = {
@@ -32,20 +32,20 @@ NOTE = "foldgauss "
 LONGEST_WORD = 64
 
 
-class FormatError(ValueError):
+class FormatError(ParameterError):
     """A file of another program's format cannot be read or written; the message is one line."""
 
 
 def format_error(path: object, *, expected: str, got: str, cure: str = "") -> FormatError:
     """The error for a file; `path` is its name, optionally with the position in it."""
-    return FormatError(str(invalid(str(path), expected=expected, got=got, cure=cure)))
+    return invalid(str(path), expected=expected, got=got, cure=cure, kind=FormatError)
 
 
 def facts_error(path: object, error: Exception) -> FormatError:
     """The error for invalid metadata, with the text of `error` where it is one of our messages."""
     text = " ".join(str(error).split())[:300]
-    if ": expected " in text:
-        return FormatError(f"{path}: {text}")
+    if isinstance(error, ParameterError):
+        return FormatError(str(path), text)
     got = f"others ({type(error).__name__}: {text})"
     return format_error(path, expected="metadata as foldgauss writes them", got=got, cure="Remove them.")
 

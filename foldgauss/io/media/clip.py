@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
+from foldgauss._runtime.checks import ParameterError, check_one_of, invalid, is_integer, is_within
 from foldgauss.io._atomic import PathLike, check_path, missing_error, resolve
 from foldgauss.io.media.format_detection import HEAD_BYTES
 from foldgauss.io.media.frame_rate import MAX_FPS, MIN_FPS, FrameRate
@@ -29,7 +29,7 @@ RangeFacts = tuple[int, FrameRate, tuple[str, ...]]
 ReadResult = tuple[list[np.ndarray], *RangeFacts]
 
 
-class VideoError(ValueError):
+class VideoError(ParameterError):
     """A clip cannot be read or written as requested; the one-line message says what was expected, what was got, and
     how to correct it."""
 
@@ -232,7 +232,7 @@ def check_num_pixels(path: Path, size: Size | None) -> None:
 
 
 def video_error(parameter: str, *, expected: str, got: str, cure: str = "") -> VideoError:
-    return VideoError(str(invalid(parameter, expected=expected, got=got, cure=cure)))
+    return invalid(parameter, expected=expected, got=got, cure=cure, kind=VideoError)
 
 
 def no_frames_error(start: int, stop: int | None, num_decoded: int, num_total: int, path: Path) -> VideoError:

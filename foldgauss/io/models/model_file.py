@@ -13,8 +13,7 @@ import jax
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
-from foldgauss._runtime.checks import invalid
-from foldgauss._runtime.threads import check_not_forked
+from foldgauss._runtime.checks import ParameterError, invalid
 from foldgauss.io._atomic import PathLike, atomic_path, missing_error
 
 FORMAT = "foldgauss-model"
@@ -41,7 +40,7 @@ _MAGIC = {
 }
 
 
-class ModelFileError(ValueError):
+class ModelFileError(ParameterError):
     """A model cannot be saved to or loaded from this file; the message is one line."""
 
 
@@ -218,7 +217,6 @@ def load_part(path: Path, about: dict, prefix: str = "") -> Any:
     Raises `ModelFileError` as `load_model`.
     """
     kind, skeleton = match_kind(path, about)
-    check_not_forked()
     filled = _read_leaves(skeleton, path, prefix)
     try:
         kind.check(filled)
@@ -359,7 +357,7 @@ def open_tensors(path: Path) -> Iterator[Any]:
 
 def model_file_error(parameter: str, *, expected: str, got: object, cure: str = "") -> ModelFileError:
     """The error with the text of `invalid`."""
-    return ModelFileError(str(invalid(parameter, expected=expected, got=got, cure=cure)))
+    return invalid(parameter, expected=expected, got=got, cure=cure, kind=ModelFileError)
 
 
 def _unreadable_error(path: Path, got: str) -> ModelFileError:

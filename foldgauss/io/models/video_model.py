@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
+from foldgauss._runtime.checks import ParameterError, check_one_of, invalid, is_integer, is_within
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io._atomic import PathLike, check_path
 from foldgauss.io.media.clip import AS_STORED, check_frame_size, check_reading
@@ -223,8 +223,8 @@ def _video_skeleton(header: dict) -> VideoModel:
 def _describe_edited(video: EditedVideo) -> dict:
     try:
         layers = [_describe_layer(layer) for layer in video.layers]
-    except ValueError as error:  # a function
-        raise ModelFileError(str(error)) from error
+    except ParameterError as error:  # a function
+        raise ModelFileError(error.parameter, error.problem) from error
     return {"layers": layers, "camera": _describe_camera(video.camera), "timeline": video.timeline}
 
 

@@ -15,7 +15,6 @@ import numpy as np
 
 from foldgauss._runtime import notebook_hooks
 from foldgauss._runtime.checks import invalid, is_integer, is_within
-from foldgauss._runtime.threads import check_not_forked
 from foldgauss.video.compression.chunks import arrange
 from foldgauss.video.compression.quantize import Quantized, dequantize
 from foldgauss.video.fitting.budget import StepPlanner, TimeLeft, find_limit, measure_progress
@@ -139,7 +138,6 @@ def fit_steps(
     per frame. `clock` gives seconds, of which `FitConfig.minutes` is a budget: with `time.process_time` and one thread,
     fits beside other work are comparable.
     """
-    check_not_forked()
     check_frames(frames)
     _check_alpha(frames, config)
     engine = choose_engine(frames, config)

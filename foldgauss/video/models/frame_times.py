@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Float32
 
 from foldgauss._runtime.checks import invalid, is_integer, is_within, short_repr
-from foldgauss._runtime.threads import check_not_forked
 
 #: Length of the gap between two shots, in frames: this,
 GAP = 8.0
@@ -51,7 +50,6 @@ class FrameTimes(eqx.Module):
 
         Neighbors are equal only where a weight is too small for the dtype.
         """
-        check_not_forked()
         summed = jnp.cumsum(jax.nn.softmax(jnp.asarray(self.logits)))
         return jnp.concatenate([jnp.zeros(1, summed.dtype), summed / summed[-1:]])
 

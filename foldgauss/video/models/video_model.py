@@ -12,7 +12,6 @@ from jaxtyping import Array, Float
 from foldgauss._numerics.batch import concrete_value
 from foldgauss._runtime import notebook_hooks
 from foldgauss._runtime.checks import invalid, is_integer, is_within, short_repr
-from foldgauss._runtime.threads import check_not_forked
 from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.render.splats import check_size
 from foldgauss.video.models.background import BLACK, Background, check_background
@@ -29,7 +28,6 @@ ONE_SEGMENT = "Take one segment's own: video.segments[k].model."
 
 def check_time(t: float, name: str = "t", cure: str = "Frame k is at frame_times.times()[k].") -> None:
     """Raise ValueError unless t is one time, in [0, 1] if its value is known."""
-    check_not_forked()
     try:
         time = jnp.asarray(t)
         value = concrete_value(time)

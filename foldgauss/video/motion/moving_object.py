@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 from jaxtyping import Bool, Float32, Int32, UInt8
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import ParameterError, invalid
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.video.motion.background_plate import (
     Alignment,
@@ -102,7 +102,7 @@ LISTED_SHOTS = 8
 SELECT_OTHERWISE = "Select by a mask, a box or a click."
 
 
-class NothingMoves(ValueError):
+class NothingMoves(ParameterError):
     """No object moves on its own, or none that can be told from the background."""
 
 
@@ -136,7 +136,7 @@ def find_moving_object(frames: Frames, *, shadow: bool = False, alignment: Align
 
 def nothing_moves(expected: str, got: object, cure: str = SELECT_OTHERWISE) -> NothingMoves:
     """The error, to be raised."""
-    return NothingMoves(str(invalid("moving", expected=expected, got=got, cure=cure)))
+    return invalid("moving", expected=expected, got=got, cure=cure, kind=NothingMoves)
 
 
 def _log_missing(shots: list[tuple[int, int]]) -> None:

@@ -10,7 +10,7 @@ const DAMAGED = "The file is damaged or cut short. Copy it again.";
 /** {header, leaves} of a video model. Throws an Error for display. */
 export function readSafetensors(buffer) {
   const { about, tensor } = readTensors(buffer);
-  if (about.kind === "segmented-video") throw new Error("This is a model in segments, which the page cannot open as a file. Write its page with foldgauss export --format html, or extract one segment with foldgauss segment.");
+  if (about.kind === "segmented-video") throw new Error("This is a model in segments, which the page cannot open as a file. Write its page with foldgauss view --out, or extract one segment with foldgauss export --format model --segment.");
   if (about.kind === "edited-video") throw new Error("This is an edited video whose edits no folded model holds. Render it with foldgauss render, or open the model and the edit script.");
   if (about.kind !== "video") throw new Error(`This is a ${JSON.stringify(about.kind)}, not a model. Open the file that foldgauss fit wrote.`);
   const header = JSON.parse(about.header), { num_gaussians: num, degree } = header;
