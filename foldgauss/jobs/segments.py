@@ -17,8 +17,7 @@ from jaxtyping import Float
 from foldgauss._runtime.checks import invalid, is_integer, is_within
 from foldgauss.io._atomic import OutputError, atomic_path
 from foldgauss.io.media.clip import AS_STORED, Reading
-from foldgauss.io.media.frame_index import FrameIndex, index_video
-from foldgauss.io.media.indexed_reader import read_indexed
+from foldgauss.io.media.indexing import FrameIndex, index_video, read_indexed
 from foldgauss.io.models.segmented import join_segments
 from foldgauss.io.models.video_model import MODEL_SUFFIX, keep_origin, load_video_model, read_metadata
 from foldgauss.io.provenance import describe_reading

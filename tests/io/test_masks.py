@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from foldgauss.io import index_video, read_indexed, read_masks, read_video, write_image, write_video
-from foldgauss.io.media.frame_index import FrameIndex
+from foldgauss.io.media.indexing import FrameIndex
 from foldgauss.io.provenance import describe_reading
 
 SIZE = (40, 60)

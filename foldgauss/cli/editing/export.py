@@ -31,7 +31,7 @@ from foldgauss.cli.shared.rendering import progress_bar, write_images
 from foldgauss.io._atomic import check_writable
 from foldgauss.io.exchange.export_import import FORMATS, export, import_model
 from foldgauss.io.exchange.pseudomesh import read_pseudomesh
-from foldgauss.io.media.video_writing import VIDEO_SUFFIXES
+from foldgauss.io.media.writing import VIDEO_SUFFIXES
 from foldgauss.io.models.segmented import is_segmented
 from foldgauss.io.models.video_model import (
     MODEL_SUFFIX,

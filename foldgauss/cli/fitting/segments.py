@@ -15,7 +15,7 @@ from foldgauss.cli.shared.log_lines import LINE_SECONDS
 from foldgauss.cli.shared.outputs import write_result
 from foldgauss.cli.shared.rendering import progress_bar
 from foldgauss.cli.shared.tables import format_count, print_figures
-from foldgauss.io.media.resizing import describe_crop
+from foldgauss.io.media.reading import describe_crop
 from foldgauss.jobs import FitJob, JoinedFit, LongFit, Outcome, plan_long_fit, segments_folder
 from foldgauss.jobs.job import read_record
 from foldgauss.jobs.segments import SEGMENT_SECONDS, read_segment_seconds

@@ -19,7 +19,7 @@ from foldgauss._runtime import threads
 from foldgauss._runtime.device import default_platform
 from foldgauss._runtime.machine import cpu_model
 from foldgauss._runtime.threads import available_cores, num_threads
-from foldgauss.io.media.resizing import memory_limit
+from foldgauss.io.media.reading import memory_limit
 from foldgauss.render import ENGINES, RenderOptions, Splats2D, render
 from foldgauss.render.api import choose_engine
 from foldgauss.video.fitting.config import FitConfig

@@ -44,7 +44,7 @@ from foldgauss.cli.shared.rendering import TIME_LEFT
 from foldgauss.io._atomic import OutputError
 from foldgauss.io._lock import lock_output
 from foldgauss.io.media.clip import DEINTERLACE, Clip
-from foldgauss.io.media.video_reading import read_video
+from foldgauss.io.media.reading import read_video
 from foldgauss.io.models.compact import save_compact
 from foldgauss.io.models.video_model import load_video_model, save_video_model
 from foldgauss.io.provenance import fingerprint

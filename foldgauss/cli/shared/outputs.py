@@ -9,9 +9,9 @@ import typer
 
 from foldgauss.cli.app.application import WrongUse, err, wrong_use
 from foldgauss.io._atomic import OutputError, Result, check_replaceable, check_writable, resolve, write_or_keep
-from foldgauss.io.media.image_files import IMAGE_SUFFIXES
-from foldgauss.io.media.resizing import memory_limit
-from foldgauss.io.media.video_writing import ANIMATION_SUFFIXES, FRAME_NAMES, VIDEO_SUFFIXES
+from foldgauss.io.media.images import IMAGE_SUFFIXES
+from foldgauss.io.media.reading import memory_limit
+from foldgauss.io.media.writing import ANIMATION_SUFFIXES, FRAME_NAMES, VIDEO_SUFFIXES
 
 IMAGE_SUFFIX = ".png"
 

@@ -23,7 +23,7 @@ from foldgauss.cli.shared.outputs import (
 )
 from foldgauss.cli.shared.rendering import Flow
 from foldgauss.io._atomic import check_writable
-from foldgauss.io.media.video_writing import write_image
+from foldgauss.io.media.writing import write_image
 from foldgauss.io.models.video_model import load_video_model
 from foldgauss.video.models.frame_times import times_at
 from foldgauss.video.models.metrics import psnr

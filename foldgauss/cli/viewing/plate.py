@@ -28,7 +28,7 @@ from foldgauss.cli.shared.rendering import (
 from foldgauss.cli.shared.timeline import Timeline
 from foldgauss.io._atomic import resolve
 from foldgauss.io.media.masks import read_masks
-from foldgauss.io.media.video_writing import VIDEO_SUFFIXES
+from foldgauss.io.media.writing import VIDEO_SUFFIXES
 from foldgauss.io.models.video_model import load_video_model, read_frame_seconds, read_origin
 from foldgauss.video.motion.background_plate import Alignment, Frames, Masks, fill_background
 from foldgauss.video.motion.moving_object import LEAST_FRAMES, NothingMoves, find_moving_object

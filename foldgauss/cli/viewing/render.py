@@ -38,7 +38,7 @@ from foldgauss.cli.shared.rendering import (
     render_to_file,
 )
 from foldgauss.cli.shared.timeline import Fps, SkipRepeats, Speed, Timeline, Upsample, parse_remap
-from foldgauss.io.media.video_writing import IMAGE_FORMATS, VIDEO_SUFFIXES
+from foldgauss.io.media.writing import IMAGE_FORMATS, VIDEO_SUFFIXES
 from foldgauss.io.models.video_model import load_video_model, read_frame_seconds, read_origin
 
 

@@ -25,7 +25,7 @@ from foldgauss.cli.shared.rendering import (
     video_option,
 )
 from foldgauss.cli.shared.timeline import Fps, SkipRepeats, Speed, Timeline, Upsample
-from foldgauss.io.media.video_writing import VIDEO_SUFFIXES
+from foldgauss.io.media.writing import VIDEO_SUFFIXES
 from foldgauss.io.models.video_model import load_video_model, read_frame_seconds, read_origin
 from foldgauss.video.motion.stabilization import BORDERS, MAX_ZOOM, SMOOTHING, stabilize
 

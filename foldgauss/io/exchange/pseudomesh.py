@@ -20,7 +20,7 @@ from foldgauss.io.exchange.gaussians_ply import check_times, frame_gaussians, re
 from foldgauss.io.exchange.ply_file import facts_error, format_error, read_bytes
 from foldgauss.io.media.clip import Size
 from foldgauss.io.media.frame_rate import DEFAULT_FPS
-from foldgauss.io.media.image_files import natural_sort_key
+from foldgauss.io.media.images import natural_sort_key
 from foldgauss.render import COMPOSITINGS, Camera, Gaussians3D, RenderOptions, Splats2D, Triangles, cpu, project
 from foldgauss.render.splats import check_size, pixels_per_unit
 from foldgauss.render.triangle import COLLINEAR

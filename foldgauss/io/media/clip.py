@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
-from foldgauss.io._atomic import PathLike, check_path, missing_error, resolve
-from foldgauss.io.media.format_detection import HEAD_BYTES
-from foldgauss.io.media.frame_rate import MAX_FPS, MIN_FPS, FrameRate
+from foldgauss.io._atomic import PathLike, check_path, missing_error
+from foldgauss.io.media.frame_rate import MAX_FPS, MIN_FPS
 
-MAX_PIXELS = 1 << 28  # of one image, 16384x16384: a header may claim any size
+HEAD_BYTES = 1 << 16  # by which the format of a file is detected
+MAX_PIXELS = 178_956_970  # of one image, Pillow's limit: a header may claim any size
 VIDEO = "a video file or a folder of images"
 #: What becomes of an interlaced frame: one frame, one for each of its two fields, or an error.
 DEINTERLACE = ("frames", "fields", "refuse")
@@ -23,10 +23,6 @@ DEPTHS = (8, 10, 12, 14)  # bits of cameras and microscopes whose values are sto
 Range = tuple[int | None, int | None]
 Size = tuple[int, int]  # (height, width)
 Stretch = tuple[Size, Size]  # the size of frames as stored, and that to which they are stretched
-#: (frames declared within a range, frame rate, notes)
-RangeFacts = tuple[int, FrameRate, tuple[str, ...]]
-#: (prepared frames, and the facts)
-ReadResult = tuple[list[np.ndarray], *RangeFacts]
 
 
 class VideoError(ValueError):
@@ -153,12 +149,7 @@ def translate_os_errors(path: Path) -> Iterator[None]:
 
 
 def read_head(path: Path) -> bytes:
-    """The first bytes of a file. Raises `VideoError` for a name that is not Unicode: OpenCV crashes on it."""
-    try:
-        str(resolve(path)).encode()
-    except UnicodeEncodeError as error:
-        got, cure = f"{str(path)!a}, which is not Unicode", "Rename the file or its folder."
-        raise video_error("path", expected="a name that OpenCV can open", got=got, cure=cure) from error
+    """The first bytes of a file."""
     with open(path, "rb") as file:
         return file.read(HEAD_BYTES)
 
@@ -201,14 +192,6 @@ def clamp_stop(start: int, stop: int | None, num_total: int, path: Path) -> int:
     return num_total if stop is None else min(stop, num_total)
 
 
-def describe_clamped(num: int, start: int, stop: int | None) -> tuple[str, ...]:
-    """A note if a range ends beyond its clip, which has `num` frames from `start` on."""
-    if stop is None or num >= stop - start:
-        return ()
-    end = start + num
-    return (f"frames {format_range(start, stop)} were asked for, and the clip ends at {end}: {start}:{end} are used.",)
-
-
 def check_fps(fps: float) -> None:
     if not is_within(fps, f"[{MIN_FPS}, {MAX_FPS}]"):
         raise video_error("fps", expected=f"a rate in [{MIN_FPS:g}, {MAX_FPS:g}]", got=repr(fps), cure="Try 25.")
@@ -222,11 +205,13 @@ def check_reading(deinterlace: str, levels: int | None) -> Reading:
     return Reading(deinterlace, levels)
 
 
-def check_num_pixels(path: Path, size: Size | None) -> None:
+def check_num_pixels(path: Path, size: Size) -> None:
     """Raise where a header claims more than `MAX_PIXELS`, before memory is allocated for them."""
-    if size is not None and size[0] * size[1] > MAX_PIXELS:
-        expected = f"images of at most {MAX_PIXELS:,} pixels"
-        got = f"{format_size(size)} in the header of {str(path)!r}"
+    if size[0] * size[1] > MAX_PIXELS:
+        expected, got = (
+            f"images of at most {MAX_PIXELS:,} pixels",
+            f"{format_size(size)} in the header of {str(path)!r}",
+        )
         cure = "The file is damaged, or must be scaled down first."
         raise video_error("path", expected=expected, got=got, cure=cure)
 
@@ -239,22 +224,6 @@ def no_frames_error(start: int, stop: int | None, num_decoded: int, num_total: i
     """The error for a range in which no frame decodes."""
     got = f"{format_range(start, stop)}, while {num_decoded} of {num_total} frames decode in {str(path)!r}"
     return video_error("frames", expected="a range with frames that decode", got=got, cure="Choose earlier frames.")
-
-
-def describe_lost(num_decoded: int, num_declared: int) -> tuple[str, ...]:
-    """A note if fewer frames of a range decode than its container declares."""
-    if num_decoded >= num_declared:
-        return ()
-    return (f"only {num_decoded} of {num_declared} frames decode; those are used.",)
-
-
-def describe_few(positions: list[int], what: str) -> tuple[str, ...]:
-    """A note about frames at these positions; `what`: their property, as a predicate without its verb."""
-    if not positions:
-        return ()
-    which = f"frame {positions[0]} is"
-    which = which if len(positions) == 1 else f"{len(positions):,} frames, the first of them {positions[0]}, are"
-    return (f"{which} {what}.",)
 
 
 def format_range(start: int, stop: int | None) -> str:

@@ -12,9 +12,8 @@ from PIL import Image
 from foldgauss._runtime.checks import check_within, invalid, is_integer
 from foldgauss.io._atomic import PathLike, check_input, check_path
 from foldgauss.io.media.clip import Range, Size, Stretch, check_frame_size, check_range, format_size
-from foldgauss.io.media.image_files import IMAGE_SUFFIXES, choose_images
-from foldgauss.io.media.resizing import aspect_window
-from foldgauss.io.media.video_reading import read_video
+from foldgauss.io.media.images import IMAGE_SUFFIXES, choose_images
+from foldgauss.io.media.reading import aspect_window, read_video
 from foldgauss.render.splats import check_size
 
 MASK_LEVEL = 0.5  # fraction of white from which a pixel of a video belongs to the mask
