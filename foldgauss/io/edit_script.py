@@ -267,8 +267,11 @@ class EditScript:
         criteria = _convert_spans(table)
         if "file" in criteria:
             if not isinstance(video, VideoModel):
-                got = "one in segments" if isinstance(video, SegmentedVideo) else "an edited video"
-                raise invalid("file", expected="a model without layers or overlays", got=got)
+                raise invalid(
+                    "file",
+                    expected="a model without layers or overlays",
+                    got="one in segments" if isinstance(video, SegmentedVideo) else "an edited video",
+                )
             found = load_selection(self._path(criteria.pop("file")), video)
             return found & edit(video).select(**criteria).selection if criteria else found
         if "mask" in criteria:
@@ -285,8 +288,11 @@ class EditScript:
         if "select" in table:
             edits = edits.select_begun(named[table["select"]])
             if not len(edits.selection):
-                got = f"{table['select']!r}, which found nothing, or only deleted Gaussians"
-                raise invalid("select", expected="a selection of at least one Gaussian", got=got)
+                raise invalid(
+                    "select",
+                    expected="a selection of at least one Gaussian",
+                    got=f"{table['select']!r}, which found nothing, or only deleted Gaussians",
+                )
         given = {key: value for key, value in _convert_spans(table).items() if key not in ("do", "select")}
         if "degrees" in given:
             given[ACTIONS[table["do"]].angle] = np.radians(given.pop("degrees")).tolist()
@@ -405,8 +411,9 @@ class _TableContext:
         if not re.fullmatch(r"[a-z_]+(, [a-z_]+)*", parameters):
             raise self._locate(None, parameters + colon + rest) from error
         keys = [self.named.get(name, name) for name in parameters.split(", ")]
-        known = next((key for key in keys if self._line(key) is not None), None)
-        raise self._locate(known, f"{', '.join(keys)}{colon}{rest}") from error
+        raise self._locate(
+            next((key for key in keys if self._line(key) is not None), None), f"{', '.join(keys)}{colon}{rest}"
+        ) from error
 
     def _locate(self, key: str | None, text: str) -> EditScriptError:
         line = self._line(key) or self._line(None)
@@ -445,8 +452,12 @@ def _check_known(context: _TableContext, key: str, expected: str, word: str, kno
     """Raise unless a word is known; `expected` says what it is one of."""
     if word not in known:
         near = difflib.get_close_matches(word, known, 1)
-        cure = f"Did you mean {near[0]!r}?" if near else ""
-        raise context.error(key, expected + (", ".join(known) or "there is none"), _truncated_repr(word), cure)
+        raise context.error(
+            key,
+            expected + (", ".join(known) or "there is none"),
+            _truncated_repr(word),
+            f"Did you mean {near[0]!r}?" if near else "",
+        )
 
 
 def _truncated_repr(value: Any) -> str:
@@ -500,16 +511,22 @@ def _select_indices(
     if isinstance(video, SegmentedVideo):
         counts = [one.num_gaussians for one in video.segments]
         if segment is None or segment >= len(counts):
-            expected = f"the number of one of {len(counts)} segments"
-            raise invalid("segment", expected=expected, got="none" if segment is None else segment)
+            raise invalid(
+                "segment",
+                expected=f"the number of one of {len(counts)} segments",
+                got="none" if segment is None else segment,
+            )
     elif segment is not None:
         raise invalid("segment", expected="none, since the video has no segments", got=segment)
     else:
         counts, segment = [video.num_gaussians], 0
     if num_gaussians not in (None, counts[segment]):
-        cure = "Give the model that the selection was made in, unchanged."
-        expected = f"{counts[segment]}, as many as there are"
-        raise invalid("num_gaussians", expected=expected, got=num_gaussians, cure=cure)
+        raise invalid(
+            "num_gaussians",
+            expected=f"{counts[segment]}, as many as there are",
+            got=num_gaussians,
+            cure="Give the model that the selection was made in, unchanged.",
+        )
     parts = [Selection(np.zeros(num, bool)) for num in counts]
     parts[segment] = parse_indices(indices, counts[segment])
     return SegmentedSelection(tuple(parts)) if isinstance(video, SegmentedVideo) else parts[0]

@@ -3,7 +3,6 @@
 Clips are made with ffmpeg, and skipped where there is none.
 """
 
-import hashlib
 import json
 import os
 import pickle
@@ -178,7 +177,6 @@ def test_going_forward_decodes_each_frame_once(long, long_index, counting):
         np.testing.assert_array_equal(frame, whole[k])
     assert counting.opened == 1
     assert counting.decoded == counting.converted == 620
-    assert frames.digest() == hashlib.blake2b(whole, digest_size=16).hexdigest()
 
 
 def test_cuts_are_found_in_passing(long, long_index):
@@ -385,15 +383,6 @@ def test_folders_are_read_by_the_names_indexed(tmp_path):
     (path / "00005.png").unlink()
     with pytest.raises(VideoError, match="frame 4 differs"):
         read_indexed(index, 3, 8)
-
-
-def test_missing_numbers_of_a_folder_are_noted(tmp_path):
-    path = write_frames(tmp_path / "frames", _moving(12))
-    (path / "00005.png").unlink()
-    index = index_video(path)
-    for first, stop in ((2, 8), (6, 10)):
-        assert read_indexed(index, first, stop).notes == read_video(path, frames=(first, stop)).notes
-    assert "1 number is missing" in read_indexed(index, 2, 8).notes[0]
 
 
 @pytest.mark.parametrize("error", [ValueError, OSError, IndexError])
@@ -674,7 +663,6 @@ def test_frames_as_an_array(long, long_index):
     whole = read_video(long, frames=(90, 200), size=(24, 40)).frames
     lazy = LazyFrames(long_index, (24, 40), 90, 200)
     assert (lazy.shape, lazy.dtype, lazy.ndim, len(lazy)) == (whole.shape, whole.dtype, 4, 110)
-    assert lazy.nbytes == whole.nbytes
     for which in (
         slice(3, 9),
         slice(None, None, 40),
@@ -695,7 +683,6 @@ def test_frames_as_an_array(long, long_index):
     np.testing.assert_array_equal(np.asarray(lazy), whole)
     again = pickle.loads(pickle.dumps(lazy))
     np.testing.assert_array_equal(again[5:8], whole[5:8])
-    assert again.digest() == lazy.digest() == hashlib.blake2b(whole, digest_size=16).hexdigest()
     lazy.close()
     np.testing.assert_array_equal(lazy[2], whole[2])
 

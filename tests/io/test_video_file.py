@@ -28,7 +28,6 @@ from foldgauss.io import (
 from foldgauss.io._atomic import OutputError
 from foldgauss.io.datasets import sample_clip
 from foldgauss.io.media import reading
-from foldgauss.io.media.facts import describe_missing
 
 
 def _psnr(a, b):
@@ -66,38 +65,6 @@ def folder(tmp_path):
     for number in (1, 2, 9, 10, 11):
         write_image(place / f"img{number}.png", np.full((20, 30, 3), 10 * number, np.uint8))
     return place
-
-
-@pytest.mark.parametrize(
-    ("numbers", "note"),
-    [
-        ((1, 2, 3), None),
-        ((10, 20, 30, 40), None),
-        ((1, 7, 11, 90), None),  # no sequence
-        ((1, 2, 4, 5, 6), "1 number is missing in the names, the first after img2.png"),
-        ((8, 9, 10, 13, 14, 17), "4 numbers are missing in the names, the first after img10.png"),
-        ((10, 20, 40, 50), "1 number is missing in the names, the first after img20.png"),
-        ((20240130, 20240131, 20240201, 20240202), None),  # dates
-    ],
-)
-def test_missing_images_of_a_sequence_are_reported(tmp_path, numbers, note):
-    for number in numbers:
-        write_image(tmp_path / f"img{number}.png", np.full((4, 5, 3), number % 256, np.uint8))
-    notes = read_video(tmp_path).notes
-    assert notes == (() if note is None else (f"{note}; frames are taken to be evenly spaced.",))
-
-
-@pytest.mark.parametrize(
-    "names", [("a1", "a2", "a3", "b9", "b10"), ("1_1", "1_2", "1_3", "2_8", "2_9"), ("1", "2", "3", "x4", "x5", "x7")]
-)
-def test_names_of_several_sequences_are_not_missing(names):
-    assert describe_missing([f"{name}.png" for name in names]) == ()
-
-
-@pytest.mark.parametrize("first", [2**63 - 2, 2**64 - 2, 10**30])
-def test_missing_images_of_a_sequence_with_huge_numbers(first):
-    names = [f"{first + k}.png" for k in (0, 1, 2, 4)]
-    assert describe_missing(names)[0].startswith(f"1 number is missing in the names, the first after {first + 2}.png")
 
 
 def test_center_crop_cuts_first_and_resizes_then(clip_file):
@@ -610,13 +577,6 @@ def test_one_channel_is_as_loud_as_two(tmp_path):
             samples = np.concatenate([frame.to_ndarray() for frame in container.decode(audio=0)], axis=1)
         heard.append(np.sqrt(2 * np.mean(samples[:, 12_000:24_000] ** 2, axis=1)))
     np.testing.assert_allclose(heard, 0.3, rtol=0.05)
-
-
-def test_sound_may_change_its_format(tmp_path):
-    source = tmp_path / "a.aac"
-    source.write_bytes(_tone_bytes(source, 440, 44_100, "stereo") + _tone_bytes(source, 880, 24_000, "mono"))
-    path = write_video(tmp_path / "a.mp4", _moving(16), 10, sound=Sound(source))
-    assert _tones(path, [0.3, 1.2])[1] == pytest.approx([440, 880], abs=10)
 
 
 def test_sound_whose_packets_hold_several_frames_is_carried_over(tmp_path):

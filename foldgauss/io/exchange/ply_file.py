@@ -98,9 +98,11 @@ class Ply:
         found = self.names(element)
         missing = [name for name in names if name not in found]
         if missing:
-            has = "the properties " + ", ".join(found[:40]) if found else "no such element"
-            expected = f"properties {', '.join(missing)} of element {element!r}"
-            raise self.error(expected=expected, got=has, cure="It holds another kind of data.")
+            raise self.error(
+                expected=f"properties {', '.join(missing)} of element {element!r}",
+                got="the properties " + ", ".join(found[:40]) if found else "no such element",
+                cure="It holds another kind of data.",
+            )
         rows = self.elements[element]
         columns = np.empty((len(rows), len(names)), np.float64)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -109,8 +111,11 @@ class Ply:
             wrong = np.argwhere(~np.isfinite(columns.astype(np.float32)))
         if len(wrong):
             row, place = wrong[0]
-            got = f"{columns[row, place]} in {names[place]} of {element} {row}"
-            raise self.error(expected="numbers that float32 can represent", got=got, cure="Drop that row.")
+            raise self.error(
+                expected="numbers that float32 can represent",
+                got=f"{columns[row, place]} in {names[place]} of {element} {row}",
+                cure="Drop that row.",
+            )
         return columns
 
 
@@ -138,8 +143,12 @@ def read_ply(path: PathLike, wanted: Iterable[str]) -> Ply:
             continue
         lists = [name for name, code in element.properties if "," in code]
         if lists:
-            expected, got = f"plain numbers only in element {element.name!r}", f"the list {lists[0]!r}"
-            raise format_error(path, expected=expected, got=got, cure="It is a mesh, or made by another program.")
+            raise format_error(
+                path,
+                expected=f"plain numbers only in element {element.name!r}",
+                got=f"the list {lists[0]!r}",
+                cure="It is a mesh, or made by another program.",
+            )
         found[element.name] = body.read(element)
     return Ply(path, found, comments)
 
@@ -150,19 +159,28 @@ def read_bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        expected, got = "a file that can be read", error.strerror or str(error)
-        raise format_error(path, expected=expected, got=got, cure="Give the path of a file.") from error
+        raise format_error(
+            path, expected="a file that can be read", got=error.strerror or str(error), cure="Give the path of a file."
+        ) from error
 
 
 def _split_header(path: Path, data: bytes) -> tuple[list[str], int]:
     """The lines between "ply" and "end_header", and where the rows start."""
     if data[:4] not in (b"ply\n", b"ply\r"):
-        got = "an empty file" if not data else f"one that starts with {data[:8]!r}"
-        raise format_error(path, expected="a PLY file, which starts with 'ply'", got=got, cure="Check the path.")
+        raise format_error(
+            path,
+            expected="a PLY file, which starts with 'ply'",
+            got="an empty file" if not data else f"one that starts with {data[:8]!r}",
+            cure="Check the path.",
+        )
     found = _END_OF_HEADER.search(data[:MAX_HEADER])
     if found is None:
-        got = f"none in {min(len(data), MAX_HEADER)} bytes"
-        raise format_error(path, expected="a line 'end_header'", got=got, cure="Copy the file again.")
+        raise format_error(
+            path,
+            expected="a line 'end_header'",
+            got=f"none in {min(len(data), MAX_HEADER)} bytes",
+            cure="Copy the file again.",
+        )
     return data[: found.start()].decode("ascii", errors="replace").split("\n")[1:-1], found.end()
 
 
@@ -193,8 +211,11 @@ def _parse_header(path: Path, lines: list[str]) -> tuple[str, list[_Element], tu
     for element in elements:
         names = [name for name, _ in element.properties]
         if len(set(names)) < len(names) or not names:
-            got = "none" if not names else f"{max(names, key=names.count)!r} twice"
-            raise format_error(path, expected=f"different properties of element {element.name!r}", got=got)
+            raise format_error(
+                path,
+                expected=f"different properties of element {element.name!r}",
+                got="none" if not names else f"{max(names, key=names.count)!r} twice",
+            )
     return order, elements, tuple(comments)
 
 
@@ -204,8 +225,11 @@ def _parse_property(where: str, words: list[str]) -> tuple[str, str]:
         return words[1], _SIZES[words[0]]
     if len(words) == 4 and words[0] == "list" and words[2] in _SIZES and _SIZES.get(words[1], "f")[0] in "iu":
         return words[3], f"{_SIZES[words[1]]},{_SIZES[words[2]]}"
-    expected = "property TYPE NAME or property list COUNT_TYPE TYPE NAME, of known types"
-    raise format_error(where, expected=expected, got=repr(" ".join(["property", *words])[:80]))
+    raise format_error(
+        where,
+        expected="property TYPE NAME or property list COUNT_TYPE TYPE NAME, of known types",
+        got=repr(" ".join(["property", *words])[:80]),
+    )
 
 
 def _is_count(text: str) -> bool:
@@ -262,8 +286,12 @@ class _Body:
         except ValueError:
             place = next(place for place, word in enumerate(words) if not _is_number(word))
             name, where = element.properties[place % width][0], f"{element.name} {place // width}"
-            got = f"{words[place][:40]!r} in {name} of {where}"
-            raise format_error(self.path, expected="numbers", got=got, cure="The file is damaged.") from None
+            raise format_error(
+                self.path,
+                expected="numbers",
+                got=f"{words[place][:40]!r} in {name} of {where}",
+                cure="The file is damaged.",
+            ) from None
         return values.view([(name, "f8") for name, _ in element.properties])[:, 0]
 
     def _take(self, element: _Element, num: int) -> memoryview | list[bytes]:
@@ -274,8 +302,12 @@ class _Body:
     def _need(self, element: _Element, num: int) -> None:
         left, unit = len(self.values) - self.at, "bytes" if self.order else "numbers"
         if num > left:
-            expected = f"{element.count} rows of element {element.name!r}, {num} {unit} or more"
-            raise format_error(self.path, expected=expected, got=f"{left} {unit}", cure="The file is truncated.")
+            raise format_error(
+                self.path,
+                expected=f"{element.count} rows of element {element.name!r}, {num} {unit} or more",
+                got=f"{left} {unit}",
+                cure="The file is truncated.",
+            )
 
 
 def _is_number(word: bytes) -> bool:

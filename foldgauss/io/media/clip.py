@@ -64,8 +64,12 @@ class Levels:
         Raises `VideoError` where `white` is given, but applies to no frame of `path`, a clip of this `kind`.
         """
         if self.white is not None and self.most < 0:
-            got, cure = f"{kind}, {str(path)!r}", "Leave levels out."
-            raise video_error("levels", expected="images or videos of 16 bits, in RGB or gray", got=got, cure=cure)
+            raise video_error(
+                "levels",
+                expected="images or videos of 16 bits, in RGB or gray",
+                got=f"{kind}, {str(path)!r}",
+                cure="Leave levels out.",
+            )
         if self.white is not None:
             clipped = f"values of up to {self.most:,} are above levels={self.white} and become white."
             return (clipped,) if self.most > self.white else ()
@@ -133,8 +137,9 @@ def check_readable(path: PathLike) -> Path:
     if os.path.isdir(path) or os.path.isfile(path):
         return path
     if os.path.exists(path):
-        got, cure = f"{str(path)!r}, a pipe or a device", "Save its output to a file."
-        raise video_error("path", expected=VIDEO, got=got, cure=cure)
+        raise video_error(
+            "path", expected=VIDEO, got=f"{str(path)!r}, a pipe or a device", cure="Save its output to a file."
+        )
     raise missing_error(path, VIDEO)
 
 
@@ -144,8 +149,9 @@ def translate_os_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        got = f"{str(path)!r} ({error.strerror or error})"
-        raise video_error("path", expected="a file that can be read", got=got) from error
+        raise video_error(
+            "path", expected="a file that can be read", got=f"{str(path)!r} ({error.strerror or error})"
+        ) from error
 
 
 def read_head(path: Path) -> bytes:
@@ -170,9 +176,12 @@ def check_range(frames: Range | None) -> tuple[int, int | None]:
 
 def check_range_within(start: int, stop: int | None, num_total: int, path: Path) -> None:
     if start >= num_total or (stop is not None and stop > num_total):
-        expected = f"A:B within 0:{num_total}, the frames of {str(path)!r}"
-        cure = f"Choose B <= {num_total} and A below it."
-        raise video_error("frames", expected=expected, got=format_range(start, stop), cure=cure)
+        raise video_error(
+            "frames",
+            expected=f"A:B within 0:{num_total}, the frames of {str(path)!r}",
+            got=format_range(start, stop),
+            cure=f"Choose B <= {num_total} and A below it.",
+        )
 
 
 def check_frame_size(size: Size | None, parameter: str = "size") -> Size | None:
@@ -180,9 +189,12 @@ def check_frame_size(size: Size | None, parameter: str = "size") -> Size | None:
         return None
     sides = tuple(size) if isinstance(size, tuple | list | np.ndarray) else ()
     if len(sides) != 2 or not all(is_within(side, "[1, inf)") and side == int(side) for side in sides):
-        got = f"{sides[0]}x{sides[1]}" if len(sides) == 2 else repr(size)
-        cure = "Write it as HEIGHTxWIDTH, such as 160x320."
-        raise video_error(parameter, expected="height and width of whole pixels, at least 1", got=got, cure=cure)
+        raise video_error(
+            parameter,
+            expected="height and width of whole pixels, at least 1",
+            got=f"{sides[0]}x{sides[1]}" if len(sides) == 2 else repr(size),
+            cure="Write it as HEIGHTxWIDTH, such as 160x320.",
+        )
     return int(sides[0]), int(sides[1])
 
 
@@ -200,20 +212,24 @@ def check_fps(fps: float) -> None:
 def check_reading(deinterlace: str, levels: int | None) -> Reading:
     check_one_of("deinterlace", deinterlace, DEINTERLACE)
     if levels is not None and not (is_integer(levels, 1) and levels <= WHITE):
-        cure = "Of data of 12 bits it is 4095."
-        raise video_error("levels", expected=f"the value of white, 1 to {WHITE}", got=repr(levels), cure=cure)
+        raise video_error(
+            "levels",
+            expected=f"the value of white, 1 to {WHITE}",
+            got=repr(levels),
+            cure="Of data of 12 bits it is 4095.",
+        )
     return Reading(deinterlace, levels)
 
 
 def check_num_pixels(path: Path, size: Size) -> None:
     """Raise where a header claims more than `MAX_PIXELS`, before memory is allocated for them."""
     if size[0] * size[1] > MAX_PIXELS:
-        expected, got = (
-            f"images of at most {MAX_PIXELS:,} pixels",
-            f"{format_size(size)} in the header of {str(path)!r}",
+        raise video_error(
+            "path",
+            expected=f"images of at most {MAX_PIXELS:,} pixels",
+            got=f"{format_size(size)} in the header of {str(path)!r}",
+            cure="The file is damaged, or must be scaled down first.",
         )
-        cure = "The file is damaged, or must be scaled down first."
-        raise video_error("path", expected=expected, got=got, cure=cure)
 
 
 def video_error(parameter: str, *, expected: str, got: str, cure: str = "") -> VideoError:

@@ -297,9 +297,12 @@ class VideoDecoder:
             return self._converters[is_deep].reformat(frame, width, height, wanted, **how).to_ndarray()
         except av.FFmpegError as error:
             given = f"{frame.format.name}, {frame.height}x{frame.width}, matrix {frame.colorspace} of ITU-T H.273"
-            got = f"one that it cannot ({given}, to be shown at {height}x{width})"
-            cure = "The file is damaged, or of an unknown matrix: ffmpeg -i IN -vf zscale=matrix=709 OUT."
-            raise video_error("path", expected="frames that FFmpeg converts to RGB", got=got, cure=cure) from error
+            raise video_error(
+                "path",
+                expected="frames that FFmpeg converts to RGB",
+                got=f"one that it cannot ({given}, to be shown at {height}x{width})",
+                cure="The file is damaged, or of an unknown matrix: ffmpeg -i IN -vf zscale=matrix=709 OUT.",
+            ) from error
 
     def _decode(self) -> Iterator[av.VideoFrame]:
         for packet in self._read_packets():
@@ -349,23 +352,33 @@ class VideoDecoder:
             follows = self._deinterlace == "fields" and self._has_sought  # interlaced ones before the place sought
             if graph is None and not frame.interlaced_frame and not follows:
                 if self._deinterlace == "fields":
-                    got, cure = f"a progressive one in {str(self._path)!r}", "Leave deinterlace='fields' out."
-                    raise video_error("deinterlace", expected="a first frame of two fields", got=got, cure=cure)
+                    raise video_error(
+                        "deinterlace",
+                        expected="a first frame of two fields",
+                        got=f"a progressive one in {str(self._path)!r}",
+                        cure="Leave deinterlace='fields' out.",
+                    )
                 yield frame
                 continue
             if self._deinterlace == "refuse":
-                got = f"one of interlaced fields, {str(self._path)!r}"
-                cure = "Convert it while reading, with deinterlace='frames' or 'fields'."
-                raise video_error("path", expected="a video of progressive frames", got=got, cure=cure)
+                raise video_error(
+                    "path",
+                    expected="a video of progressive frames",
+                    got=f"one of interlaced fields, {str(self._path)!r}",
+                    cure="Convert it while reading, with deinterlace='frames' or 'fields'.",
+                )
             kind = frame.height, frame.width, frame.format.name
             if graph is None or kind != of_graph:
                 yield from filter_frame(graph, None)
                 try:
                     graph, of_graph = _make_deinterlacer(frame, self.time_base, self._per_stored), kind
                 except av.FFmpegError as error:  # bwdif takes at least 3 rows and columns of each channel
-                    got = f"interlaced ones of {frame.height}x{frame.width} (height x width) in {str(self._path)!r}"
-                    cure = "Convert it with ffmpeg."
-                    raise video_error("path", expected="frames that bwdif takes", got=got, cure=cure) from error
+                    raise video_error(
+                        "path",
+                        expected="frames that bwdif takes",
+                        got=f"interlaced ones of {frame.height}x{frame.width} (height x width) in {str(self._path)!r}",
+                        cure="Convert it with ffmpeg.",
+                    ) from error
                 self.has_converted = True
             yield from filter_frame(graph, frame)
         yield from filter_frame(graph, None)
@@ -438,9 +451,12 @@ def scan_video(
         fps = decoder.fps if 0 < decoder.fps <= MAX_FPS else DEFAULT_FPS
         kept = keep(select())
         if not places:
-            cure = "The file is damaged or its codec is unknown here; convert it with ffmpeg."
-            got = f"none in {str(path)!r}"
-            raise video_error("path", expected="a video with frames that decode", got=got, cure=cure)
+            raise video_error(
+                "path",
+                expected="a video with frames that decode",
+                got=f"none in {str(path)!r}",
+                cure="The file is damaged or its codec is unknown here; convert it with ffmpeg.",
+            )
         time_base, num_reached = float(decoder.time_base), places[-1] + 1
         seconds = make_increasing((np.array(ticks + following) * time_base).tolist(), fps)
         seconds, end = seconds[: len(ticks)], float(seconds[-1])
@@ -491,33 +507,46 @@ def open_container(path: Path, demuxers: str = DEMUXERS) -> av.container.InputCo
     """An open file, restricted to itself. Raises `VideoError`."""
     kind = describe_kind(read_head(path))
     if kind == LIST:
-        got, cure = f"{kind}, {str(path)!r}", "The files that it names are not opened: give the video itself."
-        raise video_error("path", expected=VIDEO, got=got, cure=cure)
+        raise video_error(
+            "path",
+            expected=VIDEO,
+            got=f"{kind}, {str(path)!r}",
+            cure="The files that it names are not opened: give the video itself.",
+        )
     # An absolute path, because FFmpeg takes 'name:rest' for a protocol. One local file and nothing that it refers to.
     options = {"protocol_whitelist": "file", "format_whitelist": demuxers}
     try:
         return av.open(f"file:{resolve(path)}", options=options, metadata_errors="replace")
     except (av.FFmpegError, ValueError) as error:
         about = format_num_bytes(path) + (f", {kind}" if kind else "")
-        got = f"{str(path)!r} ({about}), which does not open as a video"
-        cure = "Check that it is a video and that its copy or download is complete."
-        raise video_error("path", expected=VIDEO, got=got, cure=cure) from error
+        raise video_error(
+            "path",
+            expected=VIDEO,
+            got=f"{str(path)!r} ({about}), which does not open as a video",
+            cure="Check that it is a video and that its copy or download is complete.",
+        ) from error
 
 
 def _choose_stream(container: av.container.InputContainer, path: Path) -> av.VideoStream:
-    known = [one for one in container.streams.video if one.codec_context is not None]
-    if container.streams.video and not known:
-        got, cure = f"an unknown one in {str(path)!r}", "Convert it with ffmpeg."
-        raise video_error("path", expected="a video whose codec is known here", got=got, cure=cure)
-    streams = [one for one in known if not one.disposition & Disposition.attached_pic]
-    if streams:
-        best = container.streams.best("video")
-        return best if best in streams else streams[0]
-    if container.streams.video:
-        got = f"audio with a cover image, {str(path)!r}"
-        raise video_error("path", expected="a video", got=got, cure="Give a file with moving images.")
-    got = f"{str(path)!r} ({'audio' if container.streams.audio else 'no video stream'}), which does not open as a video"
-    raise video_error("path", expected=VIDEO, got=got)
+    stream = container.streams.best("video")
+    if stream is None:
+        kind = "audio" if container.streams.audio else "no video stream"
+        raise video_error("path", expected=VIDEO, got=f"{str(path)!r} ({kind}), which does not open as a video")
+    if stream.codec_context is None:
+        raise video_error(
+            "path",
+            expected="a video whose codec is known here",
+            got=f"an unknown one in {str(path)!r}",
+            cure="Convert it with ffmpeg.",
+        )
+    if stream.disposition & Disposition.attached_pic:
+        raise video_error(
+            "path",
+            expected="a video",
+            got=f"audio with a cover image, {str(path)!r}",
+            cure="Give a file with moving images.",
+        )
+    return stream
 
 
 def _make_deinterlacer(frame: av.VideoFrame, clock: Fraction, num: int) -> Graph:

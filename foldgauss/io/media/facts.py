@@ -1,6 +1,5 @@
 """What one pass through a clip finds besides its frames, from which the rate and the notes of any range follow."""
 
-import re
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -56,7 +55,6 @@ class ClipFacts:
         notes += _describe_few([one for one in self.damaged if one in within], "damaged, and may show artifacts")
         resized = [one for one in self.resized if one in within]
         notes += _describe_few(resized, "of another size than the video, and stretched to it")
-        notes += describe_missing(self.names[first:end])
         rate = self._find_rate(first, end) if fps is None else FrameRate(fps)
         return num_declared, rate, (*notes, *describe_rate(rate))
 
@@ -81,22 +79,3 @@ def _describe_few(positions: list[int], what: str) -> tuple[str, ...]:
     which = f"frame {positions[0]} is"
     which = which if len(positions) == 1 else f"{len(positions):,} frames, the first of them {positions[0]}, are"
     return (f"{which} {what}.",)
-
-
-def describe_missing(names: list[str]) -> tuple[str, ...]:
-    """A note if numbers are missing in the names of a sequence, such as f7.png, f8.png, f10.png.
-
-    Names of a sequence differ in their last number only.
-    """
-    parts = [re.fullmatch(r"(.*?)([0-9]+)([^0-9]*\.[^.]*)", name, re.DOTALL) for name in names]
-    if len(names) < 3 or not all(parts) or len({part.group(1, 3) for part in parts}) > 1:
-        return ()
-    steps = np.diff(np.array([int(part[2]) for part in parts], object))  # of any size
-    usual = min(steps)
-    if usual < 1 or (steps == usual).sum() < len(steps) / 2 or (steps % usual).any():
-        return ()  # not a sequence
-    first, num = int(np.argmax(steps > usual)), int((steps // usual - 1).sum())
-    if not 0 < num <= len(names):  # with more, the numbers are dates, or images were picked
-        return ()
-    what = "1 number is" if num == 1 else f"{num:,} numbers are"
-    return (f"{what} missing in the names, the first after {names[first]}; frames are taken to be evenly spaced.",)

@@ -58,9 +58,12 @@ def choose_images(folder: Path, start: int, stop: int | None) -> list[Path]:
     """The images of a folder from `start` up to `stop`. Raises `VideoError` where there are none."""
     images = image_paths(folder)
     if not images:
-        expected = "a folder with images (" + ", ".join(s[1:] for s in IMAGE_SUFFIXES) + ")"
-        got, cure = f"{str(folder)!r} without any", "Give the folder that holds the frames, or a video file."
-        raise video_error("path", expected=expected, got=got, cure=cure)
+        raise video_error(
+            "path",
+            expected="a folder with images (" + ", ".join(s[1:] for s in IMAGE_SUFFIXES) + ")",
+            got=f"{str(folder)!r} without any",
+            cure="Give the folder that holds the frames, or a video file.",
+        )
     return images[start : clamp_stop(start, stop, len(images), folder)]
 
 
@@ -117,10 +120,12 @@ def read_images(paths: list[Path], levels: Levels) -> Iterator[np.ndarray]:
         image = read_image(path, levels)
         first_shape = first_shape or image.shape[:2]
         if image.shape[:2] != first_shape:
-            expected = f"images of one size, {format_size(first_shape)} as in {paths[0].name!r}"
-            got = f"{format_size(image.shape)} in {path.name!r}"
-            cure = "Resize the images, or choose others with frames=(A, B)."
-            raise video_error("path", expected=expected, got=got, cure=cure)
+            raise video_error(
+                "path",
+                expected=f"images of one size, {format_size(first_shape)} as in {paths[0].name!r}",
+                got=f"{format_size(image.shape)} in {path.name!r}",
+                cure="Resize the images, or choose others with frames=(A, B).",
+            )
         yield image
 
 
@@ -132,14 +137,18 @@ def open_image(path: Path, file: BinaryIO | None = None) -> Image.Image:
     try:
         image = Image.open(file or path, formats=FORMATS)
     except Image.DecompressionBombError as error:
-        expected, got = f"images of at most {MAX_PIXELS:,} pixels", f"more in the header of {str(path)!r}"
-        cure = "The file is damaged, or must be scaled down first."
-        raise video_error("path", expected=expected, got=got, cure=cure) from error
+        raise video_error(
+            "path",
+            expected=f"images of at most {MAX_PIXELS:,} pixels",
+            got=f"more in the header of {str(path)!r}",
+            cure="The file is damaged, or must be scaled down first.",
+        ) from error
     except Exception as error:  # Pillow's decoders raise anything
-        raise _undecodable_error(path) from error
+        raise undecodable_error(path) from error
     most = _PIXELS_PER_BYTE.get(image.format)
     if most is not None and image.width * image.height >= most * (path.stat().st_size + 1):
-        raise _undecodable_error(path)
+        image.close()
+        raise undecodable_error(path)
     return image
 
 
@@ -159,14 +168,18 @@ def read_image(path: Path, levels: Levels) -> np.ndarray:
             flags = cv2.IMREAD_COLOR if header.format in ("JPEG", "MPO") else cv2.IMREAD_UNCHANGED
             image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
         except Exception as error:
-            raise _undecodable_error(path) from error
+            raise undecodable_error(path) from error
     if image is None:
-        raise _undecodable_error(path)
+        raise undecodable_error(path)
     if image.dtype == np.uint16:
         image = levels.convert(image)
     if image.dtype != np.uint8:
-        got, cure = f"{image.dtype} in {str(path)!r}", "Convert it to an 8-bit PNG."
-        raise video_error("path", expected="images of 8 or 16 bits", got=got, cure=cure)
+        raise video_error(
+            "path",
+            expected="images of 8 or 16 bits",
+            got=f"{image.dtype} in {str(path)!r}",
+            cure="Convert it to an 8-bit PNG.",
+        )
     if image.ndim == 2:
         return cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     # OpenCV returns colors times alpha for a TIFF that declares it, unless it is straight and of 16 bits.
@@ -190,7 +203,7 @@ def premultiply(image: np.ndarray) -> np.ndarray:
     return np.concatenate([((image[..., :3] * alpha + 127) // 255).astype(np.uint8), image[..., 3:]], axis=-1)
 
 
-def _undecodable_error(path: Path) -> VideoError:
+def undecodable_error(path: Path) -> VideoError:
     got = f"{str(path)!r} ({format_num_bytes(path)}), which does not"
     return video_error("path", expected="images that decode", got=got, cure="Replace or remove it.")
 
@@ -210,8 +223,12 @@ def scan_picture(
         with suppress(Exception):
             num = getattr(image, "n_frames", 1)
         if image.format == "TIFF" and num > 1:
-            got = f"{num} in {str(path)!r}"
-            raise video_error("path", expected="one image in a TIFF", got=got, cure="Unpack it to a folder of images.")
+            raise video_error(
+                "path",
+                expected="one image in a TIFF",
+                got=f"{num} in {str(path)!r}",
+                cure="Unpack it to a folder of images.",
+            )
         if image.format == "GIF" or (image.format in ("PNG", "WEBP") and num > 1):
             return _scan_animation(image, num, path, start, stop, keep, levels)
     clamp_stop(start, stop, 1, path)
@@ -224,7 +241,7 @@ def _scan_animation(animation, num_declared, path, start, stop, keep, levels) ->
     delays: list[float] = []
     kept = keep(_decode_animation(animation, start, min(num_declared or MAX_FRAMES, stop or MAX_FRAMES), delays))
     if not delays:
-        raise _undecodable_error(path)
+        raise undecodable_error(path)
     num_total = num_declared or len(delays) + (len(delays) < (stop or MAX_FRAMES))
     clamp_stop(start, stop, num_total, path)
     if not len(kept):

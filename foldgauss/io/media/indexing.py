@@ -141,9 +141,12 @@ class FrameIndex:
         except FileNotFoundError:
             raise
         except Exception as error:  # its type depends on the damage
-            expected, got = "an index of a clip, as FrameIndex.save writes it", repr(str(path))
-            cure = "Make it again: index_video(CLIP).save(PATH)."
-            raise video_error("path", expected=expected, got=got, cure=cure) from error
+            raise video_error(
+                "path",
+                expected="an index of a clip, as FrameIndex.save writes it",
+                got=repr(str(path)),
+                cure="Make it again: index_video(CLIP).save(PATH).",
+            ) from error
 
 
 def _digest_frame(image: np.ndarray) -> bytes:
@@ -293,10 +296,6 @@ class LazyFrames:
     def __len__(self) -> int:
         return self.shape[0]
 
-    @property
-    def nbytes(self) -> int:
-        return int(np.prod(self.shape, dtype=np.int64))
-
     def __getitem__(self, which: int | slice) -> np.ndarray:
         if isinstance(which, slice):
             chosen = range(len(self))[which]
@@ -306,9 +305,12 @@ class LazyFrames:
         try:
             number = operator.index(which)
         except TypeError as error:
-            got, cure = short_repr(which), "For other indices use np.stack([frames[k] for k in ...])."
-            expected = "the number of a frame, or a slice"
-            raise video_error("frames[...]", expected=expected, got=got, cure=cure) from error
+            raise video_error(
+                "frames[...]",
+                expected="the number of a frame, or a slice",
+                got=short_repr(which),
+                cure="For other indices use np.stack([frames[k] for k in ...]).",
+            ) from error
         if not -len(self) <= number < len(self):
             raise IndexError(f"frames[{number}]: expected a number within {len(self)} frames.")
         number %= len(self)
@@ -323,13 +325,6 @@ class LazyFrames:
         if copy is False:
             raise ValueError("copy: expected True or None for frames that are read from a file, got False.")
         return np.asarray(self[:], dtype)
-
-    def digest(self) -> str:
-        """blake2b of 16 bytes over the bytes of all frames in order, in hexadecimal; computed a run at a time."""
-        whole = hashlib.blake2b(digest_size=DIGEST_BYTES)
-        for first in range(0, len(self), RUN):
-            whole.update(self[first : first + RUN])
-        return whole.hexdigest()
 
     def _read(self, first: int, stop: int) -> np.ndarray:
         """Frames `first` up to `stop`, each compared with the index."""

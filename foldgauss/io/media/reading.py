@@ -103,8 +103,12 @@ def scan_clip(
     if not path.is_dir() and (not is_image(head) or is_bare_jpegs(path, head)):
         return scan_video(path, start, stop, keep, reading)
     if reading.deinterlace == "fields":
-        got, cure = f"images, {str(path)!r}", "Leave deinterlace='fields' out."
-        raise video_error("deinterlace", expected="a video of interlaced frames", got=got, cure=cure)
+        raise video_error(
+            "deinterlace",
+            expected="a video of interlaced frames",
+            got=f"images, {str(path)!r}",
+            cure="Leave deinterlace='fields' out.",
+        )
     scan = scan_folder if path.is_dir() else scan_picture
     return scan(path, start, stop, keep, Levels(reading.levels))
 
@@ -157,9 +161,12 @@ def describe_crop(sizes: Iterable[Size], want: Size) -> tuple[str, ...]:
 def center_window(have: Size, window: Size) -> tuple[slice, slice]:
     """Rows and columns of the central (height, width) `window`. Raises `VideoError` where it does not fit."""
     if window[0] > have[0] or window[1] > have[1]:
-        expected, got = f"at most the frame's {format_size(have)}", f"{window[0]}x{window[1]}"
-        cure = "Crop a smaller window, or enlarge with size=(height, width) instead."
-        raise video_error("center_crop", expected=expected, got=got, cure=cure)
+        raise video_error(
+            "center_crop",
+            expected=f"at most the frame's {format_size(have)}",
+            got=f"{window[0]}x{window[1]}",
+            cure="Crop a smaller window, or enlarge with size=(height, width) instead.",
+        )
     top, left = (have[0] - window[0]) // 2, (have[1] - window[1]) // 2
     return slice(top, top + window[0]), slice(left, left + window[1])
 
@@ -179,9 +186,12 @@ def stack_frames(frames: Iterable[np.ndarray], channels: int = 3) -> np.ndarray:
         if num == len(clip):
             clip.resize((num + max(1, BLOCK_BYTES // frame.nbytes), *clip.shape[1:]), refcheck=False)
         if (num + 1) * clip[num].nbytes > limit:
-            expected = f"a clip of at most {limit / 2**30:.1f} GiB, a third of this machine's memory"
-            got = f"more, at frame {num + 1} of {frame.shape[0]}x{frame.shape[1]}"
-            raise video_error("size", expected=expected, got=got, cure="Take fewer frames or a smaller size.")
+            raise video_error(
+                "size",
+                expected=f"a clip of at most {limit / 2**30:.1f} GiB, a third of this machine's memory",
+                got=f"more, at frame {num + 1} of {frame.shape[0]}x{frame.shape[1]}",
+                cure="Take fewer frames or a smaller size.",
+            )
         clip[num, ..., 3:] = 255
         clip[num, ..., : frame.shape[2]] = frame
         num += 1

@@ -7,7 +7,7 @@ from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from fractions import Fraction
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -71,6 +71,12 @@ CODECS = {
 }
 #: The codec of each extension unless one is given.
 DEFAULT_CODECS = {".mp4": "h264", ".webm": "vp9", ".mov": "prores", ".mkv": "ffv1"}
+#: Colors of the frames of YUV; ProRes writes those of its frames into the file.
+_BT709 = {
+    "dst_colorspace": Colorspace.ITU709,
+    "dst_color_primaries": ColorPrimaries.BT709,
+    "dst_color_trc": ColorTrc.BT709,
+}
 SAMPLE_RATE = 48_000
 #: Units of the time stamps of unevenly spaced frames, as parts of a second; Matroska counts milliseconds.
 CLOCKS = {".mp4": 90_000, ".mov": 90_000, ".mkv": 1000, ".webm": 1000}
@@ -143,29 +149,37 @@ def write_video(
     path = check_path(path, "path, frames, fps")
     check_fps(fps)
     if not isinstance(frames, Iterable):
-        cure = "For a model: model.frames()."
-        raise video_error("frames", expected="an iterable of images", got=type(frames).__name__, cure=cure)
+        raise video_error(
+            "frames", expected="an iterable of images", got=type(frames).__name__, cure="For a model: model.frames()."
+        )
     check_one_of("image_format", image_format, IMAGE_FORMATS)
     if times is not None:
         if not are_rising_seconds(times):
-            expected = f"seconds that rise from 0 to at most {MAX_SECONDS:,.0f}, one for each frame"
-            raise video_error("times", expected=expected, got=short_repr(times))
+            raise video_error(
+                "times",
+                expected=f"seconds that rise from 0 to at most {MAX_SECONDS:,.0f}, one for each frame",
+                got=short_repr(times),
+            )
         times = np.array(times, np.float64)
         frames = _match_times(frames, len(times))
     suffix = path.suffix.lower()
     options = {"codec": codec, "crf": crf, "pixel_format": pixel_format, "sound": sound}
     given = [name for name, value in options.items() if value is not None]
     if given and suffix not in VIDEO_SUFFIXES:
-        got, cure = repr(path.name), f"Take {', '.join(VIDEO_SUFFIXES)}."
-        raise video_error(given[0], expected="a video file for it", got=got, cure=cure)
+        raise video_error(
+            given[0], expected="a video file for it", got=repr(path.name), cure=f"Take {', '.join(VIDEO_SUFFIXES)}."
+        )
     if os.path.isdir(path) or not path.suffix:  # not Path's, which raises for a name that is too long
         return write_frames(path, frames, overwrite=overwrite, image_format=image_format)
     if suffix in ANIMATION_SUFFIXES:
         return _write_animation(path, suffix, frames, float(fps), times)
     if suffix not in VIDEO_SUFFIXES:
-        expected = "a name ending in .mp4, .webm, .mov, .mkv, .gif or .webp, or a folder (no extension) for images"
-        cure = "For one image: write_image." if suffix == ".png" else "Rename the output."
-        raise video_error("path", expected=expected, got=repr(path.name), cure=cure)
+        raise video_error(
+            "path",
+            expected="a name ending in .mp4, .webm, .mov, .mkv, .gif or .webp, or a folder (no extension) for images",
+            got=repr(path.name),
+            cure="For one image: write_image." if suffix == ".png" else "Rename the output.",
+        )
     frames = _check_frames(frames)
     first = next(frames)
     encoding = choose_encoding(suffix, codec, crf, pixel_format, first.shape)
@@ -177,9 +191,12 @@ def write_video(
         except av.FFmpegError as error:  # an OSError of making the frames is none of these
             if isinstance(error, OSError):
                 raise output_error(path, error) from error
-            expected, got = f"frames that {encoding.codec.encoder} takes", f"{format_size(first.shape)} at {fps:g} fps"
-            cure = f"It says: {error.strerror}. Take another size, rate or codec."
-            raise video_error("frames", expected=expected, got=got, cure=cure) from error
+            raise video_error(
+                "frames",
+                expected=f"frames that {encoding.codec.encoder} takes",
+                got=f"{format_size(first.shape)} at {fps:g} fps",
+                cure=f"It says: {error.strerror}. Take another size, rate or codec.",
+            ) from error
     return path
 
 
@@ -224,14 +241,15 @@ def write_image(path: PathLike, image: np.ndarray) -> Path:
 def _match_times(frames: Iterable[np.ndarray], num: int) -> Iterator[np.ndarray]:
     """The frames. Raises `VideoError` unless there are as many as times, `num`, or one fewer: the last is the end."""
     count = 0
-    for frame in frames:
-        count += 1
-        if count > num:
-            break
-        yield frame
+    for count, frame in enumerate(islice(frames, num + 1), 1):
+        if count <= num:
+            yield frame
     if not num - 1 <= count <= num:
-        got = f"more than {num}" if count > num else f"{count}"
-        raise video_error("frames", expected=f"{num}, as many as times, or one fewer", got=got)
+        raise video_error(
+            "frames",
+            expected=f"{num}, as many as times, or one fewer",
+            got=f"more than {num}" if count > num else f"{count}",
+        )
 
 
 def _check_frames(frames: Iterable[np.ndarray], channels: tuple[int, ...] = (3, 4)) -> Iterator[np.ndarray]:
@@ -253,16 +271,24 @@ def _check_frame(frame: np.ndarray, shape: tuple | None, parameter: str, channel
             cure = "For floats in [0, 1]: np.rint(255 * np.clip(frame, 0, 1)).astype(np.uint8)."
         elif frame.ndim == 3 and frame.shape[2] == 4:
             cure = "Composite it over a color, or take a kind of file that has alpha: .webm, .mov, .mkv or images."
-        expected, got = f"uint8 RGB of shape {shape or '(height, width, 3)'}", f"{frame.dtype} of shape {frame.shape}"
-        raise video_error(parameter, expected=expected, got=got, cure=cure)
+        raise video_error(
+            parameter,
+            expected=f"uint8 RGB of shape {shape or '(height, width, 3)'}",
+            got=f"{frame.dtype} of shape {frame.shape}",
+            cure=cure,
+        )
     return np.ascontiguousarray(frame)
 
 
 def _encode_image(frame: np.ndarray, image_format: str = "png") -> bytes:
     """Without loss; with alpha, colors become straight."""
     if image_format == "webp" and max(frame.shape[:2]) > MAX_WEBP_SIDE:
-        got = format_size(frame.shape)
-        raise video_error("frames", expected=f"sides of at most {MAX_WEBP_SIDE:,} for WebP", got=got, cure="Take PNG.")
+        raise video_error(
+            "frames",
+            expected=f"sides of at most {MAX_WEBP_SIDE:,} for WebP",
+            got=format_size(frame.shape),
+            cure="Take PNG.",
+        )
     rgba = frame.shape[2] == 4
     image = cv2.cvtColor(straighten(frame), cv2.COLOR_RGBA2BGRA) if rgba else cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
     quality = [cv2.IMWRITE_WEBP_QUALITY, 101] if image_format == "webp" else []  # above 100: lossless
@@ -277,8 +303,12 @@ def _write_animation(
 ) -> Path:
     """Write an animated GIF or WebP that repeats forever."""
     if suffix == ".gif" and fps > MAX_GIF_FPS:
-        expected, cure = f"at most {MAX_GIF_FPS:g} for a GIF", "Take fewer frames, or a .webp or .webm."
-        raise video_error("fps", expected=expected, got=f"{fps:g}", cure=cure)
+        raise video_error(
+            "fps",
+            expected=f"at most {MAX_GIF_FPS:g} for a GIF",
+            got=f"{fps:g}",
+            cure="Take fewer frames, or a .webp or .webm.",
+        )
     with atomic_path(path) as temporary:
         images = map(Image.fromarray, _check_frames(frames, channels=(3,)))
         first, *rest = (image.quantize(256) for image in images) if suffix == ".gif" else images
@@ -298,8 +328,12 @@ def _write_animation(
             raise output_error(path, error) from error
         except (OverflowError, RuntimeError, ValueError) as error:
             longest, expected = np.diff(ends).max(), f"a size and times that {suffix} can hold"
-            got = f"{first.height}x{first.width}, shown for up to {longest:g} s"
-            raise video_error("frames", expected=expected, got=got, cure="Take an .mp4 or .webm.") from error
+            raise video_error(
+                "frames",
+                expected=expected,
+                got=f"{first.height}x{first.width}, shown for up to {longest:g} s",
+                cure="Take an .mp4 or .webm.",
+            ) from error
     return path
 
 
@@ -327,8 +361,12 @@ def choose_encoding(
     chosen = CODECS[name]
     if suffix not in chosen.suffixes:
         fitting = [other for other, one in CODECS.items() if suffix in one.suffixes]
-        cure = f"For {suffix} take {', '.join(fitting)}."
-        raise invalid("codec", expected=f"{name} in one of {', '.join(chosen.suffixes)}", got=f"{suffix}", cure=cure)
+        raise invalid(
+            "codec",
+            expected=f"{name} in one of {', '.join(chosen.suffixes)}",
+            got=f"{suffix}",
+            cure=f"For {suffix} take {', '.join(fitting)}.",
+        )
     if min(shape[:2]) < chosen.min_side:
         expected, got = f"at least {chosen.min_side}x{chosen.min_side} for {name}", f"{shape[0]}x{shape[1]}"
         raise video_error("frames", expected=expected, got=f"{got} (height x width)", cure="Take h264, vp9 or ffv1.")
@@ -369,7 +407,7 @@ def encode_video(
     ticks = None if times is None else count_ticks(np.append(times, times[-1] + 1 / fps) / float(clock)).tolist()
     options = dict(encoding.codec.options) | ({} if encoding.crf is None else {"crf": str(encoding.crf)})
     pixel_format = av.VideoFormat(encoding.pixel_format, 64, 64)
-    matrix = None if pixel_format.is_rgb else Colorspace.ITU709
+    colors = {} if pixel_format.is_rgb else _BT709
     steps = 64 // pixel_format.chroma_height(), 64 // pixel_format.chroma_width()
     container = av.open(f"file:{path}", "w", options={"movflags": "+faststart"} if suffix in (".mp4", ".mov") else {})
     with container:
@@ -385,7 +423,7 @@ def encode_video(
                 image = straighten(image)
             if number == 0:
                 stream.height, stream.width = image.shape[:2]
-                if matrix is not None:
+                if colors:
                     context = stream.codec_context
                     context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
                     context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
@@ -394,9 +432,7 @@ def encode_video(
                     stream.codec_context.max_b_frames = 0
                 open_with_own_priority(stream.codec_context)
             given = av.VideoFrame.from_ndarray(image, format="rgba" if image.shape[2] == 4 else "rgb24")
-            given = converter.reformat(given, format=pixel_format.name, dst_colorspace=matrix, interpolation=CONVERSION)
-            if matrix is not None:  # ProRes writes those of its frames
-                given.color_primaries, given.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
+            given = converter.reformat(given, format=pixel_format.name, interpolation=CONVERSION, **colors)
             begin, end = (number, number + 1) if ticks is None else ticks[number : number + 2]
             given.pts, given.time_base = begin, clock
             container.mux(_set_durations(stream.encode(given), ticks))
@@ -419,30 +455,43 @@ def _encode_sound(stream: av.AudioStream, sound: Sound) -> Iterator[av.Packet]:
     """The packets of the sound, as they are asked for. Raises `VideoError` where FFmpeg cannot convert it."""
     try:
         with open_container(Path(sound.path), SOUND_DEMUXERS) as source:
-            of_file = source.streams.best("audio")
-            # atempo takes factors from 0.5 to 100; at 1 it would still shift the sound.
-            num = 0 if sound.speed == 1 else max(1, math.ceil(-math.log2(sound.speed)))
-            tempo = [("atempo", f"{sound.speed ** (1 / max(num, 1)):.9f}")] * num
-            begin = _first_shown(Path(sound.path), of_file) + sound.start - (TEMPO_LEAD if num else 0)
-            steps = [("atrim", f"start={begin:.6f}"), ("asetpts", f"PTS-({begin:.6f})/TB")]
-            steps += [("aresample", "async=1:first_pts=0"), *tempo]  # silence where there is none
-            steps += [("aformat", f"sample_fmts={stream.format.name}")]
-            graph = _link_sound_filters(steps, SAMPLE_RATE, "fltp", "stereo", Fraction(1, SAMPLE_RATE))
-            if stream.codec_context.frame_size:
-                graph.set_audio_frame_size(stream.codec_context.frame_size)
-            for frame in chain(_unify_sound(source, of_file), [None]):
+            of_file, graph = source.streams.best("audio"), None
+            begin = _first_shown(Path(sound.path), of_file) + sound.start
+            for frame in chain(_decode_sound(source, of_file), [None]):
+                if graph is None and frame is not None:
+                    graph = _make_sound_graph(frame, of_file.time_base, begin, sound.speed, stream)
                 for filtered in filter_frame(graph, frame):
                     yield from stream.encode(filtered)
             yield from stream.encode()
     except av.FFmpegError as error:
-        got, cure = f"{str(sound.path)!r} ({error.strerror})", "Convert it with ffmpeg, or leave it out."
-        raise video_error("sound", expected="sound that FFmpeg converts", got=got, cure=cure) from error
+        raise video_error(
+            "sound",
+            expected="sound that FFmpeg converts",
+            got=f"{str(sound.path)!r} ({error.strerror})",
+            cure="Convert it with ffmpeg, or leave it out.",
+        ) from error
 
 
-def _link_sound_filters(steps: list[tuple[str, str]], rate: int, kind: str, layout: str, clock: Fraction) -> Graph:
+def _make_sound_graph(
+    frame: av.AudioFrame, clock: Fraction, begin: float, speed: float, stream: av.AudioStream
+) -> Graph:
+    """A filter of sound like `frame`, with times in units of `clock`, from second `begin` on, for the encoder of
+    `stream`."""
+    # FFmpeg's conversion of one channel to two makes it quieter, as if it were in the middle of others.
+    steps = [("pan", "stereo|c0=c0|c1=c0")] if frame.layout.nb_channels == 1 else []
+    steps += [("aformat", f"sample_fmts=fltp:sample_rates={SAMPLE_RATE}:channel_layouts=stereo")]
+    # atempo takes factors from 0.5 to 100; at 1 it would still shift the sound.
+    num = 0 if speed == 1 else max(1, math.ceil(-math.log2(speed)))
+    begin -= TEMPO_LEAD if num else 0
+    steps += [("asettb", f"1/{SAMPLE_RATE}"), ("atrim", f"start={begin:.6f}"), ("asetpts", f"PTS-({begin:.6f})/TB")]
+    steps += [("aresample", "async=1:first_pts=0")]  # silence where there is no sound
+    steps += [("atempo", f"{speed ** (1 / max(num, 1)):.9f}")] * num
+    steps += [("aformat", f"sample_fmts={stream.format.name}"), ("abuffersink",)]
     graph = Graph()
-    source = graph.add_abuffer(sample_rate=rate, format=kind, layout=layout, time_base=clock)
-    graph.link_nodes(source, *(graph.add(*step) for step in (*steps, ("abuffersink",)))).configure()
+    kind = {"sample_rate": frame.sample_rate, "format": frame.format.name, "layout": frame.layout.name}
+    graph.link_nodes(graph.add_abuffer(**kind, time_base=clock), *(graph.add(*step) for step in steps)).configure()
+    if stream.codec_context.frame_size:
+        graph.set_audio_frame_size(stream.codec_context.frame_size)
     return graph
 
 
@@ -453,11 +502,9 @@ def _first_shown(path: Path, of_file: av.AudioStream) -> float:
     return float((of_file.start_time or 0) * of_file.time_base)
 
 
-def _unify_sound(source: av.container.InputContainer, stream: av.AudioStream) -> Iterator[av.AudioFrame]:
-    """The frames of sound that decode, in one format, though that of the file may change."""
-    graph, of_graph, end = None, None, None
-    steps = [("aformat", f"sample_fmts=fltp:sample_rates={SAMPLE_RATE}:channel_layouts=stereo")]
-    steps += [("asettb", f"1/{SAMPLE_RATE}")]
+def _decode_sound(source: av.container.InputContainer, stream: av.AudioStream) -> Iterator[av.AudioFrame]:
+    """The frames of sound that decode, each with its time stamp."""
+    end = None
     for packet in source.demux(stream):
         found = []
         with suppress(av.FFmpegError):
@@ -467,21 +514,15 @@ def _unify_sound(source: av.container.InputContainer, stream: av.AudioStream) ->
                 frame.pts = end
             if frame.pts is not None:
                 end = frame.pts + round(Fraction(frame.samples, frame.sample_rate) / stream.time_base)
-            kind = frame.sample_rate, frame.format.name, frame.layout.name
-            if kind != of_graph:
-                yield from filter_frame(graph, None)
-                # FFmpeg's conversion of one channel to two makes it quieter, as if it were in the middle of others.
-                both = [("pan", "stereo|c0=c0|c1=c0")] if frame.layout.nb_channels == 1 else []
-                graph, of_graph = _link_sound_filters([*both, *steps], *kind, stream.time_base), kind
-            yield from filter_frame(graph, frame)
-    yield from filter_frame(graph, None)
+            yield frame
 
 
 def check_sound(sound: Sound) -> None:
     """Raise `VideoError` for a file without sound, ValueError for other values that are refused."""
     if not isinstance(sound, Sound):
-        cure = "Write Sound('clip.mp4')."
-        raise invalid("sound", expected="a foldgauss.io.Sound", got=type(sound).__name__, cure=cure)
+        raise invalid(
+            "sound", expected="a foldgauss.io.Sound", got=type(sound).__name__, cure="Write Sound('clip.mp4')."
+        )
     check_within("sound.start", sound.start, "[0, 1e9]", "seconds from 0 to 1e9")
     check_within("sound.speed", sound.speed, "[0.01, 100]", "a speed from 0.01 to 100")
     got = f"{str(sound.path)!r}, which does not open"
