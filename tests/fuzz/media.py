@@ -16,10 +16,9 @@ from PIL import Image
 
 from foldgauss.cli.measuring.profiles_file import load_profiles, save_profiles
 from foldgauss.io import VideoError, read_masks, read_video, write_video
-from foldgauss.io.media.clip import HEAD_BYTES
+from foldgauss.io.media.clip import HEAD_BYTES, MAX_PIXELS
 from foldgauss.io.media.decoder import describe_kind
 from foldgauss.io.media.images import is_image
-from foldgauss.io.media.masks import MAX_PIXELS, MAX_PIXELS_PER_BYTE
 from foldgauss.uncertainty import FrameNoise, LikelihoodProfiles, ProfileCurves
 from foldgauss.uncertainty.posterior import draws_file
 from foldgauss.uncertainty.posterior.optional_imports import import_optional
@@ -53,8 +52,8 @@ def _images() -> list[bytes]:
 
 
 def _picture_memory(size: int) -> int:
-    """As many pixels as are taken, 4 channels of a byte, decoded and copied; see `foldgauss.io.media.masks`."""
-    return 2 * CONSTANT + 12 * max(MAX_PIXELS, MAX_PIXELS_PER_BYTE * size)
+    """As many pixels as are taken, 4 channels of a byte, decoded and copied."""
+    return 2 * CONSTANT + 12 * MAX_PIXELS
 
 
 #: What is asked for besides: a label, a size, the folder that the image is alone in, frames of it.

@@ -37,13 +37,13 @@ def _text_of(data: bytes, order: str = "ascii") -> bytes:
 
 
 def _with_lists(data: bytes, order: str = "<") -> bytes:
-    """With an element of lists, which is skipped, before the others, and a plain one after."""
+    """With an element that is skipped before the others, and one of lists after."""
     head, body = data.split(b"end_header\n", 1)
     lines = head.split(b"\n", 2)
-    lines[2] = b"element face 2\nproperty list uchar int vertex\nproperty short flag\n" + lines[2]
-    lines[2] += b"element extra 1\nproperty double a\n"
-    rows = b"2 0 1 7 0 -3\n" if order == "" else struct.pack("<BiihBh", 2, 0, 1, 7, 0, -3)
-    return b"\n".join(lines) + b"end_header\n" + rows + body + (b"1.5\n" if order == "" else struct.pack("<d", 1.5))
+    lines[2] = b"element extra 1\nproperty double a\nproperty short flag\n" + lines[2]
+    lines[2] += b"element face 1\nproperty list uchar int vertex\n"
+    rows = b"1.5 -3\n" if order == "" else struct.pack("<dh", 1.5, -3)
+    return b"\n".join(lines) + b"end_header\n" + rows + body + b"\0"
 
 
 def _rows_of_times(data: bytes) -> bytes:

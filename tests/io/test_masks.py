@@ -67,7 +67,7 @@ def test_masks_of_16_bits(tmp_path, white, suffix):
     np.testing.assert_array_equal(read_masks(tmp_path), [labels(3) == 1, np.zeros(SIZE, bool)])
     np.testing.assert_array_equal(read_masks(tmp_path, label=min(white, 3) if white < 256 else 1)[0], labels(3) == 1)
     Image.fromarray(labels(3).astype(np.uint16) * 300).save(tmp_path / f"2{suffix}")
-    with pytest.raises(ValueError, match="expected masks with labels up to 255, got labels up to (10,964|65,535)"):
+    with pytest.raises(ValueError, match=r"expected masks with labels up to 255, got labels up to (10,964|65,535)"):
         read_masks(tmp_path)
 
 
