@@ -145,7 +145,7 @@ _READ = {
         "reading": (ONLY, "scan_clip", "resize_frame", "stack_frames"),
         "decoder": (),
         "images": ("natural_sort_key", "is_bare_jpegs"),
-        "facts": ("describe_missing",),
+        "facts": (),
         "frame_rate": (),
     }.items()
 }  # fmt: skip
