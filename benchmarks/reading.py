@@ -54,7 +54,7 @@ def measured(video: Path, rounds: int) -> tuple[dict[str, float], FrameIndex]:
     span = max(1, min(round(index.fps), num // 3))
     places = {"start": 0, "middle": num // 2, "end": num - span}
     for place, first in places.items():
-        range_ = index.span(first, first + span)
+        range_ = first, first + span
         by_index, by_decoding = [], []
         for _ in range(rounds):
             lasted, found = seconds_of(lambda range_=range_: read_indexed(index, *range_))

@@ -208,7 +208,7 @@ def read_clip(job: FitJob) -> Clip:
     if job.index is None:
         return read_video(job.clip, frames=job.frames, size=job.size, **job.reading._asdict())
     index = FrameIndex.load(job.index)
-    clip = read_indexed(index, *index.span(*job.frames), size=job.size)
+    clip = read_indexed(index, *job.frames, size=job.size)
     return clip if job.fps is None else dataclasses.replace(clip, fps=job.fps)
 
 

@@ -92,7 +92,7 @@ class LongFit:
         """Replace the scores of shared frames by those of the joined video."""
         times = video.frame_times.times()
         for first, stop in fades:
-            clip = read_indexed(self.index, *self.index.span(first, stop), size=self.jobs[0].size)
+            clip = read_indexed(self.index, first, stop, size=self.jobs[0].size)
             for k, image in enumerate(video.frames(times[first:stop]), first):
                 target = clip.over_black[k - first]
                 psnr_of[k], ssim_of[k] = psnr(target, image), ssim(target, image)

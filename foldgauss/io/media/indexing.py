@@ -32,7 +32,6 @@ from foldgauss.io.media.clip import (
     check_range_within,
     check_readable,
     check_reading,
-    no_frames_error,
     translate_os_errors,
     video_error,
 )
@@ -104,8 +103,8 @@ class FrameIndex:
         return whole.hexdigest()
 
     def span(self, first: int, stop: int) -> tuple[int, int]:
-        """The range, for `read_indexed`, of the frames `first` up to `stop` of those that decode: the same numbers
-        except in a damaged clip. Raises `VideoError` for frames that do not exist."""
+        """The range, for `read_video`, of the frames `first` up to `stop` of those that decode: the same numbers except
+        in a damaged clip, and from the index's first frame on. Raises `VideoError` for frames that do not exist."""
         first, stop = self.check_frames(first, stop)
         return int(self.positions[first]), int(self.positions[stop - 1]) + 1
 
@@ -207,30 +206,22 @@ def index_video(
 # ----------------------------------------------------------------------------------------------- access
 
 
-def read_indexed(index: FrameIndex, first: int, stop: int | None, *, size: Size | None = None) -> Clip:
+def read_indexed(index: FrameIndex, first: int, stop: int | None = None, *, size: Size | None = None) -> Clip:
     """Frames `first` up to `stop` of an indexed clip, without decoding from the start: equal to the bit to
-    `read_video(path, frames=(first, stop), size=size)`.
+    `read_video(path, frames=index.span(first, stop), size=size)`.
 
-    The range counts positions in the clip, as that of `read_video` does: frames lost to damage are missing from the
-    result (`FrameIndex.span` converts from numbers of decoded frames). `stop=None`: to the end. An index made with
-    `frames=(A, B)` counts from A. Where any frame of the whole clip is transparent, the result has alpha, even if none
-    of its own frames is. Every frame is compared with the index.
+    The range counts frames that decode. `stop=None`: to the end. Where any frame of the whole clip is transparent, the
+    result has alpha, even if none of its own frames is. Every frame is compared with the index.
 
-    Raises `FileNotFoundError` for a missing path; `VideoError` for a range outside the clip, one in which no frame
-    decodes, and a file that is not the one indexed.
+    Raises `FileNotFoundError` for a missing path; `VideoError` for a range outside the clip, and a file that is not
+    the one indexed.
     """
-    first, stop = check_range((operator.index(first), None if stop is None else operator.index(stop)))
-    num_positions = int(index.positions[-1]) + 1  # those of frames lost to damage between others included
-    check_range_within(first, stop, max(num_positions, index.num_declared), index.source)
-    path = check_readable(index.path)
-    low, high = np.searchsorted(index.positions, [first, num_positions if stop is None else stop]).tolist()
-    if low == high:
-        raise no_frames_error(first, stop, index.num_frames, num_positions, path)
-    with closing(LazyFrames(index, size, low, high)) as lazy:
+    first, stop = index.check_frames(first, stop)
+    with closing(LazyFrames(index, size, first, stop)) as lazy:
         frames = lazy[:]
-    span = index.num_before + low, index.num_before + high, index.start + first
-    end = index.start + (index.num_declared if stop is None else stop)
-    num_declared, rate, notes = index.facts.describe_span(*span, end, index.fixed_fps)
+    before, positions = index.num_before, (index.start + position for position in index.span(first, stop))
+    span = before + first, before + stop, *positions, index.fixed_fps
+    num_declared, rate, notes = index.facts.describe_span(*span)
     crop = () if size is None else describe_crop([index.size], size)
     about = index.source, num_declared, rate.times, notes + crop, rate.first_second, rate.duration, index.reading
     return Clip(frames, float(rate.fps), *about, index.stretched)
@@ -339,8 +330,8 @@ class LazyFrames:
                     raise _changed_error(index, number)
                 yield image
 
+        check_readable(index.path)
         with self._lock, translate_os_errors(index.path):
-            check_readable(index.path)
             if index.kind == "video":
                 return keep(self._decode_video(first, stop))
             if index.kind == "folder":
