@@ -90,8 +90,9 @@ def map_tones(
         light *= cv2.transform(light, _LUMINANCE)[..., None] ** np.float32(0.2)
     matrix = np.array(_TO_BT709.get(frame.color_primaries, np.eye(3)), np.float32)
     light = cv2.transform(light, matrix)
-    highest = np.clip(light.max(-1, keepdims=True) / _BRIGHTEST, 0, 1)
-    light *= tables[1][np.rint(np.sqrt(highest) * _LAST).astype(np.uint16)]
+    red, green, blue = cv2.split(light)
+    highest = np.clip(np.maximum(np.maximum(red, green), blue) / _BRIGHTEST, 0, 1)
+    light *= tables[1][np.rint(np.sqrt(highest) * _LAST).astype(np.uint16)][..., None]
     return tables[2][np.rint(np.sqrt(np.clip(light, 0, 1)) * _LAST).astype(np.uint16)]
 
 

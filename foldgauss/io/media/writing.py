@@ -312,18 +312,15 @@ def _write_animation(
     with atomic_path(path) as temporary:
         images = map(Image.fromarray, _check_frames(frames, channels=(3,)))
         first, *rest = (image.quantize(256) for image in images) if suffix == ".gif" else images
-        shared = {"save_all": True, "append_images": rest, "loop": 0}
         ends = np.arange(len(rest) + 2) / fps
         if times is not None:
             ends = np.append(times, times[-1] + 1 / fps)[: len(ends)]
+        # In milliseconds, for a GIF in whole hundredths of a second, whose sums are the true times rounded.
+        step, least, kind = (10, 2, {"optimize": False}) if suffix == ".gif" else (1, 1, {"quality": WEBP_QUALITY})
+        durations = (step * np.diff(count_ticks(1000 / step * ends, least=least))).tolist()
         try:
-            if suffix == ".gif":
-                # Milliseconds, in whole hundredths of a second, whose sums are the true times rounded.
-                durations = (10 * np.diff(count_ticks(100 * ends, least=2))).tolist()
-                first.save(temporary, "GIF", duration=durations, optimize=False, **shared)
-            else:
-                durations = 1000 / fps if times is None else np.diff(count_ticks(1000 * ends)).tolist()
-                first.save(temporary, "WEBP", duration=durations, quality=WEBP_QUALITY, **shared)
+            kind |= {"save_all": True, "append_images": rest, "loop": 0, "duration": durations}
+            first.save(temporary, suffix.removeprefix("."), **kind)
         except OSError as error:
             raise output_error(path, error) from error
         except (OverflowError, RuntimeError, ValueError) as error:
