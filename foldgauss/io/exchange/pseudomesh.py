@@ -32,6 +32,8 @@ NOTES = "pseudomesh.json"
 _FILES = r"frame_[0-9]{4,}\.(obj|ply)|pseudomesh\.json"
 #: Model space (x right, y down, z away) to the axes of mesh tools (x right, y up, z towards the viewer), and back.
 _AXES_TURN = np.array([1.0, -1.0, -1.0])
+#: How to cure a soup of triangles whose vertices a tool changed.
+_KEEP_ORDER = "Export with the vertices' order kept, and merge none by distance."
 #: No sine of the angle between two edges is smaller than that in a face that float32 tells from a line.
 _COLLINEAR = COLLINEAR * float(np.finfo(np.float32).eps)
 _LARGEST = 1e38  # of a coordinate: float32 holds the difference of two such
@@ -309,30 +311,22 @@ def read_obj(path: PathLike) -> Float[np.ndarray, "faces 3 3"]:
     """
     path = Path(path)
     vertices: list[tuple[float, ...]] = []
-    faces: list[tuple[int, list[int]]] = []
-    for number, words in _obj_lines(path):
-        if words[0] == "v":
-            vertices.append(_parse_vertex(path, number, words[1:]))
-        elif words[0] == "f":
-            faces.append((number, _parse_face(path, number, words[1:], len(vertices))))
-    if not faces and vertices:
-        raise format_error(path, expected="faces", got=f"none, and {len(vertices)} vertices", cure="Export them too.")
-    _check_soup(path, faces, len(vertices))
+    num_faces = 0
+    for number, line in enumerate(read_bytes(path).splitlines(), start=1):
+        kind, *words = line.decode("utf-8", errors="replace").split("#", 1)[0].split() or [""]
+        if kind == "v":
+            vertices.append(_parse_vertex(path, number, words))
+        elif kind == "f":
+            num_faces += 1
+            _check_face(f"{path}, line {number}", words, num_faces)
+    if len(vertices) != 3 * num_faces:
+        raise format_error(
+            path,
+            expected="3 vertices of its own for each face",
+            got=f"{len(vertices)} vertices for {num_faces} faces: a tool merged, split or dropped some",
+            cure=_KEEP_ORDER,
+        )
     return np.array(vertices).reshape(-1, 3, 3)
-
-
-def _obj_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Numbered lines of words, those that a backslash continues as one, without comments and blank ones."""
-    parts: list[str] = []  # of a line that goes on; joined once, as there may be a million
-    for number, data in enumerate(read_bytes(path).splitlines(), start=1):  # of bytes: not at the separators of Unicode
-        line = data.decode("utf-8", errors="replace")
-        if line.endswith("\\"):
-            parts.append(line[:-1])
-            continue
-        words = " ".join([*parts, line]).split("#", 1)[0].split()
-        parts = []
-        if words:
-            yield number, words
 
 
 def _parse_vertex(path: Path, number: int, words: list[str]) -> tuple[float, ...]:
@@ -350,38 +344,20 @@ def _parse_vertex(path: Path, number: int, words: list[str]) -> tuple[float, ...
     return place
 
 
-def _parse_face(path: Path, number: int, words: list[str], num_vertices: int) -> list[int]:
-    """Numbers of the vertices from 0 on; a negative index counts back from the last vertex so far."""
-    where = f"{path}, line {number}"
-    try:
-        indices = [int(word.split("/", 1)[0]) for word in words]
-    except ValueError:
-        indices = []
-    if len(indices) != 3 or 0 in indices:
+def _check_face(where: str, words: list[str], number: int) -> None:
+    """Raise unless face `number`, from 1 on, has three vertices of its own, in the order in which they were written."""
+    if len(words) != 3:
         raise format_error(
             where,
             expected="a face of 3 vertices",
             got=repr(" ".join(words)[:60]),
             cure="Only triangles represent Gaussians: disable the merging of triangles into polygons.",
         )
-    return [index - 1 if index > 0 else num_vertices + index for index in indices]
-
-
-def _check_soup(path: Path, faces: list[tuple[int, list[int]]], num_vertices: int) -> None:
-    """Raise unless every face has three vertices of its own, in the order in which they were written."""
-    cure = "Export with the vertices' order kept, and merge none by distance."
-    if num_vertices != 3 * len(faces):
+    own = [str(3 * number + k) for k in (-2, -1, 0)]
+    if [word.split("/", 1)[0] for word in words] != own:
         raise format_error(
-            path,
-            expected="3 vertices of its own for each face",
-            got=f"{num_vertices} vertices for {len(faces)} faces: a tool merged, split or dropped some",
-            cure=cure,
+            where,
+            expected=f"face {number} of vertices {', '.join(own)}",
+            got=f"{' '.join(words)[:60]}: a tool merged, split or reordered them",
+            cure=_KEEP_ORDER,
         )
-    for first, (line, indices) in zip(range(0, num_vertices, 3), faces, strict=True):
-        if indices != [first, first + 1, first + 2]:
-            raise format_error(
-                f"{path}, line {line}",
-                expected=f"face {first // 3 + 1} of vertices {first + 1}, {first + 2}, {first + 3}",
-                got=", ".join(str(index + 1) for index in indices) + ": a tool reordered them",
-                cure=cure,
-            )
