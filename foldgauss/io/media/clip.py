@@ -1,6 +1,5 @@
 """Clips in memory, and the error and argument checks that readers and writers of clips share."""
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
-from foldgauss.io._atomic import PathLike, check_path, missing_error
+from foldgauss.io._atomic import PathLike, check_input, check_path
 from foldgauss.io.media.frame_rate import MAX_FPS, MIN_FPS
 
 HEAD_BYTES = 1 << 16  # by which the format of a file is detected
@@ -134,13 +133,11 @@ class Clip:
 def check_readable(path: PathLike) -> Path:
     """The path of an existing file or folder. Raises `FileNotFoundError`, or `VideoError` for pipes and devices."""
     path = check_path(path)
-    if os.path.isdir(path) or os.path.isfile(path):
-        return path
-    if os.path.exists(path):
-        raise video_error(
-            "path", expected=VIDEO, got=f"{str(path)!r}, a pipe or a device", cure="Save its output to a file."
-        )
-    raise missing_error(path, VIDEO)
+    try:
+        check_input(path, VIDEO)
+    except ValueError as error:
+        raise VideoError(str(error)) from error
+    return path
 
 
 @contextmanager

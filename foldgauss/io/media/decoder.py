@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterator, Sized
 from contextlib import closing, suppress
 from fractions import Fraction
+from itertools import chain, repeat
 from pathlib import Path
 
 import av
@@ -104,9 +105,7 @@ class VideoDecoder:
         self.time_base = (self._stream.time_base or Fraction(1, 1000)) / self._per_stored
         self._rate = (self._stream.guessed_rate or 0) * self._per_stored
         self.fps = float(self._rate)  # that the container declares; 0 where there is none
-        #: Whether an edit list may hide frames that the container counts.
-        self.hides_frames = self._container.format.name.startswith("mov")
-        self._is_avi = self._container.format.name == "avi"
+        self._kind = self._container.format.name
         self._num_repeated = 0  # frames that an AVI counts, but does not store: the one before is shown again
         self.has_converted = False  # whether any frame was interlaced
         self.tilt = 0  # degrees by which a frame is to be rotated beyond a multiple of 90
@@ -167,7 +166,7 @@ class VideoDecoder:
         The duration of a whole file may be that of its sound. Streams and Ogg derive it from their last packets, and
         Flash videos declare up to 2 frames more.
         """
-        kind, stream = self._container.format.name, self._stream
+        kind, stream = self._kind, self._stream
         if kind in ("flv", "live_flv", "ogg", "mpeg", "mpegts") or (kind == "asf" and self._container.streams.audio):
             return None
         if stream.duration and stream.duration > 0:
@@ -194,10 +193,10 @@ class VideoDecoder:
         `duration` is that of the decoder, in units of `time_base`: in an MP4 that of another frame where frames are
         stored in another order, in Matroska often a default.
         """
-        if self.hides_frames or self._is_avi:
+        if self._kind.startswith(("mov", "avi")):
             is_known = self.declared_seconds is not None and self.num_declared in (0, num_frames)
             return max(self.declared_seconds - elapsed, 0.0) if is_known else 0.0
-        if "matroska" not in self._container.format.name:
+        if "matroska" not in self._kind:
             return 0.0
         seconds, rates = duration * self.time_base, (self._stream.average_rate, self._stream.guessed_rate)
         is_default = any(abs(seconds - 1 / rate / self._per_stored) <= 1.5 * self.time_base for rate in rates if rate)
@@ -211,7 +210,7 @@ class VideoDecoder:
         none, the number follows from its duration.
         """
         shown = self.declared_seconds
-        if shown is None or (self.num_declared and not self.hides_frames):
+        if shown is None or (self.num_declared and not self._kind.startswith("mov")):
             return max(self.num_declared, num_reached)
         left, intervals, estimated = shown - (seconds[-1] - seconds[0]), np.diff(seconds), num_reached
         if left > MAX_LAST_DURATION * max(1 / fps, intervals.max(initial=0.0), last):
@@ -305,24 +304,21 @@ class VideoDecoder:
             ) from error
 
     def _decode(self) -> Iterator[av.VideoFrame]:
-        for packet in self._read_packets():
+        """The frames that decode. None ends them; a damaged frame may end those buffered, and each call passes one."""
+        for packet in chain(self._read_packets(), repeat(None, MAX_DELAY)):
             try:
                 found = self._codec.decode(packet)
-            except av.FFmpegError:
-                self._num_suspect = MAX_DELAY
-                continue
-            self._read_bytes = max(self._read_bytes, (packet.pos or 0) + packet.size)
-            yield from map(self._set_time, found)
-        self._at_end = True
-        # A damaged frame may end the decoding of those buffered; each call passes one.
-        for _ in range(MAX_DELAY):
-            try:
-                yield from map(self._set_time, self._codec.decode(None))
-                return
             except av.EOFError:
                 return
             except av.FFmpegError:
                 self._num_suspect = MAX_DELAY
+                continue
+            self._at_end = packet is None
+            if not self._at_end:
+                self._read_bytes = max(self._read_bytes, (packet.pos or 0) + packet.size)
+            yield from map(self._set_time, found)
+            if self._at_end:
+                return
 
     def _read_packets(self) -> Iterator[av.Packet]:
         """The packets of the stream, of which those that cannot be read are left out."""
@@ -333,7 +329,7 @@ class VideoDecoder:
                     if packet.is_corrupt:
                         self._num_suspect = MAX_DELAY
                     if packet.size:
-                        if self._is_avi and packet.dts is not None:
+                        if self._kind == "avi" and packet.dts is not None:
                             self._num_repeated += max(packet.dts - before - 1, 0)
                             before = packet.dts
                         num_errors = 0
@@ -386,9 +382,9 @@ class VideoDecoder:
     def _set_time(self, frame: av.VideoFrame) -> av.VideoFrame:
         """The frame with its time. AVI stores none: FFmpeg numbers its packets, in the order of decoding. Of raw AV1 it
         makes times up."""
-        if self._is_avi:
+        if self._kind == "avi":
             self._stamp = frame.pts = self._stamp + 1 if frame.dts is None else frame.dts
-        elif self._container.format.name in ("obu", "av1"):
+        elif self._kind in ("obu", "av1"):
             frame.pts = None
         return frame
 
