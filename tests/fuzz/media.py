@@ -84,7 +84,7 @@ MASKS = Target(
     ".png",
     _images,
     _read_mask,
-    (ValueError,),
+    (ValueError, VideoError),
     {"foldgauss.io.media.masks": ()},
     lambda data: 8 if data.startswith(b"\x89PNG") else 2,
     _picture_memory,
