@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from foldgauss.io import Clip, read_video
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.image_files import image_paths
+from foldgauss.io.media.images import image_paths
 
 #: The sample clips, and the size that each is fitted at; None: that of its file.
 SAMPLE_SIZES: dict[str, tuple[int, int] | None] = {"bunny": (640, 1280), "bikes": None, "carphone": None}

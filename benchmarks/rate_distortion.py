@@ -42,7 +42,7 @@ from benchmarks._runs import Run, Runs, fit_by_clock
 from foldgauss._runtime.threads import set_num_threads
 from foldgauss.io import load_video_model, read_video, save_compact
 from foldgauss.io.media.decoder import CONVERSION
-from foldgauss.io.media.encoder import open_with_own_priority
+from foldgauss.io.media.writing import open_with_own_priority
 from foldgauss.video import FitConfig, psnr
 
 NUM_FRAMES = 50

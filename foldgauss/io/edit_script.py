@@ -19,14 +19,14 @@ values are in the units of `Edit`:
 
 import dataclasses
 import difflib
+import functools
 import math
 import operator
 import os
 import re
 import tomllib
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping
-from functools import reduce
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -35,7 +35,6 @@ import numpy as np
 
 from foldgauss._runtime.checks import ParameterError, invalid
 from foldgauss.io._atomic import MissingInput, PathLike, describe_missing, resolve
-from foldgauss.io._toml_lines import key_lines
 from foldgauss.io.media.masks import read_masks
 from foldgauss.io.models.selections import load_selection, parse_indices, parse_ranges
 from foldgauss.io.models.video_model import load_video_model, read_origin
@@ -58,6 +57,9 @@ MAX_BYTES = 32_000_000
 #: Largest number of parts of a dotted key; the parser makes a table for each.
 MAX_PARTS = 16
 _DEEP_KEY = re.compile(rf"(?<![\w\"'-])(?:[\w\"'-]+[ \t]*\.[ \t]*){{{MAX_PARTS}}}")
+#: The header of a table, and a key, at the beginning of a line.
+_HEADER = re.compile(r"\s*(\[{1,2})\s*([A-Za-z\"'][^\[\]=,]*)\]{1,2}\s*(?:#.*)?$")
+_KEY = re.compile(r"\s*([\"']?)([\w-]+)\1\s*[.=]")
 #: Largest absolute value of a number; no position, time or angle is larger, and squares could overflow.
 LARGEST = 1e9
 
@@ -267,8 +269,11 @@ class EditScript:
         criteria = _convert_spans(table)
         if "file" in criteria:
             if not isinstance(video, VideoModel):
-                got = "one in segments" if isinstance(video, SegmentedVideo) else "an edited video"
-                raise invalid("file", expected="a model without layers or overlays", got=got)
+                raise invalid(
+                    "file",
+                    expected="a model without layers or overlays",
+                    got="one in segments" if isinstance(video, SegmentedVideo) else "an edited video",
+                )
             found = load_selection(self._path(criteria.pop("file")), video)
             return found & edit(video).select(**criteria).selection if criteria else found
         if "mask" in criteria:
@@ -285,8 +290,11 @@ class EditScript:
         if "select" in table:
             edits = edits.select_begun(named[table["select"]])
             if not len(edits.selection):
-                got = f"{table['select']!r}, which found nothing, or only deleted Gaussians"
-                raise invalid("select", expected="a selection of at least one Gaussian", got=got)
+                raise invalid(
+                    "select",
+                    expected="a selection of at least one Gaussian",
+                    got=f"{table['select']!r}, which found nothing, or only deleted Gaussians",
+                )
         given = {key: value for key, value in _convert_spans(table).items() if key not in ("do", "select")}
         if "degrees" in given:
             given[ACTIONS[table["do"]].angle] = np.radians(given.pop("degrees")).tolist()
@@ -422,11 +430,30 @@ class _TableContext:
         return f", [{'.'.join(map(str, self.table))}]"
 
     def _line(self, key: str | None) -> int | None:
-        """The line of a key of the table, or of the table itself; None if the text has no such key."""
-        try:
-            return key_lines(self.text).get(self.table if key is None else (*self.table, key))
-        except RecursionError:  # values nested almost too deeply for `tomllib`
-            return None
+        """The line of a key of the table, None if no line begins with it; of the table that of what it stands in."""
+        lines, table = _key_lines(self.text), self.table
+        if key is not None:
+            return lines.get((*table, key))
+        return next((lines[table[:num]] for num in range(len(table), 0, -1) if table[:num] in lines), None)
+
+
+@functools.lru_cache(maxsize=1)
+def _key_lines(text: str) -> Mapping[tuple[str | int, ...], int]:
+    """The line, from 1, of each table and of each key that begins a line; tables of an array count from
+    0. `tomllib` does not report them; a script that is laid out otherwise has lines of what its keys stand in."""
+    lines, table, counts = {}, (), Counter()
+    for number, line in enumerate(text.split("\n"), 1):
+        if header := _HEADER.match(line):
+            table = tuple(part.strip(" \t\"'") for part in header[2].split("."))
+            for num in range(len(table)):
+                lines.setdefault(table[: num + 1], number)
+            if header[1] == "[[":
+                counts[table] += 1
+                table = (*table, counts[table] - 1)
+                lines[table] = number
+        elif key := _KEY.match(line):
+            lines.setdefault((*table, key[2]), number)
+    return lines
 
 
 def _check_keys(context: _TableContext, table: dict[str, Any], known: _Keys, needed: _Keys | None = None) -> None:
@@ -445,8 +472,12 @@ def _check_known(context: _TableContext, key: str, expected: str, word: str, kno
     """Raise unless a word is known; `expected` says what it is one of."""
     if word not in known:
         near = difflib.get_close_matches(word, known, 1)
-        cure = f"Did you mean {near[0]!r}?" if near else ""
-        raise context.error(key, expected + (", ".join(known) or "there is none"), _truncated_repr(word), cure)
+        raise context.error(
+            key,
+            expected + (", ".join(known) or "there is none"),
+            _truncated_repr(word),
+            f"Did you mean {near[0]!r}?" if near else "",
+        )
 
 
 def _truncated_repr(value: Any) -> str:
@@ -500,27 +531,33 @@ def _select_indices(
     if isinstance(video, SegmentedVideo):
         counts = [one.num_gaussians for one in video.segments]
         if segment is None or segment >= len(counts):
-            expected = f"the number of one of {len(counts)} segments"
-            raise invalid("segment", expected=expected, got="none" if segment is None else segment)
+            raise invalid(
+                "segment",
+                expected=f"the number of one of {len(counts)} segments",
+                got="none" if segment is None else segment,
+            )
     elif segment is not None:
         raise invalid("segment", expected="none, since the video has no segments", got=segment)
     else:
         counts, segment = [video.num_gaussians], 0
     if num_gaussians not in (None, counts[segment]):
-        cure = "Give the model that the selection was made in, unchanged."
-        expected = f"{counts[segment]}, as many as there are"
-        raise invalid("num_gaussians", expected=expected, got=num_gaussians, cure=cure)
+        raise invalid(
+            "num_gaussians",
+            expected=f"{counts[segment]}, as many as there are",
+            got=num_gaussians,
+            cure="Give the model that the selection was made in, unchanged.",
+        )
     parts = [Selection(np.zeros(num, bool)) for num in counts]
     parts[segment] = parse_indices(indices, counts[segment])
     return SegmentedSelection(tuple(parts)) if isinstance(video, SegmentedVideo) else parts[0]
 
 
 def _combine(table: dict[str, Any], named: dict[str, Selected]) -> Selected:
-    some = [reduce(operator.or_, (named[name] for name in table["any"]))] if "any" in table else []
+    some = [functools.reduce(operator.or_, (named[name] for name in table["any"]))] if "any" in table else []
     every = [named[name] for name in table.get("all", ())]
     any_one = next(iter(named.values()))
-    found = reduce(operator.and_, some + every or [any_one | ~any_one])
-    return reduce(operator.sub, (named[name] for name in table.get("without", ())), found)
+    found = functools.reduce(operator.and_, some + every or [any_one | ~any_one])
+    return functools.reduce(operator.sub, (named[name] for name in table.get("without", ())), found)
 
 
 def _masks_of_frames(masks, num_frames: int, criteria: dict[str, Any]):

@@ -39,10 +39,12 @@ class HistoryFile:
             self._last = kept[-1]["step"] if kept else 0
             same = psnr is None or (kept and kept[-1].get("psnr") == _to_json(psnr))
             if self._last != resumed_at or not same:
-                expected = f"that of the fit which is resumed at step {resumed_at}"
-                got = f"{str(self.path)!r} of another, or with that step missing"
-                cure = "Give a new name, or the file that the fit wrote before."
-                raise invalid("history", expected=expected, got=got, cure=cure)
+                raise invalid(
+                    "history",
+                    expected=f"that of the fit which is resumed at step {resumed_at}",
+                    got=f"{str(self.path)!r} of another, or with that step missing",
+                    cure="Give a new name, or the file that the fit wrote before.",
+                )
             with atomic_path(self.path) as temporary:
                 temporary.write_text("".join(json.dumps(line) + "\n" for line in kept))
 
@@ -96,8 +98,12 @@ def _read_lines(path: Path) -> list[dict[str, Any]]:
     lines = [_parse_line(line) for line in text.split("\n")[:-1]]
     if None in lines or not _START.startswith(text[: len(_START)]):
         broken = lines.index(None) + 1 if None in lines else 1
-        got, cure = f"something else in line {broken} of {str(path)!r}", "Choose another path, or remove the file."
-        raise invalid("history", expected="one JSON object with a step per line", got=got, cure=cure)
+        raise invalid(
+            "history",
+            expected="one JSON object with a step per line",
+            got=f"something else in line {broken} of {str(path)!r}",
+            cure="Choose another path, or remove the file.",
+        )
     return lines
 
 

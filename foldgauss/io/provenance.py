@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from foldgauss.io.media.clip import Clip
-from foldgauss.io.media.frame_index import FrameIndex
-from foldgauss.io.media.lazy_frames import LazyFrames
+from foldgauss.io.media.indexing import FrameIndex, LazyFrames
 
 
 def fingerprint(clip: Clip) -> dict[str, Any]:

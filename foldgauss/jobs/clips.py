@@ -9,8 +9,8 @@ from typing import NamedTuple
 from foldgauss._runtime.checks import invalid
 from foldgauss.io._atomic import MissingInput, describe_missing
 from foldgauss.io.media.clip import AS_STORED, Reading
-from foldgauss.io.media.image_files import IMAGE_SUFFIXES, image_paths, natural_sort_key
-from foldgauss.io.media.video_writing import ANIMATION_SUFFIXES
+from foldgauss.io.media.images import IMAGE_SUFFIXES, image_paths, natural_sort_key
+from foldgauss.io.media.writing import ANIMATION_SUFFIXES
 from foldgauss.io.models.compact import COMPACT_SUFFIX
 from foldgauss.io.models.video_model import MODEL_SUFFIX
 from foldgauss.jobs.job import FitJob

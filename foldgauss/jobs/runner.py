@@ -22,9 +22,8 @@ from foldgauss._runtime.machine import waiting_seconds
 from foldgauss.io._atomic import OutputError, atomic_path, write_or_keep
 from foldgauss.io._lock import lock_output
 from foldgauss.io.media.clip import Clip
-from foldgauss.io.media.frame_index import FrameIndex
-from foldgauss.io.media.indexed_reader import read_indexed
-from foldgauss.io.media.video_reading import read_video
+from foldgauss.io.media.indexing import FrameIndex, read_indexed
+from foldgauss.io.media.reading import read_video
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.io.models.compact import COMPACT_SUFFIX, leave_room, save_compact
 from foldgauss.io.models.video_model import save_video_model
@@ -211,7 +210,7 @@ def read_clip(job: FitJob) -> Clip:
     if job.index is None:
         return read_video(job.clip, frames=job.frames, size=job.size, **job.reading._asdict())
     index = FrameIndex.load(job.index)
-    clip = read_indexed(index, *index.span(*job.frames), size=job.size)
+    clip = read_indexed(index, *job.frames, size=job.size)
     return clip if job.fps is None else dataclasses.replace(clip, fps=job.fps)
 
 

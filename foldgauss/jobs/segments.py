@@ -17,8 +17,7 @@ from jaxtyping import Float
 from foldgauss._runtime.checks import invalid, is_integer, is_within
 from foldgauss.io._atomic import OutputError, atomic_path
 from foldgauss.io.media.clip import AS_STORED, Reading
-from foldgauss.io.media.frame_index import FrameIndex, index_video
-from foldgauss.io.media.indexed_reader import read_indexed
+from foldgauss.io.media.indexing import FrameIndex, index_video, read_indexed
 from foldgauss.io.models.segmented import join_segments
 from foldgauss.io.models.video_model import MODEL_SUFFIX, keep_origin, load_video_model, read_metadata
 from foldgauss.io.provenance import describe_reading
@@ -96,7 +95,7 @@ class LongFit:
         """Replace the scores of shared frames by those of the joined video."""
         times = video.frame_times.times()
         for first, stop in fades:
-            clip = read_indexed(self.index, *self.index.span(first, stop), size=self.jobs[0].size)
+            clip = read_indexed(self.index, first, stop, size=self.jobs[0].size)
             for k, image in enumerate(video.frames(times[first:stop]), first):
                 target = clip.over_black[k - first]
                 psnr_of[k], ssim_of[k] = psnr(target, image), ssim(target, image)

@@ -15,8 +15,9 @@ import numpy as np
 from PIL import Image
 
 from foldgauss.io import VideoError, read_masks, read_video, write_video
-from foldgauss.io.media import format_detection
-from foldgauss.io.media.masks import MAX_PIXELS, MAX_PIXELS_PER_BYTE
+from foldgauss.io.media.clip import HEAD_BYTES, MAX_PIXELS
+from foldgauss.io.media.decoder import describe_kind
+from foldgauss.io.media.images import is_image
 from foldgauss.uncertainty.posterior import draws_file
 from foldgauss.uncertainty.posterior.optional_imports import import_optional
 
@@ -49,8 +50,8 @@ def _images() -> list[bytes]:
 
 
 def _picture_memory(size: int) -> int:
-    """As many pixels as are taken, 4 channels of a byte, decoded and copied; see `foldgauss.io.media.masks`."""
-    return 2 * CONSTANT + 12 * max(MAX_PIXELS, MAX_PIXELS_PER_BYTE * size)
+    """As many pixels as are taken, 4 channels of a byte, decoded and copied."""
+    return 2 * CONSTANT + 12 * MAX_PIXELS
 
 
 #: What is asked for besides: a label, a size, the folder that the image is alone in, frames of it.
@@ -81,7 +82,7 @@ MASKS = Target(
     ".png",
     _images,
     _read_mask,
-    (ValueError,),
+    (ValueError, VideoError),
     {"foldgauss.io.media.masks": ()},
     lambda data: 8 if data.startswith(b"\x89PNG") else 2,
     _picture_memory,
@@ -139,14 +140,10 @@ _READ = {
     f"foldgauss.io.media.{module}": names
     for module, names in {
         "clip": (ONLY, "check_range_within", "check_num_pixels"),
-        "resizing": (
-            ONLY, "make_resizer", "convert_channels", "copy_to_blocks", "stack_frames",
-        ),
+        "reading": (ONLY, "scan_clip", "resize_frame", "stack_frames"),
         "decoder": (),
-        "image_files": ("natural_sort_key", "_is_jpeg_sequence"),
-        "video_decoding": (),
-        "video_reading": (),
-        "format_detection": (),
+        "images": ("natural_sort_key", "is_bare_jpegs"),
+        "facts": (),
         "frame_rate": (),
     }.items()
 }  # fmt: skip
@@ -300,12 +297,9 @@ VIDEO = Target(
 
 def _read_head(path: Path) -> None:
     """All that is asked of a file's first bytes, without decoding."""
-    head = path.read_bytes()[: format_detection.HEAD_BYTES]
-    for ask in ("is_image_format", "may_be_animation"):
-        getattr(format_detection, ask)(head)
-    claimed = format_detection.parse_image_size(head)
-    assert claimed is None or format_detection.min_file_bytes(head, claimed) >= 0
-    kind = format_detection.describe_kind(head)
+    head = path.read_bytes()[:HEAD_BYTES]
+    is_image(head)
+    kind = describe_kind(head)
     if kind is not None:
         raise ValueError(f"expected a video or an image, got {kind}")
 
@@ -329,7 +323,7 @@ HEADERS = Target(
     lambda: [*_clips(), *_images(), *_more_images()],
     _read_head,
     (ValueError,),
-    {"foldgauss.io.media.format_detection": ()},
+    {"foldgauss.io.media.decoder": (ONLY, "describe_kind"), "foldgauss.io.media.images": (ONLY, "is_image")},
     lambda data: 8,
     mutations=(_resized_box, png_sized, _marked, _another_kind),
     past_header=2,

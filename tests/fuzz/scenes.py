@@ -37,13 +37,13 @@ def _text_of(data: bytes, order: str = "ascii") -> bytes:
 
 
 def _with_lists(data: bytes, order: str = "<") -> bytes:
-    """With an element of lists, which is skipped, before the others, and a plain one after."""
+    """With an element that is skipped before the others, and one of lists after."""
     head, body = data.split(b"end_header\n", 1)
     lines = head.split(b"\n", 2)
-    lines[2] = b"element face 2\nproperty list uchar int vertex\nproperty short flag\n" + lines[2]
-    lines[2] += b"element extra 1\nproperty double a\n"
-    rows = b"2 0 1 7 0 -3\n" if order == "" else struct.pack("<BiihBh", 2, 0, 1, 7, 0, -3)
-    return b"\n".join(lines) + b"end_header\n" + rows + body + (b"1.5\n" if order == "" else struct.pack("<d", 1.5))
+    lines[2] = b"element extra 1\nproperty double a\nproperty short flag\n" + lines[2]
+    lines[2] += b"element face 1\nproperty list uchar int vertex\n"
+    rows = b"1.5 -3\n" if order == "" else struct.pack("<dh", 1.5, -3)
+    return b"\n".join(lines) + b"end_header\n" + rows + body + b"\0"
 
 
 def _rows_of_times(data: bytes) -> bytes:
@@ -210,21 +210,15 @@ def _beside(folder: Path, but: str) -> None:
 
 
 def _tool(data: bytes) -> bytes:
-    """As a mesh tool writes it: groups, normals, indices with slashes and from the end, lines that go on."""
+    """As a mesh tool writes it: groups, normals, comments, indices with slashes."""
     lines = [b"# a tool", b"mtllib a.mtl", b"o frame", b"vn 0 0 1", b"", b"s off"]
     for line in data.split(b"\n"):
         words = line.split()
         if line.startswith(b"v "):
-            lines.append(b"v " + b" \\\n ".join(words[1:4]) + b" # a comment")
+            lines.append(b"v " + b" ".join(words[1:4]) + b" # a comment")
         elif line.startswith(b"f "):
             lines.append(b"f " + b" ".join(word + b"//1" for word in words[1:]))
     return b"\r\n".join(lines) + b"\r\n"
-
-
-def _from_the_end(data: bytes) -> bytes:
-    """Faces right behind their vertices, by indices that count back."""
-    vertices = [line for line in data.split(b"\n") if line.startswith(b"v ")]
-    return b"".join(b"\n".join(vertices[k : k + 3]) + b"\nf -3 -2 -1\n" for k in range(0, len(vertices), 3))
 
 
 def line_changed(data: bytes, random: Random) -> bytes:
@@ -264,7 +258,7 @@ _MESH = {
 OBJ = Target(
     "obj",
     ".obj",
-    lambda: [_mesh()["frame_0000.obj"], _tool(_mesh()["frame_0000.obj"]), _from_the_end(_mesh()["frame_0000.obj"])],
+    lambda: [_mesh()["frame_0000.obj"], _tool(_mesh()["frame_0000.obj"])],
     _read_mesh,
     (FormatError,),
     {"foldgauss.io.exchange.pseudomesh": (*_MESH["foldgauss.io.exchange.pseudomesh"], "_read_notes", "_check_notes")},
@@ -305,8 +299,8 @@ NOTES = Target(
     {
         "foldgauss.io.exchange.pseudomesh": (
             *_MESH["foldgauss.io.exchange.pseudomesh"],
-            "_read_frame", "_check_area", "read_obj", "_obj_lines", "_parse_vertex",
-            "_parse_face", "_check_soup",
+            "_read_frame", "_check_area", "read_obj", "_parse_vertex",
+            "_check_face",
         )
     },
     lambda data: 0,

@@ -274,7 +274,6 @@ SCRIPT = Target(
     (EditScriptError,),
     {
         "foldgauss.io.edit_script": (),
-        "foldgauss.io._toml_lines": (),
         "foldgauss.io.models.selections": (ONLY, "parse_indices", "parse_ranges"),
     },
     lambda data: 0,

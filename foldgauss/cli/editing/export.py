@@ -23,7 +23,7 @@ from foldgauss.cli.shared.tables import format_count
 from foldgauss.io._atomic import write_or_keep
 from foldgauss.io.exchange.export_import import export, import_model
 from foldgauss.io.exchange.pseudomesh import read_pseudomesh
-from foldgauss.io.media.video_writing import VIDEO_SUFFIXES
+from foldgauss.io.media.writing import VIDEO_SUFFIXES
 from foldgauss.io.models.video_model import (
     MODEL_SUFFIX,
     keep_origin,

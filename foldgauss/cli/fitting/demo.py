@@ -16,8 +16,8 @@ from foldgauss.cli.shared.outputs import make_folder, refuse_existing
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import print_figures, summarize_scores, write_json
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.video_reading import read_video
-from foldgauss.io.media.video_writing import write_image, write_video
+from foldgauss.io.media.reading import read_video
+from foldgauss.io.media.writing import write_image, write_video
 from foldgauss.io.models.compact import save_compact
 from foldgauss.io.provenance import describe_source
 from foldgauss.jobs.runner import describe_fit, mean_scores, run_steps

@@ -16,7 +16,7 @@ from foldgauss.cli.shared.log_lines import show_status
 from foldgauss.cli.shared.rendering import progress_bar
 from foldgauss.cli.shared.tables import format_count, print_figures
 from foldgauss.io._atomic import write_or_keep
-from foldgauss.io.media.resizing import describe_crop
+from foldgauss.io.media.reading import describe_crop
 from foldgauss.jobs import FitJob, JoinedFit, LongFit, Outcome, plan_long_fit, segments_folder
 from foldgauss.jobs.job import read_record
 from foldgauss.jobs.segments import SEGMENT_SECONDS, read_segment_seconds

@@ -39,7 +39,7 @@ from foldgauss.cli.shared.outputs import make_folder, name_after, refuse_foreign
 from foldgauss.io._atomic import OutputError
 from foldgauss.io._lock import lock_output
 from foldgauss.io.media.clip import DEINTERLACE, Clip, check_reading
-from foldgauss.io.media.video_reading import read_video
+from foldgauss.io.media.reading import read_video
 from foldgauss.io.models.compact import save_compact
 from foldgauss.io.models.video_model import load_video_model, save_video_model
 from foldgauss.io.provenance import fingerprint

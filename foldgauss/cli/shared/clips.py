@@ -9,9 +9,8 @@ from foldgauss.cli.app.application import warn
 from foldgauss.cli.shared.arguments import parse_frames
 from foldgauss.cli.shared.log_lines import show_status
 from foldgauss.io.media.clip import Clip
-from foldgauss.io.media.frame_index import index_video
-from foldgauss.io.media.lazy_frames import LazyFrames
-from foldgauss.io.media.video_reading import read_video
+from foldgauss.io.media.indexing import LazyFrames, index_video
+from foldgauss.io.media.reading import read_video
 from foldgauss.io.models.segmented import is_segmented
 from foldgauss.io.models.video_model import read_origin
 from foldgauss.io.provenance import has_other_frames

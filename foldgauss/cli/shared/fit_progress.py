@@ -16,7 +16,7 @@ from foldgauss.cli.shared.contact_sheet import make_comparison_sheet
 from foldgauss.cli.shared.log_lines import FIRST_LINE_SECONDS, LINE_SECONDS
 from foldgauss.io.history import HistoryFile, info_line
 from foldgauss.io.media.clip import Clip
-from foldgauss.io.media.video_writing import write_image
+from foldgauss.io.media.writing import write_image
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.loop import FitInfo
 from foldgauss.video.fitting.state import FitState, to_model

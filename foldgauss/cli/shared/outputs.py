@@ -6,9 +6,9 @@ from pathlib import Path
 
 from foldgauss._runtime.checks import ParameterError, invalid
 from foldgauss.io._atomic import check_replaceable, check_writable, resolve
-from foldgauss.io.media.image_files import IMAGE_SUFFIXES
-from foldgauss.io.media.resizing import memory_limit
-from foldgauss.io.media.video_writing import ANIMATION_SUFFIXES, FRAME_NAMES, VIDEO_SUFFIXES
+from foldgauss.io.media.images import IMAGE_SUFFIXES
+from foldgauss.io.media.reading import memory_limit
+from foldgauss.io.media.writing import ANIMATION_SUFFIXES, FRAME_NAMES, VIDEO_SUFFIXES
 
 IMAGE_SUFFIX = ".png"
 

@@ -22,13 +22,15 @@ from foldgauss.cli.shared.outputs import IMAGE_SUFFIX
 from foldgauss.cli.shared.tables import format_count
 from foldgauss.cli.shared.timeline import Timeline
 from foldgauss.io._atomic import write_or_keep
-from foldgauss.io.media.encoder import CODECS, Sound, choose_encoding
 from foldgauss.io.media.frame_rate import MAX_FPS
-from foldgauss.io.media.lazy_frames import LazyFrames
-from foldgauss.io.media.video_writing import (
+from foldgauss.io.media.indexing import LazyFrames
+from foldgauss.io.media.writing import (
     ANIMATION_SUFFIXES,
+    CODECS,
     MAX_GIF_FPS,
     VIDEO_SUFFIXES,
+    Sound,
+    choose_encoding,
     write_image,
     write_video,
 )

@@ -37,7 +37,7 @@ from foldgauss.cli.shared.rendering import (
 )
 from foldgauss.cli.shared.timeline import Fps, SkipRepeats, Speed, Timeline, Upsample, parse_remap
 from foldgauss.cli.viewing.plate import make_plate
-from foldgauss.io.media.video_writing import IMAGE_FORMATS, VIDEO_SUFFIXES
+from foldgauss.io.media.writing import IMAGE_FORMATS, VIDEO_SUFFIXES
 from foldgauss.io.models.video_model import load_video_model, read_frame_seconds, read_origin
 from foldgauss.video.motion.slow_motion import interpolate_frames
 from foldgauss.video.motion.stabilization import BORDERS, MAX_ZOOM, SMOOTHING, stabilize

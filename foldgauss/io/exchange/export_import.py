@@ -51,9 +51,12 @@ def export(
     **Example:** `export(load_video_model("holiday.safetensors"), "ply3dgs", "frames")`
     """
     if not isinstance(model, VideoModel | EditedVideo | SegmentedVideo):
-        cure = "End the chain with .video()." if isinstance(model, Edit) else "The order is (model, format, out)."
-        expected = "a VideoModel, an EditedVideo or a SegmentedVideo"
-        raise invalid("model", expected=expected, got=type(model).__name__, cure=cure)
+        raise invalid(
+            "model",
+            expected="a VideoModel, an EditedVideo or a SegmentedVideo",
+            got=type(model).__name__,
+            cure="End the chain with .video()." if isinstance(model, Edit) else "The order is (model, format, out).",
+        )
     check_one_of("format", format, FORMATS)
     out = check_path(out, "model, format, out")
     options = {"depth_step": depth_step, "axes": axes, "sh_degree": sh_degree}
@@ -69,23 +72,34 @@ def export(
         return write_vegas_ply(out, model)
     if format == "obj":
         if out.suffix.lower() == ".obj" and not out.is_dir():
-            cure = "Each frame becomes a file in it: leave the extension out."
-            raise invalid("out", expected="a folder", got=repr(str(out)), cure=cure)
+            raise invalid(
+                "out",
+                expected="a folder",
+                got=repr(str(out)),
+                cure="Each frame becomes a file in it: leave the extension out.",
+            )
         return write_pseudomesh(out, model, times, overwrite=overwrite, on_frame=on_frame)
     if out.suffix.lower() != ".ply" or out.is_dir():
         return write_3dgs_frames(out, model, times, overwrite=overwrite, on_frame=on_frame, **of_scenes)
     if times is None or np.size(times) != 1:
-        got = "all frames" if times is None else str(np.size(times))
-        cure = "Give one time, or a folder (a name without .ply)."
-        raise invalid("times", expected="one for a single file", got=got, cure=cure)
+        raise invalid(
+            "times",
+            expected="one for a single file",
+            got="all frames" if times is None else str(np.size(times)),
+            cure="Give one time, or a folder (a name without .ply).",
+        )
     _check_new(out, overwrite)
     return write_3dgs_ply(out, model, float(np.ravel(times)[0]), **of_scenes)
 
 
 def _write_vegas_segments(folder: Path, video: SegmentedVideo, overwrite: bool) -> Path:
     if folder.suffix.lower() == ".ply" and not folder.is_dir():
-        cure = "Each segment becomes a file in it: leave the extension out."
-        raise invalid("out", expected="a folder", got=repr(str(folder)), cure=cure)
+        raise invalid(
+            "out",
+            expected="a folder",
+            got=repr(str(folder)),
+            cure="Each segment becomes a file in it: leave the extension out.",
+        )
     with atomic_folder(folder, overwrite, pattern=r"segment-[0-9]{3,}\.ply", what="segments") as temporary:
         for number, segment in enumerate(video.segments):
             write_vegas_ply(temporary / f"segment-{number:03d}.ply", segment.model)
@@ -109,6 +123,10 @@ def import_model(path: PathLike, *, size: Size | None = None, fps: float | None 
     """
     path = check_path(path)
     if path.is_dir() or path.suffix.lower() == ".obj":
-        cure = "Render frames of triangles with foldgauss.io.read_pseudomesh(FOLDER).frames()."
-        raise format_error(path, expected="a .ply file with a video", got="a folder or a mesh", cure=cure)
+        raise format_error(
+            path,
+            expected="a .ply file with a video",
+            got="a folder or a mesh",
+            cure="Render frames of triangles with foldgauss.io.read_pseudomesh(FOLDER).frames().",
+        )
     return read_vegas_ply(path, size=size, fps=fps)

@@ -130,8 +130,12 @@ def write_3dgs_ply(
     """
     video = model.model if isinstance(model, VideoRenderer) else model
     if video.compositing != "over":
-        cure = "Fit it with --compositing over."
-        raise invalid("model's compositing", expected="over, as viewers blend", got=video.compositing, cure=cure)
+        raise invalid(
+            "model's compositing",
+            expected="over, as viewers blend",
+            got=video.compositing,
+            cure="Fit it with --compositing over.",
+        )
     columns = _columns(frame_gaussians(model, t, depth_step=depth_step), axes, sh_degree)
     note = {"size": list(video.size), "axes": axes, "options": dataclasses.asdict(video.options)}
     return write_ply(path, {"vertex": columns}, comments=[NOTE + json.dumps(note)])
@@ -192,17 +196,21 @@ def read_3dgs_ply(path: PathLike, *, axes: str = "y-down") -> Gaussians3D:
     check_one_of("axes", axes, AXES)
     ply = read_ply(path, ("vertex",))
     if not ply.is_3dgs():
-        got = ply.describe_vertices()
-        cure = "For a video use read_vegas_ply." if ply.is_vegas() else "It may be a mesh or a point cloud."
-        expected = "a 3DGS scene, with f_dc_0, opacity, scale_2 and rot_3"
-        raise ply.error(expected=expected, got=got, cure=cure)
+        raise ply.error(
+            expected="a 3DGS scene, with f_dc_0, opacity, scale_2 and rot_3",
+            got=ply.describe_vertices(),
+            cure="For a video use read_vegas_ply." if ply.is_vegas() else "It may be a mesh or a point cloud.",
+        )
     spatial = ply.columns("vertex", ["x", "y", "z", "scale_0", "scale_1", "scale_2"])
     turn = ply.columns("vertex", [f"rot_{k}" for k in range(4)])
     opacity, *color = ply.columns("vertex", ["opacity", "f_dc_0", "f_dc_1", "f_dc_2"]).T
     lengths = np.linalg.norm(turn, axis=1)
     if (lengths < _SMALLEST).any():
-        got = f"0 in vertex {np.argmax(lengths < _SMALLEST)}"
-        raise ply.error(expected="quaternions of nonzero length", got=got, cure="Drop that row.")
+        raise ply.error(
+            expected="quaternions of nonzero length",
+            got=f"0 in vertex {np.argmax(lengths < _SMALLEST)}",
+            cure="Drop that row.",
+        )
     rotation = np.empty((0, 3, 3))
     if len(turn):
         rotation = scipy.spatial.transform.Rotation.from_quat(turn[:, [1, 2, 3, 0]]).as_matrix()

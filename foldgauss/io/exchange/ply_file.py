@@ -22,14 +22,13 @@ _SIZES = {
     "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
     "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
+_LIST = "list"
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 #: Bytes; a header names each frame of a VeGaS video in about 30, so this allows some 100,000 frames.
 MAX_HEADER = 4 << 20
 _END_OF_HEADER = re.compile(rb"^[ \t]*end_header[ \t\r]*\n", re.MULTILINE)
 #: Prefix of our metadata in a comment of the header, which other programs skip.
 NOTE = "foldgauss "
-#: Characters of the longest accepted number.
-LONGEST_WORD = 64
 
 
 class FormatError(ParameterError):
@@ -48,13 +47,6 @@ def facts_error(path: object, error: Exception) -> FormatError:
         return FormatError(str(path), text)
     got = f"others ({type(error).__name__}: {text})"
     return format_error(path, expected="metadata as foldgauss writes them", got=got, cure="Remove them.")
-
-
-@dataclass(frozen=True)
-class _Element:
-    name: str
-    count: int
-    properties: list[tuple[str, str]]  # (name, type code); of a list "count type, item type"
 
 
 @dataclass(frozen=True)
@@ -98,9 +90,11 @@ class Ply:
         found = self.names(element)
         missing = [name for name in names if name not in found]
         if missing:
-            has = "the properties " + ", ".join(found[:40]) if found else "no such element"
-            expected = f"properties {', '.join(missing)} of element {element!r}"
-            raise self.error(expected=expected, got=has, cure="It holds another kind of data.")
+            raise self.error(
+                expected=f"properties {', '.join(missing)} of element {element!r}",
+                got="the properties " + ", ".join(found[:40]) if found else "no such element",
+                cure="It holds another kind of data.",
+            )
         rows = self.elements[element]
         columns = np.empty((len(rows), len(names)), np.float64)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -109,8 +103,11 @@ class Ply:
             wrong = np.argwhere(~np.isfinite(columns.astype(np.float32)))
         if len(wrong):
             row, place = wrong[0]
-            got = f"{columns[row, place]} in {names[place]} of {element} {row}"
-            raise self.error(expected="numbers that float32 can represent", got=got, cure="Drop that row.")
+            raise self.error(
+                expected="numbers that float32 can represent",
+                got=f"{columns[row, place]} in {names[place]} of {element} {row}",
+                cure="Drop that row.",
+            )
         return columns
 
 
@@ -120,28 +117,47 @@ class Ply:
 def read_ply(path: PathLike, wanted: Iterable[str]) -> Ply:
     """Read the `wanted` elements of a PLY file, those of them that it has: text or binary, of either byte order.
 
-    Other elements, lists among them, are skipped. Raises `FileNotFoundError` for a missing path and `FormatError` for
-    a file that is not PLY, breaks off, declares more rows than it holds, or has lists in a wanted element.
+    Others are skipped. Raises `FileNotFoundError` for a missing path and `FormatError` for a file that is not PLY,
+    breaks off, declares more rows than it holds, or has lists in a wanted element or before one.
     """
-    path = Path(path)
+    path, wanted = Path(path), set(wanted)
     data = read_bytes(path)
-    header, start = _split_header(path, data)
+    header, at = _split_header(path, data)
     order, elements, comments = _parse_header(path, header)
-    wanted = set(wanted)
-    body = _Body(path, memoryview(data)[start:], order)
+    values = data if order else data[at:].split()
+    at = at if order else 0
     found = {}
-    for element in elements:
+    for name, (count, columns) in elements.items():
         if wanted <= found.keys():
             break
-        if element.name not in wanted:
-            body.skip(element)
-            continue
-        lists = [name for name, code in element.properties if "," in code]
+        lists = [column for column, code in columns.items() if code == _LIST]
         if lists:
-            expected, got = f"plain numbers only in element {element.name!r}", f"the list {lists[0]!r}"
-            raise format_error(path, expected=expected, got=got, cure="It is a mesh, or made by another program.")
-        found[element.name] = body.read(element)
+            raise format_error(
+                path,
+                expected=f"plain numbers only in element {name!r}",
+                got=f"the list {lists[0]!r}",
+                cure="It is a mesh, or made by another program.",
+            )
+        row = np.dtype([(column, order + code if order else "f8") for column, code in columns.items()])
+        first, at = at, at + count * (row.itemsize if order else len(columns))
+        if at > len(values):
+            raise format_error(
+                path,
+                expected=f"{count} rows of element {name!r}, {at - first} {'bytes' if order else 'numbers'} or more",
+                got=str(len(values) - first),
+                cure="The file is truncated.",
+            )
+        if name in wanted:
+            rows = values[first:at] if order else _parse_numbers(path, values[first:at])
+            found[name] = np.frombuffer(rows, row)
     return Ply(path, found, comments)
+
+
+def _parse_numbers(path: Path, words: list[bytes]) -> np.ndarray:
+    try:
+        return np.array([float(word) for word in words])
+    except ValueError as error:
+        raise format_error(path, expected="numbers", got=str(error)[:80], cure="The file is damaged.") from None
 
 
 def read_bytes(path: Path) -> bytes:
@@ -150,140 +166,61 @@ def read_bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        expected, got = "a file that can be read", error.strerror or str(error)
-        raise format_error(path, expected=expected, got=got, cure="Give the path of a file.") from error
+        raise format_error(
+            path, expected="a file that can be read", got=error.strerror or str(error), cure="Give the path of a file."
+        ) from error
 
 
 def _split_header(path: Path, data: bytes) -> tuple[list[str], int]:
     """The lines between "ply" and "end_header", and where the rows start."""
     if data[:4] not in (b"ply\n", b"ply\r"):
-        got = "an empty file" if not data else f"one that starts with {data[:8]!r}"
-        raise format_error(path, expected="a PLY file, which starts with 'ply'", got=got, cure="Check the path.")
+        raise format_error(
+            path,
+            expected="a PLY file, which starts with 'ply'",
+            got="an empty file" if not data else f"one that starts with {data[:8]!r}",
+            cure="Check the path.",
+        )
     found = _END_OF_HEADER.search(data[:MAX_HEADER])
     if found is None:
-        got = f"none in {min(len(data), MAX_HEADER)} bytes"
-        raise format_error(path, expected="a line 'end_header'", got=got, cure="Copy the file again.")
+        raise format_error(
+            path,
+            expected="a line 'end_header'",
+            got=f"none in {min(len(data), MAX_HEADER)} bytes",
+            cure="Copy the file again.",
+        )
     return data[: found.start()].decode("ascii", errors="replace").split("\n")[1:-1], found.end()
 
 
-def _parse_header(path: Path, lines: list[str]) -> tuple[str, list[_Element], tuple[str, ...]]:
-    """(byte order, elements, comments); see `_ORDERS`."""
-    order, comments = None, []
-    elements: list[_Element] = []
+def _parse_header(path: Path, lines: list[str]) -> tuple[str, dict[str, tuple[int, dict[str, str]]], tuple[str, ...]]:
+    """(byte order, elements, comments): see `_ORDERS`; of each element the number of rows, and type codes by column."""
+    order, comments, elements = None, [], {}
     for number, line in enumerate(lines, start=2):
         word, *rest = line.split() or [""]
-        where = f"{path}, line {number}"
         if word == "comment":
             comments.append(line.strip()[len("comment ") :])
         elif word in ("obj_info", ""):
             continue
         elif word == "format" and order is None and len(rest) == 2 and rest[0] in _ORDERS and rest[1] == "1.0":
             order = _ORDERS[rest[0]]
-        elif word == "element" and len(rest) == 2 and _is_count(rest[1]):
-            if any(rest[0] == known.name for known in elements):
-                raise format_error(where, expected="elements of different names", got=f"{rest[0]!r} twice")
-            elements.append(_Element(rest[0], int(rest[1]), []))
-        elif word == "property" and elements:
-            elements[-1].properties.append(_parse_property(where, rest))
+        elif word == "element" and len(rest) == 2 and rest[0] not in elements and re.fullmatch("[0-9]{1,15}", rest[1]):
+            columns = {}
+            elements[rest[0]] = int(rest[1]), columns
+        elif word == "property" and elements and rest and rest[-1] not in columns and rest[0] in (*_SIZES, _LIST):
+            columns[rest[-1]] = _SIZES.get(rest[0], _LIST)
         else:
-            expected = "format ascii|binary_little_endian|binary_big_endian 1.0, element NAME COUNT, property TYPE NAME"
-            raise format_error(where, expected=expected, got=repr(line.rstrip()[:80]), cure="The header is damaged.")
+            raise format_error(
+                f"{path}, line {number}",
+                expected="format ascii|binary_little_endian|binary_big_endian 1.0, element NAME COUNT, "
+                "property TYPE NAME, with names that differ",
+                got=repr(line.rstrip()[:80]),
+                cure="The header is damaged.",
+            )
     if order is None:
         raise format_error(path, expected="a line 'format ...' in the header", got="none", cure="Copy it again.")
-    for element in elements:
-        names = [name for name, _ in element.properties]
-        if len(set(names)) < len(names) or not names:
-            got = "none" if not names else f"{max(names, key=names.count)!r} twice"
-            raise format_error(path, expected=f"different properties of element {element.name!r}", got=got)
+    empty = [name for name, (_, columns) in elements.items() if not columns]
+    if empty:
+        raise format_error(path, expected=f"properties of element {empty[0]!r}", got="none", cure="Copy it again.")
     return order, elements, tuple(comments)
-
-
-def _parse_property(where: str, words: list[str]) -> tuple[str, str]:
-    """(name, type code) of what follows "property"."""
-    if len(words) == 2 and words[0] in _SIZES:
-        return words[1], _SIZES[words[0]]
-    if len(words) == 4 and words[0] == "list" and words[2] in _SIZES and _SIZES.get(words[1], "f")[0] in "iu":
-        return words[3], f"{_SIZES[words[1]]},{_SIZES[words[2]]}"
-    expected = "property TYPE NAME or property list COUNT_TYPE TYPE NAME, of known types"
-    raise format_error(where, expected=expected, got=repr(" ".join(["property", *words])[:80]))
-
-
-def _is_count(text: str) -> bool:
-    return text.isascii() and text.isdigit() and len(text) <= 15
-
-
-class _Body:
-    """Rows element after element: of bytes in an `order`, or of a text's words where it is empty."""
-
-    def __init__(self, path: Path, data: memoryview, order: str):
-        self.path, self.order, self.at = path, order, 0
-        self.values = data if order else bytes(data).split()
-
-    def read(self, element: _Element) -> np.ndarray:
-        values = self._take(element, element.count * sum(self._sizes(element)))
-        if not self.order:
-            return self._parse(element, values)
-        return np.frombuffer(values, [(name, self.order + code) for name, code in element.properties])
-
-    def skip(self, element: _Element) -> None:
-        sizes = self._sizes(element)
-        items = [np.dtype(code.split(",")[1]).itemsize if "," in code else 0 for _, code in element.properties]
-        if not any(items):
-            self._take(element, element.count * sum(sizes))
-            return
-        self._need(element, element.count * sum(sizes))
-        for _ in range(element.count):
-            for (_, code), size, item in zip(element.properties, sizes, items, strict=True):
-                first = self._take(element, size)
-                if item:
-                    self._take(element, self._length(element, first, code) * (item if self.order else 1))
-
-    def _sizes(self, element: _Element) -> list[int]:
-        """Bytes or words of each property; of a list those of its length."""
-        return [np.dtype(code.split(",")[0]).itemsize if self.order else 1 for _, code in element.properties]
-
-    def _length(self, element: _Element, first: memoryview | list[bytes], code: str) -> int:
-        """The number of items of a list."""
-        if self.order:
-            number = str(np.frombuffer(first, self.order + code.split(",")[0])[0])
-        else:
-            number = first[0].decode("ascii", errors="replace")
-        if not _is_count(number):
-            raise format_error(self.path, expected=f"lengths of lists in {element.name!r}", got=repr(number[:40]))
-        return int(number)
-
-    def _parse(self, element: _Element, words: list[bytes]) -> np.ndarray:
-        width = len(element.properties)
-        long = next((word for word in words if len(word) > LONGEST_WORD), None)
-        if long is not None:  # an array of words gives each the room of the longest
-            raise format_error(self.path, expected="numbers", got=f"a word of {len(long)} characters")
-        try:
-            values = np.array(words, dtype=np.bytes_).astype(np.float64).reshape(element.count, width)
-        except ValueError:
-            place = next(place for place, word in enumerate(words) if not _is_number(word))
-            name, where = element.properties[place % width][0], f"{element.name} {place // width}"
-            got = f"{words[place][:40]!r} in {name} of {where}"
-            raise format_error(self.path, expected="numbers", got=got, cure="The file is damaged.") from None
-        return values.view([(name, "f8") for name, _ in element.properties])[:, 0]
-
-    def _take(self, element: _Element, num: int) -> memoryview | list[bytes]:
-        self._need(element, num)
-        self.at += num
-        return self.values[self.at - num : self.at]
-
-    def _need(self, element: _Element, num: int) -> None:
-        left, unit = len(self.values) - self.at, "bytes" if self.order else "numbers"
-        if num > left:
-            expected = f"{element.count} rows of element {element.name!r}, {num} {unit} or more"
-            raise format_error(self.path, expected=expected, got=f"{left} {unit}", cure="The file is truncated.")
-
-
-def _is_number(word: bytes) -> bool:
-    try:
-        np.array([word]).astype(np.float64)
-    except ValueError:
-        return False
-    return True
 
 
 # ---------------------------------------------------------------------------------------------- writing

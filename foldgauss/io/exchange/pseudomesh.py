@@ -20,7 +20,7 @@ from foldgauss.io.exchange.gaussians_ply import check_times, frame_gaussians, re
 from foldgauss.io.exchange.ply_file import facts_error, format_error, read_bytes
 from foldgauss.io.media.clip import Size
 from foldgauss.io.media.frame_rate import DEFAULT_FPS
-from foldgauss.io.media.image_files import natural_sort_key
+from foldgauss.io.media.images import natural_sort_key
 from foldgauss.render import COMPOSITINGS, Camera, Gaussians3D, RenderOptions, Splats2D, Triangles, cpu, project
 from foldgauss.render.splats import check_size, pixels_per_unit
 from foldgauss.render.triangle import COLLINEAR
@@ -32,6 +32,8 @@ NOTES = "pseudomesh.json"
 _FILES = r"frame_[0-9]{4,}\.(obj|ply)|pseudomesh\.json"
 #: Model space (x right, y down, z away) to the axes of mesh tools (x right, y up, z towards the viewer), and back.
 _AXES_TURN = np.array([1.0, -1.0, -1.0])
+#: How to cure a soup of triangles whose vertices a tool changed.
+_KEEP_ORDER = "Export with the vertices' order kept, and merge none by distance."
 #: No sine of the angle between two edges is smaller than that in a face that float32 tells from a line.
 _COLLINEAR = COLLINEAR * float(np.finfo(np.float32).eps)
 _LARGEST = 1e38  # of a coordinate: float32 holds the difference of two such
@@ -202,8 +204,12 @@ def read_pseudomesh(
         raise missing_error(folder, "a folder")
     paths = sorted(folder.glob("*.obj"), key=lambda path: natural_sort_key(path.name)) if folder.is_dir() else []
     if not paths:
-        cure = "Give the folder that write_pseudomesh or `foldgauss export --format obj` made."
-        raise format_error(folder, expected="a folder with .obj files", got="none", cure=cure)
+        raise format_error(
+            folder,
+            expected="a folder with .obj files",
+            got="none",
+            cure="Give the folder that write_pseudomesh or `foldgauss export --format obj` made.",
+        )
     given = {name: value for name, value in (("size", size), ("fps", fps)) if value is not None}
     facts = _check_notes(folder, _read_notes(folder, len(paths)) | given, len(paths))
     return Pseudomesh(tuple(_read_frame(path, axes) for path in paths), **facts)
@@ -227,8 +233,12 @@ def _read_notes(folder: Path, num_frames: int) -> dict:
 
 def _check_notes(folder: Path, notes: dict, num_frames: int) -> dict:
     if notes["size"] is None:
-        cure = "Give the size of the video, such as size=(480, 854)."
-        raise format_error(folder, expected=f"a size in {NOTES}", got="none", cure=cure)
+        raise format_error(
+            folder,
+            expected=f"a size in {NOTES}",
+            got="none",
+            cure="Give the size of the video, such as size=(480, 854).",
+        )
     try:
         times, size, fps = np.asarray(notes["times"], np.float64), tuple(notes["size"]), float(notes["fps"])
         options = RenderOptions(**notes["options"])
@@ -236,9 +246,12 @@ def _check_notes(folder: Path, notes: dict, num_frames: int) -> dict:
         check_size(size)
         check_within("fps", fps, "(0, inf)", "a positive rate")
         if times.shape != (num_frames,) or not ((times >= 0) & (times <= 1)).all():
-            expected = f"{num_frames} numbers in [0, 1], one for each .obj"
-            cure = "A frame was added or removed: correct the list too, or remove the file and give size."
-            raise invalid("times", expected=expected, got=f"shape {times.shape}", cure=cure)
+            raise invalid(
+                "times",
+                expected=f"{num_frames} numbers in [0, 1], one for each .obj",
+                got=f"shape {times.shape}",
+                cure="A frame was added or removed: correct the list too, or remove the file and give size.",
+            )
     except (TypeError, ValueError, OverflowError) as error:
         raise facts_error(folder / NOTES, error) from error
     return notes | {"times": times, "size": (int(size[0]), int(size[1])), "fps": fps, "options": options}
@@ -247,13 +260,19 @@ def _check_notes(folder: Path, notes: dict, num_frames: int) -> dict:
 def _read_frame(path: Path, axes: str) -> Triangles:
     beside = path.with_suffix(".ply")
     if not beside.exists():
-        got = f"{path.name!r} without {beside.name!r}"
-        raise format_error(path.parent, expected="a .ply with opacity and color beside every .obj", got=got)
+        raise format_error(
+            path.parent,
+            expected="a .ply with opacity and color beside every .obj",
+            got=f"{path.name!r} without {beside.name!r}",
+        )
     look, vertices = read_3dgs_ply(beside), read_obj(path)  # both are empty where no Gaussian was visible
     if len(vertices) != len(look.opacity):
-        cure = "Faces were added or removed: keep them all, and hide Gaussians by opacity instead."
-        expected = f"{len(look.opacity)} faces, a face for each Gaussian of {beside.name!r}"
-        raise format_error(path, expected=expected, got=str(len(vertices)), cure=cure)
+        raise format_error(
+            path,
+            expected=f"{len(look.opacity)} faces, a face for each Gaussian of {beside.name!r}",
+            got=str(len(vertices)),
+            cure="Faces were added or removed: keep them all, and hide Gaussians by opacity instead.",
+        )
     if axes == "y-up":
         vertices = vertices * _AXES_TURN
     edges = vertices[:, 1:] - vertices[:, :1]
@@ -268,8 +287,12 @@ def _check_area(path: Path, edges: Float[np.ndarray, "num 2 3"]) -> None:
         area = np.linalg.norm(np.cross(first, second), axis=-1)
         valid = area > _COLLINEAR * np.linalg.norm(first, axis=-1) * np.linalg.norm(second, axis=-1)
     if not valid.all():
-        got, cure = f"none in face {np.argmin(valid) + 1}", "Move a vertex off the line through the other two."
-        raise format_error(path, expected="faces of nonzero area", got=got, cure=cure)
+        raise format_error(
+            path,
+            expected="faces of nonzero area",
+            got=f"none in face {np.argmin(valid) + 1}",
+            cure="Move a vertex off the line through the other two.",
+        )
 
 
 def read_obj(path: PathLike) -> Float[np.ndarray, "faces 3 3"]:
@@ -288,30 +311,22 @@ def read_obj(path: PathLike) -> Float[np.ndarray, "faces 3 3"]:
     """
     path = Path(path)
     vertices: list[tuple[float, ...]] = []
-    faces: list[tuple[int, list[int]]] = []
-    for number, words in _obj_lines(path):
-        if words[0] == "v":
-            vertices.append(_parse_vertex(path, number, words[1:]))
-        elif words[0] == "f":
-            faces.append((number, _parse_face(path, number, words[1:], len(vertices))))
-    if not faces and vertices:
-        raise format_error(path, expected="faces", got=f"none, and {len(vertices)} vertices", cure="Export them too.")
-    _check_soup(path, faces, len(vertices))
+    num_faces = 0
+    for number, line in enumerate(read_bytes(path).splitlines(), start=1):
+        kind, *words = line.decode("utf-8", errors="replace").split("#", 1)[0].split() or [""]
+        if kind == "v":
+            vertices.append(_parse_vertex(path, number, words))
+        elif kind == "f":
+            num_faces += 1
+            _check_face(f"{path}, line {number}", words, num_faces)
+    if len(vertices) != 3 * num_faces:
+        raise format_error(
+            path,
+            expected="3 vertices of its own for each face",
+            got=f"{len(vertices)} vertices for {num_faces} faces: a tool merged, split or dropped some",
+            cure=_KEEP_ORDER,
+        )
     return np.array(vertices).reshape(-1, 3, 3)
-
-
-def _obj_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Numbered lines of words, those that a backslash continues as one, without comments and blank ones."""
-    parts: list[str] = []  # of a line that goes on; joined once, as there may be a million
-    for number, data in enumerate(read_bytes(path).splitlines(), start=1):  # of bytes: not at the separators of Unicode
-        line = data.decode("utf-8", errors="replace")
-        if line.endswith("\\"):
-            parts.append(line[:-1])
-            continue
-        words = " ".join([*parts, line]).split("#", 1)[0].split()
-        parts = []
-        if words:
-            yield number, words
 
 
 def _parse_vertex(path: Path, number: int, words: list[str]) -> tuple[float, ...]:
@@ -320,37 +335,29 @@ def _parse_vertex(path: Path, number: int, words: list[str]) -> tuple[float, ...
     except ValueError:
         place = ()
     if len(place) < 3 or not all(abs(x) <= _LARGEST for x in place):
-        got, cure = repr(" ".join(words)[:60]), "The file is damaged, or the tool wrote NaN."
-        raise format_error(f"{path}, line {number}", expected="a vertex x y z", got=got, cure=cure)
+        raise format_error(
+            f"{path}, line {number}",
+            expected="a vertex x y z",
+            got=repr(" ".join(words)[:60]),
+            cure="The file is damaged, or the tool wrote NaN.",
+        )
     return place
 
 
-def _parse_face(path: Path, number: int, words: list[str], num_vertices: int) -> list[int]:
-    """Numbers of the vertices from 0 on; a negative index counts back from the last vertex so far."""
-    where = f"{path}, line {number}"
-    try:
-        indices = [int(word.split("/", 1)[0]) for word in words]
-    except ValueError:
-        indices = []
-    if len(indices) != 3 or 0 in indices:
-        cure = "Only triangles represent Gaussians: disable the merging of triangles into polygons."
-        raise format_error(where, expected="a face of 3 vertices", got=repr(" ".join(words)[:60]), cure=cure)
-    return [index - 1 if index > 0 else num_vertices + index for index in indices]
-
-
-def _check_soup(path: Path, faces: list[tuple[int, list[int]]], num_vertices: int) -> None:
-    """Raise unless every face has three vertices of its own, in the order in which they were written."""
-    for line, indices in faces:
-        for index in indices:
-            if not 0 <= index < num_vertices:
-                expected, cure = f"vertices from 1 to {num_vertices}", "The file is damaged."
-                raise format_error(f"{path}, line {line}", expected=expected, got=str(index + 1), cure=cure)
-    cure = "Export with the vertices' order kept, and merge none by distance."
-    if num_vertices != 3 * len(faces):
-        got = f"{num_vertices} vertices for {len(faces)} faces: a tool merged, split or dropped some"
-        raise format_error(path, expected="3 vertices of its own for each face", got=got, cure=cure)
-    for place, (line, indices) in enumerate(faces):
-        if indices != [3 * place, 3 * place + 1, 3 * place + 2]:
-            expected = f"face {place + 1} of vertices {3 * place + 1}, {3 * place + 2}, {3 * place + 3}"
-            got = ", ".join(str(index + 1) for index in indices) + ": a tool reordered them"
-            raise format_error(f"{path}, line {line}", expected=expected, got=got, cure=cure)
+def _check_face(where: str, words: list[str], number: int) -> None:
+    """Raise unless face `number`, from 1 on, has three vertices of its own, in the order in which they were written."""
+    if len(words) != 3:
+        raise format_error(
+            where,
+            expected="a face of 3 vertices",
+            got=repr(" ".join(words)[:60]),
+            cure="Only triangles represent Gaussians: disable the merging of triangles into polygons.",
+        )
+    own = [str(3 * number + k) for k in (-2, -1, 0)]
+    if [word.split("/", 1)[0] for word in words] != own:
+        raise format_error(
+            where,
+            expected=f"face {number} of vertices {', '.join(own)}",
+            got=f"{' '.join(words)[:60]}: a tool merged, split or reordered them",
+            cure=_KEEP_ORDER,
+        )

@@ -161,12 +161,17 @@ def _vegas_unit(size: Size) -> float:
 
 def _check_is_vegas(ply: Ply) -> None:
     if not ply.is_vegas():
-        cure = "For a still scene use read_3dgs_ply." if ply.is_3dgs() else "Check that it is the right file."
-        got = ply.describe_vertices()
-        raise ply.error(expected="a VeGaS video, with m_0, sigma_0 and rot_0", got=got, cure=cure)
+        raise ply.error(
+            expected="a VeGaS video, with m_0, sigma_0 and rot_0",
+            got=ply.describe_vertices(),
+            cure="For a still scene use read_3dgs_ply." if ply.is_3dgs() else "Check that it is the right file.",
+        )
     if "time" not in ply.elements:
-        cure = "It may be of another version of the published code."
-        raise ply.error(expected="an element 'time' with the frames' weights", got="none", cure=cure)
+        raise ply.error(
+            expected="an element 'time' with the frames' weights",
+            got="none",
+            cure="It may be of another version of the published code.",
+        )
     if len(ply.elements["vertex"]) == 0:
         raise ply.error(expected="Gaussians", got="none")
     rest = [name for name in ply.names("vertex") if name.startswith("f_rest_")]
@@ -189,8 +194,11 @@ def _fill_in(ply: Ply, size: Size | None, fps: float | None) -> tuple[Size, floa
     """Size, rate, options, cutoff and power: as given, else as recorded in the file, else the published defaults."""
     note = _read_note(ply)
     if size is None and "size" not in note:
-        cure = "Give the size of the video that it was made from, such as size=(480, 854)."
-        raise ply.error(expected="a size, which a VeGaS file does not hold", got="none", cure=cure)
+        raise ply.error(
+            expected="a size, which a VeGaS file does not hold",
+            got="none",
+            cure="Give the size of the video that it was made from, such as size=(480, 854).",
+        )
     try:
         options = RenderOptions(**note.get("options", {}))
         size = note["size"] if size is None else size
@@ -225,17 +233,30 @@ def _check_writable_as_vegas(model: VideoModel) -> None:
             cure = "export(model, 'ply', FOLDER) writes one for each segment."
         raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
     if model.num_frames < 2:
-        expected = "at least 2 frames, as a VeGaS file stores the intervals between frames"
-        raise invalid("model", expected=expected, got="1", cure="Write the picture as a still scene, ply3dgs.")
+        raise invalid(
+            "model",
+            expected="at least 2 frames, as a VeGaS file stores the intervals between frames",
+            got="1",
+            cure="Write the picture as a still scene, ply3dgs.",
+        )
     floors = np.unique(model.splats.envelope.floor)
     if not (floors == 0).all():
-        got, expected = ", ".join(map(str, floors[:3])), "0.0, the only one in a VeGaS file"
-        raise invalid("model's floor", expected=expected, got=got, cure="Fit it without a floor.")
+        raise invalid(
+            "model's floor",
+            expected="0.0, the only one in a VeGaS file",
+            got=", ".join(map(str, floors[:3])),
+            cure="Fit it without a floor.",
+        )
     if model.compositing != "over":
-        expected, cure = "over, the only one in a VeGaS file", "Fit it with --compositing over."
-        raise invalid("model's compositing", expected=expected, got=model.compositing, cure=cure)
+        raise invalid(
+            "model's compositing",
+            expected="over, the only one in a VeGaS file",
+            got=model.compositing,
+            cure="Fit it with --compositing over.",
+        )
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model)):
         raise invalid("model", expected="finite numbers", got="NaN or infinities", cure="The fit diverged: fit again.")
     if not (np.asarray(model.splats.envelope.power) > 0).all():
-        cure = "Fit it with another --power."
-        raise invalid("model's power", expected="above 0, as VeGaS files require", got="0", cure=cure)
+        raise invalid(
+            "model's power", expected="above 0, as VeGaS files require", got="0", cure="Fit it with another --power."
+        )

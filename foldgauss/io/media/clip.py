@@ -1,6 +1,5 @@
 """Clips in memory, and the error and argument checks that readers and writers of clips share."""
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -10,11 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from foldgauss._runtime.checks import ParameterError, check_one_of, invalid, is_integer, is_within
-from foldgauss.io._atomic import PathLike, check_path, missing_error, resolve
-from foldgauss.io.media.format_detection import HEAD_BYTES
-from foldgauss.io.media.frame_rate import MAX_FPS, MIN_FPS, FrameRate
+from foldgauss.io._atomic import PathLike, check_input, check_path
+from foldgauss.io.media.frame_rate import MAX_FPS, MIN_FPS
 
-MAX_PIXELS = 1 << 28  # of one image, 16384x16384: a header may claim any size
+HEAD_BYTES = 1 << 16  # by which the format of a file is detected
+MAX_PIXELS = 178_956_970  # of one image, Pillow's limit: a header may claim any size
 VIDEO = "a video file or a folder of images"
 #: What becomes of an interlaced frame: one frame, one for each of its two fields, or an error.
 DEINTERLACE = ("frames", "fields", "refuse")
@@ -23,10 +22,6 @@ DEPTHS = (8, 10, 12, 14)  # bits of cameras and microscopes whose values are sto
 Range = tuple[int | None, int | None]
 Size = tuple[int, int]  # (height, width)
 Stretch = tuple[Size, Size]  # the size of frames as stored, and that to which they are stretched
-#: (frames declared within a range, frame rate, notes)
-RangeFacts = tuple[int, FrameRate, tuple[str, ...]]
-#: (prepared frames, and the facts)
-ReadResult = tuple[list[np.ndarray], *RangeFacts]
 
 
 class VideoError(ParameterError):
@@ -68,8 +63,12 @@ class Levels:
         Raises `VideoError` where `white` is given, but applies to no frame of `path`, a clip of this `kind`.
         """
         if self.white is not None and self.most < 0:
-            got, cure = f"{kind}, {str(path)!r}", "Leave levels out."
-            raise video_error("levels", expected="images or videos of 16 bits, in RGB or gray", got=got, cure=cure)
+            raise video_error(
+                "levels",
+                expected="images or videos of 16 bits, in RGB or gray",
+                got=f"{kind}, {str(path)!r}",
+                cure="Leave levels out.",
+            )
         if self.white is not None:
             clipped = f"values of up to {self.most:,} are above levels={self.white} and become white."
             return (clipped,) if self.most > self.white else ()
@@ -134,12 +133,11 @@ class Clip:
 def check_readable(path: PathLike) -> Path:
     """The path of an existing file or folder. Raises `FileNotFoundError`, or `VideoError` for pipes and devices."""
     path = check_path(path)
-    if os.path.isdir(path) or os.path.isfile(path):
-        return path
-    if os.path.exists(path):
-        got, cure = f"{str(path)!r}, a pipe or a device", "Save its output to a file."
-        raise video_error("path", expected=VIDEO, got=got, cure=cure)
-    raise missing_error(path, VIDEO)
+    try:
+        check_input(path, VIDEO)
+    except ValueError as error:
+        raise VideoError(str(error)) from error
+    return path
 
 
 @contextmanager
@@ -148,17 +146,13 @@ def translate_os_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        got = f"{str(path)!r} ({error.strerror or error})"
-        raise video_error("path", expected="a file that can be read", got=got) from error
+        raise video_error(
+            "path", expected="a file that can be read", got=f"{str(path)!r} ({error.strerror or error})"
+        ) from error
 
 
 def read_head(path: Path) -> bytes:
-    """The first bytes of a file. Raises `VideoError` for a name that is not Unicode: OpenCV crashes on it."""
-    try:
-        str(resolve(path)).encode()
-    except UnicodeEncodeError as error:
-        got, cure = f"{str(path)!a}, which is not Unicode", "Rename the file or its folder."
-        raise video_error("path", expected="a name that OpenCV can open", got=got, cure=cure) from error
+    """The first bytes of a file."""
     with open(path, "rb") as file:
         return file.read(HEAD_BYTES)
 
@@ -179,9 +173,12 @@ def check_range(frames: Range | None) -> tuple[int, int | None]:
 
 def check_range_within(start: int, stop: int | None, num_total: int, path: Path) -> None:
     if start >= num_total or (stop is not None and stop > num_total):
-        expected = f"A:B within 0:{num_total}, the frames of {str(path)!r}"
-        cure = f"Choose B <= {num_total} and A below it."
-        raise video_error("frames", expected=expected, got=format_range(start, stop), cure=cure)
+        raise video_error(
+            "frames",
+            expected=f"A:B within 0:{num_total}, the frames of {str(path)!r}",
+            got=format_range(start, stop),
+            cure=f"Choose B <= {num_total} and A below it.",
+        )
 
 
 def check_frame_size(size: Size | None, parameter: str = "size") -> Size | None:
@@ -189,9 +186,12 @@ def check_frame_size(size: Size | None, parameter: str = "size") -> Size | None:
         return None
     sides = tuple(size) if isinstance(size, tuple | list | np.ndarray) else ()
     if len(sides) != 2 or not all(is_within(side, "[1, inf)") and side == int(side) for side in sides):
-        got = f"{sides[0]}x{sides[1]}" if len(sides) == 2 else repr(size)
-        cure = "Write it as HEIGHTxWIDTH, such as 160x320."
-        raise video_error(parameter, expected="height and width of whole pixels, at least 1", got=got, cure=cure)
+        raise video_error(
+            parameter,
+            expected="height and width of whole pixels, at least 1",
+            got=f"{sides[0]}x{sides[1]}" if len(sides) == 2 else repr(size),
+            cure="Write it as HEIGHTxWIDTH, such as 160x320.",
+        )
     return int(sides[0]), int(sides[1])
 
 
@@ -199,14 +199,6 @@ def clamp_stop(start: int, stop: int | None, num_total: int, path: Path) -> int:
     """The end of a range in a clip of `num_total` frames, which may end before. Raises `VideoError` if empty."""
     check_range_within(start, None, num_total, path)
     return num_total if stop is None else min(stop, num_total)
-
-
-def describe_clamped(num: int, start: int, stop: int | None) -> tuple[str, ...]:
-    """A note if a range ends beyond its clip, which has `num` frames from `start` on."""
-    if stop is None or num >= stop - start:
-        return ()
-    end = start + num
-    return (f"frames {format_range(start, stop)} were asked for, and the clip ends at {end}: {start}:{end} are used.",)
 
 
 def check_fps(fps: float) -> None:
@@ -217,18 +209,24 @@ def check_fps(fps: float) -> None:
 def check_reading(deinterlace: str, levels: int | None) -> Reading:
     check_one_of("deinterlace", deinterlace, DEINTERLACE)
     if levels is not None and not (is_integer(levels, 1) and levels <= WHITE):
-        cure = "Of data of 12 bits it is 4095."
-        raise video_error("levels", expected=f"the value of white, 1 to {WHITE}", got=repr(levels), cure=cure)
+        raise video_error(
+            "levels",
+            expected=f"the value of white, 1 to {WHITE}",
+            got=repr(levels),
+            cure="Of data of 12 bits it is 4095.",
+        )
     return Reading(deinterlace, levels)
 
 
-def check_num_pixels(path: Path, size: Size | None) -> None:
+def check_num_pixels(path: Path, size: Size) -> None:
     """Raise where a header claims more than `MAX_PIXELS`, before memory is allocated for them."""
-    if size is not None and size[0] * size[1] > MAX_PIXELS:
-        expected = f"images of at most {MAX_PIXELS:,} pixels"
-        got = f"{format_size(size)} in the header of {str(path)!r}"
-        cure = "The file is damaged, or must be scaled down first."
-        raise video_error("path", expected=expected, got=got, cure=cure)
+    if size[0] * size[1] > MAX_PIXELS:
+        raise video_error(
+            "path",
+            expected=f"images of at most {MAX_PIXELS:,} pixels",
+            got=f"{format_size(size)} in the header of {str(path)!r}",
+            cure="The file is damaged, or must be scaled down first.",
+        )
 
 
 def video_error(parameter: str, *, expected: str, got: str, cure: str = "") -> VideoError:
@@ -239,22 +237,6 @@ def no_frames_error(start: int, stop: int | None, num_decoded: int, num_total: i
     """The error for a range in which no frame decodes."""
     got = f"{format_range(start, stop)}, while {num_decoded} of {num_total} frames decode in {str(path)!r}"
     return video_error("frames", expected="a range with frames that decode", got=got, cure="Choose earlier frames.")
-
-
-def describe_lost(num_decoded: int, num_declared: int) -> tuple[str, ...]:
-    """A note if fewer frames of a range decode than its container declares."""
-    if num_decoded >= num_declared:
-        return ()
-    return (f"only {num_decoded} of {num_declared} frames decode; those are used.",)
-
-
-def describe_few(positions: list[int], what: str) -> tuple[str, ...]:
-    """A note about frames at these positions; `what`: their property, as a predicate without its verb."""
-    if not positions:
-        return ()
-    which = f"frame {positions[0]} is"
-    which = which if len(positions) == 1 else f"{len(positions):,} frames, the first of them {positions[0]}, are"
-    return (f"{which} {what}.",)
 
 
 def format_range(start: int, stop: int | None) -> str:

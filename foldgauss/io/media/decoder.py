@@ -1,10 +1,10 @@
 """A video decoder restricted to one local file: PyAV, that is FFmpeg's libraries."""
 
 import math
-from collections.abc import Iterator
-from contextlib import suppress
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sized
+from contextlib import closing, suppress
 from fractions import Fraction
+from itertools import chain, repeat
 from pathlib import Path
 
 import av
@@ -19,20 +19,21 @@ from foldgauss.io._atomic import resolve
 from foldgauss.io.media.clip import (
     AS_STORED,
     VIDEO,
-    WHITE,
     Levels,
     Reading,
     Size,
     VideoError,
     check_num_pixels,
+    clamp_stop,
     format_num_bytes,
+    no_frames_error,
     read_head,
     video_error,
 )
-from foldgauss.io.media.format_detection import DEMUXERS, LIST, describe_kind
-from foldgauss.io.media.frame_rate import DEFAULT_FPS
-from foldgauss.io.media.image_files import premultiply
-from foldgauss.io.media.tone_mapping import HDR, LIMITED_WHITE, map_tones
+from foldgauss.io.media.facts import ClipFacts
+from foldgauss.io.media.frame_rate import DEFAULT_FPS, MAX_FPS, MAX_LAST_DURATION, make_increasing
+from foldgauss.io.media.images import premultiply
+from foldgauss.io.media.tone_mapping import HDR, map_tones
 
 MAX_ERRORS = 1000  # packets in a row that cannot be read after which a video has ended
 MAX_FRAMES = 1 << 30  # a container that declares as many does not know, or is damaged
@@ -50,93 +51,34 @@ CONVERSION = (
     | Interpolation.FULL_CHR_H_INP
     | Interpolation.BITEXACT
 )
-#: Luma of limited range as that of full range: FFmpeg's conversion takes all gray video for full range.
-_EXPANDED = np.rint(np.clip((np.arange(256) - 16) * (255 / 219), 0, 255)).astype(np.uint8)
-#: Likewise in 16 bits, up to the white that FFmpeg makes of color video of limited range.
-_EXPANDED_DEEP = np.rint(np.clip((np.arange(1 << 16) - 16 * 256) * (LIMITED_WHITE / (219 * 256)), 0, WHITE))
-_EXPANDED_DEEP = _EXPANDED_DEEP.astype(np.uint16)
 _UNSPECIFIED = 2  # FFmpeg's number of a matrix that is not declared
 #: FFmpeg's decoders of VP8 and VP9 drop alpha; these are the ones that keep it.
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
+#: Fraction of a file after its last frame, above which it is reported; sound may follow the last frame.
+MAX_UNREAD = 0.2
 
+#: FFmpeg's demuxers that read one file and nothing else. Playlists (hls, dash), lists (concat), stream descriptions
+#: (sdp) and image sequences are left out, because they open other files or addresses.
+DEMUXERS = (
+    "mov,matroska,avi,flv,live_flv,asf,asf_o,mpeg,mpegts,mpegvideo,m4v,h261,h263,h264,hevc,vvc,evc,obu,av1,ivf,ogg,"
+    "yuv4mpegpipe,nut,dv,mxf,mxf_opatom,rm,swf,wtv,nsv,gxf,dirac,vc1,vc1test,mjpeg,flic,smk,bink,avs2,avs3"
+)
+SOUND_DEMUXERS = f"{DEMUXERS},wav,mp3,flac,aac"
 
-@dataclass(frozen=True)
-class DecodedFrame:
-    """A frame that decodes. `position`: in the file, with the frames lost to damage counted. `stamp`: in units of
-    `VideoDecoder.time_base`; 0 for a stream without time stamps. `size`: (height, width) of the video with square
-    pixels, to which each frame is stretched. `matrix`: (a, b, c, d), right is shown along (a, b), down along (c, d), in
-    units of 2^-16. `converters`, to 8 bits and to 16: the same for all frames, since FFmpeg takes longer to prepare one
-    than to convert a small frame. `levels` converts frames of 16 bits."""
-
-    position: int
-    stamp: int
-    decoded: av.VideoFrame
-    size: Size
-    matrix: tuple[int, int, int, int] = (1 << 16, 0, 0, 1 << 16)
-    converters: tuple[VideoReformatter, VideoReformatter] = field(
-        default_factory=lambda: (VideoReformatter(), VideoReformatter())
-    )
-    levels: Levels = field(default_factory=Levels)
-
-    @property
-    def hdr(self) -> str | None:
-        """The transfer function of a frame in HDR, "PQ" or "HLG"; None for others."""
-        return HDR.get(self.decoded.color_trc)
-
-    @property
-    def is_turned(self) -> bool:
-        """Whether rows of the frame are columns of the upright image."""
-        return abs(self.matrix[1]) > abs(self.matrix[0])
-
-    def to_array(self) -> np.ndarray:
-        """Upright and uint8: BGR of shape (height, width, 3), or premultiplied BGRA of shape (height, width, 4).
-
-        HDR is tone-mapped. Raises `VideoError` for what FFmpeg cannot convert, such as the extreme
-        sizes of a damaged file.
-        """
-        alpha_bits = min(next((part.bits for part in self.decoded.format.components if part.is_alpha), 0), 16)
-        kind, deep = self.decoded.format, None
-        has_levels = kind.components[0].bits == 16 and (kind.is_rgb or kind.name.startswith(("gray", "ya")))
-        if self.hdr is not None or alpha_bits > 8 or has_levels:
-            deep = self._convert("gbrap16le" if alpha_bits else "gbrp16le")
-        is_limited_gray = kind.name.startswith("gray") and self.decoded.color_range == ColorRange.MPEG
-        if self.hdr is not None:
-            image = map_tones(self.decoded, _EXPANDED_DEEP[deep] if is_limited_gray else deep, self.hdr)
-        elif has_levels:
-            image = cv2.cvtColor(self.levels.convert(deep), cv2.COLOR_RGBA2BGRA if alpha_bits else cv2.COLOR_RGB2BGR)
-        else:
-            image = self._convert("bgra" if alpha_bits else "bgr24")
-        if is_limited_gray and self.hdr is None:
-            image = _EXPANDED[image]
-        if alpha_bits and deep is not None and self.levels.white is None:
-            image[..., 3] = round_alpha(deep[..., 3] >> (16 - alpha_bits), (1 << alpha_bits) - 1, 255)
-        if alpha_bits:
-            opaque = image[..., 3].min() == 255
-            image = np.ascontiguousarray(image[..., :3]) if opaque else premultiply(image)
-        a, b, c, d = self.matrix
-        if self.is_turned:
-            image, a, d = image.swapaxes(0, 1), c, b
-        return np.ascontiguousarray(image[:: 1 if d >= 0 else -1, :: 1 if a >= 0 else -1])
-
-    def _convert(self, kind: str) -> np.ndarray:
-        """The frame as FFmpeg converts it to `kind`: of 8 bits, or planar and of 16, where 4:2:0 becomes wrong in
-        packed formats of FFmpeg 8. Raises `VideoError` where FFmpeg cannot."""
-        height, width = self.size
-        matrix = Colorspace.BT2020 if self.hdr is not None and self.decoded.colorspace == _UNSPECIFIED else None
-        how = {"src_colorspace": matrix, "interpolation": CONVERSION}
-        try:
-            return self.converters["16" in kind].reformat(self.decoded, width, height, kind, **how).to_ndarray()
-        except av.FFmpegError as error:
-            frame = self.decoded
-            given = f"{frame.format.name}, {frame.height}x{frame.width}, matrix {frame.colorspace} of ITU-T H.273"
-            got = f"one that it cannot ({given}, to be shown at {height}x{width})"
-            cure = "The file is damaged, or of an unknown matrix: ffmpeg -i IN -vf zscale=matrix=709 OUT."
-            raise video_error("path", expected="frames that FFmpeg converts to RGB", got=got, cure=cure) from error
-
-
-def round_alpha(alpha: np.ndarray, largest: int, wanted: int) -> np.ndarray:
-    """Alpha from 0 to `largest` in the range from 0 to `wanted`, to nearest: FFmpeg rounds part of it up."""
-    return (alpha.astype(np.uint32) * (2 * wanted) + largest) // (2 * largest)
+_PLAYLISTS = (b"#EXTM3U", b"ffconcat", b"v=0", b"[playlist]", b"[Reference]", b"<ASX", b"<asx", b"RTSPtext")
+_ADDRESS = (b"http://", b"https://", b"rtsp://", b"rtmp://", b"udp://", b"file://")
+LIST = "a list of other files or addresses"
+_KINDS = {
+    b"PK\x03\x04": "a zip archive",
+    b"\x1f\x8b": "a gzip archive",
+    b"%PDF": "a PDF",
+    b"\x89HDF": "an HDF5 file",
+    b"ply\n": "a PLY file",
+    b"ID3": "audio",
+    b"\xff\xfb": "audio",
+    b"fLaC": "audio",
+    b"OggS": "audio",
+}
 
 
 class VideoDecoder:
@@ -163,9 +105,7 @@ class VideoDecoder:
         self.time_base = (self._stream.time_base or Fraction(1, 1000)) / self._per_stored
         self._rate = (self._stream.guessed_rate or 0) * self._per_stored
         self.fps = float(self._rate)  # that the container declares; 0 where there is none
-        #: Whether an edit list may hide frames that the container counts.
-        self.hides_frames = self._container.format.name.startswith("mov")
-        self._is_avi = self._container.format.name == "avi"
+        self._kind = self._container.format.name
         self._num_repeated = 0  # frames that an AVI counts, but does not store: the one before is shown again
         self.has_converted = False  # whether any frame was interlaced
         self.tilt = 0  # degrees by which a frame is to be rotated beyond a multiple of 90
@@ -174,9 +114,12 @@ class VideoDecoder:
         self.stored_size = self._codec.height, self._codec.width  # which frames of another size are stretched to
         self._read_bytes = 0  # up to the end of the last packet that decodes
         self._at_end = False
+        #: To 8 bits and to 16: FFmpeg takes longer to prepare a conversion than to convert a small frame.
         self._converters = VideoReformatter(), VideoReformatter()
         self._angle: int | None = None  # of the display matrix
+        self._matrix = 1 << 16, 0, 0, 1 << 16  # right is shown along the first two, down along the others
         self._last = -1  # position of the frame decoded last
+        self._stamp = -1  # of the frame decoded last from an AVI
         self._before: int | None = None  # the largest time stamp
         self._num_suspect = 0  # frames before which others may have been lost to damage
 
@@ -223,7 +166,7 @@ class VideoDecoder:
         The duration of a whole file may be that of its sound. Streams and Ogg derive it from their last packets, and
         Flash videos declare up to 2 frames more.
         """
-        kind, stream = self._container.format.name, self._stream
+        kind, stream = self._kind, self._stream
         if kind in ("flv", "live_flv", "ogg", "mpeg", "mpegts") or (kind == "asf" and self._container.streams.audio):
             return None
         if stream.duration and stream.duration > 0:
@@ -250,14 +193,31 @@ class VideoDecoder:
         `duration` is that of the decoder, in units of `time_base`: in an MP4 that of another frame where frames are
         stored in another order, in Matroska often a default.
         """
-        if self.hides_frames or self._is_avi:
+        if self._kind.startswith(("mov", "avi")):
             is_known = self.declared_seconds is not None and self.num_declared in (0, num_frames)
             return max(self.declared_seconds - elapsed, 0.0) if is_known else 0.0
-        if "matroska" not in self._container.format.name:
+        if "matroska" not in self._kind:
             return 0.0
         seconds, rates = duration * self.time_base, (self._stream.average_rate, self._stream.guessed_rate)
         is_default = any(abs(seconds - 1 / rate / self._per_stored) <= 1.5 * self.time_base for rate in rates if rate)
         return 0.0 if is_default else float(max(seconds, 0))
+
+    def count_declared(self, seconds: np.ndarray, fps: float, num_reached: int, last: float) -> int:
+        """The number of frames that the container declares, at least `num_reached`, of which the last is shown at
+        seconds[-1] for `last`.
+
+        Its own count includes frames that an edit list hides, as in an MP4 that was cut without encoding; where it has
+        none, the number follows from its duration.
+        """
+        shown = self.declared_seconds
+        if shown is None or (self.num_declared and not self._kind.startswith("mov")):
+            return max(self.num_declared, num_reached)
+        left, intervals, estimated = shown - (seconds[-1] - seconds[0]), np.diff(seconds), num_reached
+        if left > MAX_LAST_DURATION * max(1 / fps, intervals.max(initial=0.0), last):
+            estimated += round(left / (intervals.mean() if len(intervals) else 1 / fps)) - 1
+        if estimated >= MAX_FRAMES:  # a damaged header
+            return num_reached
+        return max(min(self.num_declared or estimated, estimated), num_reached)
 
     def seek(self, stamp: int) -> None:
         """Continue at the last key frame up to `stamp`; positions are counted from there."""
@@ -267,49 +227,98 @@ class VideoDecoder:
         self._has_sought = True
         self._last, self._before, self._num_suspect = -1, None, 0
 
-    def frames(self) -> Iterator[DecodedFrame]:
-        """The frames that decode, in the order in which they are shown. Raises `VideoError` for interlaced ones that
-        are not to be converted."""
+    def frames(self) -> Iterator[tuple[int, int, av.VideoFrame]]:
+        """The frames that decode, in the order in which they are shown: for each its position in the file, with the
+        frames lost to damage counted, and its stamp in units of `time_base`; 0 for a stream without time stamps.
+
+        Raises `VideoError` for interlaced ones that are not to be converted.
+        """
         for frame in self._convert_interlaced(self._decode()):
-            stamp = self._find_stamp(frame)
             self._num_suspect = MAX_DELAY if frame.is_corrupt else self._num_suspect
-            self._last = self._find_position(stamp)
+            self._last = self._find_position(frame.pts)
             self.stored_size = self.stored_size if all(self.stored_size) else (frame.height, frame.width)
-            matrix = self._find_matrix(frame)
-            yield DecodedFrame(self._last, stamp or 0, frame, self.size, matrix, self._converters, self.levels)
+            self._find_matrix(frame)
+            yield self._last, frame.pts or 0, frame
             if self._closed:  # FFmpeg would read on in memory that is freed
                 return
 
-    def _find_matrix(self, frame: av.VideoFrame) -> tuple[int, int, int, int]:
-        """The display matrix of the frame, read anew where its angle is another: to read it keeps the frame in memory
-        until the next collection of garbage."""
+    def _find_matrix(self, frame: av.VideoFrame) -> None:
+        """Read the display matrix of the frame, where its angle is another than before: to read it keeps the frame in
+        memory until the next collection of garbage."""
         if frame.rotation != self._angle:
             data = frame.side_data.get("DISPLAYMATRIX")
             numbers = [1 << 16, 0, 0, 0, 1 << 16] if data is None else np.frombuffer(data, np.int32)[:5].tolist()
             self._angle, self._matrix = frame.rotation, (numbers[0], numbers[1], numbers[3], numbers[4])
-            a, b = self._matrix[:2]
-            self.tilt = self.tilt or 45 - (45 - round(math.degrees(math.atan2(b, a)))) % 90
-        return self._matrix
+            self.tilt = self.tilt or 45 - (45 - round(math.degrees(math.atan2(numbers[1], numbers[0])))) % 90
+
+    @property
+    def is_turned(self) -> bool:
+        """Whether rows of the frame decoded last are columns of the upright image."""
+        return abs(self._matrix[1]) > abs(self._matrix[0])
+
+    def to_array(self, frame: av.VideoFrame) -> np.ndarray:
+        """The frame decoded last, upright and uint8: BGR of shape (height, width, 3), or premultiplied BGRA of shape
+        (height, width, 4) if any pixel is transparent.
+
+        HDR is tone-mapped. Raises `VideoError` for what FFmpeg cannot convert, such as the extreme sizes of a damaged
+        file.
+        """
+        kind, hdr = frame.format, HDR.get(frame.color_trc)
+        has_alpha = any(part.is_alpha for part in kind.components)
+        has_levels = kind.components[0].bits == 16 and (kind.is_rgb or kind.name.startswith(("gray", "ya")))
+        image = self._convert(frame, bool(hdr or has_levels), has_alpha)
+        if kind.name.startswith("gray") and frame.color_range == ColorRange.MPEG:  # FFmpeg takes it for full range
+            step, bits = (256, kind.components[0].bits) if image.dtype == np.uint16 else (1, 8)
+            largest = ((1 << bits) - 1) * step >> (bits - 8)
+            expanded = (image.astype(np.float32) - 16 * step) * (largest / (219 * step))
+            image = np.rint(np.clip(expanded, 0, largest)).astype(image.dtype)
+        if hdr:
+            shown = map_tones(frame, image[..., :3], hdr)
+            image = np.concatenate([shown, Levels().convert(image[..., 3:])], -1) if has_alpha else shown
+        elif has_levels:
+            image = self.levels.convert(image)
+        if hdr or has_levels:
+            image = cv2.cvtColor(image, cv2.COLOR_RGBA2BGRA if has_alpha else cv2.COLOR_RGB2BGR)
+        image = premultiply(image)
+        a, b, c, d = self._matrix
+        if self.is_turned:
+            image, a, d = image.swapaxes(0, 1), c, b
+        return np.ascontiguousarray(image[:: 1 if d >= 0 else -1, :: 1 if a >= 0 else -1])
+
+    def _convert(self, frame: av.VideoFrame, is_deep: bool, has_alpha: bool) -> np.ndarray:
+        """The frame as FFmpeg converts it to BGR of 8 bits, or RGB of 16: planar, since 4:2:0 becomes wrong in packed
+        formats of FFmpeg 8. Raises `VideoError` where FFmpeg cannot."""
+        height, width = self.size
+        wanted = f"gbr{'a' * has_alpha}p16le" if is_deep else "bgra" if has_alpha else "bgr24"
+        matrix = Colorspace.BT2020 if frame.color_trc in HDR and frame.colorspace == _UNSPECIFIED else None
+        how = {"src_colorspace": matrix, "interpolation": CONVERSION}
+        try:
+            return self._converters[is_deep].reformat(frame, width, height, wanted, **how).to_ndarray()
+        except av.FFmpegError as error:
+            given = f"{frame.format.name}, {frame.height}x{frame.width}, matrix {frame.colorspace} of ITU-T H.273"
+            raise video_error(
+                "path",
+                expected="frames that FFmpeg converts to RGB",
+                got=f"one that it cannot ({given}, to be shown at {height}x{width})",
+                cure="The file is damaged, or of an unknown matrix: ffmpeg -i IN -vf zscale=matrix=709 OUT.",
+            ) from error
 
     def _decode(self) -> Iterator[av.VideoFrame]:
-        for packet in self._read_packets():
+        """The frames that decode. None ends them; a damaged frame may end those buffered, and each call passes one."""
+        for packet in chain(self._read_packets(), repeat(None, MAX_DELAY)):
             try:
                 found = self._codec.decode(packet)
-            except av.FFmpegError:
-                self._num_suspect = MAX_DELAY
-                continue
-            self._read_bytes = max(self._read_bytes, (packet.pos or 0) + packet.size)
-            yield from map(self._stamp, found)
-        self._at_end = True
-        # A damaged frame may end the decoding of those buffered; each call passes one.
-        for _ in range(MAX_DELAY):
-            try:
-                yield from map(self._stamp, self._codec.decode(None))
-                return
             except av.EOFError:
                 return
             except av.FFmpegError:
                 self._num_suspect = MAX_DELAY
+                continue
+            self._at_end = packet is None
+            if not self._at_end:
+                self._read_bytes = max(self._read_bytes, (packet.pos or 0) + packet.size)
+            yield from map(self._set_time, found)
+            if self._at_end:
+                return
 
     def _read_packets(self) -> Iterator[av.Packet]:
         """The packets of the stream, of which those that cannot be read are left out."""
@@ -320,7 +329,7 @@ class VideoDecoder:
                     if packet.is_corrupt:
                         self._num_suspect = MAX_DELAY
                     if packet.size:
-                        if self._is_avi and packet.dts is not None:
+                        if self._kind == "avi" and packet.dts is not None:
                             self._num_repeated += max(packet.dts - before - 1, 0)
                             before = packet.dts
                         num_errors = 0
@@ -339,36 +348,45 @@ class VideoDecoder:
             follows = self._deinterlace == "fields" and self._has_sought  # interlaced ones before the place sought
             if graph is None and not frame.interlaced_frame and not follows:
                 if self._deinterlace == "fields":
-                    got, cure = f"a progressive one in {str(self._path)!r}", "Leave deinterlace='fields' out."
-                    raise video_error("deinterlace", expected="a first frame of two fields", got=got, cure=cure)
+                    raise video_error(
+                        "deinterlace",
+                        expected="a first frame of two fields",
+                        got=f"a progressive one in {str(self._path)!r}",
+                        cure="Leave deinterlace='fields' out.",
+                    )
                 yield frame
                 continue
             if self._deinterlace == "refuse":
-                got = f"one of interlaced fields, {str(self._path)!r}"
-                cure = "Convert it while reading, with deinterlace='frames' or 'fields'."
-                raise video_error("path", expected="a video of progressive frames", got=got, cure=cure)
+                raise video_error(
+                    "path",
+                    expected="a video of progressive frames",
+                    got=f"one of interlaced fields, {str(self._path)!r}",
+                    cure="Convert it while reading, with deinterlace='frames' or 'fields'.",
+                )
             kind = frame.height, frame.width, frame.format.name
             if graph is None or kind != of_graph:
                 yield from filter_frame(graph, None)
                 try:
-                    graph = _make_deinterlacer(frame, self.time_base, self._per_stored)
-                    of_graph, self.has_converted = kind, True
+                    graph, of_graph = _make_deinterlacer(frame, self.time_base, self._per_stored), kind
                 except av.FFmpegError as error:  # bwdif takes at least 3 rows and columns of each channel
-                    got = f"interlaced ones of {frame.height}x{frame.width} (height x width) in {str(self._path)!r}"
-                    cure = "Convert it with ffmpeg."
-                    raise video_error("path", expected="frames that bwdif takes", got=got, cure=cure) from error
+                    raise video_error(
+                        "path",
+                        expected="frames that bwdif takes",
+                        got=f"interlaced ones of {frame.height}x{frame.width} (height x width) in {str(self._path)!r}",
+                        cure="Convert it with ffmpeg.",
+                    ) from error
+                self.has_converted = True
             yield from filter_frame(graph, frame)
         yield from filter_frame(graph, None)
 
-    def _stamp(self, frame: av.VideoFrame) -> av.VideoFrame:
+    def _set_time(self, frame: av.VideoFrame) -> av.VideoFrame:
         """The frame with its time. AVI stores none: FFmpeg numbers its packets, in the order of decoding. Of raw AV1 it
         makes times up."""
-        if self._is_avi or self._container.format.name in ("obu", "av1"):
-            frame.pts = frame.dts if self._is_avi else None
+        if self._kind == "avi":
+            self._stamp = frame.pts = self._stamp + 1 if frame.dts is None else frame.dts
+        elif self._kind in ("obu", "av1"):
+            frame.pts = None
         return frame
-
-    def _find_stamp(self, frame: av.VideoFrame) -> int | None:
-        return self._before + 1 if self._is_avi and frame.pts is None and self._before is not None else frame.pts
 
     def _find_position(self, stamp: int | None) -> int:
         """The position of the next frame; the number of frames lost before it to damage is estimated by time stamps."""
@@ -393,37 +411,138 @@ class VideoDecoder:
         return codec
 
 
+def scan_video(
+    path: Path, start: int, stop: int | None, keep: Callable[[Iterator[np.ndarray]], Sized], reading: Reading
+) -> tuple[Sized, ClipFacts]:
+    """What `keep` makes of the frames of a video file from `start` up to `stop`, and the facts about the file.
+
+    Raises `VideoError` for a file that cannot be read.
+    """
+    places, ticks, following, transfers, duration = [], [], [], set(), 0
+    damaged, resized = [], []
+
+    def select() -> Iterator[np.ndarray]:
+        """The frames from `start` up to `stop`; all that are decoded are recorded, and so is the next one.
+
+        Frames before `start` are decoded and dropped: seeking stops at key frames.
+        """
+        nonlocal duration
+        for position, stamp, frame in decoder.frames():
+            if stop is not None and position >= stop:
+                if places and position == places[-1] + 1:
+                    following.append(stamp)
+                return
+            places.append(position)
+            ticks.append(stamp)
+            duration = frame.duration or 0
+            if frame.is_corrupt:
+                damaged.append(position)
+            if (frame.height, frame.width) != decoder.stored_size:
+                resized.append(position)
+            if position >= start:
+                transfers.add(HDR.get(frame.color_trc))
+                yield decoder.to_array(frame)
+
+    with closing(VideoDecoder(path, reading=reading)) as decoder:
+        fps = decoder.fps if 0 < decoder.fps <= MAX_FPS else DEFAULT_FPS
+        kept = keep(select())
+        if not places:
+            raise video_error(
+                "path",
+                expected="a video with frames that decode",
+                got=f"none in {str(path)!r}",
+                cure="The file is damaged or its codec is unknown here; convert it with ffmpeg.",
+            )
+        time_base, num_reached = float(decoder.time_base), places[-1] + 1
+        seconds = make_increasing((np.array(ticks + following) * time_base).tolist(), fps)
+        seconds, end = seconds[: len(ticks)], float(seconds[-1])
+        if not following:
+            last = decoder.find_last_duration(duration, seconds[-1] - seconds[0], num_reached)
+            end = float(seconds[-1] + last) if last else 0.0
+        num_total = decoder.count_declared(seconds, fps, num_reached, max(end - seconds[-1], 0.0))
+        notes = _describe_video(decoder, path, sorted(transfers - {None}), reading) if len(kept) else []
+        order = -1 if decoder.is_turned else 1
+        stretched = decoder.stored_size[::order], decoder.size[::order]
+    # The container's count may be an estimate, so the range is checked against the decoded frames as well.
+    clamp_stop(start, stop, num_total, path)
+    if not len(kept):
+        raise no_frames_error(start, stop, len(places), num_total, path)
+    return kept, ClipFacts(
+        *("video", fps, num_total, np.array(places, np.int64), np.array(ticks, np.int64), time_base, end, notes),
+        threads=decoder.threads,
+        damaged=damaged,
+        resized=resized,
+        stretched=stretched if stretched[0] != stretched[1] else None,
+    )
+
+
+def _describe_video(decoder: VideoDecoder, path: Path, hdr: list[str], reading: Reading) -> list[str]:
+    """Notes about a video that was read, whose frames in HDR have these transfer functions."""
+    notes = []
+    if abs(decoder.pixel_aspect - 1) > EQUAL_ASPECT:
+        (height, width), is_kept = decoder.size, decoder.size == decoder.stored_size
+        shown = "kept as stored" if is_kept else f"stretched to {height}x{width}"
+        notes.append(f"pixels are {decoder.pixel_aspect:.3g} times as wide as high; frames are {shown}.")
+    if hdr:
+        notes.append(f"colors are HDR ({' and '.join(hdr)}), and are tone-mapped to SDR.")
+    if decoder.tilt:
+        turn = f"{decoder.tilt} degrees beyond multiples of 90"
+        notes.append(f"the file asks for a rotation by {turn}; it is left out.")
+    if decoder.has_converted:
+        each = "one of each; foldgauss fit --deinterlace fields makes two"
+        each = "one of each field" if reading.deinterlace == "fields" else each
+        notes.append(f"interlaced frames are converted to progressive ones, {each}.")
+    if (unread := decoder.unread_fraction) > MAX_UNREAD:
+        notes.append(f"the last {unread:.0%} of the file hold no frame that decodes.")
+    return notes + list(
+        decoder.levels.describe(path, "HDR, whose tone mapping defines white" if hdr else "a clip of fewer bits")
+    )
+
+
 def open_container(path: Path, demuxers: str = DEMUXERS) -> av.container.InputContainer:
     """An open file, restricted to itself. Raises `VideoError`."""
     kind = describe_kind(read_head(path))
     if kind == LIST:
-        got, cure = f"{kind}, {str(path)!r}", "The files that it names are not opened: give the video itself."
-        raise video_error("path", expected=VIDEO, got=got, cure=cure)
+        raise video_error(
+            "path",
+            expected=VIDEO,
+            got=f"{kind}, {str(path)!r}",
+            cure="The files that it names are not opened: give the video itself.",
+        )
     # An absolute path, because FFmpeg takes 'name:rest' for a protocol. One local file and nothing that it refers to.
     options = {"protocol_whitelist": "file", "format_whitelist": demuxers}
     try:
         return av.open(f"file:{resolve(path)}", options=options, metadata_errors="replace")
     except (av.FFmpegError, ValueError) as error:
         about = format_num_bytes(path) + (f", {kind}" if kind else "")
-        got = f"{str(path)!r} ({about}), which does not open as a video"
-        cure = "Check that it is a video and that its copy or download is complete."
-        raise video_error("path", expected=VIDEO, got=got, cure=cure) from error
+        raise video_error(
+            "path",
+            expected=VIDEO,
+            got=f"{str(path)!r} ({about}), which does not open as a video",
+            cure="Check that it is a video and that its copy or download is complete.",
+        ) from error
 
 
 def _choose_stream(container: av.container.InputContainer, path: Path) -> av.VideoStream:
-    known = [one for one in container.streams.video if one.codec_context is not None]
-    if container.streams.video and not known:
-        got, cure = f"an unknown one in {str(path)!r}", "Convert it with ffmpeg."
-        raise video_error("path", expected="a video whose codec is known here", got=got, cure=cure)
-    streams = [one for one in known if not one.disposition & Disposition.attached_pic]
-    if streams:
-        best = container.streams.best("video")
-        return best if best in streams else streams[0]
-    if container.streams.video:
-        got = f"audio with a cover image, {str(path)!r}"
-        raise video_error("path", expected="a video", got=got, cure="Give a file with moving images.")
-    got = f"{str(path)!r} ({'audio' if container.streams.audio else 'no video stream'}), which does not open as a video"
-    raise video_error("path", expected=VIDEO, got=got)
+    stream = container.streams.best("video")
+    if stream is None:
+        kind = "audio" if container.streams.audio else "no video stream"
+        raise video_error("path", expected=VIDEO, got=f"{str(path)!r} ({kind}), which does not open as a video")
+    if stream.codec_context is None:
+        raise video_error(
+            "path",
+            expected="a video whose codec is known here",
+            got=f"an unknown one in {str(path)!r}",
+            cure="Convert it with ffmpeg.",
+        )
+    if stream.disposition & Disposition.attached_pic:
+        raise video_error(
+            "path",
+            expected="a video",
+            got=f"audio with a cover image, {str(path)!r}",
+            cure="Give a file with moving images.",
+        )
+    return stream
 
 
 def _make_deinterlacer(frame: av.VideoFrame, clock: Fraction, num: int) -> Graph:
@@ -447,3 +566,17 @@ def filter_frame(
                 yield graph.pull()
             except (av.BlockingIOError, av.EOFError):
                 return
+
+
+def describe_kind(head: bytes) -> str | None:
+    """What a file that is not a video seems to be, by its first bytes; None where they are unknown."""
+    text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
+    if text.startswith((*_PLAYLISTS, *_ADDRESS)) or (text.startswith(b"<") and b"<MPD" in text):
+        return LIST
+    found = next((kind for magic, kind in _KINDS.items() if head.startswith(magic)), None)
+    is_wave = head[:4] == b"RIFF" and head[8:12] == b"WAVE"
+    if found or is_wave or (head[4:8] == b"ftyp" and b"soun" in head and b"vide" not in head):
+        return found or "audio"
+    if head[8:9] == b"{" and int.from_bytes(head[:8], "little") < 100_000_000:
+        return "a .safetensors file, probably a model"
+    return "a text" if head and not any(byte < 9 or 13 < byte < 32 for byte in head[:4096]) else None

@@ -1,32 +1,23 @@
 """Object masks from images, folders of images and videos."""
 
-import math
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool
-from PIL import Image
+from jaxtyping import Bool, UInt8
 
 from foldgauss._runtime.checks import check_within, invalid, is_integer
 from foldgauss.io._atomic import PathLike, check_input, check_path
 from foldgauss.io.media.clip import Range, Size, Stretch, check_frame_size, check_range, format_size
-from foldgauss.io.media.image_files import IMAGE_SUFFIXES, choose_images
-from foldgauss.io.media.resizing import aspect_window
-from foldgauss.io.media.video_reading import read_video
+from foldgauss.io.media.images import IMAGE_SUFFIXES, choose_images, open_image, undecodable_error
+from foldgauss.io.media.reading import aspect_window, read_video
 from foldgauss.render.splats import check_size
 
 MASK_LEVEL = 0.5  # fraction of white from which a pixel of a video belongs to the mask
-#: Pillow modes whose stored values are labels: palette, grayscale, and black and white.
-_LABEL_MODES = ("P", "L", "1")
-_DEEP_MODES = ("I;16", "I;16B", "I")  # grayscale of 16 bits
+#: Pillow modes whose stored values are labels: palette, grayscale of 8 and of 16 bits, and black and white.
+_LABEL_MODES = ("P", "L", "1", "I;16", "I;16B", "I")
 _COLOR_MODES = {"RGB": 3, "RGBA": 3, "LA": 1}  # channels besides alpha
-#: Other formats are not decoded, whatever the suffix: Pillow would pass some, such as PostScript, to other programs.
-_FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
-#: Limits on the pixels of a mask: 8K, or the largest ratio of deflate at 1 bit per pixel, whichever is larger.
-MAX_PIXELS, MAX_PIXELS_PER_BYTE = 2**25, 8 * 1032
-_WHITE = 255
 #: The label of pixels without annotation.
 VOID = 255
 
@@ -73,8 +64,12 @@ def read_masks(
         masks = _select_label([path], label, path)[0]
     else:
         if label is not None:
-            cure = "Leave label out, or give a folder of PNGs."
-            raise invalid("label", expected="images with labels", got=f"the video {str(path)!r}", cure=cure)
+            raise invalid(
+                "label",
+                expected="images with labels",
+                got=f"the video {str(path)!r}",
+                cure="Leave label out, or give a folder of PNGs.",
+            )
         check_within("level", level, "(0, 1]", "a fraction of white in (0, 1]")
         clip = read_video(path, frames=frames)
         for note in clip.notes:
@@ -94,16 +89,19 @@ def _select_label(paths: list[Path], label: int | None, source: Path) -> Bool[np
     labels = read_labels(paths)
     present = sorted(set(np.unique(labels).tolist()) - {0, VOID})
     if label is not None and label not in present:
-        expected = f"one of {present} in {str(source)!r}" if present else f"masks with objects in {str(source)!r}"
-        raise invalid("label", expected=expected, got=label)
+        raise invalid(
+            "label",
+            expected=f"one of {present} in {str(source)!r}" if present else f"masks with objects in {str(source)!r}",
+            got=label,
+        )
     return (labels != 0) & (labels != VOID) if label is None else labels == label
 
 
 # ----------------------------------------------------------------------------------------------- labels
 
 
-def read_labels(paths: Sequence[Path]) -> np.ndarray:
-    """Label images as uint8 (num_masks, height, width): 0 is the background, k the object k, 255 void.
+def read_labels(paths: Sequence[Path]) -> UInt8[np.ndarray, "num_masks height width"]:
+    """Label images: 0 is the background, k the object k, 255 void.
 
     A palette image gives the *index* of each pixel, whatever its color (OpenCV gives the color, hence Pillow here); a
     grayscale one its level, also where that is stored as three equal channels or with alpha, which is ignored. Masks
@@ -115,50 +113,42 @@ def read_labels(paths: Sequence[Path]) -> np.ndarray:
         mask, mode = _read_label_image(path)
         modes.add(mode)
         if masks and mask.shape != masks[0].shape:
-            expected = f"masks of one size, {format_size(masks[0].shape)} as in {paths[0].name!r}"
-            raise invalid("path", expected=expected, got=f"{format_size(mask.shape)} in {str(path)!r}")
+            raise invalid(
+                "path",
+                expected=f"masks of one size, {format_size(masks[0].shape)} as in {paths[0].name!r}",
+                got=f"{format_size(mask.shape)} in {str(path)!r}",
+            )
         masks.append(mask)
     labels = np.stack(masks)
-    if "P" not in modes and set(np.unique(labels)) <= {0, _WHITE}:
-        labels = (labels == _WHITE).astype(np.uint8)
-    return labels
+    values = np.unique(labels).tolist()
+    if "P" not in modes and values[-1] >= VOID and set(values) <= {0, values[-1]}:
+        return (labels > 0).astype(np.uint8)
+    if values[-1] > VOID:
+        raise invalid(
+            "path",
+            expected=f"masks with labels up to {VOID}",
+            got=f"labels up to {values[-1]:,} in {str(paths[0].parent)!r}",
+            cure="Renumber them, or store one object in black and white.",
+        )
+    return labels.astype(np.uint8)
 
 
 def _read_label_image(path: Path) -> tuple[np.ndarray, str]:
-    """(labels, Pillow mode) of one mask; the size is checked before memory is allocated."""
-    most = max(MAX_PIXELS, MAX_PIXELS_PER_BYTE * path.stat().st_size)
-    try:
-        # Warnings are about damage: the image either decodes or raises.
-        with warnings.catch_warnings(action="ignore"), Image.open(path, formats=_FORMATS) as image:
-            if math.prod(image.size) > most:
-                raise Image.DecompressionBombError
+    """(labels, Pillow mode) of one mask."""
+    # Warnings are about damage: the image either decodes or raises.
+    with warnings.catch_warnings(action="ignore"), open_image(path) as image:
+        try:
             mode, pixels = image.mode, np.array(image)
-    except Image.DecompressionBombError as error:
-        most = min(most, 2 * (Image.MAX_IMAGE_PIXELS or most))  # Pillow's own limit
-        expected = f"a mask of at most {most:,} pixels, as its file has {path.stat().st_size:,} bytes"
-        cure = "Is it a mask? If so, crop it, or store it uncompressed."
-        raise invalid("path", expected=expected, got=f"more in {str(path)!r}", cure=cure) from error
-    except Exception as error:  # Pillow's decoders raise anything: SyntaxError, struct.error, zlib.error, IndexError
-        got = f"{str(path)!r}, which does not"
-        raise invalid("path", expected="masks that decode", got=got, cure="Copy it again.") from error
+        except Exception as error:  # Pillow's decoders raise anything
+            raise undecodable_error(path) from error
     channels = _COLOR_MODES.get(mode)  # grayscale as paint programs store it, and one mask of bear in DAVIS
     if channels is not None and (pixels[..., :channels] == pixels[..., :1]).all():
         mode, pixels = "L", pixels[..., 0]
-    if mode in _DEEP_MODES:
-        mode, pixels = "L", _narrow(pixels, path)
     if mode not in _LABEL_MODES:
-        got = f"an image of mode {mode!r} in {str(path)!r}"
-        cure = "Its colors were stored in place of the labels; use the original PNG."
-        raise invalid("path", expected="masks with a label per pixel (palette or grayscale)", got=got, cure=cure)
-    return pixels.astype(np.uint8) * (_WHITE if mode == "1" else 1), mode
-
-
-def _narrow(pixels: np.ndarray, path: Path) -> np.ndarray:
-    """Labels of 16 bits in the range of 8; where there are only 0 and one larger value, black and white."""
-    most = pixels.max()
-    if most > VOID and np.isin(pixels, (0, most)).all():
-        return np.where(pixels == most, _WHITE, 0)
-    if most > VOID:
-        got, cure = f"labels up to {most:,} in {str(path)!r}", "Renumber them, or store one object in black and white."
-        raise invalid("path", expected=f"masks with labels up to {VOID}", got=got, cure=cure)
-    return pixels
+        raise invalid(
+            "path",
+            expected="masks with a label per pixel (palette or grayscale)",
+            got=f"an image of mode {mode!r} in {str(path)!r}",
+            cure="Its colors were stored in place of the labels; use the original PNG.",
+        )
+    return pixels * np.uint8(VOID) if mode == "1" else pixels, mode

@@ -1,5 +1,7 @@
 """Tone mapping: HDR video, of the transfer functions PQ and HLG, as SDR video.
 
+FFmpeg's `tonemap` filter needs linear light, which only its `zscale` filter makes, and PyAV's builds have none.
+
 Signals become light of an HDR display (ITU-R BT.2100; for HLG one of 1,000 cd/m2), in the primaries of BT.709. The
 curve of ITU-R BT.2390 lowers the highest of the three channels from at most 1,000 cd/m2 to at most 203, which is white
 in the result, and the others by the same factor, which keeps the hue. HDR reference white, 203 cd/m2 (BT.2408), becomes
@@ -9,19 +11,18 @@ in the result, and the others by the same factor, which keeps the hue. HDR refer
 import functools
 
 import av
+import cv2
 import numpy as np
 from av.video.reformatter import ColorPrimaries, ColorRange, ColorTrc
-from jaxtyping import Float, UInt8, UInt16
-
-from foldgauss._runtime.kernels import exact_kernel, inline
+from jaxtyping import Float, Float32, UInt8, UInt16
 
 #: Transfer functions of HDR.
 HDR = {ColorTrc.SMPTE2084: "PQ", ColorTrc.ARIB_STD_B67: "HLG"}
 #: cd/m2 that become white, and of white in the result.
-PEAK, WHITE = 1000.0, 203.0
-GAMMA, HLG_GAMMA = 2.4, 1.2
-#: Luminance of red, green and blue of BT.2020.
-_LUMINANCE = 0.2627, 0.6780, 0.0593
+PEAK = 1000.0
+WHITE = 203.0
+#: Luminance of linear red, green and blue of BT.2020.
+_LUMINANCE = np.array([[0.2627, 0.6780, 0.0593]], np.float32)
 #: Linear red, green and blue to those of BT.709, from BT.2020 and from P3 with the white of D65.
 _FROM_BT2020 = [
     [1.6604910021, -0.5876411388, -0.0728498633],
@@ -40,10 +41,11 @@ _TO_BT709 = {
     ColorPrimaries.SMPTE432: _FROM_P3,
 }
 #: Signal of white that FFmpeg makes of YUV of limited range, in 16 bits.
-LIMITED_WHITE = 65283
-#: Tables have this many entries, at equal steps of the square root of light, up to `_BRIGHTEST` times `PEAK`: PQ has up
-#: to 10,000 cd/m2, and colors outside BT.709 have higher channels than that.
-_ENTRIES, _BRIGHTEST = 8192, 20.0
+_LIMITED_WHITE = 65283
+#: Tables have an entry for each value of 16 bits, at equal steps of the square root of light, up to `_BRIGHTEST` times
+#: `PEAK`: PQ has up to 10,000 cd/m2, and colors outside BT.709 have higher channels than that.
+_LAST = (1 << 16) - 1
+_BRIGHTEST = 20.0
 
 
 def pq_signal(light: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
@@ -77,60 +79,32 @@ def lower_highlights(light: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."
 
 def map_tones(
     frame: av.VideoFrame, image: UInt16[np.ndarray, "height width rgb"], transfer: str
-) -> UInt8[np.ndarray, "height width bgr"]:
-    """A frame of the transfer function "PQ" or "HLG" as SDR.
-
-    `image`: its red, green and blue as FFmpeg converts them to 16 bits, and alpha, which is not converted, if there are
-    four channels. The result has blue first, as OpenCV has it.
-    """
+) -> UInt8[np.ndarray, "height width rgb"]:
+    """A frame of the transfer function "PQ" or "HLG" as SDR. `image`: it, as FFmpeg converts it to 16 bits."""
     kind = frame.format
-    is_full = kind.is_rgb or frame.color_range == ColorRange.JPEG
-    is_full |= kind.name.startswith("gray") and frame.color_range != ColorRange.MPEG  # as gray video that is not HDR
+    is_full = kind.is_rgb or kind.name.startswith("gray") or frame.color_range == ColorRange.JPEG
     bits = kind.components[0].bits
-    white = ((1 << bits) - 1) << (16 - bits) if is_full else LIMITED_WHITE
-    matrix = np.array(_TO_BT709.get(frame.color_primaries, np.eye(3)))
-    out = np.empty(image.shape, np.uint8)
-    _map_tones(image, out, *_tables(transfer, white), matrix, np.array(_LUMINANCE), np.sqrt(_BRIGHTEST))
-    return out
+    tables = _tables(transfer, ((1 << bits) - 1) << (16 - bits) if is_full else _LIMITED_WHITE)
+    light = tables[0][image]
+    if transfer == "HLG":  # light of the scene becomes that of a display of 1,000 cd/m2 by its luminance
+        light *= cv2.transform(light, _LUMINANCE)[..., None] ** np.float32(0.2)
+    matrix = np.array(_TO_BT709.get(frame.color_primaries, np.eye(3)), np.float32)
+    light = cv2.transform(light, matrix)
+    red, green, blue = cv2.split(light)
+    highest = np.clip(np.maximum(np.maximum(red, green), blue) / _BRIGHTEST, 0, 1)
+    light *= tables[1][np.rint(np.sqrt(highest) * _LAST).astype(np.uint16)][..., None]
+    return tables[2][np.rint(np.sqrt(np.clip(light, 0, 1)) * _LAST).astype(np.uint16)]
 
 
 @functools.cache
-def _tables(transfer: str, white: int) -> tuple[Float[np.ndarray, " entries"], ...]:
+def _tables(transfer: str, white: int) -> tuple[Float32[np.ndarray, " 65536"], ...]:
     """Light of each signal of 16 bits, of the display for PQ and of the scene for HLG, in units of `PEAK`.
 
-    And three tables by the square root of light: the factor from that light to the display's, the factor of tone
-    mapping to light in units of `WHITE`, and the 8-bit signal of such light. `white`: the largest signal.
+    And two tables by the square root of light: the factor of tone mapping to light in units of `WHITE`, and the 8-bit
+    signal of such light. `white`: the largest signal.
     """
-    signals, roots = np.minimum(np.arange(1 << 16) / white, 1), np.linspace(0, 1, _ENTRIES)
+    signals, roots = np.minimum(np.arange(1 << 16) / white, 1), np.linspace(0, 1, 1 << 16)
     light = np.maximum(_BRIGHTEST * roots**2, 1e-9)
-    if transfer == "PQ":
-        shown, factor = pq_light(signals) / PEAK, np.ones(_ENTRIES)
-    else:
-        shown, factor = hlg_scene_light(signals), light ** (HLG_GAMMA - 1)
-    return shown, factor, lower_highlights(PEAK * light) / (WHITE * light), 255 * roots ** (2 / GAMMA)
-
-
-@inline
-def _look_up(table, root):
-    """The value of a table at `root` from 0 to 1, linear between entries."""
-    place = root * (len(table) - 1)
-    k = min(int(place), len(table) - 2)
-    return table[k] + (place - k) * (table[k + 1] - table[k])
-
-
-@exact_kernel
-def _map_tones(image, out, shown, factor, lowered, codes, matrix, luminance, brightest):
-    for y in range(image.shape[0]):
-        for x in range(image.shape[1]):
-            red, green, blue = shown[image[y, x, 0]], shown[image[y, x, 1]], shown[image[y, x, 2]]
-            light = luminance[0] * red + luminance[1] * green + luminance[2] * blue
-            scale = _look_up(factor, np.sqrt(light) / brightest)
-            own = (
-                scale * (matrix[0, 0] * red + matrix[0, 1] * green + matrix[0, 2] * blue),
-                scale * (matrix[1, 0] * red + matrix[1, 1] * green + matrix[1, 2] * blue),
-                scale * (matrix[2, 0] * red + matrix[2, 1] * green + matrix[2, 2] * blue),
-            )
-            most = max(1e-9, own[0], own[1], own[2])
-            gain = _look_up(lowered, min(np.sqrt(most) / brightest, 1.0))
-            for c in range(3):
-                out[y, x, 2 - c] = int(_look_up(codes, np.sqrt(min(max(own[c] * gain, 0.0), 1.0))) + 0.5)
+    shown = pq_light(signals) / PEAK if transfer == "PQ" else hlg_scene_light(signals)
+    factor = lower_highlights(PEAK * light) / (WHITE * light)
+    return shown.astype(np.float32), factor.astype(np.float32), np.rint(255 * roots ** (2 / 2.4)).astype(np.uint8)

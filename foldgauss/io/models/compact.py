@@ -197,8 +197,9 @@ def _load(path: Path, visible: tuple[float, float], data: bytes | None = None, *
         except HEADER_ERRORS as error:
             if isinstance(error, ModelFileError):
                 raise
-            got = f"one that does not fit together ({type(error).__name__}: {one_line(error)})"
-            raise _unreadable(path, got) from error
+            raise _unreadable(
+                path, f"one that does not fit together ({type(error).__name__}: {one_line(error)})"
+            ) from error
     if note:
         warnings.warn(note, stacklevel=stacklevel)
     return quantized
@@ -222,15 +223,19 @@ def _read_header(path: Path, file: BinaryIO) -> dict:
     """The header, once its checksum is verified; `file` is then at the first stream."""
     data = file.read(_FIXED)
     if not data.startswith(MAGIC):
-        got = "one that a transfer as text has changed" if data.startswith(MAGIC[:4]) else "a file of another kind"
-        raise _unreadable(path, got)
+        raise _unreadable(
+            path, "one that a transfer as text has changed" if data.startswith(MAGIC[:4]) else "a file of another kind"
+        )
     if len(data) < _FIXED:
         raise _unreadable(path, f"one cut off after {len(data)} bytes")
     version, length, checksum = (int.from_bytes(data[k : k + 4], "little") for k in range(len(MAGIC), _FIXED, 4))
     if version != VERSION:
-        expected = f"a compact model of version {VERSION}, which this program reads"
-        cure = "Compress the model again." if version < VERSION else "Update foldgauss."
-        raise model_file_error("path", expected=expected, got=f"version {version} in {str(path)!r}", cure=cure)
+        raise model_file_error(
+            "path",
+            expected=f"a compact model of version {VERSION}, which this program reads",
+            got=f"version {version} in {str(path)!r}",
+            cure="Compress the model again." if version < VERSION else "Update foldgauss.",
+        )
     text = file.read(min(length, _count_bytes(file)))
     if length > len(text) or zlib.crc32(text) != checksum:
         raise _unreadable(path, "one that is cut off or damaged (the checksum of its header is another)")

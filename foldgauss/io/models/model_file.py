@@ -88,8 +88,12 @@ def save_model(path: PathLike, model: Any, *, metadata: dict | None = None) -> P
     """
     kind = next((kind for kind in _KINDS.values() if type(model) is kind.model_type), None)
     if kind is None:
-        expected, cure = "one of the registered types " + ", ".join(sorted(_KINDS)), "Register it with register_model."
-        raise model_file_error("model", expected=expected, got=type(model).__name__, cure=cure)
+        raise model_file_error(
+            "model",
+            expected="one of the registered types " + ", ".join(sorted(_KINDS)),
+            got=type(model).__name__,
+            cure="Register it with register_model.",
+        )
     arrays = {key: _to_numpy(key, leaf) for key, leaf in _array_leaves(model).items()}
     header = kind.to_header(model)
     _check_described(kind, model, to_json("header", header))
@@ -122,8 +126,12 @@ def write_tensors(
     text = json.dumps(entries, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
     if len(text) > _LONGEST_HEADER:
-        got, cure = f"one of {len(text):,} bytes for {len(specs):,} tensors", "Write the clip as several files."
-        raise model_file_error("path", expected=f"a header of at most {_LONGEST_HEADER:,} bytes", got=got, cure=cure)
+        raise model_file_error(
+            "path",
+            expected=f"a header of at most {_LONGEST_HEADER:,} bytes",
+            got=f"one of {len(text):,} bytes for {len(specs):,} tensors",
+            cure="Write the clip as several files.",
+        )
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write(len(text).to_bytes(_PREFIX, "little") + text)
         for array in tensors(order):
@@ -137,13 +145,18 @@ def _array_leaves(tree: Any) -> dict[str, Any]:
     for keys, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         key = jax.tree_util.keystr(keys, simple=True, separator=".")
         if isinstance(leaf, bool | int | float | complex) and not isinstance(leaf, np.generic):
-            got, cure = f"the plain number {leaf!r}", "Make it an array, or a static field that the header holds."
-            raise model_file_error(key, expected="an array or a static field", got=got, cure=cure)
+            raise model_file_error(
+                key,
+                expected="an array or a static field",
+                got=f"the plain number {leaf!r}",
+                cure="Make it an array, or a static field that the header holds.",
+            )
         if not isinstance(leaf, jax.Array | np.ndarray | np.generic | jax.ShapeDtypeStruct):
             continue  # a function or a name, which the skeleton contains
         if key in found or key == _RESERVED:
-            cure = "Rename the field or dictionary key."
-            raise model_file_error(key, expected="one leaf per path", got="a clash", cure=cure)
+            raise model_file_error(
+                key, expected="one leaf per path", got="a clash", cure="Rename the field or dictionary key."
+            )
         found[key] = leaf
     return found
 
@@ -151,8 +164,12 @@ def _array_leaves(tree: Any) -> dict[str, Any]:
 def _to_numpy(key: str, leaf: Any) -> np.ndarray:
     """Little-endian, of a type that the format holds; nothing is converted but the byte order."""
     if leaf.dtype.name not in _DTYPES:
-        got, cure = f"dtype {leaf.dtype}", "Store complex numbers as two arrays and PRNG keys by jax.random.key_data."
-        raise model_file_error(key, expected="a real, integer or boolean array", got=got, cure=cure)
+        raise model_file_error(
+            key,
+            expected="a real, integer or boolean array",
+            got=f"dtype {leaf.dtype}",
+            cure="Store complex numbers as two arrays and PRNG keys by jax.random.key_data.",
+        )
     # In any strides: tobytes gives C order.
     return np.asarray(leaf).astype(leaf.dtype.newbyteorder("<"), copy=False)
 
@@ -163,9 +180,12 @@ def _check_described(kind: Kind, model: Any, header: str) -> None:
     _check_tensors(_get_specs(_array_leaves(model)), _get_specs(_array_leaves(skeleton)), "model")
     have, want = jax.tree_util.tree_structure(skeleton), jax.tree_util.tree_structure(model)
     if have != want:
-        expected = f"every static field of the model of kind {kind.name!r}"
-        cure = "Let to_header and from_header carry each static field."
-        raise model_file_error("header", expected=expected, got="a skeleton of another structure", cure=cure)
+        raise model_file_error(
+            "header",
+            expected=f"every static field of the model of kind {kind.name!r}",
+            got="a skeleton of another structure",
+            cure="Let to_header and from_header carry each static field.",
+        )
 
 
 def to_json(parameter: str, value: Any) -> str:
@@ -173,8 +193,9 @@ def to_json(parameter: str, value: Any) -> str:
     try:
         return json.dumps(value, allow_nan=False, sort_keys=True, default=_encode_scalar)
     except (TypeError, ValueError, RecursionError) as error:
-        expected = "a dict that JSON can hold"
-        raise model_file_error(parameter, expected=expected, got=str(error), cure="Use plain types.") from error
+        raise model_file_error(
+            parameter, expected="a dict that JSON can hold", got=str(error), cure="Use plain types."
+        ) from error
 
 
 def _encode_scalar(value: Any) -> Any:
@@ -221,8 +242,9 @@ def load_part(path: Path, about: dict, prefix: str = "") -> Any:
     try:
         kind.check(filled)
     except ValueError as error:
-        got = f"others in {str(path)!r} ({one_line(error)})"
-        raise model_file_error("path", expected="tensors that fit each other", got=got) from error
+        raise model_file_error(
+            "path", expected="tensors that fit each other", got=f"others in {str(path)!r} ({one_line(error)})"
+        ) from error
     return filled
 
 
@@ -230,9 +252,12 @@ def match_kind(path: Path, about: dict) -> tuple[Kind, Any]:
     """The kind of model, and the skeleton made from the header, checked against the tensors, of which none is read."""
     kind = _KINDS.get(about["kind"])
     if kind is None:
-        expected = "a model of kind " + " or ".join(map(repr, sorted(_KINDS)))
-        got, cure = f"kind {about['kind']!r} in {str(path)!r}", "Load it with the program that wrote it."
-        raise model_file_error("path", expected=expected, got=got, cure=cure)
+        raise model_file_error(
+            "path",
+            expected="a model of kind " + " or ".join(map(repr, sorted(_KINDS))),
+            got=f"kind {about['kind']!r} in {str(path)!r}",
+            cure="Load it with the program that wrote it.",
+        )
     with translate_header_errors(path, kind.name):
         skeleton = kind.from_header(about["header"])
     _check_tensors(about["tensors"], _get_specs(_array_leaves(skeleton)), str(path))
@@ -247,8 +272,11 @@ def translate_header_errors(path: Path, kind: str) -> Iterator[None]:
     except ModelFileError:
         raise
     except HEADER_ERRORS as error:
-        got = f"one that does not describe it in {str(path)!r} ({type(error).__name__}: {one_line(error)})"
-        raise model_file_error("path", expected=f"the header of a model of kind {kind!r}", got=got) from error
+        raise model_file_error(
+            "path",
+            expected=f"the header of a model of kind {kind!r}",
+            got=f"one that does not describe it in {str(path)!r} ({type(error).__name__}: {one_line(error)})",
+        ) from error
 
 
 def read_header(path: PathLike) -> dict:
@@ -293,10 +321,12 @@ def _check_version(path: Path, strings: dict[str, str]) -> None:
     if strings.get("format") != FORMAT:
         raise _unreadable_error(path, f"a safetensors file of format {strings.get('format', 'unknown')!r}")
     if strings.get("version") != VERSION:
-        expected = f"a model file of version {VERSION}, which this program reads"
-        got = f"version {strings.get('version')} in {str(path)!r}"
-        cure = "Update foldgauss, or load it with the one that wrote it."
-        raise model_file_error("path", expected=expected, got=got, cure=cure)
+        raise model_file_error(
+            "path",
+            expected=f"a model file of version {VERSION}, which this program reads",
+            got=f"version {strings.get('version')} in {str(path)!r}",
+            cure="Update foldgauss, or load it with the one that wrote it.",
+        )
     for name in ("kind", "header", "metadata"):
         if name not in strings:
             raise _unreadable_error(path, f"one without the field {name!r}")

@@ -120,8 +120,9 @@ def _source(number: int, source: object) -> tuple[int, Path]:
     try:
         first, file = source
     except (TypeError, ValueError):
-        expected = "(number of its first frame, model file)"
-        raise invalid(f"sources[{number}]", expected=expected, got=short_repr(source)) from None
+        raise invalid(
+            f"sources[{number}]", expected="(number of its first frame, model file)", got=short_repr(source)
+        ) from None
     if not is_integer(first, 0):
         raise invalid(f"sources[{number}]", expected="the number of its first frame first", got=short_repr(first))
     return int(first), check_path(file, "path, sources")
@@ -171,8 +172,9 @@ def _segments(path: Path, about: dict) -> list[Segment]:
     @lru_cache(maxsize=MAX_PREPARED)
     def load(number: int) -> VideoModel | EditedVideo:
         if _stamp(path) != stamp:
-            expected, got = "the file as it was opened", f"a changed {str(path)!r}"
-            raise model_file_error("path", expected=expected, got=got, cure="Load it again.")
+            raise model_file_error(
+                "path", expected="the file as it was opened", got=f"a changed {str(path)!r}", cure="Load it again."
+            )
         if entries[number]["kind"] == COMPACT:
             named = path.with_name(f"{path.name}, segment {number + 1}")  # for messages
             return load_compact_model(named, _read_file(path, number))

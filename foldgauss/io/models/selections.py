@@ -37,8 +37,12 @@ def save_selection(path: PathLike, selection: Selection, model: VideoModel) -> P
     """
     check_path(path, "path, selection, model")
     if not isinstance(selection, Selection):
-        cure = "The order is (path, selection, model); Selection(mask) makes one of a mask."
-        raise invalid("selection", expected="a Selection", got=type(selection).__name__, cure=cure)
+        raise invalid(
+            "selection",
+            expected="a Selection",
+            got=type(selection).__name__,
+            cure="The order is (path, selection, model); Selection(mask) makes one of a mask.",
+        )
     _check_model(model, "Save the selection with the model that it was made in.")
     num = model.splats.num_gaussians
     if selection.num_gaussians != num:
@@ -56,13 +60,21 @@ def load_selection(path: PathLike, model: VideoModel) -> Selection:
     _check_model(model, "The order is (path, model).")
     kind = read_header(path)["kind"]
     if kind != SELECTION:
-        cure = "Give the file that save_selection wrote."
-        raise model_file_error("path", expected="a selection", got=f"{kind!r} in {str(path)!r}", cure=cure)
+        raise model_file_error(
+            "path",
+            expected="a selection",
+            got=f"{kind!r} in {str(path)!r}",
+            cure="Give the file that save_selection wrote.",
+        )
     record = load_model(path)
     num, cure = model.splats.num_gaussians, "Load it with the model that it was made for, unchanged."
     if len(record.mask) != num:
-        got = f"one of {len(record.mask):,} in {str(path)!r}"
-        raise invalid("path", expected=f"a selection of the model's {num:,} Gaussians", got=got, cure=cure)
+        raise invalid(
+            "path",
+            expected=f"a selection of the model's {num:,} Gaussians",
+            got=f"one of {len(record.mask):,} in {str(path)!r}",
+            cure=cure,
+        )
     if record.digest != compute_digest(model):
         raise invalid("path", expected="a selection of this model", got=f"another's in {str(path)!r}", cure=cure)
     return Selection(np.asarray(record.mask))
@@ -70,8 +82,12 @@ def load_selection(path: PathLike, model: VideoModel) -> Selection:
 
 def _check_model(model: object, cure: str) -> None:
     if not isinstance(model, VideoModel):
-        cure = ONE_SEGMENT if isinstance(model, SegmentedVideo) else cure
-        raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
+        raise invalid(
+            "model",
+            expected="a VideoModel",
+            got=type(model).__name__,
+            cure=ONE_SEGMENT if isinstance(model, SegmentedVideo) else cure,
+        )
 
 
 _INDEX_RANGE = re.compile(r"\s*([0-9]{1,9})(?:-([0-9]{1,9}))?\s*")
@@ -94,8 +110,12 @@ def parse_indices(text: str, num_gaussians: int) -> Selection:
     mask = np.zeros(num_gaussians, bool)
     for first, last in parse_ranges(text):
         if last >= num_gaussians:
-            cure = "Is it another model's script?"
-            raise invalid("indices", expected=f"Gaussians from 0 to {num_gaussians - 1:,}", got=f"{last:,}", cure=cure)
+            raise invalid(
+                "indices",
+                expected=f"Gaussians from 0 to {num_gaussians - 1:,}",
+                got=f"{last:,}",
+                cure="Is it another model's script?",
+            )
         mask[first : last + 1] = True
     return Selection(mask)
 

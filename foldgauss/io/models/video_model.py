@@ -69,8 +69,12 @@ def check_model_name(path: PathLike, parameter: str = "path") -> None:
         cure = "Images: write_video, or foldgauss render; other programs' formats: export."
         if path.suffix.lower() == COMPACT_SUFFIX:
             cure = "A compact file: foldgauss compress, or foldgauss.video.compress and foldgauss.io.save_compact."
-        expected = f"a name for the model, as {path.with_suffix(MODEL_SUFFIX).name}"
-        raise invalid(parameter, expected=expected, got=repr(str(path)), cure=cure)
+        raise invalid(
+            parameter,
+            expected=f"a name for the model, as {path.with_suffix(MODEL_SUFFIX).name}",
+            got=repr(str(path)),
+            cure=cure,
+        )
 
 
 def load_video_model(path: PathLike) -> VideoModel | EditedVideo | SegmentedVideo:
@@ -161,8 +165,9 @@ def read_header_of_kind(path: PathLike, *kinds: str) -> dict:
     about = read_header(path)
     if about["kind"] not in kinds:
         expected, cure = " or ".join(map(repr, kinds)), "Give the file that `foldgauss fit` wrote to --out."
-        got = f"{about['kind']!r} in {str(path)!r}"
-        raise model_file_error("path", expected=f"a model of kind {expected}", got=got, cure=cure)
+        raise model_file_error(
+            "path", expected=f"a model of kind {expected}", got=f"{about['kind']!r} in {str(path)!r}", cure=cure
+        )
     return about
 
 
@@ -240,8 +245,12 @@ def _describe_camera(camera: Camera | Callable | None) -> dict | None:
     if camera is None:
         return None
     if not isinstance(camera, Camera):
-        cure = "Write the images, or save with seen_from(None) and set the camera again."
-        raise model_file_error("camera", expected="a Camera, which can be saved", got="a function", cure=cure)
+        raise model_file_error(
+            "camera",
+            expected="a Camera, which can be saved",
+            got="a function",
+            cure="Write the images, or save with seen_from(None) and set the camera again.",
+        )
     about = {"aspect": camera.aspect, "dtype": camera.position.dtype.name}
     return about if camera.lens is None else about | {"lens": True}
 

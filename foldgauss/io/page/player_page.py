@@ -215,8 +215,12 @@ def _load(model: Model) -> tuple[Loaded, str, dict]:
             kept |= keep_origin(about, "frame_seconds")
         return loaded, about.get("clip", path.stem), kept
     if not isinstance(model, Loaded):
-        cure = "End the chain with .video()." if type(model).__name__ == "Edit" else "The model comes first."
-        raise invalid("model", expected="a VideoModel or an EditedVideo", got=short_repr(model), cure=cure)
+        raise invalid(
+            "model",
+            expected="a VideoModel or an EditedVideo",
+            got=short_repr(model),
+            cure="End the chain with .video()." if type(model).__name__ == "Edit" else "The model comes first.",
+        )
     return model, "foldgauss", {}
 
 
@@ -306,8 +310,12 @@ def _encode_original(original: Frames, model: Loaded, quality: int) -> Iterator[
     frames = original.frames if isinstance(original, Clip) else original
     shape, dtype, own = np.shape(frames), getattr(frames, "dtype", None), (model.num_frames, *model.size, 3)
     if len(shape) != 4 or shape[:3] != own[:3] or shape[3] not in (3, 4) or dtype != np.uint8:
-        expected, cure = f"frames uint8 {own}, those of the model", "Read them with read_video(path, size=model.size)."
-        raise invalid("original", expected=expected, got=f"{dtype} {shape}", cure=cure)
+        raise invalid(
+            "original",
+            expected=f"frames uint8 {own}, those of the model",
+            got=f"{dtype} {shape}",
+            cure="Read them with read_video(path, size=model.size).",
+        )
     for number, frame in enumerate(frames):
         bgr = frame[..., 2::-1]  # premultiplied colors without their alpha are the image over black
         done, data = cv2.imencode(".webp", bgr, [cv2.IMWRITE_WEBP_QUALITY, quality])
