@@ -38,7 +38,6 @@ from foldgauss.uncertainty import (
     SimulatedRanks,
     ecdf_band,
     exact_posterior,
-    frame_time_log_prob,
     frame_time_posterior,
     likelihood_profiles,
     simulated_ranks,
@@ -105,12 +104,12 @@ def clip_posterior(model: VideoModel, frames: np.ndarray, seed: int, figures: di
     begun = time.perf_counter()
     profiles = likelihood_profiles(model, frames, noise="score")
     pictures = time.perf_counter() - begun
-    log_prob = frame_time_log_prob(model, profiles=profiles)
+    increments = Increments(np.linspace(0, 1, len(frames)))
     begun = time.perf_counter()
-    exact_posterior(profiles.curves, log_prob.increments)
+    exact_posterior(profiles.curves, increments)
     passes = time.perf_counter() - begun
     begun = time.perf_counter()
-    found = frame_time_posterior(log_prob=log_prob, seed=seed, progress=False)
+    found = frame_time_posterior(profiles, seed=seed)
     sampling = time.perf_counter() - begun
     exact, free, frame = found.exact, found.free, 1 / (len(frames) - 1)
     std = exact.std()[free]
@@ -135,7 +134,6 @@ def clip_posterior(model: VideoModel, frames: np.ndarray, seed: int, figures: di
         "clip.exact.mean.z": np.abs((found.mean() - exact.mean())[free] / error).max(),
         "clip.exact.std": np.abs(found.std()[free] / std - 1).max(),
         "clip.exact.ends": ends.max(),
-        "clip.laplace.std": float(np.median(np.abs(found.laplace.std[free] / std - 1))),
     }
     console.print(found.message)
     return found
@@ -146,7 +144,7 @@ def subset_of_clip(model: VideoModel, frames: np.ndarray, whole, figures: dict[s
     last = len(frames) - 1
     numbers = np.unique(np.rint(warp(np.linspace(0, 1, last // 2 + 1)) * last).astype(int))
     profiles = likelihood_profiles(model, frames[numbers], noise="score")
-    found = exact_posterior(profiles.curves, frame_time_log_prob(model, profiles=profiles).increments)
+    found = exact_posterior(profiles.curves, Increments(np.linspace(0, 1, len(numbers))))
     truth, spread = whole.exact.mean()[numbers], whole.exact.std()[numbers]
     miss = np.abs(found.mean() - truth)[1:-1] * last
     both = np.hypot(found.std(), spread)[1:-1] * last
@@ -263,7 +261,7 @@ def put(figures: dict[str, float], name: str, values) -> None:
 
 def posterior_of(model: VideoModel, frames: np.ndarray, noise: FrameNoise | str):
     profiles = likelihood_profiles(model, frames, noise=noise)
-    return exact_posterior(profiles.curves, Increments.with_free(np.linspace(0, 1, len(frames))))
+    return exact_posterior(profiles.curves, Increments(np.linspace(0, 1, len(frames))))
 
 
 def measured(model: VideoModel, frames: np.ndarray, truth: np.ndarray) -> list[float]:
@@ -331,7 +329,7 @@ def unseen_part(options: argparse.Namespace, figures: dict[str, float]) -> None:
     truth = np.concatenate([[0.0], (learned[1:] + learned[:-1]) / 2, [1.0]])
     numbers = [0, *range(1, len(frames), 2), len(frames) - 1]
     profiles = likelihood_profiles(model, frames[numbers], noise="score")
-    found = exact_posterior(profiles.curves, Increments.with_free(np.linspace(0, 1, len(numbers))))
+    found = exact_posterior(profiles.curves, Increments(np.linspace(0, 1, len(numbers))))
     miss, median_std, z = errors(found, truth)
     last = (len(frames) - 1) / (len(numbers) - 1)  # `errors` counts in steps of this video, two frames each
     figures |= {

@@ -27,21 +27,26 @@ from foldgauss.io._lock import lock_output
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.video_model import load_video_model, read_origin
 from foldgauss.io.provenance import fingerprint
-from foldgauss.uncertainty import LikelihoodProfiles, frame_time_log_prob, frame_time_posterior, likelihood_profiles
+from foldgauss.uncertainty import (
+    Increments,
+    LikelihoodProfiles,
+    frame_time_posterior,
+    likelihood_profiles,
+    marginalize_colors,
+)
 from foldgauss.uncertainty.diagnostics import plots
 from foldgauss.uncertainty.diagnostics.irregularities import irregularities
 from foldgauss.uncertainty.diagnostics.report import frame_table, summary
 from foldgauss.uncertainty.likelihood.noise import NOISES
-from foldgauss.uncertainty.posterior.draws_file import is_sealed, lock_draws
-from foldgauss.uncertainty.posterior.increments import Increments
-from foldgauss.uncertainty.posterior.log_prob import LEVELS, condition_on_level
 from foldgauss.uncertainty.posterior.optional_imports import import_optional
 from foldgauss.uncertainty.posterior.result import FrameTimePosterior
-from foldgauss.uncertainty.posterior.settings import check_settings
+from foldgauss.uncertainty.posterior.sampling import check_settings
 from foldgauss.video.models.video_model import VideoModel
 
 CHAINS, PROFILES = "chains.h5", "evidence.npz"
-PLOTS = ("times.png", "increments.png", "corner.png", "trace.png", "correlation.png")
+PLOTS = ("times.png", "increments.png", "correlation.png")
+#: What the posterior is conditioned on: all splats, or all but their colors.
+LEVELS = ("splats", "colors")
 IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 FILES = ("frame_times.csv", "summary.md", "posterior.nc", *PLOTS)
 #: Largest number of draws of each ensemble in posterior.nc, evenly spaced; all of them may take gigabytes.
@@ -89,9 +94,6 @@ def uncertainty_command(
             help="Concentration of the Dirichlet prior on increments: 1 is uniform, more favors equal increments."
         ),
     ] = 1.0,
-    walkers: Annotated[
-        int | None, typer.Option(help="Walkers of each ensemble [default: chosen by the number of frames].")
-    ] = None,
     ensembles: Annotated[int, typer.Option(help="Independent ensembles, compared by R-hat.")] = 4,
     steps: Annotated[
         int, typer.Option(help="Largest number of steps; sampling ends earlier once it has converged.")
@@ -123,17 +125,14 @@ def uncertainty_command(
         expected = f"the {model.num_frames} frames that the model was fitted to: its first is at 0 and its last at 1"
         cure = "To sample the times of some of them: --only A:B."
         raise wrong_use("--frames", expected=expected, got=f"{clip.num_frames} of this clip", cure=cure)
-    _check_settings(clip.num_frames, wanted, concentration, walkers, ensembles, steps)
+    _check_settings(clip.num_frames, wanted, concentration, ensembles, steps, seed)
     key = _digest_inputs(model_path, clip, noise, level, wanted if level == "colors" else None)
     context.with_resource(_create_folder(out_dir))
     own = tuple(out_dir / name for name in (*FILES, PROFILES))
     context.with_resource(lock_output(out_dir / CHAINS, own=own, what="run of uncertainty"))
-    with _explain_other_run(), lock_draws(out_dir / CHAINS):
-        pass  # fails now rather than after rendering
     profiles = load_profiles(out_dir / PROFILES, key, clip.num_frames)
     if profiles is None and (out_dir / CHAINS).exists() and not overwrite:
-        kept = out_dir / CHAINS
-        raise _other_draws(kept) if is_sealed(kept) else _damaged_draws(kept)
+        raise _other_draws(out_dir / CHAINS)
     with _bars() as bars:
         if profiles is not None:
             for note in profiles.notes:
@@ -141,12 +140,11 @@ def uncertainty_command(
         else:
             profiles = _compute_profiles(model, clip, noise, level, wanted, bars)
             write_or_keep(out_dir / PROFILES, lambda path: save_profiles(path, key, profiles))
-        log_prob = frame_time_log_prob(model, frames=wanted, concentration=concentration, profiles=profiles)
-        settings = {"walkers": walkers, "ensembles": ensembles, "steps": steps, "seed": seed}
-        posterior = _sample(out_dir / CHAINS, overwrite, bars, profiles=profiles, log_prob=log_prob, **settings)
+        settings = {"concentration": concentration, "ensembles": ensembles, "steps": steps, "seed": seed}
+        posterior = _sample(out_dir / CHAINS, overwrite, bars, profiles=profiles, frames=wanted, **settings)
     fitted = np.asarray(model.frame_times.times(), np.float64) if model.num_frames == clip.num_frames else None
     title = f"{model_path.name}, by {Path(clip.source).name}"
-    written = write_result(out_dir, lambda folder: _write(folder, posterior, fitted, title, level))
+    written = write_result(out_dir, lambda folder: _write(folder, posterior, fitted, title))
     _print_summary(written, posterior)
 
 
@@ -206,10 +204,10 @@ def _create_folder(path: Path) -> Iterator[None]:
                 path.rmdir()
 
 
-def _check_settings(num_frames: int, only, concentration: float, walkers, ensembles: int, steps: int) -> None:
+def _check_settings(num_frames: int, only, concentration: float, ensembles: int, steps: int, seed: int) -> None:
     """Refuse invalid settings before anything is rendered."""
     try:
-        found = Increments.with_free(np.linspace(0.0, 1.0, num_frames), only, concentration)
+        Increments(np.linspace(0.0, 1.0, num_frames), only, concentration)
     except ValueError as error:
         if str(error).startswith("concentration"):
             raise
@@ -218,7 +216,7 @@ def _check_settings(num_frames: int, only, concentration: float, walkers, ensemb
         else:
             text = str(error).replace("frames:", "--only:", 1)
         raise WrongUse(text) from error
-    check_settings(found.num_free, walkers=walkers, ensembles=ensembles, steps=steps)
+    check_settings(steps, ensembles, seed)
 
 
 def _digest_inputs(model_path: Path, clip: Clip, noise: str, level: str, only: list[int] | None) -> str:
@@ -235,18 +233,11 @@ def _compute_profiles(
     profiles = likelihood_profiles(
         model, clip.frames, noise=noise, on_render=lambda done, total: bars("pictures", done, total)
     )
-    return condition_on_level(
-        level, model, clip.frames, profiles, only, lambda done, total: bars("frames", done, total)
+    if level == "splats":
+        return profiles
+    return marginalize_colors(
+        model, clip.frames, profiles, frames=only, on_frame=lambda done, total: bars("frames", done, total)
     )
-
-
-@contextmanager
-def _explain_other_run() -> Iterator[None]:
-    """Convert the error about another run that samples to the same file."""
-    try:
-        yield
-    except BlockingIOError as error:
-        raise OutputError(str(error).replace("backend:", "--out:", 1)) from error
 
 
 def _other_draws(path: Path) -> WrongUse:
@@ -279,14 +270,13 @@ def _sample(path: Path, overwrite: bool, bars, **arguments: Any) -> FrameTimePos
     """Sample, from the draws of a stopped run if there are any; with `overwrite`, draws of another run are replaced."""
     existed, sampled = path.exists(), False
 
-    def show(what: str, done: int, total: int) -> None:
+    def show(done: int, total: int) -> None:
         nonlocal sampled
         sampled = True
-        bars(what, done, total)
+        bars("steps", done, total)
 
     def sample() -> FrameTimePosterior:
-        with _explain_other_run():
-            return frame_time_posterior(progress=show, backend=path, **arguments)
+        return frame_time_posterior(on_progress=show, backend=path, **arguments)
 
     try:
         try:
@@ -313,21 +303,18 @@ def _sample(path: Path, overwrite: bool, bars, **arguments: Any) -> FrameTimePos
     return posterior
 
 
-def _write(folder: Path, posterior: FrameTimePosterior, fitted: np.ndarray | None, title: str, level: str) -> Path:
+def _write(folder: Path, posterior: FrameTimePosterior, fitted: np.ndarray | None, title: str) -> Path:
     """Write all files, each atomically, the most important ones first; returns the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     flagged = irregularities(posterior)
     _write_table(folder / "frame_times.csv", frame_table(posterior, fitted))
     with atomic_path(folder / "summary.md") as temporary:
-        text = summary(posterior, fitted, flagged=flagged, level=level)
+        text = summary(posterior, fitted, flagged=flagged)
         temporary.write_text(f"# Frame times of {title}\n\n{text}")
     _write_netcdf(folder / "posterior.nc", posterior)
     _save_plot(folder / "times.png", plots.plot_times, posterior, fitted=fitted, flagged=flagged)
     _save_plot(folder / "increments.png", plots.plot_increments, posterior, flagged=flagged)
-    _save_plot(folder / "corner.png", plots.plot_pairs, posterior)
-    _save_plot(folder / "trace.png", plots.plot_trace, posterior)
-    if posterior.profiles is not None:
-        _save_plot(folder / "correlation.png", plots.plot_correlation, posterior.profiles)
+    _save_plot(folder / "correlation.png", plots.plot_correlation, posterior.profiles)
     return folder
 
 
