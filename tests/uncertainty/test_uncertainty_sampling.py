@@ -20,13 +20,11 @@ from foldgauss.uncertainty import (
     likelihood_profiles,
     rendered_log_likelihood,
 )
-from foldgauss.uncertainty.posterior import sampling
+from foldgauss.uncertainty.posterior import moves
 from foldgauss.uncertainty.posterior.optional_imports import import_optional
 
 #: Two of the three are so near that their order constrains them.
 NEAR = (0.3, 0.34, 0.7), (0.03, 0.05, 0.04)
-#: emcee's moves, without sweeps.
-STOCK = [(emcee.moves.DEMove(), 0.7), (emcee.moves.StretchMove(), 0.3)]
 #: A toy whose posterior is Gaussian: 0.08 apart at 10 standard deviations.
 MANY = np.linspace(0, 1, 16)[1:-1], np.full(14, 0.006)
 
@@ -80,7 +78,7 @@ def test_few_frames_sample_the_known_posterior(near):
     assert (near.r_hat < 1.01).all()
     assert (near.ess > 400).all()
     assert (near.tau >= 1).all()
-    assert ((near.acceptance > 0.1) & (near.acceptance < 0.9)).all()
+    assert (near.acceptance > 0.5).all()
     assert near.acceptance.shape == (4,)
     assert agrees(near)
     np.testing.assert_allclose(near.interval(0.9), near.exact.interval(0.9), atol=0.15 * near.exact.std().max())
@@ -91,8 +89,8 @@ def test_few_frames_sample_the_known_posterior(near):
 
 
 def test_wrong_prior_is_detected(monkeypatch):
-    # One power of every increment too many in the density that emcee's own moves sample, not in the exact posterior.
-    monkeypatch.setattr(sampling, "_choose_moves", lambda *_: STOCK)
+    # One power of every increment too many in the density that a move of emcee samples, not in the exact posterior.
+    monkeypatch.setattr(moves, "FrameSweep", lambda log_prob: emcee.moves.DEMove())
     right = Increments.log_prior
 
     def wrong(self, times):
@@ -111,8 +109,7 @@ def test_draws_keep_their_order_and_their_ends(near):
 
 
 @pytest.mark.parametrize("concentration", [1.0, 3.0])
-def test_sweeps_sample_the_known_posterior(concentration, monkeypatch):
-    monkeypatch.setattr(sampling, "AT_ONCE", 0)
+def test_sweeps_sample_the_known_posterior(concentration):
     found = sampled(toy((0.2, 0.25, 0.4, 0.42, 0.75), (0.03, 0.04, 0.03, 0.05, 0.06)), concentration=concentration)
     assert found.converged
     assert agrees(found)
@@ -155,8 +152,8 @@ def test_few_frames_change_modes(two_modes):
 
 
 def test_ensembles_that_all_miss_a_mode_have_not_converged(two_modes, monkeypatch):
-    # Started at one mode, emcee's own moves stay there: tau and R-hat do not detect the other one.
-    monkeypatch.setattr(sampling, "_choose_moves", lambda *_: STOCK)
+    # Started at one mode, emcee's moves stay there: tau and R-hat do not detect the other one.
+    monkeypatch.setattr(moves, "FrameSweep", lambda log_prob: emcee.moves.DEMove())
     draws = exact_posterior(two_modes.curves, free_times(5)).sample(400)
     monkeypatch.setattr(ExactPosterior, "sample", lambda self, num, seed: draws[draws[:, 2] < 0.5][:num])
     found = sampled(two_modes, steps=1500)
@@ -196,9 +193,7 @@ def test_too_few_steps_are_reported():
     assert "autocorrelation times" in found.message
 
 
-@pytest.mark.parametrize("at_once", [0, 12])
-def test_resumed_run_equals_an_uninterrupted_one(tmp_path, at_once, monkeypatch):
-    monkeypatch.setattr(sampling, "AT_ONCE", at_once)
+def test_resumed_run_equals_an_uninterrupted_one(tmp_path):
     profiles, settings = toy(*NEAR), {"steps": 600, "seed": 5}
     whole = sampled(profiles, **settings)
     sampled(profiles, **{**settings, "steps": 300}, backend=tmp_path / "run.h5")
@@ -233,14 +228,6 @@ def test_file_of_another_run_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"backend: expected a file of draws, or none yet, got .*damaged"):
         sampled(toy(*NEAR), steps=100, backend=tmp_path / "text.h5")
     assert (tmp_path / "text.h5").read_text() == "no such file"
-
-
-@pytest.mark.parametrize("num", [1, 2, 8, 9, 11, 12, 13])
-def test_default_walkers_suffice(num):
-    means = np.linspace(0, 1, num + 2)[1:-1]
-    found = sampled(toy(means, np.full(num, 0.2 / num), nodes=101), steps=20, ensembles=2)
-    assert found.times.shape[2] % 2 == 0
-    assert found.times.shape[3] == num + 2
 
 
 @pytest.mark.parametrize(

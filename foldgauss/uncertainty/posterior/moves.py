@@ -1,4 +1,4 @@
-"""An emcee move that updates one frame after the other, for more frames than one move can update."""
+"""An emcee move that updates one frame after the other; moves of all frames at once mix far worse (`notes`)."""
 
 import numpy as np
 from emcee.moves import Move

@@ -7,7 +7,6 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -30,9 +29,7 @@ BURN_IN = 10.0
 CHECK_EVERY = 50
 #: Steps per kept step.
 THIN = 10
-#: With up to this many free frames emcee's own moves update all at once, beside sweeps; with more, only sweeps move.
-AT_ONCE = 12
-#: Walkers of an ensemble: emcee's moves need twice as many as there are free frames.
+#: Walkers of an ensemble.
 WALKERS = 32
 #: Disk space that an HDF5 file needs beside its draws, in bytes.
 SPARE_BYTES = 4 << 20
@@ -53,8 +50,7 @@ def frame_time_posterior(
 
     Independent emcee ensembles, started from exact draws, run until more than 50 autocorrelation times of every frame
     are kept, split rank R-hat is below 1.01 for all and the means agree with the exact ones, or for `steps` steps, of
-    which every tenth is kept. The moves are `FrameSweep` and, for few frames, emcee's differential evolution and
-    stretch moves.
+    which every tenth is kept. A step is a `FrameSweep`.
 
     `frames`, `concentration`: see `frame_time_log_prob`. `backend`: an HDF5 file to which emcee's `HDFBackend` writes
     the draws; called again with the same arguments, sampling resumes. `on_progress` is called with the numbers of steps
@@ -105,13 +101,10 @@ class _Run:
         self, log_prob: FrameTimeLogProb, profiles: LikelihoodProfiles, ensembles: int, seed: int, backend: Path | None
     ):
         self.log_prob, self.profiles, self.seed, self.backend = log_prob, profiles, seed, backend
-        few = log_prob.increments.num_free <= AT_ONCE
-        self.walkers = max(WALKERS, 4 * log_prob.increments.num_free) if few else WALKERS
         self.exact = exact_posterior(log_prob.curves, log_prob.increments)
         if backend is not None:
             open_draws(backend, self._fingerprint(ensembles))
-        moves = _choose_moves(log_prob, few)
-        self.samplers = [self._make_sampler(n, moves) for n in range(ensembles)]
+        self.samplers = [self._make_sampler(n) for n in range(ensembles)]
 
     def _fingerprint(self, ensembles: int) -> str:
         """A hash of everything that the draws depend on."""
@@ -121,20 +114,27 @@ class _Run:
         digest.update(repr((increments.concentration, int(self.seed), int(ensembles))).encode())
         return digest.hexdigest()
 
-    def _make_sampler(self, n: int, moves):
+    def _make_sampler(self, n: int):
         import emcee
+
+        from foldgauss.uncertainty.posterior.moves import FrameSweep
 
         kept = emcee.backends.Backend()
         if self.backend is not None:
             kept = emcee.backends.HDFBackend(str(self.backend), name=f"ensemble_{n}")
         sampler = emcee.EnsembleSampler(
-            self.walkers, self.log_prob.increments.num_free, self.log_prob, vectorize=True, moves=moves, backend=kept
+            WALKERS,
+            self.log_prob.increments.num_free,
+            self.log_prob,
+            vectorize=True,
+            moves=FrameSweep(self.log_prob),
+            backend=kept,
         )
         if kept.iteration:
             sampler.start = kept.get_last_sample()
             return sampler
         seeds = seed_sequence(Stream.WALKERS, n, seed=self.seed)
-        times = self.exact.sample(self.walkers, int(seeds.generate_state(1)[0]))
+        times = self.exact.sample(WALKERS, int(seeds.generate_state(1)[0]))
         sampler.start = emcee.State(times[:, self.log_prob.increments.free])
         sampler.start.random_state = np.random.RandomState(np.random.MT19937(seeds)).get_state()
         return sampler
@@ -158,7 +158,7 @@ class _Run:
         """Sample until every ensemble has `goal` kept steps."""
         if self.backend is not None:
             left = sum(goal - sampler.iteration for sampler in self.samplers)
-            _check_space(self.backend, 8 * left * self.walkers * (self.log_prob.increments.num_free + 1))
+            _check_space(self.backend, 8 * left * WALKERS * (self.log_prob.increments.num_free + 1))
         for sampler in self.samplers:
             for state in sampler.sample(
                 sampler.start, iterations=goal - sampler.iteration, thin_by=THIN, skip_initial_state_check=True
@@ -181,7 +181,7 @@ class _Run:
             acceptance=np.array([np.mean(sampler.acceptance_fraction) for sampler in self.samplers]),
             tau=tau * THIN,
             r_hat=np.array([_r_hat(times[..., k]) for k in free]),
-            ess=kept * self.walkers * len(self.samplers) / tau,
+            ess=kept * WALKERS * len(self.samplers) / tau,
         )
         missing = _missing_for_convergence(found, kept / tau)
         message = f"Converged after {steps * THIN:,} steps."
@@ -231,16 +231,6 @@ def _check_space(path: Path, num_bytes: int) -> None:
     """Raise OSError if the disk lacks space for `num_bytes` more: HDF5 may crash on a full disk."""
     if shutil.disk_usage(path.parent).free < num_bytes + SPARE_BYTES:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
-
-
-def _choose_moves(log_prob: FrameTimeLogProb, few: bool) -> list[tuple[Any, float]]:
-    from emcee.moves import DEMove, StretchMove
-
-    from foldgauss.uncertainty.posterior.moves import FrameSweep
-
-    # emcee's moves alone stay at the mode at which they start; sweeps change modes.
-    sweep = FrameSweep(log_prob)
-    return [(sweep, 0.5), (DEMove(), 0.3), (StretchMove(), 0.2)] if few else [(sweep, 1.0)]
 
 
 def _autocorrelation_time(times: Float64[np.ndarray, "steps walkers"]) -> float:
