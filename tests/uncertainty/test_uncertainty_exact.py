@@ -148,6 +148,21 @@ def test_known_frame_splits_the_prior_in_two(concentration):
     assert found.log_evidence == pytest.approx(likelihood_profiles + np.log(1e-6 * np.sqrt(2 * np.pi)), abs=3e-3)
 
 
+@pytest.mark.parametrize("concentration", [1.0, 3.0, 20.0])
+@pytest.mark.parametrize("gap", [1e-4, 0.2])
+def test_evidence_of_increments_that_the_prior_hardly_allows(concentration, gap):
+    num, known, width = 30, 12, 1e-7
+    parts = [flat_except(num, (known + n,), 0.4 + n * gap, width)[known + n] for n in (0, 1)]
+    flat = flat_except(num)
+    curves = [parts[k - known] if k in (known, known + 1) else flat[k] for k in range(num)]
+    curves = ProfileCurves.from_nodes(*zip(*(each.nodes_and_values(0) for each in curves), strict=True))
+    found = exact_posterior(curves, free_times(num, concentration))
+    grouped = concentration * np.array([known, 1, num - 2 - known])
+    expected = scipy.stats.dirichlet.logpdf([0.4, gap, 0.6 - gap], grouped) + 2 * np.log(width * np.sqrt(2 * np.pi))
+    assert found.log_evidence == pytest.approx(expected, abs=0.02)
+    np.testing.assert_allclose(found.mean()[[known, known + 1]], [0.4, 0.4 + gap], atol=3 * width)
+
+
 def test_many_flat_profiles_need_few_grid_points():
     found = exact_posterior(flat_except(300), free_times(300))
     assert max(map(len, found.edges)) < 1000

@@ -17,7 +17,7 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.special import betainc
+from scipy.special import betainc, betaincc
 
 from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.checks import check_within, invalid
@@ -197,7 +197,7 @@ def _passes(curves: ProfileCurves, frames: range, edges: list[np.ndarray], ends:
 
 
 def _out_of_order() -> ValueError:
-    cure = "The frames are out of order or of another video, or the noise is too small."
+    cure = "They are out of order or of another video, the noise is too small, or the concentration too large."
     return invalid("video", expected="frames in the model's order", got="times that cannot increase", cure=cure)
 
 
@@ -210,8 +210,12 @@ def _log_weights(edges: np.ndarray, gaps: int, alpha: float, times: np.ndarray) 
     """Log of the prior probabilities of cells, given that the next frame is at each of `times`."""
     fraction = np.minimum(edges / times[:, None], 1.0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        below = gaps * np.log(fraction) if alpha == 1 else np.log(betainc(alpha * gaps, alpha, fraction))
-        inside = below[:, 1:] + np.log(-np.expm1(below[:, :-1] - below[:, 1:]))
+        if alpha == 1:
+            below = gaps * np.log(fraction)
+            inside = below[:, 1:] + np.log(-np.expm1(below[:, :-1] - below[:, 1:]))
+        else:  # from the tail that is smaller, whose differences are precise
+            below, above = betainc(alpha * gaps, alpha, fraction), betaincc(alpha * gaps, alpha, fraction)
+            inside = np.log(np.where(below[:, 1:] < 0.5, np.diff(below), -np.diff(above)))
     return np.where(np.isnan(inside), -np.inf, inside)
 
 

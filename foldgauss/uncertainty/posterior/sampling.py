@@ -103,7 +103,7 @@ class _Run:
         self.log_prob, self.profiles, self.seed, self.backend = log_prob, profiles, seed, backend
         self.exact = exact_posterior(log_prob.curves, log_prob.increments)
         if backend is not None:
-            open_draws(backend, self._fingerprint(ensembles))
+            _open_draws(backend, self._fingerprint(ensembles))
         self.samplers = [self._make_sampler(n) for n in range(ensembles)]
 
     def _fingerprint(self, ensembles: int) -> str:
@@ -212,7 +212,7 @@ def _missing_for_convergence(found: FrameTimePosterior, lengths: Float64[np.ndar
     return missing
 
 
-def open_draws(path: Path, fingerprint: str) -> None:
+def _open_draws(path: Path, fingerprint: str) -> None:
     """Create a file of draws, or check that an existing one is of the run with this fingerprint."""
     existed = path.exists()
     try:
@@ -221,7 +221,8 @@ def open_draws(path: Path, fingerprint: str) -> None:
     except OSError as error:
         if error.errno is not None and error.errno != errno.EINVAL:
             raise
-        raise invalid("backend", expected="a file of draws, or none yet", got=f"{path}, damaged") from error
+        cure = "Remove it, or choose another."
+        raise invalid("backend", expected="a file of draws, or none yet", got=f"{path}, damaged", cure=cure) from error
     if found != fingerprint:
         cure = "Choose another file, or give the same model, video and settings."
         raise invalid("backend", expected="the file of this very run", got=f"{path}, of another run", cure=cure)
