@@ -214,6 +214,7 @@ def _missing_for_convergence(found: FrameTimePosterior, lengths: Float64[np.ndar
 
 def _open_draws(path: Path, fingerprint: str) -> None:
     """Create a file of draws, or check that an existing one is of the run with this fingerprint."""
+    _check_space(path, 0)
     existed = path.exists()
     try:
         with import_optional("h5py").File(path, "a") as file:
