@@ -31,7 +31,13 @@ from foldgauss.io import Clip
 from foldgauss.io._atomic import atomic_path
 from foldgauss.io.datasets import bunny
 from foldgauss.render import Camera, Gaussians3D, project, render
-from foldgauss.uncertainty import FrameTimePosterior, frame_time_posterior, increment_intervals, irregularities
+from foldgauss.uncertainty import (
+    FrameTimePosterior,
+    frame_time_posterior,
+    increment_intervals,
+    irregularities,
+    likelihood_profiles,
+)
 from foldgauss.uncertainty.diagnostics.plots import plot_increments
 from foldgauss.video import FitConfig, VideoModel, Views, fit
 
@@ -273,7 +279,7 @@ def _frame_times(clip: Clip) -> FrameTimePosterior:
     """Times of the frames, given a fit without shared paths."""
     gaussians, steps = (rate * len(clip.frames) for rate in PER_FRAME)
     config = FitConfig(num_gaussians=gaussians, steps=steps, follow_camera=False)
-    return frame_time_posterior(fit(clip.frames, config, fps=clip.fps).model, clip.frames, progress=False)
+    return frame_time_posterior(likelihood_profiles(fit(clip.frames, config, fps=clip.fps).model, clip.frames))
 
 
 def increments() -> plt.Figure:

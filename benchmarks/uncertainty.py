@@ -35,7 +35,6 @@ from foldgauss.uncertainty import (
     SimulatedRanks,
     ecdf_band,
     exact_posterior,
-    frame_time_log_prob,
     frame_time_posterior,
     likelihood_profiles,
     simulated_ranks,
@@ -121,8 +120,7 @@ def clip_posterior(options: argparse.Namespace) -> dict[str, float]:
     clock = [time.perf_counter()]
     profiles = likelihood_profiles(model, frames, noise="score")
     clock.append(time.perf_counter())
-    log_prob = frame_time_log_prob(model, profiles=profiles)
-    found = frame_time_posterior(log_prob=log_prob, seed=options.seed, progress=False)
+    found = frame_time_posterior(profiles, seed=options.seed)
     clock.append(time.perf_counter())
     exact, free = found.exact, found.free
     std = exact.std()[free]
@@ -223,7 +221,7 @@ def retimed(seed: int) -> dict[str, float]:
 def measured(model: VideoModel, frames: np.ndarray, truth: np.ndarray, noise: FrameNoise | str) -> list[float]:
     """`MEASURES`: fractions of true times in intervals; median miss and std; root mean square of their quotient."""
     profiles = likelihood_profiles(model, frames, noise=noise)
-    found = exact_posterior(profiles.curves, Increments.with_free(np.linspace(0, 1, len(frames))))
+    found = exact_posterior(profiles.curves, Increments(np.linspace(0, 1, len(frames))))
     covered = [inside(found.interval(level), truth) for level in LEVELS]
     miss, std, last = (found.mean() - truth)[1:-1], found.std()[1:-1], len(truth) - 1
     z = np.sqrt(np.mean((miss / std) ** 2))

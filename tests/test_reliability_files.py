@@ -490,15 +490,15 @@ def test_a_command_that_does_not_end_is_ended_by_the_next_sigterm(late):
 @pytest.mark.skipif(os.name == "nt", reason="signals are POSIX's; CI runs it on Linux")
 def test_sigterm_to_a_run_of_draws_keeps_them(work, tmp_path, monkeypatch, capsys):
     pytest.importorskip("emcee", reason="draws need foldgauss[uncertainty]")
-    from foldgauss.uncertainty.posterior import draws_file
+    from emcee.backends import HDFBackend
 
-    keep = draws_file.DrawsFile.save
+    keep = HDFBackend.save_step
 
-    def kept(self):
-        keep(self)
+    def kept(self, *step):
+        keep(self, *step)
         signal.raise_signal(signal.SIGTERM)
 
-    monkeypatch.setattr(draws_file.DrawsFile, "save", kept)
+    monkeypatch.setattr(HDFBackend, "save_step", kept)
     words = ["uncertainty", work / "model.safetensors", work / "clip.mp4", "--out", tmp_path, "--steps", "600"]
     assert run(*words) == 143
     assert "the same command continues from" in " ".join(capsys.readouterr().err.split())

@@ -611,11 +611,11 @@ MADE = """
             em = FoldedGaussianMixture(3, random_state=0, max_iter=5).fit(points)
         say("EM", b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(em.to_mixture())))
         say("draws", em.sample(1000)[0].tobytes())
-        from foldgauss.uncertainty import frame_time_posterior
+        from foldgauss.uncertainty import frame_time_posterior, likelihood_profiles
         seen = fit(frames, change(usual, num_gaussians=800, steps=200)).model
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # nor this
-            drawn = frame_time_posterior(seen, frames, steps=200, seed=1, progress=False)
+            drawn = frame_time_posterior(likelihood_profiles(seen, frames), steps=200, seed=1)
         say("posterior", np.ascontiguousarray(drawn.times).tobytes())
 """
 

@@ -2,7 +2,7 @@
 
 `likelihood_profiles` renders the model at many times and gives the log-likelihood of each frame as a function of its
 time; `frame_time_posterior` samples the times from their posterior by emcee, beside the exact marginals
-(`exact_posterior`) and Laplace's approximation; `irregularities`, `summary` and `frame_table` report on it;
+(`exact_posterior`); `irregularities`, `summary` and `frame_table` report on it;
 `simulated_ranks` checks the calibration and `refit_frame_times` refits splats and times together. Sampling needs the
 extra `uncertainty`.
 """
@@ -24,7 +24,6 @@ from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves
 from foldgauss.uncertainty.likelihood.refit import Refit, RefitTimes, iter_refits, refit_frame_times
 from foldgauss.uncertainty.posterior.exact import ExactPosterior, exact_posterior
 from foldgauss.uncertainty.posterior.increments import Increments
-from foldgauss.uncertainty.posterior.laplace import LaplaceApproximation, laplace_approximation
 from foldgauss.uncertainty.posterior.log_prob import FrameTimeLogProb, frame_time_log_prob, rendered_log_likelihood
 from foldgauss.uncertainty.posterior.result import FrameTimePosterior
 from foldgauss.uncertainty.posterior.sampling import frame_time_posterior
@@ -37,7 +36,6 @@ __all__ = [
     "IncrementIntervals",
     "Increments",
     "Irregularity",
-    "LaplaceApproximation",
     "LikelihoodProfiles",
     "ProfileCurves",
     "Refit",
@@ -54,7 +52,6 @@ __all__ = [
     "increment_intervals",
     "irregularities",
     "iter_refits",
-    "laplace_approximation",
     "likelihood_profiles",
     "marginalize_colors",
     "refit_frame_times",

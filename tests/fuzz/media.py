@@ -10,7 +10,6 @@ from random import Random
 
 import av
 import cv2
-import h5py
 import numpy as np
 from PIL import Image
 
@@ -18,8 +17,6 @@ from foldgauss.io import VideoError, read_masks, read_video, write_video
 from foldgauss.io.media.clip import HEAD_BYTES, MAX_PIXELS
 from foldgauss.io.media.decoder import describe_kind
 from foldgauss.io.media.images import is_image
-from foldgauss.uncertainty.posterior import draws_file
-from foldgauss.uncertainty.posterior.optional_imports import import_optional
 
 from .branches import ONLY
 from .models import written
@@ -330,132 +327,7 @@ HEADERS = Target(
 )
 
 
-# ---------------------------------------------------------------------------------------------- HDF5, arrays
-
-_FINGERPRINT, _SHAPE = "0" * 64, (2, 4, 2)
+# ---------------------------------------------------------------------------------------------------- arrays
 
 
-def _chains(steps: int, version: str, done: bool = True) -> bytes:
-    """A file of an interrupted run, as emcee writes it."""
-
-    def write(path: Path) -> None:
-        rng = np.random.default_rng(0)
-        with h5py.File(path, "w", libver=version, userblock_size=draws_file._BLOCK) as file:
-            file.attrs["fingerprint"] = _FINGERPRINT
-            for n in range(_SHAPE[0]):
-                group = file.create_group(f"ensemble_{n}")
-                about = {
-                    "version": "3",
-                    "nwalkers": 4,
-                    "ndim": 2,
-                    "has_blobs": False,
-                    "iteration": steps if done else 0,
-                }
-                group.attrs.update(about)
-                group.create_dataset("accepted", data=np.zeros(4))
-                group.create_dataset(
-                    "chain", data=rng.normal(size=(steps, 4, 2)), maxshape=(None, 4, 2), chunks=(2, 4, 2)
-                )
-                group.create_dataset("log_prob", data=rng.normal(size=(steps, 4)), maxshape=(None, 4), chunks=(2, 4))
-                for k, value in enumerate(np.random.RandomState(0).get_state()):
-                    group.attrs[f"random_state_{k}"] = value
-        draws_file._seal(path)
-
-    return written(write, ".h5")
-
-
-def _import_arviz(folder: Path) -> None:
-    """Before memory is measured."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        import_optional("arviz")
-
-
-def _read_chains(path: Path) -> None:
-    there = path.exists()
-    kept = draws_file.DrawsFile(path, _FINGERPRINT, _SHAPE)
-    if not there:  # a run begins there
-        kept.live.unlink()
-        raise FileNotFoundError
-    try:
-        for n in range(_SHAPE[0]):
-            backend = kept.backend(n)
-            assert backend.initialized
-            assert backend.shape == _SHAPE[1:]
-            if backend.iteration:
-                state = backend.get_last_sample()
-                np.random.RandomState().set_state(state.random_state)
-                assert backend.get_chain().shape == (backend.iteration, *_SHAPE[1:])
-    finally:
-        kept.live.unlink()
-
-
-_VALUES = (
-    0, -1, 2, 5, 2**40, 1.5, np.nan, "x", b"x", [], [0, 1], True, np.zeros(3), np.zeros((2, 624), np.uint32), "MT19937",
-)  # fmt: skip
-
-
-def h5_changed(data: bytes, random: Random) -> bytes:
-    """A sound HDF5 file, under a right seal, in which something is missing, of another kind, or elsewhere."""
-
-    def write(path: Path) -> None:
-        path.write_bytes(data)
-        with h5py.File(path, "r+") as file:
-            group = file[f"ensemble_{random.randrange(_SHAPE[0])}"]
-            how = random.randrange(8)
-            if how <= 2:
-                holder = random.choice((file, group, group))
-                holder.attrs[random.choice(sorted(holder.attrs))] = random.choice(_VALUES)
-            elif how == 3:
-                del group.attrs[random.choice(sorted(group.attrs))]
-            elif how == 4:
-                holder, name = random.choice(
-                    ((file, group.name), (group, "chain"), (group, "log_prob"), (group, "accepted"))
-                )
-                del holder[name]
-            else:
-                name = random.choice(("chain", "log_prob", "accepted"))
-                del group[name]
-                if how == 5:
-                    group[name] = random.choice(
-                        (h5py.SoftLink("/a"), h5py.ExternalLink("/etc/a.h5", "/b"), np.zeros(4))
-                    )
-                else:
-                    shape = random.choice(((4,), (4, 4), (4, 4, 2), (2**40, 4, 2), (2**40, 4), (0, 4, 2), (3, 5, 2)))
-                    options = random.choice(
-                        ({}, {"compression": "gzip"}, {"chunks": True}, {"maxshape": (None, *shape[1:])})
-                    )
-                    kind = random.choice(("f8", "f8", "f4", "i8", "S3"))
-                    if int(np.prod(shape)) > 10**6:
-                        options = {"chunks": (1, *shape[1:])}
-                    group.create_dataset(name, shape, kind, **options)
-        draws_file._seal(path)
-
-    try:
-        return written(write, ".h5")
-    except (OSError, KeyError, ValueError, TypeError, IndexError):
-        return by_chance(data, random, draws_file._BLOCK)
-
-
-CHAINS = Target(
-    "hdf5",
-    ".h5",
-    lambda: [_chains(4, "earliest"), _chains(3, "latest"), _chains(2, "earliest", done=False)],
-    _read_chains,
-    (ValueError,),
-    {
-        "foldgauss.uncertainty.posterior.draws_file": (
-            ONLY, "DrawsFile", "-check_space", "-raise_system_error", "-convert_errors",
-            "read_fingerprint", "_damaged", "_is_valid", "_is_random_state", "is_sealed",
-        )
-    },
-    lambda data: draws_file._BLOCK,
-    lambda size: 4 * CONSTANT + 64 * size,
-    (h5_changed,),
-    past_header=1,
-    prepare=_import_arviz,
-    share=0.4,
-)  # fmt: skip
-
-
-TARGETS = (MASKS, PICTURES, VIDEO, HEADERS, CHAINS)
+TARGETS = (MASKS, PICTURES, VIDEO, HEADERS)

@@ -12,7 +12,6 @@ import zlib
 from contextlib import contextmanager
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 from PIL import Image
@@ -20,7 +19,6 @@ from PIL import Image
 import foldgauss
 from foldgauss.io import VideoError, html_page, read_history, read_masks, read_video, save_video_model, write_video
 from foldgauss.io.history import HistoryFile
-from foldgauss.uncertainty.posterior import draws_file
 
 from . import media, models, scenes, texts
 from .models import sealed, tiny_model, unsealed
@@ -190,24 +188,6 @@ def _npz_bomb() -> bytes:
     return out.getvalue()
 
 
-def _h5(change) -> bytes:
-    def write(path: Path) -> None:
-        path.write_bytes(media._chains(4, "earliest"))
-        with h5py.File(path, "r+") as file:
-            change(file)
-        draws_file._seal(path)
-
-    return models.written(write, ".h5")
-
-
-def _huge_chain(file) -> None:
-    group = file["ensemble_1"]
-    for name, shape in (("chain", (4, 2)), ("log_prob", (4,))):
-        del group[name]
-        group.create_dataset(name, (HUGE, *shape), maxshape=(None, *shape), chunks=(2, *shape), dtype="f8")
-    group.attrs["iteration"] = HUGE
-
-
 CLAIMS = {
     "model: Gaussians": ("model", lambda: _model(num_gaussians=HUGE)),
     "model: frames": ("model", lambda: _model(num_frames=HUGE)),
@@ -239,7 +219,6 @@ CLAIMS = {
     "masks: pixels": ("masks", lambda: _png(2**31 - 1, 2**31 - 1)),
     "masks: many pixels": ("masks", lambda: _png(2**15, 2**15)),
     "pictures: pixels": ("pictures", lambda: _png(2**31 - 1, 2**31 - 1)),
-    "hdf5: steps": ("hdf5", lambda: _h5(_huge_chain)),
 }
 
 
@@ -305,83 +284,6 @@ def test_lines_that_go_on_are_read_in_time(tmp_path):
 @pytest.mark.parametrize("facts", [{"size": [4, 6], "options": None}, {"size": [4, 6], "fps": "x"}, {"size": 4}])
 def test_notes_of_a_mesh_are_refused_in_words(tmp_path, facts):
     assert _judged(scenes.NOTES, tmp_path, json.dumps(facts).encode()) == "FormatError"
-
-
-def _fingerprint_of_many(file) -> None:
-    file.attrs["fingerprint"] = np.array([media._FINGERPRINT] * 2, dtype="S64")
-
-
-def _no_ensemble(file) -> None:
-    del file["ensemble_1"]
-
-
-def _no_chain(file) -> None:
-    del file["ensemble_0"]["chain"]
-
-
-def _linked(file) -> None:
-    del file["ensemble_0"]["chain"]
-    file["ensemble_0"]["chain"] = h5py.ExternalLink("/etc/other.h5", "/chain")
-
-
-def _outside(file) -> None:
-    del file["ensemble_0"]["accepted"]
-    file["ensemble_0"].create_dataset("accepted", (4,), "f8", external=[("/etc/hostname", 0, h5py.h5f.UNLIMITED)])
-
-
-def _more_steps(file) -> None:
-    file["ensemble_0"].attrs["iteration"] = 5
-
-
-def _random_place(file) -> None:
-    file["ensemble_0"].attrs["random_state_2"] = 10**6
-
-
-def _random_texts(file) -> None:
-    file["ensemble_0"].attrs["random_state_3"] = "x"
-
-
-def _random_flag(file) -> None:
-    file["ensemble_0"].attrs["random_state_3"] = 2**40
-
-
-def _many_steps(file) -> None:
-    file["ensemble_0"].attrs["iteration"] = [4]
-
-
-def _not_finite(file) -> None:
-    file["ensemble_0"]["chain"][3] = np.nan
-
-
-def _text_for_numbers(file) -> None:
-    file["ensemble_0"].attrs["iteration"] = "four"
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        _fingerprint_of_many, _no_ensemble, _no_chain, _linked, _outside, _more_steps,
-        _random_place, _random_texts, _random_flag, _many_steps, _not_finite,
-        _text_for_numbers,
-    ],
-)  # fmt: skip
-def test_chains_that_emcee_would_stumble_over_are_refused(change, tmp_path):
-    (tmp_path / "c.h5").write_bytes(_h5(change))
-    with pytest.raises(ValueError, match=r"backend: expected a file of draws, or none yet, got .*damaged"):
-        draws_file.DrawsFile(tmp_path / "c.h5", media._FINGERPRINT, media._SHAPE)
-    assert not list(tmp_path.glob(".*"))
-
-
-def test_the_library_never_sees_draws_that_are_damaged(tmp_path, monkeypatch):
-    """On some it does not come back: on one of 800 with a bit or a length changed."""
-    whole = media._chains(4, "earliest")
-    monkeypatch.setattr("h5py.File", lambda *_, **__: pytest.fail("it was opened"))
-    for at in range(0, len(whole), len(whole) // 50):
-        (tmp_path / "c.h5").write_bytes(whole[:at] + bytes([whole[at] ^ 4]) + whole[at + 1 :])
-        if at in range(len(draws_file._SEAL) + 64, draws_file._BLOCK):  # idle
-            continue
-        with pytest.raises(ValueError, match=r"backend: .*damaged"):
-            draws_file.DrawsFile(tmp_path / "c.h5", media._FINGERPRINT, media._SHAPE)
 
 
 @pytest.mark.parametrize("side", [2**13, 2**15])  # beyond our limit, and beyond Pillow's

@@ -10,7 +10,6 @@ from foldgauss.uncertainty import (
     LikelihoodProfiles,
     ProfileCurves,
     exact_posterior,
-    laplace_approximation,
 )
 
 
@@ -23,15 +22,13 @@ def posterior_about(
     nodes = [np.unique(np.clip(np.concatenate([np.linspace(0, 1, 60), t + s * np.linspace(-7, 7, 57)]), 0, 1))
              for t, s in zip(times, std, strict=True)]  # fmt: skip
     values = [-0.5 * ((at - t) / s) ** 2 for at, t, s in zip(nodes, times, std, strict=True)]
-    increments = Increments.with_free(np.asarray(times, float), frames, concentration)
-    log_prob = FrameTimeLogProb(ProfileCurves.from_nodes(nodes, values), increments)
-    exact = exact_posterior(log_prob.curves, increments)
-    laplace = laplace_approximation(log_prob.curves, increments, exact.quantile(0.5))
+    noise = FrameNoise(np.full(num, 0.02), np.full(num, 0.1))
+    profiles = LikelihoodProfiles(ProfileCurves.from_nodes(nodes, values), noise, 0.7 ** np.arange(12.0), 100)
+    increments = Increments(np.asarray(times, float), frames, concentration)
+    exact = exact_posterior(profiles.curves, increments)
     draws = exact.sample(int(np.prod(shape)), seed).reshape(*shape, num)
     ones = np.ones(increments.num_free)
-    noise = FrameNoise(np.full(num, 0.02), np.full(num, 0.1))
-    profiles = LikelihoodProfiles(log_prob.curves, noise, 0.7 ** np.arange(12.0), 100)
     return FrameTimePosterior(
-        log_prob, draws, np.full(shape[0], 0.3), 40 * ones, 1.001 * ones, 1000 * ones, True, "Converged.",
-        laplace, exact, profiles,
+        FrameTimeLogProb(profiles.curves, increments), profiles, exact, draws, np.full(shape[0], 0.3), 40 * ones,
+        1.001 * ones, 1000 * ones, True, "Converged.",
     )  # fmt: skip

@@ -26,7 +26,7 @@ FEW = 120
 
 
 @pytest.mark.parametrize(
-    ("concentration", "replicates"), [(1.0, 80), *[pytest.param(a, REPLICATES, marks=slow) for a in (0.5, 1.0, 3.0)]]
+    ("concentration", "replicates"), [(1.0, 80), *[pytest.param(a, REPLICATES, marks=slow) for a in (1.0, 3.0)]]
 )
 def test_exact_posterior_is_calibrated(concentration, replicates):
     found = ranks(concentration=concentration, replicates=replicates)
@@ -83,7 +83,7 @@ def test_wrong_prior_is_detected(monkeypatch):
     right = Increments.draw_prior
 
     def wrong(self, rng, num):
-        return right(Increments(self.held, self.free, 4 * self.concentration), rng, num)
+        return right(Increments(self.held, None, 4 * self.concentration), rng, num)
 
     monkeypatch.setattr(Increments, "draw_prior", wrong)
     settings = {"num_frames": 4, "replicates": REPLICATES}

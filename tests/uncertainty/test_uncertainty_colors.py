@@ -97,8 +97,8 @@ def test_estimated_profile_with_all_probes_is_exact(over):
 
 def test_estimate_is_near_the_exact_profile(over):
     model, video, base = over
-    exact = marginalize_colors(model, video, base, frames=[FRAME], prior_scale=PRIOR)
-    near = marginalize_colors(model, video, base, frames=[FRAME], prior_scale=PRIOR, most_dense=0, probes=16)
+    exact = marginalize_colors(model, video, base, frames=[FRAME], prior_scale=PRIOR).curves
+    near = marginalize_colors(model, video, base, frames=[FRAME], prior_scale=PRIOR, most_dense=0, probes=16).curves
     nodes, values = exact[FRAME].nodes_and_values(0)
     top = values > -module.REACH
     np.testing.assert_allclose(near[FRAME](nodes[top, None])[:, 0], values[top], atol=0.5)
@@ -106,7 +106,7 @@ def test_estimate_is_near_the_exact_profile(over):
 
 def test_narrow_color_prior_gives_the_base_profile(over):
     model, video, base = over
-    found = marginalize_colors(model, video, base, frames=[FRAME], prior_scale=1e-7)
+    found = marginalize_colors(model, video, base, frames=[FRAME], prior_scale=1e-7).curves
     nodes, values = base.curves.nodes_and_values(FRAME)
     top = values > -8
     np.testing.assert_allclose(found[FRAME](nodes[top, None])[:, 0], values[top], atol=0.1)
@@ -116,6 +116,8 @@ def test_profiles_widen_and_those_of_other_frames_are_kept(scene):
     model, video, base = scene
     done = []
     found = marginalize_colors(model, video, base, frames=[2, 4], on_frame=lambda *each: done.append(each))
+    assert found.level == "colors"
+    found = found.curves
     assert done == [(1, 2), (2, 2)]
     for k in range(NUM_FRAMES):
         if k not in (2, 4):
@@ -153,7 +155,7 @@ def test_information_decreases_with_free_colors(scene):
 def test_seeds_reproduce(over):
     model, video, base = over
     few = {"frames": [FRAME], "most_dense": 0, "probes": 2}
-    one, same, other = (marginalize_colors(model, video, base, **few, seed=seed) for seed in (1, 1, 2))
+    one, same, other = (marginalize_colors(model, video, base, **few, seed=seed).curves for seed in (1, 1, 2))
     np.testing.assert_array_equal(one.values, same.values)
     assert one.count[FRAME] != other.count[FRAME] or (one.values[FRAME] != other.values[FRAME]).any()
 

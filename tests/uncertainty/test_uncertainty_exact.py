@@ -1,14 +1,14 @@
-"""The forward-backward algorithm and Laplace's approximation, against quadrature and Gaussians."""
+"""The forward-backward algorithm, against quadrature and Gaussians."""
 
 import numpy as np
 import pytest
+import scipy.special
 import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.integrate import trapezoid
 from time_clips import free_times, parabolas
 
-from foldgauss.uncertainty import FrameTimeLogProb, Increments, ProfileCurves, exact_posterior, laplace_approximation
+from foldgauss.uncertainty import FrameTimeLogProb, Increments, ProfileCurves, exact_posterior
 
 #: Far from each other, in standard deviations: the order does not constrain them, and the posterior is Gaussian.
 FAR = np.array([0.2, 0.4, 0.55, 0.8]), np.array([0.01, 0.02, 0.015, 0.01])
@@ -35,25 +35,25 @@ def assert_near(found, frames, priors, starts, lengths):
 
 
 def by_quadrature(curves, increments, far: float, points: int):
-    """Mean and covariance of the free times, and the log-evidence, by sums over a grid of log-ratios."""
-    log_prob, num = FrameTimeLogProb(curves, increments), increments.num_free
+    """Mean and covariance of the free times, and the log-evidence, by sums over a grid of log-ratios of increments."""
+    num = increments.num_free
     z = np.linspace(-far, far, points)
     grid = np.stack(np.meshgrid(*[z] * num, indexing="ij"), -1).reshape(-1, num)
-    heights, times = log_prob(grid), increments.times(grid)[:, increments.free]
+    fractions = scipy.special.softmax(np.concatenate([grid, np.zeros((len(grid), 1))], 1), axis=1)
+    times = np.cumsum(fractions, axis=1)[:, :-1]
+    heights = FrameTimeLogProb(curves, increments)(times) + np.log(fractions).sum(1)  # the Jacobian
     weights = np.exp(heights - heights.max())
     mean = weights @ times / weights.sum()
     covariance = (times - mean).T @ ((times - mean) * weights[:, None]) / weights.sum()
     return mean, covariance, np.log(weights.sum()) + heights.max() + num * np.log(z[1] - z[0])
 
 
-@pytest.mark.parametrize(
-    "concentration", [0.2, 1.0, 20.0, *(pytest.param(a, marks=pytest.mark.slow) for a in (0.5, 4.0))]
-)
+@pytest.mark.parametrize("concentration", [1.0, 1.5, 20.0])
 @pytest.mark.parametrize("means", [(0.4, 0.6), (0.5, 0.52), (0.62, 0.45), (0.1, 0.9)])
 def test_two_frames_agree_with_quadrature(concentration, means):
     # Also where frames are so near, or so far out of order, that only their order separates them.
     curves, increments = parabolas(means, (0.06, 0.1), 401), free_times(4, concentration)
-    mean, covariance, likelihood_profiles = by_quadrature(curves, increments, 14 / min(concentration, 1), 501)
+    mean, covariance, likelihood_profiles = by_quadrature(curves, increments, 14, 501)
     found = exact_posterior(curves, increments)
     std = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(found.mean()[1:-1], mean, atol=2e-3 * std.min())
@@ -75,7 +75,7 @@ def test_three_frames_agree_with_quadrature(concentration):
 def test_draws_have_the_quadratures_covariance():
     curves, increments = parabolas((0.5, 0.52), (0.06, 0.1), 401), free_times(4)
     _, covariance, _ = by_quadrature(curves, increments, 14, 501)
-    draws = exact_posterior(curves, increments).sample(40_000, 1)[:, 1:-1]
+    draws = exact_posterior(curves, increments).sample(10_000, 1)[:, 1:-1]
     found = np.corrcoef(draws.T)[0, 1]
     assert found == pytest.approx(covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]), abs=0.02)
     np.testing.assert_allclose(np.cov(draws.T).diagonal(), covariance.diagonal(), rtol=0.03)
@@ -108,24 +108,23 @@ def test_draws_follow_the_known_marginals():
     assert (draws != found.sample(5000, 4)).any()
 
 
-@pytest.mark.parametrize("concentration", [0.2, 0.5, 1.0, 4.0, 20.0])
+@pytest.mark.parametrize("concentration", [1.0, 4.0, 20.0])
 def test_draws_follow_the_exact_marginals_where_order_ties(concentration):
     found = exact_posterior(parabolas((0.45, 0.47, 0.6), (0.08, 0.08, 0.1), 401), free_times(5, concentration))
     draws = found.sample(4000, 0)
-    for n, (grid, density) in enumerate(zip(found.grids, found.densities, strict=True)):
-        steps = (density[1:] + density[:-1]) / 2 * np.diff(grid)
-        summed = np.concatenate([[0], np.cumsum(steps)])
+    for n, (edges, masses) in enumerate(zip(found.edges, found.masses, strict=True)):
+        summed = np.concatenate([[0], np.cumsum(masses)])
 
-        def cdf(t, grid=grid, summed=summed):
-            return np.interp(t, grid, summed)
+        def cdf(t, edges=edges, summed=summed):
+            return np.interp(t, edges, summed)
 
         assert scipy.stats.kstest(draws[:, n + 1], cdf).pvalue > 1e-3
 
 
-LONG = [pytest.param(150, a, marks=pytest.mark.slow) for a in (0.2, 1.0, 3.0, 20.0)]
+LONG = [pytest.param(150, a, marks=pytest.mark.slow) for a in (1.0, 3.0, 20.0)]
 
 
-@pytest.mark.parametrize(("num", "concentration"), [*[(n, a) for n in (4, 30) for a in (0.2, 1.0, 3.0, 20.0)], *LONG])
+@pytest.mark.parametrize(("num", "concentration"), [*[(n, a) for n in (4, 30) for a in (1.0, 3.0, 20.0)], *LONG])
 def test_flat_profiles_give_the_prior(num, concentration):
     found = exact_posterior(flat_except(num), free_times(num, concentration))
     frames = sorted({1, 2, num // 3, num // 2, num - 2})
@@ -134,7 +133,7 @@ def test_flat_profiles_give_the_prior(num, concentration):
     assert found.log_evidence == pytest.approx(0, abs=5e-3 if num > 100 else 1e-3)
 
 
-@pytest.mark.parametrize("concentration", [0.2, 0.5, 1.0, 3.0, 20.0])
+@pytest.mark.parametrize("concentration", [1.0, 3.0, 20.0])
 def test_known_frame_splits_the_prior_in_two(concentration):
     # Its time is known to 1e-6, all others are flat: Beta densities on both sides.
     num, known = 12, 5
@@ -149,13 +148,28 @@ def test_known_frame_splits_the_prior_in_two(concentration):
     assert found.log_evidence == pytest.approx(likelihood_profiles + np.log(1e-6 * np.sqrt(2 * np.pi)), abs=3e-3)
 
 
+@pytest.mark.parametrize("concentration", [1.0, 3.0, 20.0])
+@pytest.mark.parametrize("gap", [1e-4, 0.2])
+def test_evidence_of_increments_that_the_prior_hardly_allows(concentration, gap):
+    num, known, width = 30, 12, 1e-7
+    parts = [flat_except(num, (known + n,), 0.4 + n * gap, width)[known + n] for n in (0, 1)]
+    flat = flat_except(num)
+    curves = [parts[k - known] if k in (known, known + 1) else flat[k] for k in range(num)]
+    curves = ProfileCurves.from_nodes(*zip(*(each.nodes_and_values(0) for each in curves), strict=True))
+    found = exact_posterior(curves, free_times(num, concentration))
+    grouped = concentration * np.array([known, 1, num - 2 - known])
+    expected = scipy.stats.dirichlet.logpdf([0.4, gap, 0.6 - gap], grouped) + 2 * np.log(width * np.sqrt(2 * np.pi))
+    assert found.log_evidence == pytest.approx(expected, abs=0.02)
+    np.testing.assert_allclose(found.mean()[[known, known + 1]], [0.4, 0.4 + gap], atol=3 * width)
+
+
 def test_many_flat_profiles_need_few_grid_points():
     found = exact_posterior(flat_except(300), free_times(300))
-    assert max(map(len, found.grids)) < 1000
+    assert max(map(len, found.edges)) < 1000
     assert_near(found, [150], [scipy.stats.beta(150, 149)], [0], [1])
 
 
-@pytest.mark.parametrize("concentration", [0.2, 1.0, *(pytest.param(c, marks=pytest.mark.slow) for c in (3.0, 20.0))])
+@pytest.mark.parametrize("concentration", [1.0, 1.5, *(pytest.param(c, marks=pytest.mark.slow) for c in (3.0, 20.0))])
 @pytest.mark.parametrize("known", [(), (5,)])
 def test_increments_of_draws_follow_the_prior(concentration, known):
     num, many = 12, 3000
@@ -169,14 +183,7 @@ def test_increments_of_draws_follow_the_prior(concentration, known):
             start, stop = 0, 11
         length = {(0, 5): 0.4, (5, 11): 0.6, (0, 11): 1.0}[start, stop]
         prior = scipy.stats.beta(concentration, concentration * (stop - start - 1))
-        # Times have a resolution of 1e-16: increments below 1e-13 are not resolved.
-        below = prior.cdf(1e-13 / length)
-
-        def cdf(step, prior=prior, length=length):
-            return np.where(step > 1e-13, prior.cdf(step / length), 0.0)
-
-        assert (steps[:, k] < 1e-13).mean() == pytest.approx(below, abs=4 * np.sqrt(below / many) + 1e-4)
-        assert scipy.stats.kstest(np.maximum(steps[:, k], 1e-13), cdf).pvalue > 1e-3
+        assert scipy.stats.kstest(steps[:, k] / length, prior.cdf).pvalue > 1e-3
         if not known:
             marginal = scipy.stats.beta(concentration * (k + 1), concentration * (10 - k)) if k < 10 else None
             assert marginal is None or scipy.stats.kstest(draws[:, k + 1], marginal.cdf).pvalue > 1e-3
@@ -189,15 +196,16 @@ def test_levels_are_checked():
 
 
 @settings(max_examples=15, deadline=None)
-@given(seed=st.integers(0, 10_000), concentration=st.sampled_from([0.5, 1.0, 3.0]))
+@given(seed=st.integers(0, 10_000), concentration=st.sampled_from([1.0, 1.5, 3.0]))
 def test_densities_integrate_to_one_and_means_increase(seed, concentration):
     rng = np.random.default_rng(seed)
     num = int(rng.integers(1, 6))
     curves = parabolas(np.sort(rng.uniform(0.1, 0.9, num)), rng.uniform(0.02, 0.3, num))
     found = exact_posterior(curves, free_times(num + 2, concentration))
-    for grid, density in zip(found.grids, found.densities, strict=True):
-        assert (density >= 0).all()
-        assert trapezoid(density, grid) == pytest.approx(1)
+    for edges, masses in zip(found.edges, found.masses, strict=True):
+        assert (masses >= 0).all()
+        assert masses.sum() == pytest.approx(1)
+        assert (np.diff(edges) > 0).all()
     assert (np.diff(found.mean()) > 0).all()
     assert (np.diff(found.quantile(0.5)) > 0).all()
     assert (found.interval(0.5)[0] >= found.interval(0.9)[0]).all()
@@ -207,7 +215,7 @@ def test_densities_integrate_to_one_and_means_increase(seed, concentration):
 def test_runs_are_independent():
     held = np.array([0, 0.2, 0.4, 0.55, 0.8, 1])
     curves = parabolas(*FAR, 801)
-    part = exact_posterior(curves, Increments.with_free(held, [1, 3, 4]))
+    part = exact_posterior(curves, Increments(held, [1, 3, 4]))
     np.testing.assert_allclose(part.std()[[0, 2, 5]], 0)
     np.testing.assert_allclose(part.std()[[1, 3, 4]], FAR[1][[0, 2, 3]], rtol=5e-3)
     np.testing.assert_array_equal(part.sample(5)[:, 2], 0.4)
@@ -222,42 +230,3 @@ def test_probabilities_of_quantiles_are_checked():
     found = exact_posterior(parabolas([0.5], [0.1]), free_times(3))
     with pytest.raises(ValueError, match="probability"):
         found.quantile(1.5)
-
-
-# Laplace's approximation
-
-
-def test_laplace_is_exact_for_gaussians():
-    means, widths = FAR
-    found = laplace_approximation(parabolas(*FAR, 801), free_times(6, 1e-6), np.linspace(0, 1, 6))
-    np.testing.assert_allclose(found.mode[1:-1], means, atol=1e-5)
-    np.testing.assert_allclose(found.std[1:-1], widths, rtol=1e-3)
-    draws = found.sample(20_000, 0)
-    np.testing.assert_allclose(draws.std(0)[1:-1], widths, rtol=0.03)
-    np.testing.assert_array_equal(draws, found.sample(20_000, 0))
-
-
-def test_laplace_is_at_the_mode_of_the_log_ratios_density():
-    curves, increments = parabolas((0.5, 0.52), (0.06, 0.1), 401), free_times(4, 2.0)
-    found = laplace_approximation(curves, increments, np.linspace(0, 1, 4))
-    log_prob = FrameTimeLogProb(curves, increments)
-    top = increments.coordinates(found.mode)
-    around = top + 1e-2 * np.random.default_rng(0).standard_normal((200, 2))
-    assert (log_prob(around) <= log_prob(top)).all()
-    # Its covariance is the inverse of the negative Hessian there, transformed to times.
-    step = 1e-3 * np.eye(2)
-    hessian = np.array(
-        [[(log_prob(top + a + b) - log_prob(top + a - b) - log_prob(top - a + b) + log_prob(top - a - b)) / 4e-6
-          for a in step] for b in step]
-    )  # fmt: skip
-    jacobian = (increments.times(top + step) - increments.times(top - step))[:, 1:-1].T / 2e-3
-    covariance = jacobian @ np.linalg.inv(-hessian) @ jacobian.T
-    np.testing.assert_allclose(found.std[1:-1], np.sqrt(np.diag(covariance)), rtol=0.15)
-
-
-def test_laplace_is_near_the_exact_posterior_for_separate_frames():
-    curves, increments = parabolas((0.3, 0.5, 0.7), (0.02, 0.03, 0.02), 401), free_times(5)
-    exact = exact_posterior(curves, increments)
-    found = laplace_approximation(curves, increments, exact.quantile(0.5))
-    np.testing.assert_allclose(found.std, exact.std(), rtol=0.05, atol=1e-12)
-    assert (np.diff(found.sample(500)) > 0).all()

@@ -34,7 +34,6 @@ def test_times_in_frames(posterior):
     assert lines["dropped"].get_xdata().tolist() == [12.5]
     half = np.diff(posterior.exact.interval(0.9), axis=0)[0, 1:-1] * 10
     np.testing.assert_allclose(lines["exact, 90%"].get_ydata(), half)
-    np.testing.assert_allclose(lines["Laplace, 90%"].get_ydata()[7:9], half[7:9], rtol=0.1)
     assert "frames" in upper.get_ylabel()
     own = pyplot.subplots(2, 1)[1]
     assert plots.plot_times(posterior, own) is own
@@ -51,32 +50,6 @@ def test_increments(posterior):
     assert low < 0
     assert high > 2.2
     assert plots.plot_increments(posterior, ax=ax, flagged=[]) is ax
-
-
-def test_pairs_of_frames(posterior):
-    axes = plots.plot_pairs(posterior, [3, 9])
-    axes[0, 0].figure.canvas.draw()
-    assert axes.shape == (2, 2)
-    grid, density = axes[0, 0].lines[0].get_data()
-    assert np.trapezoid(density, grid) == pytest.approx(1, abs=1e-6)
-    assert np.trapezoid(grid * density, grid) == pytest.approx(0, abs=3e-3)
-    assert axes[1, 0].get_xlabel() == "$t_{3}$ (frames)"
-    assert plots.plot_pairs(posterior).shape == (4, 4)
-    assert plots.plot_pairs(posterior, [5]).shape == (1, 1)
-    for wrong in ([0, 3], [3, 3], [], range(1, 9)):
-        with pytest.raises(ValueError, match="frames: expected"):
-            plots.plot_pairs(posterior, wrong)
-
-
-def test_trace_has_a_line_for_each_ensemble(posterior):
-    axes = plots.plot_trace(posterior, [7])
-    lines = [line for line in axes[0, 0].lines if line.get_label().startswith("ensemble")]
-    expected = (posterior.times[:, :, :, 7].mean(2) - posterior.mean()[7]) * 20
-    np.testing.assert_allclose([line.get_ydata() for line in lines], expected)
-    assert "R-hat 1.0010" in axes[0, 0].get_title()
-    assert plots.plot_trace(posterior).shape[1] == 2
-    with pytest.raises(ValueError, match="frames: expected"):
-        plots.plot_trace(posterior, [0])
 
 
 def test_correlation_title_states_the_effective_number(posterior):

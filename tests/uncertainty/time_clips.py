@@ -19,7 +19,7 @@ def parabolas(means, widths, num_nodes: int = 201) -> ProfileCurves:
 
 
 def free_times(num_frames: int, concentration: float = 1.0) -> Increments:
-    return Increments.with_free(np.linspace(0, 1, num_frames), None, concentration)
+    return Increments(np.linspace(0, 1, num_frames), None, concentration)
 
 
 @functools.cache

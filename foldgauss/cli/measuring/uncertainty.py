@@ -19,20 +19,20 @@ from foldgauss.cli.shared.rendering import progress_bars
 from foldgauss.io._atomic import atomic_path, translate_output_errors, write_or_keep
 from foldgauss.io._lock import lock_output
 from foldgauss.io.models.video_model import load_video_model, read_origin
-from foldgauss.uncertainty import frame_time_log_prob, frame_time_posterior, likelihood_profiles
+from foldgauss.uncertainty import Increments, frame_time_posterior, likelihood_profiles, marginalize_colors
 from foldgauss.uncertainty.diagnostics import plots
 from foldgauss.uncertainty.diagnostics.irregularities import irregularities
 from foldgauss.uncertainty.diagnostics.report import frame_table, summary
 from foldgauss.uncertainty.likelihood.noise import NOISES
-from foldgauss.uncertainty.posterior.increments import Increments
-from foldgauss.uncertainty.posterior.log_prob import LEVELS, condition_on_level
 from foldgauss.uncertainty.posterior.optional_imports import import_optional
 from foldgauss.uncertainty.posterior.result import FrameTimePosterior
-from foldgauss.uncertainty.posterior.settings import check_settings
+from foldgauss.uncertainty.posterior.sampling import check_settings
 from foldgauss.video.models.video_model import VideoModel
 
 CHAINS = "chains.h5"
-PLOTS = ("times.png", "increments.png", "corner.png", "trace.png", "correlation.png")
+PLOTS = ("times.png", "increments.png", "correlation.png")
+#: What the posterior is conditioned on: all splats, or all but their colors.
+LEVELS = ("splats", "colors")
 FILES = ("frame_times.csv", "summary.md", "posterior.nc", *PLOTS)
 #: Largest number of draws of each ensemble in posterior.nc, evenly spaced; all of them may take gigabytes.
 MAX_DRAWS = 4000
@@ -79,9 +79,6 @@ def uncertainty_command(
             help="Concentration of the Dirichlet prior on increments: 1 is uniform, more favors equal increments."
         ),
     ] = 1.0,
-    walkers: Annotated[
-        int | None, typer.Option(help="Walkers of each ensemble [default: chosen by the number of frames].")
-    ] = None,
     ensembles: Annotated[int, typer.Option(help="Independent ensembles, compared by R-hat.")] = 4,
     steps: Annotated[
         int, typer.Option(help="Largest number of steps; sampling ends earlier once it has converged.")
@@ -113,8 +110,8 @@ def uncertainty_command(
         expected = f"the {model.num_frames} frames that the model was fitted to: its first is at 0 and its last at 1"
         cure = "To sample the times of some of them: --only A:B."
         raise invalid("--frames", expected=expected, got=f"{clip.num_frames} of this clip", cure=cure)
-    num_free = _count_free(clip.num_frames, wanted, concentration)
-    check_settings(num_free, walkers=walkers, ensembles=ensembles, steps=steps)
+    _check_frames(clip.num_frames, wanted, concentration)
+    check_settings(steps, ensembles, seed)
     make_folder(out_dir)
     own = tuple(out_dir / name for name in FILES)
     context.with_resource(lock_output(out_dir / CHAINS, own=own, what="run of uncertainty"))
@@ -122,15 +119,14 @@ def uncertainty_command(
         profiles = likelihood_profiles(
             model, clip.frames, noise=noise, on_render=lambda done, total: show("Rendering", done, total)
         )
-        profiles = condition_on_level(
-            level, model, clip.frames, profiles, wanted, lambda done, total: show("Integrating colors", done, total)
-        )
-        log_prob = frame_time_log_prob(model, frames=wanted, concentration=concentration, profiles=profiles)
-        settings = {"walkers": walkers, "ensembles": ensembles, "steps": steps, "seed": seed}
-        posterior = _sample(out_dir / CHAINS, overwrite, show, profiles=profiles, log_prob=log_prob, **settings)
+        if level == "colors":
+            on_frame = lambda done, total: show("Integrating colors", done, total)  # noqa: E731
+            profiles = marginalize_colors(model, clip.frames, profiles, frames=wanted, on_frame=on_frame)
+        settings = {"concentration": concentration, "ensembles": ensembles, "steps": steps, "seed": seed}
+        posterior = _sample(out_dir / CHAINS, overwrite, show, profiles=profiles, frames=wanted, **settings)
     fitted = np.asarray(model.frame_times.times(), np.float64) if model.num_frames == clip.num_frames else None
     title = f"{model_path.name}, by {Path(clip.source).name}"
-    written = write_or_keep(out_dir, lambda folder: _write(folder, posterior, fitted, title, level))
+    written = write_or_keep(out_dir, lambda folder: _write(folder, posterior, fitted, title))
     out.print((written / "summary.md").read_text(), soft_wrap=True)
     if not posterior.converged:
         warn(f"{posterior.message} The draws so far are in {written}.")
@@ -152,12 +148,12 @@ def _parse_only(text: str | None) -> list[int] | None:
     return sorted(set(found))
 
 
-def _count_free(num_frames: int, only: list[int] | None, concentration: float) -> int:
-    """The number of sampled times; refuses frames that have none, before anything is rendered."""
+def _check_frames(num_frames: int, only: list[int] | None, concentration: float) -> None:
+    """Refuse frames without times to sample, before anything is rendered."""
     if num_frames < 3:
         raise invalid("--frames", expected="at least 3 frames", got=num_frames)
     try:
-        return Increments.with_free(np.linspace(0.0, 1.0, num_frames), only, concentration).num_free
+        Increments(np.linspace(0.0, 1.0, num_frames), only, concentration)
     except ParameterError as error:
         raise ParameterError("--only" if error.parameter == "frames" else error.parameter, error.problem) from error
 
@@ -166,14 +162,14 @@ def _sample(path: Path, overwrite: bool, show: Callable, **arguments: Any) -> Fr
     """Sample, from the draws of a stopped run if there are any; with `overwrite`, draws of another run are replaced."""
     existed, sampled = path.exists(), False
 
-    def on_steps(what: str, done: int, total: int) -> None:
+    def on_steps(done: int, total: int) -> None:
         nonlocal sampled
         sampled = True
         show("Sampling", done, total)
 
     try:
         with translate_output_errors(path):
-            posterior = frame_time_posterior(progress=on_steps, backend=path, **arguments)
+            posterior = frame_time_posterior(on_progress=on_steps, backend=path, **arguments)
     except ParameterError as error:
         if error.parameter != "backend":
             raise
@@ -190,21 +186,18 @@ def _sample(path: Path, overwrite: bool, show: Callable, **arguments: Any) -> Fr
     return posterior
 
 
-def _write(folder: Path, posterior: FrameTimePosterior, fitted: np.ndarray | None, title: str, level: str) -> Path:
+def _write(folder: Path, posterior: FrameTimePosterior, fitted: np.ndarray | None, title: str) -> Path:
     """Write all files, each atomically, the most important ones first; returns the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     flagged = irregularities(posterior)
     _write_table(folder / "frame_times.csv", frame_table(posterior, fitted))
     with atomic_path(folder / "summary.md") as temporary:
-        text = summary(posterior, fitted, flagged=flagged, level=level)
+        text = summary(posterior, fitted, flagged=flagged)
         temporary.write_text(f"# Frame times of {title}\n\n{text}")
     _write_netcdf(folder / "posterior.nc", posterior)
     _save_plot(folder / "times.png", plots.plot_times, posterior, fitted=fitted, flagged=flagged)
     _save_plot(folder / "increments.png", plots.plot_increments, posterior, flagged=flagged)
-    _save_plot(folder / "corner.png", plots.plot_pairs, posterior)
-    _save_plot(folder / "trace.png", plots.plot_trace, posterior)
-    if posterior.profiles is not None:
-        _save_plot(folder / "correlation.png", plots.plot_correlation, posterior.profiles)
+    _save_plot(folder / "correlation.png", plots.plot_correlation, posterior.profiles)
     return folder
 
 

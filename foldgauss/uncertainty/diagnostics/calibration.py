@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float32, Float64, Int
 
 from foldgauss._numerics.random_streams import Stream, make_generator, seed_sequence
 from foldgauss._runtime.checks import invalid
-from foldgauss.uncertainty.likelihood.likelihood_profiles import ProfileBuilder
+from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles, ProfileBuilder
 from foldgauss.uncertainty.likelihood.noise import NOISES, FrameNoise
 from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.uncertainty.posterior.exact import exact_posterior
@@ -107,7 +107,7 @@ def simulated_ranks(
         assumed = assumed.for_frames(num_frames)
     elif assumed not in NOISES:
         raise invalid("assumed_noise", expected=f"one of {', '.join(NOISES)}, or a FrameNoise", got=assumed_noise)
-    increments = Increments.with_free(np.linspace(0.0, 1.0, num_frames), None, concentration)
+    increments = Increments(np.linspace(0.0, 1.0, num_frames), None, concentration)
     cache = _RenderCache(model)
     ranks, true, converged = [], [], 0
     for seeds in seed_sequence(Stream.CALIBRATION, seed=seed).spawn(replicates):
@@ -120,8 +120,13 @@ def simulated_ranks(
         else:
             builder = ProfileBuilder(_SimulatedResiduals(cache, frames))
         builder.compare_coarse()
-        log_prob = FrameTimeLogProb(builder.build(assumed).curves, increments)
-        sample, success = _sample_posterior(log_prob, sampler, draws, steps, int(rng.integers(2**31)))
+        profiles = builder.build(assumed)
+        log_prob = FrameTimeLogProb(profiles.curves, increments)
+        seed_of_draws = int(rng.integers(2**31))
+        if sampler == "exact":
+            sample, success = exact_posterior(profiles.curves, increments).sample(draws, seed_of_draws), True
+        else:
+            sample, success = _sample_by_emcee(profiles, concentration, draws, steps, seed_of_draws)
         any_frame = int(rng.integers(1, num_frames - 1))
         ranks.append(_ranks(log_prob, times, sample, any_frame))
         true.append(times)
@@ -232,14 +237,12 @@ class _SimulatedResiduals:
         return self.frames[k] - image
 
 
-def _sample_posterior(
-    log_prob: FrameTimeLogProb, sampler: str, draws: int, steps: int, seed: int
+def _sample_by_emcee(
+    profiles: LikelihoodProfiles, concentration: float, draws: int, steps: int, seed: int
 ) -> tuple[Float64[np.ndarray, "draws num_frames"], bool]:
-    if sampler == "exact":
-        return exact_posterior(log_prob.curves, log_prob.increments).sample(draws, seed), True
     from foldgauss.uncertainty.posterior.sampling import frame_time_posterior
 
-    found = frame_time_posterior(log_prob=log_prob, steps=steps, ensembles=2, seed=seed, progress=False)
+    found = frame_time_posterior(profiles, concentration=concentration, steps=steps, ensembles=2, seed=seed)
     if len(found.draws) < draws:
         raise invalid("steps", expected=f"enough steps for {draws} kept draws", got=steps)
     which = make_generator(Stream.THINNING, seed=seed).choice(len(found.draws), draws, replace=False)

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
-from foldgauss._runtime.checks import invalid, is_integer, is_within
+from foldgauss._runtime.checks import check_within, invalid, is_integer
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles, likelihood_profiles
 from foldgauss.uncertainty.likelihood.noise import FrameNoise
 from foldgauss.uncertainty.posterior.exact import exact_posterior
@@ -61,8 +61,7 @@ def increment_intervals(posterior: FrameTimePosterior, level: float = 0.95) -> I
 
     An increment between two held frames varies only through the median. Raises ValueError for a level outside (0, 1).
     """
-    if not is_within(level, "(0, 1)"):
-        raise invalid("level", expected="a number in (0, 1)", got=level)
+    check_within("level", level, "(0, 1)", "a number in (0, 1)")
     steps = np.diff(_thin_draws(posterior), axis=1)
     steps /= np.median(steps[:, ~find_cuts(posterior)], axis=1, keepdims=True)
     low, high = np.quantile(steps, [(1 - level) / 2, (1 + level) / 2], axis=0)
@@ -94,12 +93,9 @@ def irregularities(
 
     **Example:** `[one.frames for one in irregularities(posterior) if one.kind == "duplicated"]`.
     """
-    if not is_within(duplicate, "(0, 1)"):
-        raise invalid("duplicate", expected="a number in (0, 1)", got=duplicate)
-    if not (np.isfinite(dropped) and dropped > 1):
-        raise invalid("dropped", expected="a number > 1", got=dropped)
-    if not is_within(probability, "(0, 1]"):
-        raise invalid("probability", expected="a number in (0, 1]", got=probability)
+    check_within("duplicate", duplicate, "(0, 1)", "a number in (0, 1)")
+    check_within("dropped", dropped, "(1, inf)", "a number > 1")
+    check_within("probability", probability, "(0, 1]", "a number in (0, 1]")
     if not is_integer(reach, 1):
         raise invalid("reach", expected="a whole number >= 1", got=reach)
     steps, assessable, found = np.diff(_thin_draws(posterior), axis=1), is_assessable(posterior), []
@@ -168,7 +164,7 @@ def _compare(
     even = np.linspace(0.0, 1.0, num_frames)
     # Profiles are 0 at their modes: the log-likelihood there is rendered.
     zero = float(rendered_log_likelihood(model, video, profiles.curves.modes(), profiles.noise).sum())
-    found = exact_posterior(profiles.curves, Increments.with_free(even, None, concentration))
+    found = exact_posterior(profiles.curves, Increments(even, None, concentration))
     own = np.asarray(model.frame_times.times(), np.float64)
     return TimesComparison(
         name,

@@ -1,7 +1,6 @@
 """Summary of the posterior of frame times as Markdown and as a table."""
 
 from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +14,7 @@ def frame_table(
     posterior: FrameTimePosterior, fitted: Float[np.ndarray, " num_frames"] | None = None
 ) -> dict[str, np.ndarray]:
     """Columns with one entry per frame: `frame`, `fitted` (NaN if not given), `mean`, `std`, `low_50`, `high_50`,
-    `low_90`, `high_90`, `laplace_mode`, `laplace_std`, `exact_mean`, `exact_std`, `r_hat`, `tau`, `ess`, `identified`.
+    `low_90`, `high_90`, `exact_mean`, `exact_std`, `r_hat`, `tau`, `ess`, `identified`.
 
     **Units:** times of the model, [0, 1]; `tau` in steps. Held frames have a spread of 0, NaN for `r_hat`, `tau` and
     `ess`, and count as identified. Raises ValueError for `fitted` of another length.
@@ -34,8 +33,6 @@ def frame_table(
         "high_50": inner[1],
         "low_90": outer[0],
         "high_90": outer[1],
-        "laplace_mode": posterior.laplace.mode,
-        "laplace_std": posterior.laplace.std,
         "exact_mean": posterior.exact.mean(),
         "exact_std": posterior.exact.std(),
     }
@@ -50,26 +47,22 @@ def summary(
     fitted: Float[np.ndarray, " num_frames"] | None = None,
     *,
     flagged: Sequence[Irregularity] | None = None,
-    level: Literal["splats", "colors"] | None = None,
 ) -> str:
     """Results, convergence, and what the posterior is conditioned on, in Markdown.
 
-    `fitted`: the model's own times, for comparison. `flagged`: default `irregularities(posterior)`. `level`: whether
-    all splats are held or their colors are integrated out; default: that of its profiles.
+    `fitted`: the model's own times, for comparison. `flagged`: default `irregularities(posterior)`.
 
     **Example:** `print(summary(posterior, model.frame_times.times()))`.
     """
     flagged = irregularities(posterior) if flagged is None else flagged
-    profiles = posterior.profiles
-    level = level or ("splats" if profiles is None else profiles.level)
     parts = [
         posterior.message,
-        *(f"**Note:** {note}" for note in (() if profiles is None else profiles.notes)),
+        *(f"**Note:** {note}" for note in posterior.profiles.notes),
         _sampling(posterior),
         "## Precision\n\n" + _precision(posterior),
         "## Playback speed\n\n" + _playback_speed(posterior, flagged),
         "## Comparison with other times\n\n" + _comparison(posterior, fitted),
-        "## Conditioned on\n\n" + _conditions(posterior, level),
+        "## Conditioned on\n\n" + _conditions(posterior),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -91,16 +84,16 @@ def _sampling(posterior: FrameTimePosterior) -> str:
 
 
 def _precision(posterior: FrameTimePosterior) -> str:
-    """Standard deviations in frames, and whether the three methods agree."""
+    """Standard deviations in frames, and whether emcee and the exact posterior agree."""
     free, (_, unit) = posterior.free, even_times(posterior)
     std = posterior.std()[free]
-    sampled, exact, laplace = std / unit, posterior.exact.std()[free] / unit, posterior.laplace.std[free] / unit
+    sampled, exact = std / unit, posterior.exact.std()[free] / unit
     widest, apart = sampled.argmax(), np.abs(posterior.mean() - posterior.exact.mean())[free] / exact / unit
     lines = [
         f"Standard deviation of a time: median {np.median(sampled):.3g} frames, largest {sampled[widest]:.3g} "
         f"(frame {free[widest]}). One frame is 1 / {1 / unit:.4g} of the model's time.",
         f"emcee against the exact posterior: means differ by at most {apart.max():.2g} standard deviations, the ratio "
-        f"of standard deviations is {_factor(sampled, exact)}. Laplace's approximation: {_factor(laplace, exact)}.",
+        f"of standard deviations is {(sampled / exact).min():.2f} to {(sampled / exact).max():.2f}.",
     ]
     unknown = np.flatnonzero(~posterior.identified())
     if len(unknown):
@@ -159,25 +152,19 @@ def _comparison(posterior: FrameTimePosterior, fitted) -> str:
     return _table(("times", "log-likelihood (nats; 0: each frame near its mode)"), rows)
 
 
-def _conditions(posterior: FrameTimePosterior, level: str) -> str:
+def _conditions(posterior: FrameTimePosterior) -> str:
     increments = posterior.log_prob.increments
-    held = "durations, colors" if level == "splats" else "durations; their colors are integrated out"
+    held = "durations, colors" if posterior.profiles.level == "splats" else "durations; their colors are integrated out"
     lines = [
         f"- The splats, held as fitted: positions, folds, {held}. A warp of time that the folds, or the maps of an "
-        "unsteady camera, have absorbed is not visible: intervals are those of times given these."
+        "unsteady camera, have absorbed is not visible: intervals are those of times given these.",
+        f"- The noise: {posterior.profiles.noise.describe()}.",
+        f"- The prior: Dirichlet on the increments, of concentration {increments.concentration:g}.",
     ]
-    if posterior.profiles is not None:
-        lines.append(f"- The noise: {posterior.profiles.noise.describe()}.")
-    lines.append(f"- The prior: Dirichlet on the increments, of concentration {increments.concentration:g}.")
     held = np.flatnonzero(~increments.free)[1:-1]
     text = "- The first frame at 0 and the last at 1"
     lines.append(f"{text}, and the times of {_listed(held)}, held." if len(held) else f"{text}.")
     return "\n".join(lines)
-
-
-def _factor(one: np.ndarray, other: np.ndarray) -> str:
-    ratio = one / other
-    return f"{ratio.min():.2f} to {ratio.max():.2f}"
 
 
 def _listed(frames: np.ndarray) -> str:

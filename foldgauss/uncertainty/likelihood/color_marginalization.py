@@ -5,6 +5,7 @@ colors, so all of these are integrated out in closed form, with every other fram
 """
 
 import bisect
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -40,7 +41,7 @@ def marginalize_colors(
     probes: int = 4,
     seed: int = 0,
     on_frame: Callable[[int, int], None] | None = None,
-) -> ProfileCurves:
+) -> LikelihoodProfiles:
     r"""Integrate out the colors in the profiles of `frames` (default: all but the first and the last); keep the others.
 
     $$
@@ -92,7 +93,7 @@ def marginalize_colors(
         nodes[k], values[k] = _join(*curve.profile(), nodes[k], values[k])
         if on_frame is not None:
             on_frame(done + 1, len(chosen))
-    return ProfileCurves.from_nodes(nodes, values)
+    return dataclasses.replace(base, curves=ProfileCurves.from_nodes(nodes, values), level="colors")
 
 
 def _check(base: LikelihoodProfiles, num_frames: int, prior_scale: float, most_dense: int, probes: int) -> None:

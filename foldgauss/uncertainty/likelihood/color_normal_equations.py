@@ -3,15 +3,12 @@
 import functools
 from collections.abc import Callable
 
-import numba as nb
 import numpy as np
 import scipy.linalg
 import scipy.sparse
 from jaxtyping import Float, Float64
 
 from foldgauss._runtime.checks import invalid
-from foldgauss._runtime.kernels import kernel
-from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import cpu
 from foldgauss.render.weights import build_weight_matrix
 from foldgauss.uncertainty.likelihood.noise import FrameNoise
@@ -24,14 +21,11 @@ from foldgauss.video.models.splats import SH_C0
 BATCH = 8
 #: Gaussians per block of the preconditioner: larger blocks cost about as much time as they save.
 BLOCK = 512
-#: Gaussians per task.
-CHUNK = 1024
 #: Iteration limit of the solver. The 40,000 Gaussians of a fitted clip take 40 to 200.
 MAX_ITERATIONS = 2000
 
 _behind = np.asarray(BLACK, np.float32)
 _level = 1 / 255
-_d = nb.float64
 
 
 class ColorEquations:
@@ -70,7 +64,7 @@ class ColorEquations:
         return self.residuals.frames[k].reshape(-1, 3) * _level - weights @ self.color
 
     def _accumulate(self, prior_scale: float) -> None:
-        half = scipy.sparse.csr_array((self.num, self.num))
+        self.matrix = scipy.sparse.diags_array(np.full(self.num, prior_scale**-2), format="csr")
         self.rhs, batch = np.zeros((self.num, 3)), []
         for k, t in enumerate(self.times):
             here = self.weights(t)
@@ -78,11 +72,9 @@ class ColorEquations:
             here.data /= np.sqrt(self.variance[k])
             batch.append(here)
             if len(batch) == BATCH or k + 1 == len(self.times):
-                half = half + _upper_gram(scipy.sparse.vstack(batch, format="csr"))
+                rows = scipy.sparse.vstack(batch, format="csr")
+                self.matrix = (self.matrix + rows.T @ rows).tocsr()
                 batch = []
-        diagonal = half.diagonal()
-        own = scipy.sparse.diags_array(prior_scale**-2 - diagonal)
-        self.matrix = (half + half.T + own).tocsr()
         self.matrix.sort_indices()
 
     def at(self, k: int, t: float) -> "FrameAt":
@@ -183,55 +175,3 @@ def _partition(places: Float64[np.ndarray, "num 2"], most: int) -> list[np.ndarr
         part = part[np.argsort(places[part, side], kind="stable")]
         left += [part[: len(part) // 2], part[len(part) // 2 :]]
     return parts
-
-
-def _upper_gram(rows: scipy.sparse.csr_array) -> scipy.sparse.csr_array:
-    """The upper triangle of rows^T rows; the columns of each row must be sorted."""
-    num = rows.shape[1]
-    columns = rows.tocsc()
-    # Position of each entry in its row: it is multiplied by the entries that follow it there.
-    entry = scipy.sparse.csr_array((np.arange(rows.nnz), rows.indices, rows.indptr), shape=rows.shape).tocsc().data
-    starts = range(0, num, CHUNK)
-    parts: list = [None] * len(starts)
-
-    def accumulate(n: int) -> None:
-        span = starts[n], min(starts[n] + CHUNK, num)
-        parts[n] = _gram(*span, num, rows.indptr, rows.indices, rows.data, columns.indptr, columns.indices, entry)
-
-    run_tasks(accumulate, range(len(starts)))
-    counts, indices, values = (np.concatenate(each) for each in zip(*parts, strict=True))
-    indptr = np.concatenate([[0], np.cumsum(counts)])
-    return scipy.sparse.csr_array((values, indices, indptr), shape=(num, num))
-
-
-@kernel
-def _gram(start, stop, num, row_start, indices, values, column_start, pixels, entry):
-    """Rows start..stop of the upper triangle of A^T A: number of entries per row, their columns, their values."""
-    sums, present, touched = np.zeros(num), np.zeros(num, np.bool_), np.empty(num, np.int32)
-    counts = np.zeros(stop - start, np.int64)
-    room, total = 64 * (stop - start), 0
-    found, products = np.empty(room, np.int32), np.empty(room)
-    for i in range(start, stop):
-        count = 0
-        for n in range(column_start[i], column_start[i + 1]):
-            first, own = entry[n], values[entry[n]]
-            for e in range(first, row_start[pixels[n] + 1]):
-                j = indices[e]
-                if not present[j]:
-                    present[j] = True
-                    touched[count] = j
-                    count += 1
-                sums[j] += own * values[e]
-        if total + count > room:
-            room = max(2 * room, total + count)
-            more, further = np.empty(room, np.int32), np.empty(room)
-            more[:total], further[:total] = found[:total], products[:total]
-            found, products = more, further
-        which = np.sort(touched[:count])
-        for n in range(count):
-            j = which[n]
-            found[total + n], products[total + n] = j, sums[j]
-            sums[j], present[j] = _d(0), False
-        total += count
-        counts[i - start] = count
-    return counts, found[:total], products[:total]

@@ -81,20 +81,6 @@ class ProfileCurves:
         which = np.atleast_1d(np.arange(self.num_frames)[which])
         return ProfileCurves(self.nodes[which], self.values[which], self.slopes[which], self.count[which])
 
-    def scaled(self, factor: Float[np.ndarray, "num_frames"] | float) -> "ProfileCurves":
-        """Multiply all log-likelihoods by `factor` > 0, one number or one per frame, to change the noise.
-
-        Raises ValueError for factors that are not finite and positive, and for another number of them.
-        """
-        factor = np.asarray(factor)
-        if factor.dtype.kind not in "iuf" or factor.shape not in ((), (1,), (self.num_frames,)):
-            expected, got = f"a number, or {self.num_frames} of them", f"{factor.dtype} of shape {factor.shape}"
-            raise invalid("factor", expected=expected, got=got)
-        if not (np.isfinite(factor) & (factor > 0)).all():
-            raise invalid("factor", expected="numbers > 0", got=f"one of {factor.min():.3g}")
-        factor = np.broadcast_to(factor.astype(np.float64), self.num_frames)[:, None]
-        return dataclasses.replace(self, values=self.values * factor, slopes=self.slopes * factor)
-
 
 @inline
 def piece_of(value, knots, last):

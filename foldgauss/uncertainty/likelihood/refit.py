@@ -27,7 +27,8 @@ from foldgauss.video.fitting.loop import FitState, fit_steps, start_from, to_mod
 from foldgauss.video.fitting.loop import start as start_anew
 from foldgauss.video.models.video_model import VideoModel
 
-METHODS, STARTS, PLACES = ("pixels", "frames", "order"), ("model", "scratch"), ("kept", "moved")
+METHODS = ("pixels", "frames", "order")
+STARTS = ("model", "scratch")
 #: A refit that starts at the model repeats the schedule from this fraction on, with its last learning rates and loss.
 START_AT = 0.7
 #: The least `LearningRates.cooldown` of refits: the spread is that of the estimate, not of its last steps.
@@ -164,7 +165,6 @@ def refit_frame_times(
     replicates: int = 20,
     method: str = "pixels",
     block: int = 16,
-    place: str = "kept",
     seed: int = 0,
     steps: int | None = None,
     start: str | None = None,
@@ -178,7 +178,7 @@ def refit_frame_times(
     if not is_integer(replicates, 2):
         raise invalid("replicates", expected="a whole number >= 2", got=repr(replicates))
     found = []
-    how = {"method": method, "block": block, "place": place, "seed": seed, "steps": steps, "start": start}
+    how = {"method": method, "block": block, "seed": seed, "steps": steps, "start": start}
     for each in iter_refits(model, video, config, replicates=replicates, **how):
         if on_replicate is not None:
             on_replicate(each)
@@ -195,7 +195,6 @@ def iter_refits(
     first: int = 0,
     method: str = "pixels",
     block: int = 16,
-    place: str = "kept",
     seed: int = 0,
     steps: int | None = None,
     start: str | None = None,
@@ -217,12 +216,11 @@ def iter_refits(
     another seed, the only option for frames. `steps` of each: by default those of `config`, or of the end of its
     schedule; `config.minutes` and a compact model that it asks for are ignored.
 
-    Source: Kuensch 1989 (blocks), Wu 1986 (residuals kept in place), Efron and Tibshirani 1993, chapters 9 and 17.
+    Source: Wu 1986 (random signs), Efron and Tibshirani 1993, chapters 9 and 17.
     Raises ValueError for a video that is not the model's, a config that could not have fitted it, and settings out of
     range.
     """
     check_one_of("method", method, METHODS)
-    check_one_of("place", place, PLACES)
     start = ("scratch" if method == "frames" else "model") if start is None else start
     check_one_of("start", start, STARTS)
     if method == "frames" and start == "model":
@@ -248,7 +246,7 @@ def iter_refits(
         frames = video
         if method == "pixels":
             rng = make_generator(Stream.RESAMPLED_FRAME, number, seed=seed)
-            frames = resample_frames(residuals, block, rng, place=place)
+            frames = resample_frames(residuals, block, rng)
         state = start_from(model, own, own.steps, START_AT) if start == "model" else None
         fitted, psnr = _fit(frames, own, model.fps, state)
         times = np.asarray(fitted.frame_times.times(), np.float64)
@@ -293,25 +291,23 @@ def _fix_steps(config: FitConfig, num_frames: int, start: str, steps: int | None
 
 
 def resample_frames(
-    residuals: Residuals, block: int, rng: np.random.Generator, *, place: str = "kept"
+    residuals: Residuals, block: int, rng: np.random.Generator
 ) -> UInt8[np.ndarray, "num_frames height width 3"]:
     """Bootstrap frames: the model's images plus residuals in blocks with random signs.
 
     A randomly placed grid divides every frame into blocks of `block` pixels, whose residuals are multiplied by 1 or -1.
-    With place="kept" they stay in place, and the variance is the pixel's squared residual, as `score_fraction` assumes.
-    With "moved" they are taken from a random position of the same frame, periodic at its borders, and the variance is
-    uniform, as `effective_fraction` assumes. Values are rounded to 8 bits and clipped.
+    The variance is the pixel's squared residual, as `score_fraction` assumes. Values are rounded to 8 bits and clipped.
     """
     frames = np.empty(residuals.frames.shape, np.uint8)
     times = np.asarray(residuals.model.frame_times.times())
     for k, image in enumerate(residuals.render_at(times)):
-        resampled = image + resample_blocks(residuals.residual(k, image), block, rng, place=place)
+        resampled = image + resample_blocks(residuals.residual(k, image), block, rng)
         frames[k] = np.moveaxis(np.clip(np.rint(255 * resampled), 0, 255), 0, -1)
     return frames
 
 
 def resample_blocks(
-    residual: Float[np.ndarray, "channels height width"], block: int, rng: np.random.Generator, *, place: str = "kept"
+    residual: Float[np.ndarray, "channels height width"], block: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "channels height width"]:
     """Residuals in blocks with random signs, see `resample_frames`."""
     _, height, width = residual.shape
@@ -319,12 +315,7 @@ def resample_blocks(
     row, column = (np.arange(size) + shift for size, shift in zip((height, width), origin, strict=True))
     tile = (row // block)[:, None], (column // block)[None, :]
     shape = tile[0].max() + 1, tile[1].max() + 1
-    sign = rng.choice(np.array([-1, 1], residual.dtype), shape)[tile]
-    if place == "kept":
-        return sign * residual
-    down, right = rng.integers(0, height, shape)[tile], rng.integers(0, width, shape)[tile]
-    y, x = (np.arange(height)[:, None] + down) % height, (np.arange(width)[None, :] + right) % width
-    return sign * residual[:, y, x]
+    return rng.choice(np.array([-1, 1], residual.dtype), shape)[tile] * residual
 
 
 def _leave_out_frames(model: VideoModel, video: np.ndarray, config: FitConfig, number: int, folds: int) -> Refit:

@@ -1,5 +1,5 @@
-"""Posterior of frame times: parametrization and prior, and three ways to compute it.
+"""Posterior of frame times: the prior, and two ways to compute it.
 
-`increments` maps ordered times to unconstrained coordinates; `exact` runs the forward-backward algorithm on grids,
-`laplace` a Gaussian approximation, and `sampling` emcee with convergence checks and resumable files of draws.
+`increments` holds the prior of ordered times; `exact` runs the forward-backward algorithm on grids, and `sampling`
+emcee, with convergence checks and draws in files from which it resumes.
 """

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float64
 
-from foldgauss._runtime.checks import invalid, is_within, short_repr
+from foldgauss._runtime.checks import check_within
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles
 from foldgauss.uncertainty.posterior.exact import ExactPosterior
-from foldgauss.uncertainty.posterior.laplace import LaplaceApproximation
+from foldgauss.uncertainty.posterior.increments import logits_of
 from foldgauss.uncertainty.posterior.log_prob import FrameTimeLogProb
 from foldgauss.uncertainty.posterior.optional_imports import import_optional
 
@@ -33,23 +33,22 @@ class FrameTimePosterior:
     `converged`: more than 50 tau are kept for every frame, every R-hat is below 1.01, and every mean is within
     0.1 + 5 / sqrt(ess) standard deviations of the exact one, which detects ensembles that all miss the same mode.
     `message` states this or what is missing, and how many frames are `identified` if not all are.
-    `laplace`, `exact`: the same posterior by Laplace's approximation and by the forward-backward algorithm.
+    `exact`: the same posterior by the forward-backward algorithm.
 
     **Source:** emcee, Foreman-Mackey et al. 2013; R-hat, Vehtari et al. 2021. The walkers of one ensemble are
     dependent, so each ensemble is one chain; ESS is steps times walkers over tau.
     """
 
     log_prob: FrameTimeLogProb
+    profiles: LikelihoodProfiles
+    exact: ExactPosterior
     times: Float64[np.ndarray, "ensembles steps walkers num_frames"]
     acceptance: Float64[np.ndarray, " ensembles"]
     tau: Float64[np.ndarray, " num_free"]
     r_hat: Float64[np.ndarray, " num_free"]
     ess: Float64[np.ndarray, " num_free"]
-    converged: bool
-    message: str
-    laplace: LaplaceApproximation
-    exact: ExactPosterior
-    profiles: LikelihoodProfiles | None = None
+    converged: bool = False
+    message: str = ""
 
     def __repr__(self) -> str:
         ensembles, steps, walkers, frames = self.times.shape
@@ -69,7 +68,7 @@ class FrameTimePosterior:
     @property
     def logits(self) -> Float64[np.ndarray, "ensembles steps walkers intervals"]:
         """The model's softmax weights w of all draws, centered."""
-        return self.log_prob.increments.logits(self.times)
+        return logits_of(self.times)
 
     def mean(self) -> Float64[np.ndarray, " num_frames"]:
         return self.times.mean((0, 1, 2))
@@ -79,8 +78,7 @@ class FrameTimePosterior:
 
     def interval(self, level: float = 0.95) -> tuple[Float64[np.ndarray, " num_frames"], ...]:
         """(low, high) of the central intervals that contain the fraction `level` of the draws."""
-        if not is_within(level, "(0, 1)"):
-            raise invalid("level", expected="a number in (0, 1)", got=short_repr(level))
+        check_within("level", level, "(0, 1)", "a number in (0, 1)")
         bounds = [(1 - level) / 2, (1 + level) / 2]
         return tuple(self._reduce(lambda draws: np.quantile(draws, bounds, axis=0)))
 
@@ -112,8 +110,8 @@ class FrameTimePosterior:
         arviz, xarray = import_optional("arviz"), import_optional("xarray")
         ensembles, steps, walkers, num_frames = self.times.shape
         times = np.moveaxis(self.times, 2, 1).reshape(ensembles * walkers, steps, num_frames)
-        increments, attrs = self.log_prob.increments, {"converged": int(self.converged), "message": self.message}
-        lp = np.stack([self.log_prob(increments.coordinates(chain)) for chain in times])
+        attrs = {"converged": int(self.converged), "message": self.message}
+        lp = np.stack([self.log_prob(chain[..., self.free]) for chain in times])
         coords = {
             "chain": np.arange(ensembles * walkers),
             "draw": np.arange(steps),
@@ -122,7 +120,7 @@ class FrameTimePosterior:
         places = {"frame": np.arange(num_frames), "interval": np.arange(num_frames - 1)}
         arrays = {
             "t": (("chain", "draw", "frame"), times),
-            "w": (("chain", "draw", "interval"), increments.logits(times)),
+            "w": (("chain", "draw", "interval"), logits_of(times)),
         }
         posterior = xarray.Dataset(arrays, coords | places)
         statistics = xarray.Dataset({"lp": (("chain", "draw"), lp)}, coords)
