@@ -1,6 +1,5 @@
 """How files go bad: by chance, and as somebody would make them who knows the format."""
 
-import io
 import json
 import math
 import struct
@@ -267,32 +266,6 @@ def png_sized(data: bytes, random: Random) -> bytes:
 
 #: What `zipfile` raises of damaged archives; a RuntimeError, too, of encryption and of packing that it does not know.
 _BAD_ZIP = (zipfile.BadZipFile, ValueError, OSError, EOFError, RuntimeError, zlib.error)
-
-
-def zip_resealed(data: bytes, random: Random) -> bytes:
-    """A zip archive with one of its members changed and right checksums."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as old:
-            members = [(info.filename, old.read(info)) for info in old.infolist()]
-    except _BAD_ZIP:
-        return by_chance(data, random)
-    if not members:
-        return by_chance(data, random)
-    at = random.randrange(len(members))
-    name, own = members[at]
-    how = random.randrange(10)
-    if how == 0:
-        del members[at]
-    elif how == 1:
-        members[at] = name + "x", own
-    else:
-        start = 0 if how == 2 else min(own.find(b"\n") + 1, len(own))
-        members[at] = name, npy_changed(own, random) if how <= 5 else by_chance(own, random, start)
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w", random.choice((zipfile.ZIP_STORED,) * 9 + (zipfile.ZIP_DEFLATED,))) as new:
-        for name, own in members:
-            new.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), own)
-    return out.getvalue()
 
 
 def npy_changed(data: bytes, random: Random) -> bytes:

@@ -2,12 +2,10 @@
 
 import ast
 import html.parser
-import io
 import json
 import resource
 import struct
 import tracemalloc
-import zipfile
 import zlib
 from contextlib import contextmanager
 from pathlib import Path
@@ -166,26 +164,6 @@ def _png(width: int, height: int) -> bytes:
     chunks = png_chunks(TARGETS["masks"].seeds()[1])
     chunks[0] = b"IHDR", struct.pack(">II", width, height) + chunks[0][1][8:]
     return png_of(chunks)
-
-
-def _npz(shape: str) -> bytes:
-    with zipfile.ZipFile(io.BytesIO(media._evidence())) as old:
-        members = {name: old.read(name) for name in old.namelist()}
-    header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".ljust(117).encode() + b"\n"
-    members["nodes.npy"] = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(96)
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w") as new:
-        for name, data in members.items():
-            new.writestr(name, data)
-    return out.getvalue()
-
-
-def _npz_bomb() -> bytes:
-    """256 MB of zeros in a quarter of one."""
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as new:
-        new.writestr("key.npy", bytes(256 << 20))
-    return out.getvalue()
 
 
 CLAIMS = {
