@@ -25,6 +25,7 @@ slow = pytest.mark.slow
 FEW = 120
 
 
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize(
     ("concentration", "replicates"), [(1.0, 80), *[pytest.param(a, REPLICATES, marks=slow) for a in (1.0, 3.0)]]
 )
