@@ -181,7 +181,8 @@ def finish(path: Path | None, figures: dict[str, float], **more: object) -> None
     """Print the figures and the machine, and write them to `path`, whole or not at all."""
     figures = {name: float(value) for name, value in figures.items()}
     shown = ((name, f"{value:.4g}" if abs(value) < 1000 else f"{value:,.0f}") for name, value in figures.items())
-    print_table("Figures", ("name", "value"), shown)
+    if figures:
+        print_table("Figures", ("name", "value"), shown)
     facts = describe_machine() | more.pop("facts", {})
     console.print("machine: " + ", ".join(f"{name} {value}" for name, value in facts.items()), style="dim")
     if path is not None:

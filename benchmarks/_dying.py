@@ -6,7 +6,7 @@ Of the files written in hidden names beside their place (`foldgauss.io._atomic`)
 count; in the writing of the `number`-th (from 1) the process dies: `bytes` once `count` of them are with the system,
 `written` before they are flushed to the disk, `flushed` before the file gets its name, `named` right after that.
 `every`: seconds between two checkpoints of a fit, instead of its own 30. With the moment `never` it lives, and at its
-end tells how many such files it wrote (`files 17`, on standard error).
+end tells how many such files it wrote, and the bytes of the smallest (`files 17 4711`, on standard error).
 """
 
 import builtins
@@ -46,7 +46,7 @@ class Plan:
 
     def __init__(self, ending: str, moment: str = "never", number: int = 1, count: int = 1, every: float | None = None):
         self.ending, self.moment, self.number, self.count, self.every = ending, moment, number, count, every
-        self.begun = self.renamed = 0
+        self.begun, self.sizes = 0, []  # files that were begun, and bytes of those that have got their names
         self.path = None  # the hidden file that counts now
         self._open, self._fsync, self._replace = builtins.open, os.fsync, os.replace
 
@@ -96,7 +96,8 @@ class Plan:
     def replace(self, source, target, **options) -> None:
         own = self._is_hidden(source)
         self._replace(source, target, **options)
-        self.renamed += own
+        if own:
+            self.sizes.append(os.path.getsize(target))
         if own and self.moment == "named" and self._due():
             die()
 
@@ -113,7 +114,7 @@ def main(arguments: list[str]) -> None:
         cli.main(arguments[1:])
     finally:
         if plan.moment == "never":
-            print(f"files {plan.renamed}", file=sys.stderr)
+            print(f"files {len(plan.sizes)} {min(plan.sizes, default=0)}", file=sys.stderr)
 
 
 if __name__ == "__main__":

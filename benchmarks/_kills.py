@@ -33,8 +33,6 @@ EVERY = 0.2
 AIMS = ("time", "checkpoint", "time", "checkpoint", "time", "model")
 #: Moments in the writing of a file, and their probabilities: most while bytes go out, else between that and its name.
 MOMENTS = {"bytes": 0.55, "written": 0.15, "flushed": 0.15, "named": 0.15}
-#: A checkpoint has at least so many times the bytes of the model: parameters, and two moments of each.
-CHECKPOINT_BYTES = 3
 
 
 class Wrong(AssertionError):
@@ -48,6 +46,7 @@ class Uninterrupted(NamedTuple):
     before_scores: bytes
     seconds: float
     num_checkpoints: int
+    checkpoint_bytes: int  # of the smallest
 
 
 def write_clip(path: Path) -> None:
@@ -70,7 +69,8 @@ def uninterrupted(clip: Path, options: list[str], folder: Path) -> Uninterrupted
     seconds = time.monotonic() - begun
     about = {name: value for name, value in read_metadata(target).items() if name not in ("mean_psnr", "mean_ssim")}
     save_video_model(unscored, load_video_model(target), metadata=about)
-    return Uninterrupted(target.read_bytes(), unscored.read_bytes(), seconds, int(done.stderr.split()[-1]))
+    num, least = map(int, done.stderr.split()[-2:])
+    return Uninterrupted(target.read_bytes(), unscored.read_bytes(), seconds, num, least)
 
 
 def run(
@@ -119,7 +119,7 @@ def _aimed(aim: str, rng: np.random.Generator, whole: Uninterrupted) -> tuple[di
         return {"ending": ".checkpoint"}, None
     size, most, ending = len(whole.before_scores), 2, ".safetensors"  # without its scores, and with them
     if aim == "checkpoint":
-        size, most, ending = CHECKPOINT_BYTES * size, max(whole.num_checkpoints // 2, 1), ".checkpoint"
+        size, most, ending = whole.checkpoint_bytes, max(whole.num_checkpoints // 2, 1), ".checkpoint"
     plan = {"ending": ending, "moment": str(rng.choice(list(MOMENTS), p=list(MOMENTS.values())))}
     return plan | {"number": int(rng.integers(1, most + 1)), "count": int(rng.integers(1, size))}, None
 
