@@ -87,8 +87,8 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
     **Data larger than memory:** in place of rows (n, d), X may be chunks of rows: an iterable of arrays (n_i, d) that
     can be iterated repeatedly (such as a list), or a dask array chunked along its rows. `sample_weight` is then chunked
     likewise, or one array of n weights. Every iteration reads all chunks once (twice with an envelope other than
-    "constant"), one after another; those of a dask array on the workers if a `dask.distributed` client is active. The
-    result equals that of the rows in one array, up to rounding.
+    "constant"): those of an iterable one after another, each chunk of a dask array as a task of dask's scheduler, on
+    workers if a `dask.distributed` client is active. The result equals that of the rows in one array, up to rounding.
 
     **Parameters:**
 
@@ -107,7 +107,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
     * `annealing`: the initial inverse temperature of EM, raised to 1 in 50 steps; 1 is no annealing. 0.1 separates
       crossing tracks from almost any start; well separated clusters are fitted better without.
     * `criterion`: "bic" or "aic", for "auto".
-    * `devices`: the number of JAX devices that the points are distributed over.
+    * `devices`: the number of JAX devices that the points are distributed over (1 for each task of a dask array).
 
     **dtype:** float32 data are fitted in float32, those with degrees above 6 or of units whose powers float32 does not
     hold, and all others, in float64, whatever JAX's default is.
