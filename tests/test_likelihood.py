@@ -12,7 +12,7 @@ from scipy import stats
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import Constant, TimeLikelihood
 from foldgauss.estimator import likelihood
-from foldgauss.estimator.likelihood import FitStatus, bootstrap
+from foldgauss.estimator.likelihood import FitStatus, _student_quantile, bootstrap
 from foldgauss.fold import PolynomialFold
 
 BEND = [[0.8, -0.5], [0.6, 0.9]]  # odd and even powers, so that each sign mistake shows
@@ -166,6 +166,18 @@ def test_intervals_have_stated_coverage(x64, power, floor):
     assert (np.abs(rates - 0.95) < 4.5 * np.sqrt(0.95 * 0.05 / n)).all()
     # Power: u = t - time_loc instead of time_loc - t turns the odd coefficients round, and must be caught.
     assert (mirrored.mean(0)[1] < 0.5).all()
+
+
+@pytest.mark.parametrize(
+    ("dtype", "tolerance", "level"), [(np.float64, 1e-8, 0.5), (np.float64, 1e-8, 0.95), (np.float32, 2e-4, 0.999)]
+)
+def test_half_widths_match_student_t(x64, dtype, tolerance, level):
+    # 17 degrees of freedom matter: 1.96 instead of 2.11 would cover 93.3%.
+    freedom = np.array([1, 2, 17, 400, 1e6, 0], dtype)
+    width = jax.jit(_student_quantile, static_argnums=0)(level, freedom)
+    assert width.dtype == dtype
+    np.testing.assert_allclose(width[:5], stats.t.ppf(0.5 + level / 2, freedom[:5]), rtol=tolerance)
+    assert np.isnan(width[5])
 
 
 # --- joint time ---------------------------------------------------------------------------------------------

@@ -250,6 +250,7 @@ def weighted_moments(x: Float[np.ndarray, "n d"], weights: Float[np.ndarray, " n
     return mean + correction, weights @ (centered - correction) ** 2
 
 
+@np.errstate(over="ignore", invalid="ignore")  # units out of range are refused elsewhere
 def summarize_rows(chunks: IterableChunks | DaskChunks) -> tuple[RowSummary, list[int]]:
     """Summarize all rows in one pass; also the number of rows of positive weight in each part."""
     parts = list(chunks.run(_summarize))
@@ -265,6 +266,7 @@ def summarize_rows(chunks: IterableChunks | DaskChunks) -> tuple[RowSummary, lis
     return summary, [sum(piece.size for piece in part) for part in parts]
 
 
+@np.errstate(over="ignore", invalid="ignore")  # units out of range are refused elsewhere
 def _summarize(pieces: Iterable[Piece]) -> list[RowSummary]:
     """A summary of each piece."""
     summaries = []

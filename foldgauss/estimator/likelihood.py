@@ -6,13 +6,13 @@ Not the |X| "folded normal" of scipy and numpyro: here a Gaussian's *center* fol
 import inspect
 from collections.abc import Callable
 from enum import IntEnum
+from statistics import NormalDist
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.special
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key
 
@@ -368,12 +368,27 @@ def _num_parameters(degree: int, dim: int, time: str, covariance_type: str) -> i
 
 def _student_quantile(level: float, freedom):
     """Half-width of the central interval of Student's t, in standard errors; NaN unless freedom > 0."""
+    many = freedom > 300  # where the incomplete beta function loses digits, and the series has 9
+    n = jnp.where((freedom > 0) & ~many, freedom, 1)
+    # P(|T| > q) = I_x(n/2, 1/2) with x = n / (n + q^2): bisection over log q.
+    tail = lambda z: jax.scipy.special.betainc(0.5 * n, 0.5 * jnp.ones_like(n), n / (n + jnp.exp(2 * z)))  # noqa: E731
 
-    def quantile(values):
-        return np.asarray(scipy.special.stdtrit(np.asarray(values, np.float64), 0.5 + 0.5 * level), freedom.dtype)
+    def halve(_, ends):
+        middle = 0.5 * (ends[0] + ends[1])
+        below = tail(middle) > 1 - level
+        return jnp.where(below, middle, ends[0]), jnp.where(below, ends[1], middle)
 
-    shape = jax.ShapeDtypeStruct(freedom.shape, freedom.dtype)
-    return jax.pure_callback(quantile, shape, freedom, vmap_method="expand_dims")
+    ends = (jnp.full_like(n, -20), jnp.full_like(n, 40))
+    quantile = jnp.exp(lax.fori_loop(0, 60, halve, ends)[0])
+    quantile = jnp.where(many, _student_series(level, jnp.where(many, freedom, 1)), quantile)
+    return jnp.where(freedom > 0, quantile, jnp.nan)
+
+
+def _student_series(level: float, n):
+    """The same for many degrees of freedom (Abramowitz and Stegun 26.7.5)."""
+    z = NormalDist().inv_cdf(0.5 + 0.5 * level)
+    first, second = (z**3 + z) / 4, (5 * z**5 + 16 * z**3 + 3 * z) / 96
+    return z + (first + (second + (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384 / n) / n) / n
 
 
 # --- bootstrap ----------------------------------------------------------------------------------------------

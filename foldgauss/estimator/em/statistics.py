@@ -41,7 +41,6 @@ __all__ = [
     "make_points",
     "map_chunks",
     "map_leading",
-    "step_derivatives",
     "step_times",
     "sum_chunks",
     "sum_over_points",
@@ -258,8 +257,9 @@ def _sum_chunk(params, envelope, t, pairs: Densities, mass, total, times, order)
         log_a = [jnp.zeros(mass.shape[1], v.dtype)]
     else:
         times = Times(params.time_loc, params.time_scale) if times is None else times
-        log_as, weights = _divide_by_a(envelope, t, times, mass, order)
+        log_as = _log_a_derivatives(envelope, t, times, order)
         log_a = [(mass * z).sum(0) for z in log_as]
+        weights = _divide_by_a(mass, log_as)
     gram = jnp.stack([_gram(w, basis, pairs.whitened) for w in weights])
     if isinstance(envelope, Constant) and degree:  # He_0 = 1 and He_1 = v: the gram has these sums already
         mass, first, second = gram[0, :, 0, 0], gram[0, :, 0, 1], gram[0, :, 1, 1]
@@ -293,27 +293,30 @@ def step_times(times: Times, steps: Float[Array, "2 ..."]) -> Times:
     return Times(times.loc + times.scale * steps[0], times.scale * jnp.exp(steps[1]))
 
 
-def step_derivatives(function: Callable, zero: Float[Array, "2 k"], order: int = 2) -> list:
-    """The value at 0 of a function of the steps of the times; with order 2 also its derivatives by d0, d1, d00, d01,
-    d11, for each component by itself."""
-    if order == 0:
-        return [function(zero)]
-    directions = [zero.at[j].set(1) for j in range(2)]
-    slope = lambda j: lambda steps: jax.jvp(function, (steps,), (directions[j],))[1]  # noqa: E731
-    curvature = lambda i, j: jax.jvp(slope(i), (zero,), (directions[j],))[1]  # noqa: E731
-    return [function(zero), slope(0)(zero), slope(1)(zero), curvature(0, 0), curvature(0, 1), curvature(1, 1)]
+def _log_a_derivatives(envelope, t, times: Times, order: int) -> list[Float[Array, "n k"]]:
+    """log a, with order 2 also its derivatives by d0, d1, d00, d01, d11 at 0."""
 
-
-def _divide_by_a(envelope, t, times: Times, mass: Float[Array, "n k"], order: int):
-    """log a and mass / a, each as a tuple of the value and, with order 2, its derivatives by the steps of the times."""
-    largest = 0.95 * float(np.log(jnp.finfo(mass.dtype).max))
-    log_mass = jnp.log(jnp.where(mass > 0, mass, 1))
-
-    def terms(steps):
+    def value(steps):
         at = step_times(times, steps)
-        log_a = envelope.log_a(t, time_loc=at.loc[None], time_scale=at.scale[None])
-        # One exponential of the sum: 1/a alone may overflow where the responsibility is small.
-        return log_a, jnp.where(mass > 0, jnp.exp(jnp.minimum(log_mass - log_a, largest)), 0)
+        return envelope.log_a(t, time_loc=at.loc[None], time_scale=at.scale[None])
 
     zero = jnp.zeros((2, *times.loc.shape), times.loc.dtype)
-    return zip(*step_derivatives(terms, zero, order), strict=True)
+    if order == 0:
+        return [value(zero)]
+    directions = [zero.at[j].set(1) for j in range(2)]
+    slope = lambda j: lambda steps: jax.jvp(value, (steps,), (directions[j],))[1]  # noqa: E731
+    curvature = lambda i, j: jax.jvp(slope(i), (zero,), (directions[j],))[1]  # noqa: E731
+    return [value(zero), slope(0)(zero), slope(1)(zero), curvature(0, 0), curvature(0, 1), curvature(1, 1)]
+
+
+def _divide_by_a(mass, log_a) -> list[Float[Array, "n k"]]:
+    """mass / a and its derivatives: e^-l, -l_i e^-l, (l_i l_j - l_ij) e^-l."""
+    largest = 0.95 * float(np.log(jnp.finfo(mass.dtype).max))
+    # One exponential of the sum: 1/a alone may overflow where the responsibility is small.
+    log_mass = jnp.log(jnp.where(mass > 0, mass, 1))
+    weight = jnp.where(mass > 0, jnp.exp(jnp.minimum(log_mass - log_a[0], largest)), 0)
+    if len(log_a) == 1:
+        return [weight]
+    _, l0, l1, l00, l01, l11 = log_a
+    factors = [-l0, -l1, l0 * l0 - l00, l0 * l1 - l01, l1 * l1 - l11]
+    return [weight, *(weight * factor for factor in factors)]
