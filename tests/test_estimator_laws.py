@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 pytest.importorskip("sklearn")
+from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.mixture import GaussianMixture
+from sklearn.utils import estimator_checks
 
 from foldgauss.estimator import EMStatus, FoldedGaussianMixture, FoldedMixtureRegressor
 from foldgauss.estimator.model_selection import select_mixture
@@ -31,6 +33,58 @@ def _fit(x, num=K, *, groups=None, **options):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
         return FoldedGaussianMixture(num, **({"degree": 1, "random_state": 0} | options)).fit(x, **groups)
+
+
+ESTIMATORS = [
+    FoldedGaussianMixture(2, degree=1),
+    FoldedGaussianMixture(),
+    FoldedMixtureRegressor(FoldedGaussianMixture(2, degree=1)),
+    FoldedMixtureRegressor(),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_passes_scikit_learns_checks(estimator):
+    """All of them: none is expected to fail."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        results = estimator_checks.check_estimator(estimator, on_fail=None)
+    failed = [r for r in results if r["status"] not in ("passed", "skipped")]
+    assert not failed, failed
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize(
+    "check",
+    ["check_no_attributes_set_in_init", "check_parameters_default_constructible", "check_get_params_invariance",
+     "check_estimators_unfitted", "check_fit2d_1sample", "check_fit2d_1feature"],
+)  # fmt: skip
+def test_passes_quick_checks(estimator, check):
+    if check == "check_fit2d_1feature" and isinstance(estimator, FoldedMixtureRegressor):
+        pytest.skip("A single feature is the time.")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        getattr(estimator_checks, check)(type(estimator).__name__, clone(estimator))
+
+
+@pytest.mark.parametrize("regression", [False, True])
+def test_weights_equal_repetitions(regression):
+    x, weights = _blobs(), np.random.default_rng(1).choice(3, N, p=[0.1, 0.6, 0.3])
+    mixture = FoldedGaussianMixture(K, degree=1, random_state=0, max_iter=20, tol=0)
+    estimator = FoldedMixtureRegressor(mixture) if regression else mixture
+
+    def fit(repeats, **options):
+        rows = np.repeat(x, repeats, axis=0)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConvergenceWarning)
+            fitted = clone(estimator).fit(*((rows[:, :2], rows[:, 2:]) if regression else (rows,)), **options)
+        return getattr(fitted, "mixture_", fitted)
+
+    weighted, repeated, plain = fit(1, sample_weight=weights), fit(weights), fit(1)
+    for name in ("weights_", "means_", "covariances_", "lower_bound_"):
+        np.testing.assert_allclose(getattr(weighted, name), getattr(repeated, name), rtol=1e-7, atol=1e-9)
+    assert not np.allclose(weighted.means_, plain.means_, rtol=1e-3)  # power
 
 
 @pytest.mark.parametrize("kind", SOME_KINDS)
@@ -247,7 +301,7 @@ def test_criteria_count_groups():
 def test_groups_of_a_weighted_regression_are_one_per_row(num):
     x = _blobs()[:60]
     with pytest.raises(ValueError, match=r"^groups: expected shape \(60,\)"):
-        FoldedMixtureRegressor(2).fit(x[:, :1], x[:, 1], np.ones(60), np.arange(num) // 5)
+        FoldedMixtureRegressor(FoldedGaussianMixture(2)).fit(x[:, :1], x[:, 1], np.ones(60), np.arange(num) // 5)
 
 
 @pytest.mark.parametrize(

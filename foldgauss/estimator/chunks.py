@@ -1,27 +1,27 @@
 """Chunks of rows, for data larger than memory: read anew in every pass, one piece at a time.
 
 A source of chunks is a dask array, or an iterable of arrays that can be iterated repeatedly (a list of `np.memmap`, an
-object whose `__iter__` reads files). A pass runs a task, a function of pieces. Those of a dask array run by parts, on
-workers if a `dask.distributed` client is active; results come in the order of the rows. dask is imported only if the
-rows are a dask array.
+object whose `__iter__` reads files). A pass runs a task, a function of pieces. That of a dask array runs once for each
+of its chunks, by dask's scheduler; results come in the order of the rows. dask is imported only if the rows are a dask
+array.
 """
 
-import abc
 import functools
 import itertools
 import sys
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
-from numbers import Real
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+from sklearn.utils import assert_all_finite, check_array
 
 from foldgauss._runtime.checks import invalid
+from foldgauss.estimator.parameter_checks import check_real
 
 __all__ = [
-    "Chunks",
+    "DaskChunks",
+    "IterableChunks",
     "Piece",
     "RowSummary",
     "collect_rows",
@@ -33,8 +33,6 @@ __all__ = [
 
 #: The largest number of rows of a piece: it bounds temporary arrays, whatever the chunks are.
 _PIECE_ROWS = 2**16
-#: Tasks submitted ahead of the one that is waited for, for each of the workers' threads.
-_TASKS_PER_THREAD = 2
 _SOURCES = "Pass a list of arrays, or an object whose __iter__ reads files."
 
 
@@ -56,131 +54,92 @@ def is_chunked(X) -> bool:
     return isinstance(X, Iterable) and not isinstance(X, str | bytes | Mapping | Set)
 
 
-def open_chunks(X, sample_weight=None, width: int | None = None) -> "Chunks":
+def open_chunks(X, sample_weight=None, width: int | None = None) -> "IterableChunks | DaskChunks":
     """The source of the chunks X; `width` is the number of columns if it is known.
 
-    `sample_weight` is chunked as X is, or an array of one weight a row, or a number for all.
+    `sample_weight` is chunked as X is, or an array of one weight a row.
 
     **Raises:** ValueError if X can be iterated only once, or is a dask array whose chunks are unknown or split rows.
     """
-    return (_DaskChunks if _is_dask(X) else _IterableChunks)(X, sample_weight, width)
+    return (DaskChunks if _is_dask(X) else IterableChunks)(X, sample_weight, width)
 
 
-class Chunks(abc.ABC):
-    """Chunks of rows that can be read repeatedly, in a pass of `num_parts` tasks."""
+class IterableChunks:
+    """Chunks from an iterable of arrays, read in a single part.
 
-    num_parts: int
-    width: int | None
-    on_workers = False
+    `run(task, *arguments, each)` runs `task(pieces, *arguments)`, or `task(pieces, each[part], *arguments)`, on every
+    part; results in order. `map(function, fitted)` applies `function(fitted, x)`, of shape (n_i,) or
+    (n_i, num_columns), to each chunk.
+    """
 
-    @abc.abstractmethod
-    def run(self, task: Callable, *arguments, each: Sequence | None = None) -> Iterator:
-        """Run `task(pieces, *arguments)` or `task(pieces, each[part], *arguments)` on every part; results in order."""
-
-    @abc.abstractmethod
-    def map(self, function: Callable, fitted, *, num_columns: int | None = None, dtype=None):
-        """Apply `function(fitted, x)`, of shape (n_i,) or (n_i, num_columns), to each chunk: an iterator or dask array.
-
-        `dtype` is that of the results, by default float32 of float32 chunks and else float64.
-        """
-
-
-class _IterableChunks(Chunks):
-    """An iterable of arrays: a single part."""
-
-    num_parts = 1
+    concurrent = False  # whether several parts run at a time, perhaps in other processes
 
     def __init__(self, X, sample_weight, width):
         _check_iterable("X", X)
-        self._chunks, self._weights, self.width = X, sample_weight, width
-        self._num_rows = None
-        if _is_array(sample_weight):
-            self._weights = np.asarray(sample_weight)
-        elif not (sample_weight is None or isinstance(sample_weight, Real)):
+        if sample_weight is not None and not _is_array(sample_weight):
             _check_iterable("sample_weight", sample_weight)
+        self._weights = np.asarray(sample_weight) if _is_array(sample_weight) else sample_weight
+        self._chunks, self.width, self._num_rows = X, width, None
 
     def run(self, task, *arguments, each=None):
         own = () if each is None else (each[0],)
-        yield task(_split_pieces(self._read(), self.width), *own, *arguments)
+        yield task(self._read(), *own, *arguments)
 
     def map(self, function, fitted, *, num_columns=None, dtype=None):
         return (_map_chunk(function, fitted, self.width, x, number) for number, x in enumerate(self._chunks))
 
-    def _read(self):
-        """Number, rows and weights of every chunk, after checking that they match and equal those of earlier passes."""
-        row, own = 0, self._weights
-        weights = None if own is None or isinstance(own, Real | np.ndarray) else iter(own)
+    def _read(self) -> Iterator[Piece]:
+        """The pieces of all chunks, after checking that weights match and that passes have equal numbers of rows."""
+        row, own, one_array = 0, None, isinstance(self._weights, np.ndarray)
+        of_chunks = iter(() if self._weights is None else self._weights)
         for number, x in enumerate(self._chunks):
-            x = _check_chunk(number, x, self.width)
-            self.width, stop = x.shape[1], row + len(x)
-            if weights is not None:
-                own = next(weights, _MISSING)
-            of_chunk = own[row:stop] if weights is None and isinstance(own, np.ndarray) else own
-            yield number, x, _check_weights(number, of_chunk, len(x))
-            row = stop
-        if self._num_rows is None:
-            self._check_end(weights, row)
-            self._num_rows = row
-        if row != self._num_rows:
+            if one_array:
+                own = self._weights[row : row + len(x)]
+            elif self._weights is not None:
+                own = next(of_chunks, ())
+            for piece in _split_chunk(number, x, own, self.width):
+                self.width = piece.x.shape[1]
+                yield piece
+            row += len(x)
+        if one_array and len(self._weights) != row:
+            raise invalid("sample_weight", expected=f"{row} weights, one for each row", got=len(self._weights))
+        if not one_array and next(of_chunks, None) is not None:
+            raise invalid("sample_weight", expected="as many chunks as X", got="more")
+        if self._num_rows not in (None, row):
             got, cure = f"{self._num_rows} at first and {row} now", f"Each pass reads them anew. {_SOURCES}"
             raise invalid("X", expected="the same rows in each pass", got=got, cure=cure)
-
-    def _check_end(self, weights: Iterator | None, num_rows: int) -> None:
-        if weights is not None and next(weights, _MISSING) is not _MISSING:
-            raise invalid("sample_weight", expected="as many chunks as X", got="more")
-        if isinstance(self._weights, np.ndarray) and len(self._weights) != num_rows:
-            got = len(self._weights)
-            raise invalid("sample_weight", expected=f"{num_rows} weights, one for each row", got=got)
+        self._num_rows = row
 
 
-class _DaskChunks(Chunks):
-    """A dask array, chunked along its rows: small chunks are combined to one part."""
+class DaskChunks:
+    """Chunks of a dask array, each a part, with `run` and `map` as those of `IterableChunks`.
+
+    dask's scheduler runs the parts: threads, or workers if a `dask.distributed` client is active. `map` returns a dask
+    array of `dtype`, by default float32 of float32 chunks and else float64.
+    """
+
+    concurrent = True
 
     def __init__(self, X, sample_weight, width):
+        import dask.array
+
         _check_dask(X)
         if width not in (None, X.shape[1]):
             raise invalid("X", expected=f"{width} columns", got=X.shape[1], cure="Pass the columns of the fit.")
-        self._array, self.width, self._sizes = X, X.shape[1], X.chunks[0]
-        self._delayed, rows = X.to_delayed().ravel().tolist(), np.cumsum((0, *self._sizes))
-        self._weights = self._split_weights(X, sample_weight, rows)
-        parts, first = [], 0
-        for k in range(len(self._sizes)):
-            if rows[k + 1] - rows[first] >= _PIECE_ROWS or k + 1 == len(self._sizes):
-                parts.append((first, k + 1))
-                first = k + 1
-        self._parts, self.num_parts = parts, len(parts)
-        self._client = _active_client()
-        self.on_workers = self._client is not None
-
-    def _split_weights(self, X, weights, rows) -> list:
-        """Weights by chunk: None, a number, an array, or a delayed one."""
-        if weights is None or isinstance(weights, Real):
-            return [weights] * len(self._sizes)
-        if _is_dask(weights):
-            self._check_weight_count(X, weights)
-            return weights.rechunk((self._sizes,)).to_delayed().ravel().tolist()
-        if not _is_array(weights):
-            got = type(weights).__name__
-            raise invalid("sample_weight", expected="a dask or NumPy array, a number or None", got=got)
-        weights = np.asarray(weights)
-        self._check_weight_count(X, weights)
-        return [weights[a:b] for a, b in itertools.pairwise(rows)]
-
-    def _check_weight_count(self, X, weights) -> None:
+        weights = dask.array.ones(len(X)) if sample_weight is None else dask.array.asanyarray(sample_weight)
         if weights.shape != X.shape[:1]:
             raise invalid("sample_weight", expected=f"shape {X.shape[:1]}", got=f"shape {weights.shape}")
+        self._array, self.width = X, X.shape[1]
+        pairs = (X.to_delayed().ravel(), weights.rechunk(X.chunks[:1]).to_delayed())
+        self._delayed = list(zip(*pairs, strict=True))
 
     def run(self, task, *arguments, each=None):
-        calls = (
-            functools.partial(_run_part, task, first, self.width, () if each is None else (each[k],), arguments)
-            for k, (first, _) in enumerate(self._parts)
-        )
-        data = ((self._delayed[a:b], self._weights[a:b]) for a, b in self._parts)
-        if self.on_workers:
-            yield from _run_on_workers(self._client, calls, data)
-        else:
-            for call, (chunks, weights) in zip(calls, data, strict=True):
-                yield call(_compute_each(chunks), _compute_each(weights))
+        import dask
+
+        own = [() if each is None else (each[number],) for number in range(len(self._delayed))]
+        calls = (functools.partial(_run_part, task, k, self.width, own[k], arguments) for k in range(len(own)))
+        pairs = zip(calls, self._delayed, strict=True)
+        return iter(dask.compute(*(dask.delayed(call, traverse=False)(*data) for call, data in pairs)))
 
     def map(self, function, fitted, *, num_columns=None, dtype=None):
         one = functools.partial(_map_block, function, fitted, self.width)
@@ -216,45 +175,8 @@ def _check_dask(X) -> None:
         raise invalid("X", expected="a dask array chunked along rows alone", got=got, cure=cure)
 
 
-def _active_client():
-    """The `dask.distributed` client of this thread, or None."""
-    distributed = sys.modules.get("distributed")
-    if distributed is None:
-        return None
-    try:
-        return distributed.get_client()
-    except ValueError:
-        return None
-
-
-def _run_on_workers(client, calls, data) -> Iterator:
-    """The calls' results in order; the number of pending calls is limited, so that not all data are in memory."""
-    import dask
-
-    most = _TASKS_PER_THREAD * max(1, sum(client.nthreads().values()))
-    waiting = deque()
-    for call, (chunks, weights) in zip(calls, data, strict=True):
-        waiting.append(client.compute(dask.delayed(call, traverse=False)(chunks, weights)))
-        if len(waiting) >= most:
-            yield waiting.popleft().result()
-    while waiting:
-        yield waiting.popleft().result()
-
-
-def _compute_each(chunks) -> Iterator:
-    """Compute one after another, by dask's configured scheduler."""
-    return (chunk.compute() if _is_dask(chunk) else chunk for chunk in chunks)
-
-
-def _run_part(task, first, width, own, arguments, chunks, weights):
-    """Run a task on one part's chunks, in order."""
-
-    def read():
-        for number, (x, w) in enumerate(zip(chunks, weights, strict=True), first):
-            x = _check_chunk(number, x, None)
-            yield number, x, _check_weights(number, w, len(x))
-
-    return task(_split_pieces(read(), width), *own, *arguments)
+def _run_part(task, number, width, own, arguments, x, weights):
+    return task(_split_chunk(number, x, weights, width), *own, *arguments)
 
 
 def _map_block(function, fitted, width, x, block_info=None):
@@ -262,8 +184,6 @@ def _map_block(function, fitted, width, x, block_info=None):
 
 
 # --- iterables ------------------------------------------------------------------------------------------------
-
-_MISSING = object()
 
 
 def _check_iterable(name: str, chunks) -> None:
@@ -275,78 +195,36 @@ def _check_iterable(name: str, chunks) -> None:
         raise invalid(name, expected="chunks that can be read again in each pass", got=got, cure=_SOURCES)
 
 
-def _is_array(value) -> bool:
-    """Whether `value` is one array of rows, such as a list of numbers."""
-    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
-        return len(value) > 0 and isinstance(value[0], Real)
-    return not isinstance(value, Real) and (hasattr(value, "__array__") or hasattr(value, "shape"))
+def _is_array(weights) -> bool:
+    """Whether these are weights of rows, such as a list of numbers, rather than chunks of weights."""
+    is_list = isinstance(weights, Sequence) and len(weights) > 0 and np.ndim(weights[0]) == 0
+    return is_list or (hasattr(weights, "__array__") and np.ndim(weights) == 1)
 
 
-def _check_weights(number: int, weights, num: int) -> np.ndarray:
-    """The weights of the `num` rows of a chunk, given as an array, as a number for all, or as None for 1."""
-    if weights is _MISSING:
-        raise invalid("sample_weight", expected=f"as many chunks as X, at least {number + 1}", got=number)
-    if weights is None or isinstance(weights, Real):
-        return np.broadcast_to(np.float64(1 if weights is None else weights), (num,))
-    weights = np.asarray(weights)
-    if weights.shape != (num,):
-        cure = "One weight for each row of X."
-        raise invalid(
-            f"sample_weight, chunk {number}", expected=f"shape ({num},)", got=f"shape {weights.shape}", cure=cure
-        )
-    return weights
-
-
-# --- checks ---------------------------------------------------------------------------------------------------
-
-
-def _check_chunk(number: int, x, width: int | None):
-    """The chunk as a two-dimensional array, or as a lazy one that is read when sliced."""
-    if not all(hasattr(x, name) for name in ("dtype", "shape", "__array__")):
-        x = np.asarray(x)
+def _split_chunk(number: int, x, weights, width: int | None) -> Iterator[Piece]:
+    """Split a chunk to pieces of checked values; weights of None are 1."""
     name = f"X, chunk {number}"
-    if len(x.shape) != 2:
-        got = f"{type(x).__name__} of shape {tuple(x.shape)}"
-        raise invalid(name, expected="an array (n, d)", got=got, cure="One row alone is x[None].")
-    if getattr(x.dtype, "kind", "O") not in "biuf":
-        raise invalid(name, expected="real numbers", got=f"dtype {x.dtype}", cure="Convert it by astype(np.float64).")
-    if width is not None and x.shape[1] != width:
-        raise invalid(name, expected=f"{width} columns", got=x.shape[1], cure="All chunks have the same columns.")
-    return x
-
-
-def _split_pieces(chunks: Iterable[tuple], width: int | None) -> Iterator[Piece]:
-    """Split chunks to checked pieces; `width` None means that of the first chunk."""
-    for number, x, weights in chunks:
-        x = _check_chunk(number, x, width)
-        width = x.shape[1]
-        for row in range(0, len(x), _PIECE_ROWS):
-            rows = slice(row, row + _PIECE_ROWS)
-            part = np.asarray(x[rows])
-            part = part if part.dtype == np.float32 else part.astype(np.float64, copy=False)
-            yield Piece(part, _check_values(number, row, part, weights[rows]))
+    check_real(name, x)
+    if weights is not None and len(weights) != len(x):
+        raise invalid(f"sample_weight, chunk {number}", expected=f"{len(x)} weights", got=len(weights))
+    for row in range(0, len(x), _PIECE_ROWS):
+        rows = slice(row, row + _PIECE_ROWS)
+        part = check_array(x[rows], dtype=[np.float64, np.float32], ensure_all_finite=False, input_name=name)
+        if width not in (None, part.shape[1]):
+            cure = "All chunks have the columns of the first, or of the fit."
+            raise invalid(name, expected=f"{width} columns", got=part.shape[1], cure=cure)
+        own = np.ones(len(part), part.dtype) if weights is None else np.asarray(weights[rows], part.dtype)
+        if not (np.isfinite(own) & (own >= 0)).all():
+            got, cure = f"between {own.min()} and {own.max()}", "0 leaves a row out."
+            raise invalid(f"sample_weight, chunk {number}", expected="finite numbers >= 0", got=got, cure=cure)
+        assert_all_finite(part[own > 0], input_name=name)
+        width = part.shape[1]
+        yield Piece(part, own)
 
 
 def _map_chunk(function, fitted, width: int, x, number: int):
-    pieces = _split_pieces([(number, x, np.broadcast_to(1.0, len(x)))], width)
-    parts = [function(fitted, part) for part, _ in pieces]
+    parts = [function(fitted, part) for part, _ in _split_chunk(number, x, None, width)]
     return np.concatenate(parts) if parts else function(fitted, np.zeros((0, width)))
-
-
-def _check_values(number: int, row: int, x: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """The weights in the dtype of x. **Raises:** ValueError on NaN, infinity, and negative weights."""
-    finite = np.isfinite(x).all(1) | (weights == 0)
-    if not finite.all():
-        got = f"NaN or infinity in its row {row + int(np.argmin(finite))}"
-        raise invalid(f"X, chunk {number}", expected="finite numbers", got=got, cure="Remove such rows.")
-    if weights.dtype.kind not in "biuf":
-        raise invalid(f"sample_weight, chunk {number}", expected="real numbers", got=f"dtype {weights.dtype}")
-    valid = np.isfinite(weights) & (weights >= 0)
-    if not valid.all():
-        k = int(np.argmin(valid))
-        got = f"{weights[k]} in its row {row + k}"
-        raise invalid(f"sample_weight, chunk {number}", expected="numbers >= 0", got=got, cure="0 leaves a row out.")
-    return weights.astype(x.dtype)
 
 
 # --- tasks ----------------------------------------------------------------------------------------------------
@@ -358,23 +236,9 @@ class RowSummary(NamedTuple):
     num_rows: int
     size: int  # rows with weight
     total: float  # of the weights
-    mean: Float[np.ndarray, " d"] | None
-    scatter: Float[np.ndarray, " d"] | None  # sum of w (x - mean)^2
+    mean: Float[np.ndarray, " d"]
+    variance: Float[np.ndarray, " d"]
     single: bool  # all are float32
-
-    def merge(self, other: "RowSummary") -> "RowSummary":
-        """The summary of both sets of rows, from their centered sums of squares.
-
-        **Source:** Chan, Golub and LeVeque 1983, Algorithms for computing the sample variance.
-        """
-        counts = (self.num_rows + other.num_rows, self.size + other.size, self.total + other.total)
-        single = self.single and other.single
-        if not (self.size and other.size):
-            present = self if self.size else other
-            return RowSummary(*counts, present.mean, present.scatter, single)
-        fraction, shift = other.total / counts[2], other.mean - self.mean
-        scatter = self.scatter + other.scatter + (self.total * fraction) * shift**2
-        return RowSummary(*counts, self.mean + fraction * shift, scatter, single)
 
 
 def weighted_moments(x: Float[np.ndarray, "n d"], weights: Float[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
@@ -386,46 +250,49 @@ def weighted_moments(x: Float[np.ndarray, "n d"], weights: Float[np.ndarray, " n
     return mean + correction, weights @ (centered - correction) ** 2
 
 
-def summarize_rows(chunks: Chunks) -> tuple[RowSummary, list[int]]:
+@np.errstate(over="ignore", invalid="ignore")  # units out of range are refused elsewhere
+def summarize_rows(chunks: IterableChunks | DaskChunks) -> tuple[RowSummary, list[int]]:
     """Summarize all rows in one pass; also the number of rows of positive weight in each part."""
     parts = list(chunks.run(_summarize))
-    if not any(part.num_rows for part in parts):
+    pieces = list(itertools.chain(*parts))
+    if not pieces:
         raise invalid("X", expected="at least one chunk with rows", got="none", cure=_SOURCES)
-    return functools.reduce(RowSummary.merge, parts), [part.size for part in parts]
+    num_rows, sizes, totals, means, variances, single = map(np.array, zip(*pieces, strict=True))
+    total = totals.sum()
+    fractions = totals / total if total > 0 else totals
+    mean = fractions @ means
+    variance = fractions @ (variances + (means - mean) ** 2)  # within pieces and between them
+    summary = RowSummary(int(num_rows.sum()), int(sizes.sum()), float(total), mean, variance, bool(single.all()))
+    return summary, [sum(piece.size for piece in part) for part in parts]
 
 
-def _summarize(pieces: Iterable[Piece]) -> RowSummary:
-    whole = RowSummary(0, 0, 0.0, None, None, True)
+@np.errstate(over="ignore", invalid="ignore")  # units out of range are refused elsewhere
+def _summarize(pieces: Iterable[Piece]) -> list[RowSummary]:
+    """A summary of each piece."""
+    summaries = []
     for x, weights in pieces:
-        present = weights > 0
-        one = RowSummary(len(x), int(present.sum()), 0.0, None, None, x.dtype == np.float32)
-        if one.size:
-            total = float(weights.sum(dtype=np.float64))
-            mean, variance = weighted_moments(x[present], weights[present])
-            one = one._replace(total=total, mean=mean, scatter=total * variance)
-        whole = whole.merge(one)
-    return whole
+        present, total = weights > 0, float(weights.sum(dtype=np.float64))
+        moments = weighted_moments(x[present], weights[present]) if total > 0 else np.zeros((2, x.shape[1]))
+        summaries.append(RowSummary(len(x), int(present.sum()), total, *moments, x.dtype == np.float32))
+    return summaries
 
 
-def collect_rows(chunks: Chunks, sizes: Sequence[int], indices: Int[np.ndarray, " m"] | None, prepare) -> tuple:
+def collect_rows(chunks, sizes: Sequence[int], indices: Int[np.ndarray, " m"] | None, prepare) -> tuple:
     """The prepared rows with these indices among rows of positive weight (None: all), in ascending order."""
-    firsts = np.cumsum((0, *sizes))
     each = [None] * len(sizes)
     if indices is not None:
-        indices = np.sort(indices)
+        firsts, indices = np.cumsum((0, *sizes)), np.sort(indices)
         each = [indices[(a <= indices) & (indices < b)] - a for a, b in itertools.pairwise(firsts)]
     parts = [part for parts in chunks.run(_collect, prepare, each=each) for part in parts]
-    return np.concatenate([y for y, _ in parts]), np.concatenate([weights for _, weights in parts])
+    return tuple(map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _collect(pieces, indices, prepare):
     parts, first = [], 0
-    for piece in pieces:
-        y, weights = prepare(piece)
+    for y, weights in map(prepare, pieces):
+        here = slice(None)
         if indices is not None:
-            local = indices[(first <= indices) & (indices < first + len(y))] - first
-            first += len(y)
-            y, weights = y[local], weights[local]
-        if len(y):
-            parts.append((y, weights))
+            here = indices[(first <= indices) & (indices < first + len(y))] - first
+        parts.append((y[here], weights[here]))
+        first += len(y)
     return parts

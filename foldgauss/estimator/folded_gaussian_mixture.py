@@ -5,27 +5,36 @@ model. Needs scikit-learn: `pip install "foldgauss[sklearn]"`.
 """
 
 import warnings
+from numbers import Integral, Real
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from sklearn.base import BaseEstimator, ClassNamePrefixFeaturesOutMixin, DensityMixin, TransformerMixin
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.utils import assert_all_finite, check_random_state
+from sklearn.utils import check_random_state
+from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
 
 from foldgauss._runtime.checks import invalid, is_integer
 from foldgauss.envelope import Constant, TimeLikelihood
-from foldgauss.estimator.chunks import Chunks, is_chunked, open_chunks, summarize_rows
+from foldgauss.estimator.chunks import is_chunked, open_chunks, summarize_rows
 from foldgauss.estimator.em.components import Parameters
-from foldgauss.estimator.em.initialization import draw_subset, initialize, restrict_covariances
-from foldgauss.estimator.em.loop import EMStatus, Run, broadcast_degrees, run_em, select_best
+from foldgauss.estimator.em.initialization import INITIALIZERS, draw_subset, initialize, restrict_covariances
+from foldgauss.estimator.em.loop import EMStatus, Run, run_em, select_best
 from foldgauss.estimator.em.m_step import Model
-from foldgauss.estimator.em.online import FORGETTING, compute_batch_statistics, update_online
+from foldgauss.estimator.em.online import FORGETTING, update_online
 from foldgauss.estimator.em.prune import count_parameters, drop_unused, prune_mixture
 from foldgauss.estimator.em.scaling import Scaling, check_export, compute_scaling, to_mixture
-from foldgauss.estimator.em.statistics import Blocks, Points, enable_dtype, make_points
+from foldgauss.estimator.em.statistics import (
+    Blocks,
+    Points,
+    SufficientStatistics,
+    accumulate,
+    enable_dtype,
+    sum_over_points,
+)
 from foldgauss.estimator.parameter_checks import (
     check_column,
     check_parameters,
@@ -33,23 +42,20 @@ from foldgauss.estimator.parameter_checks import (
     check_sizes,
     make_envelope,
 )
-from foldgauss.estimator.precisions import factor_precisions, replace_initial
+from foldgauss.estimator.precisions import replace_initial
 from foldgauss.estimator.prediction import (
     FittedParameters,
-    compute_log_densities,
-    compute_responsibilities,
     predict_components,
     predict_log_prob,
     predict_responsibilities,
-    sum_log_prob,
 )
 from foldgauss.estimator.rows import (
-    ChunkedRows,
+    SMOOTH_ROWS,
     Rows,
     check_groups,
     choose_dtype,
+    measure_gaps,
     order_columns,
-    refuse_groups,
     warn_narrow,
     warn_smooth,
 )
@@ -80,8 +86,8 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
     **Data larger than memory:** in place of rows (n, d), X may be chunks of rows: an iterable of arrays (n_i, d) that
     can be iterated repeatedly (such as a list), or a dask array chunked along its rows. `sample_weight` is then chunked
     likewise, or one array of n weights. Every iteration reads all chunks once (twice with an envelope other than
-    "constant"), one after another; those of a dask array on the workers if a `dask.distributed` client is active. The
-    result equals that of the rows in one array, up to rounding.
+    "constant"): those of an iterable one after another, each chunk of a dask array as a task of dask's scheduler, on
+    workers if a `dask.distributed` client is active. The result equals that of the rows in one array, up to rounding.
 
     **Parameters:**
 
@@ -100,7 +106,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
     * `annealing`: the initial inverse temperature of EM, raised to 1 in 50 steps; 1 is no annealing. 0.1 separates
       crossing tracks from almost any start; well separated clusters are fitted better without.
     * `criterion`: "bic" or "aic", for "auto".
-    * `devices`: the number of JAX devices that the points are distributed over.
+    * `devices`: the number of JAX devices that the points are distributed over (1 for each task of a dask array).
 
     **dtype:** float32 data are fitted in float32, those with degrees above 6 or of units whose powers float32 does not
     hold, and all others, in float64, whatever JAX's default is.
@@ -120,6 +126,26 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
 
     **Source:** eq:vegas and eq:foldgauss; Dempster, Laird and Rubin 1977. **Raises:** ValueError naming the parameter.
     """
+
+    _parameter_constraints = {  # noqa: RUF012  scikit-learn's, which checks them
+        "n_components": [Interval(Integral, 1, None, closed="left"), StrOptions({"auto"})],
+        "degree": [Interval(Integral, 0, None, closed="left"), StrOptions({"auto"})],
+        "covariance_type": [StrOptions({"full", "diag", "spherical", "tied"})],
+        "init_params": [StrOptions(set(INITIALIZERS))],
+        "criterion": [StrOptions({"bic", "aic"})],
+        "tol": [Interval(Real, 0, None, closed="left")],
+        "reg_covar": [Interval(Real, 0, None, closed="left")],
+        "reg_relative": [Interval(Real, 0, None, closed="left")],
+        "annealing": [Interval(Real, 0, 1, closed="right")],
+        "max_components": [Interval(Integral, 1, None, closed="left")],
+        "max_degree": [Interval(Integral, 0, None, closed="left")],
+        "max_iter": [Interval(Integral, 0, None, closed="left")],
+        "n_init": [Interval(Integral, 1, None, closed="left")],
+        "devices": [Interval(Integral, 1, None, closed="left")],
+        "random_state": ["random_state"],
+        "warm_start": ["boolean"],
+        "verbose": ["verbose"],
+    }
 
     def __init__(
         self,
@@ -187,66 +213,48 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         columns differ, that can be iterated only once, or that change from one pass to the next. Warns
         (ConvergenceWarning) if EM did not converge, see `status_`.
         """
-        self._fit(X, sample_weight, groups)
+        check_parameters(self)
+        data, present = self._check_rows(X, sample_weight)
+        groups = check_groups(groups, present)
+        if data.in_memory and groups is None and self.n_components != 1:
+            warn_smooth(data.take(np.arange(min(data.summary.size, SMOOTH_ROWS)))[0])
+        data = data._replace(dtype=choose_dtype(data, self.max_degree if self.degree == "auto" else self.degree))
+        with enable_dtype(data.dtype):
+            run, model = self._run(data, groups)
+        self._set_fitted(run, model)
+        if run.status != EMStatus.CONVERGED:
+            warnings.warn(
+                f"EM ended as {run.status.name} after {self.n_iter_} iterations. {_CURES[run.status]}",
+                ConvergenceWarning,
+                stacklevel=2,
+            )
         return self
 
     def fit_predict(self, X, y=None, sample_weight=None, groups=None) -> Int[np.ndarray, " n"]:
         """Fit, and return the most likely component of each row, as `predict`."""
-        scaled = self._fit(X, sample_weight, groups)
-        if scaled is None:
-            return self.predict(X)
-        with enable_dtype(scaled.dtype):
-            return self._responsibilities(scaled).argmax(1)
+        return self.fit(X, y, sample_weight, groups).predict(X)
 
-    def _fit(self, X, sample_weight, groups=None):
-        check_parameters(self)
-        if is_chunked(X):
-            refuse_groups(groups)
-            x, data = None, self._check_chunks(X, sample_weight)
+    def _check_rows(self, X, sample_weight, reset: bool = True) -> tuple[Rows, Bool[np.ndarray, " n"] | None]:
+        """The rows after a first pass over them, and which of them have weight; None for chunks."""
+        if chunked := is_chunked(X):
+            vars(self).pop("feature_names_in_", None)
+            chunks, present = open_chunks(X, sample_weight), None
         else:
-            x, weights = self._check_rows(X, sample_weight)
-            present = weights > 0
-            data = Rows(x[present], weights[present], check_groups(groups, present))
-            if groups is None and self.n_components != 1:
-                warn_smooth(data.x)
-        degree = self.max_degree if self.degree == "auto" else self.degree
-        data = data.astype(choose_dtype(data, degree, self._order_columns(self.n_features_in_)))
-        with enable_dtype(data.dtype):
-            run, model = self._run(data)
-        self._set_fitted(run, model)
-        if run.status != EMStatus.CONVERGED:
-            warnings.warn(
-                f"EM ended as {run.status.name} after {run.num_steps} iterations. {_CURES[run.status]}",
-                ConvergenceWarning,
-                stacklevel=3,
-            )
-        return None if x is None else self._scaling.apply(x.astype(data.dtype))
-
-    def _check_rows(self, X, sample_weight, reset: bool = True) -> tuple[np.ndarray, np.ndarray]:
-        """Rows with time last, and weights, in the dtype of the fit."""
-        check_real("X", X)
-        options = {"dtype": [np.float64, np.float32], "ensure_min_samples": 2 if reset else 1, "reset": reset}
-        X = validate_data(self, X, ensure_all_finite=sample_weight is None, **options)
-        weights = _check_sample_weight(sample_weight, X, dtype=X.dtype, ensure_non_negative=True)
-        if sample_weight is not None:
-            assert_all_finite(X[weights > 0], estimator_name=type(self).__name__, input_name="X")
-        least = 1 if self.n_components == "auto" or not reset else self.n_components
-        check_sizes(X.shape[1], int((weights > 0).sum()), weights.sum(), least)
-        return X[:, self._order_columns(X.shape[1])], weights
-
-    def _check_chunks(self, X, sample_weight) -> ChunkedRows:
-        """Chunks of rows, after a first pass over them."""
-        chunks = open_chunks(X, sample_weight)
+            check_real("X", X)
+            options = {"dtype": [np.float64, np.float32], "ensure_min_samples": 2 if reset else 1, "reset": reset}
+            X = validate_data(self, X, ensure_all_finite=sample_weight is None, **options)
+            weights = _check_sample_weight(sample_weight, X, dtype=X.dtype, ensure_non_negative=True)
+            chunks, present = open_chunks([X], weights), weights > 0
         summary, sizes = summarize_rows(chunks)
-        if summary.num_rows < 2:
+        if chunked and summary.num_rows < 2:
             raise invalid("X", expected="at least 2 rows", got=summary.num_rows)
         width = chunks.width
-        check_sizes(width, summary.size, summary.total, 1 if self.n_components == "auto" else self.n_components)
-        vars(self).pop("feature_names_in_", None)
-        order = self._order_columns(width)
+        least = 1 if self.n_components == "auto" or not reset else self.n_components
+        check_sizes(width, summary.size, summary.total, least)
         self.n_features_in_ = width
         dtype = np.dtype(np.float32 if summary.single else np.float64)
-        return ChunkedRows(chunks, summary, sizes, order, dtype)
+        unscaled = Scaling(np.zeros(width), np.ones(width))
+        return Rows(chunks, summary, sizes, self._order_columns(width), dtype, not chunked, unscaled), present
 
     def _order_columns(self, num_columns: int) -> Int[np.ndarray, " d"]:
         return order_columns(self._time_index(num_columns), num_columns)
@@ -254,25 +262,25 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
     def _time_index(self, num_columns: int) -> int:
         return check_column(self.time_column, num_columns, getattr(self, "feature_names_in_", None))
 
-    def _run(self, data: Rows | ChunkedRows) -> tuple[Run, Model]:
-        auto = "auto" in (self.n_components, self.degree)
-        if data.num_groups is not None:
-            data = data.reweight(data.num_groups / data.total)
-        elif auto and data.total < data.size:  # normalized weights: information criteria need the number of points
-            data = data.reweight(data.size / data.total)
+    def _run(self, data: Rows, groups: Int[np.ndarray, " n"] | None) -> tuple[Run, Model]:
+        auto, size = "auto" in (self.n_components, self.degree), data.summary.size
+        if groups is not None:
+            data = data._replace(factor=(int(groups.max()) + 1) / data.total)
+        elif auto and data.total < size:  # normalized weights: information criteria need the number of points
+            data = data._replace(factor=size / data.total)
         mean, variance = data.moments()
         num_columns, total = len(mean), data.total
         envelope = make_envelope(self.envelope)
         warm = self._warm_start(num_columns)
         if warm is None:
             scaling = compute_scaling(mean, variance, envelope, self.covariance_type)
-            num, degree = self._sizes(data.size)
+            num, degree = self._sizes(size)
         else:
             scaling, (num, degree) = self._scaling, warm
-        data = data.rescale(scaling)
-        gaps = data.gaps()
+        data = data._replace(scaling=scaling)
+        gaps = 0.0 if groups is None else measure_gaps(data.take()[0], groups)
         floor = (self.reg_covar + self.reg_relative * variance) / scaling.scale**2 + gaps
-        degrees = broadcast_degrees(degree if warm is None else self.degrees_, num)
+        degrees = jnp.broadcast_to(jnp.asarray(degree if warm is None else self.degrees_, jnp.int32), (num,))
         model = Model(degrees, jnp.asarray(floor, data.dtype), self.covariance_type)
         starts = self._starts(data, scaling, model, degree, warm is not None)
         points = data.to_points(num * len(starts.time_loc), self.devices)
@@ -283,7 +291,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
                 envelope,
                 model,
                 total=total,
-                least_mass=0.5 * total / data.size,
+                least_mass=0.5 * total / size,
                 tol=self.tol,
                 max_steps=self.max_iter,
                 annealing=self.annealing,
@@ -297,7 +305,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         warn_narrow(run.params.tril, gaps)
         vars(self).pop("_online", None)
         self._fitted_with = self.covariance_type, self._time_index(num_columns)
-        return run._replace(log_likelihood=run.log_likelihood - scaling.log_volume), model
+        return run, model
 
     def _prune(self, run: Run, points: Points | Blocks, envelope, model: Model, total: float) -> tuple[Run, Model]:
         params, model = prune_mixture(
@@ -315,7 +323,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         params, model = drop_unused(params, model)
         starts = jax.tree.map(lambda z: z[None], params)
         last = run_em(starts, points, envelope, model, total=total, tol=self.tol, max_steps=self.max_iter)[0]
-        return last._replace(num_steps=run.num_steps + last.num_steps, history=run.history + last.history), model
+        return last._replace(history=run.history + last.history), model
 
     def _sizes(self, num_points: int) -> tuple[int, int]:
         degree = self.max_degree if self.degree == "auto" else self.degree
@@ -338,7 +346,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         rng = check_random_state(self.random_state)
         made, whole = [], None
         for _ in range(self.n_init):
-            subset = draw_subset(data.size, rng)
+            subset = draw_subset(data.summary.size, rng)
             if subset is None and whole is None:
                 whole = data.take()
             one = initialize(self.init_params, *(whole if subset is None else data.take(subset)), model, degree, rng)
@@ -349,7 +357,8 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
     def precisions_cholesky_(self) -> np.ndarray:
         """Upper-triangular factors U of `precisions_` (K, d, d) = U U^T. Raises LinAlgError for a singular one."""
         check_is_fitted(self)
-        return factor_precisions(self.covariances_)
+        inverse = np.linalg.inv(np.linalg.cholesky(self.covariances_))
+        return np.tril(inverse).swapaxes(-1, -2)  # some LAPACKs leave rounding above the diagonal
 
     @property
     def precisions_(self) -> np.ndarray:
@@ -376,7 +385,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         self.weights_ = np.exp(params.log_weights) / np.exp(params.log_weights).sum()
         self.degrees_ = np.asarray(model.degrees)
         self.status_, self.converged_ = run.status, run.status == EMStatus.CONVERGED
-        self.n_iter_, self.lower_bound_ = run.num_steps, run.log_likelihood
+        self.n_iter_, self.lower_bound_ = len(run.history), run.log_likelihood - self._scaling.log_volume
         self.lower_bounds_ = [value - self._scaling.log_volume for value in run.history]
 
     def partial_fit(self, X, y=None, sample_weight=None):
@@ -394,63 +403,54 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
             cure = "fit takes chunks; or call partial_fit with one after another."
             raise invalid("X", expected="one batch of rows", got="chunks", cure=cure)
         if not hasattr(self, "_online"):
-            if not isinstance(make_envelope(self.envelope), Constant):
-                cure = "Use fit, or gradient_fit.fit_gradient with batch_size."
-                raise invalid("envelope", expected='"constant" for partial_fit', got=repr(self.envelope), cure=cure)
             return self._fit_first_batch(X, sample_weight)
         check_parameters(self)
-        x, weights = self._check_rows(X, sample_weight, reset=False)
-        x, weights = x[weights > 0], weights[weights > 0]
-        sums, seen, batches, model = self._online
+        sums, seen, history, model = self._online
         with enable_dtype(self._params.curve.dtype):
-            scaled = self._scaling.apply(x.astype(self._params.curve.dtype))
-            points = make_points(scaled, weights.astype(scaled.dtype), len(self.weights_), self.devices)
-            total, batches = float(weights.sum(dtype=np.float64)), batches + 1
-            fraction = (total / (seen + total)) ** FORGETTING
-            params = self._arrays(scaled.dtype)
-            new = compute_batch_statistics(params, points)
-            value = float(new.log_likelihood) / total
-            params, sums = update_online(params, sums, new, model, jnp.asarray(fraction, scaled.dtype))
-        status = EMStatus.NOT_CONVERGED if np.isfinite(value) else EMStatus.NOT_FINITE
-        if status == EMStatus.NOT_FINITE:
-            expected, got = "a batch near the components", "densities that underflow"
-            raise invalid("X", expected=expected, got=got, cure="Shuffle the data.")
-        history = [*self._history, value]
-        self._set_fitted(Run(params, value - self._scaling.log_volume, history, batches, status, 0), model)
-        self._online, self._history = (sums, seen + total, batches, model), history
+            new, total = self._sum_batch(X, sample_weight)
+            value, fraction = float(new.log_likelihood) / total, (total / (seen + total)) ** FORGETTING
+            if not np.isfinite(value):
+                expected, got = "a batch near the components", "densities that underflow"
+                raise invalid("X", expected=expected, got=got, cure="Shuffle the data.")
+            fraction = jnp.asarray(fraction, self._params.curve.dtype)
+            params, sums = update_online(self._arrays(), sums, new, model, fraction)
+        history = [*history, value]
+        self._set_fitted(Run(params, history, EMStatus.NOT_CONVERGED), model)
+        self._online = sums, seen + total, history, model
         return self
 
     def _fit_first_batch(self, X, sample_weight):
+        if not isinstance(make_envelope(self.envelope), Constant):
+            cure = "Use fit, or gradient_fit.fit_gradient with batch_size."
+            raise invalid("envelope", expected='"constant" for partial_fit', got=repr(self.envelope), cure=cure)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ConvergenceWarning)
-            scaled = self._fit(X, sample_weight)
+            self.fit(X, sample_weight=sample_weight)
         if self.status_ in (EMStatus.NOT_FINITE, EMStatus.SINGULAR):
             warnings.warn(
                 f"The first batch ended as {self.status_.name}. {_CURES[self.status_]}",
                 ConvergenceWarning,
                 stacklevel=3,
             )
-        with enable_dtype(scaled.dtype):
-            weights = _check_sample_weight(sample_weight, scaled, dtype=scaled.dtype)
-            points = make_points(scaled[weights > 0], weights[weights > 0], len(self.weights_), self.devices)
-            sums = compute_batch_statistics(self._arrays(scaled.dtype), points)
-            model = Model(jnp.asarray(self.degrees_), jnp.asarray(self._floor, scaled.dtype), self.covariance_type)
-        self._online = (sums, float(weights.sum(dtype=np.float64)), 1, model)
-        self._history = [self.lower_bound_ + self._scaling.log_volume]
-        self.n_iter_ = 1
+        dtype = self._params.curve.dtype
+        with enable_dtype(dtype):
+            sums, total = self._sum_batch(X, sample_weight)
+            model = Model(jnp.asarray(self.degrees_), jnp.asarray(self._floor, dtype), self.covariance_type)
+        self._online, self.n_iter_ = (sums, total, [self.lower_bound_ + self._scaling.log_volume], model), 1
         return self
+
+    def _sum_batch(self, X, sample_weight) -> tuple[SufficientStatistics, float]:
+        """The sufficient statistics of a batch, and its weight."""
+        data = self._check_rows(X, sample_weight, reset=False)[0]
+        data = data._replace(dtype=self._params.curve.dtype, scaling=self._scaling)
+        points = data.to_points(len(self.weights_), self.devices)
+        return sum_over_points(accumulate, points, self._arrays(), Constant()), data.total
 
     # --- prediction: for chunks an iterator of arrays, for a dask array another, lazy one ----------------------
 
     def score_samples(self, X) -> Float[np.ndarray, " n"]:
         """log p(x) of each row, in the units of X; an iterator of arrays for chunks, a dask array for a dask array."""
-        if is_chunked(X):
-            return self._open_chunks(X).map(predict_log_prob, self._fitted_parameters())
-        y = self._scaled(X)
-        with enable_dtype(y.dtype):
-            points = make_points(y, np.ones(len(y), y.dtype), len(self._params.time_loc))
-            value = np.asarray(compute_log_densities(self._arrays(y.dtype), self._envelope, points))[: len(y)]
-        return value - y.dtype.type(self._scaling.log_volume)
+        return self._evaluate(predict_log_prob, X)
 
     def score(self, X, y=None) -> float:
         """The mean of `score_samples`, over all chunks."""
@@ -458,18 +458,11 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
 
     def predict(self, X) -> Int[np.ndarray, " n"]:
         """The most likely component of each row; an iterator of arrays for chunks, a dask array for a dask array."""
-        if is_chunked(X):
-            return self._open_chunks(X).map(predict_components, self._fitted_parameters(), dtype=np.int64)
-        return self.predict_proba(X).argmax(1)
+        return self._evaluate(predict_components, X, dtype=np.int64)
 
     def predict_proba(self, X) -> Float[np.ndarray, "n k"]:
         """P(component | x) of each row; an iterator of arrays for chunks, a dask array for a dask array."""
-        if is_chunked(X):
-            chunks = self._open_chunks(X)
-            return chunks.map(predict_responsibilities, self._fitted_parameters(), num_columns=len(self.weights_))
-        y = self._scaled(X)
-        with enable_dtype(y.dtype):
-            return self._responsibilities(y)
+        return self._evaluate(predict_responsibilities, X, columns=True)
 
     def transform(self, X) -> Float[np.ndarray, "n k"]:
         """`predict_proba` of rows, as features named foldedgaussianmixture0, ... in the container of `set_output`."""
@@ -481,30 +474,27 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
     def _n_features_out(self) -> int:
         return len(self.weights_)
 
-    def _responsibilities(self, y):
-        points = make_points(y, np.ones(len(y), y.dtype), len(self._params.time_loc))
-        return np.asarray(compute_responsibilities(self._arrays(y.dtype), self._envelope, points))[: len(y)]
+    def _evaluate(self, function, X, dtype=None, columns: bool = False):
+        """Apply `function(fitted, x)` to the rows, or to each chunk; `dtype` and `columns` describe its results."""
+        check_is_fitted(self)
+        envelope = jax.tree.map(lambda z: np.asarray(z) if isinstance(z, jax.Array) else z, self._envelope)
+        fitted = FittedParameters(self._params, envelope, self._scaling, self._order_columns(self.n_features_in_))
+        if is_chunked(X):
+            chunks, num = open_chunks(X, width=self.n_features_in_), len(self.weights_) if columns else None
+            return chunks.map(function, fitted, num_columns=num, dtype=dtype)
+        check_real("X", X)
+        return function(fitted, validate_data(self, X, dtype=[np.float64, np.float32], reset=False))
 
     def _mean_score(self, X, groups=None) -> tuple[float, int]:
         """The mean log p(x), and the number of rows, or of groups."""
-        if not is_chunked(X):
-            value = self.score_samples(X)
-            which = check_groups(groups, np.ones(len(value), bool))
-            return float(value.mean(dtype=np.float64)), len(value) if which is None else int(which.max()) + 1
-        refuse_groups(groups)
-        parts = list(self._open_chunks(X).run(sum_log_prob, self._fitted_parameters()))
-        num = sum(size for _, size in parts)
+        values = self.score_samples(X)
+        parts = [values] if hasattr(values, "shape") else values
+        sums = np.array([(float(part.sum(dtype=np.float64)), len(part)) for part in parts]).reshape(-1, 2)
+        total, num = sums.sum(0)
         if not num:
             raise invalid("X", expected="at least one chunk with rows", got="none")
-        return sum(total for total, _ in parts) / num, num
-
-    def _open_chunks(self, X) -> Chunks:
-        check_is_fitted(self)
-        return open_chunks(X, width=self.n_features_in_)
-
-    def _fitted_parameters(self) -> FittedParameters:
-        envelope = jax.tree.map(lambda z: np.asarray(z) if isinstance(z, jax.Array) else z, self._envelope)
-        return FittedParameters(self._params, envelope, self._scaling, self._order_columns(self.n_features_in_))
+        which = check_groups(groups, None if is_chunked(X) else np.ones(int(num), bool))
+        return float(total / num), int(num) if which is None else int(which.max()) + 1
 
     def bic(self, X, groups=None) -> float:
         """-2 log-likelihood + parameters log n: smaller is better. `groups` as in `fit`: n is their number."""
@@ -573,15 +563,8 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
             mixture = self.to_mixture().condition([order.index(column) for column in columns], values)
         return jax.tree.map(lambda z: jnp.asarray(z, jax.dtypes.canonicalize_dtype(z.dtype)), mixture)
 
-    def _scaled(self, X) -> np.ndarray:
-        check_is_fitted(self)
-        check_real("X", X)
-        X = validate_data(self, X, dtype=[np.float64, np.float32], reset=False)
-        dtype = np.result_type(X, self._params.curve)  # parameters fitted in float64 may be out of float32's range
-        return self._scaling.apply(X[:, self._order_columns(X.shape[1])].astype(dtype))
-
-    def _arrays(self, dtype) -> Parameters:
-        return Parameters(*(jnp.asarray(z, dtype) for z in self._params))
+    def _arrays(self) -> Parameters:
+        return Parameters(*map(jnp.asarray, self._params))
 
 
 def _print_progress(number: int, values: np.ndarray) -> None:

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
-from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
+from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, clone
 from sklearn.utils import _safe_indexing
 from sklearn.utils.validation import check_is_fitted, validate_data
 
@@ -32,8 +32,8 @@ class FoldedMixtureRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     other slopes, variances and numbers of modes in other regions; far from all data the nearest component's polynomial
     extrapolates.
 
-    **Parameters:** those of `FoldedGaussianMixture`, except that `time_column` is a column of X (by default the last).
-    They maximize the joint likelihood of X and y, not the error of y.
+    **Parameters:** `mixture`, an unfitted `FoldedGaussianMixture` (default: one with its defaults), whose `time_column`
+    is a column of X. It maximizes the joint likelihood of X and y, not the error of y.
 
     **Shapes:** X (n, p), p >= 1; y (n,) or (n, m); predictions have the shape of y. **dtype:** float64.
 
@@ -41,7 +41,7 @@ class FoldedMixtureRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     **Example:**
 
-        regressor = FoldedMixtureRegressor(3, degree=2, random_state=0).fit(X, y)
+        regressor = FoldedMixtureRegressor(FoldedGaussianMixture(3, degree=2, random_state=0)).fit(X, y)
         mean, std = regressor.predict(X, return_std=True)
         low, median, high = regressor.predict_quantiles(X, [0.05, 0.5, 0.95]).T
 
@@ -49,42 +49,8 @@ class FoldedMixtureRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     **Raises:** ValueError naming the parameter.
     """
 
-    def __init__(
-        self,
-        n_components="auto",
-        *,
-        degree="auto",
-        covariance_type="full",
-        envelope="constant",
-        time_column=-1,
-        tol=1e-3,
-        reg_covar=1e-6,
-        reg_relative=1e-9,
-        max_iter=100,
-        n_init=1,
-        init_params="kmeans",
-        annealing=1.0,
-        max_components=10,
-        max_degree=3,
-        criterion="bic",
-        random_state=None,
-    ):
-        self.n_components = n_components
-        self.degree = degree
-        self.covariance_type = covariance_type
-        self.envelope = envelope
-        self.time_column = time_column
-        self.tol = tol
-        self.reg_covar = reg_covar
-        self.reg_relative = reg_relative
-        self.max_iter = max_iter
-        self.n_init = n_init
-        self.init_params = init_params
-        self.annealing = annealing
-        self.max_components = max_components
-        self.max_degree = max_degree
-        self.criterion = criterion
-        self.random_state = random_state
+    def __init__(self, mixture=None):
+        self.mixture = mixture
 
     def fit(self, X, y, sample_weight=None, groups=None):
         """Fit the mixture of (X, y); `sample_weight` (n,) and `groups` (n,) as in `FoldedGaussianMixture.fit`.
@@ -99,9 +65,11 @@ class FoldedMixtureRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             X, y, sample_weight = (_safe_indexing(z, present) for z in (X, y, sample_weight))
             groups = None if groups is None else np.asarray(groups)[present]
         X, y = validate_data(self, X, y, dtype=np.float64, multi_output=True, y_numeric=True, ensure_min_samples=2)
-        column = check_column(self.time_column, X.shape[1], getattr(self, "feature_names_in_", None))
-        mixture = FoldedGaussianMixture(**self.get_params(deep=False) | {"time_column": column})
-        self.mixture_ = mixture.fit(np.column_stack([X, y]), sample_weight=sample_weight, groups=groups)
+        mixture = FoldedGaussianMixture() if self.mixture is None else clone(self.mixture)
+        column = check_column(mixture.time_column, X.shape[1], getattr(self, "feature_names_in_", None))
+        self.mixture_ = mixture.set_params(time_column=column).fit(
+            np.column_stack([X, y]), sample_weight=sample_weight, groups=groups
+        )
         self.n_iter_, self._target_shape = self.mixture_.n_iter_, y.shape[1:]
         return self
 

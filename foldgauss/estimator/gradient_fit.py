@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Key
 
 from foldgauss._runtime.checks import invalid, is_integer
 from foldgauss.envelope import CallableEnvelope
@@ -30,19 +30,6 @@ class GradientFit(NamedTuple):
     log_likelihoods: np.ndarray
     success: bool
     message: str
-
-
-class _Raw(NamedTuple):
-    """The optimized parameters: unconstrained, and in units of each component's initial scales."""
-
-    logits: Float[Array, " k"]
-    loc: Float[Array, "k d-1"]
-    log_diagonal: Float[Array, "k d-1"]
-    lower: Float[Array, "k d-1 d-1"]
-    time_loc: Float[Array, " k"]
-    log_time_scale: Float[Array, " k"]
-    fold: PyTree
-    envelope: PyTree
 
 
 def fit_gradient(
@@ -131,44 +118,33 @@ def _step(raw, state, start, x, weights, key, optimizer, batch_size):
     return new, state, -value, current, jnp.isfinite(value) & _is_finite(current)
 
 
-def _init_raw(mixture: FoldedMixture) -> _Raw:
+def _parts(mixture: FoldedMixture) -> tuple:
     components = mixture.components
-    zero = jnp.zeros_like(components.loc)
-    fold = eqx.filter(components.fold, eqx.is_inexact_array)
-    envelope = components.envelope if isinstance(components.envelope, CallableEnvelope) else None
-    return _Raw(
-        jnp.zeros_like(mixture.logits),
-        zero,
-        zero,
-        jnp.zeros_like(components.scale_tril),
-        jnp.zeros_like(components.time_loc),
-        jnp.zeros_like(components.time_loc),
-        fold,
-        eqx.filter(envelope, eqx.is_inexact_array),
-    )
+    times = (components.time_loc, components.time_scale)
+    return (mixture.logits, components.loc, components.scale_tril, *times, components.fold, components.envelope)
 
 
-def _build_mixture(raw: _Raw, start: FoldedMixture) -> FoldedMixture:
+def _init_raw(mixture: FoldedMixture) -> tuple:
+    """The optimized parameters, one of each part: unconstrained, and in units of each component's initial scales."""
+    *arrays, fold, envelope = _parts(mixture)
+    trained = envelope if isinstance(envelope, CallableEnvelope) else None
+    return (*map(jnp.zeros_like, arrays), *(eqx.filter(z, eqx.is_inexact_array) for z in (fold, trained)))
+
+
+def _build_mixture(raw: tuple, start: FoldedMixture) -> FoldedMixture:
     """Apply `raw` to the start: it shifts centers in units of Sigma's factor, times in units of sigma_t."""
+    logits, loc, factor, time_loc, log_time_scale, fold, envelope = raw
     initial = start.components
-    diagonal = jnp.diagonal(initial.scale_tril, axis1=1, axis2=2)
+    diagonal, log_diagonal = (jnp.diagonal(z, axis1=1, axis2=2) for z in (initial.scale_tril, factor))
     eye = jnp.eye(diagonal.shape[-1], dtype=diagonal.dtype)[None]
-    lower = jnp.tril(initial.scale_tril + diagonal[:, :, None] * raw.lower, -1)
-    leaves = (
-        initial.loc + diagonal * raw.loc,
-        lower + (diagonal * jnp.exp(raw.log_diagonal))[:, :, None] * eye,
-        initial.time_loc + initial.time_scale * raw.time_loc,
-        initial.time_scale * jnp.exp(raw.log_time_scale),
-        eqx.combine(raw.fold, initial.fold),
-        initial.envelope if raw.envelope is None else eqx.combine(raw.envelope, initial.envelope),
+    lower = jnp.tril(initial.scale_tril + diagonal[:, :, None] * factor, -1)
+    parts = (
+        start.logits + logits,
+        initial.loc + diagonal * loc,
+        lower + (diagonal * jnp.exp(log_diagonal))[:, :, None] * eye,
+        initial.time_loc + initial.time_scale * time_loc,
+        initial.time_scale * jnp.exp(log_time_scale),
+        eqx.combine(fold, initial.fold),
+        initial.envelope if envelope is None else eqx.combine(envelope, initial.envelope),
     )
-    where = lambda m: (  # noqa: E731
-        m.components.loc,
-        m.components.scale_tril,
-        m.components.time_loc,
-        m.components.time_scale,
-        m.components.fold,
-        m.components.envelope,
-        m.logits,
-    )
-    return eqx.tree_at(where, start, (*leaves, start.logits + raw.logits))
+    return eqx.tree_at(_parts, start, parts)

@@ -132,7 +132,7 @@ class Fit(eqx.Module):
     def standard_errors(self) -> CenterParameters:
         """Of loc and the fold's coefficients, given the times and (time_loc, time_scale)."""
         to_powers = jnp.asarray(hermite_to_powers(self.degree), self.triangle_inverse.dtype)
-        length = _norm(jnp.matmul(to_powers, self.triangle_inverse))
+        length = jnp.linalg.norm(jnp.matmul(to_powers, self.triangle_inverse), axis=-1)
         errors = length[:, None] * self.residual_scale[None]
         return CenterParameters(errors[0], errors[1:] / _powers(self.distribution.time_scale, self.degree))
 
@@ -147,7 +147,7 @@ class Fit(eqx.Module):
         """(lower, upper) for the curve loc + f(time_loc - t), exact at each t: shapes (*m, d-1)."""
         dist, t = self.distribution, jnp.asarray(t, self.residual_scale.dtype)
         rows = hermite((dist.time_loc - t) / dist.time_scale, self.degree)
-        error = _norm(jnp.matmul(rows, self.triangle_inverse))[..., None]
+        error = jnp.linalg.norm(jnp.matmul(rows, self.triangle_inverse), axis=-1)[..., None]
         half = _student_quantile(_check_level(level), self.degrees_of_freedom) * error
         half = half * lax.expand_dims(self.residual_scale, range(t.ndim))
         center = dist.condition_time(t).loc
@@ -349,7 +349,7 @@ def _assemble_fit(plan: _Plan, data: _Data, space: Space, when, status, steps, u
         status=status,
         steps=steps,
         triangle_inverse=solve_upper_matrix(triangle, jnp.eye(len(triangle), dtype=triangle.dtype)),
-        residual_scale=unbiased * _norm(space.tril) * data.scale,
+        residual_scale=unbiased * jnp.linalg.norm(space.tril, axis=-1) * data.scale,
         time=plan.time,
         covariance_type=plan.covariance_type,
     )
@@ -358,10 +358,6 @@ def _assemble_fit(plan: _Plan, data: _Data, space: Space, when, status, steps, u
 def _powers(time_scale, degree: int) -> Float[Array, "degree 1"]:
     """time_scale^k, k = 1..degree."""
     return jnp.cumprod(jnp.broadcast_to(time_scale, (degree,)))[:, None]
-
-
-def _norm(rows):
-    return jnp.sqrt((rows * rows).sum(-1))
 
 
 def _num_parameters(degree: int, dim: int, time: str, covariance_type: str) -> int:
@@ -485,16 +481,12 @@ def select_degree(
     **Example:** `select_degree(x, 6, "bic").degree`
 
     **Source:** Schwarz 1978; Akaike 1974; Stone 1974. **Raises:** ValueError on an unknown criterion, or if no
-    degree can be fitted.
+    degree can be fitted; TypeError on unknown options.
     """
     check_one_of("criterion", criterion, (*_CRITERIA, "cv"))
-    if "degree" in options:
-        raise invalid("degree", expected="no such option", got=options["degree"], cure="It is selected.")
-    defaults = {name: p.default for name, p in inspect.signature(fit).parameters.items() if name != "x"}
-    unknown = set(options) - set(defaults)
-    if unknown:
-        raise invalid("options", expected="options of fit", got=", ".join(sorted(unknown)), cure="See fit.")
-    plan = _make_plan(x, **(defaults | options | {"degree": _check_degree("max_degree", max_degree)}))
+    call = inspect.signature(fit).bind(x, degree=_check_degree("max_degree", max_degree), **options)
+    call.apply_defaults()
+    plan = _make_plan(**call.arguments)
     if criterion == "cv":
         key = jax.random.key(0) if key is None else key
         scores = _cross_validate(plan, jax.random.permutation(key, jnp.arange(len(plan.x)) % _CV_FOLDS))

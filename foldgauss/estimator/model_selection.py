@@ -61,27 +61,23 @@ def select_mixture(
         raise invalid("n_components", expected="whole numbers >= 1", got=sizes, cure="For example range(1, 6).")
     if not degrees or not all(q == "auto" or is_integer(q, 0) for q in degrees):
         raise invalid("degrees", expected='whole numbers >= 0 or "auto"', got=degrees)
-    parts, least = None, np.inf
-    if not is_chunked(X):
+    parts = None
+    if criterion == "cv":
+        if is_chunked(X):
+            got, cure = '"cv"', "Or pass one array."
+            raise invalid("criterion", expected='"bic" or "aic" for chunks of rows', got=got, cure=cure)
         X = X if hasattr(X, "shape") else np.asarray(X)  # a data frame keeps the names of its columns
-        parts = _assign_folds(len(X), folds, groups) if criterion == "cv" else None
-        least = len(X) if parts is None else min(int((parts != part).sum()) for part in range(parts.max() + 1))
-    elif criterion == "cv":
-        raise invalid("criterion", expected='"bic" or "aic" for chunks of rows', got='"cv"', cure="Or pass one array.")
-    if max(sizes) > least:
-        got, cure = max(sizes), "Fewer components."
-        raise invalid("n_components", expected=f"at most {least}, the points of a fit", got=got, cure=cure)
+        parts = _assign_folds(len(X), folds, groups)
     scores, chosen, told = np.full((len(sizes), len(degrees)), np.inf), None, []
     for i, size in enumerate(sizes):
         for j, degree in enumerate(degrees):
             one = clone(estimator).set_params(n_components=int(size), degree=degree)
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always", ConvergenceWarning)
-                scores[i, j] = (
-                    _cross_validate(one, X, parts, groups)
-                    if criterion == "cv"
-                    else _penalize(one, X, groups, criterion)
-                )
+                if criterion == "cv":
+                    scores[i, j] = _hold_out(one, X, parts, groups)
+                else:
+                    scores[i, j] = _penalize(one, X, groups, criterion)
             if scores[i, j] < np.inf and scores[i, j] == scores.min():
                 chosen, told = one, caught
     if not np.isfinite(scores).any():
@@ -95,28 +91,22 @@ def select_mixture(
 
 
 def _penalize(estimator, X, groups, criterion: str) -> float:
-    fitted = _fit_or_none(estimator, X, groups)
-    return np.inf if fitted is None else getattr(fitted, criterion)(X, groups)
+    estimator.fit(X, groups=groups)
+    return np.inf if estimator.status_ == EMStatus.NOT_FINITE else getattr(estimator, criterion)(X, groups)
 
 
-def _cross_validate(estimator, X, parts, groups) -> float:
+def _hold_out(estimator, X, parts, groups) -> float:
     total = 0.0
     for part in range(parts.max() + 1):
-        kept = parts != part
-        # The rows of a single group give no gap between groups.
-        some = None if groups is None or len(np.unique(np.asarray(groups)[kept])) < 2 else np.asarray(groups)[kept]
-        fitted = _fit_or_none(clone(estimator), _safe_indexing(X, np.flatnonzero(kept)), some)
-        if fitted is None:
+        kept, held = np.flatnonzero(parts != part), np.flatnonzero(parts == part)
+        some = None if groups is None else np.asarray(groups)[kept]
+        if some is not None and len(np.unique(some)) < 2:  # the rows of a single group give no gap between groups
+            some = None
+        fitted = clone(estimator).fit(_safe_indexing(X, kept), groups=some)
+        if fitted.status_ == EMStatus.NOT_FINITE:
             return np.inf
-        total += -2 * float(
-            fitted.score_samples(_safe_indexing(X, np.flatnonzero(parts == part))).sum(dtype=np.float64)
-        )
+        total -= 2 * float(fitted.score_samples(_safe_indexing(X, held)).sum(dtype=np.float64))
     return total if np.isfinite(total) else np.inf
-
-
-def _fit_or_none(estimator, X, groups) -> FoldedGaussianMixture | None:
-    fitted = estimator.fit(X, groups=groups)
-    return None if fitted.status_ == EMStatus.NOT_FINITE else fitted
 
 
 def _assign_folds(num: int, folds: int, groups: np.ndarray | None) -> np.ndarray:

@@ -5,9 +5,8 @@ from numbers import Integral
 import jax
 import numpy as np
 
-from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within, short_repr
+from foldgauss._runtime.checks import check_one_of, invalid, short_repr
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood, as_envelope, check_peak
-from foldgauss.estimator.em.initialization import INITIALIZERS
 
 __all__ = [
     "check_array",
@@ -18,33 +17,12 @@ __all__ = [
     "make_envelope",
 ]
 
-_COVARIANCES = ("full", "diag", "spherical", "tied")
 _ENVELOPES = {"constant": Constant, "time_likelihood": lambda: TimeLikelihood(power=1.0, floor=1e-3)}
 
 
 def check_parameters(estimator) -> None:
     """Raise ValueError naming the first parameter that is out of its bounds."""
-    for name, least in {"n_components": 1, "degree": 0}.items():
-        value = getattr(estimator, name)
-        if value != "auto" and not is_integer(value, least):
-            raise invalid(name, expected=f'a whole number >= {least} or "auto"', got=repr(value))
-    for name, least in {"max_components": 1, "max_degree": 0, "max_iter": 0, "n_init": 1, "devices": 1}.items():
-        if not is_integer(getattr(estimator, name), least):
-            raise invalid(name, expected=f"a whole number >= {least}", got=repr(getattr(estimator, name)))
-    for name in ("tol", "reg_covar", "reg_relative"):
-        if not is_within(getattr(estimator, name), "[0, inf)"):
-            raise invalid(name, expected="a number >= 0", got=repr(getattr(estimator, name)))
-    if not isinstance(estimator.warm_start, bool | np.bool_):
-        raise invalid("warm_start", expected="True or False", got=repr(estimator.warm_start))
-    if not isinstance(estimator.verbose, bool | np.bool_) and not is_integer(estimator.verbose, 0):
-        raise invalid("verbose", expected="a whole number >= 0", got=repr(estimator.verbose), cure="0 is silent.")
-    if not is_within(estimator.annealing, "(0, 1]"):
-        raise invalid(
-            "annealing", expected="a number in (0, 1]", got=repr(estimator.annealing), cure="1 is no annealing."
-        )
-    check_one_of("covariance_type", estimator.covariance_type, _COVARIANCES)
-    check_one_of("init_params", estimator.init_params, tuple(INITIALIZERS))
-    check_one_of("criterion", estimator.criterion, ("bic", "aic"))
+    estimator._validate_params()
     make_envelope(estimator.envelope)
     if estimator.devices > len(jax.devices()):
         expected, cure = f"at most {len(jax.devices())}", "See jax.devices()."
@@ -84,15 +62,10 @@ def check_column(column, num_columns: int, names=None, parameter: str = "time_co
 
 def check_real(name: str, X) -> None:
     """Raise if rows hold dates, durations or complex numbers, which other libraries convert or report at length."""
-    kinds = getattr(X, "dtypes", None)
-    if kinds is None:
-        kinds = [np.asarray(X).dtype if isinstance(X, list | tuple) else getattr(X, "dtype", None)]
-    for kind in map(str, np.atleast_1d(np.asarray(kinds, object))):
-        if kind.lower().startswith(("date", "time", "duration")):
-            cure = "Convert times to seconds as floats, from an origin near them."
-            raise invalid(name, expected="numbers", got=kind, cure=cure)
-        if kind.startswith("complex"):
-            cure = "Complex data not supported: pass real and imaginary parts as columns."
+    of_list = np.asarray(X).dtype if isinstance(X, list | tuple) else None
+    for kind in map(str, np.ravel(np.asarray(getattr(X, "dtypes", getattr(X, "dtype", of_list)), object))):
+        if kind.lower().startswith(("date", "time", "duration", "complex")):
+            cure = "Convert times to seconds, from an origin near them. Complex data not supported: pass two columns."
             raise invalid(name, expected="real numbers", got=kind, cure=cure)
 
 

@@ -1,7 +1,6 @@
 """Initial values and precision matrices in scikit-learn's conventions."""
 
 import numpy as np
-from jaxtyping import Float
 
 from foldgauss._runtime.checks import invalid
 from foldgauss.envelope import Constant
@@ -10,7 +9,7 @@ from foldgauss.estimator.em.initialization import params_from_gaussians
 from foldgauss.estimator.em.scaling import Scaling, to_mixture
 from foldgauss.estimator.parameter_checks import check_array
 
-__all__ = ["factor_precisions", "replace_initial"]
+__all__ = ["replace_initial"]
 
 
 def replace_initial(estimator, params: Parameters, scaling: Scaling, degree: int) -> Parameters:
@@ -57,9 +56,3 @@ def _invert_precisions(precisions, kind: str, num: int, dim: int) -> np.ndarray:
             "precisions_init", expected="symmetric and positive definite", got="others", cure="Invert covariances."
         )
     return np.linalg.inv(precisions)
-
-
-def factor_precisions(covariances: Float[np.ndarray, "k d d"]) -> Float[np.ndarray, "k d d"]:
-    """Upper-triangular U with U U^T the inverses of the covariances. Raises LinAlgError for singular ones."""
-    inverse = np.linalg.inv(np.linalg.cholesky(covariances))  # lower triangular up to rounding, by some LAPACK
-    return np.tril(inverse).swapaxes(-1, -2)

@@ -1,24 +1,26 @@
-"""The training data of a fit: rows in memory or in chunks, under one interface, and the order of their columns."""
+"""The training data of a fit, rows in memory or in chunks: their preparation, groups, dtype, and order of columns."""
 
+import functools
 import warnings
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from sklearn.exceptions import ConvergenceWarning
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.estimator.chunks import Chunks, RowSummary, collect_rows, weighted_moments
-from foldgauss.estimator.em.scaling import RowTransform, Scaling
+from foldgauss.estimator.chunks import DaskChunks, IterableChunks, Piece, RowSummary, collect_rows
+from foldgauss.estimator.em.scaling import Scaling
 from foldgauss.estimator.em.statistics import Blocks, Points, make_points
 
 __all__ = [
-    "ChunkedRows",
+    "SMOOTH_ROWS",
     "Rows",
     "check_groups",
     "choose_dtype",
+    "measure_gaps",
     "order_columns",
-    "refuse_groups",
     "warn_narrow",
     "warn_smooth",
 ]
@@ -31,125 +33,78 @@ _GAP_ROWS = 200
 #: Rows lie on smooth curves if the second differences of successive rows are less than this fraction of the first ones:
 #: 1.7 for independent rows, 1.4 for a random walk, and 0.3 for curves with noise of an eighth of a step.
 _SMOOTH = 0.3
+#: Rows of which that is measured: the first ones.
+SMOOTH_ROWS = 10_000
 #: A component is narrow if its variance is less than this many squared gaps; one of them is added to every variance.
 _NARROW = 1.25
 
 
 class Rows(NamedTuple):
-    """Rows of positive weight in memory, time last."""
+    """The rows of a fit in chunks, their summary from a first pass, and how they are prepared; one array is one chunk.
 
-    x: Float[np.ndarray, "n d"]
-    weights: Float[np.ndarray, " n"]
-    groups: Int[np.ndarray, " n"] | None = None
+    Prepared are the rows of positive weight: time last, scaled, and the weights times `factor`.
+    """
 
-    @property
-    def dtype(self) -> np.dtype:
-        return self.x.dtype
-
-    @property
-    def size(self) -> int:
-        return len(self.weights)
-
-    @property
-    def total(self) -> float:
-        return float(self.weights.sum(dtype=np.float64))
-
-    def moments(self) -> tuple[np.ndarray, np.ndarray]:
-        """Weighted mean and variance of each column."""
-        return weighted_moments(self.x, self.weights)
-
-    def astype(self, dtype: np.dtype) -> "Rows":
-        return self._replace(x=self.x.astype(dtype, copy=False), weights=self.weights.astype(dtype, copy=False))
-
-    def reweight(self, factor: float) -> "Rows":
-        return self._replace(weights=self.weights * self.dtype.type(factor))
-
-    def rescale(self, scaling: Scaling) -> "Rows":
-        return self._replace(x=scaling.apply(self.x))
-
-    @property
-    def num_groups(self) -> int | None:
-        return None if self.groups is None else len(np.unique(self.groups))
-
-    def gaps(self) -> Float[np.ndarray, " d"] | float:
-        """The median squared distance in each column to the nearest row of another group; 0 without groups."""
-        if self.groups is None:
-            return 0.0
-
-        def one(row: int) -> np.ndarray:
-            square = (self.x[self.groups != self.groups[row]] - self.x[row]) ** 2
-            return square[square.sum(1).argmin()]
-
-        return np.median([one(row) for row in np.unique(np.linspace(0, self.size - 1, _GAP_ROWS).astype(int))], axis=0)
-
-    def take(self, subset: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """The rows with these indices (None: all), and their weights."""
-        return (self.x, self.weights) if subset is None else (self.x[subset], self.weights[subset])
-
-    def to_points(self, num_components: int, devices: int) -> Points:
-        return make_points(self.x, self.weights, num_components, devices)
-
-
-class ChunkedRows(NamedTuple):
-    """Rows in chunks, and their summary from a first pass."""
-
-    chunks: Chunks
+    chunks: IterableChunks | DaskChunks
     summary: RowSummary
     sizes: list[int]
     order: Int[np.ndarray, " d"]
     dtype: np.dtype
+    in_memory: bool
+    scaling: Scaling
     factor: float = 1.0
-    scaling: Scaling | None = None
-    num_groups = None
-
-    @property
-    def size(self) -> int:
-        return self.summary.size
 
     @property
     def total(self) -> float:
         return self.summary.total * self.factor
 
     @property
-    def transform(self) -> RowTransform:
-        return RowTransform(self.order, self.scaling, self.factor, self.dtype)
+    def prepare(self) -> Callable:
+        return functools.partial(_prepare, self.order, self.scaling, self.factor, self.dtype)
 
     def moments(self) -> tuple[np.ndarray, np.ndarray]:
         """Weighted mean and variance of each column."""
-        return self.summary.mean[self.order], self.summary.scatter[self.order] / self.summary.total
-
-    def gaps(self) -> float:
-        return 0.0
-
-    def astype(self, dtype: np.dtype) -> "ChunkedRows":
-        return self._replace(dtype=dtype)
-
-    def reweight(self, factor: float) -> "ChunkedRows":
-        return self._replace(factor=factor)
-
-    def rescale(self, scaling: Scaling) -> "ChunkedRows":
-        return self._replace(scaling=scaling)
+        return self.summary.mean[self.order], self.summary.variance[self.order]
 
     def take(self, subset: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """The rows with these indices (None: all), and their weights."""
-        return collect_rows(self.chunks, self.sizes, subset, self.transform)
+        """The prepared rows with these indices (None: all), and their weights."""
+        return collect_rows(self.chunks, self.sizes, subset, self.prepare)
 
-    def to_points(self, num_components: int, devices: int) -> Blocks:
-        return Blocks(self.chunks, self.transform, self.dtype, num_components, self.sizes, devices)
+    def to_points(self, num_components: int, devices: int) -> Points | Blocks:
+        if self.in_memory:
+            return make_points(*self.take(), num_components, devices)
+        return Blocks(self.chunks, self.prepare, self.dtype, num_components, self.sizes, devices)
 
 
-def choose_dtype(data: Rows | ChunkedRows, degree: int, order: Int[np.ndarray, " d"]) -> np.dtype:
-    """Return the dtype of the data, or float64 if float32 is too short. Column i of the data is order[i] of X."""
+def _prepare(order: Int[np.ndarray, " d"], scaling: Scaling, factor: float, dtype: np.dtype, piece: Piece) -> tuple:
+    """The rows of positive weight of a piece, columns in `order` and scaled, and their weights times `factor`."""
+    kept = piece.weights > 0
+    x, weights = (z.astype(dtype, copy=False) for z in (piece.x[kept][:, order], piece.weights[kept]))
+    return scaling.apply(x), weights if factor == 1 else weights * dtype.type(factor)
+
+
+def measure_gaps(x: Float[np.ndarray, "n d"], groups: Int[np.ndarray, " n"]) -> Float[np.ndarray, " d"]:
+    """The median squared distance in each column to the nearest row of another group."""
+
+    def one(row: int) -> np.ndarray:
+        square = (x[groups != groups[row]] - x[row]) ** 2
+        return square[square.sum(1).argmin()]
+
+    return np.median([one(row) for row in np.unique(np.linspace(0, len(x) - 1, _GAP_ROWS).astype(int))], axis=0)
+
+
+def choose_dtype(data: Rows, degree: int) -> np.dtype:
+    """Return the dtype of the data, or float64 if float32 is too short."""
     if data.dtype == np.float32 and (degree > _MAX_SINGLE_DEGREE or _find_extreme(data, degree) is not None):
-        data = data.astype(np.dtype(np.float64))
+        data = data._replace(dtype=np.dtype(np.float64))
     if (column := _find_extreme(data, degree)) is not None:
         expected = f"columns whose spread to the power {degree + 1} float64 holds"
         cure = "Divide it by its standard deviation."
-        raise invalid("X", expected=expected, got=f"another in column {order[column]}", cure=cure)
+        raise invalid("X", expected=expected, got=f"another in column {data.order[column]}", cure=cure)
     return data.dtype
 
 
-def _find_extreme(data: Rows | ChunkedRows, degree: int) -> int | None:
+def _find_extreme(data: Rows, degree: int) -> int | None:
     """A column whose powers, in covariances and coefficients of this degree, are out of the dtype's range."""
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         mean, variance = data.moments()
@@ -159,10 +114,12 @@ def _find_extreme(data: Rows | ChunkedRows, degree: int) -> int | None:
     return int(extreme.argmax()) if extreme.any() else None
 
 
-def check_groups(groups, present: np.ndarray) -> Int[np.ndarray, " n"] | None:
-    """The number of the group of each row that is present."""
+def check_groups(groups, present: Bool[np.ndarray, " n"] | None) -> Int[np.ndarray, " n"] | None:
+    """The number of the group of each row that is present; `present` is None for chunks of rows, which have none."""
     if groups is None:
         return None
+    if present is None:
+        raise invalid("groups", expected="None for chunks of rows", got="groups", cure="Or pass one array.")
     if np.shape(groups) != present.shape:
         raise invalid("groups", expected=f"shape {present.shape}", got=f"shape {np.shape(groups)}", cure="One per row.")
     try:
@@ -174,17 +131,11 @@ def check_groups(groups, present: np.ndarray) -> Int[np.ndarray, " n"] | None:
     return which
 
 
-def refuse_groups(groups) -> None:
-    """Raise if there are groups, for chunks of rows."""
-    if groups is not None:
-        raise invalid("groups", expected="None for chunks of rows", got="groups", cure="Or pass one array.")
-
-
 def warn_smooth(x: Float[np.ndarray, "n d"]) -> None:
     """Warn of successive rows on smooth curves in space, which count as one observation rather than as many."""
     if len(x) < 10:
         return
-    space = np.asarray(x[:10_000, :-1], np.float64)
+    space = np.asarray(x[:, :-1], np.float64)
     with np.errstate(all="ignore"):  # units out of range are refused elsewhere
         scale = space.std(0)
         step = np.diff(space / np.where(scale > 0, scale, 1), axis=0)
@@ -195,7 +146,7 @@ def warn_smooth(x: Float[np.ndarray, "n d"]) -> None:
             "that components may collapse onto single curves. Pass the curve of each row as groups, and hold out "
             "whole curves to compare mixtures.",
             UserWarning,
-            stacklevel=4,
+            stacklevel=3,
         )
 
 
@@ -210,7 +161,7 @@ def warn_narrow(tril: Float[np.ndarray, "k d-1 d-1"], gaps: Float[np.ndarray, " 
             f"{narrow} of {len(whitened)} components are as narrow as the gap between groups and may each describe one "
             "group only. Lower n_components or max_components, or fit more groups.",
             ConvergenceWarning,
-            stacklevel=5,
+            stacklevel=4,
         )
 
 

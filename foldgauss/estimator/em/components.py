@@ -8,9 +8,7 @@ so that all parameters are of order one once the points are centered and scaled.
 `FoldedGaussian.condition_time`, where the fold equation is defined.
 """
 
-import functools
 import math
-import operator
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -60,8 +58,8 @@ def evaluate_densities(params: Parameters, envelope: AbstractEnvelope, x: Float[
     inverse = inverse_lower(params.tril)
     if dim <= UNROLLED_SIZE:
         residual = [x[:, j : j + 1] - _evaluate_polynomial(params.curve[:, :, j], v) for j in range(dim)]
-        whitened = [_add_up(inverse[None, :, a, b] * residual[b] for b in range(a + 1)) for a in range(dim)]
-        square = _add_up(e * e for e in whitened)
+        whitened = [sum(inverse[None, :, a, b] * residual[b] for b in range(a + 1)) for a in range(dim)]
+        square = sum(e * e for e in whitened)
     else:
         fitted = _evaluate_polynomial(params.curve, v[..., None])
         whitened = [jnp.einsum("kab,nkb->nka", inverse, x[:, None, :-1] - fitted)]
@@ -101,7 +99,3 @@ def _evaluate_polynomial(
     for j in reversed(range(coefficients.shape[1] - 1)):
         value = value * v + coefficients[None, :, j]
     return value
-
-
-def _add_up(terms):
-    return functools.reduce(operator.add, terms)

@@ -3,6 +3,7 @@
 **Source:** Dempster, Laird and Rubin 1977; generalized EM where the envelope depends on time.
 """
 
+import functools
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -10,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss.envelope import AbstractEnvelope, Constant
@@ -22,11 +23,12 @@ from foldgauss.estimator.em.statistics import (
     SufficientStatistics,
     Times,
     accumulate,
+    map_leading,
     step_times,
     sum_over_points,
 )
 
-__all__ = ["EMStatus", "Run", "State", "broadcast_degrees", "log_likelihood", "run_em", "select_best", "step"]
+__all__ = ["EMStatus", "Run", "State", "log_likelihood", "run_em", "select_best", "step"]
 
 #: Armijo's condition: the fraction of the predicted gain that a Newton step of the times must achieve.
 _ARMIJO = 1e-4
@@ -68,49 +70,60 @@ class Run(NamedTuple):
     """The result of one restart: the last parameters, and the mean log-likelihood before each of its steps."""
 
     params: Parameters
-    log_likelihood: float
     history: list[float]
-    num_steps: int
     status: EMStatus
-    num_resets: int
+
+    @property
+    def log_likelihood(self) -> float:
+        """The last one that is finite."""
+        return next((value for value in reversed(self.history) if np.isfinite(value)), -np.inf)
 
 
 def step(
-    state: State, points: Points, envelope: AbstractEnvelope, model: Model, inverse_temperature=None
+    states: State, points: Points | Blocks, envelope: AbstractEnvelope, model: Model, inverse_temperature=None
 ) -> tuple[State, Info]:
-    """One iteration: exact EM for a constant envelope, else generalized EM with an ascent step of the times."""
-    params = state.params
+    """One iteration of all restarts: exact EM for a constant envelope, else generalized EM with an ascent step of the
+    times. The sums are one program, called for each block of points, and the M-step another."""
+    sums = functools.partial(sum_over_points, _accumulate, points, states.params, envelope)
+    here = sums(None, 2, inverse_temperature)
     if isinstance(envelope, Constant):
-        return _m_step(state, accumulate(params, envelope, points, inverse_temperature=inverse_temperature), model)
-    here = accumulate(params, envelope, points, order=2, inverse_temperature=inverse_temperature)
-    proposal = _propose_times(state, here, model)
-    there = accumulate(params, envelope, points, times=proposal.times, inverse_temperature=inverse_temperature)
-    return _m_step_with_times(state, here, proposal, there, model)
+        return _m_step(model, states, here)
+    steps, predicted, times = _propose_times(model, states, here)
+    there = sums(times, 0, inverse_temperature)
+    return _m_step_with_times(model, states, here, there, steps, predicted)
 
 
-class _TimeProposal(NamedTuple):
-    """A proposed step of the times."""
+def _accumulate(params: Parameters, envelope, times: Times | None, order: int, inverse_temperature, points: Points):
+    def one(params, times):
+        return accumulate(params, envelope, points, times=times, order=order, inverse_temperature=inverse_temperature)
 
-    steps: Float[Array, "2 k"]
-    predicted: Float[Array, " k"]
-    times: Times
+    return map_leading(one, params, times)
 
 
-def _m_step(state: State, sums: SufficientStatistics, model: Model) -> tuple[State, Info]:
+def _over_restarts(function):
+    """The compiled function of a model, and of arrays with a leading axis of restarts, from that of one restart."""
+    return eqx.filter_jit(lambda model, *arguments: map_leading(functools.partial(function, model), *arguments))
+
+
+@_over_restarts
+def _m_step(model: Model, state: State, sums: SufficientStatistics) -> tuple[State, Info]:
     new, stuck = update_components(state.params, sums, model)
     return State(new, state.step_fraction), Info(sums.log_likelihood, sums.mass, stuck, jnp.zeros((), sums.mass.dtype))
 
 
-def _propose_times(state: State, here: SufficientStatistics, model: Model) -> _TimeProposal:
+@_over_restarts
+def _propose_times(model: Model, state: State, here: SufficientStatistics):
+    """Steps of the times (2, k), the gains that they promise, and the times after them."""
     direction, predicted = newton_step(here, model, state.params.degree)
     steps = state.step_fraction[None] * direction
-    return _TimeProposal(steps, predicted, step_times(Times(state.params.time_loc, state.params.time_scale), steps))
+    return steps, predicted, step_times(Times(state.params.time_loc, state.params.time_scale), steps)
 
 
+@_over_restarts
 def _m_step_with_times(
-    state: State, here: SufficientStatistics, proposal: _TimeProposal, there: SufficientStatistics, model: Model
+    model: Model, state: State, here: SufficientStatistics, there: SufficientStatistics, steps, predicted
 ) -> tuple[State, Info]:
-    (steps, predicted, _), params = proposal, state.params
+    params = state.params
     before = profile_log_likelihood(here, model, params.degree, jnp.zeros_like(steps), here.gram[0], here.log_a[0])
     after = profile_log_likelihood(here, model, params.degree, steps, there.gram[0], there.log_a[0])
     rises = after >= before + _ARMIJO * state.step_fraction * predicted  # false for NaN
@@ -121,80 +134,9 @@ def _m_step_with_times(
     return State(new, step_fraction), Info(here.log_likelihood, here.mass, stuck, rejected)
 
 
-@eqx.filter_jit
-def _step_restarts(states: State, frozen, points, envelope, model, inverse_temperature):
-    """Step every restart except frozen ones."""
-
-    def one(state, frozen):
-        return _freeze(frozen, state, *step(state, points, envelope, model, inverse_temperature))
-
-    return _map_restarts(one, states, frozen)
-
-
-def _freeze(frozen, state: State, new: State, info: Info) -> tuple[State, Info]:
-    return jax.tree.map(lambda a, b: jnp.where(frozen, a, b), state, new), info
-
-
-def _map_restarts(function, *arguments):
-    """Apply a function to each restart (leading axis)."""
-    if len(jax.tree.leaves(arguments)[0]) == 1:  # avoids an axis of size one in every array
-        return jax.tree.map(lambda z: z[None], function(*jax.tree.map(lambda z: z[0], arguments)))
-    return jax.vmap(function)(*arguments)
-
-
-# --- the same step over blocks: the sums are one program, called for each block, the M-step another ----------------
-
-
-def _step_over_blocks(states: State, frozen, blocks: Blocks, envelope, model, inverse_temperature):
-    """As `_step_restarts`, for points that are read block by block."""
-    if isinstance(envelope, Constant):
-        sums = sum_over_points(_accumulate_restarts, blocks, states.params, envelope, None, 0, inverse_temperature)
-        return _m_step_each(states, frozen, sums, model)
-    here = sum_over_points(_accumulate_restarts, blocks, states.params, envelope, None, 2, inverse_temperature)
-    proposal = _propose_times_each(states, here, model)
-    there = sum_over_points(
-        _accumulate_restarts, blocks, states.params, envelope, proposal.times, 0, inverse_temperature
-    )
-    return _m_step_with_times_each(states, frozen, here, proposal, there, model)
-
-
-def _accumulate_restarts(
-    params: Parameters, envelope, times: Times | None, order: int, inverse_temperature, points: Points
-):
-    def one(params, times):
-        return accumulate(params, envelope, points, times=times, order=order, inverse_temperature=inverse_temperature)
-
-    return _map_restarts(one, params, times)
-
-
-@eqx.filter_jit
-def _m_step_each(states, frozen, sums, model):
-    def one(frozen, state, sums):
-        return _freeze(frozen, state, *_m_step(state, sums, model))
-
-    return _map_restarts(one, frozen, states, sums)
-
-
-@eqx.filter_jit
-def _propose_times_each(states, here, model):
-    return _map_restarts(lambda state, here: _propose_times(state, here, model), states, here)
-
-
-@eqx.filter_jit
-def _m_step_with_times_each(states, frozen, here, proposal, there, model):
-    def one(frozen, state, *sums):
-        return _freeze(frozen, state, *_m_step_with_times(state, *sums, model))
-
-    return _map_restarts(one, frozen, states, here, proposal, there)
-
-
 def log_likelihood(params: Parameters, points: Points | Blocks, envelope: AbstractEnvelope) -> Float[Array, ""]:
     """sum_i w_i log p(x_i)."""
-    return sum_over_points(_log_likelihood, points, params, envelope)
-
-
-def _log_likelihood(params: Parameters, envelope: AbstractEnvelope, points: Points) -> Float[Array, ""]:
-    return accumulate(params, envelope, points).log_likelihood
+    return sum_over_points(accumulate, points, params, envelope).log_likelihood
 
 
 def run_em(
@@ -211,8 +153,8 @@ def run_em(
     last: float = -np.inf,
     observe=None,
 ) -> list[Run]:
-    """Run EM from every start (leading axis) in one program, or one for each block; `total` is the sum of weights, and
-    `last` the mean log-likelihood before the start, if a run is continued.
+    """Run EM from every start (leading axis) at once; `total` is the sum of weights, and `last` the mean log-likelihood
+    before the start, if a run is continued.
 
     A component with less mass than `least_mass` is reset to half of the heaviest one, at most as often as there are
     components. A run has converged when the mean log-likelihood changes by less than `tol`, at temperature 1 (for at
@@ -220,28 +162,25 @@ def run_em(
     """
     first_end = 1 if annealing == 1.0 else ANNEALING_STEPS + SETTLING_STEPS
     states, restarts = State(starts, jnp.ones_like(starts.time_loc)), len(starts.time_loc)
-    step_all = _step_over_blocks if isinstance(points, Blocks) else _step_restarts
     before, lasts = states, np.full(restarts, last)
     statuses = np.full(restarts, EMStatus.NOT_CONVERGED)
-    done, num_steps = np.zeros(restarts, bool), np.zeros(restarts, int)
-    resets, histories = np.zeros(restarts, int), [[] for _ in range(restarts)]
+    done, resets, histories = np.zeros(restarts, bool), np.zeros(restarts, int), [[] for _ in range(restarts)]
     for number in range(1, max_steps + 1):
         inverse_temperature = annealing ** max(1 - (number - 1) / ANNEALING_STEPS, 0)
         annealed = inverse_temperature == 1.0
         beta = None if annealed else jnp.asarray(inverse_temperature, starts.time_loc.dtype)
-        new, info = step_all(states, jnp.asarray(done), points, envelope, model, beta)
+        new, info = step(states, points, envelope, model, beta)
         values, rejected = np.asarray(info.log_likelihood) / total, np.asarray(info.rejected) / total
         broken = ~done & ~np.isfinite(values)
         small = (np.abs(values - lasts) < tol) & (rejected < max(tol, 1e-12)) & (number >= first_end)
         lasts, running = np.where(done, lasts, values), ~done
         for r in np.flatnonzero(running):
             histories[r].append(float(values[r]))
-        num_steps[running] = number
         statuses[broken] = EMStatus.NOT_FINITE
         if not annealed:
             new = _jitter(new, number)
-        if broken.any():  # back to the last parameters with a finite likelihood
-            new = _select_restarts(broken, before, new)
+        if (done | broken).any():  # a broken run goes back to the last parameters with a finite likelihood
+            new = _select_restarts(done, states, _select_restarts(broken, before, new))
         empty = running[:, None] & ~broken[:, None] & (np.asarray(info.mass) < least_mass)
         reset = empty.any(1) & (resets < empty.shape[1]) & (number < max_steps)
         for r in np.flatnonzero(reset):
@@ -256,17 +195,8 @@ def run_em(
             observe(number, values)
         if done.all():
             break
-    return [
-        Run(
-            jax.tree.map(lambda z, r=r: z[r], states.params),
-            _last_finite(histories[r]),
-            histories[r],
-            int(num_steps[r]),
-            EMStatus(int(statuses[r])),
-            int(resets[r]),
-        )
-        for r in range(restarts)
-    ]
+    params = [jax.tree.map(lambda z, r=r: z[r], states.params) for r in range(restarts)]
+    return [Run(params[r], histories[r], EMStatus(int(statuses[r]))) for r in range(restarts)]
 
 
 def select_best(runs: list[Run]) -> Run:
@@ -284,14 +214,10 @@ def _rank(run: Run) -> tuple[bool, float]:
     return run.status != EMStatus.NOT_FINITE, run.log_likelihood
 
 
-def _last_finite(history: list[float]) -> float:
-    return next((value for value in reversed(history) if np.isfinite(value)), -np.inf)
-
-
-def _select_restarts(flags: np.ndarray, these: State, others: State) -> State:
+@jax.jit
+def _select_restarts(flags: Bool[Array, " restarts"], these: State, others: State) -> State:
     """`these` for restarts whose flag is true, else `others`."""
-    choose = lambda a, b: jnp.where(jnp.asarray(flags).reshape(-1, *[1] * (a.ndim - 1)), a, b)  # noqa: E731
-    return jax.tree.map(choose, these, others)
+    return jax.vmap(lambda flag, *two: jax.tree.map(lambda a, b: jnp.where(flag, a, b), *two))(flags, these, others)
 
 
 def _jitter(states: State, number: int) -> State:
@@ -322,8 +248,3 @@ def _reset_components(states: State, restart: int, empty: np.ndarray, mass: np.n
         mass[[donor, k]] = mass[donor] / 2
     params = Parameters(*(jnp.asarray(z) for z in (log_weights, time_loc, time_scale, curve, tril)))
     return states._replace(params=params)
-
-
-def broadcast_degrees(degrees, num_components: int) -> Int[Array, " k"]:
-    """One degree for all components, or one for each."""
-    return jnp.broadcast_to(jnp.asarray(degrees, jnp.int32), (num_components,))

@@ -11,22 +11,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from foldgauss._numerics.regression import hermite_to_powers
-from foldgauss.envelope import Constant
 from foldgauss.estimator.em.cholesky import inverse_lower
 from foldgauss.estimator.em.components import Parameters, change_variable, to_powers
 from foldgauss.estimator.em.m_step import Model, update_components
-from foldgauss.estimator.em.statistics import Points, SufficientStatistics, accumulate
+from foldgauss.estimator.em.statistics import SufficientStatistics
 
-__all__ = ["FORGETTING", "change_reference", "compute_batch_statistics", "update_online"]
+__all__ = ["FORGETTING", "change_reference", "update_online"]
 
 #: A batch is weighted by its fraction of all weight so far to this power; EM converges for values in (1/2, 1].
 FORGETTING = 0.7
-
-
-@eqx.filter_jit
-def compute_batch_statistics(params: Parameters, points: Points) -> SufficientStatistics:
-    """The sufficient statistics of one batch."""
-    return accumulate(params, Constant(), points)
 
 
 @eqx.filter_jit
@@ -35,7 +28,7 @@ def update_online(
 ) -> tuple[Parameters, SufficientStatistics]:
     """Average in a batch's statistics with weight `fraction` (both per unit of weight), and update the components.
 
-    Separate from `compute_batch_statistics`, so that this is compiled once for batches of all sizes.
+    Separate from the sums of a batch, so that this is compiled once for batches of all sizes.
     """
     unit = lambda sums: jax.tree.map(lambda z: z / sums.mass.sum(), sums)  # noqa: E731
     sums = jax.tree.map(lambda old, new: (1 - fraction) * old + fraction * new, unit(sums), unit(new))

@@ -9,7 +9,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
 from foldgauss._numerics.regression import hermite_to_powers
@@ -18,7 +17,14 @@ from foldgauss.estimator.em.cholesky import cholesky, inverse_lower, log_det
 from foldgauss.estimator.em.components import Parameters, evaluate_densities, to_powers
 from foldgauss.estimator.em.loop import log_likelihood, run_em, select_best
 from foldgauss.estimator.em.m_step import Model, residual_scatter
-from foldgauss.estimator.em.statistics import Blocks, Points, SufficientStatistics, accumulate, sum_over_points
+from foldgauss.estimator.em.statistics import (
+    Blocks,
+    Points,
+    SufficientStatistics,
+    accumulate,
+    sum_chunks,
+    sum_over_points,
+)
 
 __all__ = ["count_parameters", "drop_unused", "prune_mixture"]
 
@@ -142,8 +148,7 @@ def _log_likelihoods_without(params: Parameters, envelope, points: Points) -> Fl
         rest = total + jnp.log(jnp.maximum(-jnp.expm1(jnp.minimum(log_density - total, 0)), eps))
         return jnp.where((weights > 0)[:, None], weights[:, None] * rest, 0).sum(0)
 
-    chunks = jax.tree.map(lambda z: z.reshape(-1, *z.shape[2:]), (points.x, points.weights))
-    return lax.map(of_chunk, chunks).sum(0)
+    return sum_chunks(of_chunk, (points.x, points.weights))
 
 
 @eqx.filter_jit

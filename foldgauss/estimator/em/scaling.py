@@ -4,17 +4,16 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from foldgauss._runtime.checks import invalid
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
-from foldgauss.estimator.chunks import Piece
 from foldgauss.estimator.em.components import Parameters
 from foldgauss.fold import PolynomialFold
 from foldgauss.mixture import FoldedMixture
 
-__all__ = ["RowTransform", "Scaling", "check_export", "check_time_resolution", "compute_scaling", "to_mixture"]
+__all__ = ["Scaling", "check_export", "check_time_resolution", "compute_scaling", "to_mixture"]
 
 #: Spacings of floating-point times up to this fraction of a spread are harmless.
 _MAX_SPACING = 0.01
@@ -35,20 +34,6 @@ class Scaling(NamedTuple):
     def log_volume(self) -> float:
         """log |dx/dy|."""
         return float(np.log(self.scale).sum())
-
-
-class RowTransform(NamedTuple):
-    """Prepares pieces of chunks for fitting: rows of positive weight, columns in `order`, scaled."""
-
-    order: Int[np.ndarray, " d"]
-    scaling: Scaling
-    factor: float  # of the weights
-    dtype: np.dtype
-
-    def __call__(self, piece: Piece) -> tuple[np.ndarray, np.ndarray]:
-        kept = piece.weights > 0
-        x, weights = (z.astype(self.dtype, copy=False) for z in (piece.x[kept][:, self.order], piece.weights[kept]))
-        return self.scaling.apply(x), weights if self.factor == 1 else weights * self.dtype.type(self.factor)
 
 
 def compute_scaling(mean, variance, envelope: AbstractEnvelope, covariance: str) -> Scaling:

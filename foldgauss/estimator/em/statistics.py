@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 from foldgauss._numerics.batch import cast
 from foldgauss._numerics.regression import hermite_columns
 from foldgauss.envelope import AbstractEnvelope, Constant
-from foldgauss.estimator.chunks import Chunks, Piece
+from foldgauss.estimator.chunks import DaskChunks, IterableChunks, Piece
 from foldgauss.estimator.em.components import Densities, Parameters, evaluate_densities
 
 __all__ = [
@@ -36,10 +36,12 @@ __all__ = [
     "Times",
     "accumulate",
     "enable_dtype",
-    "log_densities",
     "make_blocks",
     "make_points",
+    "map_chunks",
+    "map_leading",
     "step_times",
+    "sum_chunks",
     "sum_over_points",
 ]
 
@@ -59,7 +61,6 @@ class Points(eqx.Module):
 
     x: Float[Array, "devices chunks rows d"]
     weights: Float[Array, "devices chunks rows"]
-    size: int = eqx.field(static=True)
 
 
 class Times(NamedTuple):
@@ -81,22 +82,22 @@ class SufficientStatistics(NamedTuple):
     gram: Float[Array, "order k m m"]
 
 
-def make_points(x: np.ndarray, weights: np.ndarray, num_components: int, devices: int = 1) -> Points:
-    """Chunk and pad points (n, d) and weights (n,) to few distinct shapes, so that few programs are compiled."""
-    n, d = x.shape
-    per_device = -(-n // devices)
+def make_points(
+    x: np.ndarray, weights: np.ndarray, num_components: int, devices: int = 1, size: int | None = None
+) -> Points:
+    """Chunk points (n, d) and weights (n,), padded to `size` (default: n) and then to few distinct shapes, so that few
+    programs are compiled."""
+    per_device = -(-(len(x) if size is None else size) // devices)
     rows = min(_rows_per_chunk(num_components), _padded_rows(per_device))
-    chunks = -(-per_device // rows)
-    missing = devices * chunks * rows - n
-    x = np.concatenate([x, np.zeros((missing, d), x.dtype)]) if missing else x
-    weights = np.concatenate([weights, np.zeros(missing, weights.dtype)]) if missing else weights
-    shape = (devices, chunks, rows)
-    x, weights = x.reshape(*shape, d), weights.reshape(shape)
+    shape = (devices, -(-per_device // rows), rows)
+    missing = math.prod(shape) - len(x)
+    x = np.pad(x, ((0, missing), (0, 0))).reshape(*shape, x.shape[1])
+    weights = np.pad(weights, (0, missing)).reshape(shape)
     if devices == 1:
-        return Points(jnp.asarray(x), jnp.asarray(weights), n)
+        return Points(jnp.asarray(x), jnp.asarray(weights))
     mesh = jax.sharding.Mesh(np.asarray(jax.devices()[:devices]), ("points",))
     where = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("points"))
-    return Points(jax.device_put(x, where), jax.device_put(weights, where), n)
+    return Points(jax.device_put(x, where), jax.device_put(weights, where))
 
 
 def _rows_per_chunk(num_components: int) -> int:
@@ -107,13 +108,30 @@ def _padded_rows(num_rows: int) -> int:
     return max(2 ** math.ceil(math.log2(max(num_rows, 1))), _MIN_ROWS)
 
 
+def map_leading(function: Callable, *arguments):
+    """`jax.vmap`; of a single entry, without an axis of size one in every array."""
+    if len(jax.tree.leaves(arguments)[0]) == 1:
+        return jax.tree.map(lambda z: z[None], function(*jax.tree.map(lambda z: z[0], arguments)))
+    return jax.vmap(function)(*arguments)
+
+
+def map_chunks(function: Callable, arrays):
+    """Apply a function to each chunk of `arrays`, of leading axes (devices, chunks): on each device one at a time."""
+    return map_leading(lambda chunks: lax.map(function, chunks), arrays)
+
+
+def sum_chunks(function: Callable, arrays):
+    """The sum of a function of chunks over all of them."""
+    return jax.tree.map(lambda z: z.sum((0, 1)), map_chunks(function, arrays))
+
+
 # --- points that are read piece by piece ----------------------------------------------------------------------
 
 
 class Blocks(NamedTuple):
     """Points that are read anew in every pass; `prepare` converts a piece to scaled points and weights."""
 
-    chunks: Chunks
+    chunks: IterableChunks | DaskChunks
     prepare: Callable[[Piece], tuple[np.ndarray, np.ndarray]]
     dtype: np.dtype
     num_components: int
@@ -130,7 +148,7 @@ def sum_over_points(function: Callable, points: Points | Blocks, *arguments):
         return _compiled(function)(*arguments, points)
     # Workers get NumPy arrays: JAX arrays belong to a process.
     arguments = jax.tree.map(lambda z: np.asarray(z) if isinstance(z, jax.Array) else z, arguments)
-    devices = 1 if points.chunks.on_workers else points.devices
+    devices = 1 if points.chunks.concurrent else points.devices
     settings = (points.prepare, points.dtype, points.num_components, devices, function, arguments)
     total = functools.reduce(_add, points.chunks.run(_sum_part, *settings, each=points.sizes))
     return jax.tree.map(lambda z: jnp.asarray(z, points.dtype), total)
@@ -158,25 +176,20 @@ def make_blocks(rows: Iterable[tuple], size: int, num_components: int, devices: 
     """Regroup `rows`, (points, weights) of any lengths, `size` in all, to blocks of one shape: compiled once."""
     most = devices * _CHUNKS_PER_BLOCK * _rows_per_chunk(num_components)
     size, held, count = min(devices * _padded_rows(-(-size // devices)), most), [], 0
+
+    def block():
+        return make_points(*map(np.concatenate, zip(*held, strict=True)), num_components, devices, size)
+
     for y, weights in rows:
         while len(y):
             taken = min(len(y), size - count)
             held.append((y[:taken], weights[:taken]))
             count, y, weights = count + taken, y[taken:], weights[taken:]
             if count == size:
-                yield _block(held, size, num_components, devices)
+                yield block()
                 held, count = [], 0
     if held:
-        yield _block(held, size, num_components, devices)
-
-
-def _block(held: list[tuple], size: int, num_components: int, devices: int) -> Points:
-    y = np.zeros((size, held[0][0].shape[1]), held[0][0].dtype)
-    weights, row = np.zeros(size, y.dtype), 0
-    for part, mass in held:
-        y[row : row + len(part)], weights[row : row + len(part)] = part, mass
-        row += len(part)
-    return make_points(y, weights, num_components, devices)
+        yield block()
 
 
 @functools.cache
@@ -220,33 +233,7 @@ def accumulate(
         total = jnp.where(weights > 0, weights * log_likelihood, 0).sum()
         return _sum_chunk(params, envelope, x[:, -1:], pairs, mass, total, times, order)
 
-    def of_device(chunks):
-        if chunks[0].shape[0] == 1:
-            return of_chunk(jax.tree.map(lambda z: z[0], chunks))
-        shapes = jax.eval_shape(of_chunk, jax.tree.map(lambda z: z[0], chunks))
-        zero = jax.tree.map(lambda z: jnp.zeros(z.shape, z.dtype), shapes)
-        return lax.scan(lambda sums, chunk: (jax.tree.map(jnp.add, sums, of_chunk(chunk)), None), zero, chunks)[0]
-
-    chunks = (points.x, points.weights, responsibilities)
-    if points.x.shape[0] == 1:
-        return of_device(jax.tree.map(lambda z: z[0], chunks))
-    return jax.tree.map(lambda z: z.sum(0), jax.vmap(of_device)(chunks))
-
-
-def log_densities(
-    params: Parameters, envelope: AbstractEnvelope, points: Points
-) -> Float[Array, " devices*chunks*rows"]:
-    """log p(x) of every point."""
-
-    def of_chunk(x):
-        return jax.nn.logsumexp(evaluate_densities(params, envelope, x).log_density, axis=-1)
-
-    def of_device(chunks):
-        return of_chunk(chunks[0])[None] if chunks.shape[0] == 1 else lax.map(of_chunk, chunks)
-
-    devices = points.x.shape[0]
-    value = of_device(points.x[0])[None] if devices == 1 else jax.vmap(of_device)(points.x)
-    return value.reshape(-1)
+    return sum_chunks(of_chunk, (points.x, points.weights, responsibilities))
 
 
 def _weigh_responsibilities(log_density: Float[Array, "n k"], weights: Float[Array, " n"]):
