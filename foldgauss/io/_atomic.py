@@ -61,14 +61,13 @@ def describe_missing(path: PathLike) -> str:
     return "which is missing"  # it has come meanwhile
 
 
-def check_input(path: Path, expected: str) -> None:
-    """Raise FileNotFoundError for an input that is missing, ValueError for a pipe or a device: opening may not end."""
+def check_input(path: Path, expected: str, kind: type[ParameterError] = ParameterError) -> None:
+    """Raise MissingInput for an input that is missing, `kind` for a pipe or a device: opening may not end."""
     if not os.path.exists(path):
         raise missing_error(path, expected)
     if not (os.path.isfile(path) or os.path.isdir(path)):
-        raise invalid(
-            "path", expected=expected, got=f"{str(path)!r}, a pipe or a device", cure="Save its output to a file."
-        )
+        got = f"{str(path)!r}, a pipe or a device"
+        raise invalid("path", expected=expected, got=got, cure="Save its output to a file.", kind=kind)
 
 
 def resolve(path: PathLike) -> Path:

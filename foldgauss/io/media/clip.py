@@ -133,10 +133,7 @@ class Clip:
 def check_readable(path: PathLike) -> Path:
     """The path of an existing file or folder. Raises `FileNotFoundError`, or `VideoError` for pipes and devices."""
     path = check_path(path)
-    try:
-        check_input(path, VIDEO)
-    except ValueError as error:
-        raise VideoError(str(error)) from error
+    check_input(path, VIDEO, VideoError)
     return path
 
 
