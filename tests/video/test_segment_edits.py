@@ -20,7 +20,6 @@ from foldgauss.video import (
     FrameTimes,
     Segment,
     SegmentedEdit,
-    SegmentedSelection,
     SegmentedVideo,
     Selection,
     VideoModel,
@@ -117,13 +116,10 @@ CHAINS = {
     "still": lambda e: e.freeze(2.5).to_back(),
     "gone": lambda e: e.vanish().select().opacity(0.7),
     "in space": lambda e: e.place(depth=0.2, rotate=(0, 0.4, 0)).seen_from(orbit),
-    "a function": lambda e: e.apply(wider, frame=3).select(lambda video: chosen(video)).transform([[1, 0.2], [0, 1]]),
+    "a function": lambda e: (
+        e.apply(wider, frame=3).select(lambda video: np.arange(NUM) % 3 == 0).transform([[1, 0.2], [0, 1]])
+    ),
 }
-
-
-def chosen(video):
-    mask = np.arange(NUM) % 3 == 0
-    return SegmentedSelection((Selection(mask),)) if isinstance(video, SegmentedVideo) else mask
 
 
 @pytest.mark.parametrize("name", CHAINS)
@@ -163,15 +159,21 @@ def test_one_segment_answers_as_the_model(name):
     wanted = edit(soft_model()).select(**QUESTIONS[name]).selection
     got = edit(SegmentedVideo.from_models([(0, soft_model())])).select(**QUESTIONS[name]).selection
     assert 0 < len(wanted) < NUM
-    assert got == SegmentedSelection((wanted,))
+    assert got == wanted
 
 
 # ------------------------------------------------------------------------------------ who, from segment to segment
 
 
+def by_segment(video, selection):
+    """The selection of each segment."""
+    ends = np.cumsum([segment.num_gaussians for segment in video.segments])
+    return tuple(map(Selection, np.split(selection.mask, ends[:-1])))
+
+
 def shares(selection):
     """Of each segment's disc what is selected, and of all else that moves."""
-    masks, labels = [part.mask for part in selection.parts], scene()[1]
+    masks, labels = [part.mask for part in by_segment(scene()[0], selection)], scene()[1]
     of_disc = [mask[label == DISC].mean() for mask, label in zip(masks, labels, strict=True)]
     return of_disc, [mask[label == BOX].mean() for mask, label in zip(masks, labels, strict=True)]
 
@@ -196,12 +198,10 @@ def test_a_click_is_carried():
     model, label = scene()[0].segments[2].model, scene()[1][2]
     rows, columns = np.nonzero(square(scene()[0], DISC, 28))
     place = (float(columns.mean()), float(rows.mean()))
-    alone = (
-        edit(SegmentedVideo.from_models([(0, model)])).select(click=place, frame=10, tolerance=25).selection.parts[0]
-    )
+    alone = edit(SegmentedVideo.from_models([(0, model)])).select(click=place, frame=10, tolerance=25).selection
     assert alone.mask[label == DISC].mean() > 0.8
     carried = edit(scene()[0]).select(click=place, frame=28, tolerance=25).selection
-    assert carried.parts[2] == alone
+    assert by_segment(scene()[0], carried)[2] == alone
     assert min(shares(carried)[0]) > 0.75
     assert max(shares(carried)[1]) < 0.1
 
@@ -217,7 +217,7 @@ def test_what_is_told_of_both_ends_is_told_between():
     assert shares(selection)[0][2] == 0
     middle = scene()[0].segments[1].model
     shown = carried_masks(0, 1, selection) | carried_masks(2, 1, selection)
-    assert selection.parts[1] == by_mask(middle, shown)
+    assert by_segment(video, selection)[1] == by_mask(middle, shown)
 
 
 def carried_masks(one, other, selection):
@@ -227,66 +227,41 @@ def carried_masks(one, other, selection):
     shared = range(max(segments[one].first, segments[other].first), min(segments[one].stop, segments[other].stop))
     model = segments[one].model
     times = np.asarray(model.frame_times.times())
-    picture = lambda k: matte(model, selection.parts[one], float(times[k - segments[one].first])) >= 0.5  # noqa: E731
+    picture = lambda k: (
+        matte(model, by_segment(scene()[0], selection)[one], float(times[k - segments[one].first])) >= 0.5
+    )  # noqa: E731
     return {k - segments[other].first: picture(k) for k in shared}
 
 
 def test_nothing_is_carried_over_a_cut_or_without_follow():
     box = {"box": disc_box(2), "frame": 2}
-    still = edit(scene()[0]).select(**box, follow=False).selection
-    assert len(still.parts[0])
-    assert not len(still.parts[1]) + len(still.parts[2])
+    still = by_segment(scene()[0], edit(scene()[0]).select(**box, follow=False).selection)
+    assert len(still[0])
+    assert not len(still[1]) + len(still[2])
     models = [segment.model for segment in scene()[0].segments]
     cut = SegmentedVideo.from_models([(0, models[0]), (12, models[1]), (21, models[2])])
-    found = edit(cut).select(**box).selection
-    assert found.parts[0] == disc().parts[0]
-    assert not len(found.parts[1]) + len(found.parts[2])
-    found = edit(cut).select(box=disc_box(10), frame=13).selection
-    assert not len(found.parts[0])
-    assert len(found.parts[1])
-    assert len(found.parts[2])
+    found = by_segment(cut, edit(cut).select(**box).selection)
+    assert found[0] == by_segment(cut, disc())[0]
+    assert not len(found[1]) + len(found[2])
+    found = by_segment(cut, edit(cut).select(box=disc_box(10), frame=13).selection)
+    assert [len(part) > 0 for part in found] == [False, True, True]
 
 
 def test_colors_and_times_are_asked_of_every_segment():
     video, labels = scene()
     red = edit(video).select(color=(0.9, 0.3, 0.1), tolerance=25).selection
-    assert red.parts == tuple(by_color(segment.model, (0.9, 0.3, 0.1), tolerance=25) for segment in video.segments)
+    each = tuple(by_color(segment.model, (0.9, 0.3, 0.1), tolerance=25) for segment in video.segments)
+    assert by_segment(video, red) == each
     both = edit(video).select(box=disc_box(2), frame=2, color=(0.9, 0.3, 0.1), tolerance=25).selection
     assert both == disc() & red
-    middle = edit(video).select(frames=(10, 15)).selection
+    middle = by_segment(video, edit(video).select(frames=(10, 15)).selection)
     last = video.segments[2].model
-    assert middle.parts[0] == by_time(video.segments[0].model, frames=(10, 12))
-    assert middle.parts[1] == by_time(video.segments[1].model, frames=(1, 6))
-    assert middle.parts[2] == Selection.none(last)
+    assert middle[0] == by_time(video.segments[0].model, frames=(10, 12))
+    assert middle[1] == by_time(video.segments[1].model, frames=(1, 6))
+    assert middle[2] == Selection.none(last)
     timed = edit(video).select(times=(10 / 29, 20 / 29), alive=True).selection
-    assert timed.parts[2] == by_time(last, (0.0, 2 / 11), alive=True)
+    assert by_segment(video, timed)[2] == by_time(last, (0.0, 2 / 11), alive=True)
     assert sum(label.size for label in labels) == timed.num_gaussians
-
-
-def test_selections_are_sets():
-    video = scene()[0]
-    red = edit(video).select(color=(0.9, 0.3, 0.1), tolerance=25).selection
-    masks = [[part.mask for part in one.parts] for one in (red, disc())]
-    for got, combine in (
-        (red | disc(), np.logical_or),
-        (red & disc(), np.logical_and),
-        (red - disc(), lambda one, other: one & ~other),
-        (red ^ disc(), np.logical_xor),
-    ):
-        assert [part.mask.tolist() for part in got.parts] == [
-            combine(*pair).tolist() for pair in zip(*masks, strict=True)
-        ]
-        assert len(got) == sum(int(part.mask.sum()) for part in got.parts)
-    assert ~~red == red
-    assert red != disc()
-    assert red != "red"
-    assert repr(red).startswith(f"SegmentedSelection({len(red):,} of {video.num_gaussians:,}")
-    with pytest.raises(TypeError, match="SegmentedSelection, got Selection"):
-        red | red.parts[0]
-    with pytest.raises(ValueError, match="in 3 segments, got one in 1"):
-        red | SegmentedSelection(red.parts[:1])
-    with pytest.raises(ValueError, match="a Selection for each segment"):
-        SegmentedSelection((np.ones(3, bool),))
 
 
 # ------------------------------------------------------------------------------------------------ pictures
@@ -295,7 +270,7 @@ def test_selections_are_sets():
 def reached(k, selection):
     """Where a selection's Gaussians are at a frame, in whichever segments show it."""
     there = np.zeros((40, 60), bool)
-    for segment, part in zip(scene()[0].segments, selection.parts, strict=True):
+    for segment, part in zip(scene()[0].segments, by_segment(scene()[0], selection), strict=True):
         if segment.first <= k < segment.stop:
             model = segment.model
             there |= influence(model, part, float(model.frame_times.times()[k - segment.first]))
@@ -452,23 +427,24 @@ def test_the_first_segment_holds_before_the_clip_and_the_last_behind_it():
     video = soft_video(evenly=True)
     first, last = (video.segments[k].model for k in (0, 2))
     steps = video.num_frames - 1
-    none = [Selection(np.zeros(NUM, bool))] * 3
-    begin = edit(video).select(SegmentedSelection((Selection(OBJECT), *none[1:]))).retime(shift=2 / steps).video()
+    nobody = np.zeros(NUM, bool)
+    in_first, in_last = np.concatenate([OBJECT, nobody, nobody]), np.concatenate([nobody, nobody, OBJECT])
+    begin = edit(video).select(in_first).retime(shift=2 / steps).video()
     wanted = edit(first).select(OBJECT).retime(shift=2 / 6).video()
     np.testing.assert_allclose(drawn(begin)[:4], drawn(wanted)[:4], atol=1)
     assert begin.segments[1:] == video.segments[1:]
     uneven = soft_video()
     model = uneven.segments[0].model
     early = Clock.frozen(0.0)
-    begin = edit(uneven).select(SegmentedSelection((Selection(OBJECT), *none[1:]))).retime(shift=2 / steps).video()
+    begin = edit(uneven).select(in_first).retime(shift=2 / steps).video()
     wanted = edit(model).select(OBJECT).retime(clock=early).video()
     np.testing.assert_allclose(begin.render(0.0), wanted.render(0.0), atol=1e-4)
-    end = edit(video).select(SegmentedSelection((*none[:2], Selection(OBJECT)))).retime(shift=-2 / steps).video()
+    end = edit(video).select(in_last).retime(shift=-2 / steps).video()
     np.testing.assert_allclose(
         drawn(end)[13:], drawn(edit(last).select(OBJECT).retime(shift=-2 / 5).video())[3:], atol=1
     )
     with pytest.raises(ValueError, match=r"shift: .*frames 10 to 15, got frame 8 for frame 10, which is in another"):
-        edit(video).select(SegmentedSelection((*none[:2], Selection(OBJECT)))).retime(shift=2 / steps).video()
+        edit(video).select(in_last).retime(shift=2 / steps).video()
 
 
 @pytest.mark.parametrize(
@@ -512,8 +488,8 @@ def test_functions_and_cameras_are_given_the_clips_time(evenly):
         num = len(video.weights(k))
         np.testing.assert_allclose(told, [times[k]] * 2 * num, atol=1e-4 if evenly else 1e-6)
         np.testing.assert_allclose(asked, [times[k]] * num, atol=1e-4 if evenly else 1e-6)
-    nobody = SegmentedSelection((Selection(OBJECT), *[Selection(np.zeros(NUM, bool))] * 2))  # in all but the first
-    other = edit(video).select(nobody).seen_from(Camera.front(0.625).orbit(0.4, 0)).video()
+    in_first = np.concatenate([OBJECT, np.zeros(2 * NUM, bool)])
+    other = edit(video).select(in_first).seen_from(Camera.front(0.625).orbit(0.4, 0)).video()
     assert all(segment.model.camera is not None for segment in other.segments)
 
 
@@ -523,21 +499,23 @@ def test_functions_and_cameras_are_given_the_clips_time(evenly):
 def test_edits_act_in_their_order_and_a_selection_goes_along():
     """As on each model alone."""
     video = soft_video()
-    parts = SegmentedSelection(tuple(Selection(np.arange(NUM) % (k + 2) == 0) for k in range(3)))
+    parts = [np.arange(NUM) % (k + 2) == 0 for k in range(3)]
+    whole = Selection(np.concatenate(parts))
     chain = lambda e, one: (  # noqa: E731
-        e.select(one).multiply([(0.2, 0)]).to_front().select_begun(one).rotate(0.3, about=(0, 0)).select().opacity(0.6)
+        e.select(one).multiply([(0.2, 0)]).to_front().select(one).rotate(0.3, about=(0, 0)).select().opacity(0.6)
     )
-    edited = chain(edit(video), parts).video()
-    for segment, part in zip(edited.segments, parts.parts, strict=True):
+    edited = chain(edit(video), whole).video()
+    for segment, part in zip(edited.segments, parts, strict=True):
         model = next(own.model for own in video.segments if own.first == segment.first)
         wanted = chain(edit(model), part).video()
         for one, other in zip(jax.tree.leaves(segment.model), jax.tree.leaves(wanted), strict=True):
             np.testing.assert_array_equal(one, other)
         assert (segment.num_gaussians, segment.num_parameters) == (wanted.num_gaussians, wanted.num_parameters)
-    copied = edit(video).select(parts).multiply([(0.2, 0)])
-    assert len(copied.selection) == len(parts)
-    assert len(copied.select_begun(parts).selection) == 2 * len(parts)
-    assert copied.selection.num_gaussians == video.num_gaussians + len(parts)
+    copied = edit(video).select(whole).multiply([(0.2, 0)])
+    assert len(copied.selection) == len(whole)
+    assert len(copied.select(whole).selection) == 2 * len(whole)
+    assert copied.selection.num_gaussians == video.num_gaussians + len(whole)
+    assert copied.select(lambda video: copied.selection).selection == copied.selection
     again = edit(edited).select(color=(0.5, 0.5, 0.5), tolerance=30).vanish().video()
     assert again.num_gaussians < edited.num_gaussians
     assert len(edit(video).vanish().select().selection) == video.num_gaussians
@@ -548,11 +526,13 @@ def test_layers_of_segments_are_edited():
     models = [layers(*(span_of_scene(first, 10 * k + n)[0] for n in range(2))) for k, first in enumerate((0, 9))]
     video = SegmentedVideo.from_models([(0, models[0]), (9, models[1])])
     found = edit(video).select(box=disc_box(2), frame=2, layer=1).selection
-    for part, model in zip(found.parts, models, strict=True):
+    for part, model in zip(by_segment(video, found), models, strict=True):
         front = model.layers[0].num_gaussians
         assert not part.mask[:front].any()
         assert part.mask[front:].any()
-    assert found.parts[0] == edit(models[0]).select(box=disc_box(2), frame=2, layer=1).selection
+    assert by_segment(video, found)[0] == edit(models[0]).select(box=disc_box(2), frame=2, layer=1).selection
+    some = np.arange(sum(model.layers[1].num_gaussians for model in models)) % 3 == 0
+    assert len(edit(video).select(some, layer=1).selection) == some.sum()
     with pytest.raises(ValueError, match="layer: expected a whole number in"):
         edit(video).select(layer=2).video()
 
@@ -613,10 +593,9 @@ def test_an_edited_clip_is_saved_drawn_and_edited_again(tmp_path):
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        (lambda e: e.select(np.ones(NUM, bool)), "selection: expected a SegmentedSelection, got ndarray"),
-        (lambda e: e.select(Selection(OBJECT)), "selection: expected a SegmentedSelection, got Selection"),
-        (lambda e: e.select(SegmentedSelection((Selection(OBJECT),))), "in 3 segments, got one in 1"),
-        (lambda e: e.select(lambda video: 3), "expected a SegmentedSelection, got int"),
+        (lambda e: e.select(np.ones(NUM, bool)), "selection: expected a Selection or mask of 120 Gaussians"),
+        (lambda e: e.select(Selection(OBJECT)), "selection: expected a Selection or mask of 120 Gaussians"),
+        (lambda e: e.select(lambda video: 3), "selection: expected a Selection or mask of 120 Gaussians"),
         (lambda e: e.select(box=(0, 0, 9, 9), frame=16), r"frame: expected a frame's number in \[0, 16\), got 16"),
         (lambda e: e.select(box=(0, 0, 9, 9), frames=(3, 17)), "frames: expected .first, stop. with .* <= 16"),
         (lambda e: e.select(box=(70, 0, 90, 9), frame=6), "box: expected pixels of a 40x64 frame"),
@@ -625,7 +604,7 @@ def test_an_edited_clip_is_saved_drawn_and_edited_again(tmp_path):
         (lambda e: e.select(times=(0.5, 2)), "times: expected .start, stop."),
         (lambda e: e.select(frame=3, color=(2, 0, 0)), "color: expected red, green and blue"),
         (lambda e: e.select(tolerance=3, frame=1), "tolerance: expected color or click"),
-        (lambda e: e.select(SegmentedSelection((Selection(OBJECT),) * 3), frame=1), "a selection or criteria"),
+        (lambda e: e.select(np.tile(OBJECT, 3), frame=1), "a selection or criteria"),
         (lambda e: e.select(layer=-1), "layer: expected a whole number >= 0"),
         (lambda e: e.move((1, 2, 3)), "offset: expected 2 finite numbers"),
         (lambda e: e.move((0.1, 0), frames=(3, 17)), "frames: expected .*stop <= 16"),
@@ -647,11 +626,11 @@ def test_mistakes_are_told_when_they_are_made(change, match):
 
 
 def test_what_only_the_models_tell_is_told_by_video():
-    all_of = SegmentedSelection((Selection(OBJECT),) * 3)
-    gone = edit(soft_video()).select(all_of).vanish().select_begun(all_of).move((0.1, 0))
+    all_of = np.tile(OBJECT, 3)
+    gone = edit(soft_video()).select(all_of).vanish().select(all_of).move((0.1, 0))
     with pytest.raises(ValueError, match="selection: expected at least one Gaussian"):
         gone.video()
-    some = SegmentedSelection((Selection(np.arange(NUM) < 3),) * 3)
+    some = np.tile(np.arange(NUM) < 3, 3)
     with pytest.raises(ValueError, match="Retime it before that edit"):
         edit(soft_video()).select(all_of).rotate(0.3).select(some).freeze(7, frames=(7, 9)).video()
 

@@ -8,7 +8,6 @@ from jaxtyping import Int
 
 from foldgauss._runtime.checks import invalid
 from foldgauss.video.editing.edited_video import Layer
-from foldgauss.video.editing.origins import Mask
 from foldgauss.video.editing.overlays import (
     IDENTITY,
     AbstractOverlay,
@@ -19,6 +18,7 @@ from foldgauss.video.editing.overlays import (
     TriangleFunction,
 )
 from foldgauss.video.models.splats import FoldedSplats
+from foldgauss.video.selection.selectors import Mask
 
 Bake = Callable[[FoldedSplats, Mask], FoldedSplats | None]
 

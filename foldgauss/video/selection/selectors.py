@@ -3,7 +3,8 @@
 import dataclasses
 import functools
 import logging
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -54,11 +55,15 @@ COLOR_TOLERANCE = 10.0
 CLICK_TOLERANCE = 15.0
 
 
+Mask = Bool[np.ndarray, "num"]
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Selection:
-    """A set of Gaussians of one model, with the operations of sets: `|`, `&`, `-`, `^`, `~`, `==`, `len`, `in`.
+    """A set of Gaussians of one video, with the operations of sets: `|`, `&`, `-`, `^`, `~`, `==`, `len`, `in`.
 
-    **Shapes:** `mask` is bool (num_gaussians,), in the model's array order; it is copied and cannot be written to.
+    **Shapes:** `mask` is bool (num_gaussians,), in the model's array order, of segments and of layers one after
+    another; it is copied and cannot be written to.
 
     **Example:** `moving = by_box(model, (10, 10, 50, 40), frame=0) - by_color(model, (0, 1, 0), tolerance=20)`.
 
@@ -145,6 +150,28 @@ class Selection:
             got, cure = f"one of {other.num_gaussians:,}", "Is it another model's?"
             raise invalid("selection", expected=expected, got=got, cure=cure)
         return other.mask
+
+
+def check_mask(selection: object, num: int) -> Mask:
+    """The mask of a `Selection`, or a mask itself. Raises ValueError for anything but those of `num` Gaussians."""
+    if isinstance(selection, str | os.PathLike):
+        cure = "Read a file with foldgauss.io.load_selection(path, model)."
+        raise invalid("selection", expected="a Selection or a mask", got=repr(selection), cure=cure)
+    mask = np.asarray(selection.mask if isinstance(selection, Selection) else selection)
+    if mask.dtype == bool and mask.shape == (num,):
+        return mask
+    cure = "Is it another model's? For Gaussians after edits: select(lambda video: mask)."
+    if mask.ndim > 1:
+        cure = "For a mask of pixels: select(mask=mask, frame=k)."
+    elif mask.dtype.kind in "iu":
+        cure = "For indices of Gaussians: Selection.of(model, [...])."
+    expected = f"a Selection or mask of {num:,} Gaussians"
+    raise invalid("selection", expected=expected, got=f"{mask.dtype} {mask.shape}", cure=cure)
+
+
+def split_mask(mask: Mask, counts: Sequence[int]) -> list[Mask]:
+    """The masks of several parts, from a mask over all."""
+    return np.split(mask, np.cumsum(counts)[:-1])
 
 
 def select(
