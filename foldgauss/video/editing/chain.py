@@ -47,10 +47,11 @@ from foldgauss.video.editing.overlays import (
     Recolor,
     Retiming,
     SelectedGaussians,
+    TimedEdit,
     TriangleFunction,
     polar_decompose,
 )
-from foldgauss.video.editing.span import NEVER, Span, When, check_when, make_span
+from foldgauss.video.editing.span import NEVER, Span, When, make_span
 from foldgauss.video.editing.time_map import TimeMap, frame_times_of
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.selection.selectors import Mask, Selection, check_mask, select, split_mask
@@ -511,7 +512,7 @@ class Edit:
 
     def _apply(
         self,
-        make: Callable[..., AbstractOverlay | Retiming],
+        make: Callable[..., TimedEdit],
         when: When,
         bake: Bake | None = None,
         *,
@@ -568,7 +569,6 @@ class Edit:
         return span if span is None or self._time_map is None else self._time_map.convert_span(span)
 
     def _clip_span(self, when: When) -> Span | None:
-        check_when(when)
         return make_span(self._frame_times, **when)
 
 

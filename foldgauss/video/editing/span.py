@@ -1,7 +1,6 @@
 """Spans: when an edit acts, and with which progress between 0 and 1."""
 
 import dataclasses
-import difflib
 import math
 from collections.abc import Sequence
 from numbers import Real
@@ -79,15 +78,6 @@ class Span:
 
 #: The span of an edit that acts on no frame of a segment: no video has these times.
 NEVER = Span(2.0, 3.0)
-
-
-def check_when(when: When) -> None:
-    """Raise ValueError for a name that is no keyword of `make_span`."""
-    for name in when:
-        if name not in When.__annotations__:
-            near = difflib.get_close_matches(name, When.__annotations__, 1)
-            expected, cure = "one of " + ", ".join(When.__annotations__), f"Did you mean {near[0]}?" if near else ""
-            raise invalid("when", expected=expected, got=name, cure=cure)
 
 
 def make_span(

@@ -129,10 +129,10 @@ def _own_arguments(positions: Any, segment: Segment, one: Edit, arguments: dict[
     """The arguments of `by_time` in a segment's own frames or times."""
     if isinstance(positions, range):
         first, stop = max(positions.start, segment.first), min(positions.stop, segment.stop)
-        return {"frames": (first - segment.first, stop - segment.first), "alive": arguments["alive"]}
+        return {**arguments, "frame": None, "frames": (first - segment.first, stop - segment.first)}
     if one._time_map is None:
         return arguments
-    return {"times": tuple(map(one._time_map.to_own, arguments["times"])), "alive": arguments["alive"]}
+    return {**arguments, "times": tuple(map(one._time_map.to_own, arguments["times"]))}
 
 
 class _RegionCriterion:
@@ -141,7 +141,7 @@ class _RegionCriterion:
     def __init__(self, context: CriteriaEvaluator, function: Callable[..., Selection], arguments: dict[str, Any]):
         self._context, self._function, self._arguments = context, function, arguments
         self._segments = context.segments
-        where = {"frame": arguments["frame"], "frames": arguments.get("frames")}
+        where = {name: arguments.get(name) for name in ("frame", "frames")}
         if function is by_click:
             self._frames = tuple(resolve_frames(context.stand_in, **where))
         else:
