@@ -233,10 +233,6 @@ ONE_FRAME = {
 }
 
 
-def quality(frame, clip, where) -> float:
-    return -10 * np.log10(np.mean((frame - clip)[where] ** 2))
-
-
 @pytest.mark.parametrize("name", ONE_FRAME)
 def test_a_single_frame_and_no_other(name):
     """The edited frame differs where the selection reaches, by decibels, and nowhere else; no other frame does."""
@@ -249,12 +245,10 @@ def test_a_single_frame_and_no_other(name):
     reached = (object_before > 0) | (picture(alone(chain.video(), chain.selection.mask), TIMES[3])[0] > 0)
     assert 0.1 < reached.mean() < 0.9
     np.testing.assert_array_equal(before[3][~reached], after[3][~reached])
-    clip = before[3] + np.random.default_rng(0).normal(0, 4, before[3].shape)  # what was fitted, say
-    assert abs(quality(before[3], clip, ~reached) - quality(after[3], clip, ~reached)) < 0.1
     inside = object_before > 0.3
     assert inside.sum() > 50
     if name == "recolor":
-        assert quality(before[3], clip, inside) - quality(after[3], clip, inside) > 5
+        assert np.square(before[3] - after[3])[inside].mean() > 500  # levels of 255
     assert (before[3] != after[3])[inside].any()
     # Half way to the neighbors it is seen, beyond it is not.
     near, far = (np.interp(k, np.arange(NUM_FRAMES), TIMES) for k in (3.4, 3.6))

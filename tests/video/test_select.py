@@ -102,26 +102,15 @@ def test_selection_is_immutable():
     with pytest.raises(dataclasses.FrozenInstanceError):
         one.mask = mask
     assert repr(Selection(mask)) == "Selection(1 of 5)"
+    assert one != "none"
+    with pytest.raises(TypeError, match="expected a Selection, got ndarray"):
+        one & mask
 
 
 def test_all_none_and_numbers():
     assert len(Selection.all(MODEL)) == len(LABEL) == Selection.none(MODEL).num_gaussians
     assert Selection.of(MODEL, [3, 1, 3]).indices.tolist() == [1, 3]
     assert Selection.of(MODEL, []) == Selection.none(MODEL) == ~Selection.all(MODEL)
-
-
-def test_bad_sets():
-    for mask in (np.zeros(3), np.zeros((3, 1), bool), [1, 0]):
-        with pytest.raises(ValueError, match=r"^mask: expected bool \(num_gaussians,\)"):
-            Selection(mask)
-    for indices in ([-1], [len(LABEL)], [0.5], [[1]], [True]):
-        with pytest.raises(ValueError, match=r"^indices: expected whole numbers"):
-            Selection.of(MODEL, indices)
-    with pytest.raises(ValueError, match=r"^selection: expected a selection of 3 Gaussians, got one of 4"):
-        Selection(np.zeros(3, bool)) | Selection(np.zeros(4, bool))
-    with pytest.raises(TypeError, match="expected a Selection, got ndarray"):
-        Selection(np.zeros(3, bool)) & np.zeros(3, bool)
-    assert Selection(np.zeros(3, bool)) != "none"
 
 
 # --------------------------------------------------------------------------------------------- contribution
@@ -424,24 +413,6 @@ def test_what_select_cannot_ask():
             by_time(MODEL, **options)
 
 
-def test_bad_models():
-    broken = eqx.tree_at(lambda m: m.splats.loc, MODEL, np.full_like(MODEL.splats.loc, np.nan))
-    with pytest.raises(ValueError, match=r"^model: expected finite numbers"):
-        by_color(broken, (0, 0, 0))
-    many = TimeLikelihood(np.linspace(1, 2, len(LABEL), dtype=np.float32), 0.3)
-    mixed = eqx.tree_at(lambda m: m.splats.envelope, MODEL, many)
-    with pytest.raises(ValueError, match=r"^model\.splats\.envelope\.power: expected one number"):
-        by_color(mixed, (0, 0, 0))
-    with pytest.raises(ValueError, match=r"^model: expected a VideoModel, got FoldedSplats"):
-        matte(MODEL.splats, truth(DISC), 0.5)
-    with pytest.raises(ValueError, match=r"^model: expected a VideoModel, got str"):
-        by_click("model.safetensors", (1, 1), frame=0)
-    with pytest.raises(ValueError, match=r"^selection"):
-        matte(MODEL, Selection(np.zeros(3, bool)), 0.5)
-    with pytest.raises(ValueError, match=r"^t: expected one time in \[0, 1\], got \[0\.1, 0\.2\]"):
-        matte(MODEL, truth(DISC), [0.1, 0.2])
-
-
 # ------------------------------------------------------------------------------------------------- a real fit
 
 
@@ -472,28 +443,6 @@ def test_a_fitted_object_is_selected(fitted, name):
     assert overlap(model, other, masks) < 0.05  # the measure can fail
 
 
-SWAPPED = {
-    "text": (lambda m, s: by_box("m", (1, 2, 3, 4)), "model: expected a VideoModel, got str. The model comes first"),
-    "box first": (lambda m, s: by_box((1, 2, 3, 4), m, frame=0), "model: expected a VideoModel, got tuple"),
-    "mask first": (lambda m, s: by_mask(np.ones((4, 4), bool), m, frame=0), "model: .*got ndarray"),
-    "chain": (lambda m, s: by_box(edit(m), (1, 2, 3, 4)), "model: .*got Edit. End the chain with .video"),
-    "all of no model": (lambda m, s: Selection.all(s), "model: .*got Selection"),
-    "of no model": (lambda m, s: Selection.of(3, [1]), "model: .*got int"),
-    "a mask": (lambda m, s: matte(m, s.mask, 0.5), r"selection: expected a Selection, got ndarray.*Selection\(mask\)"),
-    "time first": (lambda m, s: influence(m, 0.5, s), r"selection: .*The order is \(model, selection, t\)"),
-    "time beyond": (lambda m, s: matte(m, s, 3), "t: expected a time in"),
-    "no time": (lambda m, s: influence(m, s, "x"), "t: expected a time in"),
-}
-
-
-@pytest.mark.parametrize("name", SWAPPED)
-def test_swapped_arguments(name):
-    call, message = SWAPPED[name]
-    model = soft_model()
-    with pytest.raises(ValueError, match=f"^{message}"):
-        call(model, Selection.all(model))
-
-
 def test_frames_with_open_ends():
     model = soft_model()
     box = (12, 10, 32, 30)
@@ -504,3 +453,43 @@ def test_frames_with_open_ends():
 def test_indices_out_of_range_are_in_no_selection():
     chosen = Selection(np.array([True, False, True]))
     assert [k in chosen for k in (0, 1, 2, 3, -1)] == [True, False, True, False, False]
+
+
+BROKEN = eqx.tree_at(lambda m: m.splats.loc, MODEL, np.full_like(MODEL.splats.loc, np.nan))
+MANY = TimeLikelihood(np.linspace(1, 2, len(LABEL), dtype=np.float32), 0.3)
+MIXED = eqx.tree_at(lambda m: m.splats.envelope, MODEL, MANY)
+ALL, THREE = Selection.all(MODEL), np.zeros(3, bool)
+WRONG_CALLS = [
+    *((lambda mask=mask: Selection(mask), r"mask: expected bool \(num_gaussians,\)") for mask in (0 * THREE, [1, 0])),
+    (lambda: Selection(THREE[:, None]), r"mask: expected bool \(num_gaussians,\)"),
+    *(
+        (lambda indices=indices: Selection.of(MODEL, indices), "indices: expected whole numbers")
+        for indices in ([-1], [len(LABEL)], [0.5], [[1]], [True])
+    ),
+    (
+        lambda: Selection(THREE) | Selection(np.zeros(4, bool)),
+        "selection: expected a selection of 3 Gaussians, got one",
+    ),
+    (lambda: by_color(BROKEN, (0, 0, 0)), "model: expected finite numbers"),
+    (lambda: by_color(MIXED, (0, 0, 0)), r"model\.splats\.envelope\.power: expected one number"),
+    (lambda: matte(MODEL.splats, ALL, 0.5), "model: expected a VideoModel, got FoldedSplats"),
+    (lambda: by_click("model.safetensors", (1, 1), frame=0), "model: expected a VideoModel, got str"),
+    (lambda: matte(MODEL, Selection(THREE), 0.5), "selection"),
+    (lambda: matte(MODEL, ALL, [0.1, 0.2]), r"t: expected one time in \[0, 1\], got \[0\.1, 0\.2\]"),
+    (lambda: by_box("m", (1, 2, 3, 4)), "model: expected a VideoModel, got str. The model comes first"),
+    (lambda: by_box((1, 2, 3, 4), MODEL, frame=0), "model: expected a VideoModel, got tuple"),
+    (lambda: by_mask(np.ones((4, 4), bool), MODEL, frame=0), "model: .*got ndarray"),
+    (lambda: by_box(edit(MODEL), (1, 2, 3, 4)), "model: .*got Edit. End the chain with .video"),
+    (lambda: Selection.all(ALL), "model: .*got Selection"),
+    (lambda: Selection.of(3, [1]), "model: .*got int"),
+    (lambda: matte(MODEL, ALL.mask, 0.5), r"selection: expected a Selection, got ndarray.*Selection\(mask\)"),
+    (lambda: influence(MODEL, 0.5, ALL), r"selection: .*The order is \(model, selection, t\)"),
+    (lambda: matte(MODEL, ALL, 3), "t: expected a time in"),
+    (lambda: influence(MODEL, ALL, "x"), "t: expected a time in"),
+]
+
+
+@pytest.mark.parametrize(("call", "message"), WRONG_CALLS)
+def test_wrong_calls(call, message):
+    with pytest.raises(ValueError, match=f"^{message}"):
+        call()

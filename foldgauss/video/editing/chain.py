@@ -14,13 +14,12 @@ from foldgauss._runtime.checks import check_signature, invalid, is_integer, is_w
 from foldgauss.render import Camera
 from foldgauss.video.editing.arguments import (
     broadcast_numbers,
+    check_array,
     check_color,
     check_color_map,
-    check_matrix,
     check_number,
     check_numbers,
     check_one_or_more,
-    check_pairs,
     check_select_arguments,
     missing_attribute,
     warn_if_outside_clip,
@@ -212,7 +211,7 @@ class Edit:
         `about`: c, (x, y); then baked without a span. None: the selection's own center at each time. Easing
         interpolates the rotation and the symmetric part of A, see `Affine`.
         """
-        rows = check_matrix("matrix", matrix, 2)
+        rows = check_array("matrix", matrix, 2, 2)
         # By its formula: LAPACK's elimination divides by zero where a pivot is subnormal.
         determinant = rows[0, 0] * rows[1, 1] - rows[0, 1] * rows[1, 0]
         if not abs(determinant) > 1e-12 * np.abs(rows).max() ** 2:
@@ -259,10 +258,12 @@ class Edit:
         Copies have the edits of their originals, each about its own center, even if the edit was of a larger selection.
         """
         # By `map`: a list comprehension is a frame of its own in Python 3.11, at which warnings would point.
-        shifts = list(map(partial(self._point, "offsets"), check_pairs("offsets", offsets)))
+        shifts = list(map(partial(self._point, "offsets"), check_array("offsets", offsets, None, 2).tolist()))
         about = self._fixed_point(about)
         named = (("delays", delays), ("scale", scale), ("angle", angle))
         delays, sizes, angles = (broadcast_numbers(name, values, len(shifts)) for name, values in named)
+        if not shifts:
+            raise invalid("offsets", expected="at least one pair", got="none")
         if min(sizes) <= 0:
             raise invalid("scale", expected="numbers > 0", got=scale, cure="Mirror with transform().")
         if not isinstance(originals, bool | np.bool_):

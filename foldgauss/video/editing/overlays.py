@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from foldgauss._runtime.checks import check_one_of, invalid
 from foldgauss.render import Gaussians3D, Triangles
-from foldgauss.video.editing.arguments import check_number, check_numbers
+from foldgauss.video.editing.arguments import check_array, check_number, check_numbers
 from foldgauss.video.editing.clock import Clock
 from foldgauss.video.editing.span import Span
 
@@ -125,14 +125,13 @@ class Affine(AbstractOverlay):
 
     def __check_init__(self) -> None:
         check_number("angle", self.angle)
-        for row in self.stretch:
-            check_numbers("stretch", row, 2)
+        check_array("stretch", self.stretch, 2, 2)
         check_numbers("offset", self.offset, 2)
         if self.about is not None:
             check_numbers("about", self.about, 2)
-        if len(self.stretch) != 2 or self.stretch[0][1] != self.stretch[1][0]:
-            raise invalid("stretch", expected="a symmetric 2x2 matrix", got=self.stretch)
-        (first, shear), (_, second) = self.stretch
+        (first, shear), (other, second) = self.stretch
+        if shear != other:
+            raise invalid("stretch", expected="a symmetric matrix", got=self.stretch)
         if first * second - shear**2 == 0:
             raise invalid("stretch", expected="an invertible matrix", got=self.stretch, cure="See vanish().")
 
@@ -213,10 +212,8 @@ class Recolor(AbstractOverlay):
     hue: float | None = eqx.field(static=True, default=None)
 
     def __check_init__(self) -> None:
-        if len(self.matrix) != 3:
-            raise invalid("matrix", expected="a 3x3 matrix", got=self.matrix)
-        for row in (*self.matrix, self.offset):
-            check_numbers("matrix, offset", row, 3)
+        check_array("matrix", self.matrix, 3, 3)
+        check_numbers("offset", self.offset, 3)
         if self.hue is not None:
             check_number("hue", self.hue)
 

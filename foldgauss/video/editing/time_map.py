@@ -14,6 +14,8 @@ from foldgauss.video.editing.span import NEVER, Span, distinct_knots
 
 #: Frames. Rounding error of the frame that a clock shows.
 _FRAME_TOLERANCE = 1e-6
+#: Frames. Times this close are the same, so that edits of a clip in one segment are those of its model.
+_SAME = 1e-3
 
 
 def frame_times_of(video: Any) -> Float64[np.ndarray, " num_frames"]:
@@ -34,10 +36,10 @@ class TimeMap:
     own: Float64[np.ndarray, " num_frames"]
     whole: Float64[np.ndarray, " num_frames"]
 
-    def is_linear(self, first: float, last: float, tolerance: float) -> bool:
-        """Whether own times 0 to 1 are times `first` to `last` of the whole, to a tolerance in frame intervals."""
-        error = np.abs(first + self.own * (last - first) - self.whole).max()
-        return bool(error * max(len(self.own) - 1, 1) <= tolerance * abs(last - first))
+    @property
+    def is_identity(self) -> bool:
+        """Whether both times are the same, to `_SAME`."""
+        return bool(np.abs(self.own - self.whole).max() * max(len(self.own) - 1, 1) <= _SAME)
 
     def to_own(self, t: float) -> float:
         """The own time at a time of the whole; before the first frame and after the last, the time of that frame."""

@@ -18,8 +18,6 @@ from foldgauss.video.selection.selectors import by_time
 
 Video = VideoModel | EditedVideo | SegmentedVideo
 
-#: Frames. Times this close to a straight line count as linear.
-_LINEAR_TOLERANCE = 1e-3
 #: Clip time. Gaussians that are alive within this margin around a segment are kept.
 _MARGIN = 1e-4
 
@@ -93,7 +91,7 @@ def _format_bounds(video: SegmentedVideo) -> str:
 
 def _convert(other: EditedVideo, time_map: TimeMap) -> EditedVideo:
     """The other video in the segment's time; unchanged if the times are the same."""
-    if time_map.is_linear(0.0, 1.0, _LINEAR_TOLERANCE):
+    if time_map.is_identity:
         return other
     return dataclasses.replace(other, layers=tuple(_convert_layer(layer, time_map) for layer in other.layers))
 

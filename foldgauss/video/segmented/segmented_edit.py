@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import ArrayLike
 
-from foldgauss._runtime.checks import check_signature, invalid, is_integer
+from foldgauss._runtime.checks import check_signature
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.editing.arguments import check_color, check_select_arguments, missing_attribute
 from foldgauss.video.editing.bake import mean_lightness
@@ -27,8 +27,6 @@ from foldgauss.video.segmented.criteria import CriteriaEvaluator
 from foldgauss.video.segmented.segmented_video import MAX_PREPARED, Segment, SegmentedVideo
 from foldgauss.video.selection.selectors import Mask, Selection, check_mask, list_criteria, select, split_mask
 
-#: Frames. Frame times of a clip in one segment that are this close to even spacing are evenly spaced.
-_EVEN_TOLERANCE = 1e-3
 #: The methods that may change the number or the order of the Gaussians, or hide some of them.
 _CHANGE_INDICES = ("multiply", "vanish", "opacity", "to_front", "to_back")
 
@@ -135,8 +133,6 @@ class SegmentedEdit:
         one model after another.
         """
         check_select_arguments(selection, criteria)
-        if layer is not None and not is_integer(layer, 0):
-            raise invalid("layer", expected="a whole number >= 0", got=layer)
         if criteria:
             inspect.signature(select).bind(None, **criteria)
             return self._select_current(self._evaluator(layer).evaluate(list_criteria(**criteria)))
@@ -230,7 +226,7 @@ class SegmentedEdit:
         segment = self._video.segments[number]
         video, clip_times = as_edited(segment.model), self._video.frame_times.times()
         time_map = TimeMap(frame_times_of(video), clip_times[segment.first : segment.stop])
-        if len(clip_times) == segment.num_frames and time_map.is_linear(0.0, 1.0, _EVEN_TOLERANCE):
+        if len(clip_times) == segment.num_frames and time_map.is_identity:
             return start_chain(video)
         return start_chain(video, clip_times, time_map)
 

@@ -85,26 +85,22 @@ class Selection:
     def of(cls, model: VideoModel, indices: Int[np.ndarray, " num"]) -> "Selection":
         """The Gaussians with these indices. Raises ValueError for indices that the model does not have."""
         check_model(model)
-        indices, num = np.asarray(indices), model.splats.num_gaussians
-        if indices.size == 0:
-            return cls.none(model)
-        if indices.ndim != 1 or indices.dtype.kind not in "iu" or indices.min() < 0 or indices.max() >= num:
-            raise invalid("indices", expected=f"whole numbers in [0, {num})", got=indices)
-        mask = np.zeros(num, bool)
-        mask[indices] = True
+        indices, mask = np.asarray(indices), np.zeros(model.splats.num_gaussians, bool)
+        if indices.size:
+            if indices.ndim != 1 or indices.dtype.kind not in "iu" or indices.min() < 0 or indices.max() >= len(mask):
+                raise invalid("indices", expected=f"whole numbers in [0, {len(mask)})", got=indices)
+            mask[indices] = True
         return cls(mask)
 
     @classmethod
     def all(cls, model: VideoModel) -> "Selection":
         """Every Gaussian."""
-        check_model(model)
-        return cls(np.ones(model.splats.num_gaussians, bool))
+        return ~cls.none(model)
 
     @classmethod
     def none(cls, model: VideoModel) -> "Selection":
         """No Gaussian."""
-        check_model(model)
-        return cls(np.zeros(model.splats.num_gaussians, bool))
+        return cls.of(model, ())
 
     @property
     def indices(self) -> Int[np.ndarray, " num_selected"]:
