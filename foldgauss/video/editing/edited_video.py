@@ -131,16 +131,18 @@ def as_edited(video: VideoModel | EditedVideo) -> EditedVideo:
     if isinstance(video, EditedVideo):
         return video
     if not isinstance(video, VideoModel):
-        cure = "End a chain of edits with .video()."
-        if isinstance(video, list | tuple):
-            cure = "Stack several with layers(*videos)."
-        elif isinstance(video, str | os.PathLike):
-            cure = "Read a file with foldgauss.io.load_video_model(path)."
-        elif type(video).__name__ == "SegmentedVideo":
-            cure = ONE_SEGMENT
-        elif type(video).__name__ == "StabilizedVideo":
-            cure = "Edit first, and stabilize the edited video."
-        raise invalid("video", expected="a VideoModel or an EditedVideo", got=type(video).__name__, cure=cure)
+        kind = "path" if isinstance(video, str | os.PathLike) else type(video).__name__
+        cures = {
+            "Edit": "End a chain of edits with .video().",
+            "SegmentedEdit": "End a chain of edits with .video().",
+            "list": "Stack several with layers(*videos).",
+            "tuple": "Stack several with layers(*videos).",
+            "path": "Read a file with foldgauss.io.load_video_model(path).",
+            "SegmentedVideo": ONE_SEGMENT,
+            "StabilizedVideo": "Edit first, and stabilize the edited video.",
+        }
+        got, cure = type(video).__name__, cures.get(kind, "")
+        raise invalid("video", expected="a VideoModel or an EditedVideo", got=got, cure=cure)
     return EditedVideo((Layer(video),), timeline=0)
 
 

@@ -215,14 +215,10 @@ def _move_points(affine: Affine, points: Float[np.ndarray, "num 2"]) -> Float[np
 
 
 def _find_zoom(maps: Float[np.ndarray, "frames 3 3"], size: tuple[int, int]) -> float:
-    """The least zoom, to 0.1%, with which every moved image covers the output; just over `MAX_ZOOM` if none does."""
-    half = np.array([size[1], size[0]]) / max(size) / 2
-    corners = np.array(list(itertools.product([-1, 1], [-1, 1]))) * half
-    zooms = 1.001 ** np.arange(np.ceil(np.log(MAX_ZOOM) / np.log(1.001)) + 2)
-
-    def covers(zoom: float) -> bool:
-        inverse = np.linalg.inv(maps)
-        seen = np.einsum("nij,cj->nci", inverse[:, :2, :2], corners / zoom) + inverse[:, None, :2, 2]
-        return bool((np.abs(seen) <= half + 1e-9).all())
-
-    return float(next((zoom for zoom in zooms if covers(zoom)), zooms[-1]))
+    """The least zoom, to 0.1%, with which every moved image covers the output; above `MAX_ZOOM` if none does."""
+    half, inverse = np.array([size[1], size[0]]) / max(size) / 2, np.linalg.inv(maps)
+    corners = np.array([[1, 1], [1, -1]]) * half  # and their opposites
+    reach = np.abs(np.einsum("nij,cj->nci", inverse[:, :2, :2], corners)).max(1)
+    room = half - np.abs(inverse[:, :2, 2])
+    zoom = max(1.0, (reach / np.maximum(room, 1e-9)).max())
+    return float(1.001 ** np.ceil(np.log(zoom) / np.log(1.001) - 1e-6))

@@ -237,17 +237,15 @@ class PreparedSegmentedVideo:
 
     def _prepare_at(self, number: int, position: float, max_kept: int) -> tuple[PreparedVideo, np.ndarray]:
         """A prepared segment, one of at most `max_kept`, and its own time at a frame position of the clip."""
-        prepared, times = self._prepare(number, max_kept)
-        return prepared, times_at(times, position - self._video.segments[number].first)
-
-    def _prepare(self, number: int, max_kept: int) -> tuple[PreparedVideo, np.ndarray]:
+        segment = self._video.segments[number]
         if number not in self._kept:
             while len(self._kept) >= max_kept:
                 self._kept.popitem(last=False)  # before the next one is loaded, to free its memory
-            model = self._video.segments[number].model
+            model = segment.model
             self._kept[number] = model.prepare(self._size), np.asarray(model.frame_times.times())
         self._kept.move_to_end(number)
-        return self._kept[number]
+        prepared, times = self._kept[number]
+        return prepared, times_at(times, position - segment.first)
 
 
 def _check_segments(segments: tuple[Segment, ...]) -> None:
