@@ -108,12 +108,12 @@ class Edit:
 
     _video: EditedVideo
     selection: Selection
-    _counts: tuple[int, ...] = dataclasses.field(repr=False)  # by layer, of Gaussians at the start of the chain
-    _sources: tuple[Int[np.ndarray, " num"], ...] = dataclasses.field(
-        repr=False
-    )  # by layer, the Gaussians' indices then
-    _frame_times: Float[np.ndarray, " num_frames"] = dataclasses.field(repr=False)  # to which spans refer
-    _time_map: TimeMap | None = dataclasses.field(repr=False)  # from the video's time, if that is another
+    #: By layer: the number of Gaussians at the start of the chain, and for each current one the index of its original.
+    _counts: tuple[int, ...] = dataclasses.field(repr=False)
+    _sources: tuple[Int[np.ndarray, " num"], ...] = dataclasses.field(repr=False)
+    #: To which frames and spans refer, and the map from the video's own time, where that is another.
+    _frame_times: Float[np.ndarray, " num_frames"] = dataclasses.field(repr=False)
+    _time_map: TimeMap | None = dataclasses.field(repr=False)
 
     def video(self) -> VideoModel | EditedVideo:
         """The edited video: a folded model if all edits could be baked, else an `EditedVideo`."""

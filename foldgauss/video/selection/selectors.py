@@ -237,9 +237,10 @@ def list_criteria(**arguments: Any) -> list[tuple[Callable[..., Selection], dict
 
     Raises ValueError as `select`, where that does not depend on the model.
     """
-    parameters = inspect.signature(select).parameters
-    given = {name: value for name, value in arguments.items() if value is not parameters[name].default}
-    if not isinstance(given.get("moving", True), bool | np.bool_):
+    defaults = {name: parameter.default for name, parameter in inspect.signature(select).parameters.items()}
+    arguments = {name: bool(value) if isinstance(value, np.bool_) else value for name, value in arguments.items()}
+    given = {name: value for name, value in arguments.items() if value is not defaults[name]}
+    if not isinstance(given.get("moving", True), bool):
         raise invalid("moving", expected="True or False", got=repr(given["moving"]))
     functions = {"mask": by_mask, "box": by_box, "polygon": by_polygon, "moving": by_motion, "color": by_color}
     functions |= {"click": by_click, "times": by_time}
