@@ -6,7 +6,7 @@ import numpy as np
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions
-from foldgauss.video import FoldedSplats, FrameTimes, VideoModel
+from foldgauss.video import FoldedSplats, FrameTimes, SegmentedVideo, VideoModel
 from foldgauss.video.models.shared_paths import SharedPaths
 
 SIZE, NUM, NUM_FRAMES = (40, 64), 40, 7
@@ -36,6 +36,19 @@ def soft_model(
     )
     options = RenderOptions.exact() if options is None else options
     return VideoModel(splats, FrameTimes.uniform(num_frames), size, 25.0, options, compositing)
+
+
+def learned(model, seed=0) -> VideoModel:
+    """The model with frame times of its own."""
+    logits = 0.3 * np.random.default_rng(seed).standard_normal(model.num_frames - 1).astype(np.float32)
+    return dataclasses.replace(model, frame_times=FrameTimes(logits))
+
+
+def soft_segments(firsts=(0, 4, 10), lengths=(7, 9, 6), *, evenly=False, seed=0) -> SegmentedVideo:
+    """Segments that are independent of each other, with frame times of their own or even ones."""
+    models = [soft_model(seed=seed + k, num_frames=length) for k, length in enumerate(lengths)]
+    models = models if evenly else [learned(model, seed + k) for k, model in enumerate(models)]
+    return SegmentedVideo.from_models(list(zip(firsts, models, strict=True)))
 
 
 def on_paths(model, *, at_frames=True, reach=1.0, seed=7) -> VideoModel:

@@ -44,12 +44,10 @@ from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.layering import layers
 from foldgauss.video.segmented.segmented_edit import SegmentedEdit
-from foldgauss.video.segmented.segmented_selection import SegmentedSelection
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 from foldgauss.video.selection.selectors import Selection
 
 Video = VideoModel | EditedVideo | SegmentedVideo
-Selected = Selection | SegmentedSelection
 Chain = Edit | SegmentedEdit
 
 #: Size of the largest script that is read: some hundred selections of scattered Gaussians by their indices.
@@ -260,8 +258,8 @@ class EditScript:
         return video
 
     def _select(
-        self, video: Video, table: dict[str, Any], named: dict[str, Selected], origin: Mapping[str, Any]
-    ) -> Selected:
+        self, video: Video, table: dict[str, Any], named: dict[str, Selection], origin: Mapping[str, Any]
+    ) -> Selection:
         if table.keys() & _COMBINATION.keys():
             return _combine(table, named)
         if "indices" in table:
@@ -286,9 +284,9 @@ class EditScript:
             criteria["mask"] = _masks_of_frames(masks, video.num_frames, criteria)
         return edit(video).select(**criteria).selection
 
-    def _apply_edit(self, edits: Chain, table: dict[str, Any], named: dict[str, Selected]) -> Chain:
+    def _apply_edit(self, edits: Chain, table: dict[str, Any], named: dict[str, Selection]) -> Chain:
         if "select" in table:
-            edits = edits.select_begun(named[table["select"]])
+            edits = edits.select(named[table["select"]])
             if not len(edits.selection):
                 raise invalid(
                     "select",
@@ -526,7 +524,7 @@ def _check_layer(context: _TableContext, table: dict[str, Any]) -> None:
 
 def _select_indices(
     video: Video, indices: str, num_gaussians: int | None = None, segment: int | None = None
-) -> Selected:
+) -> Selection:
     """Gaussians by their indices in the video's order, of layers the front one's first; or in that of a segment."""
     if isinstance(video, SegmentedVideo):
         counts = [one.num_gaussians for one in video.segments]
@@ -549,10 +547,10 @@ def _select_indices(
         )
     parts = [Selection(np.zeros(num, bool)) for num in counts]
     parts[segment] = parse_indices(indices, counts[segment])
-    return SegmentedSelection(tuple(parts)) if isinstance(video, SegmentedVideo) else parts[0]
+    return Selection(np.concatenate([part.mask for part in parts]))
 
 
-def _combine(table: dict[str, Any], named: dict[str, Selected]) -> Selected:
+def _combine(table: dict[str, Any], named: dict[str, Selection]) -> Selection:
     some = [functools.reduce(operator.or_, (named[name] for name in table["any"]))] if "any" in table else []
     every = [named[name] for name in table.get("all", ())]
     any_one = next(iter(named.values()))

@@ -35,7 +35,6 @@ from foldgauss.video.motion.slow_motion import even_durations, interpolate_frame
 from foldgauss.video.motion.stabilization import StabilizedVideo, stabilize
 from foldgauss.video.segmented.layering import layers
 from foldgauss.video.segmented.segmented_edit import SegmentedEdit
-from foldgauss.video.segmented.segmented_selection import SegmentedSelection
 from foldgauss.video.segmented.segmented_video import Segment, SegmentedVideo, plan_segments
 from foldgauss.video.selection.selectors import (
     Selection,
@@ -74,7 +73,6 @@ __all__ = [
     "NothingMoves",
     "Segment",
     "SegmentedEdit",
-    "SegmentedSelection",
     "SegmentedVideo",
     "SelectedGaussians",
     "Selection",

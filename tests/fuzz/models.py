@@ -161,7 +161,7 @@ _MODEL_FILE = {
 @functools.cache
 def _edited():
     model = tiny_model()
-    found = edit(model).select_begun(Selection(np.array([True, False, True])))
+    found = edit(model).select(Selection(np.array([True, False, True])))
     moved = found.move((0.1, 0.0)).opacity(0.5, times=(0.2, 0.8)).recolor(hue=0.2).retime(shift=0.1).place(depth=0.1)
     video = layers(moved.video(), tiny_model(seed=1))
     return edit(video).seen_from(Camera.front(4 / 6).orbit(0.1, 0.0)).video()

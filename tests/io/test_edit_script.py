@@ -560,8 +560,8 @@ def test_keys_of_endless_parts_are_refused():
 def test_names_mean_the_first_gaussians_however_many_there_are_now():
     """Also where as many were copied as deleted, and in another order."""
     first, last, middle = (Selection.of(MODEL, np.arange(*ends)) for ends in ((0, 5), (NUM - 5, NUM), (9, 20)))
-    chain = edit(MODEL).select(first).vanish().select_begun(last).multiply([(0.1, 0)]).select_begun(middle).to_front()
-    expected = chain.select_begun(middle).recolor(hue=0.5).video()
+    chain = edit(MODEL).select(first).vanish().select(last).multiply([(0.1, 0)]).select(middle).to_front()
+    expected = chain.select(middle).recolor(hue=0.5).video()
     with tempfile.TemporaryDirectory() as name:
         for key, one in (("a", first), ("b", last), ("c", middle)):
             save_selection(Path(name) / f"{key}.selection", one, MODEL)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import importlib
 
 import jax
 import numpy as np
@@ -10,12 +9,23 @@ import pytest
 from edit_cases import ALWAYS, BAKED, BETWEEN, MAPS, TIMES, TURN, apart, picture
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from path_models import path_model
 from scipy.ndimage import map_coordinates, spline_filter
 from soft_models import NUM, NUM_FRAMES, OBJECT, SIZE, soft_model
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import Camera, RenderOptions, cpu
-from foldgauss.video import Clock, EditedVideo, FrameTimes, SelectedGaussians, Selection, VideoModel, edit, layers
+from foldgauss.video import (
+    Clock,
+    EditedVideo,
+    FrameTimes,
+    SelectedGaussians,
+    Selection,
+    VideoModel,
+    edit,
+    layers,
+    select,
+)
 from foldgauss.video.editing.chain import MAX_DISTANCE
 from foldgauss.video.models.frame_times import make_time_logits
 from foldgauss.video.models.prepared import PreparedModel
@@ -79,30 +89,21 @@ def splines_around(t):
     return [spline_filter(channel) for channel in image]
 
 
-@pytest.mark.parametrize(("power", "floor"), [(2.0, 0.0), (1.0, 0.1)])
+@pytest.mark.parametrize("kind", ["Gaussian", "floor", "short-lived", "paths"])
 @pytest.mark.parametrize("name", BAKED)
-def test_what_is_baked_is_what_the_overlay_draws(name, power, floor):
-    model = soft_model(power=power, floor=floor)
+def test_what_is_baked_is_what_the_overlay_draws(name, kind):
+    model = {"floor": soft_model(power=1.0, floor=0.1), "paths": path_model()}.get(kind, MODEL)
+    if kind == "short-lived":  # masks are of the model, not of those alive
+        short = MODEL.splats.log_time_scale - np.float32(2.2)
+        model = dataclasses.replace(MODEL, splats=dataclasses.replace(MODEL.splats, log_time_scale=short))
+        assert min(len(splats(model, t).opacity) for t in BETWEEN) < NUM / 2
     chain = edit(model).select(OBJECT)
     baked, laid_over = BAKED[name](chain).video(), BAKED[name](chain, **ALWAYS).video()
     assert isinstance(baked, VideoModel)
     assert isinstance(laid_over, EditedVideo)
     assert max(apart(baked, model, t) for t in BETWEEN) > 0.02
     for t in BETWEEN:
-        assert apart(baked, laid_over, t) < 1e-5
-
-
-@pytest.mark.parametrize("name", ["move", "gain", "vanish", "reverse", "multiply"])
-def test_masks_are_of_the_model_not_of_those_alive(name):
-    """As above where most come and go."""
-    short = MODEL.splats.log_time_scale - np.float32(2.2)
-    model = dataclasses.replace(MODEL, splats=dataclasses.replace(MODEL.splats, log_time_scale=short))
-    chain = edit(model).select(OBJECT)
-    baked, laid_over = BAKED[name](chain).video(), BAKED[name](chain, **ALWAYS).video()
-    for t in BETWEEN:
-        assert apart(baked, laid_over, t) < 1e-5
-    assert max(apart(baked, model, t) for t in BETWEEN) > 0.02
-    assert min(len(splats(model, t).opacity) for t in BETWEEN) < NUM / 2
+        assert apart(baked, laid_over, t) < 2e-5
 
 
 @pytest.mark.parametrize("name", sorted(set(BAKED) - {"vanish", "multiply"}))
@@ -145,7 +146,6 @@ def test_functions_that_change_nothing_are_exact():
 
 # ---------------------------------------------------------------------------------------------------- composition
 
-angles = st.floats(-6, 6)
 points = st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
 
 
@@ -164,40 +164,19 @@ def assert_same_splats(one, other, tolerance=1e-4):
     np.testing.assert_allclose(a.color, b.color, atol=1e-5)
 
 
-@settings(max_examples=25, deadline=None)
-@given(angle=angles, about=points)
-def test_a_turn_and_back(angle, about):
-    chain = edit(MODEL).select(OBJECT).rotate(angle, about=about).rotate(-angle, about=about)
-    assert_same_splats(chain.video(), MODEL)
-
-
-@settings(max_examples=25, deadline=None)
-@given(first=points, second=points)
-def test_shifts_add(first, second):
-    total = np.add(first, second)
-    assert_same_splats(edit(MODEL).move(first).move(second).video(), edit(MODEL).move(total).video())
-
-
-@settings(max_examples=25, deadline=None)
-@given(first=st.floats(0.2, 5), second=st.floats(0.2, 5), about=points, angle=angles)
-def test_scales_multiply_and_turns_commute_with_them(first, second, about, angle):
-    one = edit(MODEL).scale(first, about=about).rotate(angle, about=about).scale(second, about=about)
-    other = edit(MODEL).rotate(angle, about=about).scale(first * second, about=about)
-    assert_same_splats(one.video(), other.video())
-
-
-@settings(max_examples=25, deadline=None)
-@given(entries=st.tuples(*[st.floats(-2, 2)] * 4), about=points, offset=points)
-def test_a_map_and_its_inverse(entries, about, offset):
-    matrix = np.reshape(entries, (2, 2))
-    if abs(entries[0] * entries[3] - entries[1] * entries[2]) < 0.1:
+@settings(max_examples=60, deadline=None)
+@given(maps=st.tuples(*[st.tuples(st.tuples(*[st.floats(-2, 2)] * 4), points)] * 2), about=points)
+def test_maps_compose(maps, about):
+    """Two maps about one point are one; with the inverse as the second, none."""
+    (first, one), (second, other) = ((np.reshape(entries, (2, 2)), np.array(offset)) for entries, offset in maps)
+    if min(abs(first[0, 0] * first[1, 1] - first[0, 1] * first[1, 0]), abs(np.linalg.det(second))) < 0.1:
         return
-    inverse = np.linalg.inv(matrix)
-    if np.abs(inverse @ offset).max() > MAX_DISTANCE:
-        return
-    there = edit(MODEL).transform(matrix, offset, about=about)
-    back = there.transform(inverse, -inverse @ offset, about=about)
-    assert_same_splats(back.video(), MODEL, 1e-3)
+    there = edit(MODEL).transform(first, one, about=about)
+    both = edit(MODEL).transform(second @ first, second @ one + other, about=about)
+    assert_same_splats(there.transform(second, other, about=about).video(), both.video(), 1e-3)
+    inverse = np.linalg.inv(first)
+    if np.abs(inverse @ one).max() <= MAX_DISTANCE:
+        assert_same_splats(there.transform(inverse, -inverse @ one, about=about).video(), MODEL, 1e-3)
 
 
 @settings(max_examples=25, deadline=None)
@@ -254,10 +233,6 @@ ONE_FRAME = {
 }
 
 
-def quality(frame, clip, where) -> float:
-    return -10 * np.log10(np.mean((frame - clip)[where] ** 2))
-
-
 @pytest.mark.parametrize("name", ONE_FRAME)
 def test_a_single_frame_and_no_other(name):
     """The edited frame differs where the selection reaches, by decibels, and nowhere else; no other frame does."""
@@ -270,12 +245,10 @@ def test_a_single_frame_and_no_other(name):
     reached = (object_before > 0) | (picture(alone(chain.video(), chain.selection.mask), TIMES[3])[0] > 0)
     assert 0.1 < reached.mean() < 0.9
     np.testing.assert_array_equal(before[3][~reached], after[3][~reached])
-    clip = before[3] + np.random.default_rng(0).normal(0, 4, before[3].shape)  # what was fitted, say
-    assert abs(quality(before[3], clip, ~reached) - quality(after[3], clip, ~reached)) < 0.1
     inside = object_before > 0.3
     assert inside.sum() > 50
     if name == "recolor":
-        assert quality(before[3], clip, inside) - quality(after[3], clip, inside) > 5
+        assert np.square(before[3] - after[3])[inside].mean() > 500  # levels of 255
     assert (before[3] != after[3])[inside].any()
     # Half way to the neighbors it is seen, beyond it is not.
     near, far = (np.interp(k, np.arange(NUM_FRAMES), TIMES) for k in (3.4, 3.6))
@@ -576,22 +549,13 @@ def test_selections():
     assert chain.video() is MODEL
 
 
-def test_criteria_are_asked_of_each_layer(monkeypatch):
-    asked = []
-
-    def by_criteria(model, **criteria):
-        asked.append((model, criteria))
-        return Selection(OBJECT)
-
-    monkeypatch.setattr(importlib.import_module("foldgauss.video.editing.chain"), "select", by_criteria)
-    moved = edit(MODEL).move((0.1, 0))
-    assert len(moved.select(box=(0, 0, 9, 9), frame=2).selection) == OBJECT.sum()
-    model, criteria = asked.pop()
-    assert model is moved.video()  # what could be baked is seen
-    assert criteria == {"box": (0, 0, 9, 9), "frame": 2}
-    chain = edit(layers(MODEL, MODEL))
-    assert len(chain.select(color=(1, 0, 0)).selection) == 2 * OBJECT.sum()
-    np.testing.assert_array_equal(chain.select(layer=1, color=(1, 0, 0)).selection.mask[:NUM], False)
+def test_criteria_are_asked_of_each_layer():
+    box, other = {"box": (0, 0, 32, 40), "frame": 2}, soft_model(seed=1)
+    moved = edit(MODEL).move((0.3, 0))
+    assert moved.select(**box).selection == select(moved.video(), **box) != select(MODEL, **box)  # with baked edits
+    chain, masks = edit(layers(MODEL, other)), [select(model, **box).mask for model in (MODEL, other)]
+    np.testing.assert_array_equal(chain.select(**box).selection.mask, np.concatenate(masks))
+    np.testing.assert_array_equal(chain.select(layer=1, **box).selection.mask, np.concatenate([0 * OBJECT, masks[1]]))
 
 
 def test_selections_of_before_go_on():
@@ -600,18 +564,13 @@ def test_selections_of_before_go_on():
     chain = edit(MODEL).select(OBJECT).multiply([(0.1, 0), (0.2, 0)]).select(some).vanish().select(OBJECT)
     assert len(chain.selection) == 3 * OBJECT.sum()
     np.testing.assert_array_equal(chain.selection.mask, np.repeat(OBJECT, np.where(OBJECT, 3, 1))[:-5])
-    assert len(chain.select(chain.selection).selection) == 3 * OBJECT.sum()  # nor is one of now mistaken
-    with pytest.raises(ValueError, match=r"^selection: expected a Selection or mask of 59 .*another model's"):
-        chain.select(np.ones(58, bool))
-    with pytest.raises(ValueError, match=r"^selection: expected a Selection or mask of 59"):
-        chain.select(lambda model: OBJECT)  # asked now
+    assert chain.select(lambda video: chain.selection).selection == chain.selection
+    for wrong in (np.ones(59, bool), lambda model: OBJECT):  # over the current Gaussians, and over those of the start
+        with pytest.raises(ValueError, match=r"^selection: expected a Selection or mask of .*lambda video: mask"):
+            chain.select(wrong)
     equal = edit(MODEL).select(some).multiply([(0.1, 0)]).select(np.arange(NUM) < 5).vanish()
-    with pytest.raises(ValueError, match=r"^selection: expected a mask with one meaning"):
-        equal.select(OBJECT)
     begun = OBJECT[np.r_[5 : NUM - 5, np.repeat(np.arange(NUM - 5, NUM), 2)]]
-    np.testing.assert_array_equal(equal.select_begun(OBJECT).selection.mask, begun)
-    with pytest.raises(ValueError, match=r"^selection: expected a Selection or mask of 40"):
-        equal.select_begun(OBJECT[:-1])
+    np.testing.assert_array_equal(equal.select(OBJECT).selection.mask, begun)
     assert len(equal.select(lambda model: OBJECT).selection) == OBJECT.sum()
     assert len(equal.select().selection) == NUM
 
@@ -674,7 +633,6 @@ WRONG = {
     "no videos": (lambda: layers(), "videos: expected at least one"),
     "list of videos": (lambda: layers([MODEL]), r"video: .*layers\(\*videos\)"),
     "path": (lambda: edit("m.safetensors"), r"video: .*load_video_model\(path\)"),
-    "another when": (lambda: E.move((0, 0), easing=2), "when: expected one of .*got easing. Did you mean ease"),
     "camera": (lambda: E.seen_from("left"), "camera: expected a Camera"),
     "frame": (lambda: E.move((0, 0), frame=7), r"frame: expected a whole number in \[0, 6\]"),
     "frames": (lambda: E.move((0, 0), frames=(3, 3)), "frames: expected .first, stop."),
@@ -686,6 +644,9 @@ WRONG = {
     "ease": (lambda: E.move((0, 0), frames=(2, 4), ease=-1), "ease: expected a number of frames"),
     "curve": (lambda: E.move((0, 0), frame=2, curve="cubic"), "curve: expected one of"),
     "clock knots": (lambda: Clock((0, 0), (0, 1)), "times: expected strictly increasing"),
+    "file of a selection": (lambda: E.select("it.selection"), "selection: .*got 'it.selection'.*load_selection"),
+    "mask of pixels": (lambda: E.select(np.ones(SIZE, bool)), r"selection: .*select\(mask=mask, frame=k\)"),
+    "one pair": (lambda: E.multiply((0.2, 0)), "offsets: expected pairs"),
     "clock lengths": (lambda: Clock((0, 1), (0,)), "times, own_times: expected as many"),
 }
 
@@ -732,6 +693,8 @@ def test_a_forgotten_end_of_the_chain_is_told():
         E.move((0.1, 0)).render(0.5)
     with pytest.raises(AttributeError, match=r"no attribute 'mve'\.$"):
         E.mve((0.1, 0))
+    with pytest.raises(TypeError, match="unexpected keyword argument 'easing'"):
+        E.move((0, 0), easing=2)
 
 
 @pytest.mark.parametrize("times", [5, [0, 7], "x", [np.nan]])
@@ -743,44 +706,32 @@ def test_times_beyond_the_clip_are_no_times(times):
             video.render("x")
 
 
+def in_place(gaussians, t):
+    gaussians.mean[:] += 1
+    return gaussians
+
+
+TRIANGLES = "vertices: expected triangles whose three vertices span a plane, got 40 without area, the first at index 0"
 DRAWN_WRONG = {
     "nothing back": (lambda g, t: None, "function: expected SelectedGaussians"),
     "fewer": (lambda g, t: dataclasses.replace(g, mean=g.mean[1:]), "function's mean"),
     "nan": (lambda g, t: dataclasses.replace(g, color=g.color * np.nan), "function's color"),
     "opacity": (lambda g, t: dataclasses.replace(g, opacity=g.opacity + 1), "function: expected opacity in"),
     "others": (lambda g, t: dataclasses.replace(g, index=g.index + 1), "function: expected the same Gaussians"),
+    "in place": (in_place, "assignment destination is read-only"),
+    "flat triangles": (lambda v, t: np.repeat(v[:, :1], 3, 1), TRIANGLES),
+    "nan triangles": (lambda v, t: v * np.nan, "vertices: expected finite numbers"),
+    "fewer triangles": (lambda v, t: v[1:], r"vertices: expected numbers of shape \(40, 3, 3\)"),
+    "no triangles": (lambda v, t: None, "vertices: expected numbers of shape"),
 }
 
 
 @pytest.mark.parametrize("name", DRAWN_WRONG)
 def test_functions_that_return_nonsense(name):
     function, message = DRAWN_WRONG[name]
+    chain = edit(MODEL).apply_triangles(function) if "triangles" in name else edit(MODEL).apply(function)
     with pytest.raises(ValueError, match=f"^{message}"):
-        edit(MODEL).apply(function).video().render(0.5)
-
-
-def test_functions_cannot_write_to_what_they_are_given():
-    def in_place(gaussians, t):
-        gaussians.mean[:] += 1
-        return gaussians
-
-    with pytest.raises(ValueError, match="read-only"):
-        edit(MODEL).apply(in_place).video().render(0.5)
-
-
-def test_broken_triangles():
-    flat = lambda v, t: np.repeat(v[:, :1], 3, 1)  # noqa: E731
-    for function, message in (
-        (
-            flat,
-            "vertices: expected triangles whose three vertices span a plane, got 40 without area, the first at index 0",
-        ),
-        (lambda v, t: v * np.nan, "vertices: expected finite numbers"),
-        (lambda v, t: v[1:], r"vertices: expected numbers of shape \(40, 3, 3\)"),
-        (lambda v, t: None, "vertices: expected numbers of shape"),
-    ):
-        with pytest.raises(ValueError, match=f"^{message}"):
-            edit(MODEL).apply_triangles(function).video().render(0.5)
+        chain.video().render(0.5)
 
 
 def test_to_the_front_and_to_the_back():
@@ -792,15 +743,7 @@ def test_to_the_front_and_to_the_back():
     ):
         np.testing.assert_array_equal(chain.video().splats.loc, np.asarray(MODEL.splats.loc)[expected])
         np.testing.assert_array_equal(chain.selection.mask, OBJECT[expected])
-        for again in (
-            chain.select_begun(OBJECT),
-            chain.select().select_begun(Selection(OBJECT)),
-            chain.select(chain.selection),
-        ):
-            np.testing.assert_array_equal(again.selection.mask, OBJECT[expected])
-        if (expected != order).any():
-            with pytest.raises(ValueError, match=r"^selection: expected a mask with one meaning.*select_begun"):
-                chain.select(OBJECT)
+        np.testing.assert_array_equal(chain.select().select(Selection(OBJECT)).selection.mask, OBJECT[expected])
     eased = edit(MODEL).select(OBJECT).scale(1.5, frame=2).to_front()  # an overlay goes along
     assert isinstance(eased.video(), EditedVideo)
     np.testing.assert_array_equal(eased.video().layers[0].overlays[0].mask, eased.selection.mask)
@@ -829,19 +772,3 @@ def test_sizes_are_not_baked_where_small_ones_are_left_out():
     assert isinstance(smaller, EditedVideo)
     assert smaller.render(0.5).mean() > 0.5 * edit(model).scale(0.5, about=(0, 0), **ALWAYS).video().render(0.5).mean()
     assert isinstance(edit(model).rotate(0.5, about=(0, 0)).video(), VideoModel)
-
-
-def test_freezing_over_a_span():
-    frozen = edit(MODEL).freeze(3, frames=(1, 4)).video()
-    np.testing.assert_allclose(frozen.render(TIMES[2]), MODEL.render(TIMES[3]), atol=1e-4)
-    np.testing.assert_allclose(frozen.render(TIMES[0]), MODEL.render(TIMES[0]), atol=1e-4)
-    assert np.abs(frozen.render(TIMES[2]) - MODEL.render(TIMES[2])).max() > 0.01
-
-
-def test_what_is_no_selection_is_told():
-    with pytest.raises(ValueError, match=r"^selection: .*got 'it.selection'.*load_selection"):
-        E.select("it.selection")
-    with pytest.raises(ValueError, match=r"^selection: .*select\(mask=mask, frame=k\)"):
-        E.select(np.ones(SIZE, bool))
-    with pytest.raises(ValueError, match=r"^offsets: expected pairs"):
-        E.multiply((0.2, 0))

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from edit_cases import apart, picture
 from soft_models import NUM, OBJECT, SIZE, soft_model
 
 from foldgauss.io import ModelFileError, load_video_model, save_video_model
@@ -21,14 +22,6 @@ MODEL = soft_model(options=RenderOptions())
 TIMES = np.asarray(MODEL.frame_times.times())
 ASPECT = SIZE[0] / SIZE[1]
 BETWEEN = (0.0, 0.31, 1.0)
-
-
-def picture(video, t, size=None) -> np.ndarray:
-    return np.array(VideoRenderer(video, size).image(t))
-
-
-def apart(one, other, t) -> float:
-    return float(np.abs(picture(one, t) - picture(other, t)).max())
 
 
 def laid_over(model) -> EditedVideo:
@@ -129,7 +122,6 @@ def test_sums_are_layered_too():
 
 
 WRONG_LAYERS = {
-    "none": (lambda: layers(), "videos: expected at least one"),
     "timeline": (lambda: layers(MODEL, timeline=1), "timeline: expected the number of one of 1"),
     "no number": (lambda: layers(MODEL, timeline="first"), "timeline"),
     "kind": (lambda: layers(MODEL, edit(MODEL)), r"video: expected a VideoModel .*got Edit\. End .* \.video"),

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from commands import run
-from edit_cases import ALWAYS, BAKED, BETWEEN, apart
+from edit_cases import ALWAYS, BETWEEN
 from path_models import INDEX, path_model
 from soft_models import NUM, OBJECT, SIZE, soft_model
 
@@ -27,17 +27,6 @@ from foldgauss.video.segmented.segmented_video import Segment
 from foldgauss.video.selection.contributions import Contributions
 
 MODEL = path_model()
-
-
-@pytest.mark.parametrize("name", BAKED)
-def test_what_is_baked_is_what_the_overlay_draws(name):
-    chain = edit(MODEL).select(OBJECT)
-    baked, laid_over = BAKED[name](chain).video(), BAKED[name](chain, **ALWAYS).video()
-    assert isinstance(baked, VideoModel)
-    assert isinstance(laid_over, EditedVideo)
-    assert max(apart(baked, MODEL, t) for t in BETWEEN) > 0.02
-    for t in BETWEEN:
-        assert apart(baked, laid_over, t) < 2e-5
 
 
 def test_edits_of_one_object_reuse_its_paths_and_leave_others_as_they_are():

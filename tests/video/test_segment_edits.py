@@ -10,17 +10,15 @@ import numpy as np
 import pytest
 from object_clips import BACKGROUND, BOX, DISC, SPEED, named_model, square
 from scipy.special import expit
-from soft_models import NUM, OBJECT, soft_model
+from soft_models import NUM, OBJECT, soft_model, soft_segments
 
 from foldgauss.io import load_video_model, save_video_model
 from foldgauss.render import Camera
 from foldgauss.video import (
     Clock,
     EditedVideo,
-    FrameTimes,
     Segment,
     SegmentedEdit,
-    SegmentedSelection,
     SegmentedVideo,
     Selection,
     VideoModel,
@@ -36,12 +34,6 @@ from foldgauss.video.segmented.segmented_video import MAX_PREPARED
 #: Three segments of a dozen frames, three of which are shared with each neighbor.
 FIRSTS, LENGTH, NUM_FRAMES = (0, 9, 18), 12, 30
 SHARED = (9, 10, 11, 18, 19, 20)
-
-
-def learned(model, seed):
-    """The same with frame times of its own."""
-    logits = 0.3 * np.random.default_rng(seed).standard_normal(model.num_frames - 1).astype(np.float32)
-    return dataclasses.replace(model, frame_times=FrameTimes(logits))
 
 
 def span_of_scene(first, seed):
@@ -80,14 +72,6 @@ def disc():
     return edit(scene()[0]).select(box=disc_box(2), frame=2).selection
 
 
-def soft_video(lengths=(7, 9, 6), overlap=3, evenly=False):
-    """Segments that have nothing to do with each other, of times of their own."""
-    firsts = np.cumsum([0, *(length - overlap for length in lengths[:-1])]).tolist()
-    models = [soft_model(seed=k, num_frames=length) for k, length in enumerate(lengths)]
-    models = models if evenly else [learned(model, k) for k, model in enumerate(models)]
-    return SegmentedVideo.from_models(list(zip(firsts, models, strict=True)))
-
-
 def drawn(video):
     return np.stack(list(video.frames())).astype(int)
 
@@ -117,13 +101,10 @@ CHAINS = {
     "still": lambda e: e.freeze(2.5).to_back(),
     "gone": lambda e: e.vanish().select().opacity(0.7),
     "in space": lambda e: e.place(depth=0.2, rotate=(0, 0.4, 0)).seen_from(orbit),
-    "a function": lambda e: e.apply(wider, frame=3).select(lambda video: chosen(video)).transform([[1, 0.2], [0, 1]]),
+    "a function": lambda e: (
+        e.apply(wider, frame=3).select(lambda video: np.arange(NUM) % 3 == 0).transform([[1, 0.2], [0, 1]])
+    ),
 }
-
-
-def chosen(video):
-    mask = np.arange(NUM) % 3 == 0
-    return SegmentedSelection((Selection(mask),)) if isinstance(video, SegmentedVideo) else mask
 
 
 @pytest.mark.parametrize("name", CHAINS)
@@ -163,15 +144,21 @@ def test_one_segment_answers_as_the_model(name):
     wanted = edit(soft_model()).select(**QUESTIONS[name]).selection
     got = edit(SegmentedVideo.from_models([(0, soft_model())])).select(**QUESTIONS[name]).selection
     assert 0 < len(wanted) < NUM
-    assert got == SegmentedSelection((wanted,))
+    assert got == wanted
 
 
 # ------------------------------------------------------------------------------------ who, from segment to segment
 
 
+def by_segment(video, selection):
+    """The selection of each segment."""
+    ends = np.cumsum([segment.num_gaussians for segment in video.segments])
+    return tuple(map(Selection, np.split(selection.mask, ends[:-1])))
+
+
 def shares(selection):
     """Of each segment's disc what is selected, and of all else that moves."""
-    masks, labels = [part.mask for part in selection.parts], scene()[1]
+    masks, labels = [part.mask for part in by_segment(scene()[0], selection)], scene()[1]
     of_disc = [mask[label == DISC].mean() for mask, label in zip(masks, labels, strict=True)]
     return of_disc, [mask[label == BOX].mean() for mask, label in zip(masks, labels, strict=True)]
 
@@ -196,12 +183,10 @@ def test_a_click_is_carried():
     model, label = scene()[0].segments[2].model, scene()[1][2]
     rows, columns = np.nonzero(square(scene()[0], DISC, 28))
     place = (float(columns.mean()), float(rows.mean()))
-    alone = (
-        edit(SegmentedVideo.from_models([(0, model)])).select(click=place, frame=10, tolerance=25).selection.parts[0]
-    )
+    alone = edit(SegmentedVideo.from_models([(0, model)])).select(click=place, frame=10, tolerance=25).selection
     assert alone.mask[label == DISC].mean() > 0.8
     carried = edit(scene()[0]).select(click=place, frame=28, tolerance=25).selection
-    assert carried.parts[2] == alone
+    assert by_segment(scene()[0], carried)[2] == alone
     assert min(shares(carried)[0]) > 0.75
     assert max(shares(carried)[1]) < 0.1
 
@@ -217,7 +202,7 @@ def test_what_is_told_of_both_ends_is_told_between():
     assert shares(selection)[0][2] == 0
     middle = scene()[0].segments[1].model
     shown = carried_masks(0, 1, selection) | carried_masks(2, 1, selection)
-    assert selection.parts[1] == by_mask(middle, shown)
+    assert by_segment(video, selection)[1] == by_mask(middle, shown)
 
 
 def carried_masks(one, other, selection):
@@ -227,66 +212,43 @@ def carried_masks(one, other, selection):
     shared = range(max(segments[one].first, segments[other].first), min(segments[one].stop, segments[other].stop))
     model = segments[one].model
     times = np.asarray(model.frame_times.times())
-    picture = lambda k: matte(model, selection.parts[one], float(times[k - segments[one].first])) >= 0.5  # noqa: E731
+    chosen = by_segment(scene()[0], selection)[one]
+
+    def picture(k):
+        return matte(model, chosen, float(times[k - segments[one].first])) >= 0.5
+
     return {k - segments[other].first: picture(k) for k in shared}
 
 
 def test_nothing_is_carried_over_a_cut_or_without_follow():
     box = {"box": disc_box(2), "frame": 2}
-    still = edit(scene()[0]).select(**box, follow=False).selection
-    assert len(still.parts[0])
-    assert not len(still.parts[1]) + len(still.parts[2])
+    still = by_segment(scene()[0], edit(scene()[0]).select(**box, follow=False).selection)
+    assert len(still[0])
+    assert not len(still[1]) + len(still[2])
     models = [segment.model for segment in scene()[0].segments]
     cut = SegmentedVideo.from_models([(0, models[0]), (12, models[1]), (21, models[2])])
-    found = edit(cut).select(**box).selection
-    assert found.parts[0] == disc().parts[0]
-    assert not len(found.parts[1]) + len(found.parts[2])
-    found = edit(cut).select(box=disc_box(10), frame=13).selection
-    assert not len(found.parts[0])
-    assert len(found.parts[1])
-    assert len(found.parts[2])
+    found = by_segment(cut, edit(cut).select(**box).selection)
+    assert found[0] == by_segment(cut, disc())[0]
+    assert not len(found[1]) + len(found[2])
+    found = by_segment(cut, edit(cut).select(box=disc_box(10), frame=13).selection)
+    assert [len(part) > 0 for part in found] == [False, True, True]
 
 
 def test_colors_and_times_are_asked_of_every_segment():
     video, labels = scene()
     red = edit(video).select(color=(0.9, 0.3, 0.1), tolerance=25).selection
-    assert red.parts == tuple(by_color(segment.model, (0.9, 0.3, 0.1), tolerance=25) for segment in video.segments)
+    each = tuple(by_color(segment.model, (0.9, 0.3, 0.1), tolerance=25) for segment in video.segments)
+    assert by_segment(video, red) == each
     both = edit(video).select(box=disc_box(2), frame=2, color=(0.9, 0.3, 0.1), tolerance=25).selection
     assert both == disc() & red
-    middle = edit(video).select(frames=(10, 15)).selection
+    middle = by_segment(video, edit(video).select(frames=(10, 15)).selection)
     last = video.segments[2].model
-    assert middle.parts[0] == by_time(video.segments[0].model, frames=(10, 12))
-    assert middle.parts[1] == by_time(video.segments[1].model, frames=(1, 6))
-    assert middle.parts[2] == Selection.none(last)
+    assert middle[0] == by_time(video.segments[0].model, frames=(10, 12))
+    assert middle[1] == by_time(video.segments[1].model, frames=(1, 6))
+    assert middle[2] == Selection.none(last)
     timed = edit(video).select(times=(10 / 29, 20 / 29), alive=True).selection
-    assert timed.parts[2] == by_time(last, (0.0, 2 / 11), alive=True)
+    assert by_segment(video, timed)[2] == by_time(last, (0.0, 2 / 11), alive=True)
     assert sum(label.size for label in labels) == timed.num_gaussians
-
-
-def test_selections_are_sets():
-    video = scene()[0]
-    red = edit(video).select(color=(0.9, 0.3, 0.1), tolerance=25).selection
-    masks = [[part.mask for part in one.parts] for one in (red, disc())]
-    for got, combine in (
-        (red | disc(), np.logical_or),
-        (red & disc(), np.logical_and),
-        (red - disc(), lambda one, other: one & ~other),
-        (red ^ disc(), np.logical_xor),
-    ):
-        assert [part.mask.tolist() for part in got.parts] == [
-            combine(*pair).tolist() for pair in zip(*masks, strict=True)
-        ]
-        assert len(got) == sum(int(part.mask.sum()) for part in got.parts)
-    assert ~~red == red
-    assert red != disc()
-    assert red != "red"
-    assert repr(red).startswith(f"SegmentedSelection({len(red):,} of {video.num_gaussians:,}")
-    with pytest.raises(TypeError, match="SegmentedSelection, got Selection"):
-        red | red.parts[0]
-    with pytest.raises(ValueError, match="in 3 segments, got one in 1"):
-        red | SegmentedSelection(red.parts[:1])
-    with pytest.raises(ValueError, match="a Selection for each segment"):
-        SegmentedSelection((np.ones(3, bool),))
 
 
 # ------------------------------------------------------------------------------------------------ pictures
@@ -295,7 +257,7 @@ def test_selections_are_sets():
 def reached(k, selection):
     """Where a selection's Gaussians are at a frame, in whichever segments show it."""
     there = np.zeros((40, 60), bool)
-    for segment, part in zip(scene()[0].segments, selection.parts, strict=True):
+    for segment, part in zip(scene()[0].segments, by_segment(scene()[0], selection), strict=True):
         if segment.first <= k < segment.stop:
             model = segment.model
             there |= influence(model, part, float(model.frame_times.times()[k - segment.first]))
@@ -367,7 +329,7 @@ def progress_at(position, last, *, frame=None, frames=None, times=None, ease=0, 
 )
 def test_a_span_acts_over_seams_as_if_there_were_none(when, evenly):
     """Light by a factor that comes and goes: each picture is the unedited one times it, whichever segment shows it."""
-    video = soft_video(evenly=evenly)
+    video = soft_segments(evenly=evenly)
     edited = edit(video).recolor(gain=0.2, **when).video()
     times = video.frame_times.times()
     last = len(times) - 1
@@ -389,7 +351,7 @@ def test_a_span_acts_over_seams_as_if_there_were_none(when, evenly):
 
 
 def test_what_a_span_does_not_reach_is_the_same_segment():
-    video = soft_video()
+    video = soft_segments()
     edited = edit(video).move((0.1, 0), frames=(7, 9)).video()
     assert edited.segments[0] is video.segments[0]
     assert edited.segments[2] is not video.segments[2] or video.segments[2].first > 8
@@ -406,7 +368,7 @@ def test_what_a_span_does_not_reach_is_the_same_segment():
 
 def test_one_color_for_the_object_in_all_segments():
     """By the mean lightness over all, so that it does not jump where one segment follows another."""
-    video = soft_video()
+    video = soft_segments()
     models = [segment.model for segment in video.segments]
     opacity = np.concatenate([expit(np.float64(model.splats.opacity_logit)) for model in models])
     color = np.concatenate([np.maximum(0.5 + 0.28209479177387814 * np.float64(m.splats.color_dc), 0) for m in models])
@@ -426,7 +388,7 @@ def test_one_color_for_the_object_in_all_segments():
 @pytest.mark.parametrize("evenly", [True, False])
 def test_clocks_go_by_the_clip(evenly):
     """Shown at frame k what is there at another, where one segment has both: frames 4 to 12 are the second's."""
-    video = soft_video(evenly=evenly)
+    video = soft_segments(evenly=evenly)
     assert [segment.first for segment in video.segments] == [0, 4, 10]
     before, per_frame = drawn(video), 1 / (video.num_frames - 1)
     later = edit(video).retime(shift=2 * per_frame, frames=(9, 10)).video()
@@ -447,28 +409,19 @@ def test_clocks_go_by_the_clip(evenly):
     np.testing.assert_allclose(half.render(8 * per_frame), wanted.render(float(own[4])), atol=1e-4)
 
 
-def test_the_first_segment_holds_before_the_clip_and_the_last_behind_it():
+@pytest.mark.parametrize(("number", "frames"), [(0, 2), (2, -2)])
+def test_the_first_segment_holds_before_the_clip_and_the_last_behind_it(number, frames):
     """As a model of one piece does: there is no other segment to ask."""
-    video = soft_video(evenly=True)
-    first, last = (video.segments[k].model for k in (0, 2))
-    steps = video.num_frames - 1
-    none = [Selection(np.zeros(NUM, bool))] * 3
-    begin = edit(video).select(SegmentedSelection((Selection(OBJECT), *none[1:]))).retime(shift=2 / steps).video()
-    wanted = edit(first).select(OBJECT).retime(shift=2 / 6).video()
-    np.testing.assert_allclose(drawn(begin)[:4], drawn(wanted)[:4], atol=1)
-    assert begin.segments[1:] == video.segments[1:]
-    uneven = soft_video()
-    model = uneven.segments[0].model
-    early = Clock.frozen(0.0)
-    begin = edit(uneven).select(SegmentedSelection((Selection(OBJECT), *none[1:]))).retime(shift=2 / steps).video()
-    wanted = edit(model).select(OBJECT).retime(clock=early).video()
-    np.testing.assert_allclose(begin.render(0.0), wanted.render(0.0), atol=1e-4)
-    end = edit(video).select(SegmentedSelection((*none[:2], Selection(OBJECT)))).retime(shift=-2 / steps).video()
-    np.testing.assert_allclose(
-        drawn(end)[13:], drawn(edit(last).select(OBJECT).retime(shift=-2 / 5).video())[3:], atol=1
-    )
-    with pytest.raises(ValueError, match=r"shift: .*frames 10 to 15, got frame 8 for frame 10, which is in another"):
-        edit(video).select(SegmentedSelection((*none[:2], Selection(OBJECT)))).retime(shift=2 / steps).video()
+    video = soft_segments(evenly=True)
+    segment, steps = video.segments[number], video.num_frames - 1
+    mask = np.repeat(np.arange(3) == number, NUM) & np.tile(OBJECT, 3)
+    held = edit(video).select(mask).retime(shift=frames / steps).video()
+    wanted = edit(segment.model).select(OBJECT).retime(shift=frames / (segment.num_frames - 1)).video()
+    alone = slice(3, None) if number else slice(0, 4)  # of the segment's frames, those that no other shares
+    np.testing.assert_allclose(drawn(held)[segment.first : segment.stop][alone], drawn(wanted)[alone], atol=1)
+    assert [one is other for one, other in zip(held.segments, video.segments, strict=True)].count(True) == 2
+    with pytest.raises(ValueError, match=r"shift: .*, got frame \d+ for frame \d+, which is in another"):
+        edit(video).select(mask).retime(shift=-frames / steps).video()
 
 
 @pytest.mark.parametrize(
@@ -484,26 +437,22 @@ def test_the_first_segment_holds_before_the_clip_and_the_last_behind_it():
 )
 def test_what_another_segment_has_is_refused(parameter, change):
     with pytest.raises(ValueError, match=rf"^{parameter}: expected times of the segment that shows .*another segment"):
-        change(edit(soft_video())).video()
+        change(edit(soft_segments())).video()
 
 
 @pytest.mark.parametrize("evenly", [True, False])
 def test_functions_and_cameras_are_given_the_clips_time(evenly):
-    video, told, asked = soft_video(evenly=evenly), [], []
+    video, told, asked = soft_segments(evenly=evenly), [], []
 
-    def note(gaussians, t):
+    def note(anything, t):
         told.append(t)
-        return gaussians
-
-    def note_faces(vertices, t):
-        told.append(t)
-        return vertices
+        return anything
 
     def camera(t):
         asked.append(t)
         return Camera.front(0.625)
 
-    edited = edit(video).apply(note).apply_triangles(note_faces).seen_from(camera).video()
+    edited = edit(video).apply(note).apply_triangles(note).seen_from(camera).video()
     times = video.frame_times.times()
     for k in (0, 3, 5, 9, 11, 15):
         told.clear()
@@ -512,8 +461,8 @@ def test_functions_and_cameras_are_given_the_clips_time(evenly):
         num = len(video.weights(k))
         np.testing.assert_allclose(told, [times[k]] * 2 * num, atol=1e-4 if evenly else 1e-6)
         np.testing.assert_allclose(asked, [times[k]] * num, atol=1e-4 if evenly else 1e-6)
-    nobody = SegmentedSelection((Selection(OBJECT), *[Selection(np.zeros(NUM, bool))] * 2))  # in all but the first
-    other = edit(video).select(nobody).seen_from(Camera.front(0.625).orbit(0.4, 0)).video()
+    in_first = np.concatenate([OBJECT, np.zeros(2 * NUM, bool)])
+    other = edit(video).select(in_first).seen_from(Camera.front(0.625).orbit(0.4, 0)).video()
     assert all(segment.model.camera is not None for segment in other.segments)
 
 
@@ -522,22 +471,24 @@ def test_functions_and_cameras_are_given_the_clips_time(evenly):
 
 def test_edits_act_in_their_order_and_a_selection_goes_along():
     """As on each model alone."""
-    video = soft_video()
-    parts = SegmentedSelection(tuple(Selection(np.arange(NUM) % (k + 2) == 0) for k in range(3)))
+    video = soft_segments()
+    parts = [np.arange(NUM) % (k + 2) == 0 for k in range(3)]
+    whole = Selection(np.concatenate(parts))
     chain = lambda e, one: (  # noqa: E731
-        e.select(one).multiply([(0.2, 0)]).to_front().select_begun(one).rotate(0.3, about=(0, 0)).select().opacity(0.6)
+        e.select(one).multiply([(0.2, 0)]).to_front().select(one).rotate(0.3, about=(0, 0)).select().opacity(0.6)
     )
-    edited = chain(edit(video), parts).video()
-    for segment, part in zip(edited.segments, parts.parts, strict=True):
+    edited = chain(edit(video), whole).video()
+    for segment, part in zip(edited.segments, parts, strict=True):
         model = next(own.model for own in video.segments if own.first == segment.first)
         wanted = chain(edit(model), part).video()
         for one, other in zip(jax.tree.leaves(segment.model), jax.tree.leaves(wanted), strict=True):
             np.testing.assert_array_equal(one, other)
         assert (segment.num_gaussians, segment.num_parameters) == (wanted.num_gaussians, wanted.num_parameters)
-    copied = edit(video).select(parts).multiply([(0.2, 0)])
-    assert len(copied.selection) == len(parts)
-    assert len(copied.select_begun(parts).selection) == 2 * len(parts)
-    assert copied.selection.num_gaussians == video.num_gaussians + len(parts)
+    copied = edit(video).select(whole).multiply([(0.2, 0)])
+    assert len(copied.selection) == len(whole)
+    assert len(copied.select(whole).selection) == 2 * len(whole)
+    assert copied.selection.num_gaussians == video.num_gaussians + len(whole)
+    assert copied.select(lambda video: copied.selection).selection == copied.selection
     again = edit(edited).select(color=(0.5, 0.5, 0.5), tolerance=30).vanish().video()
     assert again.num_gaussians < edited.num_gaussians
     assert len(edit(video).vanish().select().selection) == video.num_gaussians
@@ -548,11 +499,13 @@ def test_layers_of_segments_are_edited():
     models = [layers(*(span_of_scene(first, 10 * k + n)[0] for n in range(2))) for k, first in enumerate((0, 9))]
     video = SegmentedVideo.from_models([(0, models[0]), (9, models[1])])
     found = edit(video).select(box=disc_box(2), frame=2, layer=1).selection
-    for part, model in zip(found.parts, models, strict=True):
+    for part, model in zip(by_segment(video, found), models, strict=True):
         front = model.layers[0].num_gaussians
         assert not part.mask[:front].any()
         assert part.mask[front:].any()
-    assert found.parts[0] == edit(models[0]).select(box=disc_box(2), frame=2, layer=1).selection
+    assert by_segment(video, found)[0] == edit(models[0]).select(box=disc_box(2), frame=2, layer=1).selection
+    some = np.arange(sum(model.layers[1].num_gaussians for model in models)) % 3 == 0
+    assert len(edit(video).select(some, layer=1).selection) == some.sum()
     with pytest.raises(ValueError, match="layer: expected a whole number in"):
         edit(video).select(layer=2).video()
 
@@ -595,7 +548,7 @@ def test_models_are_loaded_one_after_another_and_let_go():
 
 
 def test_an_edited_clip_is_saved_drawn_and_edited_again(tmp_path):
-    video = soft_video()
+    video = soft_segments()
     edited = edit(video).select(color=(0.5, 0.5, 0.5), tolerance=40).move((0.2, 0), frames=(3, 12), ease=2).video()
     save_video_model(tmp_path / "edited.safetensors", edited)
     loaded = load_video_model(tmp_path / "edited.safetensors")
@@ -613,10 +566,9 @@ def test_an_edited_clip_is_saved_drawn_and_edited_again(tmp_path):
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        (lambda e: e.select(np.ones(NUM, bool)), "selection: expected a SegmentedSelection, got ndarray"),
-        (lambda e: e.select(Selection(OBJECT)), "selection: expected a SegmentedSelection, got Selection"),
-        (lambda e: e.select(SegmentedSelection((Selection(OBJECT),))), "in 3 segments, got one in 1"),
-        (lambda e: e.select(lambda video: 3), "expected a SegmentedSelection, got int"),
+        (lambda e: e.select(np.ones(NUM, bool)), "selection: expected a Selection or mask of 120 Gaussians"),
+        (lambda e: e.select(Selection(OBJECT)), "selection: expected a Selection or mask of 120 Gaussians"),
+        (lambda e: e.select(lambda video: 3), "selection: expected a Selection or mask of 120 Gaussians"),
         (lambda e: e.select(box=(0, 0, 9, 9), frame=16), r"frame: expected a frame's number in \[0, 16\), got 16"),
         (lambda e: e.select(box=(0, 0, 9, 9), frames=(3, 17)), "frames: expected .first, stop. with .* <= 16"),
         (lambda e: e.select(box=(70, 0, 90, 9), frame=6), "box: expected pixels of a 40x64 frame"),
@@ -624,12 +576,11 @@ def test_an_edited_clip_is_saved_drawn_and_edited_again(tmp_path):
         (lambda e: e.select(click=(3, 3)), "frame: expected the frame that was clicked in"),
         (lambda e: e.select(times=(0.5, 2)), "times: expected .start, stop."),
         (lambda e: e.select(frame=3, color=(2, 0, 0)), "color: expected red, green and blue"),
-        (lambda e: e.select(tolerance=3, frame=1), "tolerance: expected color or click"),
-        (lambda e: e.select(SegmentedSelection((Selection(OBJECT),) * 3), frame=1), "a selection or criteria"),
-        (lambda e: e.select(layer=-1), "layer: expected a whole number >= 0"),
+        (lambda e: e.select(tolerance=3, frame=1), "tolerance: expected one of color, click"),
+        (lambda e: e.select(np.tile(OBJECT, 3), frame=1), "a selection or criteria"),
+        (lambda e: e.select(layer=-1).video(), "layer: expected a whole number in"),
         (lambda e: e.move((1, 2, 3)), "offset: expected 2 finite numbers"),
         (lambda e: e.move((0.1, 0), frames=(3, 17)), "frames: expected .*stop <= 16"),
-        (lambda e: e.move((0.1, 0), frame=3, easing=2), "when: expected one of .*got easing"),
         (lambda e: e.recolor((2, 0, 0)), "color: expected red, green and blue"),
         (lambda e: e.recolor((1, 0, 0), hue=0.3), "expected color, hue, or gain"),
         (lambda e: e.freeze(16), r"at: expected a frame in \[0, 15\], got 16"),
@@ -643,27 +594,27 @@ def test_an_edited_clip_is_saved_drawn_and_edited_again(tmp_path):
 )
 def test_mistakes_are_told_when_they_are_made(change, match):
     with pytest.raises(ValueError, match=match):
-        change(edit(soft_video()))
+        change(edit(soft_segments()))
 
 
 def test_what_only_the_models_tell_is_told_by_video():
-    all_of = SegmentedSelection((Selection(OBJECT),) * 3)
-    gone = edit(soft_video()).select(all_of).vanish().select_begun(all_of).move((0.1, 0))
+    all_of = np.tile(OBJECT, 3)
+    gone = edit(soft_segments()).select(all_of).vanish().select(all_of).move((0.1, 0))
     with pytest.raises(ValueError, match="selection: expected at least one Gaussian"):
         gone.video()
-    some = SegmentedSelection((Selection(np.arange(NUM) < 3),) * 3)
+    some = np.tile(np.arange(NUM) < 3, 3)
     with pytest.raises(ValueError, match="Retime it before that edit"):
-        edit(soft_video()).select(all_of).rotate(0.3).select(some).freeze(7, frames=(7, 9)).video()
+        edit(soft_segments()).select(all_of).rotate(0.3).select(some).freeze(7, frames=(7, 9)).video()
 
 
 def test_warnings_and_forgotten_ends():
     with pytest.warns(UserWarning, match="expected radians, got 45") as told:
-        edit(soft_video()).rotate(45).video()
+        edit(soft_segments()).rotate(45).video()
     assert len(told) == 1
     assert told[0].filename == __file__
-    assert isinstance(edit(soft_video()), SegmentedEdit)
+    assert isinstance(edit(soft_segments()), SegmentedEdit)
     with pytest.raises(AttributeError, match="End the chain with"):
-        edit(soft_video()).frames()
+        edit(soft_segments()).frames()
     with pytest.raises(TypeError, match="colour"):
-        edit(soft_video()).select(colour=(1, 0, 0))
+        edit(soft_segments()).select(colour=(1, 0, 0))
     assert BACKGROUND not in (DISC, BOX)

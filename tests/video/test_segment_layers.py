@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from object_clips import named_model
 from soft_models import OBJECT, soft_model
+from soft_models import soft_segments as ground
 
 from foldgauss.io import load_video_model, save_video_model
 from foldgauss.io.edit_script import parse_edit_script
@@ -13,19 +14,8 @@ from foldgauss.render import Camera, cpu
 from foldgauss.video import EditedVideo, FrameTimes, SegmentedVideo, edit, layers
 from foldgauss.video.segmented.segmented_video import Segment
 
-FIRSTS, LENGTHS, NUM_FRAMES = (0, 4, 10), (7, 9, 6), 16
+FIRSTS, NUM_FRAMES = (0, 4, 10), 16
 BLACK = np.zeros(3, np.float32)
-
-
-def learned(model, seed):
-    logits = 0.3 * np.random.default_rng(seed).standard_normal(model.num_frames - 1).astype(np.float32)
-    return dataclasses.replace(model, frame_times=FrameTimes(logits))
-
-
-def ground(seed=0, evenly=False):
-    models = [soft_model(seed=seed + k, num_frames=length) for k, length in enumerate(LENGTHS)]
-    models = models if evenly else [learned(model, seed + k) for k, model in enumerate(models)]
-    return SegmentedVideo.from_models(list(zip(FIRSTS, models, strict=True)))
 
 
 def brighter(gaussians, t):
@@ -58,13 +48,17 @@ def front(kind):
     return edit(model).apply(brighter).video()
 
 
-def together(video, front_video, k, *, before=True):
-    """Frame k of the clip with the other before it: by splats put together."""
+def together(video, others, k, *, before=True):
+    """Frame k of the clip with the splats of another video before it, or with those of each segment of another."""
     image = 0
     for number, share in video.weights(k):
         segment = video.segments[number]
         own = segment.model.at(float(segment.model.frame_times.times()[k - segment.first]))
-        other = front_video.at(k / (NUM_FRAMES - 1) if front_video.num_frames > 1 else 0.0, video.size)
+        if isinstance(others, SegmentedVideo):
+            model = others.segments[number].model
+            other = model.at(float(model.frame_times.times()[k - segment.first]))
+        else:
+            other = others.at(k / (NUM_FRAMES - 1) if others.num_frames > 1 else 0.0, video.size)
         pair = (other, own) if before else (own, other)
         leaves = [
             np.concatenate([np.asarray(getattr(one, name)) for one in pair])
@@ -115,28 +109,7 @@ def test_two_clips_in_segments():
     one, other = ground(), ground(seed=5)
     made = layers(other, one)
     for k in (0, 5, 8, 11, 15):
-        np.testing.assert_allclose(
-            made.render(k / 15), together(one, other, k) if not shared(k) else both(one, other, k), atol=1e-4
-        )
-
-
-def shared(k):
-    return sum(first <= k < first + length for first, length in zip(FIRSTS, LENGTHS, strict=True)) > 1
-
-
-def both(one, other, k):
-    """In a fade each segment has its own layers."""
-    image = 0
-    for number, share in one.weights(k):
-        own, theirs = one.segments[number].model, other.segments[number].model
-        times = [float(model.frame_times.times()[k - FIRSTS[number]]) for model in (own, theirs)]
-        splats = [theirs.at(times[1]), own.at(times[0])]
-        leaves = [
-            np.concatenate([np.asarray(getattr(part, name)) for part in splats])
-            for name in ("mean", "factor", "opacity", "color")
-        ]
-        image = image + share * cpu.forward(*leaves, BLACK, one.size, options=one.options).image
-    return np.moveaxis(image, 0, -1)
+        np.testing.assert_allclose(made.render(k / 15), together(one, other, k), atol=1e-4)
 
 
 def test_layers_are_saved_and_edited_and_come_from_scripts(tmp_path):
@@ -174,14 +147,20 @@ def test_models_are_loaded_when_they_are_drawn():
             lambda: layers(ground(), soft_model()),
             "timeline: expected the number of the video in segments, got a VideoM",
         ),
-        (lambda: layers(soft_model(), ground(), timeline=2), "timeline: expected the number of one of 2 videos, got 2"),
+        (
+            lambda: layers(soft_model(), ground(), timeline=2),
+            "timeline: expected the number of one of 2 videos, got 2",
+        ),
         (
             lambda: layers(SegmentedVideo.from_models([(0, soft_model(num_frames=16))]), ground()),
             "videos: expected the segments of video 1, 0:7, 4:13, 10:16, got 0:16 in video 0",
         ),
         (lambda: layers(3, ground()), "video: expected a VideoModel or an EditedVideo, got int"),
         (lambda: layers(soft_model(size=(30, 64)), ground()), "frames of one aspect ratio"),
-        (lambda: layers(edit(soft_model()).seen_from(Camera.front(1)).video(), ground()), "videos without a camera"),
+        (
+            lambda: layers(edit(soft_model()).seen_from(Camera.front(1)).video(), ground()),
+            "videos without a camera",
+        ),
     ],
 )
 def test_mistakes(make, match):

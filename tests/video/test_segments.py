@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from soft_models import NUM, SIZE, soft_model
+from soft_models import NUM, SIZE, learned, soft_model, soft_segments
 
 from foldgauss.io import save_selection
 from foldgauss.render import RenderOptions
@@ -44,18 +44,12 @@ FIRSTS, LENGTHS = (0, 4, 13, 17), (7, 9, 5, 6)
 NUM_FRAMES = 23
 
 
-def learned(model, seed=0):
-    """The same with frame times of its own."""
-    logits = 0.3 * np.random.default_rng(seed).standard_normal(model.num_frames - 1).astype(np.float32)
-    return dataclasses.replace(model, frame_times=FrameTimes(logits))
+def video():
+    return soft_segments(FIRSTS, LENGTHS)
 
 
 def models():
-    return [learned(soft_model(seed=k, num_frames=num), k) for k, num in enumerate(LENGTHS)]
-
-
-def video():
-    return SegmentedVideo.from_models(list(zip(FIRSTS, models(), strict=True)))
+    return [segment.model for segment in video().segments]
 
 
 def image(one, t):
@@ -376,13 +370,16 @@ def spans(*pairs):
     ("pairs", "message"),
     [
         ([], "^segments: expected at least one"),
-        ([(1, 9)], "^segments: expected the first one to begin at frame 0, got 1"),
-        ([(0, 9), (10, 20)], r"segment 1 to begin at frame 9 at the latest.*got frame 10\. Also fit frames 9:10"),
-        ([(0, 9), (9, 18), (0, 20)], r"^segments: expected segment 2 to begin and to end after segment 1, 9:18"),
-        ([(0, 9), (0, 12)], "to begin and to end after segment 0"),
-        ([(0, 9), (2, 9)], "to begin and to end after segment 0"),
-        ([(0, 9), (3, 12), (8, 20)], r"segment 2 to begin at frame 9 or later.*got frame 8.*overlap less"),
-        ([(-1, 9)], "number of a frame of the clip"),
+        ([(1, 9)], r"^segments\[0\]\.first: expected one that begins at frame 0 to 0 .*, got 1, and 8 frames"),
+        (
+            [(0, 9), (10, 20)],
+            r"^segments\[1\]\.first: expected one that begins at frame 1 to 9 .*got 10, and 10 .*no gap",
+        ),
+        ([(0, 9), (9, 18), (0, 20)], r"^segments\[2\]\.first: expected one that begins at frame 10 to 18 "),
+        ([(0, 9), (0, 12)], "one that begins at frame 1 to 9 "),
+        ([(0, 9), (2, 9)], "and ends after 9, got 2, and 7 frames"),
+        ([(0, 9), (3, 12), (8, 20)], r"begins at frame 9 to 12 .*at most two share a frame"),
+        ([(-1, 9)], r"got -1, and 10 frames"),
     ],
 )
 def test_segments_that_do_not_cover_a_clip_are_refused(pairs, message):

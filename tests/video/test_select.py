@@ -102,26 +102,15 @@ def test_selection_is_immutable():
     with pytest.raises(dataclasses.FrozenInstanceError):
         one.mask = mask
     assert repr(Selection(mask)) == "Selection(1 of 5)"
+    assert one != "none"
+    with pytest.raises(TypeError, match="expected a Selection, got ndarray"):
+        one & mask
 
 
 def test_all_none_and_numbers():
     assert len(Selection.all(MODEL)) == len(LABEL) == Selection.none(MODEL).num_gaussians
     assert Selection.of(MODEL, [3, 1, 3]).indices.tolist() == [1, 3]
     assert Selection.of(MODEL, []) == Selection.none(MODEL) == ~Selection.all(MODEL)
-
-
-def test_bad_sets():
-    for mask in (np.zeros(3), np.zeros((3, 1), bool), [1, 0]):
-        with pytest.raises(ValueError, match=r"^mask: expected bool \(num_gaussians,\)"):
-            Selection(mask)
-    for indices in ([-1], [len(LABEL)], [0.5], [[1]], [True]):
-        with pytest.raises(ValueError, match=r"^indices: expected whole numbers"):
-            Selection.of(MODEL, indices)
-    with pytest.raises(ValueError, match=r"^selection: expected a selection of 3 Gaussians, got one of 4"):
-        Selection(np.zeros(3, bool)) | Selection(np.zeros(4, bool))
-    with pytest.raises(TypeError, match="expected a Selection, got ndarray"):
-        Selection(np.zeros(3, bool)) & np.zeros(3, bool)
-    assert Selection(np.zeros(3, bool)) != "none"
 
 
 # --------------------------------------------------------------------------------------------- contribution
@@ -274,39 +263,6 @@ def test_masks_of_a_smaller_size_have_rounded_sides():
             by_mask(large, np.ones((rows, 480), bool), frame=0)
 
 
-@pytest.mark.parametrize(
-    ("mask", "options", "match"),
-    [
-        (np.zeros((48, 72), bool), {"frame": 0}, "^mask: expected a mask that is not empty"),
-        ({}, {}, "^mask: expected a mask that is not empty"),
-        (np.ones((48, 48), bool), {"frame": 0}, "^mask: expected the aspect of the model's 48x72, got 48x48"),
-        (np.ones((48, 72), np.uint8), {"frame": 0}, "^mask: expected bool .* From labels"),
-        (np.full((48, 72), 1.5), {"frame": 0}, r"fractions in \[0, 1\]"),
-        (np.full((48, 72), np.nan), {"frame": 0}, r"fractions in \[0, 1\]"),
-        (np.ones((48, 72), bool), {}, "frame=k"),
-        (np.ones((5, 48, 72), bool), {}, "^mask: expected one of shape .*, or 12 of them"),
-        (np.ones(5, bool), {"frame": 0}, "^mask: expected one of shape"),
-        (np.ones((0, 0), bool), {"frame": 0}, "^mask: expected bool"),
-        (np.ones((48, 72), bool), {"frame": 12}, r"^frame: expected a frame's number in \[0, 12\)"),
-        (np.ones((48, 72), bool), {"frame": -1}, "^frame"),
-        (np.ones((48, 72), bool), {"frame": True}, "^frame"),
-        (np.ones((48, 72), bool), {"frame": 1, "frames": (0, 2)}, "^frame, frames: expected one of the two"),
-        (np.ones((48, 72), bool), {"frames": (3, 3)}, "^frames"),
-        (np.ones((48, 72), bool), {"frames": (0, 13)}, "^frames"),
-        (np.ones((48, 72), bool), {"frames": 3}, "^frames.*frame=k"),
-        ({0: np.ones((48, 72), bool)}, {"frame": 0}, "frames given once"),
-        ({0: np.ones((2, 48, 72), bool)}, {}, "^mask: expected bool"),
-        ({99: np.ones((48, 72), bool)}, {}, "^frame"),
-        (np.ones((48, 72), bool), {"frame": 0, "threshold": 0}, "^threshold"),
-        (np.ones((48, 72), bool), {"frame": 0, "threshold": "half"}, "^threshold"),
-    ],
-)
-def test_bad_masks(mask, options, match):
-    with pytest.raises(ValueError, match=match) as caught:
-        by_mask(MODEL, mask, **options)
-    assert "\n" not in str(caught.value)
-
-
 # ------------------------------------------------------------------------------------- boxes, colors, times
 
 
@@ -321,16 +277,6 @@ def test_boxes_and_polygons_are_masks():
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     triangle = (x > 10) & (y > 5) & (x - 10 + 2 * (y - 5) < 50)
     assert by_polygon(MODEL, [(10, 5), (60, 5), (10, 30)], frame=3) == by_mask(MODEL, triangle, frame=3)
-    for box in ((5, 10, 5, 30), (25, 10, 5, 30), (0, 0, np.nan, 3), (1, 2, 3), "box"):
-        with pytest.raises(ValueError, match=r"^box"):
-            by_box(MODEL, box)
-    with pytest.raises(ValueError, match=r"^box: expected \(x0, y0, x1, y1\) in pixels, got ndarray\.$"):
-        by_box(MODEL, np.arange(100.0).reshape(10, 10))
-    with pytest.raises(ValueError, match=r"^box: expected pixels of a 48x72 frame in it, got none"):
-        by_box(MODEL, (80, 0, 90, 10))
-    for polygon in ([(0, 0), (1, 1)], [(0, 0, 0)] * 3, [(0, 0), (1, np.inf), (3, 3)], 7):
-        with pytest.raises(ValueError, match=r"^polygon"):
-            by_polygon(MODEL, polygon)
 
 
 @pytest.mark.parametrize("name", [DISC, BOX, BACKGROUND])
@@ -352,15 +298,6 @@ def test_seen_color_is_that_of_the_image():
     assert len(by_color(model, olive, tolerance=15) & truth(DISC)) > 0.1 * len(disc)
 
 
-def test_bad_colors():
-    for color in ((0.5, 0.5), (2, 0, 0), (np.nan, 0, 0), "red", (200, 10, 10)):
-        with pytest.raises(ValueError, match=r"^color: expected red, green and blue in \[0, 1\]"):
-            by_color(MODEL, color)
-    for tolerance in (-1, np.nan, "5"):
-        with pytest.raises(ValueError, match=r"^tolerance"):
-            by_color(MODEL, (0, 0, 0), tolerance=tolerance)
-
-
 def test_times():
     own, spread = (np.asarray(leaf) for leaf in (MODEL.splats.gaussians().time_loc, MODEL.splats.log_time_scale))
     np.testing.assert_array_equal(by_time(MODEL, (0.2, 0.6)).mask, (own >= 0.2) & (own <= 0.6))
@@ -371,12 +308,6 @@ def test_times():
     np.testing.assert_array_equal(by_time(MODEL, frame=0).mask, own <= 0.5 / 11)
     assert by_time(MODEL, frame=4, alive=True) == by_time(MODEL, (TIMES[4], TIMES[4]), alive=True)
     assert by_time(MODEL, frames=(0, 12)) == Selection.all(MODEL)
-    for times in ((0.5, 0.2), (-0.1, 0.5), (0, 1.1), (0, np.nan), 0.5):
-        with pytest.raises(ValueError, match=r"^times: expected"):
-            by_time(MODEL, times)
-    for options in ({}, {"times": (0, 1), "frame": 1}):
-        with pytest.raises(ValueError, match=r"^times, frames, frame: expected one"):
-            by_time(MODEL, **options)
 
 
 # ----------------------------------------------------------------------------------------------------- clicks
@@ -404,14 +335,6 @@ def test_click_stops_at_a_motion_boundary():
     assert wrong < 0.05
 
 
-def test_bad_clicks():
-    for click in ((-1, 5), (72, 5), (5, 48), (np.nan, 1), (1,), "here"):
-        with pytest.raises(ValueError, match=r"^click: expected \(x, y\)"):
-            by_click(MODEL, click, frame=0)
-    with pytest.raises(ValueError, match=r"^click: expected a pixel where something is rendered"):
-        by_click(without(MODEL, truth(BACKGROUND)), (0.5, 0.5), frame=0)
-
-
 # ----------------------------------------------------------------------------------------------------- the door
 
 
@@ -431,33 +354,63 @@ def test_criteria_are_intersected():
     )
 
 
-def test_bad_criteria():
-    for options, match in (
-        ({}, "^select: expected at least one criterion"),
-        ({"tolerance": 5.0, "frame": 1}, "^tolerance: expected color or click"),
-        ({"click": (5, 5)}, "^frame: expected the frame that was clicked in"),
-        ({"click": (5, 5), "frames": (0, 2)}, r"^frames: expected none with a click, got \(0, 2\)\. Give frame=k"),
-    ):
-        with pytest.raises(ValueError, match=match):
-            select(MODEL, **options)
+ONES = np.ones((48, 72), bool)
+WRONG = [
+    ({"mask": np.zeros((48, 72), bool), "frame": 0}, "mask: expected a mask that is not empty"),
+    ({"mask": {}}, "mask: expected a mask that is not empty"),
+    ({"mask": np.ones((48, 48), bool), "frame": 0}, "mask: expected the aspect of the model's 48x72, got 48x48"),
+    ({"mask": np.ones((48, 72), np.uint8), "frame": 0}, r"mask: expected bool .* From labels .*mask=\(levels > 127\)"),
+    ({"mask": np.full((48, 72), 1.5), "frame": 0}, r"mask: .*fractions in \[0, 1\]"),
+    ({"mask": np.full((48, 72), np.nan), "frame": 0}, r"mask: .*fractions in \[0, 1\]"),
+    ({"mask": ONES}, "mask: .*frame=k"),
+    ({"mask": "m.png", "frame": 0}, "mask: expected .*got the path 'm.png'.*read_masks"),
+    ({"mask": np.ones((5, 48, 72), bool)}, "mask: expected one of shape .*, or 12 of them"),
+    ({"mask": np.ones(5, bool), "frame": 0}, "mask: expected one of shape"),
+    ({"mask": np.ones((0, 0), bool), "frame": 0}, "mask: expected bool"),
+    *(({"mask": ONES, "frame": k}, r"frame: expected a frame's number in \[0, 12\)") for k in (12, -1, True)),
+    ({"mask": ONES, "frame": 1, "frames": (0, 2)}, "frame, frames: expected one of the two"),
+    *(({"mask": ONES, "frames": k}, "frames: expected .first, stop. with") for k in ((3, 3), (0, 13), (-1, 2), (1,))),
+    *(({"mask": ONES, "frames": k}, "frames: .*frame=k") for k in (3, "13", (None, 0), (1.0, 3))),
+    ({"mask": {0: ONES}, "frame": 0}, "mask: .*frames given once"),
+    ({"mask": {0: np.ones((2, 48, 72), bool)}}, "mask: expected bool"),
+    ({"mask": {99: ONES}}, "frame: expected"),
+    *(({"mask": ONES, "frame": 0, "threshold": share}, "threshold") for share in (0, "half")),
+    *(({"box": box}, "box") for box in ((5, 10, 5, 30), (25, 10, 5, 30), (0, 0, np.nan, 3), (1, 2, 3), "box")),
+    ({"box": np.arange(100.0).reshape(10, 10)}, r"box: expected \(x0, y0, x1, y1\) in pixels, got ndarray\.$"),
+    ({"box": MODEL, "frame": 0}, r"box: expected .*got VideoModel\.$"),
+    ({"box": (80, 0, 90, 10)}, "box: expected pixels of a 48x72 frame in it, got none"),
+    ({"box": [[1, 2], [3]], "frame": 0}, "box: expected"),
+    *(({"polygon": p}, "polygon") for p in ([(0, 0), (1, 1)], [(0, 0, 0)] * 3, [(0, 0), (1, np.inf), (3, 3)], 7)),
+    ({"polygon": [[1, 2], [3]], "frame": 0}, "polygon: expected"),
+    *(({"color": c}, r"color: expected red, green and blue in \[0, 1\]") for c in ((0.5, 0.5), (2, 0, 0), "red")),
+    *(({"color": c}, r"color: expected red, green and blue in \[0, 1\]") for c in ((np.nan, 0, 0), (200, 10, 10))),
+    *(({"color": (0, 0, 0), "tolerance": tolerance}, "tolerance") for tolerance in (-1, np.nan, "5")),
+    *(({"times": times}, "times: expected") for times in ((0.5, 0.2), (-0.1, 0.5), (0, 1.1), (0, np.nan), 0.5)),
+    *(({"click": c, "frame": 0}, r"click: expected \(x, y\)") for c in ((-1, 5), (72, 5), (5, 48), (np.nan, 1), (1,))),
+    ({"click": "here", "frame": 0}, r"click: expected \(x, y\)"),
+    ({"click": (5, 5)}, "frame: expected the frame that was clicked in"),
+    ({"click": (5, 5), "frames": (0, 2)}, r"frames: expected one of mask, .*, got \(0, 2\)\. For .* click: frame=k"),
+    ({}, "select: expected at least one criterion"),
+    ({"tolerance": 5.0, "frame": 1}, "tolerance: expected one of color, click with it"),
+    ({"color": (1, 0, 0), "threshold": 0.2}, "threshold: expected one of mask"),
+    ({"color": (1, 0, 0), "follow": False}, "follow: expected one of mask"),
+    ({"box": (0, 0, 9, 9), "alive": True}, "alive: expected one of times"),
+]
 
 
-def test_bad_models():
-    broken = eqx.tree_at(lambda m: m.splats.loc, MODEL, np.full_like(MODEL.splats.loc, np.nan))
-    with pytest.raises(ValueError, match=r"^model: expected finite numbers"):
-        by_color(broken, (0, 0, 0))
-    many = TimeLikelihood(np.linspace(1, 2, len(LABEL), dtype=np.float32), 0.3)
-    mixed = eqx.tree_at(lambda m: m.splats.envelope, MODEL, many)
-    with pytest.raises(ValueError, match=r"^model\.splats\.envelope\.power: expected one number"):
-        by_color(mixed, (0, 0, 0))
-    with pytest.raises(ValueError, match=r"^model: expected a VideoModel, got FoldedSplats"):
-        matte(MODEL.splats, truth(DISC), 0.5)
-    with pytest.raises(ValueError, match=r"^model: expected a VideoModel, got str"):
-        by_click("model.safetensors", (1, 1), frame=0)
-    with pytest.raises(ValueError, match=r"^selection"):
-        matte(MODEL, Selection(np.zeros(3, bool)), 0.5)
-    with pytest.raises(ValueError, match=r"^t: expected one time in \[0, 1\], got \[0\.1, 0\.2\]"):
-        matte(MODEL, truth(DISC), [0.1, 0.2])
+@pytest.mark.parametrize(("criteria", "match"), WRONG)
+def test_malformed_criteria(criteria, match):
+    with pytest.raises(ValueError, match=f"^{match}") as caught:
+        select(MODEL, **criteria)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_select_cannot_ask():
+    with pytest.raises(ValueError, match=r"^click: expected a pixel where something is rendered"):
+        by_click(without(MODEL, truth(BACKGROUND)), (0.5, 0.5), frame=0)
+    for options in ({}, {"times": (0, 1), "frame": 1}):
+        with pytest.raises(ValueError, match=r"^times, frames, frame: expected one"):
+            by_time(MODEL, **options)
 
 
 # ------------------------------------------------------------------------------------------------- a real fit
@@ -490,63 +443,53 @@ def test_a_fitted_object_is_selected(fitted, name):
     assert overlap(model, other, masks) < 0.05  # the measure can fail
 
 
-@pytest.mark.parametrize(
-    ("options", "name"),
-    [
-        ({"color": (1, 0, 0), "threshold": 0.2}, "threshold"),
-        ({"color": (1, 0, 0), "follow": False}, "follow"),
-        ({"box": (0, 0, 9, 9), "alive": True}, "alive"),
-        ({"click": (5, 5), "frame": 0, "frames": (0, 2)}, "frames"),
-        ({"polygon": [[1, 2], [3]], "frame": 0}, "polygon"),
-        ({"box": [[1, 2], [3]], "frame": 0}, "box"),
-    ],
-)
-def test_options_without_their_criterion_are_rejected(options, name):
-    with pytest.raises(ValueError, match=f"^{name}: expected"):
-        select(MODEL, **options)
-
-
-def test_files_are_to_be_read_first():
-    with pytest.raises(ValueError, match=r"^mask: expected .*got the path 'm.png'.*read_masks"):
-        by_mask(MODEL, "m.png", frame=0)
-    with pytest.raises(ValueError, match=r"^mask: .*mask=\(levels > 127\)"):
-        by_mask(MODEL, np.full(MODEL.size, 255, np.uint8), frame=0)
-    with pytest.raises(ValueError, match=r"^box: expected .*got VideoModel\.$"):
-        by_box(MODEL, MODEL, frame=0)
-
-
-SWAPPED = {
-    "text": (lambda m, s: by_box("m", (1, 2, 3, 4)), "model: expected a VideoModel, got str. The model comes first"),
-    "box first": (lambda m, s: by_box((1, 2, 3, 4), m, frame=0), "model: expected a VideoModel, got tuple"),
-    "mask first": (lambda m, s: by_mask(np.ones((4, 4), bool), m, frame=0), "model: .*got ndarray"),
-    "chain": (lambda m, s: by_box(edit(m), (1, 2, 3, 4)), "model: .*got Edit. End the chain with .video"),
-    "all of no model": (lambda m, s: Selection.all(s), "model: .*got Selection"),
-    "of no model": (lambda m, s: Selection.of(3, [1]), "model: .*got int"),
-    "a mask": (lambda m, s: matte(m, s.mask, 0.5), r"selection: expected a Selection, got ndarray.*Selection\(mask\)"),
-    "time first": (lambda m, s: influence(m, 0.5, s), r"selection: .*The order is \(model, selection, t\)"),
-    "time beyond": (lambda m, s: matte(m, s, 3), "t: expected a time in"),
-    "no time": (lambda m, s: influence(m, s, "x"), "t: expected a time in"),
-}
-
-
-@pytest.mark.parametrize("name", SWAPPED)
-def test_swapped_arguments(name):
-    call, message = SWAPPED[name]
-    model = soft_model()
-    with pytest.raises(ValueError, match=f"^{message}"):
-        call(model, Selection.all(model))
-
-
 def test_frames_with_open_ends():
     model = soft_model()
     box = (12, 10, 32, 30)
     assert by_box(model, box, frames=(2, None)) == by_box(model, box, frames=(2, 7))
     assert by_box(model, box, frames=(None, 3)) == by_box(model, box, frames=np.array([0, 3]))
-    for frames in ((3, 3), (-1, 2), (2, 8), (1,), "13", (None, 0), (1.0, 3)):
-        with pytest.raises(ValueError, match=r"^frames: expected \(first, stop\) with"):
-            by_box(model, box, frames=frames)
 
 
 def test_indices_out_of_range_are_in_no_selection():
     chosen = Selection(np.array([True, False, True]))
     assert [k in chosen for k in (0, 1, 2, 3, -1)] == [True, False, True, False, False]
+
+
+BROKEN = eqx.tree_at(lambda m: m.splats.loc, MODEL, np.full_like(MODEL.splats.loc, np.nan))
+MANY = TimeLikelihood(np.linspace(1, 2, len(LABEL), dtype=np.float32), 0.3)
+MIXED = eqx.tree_at(lambda m: m.splats.envelope, MODEL, MANY)
+ALL, THREE = Selection.all(MODEL), np.zeros(3, bool)
+WRONG_CALLS = [
+    *((lambda mask=mask: Selection(mask), r"mask: expected bool \(num_gaussians,\)") for mask in (0 * THREE, [1, 0])),
+    (lambda: Selection(THREE[:, None]), r"mask: expected bool \(num_gaussians,\)"),
+    *(
+        (lambda indices=indices: Selection.of(MODEL, indices), "indices: expected whole numbers")
+        for indices in ([-1], [len(LABEL)], [0.5], [[1]], [True])
+    ),
+    (
+        lambda: Selection(THREE) | Selection(np.zeros(4, bool)),
+        "selection: expected a selection of 3 Gaussians, got one",
+    ),
+    (lambda: by_color(BROKEN, (0, 0, 0)), "model: expected finite numbers"),
+    (lambda: by_color(MIXED, (0, 0, 0)), r"model\.splats\.envelope\.power: expected one number"),
+    (lambda: matte(MODEL.splats, ALL, 0.5), "model: expected a VideoModel, got FoldedSplats"),
+    (lambda: by_click("model.safetensors", (1, 1), frame=0), "model: expected a VideoModel, got str"),
+    (lambda: matte(MODEL, Selection(THREE), 0.5), "selection"),
+    (lambda: matte(MODEL, ALL, [0.1, 0.2]), r"t: expected one time in \[0, 1\], got \[0\.1, 0\.2\]"),
+    (lambda: by_box("m", (1, 2, 3, 4)), "model: expected a VideoModel, got str. The model comes first"),
+    (lambda: by_box((1, 2, 3, 4), MODEL, frame=0), "model: expected a VideoModel, got tuple"),
+    (lambda: by_mask(np.ones((4, 4), bool), MODEL, frame=0), "model: .*got ndarray"),
+    (lambda: by_box(edit(MODEL), (1, 2, 3, 4)), "model: .*got Edit. End the chain with .video"),
+    (lambda: Selection.all(ALL), "model: .*got Selection"),
+    (lambda: Selection.of(3, [1]), "model: .*got int"),
+    (lambda: matte(MODEL, ALL.mask, 0.5), r"selection: expected a Selection, got ndarray.*Selection\(mask\)"),
+    (lambda: influence(MODEL, 0.5, ALL), r"selection: .*The order is \(model, selection, t\)"),
+    (lambda: matte(MODEL, ALL, 3), "t: expected a time in"),
+    (lambda: influence(MODEL, ALL, "x"), "t: expected a time in"),
+]
+
+
+@pytest.mark.parametrize(("call", "message"), WRONG_CALLS)
+def test_wrong_calls(call, message):
+    with pytest.raises(ValueError, match=f"^{message}"):
+        call()

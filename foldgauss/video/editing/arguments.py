@@ -1,37 +1,44 @@
 """Checks of the arguments of edits: numbers, lists of numbers, matrices and colors."""
 
-import math
 import warnings
 from itertools import pairwise
-from numbers import Real
 
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import ArrayLike, Float64
 
 from foldgauss._runtime.checks import invalid, short_repr
 
 
-def check_number(parameter: str, value: object) -> float:
-    """`value` as a float. Raises ValueError unless it is one finite number or an array of shape ()."""
-    value = value.item() if getattr(value, "ndim", None) == 0 else value
-    if not isinstance(value, Real) or isinstance(value, bool) or not math.isfinite(value):
-        raise invalid(parameter, expected="a finite number", got=short_repr(value))
-    return float(value)
-
-
-def check_numbers(parameter: str, values: object, length: int | None = None) -> tuple[float, ...]:
-    """`values` as a tuple of `length` finite floats (None: any length). Raises ValueError for anything else."""
-    expected = "finite numbers in a list" if length is None else f"{length} finite numbers"
+def check_array(parameter: str, values: object, *shape: int | None) -> Float64[np.ndarray, "..."]:
+    """`values` as finite numbers of a shape, in which None is any length. Raises ValueError for anything else."""
     try:
         array = np.asarray(values)
         if array.dtype.kind in "USbOcmM":  # NumPy would convert strings and booleans to numbers
             raise TypeError
         array = array.astype(np.float64)
+        fits = np.isfinite(array).all() and array.ndim == len(shape)
     except (TypeError, ValueError):
-        raise invalid(parameter, expected=expected, got=short_repr(values)) from None
-    if array.ndim != 1 or not np.isfinite(array).all() or length not in (None, len(array)):
+        fits = False
+    if not fits or any(length not in (None, own) for own, length in zip(array.shape, shape, strict=True)):
+        texts = {
+            (): "a finite number",
+            (None,): "finite numbers in a list",
+            (None, 2): "pairs, as [(0.1, 0.0), (0.2, 0.0)]",
+        }
+        texts |= {(length,): f"{length} finite numbers" for length in shape if length is not None}
+        expected = texts.get(shape, f"finite numbers of shape {shape}")
         raise invalid(parameter, expected=expected, got=short_repr(values))
-    return tuple(array.tolist())
+    return array
+
+
+def check_number(parameter: str, value: object) -> float:
+    """`value` as a float. Raises ValueError unless it is one finite number or an array of shape ()."""
+    return float(check_array(parameter, value))
+
+
+def check_numbers(parameter: str, values: object, length: int | None = None) -> tuple[float, ...]:
+    """`values` as a tuple of `length` finite floats (None: any length). Raises ValueError for anything else."""
+    return tuple(check_array(parameter, values, length).tolist())
 
 
 def check_increasing(parameter: str, values: tuple[float, ...]) -> None:
@@ -54,26 +61,6 @@ def broadcast_numbers(parameter: str, values: ArrayLike, num: int) -> tuple[floa
     return numbers if len(numbers) == num else numbers * num
 
 
-def check_matrix(parameter: str, values: ArrayLike, size: int) -> Float[np.ndarray, "size size"]:
-    """`values` as a matrix of shape (size, size), float64."""
-    try:
-        return np.array([check_numbers(parameter, row, size) for row in values]).reshape(size, size)
-    except (TypeError, ValueError):
-        expected = f"finite numbers of shape ({size}, {size})"
-        raise invalid(parameter, expected=expected, got=short_repr(values)) from None
-
-
-def check_pairs(parameter: str, values: object) -> list:
-    """`values` as a list of at least one iterable; their lengths are not checked."""
-    try:
-        rows = list(values)
-    except TypeError:
-        rows = []
-    if not rows or any(not np.iterable(row) for row in rows):
-        raise invalid(parameter, expected="pairs, as [(0.1, 0.0), (0.2, 0.0)]", got=repr(values))
-    return rows
-
-
 def check_color(color: ArrayLike) -> tuple[float, ...]:
     """Red, green and blue. Raises ValueError unless all are in [0, 1]."""
     rgb = check_numbers("color", color, 3)
@@ -86,7 +73,7 @@ def check_color_map(
     gain: ArrayLike | None, offset: ArrayLike | None, matrix: ArrayLike | None
 ) -> tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]:
     """Matrix and offset of the map c -> gain * (M c) + offset; None is 1, 0 and the identity."""
-    rows = np.eye(3) if matrix is None else check_matrix("matrix", matrix, 3)
+    rows = np.eye(3) if matrix is None else check_array("matrix", matrix, 3, 3)
     gains = broadcast_numbers("gain", 1.0 if gain is None else gain, 3)
     shift = broadcast_numbers("offset", 0.0 if offset is None else offset, 3)
     return tuple(map(tuple, (np.array(gains)[:, None] * rows).tolist())), shift

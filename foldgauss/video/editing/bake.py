@@ -16,15 +16,14 @@ from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.special import expit, logit
 
 from foldgauss._runtime.checks import invalid
 from foldgauss.video.editing.overlays import Affine, Recolor
 from foldgauss.video.models.shared_paths import PathChange, change_paths
 from foldgauss.video.models.splats import SH_C0, FoldedSplats
-
-Mask = Bool[np.ndarray, "num"]
+from foldgauss.video.selection.selectors import Mask
 
 #: With a mean lightness below this, the lightness of the Gaussians does not tell the shading of an object.
 MIN_LIGHTNESS = 1e-4

@@ -14,13 +14,12 @@ from foldgauss._runtime.checks import check_signature, invalid, is_integer, is_w
 from foldgauss.render import Camera
 from foldgauss.video.editing.arguments import (
     broadcast_numbers,
+    check_array,
     check_color,
     check_color_map,
-    check_matrix,
     check_number,
     check_numbers,
     check_one_or_more,
-    check_pairs,
     check_select_arguments,
     missing_attribute,
     warn_if_outside_clip,
@@ -33,11 +32,9 @@ from foldgauss.video.editing.bake import (
     opacities_and_colors,
     scale_opacity,
 )
-from foldgauss.video.editing.clip_window import ClipWindow
 from foldgauss.video.editing.clock import Clock
 from foldgauss.video.editing.edited_video import EditedVideo, Layer, as_edited
 from foldgauss.video.editing.layer_edits import Bake, add_edit, apply_edit, can_delete, gather_layer
-from foldgauss.video.editing.origins import Mask, Origins, split_mask
 from foldgauss.video.editing.overlays import (
     IDENTITY,
     LUMINANCE_WEIGHTS,
@@ -49,12 +46,14 @@ from foldgauss.video.editing.overlays import (
     Recolor,
     Retiming,
     SelectedGaussians,
+    TimedEdit,
     TriangleFunction,
     polar_decompose,
 )
-from foldgauss.video.editing.span import NEVER, Span, When, check_when, make_frame_span, restrict_span
+from foldgauss.video.editing.span import NEVER, Span, When, make_span
+from foldgauss.video.editing.time_map import TimeMap, frame_times_of
 from foldgauss.video.models.video_model import VideoModel
-from foldgauss.video.selection.selectors import Selection, select
+from foldgauss.video.selection.selectors import Mask, Selection, check_mask, select, split_mask
 
 #: A point or an offset beyond this many frame sizes is probably given in pixels.
 MAX_DISTANCE = 10.0
@@ -71,10 +70,15 @@ def edit(model: VideoModel | EditedVideo) -> "Edit":
     return start_chain(as_edited(model))
 
 
-def start_chain(video: EditedVideo, window: ClipWindow | None = None) -> "Edit":
-    """As `edit`; with a `window` the video is a segment, and frames and times of edits are those of the whole clip."""
-    origins = Origins.from_counts([layer.num_gaussians for layer in video.layers])
-    return Edit(video, Selection(np.ones(video.num_gaussians, bool)), origins, window)
+def start_chain(
+    video: EditedVideo,
+    clip_times: Float[np.ndarray, " num_frames"] | None = None,
+    time_map: TimeMap | None = None,
+) -> "Edit":
+    """As `edit`; for a segment, frames and times of edits are those of the clip with frame times `clip_times`."""
+    counts = tuple(layer.num_gaussians for layer in video.layers)
+    times = frame_times_of(video) if clip_times is None else clip_times
+    return Edit(video, Selection(np.ones(sum(counts), bool)), counts, tuple(map(np.arange, counts)), times, time_map)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -88,7 +92,7 @@ class Edit:
     center, clocks, functions, depth. `video()` is a plain `VideoModel` if all edits could be baked. Gaussians that are
     not selected stay the same to the bit, and an edit that changes nothing (a factor 1, an angle 0) is skipped.
 
-    Each edit takes `frame=`, `frames=` or `times=`, with `ease=` and `curve=`, as `make_frame_span`; without, it always
+    Each edit takes `frame=`, `frames=` or `times=`, with `ease=` and `curve=`, as `make_span`; without, it always
     applies. Frame numbers are those of `video().frame_times`, and spans are in the video's time, whatever clocks its
     objects have.
 
@@ -104,8 +108,12 @@ class Edit:
 
     _video: EditedVideo
     selection: Selection
-    _origins: Origins = dataclasses.field(repr=False)
-    _window: ClipWindow | None = dataclasses.field(default=None, repr=False)
+    #: By layer: the number of Gaussians at the start of the chain, and for each current one the index of its original.
+    _counts: tuple[int, ...] = dataclasses.field(repr=False)
+    _sources: tuple[Int[np.ndarray, " num"], ...] = dataclasses.field(repr=False)
+    #: To which frames and spans refer, and the map from the video's own time, where that is another.
+    _frame_times: Float[np.ndarray, " num_frames"] = dataclasses.field(repr=False)
+    _time_map: TimeMap | None = dataclasses.field(repr=False)
 
     def video(self) -> VideoModel | EditedVideo:
         """The edited video: a folded model if all edits could be baked, else an `EditedVideo`."""
@@ -129,12 +137,11 @@ class Edit:
     ) -> "Edit":
         """Choose the Gaussians that the next edits apply to, from all Gaussians; without arguments, all of them.
 
-        `selection`: a `Selection`, a mask bool (num_gaussians,) or a function of `video()` that returns one of them.
-        Else `criteria` as `foldgauss.video.select` takes them (`mask=`, `box=`, `color=`, ...), evaluated on each
-        layer's model, or on layer number `layer` only; on the model without overlays, so with baked edits only. Masks
-        are over the Gaussians of all layers, front layer first, or of `layer`. A mask with the size of the video at the
-        start of the chain selects from the Gaussians of then, together with their copies; one with another size selects
-        from the current ones. A mask that could be both is an error: see `select_begun`.
+        `selection`: a `Selection` or a mask bool (num_gaussians,) over the Gaussians at the start of the chain, which
+        are selected wherever they are now, together with their copies; or a function of `video()` that returns one over
+        the current Gaussians. Else `criteria` as `foldgauss.video.select` takes them (`mask=`, `box=`, `color=`, ...),
+        evaluated on each layer's model, or on layer number `layer` only; on the model without overlays, so with baked
+        edits only. Masks are over the Gaussians of all layers, front layer first, or of `layer`.
         """
         check_select_arguments(selection, criteria)
         layers, numbers = self._video.layers, self._layer_numbers(layer)
@@ -154,23 +161,16 @@ class Edit:
             raise invalid("layer", expected=f"a whole number in [0, {num - 1}]", got=layer)
         return range(num) if layer is None else [layer]
 
-    def select_begun(self, selection: "Selection | Mask") -> "Edit":
-        """Select from the Gaussians at the start of the chain, wherever they are now, together with their copies.
-
-        As `select`, which refuses a mask where the current number of Gaussians is that of the start, but their order is
-        not. Raises ValueError for a mask of another size.
-        """
-        return dataclasses.replace(self, selection=Selection(self._origins.select_originals(selection)))
-
     def _resolve(self, selection: object, numbers: Sequence[int]) -> list[Mask]:
         """A mask over the current Gaussians for each of the layers `numbers`."""
+        current, begun = ([counts[k] for k in numbers] for counts in (self._layer_sizes(), self._counts))
         if selection is None:
-            return [np.ones(self._video.layers[k].num_gaussians, bool) for k in numbers]
-        is_current = callable(selection) or selection is self.selection
+            return [np.ones(num, bool) for num in current]
         if callable(selection):
             check_signature("selection", selection, "video")
-            selection = selection(self.video())
-        return self._origins.select(selection, numbers, is_current=is_current)
+            return split_mask(check_mask(selection(self.video()), sum(current)), current)
+        masks = split_mask(check_mask(selection, sum(begun)), begun)
+        return [mask[self._sources[k]] for k, mask in zip(numbers, masks, strict=True)]
 
     # ------------------------------------------------------------------------------ position in the plane
 
@@ -211,7 +211,7 @@ class Edit:
         `about`: c, (x, y); then baked without a span. None: the selection's own center at each time. Easing
         interpolates the rotation and the symmetric part of A, see `Affine`.
         """
-        rows = check_matrix("matrix", matrix, 2)
+        rows = check_array("matrix", matrix, 2, 2)
         # By its formula: LAPACK's elimination divides by zero where a pivot is subnormal.
         determinant = rows[0, 0] * rows[1, 1] - rows[0, 1] * rows[1, 0]
         if not abs(determinant) > 1e-12 * np.abs(rows).max() ** 2:
@@ -258,17 +258,19 @@ class Edit:
         Copies have the edits of their originals, each about its own center, even if the edit was of a larger selection.
         """
         # By `map`: a list comprehension is a frame of its own in Python 3.11, at which warnings would point.
-        shifts = list(map(partial(self._point, "offsets"), check_pairs("offsets", offsets)))
+        shifts = list(map(partial(self._point, "offsets"), check_array("offsets", offsets, None, 2).tolist()))
         about = self._fixed_point(about)
         named = (("delays", delays), ("scale", scale), ("angle", angle))
         delays, sizes, angles = (broadcast_numbers(name, values, len(shifts)) for name, values in named)
+        if not shifts:
+            raise invalid("offsets", expected="at least one pair", got="none")
         if min(sizes) <= 0:
             raise invalid("scale", expected="numbers > 0", got=scale, cure="Mirror with transform().")
         if not isinstance(originals, bool | np.bool_):
             raise invalid("originals", expected="True or False", got=short_repr(originals))
         warn_if_degrees("angle", *angles)
         for delay in delays:
-            warn_if_outside_clip("delays", delay, 1.0, 0.0, self._num_frames)
+            warn_if_outside_clip("delays", delay, 1.0, 0.0, len(self._frame_times))
         span = self._span(when)
         if span is NEVER:  # the copies would never be visible
             self._check_selected()
@@ -402,36 +404,32 @@ class Edit:
             _check_clock(clock, (shift, stretch, about) != (0, 1, 0))
             return self._retime_by_clock(clock, when, "clock")
         Clock.shifted(shift, stretch, about=about)  # checks them
-        warn_if_outside_clip("shift", shift, stretch, about, self._num_frames)
+        warn_if_outside_clip("shift", shift, stretch, about, len(self._frame_times))
         return self._retime_linearly(shift, stretch, about, when, "shift")
 
     def _retime_by_clock(self, clock: Clock, when: When, parameter: str) -> "Edit":
         """Add a clock."""
-        if self._window is not None:
-            self._window.check_own_times(clock, parameter, **when)
-            clock = self._window.own_clock(clock)
+        span, time_map = self._clip_span(when), self._time_map
+        if time_map is not None and (span is None or time_map.convert_span(span) is not NEVER):
+            time_map.check_clock(clock, span, parameter, len(self._frame_times))
+            clock = time_map.convert_clock(clock)
         return self._apply(partial(Retiming, clock=clock), when)
 
     def _retime_linearly(self, shift: float, stretch: float, about: float, when: When, parameter: str) -> "Edit":
         """Show t at about + shift + stretch (t - about), baked where possible."""
         clock = Clock.shifted(shift, stretch, about=about)
-        never_holds = clock.times[0] <= 0 and clock.times[-1] >= 1
         identity = (shift, stretch) == (0, 1)
-        if self._window is not None and not identity:
-            own = self._window.own_line(shift, stretch, about)
-            if own is None:
-                return self._retime_by_clock(clock, when, parameter)
-            self._window.check_own_times(clock, parameter, **when)
-            shift, stretch, about = own
-            clock = self._window.own_clock(clock)
+        if self._time_map is not None and not identity:
+            return self._retime_by_clock(clock, when, parameter)
         bake = partial(apply_retiming, shift=float(shift), stretch=float(stretch), about=float(about))
+        never_holds = clock.times[0] <= 0 and clock.times[-1] >= 1
         # Between shots a clock shows the nearer frame, which parameters cannot represent.
         bakes = never_holds and not any(layer.holds_frames for layer in self._video.layers)
         return self._apply(partial(Retiming, clock=clock), when, bake if bakes else None, skip=identity)
 
     def freeze(self, at: float, **when: Unpack[When]) -> "Edit":
         """Hold the selection as it is at frame `at`, or at a position between two frames."""
-        times = self._frame_times()
+        times = self._frame_times
         position = check_number("at", at)
         if not 0 <= position <= len(times) - 1:
             raise invalid("at", expected=f"a frame in [0, {len(times) - 1}]", got=at)
@@ -470,8 +468,7 @@ class Edit:
         if not callable(function):
             raise invalid("function", expected="a function", got=type(function).__name__)
         check_signature("function", function, argument, "t")
-        if self._window is not None:
-            function = self._window.with_clip_time(function)
+        function = function if self._time_map is None else self._time_map.convert_function(function)
         return self._apply(partial(kind, function=function), when)
 
     # -------------------------------------------------------------------------------------------- 3D space
@@ -507,7 +504,7 @@ class Edit:
                 raise invalid("camera", expected="one camera", got=f"positions of shape {camera.position.shape}")
         elif callable(camera):
             check_signature("camera", camera, "t")
-            camera = camera if self._window is None else self._window.with_clip_time(camera)
+            camera = camera if self._time_map is None else self._time_map.convert_function(camera)
         elif camera is not None:
             raise invalid("camera", expected="a Camera, a function of t or None", got=type(camera).__name__)
         return dataclasses.replace(self, _video=dataclasses.replace(self._video, camera=camera))
@@ -516,7 +513,7 @@ class Edit:
 
     def _apply(
         self,
-        make: Callable[..., AbstractOverlay | Retiming],
+        make: Callable[..., TimedEdit],
         when: When,
         bake: Bake | None = None,
         *,
@@ -555,28 +552,25 @@ class Edit:
     ) -> "Edit":
         """Replace the layers and the selection; `sources`: by layer, the indices that their Gaussians have now."""
         video = dataclasses.replace(self._video, layers=tuple(layers))
-        origins = self._origins if sources is None else self._origins.gather(sources)
-        return dataclasses.replace(self, _video=video, selection=Selection(selected), _origins=origins)
+        own = self._sources
+        if sources is not None:
+            own = tuple(old[new] for old, new in zip(own, sources, strict=True))
+        return dataclasses.replace(self, _video=video, selection=Selection(selected), _sources=own)
 
     def _masks(self) -> list[Mask]:
         """The selection by layers."""
-        return split_mask(self.selection.mask, [layer.num_gaussians for layer in self._video.layers])
+        return split_mask(self.selection.mask, self._layer_sizes())
+
+    def _layer_sizes(self) -> list[int]:
+        return [layer.num_gaussians for layer in self._video.layers]
 
     def _span(self, when: When) -> Span | None:
-        check_when(when)
-        if self._window is not None:
-            return self._window.own_span(**when)
-        return restrict_span(make_frame_span(self._frame_times(), **when), self._frame_times())
+        """The span in the video's own time."""
+        span = self._clip_span(when)
+        return span if span is None or self._time_map is None else self._time_map.convert_span(span)
 
-    @property
-    def _num_frames(self) -> int:
-        return self._video.num_frames if self._window is None else self._window.num_frames
-
-    def _frame_times(self) -> Float[np.ndarray, " num_frames"]:
-        """The frame times of the whole clip."""
-        if self._window is not None:
-            return self._window.frame_times
-        return np.asarray(self._video.frame_times.times(), np.float64)
+    def _clip_span(self, when: When) -> Span | None:
+        return make_span(self._frame_times, **when)
 
 
 def _check_clock(clock: object, has_line: bool) -> None:

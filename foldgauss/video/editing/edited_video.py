@@ -21,9 +21,9 @@ from foldgauss.video.editing.overlays import (
     pad_rows,
     padded_size,
 )
-from foldgauss.video.models.frame_times import FrameTimes, is_cut, snap_to_shots
+from foldgauss.video.models.frame_times import is_cut, snap_to_shots
 from foldgauss.video.models.prepared import PreparedModel
-from foldgauss.video.models.rendered_video import RenderedVideo
+from foldgauss.video.models.rendered_video import FollowingVideo
 from foldgauss.video.models.video_model import ONE_SEGMENT, VideoModel
 
 
@@ -55,7 +55,7 @@ class Layer(eqx.Module):
         return len(times) == 1 or bool(np.asarray(is_cut(times)).any())
 
 
-class EditedVideo(RenderedVideo, eqx.Module):
+class EditedVideo(FollowingVideo, eqx.Module):
     """A video of layers with edits; it is rendered, played and saved as a `VideoModel` is.
 
     `layers` are ordered from front to back; frame times, size and frame rate are those of layer number `timeline`.
@@ -86,30 +86,6 @@ class EditedVideo(RenderedVideo, eqx.Module):
         return self.layers[self.timeline].model
 
     @property
-    def frame_times(self) -> FrameTimes:
-        return self._lead.frame_times
-
-    @property
-    def num_frames(self) -> int:
-        return self._lead.num_frames
-
-    @property
-    def size(self) -> tuple[int, int]:
-        return self._lead.size
-
-    @property
-    def fps(self) -> float:
-        return self._lead.fps
-
-    @property
-    def options(self) -> RenderOptions:
-        return self._lead.options
-
-    @property
-    def compositing(self) -> str:
-        return self._lead.compositing
-
-    @property
     def num_gaussians(self) -> int:
         """The number of Gaussians of all layers."""
         return sum(layer.num_gaussians for layer in self.layers)
@@ -133,10 +109,6 @@ class EditedVideo(RenderedVideo, eqx.Module):
         """The video prepared for conditioning on many times, for images of `size`."""
         return PreparedEditedVideo(self, size)
 
-    def at(self, t: float, size: tuple[int, int] | None = None) -> Splats2D:
-        """The splats of time t, front to back, in pixels of an image of `size` (default: its own); NumPy leaves."""
-        return self.prepare(self.size if size is None else size).splats(float(t))
-
 
 def stack_layers(*videos: VideoModel | EditedVideo, timeline: int = -1) -> EditedVideo:
     """The layers of several videos as one video, the front one first: see `foldgauss.video.layers`."""
@@ -159,16 +131,18 @@ def as_edited(video: VideoModel | EditedVideo) -> EditedVideo:
     if isinstance(video, EditedVideo):
         return video
     if not isinstance(video, VideoModel):
-        cure = "End a chain of edits with .video()."
-        if isinstance(video, list | tuple):
-            cure = "Stack several with layers(*videos)."
-        elif isinstance(video, str | os.PathLike):
-            cure = "Read a file with foldgauss.io.load_video_model(path)."
-        elif type(video).__name__ == "SegmentedVideo":
-            cure = ONE_SEGMENT
-        elif type(video).__name__ == "StabilizedVideo":
-            cure = "Edit first, and stabilize the edited video."
-        raise invalid("video", expected="a VideoModel or an EditedVideo", got=type(video).__name__, cure=cure)
+        kind = "path" if isinstance(video, str | os.PathLike) else type(video).__name__
+        cures = {
+            "Edit": "End a chain of edits with .video().",
+            "SegmentedEdit": "End a chain of edits with .video().",
+            "list": "Stack several with layers(*videos).",
+            "tuple": "Stack several with layers(*videos).",
+            "path": "Read a file with foldgauss.io.load_video_model(path).",
+            "SegmentedVideo": ONE_SEGMENT,
+            "StabilizedVideo": "Edit first, and stabilize the edited video.",
+        }
+        got, cure = type(video).__name__, cures.get(kind, "")
+        raise invalid("video", expected="a VideoModel or an EditedVideo", got=got, cure=cure)
     return EditedVideo((Layer(video),), timeline=0)
 
 

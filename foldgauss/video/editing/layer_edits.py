@@ -8,7 +8,6 @@ from jaxtyping import Int
 
 from foldgauss._runtime.checks import invalid
 from foldgauss.video.editing.edited_video import Layer
-from foldgauss.video.editing.origins import Mask
 from foldgauss.video.editing.overlays import (
     IDENTITY,
     AbstractOverlay,
@@ -16,14 +15,16 @@ from foldgauss.video.editing.overlays import (
     GaussianFunction,
     Place,
     Retiming,
+    TimedEdit,
     TriangleFunction,
 )
 from foldgauss.video.models.splats import FoldedSplats
+from foldgauss.video.selection.selectors import Mask
 
 Bake = Callable[[FoldedSplats, Mask], FoldedSplats | None]
 
 
-def apply_edit(layer: Layer, edit: AbstractOverlay | Retiming, bake: Bake | None = None) -> Layer:
+def apply_edit(layer: Layer, edit: TimedEdit, bake: Bake | None = None) -> Layer:
     """Bake an edit into the layer's model where `bake` can, else add it as an overlay or a clock."""
     mask = np.asarray(edit.mask)
     if not mask.any():
@@ -36,7 +37,7 @@ def apply_edit(layer: Layer, edit: AbstractOverlay | Retiming, bake: Bake | None
     return dataclasses.replace(layer, model=dataclasses.replace(layer.model, splats=splats))
 
 
-def add_edit(layer: Layer, edit: AbstractOverlay | Retiming) -> Layer:
+def add_edit(layer: Layer, edit: TimedEdit) -> Layer:
     """Add an overlay or a clock after those of the layer, if it has Gaussians."""
     if not np.asarray(edit.mask).any():
         return layer
@@ -68,7 +69,7 @@ def can_delete(layer: Layer, mask: Mask) -> bool:
     return not any(_overlaps_partly(overlay, mask) for overlay in layer.overlays)
 
 
-def _may_bake(layer: Layer, edit: AbstractOverlay | Retiming) -> bool:
+def _may_bake(layer: Layer, edit: TimedEdit) -> bool:
     """Whether the parameters may be changed: always, before other edits of the same Gaussians are applied."""
     if isinstance(edit, Affine) and edit.stretch != IDENTITY and layer.model.scale_cutoff > 0:
         return False  # the cutoff would leave out Gaussians at other times

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from foldgauss._runtime.checks import check_one_of, invalid
 from foldgauss.render import Gaussians3D, Triangles
-from foldgauss.video.editing.arguments import check_number, check_numbers
+from foldgauss.video.editing.arguments import check_array, check_number, check_numbers
 from foldgauss.video.editing.clock import Clock
 from foldgauss.video.editing.span import Span
 
@@ -84,25 +84,27 @@ def _map_factors(matrix: Float[np.ndarray, "dim dim"], factor: Float[np.ndarray,
     return np.swapaxes(rows.reshape(columns.shape), 1, 2)
 
 
-class AbstractOverlay(eqx.Module):
-    """An edit of the conditioned Gaussians.
+class TimedEdit(eqx.Module):
+    """The Gaussians that an edit applies to, and when it does. **Shapes:** `mask` bool (num_gaussians,)."""
 
-    A subclass has static, hashable fields beside `mask`, checks them in `__check_init__`, and is listed in `KINDS` if
-    it can be saved.
-
-    **Shapes:** `mask` bool (num_gaussians,).
-    """
-
-    mask: eqx.AbstractVar[Bool[np.ndarray, " num_gaussians"]]
-    span: eqx.AbstractVar[Span | None]
-
-    @abstractmethod
-    def __call__(self, gaussians: SelectedGaussians, t: float, progress: float) -> SelectedGaussians:
-        """The selected Gaussians of time t, edited with progress in [0, 1]: 0 is unchanged, 1 fully edited."""
+    mask: Bool[np.ndarray, " num_gaussians"]
+    span: Span | None = eqx.field(static=True)
 
     def progress(self, t: float) -> float:
         """The progress of the edit at time t."""
         return 1.0 if self.span is None else self.span.progress(t)
+
+
+class AbstractOverlay(TimedEdit):
+    """An edit of the conditioned Gaussians.
+
+    A subclass has static, hashable fields, checks them in `__check_init__`, and is listed in `KINDS` if it can be
+    saved.
+    """
+
+    @abstractmethod
+    def __call__(self, gaussians: SelectedGaussians, t: float, progress: float) -> SelectedGaussians:
+        """The selected Gaussians of time t, edited with progress in [0, 1]: 0 is unchanged, 1 fully edited."""
 
 
 class Affine(AbstractOverlay):
@@ -116,8 +118,6 @@ class Affine(AbstractOverlay):
     **Units:** `angle` in radians from x to y, which is clockwise on the screen; `offset` and `about` model space.
     """
 
-    mask: Bool[np.ndarray, " num_gaussians"]
-    span: Span | None = eqx.field(static=True)
     angle: float = eqx.field(static=True)
     stretch: tuple[tuple[float, float], tuple[float, float]] = eqx.field(static=True)
     offset: tuple[float, float] = eqx.field(static=True)
@@ -125,14 +125,13 @@ class Affine(AbstractOverlay):
 
     def __check_init__(self) -> None:
         check_number("angle", self.angle)
-        for row in self.stretch:
-            check_numbers("stretch", row, 2)
+        check_array("stretch", self.stretch, 2, 2)
         check_numbers("offset", self.offset, 2)
         if self.about is not None:
             check_numbers("about", self.about, 2)
-        if len(self.stretch) != 2 or self.stretch[0][1] != self.stretch[1][0]:
-            raise invalid("stretch", expected="a symmetric 2x2 matrix", got=self.stretch)
-        (first, shear), (_, second) = self.stretch
+        (first, shear), (other, second) = self.stretch
+        if shear != other:
+            raise invalid("stretch", expected="a symmetric matrix", got=self.stretch)
         if first * second - shear**2 == 0:
             raise invalid("stretch", expected="an invertible matrix", got=self.stretch, cure="See vanish().")
 
@@ -183,8 +182,6 @@ def polar_decompose(
 class Opacity(AbstractOverlay):
     """Opacity times a factor, clipped at 1: `before` at progress 0, `factor` at progress 1, interpolated between."""
 
-    mask: Bool[np.ndarray, " num_gaussians"]
-    span: Span | None = eqx.field(static=True)
     factor: float = eqx.field(static=True)
     before: float = eqx.field(static=True, default=1.0)
 
@@ -210,17 +207,13 @@ class Recolor(AbstractOverlay):
     distance from gray are kept.
     """
 
-    mask: Bool[np.ndarray, " num_gaussians"]
-    span: Span | None = eqx.field(static=True)
     matrix: tuple[tuple[float, float, float], ...] = eqx.field(static=True)
     offset: tuple[float, float, float] = eqx.field(static=True)
     hue: float | None = eqx.field(static=True, default=None)
 
     def __check_init__(self) -> None:
-        if len(self.matrix) != 3:
-            raise invalid("matrix", expected="a 3x3 matrix", got=self.matrix)
-        for row in (*self.matrix, self.offset):
-            check_numbers("matrix, offset", row, 3)
+        check_array("matrix", self.matrix, 3, 3)
+        check_numbers("offset", self.offset, 3)
         if self.hue is not None:
             check_number("hue", self.hue)
 
@@ -254,8 +247,6 @@ class Place(AbstractOverlay):
     **Source:** MiraGe, flat Gaussians in space; VeGaS eq:mirage.
     """
 
-    mask: Bool[np.ndarray, " num_gaussians"]
-    span: Span | None = eqx.field(static=True)
     depth: float = eqx.field(static=True)
     rotation: tuple[float, float, float] = eqx.field(static=True)
     about: tuple[float, float] | None = eqx.field(static=True)
@@ -280,8 +271,6 @@ class Place(AbstractOverlay):
 class GaussianFunction(AbstractOverlay):
     """A function of the conditioned Gaussians and the time. It cannot be saved."""
 
-    mask: Bool[np.ndarray, " num_gaussians"]
-    span: Span | None = eqx.field(static=True)
     function: Callable[[SelectedGaussians, float], SelectedGaussians] = eqx.field(static=True)
 
     def __call__(self, gaussians, t, progress):
@@ -295,8 +284,6 @@ class TriangleFunction(AbstractOverlay):
     Source: GaMeS; VeGaS eq:traingle_face.
     """
 
-    mask: Bool[np.ndarray, " num_gaussians"]
-    span: Span | None = eqx.field(static=True)
     function: Callable[[Float[np.ndarray, "num 3 3"], float], Float[np.ndarray, "num 3 3"]] = eqx.field(static=True)
 
     def __call__(self, gaussians, t, progress):
@@ -394,19 +381,17 @@ def _interpolate(before: SelectedGaussians, after: SelectedGaussians, progress: 
     return dataclasses.replace(before, **mixed)
 
 
-class Retiming(eqx.Module):
+class Retiming(TimedEdit):
     """Gaussians with their own clock, over a span or always: at progress s their time is t + s (clock(t) - t).
 
     `clock(t)` is clipped to [0, 1], the times that the model was fitted to.
     """
 
-    mask: Bool[np.ndarray, " num_gaussians"]
-    span: Span | None = eqx.field(static=True)
     clock: Clock = eqx.field(static=True)
 
     def own_time(self, t: float) -> float:
         """The time at which the Gaussians are conditioned at the video's time t."""
-        progress = 1.0 if self.span is None else self.span.progress(t)
+        progress = self.progress(t)
         own = min(max(self.clock(t), 0.0), 1.0)
         if progress in (0, 1):  # exactly
             return own if progress else t
@@ -414,7 +399,7 @@ class Retiming(eqx.Module):
 
 
 #: The edits that can be saved, by their names in files.
-KINDS: dict[str, type[eqx.Module]] = {
+KINDS: dict[str, type[TimedEdit]] = {
     "affine": Affine,
     "opacity": Opacity,
     "recolor": Recolor,
@@ -423,7 +408,7 @@ KINDS: dict[str, type[eqx.Module]] = {
 }
 
 
-def describe_overlay(overlay: eqx.Module) -> dict:
+def describe_overlay(overlay: TimedEdit) -> dict:
     """An overlay without its mask as JSON values. Raises ValueError for functions, which cannot be saved."""
     names = {kind: name for name, kind in KINDS.items()}
     if type(overlay) not in names:
@@ -434,7 +419,7 @@ def describe_overlay(overlay: eqx.Module) -> dict:
     return {"kind": names[type(overlay)], **fields}
 
 
-def restore_overlay(description: dict, mask: Bool[np.ndarray, " num_gaussians"]) -> eqx.Module:
+def restore_overlay(description: dict, mask: Bool[np.ndarray, " num_gaussians"]) -> TimedEdit:
     """The inverse of `describe_overlay`. Raises ValueError, KeyError or TypeError for an invalid description."""
     check_one_of("kind", description["kind"], tuple(KINDS))
     kind = KINDS[description["kind"]]

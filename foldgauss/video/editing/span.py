@@ -1,11 +1,10 @@
 """Spans: when an edit acts, and with which progress between 0 and 1."""
 
 import dataclasses
-import difflib
 import math
 from collections.abc import Sequence
 from numbers import Real
-from typing import NamedTuple, TypedDict
+from typing import TypedDict
 
 import numpy as np
 from jaxtyping import Float
@@ -17,7 +16,7 @@ CURVES = ("linear", "smooth")
 
 
 class When(TypedDict, total=False):
-    """When an edit acts: the keyword arguments of `make_frame_span`. None given: always."""
+    """When an edit acts: the keyword arguments of `make_span`. None given: always."""
 
     frame: int
     frames: tuple[int | None, int | None]
@@ -32,7 +31,7 @@ class Span:
 
     The interval is `start` <= t < `stop`, None for no end. Inside, progress is 1, or it is interpolated between the
     knots `times` and `values` and passed through `curve`: "linear", or "smooth", s^2 (3 - 2 s). Outside it is 0.
-    `make_frame_span` and `restrict_span` make one from frame numbers.
+    `make_span` makes one from frame numbers.
 
     **Units:** model time. **Example:** `Span(0.4, 0.6).progress(0.5)  # 1.0`
 
@@ -81,29 +80,7 @@ class Span:
 NEVER = Span(2.0, 3.0)
 
 
-def check_when(when: When) -> None:
-    """Raise ValueError for a name that is no keyword of `make_frame_span`."""
-    for name in when:
-        if name not in When.__annotations__:
-            near = difflib.get_close_matches(name, When.__annotations__, 1)
-            expected, cure = "one of " + ", ".join(When.__annotations__), f"Did you mean {near[0]}?" if near else ""
-            raise invalid("when", expected=expected, got=name, cure=cure)
-
-
-class FrameSpan(NamedTuple):
-    """A span in frame positions of a clip, from `begin` to `end`, infinite where it has no end.
-
-    `rise` and `fall`: the number of frames over which progress rises to 1 and falls from it.
-    """
-
-    begin: float
-    end: float
-    rise: float
-    fall: float
-    curve: str
-
-
-def make_frame_span(
+def make_span(
     frame_times: Float[np.ndarray, " num_frames"],
     *,
     frame: int | None = None,
@@ -111,7 +88,7 @@ def make_frame_span(
     times: tuple[float, float] | None = None,
     ease: float | tuple[float, float] = 0,
     curve: str = "linear",
-) -> FrameSpan | None:
+) -> Span | None:
     """The span of one frame, of frames (first, stop) or of times (start, stop); None for always.
 
     A frame reaches half way to its neighbors: frame k covers |position - k| < 0.5, where `position` is the frame
@@ -122,7 +99,7 @@ def make_frame_span(
     `ease`: the number of frames over which the edit comes in and goes out, inside the span; or one number for each.
     Where the span has no end, there is no easing. `curve`: as in `Span`.
 
-    **Example:** `make_frame_span(model.frame_times.times(), frames=(10, 20), ease=4, curve="smooth")`.
+    **Example:** `make_span(model.frame_times.times(), frames=(10, 20), ease=4, curve="smooth")`.
 
     **Raises:** ValueError for more than one of `frame`, `frames` and `times`, for values outside the clip, and for
     `ease` without a span or longer than it.
@@ -143,7 +120,19 @@ def make_frame_span(
     if rise + fall > last - first:
         expected = f"no more than the span's {last - first:g} frames, in and out together"
         raise invalid("ease", expected=expected, got=f"{rise:g} and {fall:g}", cure="Make the span longer.")
-    return FrameSpan(begin, end, rise, fall, curve)
+    number = np.arange(len(knots))
+    start, stop = (float(np.interp(x, number, knots)) if math.isfinite(x) else None for x in (begin, end))
+    if not rise and not fall:
+        return Span(start, stop, curve=curve)
+    corners = {first, last, *(x for x in (begin + rise, end - fall) if first < x < last)}
+    positions = np.array(sorted(corners | set(number[(number > first) & (number < last)].tolist())))
+    values = np.ones(len(positions))
+    if rise:
+        values = np.minimum(values, (positions - begin) / rise)
+    if fall:
+        values = np.minimum(values, (end - positions) / fall)
+    values = np.clip(values, 0.0, 1.0)
+    return Span(start, stop, *distinct_knots(np.interp(positions, number, knots), values), curve)
 
 
 def _span_positions(knots: np.ndarray, frame, frames, times) -> tuple[float, float]:
@@ -165,37 +154,6 @@ def _span_positions(knots: np.ndarray, frame, frames, times) -> tuple[float, flo
         expected = f"(first, stop), whole, 0 <= first < stop <= {last + 1}"
         raise invalid("frames", expected=expected, got=frames, cure="None is the clip's own end.")
     return -math.inf if first == 0 else first - 0.5, math.inf if stop == last + 1 else stop - 0.5
-
-
-def restrict_span(
-    frame_span: FrameSpan | None, frame_times: Float[np.ndarray, " num_frames"], first: int = 0
-) -> Span | None:
-    """A clip's span in the own time of a segment whose frames, at `frame_times`, begin with the clip's frame `first`.
-
-    At the frames and between them progress is that of the clip; `NEVER` if the span contains no frame of the segment.
-    None, always, stays None.
-    """
-    if frame_span is None:
-        return None
-    knots, last = np.asarray(frame_times, np.float64), len(frame_times) - 1
-    # From here on positions count from the segment's first frame.
-    begin, end, rise, fall = frame_span.begin - first, frame_span.end - first, frame_span.rise, frame_span.fall
-    if end <= 0 or begin > last:
-        return NEVER
-    number, ends = np.arange(last + 1), (max(begin, 0.0), min(end, float(last)))
-    start = None if begin <= 0 else float(np.interp(begin, number, knots))
-    stop = None if end > last else float(np.interp(end, number, knots))
-    if not rise and not fall:
-        return Span(start, stop, curve=frame_span.curve)
-    corners = {*ends, *(x for x in (begin + rise, end - fall) if ends[0] < x < ends[1])}
-    positions = np.array(sorted(corners | set(number[(number > ends[0]) & (number < ends[1])].tolist())))
-    values = np.ones(len(positions))
-    if rise:
-        values = np.minimum(values, (positions - begin) / rise)
-    if fall:
-        values = np.minimum(values, (end - positions) / fall)
-    times = np.interp(positions, number, knots)
-    return Span(start, stop, *distinct_knots(times, np.clip(values, 0.0, 1.0)), frame_span.curve)
 
 
 def distinct_knots(

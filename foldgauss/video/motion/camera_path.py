@@ -66,11 +66,8 @@ class CameraPath:
 
     def held(self) -> Float[np.ndarray, "frames 3 3"]:
         """The maps of each frame to the middle frame of its shot: the camera stands still."""
-        maps = np.empty_like(self.matrices)
-        for first, stop in self.shots:
-            for k in range(first, stop):
-                maps[k] = self.between(k, (first + stop - 1) // 2)
-        return maps
+        pairs = ((k, (first + stop - 1) // 2) for first, stop in self.shots for k in range(first, stop))
+        return np.stack([self.between(*pair) for pair in pairs])
 
     def smoothed(self, frames: float) -> Float[np.ndarray, "frames 3 3"]:
         """The maps of each frame to where a smoother path would show it.
@@ -87,17 +84,12 @@ class CameraPath:
         weights /= weights.sum()
         maps = np.empty_like(self.matrices)
         for first, stop in self.shots:
-            steps = [np.zeros((3, 3)), *(_logarithm(self.between(k - 1, k)) for k in range(first + 1, stop))]
-            path = np.cumsum(steps, axis=0)
+            logarithms = (np.real(scipy.linalg.logm(self.between(k - 1, k))) for k in range(first + 1, stop))
+            path = np.cumsum([np.zeros((3, 3)), *logarithms], axis=0)
             longer = np.pad(path, ((reach, reach), (0, 0), (0, 0)), mode="reflect", reflect_type="odd")
             smooth = np.stack([np.tensordot(weights, longer[k : k + len(weights)], 1) for k in range(len(path))])
             maps[first:stop] = scipy.linalg.expm(smooth - path)
         return maps
-
-
-def _logarithm(affine: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """The motion, held for one frame, that leads to this map."""
-    return np.real(scipy.linalg.logm(affine))
 
 
 def estimate_camera_path(video: RenderableVideo, *, on_frame: Callable[[], None] = lambda: None) -> CameraPath:

@@ -96,8 +96,6 @@ VOTE_ODDS = 3.0
 BEYOND = 4
 #: A motion cannot be told from a camera's in fewer frames.
 LEAST_FRAMES = 3
-#: So many shots without an object are logged one by one.
-LISTED_SHOTS = 8
 #: The cure of errors of selections, which can be made otherwise.
 SELECT_OTHERWISE = "Select by a mask, a box or a click."
 
@@ -130,22 +128,15 @@ def find_moving_object(frames: Frames, *, shadow: bool = False, alignment: Align
             masks[k] = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
     if not masks.any():
         raise nothing_moves("an object that moves against the background", "none")
-    _log_missing([shot for shot in alignment.shots if not masks[slice(*shot)].any()])
+    missing = [f"{first}:{stop}" for first, stop in alignment.shots if not masks[first:stop].any()]
+    if missing:
+        _LOG.info("No moving object was found in the shots of frames %s.", ", ".join(missing))
     return masks
 
 
 def nothing_moves(expected: str, got: object, cure: str = SELECT_OTHERWISE) -> NothingMoves:
     """The error, to be raised."""
     return invalid("moving", expected=expected, got=got, cure=cure, kind=NothingMoves)
-
-
-def _log_missing(shots: list[tuple[int, int]]) -> None:
-    """Log the shots in which no object was found."""
-    for first, stop in shots[:LISTED_SHOTS]:
-        why = f", which has fewer than {LEAST_FRAMES}" if stop - first < LEAST_FRAMES else ""
-        _LOG.info("No moving object was found in the shot of frames %d:%d%s.", first, stop, why)
-    if len(shots) > LISTED_SHOTS:
-        _LOG.info("Nor in %d more shots.", len(shots) - LISTED_SHOTS)
 
 
 def _find_in_shot(frames: Frames, alignment: Alignment, shot: tuple[int, int], shadow: bool) -> Masks | list:

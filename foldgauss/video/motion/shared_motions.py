@@ -45,9 +45,7 @@ TRACK_GAP = 4
 TRACK_REACH = 12
 #: at most so many tracks.
 MAX_TRACKS = 20_000
-#: Motions besides that of the camera.
-MAX_OBJECTS = 1
-#: An object's path follows at least this fraction of all tracks, of those that the paths before it do not.
+#: An object's path follows at least this fraction of all tracks, of those that the camera's path does not.
 LEAST_FOLLOWED = 0.02
 #: A path follows a track that strays from its mean by less than this, in units of RANSAC's threshold. Distances are
 #: those of the coordinates that follow the path: pixels in the middle of each shot.
@@ -78,7 +76,8 @@ def find_shared_motions(motion: Motion, *, steady: bool = False) -> Float[np.nda
     camera = _fill_unknown(steps)
     path = clip.chain_within_limits(camera if steady else clip.keep_unsteady(steps))
     found = [path] if path is not None and (path != np.eye(3)).any() else []
-    found += _find_objects(clip, camera, smooth=None if found else SMOOTH)
+    path = _find_object(clip, camera, smooth=None if found else SMOOTH)
+    found += [] if path is None else [path]
     return np.stack(found)[:, :, :2] if found else None
 
 
@@ -196,34 +195,32 @@ def _is_near(maps: Float[np.ndarray, "frames 3 3"]) -> bool:
 # ------------------------------------------------------------------------------------------------------- objects
 
 
-def _find_objects(clip: _Clip, camera: Float[np.ndarray, "frames 3 3"], smooth: float | None) -> list[np.ndarray]:
-    """Maps to each frame, (frames, 3, 3), of up to `MAX_OBJECTS`: one after another, what moves otherwise.
+def _find_object(
+    clip: _Clip, camera: Float[np.ndarray, "frames 3 3"], smooth: float | None
+) -> Float[np.ndarray, "frames 3 3"] | None:
+    """Maps to each frame of what moves otherwise than the camera; None if nothing does, or not unsteadily.
 
-    The search ends at one that is not unsteadier than `smooth`, if given.
+    It has to be unsteadier than `smooth`, if given.
     """
     points, limit = _Points.of(clip), STRAY * clip.inlier
-    best, found = points.measure_stray(clip.chain(camera)), []
-    for _ in range(MAX_OBJECTS):
-        followed = left = best > limit
-        for _ in range(ROUNDS):
-            if not points.are_enough(followed):
-                return found
-            steps = points.estimate_steps(followed)
-            known = np.where(np.isnan(steps), camera, steps)
-            own = points.measure_stray(clip.chain(known))
-            followed = left & (own < best) & (own < WIDER * limit)
-        maps = clip.chain_within_limits(known)
-        if maps is None:
-            return found
-        own = points.measure_stray(maps)
-        followed = left & (own < limit)
+    by_camera = points.measure_stray(clip.chain(camera))
+    followed = left = by_camera > limit
+    for _ in range(ROUNDS):
         if not points.are_enough(followed):
-            return found
-        if smooth is not None and not _are_larger(clip.measure_changes(steps, points.find_middle(followed)), smooth):
-            return found
-        found.append(maps)
-        best = np.minimum(best, own)
-    return found
+            return None
+        steps = points.estimate_steps(followed)
+        known = np.where(np.isnan(steps), camera, steps)
+        own = points.measure_stray(clip.chain(known))
+        followed = left & (own < by_camera) & (own < WIDER * limit)
+    maps = clip.chain_within_limits(known)
+    if maps is None:
+        return None
+    followed = left & (points.measure_stray(maps) < limit)
+    if not points.are_enough(followed):
+        return None
+    if smooth is not None and not _are_larger(clip.measure_changes(steps, points.find_middle(followed)), smooth):
+        return None
+    return maps
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from foldgauss._runtime.checks import invalid, is_within, short_repr
-from foldgauss.render import RenderOptions, Splats2D, pixels_per_unit
-from foldgauss.video.models.frame_times import FrameTimes
-from foldgauss.video.models.rendered_video import RenderedVideo
+from foldgauss.render import Splats2D, pixels_per_unit
+from foldgauss.video.models.rendered_video import FollowingVideo
 from foldgauss.video.models.renderer import RenderableVideo
 from foldgauss.video.motion.camera_path import CameraPath, estimate_camera_path
 
@@ -85,7 +84,7 @@ def stabilize(
 
 
 @dataclasses.dataclass(frozen=True)
-class StabilizedVideo(RenderedVideo):
+class StabilizedVideo(FollowingVideo):
     """A video whose images are moved by one affine map for each frame, `maps` (num_frames, 3, 3) in model space.
 
     Between frames maps are interpolated linearly. It is rendered as any other video. Made by `stabilize`, which
@@ -98,38 +97,8 @@ class StabilizedVideo(RenderedVideo):
     border: Border = "keep"
 
     @property
-    def fill(self) -> bool:
-        """Whether other frames are shown beyond the borders."""
-        return self.border == "fill"
-
-    @property
-    def borders_visible(self) -> bool:
-        """Whether images may end inside the output."""
-        return self.border != "crop"
-
-    @property
-    def frame_times(self) -> FrameTimes:
-        return self.video.frame_times
-
-    @property
-    def num_frames(self) -> int:
-        return self.video.num_frames
-
-    @property
-    def size(self) -> tuple[int, int]:
-        return self.video.size
-
-    @property
-    def fps(self) -> float:
-        return self.video.fps
-
-    @property
-    def options(self) -> RenderOptions:
-        return self.video.options
-
-    @property
-    def compositing(self) -> str:
-        return self.video.compositing
+    def _lead(self) -> RenderableVideo:
+        return self.video
 
     @property
     def zoom(self) -> float:
@@ -145,14 +114,15 @@ class StabilizedVideo(RenderedVideo):
 
     def map_at(self, t: float) -> Affine:
         """The map of the image at time t, in model space."""
-        k, fraction = self._position(t)
-        return self.maps[k] if fraction == 0 else (1 - fraction) * self.maps[k] + fraction * self.maps[k + 1]
+        return self._interpolate(self.maps, t)
 
     def path_at(self, t: float) -> Affine:
         """The map of points of the first frame of the shot to the image at time t, in model space."""
+        return self._interpolate(self.path.matrices, t)
+
+    def _interpolate(self, maps: Float[np.ndarray, "frames 3 3"], t: float) -> Affine:
         k, fraction = self._position(t)
-        matrices = self.path.matrices
-        return matrices[k] if fraction == 0 else (1 - fraction) * matrices[k] + fraction * matrices[k + 1]
+        return maps[k] if fraction == 0 else (1 - fraction) * maps[k] + fraction * maps[k + 1]
 
     def nearby_frames(self, t: float) -> list[int]:
         """Frames of the shot that show what is beyond the borders at time t, the nearest first."""
@@ -195,12 +165,12 @@ class PreparedStabilizedVideo:
 
     def _moved(self, splats: Splats2D, t: float) -> Splats2D:
         to_output = self._to_pixels @ self._video.map_at(t)
-        if not self._video.borders_visible:
+        if self._video.border == "crop":
             return _apply(to_output @ self._to_model, splats)
         seen = self._seen(splats)
         wide = _are_wide(seen)
         parts = [_apply(to_output, _choose(seen, ~wide))]
-        if self._video.fill:
+        if self._video.border == "fill":
             parts += self._beyond_borders(t, to_output)
         parts.append(_apply(to_output, _choose(seen, wide)))
         leaves = [(part.mean, part.factor, part.opacity, part.color) for part in parts]
@@ -245,14 +215,10 @@ def _move_points(affine: Affine, points: Float[np.ndarray, "num 2"]) -> Float[np
 
 
 def _find_zoom(maps: Float[np.ndarray, "frames 3 3"], size: tuple[int, int]) -> float:
-    """The least zoom, to 0.1%, with which every moved image covers the output; just over `MAX_ZOOM` if none does."""
-    half = np.array([size[1], size[0]]) / max(size) / 2
-    corners = np.array(list(itertools.product([-1, 1], [-1, 1]))) * half
-    zooms = 1.001 ** np.arange(np.ceil(np.log(MAX_ZOOM) / np.log(1.001)) + 2)
-
-    def covers(zoom: float) -> bool:
-        inverse = np.linalg.inv(maps)
-        seen = np.einsum("nij,cj->nci", inverse[:, :2, :2], corners / zoom) + inverse[:, None, :2, 2]
-        return bool((np.abs(seen) <= half + 1e-9).all())
-
-    return float(next((zoom for zoom in zooms if covers(zoom)), zooms[-1]))
+    """The least zoom, to 0.1%, with which every moved image covers the output; above `MAX_ZOOM` if none does."""
+    half, inverse = np.array([size[1], size[0]]) / max(size) / 2, np.linalg.inv(maps)
+    corners = np.array([[1, 1], [1, -1]]) * half  # and their opposites
+    reach = np.abs(np.einsum("nij,cj->nci", inverse[:, :2, :2], corners)).max(1)
+    room = half - np.abs(inverse[:, :2, 2])
+    zoom = max(1.0, (reach / np.maximum(room, 1e-9)).max())
+    return float(1.001 ** np.ceil(np.log(zoom) / np.log(1.001) - 1e-6))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import logging
+import operator
 from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -11,10 +12,9 @@ from jaxtyping import Bool
 
 from foldgauss._runtime.checks import invalid
 from foldgauss.video.editing.chain import Edit
-from foldgauss.video.editing.clip_window import ClipWindow
+from foldgauss.video.editing.time_map import frame_times_of
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.motion.moving_object import NothingMoves
-from foldgauss.video.segmented.segmented_selection import SegmentedSelection
 from foldgauss.video.segmented.segmented_video import Segment
 from foldgauss.video.selection.contributions import Contributions, render_matte
 from foldgauss.video.selection.regions import (
@@ -63,15 +63,15 @@ class CriteriaEvaluator:
     select_none: Callable[[int], Selection]
     layer: int | None
 
-    def evaluate(self, criteria: list[Criterion]) -> SegmentedSelection:
-        """The intersection of all criteria: regions first, so that the others are evaluated on fewer segments."""
-        found: SegmentedSelection | None = None
+    def evaluate(self, criteria: list[Criterion]) -> list[Selection]:
+        """The intersection of all criteria, by segment: regions first, so that fewer segments are evaluated."""
+        found: list[Selection] | None = None
         for function, arguments in sorted(criteria, key=lambda criterion: criterion[0] in _OF_EACH):
             if function in _OF_EACH:
                 selection = self._evaluate_each(function, arguments, found)
             else:
                 selection = _RegionCriterion(self, function, arguments).evaluate()
-            found = selection if found is None else found & selection
+            found = selection if found is None else list(map(operator.and_, found, selection))
         return found
 
     def evaluate_segment(self, one: Edit, function: Callable[[VideoModel, int], Selection]) -> Selection:
@@ -84,8 +84,8 @@ class CriteriaEvaluator:
         return Selection(np.concatenate(masks))
 
     def _evaluate_each(
-        self, function: Callable[..., Selection], arguments: dict[str, Any], within: SegmentedSelection | None
-    ) -> SegmentedSelection:
+        self, function: Callable[..., Selection], arguments: dict[str, Any], within: list[Selection] | None
+    ) -> list[Selection]:
         """By color, motion or time, on each segment that is not yet known to be without selected Gaussians.
 
         Raises `NothingMoves` if nothing moves in any of them.
@@ -93,15 +93,15 @@ class CriteriaEvaluator:
         positions = self._positions(**arguments) if function is by_time else None
         parts, motionless = [], []
         for number, segment in enumerate(self.segments):
-            if within is not None and not len(within.parts[number]):
-                parts.append(within.parts[number])
+            if within is not None and not len(within[number]):
+                parts.append(within[number])
             elif positions is not None and not _overlaps(positions, segment):
                 parts.append(self.select_none(number))
             else:
                 one = self.replay(number)
                 if function is by_motion:
                     _LOG.info("Segment %d, whose first frame, 0, is frame %d of the clip:", number, segment.first)
-                own = arguments if positions is None else _own_arguments(positions, segment, one._window, arguments)
+                own = arguments if positions is None else _own_arguments(positions, segment, one, arguments)
                 try:
                     parts.append(self.evaluate_segment(one, lambda model, _, own=own: function(model, **own)))
                 except NothingMoves as error:
@@ -110,7 +110,7 @@ class CriteriaEvaluator:
                     parts.append(self.select_none(number))
         if motionless and len(motionless) == len(parts):
             raise motionless[0]
-        return SegmentedSelection(tuple(parts))
+        return parts
 
     def _positions(self, times: Any = None, frame: Any = None, frames: Any = None, alive: bool = False) -> Any:
         """First and last frame position for `times`, else the range of frames."""
@@ -125,16 +125,14 @@ def _overlaps(positions: range | tuple[float, float], segment: Segment) -> bool:
     return first <= segment.stop - 1 and segment.first <= last
 
 
-def _own_arguments(positions: Any, segment: Segment, window: ClipWindow, arguments: dict[str, Any]) -> dict[str, Any]:
+def _own_arguments(positions: Any, segment: Segment, one: Edit, arguments: dict[str, Any]) -> dict[str, Any]:
     """The arguments of `by_time` in a segment's own frames or times."""
     if isinstance(positions, range):
         first, stop = max(positions.start, segment.first), min(positions.stop, segment.stop)
-        return {"frames": (first - segment.first, stop - segment.first), "alive": arguments["alive"]}
-    if window.is_whole:
+        return {**arguments, "frame": None, "frames": (first - segment.first, stop - segment.first)}
+    if one._time_map is None:
         return arguments
-    ends = np.clip(positions, window.first, window.last) - window.first
-    times = np.interp(ends, np.arange(len(window.times)), window.times)
-    return {"times": tuple(np.clip(times, 0.0, 1.0).tolist()), "alive": arguments["alive"]}
+    return {**arguments, "times": tuple(map(one._time_map.to_own, arguments["times"]))}
 
 
 class _RegionCriterion:
@@ -143,7 +141,7 @@ class _RegionCriterion:
     def __init__(self, context: CriteriaEvaluator, function: Callable[..., Selection], arguments: dict[str, Any]):
         self._context, self._function, self._arguments = context, function, arguments
         self._segments = context.segments
-        where = {"frame": arguments["frame"], "frames": arguments.get("frames")}
+        where = {name: arguments.get(name) for name in ("frame", "frames")}
         if function is by_click:
             self._frames = tuple(resolve_frames(context.stand_in, **where))
         else:
@@ -158,8 +156,8 @@ class _RegionCriterion:
         #: By segment and layer: masks of what the neighbors show, by frames of the clip.
         self._masks: dict[int, list[dict[int, _Image]]] = {}
 
-    def evaluate(self) -> SegmentedSelection:
-        """The selection in all segments, breadth first from those that have the frames named."""
+    def evaluate(self) -> list[Selection]:
+        """The selection in each segment, breadth first from those that have the frames named."""
         named = [number for number in range(len(self._segments)) if self._named_frames(number)]
         waiting, found = deque(named), {}
         reached = set(named)
@@ -176,7 +174,7 @@ class _RegionCriterion:
                     reached.add(other)
                     waiting.append(other)
         numbers = range(len(self._segments))
-        return SegmentedSelection(tuple(found[k] if k in found else self._context.select_none(k) for k in numbers))
+        return [found[k] if k in found else self._context.select_none(k) for k in numbers]
 
     def _named_frames(self, number: int) -> list[int]:
         """The frames named that a segment has."""
@@ -211,7 +209,7 @@ class _RegionCriterion:
                 if contributions is None:
                     images[k] = np.zeros(layer.model.size, bool)
                 else:
-                    own_time = float(one._window.times[k - here.first])
+                    own_time = float(frame_times_of(one._video)[k - here.first])
                     images[k] = render_matte(contributions, mask, own_time) >= _MIN_CONTRIBUTION
 
     def _propagate(self, one: Edit, number: int) -> Selection:

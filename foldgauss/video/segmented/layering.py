@@ -4,23 +4,20 @@ import dataclasses
 import functools
 
 import numpy as np
-from jaxtyping import Float64
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.video.editing.clip_window import FunctionOfTime
 from foldgauss.video.editing.clock import Clock
 from foldgauss.video.editing.edited_video import EditedVideo, Layer, as_edited, check_timeline, stack_layers
 from foldgauss.video.editing.layer_edits import gather_layer
 from foldgauss.video.editing.overlays import AbstractOverlay, GaussianFunction, Retiming, TriangleFunction, is_active
-from foldgauss.video.editing.span import NEVER, Span, distinct_knots
+from foldgauss.video.editing.span import NEVER, distinct_knots
+from foldgauss.video.editing.time_map import TimeMap, frame_times_of
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import MAX_PREPARED, SegmentedVideo
 from foldgauss.video.selection.selectors import by_time
 
 Video = VideoModel | EditedVideo | SegmentedVideo
 
-#: Frames. Times this close to a straight line count as linear.
-_LINEAR_TOLERANCE = 1e-3
 #: Clip time. Gaussians that are alive within this margin around a segment are kept.
 _MARGIN = 1e-4
 
@@ -71,18 +68,15 @@ def _stack_segment(videos: tuple[Video, ...], timeline: int, number: int) -> Edi
     lead = videos[timeline]
     segment = lead.segments[number]
     model = segment.model
-    times = np.asarray(model.frame_times.times(), np.float64)
+    clip_times = lead.frame_times.times()[segment.first : segment.stop]
     parts = []
     for k, video in enumerate(videos):
         if k == timeline:
             parts.append(model)
-        elif isinstance(video, SegmentedVideo):
-            other = video.segments[number].model
-            own = np.asarray(other.frame_times.times(), np.float64)
-            parts.append(_TimeMap(times, own).convert(as_edited(other)))
-        else:
-            own = lead.frame_times.times()[segment.first : segment.stop]
-            parts.append(_TimeMap(times, own).convert(as_edited(video)))
+            continue
+        other = video.segments[number].model if isinstance(video, SegmentedVideo) else video
+        whole = frame_times_of(other) if isinstance(video, SegmentedVideo) else clip_times
+        parts.append(_convert(as_edited(other), TimeMap(frame_times_of(model), whole)))
     return stack_layers(*parts, timeline=timeline)
 
 
@@ -95,73 +89,39 @@ def _format_bounds(video: SegmentedVideo) -> str:
     return ", ".join(bounds if len(bounds) <= 6 else [*bounds[:5], "..."])
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _TimeMap:
-    """From the time of a segment to that of another video: `times` of the segment's frames, `own` the other's then."""
+def _convert(other: EditedVideo, time_map: TimeMap) -> EditedVideo:
+    """The other video in the segment's time; unchanged if the times are the same."""
+    if time_map.is_identity:
+        return other
+    return dataclasses.replace(other, layers=tuple(_convert_layer(layer, time_map) for layer in other.layers))
 
-    times: Float64[np.ndarray, " num_frames"]
-    own: Float64[np.ndarray, " num_frames"]
 
-    def convert(self, other: EditedVideo) -> EditedVideo:
-        """The other video in the segment's time; unchanged if the times are the same."""
-        if self._is_linear(0.0, 1.0):
-            return other
-        return dataclasses.replace(other, layers=tuple(map(self._convert_layer, other.layers)))
+def _convert_layer(layer: Layer, time_map: TimeMap) -> Layer:
+    layer = _drop_unseen(layer, time_map)
+    overlays = (_convert_overlay(overlay, time_map) for overlay in layer.overlays)
+    clock = Clock(*distinct_knots(time_map.own, time_map.whole))
+    retiming = Retiming(np.ones(layer.num_gaussians, bool), None, clock)  # the last clock is applied first
+    return Layer(layer.model, tuple(one for one in overlays if one is not None), (*layer.clocks, retiming))
 
-    def _is_linear(self, first: float, last: float) -> bool:
-        """Whether the map is linear, to `first` ... `last`."""
-        error = np.abs(first + self.times * (last - first) - self.own).max()
-        return bool(error * max(len(self.own) - 1, 1) <= _LINEAR_TOLERANCE * abs(last - first))
 
-    def _convert_layer(self, layer: Layer) -> Layer:
-        layer = self._drop_unseen(layer)
-        overlays = tuple(overlay for overlay in map(self._convert_overlay, layer.overlays) if overlay is not None)
-        clock = Retiming(np.ones(layer.num_gaussians, bool), None, self._clock())  # the last clock is applied first
-        return Layer(layer.model, overlays, (*layer.clocks, clock))
+def _drop_unseen(layer: Layer, time_map: TimeMap) -> Layer:
+    """Without the Gaussians that are not alive in the segment, unless a clock or a function may show them."""
+    functions = any(isinstance(overlay, GaussianFunction | TriangleFunction) for overlay in layer.overlays)
+    if layer.clocks or functions or layer.holds_frames:
+        return layer
+    times = np.clip(time_map.whole[[0, -1]] + [-_MARGIN, _MARGIN], 0.0, 1.0)
+    alive = by_time(layer.model, times, alive=True).indices
+    if not len(alive):
+        alive = np.arange(1)
+    num = layer.num_gaussians
+    return gather_layer(layer, alive, np.zeros(num, bool)) if len(alive) < num else layer
 
-    def _drop_unseen(self, layer: Layer) -> Layer:
-        """Without the Gaussians that are not alive in the segment, unless a clock or a function may show them."""
-        functions = any(isinstance(overlay, GaussianFunction | TriangleFunction) for overlay in layer.overlays)
-        if layer.clocks or functions or layer.holds_frames:
-            return layer
-        first, last = np.clip([self.own[0] - _MARGIN, self.own[-1] + _MARGIN], 0.0, 1.0)
-        alive = by_time(layer.model, (first, last), alive=True).indices
-        if not len(alive):
-            alive = np.arange(1)
-        num = layer.num_gaussians
-        return gather_layer(layer, alive, np.zeros(num, bool)) if len(alive) < num else layer
 
-    def _clock(self) -> Clock:
-        first, last = float(self.own[0]), float(self.own[-1])
-        if len(self.own) == 1:
-            return Clock.frozen(first)
-        if self._is_linear(first, last):
-            return Clock((0.0, 1.0), (first, last))
-        return Clock(*distinct_knots(self.times, self.own))
-
-    def _convert_overlay(self, overlay: AbstractOverlay) -> AbstractOverlay | None:
-        """The overlay in the segment's time; None if it has no effect there."""
-        if isinstance(overlay, GaussianFunction | TriangleFunction):
-            overlay = dataclasses.replace(overlay, function=FunctionOfTime(overlay.function, self._other_time))
-        if overlay.span is None:
-            return overlay
-        span = self._convert_span(overlay.span)
-        return None if span is NEVER and not is_active(overlay, 0.0) else dataclasses.replace(overlay, span=span)
-
-    def _convert_span(self, span: Span) -> Span:
-        first, last = float(self.own[0]), float(self.own[-1])
-        if (span.start is not None and span.start > last) or (span.stop is not None and span.stop <= first):
-            return NEVER
-        start = None if span.start is None or span.start <= first else self._segment_time(span.start)
-        stop = None if span.stop is None or span.stop > last else self._segment_time(span.stop)
-        if not span.times:
-            return Span(start, stop, curve=span.curve)
-        corners = np.unique(np.clip([first, last, *span.times, *self.own], first, last))
-        times, values = np.interp(corners, self.own, self.times), np.interp(corners, span.times, span.values)
-        return Span(start, stop, *distinct_knots(times, values), span.curve)
-
-    def _segment_time(self, own_time: float) -> float:
-        return float(np.interp(own_time, self.own, self.times))
-
-    def _other_time(self, t: float) -> float:
-        return float(np.interp(t, self.times, self.own))
+def _convert_overlay(overlay: AbstractOverlay, time_map: TimeMap) -> AbstractOverlay | None:
+    """The overlay in the segment's time; None if it has no effect there."""
+    if isinstance(overlay, GaussianFunction | TriangleFunction):
+        overlay = dataclasses.replace(overlay, function=time_map.convert_function(overlay.function))
+    if overlay.span is None:
+        return overlay
+    span = time_map.convert_span(overlay.span)
+    return None if span is NEVER and not is_active(overlay, 0.0) else dataclasses.replace(overlay, span=span)

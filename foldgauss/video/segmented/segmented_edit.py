@@ -11,22 +11,21 @@ from typing import Any
 import numpy as np
 from jaxtyping import ArrayLike
 
-from foldgauss._runtime.checks import check_signature, invalid, is_integer
+from foldgauss._runtime.checks import check_signature
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.editing.arguments import check_color, check_select_arguments, missing_attribute
 from foldgauss.video.editing.bake import mean_lightness
 from foldgauss.video.editing.chain import Edit, edit, start_chain
-from foldgauss.video.editing.clip_window import ClipWindow
 from foldgauss.video.editing.edited_video import EditedVideo, as_edited
 from foldgauss.video.editing.overlays import LUMINANCE_WEIGHTS
 from foldgauss.video.editing.span import When
+from foldgauss.video.editing.time_map import TimeMap, frame_times_of
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.criteria import CriteriaEvaluator
-from foldgauss.video.segmented.segmented_selection import SegmentedSelection
 from foldgauss.video.segmented.segmented_video import MAX_PREPARED, Segment, SegmentedVideo
-from foldgauss.video.selection.selectors import Selection, list_criteria, select
+from foldgauss.video.selection.selectors import Mask, Selection, check_mask, list_criteria, select, split_mask
 
 #: The methods that may change the number or the order of the Gaussians, or hide some of them.
 _CHANGE_INDICES = ("multiply", "vanish", "opacity", "to_front", "to_back")
@@ -78,10 +77,10 @@ class SegmentedEdit:
     """
 
     _video: SegmentedVideo
-    _stand_in: Edit = dataclasses.field(repr=False)  # of one Gaussian in a clip as long: arguments are checked on it
+    # Of one Gaussian in a clip as long, selected unless the selection is known to be empty: checks arguments.
+    _stand_in: Edit = dataclasses.field(repr=False)
     _calls: tuple[_Call, ...] = dataclasses.field(default=(), repr=False)
-    _known: SegmentedSelection | None = dataclasses.field(default=None, repr=False)  # the selection, where it is known
-    _is_empty: bool = dataclasses.field(default=False, repr=False)  # whether the selection is known to be empty
+    _known: tuple[Selection, ...] | None = dataclasses.field(default=None, repr=False)  # by segment, where it is known
     _same_indices: bool = dataclasses.field(default=True, repr=False)  # as at the start of the chain
     _context: AbstractContextManager = dataclasses.field(default_factory=nullcontext, repr=False)
 
@@ -116,27 +115,24 @@ class SegmentedEdit:
     # ------------------------------------------------------------------------------------------- selection
 
     @property
-    def selection(self) -> SegmentedSelection:
-        """The current selection; the models are loaded if it is not known."""
-        if self._known is not None:
-            return self._known
-        return SegmentedSelection(tuple(self._replay(number).selection for number in self._numbers))
+    def selection(self) -> Selection:
+        """The current selection, of one segment after another; the models are loaded if it is not known."""
+        known = (self._replay(number).selection for number in self._numbers) if self._known is None else self._known
+        return Selection(np.concatenate([part.mask for part in known]))
 
     def select(
         self,
-        selection: SegmentedSelection | Callable[[SegmentedVideo], SegmentedSelection] | None = None,
+        selection: Selection | Mask | Callable[[SegmentedVideo], Selection] | None = None,
         *,
         layer: int | None = None,
         **criteria: Any,
     ) -> "SegmentedEdit":
         """Choose the Gaussians that the next edits apply to, from all Gaussians; without arguments, all of them.
 
-        As `Edit.select`; a selection is a `SegmentedSelection` or a function of `video()` that returns one. Criteria
-        are evaluated at once, on one model after another.
+        As `Edit.select`; a mask is over the Gaussians of one segment after another. Criteria are evaluated at once, on
+        one model after another.
         """
         check_select_arguments(selection, criteria)
-        if layer is not None and not is_integer(layer, 0):
-            raise invalid("layer", expected="a whole number >= 0", got=layer)
         if criteria:
             inspect.signature(select).bind(None, **criteria)
             return self._select_current(self._evaluator(layer).evaluate(list_criteria(**criteria)))
@@ -144,33 +140,26 @@ class SegmentedEdit:
             return self._record_selection(lambda one, number: one.select(layer=layer), None)
         if callable(selection):
             check_signature("selection", selection, "video")
-            return self._select_current(self._check_selection(selection(self.video())))
-        self._check_selection(selection)
-        known = selection if self._same_indices and layer is None else None
-        return self._record_selection(lambda one, number: one.select(selection.parts[number], layer=layer), known)
+            video = self.video()
+            return self._select_current(_split_selection(selection(video), _segment_sizes(video)))
+        counts = _segment_sizes(self._video) if layer is None else [self._layer_size(k, layer) for k in self._numbers]
+        parts = _split_selection(selection, counts)
+        known = parts if self._same_indices and layer is None else None
+        return self._record_selection(lambda one, number: one.select(parts[number], layer=layer), known)
 
-    def select_begun(self, selection: SegmentedSelection) -> "SegmentedEdit":
-        """Select from the Gaussians at the start of the chain, together with their copies: see `Edit.select_begun`."""
-        self._check_selection(selection)
-        known = selection if self._same_indices else None
-        return self._record_selection(lambda one, number: one.select_begun(selection.parts[number]), known)
-
-    def _select_current(self, selection: SegmentedSelection) -> "SegmentedEdit":
+    def _select_current(self, parts: Sequence[Selection]) -> "SegmentedEdit":
         """Select from the current Gaussians."""
-        return self._record_selection(
-            lambda one, number: dataclasses.replace(one, selection=selection.parts[number]), selection
-        )
+        return self._record_selection(lambda one, number: dataclasses.replace(one, selection=parts[number]), parts)
 
-    def _record_selection(self, act: Callable[[Edit, int], Edit], known: SegmentedSelection | None) -> "SegmentedEdit":
-        call = _Call(act, self._context, always=True)
-        return dataclasses.replace(self, _calls=(*self._calls, call), _known=known, _is_empty=False)
+    def _record_selection(self, act: Callable[[Edit, int], Edit], known: Sequence[Selection] | None) -> "SegmentedEdit":
+        call, is_empty = _Call(act, self._context, always=True), known is not None and not any(map(len, known))
+        stand_in = _deselect_all(self._stand_in) if is_empty else self._stand_in.select()
+        return dataclasses.replace(self, _stand_in=stand_in, _calls=(*self._calls, call), _known=known)
 
-    def _check_selection(self, selection: object) -> SegmentedSelection:
-        if not isinstance(selection, SegmentedSelection):
-            cure = "edit(video).select(...).selection is one."
-            raise invalid("selection", expected="a SegmentedSelection", got=type(selection).__name__, cure=cure)
-        selection.check_segments(len(self._video.segments))
-        return selection
+    def _layer_size(self, number: int, layer: int) -> int:
+        """The number of Gaussians of a layer of a segment, at the start of the chain."""
+        one = self._start(number)
+        return sum(one._counts[k] for k in one._layer_numbers(layer))
 
     def _evaluator(self, layer: int | None) -> CriteriaEvaluator:
         stand_in = self._stand_in._video.layers[0].model
@@ -216,20 +205,18 @@ class SegmentedEdit:
             self,
             _calls=(*self._calls, call),
             _known=self._known if keeps_indices else None,
-            _is_empty=self._is_empty or not len(after.selection),
+            _stand_in=self._stand_in if len(after.selection) else _deselect_all(self._stand_in),
             _same_indices=self._same_indices and keeps_indices,
         )
 
     def _try(self, name: str, args: Sequence[Any], kwargs: dict[str, Any]) -> Edit:
         """Make a call on the stand-in, to check its arguments; its warnings are raised for the user's line."""
-        is_empty = self._is_empty or (self._known is not None and not len(self._known))
-        trial = _deselect_all(self._stand_in) if is_empty else self._stand_in
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            after = getattr(trial, name)(*args, **kwargs)
+            after = getattr(self._stand_in, name)(*args, **kwargs)
         for warning in caught:
             warnings.warn(warning.message, stacklevel=4)
-        return _deselect_all(after) if is_empty else after
+        return after
 
     def _replay(self, number: int) -> Edit:
         """Load a segment and replay all calls on it."""
@@ -237,9 +224,11 @@ class SegmentedEdit:
 
     def _start(self, number: int) -> Edit:
         segment = self._video.segments[number]
-        model = segment.model
-        times = np.asarray(model.frame_times.times(), np.float64)
-        return start_chain(as_edited(model), ClipWindow(times, segment.first, self._video.num_frames))
+        video, clip_times = as_edited(segment.model), self._video.frame_times.times()
+        time_map = TimeMap(frame_times_of(video), clip_times[segment.first : segment.stop])
+        if len(clip_times) == segment.num_frames and time_map.is_identity:
+            return start_chain(video)
+        return start_chain(video, clip_times, time_map)
 
     def _replay_calls(self, one: Edit, number: int, acted: set[int]) -> Edit:
         """The chain of a segment after all calls; the numbers of the calls that were not skipped go to `acted`."""
@@ -257,6 +246,15 @@ def _is_same(one: EditedVideo, other: EditedVideo) -> bool:
     """Whether nothing was edited: an edited layer or camera is another object."""
     pairs = zip(one.layers, other.layers, strict=True)
     return one.camera is other.camera and all(layer is before for layer, before in pairs)
+
+
+def _segment_sizes(video: SegmentedVideo) -> list[int]:
+    return [segment.num_gaussians for segment in video.segments]
+
+
+def _split_selection(selection: object, counts: list[int]) -> list[Selection]:
+    """By segment, from a selection in all."""
+    return list(map(Selection, split_mask(check_mask(selection, sum(counts)), counts)))
 
 
 def _deselect_all(one: Edit) -> Edit:
@@ -280,5 +278,4 @@ def _(video: SegmentedVideo) -> SegmentedEdit:
     splats = FoldedSplats(**leaves, envelope=TimeLikelihood(2.0))
     times = FrameTimes.uniform(video.num_frames)
     model = VideoModel(splats, times, video.size, video.fps, video.options, video.compositing)
-    window = ClipWindow(video.frame_times.times(), 0, video.num_frames)
-    return SegmentedEdit(video, start_chain(as_edited(model), window))
+    return SegmentedEdit(video, edit(model))

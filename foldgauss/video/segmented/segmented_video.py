@@ -16,7 +16,7 @@ from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.frame_times import check_frame_before, times_at
 from foldgauss.video.models.rendered_video import RenderedVideo
 from foldgauss.video.models.renderer import PreparedVideo
-from foldgauss.video.models.video_model import VideoModel, check_time
+from foldgauss.video.models.video_model import VideoModel
 
 #: Models that are kept prepared at once; as many as are visible, where more are (between the last frame of one fade and
 #: the first frame of the next).
@@ -183,14 +183,6 @@ class SegmentedVideo(RenderedVideo):
         """The video prepared for conditioning on many times, for images of `size`."""
         return PreparedSegmentedVideo(self, size)
 
-    def at(self, t: float, size: tuple[int, int] | None = None) -> Splats2D:
-        """The splats of time t, front to back, in pixels of an image of `size` (default: its own); NumPy leaves.
-
-        In a cross-fade they are those of the model with the larger weight.
-        """
-        check_time(t)
-        return self.prepare(self.size if size is None else size).splats(float(t))
-
     def position(self, t: float) -> float:
         """The frame position at time t: 2.5 is half way from frame 2 to frame 3."""
         position = float(min(max(float(t), 0.0), 1.0) * (self.num_frames - 1))
@@ -232,10 +224,7 @@ class PreparedSegmentedVideo:
 
     def splats(self, t: float) -> Splats2D:
         """The splats of time t of the segment with the largest weight; NumPy leaves."""
-        position = self._video.position(t)
-        number, _ = max(self._video.weights(position), key=lambda pair: pair[1])
-        prepared, time = self._prepare_at(number, position, MAX_PREPARED)
-        return prepared.splats(time)
+        return max(self.weighted_splats(t), key=lambda part: part[0])[1]
 
     def weighted_splats(self, t: float) -> list[tuple[float, Splats2D]]:
         """The splats of the segments that are visible at time t, see `PreparedVideo`."""
@@ -248,61 +237,38 @@ class PreparedSegmentedVideo:
 
     def _prepare_at(self, number: int, position: float, max_kept: int) -> tuple[PreparedVideo, np.ndarray]:
         """A prepared segment, one of at most `max_kept`, and its own time at a frame position of the clip."""
-        prepared, times = self._prepare(number, max_kept)
-        return prepared, times_at(times, position - self._video.segments[number].first)
-
-    def _prepare(self, number: int, max_kept: int) -> tuple[PreparedVideo, np.ndarray]:
+        segment = self._video.segments[number]
         if number not in self._kept:
             while len(self._kept) >= max_kept:
                 self._kept.popitem(last=False)  # before the next one is loaded, to free its memory
-            model = self._video.segments[number].model
+            model = segment.model
             self._kept[number] = model.prepare(self._size), np.asarray(model.frame_times.times())
         self._kept.move_to_end(number)
-        return self._kept[number]
+        prepared, times = self._kept[number]
+        return prepared, times_at(times, position - segment.first)
 
 
 def _check_segments(segments: tuple[Segment, ...]) -> None:
     """Raise unless they cover a clip in their order, at most two at a frame, and are rendered alike."""
     if not segments:
         raise invalid("segments", expected="at least one", got="none")
+    first_low, first_high, last_stop = 0, 0, 0  # of the next segment
     for number, segment in enumerate(segments):
+        name = f"segments[{number}]"
         if not isinstance(segment, Segment):
             cure = "From models: SegmentedVideo.from_models([(first, model), ...])."
-            raise invalid(f"segments[{number}]", expected="a Segment", got=short_repr(segment), cure=cure)
-        if not is_integer(segment.first, 0):
-            expected = "the number of a frame of the clip"
-            raise invalid(f"segments[{number}].first", expected=expected, got=short_repr(segment.first))
-    if segments[0].first != 0:
-        cure = "Count frames from that of the first segment."
-        raise invalid("segments", expected="the first one to begin at frame 0", got=segments[0].first, cure=cure)
-    for number, (one, other) in enumerate(pairwise(segments)):
-        _check_neighbors(number, one, other)
-        _check_alike(number + 1, segments[0], other)
-    for number, (one, other) in enumerate(zip(segments, segments[2:], strict=False)):
-        if other.first < one.stop:
-            expected = f"segment {number + 2} to begin at frame {one.stop} or later, where segment {number} has ended"
-            cure = "At most two segments share a frame: leave one out, or let them overlap less."
-            raise invalid("segments", expected=expected, got=f"frame {other.first}", cure=cure)
-
-
-def _check_neighbors(number: int, one: Segment, other: Segment) -> None:
-    if not (one.first < other.first and one.stop < other.stop):
-        expected = f"segment {number + 1} to begin and to end after segment {number}, {one.first}:{one.stop}"
-        cure = "Give them in the order of the clip, none within another."
-        raise invalid("segments", expected=expected, got=f"{other.first}:{other.stop}", cure=cure)
-    if other.first > one.stop:
-        expected = f"segment {number + 1} to begin at frame {one.stop} at the latest, where segment {number} ends"
-        cure = f"Also fit frames {one.stop}:{other.first}."
-        raise invalid("segments", expected=expected, got=f"frame {other.first}", cure=cure)
-
-
-def _check_alike(number: int, lead: Segment, other: Segment) -> None:
-    for name in ("size", "fps", "compositing", "options"):
-        one, two = getattr(lead, name), getattr(other, name)
-        if one != two:
-            expected = f"{one!r}, that of the first segment"
-            cure = "They are rendered as one video: fit them alike."
-            raise invalid(f"segments[{number}].{name}", expected=expected, got=repr(two), cure=cure)
+            raise invalid(name, expected="a Segment", got=short_repr(segment), cure=cure)
+        if not (is_integer(segment.first, first_low) and segment.first <= first_high and segment.stop > last_stop):
+            expected = f"one that begins at frame {first_low} to {first_high} of the clip and ends after {last_stop}"
+            got = f"{short_repr(segment.first)}, and {segment.num_frames} frames"
+            cure = "Segments begin at frame 0, leave no gap, and at most two share a frame."
+            raise invalid(f"{name}.first", expected=expected, got=got, cure=cure)
+        for prop in ("size", "fps", "compositing", "options"):
+            one, two = getattr(segments[0], prop), getattr(segment, prop)
+            if one != two:
+                expected, cure = f"{one!r}, as in the first segment", "They are rendered as one video: fit them alike."
+                raise invalid(f"{name}.{prop}", expected=expected, got=repr(two), cure=cure)
+        first_low, first_high, last_stop = max(segment.first + 1, last_stop), segment.stop, segment.stop
 
 
 def plan_segments(num_frames: int, cuts: Sequence[int], *, length: int, overlap: int) -> list[tuple[int, int]]:

@@ -188,17 +188,3 @@ def render_matte(
     chosen = mask[frame.alive]
     own, everyone = frame.render(np.stack([chosen, np.ones_like(chosen)], 1))
     return np.divide(own, everyone, out=np.zeros_like(own), where=everyone > 0)
-
-
-def find_influence(
-    contributions: Contributions, mask: Bool[np.ndarray, " num_gaussians"], t: float
-) -> Bool[np.ndarray, "height width"]:
-    """The pixels at time t where a Gaussian of `mask` has an alpha above the cutoff, visible or occluded."""
-    splats = contributions.at(t).splats
-    chosen = mask[splats.alive]
-    leaves = splats.mean[chosen], splats.factor[chosen], splats.opacity[chosen]
-    white = np.ones((int(chosen.sum()), 3), np.float32)
-    # In a sum nothing is occluded.
-    options = contributions.model.options
-    trace = cpu.forward(*leaves, white, _BLACK, contributions.size, compositing="sum", options=options)
-    return trace.image[0] > 0

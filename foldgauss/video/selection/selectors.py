@@ -2,14 +2,17 @@
 
 import dataclasses
 import functools
+import inspect
 import logging
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, Float32, Int, Int8
 
-from foldgauss._runtime.checks import invalid, is_integer
+from foldgauss._runtime.checks import invalid, is_integer, short_repr
+from foldgauss.render import cpu
 from foldgauss.video.models.splats import SH_C0
 from foldgauss.video.models.video_model import VideoModel, check_model, check_time
 from foldgauss.video.motion.background_plate import SIDE
@@ -17,7 +20,6 @@ from foldgauss.video.motion.moving_object import LEAST_FRAMES, find_moving_objec
 from foldgauss.video.selection.contributions import (
     Contributions,
     average_seen_colors,
-    find_influence,
     render_matte,
     sum_contributions,
     update_best,
@@ -54,11 +56,15 @@ COLOR_TOLERANCE = 10.0
 CLICK_TOLERANCE = 15.0
 
 
+Mask = Bool[np.ndarray, "num"]
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Selection:
-    """A set of Gaussians of one model, with the operations of sets: `|`, `&`, `-`, `^`, `~`, `==`, `len`, `in`.
+    """A set of Gaussians of one video, with the operations of sets: `|`, `&`, `-`, `^`, `~`, `==`, `len`, `in`.
 
-    **Shapes:** `mask` is bool (num_gaussians,), in the model's array order; it is copied and cannot be written to.
+    **Shapes:** `mask` is bool (num_gaussians,), in the model's array order, of segments and of layers one after
+    another; it is copied and cannot be written to.
 
     **Example:** `moving = by_box(model, (10, 10, 50, 40), frame=0) - by_color(model, (0, 1, 0), tolerance=20)`.
 
@@ -79,26 +85,22 @@ class Selection:
     def of(cls, model: VideoModel, indices: Int[np.ndarray, " num"]) -> "Selection":
         """The Gaussians with these indices. Raises ValueError for indices that the model does not have."""
         check_model(model)
-        indices, num = np.asarray(indices), model.splats.num_gaussians
-        if indices.size == 0:
-            return cls.none(model)
-        if indices.ndim != 1 or indices.dtype.kind not in "iu" or indices.min() < 0 or indices.max() >= num:
-            raise invalid("indices", expected=f"whole numbers in [0, {num})", got=indices)
-        mask = np.zeros(num, bool)
-        mask[indices] = True
+        indices, mask = np.asarray(indices), np.zeros(model.splats.num_gaussians, bool)
+        if indices.size:
+            if indices.ndim != 1 or indices.dtype.kind not in "iu" or indices.min() < 0 or indices.max() >= len(mask):
+                raise invalid("indices", expected=f"whole numbers in [0, {len(mask)})", got=indices)
+            mask[indices] = True
         return cls(mask)
 
     @classmethod
     def all(cls, model: VideoModel) -> "Selection":
         """Every Gaussian."""
-        check_model(model)
-        return cls(np.ones(model.splats.num_gaussians, bool))
+        return ~cls.none(model)
 
     @classmethod
     def none(cls, model: VideoModel) -> "Selection":
         """No Gaussian."""
-        check_model(model)
-        return cls(np.zeros(model.splats.num_gaussians, bool))
+        return cls.of(model, ())
 
     @property
     def indices(self) -> Int[np.ndarray, " num_selected"]:
@@ -147,6 +149,28 @@ class Selection:
         return other.mask
 
 
+def check_mask(selection: object, num: int) -> Mask:
+    """The mask of a `Selection`, or a mask itself. Raises ValueError for anything but those of `num` Gaussians."""
+    if isinstance(selection, str | os.PathLike):
+        cure = "Read a file with foldgauss.io.load_selection(path, model)."
+        raise invalid("selection", expected="a Selection or a mask", got=repr(selection), cure=cure)
+    mask = np.asarray(selection.mask if isinstance(selection, Selection) else selection)
+    if mask.dtype == bool and mask.shape == (num,):
+        return mask
+    cure = "Is it another model's? For Gaussians after edits: select(lambda video: mask)."
+    if mask.ndim > 1:
+        cure = "For a mask of pixels: select(mask=mask, frame=k)."
+    elif mask.dtype.kind in "iu":
+        cure = "For indices of Gaussians: Selection.of(model, [...])."
+    expected = f"a Selection or mask of {num:,} Gaussians"
+    raise invalid("selection", expected=expected, got=f"{mask.dtype} {mask.shape}", cure=cure)
+
+
+def split_mask(mask: Mask, counts: Sequence[int]) -> list[Mask]:
+    """The masks of several parts, from a mask over all."""
+    return np.split(mask, np.cumsum(counts)[:-1])
+
+
 def select(
     model: VideoModel,
     *,
@@ -179,71 +203,65 @@ def select(
 
     **Raises:** ValueError without any criterion, for options of a criterion not given, and as the functions.
     """
-    given = {"mask": mask, "box": box, "polygon": polygon, "color": color, "click": click}
-    given |= {"moving": moving, "times": times}
-    where = {"frame": frame, "frames": frames, "tolerance": tolerance}
-    criteria = list_criteria(**given, **where, alive=alive, threshold=threshold, follow=follow)
+    criteria = list_criteria(
+        mask=mask,
+        box=box,
+        polygon=polygon,
+        color=color,
+        click=click,
+        moving=moving,
+        times=times,
+        frame=frame,
+        frames=frames,
+        tolerance=tolerance,
+        alive=alive,
+        threshold=threshold,
+        follow=follow,
+    )
     return functools.reduce(Selection.__and__, [function(model, **options) for function, options in criteria])
 
 
-def list_criteria(
-    *,
-    mask: Masks | None = None,
-    box: tuple[float, float, float, float] | None = None,
-    polygon: Float[ArrayLike, "corners 2"] | None = None,
-    color: tuple[float, float, float] | None = None,
-    click: tuple[float, float] | None = None,
-    moving: bool = False,
-    times: tuple[float, float] | None = None,
-    frame: int | None = None,
-    frames: tuple[int, int] | None = None,
-    tolerance: float | None = None,
-    alive: bool = False,
-    threshold: float = THRESHOLD,
-    follow: bool = True,
-) -> list[tuple[Callable[..., Selection], dict[str, Any]]]:
-    """The criteria of `select`: functions such as `by_mask`, each with its arguments except the model.
+#: The criteria that each option of `select` belongs to.
+_OPTIONS = {
+    "frame": ("mask", "box", "polygon", "click", "frames"),
+    "frames": ("mask", "box", "polygon", "frames"),
+    "threshold": ("mask", "box", "polygon", "moving"),
+    "follow": ("mask", "box", "polygon"),
+    "tolerance": ("color", "click"),
+    "alive": ("times", "frames"),
+}
+
+
+def list_criteria(**arguments: Any) -> list[tuple[Callable[..., Selection], dict[str, Any]]]:
+    """The criteria among the arguments of `select`: functions such as `by_mask`, each with its arguments, no model.
 
     Raises ValueError as `select`, where that does not depend on the model.
     """
-    where = {"frame": frame, "frames": frames}
-    own_tolerance = {} if tolerance is None else {"tolerance": tolerance}
-    found: list[tuple[Callable[..., Selection], dict[str, Any]]] = []
-    for name, value, function in (("mask", mask, by_mask), ("box", box, by_box), ("polygon", polygon, by_polygon)):
-        if value is not None:
-            found.append((function, {name: value, **where, "threshold": threshold, "follow": follow}))
-    regional = bool(found)
-    placed = regional or click is not None
-    if not isinstance(moving, bool | np.bool_):
-        raise invalid("moving", expected="True or False", got=repr(moving))
-    if moving:
-        found.append((by_motion, {"threshold": threshold}))
-    timed = times is not None or not (placed or (frame is None and frames is None))
-    for name, misplaced, wanted in (
-        ("threshold", threshold != THRESHOLD and not (regional or moving), "a mask, box, polygon or moving with it"),
-        ("follow", not follow and not regional, "a mask, box or polygon with it"),
-        ("alive", alive and not timed, "times or frames with it"),
-    ):
-        if misplaced:
-            raise invalid(name, expected=wanted, got="none")
-    if click is not None and frames is not None:
-        raise invalid("frames", expected="none with a click", got=repr(frames), cure="Give frame=k, that of the click.")
-    if tolerance is not None and color is None and click is None:
-        raise invalid("tolerance", expected="color or click with it", got="neither")
-    if color is not None:
-        found.append((by_color, {"color": color, **own_tolerance}))
-    if click is not None:
-        if frame is None:
-            raise invalid("frame", expected="the frame that was clicked in", got="none", cure="Give frame=k.")
-        found.append((by_click, {"click": click, "frame": frame, **own_tolerance}))
-    if times is not None:
-        found.append((by_time, {"times": times, "alive": alive}))
-    if not placed and (frame is not None or frames is not None):
-        found.append((by_time, {**where, "alive": alive}))
+    defaults = {name: parameter.default for name, parameter in inspect.signature(select).parameters.items()}
+    arguments = {name: bool(value) if isinstance(value, np.bool_) else value for name, value in arguments.items()}
+    given = {name: value for name, value in arguments.items() if value is not defaults[name]}
+    if not isinstance(given.get("moving", True), bool):
+        raise invalid("moving", expected="True or False", got=repr(given["moving"]))
+    functions = {"mask": by_mask, "box": by_box, "polygon": by_polygon, "moving": by_motion, "color": by_color}
+    functions |= {"click": by_click, "times": by_time}
+    found = {name: {name: given[name]} for name in functions if name in given}
+    if not found.keys() & {"mask", "box", "polygon", "click"} and given.keys() & {"frame", "frames"}:
+        found["frames"] = {}  # a criterion of its own
     if not found:
         cure = "Selection.all(model) is everything."
         raise invalid("select", expected="at least one criterion", got="none", cure=cure)
-    return found
+    for option in given.keys() & _OPTIONS.keys():
+        users = [name for name in _OPTIONS[option] if name in found]
+        if not users:
+            cure = "For the frame of a click: frame=k." if "click" in found else ""
+            expected = f"one of {', '.join(_OPTIONS[option])} with it"
+            raise invalid(option, expected=expected, got=short_repr(given[option]), cure=cure)
+        for name in users:
+            found[name][option] = given[option]
+    if "click" in found and "frame" not in given:
+        raise invalid("frame", expected="the frame that was clicked in", got="none", cure="Give frame=k.")
+    found.get("moving", {}).pop("moving", None)
+    return [(functions.get(name, by_time), options) for name, options in found.items()]
 
 
 def contribution(
@@ -401,7 +419,14 @@ def by_time(
     if (times is not None) + (frame is not None) + (frames is not None) != 1:
         raise invalid("times, frames, frame", expected="one of them", got="several or none")
     contributions = Contributions(model)
-    start, stop = _resolve_span(contributions, times, frame, frames, widen=not alive)
+    if times is not None:
+        start, stop = check_times(times)
+    else:
+        chosen, last = resolve_frames(model, frame, frames), model.num_frames - 1
+        margin = 0.0 if alive else 0.5
+        ends = (chosen[0] - margin, chosen[-1] + margin)
+        # A single frame covers all times.
+        start, stop = np.interp(ends, np.arange(last + 1), contributions.times) if last or alive else (0.0, 1.0)
     if alive:
         return Selection((contributions.window[:, 0] < stop) & (start < contributions.window[:, 1]))
     own = contributions.own_times
@@ -455,7 +480,12 @@ def influence(model: VideoModel, selection: Selection, t: float) -> Bool[np.ndar
     """
     contributions, mask = _prepare(model, selection)
     check_time(t)
-    return find_influence(contributions, mask, t)
+    splats = contributions.at(t).splats
+    chosen = mask[splats.alive]
+    white, black = np.ones((int(chosen.sum()), 3), np.float32), np.zeros(3, np.float32)
+    # In a sum nothing is occluded.
+    leaves = splats.mean[chosen], splats.factor[chosen], splats.opacity[chosen], white, black
+    return cpu.forward(*leaves, model.size, compositing="sum", options=model.options).image[0] > 0
 
 
 def _prepare(model: VideoModel, selection: Selection) -> tuple[Contributions, Bool[np.ndarray, " num_gaussians"]]:
@@ -499,21 +529,3 @@ def _label_by_position(
         fraction = region.at(k)[row.clip(0, height - 1), column.clip(0, width - 1)]
         label[own] = np.where(visible & (fraction >= 0.5), IN, OUT)
     return label
-
-
-def _resolve_span(
-    contributions: Contributions,
-    times: tuple[float, float] | None,
-    frame: int | None,
-    frames: tuple[int, int] | None,
-    *,
-    widen: bool,
-) -> tuple[float, float]:
-    """The span of time from first to last; of frames, half a frame wider on either side if `widen`."""
-    if times is None:
-        chosen, num_frames = resolve_frames(contributions.model, frame, frames), len(contributions.times)
-        if widen and num_frames == 1:
-            return 0.0, 1.0  # a single frame covers all times
-        ends = np.array([chosen[0], chosen[-1]]) + (np.array([-0.5, 0.5]) if widen else 0)
-        return tuple(np.interp(ends, np.arange(num_frames), contributions.times))
-    return check_times(times)
