@@ -413,11 +413,7 @@ def _solved(coefficients: Float[Array, "16"], value: Array) -> Array:
     return jnp.where(slope > 0, jnp.clip(y + step, -1, 1), y)
 
 
-def _legendre_matrices() -> tuple[np.ndarray, np.ndarray]:
-    """Values at the nodes -> Legendre coefficients of their interpolant, and of its integral from -1."""
-    legendre = np.polynomial.legendre
-    coefficients = np.linalg.inv(legendre.legvander(KRONROD_NODES, 14))
-    return coefficients, np.stack([legendre.legint(column, lbnd=-1) for column in coefficients.T], axis=1)
-
-
-_INTERPOLATING, _CUMULATIVE = _legendre_matrices()
+#: Values at the nodes -> Legendre coefficients of their interpolant.
+_INTERPOLATING = np.linalg.inv(np.polynomial.legendre.legvander(KRONROD_NODES, 14))
+#: Values at the nodes -> Legendre coefficients of its integral from -1.
+_CUMULATIVE = np.stack([np.polynomial.legendre.legint(column, lbnd=-1) for column in _INTERPOLATING.T], axis=1)

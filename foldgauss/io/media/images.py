@@ -36,7 +36,10 @@ _MAGIC = (b"\x89PNG\r\n\x1a\n", b"GIF8", b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"
 _PIXELS_PER_BYTE = {"PNG": 8 * 1032, "JPEG": 8 * 64}
 #: OpenCV's LOG_LEVEL_SILENT, which has no name up to OpenCV 4.
 _LOG_LEVEL_SILENT = 0
-_BITS, _EXTRA_SAMPLES = 258, 338  # tags of a TIFF
+#: Tag of a TIFF: bits per sample.
+_BITS = 258
+#: Tag of a TIFF: the kinds of further samples.
+_EXTRA_SAMPLES = 338
 
 
 @contextmanager

@@ -47,8 +47,10 @@ from foldgauss.video.selection.selectors import by_motion
 HTML_SUFFIX = ".html"
 #: WebP quality of the original's frames.
 QUALITY = 80
-#: Bytes above which browsers open a page slowly, and above which notebooks do not show it automatically.
-LARGE, LARGEST_IN_NOTEBOOK = 50e6, 20e6
+#: Bytes above which browsers open a page slowly.
+LARGE = 50e6
+#: Bytes above which notebooks do not show a page automatically.
+LARGEST_IN_NOTEBOOK = 20e6
 _SOURCES = Path(__file__).parent / "player"
 _DECODER = Path(__file__).parent / "compact.js"
 _IMPORT = re.compile(r'^import (?:(?P<names>\{[^}]*\})|(?P<text>\w+)) from "\./(?P<name>[\w.-]+)";\n', re.MULTILINE)

@@ -25,7 +25,10 @@ from foldgauss.uncertainty.posterior.result import FrameTimePosterior
 
 __all__ = ["plot_correlation", "plot_increments", "plot_times"]
 
-_BLUE, _RED, _GRAY, _ORANGE = "#1f4e79", "#d1242f", "#57606a", "#bc4c00"
+_BLUE = "#1f4e79"
+_RED = "#d1242f"
+_GRAY = "#57606a"
+_ORANGE = "#bc4c00"
 _FLAG = {"duplicated": (_RED, "v"), "dropped": (_ORANGE, "^")}
 
 

@@ -21,13 +21,18 @@ from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves
 from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.video.models.video_model import VideoModel
 
-#: Profiles extend until the base has fallen by REACH nats, then until they have fallen by FALL nats themselves.
-REACH, FALL = 12.0, 8.0
-#: Nodes are inserted between two that differ by more than STEP nats, up to MAX_NODES.
-STEP, MAX_NODES = 1.5, 13
-#: Relative residuals of the solver: the error of the quadratic form, some 1e5 nats, is of the order of the square of
-#: the first; that of the change of the log-determinant, some nats, of the order of the second.
-TOLERANCE, TRACE_TOLERANCE = 1e-5, 1e-3
+#: Profiles extend until the base has fallen by so many nats,
+REACH = 12.0
+#: then until they have fallen by so many nats themselves.
+FALL = 8.0
+#: Nodes are inserted between two that differ by more nats than this.
+STEP = 1.5
+#: The most nodes.
+MAX_NODES = 13
+#: Relative residual of the solver: the error of the quadratic form, some 1e5 nats, is of the order of its square.
+TOLERANCE = 1e-5
+#: Relative residual for traces: the error of the change of the log-determinant, some nats, is of its order.
+TRACE_TOLERANCE = 1e-3
 
 
 def marginalize_colors(

@@ -24,26 +24,38 @@ from foldgauss.video.models.video_model import VideoModel
 
 #: Coarse nodes in each interval between two frame times.
 COARSE = 4
-#: A profile is refined wherever it can come within DEPTH nats of its maximum, until the cubic predicts the value half
-#: way to MISS nats plus MISS_FRACTION of the distance from the maximum, and images of adjacent nodes differ by at most
-#: TRAVEL nats, or until nodes are FINEST of a coarse step apart.
-DEPTH, MISS, MISS_FRACTION, TRAVEL, FINEST = 25.0, 0.02, 0.02, 4.0, 1 / 512
+#: A profile is refined wherever it can come within so many nats of its maximum,
+DEPTH = 25.0
+#: until the cubic predicts the value half way to so many nats
+MISS = 0.02
+#: plus this fraction of the distance from the maximum,
+MISS_FRACTION = 0.02
+#: and images of adjacent nodes differ by at most so many nats,
+TRAVEL = 4.0
+#: or until nodes are this fraction of a coarse step apart.
+FINEST = 1 / 512
 #: Factor on distances of sketches, which have errors of about 6%.
 CAUTION = 1.2
 #: A profile that rises by less than this many nats does not identify the time of its frame.
 FLAT = 0.5
-#: Clips of up to this many frames are compared at all times, longer ones at first within REACH frames.
-MOST_EVERYWHERE, REACH = 400, 100
+#: Clips of up to this many frames are compared at all times,
+MOST_EVERYWHERE = 400
+#: longer ones at first within so many frames.
+REACH = 100
 #: Standard deviation of rounding to 8 bits, the lower bound of the noise.
 LEAST_SCALE = 1 / (255 * np.sqrt(12))
 #: Slopes dR/dt are central differences over this many of the finest steps.
 SLOPE_STEP = 64
-#: A model must explain this fraction of the frames' variance; and a warning is given if its squared error exceeds this
-#: multiple of the mean frame's, as that of a model of another clip of the same scene may.
-EXPLAINED, WORSE_THAN_MEAN = 0.2, 1.5
+#: A model must explain this fraction of the frames' variance.
+EXPLAINED = 0.2
+#: A warning is given if a frame's squared error exceeds this multiple of the mean frame's, as that of a model of
+#: another clip of the same scene may.
+WORSE_THAN_MEAN = 1.5
 _RIGHT_MODEL = "Give the model of this video, at its size and crop."
-#: A warning is given if the first or last frame fits better by PINNED nats at a time AWAY frames from 0 or 1.
-PINNED, AWAY = 10.0, 0.5
+#: A warning is given if the first or last frame fits better by so many nats
+PINNED = 10.0
+#: at a time so many frames from 0 or 1.
+AWAY = 0.5
 
 
 @dataclasses.dataclass(frozen=True)

@@ -33,8 +33,10 @@ STARTS = ("model", "scratch")
 START_AT = 0.7
 #: The least `LearningRates.cooldown` of refits: the spread is that of the estimate, not of its last steps.
 COOLDOWN_FRACTION = 0.2
-#: Grid search for the time of a left-out frame: points per grid, and number of ever finer grids.
-GRID_POINTS, GRID_ROUNDS = 33, 3
+#: Grid search for the time of a left-out frame: points per grid.
+GRID_POINTS = 33
+#: Number of ever finer grids.
+GRID_ROUNDS = 3
 
 
 @dataclasses.dataclass(frozen=True)

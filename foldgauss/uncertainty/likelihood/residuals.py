@@ -18,7 +18,8 @@ from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.video_model import ONE_SEGMENT, VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
-_f, _d = nb.float32, nb.float64
+_f = nb.float32
+_d = nb.float64
 _level = np.float32(1 / 255)
 _behind = np.asarray(BLACK, np.float32)
 BINS = 512

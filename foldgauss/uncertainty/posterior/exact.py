@@ -26,8 +26,10 @@ from foldgauss.uncertainty.posterior.increments import Increments
 
 #: Cells per frame. Half of them have equal masses and half have equal widths.
 CELLS = 200
-#: Grids are adapted to the posterior at most ROUNDS times, while a cell has a mass above COARSE.
-ROUNDS, COARSE = 6, 0.05
+#: Grids are adapted to the posterior at most so many times,
+ROUNDS = 6
+#: while a cell has a mass above this.
+COARSE = 0.05
 #: Outer cells with masses below this are dropped.
 NEGLIGIBLE_MASS = 1e-13
 #: Likelihoods this many nats below their maximum are dropped: they underflow in float64.

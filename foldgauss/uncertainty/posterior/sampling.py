@@ -19,10 +19,14 @@ from foldgauss.uncertainty.posterior.log_prob import FrameTimeLogProb, frame_tim
 from foldgauss.uncertainty.posterior.optional_imports import import_optional
 from foldgauss.uncertainty.posterior.result import FrameTimePosterior
 
-#: Convergence: at least this many autocorrelation times kept, and split rank R-hat below this.
-TIMES_TAU, R_HAT = 50.0, 1.01
-#: Convergence: means differ from the exact ones by at most APART standard deviations plus ERRORS standard errors.
-APART, ERRORS = 0.1, 5.0
+#: Convergence: at least so many autocorrelation times are kept,
+TIMES_TAU = 50.0
+#: split rank R-hat is below this,
+R_HAT = 1.01
+#: and means differ from the exact ones by at most so many standard deviations
+APART = 0.1
+#: plus so many standard errors.
+ERRORS = 5.0
 #: Burn-in, in autocorrelation times.
 BURN_IN = 10.0
 #: Kept steps between two checks of convergence.
