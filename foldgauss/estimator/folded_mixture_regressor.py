@@ -61,7 +61,10 @@ class FoldedMixtureRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         check_not_forked()
         check_real("X", X)
-        if np.ndim(sample_weight) == 1 and len(sample_weight) == len(y):  # rows of weight 0 may hold NaN
+        sample_weight = None if sample_weight is None else np.asarray(sample_weight)
+        if (
+            np.ndim(sample_weight) == 1 and not np.all(sample_weight) and len(sample_weight) == len(y)
+        ):  # rows of weight 0 may hold NaN
             check_groups(groups, np.ones(len(y), bool))  # before the rows are taken
             present = np.flatnonzero(sample_weight)
             if not len(present):
