@@ -59,9 +59,14 @@ class FoldedMixtureRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         (ConvergenceWarning) if EM did not converge, see `mixture_.status_`.
         """
         check_real("X", X)
-        if np.ndim(sample_weight) == 1 and len(sample_weight) == len(y):  # rows of weight 0 may hold NaN
+        sample_weight = None if sample_weight is None else np.asarray(sample_weight)
+        if (
+            np.ndim(sample_weight) == 1 and not np.all(sample_weight) and len(sample_weight) == len(y)
+        ):  # rows of weight 0 may hold NaN
             check_groups(groups, np.ones(len(y), bool))  # before the rows are taken
             present = np.flatnonzero(sample_weight)
+            if not len(present):
+                raise invalid("sample_weight", expected="a positive sum", got="only zeros", cure="0 leaves a row out.")
             X, y, sample_weight = (_safe_indexing(z, present) for z in (X, y, sample_weight))
             groups = None if groups is None else np.asarray(groups)[present]
         X, y = validate_data(self, X, y, dtype=np.float64, multi_output=True, y_numeric=True, ensure_min_samples=2)
