@@ -248,7 +248,7 @@ def test_a_single_frame_and_no_other(name):
     inside = object_before > 0.3
     assert inside.sum() > 50
     if name == "recolor":
-        assert np.square(before[3] - after[3])[inside].mean() > 500  # levels of 255
+        assert np.square(before[3].astype(int) - after[3])[inside].mean() > 40  # levels of 255
     assert (before[3] != after[3])[inside].any()
     # Half way to the neighbors it is seen, beyond it is not.
     near, far = (np.interp(k, np.arange(NUM_FRAMES), TIMES) for k in (3.4, 3.6))
