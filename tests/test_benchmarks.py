@@ -212,7 +212,7 @@ class TestReproduce:
             for name, config in made.items()
         }
         assert changed.pop("as published") == changed.pop("start in a box of 1.1 frames") == set()
-        assert changed.pop("extent of 1 unit") == {"rates", "growth"}
+        assert changed.pop("extent of 1 unit") == {"rates", "strategy"}
         assert all(len(fields) == 1 for fields in changed.values())
 
     def test_a_start_in_a_larger_box(self, tmp_path, monkeypatch):
@@ -238,7 +238,7 @@ class TestReproduce:
         starts = reproduce.PAPER_STARTS.values()
         assert [round(sum(column), 2) for column in list(zip(*starts, strict=True))[:2]] == [233.21, 3.81]
         cells = [reproduce.config_of(name, (640, 1280), 30_000, 0) for name in reproduce.CELLS]
-        assert len({(one.num_gaussians, one.batch_size, one.degree) for one in cells}) == 20
+        assert len({(one.num_gaussians, one.views.batch_size, one.degree) for one in cells}) == 20
         assert reproduce.published("100,000, batch 5, degree 3") == (37.94, 0.32)
         assert reproduce.published("as published") == (39.02, 0.65)
         assert reproduce.published("degree 1") is None
@@ -250,10 +250,10 @@ class TestReproduce:
         # A Gaussian of as many pixels is twice as long, and moves twice as far; each pixel weighs four times as much in
         # the mean, and is twice as wide in half widths.
         for length in "clone_below", "prune_scale", "screen_gradient", "time_gradient":
-            assert getattr(half.growth, length) == 2 * getattr(full.growth, length)
+            assert getattr(half.strategy.growth, length) == 2 * getattr(full.strategy.growth, length)
         assert (half.rates.loc, half.rates.coefficients) == (2 * full.rates.loc, 2 * full.rates.coefficients)
         assert half.rates.log_scale == full.rates.log_scale
-        assert half.scale_cutoff == 2 * full.scale_cutoff
+        assert half.strategy.scale_cutoff == 2 * full.strategy.scale_cutoff
 
     def test_an_interrupted_fit_continues(self, tmp_path, monkeypatch):
         """Stopped between checkpoints, it goes on from the last one: model and curve are those of a whole run."""

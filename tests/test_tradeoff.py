@@ -384,7 +384,7 @@ def test_a_point_that_fails_is_left_out(clip, tmp_path, capsys, monkeypatch):
     [
         (1e-3, LEAST_STEPS, "warning: --minutes: 0.001 are too few for 5 points"),
         (1.0, 1000, "about 1.0 minutes"),
-        (60.0, 3000, "note: 3,000 steps are the default for this clip"),
+        (60.0, 3000, "5 points around a base of 3,000 steps"),
     ],
 )
 def test_minutes_become_steps(clip, tmp_path, capsys, monkeypatch, minutes, steps, told):

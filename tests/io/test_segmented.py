@@ -234,7 +234,7 @@ def test_a_source_that_changes_meanwhile_is_refused(work, tmp_path, monkeypatch)
     ("chosen", "message"),
     [
         ([], "^segments: expected at least one"),
-        ([(0, "a"), (8, "b")], "got frame 8. Also fit frames 7:8"),
+        ([(0, "a"), (8, "b")], r"^segments\[1\]\.first: expected one that begins at frame 1 to 7"),
         ([(4, "b"), (0, "a")], "begin at frame 0"),
         (["a"], r"^sources\[0\]: expected \(number of its first frame, model file\)"),
         ([("a", 0)], r"^sources\[0\]: expected the number of its first frame first"),

@@ -1,5 +1,6 @@
 """Reading clips: `read_video`, and `scan_clip`, which detects the format."""
 
+import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Sized
 from pathlib import Path
@@ -124,11 +125,24 @@ def memory_limit() -> int:
         return 8 << 30
 
 
+def check_memory(num: int, shape: tuple[int, int, int]) -> None:
+    """Raise `VideoError` where so many frames of a `shape` take more than `memory_limit()`."""
+    limit = memory_limit()
+    if num * math.prod(shape) > limit:
+        raise video_error(
+            "size",
+            expected=f"a clip of at most {limit / 2**30:.1f} GiB, a third of this machine's memory",
+            got=f"more, at frame {num} of {shape[0]}x{shape[1]}",
+            cure="Take fewer frames or a smaller size.",
+        )
+
+
 def resize_frame(image: np.ndarray, size: Size | None, crop: Size | None = None) -> np.ndarray:
     """A BGR frame as RGB: its central window `crop`, of that the aspect of `size`, resized."""
     if crop is not None:
         image = image[center_window(image.shape[:2], crop)]
     if size is not None and image.shape[:2] != size:
+        check_memory(1, (*size, image.shape[2]))
         image = image[aspect_window(image.shape[:2], size)]
         shrinks = image.shape[0] >= size[0] and image.shape[1] >= size[1]
         image = cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
@@ -177,21 +191,15 @@ def stack_frames(frames: Iterable[np.ndarray], channels: int = 3) -> np.ndarray:
     The array grows by blocks, which the system moves without a copy, so that the peak is one copy of the clip. Raises
     `VideoError` where it is larger than `memory_limit()`.
     """
-    clip, num, limit = np.empty(0, np.uint8), 0, memory_limit()
+    clip, num = np.empty(0, np.uint8), 0
     for frame in frames:
         if num == 0:
             clip = np.empty((0, *frame.shape[:2], max(channels, frame.shape[2])), np.uint8)
         if frame.shape[2] > clip.shape[3]:
             clip = np.concatenate([clip, np.full_like(clip[..., :1], 255)], axis=-1)
+        check_memory(num + 1, clip.shape[1:])
         if num == len(clip):
             clip.resize((num + max(1, BLOCK_BYTES // frame.nbytes), *clip.shape[1:]), refcheck=False)
-        if (num + 1) * clip[num].nbytes > limit:
-            raise video_error(
-                "size",
-                expected=f"a clip of at most {limit / 2**30:.1f} GiB, a third of this machine's memory",
-                got=f"more, at frame {num + 1} of {frame.shape[0]}x{frame.shape[1]}",
-                cure="Take fewer frames or a smaller size.",
-            )
         clip[num, ..., 3:] = 255
         clip[num, ..., : frame.shape[2]] = frame
         num += 1
