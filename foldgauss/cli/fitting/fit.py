@@ -228,10 +228,7 @@ def stop_on_signals(show: Observer, checkpoint: Path | None = None) -> Iterator[
             hint = "; add --resume to continue" if kept else "; nothing was saved"
             raise Stopped(f"{error} by {request.signal}{hint}.") from error
         except FitDiverged as error:
-            if checkpoint is None or not checkpoint.exists():
-                raise Stopped(str(error)) from error
-            hint = "--resume continues from its checkpoint, with --on-divergence back-off at lower learning rates."
-            raise Stopped(f"{error} {hint}") from error
+            raise Stopped(str(error)) from error
 
 
 def _check_records(video: Path, history: Path | None, preview: Path | None, overwrite: bool) -> Path:
