@@ -1,8 +1,9 @@
 """The Gaussians that a Folded-Gaussian consists of: of time, and of space at one time (eq:cond_dens).
 
 Numerics: `a` is never computed, only `log a`. A log-density is finite or -inf for every finite input. Its gradient is 0
-where the log-density is -inf. Elsewhere it is accurate up to `_numerics.batch.steepest`, 6e32 in float32, and clipped
-or infinite beyond. With scales near 1 it is accurate for |tau| <= 13 in float32, and for |tau| <= 37 in float64.
+where the log-density is -inf. Elsewhere it is accurate where its parts are below `_numerics.batch.steepest`, 6e32 in
+float32, and clipped or infinite beyond. With residuals of about one standard deviation it is accurate for |tau| <= 12
+in float32, and for |tau| <= 34 in float64.
 """
 
 import functools

@@ -66,6 +66,14 @@ def walk(settings: Any) -> Iterator[tuple[str, dataclasses.Field, Any]]:
             yield field.name, field, value
 
 
+def flatten(values: dict[str, Any]) -> dict[str, Any]:
+    """Settings as `dataclasses.asdict` has them, with those of a part by names such as "views.batch_size"."""
+    flat = {}
+    for name, value in values.items():
+        flat |= {f"{name}.{inner}": part for inner, part in value.items()} if isinstance(value, dict) else {name: value}
+    return flat
+
+
 def settings_by_name(settings: Any) -> dict[str, Any]:
     """The values of `walk`, by their names."""
     return {name: value for name, _, value in walk(settings)}
@@ -80,8 +88,9 @@ def replace_settings(settings: Any, changes: dict[str, Any]) -> Any:
     for name, value in changes.items():
         first, _, rest = name.partition(".")
         if first not in getattr(settings, "__dataclass_fields__", ()):
-            got = f"{name}, which {type(settings).__name__} has not"
-            raise invalid("changes", expected="names of settings", got=got)
+            whole = walk(settings) if dataclasses.is_dataclass(settings) else ()
+            cure = " or ".join(f"It is {full!r}." for full, field, _ in whole if field.name == name)
+            raise invalid(name, expected="the name of a setting", got=f"none of {type(settings).__name__}", cure=cure)
         if rest:
             inner[first][rest] = value
         else:

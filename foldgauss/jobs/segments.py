@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from foldgauss._runtime.checks import invalid, is_integer, is_within
+from foldgauss._runtime.settings import flatten
 from foldgauss.io._atomic import OutputError, atomic_path
 from foldgauss.io.media.clip import AS_STORED, Reading
 from foldgauss.io.media.indexing import FrameIndex, index_video, read_indexed
@@ -349,7 +350,8 @@ def _load_plan(folder: Path, request: dict[str, Any]) -> dict[str, Any] | None:
     changed = sorted(name for name in request if request[name] != before.get(name))
     if changed:
         if changed == ["config"]:
-            pairs = {name: (before["config"].get(name), value) for name, value in request["config"].items()}
+            kept = flatten(before["config"])
+            pairs = {name: (kept.get(name), value) for name, value in flatten(request["config"]).items()}
             pairs = {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
         else:
             pairs = {name: (before.get(name), request[name]) for name in changed if name != "config"}

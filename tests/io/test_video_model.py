@@ -95,7 +95,7 @@ def test_checkpoint_keeps_what_growth_is_decided_by(tmp_path, monkeypatch):
     same(whole, to_model(state, config, (24, 32), 25.0))
     save_checkpoint(path, state, config=config, source=SOURCE)  # growth is over
     assert load_checkpoint(path, config=config, source=SOURCE).statistics is None
-    with pytest.raises(ValueError, match="resume: expected strategy="):
+    with pytest.raises(ValueError, match=r"resume: expected strategy\.growth="):
         load_checkpoint(path, config=config.replace(**{"strategy.growth": None}), source=SOURCE)
 
 

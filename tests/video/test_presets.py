@@ -44,7 +44,7 @@ def test_minutes_replace_a_presets_steps(name):
 def test_unknown_names():
     with pytest.raises(ValueError, match="preset: expected one of 'standard', 'draft', 'paper', got 'papers'"):
         FitConfig.preset("papers")
-    with pytest.raises(ValueError, match="changes: expected names of settings, got degrees"):
+    with pytest.raises(ValueError, match="degrees: expected the name of a setting"):
         FitConfig.preset("paper", degrees=3)
 
 

@@ -201,8 +201,13 @@ class _Run:
         return self._motion
 
     def measure(self, points: list[Point], base: FitConfig, format_point: Callable[[Point], str]) -> list[Skipped]:
-        """Measure and record the points without a row; returns those that failed."""
+        """Measure and record the points without a row; returns those that failed.
+
+        The base is measured again where its file is missing, since the others are compared with it.
+        """
         failed = []
+        if not self.record.path.with_name(BASE).exists():
+            self.record.rows.pop("base", None)
         with err.status("Measuring") as status:
             for number, point in enumerate(points, 1):
                 if point.name in self.record.rows:

@@ -174,8 +174,8 @@ def _sample(path: Path, overwrite: bool, show: Callable, **arguments: Any) -> Fr
         if error.parameter != "backend":
             raise
         if not overwrite:
-            problem = f"{error.problem} Choose another folder, or add --overwrite to replace them."
-            raise ParameterError("--out", problem) from error
+            expected, cure = "the draws of this model, clip and settings", "Choose another folder, or add --overwrite."
+            raise invalid("--out", expected=expected, got=f"others in {path}, or damaged ones", cure=cure) from error
         path.unlink()
         return _sample(path, overwrite, show, **arguments)
     except KeyboardInterrupt as error:

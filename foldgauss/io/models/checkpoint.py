@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.settings import flatten
 from foldgauss.io._atomic import PathLike
 from foldgauss.io.models.model_file import Kind, load_part, register_model, save_model
 from foldgauss.io.models.video_model import read_header_of_kind
@@ -27,7 +28,7 @@ def load_checkpoint(path: PathLike, *, config: FitConfig, source: dict) -> FitSt
     kept = about["metadata"]
     for part, now in (("config", dataclasses.asdict(config)), ("source", source)):
         before = kept.get(part)
-        before = before if isinstance(before, dict) else {}
+        now, before = flatten(now), flatten(before if isinstance(before, dict) else {})
         changed = sorted(name for name in now.keys() | before.keys() if now.get(name) != before.get(name))
         cure = f"Resume {str(path)!r} with the options it was started with, or start a new fit with --overwrite."
         if part == "config" and now.keys() != before.keys():

@@ -13,7 +13,7 @@ from jaxtyping import Float, Float64
 
 from foldgauss._runtime.checks import invalid
 
-#: Names that `frame_time_log_prob` accepts for `noise`, besides a FrameNoise.
+#: Names that `likelihood_profiles` accepts for `noise`, besides a FrameNoise.
 NOISES = ("score", "effective", "independent")
 #: Lags are summed until the mean correlation on a ring falls below this.
 LAST_CORRELATION = 0.02

@@ -85,10 +85,10 @@ class Growth:
     reset_opacity: float = field(default=0.01, metadata=setting("Opacity after a reset", bounds="(0, 1)"))
 
     def __post_init__(self) -> None:
-        check_settings(self, "growth.")
+        check_settings(self, "strategy.growth.")
         if self.reset_opacity < self.prune_opacity:
             raise invalid(
-                "growth.reset_opacity",
+                "strategy.growth.reset_opacity",
                 expected=f"at least prune_opacity, {self.prune_opacity:g}",
                 got=self.reset_opacity,
                 cure="Otherwise a reset would prune every Gaussian.",

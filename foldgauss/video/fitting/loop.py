@@ -365,4 +365,4 @@ def _check_alpha(frames: np.ndarray, config: FitConfig) -> None:
     if config.views.interpolation_fraction:
         cure = "Leave it out: optical flow does not determine what is behind."
         got = config.views.interpolation_fraction
-        raise invalid("interpolation_fraction", expected="0 for frames with alpha", got=got, cure=cure)
+        raise invalid("views.interpolation_fraction", expected="0 for frames with alpha", got=got, cure=cure)
