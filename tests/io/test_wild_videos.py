@@ -26,6 +26,7 @@ from PIL.GifImagePlugin import GifImageFile
 from foldgauss.io import VideoError, index_video, load_video_model, read_indexed, read_masks, read_video, write_video
 from foldgauss.io.media import clip as clip_module
 from foldgauss.io.media import decoder
+from foldgauss.io.media.writing import open_with_own_priority
 
 FLAT = np.array(
     [
@@ -943,6 +944,7 @@ def test_the_rate_of_raw_av1_is_a_guess(tmp_path):
     with av.open(str(tmp_path / "a.obu"), "w") as container:
         stream = container.add_stream("libsvtav1", rate=10, options={"preset": "12"})
         stream.height, stream.width, stream.pix_fmt = 64, 64, "yuv420p"
+        open_with_own_priority(stream.codec_context)
         for frame in _waves(8, 64, 64):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
         container.mux(stream.encode())
