@@ -269,7 +269,8 @@ def test_decoded_frames_are_not_kept(mp4, tmp_path):
     """By cycles of references, which the garbage collector would find much later."""
 
     def count():
-        return sum(isinstance(one, av.VideoFrame) for one in gc.get_objects())
+        # isinstance would follow a proxy whose object is gone.
+        return sum(issubclass(type(one), av.VideoFrame) for one in gc.get_objects())
 
     (tmp_path / "a.mp4").write_bytes(mp4)
     with contextlib.closing(decoder.VideoDecoder(tmp_path / "a.mp4")) as video:
