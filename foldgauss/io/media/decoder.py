@@ -81,6 +81,11 @@ _KINDS = {
 }
 
 
+def round_alpha(alpha: np.ndarray, largest: int, wanted: int) -> np.ndarray:
+    """Alpha from 0 to `largest` in the range from 0 to `wanted`, to nearest: FFmpeg rounds part of it up."""
+    return (alpha.astype(np.uint32) * (2 * wanted) + largest) // (2 * largest)
+
+
 class VideoDecoder:
     """An open video file, which is to be closed.
 
@@ -264,7 +269,8 @@ class VideoDecoder:
         file.
         """
         kind, hdr = frame.format, HDR.get(frame.color_trc)
-        has_alpha = any(part.is_alpha for part in kind.components)
+        alpha_bits = next((min(part.bits, 16) for part in kind.components if part.is_alpha), 0)
+        has_alpha = alpha_bits > 0
         has_levels = kind.components[0].bits == 16 and (kind.is_rgb or kind.name.startswith(("gray", "ya")))
         image = self._convert(frame, bool(hdr or has_levels), has_alpha)
         if kind.name.startswith("gray") and frame.color_range == ColorRange.MPEG:  # FFmpeg takes it for full range
@@ -279,6 +285,9 @@ class VideoDecoder:
             image = self.levels.convert(image)
         if hdr or has_levels:
             image = cv2.cvtColor(image, cv2.COLOR_RGBA2BGRA if has_alpha else cv2.COLOR_RGB2BGR)
+        if alpha_bits > 8 and self.levels.white is None:  # to nearest, which FFmpeg's conversion to 8 bits is not
+            deep = self._convert(frame, True, True)[..., 3] >> (16 - alpha_bits)
+            image[..., 3] = round_alpha(deep, (1 << alpha_bits) - 1, 255)
         image = premultiply(image)
         a, b, c, d = self._matrix
         if self.is_turned:

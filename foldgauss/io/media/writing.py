@@ -22,7 +22,14 @@ from PIL import Image
 from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_integer, short_repr
 from foldgauss.io._atomic import PathLike, atomic_folder, atomic_path, check_path, output_error
 from foldgauss.io.media.clip import VideoError, check_fps, check_readable, format_size, video_error
-from foldgauss.io.media.decoder import CONVERSION, SOUND_DEMUXERS, VideoDecoder, filter_frame, open_container
+from foldgauss.io.media.decoder import (
+    CONVERSION,
+    SOUND_DEMUXERS,
+    VideoDecoder,
+    filter_frame,
+    open_container,
+    round_alpha,
+)
 from foldgauss.io.media.frame_rate import MAX_SECONDS, are_rising_seconds, count_ticks
 
 os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 writes to stderr
@@ -430,6 +437,8 @@ def encode_video(
                 open_with_own_priority(stream.codec_context)
             given = av.VideoFrame.from_ndarray(image, format="rgba" if image.shape[2] == 4 else "rgb24")
             given = converter.reformat(given, format=pixel_format.name, interpolation=CONVERSION, **colors)
+            if image.shape[2] == 4 and len(given.planes) == 4:
+                _set_alpha(given.planes[3], image[..., 3], (1 << pixel_format.components[3].bits) - 1)
             begin, end = (number, number + 1) if ticks is None else ticks[number : number + 2]
             given.pts, given.time_base = begin, clock
             container.mux(_set_durations(stream.encode(given), ticks))
@@ -545,6 +554,14 @@ def open_with_own_priority(context: av.VideoCodecContext) -> None:
         with suppress(OSError):  # it has ended
             if os.sched_getscheduler(thread) != policy:
                 os.sched_setscheduler(thread, policy, parameters)
+
+
+def _set_alpha(plane: av.video.plane.VideoPlane, alpha: np.ndarray, largest: int) -> None:
+    """Write alpha of 8 bits to a plane from 0 to `largest`, to nearest, which FFmpeg's conversion is not."""
+    kind = np.uint8 if largest < 256 else np.uint16
+    rows = np.zeros((plane.height, plane.line_size // kind().itemsize), kind)
+    rows[:, : plane.width] = round_alpha(alpha, 255, largest)
+    plane.update(rows)
 
 
 def _pad(frame: np.ndarray, steps: tuple[int, int]) -> np.ndarray:
