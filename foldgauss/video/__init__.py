@@ -12,9 +12,11 @@ from foldgauss.video.editing.overlays import SelectedGaussians
 from foldgauss.video.editing.span import Span
 from foldgauss.video.fitting.compress import Compressed, compress
 from foldgauss.video.fitting.config import FitConfig, LearningRates, Loss, Strategy, Views
+from foldgauss.video.fitting.density_control import DensityControl
 from foldgauss.video.fitting.divergence import DivergenceWarning, FitDiverged
 from foldgauss.video.fitting.growth import Growth
 from foldgauss.video.fitting.loop import FitInfo, FitResult, FitState, fit, fit_steps, start_from
+from foldgauss.video.fitting.losses import register_loss
 from foldgauss.video.models.density import density_image
 from foldgauss.video.models.frame_times import (
     FrameTimes,
@@ -55,6 +57,7 @@ __all__ = [
     "CameraPath",
     "Clock",
     "Compressed",
+    "DensityControl",
     "DivergenceWarning",
     "Edit",
     "EditedVideo",
@@ -108,6 +111,7 @@ __all__ = [
     "plan_segments",
     "played_positions",
     "psnr",
+    "register_loss",
     "remapped_positions",
     "select",
     "ssim",

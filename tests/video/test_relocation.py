@@ -10,7 +10,7 @@ from clips import moving_blobs
 from foldgauss.render import cpu
 from foldgauss.video import FitConfig, Growth, LearningRates, Strategy, Views, evaluate, fit, fit_steps
 from foldgauss.video.fitting.loop import start
-from foldgauss.video.fitting.relocation import RELOCATED_AT, measure_influence, relocate
+from foldgauss.video.fitting.relocation import RELOCATED_AT, Relocation, measure_influence, relocate
 from foldgauss.video.fitting.schedule import COLD, RateSchedule, choose_views, steps_per_pass
 from foldgauss.video.fitting.state import frame_times
 from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
@@ -139,9 +139,9 @@ def test_new_gaussians_lie_among_those_of_their_time():
 @pytest.mark.filterwarnings("ignore::foldgauss.video.DivergenceWarning")
 def test_when_gaussians_are_relocated(changes, times, monkeypatch):
     """At the stated fractions of the plan, after a pass at least, in fits that converge."""
-    config, steps, whole = CONFIG.replace(**changes), [], CpuStepper.relocate
+    config, steps, whole = CONFIG.replace(**changes), [], Relocation.apply
     spy = lambda self, state: steps.append(state.step) or whole(self, state)  # noqa: E731
-    monkeypatch.setattr(CpuStepper, "relocate", spy)
+    monkeypatch.setattr(Relocation, "apply", spy)
     model = fit(FRAMES, config).model
     expected = [round(fraction * config.steps) for fraction in RELOCATED_AT]
     assert steps == expected[len(expected) - times :]
@@ -150,9 +150,9 @@ def test_when_gaussians_are_relocated(changes, times, monkeypatch):
 
 def test_minutes_relocate_three_times_whatever_the_plan(monkeypatch):
     """Where the plan is corrected, each fraction of it is passed once."""
-    steps, whole, now = [], CpuStepper.relocate, [0.0]
+    steps, whole, now = [], Relocation.apply, [0.0]
     spy = lambda self, state: steps.append(state.step) or whole(self, state)  # noqa: E731
-    monkeypatch.setattr(CpuStepper, "relocate", spy)
+    monkeypatch.setattr(Relocation, "apply", spy)
 
     def clock() -> float:
         now[0] += 0.002 if 0.5 < now[0] < 2.0 else 0.006

@@ -11,6 +11,7 @@ from foldgauss._runtime.threads import num_threads
 from foldgauss.render import COMPOSITINGS, RenderOptions
 from foldgauss.video.fitting.adam import RateUnits
 from foldgauss.video.fitting.growth import EXTENT, PUBLISHED_STEPS, PUBLISHED_UNIT, Growth
+from foldgauss.video.fitting.losses import LOSSES
 from foldgauss.video.models.row_layout import MAX_DEGREE
 
 #: Groups of settings, which are the panels of `foldgauss fit --help`.
@@ -89,6 +90,11 @@ class LearningRates:
 @dataclasses.dataclass(frozen=True)
 class Loss:
     """The loss of an image: first L1 and D-SSIM (Kerbl et al. 2023, eq. 7), then the squared error."""
+
+    name: str = field(
+        default="3dgs",
+        metadata=setting("The first loss: 3dgs, or the name of one given to `register_loss`", choices=LOSSES),
+    )
 
     ssim_fraction: float = field(
         default=0.2,

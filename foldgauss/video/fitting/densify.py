@@ -11,6 +11,7 @@ import numpy as np
 from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss.render import pixels_per_unit
 from foldgauss.video.fitting.config import FitConfig, most_gaussians
+from foldgauss.video.fitting.density_control import DensityControl
 from foldgauss.video.fitting.growth import GradientStatistics, Growth
 from foldgauss.video.fitting.state import FitState
 from foldgauss.video.models.row_layout import columns
@@ -19,31 +20,39 @@ from foldgauss.video.models.row_layout import columns
 _RADIUS = 3.0
 
 
-def grow(state: FitState, config: FitConfig, size: tuple[int, int]) -> bool:
-    """Carry out the densification and the reset that are due at the state's step; after the last, statistics end.
+class Densification(DensityControl):
+    """Densification, pruning and resets by the schedule of `Growth`, for frames of `size` (height, width)."""
 
-    `size`: (height, width) of the frames. Returns whether the number of Gaussians may have changed.
-    """
-    growth = config.strategy.growth.for_plan(state.plan)
-    grows = growth.grows_at(state.step)
-    if grows:
-        stay, born = densify(
-            state.rows,
-            state.statistics,
-            growth,
-            degree=config.fold_degree,
-            pixels=pixels_per_unit(size),
-            max_num=most_gaussians(config),
-            step=state.step,
-            seed=config.seed,
-        )
-        state.keep(stay)
-        state.extend(born)
-    if growth.resets_at(state.step):
-        reset_opacities(state.rows, state.first, state.second, growth, config.fold_degree)
-    if state.step + 1 >= growth.until_step:
-        state.statistics = None
-    return grows
+    def __init__(self, config: FitConfig, size: tuple[int, int]):
+        self.config, self.size = config, size
+
+    def is_due(self, state: FitState) -> bool:
+        if not (state.growing and state.plan):
+            return False
+        growth = self.config.strategy.growth.for_plan(state.plan)
+        return growth.changes_at(state.step) or state.step + 1 >= growth.until_step
+
+    def apply(self, state: FitState) -> None:
+        """What is due at the state's step; after the last, statistics end."""
+        config = self.config
+        growth = config.strategy.growth.for_plan(state.plan)
+        if growth.grows_at(state.step):
+            stay, born = densify(
+                state.rows,
+                state.statistics,
+                growth,
+                degree=config.fold_degree,
+                pixels=pixels_per_unit(self.size),
+                max_num=most_gaussians(config),
+                step=state.step,
+                seed=config.seed,
+            )
+            state.keep(stay)
+            state.extend(born)
+        if growth.resets_at(state.step):
+            reset_opacities(state.rows, state.first, state.second, growth, config.fold_degree)
+        if state.step + 1 >= growth.until_step:
+            state.statistics = None
 
 
 def densify(

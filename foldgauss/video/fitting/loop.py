@@ -19,6 +19,8 @@ from foldgauss.video.compression.chunks import arrange
 from foldgauss.video.compression.quantize import Quantized, dequantize
 from foldgauss.video.fitting.budget import StepPlanner, TimeLeft, find_limit, measure_progress
 from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig, chosen_num_gaussians, planned_steps
+from foldgauss.video.fitting.densify import Densification
+from foldgauss.video.fitting.density_control import DensityControl
 from foldgauss.video.fitting.divergence import Guard
 from foldgauss.video.fitting.initialize import (
     START_OPACITY,
@@ -28,7 +30,7 @@ from foldgauss.video.fitting.initialize import (
     with_backdrop,
 )
 from foldgauss.video.fitting.rate import RateControl, count_bytes, count_past
-from foldgauss.video.fitting.relocation import is_relocation_due, relocates
+from foldgauss.video.fitting.relocation import Relocation, relocates
 from foldgauss.video.fitting.state import FitState, envelope_of, running_psnr, to_model
 from foldgauss.video.fitting.steppers.engines import choose_engine, make_stepper
 from foldgauss.video.fitting.steppers.protocol import StepResult
@@ -84,6 +86,7 @@ def fit(
     config: FitConfig | None = None,
     *,
     fps: float = 25.0,
+    controls: Iterable[DensityControl] = (),
     observers: Iterable[Callable[[FitState, FitInfo], None]] = (),
     every: int = 10,
 ) -> FitResult:
@@ -92,7 +95,8 @@ def fit(
     Alpha, by which colors are premultiplied, is learned by compositing frames and splats over random backgrounds:
     `psnr` and `loss` are measured over these. The model is rendered over black by default.
 
-    `fps`: frames per second. `observers` are called with (state, info) after every step: progress bars, checkpoints.
+    `fps`: frames per second. `controls` change the Gaussians between steps, after those of the settings: see
+    `DensityControl`. `observers` are called with (state, info) after every step: progress bars, checkpoints.
     `every`: the history keeps every so many steps, and the last. Raises ValueError for frames or settings that cannot
     be fitted. A fit that diverges warns by `DivergenceWarning` and goes on from its last finite state with lower
     learning rates; it raises `FitDiverged` where that does not help. No budget includes the compilation of kernels,
@@ -105,7 +109,7 @@ def fit(
     if not is_integer(every, 1):
         raise invalid("every", expected="a whole number >= 1", got=repr(every))
     check_rate("fps", fps)
-    for state, info in fit_steps(frames, config):
+    for state, info in fit_steps(frames, config, controls=controls):
         for observe in observers:
             observe(state, info)
         if info.step % every == 0 or info.progress >= 1:
@@ -127,12 +131,13 @@ def fit_steps(
     config: FitConfig,
     state: FitState | None = None,
     *,
+    controls: Iterable[DensityControl] = (),
     motion: Motion | None = None,
     clock: Callable[[], float] = time.perf_counter,
 ) -> Iterator[tuple[FitState, FitInfo]]:
     """The steps of a fit to `frames`, as of `fit`, from the start or resumed from `state`: yields (state, info).
 
-    The state is updated in place: take `state.copy()` of one to keep. Raises and warns as `fit`.
+    The state is updated in place: take `state.copy()` of one to keep. `controls`, raises and warns as `fit`.
 
     `motion`: the optical flow of the frames, where it is already known; computing it takes some hundredths of a second
     per frame. `clock` gives seconds, of which `FitConfig.minutes` is a budget: with `time.process_time` and one thread,
@@ -145,11 +150,9 @@ def fit_steps(
     find_motion = motion_finder(frames, motion)
     state = _start(frames, config, None, find_motion, clock) if state is None else state
     stepper = make_stepper(engine, frames, config, state, find_motion)
-    rate = RateControl(frames, config) if config.is_compact else None
     planner, time_left = StepPlanner(config), TimeLeft(state, config)
     guard = Guard(state, config, stepper.steps_per_pass, alpha=frames.shape[3] == 4)
-    if rate is not None:
-        rate.check_size(state)
+    controls = [*_make_controls(frames, config, state, guard, find_motion), *controls]
     if state.step == 0 and guard.comparable and config.initialization != "uniform":
         begun = clock()
         state.start_errors = tuple(stepper.measure_start(state).items())
@@ -167,17 +170,15 @@ def fit_steps(
             stepper.adopt(state)
         else:
             guard.keep_good(state)
-            before = clock()
-            if rate is not None and state.plan and rate.act(state, measure_progress(state, config)):
-                stepper.adopt(state)
-                state.start_errors = ()  # those of more Gaussians
-                guard.replace_good(state)
-                planner.skip(clock() - before, rate.reserve(state, clock() - before))
-            if is_relocation_due(state, config) and guard.is_converging(state):
-                stepper.relocate(state)
-                guard.replace_good(state)
-        if state.growing and state.plan:
-            stepper.grow(state)
+            for control in controls:
+                if control.is_due(state):
+                    before = clock()
+                    state.fetch_all()
+                    control.apply(state)
+                    stepper.adopt(state)
+                    guard.replace_good(state)
+                    control.seconds = max(control.seconds, clock() - before)
+                    planner.skip(clock() - before, sum(one.reserve(state) for one in controls))
         state.seconds += clock() - begun
         planner.update(state)
         begun = clock()
@@ -186,6 +187,21 @@ def fit_steps(
             guard.finish(state)
         state.seconds += clock() - begun
         yield state, _make_info(state, config, time_left, result, stopped_by)
+
+
+def _make_controls(
+    frames: np.ndarray, config: FitConfig, state: FitState, guard: Guard, find_motion: Callable[[], Motion]
+) -> list[DensityControl]:
+    """What the settings ask for."""
+    controls: list[DensityControl] = []
+    if config.is_compact:
+        controls.append(RateControl(frames, config))
+        controls[0].check_size(state)
+    if relocates(config):
+        controls.append(Relocation(frames, config, guard, find_motion))
+    if config.strategy.growth is not None:
+        controls.append(Densification(config, frames.shape[1:3]))
+    return controls
 
 
 def _make_info(
@@ -209,8 +225,8 @@ def _warm_up(frames: np.ndarray, config: FitConfig, engine: str) -> None:
     """Compile or load the kernels, on a corner of the clip, before any clock runs: the first time takes 20 s."""
     if engine != "cpu" and not config.is_compact and not relocates(config):
         return
-    views = dataclasses.replace(config.views, interpolation_fraction=0.0)
-    tiny = dataclasses.replace(config, num_gaussians=8, max_gaussians=None, steps=1, minutes=None, views=views)
+    changes = {"views.interpolation_fraction": 0.0, "loss.name": "3dgs"}  # another loss may need the clip's size
+    tiny = config.replace(num_gaussians=8, max_gaussians=None, steps=1, minutes=None, **changes)
     if config.is_compact:
         tiny = dataclasses.replace(tiny, quality=DEFAULT_QUALITY, size_mb=None, psnr=None)
     corner = np.ascontiguousarray(frames[:2, :32, :32])

@@ -44,7 +44,9 @@ from foldgauss.video.compression.quantizer import (
     round_groups,
 )
 from foldgauss.video.compression.streams import encode_chunk, encode_motion
+from foldgauss.video.fitting.budget import measure_progress
 from foldgauss.video.fitting.config import FitConfig
+from foldgauss.video.fitting.density_control import DensityControl
 from foldgauss.video.fitting.state import FitState, running_psnr, to_model
 from foldgauss.video.models.background import BLACK, composite
 from foldgauss.video.models.metrics import psnr as psnr_of
@@ -135,12 +137,11 @@ ACTIONS = (
 COMPRESSION_START = 0.35
 
 
-class RateControl:
+class RateControl(DensityControl):
     """Makes the Gaussians of a running fit worth their bits."""
 
     def __init__(self, frames: np.ndarray, config: FitConfig):
         self.frames, self.config = frames, config
-        self.longest = 0.0
         self.trimming = {"psnr": 0.0, "size_mb": 0.0}  # seconds that the last dropping takes for each
         self.background = BEYOND_BLACK if frames.shape[-1] == 4 else np.float32(BLACK)
         self.sampled = np.unique(np.linspace(0, len(frames) - 1, _SAMPLED_FRAMES).round().astype(int))
@@ -155,12 +156,13 @@ class RateControl:
         if least > self.config.size_mb:
             raise invalid("size_mb", expected=f"at least {least:.4f} for this clip", got=self.config.size_mb)
 
-    def act(self, state: FitState, progress: float) -> bool:
-        """Take the actions that are due; whether arrays of the state were replaced."""
-        before = state.rate_actions
-        if before < len(ACTIONS) and progress >= ACTIONS[before].progress:
-            state.fetch_all()
-        while state.rate_actions < len(ACTIONS) and progress >= ACTIONS[state.rate_actions].progress:
+    def is_due(self, state: FitState) -> bool:
+        left = ACTIONS[state.rate_actions :]
+        return bool(state.plan and left) and measure_progress(state, self.config) >= left[0].progress
+
+    def apply(self, state: FitState) -> None:
+        """Take the actions that are due."""
+        while self.is_due(state):
             action = ACTIONS[state.rate_actions]
             if action.what == "drop":
                 self._drop(state, action)
@@ -173,16 +175,12 @@ class RateControl:
             else:
                 self._round(state, action)
             state.rate_actions += 1
-        return state.rate_actions > before
+        state.start_errors = ()  # those of more Gaussians
 
-    def reserve(self, state: FitState, seconds: float) -> float:
-        """Seconds that later actions will take, if the last ones took `seconds`: those that measure Gaussians.
-
-        What is dropped in the end is among them.
-        """
-        self.longest = max(self.longest, seconds)
+    def reserve(self, state: FitState) -> float:
+        """Those of the actions that measure Gaussians, and of what is dropped in the end."""
         left = [action for action in ACTIONS[state.rate_actions :] if action.what == "drop"]
-        return self.longest * (len(left) + (not state.rules)) + sum(self.trimming.values())
+        return self.seconds * (len(left) + (not state.rules)) + sum(self.trimming.values())
 
     def round_only(self, state: FitState) -> None:
         """Drop what is not worth its bits, and sort where that hardly changes the images, without any training."""

@@ -6,6 +6,7 @@ The number of Gaussians stays the same. Source: relocation of dead Gaussians in 
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -17,6 +18,8 @@ from foldgauss.render import cpu
 from foldgauss.video.fitting.adam import BETA2
 from foldgauss.video.fitting.budget import measure_progress
 from foldgauss.video.fitting.config import FitConfig
+from foldgauss.video.fitting.density_control import DensityControl
+from foldgauss.video.fitting.divergence import Guard
 from foldgauss.video.fitting.initialize import (
     SCALE_FACTOR,
     START_OPACITY,
@@ -25,7 +28,7 @@ from foldgauss.video.fitting.initialize import (
     make_splats,
 )
 from foldgauss.video.fitting.schedule import steps_per_pass, to_planes
-from foldgauss.video.fitting.state import FitState, envelope_of, frame_times, paths_of
+from foldgauss.video.fitting.state import FitState, envelope_of, frame_times, paths_of, spec_of
 from foldgauss.video.models.background import random_background
 from foldgauss.video.models.conditioning import ConditioningSpec, condition, find_windows
 from foldgauss.video.models.row_layout import columns, pack
@@ -48,14 +51,23 @@ def relocates(config: FitConfig) -> bool:
     return strategy.relocated_fraction > 0 and strategy.growth is None and strategy.sparse_updates
 
 
-def is_relocation_due(state: FitState, config: FitConfig) -> bool:
-    """Whether Gaussians are to be relocated after the state's step: at `RELOCATED_AT`, after a pass at least."""
-    if not relocates(config) or not state.plan:
-        return False
-    num_frames = len(state.frame_errors)
-    before, after = (measure_progress(state, config, step) for step in (state.step - 1, state.step))
-    crossed = any(before < fraction <= after for fraction in RELOCATED_AT)
-    return crossed and state.step >= steps_per_pass(config, num_frames) and bool(state.frame_errors.any())
+class Relocation(DensityControl):
+    """Relocation at the fractions `RELOCATED_AT` of the plan, after a pass at least, in fits that converge."""
+
+    def __init__(self, frames: np.ndarray, config: FitConfig, guard: Guard, find_motion: Callable[[], Motion]):
+        self.frames, self.config, self.guard, self.find_motion = frames, config, guard, find_motion
+
+    def is_due(self, state: FitState) -> bool:
+        if not state.plan or state.step < steps_per_pass(self.config, len(self.frames)):
+            return False
+        before, after = (measure_progress(state, self.config, step) for step in (state.step - 1, state.step))
+        crossed = any(before < fraction <= after for fraction in RELOCATED_AT)
+        return crossed and bool(state.frame_errors.any()) and self.guard.is_converging(state)
+
+    def apply(self, state: FitState) -> None:
+        motion = self.find_motion() if self.config.follows_motion else None
+        spec = spec_of(self.config, self.frames.shape[1:3])
+        relocate(state, self.frames, self.config, spec, motion)
 
 
 def relocate(

@@ -22,6 +22,7 @@ from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.fitting.adam import FRAME_TIME_ADAM, RateUnits, adam_step, sparse_adam
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.growth import GradientStatistics
+from foldgauss.video.models.conditioning import ConditioningSpec
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.metrics import psnr
 from foldgauss.video.models.renderer import VideoRenderer
@@ -250,6 +251,10 @@ class FitState:
     def sizes(self) -> Sizes:
         return Sizes(*self.rows.shape, len(self.frame_errors), self.growing, self.path_maps.shape[1])
 
+    def leaf(self, name: str) -> np.ndarray:
+        """A leaf of `FoldedSplats` in `rows`: a view (num_gaussians, width), where width is 1 for a number."""
+        return self.rows[:, columns((self.rows.shape[1] - columns(0)["coefficients"].stop) // 2)[name]]
+
     def is_finite(self, name: str) -> bool:
         """Whether all values of an array are finite, by their sum: a third of the time of testing each."""
         if self.held is not None:
@@ -386,6 +391,12 @@ def mean_psnr(state: FitState, config: FitConfig, frames: np.ndarray) -> float:
     """dB, mean over all frames, rendered over black."""
     renderer = VideoRenderer(to_model(state, config, frames.shape[1:3], 1.0))
     return float(np.mean([psnr(frame[..., :3], image) for frame, image in zip(frames, renderer.frames(), strict=True)]))
+
+
+def spec_of(config: FitConfig, size: tuple[int, int]) -> ConditioningSpec:
+    """How the Gaussians of a fit are conditioned, for frames of `size` (height, width)."""
+    cutoff = config.strategy.scale_cutoff
+    return ConditioningSpec(config.fold_degree, config.power, config.floor, tuple(size), scale_cutoff=cutoff)
 
 
 def envelope_of(config: FitConfig) -> TimeLikelihood:

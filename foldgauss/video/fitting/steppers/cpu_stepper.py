@@ -9,18 +9,19 @@ import numpy as np
 from foldgauss.render import cpu
 from foldgauss.video.fitting.adam import update_frame_times
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.densify import grow
-from foldgauss.video.fitting.relocation import relocate
+from foldgauss.video.fitting.losses import LOSSES
 from foldgauss.video.fitting.schedule import RateSchedule, choose_start_frames, steps_per_pass, to_planes
 from foldgauss.video.fitting.state import (
     FitState,
     frame_times,
     measure_relative_size,
     paths_of,
+    spec_of,
     update_paths,
     update_rows,
 )
 from foldgauss.video.fitting.steppers.interpolated_frames import choose_targets, make_interpolated
+from foldgauss.video.fitting.steppers.jax_loss import custom_loss
 from foldgauss.video.fitting.steppers.loss import ImageLoss, border_weights, image_loss, squared_loss
 from foldgauss.video.fitting.steppers.protocol import StepResult
 from foldgauss.video.models.background import random_background
@@ -45,14 +46,11 @@ class CpuStepper:
     ):
         """`find_motion` gives the optical flow of the frames, which is needed by a part of the settings only."""
         self.frames, self.config = frames, config
-        self.find_motion = find_motion = motion_finder(frames) if find_motion is None else find_motion
         self.background = np.zeros(3, np.float32)  # for frames with alpha another one in every step
-        self.num_frames, height, width, _ = frames.shape
+        self.num_frames = len(frames)
         self.rates, self.steps_per_pass = RateSchedule(config), steps_per_pass(config, self.num_frames)
-        self.spec = ConditioningSpec(
-            config.fold_degree, config.power, config.floor, (height, width), scale_cutoff=config.strategy.scale_cutoff
-        )
-        self.interpolation = make_interpolated(frames, config, find_motion)
+        self.spec = spec_of(config, frames.shape[1:3])
+        self.interpolation = make_interpolated(frames, config, find_motion or motion_finder(frames))
         self.adopt(state)
 
     def adopt(self, state: FitState) -> None:
@@ -111,15 +109,6 @@ class CpuStepper:
             errors[int(k)] = float(np.mean(np.square(image - to_planes(self.frames[k], self.background))))
         return errors
 
-    def grow(self, state: FitState) -> None:
-        if grow(state, self.config, self.spec.size):
-            self.adopt(state)
-
-    def relocate(self, state: FitState) -> None:
-        motion = self.find_motion() if self.config.follows_motion else None
-        relocate(state, self.frames, self.config, self.spec, motion)
-        self.adopt(state)
-
     def _differentiate(
         self,
         state: FitState,
@@ -154,7 +143,7 @@ class CpuStepper:
         if squared:
             loss = squared_loss(trace.image, target)
         else:
-            loss = image_loss(trace.image, target, ssim_fraction=self.config.loss.ssim_fraction)
+            loss = self._compute_loss(trace.image, target)
         if fraction is None:
             state.frame_errors[k] = loss.mean_squared_error
         gradient = loss.gradient
@@ -166,6 +155,12 @@ class CpuStepper:
         if screen is not None:
             cpu.raise_screen_gradients(screen, trace, gradients[0], done.alive)
         return loss, done, backpropagate(rows, done, gradients, spec, self.grad, by_path)
+
+    def _compute_loss(self, image: np.ndarray, target: np.ndarray) -> ImageLoss:
+        own = LOSSES[self.config.loss.name]
+        if own is not None:
+            return custom_loss(image, target, own)
+        return image_loss(image, target, ssim_fraction=self.config.loss.ssim_fraction)
 
     def _render(self, done: ConditionedSplats) -> cpu.Trace:
         return cpu.forward(

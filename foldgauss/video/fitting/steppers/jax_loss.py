@@ -1,11 +1,14 @@
 """The losses of `loss` in JAX, for fits on a device; a test compares both."""
 
+import functools
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from foldgauss.video.fitting.steppers.loss import C1, C2, RADIUS, SQUARE_WEIGHT, TAPS
+from foldgauss.video.fitting.steppers.loss import C1, C2, RADIUS, SQUARE_WEIGHT, TAPS, ImageLoss
 
 
 @jax.custom_vjp
@@ -46,8 +49,9 @@ def compute_losses(
     target: Float[Array, "batch height width channels"],
     squared: Bool[Array, ""],
     ssim_fraction: float,
+    function: Callable[[Array, Array], Array] | None = None,
 ) -> tuple[Float[Array, " batch"], Float[Array, " batch"]]:
-    """The loss of each image, as `squared_loss` or `image_loss`, and its mean squared error.
+    """The loss of each image, as `squared_loss`, or as `image_loss` or by `function`, and its mean squared error.
 
     Source: Kerbl et al. 2023, eq. 7, with D-SSIM as 1 - SSIM; Wang et al. 2004.
     """
@@ -59,7 +63,22 @@ def compute_losses(
         value = (1 - ssim_fraction) * _mean(difference * jax.lax.stop_gradient(jnp.sign(difference)))
         return value if ssim_fraction == 0 else value + ssim_fraction * (1 - _mean(ssim(rendered, target)))
 
-    return jax.lax.cond(squared, lambda: np.float32(SQUARE_WEIGHT) * errors, structural), errors
+    def first() -> Float[Array, " batch"]:
+        return structural() if function is None else jax.vmap(function)(rendered, target)
+
+    return jax.lax.cond(squared, lambda: np.float32(SQUARE_WEIGHT) * errors, first), errors
+
+
+def custom_loss(rendered: np.ndarray, target: np.ndarray, function: Callable[[Array, Array], Array]) -> ImageLoss:
+    """A function of `register_loss` for planar float32 images (channels, height, width), with its gradient."""
+    value, gradient = _differentiate(function)(np.moveaxis(rendered, 0, -1), np.moveaxis(target, 0, -1))
+    error = float(np.square(rendered - target).mean())
+    return ImageLoss(float(value), np.array(np.moveaxis(np.asarray(gradient), -1, 0), order="C"), error, None)
+
+
+@functools.cache
+def _differentiate(function: Callable[[Array, Array], Array]) -> Callable[..., tuple[Array, Array]]:
+    return jax.jit(jax.value_and_grad(function))
 
 
 def _mean(x: Float[Array, "batch height width channels"]) -> Float[Array, " batch"]:

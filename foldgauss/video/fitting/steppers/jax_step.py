@@ -8,6 +8,7 @@ The frames of a batch are divided over the devices of a mesh, each of which has 
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -20,6 +21,7 @@ from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.render.tiles import find_visible
 from foldgauss.video.fitting.adam import BETA1, BETA2, EPSILON, RateUnits, masked_adam, update_frame_times
+from foldgauss.video.fitting.config import Loss
 from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.fitting.state import SIZE_STRIDE, DeviceArrays, FitState, Sizes, frame_times
 from foldgauss.video.fitting.steppers.jax_loss import compute_losses
@@ -76,8 +78,8 @@ class Program:
     compositing: str
     options: RenderOptions
     engine: str
-    ssim_fraction: float
-    border_weight: float
+    loss: Loss
+    own_loss: Callable[[Array, Array], Array] | None  # of `register_loss`
     batch_size: int
     sparse_updates: bool
     rate_units: RateUnits
@@ -273,11 +275,11 @@ def _differentiate(program: Program, rows, path_maps, times, frames, control: Co
     images, to_splats = jax.vjp(functools.partial(jax.lax.map, functools.partial(_render, program)), splats)
 
     def mean_loss(images):
-        own, errors = compute_losses(images, target, control.squared, program.ssim_fraction)
+        own, errors = compute_losses(images, target, control.squared, program.loss.ssim_fraction, program.own_loss)
         return jnp.sum(own) / program.batch_size, errors
 
     (loss, errors), by_images = jax.value_and_grad(mean_loss, has_aux=True)(images)
-    (by_splats,) = to_splats(by_images * border_weights(*program.size, program.border_weight)[None, :, :, None])
+    (by_splats,) = to_splats(by_images * border_weights(*program.size, program.loss.border_weight)[None, :, :, None])
     by_rows, by_maps, by_t = to_rows(by_splats)
     return Gradients(
         loss,

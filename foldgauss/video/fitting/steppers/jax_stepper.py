@@ -12,8 +12,7 @@ import jax
 import numpy as np
 
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, most_gaussians
-from foldgauss.video.fitting.densify import grow
-from foldgauss.video.fitting.relocation import relocate
+from foldgauss.video.fitting.losses import LOSSES
 from foldgauss.video.fitting.schedule import RateSchedule, choose_start_frames, find_views_in_turn, steps_per_pass
 from foldgauss.video.fitting.state import DeviceArrays, FitState, Sizes, frame_times
 from foldgauss.video.fitting.steppers.interpolated_frames import Prefetcher, choose_targets, make_interpolated
@@ -27,7 +26,6 @@ from foldgauss.video.fitting.steppers.jax_step import (
     replicated,
 )
 from foldgauss.video.fitting.steppers.protocol import StepResult
-from foldgauss.video.models.conditioning import ConditioningSpec
 from foldgauss.video.motion.optical_flow import Motion, motion_finder
 
 #: A fit whose growth has no limit that it could reach has capacity for so many times the Gaussians of its start; where
@@ -84,11 +82,10 @@ class JaxStepper:
         find_motion: Callable[[], Motion] | None = None,
     ):
         self.frames, self.config, self.engine = frames, config, engine
-        self.find_motion = motion_finder(frames) if find_motion is None else find_motion
         self.num_frames, *size = frames.shape[:3]
         self.size = tuple(size)
         self.rates, self.steps_per_pass = RateSchedule(config), steps_per_pass(config, self.num_frames)
-        self.interpolation = make_interpolated(frames, config, self.find_motion)
+        self.interpolation = make_interpolated(frames, config, find_motion or motion_finder(frames))
         self.prefetcher = None if self.interpolation is None else Prefetcher(self.interpolation)
         self._prepared = 0  # steps
         self._no_targets: jax.Array | None = None
@@ -171,26 +168,6 @@ class JaxStepper:
                 break
             self._prepared = step + 1
 
-    def grow(self, state: FitState) -> None:
-        """Densification on the host, where any is due."""
-        growth = self.config.strategy.growth.for_plan(state.plan)
-        if growth.changes_at(state.step):
-            state.fetch_all()
-            grow(state, self.config, self.size)
-            self.adopt(state)
-        elif state.step + 1 >= growth.until_step:
-            state.held.growing = False
-
-    def relocate(self, state: FitState) -> None:
-        """On the host."""
-        config, (height, width) = self.config, self.size
-        spec = ConditioningSpec(
-            config.fold_degree, config.power, config.floor, (height, width), scale_cutoff=config.strategy.scale_cutoff
-        )
-        state.fetch_all()
-        relocate(state, self.frames, config, spec, self.find_motion() if config.follows_motion else None)
-        self.adopt(state)
-
     def measure_start(self, state: FitState) -> dict[int, float]:
         arrays, num = state.held.arrays, np.int32(state.held.num)
         times = np.asarray(frame_times(state.time_logits))
@@ -228,8 +205,8 @@ class JaxStepper:
             compositing=config.compositing,
             options=config.options,
             engine=self.engine,
-            ssim_fraction=config.loss.ssim_fraction,
-            border_weight=config.loss.border_weight,
+            loss=config.loss,
+            own_loss=LOSSES[config.loss.name],
             batch_size=config.views.batch_size,
             sparse_updates=config.strategy.sparse_updates,
             rate_units=config.rates.units,

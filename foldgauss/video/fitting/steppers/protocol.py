@@ -14,18 +14,12 @@ class StepResult(NamedTuple):
 
 
 class Stepper(Protocol):
-    """Computes the steps of a fit, and adds and prunes Gaussians between them. Methods change the state in place."""
+    """Computes the steps of a fit. Methods change the state in place."""
 
     steps_per_pass: int
 
     def step(self, state: FitState, progress: float) -> StepResult:
         """One step at a fraction of the plan. The step counter is the caller's."""
-
-    def grow(self, state: FitState) -> None:
-        """Densification, pruning and resets of `Growth` that are due at the state's step."""
-
-    def relocate(self, state: FitState) -> None:
-        """Move the Gaussians that matter least to the largest errors."""
 
     def adopt(self, state: FitState) -> None:
         """Prepare for a state whose arrays were replaced."""

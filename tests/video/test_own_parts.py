@@ -1,0 +1,71 @@
+"""Losses and density controls that a user brings."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from foldgauss.io import datasets
+from foldgauss.video import DensityControl, FitConfig, Loss, fit, fit_steps, register_loss
+from foldgauss.video.fitting.losses import LOSSES
+from foldgauss.video.fitting.steppers.jax_loss import custom_loss
+from foldgauss.video.fitting.steppers.loss import image_loss
+
+CLIP = datasets.waves().frames
+CONFIG = FitConfig(num_gaussians=30, steps=40, loss=Loss(ssim_fraction=0, l2_fraction=0))
+
+
+@pytest.fixture(autouse=True)
+def _forget_the_loss_of_other_tests(monkeypatch):
+    monkeypatch.delitem(LOSSES, "l1", raising=False)
+
+
+def mean_error(image, target):
+    return jnp.abs(image - target).mean()
+
+
+@pytest.mark.parametrize("engine", ["cpu", "xla"])
+def test_an_own_loss_is_minimized_as_the_built_in_one(engine):
+    """L1 by its own code and as a function: the same gradients, so the same fit to rounding."""
+    register_loss("l1", mean_error)
+    x, y = np.random.default_rng(0).random((2, 3, 20, 30), np.float32)
+    own, built_in = custom_loss(x, y, mean_error), image_loss(x, y, ssim_fraction=0)
+    np.testing.assert_allclose(own.gradient, built_in.gradient, rtol=1e-6)
+    np.testing.assert_allclose(own[::2], built_in[::2], rtol=1e-5)
+    config = dataclasses.replace(CONFIG, engine=engine)
+    models = [fit(CLIP, config.replace(**{"loss.name": name})).model for name in ("3dgs", "l1")]
+    images = [np.stack(list(model.frames())).astype(int) for model in models]
+    assert np.abs(images[0] - images[1]).max() <= 1
+
+
+def test_an_unknown_loss_is_refused():
+    with pytest.raises(ValueError, match=r"loss.name: expected one of '3dgs', got 'mine'"):
+        Loss(name="mine")
+
+
+class DropEverySecond(DensityControl):
+    """After step 20."""
+
+    def is_due(self, state):
+        return state.step == 20
+
+    def apply(self, state):
+        assert isinstance(state.rows, np.ndarray)
+        state.keep(np.arange(0, state.num_gaussians, 2))
+
+
+@pytest.mark.parametrize("engine", ["cpu", "xla"])
+def test_an_own_control_changes_the_gaussians(engine):
+    config = dataclasses.replace(CONFIG, engine=engine)
+    counts = [info.num_gaussians for _, info in fit_steps(CLIP, config, controls=[DropEverySecond()])]
+    assert counts == [30] * 19 + [15] * 21
+
+
+def test_leaves_are_views_of_the_rows():
+    state, _ = next(iter(fit_steps(CLIP, CONFIG)))
+    model = fit(CLIP, dataclasses.replace(CONFIG, steps=1)).model
+    for name in ("loc", "opacity_logit", "log_time_scale", "color_dc"):
+        expected = np.asarray(getattr(model.splats, name)).reshape(30, -1)
+        assert state.leaf(name).shape == expected.shape
+        assert np.shares_memory(state.leaf(name), state.rows)
