@@ -76,8 +76,9 @@ def _kernel_density(x: Rows, seed: int, effort: Effort) -> Fitted:
 
 # --- a normalising flow -----------------------------------------------------------------------------------------
 
-#: Fraction of the rows that decide when training stops, after so many epochs without a better one.
+#: Fraction of the rows on which the validation loss is measured.
 _VALIDATION = 0.15
+#: Training stops when the validation loss has not decreased for this many epochs.
 _PATIENCE = 30
 #: Interval of the splines.
 _INTERVAL = 4.0

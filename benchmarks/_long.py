@@ -18,8 +18,8 @@ from foldgauss.io.datasets import sample_clip
 BASE = 700 * 2**20
 #: Of the frames' bytes: a fit holds them, and their motion in a quarter; evaluation holds them, drawing one at a time.
 FRACTIONS = {"fit": 1.25, "evaluate": 1.0, "render": 0.0}
-#: Runs the command that follows, and prints its largest resident set in bytes at the end. It is a process of its own:
-#: on Linux the largest of a process is never below that of the one that started it, and other children count as well.
+#: Runs the command that follows, and prints its peak resident set size in bytes at the end. It is a separate process,
+#: because on Linux a child starts with the peak of its parent, and `RUSAGE_CHILDREN` includes all other children.
 MEASURED = [
     *(sys.executable, "-c"),
     "import resource, subprocess, sys; status = subprocess.run(sys.argv[1:]).returncode; "

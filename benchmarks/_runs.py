@@ -82,7 +82,7 @@ def scores(model: Any, frames: np.ndarray) -> Run:
 
 
 def fit_by_clock(frames: np.ndarray, config: FitConfig, fps: float, clock: Clock = time.process_time) -> FitResult:
-    """A fit whose minutes are those of `clock`; its history is the last step."""
+    """A fit whose `minutes` are measured by `clock`; its history has the last step only."""
     for state, info in fit_steps(frames, config, clock=clock):
         last = info
     model, quantized = finish_fit(state, frames, config, fps)

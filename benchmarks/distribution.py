@@ -2,9 +2,9 @@
 
     python -m benchmarks.distribution [--points N] [--rounds N] [--json FILE]
 
-d = 3, f = 0 and a = 1 is the case that both can do; numpyro is measured where it is installed. Every ratio is of two
-medians from the same run, in turn. First calls are those of this process, with their compilation: seconds, of the
-processor too, and memory maps where /proc shows them. Errors of float32 are the largest differences to float64 of
+d = 3, f = 0 and a = 1 is the case that both can do; numpyro is measured where it is installed. Every ratio compares
+two medians of alternating runs in one process. The table of first calls includes compilation: wall seconds, processor
+seconds, and memory maps where /proc lists them. Errors of float32 are the largest differences to float64 of
 log-densities and of the gradient of their sum by every parameter (degree 3, envelope of power 1), relative to
 1 + |value|; `benchmarks.numerics` has those at the extremes.
 """

@@ -74,7 +74,7 @@ WITHIN = 0.7
 BESIDE = 5
 CYAN = (0.0, 220.0, 255.0)
 MAGENTA = (255.0, 0.0, 255.0)
-#: A sheet's file is made smaller until it has at most so many bytes.
+#: Largest size of a sheet's file, in bytes; the sheet is scaled down until it fits.
 SHEET_BYTES = 400_000
 #: Width of a sheet at most, in pixels.
 SHEET_WIDTH = 1280

@@ -33,7 +33,7 @@ ALONE = "independent frames"
 PARAMETERS = 9
 #: Factor of the learning rates, which are meant for Gaussians that many frames act on (notes/experiments.md).
 RATE_FACTOR = 4.0
-#: That of positions.
+#: Factor of the learning rate of positions.
 LOC_RATE_FACTOR = 8.0
 
 

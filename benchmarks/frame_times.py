@@ -9,9 +9,10 @@ minutes for each of two fits that do not follow the camera, alike but for the le
 stay, since a model's times begin at 0 and end at 1. (*Bunny* has doubled frames of its own, of which this would know
 nothing.)
 
-Beside the PSNR of both stand, for the learned times, the root mean square of their errors, against that of even ones;
-the correlation of learned with true deviations from even times; and that of learned with true steps from frame to
-frame. The last says most: times that drift slowly are as good as others, since folds bend to them. `--plot` draws all.
+The table has the PSNR of both fits and three figures of the learned times: their root mean square error beside that
+of even times, the correlation of learned and true deviations from even times, and the correlation of learned and true
+intervals between frames. The last is the most informative one, since folds can absorb a slow drift of the times.
+`--plot` draws all.
 With --json each fit that is done is kept there, and the same command continues after it.
 """
 

@@ -15,8 +15,8 @@ render` does (`interpolate_frames`) and by the Gaussians alone. Beside them, of 
 
 PSNR and SSIM of 8-bit pictures, means over the frames; "without cuts" leaves out frames between two shots, which
 nothing can know. `--cost` instead fits all frames, with interpolated frames and without, and compares the PSNR at the
-frames. With `--cpu-time` minutes are those of the processor, on one thread, so that fits beside other work are
-comparable.
+frames. With `--cpu-time` fits run on one thread and minutes count its processor time, so that other processes do
+not affect the comparison.
 """
 
 import itertools

@@ -9,8 +9,8 @@ conditioning included; the slowest frame is shown too, since that is where a pla
 
 With --plot (PNG) 12 frames are also rendered with one field changed at a time, from the constants that the model was
 fitted with; the presets (with the fitted low pass) are shown beside. All settings render the same frames in turn
-(engine "cpu", one thread, conditioning not counted); `time` is the ratio of medians over rounds to that of the
-fitted constants. PSNR is against the clip. The tile size is not among the fields: this engine has one.
+(engine "cpu", one thread, conditioning not counted); `time` is the median over rounds, divided by
+that with the fitted constants. PSNR is against the clip. The tile size is not among the fields: this engine has one.
 """
 
 import dataclasses

@@ -1,9 +1,11 @@
 """`DensityControl`: what adds, removes, moves or changes Gaussians between the steps of a fit."""
 
+import abc
+
 from foldgauss.video.fitting.state import FitState
 
 
-class DensityControl:
+class DensityControl(abc.ABC):
     """A base class: `fit` asks `is_due` after each step, and calls `apply` where it is.
 
     `apply` changes the state in place, by `FitState.keep` and `extend`, or by new arrays; all arrays are then on the
@@ -15,13 +17,13 @@ class DensityControl:
 
     seconds: float = 0.0  #: that the longest call of `apply` took, set by the fit
 
+    @abc.abstractmethod
     def is_due(self, state: FitState) -> bool:
         """Whether to call `apply` now: `state.step` steps are done. Called after every step, so it should be cheap."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def apply(self, state: FitState) -> None:
         """Change the Gaussians of the state."""
-        raise NotImplementedError
 
     def reserve(self, state: FitState) -> float:
         """Seconds that the calls to come will take, for which a fit with a limited time keeps them."""
