@@ -58,8 +58,9 @@ CASES = {
 FOLDER_CHANGES = {"clips/": {"minutes": 10}, "clips-600k/": {"minutes": 10, "max_gaussians": 600_000}}
 
 
-#: The lowest acceptable figures of each fit, by name of the fit or prefix of `FOLDER_CHANGES`. `worst` is the PSNR of the
-#: worst frame minus the mean PSNR. The values for 1 and 5 minutes detect regressions: 40.5 and 39.1 dB were measured.
+#: The lowest acceptable figures of each fit, by name of the fit or prefix of `FOLDER_CHANGES`. `worst` is the PSNR of
+#: the worst frame minus the mean PSNR. The values for 1 and 5 minutes detect regressions: 40.5 and 39.1 dB were
+#: measured.
 LEAST: dict[str, dict[str, float]] = {
     "bunny-160-1": {"psnr": 40},
     "bunny-640-5": {"psnr": 38.5},
