@@ -199,8 +199,8 @@ def _passes(curves: ProfileCurves, frames: range, edges: list[np.ndarray], ends:
 
 
 def _out_of_order() -> ValueError:
-    cure = "They are out of order or of another video, the noise is too small, or the concentration too large."
-    return invalid("video", expected="frames in the model's order", got="times that cannot increase", cure=cure)
+    cure = "The frames are out of order or of another video, the noise is too small, or the concentration too large."
+    return invalid("curves", expected="likely times that increase", got="some that cannot", cure=cure)
 
 
 def _predict(edges: np.ndarray, message: np.ndarray, gaps: int, alpha: float, times: np.ndarray) -> np.ndarray:
