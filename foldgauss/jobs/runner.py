@@ -24,7 +24,7 @@ from foldgauss.io._lock import lock_output
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.media.indexing import FrameIndex, read_indexed
 from foldgauss.io.media.reading import read_video
-from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
+from foldgauss.io.models.checkpoint import is_known_good, load_checkpoint, save_checkpoint
 from foldgauss.io.models.compact import COMPACT_SUFFIX, leave_room, save_compact
 from foldgauss.io.models.video_model import save_video_model
 from foldgauss.io.provenance import describe_reading, describe_source, fingerprint
@@ -178,7 +178,9 @@ def run_steps(
     try:
         for state, info in steps:
             stop = observe(state, info) and info.progress < 1
-            due = time.monotonic() - saved > (CHECKPOINT_SECONDS if seconds is None else seconds)
+            # Rather at a step whose state is known to be good, for which the file is half as large.
+            longest = (CHECKPOINT_SECONDS if seconds is None else seconds) * (1 if is_known_good(state) else 2)
+            due = time.monotonic() - saved > longest
             if stop or due or info.progress >= 1:
                 now = time.process_time(), waiting_seconds()
                 state.processor_seconds += now[0] - spent

@@ -76,6 +76,18 @@ def test_checkpoint_goes_on_to_the_same_bits(tmp_path):
     same(whole, to_model(state, CONFIG, (24, 32), 25.0))
 
 
+def test_checkpoint_of_a_good_state_holds_it_once(tmp_path):
+    state, _ = next(fit_steps(frames(), CONFIG))
+    size = save_checkpoint(tmp_path / "two", state, config=CONFIG, source=SOURCE).stat().st_size
+    state.last_finite = state.copy()
+    path = save_checkpoint(tmp_path / "one", state, config=CONFIG, source=SOURCE)
+    assert path.stat().st_size < 0.6 * size
+    kept = load_checkpoint(path, config=CONFIG, source=SOURCE)
+    for one in (kept, kept.last_finite):
+        jax.tree.map(np.testing.assert_array_equal, one.copy(), state.copy())
+    assert not np.shares_memory(kept.rows, kept.last_finite.rows)
+
+
 def test_checkpoint_keeps_what_growth_is_decided_by(tmp_path, monkeypatch):
     """Kept between two births: the second is decided by the gradients of before, too."""
     monkeypatch.setattr(Growth, "for_plan", lambda self, plan: self)

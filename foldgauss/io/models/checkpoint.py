@@ -18,7 +18,12 @@ CHECKPOINT = "fit-checkpoint"
 
 
 def save_checkpoint(path: PathLike, state: FitState, *, config: FitConfig, source: dict) -> Path:
-    """Write a running fit with what it must be resumed with: its settings and its frames."""
+    """Write a running fit with what it must be resumed with: its settings and its frames.
+
+    The last finite state is left out where it is that of the same step: the file is then half as large.
+    """
+    if is_known_good(state):
+        state = dataclasses.replace(state, last_finite=None)
     return save_model(path, state, metadata={"config": dataclasses.asdict(config), "source": source})
 
 
@@ -36,8 +41,15 @@ def load_checkpoint(path: PathLike, *, config: FitConfig, source: dict) -> FitSt
         if changed:
             expected, got = (", ".join(f"{name}={one.get(name)!r}" for name in changed) for one in (before, now))
             raise invalid("resume", expected=expected, got=got, cure=cure)
-    state = load_part(Path(path), about)
-    return jax.tree.map(np.array, state)  # the fit updates its arrays in place, so they must be its own
+    state = jax.tree.map(np.array, load_part(Path(path), about))  # updated in place, so they must be its own
+    if state.last_finite is None:
+        state.last_finite = state.copy()
+    return state
+
+
+def is_known_good(state: FitState) -> bool:
+    """Whether the last finite state is that of the state's own step."""
+    return state.last_finite is not None and state.last_finite.step == state.step
 
 
 def _describe(state: FitState) -> dict:
