@@ -166,6 +166,27 @@ def test_what_a_header_claims_is_held_against_the_file(claim, tmp_path):
     assert peak < 16 << 20
 
 
+#: First bytes of files of other kinds, and texts.
+OTHERS = (
+    b"\x89PNG\r\n\x1a\n" + bytes(60),
+    b"ply\nformat ascii 1.0\n",
+    b"PK\x03\x04" + bytes(60),
+    b"hello",
+    b"{",
+    b"[" * 999,
+)
+
+
+@pytest.mark.parametrize("target", models.TARGETS, ids=lambda target: target.name)
+def test_a_file_cut_off_anywhere_or_of_another_kind_is_refused(target, tmp_path):
+    target.prepare(tmp_path)
+    path = target.path(tmp_path)
+    for seed in target.seeds()[:2]:
+        for data in (*(seed[:length] for length in range(0, len(seed), 1 + len(seed) // 200)), *OTHERS):
+            path.write_bytes(data)
+            assert judge(target, path) == target.errors[0].__name__, len(data)
+
+
 # ---------------------------------------------------------------------------------------------- once did harm
 
 
@@ -220,6 +241,7 @@ def test_good_neighbors_are_still_read(tmp_path):
 EVIL = [
     "</script><script>alert(1)</script>",
     "</title><img src=x onerror=alert(1)>",
+    '</title></script><script>alert(1)</script><b onclick="x">&{{script}}',
     "\"' onmouseover='alert(1)' x=\"",
     "<!--<script>",
     "a\u2028b\u2029c\x85",
