@@ -12,13 +12,9 @@ import typer
 from commands import run
 from soft_models import soft_model
 
-from foldgauss import cli
 from foldgauss.cli.app.application import app, load_commands
 from foldgauss.cli.app.registry import COMMANDS, EXAMPLES
-from foldgauss.cli.shared import fit_progress
-from foldgauss.cli.shared.rendering import TIME_LEFT
 from foldgauss.io import save_video_model, write_video
-from foldgauss.video.fitting.loop import FitInfo
 
 #: Of a terminal; Typer's help and ours go by it.
 WIDTHS = (80, 160)
@@ -192,35 +188,6 @@ def test_imports_are_named_after_inputs(here, capsys):
     assert (here / "video.safetensors").exists()
     assert (here / "mesh.mp4").exists()
     assert "mesh.mp4" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        "render holiday.safetensors --out holiday.safetensors",
-        "edit holiday.safetensors night.toml --out holiday.safetensors",
-        "export holiday.safetensors --format ply --out holiday.safetensors",
-        "evaluate holiday.safetensors holiday.mp4 --json holiday.safetensors",
-        "evaluate holiday.safetensors holiday.mp4 --json holiday.mp4",
-    ],
-)
-def test_no_input_is_overwritten(words, here, capsys):
-    before = {path.name: path.read_bytes() for path in here.iterdir()}
-    assert run(*words.split(), "--overwrite") == 2
-    assert "expected" in capsys.readouterr().err
-    assert {path.name: path.read_bytes() for path in here.iterdir()} == before
-
-
-def test_bars_show_the_time_left():
-    """Estimated by rich, except for a fit, whose steps differ in cost and which estimates its own."""
-    from rich.progress import TimeRemainingColumn
-
-    assert any(isinstance(column, TimeRemainingColumn) for column in TIME_LEFT)
-    sources = {path.stem: path.read_text() for path in Path(cli.__file__).parent.rglob("*.py")}
-    bars = {name for name, text in sources.items() if "BarColumn(" in text}
-    assert {name for name in bars if "TIME_LEFT" not in sources[name]} == {"fit_progress"}
-    info = FitInfo(3, 0.5, 0.4, 30.0, 40, 40, 5.0, seconds_left=7.0, stopped_by=None)
-    assert fit_progress.describe_step(info).endswith("7 s left")
 
 
 def test_only_the_commands_asked_for_are_loaded():

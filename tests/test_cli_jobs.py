@@ -1,7 +1,5 @@
 """Long clips in segments and many clips at once, by the command."""
 
-import dataclasses
-import io
 import json
 import os
 import shutil
@@ -11,7 +9,6 @@ import sys
 import numpy as np
 import pytest
 from commands import run
-from rich.console import Console
 
 import foldgauss.jobs.runner as fitting
 from foldgauss.cli.fitting import fit_many as many
@@ -296,17 +293,6 @@ def test_many_clips_begun_anew_and_stopped_go_on(clips, tmp_path, capsys, monkey
     assert {load_video_model(path).degree for path in out.glob("*.fgz")} == {2}
 
 
-def test_a_checkpoint_of_other_settings_is_not_thrown_away(clips, tmp_path, capsys, monkeypatch):
-    out = tmp_path / "models"
-    stopped(monkeypatch, "clip0.mp4", "fit-many", clips, "--out", out, *QUICK)
-    kept = out / "records" / "clip0.fgz.checkpoint"
-    before = kept.read_bytes()
-    capsys.readouterr()
-    assert run("fit-many", clips, "--out", out, *QUICK[:-1], "2") == 2
-    assert f"{kept} exists, with other settings" in " ".join(capsys.readouterr().err.split())
-    assert kept.read_bytes() == before
-
-
 @pytest.mark.parametrize("options", [("--workers", "2"), ("--scheduler", "tcp://127.0.0.1:1")])
 def test_without_dask_nothing_is_begun(clips, tmp_path, capsys, monkeypatch, options):
     monkeypatch.setitem(sys.modules, "distributed", None)
@@ -331,17 +317,6 @@ def test_names_hold_no_pictures(capsys):
     assert "no:smile:folder" in "".join(capsys.readouterr().err.split())
 
 
-def test_names_are_shown_as_they_are(monkeypatch):
-    """In a bar, too, brackets are no commands for a color."""
-    console = Console(file=io.StringIO(), force_terminal=True, width=120)
-    monkeypatch.setattr(_jobs_view, "err", console)
-    view = _jobs_view._View("clips", 2, "bar")
-    with view.bar:
-        view.update(Progress("[red]one.mp4", 0.5, 30.0, 3, 40, 1.0, 1.0))
-        view.bar.refresh()
-    assert "[red]one.mp4" in console.file.getvalue()
-
-
 def test_many_clips_in_a_place_of_its_own(clips, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert run("fit-many", clips, "--out", clips, *QUICK) == 2
@@ -350,20 +325,3 @@ def test_many_clips_in_a_place_of_its_own(clips, tmp_path, capsys, monkeypatch):
     assert run("fit-many", clips / "clip0.mp4", *QUICK) == 2
     assert "foldgauss fit" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
-
-
-def test_of_very_many_clips_the_table_shows_none(capsys):
-    """Rows of more than a screen or two help nobody: the summary has them."""
-    from foldgauss.cli.fitting.fit_many import MAX_ROWS, _print_table
-    from foldgauss.jobs import FitJob, Outcome
-    from foldgauss.video import FitConfig
-
-    record = {"num_frames": 8, "size": [24, 32], "mean_psnr": 30.0, "mean_ssim": 0.9, "num_gaussians": 40}
-    record |= {"file_bytes": 1234, "seconds": 1.5}
-    jobs = [FitJob(f"clip{k}.mp4", "", str(k), FitConfig()) for k in range(MAX_ROWS + 1)]
-    _print_table("models", [Outcome(job, record) for job in jobs[:-1]] + [Outcome(jobs[-1], failure="broken")])
-    told = capsys.readouterr().out
-    assert "clip3.mp4" not in told
-    assert f"{MAX_ROWS} models in models, mean PSNR 30.00 dB, 90 s of fitting; 1 failed" in told
-    _print_table("models", [Outcome(dataclasses.replace(jobs[0]), record)])
-    assert "clip0.mp4" in capsys.readouterr().out

@@ -14,7 +14,6 @@ from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.settings import setting_of
 from foldgauss.cli.app.application import load_commands
 from foldgauss.io import load_video_model, save_video_model, write_image, write_video
-from foldgauss.io._atomic import OutputError, write_or_keep
 from foldgauss.io.datasets import waves
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.video import FitConfig
@@ -98,19 +97,6 @@ def test_a_page_is_told_of_where_there_is_no_terminal(model, tmp_path, capsys, m
     monkeypatch.setattr("foldgauss.cli.shared.log_lines.FIRST_LINE_SECONDS", 0.0)
     assert run("view", model, "--out", tmp_path / "new" / "p.html") == 0
     assert "Writing the page" in capsys.readouterr().err
-
-
-def test_a_result_without_room_is_kept_elsewhere(tmp_path, monkeypatch):
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-
-    def write(path):
-        if path.parent.name == "full":
-            raise OutputError("path: no room.")
-        Path(path).write_text("result")
-
-    with pytest.raises(OutputError, match=r"no room\. It is kept in .*m.safetensors"):
-        write_or_keep(tmp_path / "full" / "m.safetensors", write)
-    assert [path.read_text() for path in tmp_path.glob("*/m.safetensors")] == ["result"]
 
 
 #: Commands that write after long work, by what they write; CLIP, MODEL, MASK and SCRIPT are inputs, OUT is the output.

@@ -249,6 +249,8 @@ INPUTS = {
     "view": ["view", "m.safetensors", "--original", "in.html", "--out", "in.html"],
     "compress": ["compress", "m.safetensors", "in.fgz", "--out", "in.fgz"],
     "evaluate": ["evaluate", "m.safetensors", "in.json", "--json", "in.json"],
+    "evaluate, model": ["evaluate", "in.safetensors", "in.mp4", "--json", "in.safetensors"],
+    "edit": ["edit", "in.safetensors", "s.toml", "--out", "in.safetensors"],
     "fit": ["fit", "in.safetensors", "--out", "in.safetensors"],
 }
 

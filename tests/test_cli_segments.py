@@ -80,17 +80,6 @@ def test_render_shows_what_the_model_does(options, positions, here, tmp_path):
     np.testing.assert_array_equal(pictures(tmp_path / "frames"), list(own))
 
 
-def test_render_takes_constants_of_the_picture(here, tmp_path):
-    out = tmp_path / "one.png"
-    assert run("render", here, "--times", "0.3", "--alpha-cutoff", "0.3", "--out", out) == 0
-    (with_it,), without = pictures_of(out), next(video().frames(np.array([0.3])))
-    assert np.abs(with_it.astype(int) - without).max() > 20
-
-
-def pictures_of(path):
-    return [cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)]
-
-
 def test_evaluate_reads_the_clip_bit_by_bit(here, work, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(
         "foldgauss.cli.shared.clips.read_video", lambda *_, **__: pytest.fail("the whole clip was read")

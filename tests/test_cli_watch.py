@@ -4,7 +4,6 @@ import json
 import re
 import signal
 import sys
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -48,35 +47,6 @@ def test_history_and_its_curves(clip, tmp_path):
     assert (tmp_path / "away.jsonl").read_bytes() == before
     assert run("fit", clip, "--out", target, *QUICK[:-1], "10", "--history", path, "--overwrite") == 0
     assert len(read_history(path)) == 10
-
-
-def test_history_of_a_resumed_fit_has_each_step_once(clip, tmp_path, monkeypatch):
-    """Kept at step 8, killed at step 12 with half a line written."""
-    target, path = tmp_path / "m.safetensors", tmp_path / "m.jsonl"
-    arguments = ["fit", clip, "--out", target, *QUICK, "--history", path]
-    steps = runner.fit_steps
-
-    def killed(*given):
-        for state, info in steps(*given):
-            monkeypatch.setattr(runner, "CHECKPOINT_SECONDS", -1.0 if info.step == 8 else 1e9)
-            if info.step == 13:
-                raise OSError("killed")
-            yield state, info
-
-    monkeypatch.setattr(runner, "fit_steps", killed)
-    assert run(*arguments) == 1
-    first = read_history(path)
-    assert [info.step for info in first] == list(range(1, 13))
-    with open(path, "a") as file:
-        file.write('{"step": 13, "pro')
-    monkeypatch.setattr(runner, "fit_steps", steps)
-    assert run(*arguments, "--resume") == 0
-    history = read_history(path)
-    assert [info.step for info in history] == list(range(1, 21))
-    assert history[:8] == first[:8]
-    losses = [[info.loss for info in part[8:12]] for part in (history, first)]
-    assert losses[0] == losses[1]  # those steps were taken again, to the bit
-    assert np.all(np.diff([info.seconds for info in history]) > 0)
 
 
 def test_without_matplotlib_only_the_curves_are_missing(clip, tmp_path, monkeypatch, capsys):
@@ -168,33 +138,6 @@ def test_lines_in_a_log(clip, tmp_path, monkeypatch, capfd):
     monkeypatch.undo()  # a fit shorter than the first pause tells its end alone
     assert run("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK, "--overwrite") == 0
     assert len(re.findall("^Fitting", capfd.readouterr().err, re.M)) == 1
-
-
-def test_the_clock_rings_first_soon_and_then_now_and_then(monkeypatch):
-    now = [100.0]
-    monkeypatch.setattr(_progress.time, "monotonic", lambda: now[0])
-    rung = []
-    observe = _progress._at_intervals(30.0, lambda state, info: rung.append(now[0]), first=10.0)
-    for second in range(100, 200):
-        now[0] = float(second)
-        observe(None, SimpleNamespace(progress=0.5))
-    assert rung == [110, 140, 170]
-
-
-def test_a_stopped_fit_leaves_its_history(clip, tmp_path, monkeypatch, capsys):
-    steps = runner.fit_steps
-
-    def stepping(*given):
-        for state, info in steps(*given):
-            if info.step == 7:
-                signal.raise_signal(signal.SIGINT)
-            yield state, info
-
-    monkeypatch.setattr(runner, "fit_steps", stepping)
-    path = tmp_path / "h.jsonl"
-    assert run("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK, "--history", path, "--quiet") == 1
-    assert [info.step for info in read_history(path)] == list(range(1, 8))
-    assert "--resume" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

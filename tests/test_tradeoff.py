@@ -6,10 +6,7 @@ import json
 import math
 import os
 import shlex
-import signal
-import subprocess
 import sys
-import time
 from pathlib import Path
 
 import cv2
@@ -25,7 +22,6 @@ from foldgauss.io.media.clip import AS_STORED
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.jobs import runner
 from foldgauss.video import FitConfig, FitDiverged, evaluate, tradeoff
-from foldgauss.video.motion.optical_flow import Motion
 from foldgauss.video.tradeoff import (
     AXES,
     LEAST_STEPS,
@@ -253,70 +249,6 @@ def test_commands_reproduce_their_points(done, tmp_path, monkeypatch):
             psnr = read_metadata(path)["mean_psnr"]
             assert path.stat().st_size == rows[name]["bytes"]
         assert psnr == pytest.approx(rows[name]["psnr"], abs=0.01), name
-
-
-@pytest.mark.slow
-def test_killed_run_resumes(clip, tmp_path, capsys, monkeypatch):
-    target, axes = tmp_path / "results", "time"
-    arguments = ["tradeoff", str(clip), "--out", str(target), "--axes", axes, *QUICK]
-    process = subprocess.Popen([sys.executable, "-m", "foldgauss", *arguments], stderr=subprocess.DEVNULL)
-    record = target / "tradeoff.json"
-    begun = time.monotonic()
-    while not (record.exists() and len(record_of(target)["points"]) >= 1):
-        assert process.poll() is None
-        assert time.monotonic() - begun < 200
-        time.sleep(0.02)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    before = record_of(target)["points"]
-    assert len(before) < 4
-    fitted, steps = [], command.fit_steps
-
-    def watched(frames, config, **known):
-        fitted.extend([config.steps] if config.steps > 2 else [])  # else it only compiles
-        return steps(frames, config, **known)
-
-    monkeypatch.setattr(command, "fit_steps", watched)
-    assert run(*arguments) == 0
-    after = record_of(target)["points"]
-    assert after[: len(before)] == before
-    assert len(after) == 4
-    assert (target / "tradeoff.csv").exists()
-    again = [row for row in after[len(before) :] if row["command"].startswith("foldgauss fit")]
-    assert len(fitted) == len(again)
-    capsys.readouterr()
-    fitted.clear()
-    assert run(*arguments) == 0  # nothing is left to do
-    assert fitted == []
-    assert "Commands of the points on the Pareto fronts:" in capsys.readouterr().out
-    assert record_of(target)["points"] == after
-
-
-@pytest.mark.slow
-def test_motion_is_found_once_and_counted_in_every_fit(clip, tmp_path, monkeypatch):
-    """`fit` finds it anew each time; so it is in each fit's seconds, though it was found once."""
-    found, given, steps, of = [], [], command.fit_steps, Motion.from_frames
-
-    def slow(frames):
-        found.append(len(frames))
-        time.sleep(1.5)
-        return of(frames)
-
-    def watched(frames, config, **known):
-        given.extend([known.get("motion")] if config.follows_motion else [])
-        return steps(frames, config, **known)
-
-    monkeypatch.setattr(Motion, "from_frames", slow)
-    monkeypatch.setattr(command, "fit_steps", watched)
-    assert run("tradeoff", clip, "--out", tmp_path / "r", "--axes", "compositing", *QUICK) == 0
-    assert found == [FRAMES]
-    assert len(given) == 3  # that of the pace, the base, the sum
-    assert all(isinstance(motion, Motion) and motion is given[0] for motion in given)
-    record = record_of(tmp_path / "r")
-    spent = record["plan"]["motion_seconds"]
-    assert spent >= 1.5
-    assert record["plan"]["pace"]["start"] < spent  # what it takes is not planned for in every fit
-    assert all(row["seconds"] > spent for row in record["points"])
 
 
 @pytest.mark.parametrize(("name", "writes"), [("tradeoff.json", 3), ("tradeoff.csv", 1)])  # the last point, the table

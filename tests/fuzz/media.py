@@ -14,13 +14,10 @@ import numpy as np
 from PIL import Image
 
 from foldgauss.io import VideoError, read_masks, read_video, write_video
-from foldgauss.io.media.clip import HEAD_BYTES, MAX_PIXELS
-from foldgauss.io.media.decoder import describe_kind
-from foldgauss.io.media.images import is_image
+from foldgauss.io.media.clip import MAX_PIXELS
 
-from .branches import ONLY
 from .models import written
-from .mutate import by_chance, png_resealed, png_sized
+from .mutate import by_chance, png_resealed
 from .target import CONSTANT, Target, chance
 
 _NUMBERS = np.array([[0, 1, 1, 2], [0, 0, 2, 255], [3, 1, 0, 0]], np.uint8)
@@ -80,12 +77,9 @@ MASKS = Target(
     _images,
     _read_mask,
     (ValueError, VideoError),
-    {"foldgauss.io.media.masks": ()},
+    (png_resealed,),
     lambda data: 8 if data.startswith(b"\x89PNG") else 2,
     _picture_memory,
-    (png_resealed, png_sized),
-    past_header=1,
-    share=2.0,
 )
 
 
@@ -132,31 +126,15 @@ def _read_picture(path: Path) -> None:
     assert (clip.frames.dtype, clip.frames.ndim) == (np.uint8, 4)
 
 
-#: The parts of `foldgauss.io.media` that read clips; what a path is, no contents change.
-_READ = {
-    f"foldgauss.io.media.{module}": names
-    for module, names in {
-        "clip": (ONLY, "check_range_within", "check_num_pixels"),
-        "reading": (ONLY, "scan_clip", "resize_frame", "stack_frames"),
-        "decoder": (),
-        "images": ("natural_sort_key", "is_bare_jpegs"),
-        "facts": (),
-        "frame_rate": (),
-    }.items()
-}  # fmt: skip
-
 PICTURES = Target(
     "pictures",
     ".png",
     lambda: [*_images(), *_more_images()],
     _read_picture,
     (VideoError,),
-    _READ,
+    (png_resealed, _another_picture),
     lambda data: 8,
     lambda size: 1 << 32,  # the library's own limit is 2^30 pixels
-    (png_resealed, png_sized, _another_picture),
-    past_header=1,
-    share=0.5,
 )
 
 
@@ -265,6 +243,14 @@ def _another_kind(data: bytes, random: Random) -> bytes:
     return other + data[len(other) :] if random.random() < 0.5 else other
 
 
+def _resized_box(data: bytes, random: Random) -> bytes:
+    """A box of an MP4 of another size: none, one of 64 bits, the rest, beyond the end."""
+    at = data.find(random.choice((b"ftyp", b"free", b"mdat", b"moov", b"trak", b"edts", b"elst", b"mdia", b"hdlr")))
+    if at < 4:
+        return by_chance(data, random)
+    return data[: at - 4] + random.choice((0, 1, 4, 8, 60, 1 << 31)).to_bytes(4, "big") + data[at:]
+
+
 def _read_clip(path: Path) -> None:
     number = chance(path) % 8
     if number == 0:
@@ -284,50 +270,9 @@ VIDEO = Target(
     lambda: list(_clips()),
     _read_clip,
     (VideoError,),
-    _READ | {"foldgauss.io.media.masks": ()},
+    (by_chance, by_chance, _marked, _another_kind, _resized_box),
     _clip_body,
     lambda size: 1 << 32,
-    (by_chance, by_chance, _marked, _another_kind),
-    share=1.0,
 )
 
-
-def _read_head(path: Path) -> None:
-    """All that is asked of a file's first bytes, without decoding."""
-    head = path.read_bytes()[:HEAD_BYTES]
-    is_image(head)
-    kind = describe_kind(head)
-    if kind is not None:
-        raise ValueError(f"expected a video or an image, got {kind}")
-
-
-def _resized_box(data: bytes, random: Random) -> bytes:
-    """A box of an MP4 of another size: none, one of 64 bits, the rest, beyond the end; or of version 1."""
-    name = random.choice(
-        (b"ftyp", b"free", b"mdat", b"moov", b"mvhd", b"trak", b"edts", b"elst", b"mdia", b"hdlr", b"mdhd")
-    )
-    at = data.find(name)
-    if at < 4:
-        return by_chance(data, random)
-    if random.random() < 0.2:
-        return data[: at + 4] + b"\1" + data[at + 5 :]
-    return data[: at - 4] + random.choice((0, 1, 4, 8, 60, 1 << 31)).to_bytes(4, "big") + data[at:]
-
-
-HEADERS = Target(
-    "headers",
-    ".mp4",
-    lambda: [*_clips(), *_images(), *_more_images()],
-    _read_head,
-    (ValueError,),
-    {"foldgauss.io.media.decoder": (ONLY, "describe_kind"), "foldgauss.io.media.images": (ONLY, "is_image")},
-    lambda data: 8,
-    mutations=(_resized_box, png_sized, _marked, _another_kind),
-    past_header=2,
-)
-
-
-# ---------------------------------------------------------------------------------------------------- arrays
-
-
-TARGETS = (MASKS, PICTURES, VIDEO, HEADERS)
+TARGETS = (MASKS, PICTURES, VIDEO)

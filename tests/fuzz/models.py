@@ -35,7 +35,6 @@ from foldgauss.video.fitting.state import FitState
 from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.selection.selectors import Selection
 
-from .branches import ONLY
 from .mutate import by_chance, json_changed, json_text_changed
 from .target import CONSTANT, Target, chance
 
@@ -148,14 +147,6 @@ def resized(data: bytes, random: Random) -> bytes:
 
 
 _MODEL_MUTATIONS = (facts_changed, table_changed, resized)
-#: `_array_leaves` refuses models that are saved; what is loaded comes with the shapes of a skeleton.
-_MODEL_FILE = {
-    "foldgauss.io.models.model_file": (
-        "register_model", "save_model", "write_tensors", "_to_numpy", "_check_described", "to_json",
-        "_array_leaves",
-        "_encode_scalar", "to_json_types",
-    ),
-}  # fmt: skip
 
 
 @functools.cache
@@ -201,21 +192,9 @@ VIDEO = Target(
     _video_seeds,
     _read_video,
     (ModelFileError,),
-    _MODEL_FILE
-    | {
-        "foldgauss.io.models.video_model": (
-            "save_video_model", "check_model_name", "_describe_video", "_describe_edited", "_describe_layer",
-            "_describe_camera",
-        ),
-        "foldgauss.io.models.segmented": (
-            "join_segments", "save_segmented", "is_segmented", "_source", "_unfit", "load",
-        ),
-    },
-    tensors_from,
-    lambda size: 2 * CONSTANT + 400 * size,
     _MODEL_MUTATIONS,
-    share=1.0,
-)  # fmt: skip
+    tensors_from,
+)
 
 
 _CONFIG, _SOURCE = FitConfig(), {"clip": "a", "num_frames": 3}
@@ -245,20 +224,9 @@ CHECKPOINT = Target(
     _checkpoint_seeds,
     lambda path: load_checkpoint(path, config=_CONFIG, source=_SOURCE),
     (ModelFileError, ValueError),
-    _MODEL_FILE
-    | {
-        "foldgauss.io.models.video_model": (
-            "save_video_model", "check_model_name", "load_video_model", "read_metadata", "read_origin",
-            "_is_range", "_check_video", "_describe_video", "_video_skeleton", "_describe_edited",
-            "_describe_layer", "_describe_camera", "_edited_skeleton", "_layer_skeleton", "_camera_skeleton",
-        ),
-        "foldgauss.io.models.checkpoint": ("save_checkpoint", "_describe"),
-    },
-    tensors_from,
-    lambda size: 2 * CONSTANT + 400 * size,
     _MODEL_MUTATIONS,
-    share=0.8,
-)  # fmt: skip
+    tensors_from,
+)
 
 
 @functools.cache
@@ -285,11 +253,8 @@ SELECTION = Target(
     ],
     _load_selection,
     (ModelFileError, ValueError),
-    _MODEL_FILE | {"foldgauss.io.models.selections": (ONLY, "load_selection", "_make_skeleton")},
-    tensors_from,
-    lambda size: 2 * CONSTANT + 400 * size,
     _MODEL_MUTATIONS,
-    share=1.0,
+    tensors_from,
     prepare=lambda folder: (_edited(), _in_segments()),  # once, and not while memory is measured
 )
 
@@ -423,38 +388,17 @@ def _read_compact(path: Path) -> None:
             compact.measure_chunks(path)
 
 
-def _compact_seeds() -> list[bytes]:
-    return [
-        written(lambda path, one=one: save_compact(path, one, metadata={"clip": "a"}), ".fgz") for one in _quantised()
-    ]
-
-
 COMPACT = Target(
     "compact",
     ".fgz",
-    _compact_seeds,
+    lambda: [
+        written(lambda path, one=one: save_compact(path, one, metadata={"clip": "a"}), ".fgz") for one in _quantised()
+    ],
     _read_compact,
     (ModelFileError,),
-    {
-        "foldgauss.io.models.compact": ("save_compact", "check_compact_name", "pack_compact"),
-        "foldgauss.video.compression.column_contexts": (),
-        "foldgauss.io.models.video_model": (
-            ONLY,
-            "load_video_model",
-            "read_metadata",
-            "read_origin",
-            "_is_range",
-        ),
-        "foldgauss.video.compression.range_coder": ("encode",),
-    },
+    (numbers_changed, stream_changed, compact_header_changed),
     _compact_body,
     lambda size: 4 * CONSTANT + 2_000 * size,  # a byte may hold 32 numbers: the format's own limit
-    (numbers_changed, stream_changed, compact_header_changed),
-    past_header=1,
-    share=0.25,
 )
 
-#: The same with kernels as Python, so that their branches are seen; slow.
-KERNELS = dataclasses.replace(COMPACT, name="compact-kernels", share=0.03, environment=(("NUMBA_DISABLE_JIT", "1"),))
-
-TARGETS = (VIDEO, CHECKPOINT, SELECTION, COMPACT, KERNELS)
+TARGETS = (VIDEO, CHECKPOINT, SELECTION, COMPACT)

@@ -20,10 +20,9 @@ from foldgauss.io import (
 )
 from foldgauss.io.exchange.pseudomesh import read_obj
 
-from .branches import ONLY
 from .models import tiny_model, written
-from .mutate import by_chance, json_changed, json_text_changed
-from .target import CONSTANT, Target, chance
+from .mutate import by_chance, json_text_changed
+from .target import Target, chance
 
 
 def _text_of(data: bytes, order: str = "ascii") -> bytes:
@@ -152,9 +151,6 @@ def _read_vegas(path: Path) -> None:
     assert model.num_frames >= 2
 
 
-_PLY = {
-    "foldgauss.io.exchange.ply_file": ("write_ply", "_encode"),
-}
 _PLY_MUTATIONS = (numbers_changed, note_changed, counted, columns_changed)
 
 VEGAS = Target(
@@ -166,12 +162,8 @@ VEGAS = Target(
     ],
     _read_vegas,
     (FormatError,),
-    _PLY | {"foldgauss.io.exchange.vegas_ply": ("write_vegas_ply", "_check_writable_as_vegas")},
-    _ply_body,
-    lambda size: 2 * CONSTANT + 200 * size,
     _PLY_MUTATIONS,
-    past_header=1,
-    share=2.0,
+    _ply_body,
 )  # fmt: skip
 
 SCENE = Target(
@@ -183,12 +175,8 @@ SCENE = Target(
     ],
     lambda path: read_3dgs_ply(path, axes="y-up" if chance(path) % 2 else "y-down"),
     (FormatError,),
-    _PLY | {"foldgauss.io.exchange.gaussians_ply": (ONLY, "read_3dgs_ply", "_turn")},
-    _ply_body,
-    lambda size: 2 * CONSTANT + 200 * size,
     _PLY_MUTATIONS,
-    past_header=1,
-    share=3.0,
+    _ply_body,
 )  # fmt: skip
 
 
@@ -249,35 +237,16 @@ def _read_mesh(path: Path) -> None:
     assert mesh.num_frames == 1
 
 
-_MESH = {
-    "foldgauss.io.exchange.pseudomesh": (
-        "Pseudomesh", "_flat_factor", "write_pseudomesh", "_obj_text", "_axes",
-    )
-}  # fmt: skip
-
 OBJ = Target(
     "obj",
     ".obj",
     lambda: [_mesh()["frame_0000.obj"], _tool(_mesh()["frame_0000.obj"])],
     _read_mesh,
     (FormatError,),
-    {"foldgauss.io.exchange.pseudomesh": (*_MESH["foldgauss.io.exchange.pseudomesh"], "_read_notes", "_check_notes")},
-    lambda data: 0,
-    lambda size: 2 * CONSTANT + 400 * size,
     (line_changed,),
-    past_header=1,
-    share=3.0,
     prepare=lambda folder: _beside(folder, "frame_0000.obj"),
     file_name="frame_0000",
 )
-
-
-def one_fact_changed(data: bytes, random: Random) -> bytes:
-    """One thing in a JSON object, not the object itself."""
-    try:
-        return json.dumps(json_changed(json.loads(data), random)).encode("utf-8", "surrogatepass")
-    except (ValueError, RecursionError):
-        return by_chance(data, random)
 
 
 def _read_notes(path: Path) -> None:
@@ -296,20 +265,9 @@ NOTES = Target(
     ],
     _read_notes,
     (FormatError,),
-    {
-        "foldgauss.io.exchange.pseudomesh": (
-            *_MESH["foldgauss.io.exchange.pseudomesh"],
-            "_read_frame", "_check_area", "read_obj", "_parse_vertex",
-            "_check_face",
-        )
-    },
-    lambda data: 0,
-    lambda size: 2 * CONSTANT + 400 * size,
-    (one_fact_changed, json_text_changed),
-    past_header=2,
-    share=1.0,
+    (json_text_changed,),
     prepare=lambda folder: _beside(folder, "pseudomesh.json"),
     file_name="pseudomesh",
-)  # fmt: skip
+)
 
 TARGETS = (VEGAS, SCENE, OBJ, NOTES)

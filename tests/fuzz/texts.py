@@ -20,10 +20,9 @@ from foldgauss.video.fitting.loop import FitInfo
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 from foldgauss.video.selection.selectors import Selection
 
-from .branches import ONLY
 from .models import tiny_model, written
-from .mutate import by_chance, json_changed, json_text_changed
-from .target import CONSTANT, Target, chance
+from .mutate import by_chance, json_text_changed
+from .target import Target, chance
 
 _SCRIPT = b"""\
 # an edit
@@ -272,15 +271,7 @@ SCRIPT = Target(
     ],
     read_edit_script,
     (EditScriptError,),
-    {
-        "foldgauss.io.edit_script": (),
-        "foldgauss.io.models.selections": (ONLY, "parse_indices", "parse_ranges"),
-    },
-    lambda data: 0,
-    lambda size: 2 * CONSTANT + 400 * size,
     (toml_changed,),
-    past_header=1,
-    share=1.4,
     prepare=_beside_scripts,
 )
 
@@ -292,7 +283,6 @@ APPLIED = dataclasses.replace(
     parse=_apply_script,
     errors=(EditScriptError, FileNotFoundError),
     memory=lambda size: (256 << 20) + 400 * size,
-    share=0.1,
 )
 
 
@@ -329,12 +319,7 @@ HISTORY = Target(
     lambda: [_history(), b"", _history() + b'{"step": 9, "prog'],
     _read_history,
     (ValueError,),
-    {"foldgauss.io.history": ("write_curves", "info_line", "_to_json", "__call__", "__enter__", "__exit__")},
-    lambda data: 8 if data.startswith(b'{"step"') else 0,
-    lambda size: 2 * CONSTANT + 200 * size,
     (one_line_changed,),
-    past_header=1,
-    share=3.0,
 )
 
 
@@ -354,25 +339,13 @@ def _record() -> bytes:
     return json.dumps(kept | {"points": rows}).encode()
 
 
-def record_changed(data: bytes, random: Random) -> bytes:
-    try:
-        return json.dumps(json_changed(json.loads(data), random)).encode("utf-8", "surrogatepass")
-    except (ValueError, RecursionError):
-        return by_chance(data, random)
-
-
 TRADEOFF = Target(
     "tradeoff",
     ".json",
     lambda: [_record()],
     lambda path: Record(path, {"a": 1, "b": [1, 2]}, machine={}),
     (ParameterError,),
-    {"foldgauss.cli.measuring.tradeoff_record": (ONLY, "Record")},
-    lambda data: 0,
-    lambda size: 2 * CONSTANT + 200 * size,
-    (record_changed, json_text_changed),
-    past_header=2,
-    share=0.5,
+    (json_text_changed,),
     says=("expected", "holds results of other settings"),
 )
 

@@ -1,6 +1,5 @@
 """Scripts of edits: what they say is what the Python chain does, and mistakes are told with their line."""
 
-import contextlib
 import math
 import re
 import tempfile
@@ -11,7 +10,7 @@ import cv2
 import jax
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from soft_models import NUM, NUM_FRAMES, OBJECT, SIZE, soft_model
 
@@ -19,7 +18,7 @@ from foldgauss.io import save_selection, save_video_model
 from foldgauss.io.edit_script import ACTIONS, EditScriptError, parse_edit_script, read_edit_script
 from foldgauss.io.models.selections import format_indices, parse_indices
 from foldgauss.render import Camera
-from foldgauss.video import EditedVideo, SegmentedVideo, Selection, VideoModel, edit, layers, select
+from foldgauss.video import EditedVideo, SegmentedVideo, Selection, edit, layers, select
 
 MODEL = soft_model()
 #: The same as a clip in segments, of one segment.
@@ -485,76 +484,6 @@ def test_files(tmp_path):
 
 
 # ------------------------------------------------------------------------------------------------------------- whatever
-
-WORDS = sorted({key for action in ACTIONS.values() for key in action.keys} | {"box", "polygon", "color", "click"})
-VALUES = st.recursive(
-    st.booleans()
-    | st.integers(-(10**20), 10**20)
-    | st.floats(width=32)
-    | st.sampled_from(["it", "hold", "smooth", "", "\0", "front"])
-    | st.sampled_from([0, 1, 2, 0.5, -0.25]),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.sampled_from(WORDS), inner, max_size=2),
-    max_leaves=8,
-)
-
-
-def toml(value) -> str:
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{key} = {toml(one)}" for key, one in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(toml, value)) + "]"
-    if isinstance(value, str):
-        return '"' + value.replace("\0", "\\u0000") + '"'
-    return str(value).lower()
-
-
-@st.composite
-def scripts(draw):
-    """Edits and selections with keys of their own, and values right and wrong."""
-    table = {}
-    for key in draw(st.lists(st.sampled_from(["box", "polygon", "color", "click", "times", "frame", "frames"]))):
-        good = {"box": [10, 8, 40, 30], "polygon": [[1, 2], [40, 2], [20, 30]], "color": [1, 0, 0.5], "click": [22, 20]}
-        good |= {"times": [0.1, 0.9], "frame": 2, "frames": [1, 4]}
-        table[key] = draw(st.just(good[key]) | VALUES)
-    text = "[selections.it]\n" + "".join(f"{key} = {toml(value)}\n" for key, value in table.items())
-    for _ in range(draw(st.integers(0, 3))):
-        name = draw(st.sampled_from(sorted(CHAINS)))
-        keys = tomllib.loads(
-            CHAINS[name][0] + ("\n" + SPAN if ACTIONS[name.split()[0]].spans and draw(st.booleans()) else "")
-        )
-        own = sorted(ACTIONS[name.split()[0]].keys)
-        keys |= draw(st.dictionaries(st.sampled_from(own), VALUES, max_size=2)) if own else {}
-        keys |= draw(st.just({}) | st.just({"select": "it"}))
-        text += f'[[edits]]\ndo = "{name.split()[0]}"\n' + "".join(f"{k} = {toml(v)}\n" for k, v in keys.items())
-    return text
-
-
-@settings(max_examples=100, deadline=None, suppress_health_check=list(HealthCheck))
-@given(text=scripts())
-def test_whatever_a_script_says_it_works_or_is_told(text):
-    """And what is made can be drawn and saved, so nothing wrong goes in unseen."""
-    told = None
-    try:
-        video = made(text)
-    except EditScriptError as error:
-        told = str(error)
-    if told is not None:
-        assert re.match(r"script, line \d+[,:]", told), told
-        return
-    assert isinstance(video, VideoModel | EditedVideo)
-    assert np.isfinite(video.at(0.3).mean).all()
-
-
-@settings(max_examples=150, deadline=None)
-@given(text=st.text("[]{}\"'=.,#\n\r \\ab1 edits selections camera", max_size=60))
-def test_whatever_a_text_is_it_is_read_or_told(text):
-    with contextlib.suppress(EditScriptError):
-        parse_edit_script(text)
-
-
-def test_keys_of_endless_parts_are_refused():
-    with pytest.raises(EditScriptError, match="keys of a few parts"):
-        parse_edit_script(".".join(["a"] * 16_000) + "=1")
 
 
 def test_names_mean_the_first_gaussians_however_many_there_are_now():

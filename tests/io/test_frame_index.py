@@ -11,12 +11,11 @@ import subprocess
 import sys
 import threading
 import weakref
-from fractions import Fraction
 from functools import partial
 
-import av
 import numpy as np
 import pytest
+from clips import encode, encoded, images, one_line
 from PIL import Image
 
 from foldgauss.io import (
@@ -29,7 +28,6 @@ from foldgauss.io import (
     read_video,
     write_frames,
     write_image,
-    write_video,
 )
 from foldgauss.io.datasets import sample_clip
 from foldgauss.io.media import decoder, indexing
@@ -45,19 +43,6 @@ def _moving(num_frames, height=HEIGHT, width=WIDTH):
     there_and_back = [(k % (6 * height), 2 * k % (6 * width)) for k in range(num_frames)]
     shifts = [(min(y, 6 * height - y), min(x, 6 * width - x)) for y, x in there_and_back]
     return np.stack([texture[top : top + height, left : left + width] for top, left in shifts])
-
-
-def _encoded(path, frames, *options, rate=25):
-    """Encode with ffmpeg; skip where there is none, or none with that encoder."""
-    if shutil.which("ffmpeg") is None:
-        pytest.skip("ffmpeg is not installed, and nothing else here encodes this")
-    shape = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{frames.shape[2]}x{frames.shape[1]}", "-r", str(rate)]
-    command = ["ffmpeg", "-v", "error", "-y", *shape, "-i", "-", *options, str(path)]
-    ran = subprocess.run(command, input=frames.tobytes(), capture_output=True, check=False, timeout=120)
-    if b"Unknown encoder" in ran.stderr:
-        pytest.skip(f"this ffmpeg lacks an encoder: {ran.stderr.decode().splitlines()[0]}")
-    assert ran.returncode == 0, ran.stderr.decode()
-    return path
 
 
 X264 = ["-c:v", "libx264", "-preset", "veryfast", "-pix_fmt", "yuv420p"]
@@ -107,7 +92,7 @@ def _described(index, clip):
 
 @pytest.mark.parametrize("name", [pytest.param(k, marks=[] if k in QUICK else pytest.mark.slow) for k in KINDS])
 def test_spans_are_what_decoding_from_the_start_gives(tmp_path, name):
-    path = _encoded(tmp_path / name, _moving(120), *KINDS[name])
+    path = encoded(tmp_path / name, _moving(120), *KINDS[name], rate=25)
     clip, index = read_video(path), index_video(path)
     assert clip.num_frames == 120
     assert (clip.times is not None) == (name == "uneven.mp4")
@@ -123,7 +108,7 @@ def long(tmp_path_factory):
     """620 frames, of which every 250th stands alone; another shot begins at 400."""
     frames = _moving(620)
     frames[400:] = 255 - frames[400:, :, ::-1]
-    return _encoded(tmp_path_factory.mktemp("long") / "long.mp4", frames, *LONG, "-sc_threshold", "0")
+    return encoded(tmp_path_factory.mktemp("long") / "long.mp4", frames, *LONG, "-sc_threshold", "0", rate=25)
 
 
 @pytest.fixture(scope="module")
@@ -204,7 +189,7 @@ def test_cuts_of_a_stream_are_those_of_the_clip():
 
 
 def test_a_stream_without_times_is_read_on(tmp_path, counting):
-    path = _encoded(tmp_path / "a.h264", _moving(120), *KINDS["raw.h264"])
+    path = encoded(tmp_path / "a.h264", _moving(120), *KINDS["raw.h264"], rate=25)
     lazy, whole = LazyFrames(index_video(path)), read_video(path).frames
     for first in (3, 100):
         np.testing.assert_array_equal(lazy[first : first + 2], whole[first : first + 2])
@@ -214,7 +199,7 @@ def test_a_stream_without_times_is_read_on(tmp_path, counting):
 def test_a_seek_that_lands_amid_blemishes_goes_further_back(tmp_path, counting):
     """Without frames that stand alone, a picture is whole only after a whole round of refreshing."""
     options = [*X264, "-x264-params", "intra-refresh=1:keyint=40", "-bf", "0"]
-    path = _encoded(tmp_path / "a.mp4", _moving(300, 120, 160), *options)
+    path = encoded(tmp_path / "a.mp4", _moving(300, 120, 160), *options, rate=25)
     index = index_video(path)
     thrown_away = []
     for _ in range(2):
@@ -237,7 +222,7 @@ def test_a_seek_that_lands_amid_blemishes_goes_further_back(tmp_path, counting):
     ],
 )
 def test_damaged_clips(tmp_path, name):
-    path = _encoded(tmp_path / name, _moving(120), *KINDS[name], *([] if name == "long.mp4" else ["-g", "20"]))
+    path = encoded(tmp_path / name, _moving(120), *KINDS[name], *([] if name == "long.mp4" else ["-g", "20"]), rate=25)
     data = bytearray(path.read_bytes())
     middle = 2 * len(data) // 5
     data[middle : middle + 600] = np.random.default_rng(0).bytes(600)
@@ -255,7 +240,7 @@ def test_damaged_clips(tmp_path, name):
 
 def test_damage_is_decoded_as_when_it_was_indexed(tmp_path, monkeypatch):
     """What FFmpeg makes of damaged frames depends on the number of its threads, of which each machine has its own."""
-    path = _encoded(tmp_path / "a.ts", _moving(120), *KINDS["stream.ts"])
+    path = encoded(tmp_path / "a.ts", _moving(120), *KINDS["stream.ts"], rate=25)
     data = bytearray(path.read_bytes())
     at = 6 * len(data) // 10
     data[at : at + 2000] = np.random.default_rng(3).bytes(2000)
@@ -273,7 +258,7 @@ def test_damage_is_decoded_as_when_it_was_indexed(tmp_path, monkeypatch):
 def test_frames_that_damage_left_out_keep_their_places(tmp_path):
     """`span` gives the range of places, as `read_video` has it, of frames counted as they decode."""
     frames = _moving(40)
-    path = _encoded(tmp_path / "a.avi", frames, "-c:v", "png")
+    path = encoded(tmp_path / "a.avi", frames, "-c:v", "png", rate=25)
     data = path.read_bytes()
     starts = [at for at in range(len(data)) if data.startswith(b"\x89PNG", at)]
     broken = bytearray(data)
@@ -291,18 +276,10 @@ def test_frames_that_damage_left_out_keep_their_places(tmp_path):
     np.testing.assert_array_equal(LazyFrames(index)[9:12], clip.frames[9:12])
 
 
-@pytest.mark.parametrize("num", [1, 2, 3])
-def test_shortest_clips(tmp_path, num):
-    path = write_video(tmp_path / "a.mp4", _moving(num), 25)
-    index = index_video(path)
-    _described(index, read_video(path))
-    _as_read(index, path, [(0, num), (num - 1, num)])
-
-
 def test_where_nothing_moves(tmp_path):
     """Frames are alike to the bit, then move: a seek is not led astray."""
     frames = np.concatenate([np.repeat(_moving(1), 60, 0), _moving(40)])
-    path = _encoded(tmp_path / "a.mkv", frames, *X264, "-qp", "0", "-g", "20")
+    path = encoded(tmp_path / "a.mkv", frames, *X264, "-qp", "0", "-g", "20", rate=25)
     index = index_video(path)
     assert len(np.unique(index.digests[:60], axis=0)) == 1
     _as_read(index, path, [(5, 8), (30, 50), (58, 64), (61, 63), (99, 100)])
@@ -321,7 +298,7 @@ def test_a_part_of_a_clip_counts_from_its_first_frame(long, counting):
 
 
 def test_a_rate_that_is_given_holds_for_spans(tmp_path):
-    path = _encoded(tmp_path / "a.mp4", _moving(120), *KINDS["uneven.mp4"])
+    path = encoded(tmp_path / "a.mp4", _moving(120), *KINDS["uneven.mp4"], rate=25)
     index = index_video(path, fps=10)
     clip = read_indexed(index, 50, 70)
     assert (index.fps, index.times, clip.fps, clip.times) == (10, None, 10, None)
@@ -342,16 +319,9 @@ def _clear(num_frames, which):
     return frames
 
 
-def _as_pictures(folder, frames):
-    folder.mkdir()
-    for number, frame in enumerate(frames):
-        Image.fromarray(frame).save(folder / f"img{number}.png")
-    return folder
-
-
 @pytest.mark.parametrize("which", [[], [7]])
 def test_the_whole_clip_decides_on_alpha(tmp_path, which):
-    path = _as_pictures(tmp_path / "frames", _clear(12, which))
+    path = images(tmp_path / "frames", _clear(12, which))
     clip, index = read_video(path), index_video(path)
     _described(index, clip)
     assert index.has_alpha == bool(which)
@@ -393,29 +363,6 @@ def test_an_error_of_the_caller_is_no_damage_of_an_animation(tmp_path, error):
         index_video(tmp_path / "a.gif", on_frame=fail)
 
 
-@pytest.mark.parametrize("name", ["a.gif", "a.webp", "a.png"])
-def test_animations(tmp_path, name):
-    frames = _clear(12, [0])
-    if name == "a.gif":  # which has no half of it
-        frames[frames[..., 3] < 255] = 0
-    first, *rest = map(Image.fromarray, frames)
-    first.save(tmp_path / name, save_all=True, append_images=rest, duration=[100] * 6 + [300] * 6)
-    clip, index = read_video(tmp_path / name), index_video(tmp_path / name)
-    assert clip.has_alpha
-    _described(index, clip)
-    for first, stop in [(0, 12), (7, 9), (8, 12)]:
-        span = read_video(tmp_path / name, frames=(first, stop))
-        found = read_indexed(index, first, stop)
-        np.testing.assert_array_equal(found.frames, clip.frames[first:stop])
-        np.testing.assert_array_equal(found.times, span.times)
-        assert (found.fps, found.notes, found.num_declared) == (span.fps, span.notes, span.num_declared)
-    np.testing.assert_array_equal(LazyFrames(index)[:], clip.frames)
-    part = index_video(tmp_path / name, frames=(2, 10))
-    size = (HEIGHT, WIDTH - 16)  # the left edge is cut off
-    np.testing.assert_array_equal(LazyFrames(index, size)[:], read_video(tmp_path / name, size=size).frames)
-    np.testing.assert_array_equal(read_indexed(part, 5, 7).frames, clip.frames[7:9, ..., :3])  # all opaque
-
-
 @pytest.mark.parametrize("name", ["a.gif", "a.png"])
 def test_an_animation_that_lost_frames_is_refused(tmp_path, name):
     """A GIF does not promise a number of frames, a PNG does."""
@@ -453,14 +400,9 @@ def test_threads_take_turns(long, long_index, monkeypatch):
 def test_ranges_of_an_uneven_clip_end_where_the_next_frame_begins(tmp_path, name):
     """Of 40 frames, 30 a second, one is held for 10 s; with B-frames ("b.mp4"), which come in another order, too."""
     ticks = np.arange(40) + 300 * (np.arange(40) >= 20)
-    with av.open(str(tmp_path / name), "w") as out:
-        stream = out.add_stream("libx264", rate=30, width=64, height=48, pix_fmt="yuv420p")
-        stream.codec_context.max_b_frames = 2 if name[0] == "b" else 0
-        for tick, image in zip(ticks, _moving(40), strict=True):
-            frame = av.VideoFrame.from_ndarray(image)
-            frame.pts, frame.time_base = int(tick), Fraction(1, 30)
-            out.mux(stream.encode(frame))
-        out.mux(stream.encode())
+    context = {"max_b_frames": 2 if name[0] == "b" else 0}
+    frames = _moving(40)
+    encode(tmp_path / name, frames, "libx264", "yuv420p", given="rgb24", times=ticks, context=context, rate=30)
     index = index_video(tmp_path / name)
     for first, stop, end in [(25, 35, None), (0, 20, 320), (5, 19, None), (5, 30, 330), (0, 40, 340), (20, 40, None)]:
         clip = read_video(tmp_path / name, frames=(first, stop))
@@ -518,13 +460,6 @@ def test_a_forked_process_frees_nothing_of_its_parent():
     assert (ran.stdout, ran.stderr) == ("0\n", "")
 
 
-def test_one_image_is_a_clip(tmp_path):
-    path = write_image(tmp_path / "a.png", _moving(1)[0])
-    index = index_video(path)
-    _described(index, read_video(path))
-    _same(read_indexed(index, 0, None), read_video(path))
-
-
 # ---------------------------------------------------------------------------------------- refusals
 
 
@@ -555,38 +490,15 @@ def test_what_is_refused_is_refused_alike(tmp_path, long):
         assert str(caught.value) == str(expected.value)
 
 
-def test_interlaced_clips_are_refused_or_converted(tmp_path):
-    path = _encoded(tmp_path / "a.mkv", _moving(60), *X264, "-g", "20", "-flags", "+ilme+ildct")
-    with pytest.raises(VideoError, match="interlaced"):
-        index_video(path, deinterlace="refuse")
-    index = index_video(path)
-    for first, stop in ((0, 5), (37, 41)):
-        whole = read_video(path, frames=(first, stop))
-        np.testing.assert_array_equal(read_indexed(index, first, stop).frames, whole.frames)
-
-
-@pytest.mark.parametrize("span", [(-1, 3), (3, 3), (5, 2), (0, 621), (620, 621), (620, None)], ids=str)
-def test_spans_outside_are_refused(long_index, span):
-    with pytest.raises(VideoError, match="expected"):
-        read_indexed(long_index, *span)
-
-
-def _one_line(caught, *words):
-    text = str(caught.value)
-    assert "\n" not in text
-    for word in words:
-        assert word in text
-
-
 def test_a_file_that_is_another_is_refused(tmp_path, long):
     path = tmp_path / "a.mp4"
     shutil.copy(long, path)
     index = index_video(path, find_cuts=False)
     for other in (_moving(700)[::-1], _moving(30)):
-        _encoded(path, other, *LONG)
+        encoded(path, other, *LONG, rate=25)
         with pytest.raises(VideoError) as caught:
             read_indexed(index, 500, 503)
-        _one_line(caught, "expected the file that was indexed", "frame 500 differs", "index it again")
+        one_line(caught, "expected the file that was indexed", "frame 500 differs", "index it again")
         with pytest.raises(VideoError, match="differs"):
             LazyFrames(index)[500]
     path.write_text("no video")
@@ -621,7 +533,7 @@ def test_an_index_is_saved_and_sent(tmp_path, monkeypatch, long, long_index):
 
 
 def test_an_index_with_times_is_saved(tmp_path):
-    path = _encoded(tmp_path / "a.mp4", _moving(120), *KINDS["uneven.mp4"])
+    path = encoded(tmp_path / "a.mp4", _moving(120), *KINDS["uneven.mp4"], rate=25)
     index = index_video(path)
     again = FrameIndex.load(index.save(tmp_path / "index.npz"))
     np.testing.assert_array_equal(again.times, index.times)
@@ -645,7 +557,7 @@ def test_what_is_no_index_is_refused(tmp_path, long_index):
     for name in [*others, "other.npz", "pickled.npz", "array.npy", "short.npz", "later.npz"]:
         with pytest.raises(VideoError) as caught:
             FrameIndex.load(tmp_path / name)
-        _one_line(caught, "expected an index of a clip", "index_video")
+        one_line(caught, "expected an index of a clip", "index_video")
     with pytest.raises(FileNotFoundError):
         FrameIndex.load(tmp_path / "missing")
     with pytest.raises(OutputError):
@@ -722,26 +634,6 @@ def test_what_arrays_refuse_is_refused(long_index):
             LazyFrames(long_index, **options)
 
 
-@pytest.mark.slow
-def test_nothing_is_said_on_stderr(tmp_path, long):
-    """By the decoder, in a fresh process."""
-    data = bytearray(long.read_bytes())
-    middle = 2 * len(data) // 5
-    data[middle : middle + 2000] = np.random.default_rng(0).bytes(2000)
-    (tmp_path / "damaged.mp4").write_bytes(data)
-    program = """
-import sys
-from foldgauss.io import LazyFrames, index_video, read_indexed
-index = index_video(sys.argv[1], find_cuts=False)
-read_indexed(index, 400, 405)
-LazyFrames(index)[200:210]
-"""
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("OPENCV")}
-    command = [sys.executable, "-c", program, tmp_path / "damaged.mp4"]
-    ran = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120)
-    assert (ran.returncode, ran.stdout, ran.stderr) == (0, "", "")
-
-
 _PEAK = """
 import sys
 from foldgauss.io import LazyFrames, index_video
@@ -759,7 +651,7 @@ print(peak_bytes() - before)
 @pytest.mark.skipif(sys.platform != "linux", reason="kilobytes of the largest memory are Linux's")
 def test_memory_does_not_grow_with_the_clip(tmp_path):
     """2,000 frames of 360x640 are 1.4 GB; the index and a pass through them take some MB more than a few frames do."""
-    path = _encoded(tmp_path / "a.mp4", np.tile(_moving(100, 360, 640), (20, 1, 1, 1)), *LONG)
+    path = encoded(tmp_path / "a.mp4", np.tile(_moving(100, 360, 640), (20, 1, 1, 1)), *LONG, rate=25)
     grown = {}
     for num in (200, 2000):
         command = [sys.executable, "-c", _PEAK, path, str(num)]

@@ -49,14 +49,6 @@ def test_a_second_writer_is_refused_until_the_first_is_gone(tmp_path, holder):
     assert os.listdir(tmp_path) == []  # no locks are left lying about
 
 
-def test_within_a_process_too(tmp_path):
-    path = tmp_path / "m.safetensors"
-    with lock_output(path), pytest.raises(OutputError, match="another fit"), lock_output(path):
-        pass
-    with lock_output(path):
-        pass
-
-
 def test_what_a_killed_writer_left_is_removed_and_nothing_else(tmp_path):
     path, kept = tmp_path / "m.safetensors", tmp_path / "m.safetensors.checkpoint"
     mine = tmp_path / ".m.safetensors.tmp-01ab23cd.checkpoint"

@@ -2,13 +2,10 @@
 
 import json
 import math
-import warnings
 
 import equinox as eqx
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import FormatError, frame_gaussians, read_pseudomesh, write_pseudomesh
@@ -267,37 +264,6 @@ def test_unknown_notes_do_no_harm(folder):
     notes = json.loads((folder / NOTES).read_text()) | {"made by": "me"}
     (folder / NOTES).write_text(json.dumps(notes))
     assert read_pseudomesh(folder).num_frames == FRAMES
-
-
-@pytest.fixture(scope="module")
-def damaged(tmp_path_factory):
-    folder = write_pseudomesh(tmp_path_factory.mktemp("mesh") / "mesh", random_model(3), [0.5])
-    return folder, {path.name: path.read_bytes() for path in folder.iterdir()}
-
-
-@settings(max_examples=150, deadline=None)
-@given(data=st.data())
-def test_random_damage_raises_one_kind_of_error(damaged, data):
-    folder, files = damaged
-    for name, content in files.items():
-        (folder / name).write_bytes(content)
-    name = data.draw(st.sampled_from(sorted(files)))
-    raw = bytearray(files[name])
-    for place in data.draw(st.lists(st.integers(0, len(raw) - 1), max_size=4)):
-        raw[place] = data.draw(st.integers(0, 255))
-    (folder / name).write_bytes(raw[: data.draw(st.integers(0, len(raw)) | st.just(len(raw)))])
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert "\n" not in refusal(folder)
-
-
-def refusal(folder):
-    """The message of the one error that may come, or nothing."""
-    try:
-        read_pseudomesh(folder)
-    except FormatError as error:
-        return str(error)
-    return ""
 
 
 def test_a_time_with_nothing_to_see_comes_back(tmp_path):

@@ -1,7 +1,6 @@
 """The player's edits: their pictures, scripts and models are those of `foldgauss edit`, and nothing done is lost."""
 
 import dataclasses
-import json
 import re
 
 import numpy as np
@@ -18,7 +17,7 @@ from editor_page import (
     script_of,
     select,
 )
-from soft_models import NUM, OBJECT, SIZE, soft_model
+from soft_models import NUM, OBJECT, soft_model
 
 from foldgauss.io import load_video_model, save_compact
 from foldgauss.io.edit_script import parse_edit_script
@@ -282,32 +281,6 @@ def test_too_many_copies_by_the_panel_are_told(opened, compact):
     assert page.settle().stats["undoable"] == 2
 
 
-_COPIES = f'do = "multiply"\noffsets = {[[0.1, 0.0]] * 250}\noriginals = true\n'
-
-
-@pytest.mark.slow
-def test_too_many_copies_in_a_segment_that_is_not_decoded_are_told(opened):
-    parts = [(6 * k, soft_model(seed=k, options=RenderOptions(), num_frames=7)) for k in range(4)]
-    page = opened(SegmentedVideo.from_models(parts), fresh=True)
-    page.until("foldgauss.stats.decoded.length === 4")
-    page.page.evaluate("foldgauss.player.segments.most = 0")
-    page.page.evaluate("foldgauss.seek(0)")
-    page.until("!foldgauss.stats.decoded.includes(3)")
-    page.page.evaluate("foldgauss.player.editing.history.push({ select: { 0: '0', 3: '0-39' } })")
-    step = {"do": "multiply", "offsets": [[0.1, 0.0]] * 250, "originals": True}
-    page.page.evaluate("(step) => foldgauss.controls.panel.act(step)", step)
-    page.page.evaluate("(step) => foldgauss.controls.panel.act(step)", step)
-    told = "expected at most 1,000,000 Gaussians with the copies, got 2,520,040"
-    assert told in page.page.locator("#toast").inner_text()
-    assert page.stats["undoable"] == 2
-    script = "".join(
-        f"[selections.s]\nindices = \"0-39\"\nsegment = 3\n[[edits]]\nselect = 's'\n{_COPIES}[[edits]]\n{_COPIES}"
-    )
-    read_script(page, script)
-    assert told in page.page.locator("#toast").inner_text()
-    assert page.stats["undoable"] == 2
-
-
 @pytest.mark.slow
 def test_what_the_browser_kept_is_discarded_if_it_cannot_be_applied(opened, compact):
     page = opened(compact)
@@ -384,16 +357,3 @@ def test_segments_are_edited_by_one_script(opened):
     for t in (0.2, 0.9):
         far = np.abs(page.picture(t).astype(float) - edited.frame(t)).mean()
         assert far < 0.5 < np.abs(page.picture(t).astype(float) - plain.frame(t)).mean()
-
-
-def test_json_of_steps_is_all_that_the_browser_keeps(opened, compact):
-    page = opened(compact)
-    read_script(page, IT + EDITS["hue"])
-    page.page.evaluate("foldgauss.files.storage.flush()")
-    kept = page.page.evaluate("Object.entries(localStorage)")
-    ((name, text),) = kept
-    assert name.startswith("foldgauss-edit-")
-    assert json.loads(text) == {"steps": [{"script": page.stats["steps"]}], "done": 1}
-    assert page.stats["steps"][1] == {"do": "recolor", "hue": 0.6}
-    assert OBJECT.sum() == 12
-    assert SIZE == (40, 64)

@@ -74,11 +74,3 @@ def test_other_numbers_and_files_are_refused(tmp_path, selection):
         load_selection(path, model())
     with pytest.raises(FileNotFoundError):
         load_selection(tmp_path / "none", model())
-
-
-@pytest.mark.parametrize("cut", [0, 4, 8, 100, -1, -40])
-def test_truncated(tmp_path, selection, cut):
-    path = save_selection(tmp_path / "s", selection, model())
-    path.write_bytes(path.read_bytes()[:cut])
-    with pytest.raises(ModelFileError):
-        load_selection(path, model())

@@ -12,6 +12,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+from clips import UNEVEN, moving, one_line, rgba
 from PIL import Image
 
 from foldgauss.io import (
@@ -34,27 +35,10 @@ def _psnr(a, b):
     return 10 * np.log10(255**2 / np.mean((a.astype(float) - b) ** 2))
 
 
-def _moving(num_frames=8, height=48, width=64):
-    """A smooth, moving color pattern, whose frames can still be identified after lossy compression (VP9, 4:2:0)."""
-    y, x = np.mgrid[:height, :width]
-    waves = [
-        np.stack(
-            [
-                128 + 100 * np.sin(0.05 * x + 0.5 * k),
-                128 + 90 * np.cos(0.06 * y - 0.4 * k),
-                128 + 60 * np.sin(0.04 * (x + y)),
-            ],
-            -1,
-        )
-        for k in range(num_frames)
-    ]
-    return np.rint(waves).astype(np.uint8)
-
-
 @pytest.fixture(scope="module")
 def clip_file(tmp_path_factory):
     """8 frames of 48x64 at 12 fps; WebM, whose head can be read without its tail."""
-    return write_video(tmp_path_factory.mktemp("clip") / "clip.webm", _moving(), 12.0)
+    return write_video(tmp_path_factory.mktemp("clip") / "clip.webm", moving(), 12.0)
 
 
 @pytest.fixture
@@ -75,17 +59,9 @@ def test_center_crop_cuts_first_and_resizes_then(clip_file):
     np.testing.assert_allclose(both, middle, atol=1)
     with pytest.raises(VideoError, match="center_crop: expected at most the frame's 48x64") as caught:
         read_video(clip_file, center_crop=(49, 20))
-    _one_line(caught, "49x20")
+    one_line(caught, "49x20")
     with pytest.raises(VideoError, match="center_crop: expected height and width of whole pixels"):
         read_video(clip_file, center_crop=(0, 20))
-
-
-def _one_line(caught, *words):
-    text = str(caught.value)
-    assert "\n" not in text
-    for word in words:
-        assert word in text
-    return text
 
 
 # ------------------------------------------------------------------------------------- reading a video
@@ -101,14 +77,6 @@ def test_sample_clip_is_cut_as_in_the_paper():
     # Rows 40 to 680, then the mean of each 4x4 block.
     blocks = whole.frames[:, 40:680].reshape(2, 160, 4, 320, 4, 3).mean((2, 4))
     assert np.abs(small.frames - blocks).max() <= 0.5 + 1e-6
-
-
-def test_colors_are_rgb(tmp_path):
-    red = np.zeros((4, 32, 32, 3), np.uint8)
-    red[..., 0] = 200
-    for name in ("red.mp4", "red.webm", "red"):
-        frames = read_video(write_video(tmp_path / name, red, 25)).frames
-        assert np.abs(frames.astype(int) - [200, 0, 0]).max() <= 6
 
 
 @pytest.mark.parametrize(
@@ -154,51 +122,12 @@ def test_enlarging_is_cubic_and_centered(clip_file):
     np.testing.assert_array_equal(large, cv2.resize(whole, (128, 96), interpolation=cv2.INTER_CUBIC))
 
 
-def test_rate_can_be_given(clip_file):
-    assert read_video(clip_file).fps == pytest.approx(12.0)
-    assert read_video(clip_file, fps=30).fps == 30.0
-
-
-#: Seconds at which 8 frames of a clip with an uneven rate are shown, and the end.
-UNEVEN = np.array([0, 0.1, 0.1634, 0.4, 0.5, 0.5334, 0.8, 0.9, 1.3])
-
-
-@pytest.mark.parametrize(
-    ("name", "codec", "tolerance"),
-    [
-        ("a.mp4", None, 1e-5),
-        ("a.mp4", "h265", 1e-5),
-        ("a.mp4", "av1", 1e-5),
-        ("a.webm", None, 6e-4),  # milliseconds
-        ("a.mov", None, 1e-5),
-        ("a.mkv", None, 6e-4),
-        ("a.gif", None, 6e-3),  # hundredths of a second
-        ("a.webp", None, 6e-4),
-    ],
-)
-def test_frames_are_shown_at_their_times(tmp_path, name, codec, tolerance):
-    write_video(tmp_path / name, _moving(8, 64, 64), 7 / 0.9, times=UNEVEN, codec=codec)
-    clip = read_video(tmp_path / name)
-    assert clip.num_frames == 8
-    np.testing.assert_allclose(clip.times, UNEVEN[:-1], atol=tolerance)
-    assert clip.duration == pytest.approx(UNEVEN[-1], abs=tolerance)
-    if not name.endswith((".gif", ".webp")):  # whose rate is that of the durations
-        assert clip.fps == pytest.approx(7 / 0.9, rel=1e-3)
-
-
-@pytest.mark.parametrize(("name", "tolerance"), [("a.mp4", 5e-5), ("a.mkv", 3e-3), ("a.webm", 3e-3)])
-def test_times_too_near_for_the_clock_stay_in_order(tmp_path, name, tolerance):
-    times = np.array([0, 1e-7, 2e-7, 0.1, 0.2, 0.5, 0.6, 0.7])
-    write_video(tmp_path / name, _moving(), 10, times=times)
-    np.testing.assert_allclose(read_video(tmp_path / name).times, times, atol=tolerance)
-
-
 @pytest.mark.parametrize("name", ["a.mp4", "a.webm", "a.mov", "a.mkv", "a.gif", "a.webp"])
 @pytest.mark.parametrize("hold", [0.1, 1.0])
 def test_a_last_frame_that_is_held_is_held(tmp_path, hold, name):
     """Frames are evenly spaced up to the last one, which is shown for as long as another or ten times as long."""
     times = [*(0.1 * np.arange(8)), 0.7 + hold]
-    write_video(tmp_path / name, _moving(), 10, times=times)
+    write_video(tmp_path / name, moving(), 10, times=times)
     clip = read_video(tmp_path / name)
     assert (clip.num_frames, clip.num_declared) == (8, 8)
     assert clip.duration == (None if hold == 0.1 else pytest.approx(1.7))
@@ -217,35 +146,8 @@ def test_a_last_frame_that_is_held_is_held(tmp_path, hold, name):
 @pytest.mark.parametrize("name", ["a.mp4", "a.webp", "folder"])
 def test_times_that_do_not_fit_are_refused(tmp_path, times, name):
     with pytest.raises(VideoError, match=r"times: expected seconds that rise from 0|frames: expected \d+, as many"):
-        write_video(tmp_path / name, _moving(), 10, times=times)
+        write_video(tmp_path / name, moving(), 10, times=times)
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(("name", "least"), [("a.gif", 0.02), ("a.webp", 0.001)])
-def test_frames_that_animations_cannot_show_so_quickly_are_moved_apart(tmp_path, name, least):
-    times = np.array([*(np.arange(7) * least / 3), 1.0, 1.2])
-    write_video(tmp_path / name, _moving(), 8, times=times)
-    clip = read_video(tmp_path / name)
-    np.testing.assert_allclose(clip.times, [*(np.arange(7) * least), 1.0], atol=1e-9)
-    assert clip.duration == pytest.approx(1.2)
-
-
-def test_truncated_video_yields_the_frames_that_decode(tmp_path, clip_file):
-    data = clip_file.read_bytes()
-    whole = read_video(clip_file)
-    path = tmp_path / "cut.webm"
-    counts = set()
-    for length in range(len(data) // 8, len(data), len(data) // 8):
-        path.write_bytes(data[:length])
-        try:
-            clip = read_video(path)
-        except VideoError:
-            continue
-        assert 1 <= clip.num_frames <= clip.num_declared == 8
-        sure = clip.num_frames - 1  # the last one may be the half that was left
-        np.testing.assert_array_equal(clip.frames[:sure], whole.frames[:sure])
-        counts.add(clip.num_frames)
-    assert any(count < 8 for count in counts)
 
 
 def test_damaged_video_tells_what_was_promised(tmp_path):
@@ -257,21 +159,13 @@ def test_damaged_video_tells_what_was_promised(tmp_path):
     assert 2 <= clip.num_frames < clip.num_declared == 132
     with pytest.raises(VideoError) as caught:
         read_video(path, size=(16, 32), frames=(18, 20))
-    _one_line(caught, "18:20", "of 132 frames decode")
+    one_line(caught, "18:20", "of 132 frames decode")
     # What decodes past the damage is blemished, but in its place.
     assert clip.notes[0] == f"only {clip.num_frames} of 132 frames decode; those are used."
     assert clip.notes[1].startswith("7 frames, the first of them 17, are lost to damage and left out")
     late = read_video(path, size=(16, 32), frames=(120, 130))
     assert late.num_frames == late.num_declared == 10
     np.testing.assert_array_equal(late.frames, clip.frames[120 - 7 : 130 - 7])
-
-
-def test_range_of_bad_video_counts_within_the_range(tmp_path, clip_file):
-    path = tmp_path / "cut.webm"
-    path.write_bytes(clip_file.read_bytes()[: clip_file.stat().st_size * 5 // 8])
-    whole = read_video(path)
-    clip = read_video(path, frames=(1, 8))
-    assert (clip.num_declared, clip.num_frames) == (7, whole.num_frames - 1)
 
 
 # ----------------------------------------------------------------------------------- reading a folder
@@ -314,13 +208,13 @@ def test_values_of_fewer_bits_in_images_of_16(tmp_path, kind, bits):
 @pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.tif", "a.gif", "a.mkv"])
 def test_levels_of_clips_of_8_bits_are_refused(tmp_path, name):
     if name in ("a.gif", "a.mkv"):
-        write_video(tmp_path / name, _moving(2), 10)
+        write_video(tmp_path / name, moving(2), 10)
     else:
-        assert cv2.imwrite(str(tmp_path / name), _moving(1)[0])
+        assert cv2.imwrite(str(tmp_path / name), moving(1)[0])
     for reader in (read_video, index_video):
         with pytest.raises(VideoError, match="levels: expected images or videos of 16 bits") as caught:
             reader(tmp_path / name, levels=4095)
-        _one_line(caught, name)
+        one_line(caught, name)
     for levels in (0, 65536, 1.5, True):
         with pytest.raises(VideoError, match="levels: expected the value of white"):
             read_video(tmp_path / name, levels=levels)
@@ -334,53 +228,6 @@ def test_gray_and_16_bit_images(tmp_path):
     expected = np.rint(levels / 257).astype(np.uint8)[..., None]
     np.testing.assert_array_equal(frames[0], np.repeat(expected, 3, 2))
     np.testing.assert_array_equal(frames[1], frames[0])
-
-
-@pytest.mark.parametrize("suffix", ["png", "JPG", "jpeg", "bmp", "tif", "webp"])
-def test_image_formats(tmp_path, suffix):
-    for number in range(2):
-        assert cv2.imwrite(str(tmp_path / f"{number}.{suffix}"), _moving()[number][..., ::-1])
-    assert np.abs(read_video(tmp_path).frames.astype(int) - _moving(2)).mean() < 4
-
-
-def _png_avi(frames):
-    """An AVI whose packets are PNGs, BGR or BGRA: OpenCV itself writes no alpha."""
-
-    def chunk(name, *parts):
-        data = b"".join(parts)
-        return name + struct.pack("<I", len(data)) + data + b"\0" * (len(data) % 2)
-
-    (height, width), num = frames[0].shape[:2], len(frames)
-    main = struct.pack("<14I", 100_000, 0, 0, 0, num, 0, 1, 0, width, height, 0, 0, 0, 0)
-    stream = b"vidsMPNG" + struct.pack("<IHHIIIIIIIIHHHH", 0, 0, 0, 0, 1, 10, 0, num, 0, 0, 0, 0, 0, width, height)
-    kind = struct.pack("<IiiHH4sIiiII", 40, width, height, 1, 24, b"MPNG", 0, 0, 0, 0, 0)
-    described = chunk(b"LIST", b"strl", chunk(b"strh", stream), chunk(b"strf", kind))
-    packets = [chunk(b"00dc", cv2.imencode(".png", frame)[1].tobytes()) for frame in frames]
-    head = chunk(b"LIST", b"hdrl", chunk(b"avih", main), described)
-    return chunk(b"RIFF", b"AVI ", head, chunk(b"LIST", b"movi", *packets))
-
-
-def test_alpha_of_videos_is_kept(tmp_path):
-    rgba = np.random.default_rng(0).integers(0, 256, (3, 48, 64, 4)).astype(np.uint8)
-    (tmp_path / "opaque.avi").write_bytes(_png_avi(rgba[..., :3]))
-    np.testing.assert_array_equal(read_video(tmp_path / "opaque.avi").frames, rgba[..., 2::-1])
-    (tmp_path / "clear.avi").write_bytes(_png_avi(rgba))
-    clip = read_video(tmp_path / "clear.avi")
-    np.testing.assert_array_equal(clip.frames[..., 3], rgba[..., 3])
-    np.testing.assert_allclose(clip.over_black, rgba[..., 2::-1] * (rgba[..., 3:] / 255), atol=0.51)
-    rgba[..., 3] = 255  # a plane that is opaque everywhere is dropped
-    (tmp_path / "clear.avi").write_bytes(_png_avi(rgba))
-    np.testing.assert_array_equal(read_video(tmp_path / "clear.avi").frames, rgba[..., 2::-1])
-
-
-@pytest.mark.parametrize(("name", "error"), [("a.webm", 1.5), ("a.mkv", 0), ("a.mov", 0.8)])
-def test_alpha_is_written_and_read_back(tmp_path, name, error):
-    """Colors are stored straight, so that programs which composite the file get the same picture."""
-    frames = np.concatenate([_moving(4), np.repeat(_moving(4)[..., :1], 1, -1)], -1)
-    frames[..., :3] = np.rint(frames[..., :3] * (frames[..., 3:] / 255))
-    clip = read_video(write_video(tmp_path / name, frames, 10))
-    assert clip.has_alpha
-    assert np.abs(clip.frames.astype(int) - frames).mean() <= error
 
 
 @pytest.mark.parametrize(
@@ -397,7 +244,7 @@ def test_alpha_is_written_and_read_back(tmp_path, name, error):
     ],
 )
 def test_codecs_and_pixel_formats(tmp_path, name, options, quality):
-    frames = _moving(5, 64, 96)
+    frames = moving(5, 64, 96)
     path = write_video(tmp_path / name, frames, 29.97, **options)
     with av.open(str(path)) as container:
         first = next(container.decode(video=0))
@@ -418,7 +265,7 @@ def test_encoders_keep_the_priority_of_the_process(tmp_path):
         return {os.sched_getscheduler(int(thread)) for thread in os.listdir("/proc/self/task")}
 
     def frames():
-        for frame in _moving(4, 64, 96):
+        for frame in moving(4, 64, 96):
             yield frame
             seen.extend(policies())
 
@@ -427,20 +274,11 @@ def test_encoders_keep_the_priority_of_the_process(tmp_path):
     assert {*seen, *policies()} == before
 
 
-@pytest.mark.parametrize("image_format", ["png", "webp"])
-def test_alpha_of_images_is_written_and_read_back(tmp_path, image_format):
-    frames = np.concatenate([_moving(3), _moving(3)[..., :1]], -1)
-    frames[..., :3] = np.rint(frames[..., :3] * (frames[..., 3:] / 255))
-    found = read_video(write_frames(tmp_path / "out", frames, image_format=image_format)).frames
-    np.testing.assert_array_equal(found[..., 3], frames[..., 3])
-    assert np.abs(found.astype(int) - frames).max() <= 1
-
-
 def test_a_smaller_crf_is_better_and_larger(tmp_path):
-    paths = [write_video(tmp_path / f"{crf}.mp4", _moving(), 10, crf=crf) for crf in (0, 16, 40)]
+    paths = [write_video(tmp_path / f"{crf}.mp4", moving(), 10, crf=crf) for crf in (0, 16, 40)]
     sizes, errors = (
         [path.stat().st_size for path in paths],
-        [_psnr(read_video(path).frames, _moving()) for path in paths],
+        [_psnr(read_video(path).frames, moving()) for path in paths],
     )
     assert sizes[0] > sizes[1] > sizes[2]
     assert errors[0] > errors[1] > errors[2]
@@ -488,7 +326,7 @@ def sound_file(tmp_path_factory):
     ],
 )
 def test_sound_is_added_and_stretched_at_its_pitch(tmp_path, sound_file, name, start, speed, seconds, tones):
-    path = write_video(tmp_path / name, _moving(10), 10, sound=Sound(sound_file, start, speed))
+    path = write_video(tmp_path / name, moving(10), 10, sound=Sound(sound_file, start, speed))
     found, heard = _tones(path, tones)
     assert found == pytest.approx(seconds, abs=0.08)
     assert heard == pytest.approx(list(tones.values()), abs=10)
@@ -498,7 +336,7 @@ def test_sound_is_added_and_stretched_at_its_pitch(tmp_path, sound_file, name, s
 @pytest.mark.parametrize(("video_from", "sound_from"), [(0.0, 0.5), (0.5, 0.0)])
 def test_sound_stays_with_the_frames_where_one_of_them_begins_later(tmp_path, video_from, sound_from):
     """A tone of 880 Hz from 1 s on, in a file whose first frame, or first sound, is half a second late."""
-    source, frames = tmp_path / "a.mkv", _moving(20)
+    source, frames = tmp_path / "a.mkv", moving(20)
     with av.open(str(source), "w") as container:
         video, sound = container.add_stream("ffv1", rate=10), container.add_stream("pcm_s16le", rate=48_000)
         video.height, video.width, video.pix_fmt = *frames.shape[1:3], "bgr0"
@@ -525,7 +363,7 @@ def test_sound_of_a_stream_cut_between_key_frames_stays_with_the_frames(tmp_path
         options = {"g": "20", "x264-params": "scenecut=0"}
         video = container.add_stream("libx264", rate=10, options=options, height=48, width=64)
         sound = container.add_stream("aac", rate=48_000, layout="mono")
-        for number, image in enumerate(_moving(40)):
+        for number, image in enumerate(moving(40)):
             container.mux(video.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
             seconds = number / 10 + np.arange(4800) / 48_000
             samples = 0.3 * np.sin(2 * np.pi * seconds * (440 if number < 30 else 880), dtype=np.float32)
@@ -550,7 +388,7 @@ def test_stretched_sound_stays_with_the_frames(tmp_path, speed):
     with wave.open(str(source), "wb") as file:
         file.setparams((1, 2, 48_000, 0, "NONE", ""))
         file.writeframes(samples.tobytes())
-    path = write_video(tmp_path / "a.mp4", _moving(int(20 / speed)), 10, sound=Sound(source, 0.0, speed))
+    path = write_video(tmp_path / "a.mp4", moving(int(20 / speed)), 10, sound=Sound(source, 0.0, speed))
     heard = np.abs(_samples(path))
     windows = [(int(48_000 * (click - 0.04) / speed), int(48_000 * (click + 0.04) / speed)) for click in clicks]
     found = np.array([first + heard[first:stop].argmax() for first, stop in windows]) / 48_000
@@ -572,7 +410,7 @@ def test_one_channel_is_as_loud_as_two(tmp_path):
     heard = []
     for layout in ("mono", "stereo"):
         (tmp_path / "a.aac").write_bytes(_tone_bytes(tmp_path / "a.aac", 440, 48_000, layout))
-        path = write_video(tmp_path / f"{layout}.mp4", _moving(8), 10, sound=Sound(tmp_path / "a.aac"))
+        path = write_video(tmp_path / f"{layout}.mp4", moving(8), 10, sound=Sound(tmp_path / "a.aac"))
         with av.open(str(path)) as container:
             samples = np.concatenate([frame.to_ndarray() for frame in container.decode(audio=0)], axis=1)
         heard.append(np.sqrt(2 * np.mean(samples[:, 12_000:24_000] ** 2, axis=1)))
@@ -591,7 +429,7 @@ def test_sound_whose_packets_hold_several_frames_is_carried_over(tmp_path):
             frame.sample_rate, frame.pts = 44_100, first
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
-    path = write_video(tmp_path / "a.mp4", _moving(16), 10, sound=Sound(tmp_path / "a.wav"))
+    path = write_video(tmp_path / "a.mp4", moving(16), 10, sound=Sound(tmp_path / "a.wav"))
     assert _tones(path, [0.3, 1.2])[1] == pytest.approx([440, 440], abs=10)
 
 
@@ -613,16 +451,16 @@ def test_sound_that_is_none_is_refused(tmp_path, sound_file, clip_file):
         (Sound(sound_file, 0.0, 0.001), ("sound.speed", "0.01 to 100")),
     ):
         with pytest.raises(ValueError, match="expected") as caught:
-            write_video(out, _moving(), 10, sound=sound)
-        _one_line(caught, *words)
+            write_video(out, moving(), 10, sound=sound)
+        one_line(caught, *words)
     with pytest.raises(FileNotFoundError):
-        write_video(out, _moving(), 10, sound=Sound(tmp_path / "missing.mp4"))
+        write_video(out, moving(), 10, sound=Sound(tmp_path / "missing.mp4"))
     assert not out.exists()
 
 
 def test_an_error_of_making_frames_is_not_taken_for_one_of_writing(tmp_path):
     def frames():
-        yield from _moving(2)
+        yield from moving(2)
         (tmp_path / "missing.png").read_bytes()
 
     with pytest.raises(FileNotFoundError, match=r"missing\.png"):
@@ -631,7 +469,7 @@ def test_an_error_of_making_frames_is_not_taken_for_one_of_writing(tmp_path):
 
 
 def test_alpha_that_an_mp4_would_lose_is_refused(tmp_path):
-    frames = np.concatenate([_moving(2), _moving(2)[..., :1]], -1)
+    frames = np.concatenate([moving(2), moving(2)[..., :1]], -1)
     with pytest.raises(VideoError, match=r"expected RGB for vp9 in \.mp4, .* got RGBA\. Take vp9 in a \.webm"):
         write_video(tmp_path / "a.mp4", frames, 10, codec="vp9")
     with pytest.raises(VideoError, match=r"got RGBA\. Take yuva420p\."):
@@ -640,11 +478,11 @@ def test_alpha_that_an_mp4_would_lose_is_refused(tmp_path):
 
 def test_a_relative_name_may_have_a_colon(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert read_video(write_video("a:b.mp4", _moving(2), 10)).num_frames == 2
+    assert read_video(write_video("a:b.mp4", moving(2), 10)).num_frames == 2
 
 
 def test_an_mp4_can_be_played_while_it_is_loaded(tmp_path):
-    data = write_video(tmp_path / "a.mp4", _moving(), 10).read_bytes()
+    data = write_video(tmp_path / "a.mp4", moving(), 10).read_bytes()
     assert data.index(b"moov") < data.index(b"mdat")
 
 
@@ -661,20 +499,18 @@ def test_an_mp4_can_be_played_while_it_is_loaded(tmp_path):
         ("a.mp4", {"codec": "av1"}, ("frames", "at least 64x64 for av1", "48x64", "h264")),
         ("a.gif", {"crf": 3}, ("crf: expected a video file", "a.gif")),
         ("a", {"codec": "h264"}, ("codec: expected a video file", "'a'")),
+        ("a", {"image_format": "bmp"}, ("image_format",)),
+        ("a", {"image_format": ""}, ("image_format",)),
+        ("out.gif", {"fps": 60}, ("fps", "50")),
+        *(("out.mp4", {"fps": fps}, ("fps",)) for fps in (0, 1e-6, -1, float("nan"), float("inf"))),
+        *((name, {}, (".mp4", ".webm", "folder", name)) for name in ("out.avi", "out.png", "out.mp4.tmp")),
     ],
 )
 def test_encodings_that_do_not_fit_are_refused(tmp_path, name, options, words):
     with pytest.raises(ValueError, match="expected") as caught:
-        write_video(tmp_path / name, _moving(), 10, **options)
-    _one_line(caught, *words)
+        write_video(tmp_path / name, moving(), **({"fps": 10} | options))
+    one_line(caught, *words)
     assert list(tmp_path.iterdir()) == []
-
-
-def _rgba(num_frames=3):
-    """RGB and alpha; hidden colors where alpha is 0."""
-    alpha = np.zeros((num_frames, 48, 64, 1), np.uint8)
-    alpha[:, :24], alpha[:, 24:36] = 255, 51
-    return np.concatenate([_moving(num_frames), alpha], -1)
 
 
 def _write_rgba(folder, images, depth=np.uint8):
@@ -686,14 +522,14 @@ def _write_rgba(folder, images, depth=np.uint8):
 
 @pytest.mark.parametrize("depth", [np.uint8, np.uint16])
 def test_alpha_of_images_is_kept_and_premultiplied(tmp_path, depth):
-    _write_rgba(tmp_path, _rgba(), depth)
+    _write_rgba(tmp_path, rgba(moving(3)), depth)
     clip = read_video(tmp_path)
     assert clip.has_alpha
     assert clip.frames.shape == (3, 48, 64, 4)
     assert clip.frames.flags.c_contiguous
-    np.testing.assert_array_equal(clip.frames[..., 3], _rgba()[..., 3])
-    np.testing.assert_array_equal(clip.over_black[:, :24], _moving(3)[:, :24])
-    np.testing.assert_allclose(clip.over_black[:, 24:36], _moving(3)[:, 24:36] * 0.2, atol=0.51)
+    np.testing.assert_array_equal(clip.frames[..., 3], rgba(moving(3))[..., 3])
+    np.testing.assert_array_equal(clip.over_black[:, :24], moving(3)[:, :24])
+    np.testing.assert_allclose(clip.over_black[:, 24:36], moving(3)[:, 24:36] * 0.2, atol=0.51)
     assert not clip.frames[:, 36:].any()  # hidden colors are gone
 
 
@@ -732,18 +568,18 @@ def test_alpha_is_resized_with_the_color_it_weighs(tmp_path):
 
 
 def test_opaque_alpha_is_none_and_images_without_are_opaque(tmp_path):
-    opaque = _rgba()
+    opaque = rgba(moving(3))
     opaque[..., 3] = 255
     _write_rgba(tmp_path, [*opaque[:2], opaque[2][..., :3]])
     clip = read_video(tmp_path)
     assert not clip.has_alpha
-    np.testing.assert_array_equal(clip.frames, _moving(3))
-    np.testing.assert_array_equal(clip.over_black, _moving(3))
-    _write_rgba(tmp_path, [_rgba()[0], *opaque[1:, ..., :3]])
+    np.testing.assert_array_equal(clip.frames, moving(3))
+    np.testing.assert_array_equal(clip.over_black, moving(3))
+    _write_rgba(tmp_path, [rgba(moving(3))[0], *opaque[1:, ..., :3]])
     clip = read_video(tmp_path)
     assert clip.has_alpha
     np.testing.assert_array_equal(clip.frames[1:], opaque[1:])
-    np.testing.assert_array_equal(clip.frames[0, ..., 3], _rgba()[0, ..., 3])
+    np.testing.assert_array_equal(clip.frames[0, ..., 3], rgba(moving(3))[0, ..., 3])
 
 
 def _add_image(image):
@@ -765,111 +601,38 @@ def test_folder_with_a_bad_image(folder, change, words):
     change(folder)
     with pytest.raises(VideoError) as caught:
         read_video(folder)
-    _one_line(caught, *words)
+    one_line(caught, *words)
 
 
 # ------------------------------------------------------------------------------------------ bad input
 
 
-def test_missing_path(tmp_path):
-    with pytest.raises(FileNotFoundError) as caught:
-        read_video(tmp_path / "nowhere.mp4")
-    _one_line(caught, "nowhere.mp4", "missing")
-
-
 @pytest.mark.parametrize(
-    ("content", "word"),
+    ("options", "words"),
     [
-        (b"", "an empty file"),
-        (b"I am a text, not a video.\n" * 40, "1040 bytes"),
+        *(({"frames": one}, ("frames: expected", f"{one[0]}:")) for one in ((8, None), (20, 30), (3, 3), (5, 2))),
+        *(({"frames": one}, ("frames: expected", f"{one[0]}:")) for one in ((-3, None), (0, -1))),
+        *(({"size": one}, ("size: expected", f"{one[0]}x{one[1]}")) for one in ((0, 0), (-16, 32), (0, 32), (32, 0))),
+        ({"size": (32.5, 32)}, ("size: expected", "32.5x32")),
+        *(({"fps": one}, ("fps",)) for one in (0, 1e-6, -1, float("nan"), float("inf"))),
     ],
+    ids=str,
 )
-def test_not_a_video(tmp_path, content, word):
-    path = tmp_path / "clip.mp4"
-    path.write_bytes(content)
-    with pytest.raises(VideoError) as caught:
-        read_video(path)
-    _one_line(caught, word, "clip.mp4")
-
-
-def test_mp4_cut_before_its_index(tmp_path):
-    data = sample_clip("bunny").read_bytes()
-    path = tmp_path / "cut.mp4"
-    path.write_bytes(data[: len(data) // 2])
-    with pytest.raises(VideoError) as caught:
-        read_video(path)
-    _one_line(caught, "cut.mp4", "complete")
-
-
-def test_one_frame_is_a_clip(tmp_path, clip_file):
-    for name in ("one.webm", "one"):
-        clip = read_video(write_video(tmp_path / name, _moving(1), 25))
-        assert clip.frames.shape == (1, 48, 64, 3)
-        assert clip.num_declared == 1
-    np.testing.assert_array_equal(clip.frames, _moving(1))
-    assert read_video(clip_file, frames=(4, 5)).num_frames == 1
+def test_wrong_options_are_refused(clip_file, folder, options, words):
+    for path in (clip_file, folder):
+        with pytest.raises(VideoError) as caught:
+            read_video(path, **options)
+        one_line(caught, *words)
 
 
 def test_one_image_is_a_clip_of_one_frame(tmp_path):
     """With its alpha and its 16 bits, which the decoder of videos would drop."""
-    _write_rgba(tmp_path, _rgba(1), np.uint16)
+    _write_rgba(tmp_path, rgba(moving(1)), np.uint16)
     clip = read_video(tmp_path / "0.png")
     np.testing.assert_array_equal(clip.frames, read_video(tmp_path).frames)
     assert (clip.has_alpha, clip.fps, clip.num_declared) == (True, 25.0, 1)
     with pytest.raises(VideoError, match="0:1"):
         read_video(tmp_path / "0.png", frames=(1, 2))
-
-
-def test_images_that_move_are_not_taken_for_one(tmp_path):
-    first, *rest = (Image.fromarray(frame) for frame in _moving(3))
-    first.save(tmp_path / "moving.png", save_all=True, append_images=rest)
-    np.testing.assert_array_equal(read_video(tmp_path / "moving.png").frames, _moving(3))
-    first.save(tmp_path / "pages.tiff", save_all=True, append_images=rest)
-    with pytest.raises(VideoError, match="one image in a TIFF, got 3"):
-        read_video(tmp_path / "pages.tiff")
-
-
-@pytest.mark.parametrize("size", [(1, 1), (8, 8), (1, 4096), (4096, 1)])
-def test_any_size_is_read(tmp_path, size):
-    frames = np.random.default_rng(0).integers(0, 256, (2, *size, 3)).astype(np.uint8)
-    np.testing.assert_array_equal(read_video(write_video(tmp_path / "clip", frames, 25)).frames, frames)
-    assert read_video(tmp_path / "clip", size=(3, 5)).size == (3, 5)
-
-
-def test_folder_without_images(tmp_path):
-    (tmp_path / "notes.txt").write_text("")
-    with pytest.raises(VideoError) as caught:
-        read_video(tmp_path)
-    _one_line(caught, "png", "without any")
-
-
-@pytest.mark.parametrize("frames", [(8, None), (20, 30), (3, 3), (5, 2), (-3, None), (0, -1)])
-def test_bad_range(clip_file, frames):
-    with pytest.raises(VideoError) as caught:
-        read_video(clip_file, frames=frames)
-    _one_line(caught, "frames: expected", f"{frames[0]}:")
-
-
-@pytest.mark.parametrize("frames", [(5, None), (9, 12)])
-def test_bad_range_of_a_folder(folder, frames):
-    with pytest.raises(VideoError) as caught:
-        read_video(folder, frames=frames)
-    _one_line(caught, "0:5")
-
-
-@pytest.mark.parametrize("size", [(0, 0), (-16, 32), (0, 32), (32, 0), (32.5, 32)])
-def test_bad_size(clip_file, size):
-    with pytest.raises(VideoError) as caught:
-        read_video(clip_file, size=size)
-    _one_line(caught, "size: expected", f"{size[0]}x{size[1]}")
-
-
-@pytest.mark.parametrize("fps", [0, 1e-6, -1, float("nan"), float("inf")])
-def test_bad_rate(tmp_path, clip_file, fps):
-    with pytest.raises(VideoError, match="fps"):
-        read_video(clip_file, fps=fps)
-    with pytest.raises(VideoError, match="fps"):
-        write_video(tmp_path / "out.mp4", _moving(), fps)
 
 
 def test_bad_files_print_nothing(tmp_path, clip_file):
@@ -905,7 +668,7 @@ for name in ("out.webm", "out.mp4"):
 @pytest.mark.parametrize("suffix", [".mp4", ".webm", ".MP4"])
 @pytest.mark.parametrize(("height", "width"), [(48, 64), (47, 65)])
 def test_written_video_reads_back(tmp_path, suffix, height, width):
-    frames = _moving(5, height, width)
+    frames = moving(5, height, width)
     path = write_video(tmp_path / f"out{suffix}", iter(frames), 29.97)
     clip = read_video(path)
     assert clip.frames.shape == (5, height + height % 2, width + width % 2, 3)
@@ -931,32 +694,10 @@ def test_color_error_of_the_encoder_is_centered(tmp_path):
     assert np.abs(error.mean((0, 1, 2))).max() < 0.3
 
 
-def test_folder_of_frames_is_exact(tmp_path):
-    frames = _moving(12, 33, 35)
-    folder = write_video(tmp_path / "out", (frame for frame in frames), 25)
-    assert sorted(entry.name for entry in folder.iterdir())[-1] == "00011.png"
-    np.testing.assert_array_equal(read_video(folder).frames, frames)
-
-
-def test_folder_of_webp_is_exact(tmp_path):
-    frames = _moving(3, 33, 35)
-    folder = write_video(tmp_path / "out", frames, 25, image_format="webp")
-    assert sorted(entry.name for entry in folder.iterdir()) == ["00000.webp", "00001.webp", "00002.webp"]
-    np.testing.assert_array_equal(read_video(folder).frames, frames)
-    write_frames(folder, frames[:2], overwrite=True)
-    assert sorted(entry.name for entry in folder.iterdir()) == ["00000.png", "00001.png"]
-    for write in (
-        lambda: write_frames(folder, frames, image_format="bmp"),
-        lambda: write_video("a", frames, 25, image_format=""),
-    ):
-        with pytest.raises(ValueError, match="image_format"):
-            write()
-
-
 @pytest.mark.parametrize(("name", "quality"), [("out.gif", 31), ("out.webp", 33)])
 @pytest.mark.parametrize("fps", [12.5, 29.97, 50])
 def test_animations_keep_their_pace(tmp_path, name, quality, fps):
-    frames = _moving(9, 33, 35)
+    frames = moving(9, 33, 35)
     path = write_video(tmp_path / name, iter(frames), fps)
     with Image.open(path) as image:
         assert (image.n_frames, image.info["loop"]) == (9, 0)
@@ -971,33 +712,14 @@ def test_animations_keep_their_pace(tmp_path, name, quality, fps):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_gif_is_read_as_it_was_written(tmp_path):
-    clip = read_video(write_video(tmp_path / "out.gif", _moving(9), 20))
-    assert (clip.num_frames, clip.fps, clip.frames.shape[3]) == (9, pytest.approx(20), 3)
-    assert _psnr(clip.frames, _moving(9)) > 31
-
-
-def test_a_gif_too_fast_is_refused(tmp_path):
-    with pytest.raises(VideoError) as caught:
-        write_video(tmp_path / "out.gif", _moving(), 60)
-    _one_line(caught, "fps", "50")
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("name", ["one.gif", "one.webp"])
-def test_an_animation_of_one_frame(tmp_path, name):
-    with Image.open(write_video(tmp_path / name, _moving(1), 25)) as image:
-        assert image.size == (64, 48)
-
-
 def test_existing_frames_need_overwrite(tmp_path):
-    folder = write_frames(tmp_path / "out.frames", _moving(5))
+    folder = write_frames(tmp_path / "out.frames", moving(5))
     before = sorted(folder.iterdir())
     with pytest.raises(OutputError) as caught:
-        write_video(folder, _moving(2), 25)
-    _one_line(caught, "5 frames", "overwrite it")
+        write_video(folder, moving(2), 25)
+    one_line(caught, "5 frames", "overwrite it")
     assert sorted(folder.iterdir()) == before
-    write_frames(folder, _moving(2), overwrite=True)
+    write_frames(folder, moving(2), overwrite=True)
     assert len(list(folder.iterdir())) == 2
     assert list(tmp_path.iterdir()) == [folder]
 
@@ -1005,24 +727,24 @@ def test_existing_frames_need_overwrite(tmp_path):
 def test_a_folder_with_other_things_is_never_replaced(tmp_path):
     (tmp_path / "holiday.png").write_text("precious")
     with pytest.raises(OutputError) as caught:
-        write_frames(tmp_path, _moving(2), overwrite=True)
-    _one_line(caught, "holiday.png")
+        write_frames(tmp_path, moving(2), overwrite=True)
+    one_line(caught, "holiday.png")
     assert (tmp_path / "holiday.png").read_text() == "precious"
 
 
 def test_an_empty_folder_is_taken(tmp_path):
     (tmp_path / "new").mkdir()
-    assert len(list(write_frames(tmp_path / "new", _moving(2)).iterdir())) == 2
+    assert len(list(write_frames(tmp_path / "new", moving(2)).iterdir())) == 2
 
 
 def _failing():
-    yield from _moving(3)
+    yield from moving(3)
     raise RuntimeError("the renderer failed")
 
 
 @pytest.mark.parametrize("name", ["out.mp4", "out.webm", "out.gif", "out"])
 def test_failure_leaves_what_was_there(tmp_path, name):
-    old = write_video(tmp_path / name, _moving(2), 25)
+    old = write_video(tmp_path / name, moving(2), 25)
     for entry in (old, *old.glob("*")):
         os.utime(entry, (1, 1))
     with pytest.raises(RuntimeError, match="renderer"):
@@ -1030,13 +752,6 @@ def test_failure_leaves_what_was_there(tmp_path, name):
     assert list(tmp_path.iterdir()) == [old]
     assert old.stat().st_mtime == 1
     assert read_video(old).num_frames == 2
-
-
-def test_failure_leaves_nothing_new(tmp_path):
-    for name in ("out.mp4", "out.webm", "out.gif", "out.webp", "out"):
-        with pytest.raises(RuntimeError):
-            write_video(tmp_path / name, _failing(), 25)
-    assert list(tmp_path.iterdir()) == []
 
 
 _BAD_FRAMES = {
@@ -1055,15 +770,7 @@ def test_bad_frames(tmp_path, name, frames):
         return  # images have alpha
     with pytest.raises(VideoError) as caught:
         write_video(tmp_path / name, frames, 25)
-    _one_line(caught, "frames", "expected")
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("name", ["out.avi", "out.png", "out.mp4.tmp"])
-def test_other_extensions_list_the_choices(tmp_path, name):
-    with pytest.raises(VideoError) as caught:
-        write_video(tmp_path / name, _moving(), 25)
-    _one_line(caught, ".mp4", ".webm", "folder", name)
+    one_line(caught, "frames", "expected")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -1071,39 +778,14 @@ def test_other_extensions_list_the_choices(tmp_path, name):
 def test_output_that_cannot_be_written(tmp_path, name):
     (tmp_path / "file").write_text("a file")
     with pytest.raises(OutputError) as caught:
-        write_video(tmp_path / name, _moving(), 25)
-    _one_line(caught, "hoose")
+        write_video(tmp_path / name, moving(), 25)
+    one_line(caught, "hoose")
     assert (tmp_path / "file").read_text() == "a file"
     assert len(list(tmp_path.iterdir())) == 1
 
 
-@pytest.mark.slow
-def test_a_full_disk_is_noticed(tmp_path):
-    """A limit on file size stands in for the full disk."""
-    program = """
-import os, resource, sys, numpy
-from foldgauss.io import write_image, write_video
-folder, *names = sys.argv[1:]
-noise = numpy.random.default_rng(0).integers(0, 256, (12, 64, 64, 3)).astype(numpy.uint8)
-resource.setrlimit(resource.RLIMIT_FSIZE, (6000, 6000))
-for name in names:
-    path = os.path.join(folder, name)
-    try:
-        write_image(path, noise[0]) if name.endswith(".png") else write_video(path, noise, 25)
-    except OSError as error:
-        print(name, type(error).__name__, len(os.listdir(folder)))
-"""
-    names = ["out.mp4", "out.webm", "out.gif", "out", "out.png"]
-    ran = subprocess.run([sys.executable, "-c", program, tmp_path, *names], capture_output=True, text=True, timeout=60)
-    assert ran.stderr == ""
-    told = [line.split() for line in ran.stdout.splitlines()]
-    assert [name for name, _, _ in told] == names
-    assert {error for _, error, _ in told} <= {"OutputError", "OSError"}
-    assert {left for _, _, left in told} == {"0"}
-
-
 def test_write_image_round_trip_and_refusals(tmp_path):
-    image = _moving(1)[0]
+    image = moving(1)[0]
     path = write_image(tmp_path / "a.png", image)
     np.testing.assert_array_equal(cv2.imread(str(path))[..., ::-1], image)
     with pytest.raises(VideoError, match=r"\.png"):
@@ -1113,17 +795,6 @@ def test_write_image_round_trip_and_refusals(tmp_path):
     with pytest.raises(OutputError):
         write_image(path / "a.png", image)
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_gif_is_read(tmp_path):
-    """Its decoder says that it has alpha, whatever it holds."""
-    from PIL import Image
-
-    pictures = [Image.new("RGB", (24, 20), (40 * k, 100, 200)) for k in range(4)]
-    pictures[0].save(tmp_path / "a.gif", save_all=True, append_images=pictures[1:], duration=100)
-    clip = read_video(tmp_path / "a.gif")
-    assert clip.frames.shape == (4, 20, 24, 3)
-    assert np.abs(clip.frames[2, 0, 0].astype(int) - [80, 100, 200]).max() < 12
 
 
 def test_frames_of_many_blocks(tmp_path, monkeypatch):

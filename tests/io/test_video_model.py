@@ -9,7 +9,7 @@ import pytest
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import ModelFileError, load_video_model, save_video_model
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
-from foldgauss.io.models.model_file import read_header, save_model
+from foldgauss.io.models.model_file import save_model
 from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, FrameTimes, VideoModel, edit, fit_steps
 from foldgauss.video.fitting.growth import Growth
@@ -37,30 +37,6 @@ def same(one, other):
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
         assert np.asarray(a).dtype == np.asarray(b).dtype
         np.testing.assert_array_equal(a, b)
-
-
-@pytest.mark.parametrize("degree", [0, 1, 7])
-def test_model_round_trip_is_exact(tmp_path, degree):
-    model = random_model(degree)
-    save_video_model(tmp_path / "m.safetensors", model, metadata={"clip": "x"})
-    again = load_video_model(tmp_path / "m.safetensors")
-    same(model, again)
-    assert (again.size, again.fps, again.options) == (model.size, model.fps, model.options)
-    np.testing.assert_array_equal(again.render(0.4), model.render(0.4))
-    assert read_header(tmp_path / "m.safetensors")["metadata"]["clip"] == "x"
-
-
-def test_every_leaf_is_saved(tmp_path):
-    """By traversal, not by a list: a change to any one leaf changes the file."""
-    model = random_model()
-    leaves, tree = jax.tree.flatten(model)
-    path = tmp_path / "m.safetensors"
-    save_video_model(path, model)
-    plain = path.read_bytes()
-    for k, leaf in enumerate(leaves):
-        changed = jax.tree.unflatten(tree, [*leaves[:k], np.asarray(leaf) + np.float32(1), *leaves[k + 1 :]])
-        save_video_model(path, changed)
-        assert path.read_bytes() != plain
 
 
 def test_checkpoint_goes_on_to_the_same_bits(tmp_path):
@@ -146,15 +122,6 @@ def test_names_of_other_formats_are_refused(tmp_path, name):
 def test_names_of_models(tmp_path):
     for name in ("m", "m.safetensors", "M.SafeTensors", "m.v2.safetensors"):
         assert load_video_model(save_video_model(tmp_path / name, random_model())).num_frames
-
-
-@pytest.mark.parametrize("cut", [0, 4, 8, 100, 600, -1, -100])
-def test_truncated(tmp_path, cut):
-    path = tmp_path / "m.safetensors"
-    save_video_model(path, random_model())
-    path.write_bytes(path.read_bytes()[:cut])
-    with pytest.raises(ModelFileError):
-        load_video_model(path)
 
 
 def test_a_chain_of_edits_is_no_video_yet(tmp_path):

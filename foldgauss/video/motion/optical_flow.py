@@ -61,6 +61,8 @@ FEW_POINTS = 16
 CUT_FRACTION = 0.15
 #: The longer side, in pixels, of images for the fast flow that rules out a cut.
 FAST_SIDE = 160
+#: Their least number of rows: OpenCV's fastest preset reads beyond wide images with fewer, and the process crashes.
+FAST_ROWS = 32
 #: There certainly is no cut where this fraction can be tracked by it.
 SURE_FRACTION = 0.5
 
@@ -319,8 +321,8 @@ class CutFinder:
 
     def add(self, frame: UInt8[np.ndarray, "height width 3"]) -> None:
         """Add the next frame. It is kept until the one after it, so it must not change."""
-        size = fit_size(FAST_SIDE, *frame.shape[:2])
-        now = frame, cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
+        columns, rows = fit_size(FAST_SIDE, *frame.shape[:2])
+        now = frame, cv2.resize(frame, (columns, max(rows, FAST_ROWS)), interpolation=cv2.INTER_AREA)
         if self._before is not None:
             large, small = zip(self._before, now, strict=True)
             (known,) = Motion.from_frames(np.stack(small), cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).measure_tracked()
