@@ -436,12 +436,18 @@ CLIPS = {
             lambda folder, name=name, options=options: write_video(folder / name, _LEVELS, 10, **options),
             _LEVELS,
             {"has_alpha": True},
-            near=[255, 255, 255, 1],
+            near=[255, 255, 255, 0],
         )
         for name, options in (
             ("a.mov", {}), ("a.mkv", {}), ("a.webm", {"crf": 0}), ("a.mov", {"pixel_format": "yuva444p10le"})
         )
     },
+    "alpha of 254 everywhere": Made(
+        lambda folder: write_video(folder / "a.mov", np.full_like(_LEVELS, 254), 10),
+        np.full_like(_LEVELS, 254),
+        {"has_alpha": True},
+        near=[255, 255, 255, 0],
+    ),
     "alpha of a GIF": Made(lambda folder: gif_with_holes(folder / "a.gif"), square_that_walks(), {"has_alpha": True}),
     **{
         f"alpha as written: {name}": Made(

@@ -40,7 +40,7 @@ from commands import run
 from PIL import Image
 from PIL.GifImagePlugin import GifImageFile
 
-from foldgauss.io import VideoError, index_video, load_video_model, read_indexed, read_masks, read_video, write_video
+from foldgauss.io import VideoError, index_video, load_video_model, read_indexed, read_masks, read_video
 from foldgauss.io.media import clip as clip_module
 from foldgauss.io.media import decoder
 
@@ -443,23 +443,6 @@ def test_alpha_of_videos_is_kept(tmp_path, name, options):
     assert clip.has_alpha
     assert np.abs(clip.frames - expected).mean() < 3
     assert not clip.frames[:, 40:].any()  # transparent, so their colors are gone
-
-
-def _ramp(num_frames=2):
-    """Every level of alpha, and colors that are premultiplied by it."""
-    ramp = np.broadcast_to(np.arange(256, dtype=np.uint8), (num_frames, 64, 256))
-    return np.stack([ramp // 2, ramp // 2, ramp // 2, ramp], -1)
-
-
-@pytest.mark.parametrize(
-    ("name", "options"),
-    [("a.mov", {}), ("a.mkv", {}), ("a.webm", {"crf": 0}), ("a.mov", {"pixel_format": "yuva444p10le"})],
-)
-def test_alpha_is_written_and_read_to_the_level(tmp_path, name, options):
-    clip = read_video(write_video(tmp_path / name, _ramp(), 10, **options))
-    np.testing.assert_array_equal(clip.frames[..., 3], _ramp()[..., 3])
-    nearly = np.full((2, 64, 96, 4), 254, np.uint8)
-    assert read_video(write_video(tmp_path / f"b{name}", nearly, 10, **options)).has_alpha
 
 
 @pytest.mark.parametrize("kind", ["bgra", "yuva444p", "yuva444p10le", "rgba64le"])
