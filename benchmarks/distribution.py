@@ -80,7 +80,7 @@ def _first_calls() -> dict[str, float]:
         "log_prob": lambda: dist.log_prob(x),
         "sample": lambda: dist.sample(key, (1000,)),
         "moments": dist.moments,
-        "grad_log_prob": lambda: dist.grad_log_prob(x),
+        "gradient of log_prob": lambda: jax.jit(jax.grad(lambda x: dist.log_prob(x).sum()))(x),
         "space log_prob": lambda: space.log_prob(x[:, :2]),
         "space log_prob, again": lambda: space.log_prob(x[:, :2]),
         "space log_prob, 900 points": lambda: space.log_prob(x[:900, :2]),

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     from foldgauss.mixture import FoldedMixture, GaussianMixture
 
 for _kind, _location in {
-    "distribution": "foldgauss.analysis.notebook:distribution_png",
-    "mixture": "foldgauss.analysis.notebook:mixture_png",
+    "distribution": "foldgauss.analysis.notebook:density_png",
     "history": "foldgauss.analysis.notebook:history_png",
     "video": "foldgauss.io.page.player_page:make_notebook_iframe",
 }.items():

@@ -186,10 +186,6 @@ class FoldedGaussian(BatchModule):
         unreachable = overflow | jnp.isneginf(log_space) | jnp.isneginf(log_time)
         return jnp.where(unreachable, -jnp.inf, log_space + log_time)
 
-    def logpdf(self, x: Float[Array, "*#batch d"]) -> Float[Array, "*#batch"]:
-        """`log_prob` under scipy's name."""
-        return self.log_prob(x)
-
     def pdf(self, value: Float[Array, "*#batch d"]) -> Float[Array, "*#batch"]:
         """FN(x), shapes as in `log_prob`. **Source:** eq:foldgauss."""
         return jnp.exp(self.log_prob(value))
@@ -216,42 +212,7 @@ class FoldedGaussian(BatchModule):
         s = self.condition_time(t).sample(space_key)
         return jnp.concatenate([s, t[..., None]], axis=-1)
 
-    def sample_and_log_prob(self, key: Key[Array, ""], sample_shape: int | tuple[int, ...] = ()) -> tuple[Array, Array]:
-        """Samples and their `log_prob`. **Shapes:** -> (*sample_shape, *batch, d) and (*sample_shape, *batch)."""
-        x = self.sample(key, sample_shape)
-        return x, self.log_prob(x)
-
-    # --- derivatives and whitening ----------------------------------------------------------------------------
-
-    def grad_log_prob(self, x: Float[Array, "*#batch d"]) -> Float[Array, "*#batch d"]:
-        """The gradient of `log_prob` in x, d log FN(x) / dx.
-
-        **Shapes:** x (*sample, *batch, d) -> the same. **Example:** `dist.grad_log_prob(dist.mode)  # 0`
-
-        **Source:** eq:foldgauss, differentiated. **Raises:** as `log_prob`.
-        """
-        return self._grad_log_prob(self._broadcast_value(x))
-
-    @compile_eager
-    def _grad_log_prob(self, x: Array) -> Array:
-        return jax.grad(lambda x: self.log_prob(x).sum())(x)
-
-    def observed_information(self, x: Float[Array, "*#batch d"]) -> Float[Array, "*#batch d d"]:
-        """The negative Hessian of `log_prob` in x: a precision matrix where the density is locally Gaussian.
-
-        **Shapes:** x (*sample, *batch, d) -> (*sample, *batch, d, d). **Units:** 1 / (unit of x_i x_j).
-
-        **Example:** `dist.observed_information(dist.mode)`
-
-        **Source:** eq:foldgauss, differentiated twice. **Raises:** as `log_prob`.
-        """
-        return self._observed_information(self._broadcast_value(x))
-
-    @compile_eager
-    def _observed_information(self, x: Array) -> Array:
-        directions = jnp.eye(x.shape[-1], dtype=x.dtype)
-        column = lambda e: jax.jvp(self.grad_log_prob, (x,), (jnp.broadcast_to(e, x.shape),))[1]  # noqa: E731
-        return -jax.vmap(column, out_axes=-1)(directions)
+    # --- whitening ------------------------------------------------------------------------------------------
 
     def fold_to_normal(self, x: Float[Array, "*#batch d"]) -> tuple[Float[Array, "*#batch d"], Float[Array, "*#batch"]]:
         """Whiten x: subtract the fold, then scale. Samples of the distribution become standard normal.

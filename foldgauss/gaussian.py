@@ -125,11 +125,6 @@ class Normal(BatchModule):
         """Random samples (*sample_shape, *batch), differentiable in the parameters."""
         return _as_gaussian(self).sample(key, sample_shape)[..., 0]
 
-    def sample_and_log_prob(self, key: Key[Array, ""], sample_shape: int | tuple[int, ...] = ()) -> tuple[Array, Array]:
-        """Random samples and their log-densities, both (*sample_shape, *batch)."""
-        value = self.sample(key, sample_shape)
-        return value, self.log_prob(value)
-
 
 class Gaussian(BatchModule):
     """A Gaussian in any dimension, given by a triangular factor and a scale in log space.
@@ -244,11 +239,6 @@ class Gaussian(BatchModule):
         noise, loc, tril, log_scale = align([(noise, 1), (self.loc, 1), (self.base_tril, 2), (self.log_scale, 0)])
         scale = jnp.exp(log_scale)[..., None]
         return loc + join_columns([scale * y for y in multiply_lower(tril, split_columns(noise))])
-
-    def sample_and_log_prob(self, key: Key[Array, ""], sample_shape: int | tuple[int, ...] = ()) -> tuple[Array, Array]:
-        """Random samples (*sample_shape, *batch, dim) and their log-densities (*sample_shape, *batch)."""
-        value = self.sample(key, sample_shape)
-        return value, self.log_prob(value)
 
     def marginal(self, indices) -> "Gaussian":
         """The marginal distribution of the coordinates `indices`, in this order.

@@ -228,7 +228,7 @@ class FoldedMixture(_WeightedMixture):
 
     def _repr_png_(self) -> bytes | None:
         """Notebook display: the density over time and space, by coordinates if there are several."""
-        return notebook_hooks.show("mixture", self)
+        return notebook_hooks.show("distribution", self)
 
     def condition_time(self, t: Float[Array, "*#batch"]) -> "GaussianMixture":
         """Space at time t: the components at t, each with weight `w_k N(t; m_k, sigma_k^2)`, normalized.

@@ -75,7 +75,7 @@ def _of_components(m, x):
     t = x[..., 2]
     at, time = folded.condition_time(t), folded.time_marginal
     z, log_det = folded.fold_to_normal(x)
-    found = [*_densities(folded, x), folded.grad_log_prob(x), folded.observed_information(x), z, log_det]
+    found = [*_densities(folded, x), z, log_det]
     found += [*folded.normal_to_fold(x), *_densities(folded.marginal([1, -1]), x[..., 1:])]
     found += [*_densities(at, x[..., :2]), *_moments(at), at.entropy(), *_moments(at.marginal(1))]
     return [*found, *_densities(time, t), time.cdf(t), time.icdf(jax.nn.sigmoid(t))]

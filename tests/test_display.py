@@ -11,7 +11,6 @@ import pytest
 from soft_models import NUM, NUM_FRAMES, SIZE, soft_model
 
 from foldgauss import FoldedGaussian, FoldedMixture, PolynomialFold
-from foldgauss.analysis import notebook as _display
 from foldgauss.video import FitInfo, FitResult
 
 pytest.importorskip("matplotlib", reason="matplotlib is an optional extra")
@@ -40,100 +39,33 @@ def picture(png: bytes) -> np.ndarray:
 CASES = {
     "plane": bend(1),
     "seven": bend(7),
-    "batch": bend(1, (5,)),
-    "batches": bend(2, (2, 3)),
-    "large batch": bend(2, (3000,)),
     "function": FoldedGaussian(
         [0.0, 0.0], scale=[0.1, 0.2], time_loc=0.0, time_scale=1.0, fold=lambda u: jnp.stack([jnp.sin(u), u])
     ),
     "mixture": mixture(1),
     "mixture in space": mixture(3),
-    "many components": mixture(2, 20_000),
-    "mixtures": mixture(1, 3, (4,)),
 }
 
 
-@pytest.fixture
-def compiled():
-    """Seconds of each of XLA's compilations since the test began."""
-    seconds = []
-
-    def listen(event, duration, **details):
-        if event.endswith("backend_compile_duration"):
-            seconds.append(duration)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    yield seconds
-    jax.monitoring.unregister_event_duration_listener(listen)
-
-
-SLOW_CASES = ("plane", "seven", "large batch", "batches", "many components", "mixtures")
-
-
-@pytest.mark.parametrize("name", [pytest.param(k, marks=pytest.mark.slow if k in SLOW_CASES else []) for k in CASES])
-def test_it_shows(name, compiled):
-    jax.clear_caches()
-    shown = CASES[name]
-    image = picture(shown._repr_png_())
-    assert compiled
+@pytest.mark.parametrize(
+    "name", [pytest.param(k, marks=pytest.mark.slow if k in ("plane", "seven") else []) for k in CASES]
+)
+def test_it_shows(name):
+    png = CASES[name]._repr_png_()
+    assert len(png) < 200_000
+    image = picture(png)
     assert image.shape[0] < 400
     assert image.shape[1] < 1500
-    # Something is drawn: blue of densities, red of paths.
+    # Something is drawn: blue of densities, red of conditional densities.
     blue, _, red = (image[..., k].astype(int) for k in range(3))
     assert (blue - red > 40).mean() > 0.01
     assert (red - blue > 40).sum() > 20
-    # Quick the second time, 0.1 to 0.3 s on a quiet core: nothing is compiled anew.
-    del compiled[:]
-    again = shown._repr_png_()
-    assert compiled == []
-    assert len(again) < 200_000
-
-
-def test_the_density_drawn_is_the_density(monkeypatch):
-    """Shades of (t, s_j) against the marginal's own density."""
-    shown = mixture(2, 3)
-    seen = []
-
-    class Axes:
-        def pcolormesh(self, t, s, shade, **style):
-            seen.append((t, s, shade))
-
-        def plot(self, *arguments, **style):
-            pass
-
-        set = plot
-
-    bells = _display._bells(shown.components, np.asarray(shown.weights, float))
-    for j in (0, 1):
-        _display._draw_time(bells, j, Axes())
-        t, s, shade = seen[-1]
-        points = np.stack(np.broadcast_arrays(s[:, None], t[None, :]), -1).astype(np.float32)
-        density = np.asarray(jax.jit(lambda dist, x: dist.pdf(x))(shown.marginal([j, -1]), points))
-        np.testing.assert_allclose(shade**2, density / density.max(), atol=2e-4)
-
-
-def test_the_heaviest_components_are_drawn():
-    dist = bend(2, (300,))
-    weights = np.full(300, 1e-6)
-    weights[7] = 1.0
-    chosen = []
-    honest = _display._drawn
-
-    def spy(dist, weights, title):
-        chosen.append((dist, weights, title))
-        return honest(dist, weights, title)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_display, "_drawn", spy)
-        assert FoldedMixture(dist, weights=weights)._repr_png_()
-    (drawn, kept, title) = chosen[0]
-    assert "300 components, the 48 heaviest: 100%" in title
-    assert kept.max() > 0.99
-    np.testing.assert_array_equal(drawn.loc[kept.argmax()], dist.loc[7])
 
 
 def test_it_falls_back_to_text(monkeypatch):
-    """Without matplotlib, and where a number is none."""
+    """Batches, large mixtures, values that are traced or NaN, and without matplotlib."""
+    assert bend(1, (5,))._repr_png_() is None
+    assert mixture(1, 3000)._repr_png_() is None
     assert FoldedGaussian([np.nan], scale=[0.1], time_loc=0.0, time_scale=1.0, validate_args=False)._repr_png_() is None
     assert jax.eval_shape(lambda x: _traced(x), jnp.zeros(1)).shape == (1,)
     honest = builtins.__import__

@@ -24,7 +24,6 @@ WHITEN = eqx.filter_jit(FoldedGaussian.fold_to_normal)
 COLOUR = eqx.filter_jit(FoldedGaussian.normal_to_fold)
 LOG_PROB = eqx.filter_jit(FoldedGaussian.log_prob)
 SAMPLE = eqx.filter_jit(FoldedGaussian.sample)
-SAMPLE_AND_LOG_PROB = eqx.filter_jit(FoldedGaussian.sample_and_log_prob)
 
 
 class Slope(AbstractEnvelope):
@@ -380,31 +379,6 @@ def test_whitening_is_a_bijection_with_its_log_determinant():
     one = _dist(2.0, 0.01)
     jacobian, log_det = jax.jit(jax.jacfwd(one.normal_to_fold, has_aux=True))(z[0, 0])
     np.testing.assert_allclose(np.linalg.slogdet(jacobian)[1], log_det, rtol=1e-12)
-
-
-def test_samples_come_with_their_log_prob():
-    dist = _dist(loc=jnp.zeros((2, 2)))
-    x, log_prob = SAMPLE_AND_LOG_PROB(dist, jax.random.key(0), (5,))
-    assert x.shape == (5, 2, 3)
-    np.testing.assert_allclose(x, SAMPLE(dist, jax.random.key(0), (5,)))
-    np.testing.assert_allclose(log_prob, eqx.filter_jit(FoldedGaussian.logpdf)(dist, x))
-
-
-# --- derivatives ------------------------------------------------------------------------------------------
-
-
-def test_score_and_observed_information_equal_differences():
-    # One point, two distributions.
-    dist = _dist(floor=0.1, loc=np.stack([LOC, LOC + 0.1]))
-    x, score, step = np.array([0.2, -0.3, 0.6]), eqx.filter_jit(FoldedGaussian.grad_log_prob), 1e-5
-    moved = x + step * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])[:, None]
-    difference = lambda values: (values[1:4] - values[4:]) / (2 * step)  # noqa: E731
-    scores = np.asarray(score(dist, moved))
-    assert scores.shape == (7, 2, 3)
-    np.testing.assert_allclose(scores[0], difference(np.asarray(LOG_PROB(dist, moved))).T, rtol=1e-6)
-    information = np.asarray(eqx.filter_jit(FoldedGaussian.observed_information)(dist, x))
-    np.testing.assert_allclose(information, -np.moveaxis(difference(scores), 0, -1), rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(information, np.swapaxes(information, -1, -2), rtol=1e-10)
 
 
 # --- doors ------------------------------------------------------------------------------------------------

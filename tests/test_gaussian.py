@@ -84,19 +84,6 @@ def test_standard_deviations_do_not_underflow():
     assert jnp.isinf(Gaussian(jnp.zeros(1), jnp.array([[jnp.inf]]), validate_args=False).stddev).all()
 
 
-@pytest.mark.parametrize(
-    "dist",
-    [Normal(LOC, SCALE), Gaussian(np.zeros((5, 2)), np.eye(2))],
-    ids=["normal", "gaussian"],
-)
-def test_samples_come_with_their_log_density(dist):
-    both = jax.jit(lambda dist, key: dist.sample_and_log_prob(key, (7,)))
-    alone = jax.jit(lambda dist, key: (value := dist.sample(key, (7,)), dist.log_prob(value)))
-    value, log_prob = both(dist, jax.random.key(1))
-    jax.tree.map(np.testing.assert_array_equal, (value, log_prob), alone(dist, jax.random.key(1)))
-    assert value.shape == (7, *dist.batch_shape, *dist.event_shape)
-
-
 def test_standard_deviations_of_the_others():
     folded = FoldedGaussian([0.1], [[0.3]], time_loc=0.4, time_scale=0.2)
     components = FoldedGaussian(jnp.zeros((2, 1)), [[0.3]], time_loc=[0.3, 0.7], time_scale=[0.2, 0.1])

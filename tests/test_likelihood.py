@@ -20,7 +20,6 @@ TRIL = [[0.3, 0.0], [0.1, 0.2]]
 LOC, TIME_LOC, TIME_SCALE = [0.1, -0.4], 0.4, 0.3
 #: The points' own envelope, where a test gives no other.
 fit = functools.partial(likelihood.fit, envelope="time_likelihood")
-select_degree = functools.partial(likelihood.select_degree, envelope="time_likelihood")
 
 
 @pytest.fixture
@@ -98,9 +97,15 @@ def test_closed_form_is_generalised_least_squares(x64, covariance_type, time):
     close(np.asarray(dist.scale_tril) @ np.asarray(dist.scale_tril).T, expected.sigma)
     close(np.vstack([result.standard_errors.loc, result.standard_errors.coefficients]), expected.errors)
     close(result.log_likelihood, expected.log_likelihood)
+    free = 6 + (3 if covariance_type == "full" else 2) + (2 if time is None else 0)
+    close([result.aic, result.bic], -2 * expected.log_likelihood + free * np.array([2, np.log(weights.sum())]))
     tolerance = 1e-14 if time is None else 0
     np.testing.assert_allclose(dist.time_loc, expected.time_loc, rtol=tolerance)
     np.testing.assert_allclose(dist.time_scale, expected.time_scale, rtol=tolerance)
+
+
+def test_bic_has_its_least_value_at_the_true_degree():
+    assert min((fit(_points(300), degree=degree) for degree in range(4)), key=lambda fit: fit.bic).degree == 2
 
 
 def test_true_parameters_are_recovered_in_float32():
@@ -313,7 +318,7 @@ def test_invalid_arguments_raise(options, message):
         fit(**({"x": np.zeros((5, 3))} | options))
 
 
-# --- the degree ---------------------------------------------------------------------------------------------
+# --- envelopes ----------------------------------------------------------------------------------------------
 
 
 def test_the_default_envelope_is_constant(x64):
@@ -323,68 +328,6 @@ def test_the_default_envelope_is_constant(x64):
     expected = NumpyFit(_points(), np.ones(60), 1, envelope=(0.0, 0.0))
     np.testing.assert_allclose(result.distribution.loc, expected.beta[0], rtol=1e-10)
     np.testing.assert_allclose(result.standard_errors.loc, expected.errors[0], rtol=1e-10)
-
-
-@pytest.mark.slow  # it compiles for long
-def test_select_degree_returns_scores_and_fit(x64):
-    for criterion in ("bic", "aic", "cv"):
-        choice = select_degree(_points(300), 3, criterion)
-        assert choice.fit.degree == choice.degree == choice.scores.argmin()
-        assert choice.scores.shape == (4,)
-        if criterion != "cv":
-            np.testing.assert_allclose(choice.scores[choice.degree], getattr(choice.fit, criterion), rtol=1e-12)
-
-
-def _false_degree_rate(penalty, n):
-    """P(a needless degree pays): its two coefficients gain n log(1 + T^2 / freedom) > penalty, T^2 Hotelling's."""
-    freedom = n - 4
-    hotelling = freedom * np.expm1(penalty / n)
-    return stats.f.sf(hotelling * (freedom - 1) / (2 * freedom), 2, freedom - 1)
-
-
-@pytest.mark.slow
-def test_select_degree_finds_the_true_degree_as_often_as_it_should(x64):
-    # With (time_loc, time_scale) given the law of the choice between degrees 2 (the truth) and 3 is exact.
-    n, replicates = 300, 1000
-    points = jax.jit(jax.vmap(lambda key: _dist().sample(key, (n,))))(jax.random.split(jax.random.key(0), replicates))
-    time = {"time_loc": TIME_LOC, "time_scale": TIME_SCALE}
-    chosen = {c: np.array([select_degree(x, 3, c, **time).degree for x in points]) for c in ("bic", "aic", "cv")}
-    share = {c: (degree == 3).mean() for c, degree in chosen.items()}
-    assert all((degree >= 2).all() for degree in chosen.values())  # a degree too few never explains these points
-    # AIC: 14.0%, sd 1.1%, left by 4.5 sd with p = 7e-6. Power: one parameter too few for a degree would give 37%.
-    rate = _false_degree_rate(4, n)
-    assert abs(share["aic"] - rate) < 4.5 * np.sqrt(rate * (1 - rate) / replicates)
-    assert _false_degree_rate(2, n) > rate + 20 * np.sqrt(rate * (1 - rate) / replicates)
-    # BIC: 0.37%, 3.7 of 1000; more than 15 with p = 4e-6. Power: half its penalty would give 58 of 1000.
-    assert share["bic"] <= 0.015
-    assert replicates * _false_degree_rate(np.log(n), n) > 50
-    # Held-out points choose as AIC does, roughly (Stone 1977): no exact law, but a score on the points fitted (which
-    # never prefers the lower degree), or one that knows the truth, is far off.
-    assert 0.08 < share["cv"] < 0.25
-
-
-def test_cross_validation_matches_a_loop_over_folds(x64):
-    x = _points()
-    scores = select_degree(x, 2, "cv").scores
-    parts = np.asarray(jax.random.permutation(jax.random.key(0), jnp.arange(60) % 5))
-    held = [NumpyFit(x, parts != part, 2).log_prob(x[parts == part]).sum() for part in range(5)]
-    np.testing.assert_allclose(scores[2], -2 * sum(held), rtol=1e-10)
-
-
-def test_degree_that_cannot_be_fitted_is_not_selected(x64):
-    choice = select_degree(_points(), 2, weights=np.where(np.arange(60) < 3, 1.0, 0.0))
-    np.testing.assert_array_equal(np.isinf(choice.scores), [False, True, True])
-    assert choice.degree == 0
-    with pytest.raises(ValueError, match="SINGULAR_TIME"):
-        select_degree(np.zeros((60, 3)), 2)
-
-
-def test_select_degree_checks_arguments():
-    with pytest.raises(ValueError, match="criterion: expected one of"):
-        select_degree(_points(), 1, "dic")
-    for unknown in ("degree", "envelop"):
-        with pytest.raises(TypeError, match=f"argument '{unknown}'"):
-            select_degree(_points(), 1, **{unknown: 2})
 
 
 def test_a_function_is_an_envelope():

@@ -101,7 +101,7 @@ def marginal_tril(tril: Float[Array, "*batch dim dim"], indices: tuple[int, ...]
     return jnp.tril(jnp.swapaxes(upper * sign[..., :, None], -1, -2))
 
 
-def normalize_indices(indices, dim: int, name: str = "indices") -> tuple[int, ...]:
+def normalize_indices(indices, dim: int) -> tuple[int, ...]:
     """Coordinates counted from 0, each once, from any integers (negative ones count from the end)."""
     cure = f"The coordinates are 0 to {dim - 1}, time is {dim - 1} (or -1)."
     try:
@@ -110,12 +110,12 @@ def normalize_indices(indices, dim: int, name: str = "indices") -> tuple[int, ..
     except (TypeError, ValueError, OverflowError):
         given = None
     if given is None or len(given) != np.size(indices) or not given:
-        raise invalid(name, expected="whole numbers, at least one", got=repr(indices), cure=cure)
+        raise invalid("indices", expected="whole numbers, at least one", got=repr(indices), cure=cure)
     if any(not -dim <= i < dim for i in given):
-        raise invalid(name, expected=f"numbers from {-dim} to {dim - 1}", got=repr(indices), cure=cure)
+        raise invalid("indices", expected=f"numbers from {-dim} to {dim - 1}", got=repr(indices), cure=cure)
     result = tuple(i % dim for i in given)
     if len(set(result)) != len(result):
-        raise invalid(name, expected="each coordinate once", got=repr(indices), cure=cure)
+        raise invalid("indices", expected="each coordinate once", got=repr(indices), cure=cure)
     return result
 
 

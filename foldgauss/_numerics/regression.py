@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 from numpy.polynomial import hermite_e
 
 from foldgauss._numerics.triangular import solve_upper_matrix
@@ -58,26 +58,20 @@ def weighted_regression(
     log_a: Float[Array, " n"],
     weights: Float[Array, " n"],
     degree: int,
-    used: Int[Array, ""],
 ) -> Regression:
     """argmin over polynomials g of `sum_i w_i |y_i - g(v_i)|^2 / a_i`, the same for every Sigma.
 
     With the same design and weights in every coordinate, least squares per coordinate equals generalized least squares
-    with a full Sigma (Zellner's theorem). `degree` fixes the shapes, `used` <= degree is the polynomial's degree.
+    with a full Sigma (Zellner's theorem).
     """
-    active = jnp.arange(degree + 1, dtype=used.dtype) <= used
-    design = jnp.where(active[None], hermite(v, degree), 0)
+    design = hermite(v, degree)
     present = weights > 0
     log_unit = jnp.max(jnp.where(present, -0.5 * log_a, -jnp.inf))
     row = jnp.where(present, jnp.sqrt(weights) * jnp.exp(-0.5 * log_a - log_unit), 0)[:, None]
     q, r = jnp.linalg.qr(row * design)
-    r = jnp.where(
-        active[None] & active[:, None], r, jnp.eye(degree + 1, dtype=r.dtype)
-    )  # unused columns have no effect
     diagonal = jnp.abs(jnp.diagonal(r))
     length = jnp.sqrt((r * r).sum(0))  # of the columns, to which diagonal entries are compared
     rank_deficient = (diagonal <= 8 * degree * jnp.finfo(v.dtype).eps * length).any() | (length == 0).any()
     safe = jnp.where(rank_deficient, jnp.eye(degree + 1, dtype=r.dtype), r)
-    projected = jnp.where(active[:, None], jnp.matmul(q.T, row * y), 0)
-    coefficients = solve_upper_matrix(safe, projected)
+    coefficients = solve_upper_matrix(safe, jnp.matmul(q.T, row * y))
     return Regression(coefficients, jnp.matmul(design, coefficients), safe, log_unit, rank_deficient)

@@ -5,14 +5,14 @@ in time, and nothing is reflected. Neither library is imported before it is aske
 """
 
 import functools
-from typing import TYPE_CHECKING, Any
+import math
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from foldgauss._numerics.factor import normalize_indices
-from foldgauss._runtime.checks import invalid, is_integer
+from foldgauss._runtime.checks import invalid
 from foldgauss.analysis.divergence import kl_divergence
 
 if TYPE_CHECKING:
@@ -29,11 +29,11 @@ def to_numpyro(dist: Any, *, validate_args: bool | None = None) -> "numpyro.dist
     there if its factor is assembled from them. As a *latent* site a time likelihood makes a funnel (space narrows as
     time moves away), which is hard for NUTS: sample a normal z there and use `dist.normal_to_fold(z)`.
 
-    **Shapes:** `batch_shape` and `event_shape` are those of `dist`; the support is all of R^d. `arg_constraints` names
-    every array of `dist`. Draws of mixtures are not reparametrized (`has_rsample` is False).
+    **Shapes:** `batch_shape` and `event_shape` are those of `dist`; the support is all of R^d. Draws of mixtures are
+    not reparametrized (`has_rsample` is False).
 
-    `validate_args` checks parameters against these constraints and warns of values out of the support; None is
-    numpyro's own setting (`numpyro.enable_validation`), which does not change the checks of our constructors.
+    `validate_args` warns of values out of the support; None is numpyro's own setting (`numpyro.enable_validation`).
+    Parameters are checked where `dist` is constructed.
     The methods `entropy`, `cdf`, `icdf` and `mode` call those of `dist`. They raise NotImplementedError if it has none.
     `numpyro.distributions.kl_divergence` of two of them is `foldgauss.analysis.divergence.kl_divergence`.
 
@@ -61,59 +61,15 @@ def _numpyro_class() -> type:
 
 @functools.cache
 def _make_class(distributions) -> type:
+    from numpyro.distributions.batch_util import promote_batch_shape
     from numpyro.distributions.kl import kl_divergence as numpyro_divergence
     from numpyro.distributions.util import validate_sample
 
-    constraints = distributions.constraints
-
-    class Logits(constraints.Constraint):
-        """Numbers below infinity, not all of them -inf, which is a weight of 0."""
-
-        event_dim = 1
-
-        def __call__(self, x):
-            return (x < jnp.inf).all(-1) & (x > -jnp.inf).any(-1)
-
-        def __repr__(self):
-            return "logits"
-
-        def feasible_like(self, prototype):
-            return jnp.zeros_like(prototype)
-
-        def tree_flatten(self):
-            return (), ((), {})
-
-    by_name = {
-        "scale": constraints.positive,
-        "time_scale": constraints.positive,
-        "scale_tril": constraints.lower_cholesky,
-        "base_tril": constraints.lower_cholesky,
-        "power": constraints.nonnegative,
-        "floor": constraints.unit_interval,
-        "logits": Logits(),
-    }
-
-    class Constraints(dict):
-        """Empty for numpyro, which lists those of classes; those of its arrays for a distribution."""
-
-        def __get__(self, bridge, owner=None):
-            if bridge is None:
-                return self
-            found = {}
-            for name, (_, rank) in _named_leaves(bridge.base).items():
-                each = by_name.get(name.rpartition(".")[2], constraints.real)
-                if rank is None:
-                    each = constraints.dependent
-                elif rank > each.event_dim:
-                    each = constraints.independent(each, rank - each.event_dim)
-                found[name] = each
-            return found
-
     class NumpyroDistribution(distributions.Distribution):
-        """A foldgauss distribution with numpyro's interface; parameters are its leaves: "loc", "fold.coefficients"."""
+        """A foldgauss distribution with numpyro's interface. It has no list of parameters, which `base` has checked."""
 
         pytree_data_fields = ("base",)
-        arg_constraints = Constraints()
+        arg_constraints: ClassVar[dict] = {}
 
         def __init__(self, base, *, validate_args=None):
             self.base = base
@@ -122,28 +78,13 @@ def _make_class(distributions) -> type:
         def __reduce__(self):
             return _blank_numpyro, (), self.__dict__  # the class is local, which pickle cannot find
 
-        def __getattr__(self, name):
-            if name != "base" and name in (leaves := _named_leaves(self.base)):
-                return leaves[name][0]
-            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-
-        @classmethod
-        def infer_shapes(cls, *args, **kwargs):
-            """Raise NotImplementedError, as numpyro's vectors do: parameters do not determine the shape of an event."""
-            told = "infer_shapes: use batch_shape and event_shape of the distribution."
-            raise NotImplementedError(told)  # numpyro's signal that a class cannot infer shapes
-
         @property
-        def reparametrized_params(self):
-            """All parameters; none of a mixture, whose draws jump from component to component."""
-            return list(_named_leaves(self.base)) if getattr(self.base, "has_rsample", False) else []
-
-        def get_args(self):
-            return {name: leaf for name, (leaf, _) in _named_leaves(self.base).items()}
+        def has_rsample(self):
+            return getattr(self.base, "has_rsample", False)
 
         @property
         def support(self):
-            return constraints.real_vector if self.event_shape else constraints.real
+            return distributions.constraints.real_vector if self.event_shape else distributions.constraints.real
 
         def sample(self, key, sample_shape=()):
             return self.base.sample(key, sample_shape)
@@ -173,6 +114,10 @@ def _make_class(distributions) -> type:
         def icdf(self, q):
             return _part(self.base, "icdf")(q)
 
+    @promote_batch_shape.register(NumpyroDistribution)
+    def _(dist):
+        return NumpyroDistribution(dist.base)
+
     @numpyro_divergence.register(NumpyroDistribution, NumpyroDistribution)
     def _(p, q):
         try:
@@ -195,17 +140,6 @@ def _part(dist: Any, name: str):
         told = f"{name}: expected a distribution that has one, got {type(dist).__name__}."
         raise NotImplementedError(told)  # numpyro's signal that a distribution lacks a method
     return getattr(dist, name)
-
-
-def _named_leaves(dist: Any) -> dict[str, tuple[Any, int | None]]:
-    """The arrays of a distribution by their path, and the rank of each without batch dimensions; None: not known.
-
-    It is not known for distributions that are integrals over time.
-    """
-    paths, _ = jax.tree_util.tree_flatten_with_path(dist)
-    ranks = getattr(dist, "leaf_ranks", (None,) * len(paths))
-    named = zip(paths, ranks, strict=True)
-    return {jax.tree_util.keystr(path, simple=True, separator="."): (leaf, rank) for (path, leaf), rank in named}
 
 
 def to_scipy(dist: Any) -> "FrozenDistribution":
@@ -236,7 +170,6 @@ class FrozenDistribution:
 
     def __init__(self, base: Any):
         self._base = base
-        self._event = base.event_shape
 
     def __repr__(self) -> str:
         return f"FrozenDistribution({type(self._base).__name__}, dim={self.dim})"
@@ -244,38 +177,41 @@ class FrozenDistribution:
     @property
     def dim(self) -> int:
         """Number of coordinates."""
-        return int(np.prod(self._event, dtype=int))
+        return math.prod(self._base.event_shape)
 
     def logpdf(self, x) -> np.ndarray:
-        """Log-density at x (*points, d)."""
-        return _numpy(_LOG_PROB(self._base, self._points(x)))
+        """Log-density at x (*points, d); for one coordinate, numbers are points, as in scipy."""
+        x = jnp.asarray(x, jax.tree.leaves(self._base)[0].dtype)
+        x = x[..., None] if self._base.event_shape == (1,) and x.shape[-1:] != (1,) else x
+        return _numpy(_LOG_PROB(self._base, x))
 
     def pdf(self, x) -> np.ndarray:
         """Density at x (*points, d)."""
         return np.exp(self.logpdf(x))
 
-    def rvs(self, size=None, random_state=None) -> np.ndarray:
+    def rvs(self, size=(), random_state=None) -> np.ndarray:
         """Random draws: (d,) by default, else (*size, d) without axes of size 1, as scipy has it.
 
         For a distribution on the line (`event_shape == ()`) the shape is `size`. `random_state`: None, an int, or a
         NumPy generator. **Raises:** ValueError unless `size` is a whole number >= 0, or a tuple of them.
         """
-        shape = () if size is None else tuple(np.atleast_1d(np.asarray(size)).tolist())
-        if not all(is_integer(n, 0) for n in shape):
-            raise invalid("size", expected="a whole number >= 0, or a tuple of them", got=repr(size))
-        draws = np.asarray(self._base.sample(_key(random_state), shape))
-        return draws.squeeze()[()] if self._event else draws[()]
+        seed = int(np.random.default_rng(random_state).integers(2**31))
+        draws = np.asarray(self._base.sample(jax.random.key(seed), () if size is None else size))
+        return draws.squeeze()[()] if self._base.event_shape else draws[()]
 
     def entropy(self) -> np.ndarray:
         """Differential entropy in nats."""
-        return _numpy(_entropy(self._base))
+        if not hasattr(self._base, "entropy"):
+            cure = "Average -logpdf over rvs."
+            raise invalid("entropy", expected="a distribution with an entropy", got=repr(self), cure=cure)
+        return _numpy(self._base.entropy())
 
     def marginal(self, dimensions) -> "FrozenDistribution":
         """The distribution of some coordinates alone, frozen too; time is the last one."""
         if not hasattr(self._base, "marginal"):
             cure = "Take all coordinates of interest from the joint distribution at once."
             raise invalid("dimensions", expected="a distribution with marginals", got=repr(self), cure=cure)
-        return FrozenDistribution(self._base.marginal(normalize_indices(dimensions, self.dim, name="dimensions")))
+        return FrozenDistribution(self._base.marginal(dimensions))
 
     @property
     def mean(self) -> np.ndarray:
@@ -283,45 +219,14 @@ class FrozenDistribution:
 
     @property
     def cov(self) -> np.ndarray:
-        return _numpy(_covariance(self._base))
-
-    def _points(self, x):
-        """x as an array of events; for one coordinate, numbers are points, as in scipy."""
-        x = jnp.asarray(x, _dtype(self._base))
-        return x[..., None] if self._event == (1,) and x.shape[-1:] != (1,) else x
+        """The matrix; for a distribution on the line, as in scipy's `norm`, the variance."""
+        return _numpy(self._base.covariance_matrix if self._base.event_shape else self._base.variance)
 
 
 # Jitted once: called eagerly, a density is a hundred small kernels.
 _LOG_PROB = jax.jit(lambda dist, x: dist.log_prob(x))
 
 
-def _dtype(dist):
-    leaves = (jnp.asarray(leaf) for leaf in jax.tree.leaves(dist))
-    floats = [leaf.dtype for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)]
-    return jnp.result_type(*floats) if floats else jnp.result_type(float)
-
-
 def _numpy(x) -> np.ndarray:
     """As NumPy; a scalar as a NumPy scalar, like scipy's."""
     return np.asarray(x)[()]
-
-
-def _key(random_state):
-    if hasattr(random_state, "integers"):
-        return jax.random.key(int(random_state.integers(2**31)))
-    if hasattr(random_state, "randint"):
-        return jax.random.key(int(random_state.randint(2**31 - 1)))
-    return jax.random.key(int(np.random.default_rng(random_state).integers(2**31)))
-
-
-def _covariance(dist):
-    """The matrix; for a distribution on the line, as in scipy's `norm`, the variance."""
-    return dist.covariance_matrix if dist.event_shape else dist.variance
-
-
-def _entropy(dist):
-    """In nats."""
-    if not hasattr(dist, "entropy"):
-        cure = "Average -logpdf over rvs."
-        raise invalid("entropy", expected="a distribution with an entropy", got=type(dist).__name__, cure=cure)
-    return dist.entropy()

@@ -228,7 +228,7 @@ def _running_median(values: np.ndarray) -> np.ndarray:
 def _draw_density(dist, ax, t_limits, s_limits) -> None:
     t, s = (np.linspace(*limits, _GRID) for limits in (t_limits, s_limits))
     points = np.stack(np.broadcast_arrays(s[:, None], t[None, :]), axis=-1)
-    density = np.exp(np.asarray(_LOG_PROB(dist, jnp.asarray(points, dist.mean.dtype)), float))
+    density = np.exp(np.asarray(_LOG_PROB(dist, _as_values(dist, points)), float))
     # The square root keeps the tails visible beside the peak.
     shade = np.sqrt(density / density.max())
     ax.pcolormesh(t, s, shade, cmap=_DENSITY, vmin=0, vmax=1.6, shading="gouraud", rasterized=True)
@@ -246,10 +246,10 @@ def _mass_levels(density: np.ndarray) -> np.ndarray:
 
 def _draw_slices(dist, ax, times, s_limits, width: float) -> None:
     for t in times:
-        gaussian = dist.condition_time(jnp.asarray(t, dist.mean.dtype))
+        gaussian = dist.condition_time(_as_values(dist, t))
         center, spread = _conditional(dist, np.array([t]))
         s = np.linspace(center[0] - 3.5 * spread[0], center[0] + 3.5 * spread[0], 201)
-        height = np.exp(np.asarray(gaussian.log_prob(jnp.asarray(s[:, None], dist.mean.dtype)), float))
+        height = np.exp(np.asarray(gaussian.log_prob(_as_values(dist, s[:, None])), float))
         bell = t + width * height / height.max()
         ax.fill_betweenx(s, t, bell, color=_RED, alpha=0.25, linewidth=0, zorder=3)
         ax.plot(bell, s, color=_RED, linewidth=1.4, zorder=4)
@@ -265,13 +265,19 @@ def _bell_width(times, t_limits) -> float:
 
 def _conditional(dist, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard deviation of s | t."""
-    gaussian = dist.condition_time(jnp.asarray(t, dist.mean.dtype))
+    gaussian = dist.condition_time(_as_values(dist, t))
     return np.asarray(gaussian.mean, float)[..., 0], np.sqrt(np.asarray(gaussian.variance, float)[..., 0])
+
+
+def _as_values(dist, x: np.ndarray) -> jax.Array:
+    """x in the dtype of the distribution."""
+    return jnp.asarray(x, jax.tree.leaves(dist)[0].dtype)
 
 
 def _time_moments(dist) -> tuple[float, float]:
     """Mean and standard deviation of t."""
-    return float(dist.mean[-1]), math.sqrt(float(dist.variance[-1]))
+    time = dist.marginal([-1])
+    return time.mean.item(), math.sqrt(time.variance.item())
 
 
 def _space_limits(dist, t_limits) -> tuple[float, float]:

@@ -1,9 +1,8 @@
-"""Maximum likelihood for one Folded-Gaussian: fit, standard errors, bootstrap, selection of the fold's degree.
+"""Maximum likelihood for one Folded-Gaussian: fit, standard errors, bootstrap.
 
 Not the |X| "folded normal" of scipy and numpyro: here a Gaussian's *center* follows a curve in time.
 """
 
-import inspect
 from collections.abc import Callable
 from enum import IntEnum
 from statistics import NormalDist
@@ -27,10 +26,9 @@ from foldgauss.estimator.parameter_checks import check_real, make_envelope
 from foldgauss.estimator.profile_likelihood import Profile, Space, maximize
 from foldgauss.fold import PolynomialFold
 
-__all__ = ["CenterParameters", "DegreeChoice", "Fit", "FitStatus", "Replicates", "bootstrap", "fit", "select_degree"]
+__all__ = ["CenterParameters", "Fit", "FitStatus", "Replicates", "bootstrap", "fit"]
 
 _MAX_STEPS = 200  # trial steps of the maximization over time; it takes 5 to 20
-_CV_FOLDS = 5
 
 
 class FitStatus(IntEnum):
@@ -53,12 +51,6 @@ _CURES = {
     FitStatus.SINGULAR_COVARIANCE: "the points lie on the curve, or a space coordinate is determined by the others. "
     "Drop it, use covariance_type='diag', or lower degree.",
     FitStatus.NOT_CONVERGED: "the maximization over time_loc and time_scale stopped early. Scale x, or raise floor.",
-}
-
-
-_CRITERIA = {
-    "bic": lambda log_likelihood, parameters, n: -2 * log_likelihood + parameters * jnp.log(n),
-    "aic": lambda log_likelihood, parameters, n: -2 * log_likelihood + 2 * parameters,
 }
 
 
@@ -116,17 +108,19 @@ class Fit(eqx.Module):
     @property
     def num_parameters(self) -> int:
         """Free parameters: the curve, Sigma, and time unless it was given."""
-        return _num_parameters(self.degree, self.residual_scale.shape[-1], self.time, self.covariance_type)
+        dim = self.residual_scale.shape[-1]
+        of_sigma = dim if self.covariance_type == "diag" else dim * (dim + 1) // 2
+        return (self.degree + 1) * dim + of_sigma + (0 if self.time == "given" else 2)
 
     @property
     def bic(self) -> Float[Array, ""]:
         """-2 log-likelihood + parameters * log n: smaller is better."""
-        return _CRITERIA["bic"](self.log_likelihood, self.num_parameters, self.num_points)
+        return -2 * self.log_likelihood + self.num_parameters * jnp.log(self.num_points)
 
     @property
     def aic(self) -> Float[Array, ""]:
         """-2 log-likelihood + 2 * parameters: smaller is better."""
-        return _CRITERIA["aic"](self.log_likelihood, self.num_parameters, self.num_points)
+        return -2 * self.log_likelihood + 2 * self.num_parameters
 
     @property
     def standard_errors(self) -> CenterParameters:
@@ -210,9 +204,18 @@ def fit(
     with floor 0 where it is unbounded. Problems of the *data* do not raise but set `Fit.status`, also under `jit` and
     `vmap`; see `Fit.check`.
     """
-    degree = _check_degree("degree", degree)
-    plan = _make_plan(x, degree, envelope, time, time_loc, time_scale, weights, covariance_type)
-    return _fit(plan, plan.weights, jnp.int32(degree))
+    if not is_integer(degree, 0):
+        raise invalid("degree", expected="a whole number >= 0", got=repr(degree))
+    check_one_of("time", time, ("own", "joint"))
+    check_one_of("covariance_type", covariance_type, ("full", "diag"))
+    x = _check_points(x)
+    weights = _check_weights(weights, x)
+    envelope = cast(make_envelope(envelope), x.dtype)
+    given = _check_time(time_loc, time_scale, x.dtype)
+    if given is None and time == "joint":
+        _check_bounded(envelope, x.shape[1])
+    time = time if given is None else "given"
+    return _fit(_Plan(x, weights, given, envelope, int(degree), time, covariance_type))
 
 
 # --- the fit ------------------------------------------------------------------------------------------------
@@ -243,36 +246,21 @@ class _Plan(eqx.Module):
     covariance_type: str = eqx.field(static=True)
 
 
-def _make_plan(x, degree, envelope, time, time_loc, time_scale, weights, covariance_type) -> _Plan:
-    check_one_of("time", time, ("own", "joint"))
-    check_one_of("covariance_type", covariance_type, ("full", "diag"))
-    x = _check_points(x)
-    weights = _check_weights(weights, x)
-    envelope = make_envelope(envelope)
-    given = _check_time(time_loc, time_scale, x.dtype)
-    if given is None and time == "joint":
-        _check_bounded(envelope, x.shape[1])
-    return _Plan(
-        x, weights, given, cast(envelope, x.dtype), degree, time if given is None else "given", covariance_type
-    )
-
-
 @eqx.filter_jit
-def _fit(plan: _Plan, weights: Float[Array, " n"], used: Int[Array, ""]) -> Fit:
-    """Fit with these weights and a polynomial of degree `used` <= plan.degree."""
-    data = _prepare_data(plan.x, weights, plan.degree)
+def _fit(plan: _Plan) -> Fit:
+    data = _prepare_data(plan.x, plan.weights, plan.degree)
     time_loc, time_scale = _estimate_time(data) if plan.given is None else plan.given
     singular_time = ~(time_scale > 0)
     time_scale = jnp.where(singular_time, 1, time_scale)
     diagonal = plan.covariance_type == "diag"
-    profile = Profile(data.t, data.y, data.weights, plan.envelope, used, plan.degree, diagonal)
+    profile = Profile(data.t, data.y, data.weights, plan.envelope, plan.degree, diagonal)
     converged, steps = jnp.array(True), jnp.zeros((), jnp.int32)
     if plan.time == "joint":
         time_loc, time_scale, ascent = maximize(profile, time_loc, time_scale, _MAX_STEPS)
         converged, steps = ascent.converged(slack=4.0), ascent.steps
     space = profile.space(time_loc, time_scale)
-    status = _status(data, space, used + (2 if diagonal else plan.x.shape[1]), singular_time, converged)
-    result = _assemble_fit(plan, data, space, (time_loc, time_scale), status, steps, used)
+    status = _status(data, space, plan.degree + (2 if diagonal else plan.x.shape[1]), singular_time, converged)
+    result = _assemble_fit(plan, data, space, (time_loc, time_scale), status, steps)
     failed = (status != FitStatus.OK) & (status != FitStatus.NOT_CONVERGED)
     return jax.tree.map(lambda leaf: jnp.where(failed, jnp.nan, leaf) if eqx.is_inexact_array(leaf) else leaf, result)
 
@@ -325,7 +313,7 @@ def _status(data: _Data, space: Space, needed: int, singular_time, converged) ->
     return jnp.select(conditions, [jnp.int32(code) for code in codes], jnp.int32(FitStatus.OK))
 
 
-def _assemble_fit(plan: _Plan, data: _Data, space: Space, when, status, steps, used) -> Fit:
+def _assemble_fit(plan: _Plan, data: _Data, space: Space, when, status, steps) -> Fit:
     """The fit in the units of the points."""
     time_loc, time_scale = when
     to_powers = jnp.asarray(hermite_to_powers(plan.degree), data.t.dtype)
@@ -339,7 +327,7 @@ def _assemble_fit(plan: _Plan, data: _Data, space: Space, when, status, steps, u
         envelope=plan.envelope,
         validate_args=False,
     )
-    freedom = data.total - (used.astype(data.total.dtype) + 1)
+    freedom = data.total - (plan.degree + 1)
     unbiased = jnp.sqrt(jnp.where(freedom > 0, 1 / jnp.where(freedom > 0, freedom, 1), jnp.nan))
     triangle = space.regression.triangle
     return Fit(
@@ -358,11 +346,6 @@ def _assemble_fit(plan: _Plan, data: _Data, space: Space, when, status, steps, u
 def _powers(time_scale, degree: int) -> Float[Array, "degree 1"]:
     """time_scale^k, k = 1..degree."""
     return jnp.cumprod(jnp.broadcast_to(time_scale, (degree,)))[:, None]
-
-
-def _num_parameters(degree: int, dim: int, time: str, covariance_type: str) -> int:
-    of_sigma = dim if covariance_type == "diag" else dim * (dim + 1) // 2
-    return (degree + 1) * dim + of_sigma + (0 if time == "given" else 2)
 
 
 def _student_quantile(level: float, freedom):
@@ -451,74 +434,10 @@ def _bootstrap(result: Fit, keys, num_points: int, batch_size: int) -> Replicate
     def replicate(key):
         x = dist.sample(key, (num_points,))
         plan = _Plan(x, weights, given, dist.envelope, degree, result.time, result.covariance_type)
-        refit = _fit(plan, weights, jnp.int32(degree))
+        refit = _fit(plan)
         return Replicates(refit.distribution, refit.status)
 
     return lax.map(replicate, keys, batch_size=batch_size)
-
-
-# --- the degree ---------------------------------------------------------------------------------------------
-
-
-class DegreeChoice(NamedTuple):
-    """The chosen degree, the criterion for every degree from 0 (smaller is better, inf: failed), and the fit."""
-
-    degree: int
-    scores: np.ndarray
-    fit: Fit
-
-
-def select_degree(
-    x: Float[ArrayLike, "n d"], max_degree: int, criterion: str = "bic", *, key: Key[Array, ""] | None = None, **options
-) -> DegreeChoice:
-    """Select the fold's degree, 0 to `max_degree`, that minimizes a criterion.
-
-    * "bic": finds the true degree as n grows; "aic": predicts well, but sometimes selects too high a degree;
-    * "cv": -2 times the log-likelihood of held-out points, in 5 folds; `key` shuffles them (default: key 0).
-
-    **Shapes:** x (n, d); `options` are those of `fit`, the same for every degree.
-
-    **Example:** `select_degree(x, 6, "bic").degree`
-
-    **Source:** Schwarz 1978; Akaike 1974; Stone 1974. **Raises:** ValueError on an unknown criterion, or if no
-    degree can be fitted; TypeError on unknown options.
-    """
-    check_one_of("criterion", criterion, (*_CRITERIA, "cv"))
-    call = inspect.signature(fit).bind(x, degree=_check_degree("max_degree", max_degree), **options)
-    call.apply_defaults()
-    plan = _make_plan(**call.arguments)
-    if criterion == "cv":
-        key = jax.random.key(0) if key is None else key
-        scores = _cross_validate(plan, jax.random.permutation(key, jnp.arange(len(plan.x)) % _CV_FOLDS))
-    else:
-        scores = _penalize(plan, criterion)
-    scores = np.where(np.isfinite(scores), scores, np.inf)
-    best = int(np.argmin(scores))
-    chosen = fit(x, degree=best, **options)
-    return DegreeChoice(best, scores, chosen if np.isfinite(scores[best]) else chosen.check())
-
-
-@eqx.filter_jit
-def _penalize(plan: _Plan, criterion: str) -> Float[Array, " degrees"]:
-    degrees = range(plan.degree + 1)
-    fits = jax.vmap(lambda used: _fit(plan, plan.weights, used))(jnp.arange(len(degrees), dtype=jnp.int32))
-    dim = plan.x.shape[1] - 1
-    free = jnp.array([_num_parameters(k, dim, plan.time, plan.covariance_type) for k in degrees], plan.x.dtype)
-    return _CRITERIA[criterion](fits.log_likelihood, free, fits.num_points)
-
-
-@eqx.filter_jit
-def _cross_validate(plan: _Plan, parts) -> Float[Array, " degrees"]:
-    """-2 times the log-likelihood of each fold under the fit to the others; NaN if one of those fails."""
-
-    def score(used, part):
-        trained = _fit(plan, jnp.where(parts == part, 0, plan.weights), used)
-        held = (parts == part) & (plan.weights > 0)
-        log_prob = trained.distribution.log_prob(jnp.where(held[:, None], plan.x, 0))
-        return -2 * jnp.where(held, plan.weights * log_prob, 0).sum() + 0 * trained.log_likelihood
-
-    degrees = jnp.arange(plan.degree + 1, dtype=jnp.int32)
-    return jax.vmap(lambda used: jax.vmap(lambda part: score(used, part))(jnp.arange(_CV_FOLDS)).sum())(degrees)
 
 
 # --- checks -------------------------------------------------------------------------------------------------
@@ -564,12 +483,6 @@ def _check_bounded(envelope: AbstractEnvelope, dim: int) -> None:
     if np.any((np.asarray(envelope.floor) == 0) & (np.asarray(envelope.power) * (dim - 1) > 2)):
         cure = "The likelihood is unbounded on the ridge: pass TimeLikelihood(power, floor=1e-3), or time='own'."
         raise invalid("envelope", expected="a floor above 0 where power (d-1) > 2", got="floor 0", cure=cure)
-
-
-def _check_degree(name: str, value) -> int:
-    if not is_integer(value, 0):
-        raise invalid(name, expected="a whole number >= 0", got=repr(value))
-    return int(value)
 
 
 def _check_level(level: float) -> float:

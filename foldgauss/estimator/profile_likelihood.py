@@ -35,7 +35,6 @@ class Profile(eqx.Module):
     y: Float[Array, "n d-1"]
     weights: Float[Array, " n"]
     envelope: AbstractEnvelope
-    used: Int[Array, ""]  # the polynomial's degree, at most `degree`
     degree: int = eqx.field(static=True)
     diagonal: bool = eqx.field(static=True)
 
@@ -49,7 +48,7 @@ class Profile(eqx.Module):
         log_a, held = self.log_a(time_loc, time_scale), lax.stop_gradient((time_loc, time_scale))
         v, held_log_a = (held[0] - self.t) / held[1], self.log_a(*held)
         held_log_a = lax.stop_gradient(held_log_a)
-        regression = weighted_regression(v, self.y, held_log_a, self.weights, self.degree, self.used)
+        regression = weighted_regression(v, self.y, held_log_a, self.weights, self.degree)
         unit, fitted = lax.stop_gradient((regression.log_unit, regression.fitted))
         root = jnp.where(self.weights > 0, jnp.exp(-0.5 * log_a - unit), 0)[:, None]
         tril, singular = self._factor(root * (self.y - fitted), lax.stop_gradient(root) * self.y)
