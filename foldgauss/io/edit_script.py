@@ -33,7 +33,7 @@ from typing import Any
 
 import numpy as np
 
-from foldgauss._runtime.checks import ParameterError, invalid
+from foldgauss._runtime.checks import ParameterError, invalid, require
 from foldgauss.io._atomic import MissingInput, PathLike, describe_missing, resolve
 from foldgauss.io.media.masks import read_masks
 from foldgauss.io.models.selections import load_selection, parse_indices, parse_ranges
@@ -266,12 +266,12 @@ class EditScript:
             return _select_indices(video, **table)
         criteria = _convert_spans(table)
         if "file" in criteria:
-            if not isinstance(video, VideoModel):
-                raise invalid(
-                    "file",
-                    expected="a model without layers or overlays",
-                    got="one in segments" if isinstance(video, SegmentedVideo) else "an edited video",
-                )
+            require(
+                isinstance(video, VideoModel),
+                "file",
+                expected="a model without layers or overlays",
+                got="one in segments" if isinstance(video, SegmentedVideo) else "an edited video",
+            )
             found = load_selection(self._path(criteria.pop("file")), video)
             return found & edit(video).select(**criteria).selection if criteria else found
         if "mask" in criteria:
@@ -287,12 +287,12 @@ class EditScript:
     def _apply_edit(self, edits: Chain, table: dict[str, Any], named: dict[str, Selection]) -> Chain:
         if "select" in table:
             edits = edits.select(named[table["select"]])
-            if not len(edits.selection):
-                raise invalid(
-                    "select",
-                    expected="a selection of at least one Gaussian",
-                    got=f"{table['select']!r}, which found nothing, or only deleted Gaussians",
-                )
+            require(
+                len(edits.selection),
+                "select",
+                expected="a selection of at least one Gaussian",
+                got=f"{table['select']!r}, which found nothing, or only deleted Gaussians",
+            )
         given = {key: value for key, value in _convert_spans(table).items() if key not in ("do", "select")}
         if "degrees" in given:
             given[ACTIONS[table["do"]].angle] = np.radians(given.pop("degrees")).tolist()
@@ -313,8 +313,12 @@ class EditScript:
         other: Video = load_video_model(file := self._path(table["model"]))
         if "script" in table:
             path = self._path(table["script"])
-            if resolve(path) in self._includes:
-                raise invalid("script", expected="a script that does not include itself", got=repr(table["script"]))
+            require(
+                resolve(path) not in self._includes,
+                "script",
+                expected="a script that does not include itself",
+                got=repr(table["script"]),
+            )
             script = read_edit_script(path)
             script = dataclasses.replace(script, _includes=script._includes + self._includes)
             other = script.apply(other, read_origin(file))
@@ -335,9 +339,13 @@ def read_edit_script(path: PathLike) -> EditScript:
     **Example:** `read_edit_script("edits.toml").apply(load_video_model("clip.safetensors"))`.
     """
     path = Path(path)
-    if not os.path.exists(path):
-        got = f"{str(path)!r}, {describe_missing(path)}"
-        raise invalid("script", expected="a TOML file", got=got, kind=MissingInput)
+    require(
+        os.path.exists(path),
+        "script",
+        expected="a TOML file",
+        got=f"{str(path)!r}, {describe_missing(path)}",
+        kind=MissingInput,
+    )
     if not path.is_file():
         raise EditScriptError(f"{path}: expected a TOML file, got a folder or a device.")
     if path.stat().st_size > MAX_BYTES:
@@ -528,23 +536,23 @@ def _select_indices(
     """Gaussians by their indices in the video's order, of layers the front one's first; or in that of a segment."""
     if isinstance(video, SegmentedVideo):
         counts = [one.num_gaussians for one in video.segments]
-        if segment is None or segment >= len(counts):
-            raise invalid(
-                "segment",
-                expected=f"the number of one of {len(counts)} segments",
-                got="none" if segment is None else segment,
-            )
+        require(
+            segment is not None and segment < len(counts),
+            "segment",
+            expected=f"the number of one of {len(counts)} segments",
+            got="none" if segment is None else segment,
+        )
     elif segment is not None:
         raise invalid("segment", expected="none, since the video has no segments", got=segment)
     else:
         counts, segment = [video.num_gaussians], 0
-    if num_gaussians not in (None, counts[segment]):
-        raise invalid(
-            "num_gaussians",
-            expected=f"{counts[segment]}, as many as there are",
-            got=num_gaussians,
-            cure="Give the model that the selection was made in, unchanged.",
-        )
+    require(
+        num_gaussians in (None, counts[segment]),
+        "num_gaussians",
+        expected=f"{counts[segment]}, as many as there are",
+        got=num_gaussians,
+        cure="Give the model that the selection was made in, unchanged.",
+    )
     parts = [Selection(np.zeros(num, bool)) for num in counts]
     parts[segment] = parse_indices(indices, counts[segment])
     return Selection(np.concatenate([part.mask for part in parts]))

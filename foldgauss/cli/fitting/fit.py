@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from foldgauss._runtime.checks import ParameterError, invalid
+from foldgauss._runtime.checks import ParameterError, require
 from foldgauss._runtime.threads import num_threads
 from foldgauss.cli.app.application import Stopped, command, err, out, warn
 from foldgauss.cli.app.signals import note_signals
@@ -134,8 +134,7 @@ def fit(
     begun = read_segment_seconds(target) is not None and not job.checkpoint.exists() and (resume or not overwrite)
     if begun or in_segments:
         for option, path in (("--history", history), ("--preview", preview)):
-            if path is not None:
-                raise invalid(option, expected="a fit in one piece", got="one in segments", cure="Leave it out.")
+            require(path is None, option, expected="a fit in one piece", got="one in segments", cure="Leave it out.")
         fit_in_segments(job, display, options, segment_seconds=segment_seconds, resume=resume, overwrite=overwrite)
         return
     curves = _check_records(video, history, preview, overwrite or resume)
@@ -197,9 +196,13 @@ def _choose_target(video: Path, out_path: Path | None, config: FitConfig) -> tup
     if out_path.suffix.lower() == COMPACT_SUFFIX:
         return out_path, config if config.is_compact else dataclasses.replace(config, quality=DEFAULT_QUALITY)
     check_model_name(out_path, "--out")
-    if config.size_mb is not None:
-        cure = f"Compact files end in {COMPACT_SUFFIX}."
-        raise invalid("--size-mb", expected="a compact file", got=out_path, cure=cure)
+    require(
+        config.size_mb is None,
+        "--size-mb",
+        expected="a compact file",
+        got=out_path,
+        cure=f"Compact files end in {COMPACT_SUFFIX}.",
+    )
     return out_path, config
 
 
@@ -238,11 +241,14 @@ def _check_records(video: Path, history: Path | None, preview: Path | None, over
     for option, path, suffix in records:
         if path is None:
             continue
-        if path.suffix != suffix:
-            raise invalid(option, expected=f"a name ending in {suffix}", got=path)
+        require(path.suffix == suffix, option, expected=f"a name ending in {suffix}", got=path)
         check_output(path, overwrite, {"clip": video}, option)
-    if curves is not None and preview is not None and resolve(curves) == resolve(preview):
-        raise invalid("--preview", expected="another file than the curves of --history", got=preview)
+    require(
+        curves is None or preview is None or resolve(curves) != resolve(preview),
+        "--preview",
+        expected="another file than the curves of --history",
+        got=preview,
+    )
     return curves
 
 
@@ -251,9 +257,13 @@ def _check_checkpoint(checkpoint: Path, resume: bool, overwrite: bool) -> None:
     if checkpoint.exists() and not (resume or overwrite):
         cure = "Continue it with --resume, or start over with --overwrite."
         raise ParameterError("--out", f"a stopped fit has a checkpoint, {checkpoint}. {cure}")
-    if resume and not checkpoint.exists():
-        expected, cure = f"a stopped fit in {checkpoint}", "Start it without --resume."
-        raise invalid("--resume", expected=expected, got="none", cure=cure)
+    require(
+        not resume or checkpoint.exists(),
+        "--resume",
+        expected=f"a stopped fit in {checkpoint}",
+        got="none",
+        cure="Start it without --resume.",
+    )
 
 
 def _save_model(run: FitRun) -> FitRun:

@@ -9,7 +9,7 @@ import typer
 from rich.box import SIMPLE_HEAD
 from rich.table import Column, Table
 
-from foldgauss._runtime.checks import ParameterError, invalid
+from foldgauss._runtime.checks import ParameterError, require
 from foldgauss.cli.app.application import command, out, warn
 from foldgauss.cli.app.completion import complete_files
 from foldgauss.cli.fitting.job_progress import emit_json, run_jobs
@@ -99,8 +99,12 @@ def fit_many(
     options = WorkerOptions(workers, scheduler, threads)
     found = find_clips(folder)
     out_dir = Path(f"{resolve(folder).name}-models") if out_dir is None else out_dir
-    if out_dir.exists() and resolve(out_dir) == resolve(folder):
-        raise invalid("--out", expected="another folder than the clips'", got=out_dir)
+    require(
+        not out_dir.exists() or resolve(out_dir) != resolve(folder),
+        "--out",
+        expected="another folder than the clips'",
+        got=out_dir,
+    )
     make_folder(out_dir)
     make_folder(out_dir / RECORDS)
     context.with_resource(lock_output(out_dir / SUMMARY, what="fit-many"))

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from foldgauss._runtime.checks import ParameterError, invalid
+from foldgauss._runtime.checks import ParameterError, invalid, require
 from foldgauss.cli.app.application import warn
 from foldgauss.cli.shared.arguments import parse_frames
 from foldgauss.cli.shared.log_lines import show_status
@@ -27,9 +27,13 @@ OTHER_CLIP_DB = 3.0
 
 def refuse_segments(model_path: Path) -> None:
     """For commands whose model must not be in segments."""
-    if is_segmented(model_path):
-        cure = f"Extract one: foldgauss export {model_path} --format model --segment 0."
-        raise invalid("MODEL", expected="a model of one piece", got="one in segments", cure=cure)
+    require(
+        not is_segmented(model_path),
+        "MODEL",
+        expected="a model of one piece",
+        got="one in segments",
+        cure=f"Extract one: foldgauss export {model_path} --format model --segment 0.",
+    )
 
 
 def read_fitted_clip(

@@ -4,7 +4,7 @@ import os
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
-from foldgauss._runtime.checks import ParameterError, invalid
+from foldgauss._runtime.checks import ParameterError, invalid, require
 from foldgauss.io._atomic import check_replaceable, check_writable, resolve
 from foldgauss.io.media.images import IMAGE_SUFFIXES
 from foldgauss.io.media.reading import memory_limit
@@ -21,9 +21,13 @@ def name_after(source: Path, ending: str) -> Path:
 
 def refuse_huge(size: tuple[int, int] | None) -> None:
     """Refuse images that do not fit in memory: several copies are held in floating point."""
-    if size is not None and 64 * size[0] * size[1] > memory_limit():
-        got, cure = f"{size[0]}x{size[1]}", "Choose a smaller one."
-        raise invalid("--size", expected="an image that fits in memory", got=got, cure=cure)
+    require(
+        size is None or 64 * size[0] * size[1] <= memory_limit(),
+        "--size",
+        expected="an image that fits in memory",
+        got=f"{size[0]}x{size[1]}",
+        cure="Choose a smaller one.",
+    )
 
 
 def refuse_existing(path: Path, overwrite: bool, option: str = "--out") -> None:
@@ -39,12 +43,20 @@ def refuse_inputs(path: Path, inputs: Mapping[str, Path | None], option: str = "
             continue
         # os.path: a name that is too long does not exist here; creating the file reports it.
         is_source = os.path.exists(path) and path.samefile(source)
-        if path.suffix.lower() in IMAGE_SUFFIXES and resolve(path.parent) == resolve(source):
-            cure = "It would be one of its images."
-            raise invalid(option, expected=f"a place outside the {what}'s folder", got=path, cure=cure)
-        if is_source or resolve(path) in resolve(source).parents:
-            cure = "Inputs are never replaced."
-            raise invalid(option, expected=f"another path than the {what}", got=path, cure=cure)
+        require(
+            path.suffix.lower() not in IMAGE_SUFFIXES or resolve(path.parent) != resolve(source),
+            option,
+            expected=f"a place outside the {what}'s folder",
+            got=path,
+            cure="It would be one of its images.",
+        )
+        require(
+            not is_source and resolve(path) not in resolve(source).parents,
+            option,
+            expected=f"another path than the {what}",
+            got=path,
+            cure="Inputs are never replaced.",
+        )
 
 
 def check_output(path: Path, overwrite: bool, inputs: Mapping[str, Path | None], option: str = "--out") -> None:

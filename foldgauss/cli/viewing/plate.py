@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import invalid, require
 from foldgauss.cli.app.application import out
 from foldgauss.cli.shared.clips import Video
 from foldgauss.cli.shared.log_lines import print_log, print_shots
@@ -35,14 +35,21 @@ def make_plate(
 ) -> None:
     """Write the frames of `model` without the object of the masks, or else of what moves; and the masks if wanted."""
     if save_masks is not None:
-        if save_masks.suffix:
-            raise invalid("--save-masks", expected="a folder, without extension", got=save_masks)
+        require(not save_masks.suffix, "--save-masks", expected="a folder, without extension", got=save_masks)
         check_images_output(save_masks, output.overwrite, inputs, "--save-masks")
-        if resolve(save_masks) == resolve(output.path):
-            raise invalid("--save-masks", expected="another folder than --out", got=save_masks)
-    if model.num_frames < LEAST_FRAMES:
-        cure = "Fit more frames: a plate is what other frames show behind the object."
-        raise invalid("MODEL", expected=f"at least {LEAST_FRAMES} frames", got=model.num_frames, cure=cure)
+        require(
+            resolve(save_masks) != resolve(output.path),
+            "--save-masks",
+            expected="another folder than --out",
+            got=save_masks,
+        )
+    require(
+        model.num_frames >= LEAST_FRAMES,
+        "MODEL",
+        expected=f"at least {LEAST_FRAMES} frames",
+        got=model.num_frames,
+        cure="Fit more frames: a plate is what other frames show behind the object.",
+    )
     masks = None if masks_path is None else _read_masks(masks_path, model, size, about)
     frames = np.empty((model.num_frames, *size, 3), np.uint8)
     with progress_bar("Rendering", model.num_frames) as advance:
@@ -68,11 +75,14 @@ def _read_masks(path: Path, model: Video, size: tuple[int, int], about: dict[str
     first, num = (about.get("frames") or (0,))[0] or 0, model.num_frames
     if len(masks) >= first + num:
         masks = masks[first : first + num]  # of the whole clip
-    if len(masks) not in (1, num):
-        raise invalid("--masks", expected=f"one mask, or one for each of {num} frames", got=f"{len(masks)} masks")
+    require(
+        len(masks) in (1, num),
+        "--masks",
+        expected=f"one mask, or one for each of {num} frames",
+        got=f"{len(masks)} masks",
+    )
     resized = [cv2.resize(np.uint8(mask), size[::-1], interpolation=cv2.INTER_NEAREST) > 0 for mask in masks]
-    if not np.any(resized):
-        raise invalid("--masks", expected="masks that are not empty", got=path)
+    require(np.any(resized), "--masks", expected="masks that are not empty", got=path)
     return np.broadcast_to(resized, (num, *size))
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from foldgauss._runtime.checks import check_one_of, invalid
+from foldgauss._runtime.checks import check_one_of, invalid, require
 from foldgauss.cli.app.application import command, out
 from foldgauss.cli.app.completion import complete_choice
 from foldgauss.cli.shared.arguments import (
@@ -178,8 +178,7 @@ def render(
     out_path = _name_output(model_path, timeline, image_format, kind) if out_path is None else out_path
     if image_format is not None:
         check_one_of("--format", image_format, IMAGE_FORMATS)
-        if out_path.suffix and not out_path.is_dir():
-            raise invalid("--format", expected="a folder as --out", got=out_path)
+        require(not out_path.suffix or out_path.is_dir(), "--format", expected="a folder as --out", got=out_path)
     inputs = {"model": model_path, "masks": masks_path, "sound": sound}
     check_images_output(out_path, overwrite, inputs, others=() if plate else (IMAGE_SUFFIX,))
     model, about = load_video_model(model_path), read_origin(model_path)

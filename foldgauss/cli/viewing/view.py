@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import invalid, require
 from foldgauss.cli.app.application import command, err, out
 from foldgauss.cli.app.completion import complete_clips, complete_models
 from foldgauss.cli.shared.arguments import Overwrite, refuse_together
@@ -75,14 +75,11 @@ def view_command(
     opens what is there. With --out the page is written to a file instead, which makes no requests; see docs/player.md.
     """
     if out_path is None:
-        if model_path is None:
-            raise invalid("MODEL", expected="a model file, or --out", got="neither")
-        if linked:
-            raise invalid("--linked", expected="--out too", got="--linked alone")
+        require(model_path is not None, "MODEL", expected="a model file, or --out", got="neither")
+        require(not linked, "--linked", expected="--out too", got="--linked alone")
         _serve(model_path, _read_original(model_path, original), original_quality, moving, port, browser)
         return
-    if out_path.suffix.lower() != HTML_SUFFIX:
-        raise invalid("--out", expected=f"a name ending in {HTML_SUFFIX}", got=out_path)
+    require(out_path.suffix.lower() == HTML_SUFFIX, "--out", expected=f"a name ending in {HTML_SUFFIX}", got=out_path)
     refuse_together("--out", {"--moving-object": moving, "--port": port or None})
     check_output(out_path, overwrite, {"model": model_path, "clip": original})
     if model_path is None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within, short_repr
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within, require, short_repr
 from foldgauss.io._atomic import PathLike, check_path, check_writable
 from foldgauss.io.models.compact import compact_metadata, is_compact, load_compact_model
 from foldgauss.io.models.model_file import (
@@ -123,8 +123,12 @@ def _source(number: int, source: object) -> tuple[int, Path]:
         raise invalid(
             f"sources[{number}]", expected="(number of its first frame, model file)", got=short_repr(source)
         ) from None
-    if not is_integer(first, 0):
-        raise invalid(f"sources[{number}]", expected="the number of its first frame first", got=short_repr(first))
+    require(
+        is_integer(first, 0),
+        f"sources[{number}]",
+        expected="the number of its first frame first",
+        got=short_repr(first),
+    )
     return int(first), check_path(file, "path, sources")
 
 
@@ -171,10 +175,14 @@ def _segments(path: Path, about: dict) -> list[Segment]:
 
     @lru_cache(maxsize=MAX_PREPARED)
     def load(number: int) -> VideoModel | EditedVideo:
-        if _stamp(path) != stamp:
-            raise model_file_error(
-                "path", expected="the file as it was opened", got=f"a changed {str(path)!r}", cure="Load it again."
-            )
+        require(
+            _stamp(path) == stamp,
+            "path",
+            expected="the file as it was opened",
+            got=f"a changed {str(path)!r}",
+            cure="Load it again.",
+            kind=ModelFileError,
+        )
         if entries[number]["kind"] == COMPACT:
             named = path.with_name(f"{path.name}, segment {number + 1}")  # for messages
             return load_compact_model(named, _read_file(path, number))
