@@ -203,7 +203,8 @@ def _video_skeleton(header: dict) -> VideoModel:
         raise ValueError(f"envelope {header['envelope']!r} is unknown here")
     num, degree, num_frames = header["num_gaussians"], header["degree"], header["num_frames"]
     height, width = header["size"]
-    if min(num, num_frames, height, width) < 1 or degree < 0 or not float(header["fps"]) > 0:
+    counts_fit = all(is_integer(count, 1) for count in (num, num_frames, height, width)) and is_integer(degree, 0)
+    if not counts_fit or not is_within(header["fps"], "(0, inf)"):
         raise ValueError("a size, count or rate is out of range")
     compositing = header.get("compositing", "over")  # files from before there was another
     check_one_of("compositing", compositing, COMPOSITINGS)
