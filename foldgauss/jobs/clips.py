@@ -60,8 +60,14 @@ def find_clips(folder: str | os.PathLike) -> FoundClips:
         (clips if is_clip else others).append(entry)
     if not clips:
         images = any(entry.suffix.lower() in IMAGE_SUFFIXES for entry in others)
-        cure = f"Its images are one clip: foldgauss fit {folder}." if images else "Video files, or folders of images."
-        raise invalid("folder", expected="a folder with clips", got=f"{str(folder)!r} without any", cure=cure)
+        raise invalid(
+            "folder",
+            expected="a folder with clips",
+            got=f"{str(folder)!r} without any",
+            cure=f"Its images are one clip: foldgauss fit {folder}."
+            if images
+            else "Video files, or folders of images.",
+        )
     return FoundClips(clips, others)
 
 

@@ -216,8 +216,12 @@ def plan_long_fit(
         index = index_video(clip, frames=frames, on_frame=on_frame, **reading._asdict())
         if plan is not None and plan["digest"] != index.digest:
             cure = "Use that clip, or start over with --overwrite."
-            expected = f"the clip that the fit was started with, {plan['clip']!r}"
-            raise invalid("clip", expected=expected, got=f"other frames in {str(clip)!r}", cure=cure)
+            raise invalid(
+                "clip",
+                expected=f"the clip that the fit was started with, {plan['clip']!r}",
+                got=f"other frames in {str(clip)!r}",
+                cure=cure,
+            )
     length = max(round(segment_seconds * index.fps), 2)
     spans = plan_segments(index.num_frames, index.cuts, length=length, overlap=_limit_overlap(overlap, length))
     if frames is not None and frames[1] is not None:  # the range may end beyond the clip
@@ -278,8 +282,9 @@ def _check_folder(folder: Path) -> None:
         return
     foreign = sorted(entry.name for entry in folder.iterdir() if not entry.name.startswith(_OWN))
     if foreign:
-        got = f"{foreign[0]!r} in it"
-        raise invalid("target", expected=f"only files of a fit in {folder}", got=got, cure="Move it away.")
+        raise invalid(
+            "target", expected=f"only files of a fit in {folder}", got=f"{foreign[0]!r} in it", cure="Move it away."
+        )
 
 
 def read_segment_seconds(target: str | os.PathLike) -> float | None:

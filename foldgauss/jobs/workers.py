@@ -203,8 +203,12 @@ def running_cluster(address: str) -> Iterator["WorkerPool"]:
     """
     distributed = _import_distributed("scheduler")
     if not _ADDRESS.fullmatch(address):  # dask would retry for long, and leave a client behind
-        expected, cure = "an address as tcp://host:8786", "`dask scheduler` prints it when it starts."
-        raise invalid("scheduler", expected=expected, got=repr(address), cure=cure)
+        raise invalid(
+            "scheduler",
+            expected="an address as tcp://host:8786",
+            got=repr(address),
+            cure="`dask scheduler` prints it when it starts.",
+        )
     with _silence_dask():
         try:
             client = distributed.Client(address, set_as_default=False, timeout=CONNECT_SECONDS)

@@ -7,7 +7,6 @@ import typer
 
 from foldgauss._runtime.checks import require
 from foldgauss.cli.app.application import command, warn
-from foldgauss.cli.app.completion import complete_clips
 from foldgauss.cli.shared.arguments import FittedFrames, ModelFile, Overwrite
 from foldgauss.cli.shared.clips import is_other_clip, read_fitted_clip, refuse_segments
 from foldgauss.cli.shared.fit_progress import choose_display, display_progress
@@ -34,7 +33,6 @@ def compress_command(
         Path | None,
         typer.Argument(
             help="The clip it was fitted to. Without it, nothing makes up for what is dropped and rounded.",
-            autocompletion=complete_clips,
         ),
     ] = None,
     quality: Annotated[

@@ -10,7 +10,6 @@ import typer
 
 from foldgauss._runtime.checks import require
 from foldgauss.cli.app.application import command, out
-from foldgauss.cli.app.completion import complete_files
 from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, parse_size
 from foldgauss.cli.shared.log_lines import print_log
 from foldgauss.cli.shared.outputs import check_images_output, check_output, name_after, refuse_huge
@@ -40,7 +39,6 @@ def edit_command(
         typer.Argument(
             metavar="SCRIPT.toml",
             help="The selections and their edits.",
-            autocompletion=complete_files(".toml"),
         ),
     ],
     out_path: Annotated[

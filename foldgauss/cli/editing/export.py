@@ -7,7 +7,7 @@ import typer
 
 from foldgauss._runtime.checks import check_one_of, require
 from foldgauss.cli.app.application import command, out
-from foldgauss.cli.app.completion import complete_choice, complete_files
+from foldgauss.cli.app.help import complete_choice
 from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, Times, parse_size, parse_times
 from foldgauss.cli.shared.clips import Video
 from foldgauss.cli.shared.outputs import (
@@ -145,7 +145,6 @@ def import_command(
         typer.Argument(
             metavar="FILE",
             help="A .ply of VeGaS, or a folder of .obj and .ply.",
-            autocompletion=complete_files(".ply"),
         ),
     ],
     out_path: Annotated[

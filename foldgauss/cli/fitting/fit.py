@@ -75,8 +75,8 @@ def fit(
         typer.Option(
             "--out",
             metavar="MODEL",
-            help=f"FILE{COMPACT_SUFFIX}, or FILE{MODEL_SUFFIX} with parameters as float32 [default: the clip's name, "
-            f"{COMPACT_SUFFIX}, in this folder].",
+            help=f"FILE{COMPACT_SUFFIX}, or FILE{MODEL_SUFFIX} with float32 parameters "
+            "[default: after the clip, in this folder].",
         ),
     ] = None,
     size: Size = None,
@@ -92,15 +92,13 @@ def fit(
         Path | None,
         typer.Option(
             metavar="FILE.jsonl",
-            help="Write the loss, PSNR and times of every step here, and curves of them to FILE.png (extra `plot`).",
+            help="Write the figures of every step here, and their curves to FILE.png (extra `plot`).",
             rich_help_panel=PROGRESS,
         ),
     ] = None,
     preview: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE.png", help="Write a preview image here, renewed every 10 s.", rich_help_panel=PROGRESS
-        ),
+        typer.Option(metavar="FILE.png", help="Write a preview image here every 10 s.", rich_help_panel=PROGRESS),
     ] = None,
     checkpoint_seconds: CheckpointSeconds = None,
     segment_seconds: SegmentSeconds = None,
@@ -113,7 +111,7 @@ def fit(
     """Fit a model to a clip; the first of its budgets ends the fit.
 
     A stopped fit has a checkpoint and continues with --resume. Long clips are fitted in segments, in parallel with
-    workers.
+    workers. Options for rare cases: docs/fit.md.
     """
     in_segments = not (segment_seconds is None and workers is None and scheduler is None)
     target, config = _choose_target(video, target, config)

@@ -11,7 +11,6 @@ from rich.table import Column, Table
 
 from foldgauss._runtime.checks import ParameterError, require
 from foldgauss.cli.app.application import command, out, warn
-from foldgauss.cli.app.completion import complete_files
 from foldgauss.cli.fitting.job_progress import emit_json, run_jobs
 from foldgauss.cli.fitting.options import (
     CheckpointSeconds,
@@ -67,9 +66,7 @@ def fit_many(
     context: typer.Context,
     folder: Annotated[
         Path,
-        typer.Argument(
-            metavar="FOLDER", help="Folder with video files, and folders of images.", autocompletion=complete_files()
-        ),
+        typer.Argument(metavar="FOLDER", help="Folder with video files, and folders of images."),
     ],
     config: FitConfig,
     out_dir: Annotated[
@@ -91,7 +88,7 @@ def fit_many(
     """Fit a compact model to each clip of a folder, and list those that fail.
 
     Models go to DIR under the clips' names, results to DIR/summary.json. Given again, the command continues with what
-    is left, from checkpoints of stopped fits. The exit code is 1 if a clip failed.
+    is left, from checkpoints of stopped fits. The exit code is 1 if a clip failed. Options for rare cases: docs/fit.md.
     """
     if not config.is_compact:
         config = dataclasses.replace(config, quality=DEFAULT_QUALITY)

@@ -11,7 +11,7 @@ import typer
 
 from foldgauss._runtime.checks import ParameterError, check_one_of, invalid, require
 from foldgauss.cli.app.application import Stopped, command, out, warn
-from foldgauss.cli.app.completion import complete_choice
+from foldgauss.cli.app.help import complete_choice
 from foldgauss.cli.shared.arguments import FittedClip, FittedFrames, ModelFile, Overwrite
 from foldgauss.cli.shared.clips import read_fitted_clip, refuse_segments
 from foldgauss.cli.shared.outputs import make_folder, name_after, refuse_foreign, refuse_inputs
@@ -182,8 +182,12 @@ def _sample(path: Path, overwrite: bool, show: Callable, **arguments: Any) -> Fr
         if error.parameter != "backend":
             raise
         if not overwrite:
-            expected, cure = "the draws of this model, clip and settings", "Choose another folder, or add --overwrite."
-            raise invalid("--out", expected=expected, got=f"others in {path}, or damaged ones", cure=cure) from error
+            raise invalid(
+                "--out",
+                expected="the draws of this model, clip and settings",
+                got=f"others in {path}, or damaged ones",
+                cure="Choose another folder, or add --overwrite.",
+            ) from error
         path.unlink()
         return _sample(path, overwrite, show, **arguments)
     except KeyboardInterrupt as error:

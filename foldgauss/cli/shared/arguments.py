@@ -10,7 +10,7 @@ import numpy as np
 import typer
 
 from foldgauss._runtime.checks import invalid, require
-from foldgauss.cli.app.completion import complete_choice, complete_clips, complete_models
+from foldgauss.cli.app.help import complete_choice
 from foldgauss.io.media.clip import DEINTERLACE
 from foldgauss.render import RenderOptions
 
@@ -20,23 +20,21 @@ MAX_TIMES = 100_000
 #: Panel of `--help` for the constants of the renderer.
 RENDERER = "Renderer"
 
-ModelFile = Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.", autocompletion=complete_models)]
-FittedClip = Annotated[
-    Path, typer.Argument(help="The clip that the model was fitted to.", autocompletion=complete_clips)
-]
+ModelFile = Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")]
+FittedClip = Annotated[Path, typer.Argument(help="The clip that the model was fitted to.")]
 NewClip = Annotated[
     Path,
-    typer.Argument(help="Video file, folder of images in natural order, or one image.", autocompletion=complete_clips),
+    typer.Argument(help="Video file, folder of images in natural order, or one image."),
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing outputs.")]
 Size = Annotated[str | None, typer.Option(metavar="HxW", help="Height x width in pixels, such as 160x320.")]
-Frames = Annotated[
-    str | None, typer.Option(metavar="A:B", help="Frames A up to, not including, B; either may be omitted.")
-]
+Frames = Annotated[str | None, typer.Option(metavar="A:B", help="Frames A to B, without B; either may be omitted.")]
 Levels = Annotated[
     int | None,
     typer.Option(
-        metavar="N", help="Value of white in a clip of 16 bits, such as 4095 for data of 12 [default: 65535]."
+        metavar="N",
+        help="Value of white in a clip of 16 bits, such as 4095 for data of 12 [default: 65535].",
+        hidden=True,
     ),
 ]
 Deinterlace = Annotated[
@@ -44,6 +42,7 @@ Deinterlace = Annotated[
     typer.Option(
         metavar="HOW",
         help="Interlaced frames: frames, each becomes one; fields, two at twice the rate; refuse.",
+        hidden=True,
         autocompletion=complete_choice(DEINTERLACE),
     ),
 ]

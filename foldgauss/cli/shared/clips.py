@@ -67,8 +67,12 @@ def read_fitted_clip(
             got = "to which that does not apply"
         else:
             raise
-        expected = f"the clip that the model was fitted to, {as_fitted}"
-        raise invalid(name, expected=expected, got=f"{str(video)!r}, {got}", cure="Give that clip.") from error
+        raise invalid(
+            name,
+            expected=f"the clip that the model was fitted to, {as_fitted}",
+            got=f"{str(video)!r}, {got}",
+            cure="Give that clip.",
+        ) from error
     for note in clip.notes:
         warn(f"{clip.source}: {note}")
     if same_number and clip.num_frames != model.num_frames:

@@ -21,13 +21,11 @@ def name_after(source: Path, ending: str) -> Path:
 
 def refuse_huge(size: tuple[int, int] | None) -> None:
     """Refuse images that do not fit in memory: several copies are held in floating point."""
-    require(
-        size is None or 64 * size[0] * size[1] <= memory_limit(),
-        "--size",
-        expected="an image that fits in memory",
-        got=f"{size[0]}x{size[1]}",
-        cure="Choose a smaller one.",
-    )
+    if size is None:
+        return
+    got = f"{size[0]}x{size[1]}"
+    fits = 64 * size[0] * size[1] <= memory_limit()
+    require(fits, "--size", expected="an image that fits in memory", got=got, cure="Choose a smaller one.")
 
 
 def refuse_existing(path: Path, overwrite: bool, option: str = "--out") -> None:
@@ -79,8 +77,7 @@ def check_images_output(
     if path.suffix and not path.is_dir() and path.suffix.lower() not in wanted:
         is_image = path.suffix.lower() == IMAGE_SUFFIX
         cure = "One image of a model: foldgauss render MODEL --times T --out FILE.png." if is_image else ""
-        expected = ", ".join(wanted) + ", or a folder without extension"
-        raise invalid(option, expected=expected, got=path, cure=cure)
+        raise invalid(option, expected=", ".join(wanted) + ", or a folder without extension", got=path, cure=cure)
     refuse_inputs(path, inputs, option)
     if not path.is_dir() or any(path.iterdir()):
         refuse_existing(path, overwrite, option)
@@ -103,11 +100,16 @@ def refuse_foreign(
         return
     foreign, expected = sorted(names - set(own)), f"a new folder or one that a {command} wrote"
     if foreign:
-        got = f"{folder} with {foreign[0]!r} in it"
-        raise invalid("--out", expected=expected, got=got, cure="Choose another folder.")
+        raise invalid(
+            "--out", expected=expected, got=f"{folder} with {foreign[0]!r} in it", cure="Choose another folder."
+        )
     if names and not known:
-        got = f"{folder} with {min(names)!r} in it, but no {record} of a {command}"
-        raise invalid("--out", expected=expected, got=got, cure=f"Choose another folder{cure}.")
+        raise invalid(
+            "--out",
+            expected=expected,
+            got=f"{folder} with {min(names)!r} in it, but no {record} of a {command}",
+            cure=f"Choose another folder{cure}.",
+        )
 
 
 def make_folder(path: Path) -> None:
@@ -115,6 +117,7 @@ def make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        got, cure = f"{path} ({error.strerror})", "Choose another."
-        raise invalid("--out", expected="a folder that can be created", got=got, cure=cure) from error
+        raise invalid(
+            "--out", expected="a folder that can be created", got=f"{path} ({error.strerror})", cure="Choose another."
+        ) from error
     check_writable(path / "model.safetensors")

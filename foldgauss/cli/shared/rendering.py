@@ -15,7 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from foldgauss._runtime.checks import ParameterError, require
 from foldgauss.cli.app.application import err, out
-from foldgauss.cli.app.completion import complete_choice
+from foldgauss.cli.app.help import complete_choice
 from foldgauss.cli.shared.clips import Video
 from foldgauss.cli.shared.log_lines import FIRST_LINE_SECONDS, LINE_SECONDS
 from foldgauss.cli.shared.outputs import IMAGE_SUFFIX

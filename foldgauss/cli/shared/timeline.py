@@ -184,6 +184,9 @@ def parse_remap(text: str | None) -> list[tuple[float, float]] | None:
             raise ValueError("too long")
         remapped_positions(points, fps=1.0)
     except ValueError as error:
-        expected = "seconds shown = seconds of the clip, the former rising from 0, as 0=0,1=1,3=1,4=2"
-        raise invalid("--remap", expected=expected, got=text) from error
+        raise invalid(
+            "--remap",
+            expected="seconds shown = seconds of the clip, the former rising from 0, as 0=0,1=1,3=1,4=2",
+            got=text,
+        ) from error
     return points

@@ -9,7 +9,6 @@ import typer
 
 from foldgauss._runtime.checks import invalid, require
 from foldgauss.cli.app.application import command, err, out
-from foldgauss.cli.app.completion import complete_clips, complete_models
 from foldgauss.cli.shared.arguments import Overwrite, refuse_together
 from foldgauss.cli.shared.clips import read_fitted_clip
 from foldgauss.cli.shared.log_lines import show_status
@@ -38,7 +37,6 @@ def view_command(
         typer.Argument(
             metavar="MODEL",
             help="Model file; without one --out writes a page that opens model files.",
-            autocompletion=complete_models,
         ),
     ] = None,
     out_path: Annotated[
@@ -52,7 +50,6 @@ def view_command(
         typer.Option(
             metavar="CLIP",
             help="The clip that the model was fitted to, to show next to it.",
-            autocompletion=complete_clips,
         ),
     ] = None,
     original_quality: Annotated[
@@ -118,8 +115,12 @@ def _serve(model_path: Path, original: Clip | None, quality: int, moving: bool, 
     try:
         server = PageServer(page.encode(), port, script=script, token=token)
     except OSError as error:
-        cure = "Choose another, or omit the option for a free one."
-        raise invalid("--port", expected="a free port", got=f"{port} ({error.strerror})", cure=cure) from error
+        raise invalid(
+            "--port",
+            expected="a free port",
+            got=f"{port} ({error.strerror})",
+            cure="Choose another, or omit the option for a free one.",
+        ) from error
     with server:
         out.print(f"{model_path.name}, {len(page) / 1e6:.1f} MB, until Ctrl-C at {server.url}", soft_wrap=True)
         if browser:

@@ -429,5 +429,6 @@ def _check(right: bool, name: str, got: Any) -> None:
 
 
 def _unreadable(path: Path, got: str) -> ModelFileError:
-    cure = "Copy it again, or compress again."
-    return model_file_error("path", expected="a compact model", got=f"{got}: {str(path)!r}", cure=cure)
+    return model_file_error(
+        "path", expected="a compact model", got=f"{got}: {str(path)!r}", cure="Copy it again, or compress again."
+    )

@@ -26,8 +26,7 @@ def check_array(parameter: str, values: object, *shape: int | None) -> Float64[n
             (None, 2): "pairs, as [(0.1, 0.0), (0.2, 0.0)]",
         }
         texts |= {(length,): f"{length} finite numbers" for length in shape if length is not None}
-        expected = texts.get(shape, f"finite numbers of shape {shape}")
-        raise invalid(parameter, expected=expected, got=short_repr(values))
+        raise invalid(parameter, expected=texts.get(shape, f"finite numbers of shape {shape}"), got=short_repr(values))
     return array
 
 

@@ -147,8 +147,9 @@ def as_edited(video: VideoModel | EditedVideo) -> EditedVideo:
             "SegmentedVideo": ONE_SEGMENT,
             "StabilizedVideo": "Edit first, and stabilize the edited video.",
         }
-        got, cure = type(video).__name__, cures.get(kind, "")
-        raise invalid("video", expected="a VideoModel or an EditedVideo", got=got, cure=cure)
+        raise invalid(
+            "video", expected="a VideoModel or an EditedVideo", got=type(video).__name__, cure=cures.get(kind, "")
+        )
     return EditedVideo((Layer(video),), timeline=0)
 
 

@@ -356,8 +356,12 @@ def _check_areas(factor: Float[np.ndarray, "num 3 2"]) -> None:
     collinear = np.flatnonzero(~np.isfinite(factor).all((1, 2)))
     if collinear.size:
         got = f"{collinear.size} without area, the first at index {collinear[0]}"
-        cure = "Move a vertex off the line through the other two."
-        raise invalid("vertices", expected="triangles whose three vertices span a plane", got=got, cure=cure)
+        raise invalid(
+            "vertices",
+            expected="triangles whose three vertices span a plane",
+            got=got,
+            cure="Move a vertex off the line through the other two.",
+        )
 
 
 def _check_result(before: SelectedGaussians, after: object) -> SelectedGaussians:

@@ -28,8 +28,9 @@ def flatten_video(video: VideoModel | EditedVideo | SegmentedVideo) -> VideoMode
     if isinstance(video, VideoModel):
         return video
     if isinstance(video, SegmentedVideo):
-        got = f"one in {len(video.segments)} segments"
-        raise invalid("model", expected="a model without segments", got=got, cure=ONE_SEGMENT)
+        raise invalid(
+            "model", expected="a model without segments", got=f"one in {len(video.segments)} segments", cure=ONE_SEGMENT
+        )
     require(
         video.camera is None and not any(layer.overlays or layer.clocks for layer in video.layers),
         "model",

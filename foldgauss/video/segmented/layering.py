@@ -54,8 +54,11 @@ def layers(*videos: Video, timeline: int = -1) -> EditedVideo | SegmentedVideo:
         if not isinstance(video, SegmentedVideo):
             as_edited(video)
         elif _bounds(video) != _bounds(lead):
-            expected = f"the segments of video {timeline}, {_format_bounds(lead)}"
-            raise invalid("videos", expected=expected, got=f"{_format_bounds(video)} in video {number}")
+            raise invalid(
+                "videos",
+                expected=f"the segments of video {timeline}, {_format_bounds(lead)}",
+                got=f"{_format_bounds(video)} in video {number}",
+            )
 
     @functools.lru_cache(maxsize=MAX_PREPARED)
     def load(number: int) -> EditedVideo:

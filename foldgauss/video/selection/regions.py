@@ -40,18 +40,30 @@ def region_from_mask(model: VideoModel, mask: Masks, frame: int | None, frames: 
         )
         found = {_check_frame(model, k): _check_mask(model, one, ndim=2) for k, one in mask.items()}
     elif isinstance(mask, str | os.PathLike):
-        cure = "Read it: mask=foldgauss.io.read_masks(path)."
-        raise invalid("mask", expected="bool (height, width)", got=f"the path {str(mask)!r}", cure=cure)
+        raise invalid(
+            "mask",
+            expected="bool (height, width)",
+            got=f"the path {str(mask)!r}",
+            cure="Read it: mask=foldgauss.io.read_masks(path).",
+        )
     else:
         mask = np.asarray(mask)
         if mask.ndim == 2 and frame is None and frames is None:
-            cure = "Name its frame: frame=k."
-            raise invalid("mask", expected=f"({model.num_frames}, height, width)", got=f"{mask.shape}", cure=cure)
+            raise invalid(
+                "mask",
+                expected=f"({model.num_frames}, height, width)",
+                got=f"{mask.shape}",
+                cure="Name its frame: frame=k.",
+            )
         numbers = resolve_frames(model, frame, frames)
         if mask.ndim not in (2, 3) or (mask.ndim == 3 and len(mask) != len(numbers)):
             expected = f"one of shape (height, width), or {len(numbers)} of them"
-            cure = "Name their frames: frame=k, frames=(first, stop) or mask={frame: mask}."
-            raise invalid("mask", expected=expected, got=f"shape {mask.shape}", cure=cure)
+            raise invalid(
+                "mask",
+                expected=expected,
+                got=f"shape {mask.shape}",
+                cure="Name their frames: frame=k, frames=(first, stop) or mask={frame: mask}.",
+            )
         _check_mask(model, mask, mask.ndim)
         found = dict(zip(numbers, mask, strict=True)) if mask.ndim == 3 else dict.fromkeys(numbers, mask)
     require(any(one.any() for one in found.values()), "mask", expected="a mask that is not empty", got="an empty one")
@@ -142,8 +154,12 @@ def _constant_region(name, model, inside: Bool[np.ndarray, "height width"], fram
     """The same pixels in all of the frames."""
     if not inside.any():
         height, width = model.size
-        cure = "x is right, y is down, in pixels of the model's own size."
-        raise invalid(name, expected=f"pixels of a {height}x{width} frame in it", got="none", cure=cure)
+        raise invalid(
+            name,
+            expected=f"pixels of a {height}x{width} frame in it",
+            got="none",
+            cure="x is right, y is down, in pixels of the model's own size.",
+        )
     fraction = inside.astype(np.float32)
     return Region(tuple(resolve_frames(model, frame, frames)), lambda k: fraction)
 

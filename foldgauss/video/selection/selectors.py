@@ -177,8 +177,9 @@ def check_mask(selection: object, num: int) -> Mask:
         cure = "For a mask of pixels: select(mask=mask, frame=k)."
     elif mask.dtype.kind in "iu":
         cure = "For indices of Gaussians: Selection.of(model, [...])."
-    expected = f"a Selection or mask of {num:,} Gaussians"
-    raise invalid("selection", expected=expected, got=f"{mask.dtype} {mask.shape}", cure=cure)
+    raise invalid(
+        "selection", expected=f"a Selection or mask of {num:,} Gaussians", got=f"{mask.dtype} {mask.shape}", cure=cure
+    )
 
 
 def split_mask(mask: Mask, counts: Sequence[int]) -> list[Mask]:
