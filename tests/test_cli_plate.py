@@ -7,7 +7,7 @@ import pytest
 from commands import run, seconds_heard, write_tone
 from soft_models import soft_model
 
-from foldgauss.cli.viewing import plate
+from foldgauss.cli.viewing import render as plate
 from foldgauss.io import load_video_model, read_masks, read_video, save_video_model, write_image
 from foldgauss.io.edit_script import EditScriptError, parse_edit_script
 from foldgauss.video import NothingMoves, by_mask, edit

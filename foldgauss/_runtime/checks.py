@@ -87,3 +87,17 @@ def warn_if_degrees(parameter: str, *angles: float, stacklevel: int = 3) -> None
         if abs(angle) > 2 * math.pi and float(2 * angle).is_integer():
             text = f"{parameter}: expected radians, got {angle:g}, {abs(angle) / (2 * math.pi):.1f} turns."
             warnings.warn(f"{text} For degrees use math.radians({angle:g}).", stacklevel=stacklevel)
+
+
+def require(
+    condition: object,
+    parameter: str,
+    *,
+    expected: str,
+    got: object,
+    cure: str = "",
+    kind: type[ParameterError] = ParameterError,
+) -> None:
+    """Raise the error of `invalid` unless `condition` is true."""
+    if not condition:
+        raise invalid(parameter, expected=expected, got=got, cure=cure, kind=kind)

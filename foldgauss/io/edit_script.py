@@ -20,6 +20,7 @@ values are in the units of `Edit`:
 import dataclasses
 import difflib
 import functools
+import inspect
 import math
 import operator
 import os
@@ -33,7 +34,7 @@ from typing import Any
 
 import numpy as np
 
-from foldgauss._runtime.checks import ParameterError, invalid
+from foldgauss._runtime.checks import ParameterError, invalid, require
 from foldgauss.io._atomic import MissingInput, PathLike, describe_missing, resolve
 from foldgauss.io.media.masks import read_masks
 from foldgauss.io.models.selections import load_selection, parse_indices, parse_ranges
@@ -41,11 +42,12 @@ from foldgauss.io.models.video_model import load_video_model, read_origin
 from foldgauss.render import Camera
 from foldgauss.video.editing.chain import Edit, edit
 from foldgauss.video.editing.edited_video import EditedVideo
+from foldgauss.video.editing.span import When
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.layering import layers
 from foldgauss.video.segmented.segmented_edit import SegmentedEdit
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
-from foldgauss.video.selection.selectors import Selection
+from foldgauss.video.selection.selectors import Selection, select
 
 Video = VideoModel | EditedVideo | SegmentedVideo
 Chain = Edit | SegmentedEdit
@@ -82,136 +84,82 @@ def _is_whole(value: Any) -> bool:
     return _is_number(value) and isinstance(value, int) and value >= 0
 
 
-def _is_table(value: Any) -> bool:
-    return isinstance(value, dict)
+def _are_numbers(value: Any) -> bool:
+    return all(map(_are_numbers, value)) if isinstance(value, list) else _is_number(value)
 
 
-def _is_array_of_tables(value: Any) -> bool:
-    return isinstance(value, list) and all(map(_is_table, value))
+def _are_tables(values: Any) -> bool:
+    return all(isinstance(value, dict) for value in values)
 
 
-def _is_range(value: Any) -> bool:
-    """Whether `value` is "A:B", as in the commands, where either may be left out."""
-    return isinstance(value, str) and re.fullmatch("[0-9]{0,9}:[0-9]{0,9}", value) is not None
+def _are_frames(value: Any) -> bool:
+    """Whether it is [first, stop], or "A:B", as in the commands, where either may be left out."""
+    if isinstance(value, str):
+        return re.fullmatch("[0-9]{0,9}:[0-9]{0,9}", value) is not None
+    return isinstance(value, list) and len(value) == 2 and all(map(_is_whole, value))
 
 
-def _list_check(*lengths: int, is_item: Callable[[Any], bool] = _is_number) -> Callable[[Any], bool]:
-    """A check for lists of one of these lengths, or of any length above 0 if none is given."""
-
-    def holds(value: Any) -> bool:
-        fits = isinstance(value, list) and (len(value) in lengths if lengths else bool(value))
-        return fits and all(map(is_item, value))
-
-    return holds
-
-
-def _any_of(*ways: Callable[[Any], bool]) -> Callable[[Any], bool]:
-    return lambda value: any(way(value) for way in ways)
-
-
-def _rows_check(length: int, *counts: int) -> Callable[[Any], bool]:
-    return _list_check(*counts, is_item=_list_check(length))
-
-
-_NUMBER = _Kind("a number", _is_number)
+_NUMBERS = _Kind("a number, or an array of numbers as the edit takes them", _are_numbers)
 _WHOLE = _Kind("a whole number >= 0", _is_whole)
 _BOOL = _Kind("true or false", lambda value: isinstance(value, bool))
 _TEXT = _Kind("a text in quotes", lambda value: isinstance(value, str) and bool(value))
 _PATH = _Kind("a path in quotes", lambda value: isinstance(value, str) and bool(value) and "\0" not in value)
-_PAIR = _Kind("two numbers, as [0.1, 0.2]", _list_check(2))
-_FRAMES = _Kind(
-    'two whole numbers, as [10, 20]: first, and the first beyond; or "10:", from there to the end',
-    _any_of(_list_check(2, is_item=_is_whole), _is_range),
+_NAMES = _Kind(
+    'a list of names of selections, as ["one", "other"]',
+    lambda value: isinstance(value, list) and bool(value) and all(map(_TEXT.holds, value)),
 )
-_THREE = _Kind("three numbers, as [0.9, 0.2, 0.1]", _list_check(3))
-_PAIRS = _Kind("pairs of numbers, as [[0.1, 0.0], [0.2, 0.0]]", _rows_check(2))
-_ONE_OR_TWO = _Kind("a number, or two as [1.5, 1.0]", _any_of(_is_number, _list_check(2)))
-_ONE_OR_THREE = _Kind("a number, or three as [1.0, 0.9, 0.8]", _any_of(_is_number, _list_check(3)))
-_EACH = _Kind("a number, or a list with one for each copy", _any_of(_is_number, _list_check()))
-_NAMES = _Kind('a list of names of selections, as ["one", "other"]', _list_check(is_item=_TEXT.holds))
-
-_Keys = Mapping[str, _Kind]
-
-_WHEN: _Keys = {"frame": _WHOLE, "frames": _FRAMES, "times": _PAIR, "ease": _ONE_OR_TWO, "curve": _TEXT}
-_COMBINATION: _Keys = dict.fromkeys(("any", "all", "without"), _NAMES)
-_MASK_FILE: _Keys = {"label": _WHOLE, "level": _NUMBER}
-_INDICES: _Keys = {"indices": _TEXT, "num_gaussians": _WHOLE, "segment": _WHOLE}
-_CRITERIA: _Keys = {
-    "mask": _PATH,
-    "file": _PATH,
-    "box": _Kind("four numbers, as [10, 20, 60, 80]", _list_check(4)),
-    "polygon": _Kind("pairs of numbers, as [[10, 10], [60, 12], [30, 50]]", _rows_check(2)),
-    "color": _THREE,
-    "click": _PAIR,
-    "moving": _Kind("true", lambda value: value is True),
-    "times": _PAIR,
-    "frame": _WHOLE,
-    "frames": _FRAMES,
-    "tolerance": _NUMBER,
-    "alive": _BOOL,
-    "threshold": _NUMBER,
-    "follow": _BOOL,
-}
-_LAYER: _Keys = {"model": _PATH, "where": _TEXT, "freeze": _NUMBER, "script": _PATH}
-_CAMERA: _Keys = {"azimuth": _NUMBER, "elevation": _NUMBER}
-_TABLES: _Keys = {
+_FRAMES = _Kind(
+    'two whole numbers, as [10, 20]: first, and the first beyond; or "10:", from there to the end', _are_frames
+)
+#: The values of keys; all others are numbers, whose shape and range the edits check.
+_KINDS = {
     "selections": _Kind(
         "tables, each begun by [selections.NAME]",
-        lambda value: _is_table(value) and all(map(_is_table, value.values())),
+        lambda value: isinstance(value, dict) and _are_tables(value.values()),
     ),
-    "edits": _Kind("tables, each begun by [[edits]]", _is_array_of_tables),
-    "layers": _Kind("tables, each begun by [[layers]]", _is_array_of_tables),
-    "camera": _Kind("a table begun by [camera]", _is_table),
+    "edits": _Kind("tables, each begun by [[edits]]", lambda value: isinstance(value, list) and _are_tables(value)),
+    "layers": _Kind("tables, each begun by [[layers]]", lambda value: isinstance(value, list) and _are_tables(value)),
+    "camera": _Kind("a table begun by [camera]", lambda value: isinstance(value, dict)),
+    "moving": _Kind("true", lambda value: value is True),
+    "frames": _FRAMES,
+    **dict.fromkeys(("any", "all", "without"), _NAMES),
+    **dict.fromkeys(("mask", "file", "model", "script"), _PATH),
+    **dict.fromkeys(("frame", "label", "num_gaussians", "segment"), _WHOLE),
+    **dict.fromkeys(("alive", "follow", "originals"), _BOOL),
+    **dict.fromkeys(("do", "select", "curve", "where", "indices"), _TEXT),
 }
+_COMBINATION = ("any", "all", "without")
+_MASK_FILE = ("label", "level")
+_CRITERIA = ("file", *list(inspect.signature(select).parameters)[1:])
 
 
 @dataclasses.dataclass(frozen=True)
 class _Action:
-    """A value of `do`, a method of `Edit`: its required and optional keys, and the method's name for "degrees".
+    """A value of `do`, a method of `Edit`: its keys are the parameters, but an angle is called "degrees"."""
 
-    Values of that key are converted to radians.
-    """
+    keys: tuple[str, ...]
+    required: tuple[str, ...]
+    angle: str  # the parameter that "degrees", converted to radians, are given to
+    spans: bool
 
-    required: _Keys = dataclasses.field(default_factory=dict)
-    optional: _Keys = dataclasses.field(default_factory=dict)
-    angle: str = "angle"
-    spans: bool = True
+    @classmethod
+    def of(cls, method: Callable[..., Edit]) -> "_Action":
+        parameters = dict(inspect.signature(method).parameters)
+        del parameters["self"]
+        spans = parameters.pop("when", None) is not None
+        angle = next((name for name in ("angle", "rotate") if name in parameters), "")
+        keys = {"degrees" if name == angle else name: own.default for name, own in parameters.items()}
+        keys.pop("clock", None)  # which no text describes
+        required = tuple(name for name, default in keys.items() if default is inspect.Parameter.empty)
+        return cls((*keys, *(When.__annotations__ if spans else ())), required, angle, spans)
 
-    @property
-    def keys(self) -> _Keys:
-        return {**self.required, **self.optional, **(_WHEN if self.spans else {})}
 
-
+_ACTION_NAMES = (
+    *("move", "scale", "rotate", "transform", "multiply", "vanish", "opacity", "recolor", "retime", "freeze"),
+    *("to_front", "to_back", "place"),
+)
 #: The actions of edits, each a method of `foldgauss.video.Edit`.
-ACTIONS = {
-    "move": _Action({"offset": _PAIR}),
-    "scale": _Action({"factor": _ONE_OR_TWO}, {"about": _PAIR}),
-    "rotate": _Action({"degrees": _NUMBER}, {"about": _PAIR}),
-    "transform": _Action(
-        {"matrix": _Kind("two rows of two numbers, as [[1.0, 0.2], [0.0, 1.0]]", _rows_check(2, 2))},
-        {"offset": _PAIR, "about": _PAIR},
-    ),
-    "multiply": _Action(
-        {"offsets": _PAIRS},
-        {"delays": _EACH, "scale": _EACH, "degrees": _EACH, "about": _PAIR, "originals": _BOOL},
-    ),
-    "vanish": _Action(),
-    "opacity": _Action({"factor": _NUMBER}),
-    "recolor": _Action(
-        optional={
-            "color": _THREE,
-            "hue": _NUMBER,
-            "gain": _ONE_OR_THREE,
-            "offset": _ONE_OR_THREE,
-            "matrix": _Kind("three rows of three numbers", _rows_check(3, 3)),
-        },
-    ),
-    "retime": _Action(optional={"shift": _NUMBER, "stretch": _NUMBER, "about": _NUMBER}),
-    "freeze": _Action({"at": _NUMBER}),
-    "to_front": _Action(spans=False),
-    "to_back": _Action(spans=False),
-    "place": _Action(optional={"depth": _NUMBER, "degrees": _THREE, "about": _PAIR}, angle="rotate"),
-}
+ACTIONS = {name: _Action.of(getattr(Edit, name)) for name in _ACTION_NAMES}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -260,22 +208,22 @@ class EditScript:
     def _select(
         self, video: Video, table: dict[str, Any], named: dict[str, Selection], origin: Mapping[str, Any]
     ) -> Selection:
-        if table.keys() & _COMBINATION.keys():
+        if table.keys() & set(_COMBINATION):
             return _combine(table, named)
         if "indices" in table:
             return _select_indices(video, **table)
-        criteria = _convert_spans(table)
+        criteria = _convert_frames(table)
         if "file" in criteria:
-            if not isinstance(video, VideoModel):
-                raise invalid(
-                    "file",
-                    expected="a model without layers or overlays",
-                    got="one in segments" if isinstance(video, SegmentedVideo) else "an edited video",
-                )
+            require(
+                isinstance(video, VideoModel),
+                "file",
+                expected="a model without layers or overlays",
+                got="one in segments" if isinstance(video, SegmentedVideo) else "an edited video",
+            )
             found = load_selection(self._path(criteria.pop("file")), video)
             return found & edit(video).select(**criteria).selection if criteria else found
         if "mask" in criteria:
-            options = {key: criteria.pop(key) for key in _MASK_FILE.keys() & criteria.keys()}
+            options = {key: criteria.pop(key) for key in criteria.keys() & set(_MASK_FILE)}
             options |= {"size": video.size, "stretched": origin.get("stretched")}
             masks, frames = read_masks(self._path(criteria["mask"]), **options), origin.get("frames")
             if masks.ndim == 3 and frames is not None and len(masks) != video.num_frames:
@@ -287,13 +235,13 @@ class EditScript:
     def _apply_edit(self, edits: Chain, table: dict[str, Any], named: dict[str, Selection]) -> Chain:
         if "select" in table:
             edits = edits.select(named[table["select"]])
-            if not len(edits.selection):
-                raise invalid(
-                    "select",
-                    expected="a selection of at least one Gaussian",
-                    got=f"{table['select']!r}, which found nothing, or only deleted Gaussians",
-                )
-        given = {key: value for key, value in _convert_spans(table).items() if key not in ("do", "select")}
+            require(
+                len(edits.selection),
+                "select",
+                expected="a selection of at least one Gaussian",
+                got=f"{table['select']!r}, which found nothing, or only deleted Gaussians",
+            )
+        given = {key: value for key, value in _convert_frames(table).items() if key not in ("do", "select")}
         if "degrees" in given:
             given[ACTIONS[table["do"]].angle] = np.radians(given.pop("degrees")).tolist()
         return getattr(edits, table["do"])(**given)
@@ -313,8 +261,12 @@ class EditScript:
         other: Video = load_video_model(file := self._path(table["model"]))
         if "script" in table:
             path = self._path(table["script"])
-            if resolve(path) in self._includes:
-                raise invalid("script", expected="a script that does not include itself", got=repr(table["script"]))
+            require(
+                resolve(path) not in self._includes,
+                "script",
+                expected="a script that does not include itself",
+                got=repr(table["script"]),
+            )
             script = read_edit_script(path)
             script = dataclasses.replace(script, _includes=script._includes + self._includes)
             other = script.apply(other, read_origin(file))
@@ -335,9 +287,13 @@ def read_edit_script(path: PathLike) -> EditScript:
     **Example:** `read_edit_script("edits.toml").apply(load_video_model("clip.safetensors"))`.
     """
     path = Path(path)
-    if not os.path.exists(path):
-        got = f"{str(path)!r}, {describe_missing(path)}"
-        raise invalid("script", expected="a TOML file", got=got, kind=MissingInput)
+    require(
+        os.path.exists(path),
+        "script",
+        expected="a TOML file",
+        got=f"{str(path)!r}, {describe_missing(path)}",
+        kind=MissingInput,
+    )
     if not path.is_file():
         raise EditScriptError(f"{path}: expected a TOML file, got a folder or a device.")
     if path.stat().st_size > MAX_BYTES:
@@ -363,7 +319,7 @@ def parse_edit_script(text: str, *, source: str = "script", folder: PathLike = "
     except (ValueError, RecursionError) as error:
         raise _toml_error(source, text, error) from error
     script = EditScript(tables, source, text, Path(folder))
-    _check_keys(script._context(), tables, _TABLES)
+    _check_keys(script._context(), tables, ("selections", "edits", "layers", "camera"))
     selections: dict[str, dict] = tables.get("selections", {})
     known: dict[str, None] = {}
     for name, table in selections.items():
@@ -373,7 +329,7 @@ def parse_edit_script(text: str, *, source: str = "script", folder: PathLike = "
         _check_edit(script._context("edits", number), table, known)
     for number, table in enumerate(tables.get("layers", ())):
         _check_layer(script._context("layers", number), table)
-    _check_keys(script._context("camera"), tables.get("camera", {}), _CAMERA)
+    _check_keys(script._context("camera"), tables.get("camera", {}), ("azimuth", "elevation"))
     return script
 
 
@@ -454,16 +410,19 @@ def _key_lines(text: str) -> Mapping[tuple[str | int, ...], int]:
     return lines
 
 
-def _check_keys(context: _TableContext, table: dict[str, Any], known: _Keys, needed: _Keys | None = None) -> None:
+def _check_keys(
+    context: _TableContext, table: dict[str, Any], known: Collection[str], needed: Collection[str] = ()
+) -> None:
     """Raise for unknown keys, missing required keys, and values of a wrong type."""
     for key in table:
         _check_known(context, key, "one of ", key, sorted(known))
-    missing = [key for key in needed or {} if key not in table]
+    missing = [key for key in needed if key not in table]
     if missing:
         raise context.error(None, f"the key {missing[0]!r}", ", ".join(sorted(table)) or "an empty table")
     for key, value in table.items():
-        if not known[key].holds(value):
-            raise context.error(key, known[key].expected, _truncated_repr(value))
+        kind = _KINDS.get(key, _NUMBERS)
+        if not kind.holds(value):
+            raise context.error(key, kind.expected, _truncated_repr(value))
 
 
 def _check_known(context: _TableContext, key: str, expected: str, word: str, known: Collection[str]) -> None:
@@ -490,17 +449,17 @@ def _check_selection(context: _TableContext, table: dict[str, Any], known: Colle
     """Check a selection after those that are `known`."""
     if not table:
         raise context.error(None, "at least one criterion", "none")
-    if table.keys() & _COMBINATION.keys():
+    if table.keys() & set(_COMBINATION):
         _check_keys(context, table, _COMBINATION)
         for key, names in table.items():
             for name in names:
                 _check_known(context, key, "a selection from before: ", name, known)
     elif "indices" in table:
-        _check_keys(context, table, _INDICES)
+        _check_keys(context, table, ("indices", "num_gaussians", "segment"))
         with context:
             deque(parse_ranges(table["indices"]), maxlen=0)
     else:
-        _check_keys(context, table, {**_CRITERIA, **(_MASK_FILE if "mask" in table else {})})
+        _check_keys(context, table, _CRITERIA + (_MASK_FILE if "mask" in table else ()))
         if "mask" in table and "file" in table:
             raise context.error("file", "a mask or a file", "both", "Combine two selections with all=[...].")
 
@@ -510,14 +469,13 @@ def _check_edit(context: _TableContext, table: dict[str, Any], selections: Colle
     if not isinstance(do, str):
         raise context.error("do", "one of " + ", ".join(ACTIONS), "none" if do is None else _truncated_repr(do))
     _check_known(context, "do", "one of ", do, ACTIONS)
-    action = ACTIONS[do]
-    _check_keys(context, table, {"do": _TEXT, "select": _TEXT, **action.keys}, action.required)
+    _check_keys(context, table, ("do", "select", *ACTIONS[do].keys), ACTIONS[do].required)
     if "select" in table:
         _check_known(context, "select", "the name of a selection: ", table["select"], selections)
 
 
 def _check_layer(context: _TableContext, table: dict[str, Any]) -> None:
-    _check_keys(context, table, _LAYER, {"model": _PATH})
+    _check_keys(context, table, ("model", "where", "freeze", "script"), ("model",))
     if table.get("where", "behind") not in ("front", "behind"):
         raise context.error("where", "'front' or 'behind'", repr(table["where"]))
 
@@ -528,23 +486,23 @@ def _select_indices(
     """Gaussians by their indices in the video's order, of layers the front one's first; or in that of a segment."""
     if isinstance(video, SegmentedVideo):
         counts = [one.num_gaussians for one in video.segments]
-        if segment is None or segment >= len(counts):
-            raise invalid(
-                "segment",
-                expected=f"the number of one of {len(counts)} segments",
-                got="none" if segment is None else segment,
-            )
+        require(
+            segment is not None and segment < len(counts),
+            "segment",
+            expected=f"the number of one of {len(counts)} segments",
+            got="none" if segment is None else segment,
+        )
     elif segment is not None:
         raise invalid("segment", expected="none, since the video has no segments", got=segment)
     else:
         counts, segment = [video.num_gaussians], 0
-    if num_gaussians not in (None, counts[segment]):
-        raise invalid(
-            "num_gaussians",
-            expected=f"{counts[segment]}, as many as there are",
-            got=num_gaussians,
-            cure="Give the model that the selection was made in, unchanged.",
-        )
+    require(
+        num_gaussians in (None, counts[segment]),
+        "num_gaussians",
+        expected=f"{counts[segment]}, as many as there are",
+        got=num_gaussians,
+        cure="Give the model that the selection was made in, unchanged.",
+    )
     parts = [Selection(np.zeros(num, bool)) for num in counts]
     parts[segment] = parse_indices(indices, counts[segment])
     return Selection(np.concatenate([part.mask for part in parts]))
@@ -566,12 +524,8 @@ def _masks_of_frames(masks, num_frames: int, criteria: dict[str, Any]):
     return masks[slice(*frames)] if frames is not None else masks if frame is None else masks[frame : frame + 1]
 
 
-def _convert_spans(table: dict[str, Any]) -> dict[str, Any]:
-    """The table with its spans, lists or "A:B", as tuples."""
-    spans = {key: _convert_span(table[key]) for key in ("frames", "times") if key in table}
-    return table | spans
-
-
-def _convert_span(value: list[float] | str) -> tuple[float | None, ...]:
-    ends = value.split(":") if isinstance(value, str) else value
-    return tuple((int(end) if end else None) if isinstance(end, str) else end for end in ends)
+def _convert_frames(table: dict[str, Any]) -> dict[str, Any]:
+    """A copy of the table with frames "A:B" as a tuple."""
+    frames = table.get("frames")
+    ends = frames.split(":") if isinstance(frames, str) else ()
+    return table | ({"frames": tuple(int(end) if end else None for end in ends)} if ends else {})

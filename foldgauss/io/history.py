@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
-from foldgauss._runtime.checks import invalid, is_integer
+from foldgauss._runtime.checks import invalid, is_integer, require
 from foldgauss.analysis.plot import plot_history
 from foldgauss.io._atomic import PathLike, atomic_path, translate_output_errors
 from foldgauss.io.figures import write_figure
@@ -38,13 +38,13 @@ class HistoryFile:
             self._append, kept = True, [line for line in _read_lines(self.path) if line["step"] <= resumed_at]
             self._last = kept[-1]["step"] if kept else 0
             same = psnr is None or (kept and kept[-1].get("psnr") == _to_json(psnr))
-            if self._last != resumed_at or not same:
-                raise invalid(
-                    "history",
-                    expected=f"that of the fit which is resumed at step {resumed_at}",
-                    got=f"{str(self.path)!r} of another, or with that step missing",
-                    cure="Give a new name, or the file that the fit wrote before.",
-                )
+            require(
+                self._last == resumed_at and same,
+                "history",
+                expected=f"that of the fit which is resumed at step {resumed_at}",
+                got=f"{str(self.path)!r} of another, or with that step missing",
+                cure="Give a new name, or the file that the fit wrote before.",
+            )
             with atomic_path(self.path) as temporary:
                 temporary.write_text("".join(json.dumps(line) + "\n" for line in kept))
 

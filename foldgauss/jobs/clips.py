@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import invalid, require
 from foldgauss.io._atomic import MissingInput, describe_missing
 from foldgauss.io.media.clip import AS_STORED, Reading
 from foldgauss.io.media.images import IMAGE_SUFFIXES, image_paths, natural_sort_key
@@ -39,12 +39,20 @@ def find_clips(folder: str | os.PathLike) -> FoundClips:
     Single images are not clips. Raises FileNotFoundError and ValueError unless `folder` is a folder with clips.
     """
     folder = Path(folder)
-    if not folder.exists():
-        got = f"{str(folder)!r}, {describe_missing(folder)}"
-        raise invalid("folder", expected="a folder with clips", got=got, kind=MissingInput)
-    if not folder.is_dir():
-        cure = f"One clip alone: foldgauss fit {folder}."
-        raise invalid("folder", expected="a folder with clips", got=f"the file {str(folder)!r}", cure=cure)
+    require(
+        folder.exists(),
+        "folder",
+        expected="a folder with clips",
+        got=f"{str(folder)!r}, {describe_missing(folder)}",
+        kind=MissingInput,
+    )
+    require(
+        folder.is_dir(),
+        "folder",
+        expected="a folder with clips",
+        got=f"the file {str(folder)!r}",
+        cure=f"One clip alone: foldgauss fit {folder}.",
+    )
     clips, others = [], []
     entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
     for entry in sorted(entries, key=lambda entry: natural_sort_key(entry.name)):
@@ -52,8 +60,14 @@ def find_clips(folder: str | os.PathLike) -> FoundClips:
         (clips if is_clip else others).append(entry)
     if not clips:
         images = any(entry.suffix.lower() in IMAGE_SUFFIXES for entry in others)
-        cure = f"Its images are one clip: foldgauss fit {folder}." if images else "Video files, or folders of images."
-        raise invalid("folder", expected="a folder with clips", got=f"{str(folder)!r} without any", cure=cure)
+        raise invalid(
+            "folder",
+            expected="a folder with clips",
+            got=f"{str(folder)!r} without any",
+            cure=f"Its images are one clip: foldgauss fit {folder}."
+            if images
+            else "Video files, or folders of images.",
+        )
     return FoundClips(clips, others)
 
 

@@ -7,17 +7,17 @@ import dataclasses
 import json
 import os
 import sys
-import threading
 import time
+import warnings
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax
 
 from foldgauss import __version__
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss._runtime.machine import waiting_seconds
 from foldgauss.io._atomic import OutputError, atomic_path, write_or_keep
 from foldgauss.io._lock import lock_output
@@ -29,7 +29,6 @@ from foldgauss.io.models.compact import COMPACT_SUFFIX, leave_room, save_compact
 from foldgauss.io.models.video_model import save_video_model
 from foldgauss.io.provenance import describe_reading, describe_source, fingerprint
 from foldgauss.jobs.job import FitJob, file_digest, read_record
-from foldgauss.jobs.warning_capture import WarningCapture
 from foldgauss.video.compression.quantize import Quantized
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.divergence import FitDiverged
@@ -147,11 +146,15 @@ def run_fit(
     Raises `Stopped` if the observer stops the fit, `FitDiverged` as `fit_steps`, ValueError and OSError for frames that
     cannot be read or fitted, and for a checkpoint that is required.
     """
-    if Path(job.target).suffix.lower() == COMPACT_SUFFIX and not job.config.is_compact:
-        cure = "Give a quality, a size or a PSNR."
-        raise invalid("config", expected=f"one of a compact model for {job.target}", got="others", cure=cure)
+    require(
+        Path(job.target).suffix.lower() != COMPACT_SUFFIX or job.config.is_compact,
+        "config",
+        expected=f"one of a compact model for {job.target}",
+        got="others",
+        cure="Give a quality, a size or a PSNR.",
+    )
     clip = read_clip(job)
-    _COMPILED.add(clip.frames.shape)
+    _limit_compiled(clip.frames.shape)
     checkpoint = Checkpoint(job.checkpoint, job.config, fingerprint(clip), on_checkpoint_error)
     state = None if resume == "never" else checkpoint.load(required=resume == "required")
     steps = fit_steps(clip.frames, job.config, state)
@@ -254,23 +257,18 @@ def mean_scores(scores: Evaluation) -> dict[str, float]:
     return {"mean_psnr": round(scores.mean_psnr, 3), "mean_ssim": round(scores.mean_ssim, 4)}
 
 
-class _CompilationCache:
-    """Limits what JAX has compiled, which it never discards: some MiB for each number and size of frames."""
+def _limit_compiled(shape: tuple[int, ...]) -> None:
+    """Before a clip of a new shape, and after `MAX_SHAPES` others, discard what JAX has compiled, which it never does.
 
-    def __init__(self) -> None:
-        self._shapes: set[tuple[int, ...]] = set()
-        self._lock = threading.Lock()
-
-    def add(self, shape: tuple[int, ...]) -> None:
-        """Note the shape of a clip to be fitted; after `MAX_SHAPES` others, discard all compiled programs first."""
-        with self._lock:
-            if shape not in self._shapes and len(self._shapes) >= MAX_SHAPES:
-                jax.clear_caches()
-                self._shapes.clear()
-            self._shapes.add(shape)
+    It is some MiB for each number and size of frames.
+    """
+    if shape not in _SHAPES and len(_SHAPES) >= MAX_SHAPES:
+        jax.clear_caches()
+        _SHAPES.clear()
+    _SHAPES.add(shape)
 
 
-_COMPILED = _CompilationCache()
+_SHAPES: set[tuple[int, ...]] = set()
 
 
 # -------------------------------------------------------------------------------------------- one fit with a record
@@ -310,7 +308,7 @@ class _Reporter:
 
 
 def fit_job(job: FitJob, report: Report = lambda progress: True) -> dict[str, Any]:
-    """Run the job, or what is left of it; returns its record.
+    """Run the job, or what is left of it; returns its record. A process runs one job at a time.
 
     The record: `asked` (the request), `num_frames`, `size`, `fps`, `num_gaussians`, `psnr` and `ssim` by frame,
     `mean_psnr`, `mean_ssim`, `steps`, `seconds` (spent fitting), `stopped_by`, `file_bytes`, `file_digest`,
@@ -329,26 +327,21 @@ def fit_job(job: FitJob, report: Report = lambda progress: True) -> dict[str, An
 def _lock_target(job: FitJob) -> Iterator[None]:
     """Hold the lock of the target, for which a job waits a while."""
     until = time.monotonic() + WAIT_SECONDS
-    while True:
-        holder = lock_output(Path(job.target), own=(job.checkpoint, job.record))
-        try:
-            holder.__enter__()
-            break
-        except OutputError as error:
-            if not isinstance(error.__cause__, BlockingIOError) or time.monotonic() > until:
-                raise
-            time.sleep(0.5)
-    try:
+    with ExitStack() as stack:
+        while True:
+            try:
+                stack.enter_context(lock_output(Path(job.target), own=(job.checkpoint, job.record)))
+                break
+            except OutputError as error:
+                if not isinstance(error.__cause__, BlockingIOError) or time.monotonic() > until:
+                    raise
+                time.sleep(0.5)
         yield
-    finally:
-        holder.__exit__(None, None, None)
-
-
-_WARNINGS = WarningCapture()
 
 
 def _fit_and_record(job: FitJob, report: Report) -> dict[str, Any]:
-    with _WARNINGS.capture() as caught:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
         run = run_fit(job, lambda clip, state: nullcontext(_Reporter(job.name, report)))
     run.save_checkpoint()  # the evaluation may be interrupted
     clip, info = run.clip, run.info
@@ -374,7 +367,7 @@ def _fit_and_record(job: FitJob, report: Report) -> dict[str, Any]:
         "peak_bytes": peak_bytes(),
         "warnings": [
             *(clip.notes if job.index is None else ()),
-            *dict.fromkeys(caught),
+            *dict.fromkeys(" ".join(str(warning.message).split()) for warning in caught),
             *busy_processors(run),
             *(f"psnr: {text}" for text in missed_psnr(job.config, scores.mean_psnr)),
         ],

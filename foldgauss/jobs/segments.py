@@ -7,14 +7,13 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from foldgauss._runtime.checks import invalid, is_integer, is_within
+from foldgauss._runtime.checks import invalid, is_integer, is_within, require
 from foldgauss._runtime.settings import flatten
 from foldgauss.io._atomic import OutputError, atomic_path
 from foldgauss.io.media.clip import AS_STORED, Reading
@@ -198,10 +197,13 @@ def plan_long_fit(
     Example: `plan_long_fit("long.mp4", "long.safetensors").jobs`, for `run_here` or `run_on`.
     """
     config = FitConfig() if config is None else config
-    if not is_within(segment_seconds, "(0, 1e9]"):
-        raise invalid("segment_seconds", expected="a number of seconds > 0, at most 1e9", got=repr(segment_seconds))
-    if not is_integer(overlap, 1):
-        raise invalid("overlap", expected="a whole number of frames >= 1", got=repr(overlap))
+    require(
+        is_within(segment_seconds, "(0, 1e9]"),
+        "segment_seconds",
+        expected="a number of seconds > 0, at most 1e9",
+        got=repr(segment_seconds),
+    )
+    require(is_integer(overlap, 1), "overlap", expected="a whole number of frames >= 1", got=repr(overlap))
     clip, target = Path(clip).absolute(), Path(target).absolute()
     folder = segments_folder(target)
     request = {"config": dataclasses.asdict(config), "size": size, "frames": frames, "reading": reading.changed}
@@ -214,13 +216,14 @@ def plan_long_fit(
         index = index_video(clip, frames=frames, on_frame=on_frame, **reading._asdict())
         if plan is not None and plan["digest"] != index.digest:
             cure = "Use that clip, or start over with --overwrite."
-            expected = f"the clip that the fit was started with, {plan['clip']!r}"
-            raise invalid("clip", expected=expected, got=f"other frames in {str(clip)!r}", cure=cure)
-    if plan is None or not _is_partition(plan["spans"], index.num_frames):
-        length = max(round(segment_seconds * index.fps), 2)
-        spans = plan_segments(index.num_frames, index.cuts, length=length, overlap=_limit_overlap(overlap, length))
-    else:
-        spans = plan["spans"]
+            raise invalid(
+                "clip",
+                expected=f"the clip that the fit was started with, {plan['clip']!r}",
+                got=f"other frames in {str(clip)!r}",
+                cure=cure,
+            )
+    length = max(round(segment_seconds * index.fps), 2)
+    spans = plan_segments(index.num_frames, index.cuts, length=length, overlap=_limit_overlap(overlap, length))
     if frames is not None and frames[1] is not None:  # the range may end beyond the clip
         frames = frames[0], min(frames[1], (frames[0] or 0) + index.num_declared)
     metadata = {"clip": clip.name, "seed": config.seed, "frames": frames, "clip_digest": index.digest}
@@ -230,42 +233,17 @@ def plan_long_fit(
         shutil.rmtree(folder)  # only once the clip has been read
     _make_folder(folder)
     index.save(folder / _INDEX)
-    kept = {"clip": str(clip), "digest": index.digest, "stamp": _stamp(clip), "asked": request, "spans": spans}
+    kept = {"clip": str(clip), "digest": index.digest, "stamp": _stamp(clip), "asked": request}
     with atomic_path(folder / _PLAN) as temporary:
         temporary.write_text(json.dumps(kept) + "\n")
-    jobs = _make_jobs(
-        clip,
-        folder,
-        target.suffix or MODEL_SUFFIX,
-        configs,
-        index,
-        spans,
-        size,
-        checkpoint_seconds,
-        0 if frames is None else frames[0] or 0,
-    )
-    return LongFit(target, folder, index, tuple(spans), jobs, metadata)
-
-
-def _make_jobs(
-    clip: Path,
-    folder: Path,
-    suffix: str,
-    configs: Sequence[FitConfig],
-    index: FrameIndex,
-    spans: Sequence[tuple[int, int]],
-    size: tuple[int, int] | None,
-    checkpoint_seconds: float | None,
-    begin: int,
-) -> tuple[FitJob, ...]:
-    """A job for each segment of the clip, whose first frame has the number `begin`; `suffix` of the models' names."""
+    begin = 0 if frames is None else frames[0] or 0
     jobs = []
     for number, (span, own) in enumerate(zip(spans, configs, strict=True)):
         low, high = index.span(*span)  # as `read_video` counts, where damaged frames are missing
         job = FitJob(
             name=f"segment {number}",
             clip=str(clip),
-            target=str(folder / f"segment-{number:04d}{suffix}"),
+            target=str(folder / f"segment-{number:04d}{target.suffix or MODEL_SUFFIX}"),
             config=own,
             size=size,
             frames=span,
@@ -276,7 +254,7 @@ def _make_jobs(
             metadata={"clip": clip.name, "frames": [begin + low, begin + high]},
         )
         jobs.append(job)
-    return tuple(jobs)
+    return LongFit(target, folder, index, tuple(spans), tuple(jobs), metadata)
 
 
 def _divide_size(config: FitConfig, spans: Sequence[tuple[int, int]], metadata: Mapping[str, Any]) -> list[FitConfig]:
@@ -289,9 +267,7 @@ def _divide_size(config: FitConfig, spans: Sequence[tuple[int, int]], metadata: 
     lengths = [stop - first for first, stop in spans]
     beside = _MB_PER_SEGMENT * len(spans) + 2.5e-6 * len(json.dumps(metadata))
     size_mb = config.size_mb - beside * (len(spans) > 1)
-    if size_mb <= 0:
-        expected = f"more than {beside:.4f} for {len(spans)} segments"
-        raise invalid("size_mb", expected=expected, got=config.size_mb)
+    require(size_mb > 0, "size_mb", expected=f"more than {beside:.4f} for {len(spans)} segments", got=config.size_mb)
     return [dataclasses.replace(config, size_mb=size_mb * one / sum(lengths)) for one in lengths]
 
 
@@ -306,17 +282,9 @@ def _check_folder(folder: Path) -> None:
         return
     foreign = sorted(entry.name for entry in folder.iterdir() if not entry.name.startswith(_OWN))
     if foreign:
-        got = f"{foreign[0]!r} in it"
-        raise invalid("target", expected=f"only files of a fit in {folder}", got=got, cure="Move it away.")
-
-
-def _is_partition(spans: Sequence[tuple[int, int]], num_frames: int) -> bool:
-    """Whether spans cover the clip in order, each frame in at most two; a plan may have been edited."""
-    if not spans or spans[0][0] != 0 or spans[-1][1] != num_frames:
-        return False
-    pairs, apart = pairwise(spans), zip(spans[:-2], spans[2:], strict=True)
-    in_order = all(one[0] < other[0] <= one[1] < other[1] for one, other in pairs)
-    return in_order and all(one[1] <= other[0] for one, other in apart)
+        raise invalid(
+            "target", expected=f"only files of a fit in {folder}", got=f"{foreign[0]!r} in it", cure="Move it away."
+        )
 
 
 def read_segment_seconds(target: str | os.PathLike) -> float | None:
@@ -344,23 +312,17 @@ def _load_plan(folder: Path, request: dict[str, Any]) -> dict[str, Any] | None:
         before = plan["asked"]
         before.get("config", {}).get("seed")
         plan["digest"], plan["clip"]
-        plan["spans"] = [(int(first), int(stop)) for first, stop in plan["spans"]]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
-    changed = sorted(name for name in request if request[name] != before.get(name))
-    if changed:
-        if changed == ["config"]:
-            kept = flatten(before["config"])
-            pairs = {name: (kept.get(name), value) for name, value in flatten(request["config"]).items()}
-            pairs = {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
-        else:
-            pairs = {name: (before.get(name), request[name]) for name in changed if name != "config"}
-        raise invalid(
-            "resume",
-            expected=", ".join(f"{name}={pair[0]!r}" for name, pair in pairs.items()),
-            got=", ".join(f"{name}={pair[1]!r}" for name, pair in pairs.items()),
-            cure=f"An unfinished fit is in {str(folder)!r}: give its options, or start over with --overwrite.",
-        )
+    before, now = ({**one, **flatten(one.get("config", {}))} for one in (before, request))
+    pairs = {name: (before.get(name), now[name]) for name in now if name != "config" and before.get(name) != now[name]}
+    require(
+        not pairs,
+        "resume",
+        expected=", ".join(f"{name}={pair[0]!r}" for name, pair in pairs.items()),
+        got=", ".join(f"{name}={pair[1]!r}" for name, pair in pairs.items()),
+        cure=f"An unfinished fit is in {str(folder)!r}: give its options, or start over with --overwrite.",
+    )
     return plan
 
 

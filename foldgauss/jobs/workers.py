@@ -1,7 +1,7 @@
 """Runs jobs: in this process, or by workers of dask.distributed, on this machine or a cluster.
 
-No result is lost when a process dies, see `runner`. dask replaces workers that die and reassigns their jobs; a job that
-kills every worker that takes it is given up here.
+No result is lost when a process dies, see `runner`. dask replaces workers that die and reassigns their jobs, which
+continue from their checkpoints; it gives up a job that kills the workers that take it.
 """
 
 import dataclasses
@@ -13,14 +13,13 @@ import secrets
 import signal
 import tempfile
 import time
-import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any
 
-from foldgauss._runtime.checks import invalid, is_integer
+from foldgauss._runtime.checks import invalid, is_integer, require
 from foldgauss._runtime.threads import available_cores
 from foldgauss.jobs.job import FitJob, read_record
 from foldgauss.jobs.runner import Progress, Report, Stopped, fit_job
@@ -28,22 +27,16 @@ from foldgauss.jobs.runner import Progress, Report, Stopped, fit_job
 if TYPE_CHECKING:
     from distributed import Client
 
-#: dask returns a job once so many of its workers have died.
-DEATHS = 3
-#: A job is given up after so many returns without a new checkpoint.
-ROUNDS = 3
+#: Workers of this machine that a job may kill before it is given up.
+DEATHS = 9
 #: Seconds that workers have to write their checkpoints once they are asked to stop.
 GRACE_SECONDS = 60.0
 #: The addresses that dask accepts.
 _ADDRESS = re.compile(r"((tcp|tls|ucx|ucxx|ws|wss)://)?[^/\s]+:[0-9]{1,5}/?")
-#: Seconds without workers after which a warning is issued.
-WARN_SECONDS = 10.0
 #: Seconds without workers after which the jobs are given up.
 NO_WORKERS_SECONDS = 120.0
 #: Seconds that a scheduler has to answer.
 CONNECT_SECONDS = 10.0
-#: Seconds that workers of this machine may be missing before others are started; doubled each time.
-RESTART_SECONDS = 20.0
 _POLL_SECONDS = 0.2
 
 
@@ -111,17 +104,15 @@ def one_line(error: BaseException) -> str:
     return text if plain else f"{type(error).__name__}: {text}"[:300]
 
 
+@dataclasses.dataclass(frozen=True)
 class WorkerPool:
-    """Workers of dask.distributed, as yielded by `local_workers` and `running_cluster`."""
+    """Workers of dask.distributed, as yielded by `local_workers` and `running_cluster`.
 
-    def __init__(self, client: "Client", cluster: Any = None, count: int = 0):
-        self.client, self._cluster, self._count = client, cluster, count
-        self._since, self._patience = time.monotonic(), RESTART_SECONDS
+    `cluster` is that of this machine; None for workers that are started elsewhere.
+    """
 
-    @property
-    def is_remote(self) -> bool:
-        """Whether its workers are started elsewhere."""
-        return self._cluster is None
+    client: "Client"
+    cluster: Any = None
 
     @property
     def threads(self) -> int:
@@ -132,19 +123,6 @@ class WorkerPool:
             return sum(self.client.nthreads().values())
         except (OSError, TimeoutError) as error:
             raise SchedulerLost(_LOST) from error
-
-    def restart_missing(self, alive: int) -> None:
-        """Start workers of this machine in place of those that stay away.
-
-        dask replaces workers that die during a job, but not those that die while they start.
-        """
-        now = time.monotonic()
-        if alive >= self._count:
-            self._since, self._patience = now, RESTART_SECONDS
-        elif now - self._since > self._patience:
-            self._since, self._patience = now, 2 * self._patience  # starting takes long on a busy machine
-            self._cluster.scale(alive)  # removes the missing workers first
-            self._cluster.scale(self._count)
 
 
 @contextmanager
@@ -171,8 +149,7 @@ def local_workers(count: int, *, threads: int | None = None) -> Iterator["Worker
     Raises ValueError for invalid counts, ImportError if dask.distributed is not installed.
     """
     for name, value in (("workers", count), ("threads", 1 if threads is None else threads)):
-        if not is_integer(value, 1):
-            raise invalid(name, expected="a whole number >= 1", got=repr(value))
+        require(is_integer(value, 1), name, expected="a whole number >= 1", got=repr(value))
     distributed = _import_distributed("workers")
     import dask
 
@@ -203,9 +180,9 @@ def local_workers(count: int, *, threads: int | None = None) -> Iterator["Worker
         )
         stack.enter_context(cluster)
         cluster.loop.add_callback(_block_ctrl_c)
-        pool = WorkerPool(stack.enter_context(distributed.Client(cluster, set_as_default=False)), cluster, count)
+        client = stack.enter_context(distributed.Client(cluster, set_as_default=False))
         cluster.scale(count)
-        yield pool
+        yield WorkerPool(client, cluster)
 
 
 def _block_ctrl_c() -> None:
@@ -225,22 +202,23 @@ def running_cluster(address: str) -> Iterator["WorkerPool"]:
     Raises `SchedulerLost` if no scheduler answers, ImportError if dask.distributed is not installed.
     """
     distributed = _import_distributed("scheduler")
-    with _silence_dask(), _connect(distributed, address) as client:
-        yield WorkerPool(client)
-
-
-def _connect(distributed: Any, address: str) -> "Client":
     if not _ADDRESS.fullmatch(address):  # dask would retry for long, and leave a client behind
-        expected, cure = "an address as tcp://host:8786", "`dask scheduler` prints it when it starts."
-        raise invalid("scheduler", expected=expected, got=repr(address), cure=cure)
-    try:
-        return distributed.Client(address, set_as_default=False, timeout=CONNECT_SECONDS)
-    except (OSError, TimeoutError, ValueError) as error:
-        got = f"{address!r}, which does not answer ({one_line(error)})"
-        cure = "Start one: dask scheduler; dask worker ADDRESS --nthreads 1."
-        raise SchedulerLost(
-            str(invalid("scheduler", expected="the address of a running scheduler", got=got, cure=cure))
-        ) from error
+        raise invalid(
+            "scheduler",
+            expected="an address as tcp://host:8786",
+            got=repr(address),
+            cure="`dask scheduler` prints it when it starts.",
+        )
+    with _silence_dask():
+        try:
+            client = distributed.Client(address, set_as_default=False, timeout=CONNECT_SECONDS)
+        except (OSError, TimeoutError, ValueError) as error:
+            got = f"{address!r}, which does not answer ({one_line(error)})"
+            cure = "Start one: dask scheduler; dask worker ADDRESS --nthreads 1."
+            text = str(invalid("scheduler", expected="the address of a running scheduler", got=got, cure=cure))
+            raise SchedulerLost(text) from error
+        with client:
+            yield WorkerPool(client)
 
 
 def _import_distributed(what: str):
@@ -262,120 +240,66 @@ def run_on(
 
     Raises `Stopped` once `should_stop` returns True and the workers have written their checkpoints, `SchedulerLost`.
     """
-    waiting = yield from _finished_outcomes(jobs)
-    yield from _PoolRun(pool, waiting, on_progress, should_stop).outcomes()
+    from distributed import Event
 
-
-class _PoolRun:
-    """Jobs that run on a pool: `waiting`, `running` by key, and the keys of those that `ended`."""
-
-    def __init__(
-        self, pool: WorkerPool, jobs: Sequence[FitJob], on_progress: OnProgress, should_stop: Callable[[], bool]
-    ):
-        from distributed import Event
-
-        self.pool, self.client, self.on_progress, self.should_stop = pool, pool.client, on_progress, should_stop
-        self.topic = f"foldgauss-{secrets.token_hex(6)}"
-        self.stop = Event(self.topic, client=pool.client)
-        self.events: queue.SimpleQueue = queue.SimpleQueue()
-        self.waiting, self.ended = deque(jobs), queue.SimpleQueue()
-        self.running: dict[str, tuple[Any, FitJob]] = {}
-        self.rounds: dict[str, tuple[int, Any]] = {}  # by target: fruitless rounds, and the checkpoint's stamp
-        self.seen, self.warned = time.monotonic(), False  # when there were workers; that there are none
-
-    def outcomes(self) -> Iterator[Outcome]:
-        # Events arrive on the client's own thread; `on_progress` is called on this one.
-        self.client.subscribe_topic(self.topic, lambda event: self.events.put(event[1]))
-        try:
-            while self.waiting or self.running:
-                self._submit_waiting()
-                yield from self._collect()
-        finally:
-            self._disconnect()
-
-    def _submit_waiting(self) -> None:
-        """Submit as many jobs as there are threads, no more: dask blames all jobs of a worker that dies."""
-        threads = self.pool.threads
-        self.pool.restart_missing(threads)
-        if threads:
-            self.seen = time.monotonic()
-        elif time.monotonic() - self.seen > NO_WORKERS_SECONDS:
-            cure = "start some, and run the command again" if self.pool.is_remote else _NONE_HERE
-            raise SchedulerLost(f"No worker for {NO_WORKERS_SECONDS:g} s. Finished jobs are kept: {cure}.")
-        elif self.pool.is_remote and not self.warned and time.monotonic() - self.seen > WARN_SECONDS:
-            self.warned = True
-            warnings.warn("No workers yet. Start some: dask worker ADDRESS --nthreads 1.", stacklevel=2)
-        while self.waiting and len(self.running) < threads:
-            self._submit(self.waiting.popleft())
-
-    def _submit(self, job: FitJob) -> None:
-        key = f"{self.topic}-{secrets.token_hex(6)}"
-        future = self.client.submit(_run_on_worker, job, self.topic, key=key, pure=False)
-        self.running[key] = (future, job)
-        future.add_done_callback(lambda done: self.ended.put(done.key))
-
-    def _collect(self) -> Iterator[Outcome]:
-        """Pass on progress, and yield the outcome of a job that ends within a moment."""
-        try:
-            key = self.ended.get(timeout=_POLL_SECONDS)
-        except queue.Empty:
-            key = None
-        while not self.events.empty():
-            self.on_progress(Progress(*self.events.get()))
-        if key in self.running:
-            outcome = self._outcome(*self.running.pop(key))
-            if outcome is not None:
-                yield outcome
-        if self.should_stop():
-            self._stop_workers()
-
-    def _outcome(self, future: Any, job: FitJob) -> Outcome | None:
-        """The outcome of a job that has ended; None if it will run again."""
-        from distributed import CancelledError, KilledWorker
-
-        if future.status == "cancelled":
-            raise SchedulerLost(_LOST)
-        try:
-            record, failure = future.result()
-        except KilledWorker:
-            return self._retry(job)
-        except CancelledError as error:
-            raise SchedulerLost(_LOST) from error
-        except Stopped:
-            raise
-        except Exception as error:  # of the worker, as where foldgauss is missing or of another version there
-            return Outcome(job, failure=one_line(error))
-        return Outcome(job, record, failure)
-
-    def _retry(self, job: FitJob) -> Outcome | None:
-        """Queue a job whose workers died again, or give it up if its checkpoint makes no progress."""
-        fruitless, before = self.rounds.get(job.target, (0, None))
-        now = _stamp(job)
-        fruitless = fruitless + 1 if now == before else 0
-        if fruitless >= ROUNDS:
-            return Outcome(
-                job,
-                failure=f"{job.name}: its workers died repeatedly without progress. "
-                "Memory is probably short: use fewer workers, shorter segments or smaller frames.",
-            )
-        self.rounds[job.target] = (fruitless, now)
-        self.waiting.appendleft(job)
-        return None
-
-    def _stop_workers(self) -> None:
-        """Ask the workers to write their checkpoints, and wait for that."""
-        self.stop.set()
-        until = time.monotonic() + GRACE_SECONDS
-        while time.monotonic() < until and not all(future.done() for future, _ in self.running.values()):
+    waiting = deque((yield from _finished_outcomes(jobs)))
+    client, topic = pool.client, f"foldgauss-{secrets.token_hex(6)}"
+    running: list[tuple[Any, FitJob]] = []
+    stop, events = Event(topic, client=client), queue.SimpleQueue()
+    # Events arrive on the client's own thread; `on_progress` is called on this one.
+    client.subscribe_topic(topic, lambda event: events.put(event[1]))
+    seen = time.monotonic()  # when there were workers
+    try:
+        while waiting or running:
+            threads = pool.threads
+            seen = time.monotonic() if threads else _wait_for_workers(pool, seen)
+            while waiting and len(running) < threads:  # no more: dask blames all jobs of a worker that dies
+                job = waiting.popleft()
+                running.append((client.submit(_run_on_worker, job, topic, pure=False), job))
             time.sleep(_POLL_SECONDS)
-        raise Stopped("stopped")
+            while not events.empty():
+                on_progress(Progress(*events.get()))
+            ended = [pair for pair in running if pair[0].done()]
+            running = [pair for pair in running if pair not in ended]
+            for future, job in ended:
+                yield _outcome(future, job)
+            if should_stop():
+                stop.set()
+                until = time.monotonic() + GRACE_SECONDS
+                while time.monotonic() < until and not all(future.done() for future, _ in running):
+                    time.sleep(_POLL_SECONDS)
+                raise Stopped("stopped")
+    finally:
+        with suppress(Exception):  # the scheduler may be gone
+            client.unsubscribe_topic(topic)
+            client.cancel([future for future, _ in running])
 
-    def _disconnect(self) -> None:
-        try:
-            self.client.unsubscribe_topic(self.topic)
-            self.client.cancel([future for future, _ in self.running.values()])
-        except Exception:  # the scheduler is gone
-            return
+
+def _wait_for_workers(pool: WorkerPool, seen: float) -> float:
+    """Returns `seen`, when there were workers. Raises `SchedulerLost` after `NO_WORKERS_SECONDS` without any."""
+    if time.monotonic() - seen > NO_WORKERS_SECONDS:
+        cure = _NONE_HERE if pool.cluster else "start some, dask worker ADDRESS --nthreads 1, and run the command again"
+        raise SchedulerLost(f"No worker for {NO_WORKERS_SECONDS:g} s. Finished jobs are kept: {cure}.")
+    return seen
+
+
+def _outcome(future: Any, job: FitJob) -> Outcome:
+    """The outcome of a job that has ended."""
+    from distributed import CancelledError, KilledWorker
+
+    if future.status == "cancelled":
+        raise SchedulerLost(_LOST)
+    try:
+        return Outcome(job, *future.result())
+    except CancelledError as error:
+        raise SchedulerLost(_LOST) from error
+    except Stopped:
+        raise
+    except KilledWorker:
+        cure = "Memory is probably short: use fewer workers, shorter segments or smaller frames."
+        return Outcome(job, failure=f"{job.name}: its workers died repeatedly. {cure}")
+    except Exception as error:  # of the worker, as where foldgauss is missing or of another version there
+        return Outcome(job, failure=one_line(error))
 
 
 _NONE_HERE = (
@@ -383,15 +307,6 @@ _NONE_HERE = (
     '`if __name__ == "__main__":`'
 )
 _LOST = "The scheduler does not answer any more. Finished jobs are kept: start one, and run the command again."
-
-
-def _stamp(job: FitJob) -> tuple[int, int] | None:
-    """Time and size of a job's checkpoint, which change as it makes progress."""
-    try:
-        stat = os.stat(job.checkpoint)
-    except OSError:
-        return None
-    return stat.st_mtime_ns, stat.st_size
 
 
 def _run_on_worker(job: FitJob, topic: str) -> tuple[dict[str, Any] | None, str | None]:

@@ -128,8 +128,11 @@ def check_axes(names: Sequence[str]) -> tuple[str, ...]:
     """The axes named, in the order of `AXES`. Raises ValueError for an unknown name, a name given twice and none."""
     unknown = [name for name in names if name not in AXES]
     if unknown or not names or len(set(names)) < len(names):
-        got = ", ".join(unknown) if unknown else ", ".join(names) or "none"
-        raise invalid("axes", expected="some of " + ", ".join(AXES) + ", each once", got=got)
+        raise invalid(
+            "axes",
+            expected="some of " + ", ".join(AXES) + ", each once",
+            got=", ".join(unknown) if unknown else ", ".join(names) or "none",
+        )
     return tuple(name for name in AXES if name in names)
 
 

@@ -310,9 +310,9 @@ def test_a_script_of_layers_that_reads_itself(folder):
 MISTAKES = {  # text: line, table, and what is told
     "[selection.it]\nbox = [1, 2, 3, 4]": (1, "", "selection: .*Did you mean 'selections'"),
     "\n[selections.it]\nbox = [1, 2, 3, 4]\nframs = 3": (4, "[selections.it]", "frams: .*Did you mean 'frame"),
-    '[selections.it]\nbox = "12"': (2, "[selections.it]", "box: expected four numbers.*got '12'"),
-    "[selections.it]\nbox = [1, 2, 3]": (2, "[selections.it]", "box: .*four numbers"),
-    "[selections.it]\nbox = [1, 2, 3, nan]": (2, "[selections.it]", "box: .*four numbers"),
+    '[selections.it]\nbox = "12"': (2, "[selections.it]", "box: expected a number, or an array of numbers.*got '12'"),
+    "[selections.it]\nbox = [1, 2, 3]": (2, "[selections.it]", r"box: expected \(x0, y0, x1, y1\)"),
+    "[selections.it]\nbox = [1, 2, 3, nan]": (2, "[selections.it]", "box: .*numbers"),
     "[selections.it]\nframe = 0\nbox = [900, 2, 1000, 9]": (3, "[selections.it]", "box: .*40x64"),
     "[selections.it]\nframe = 99": (2, "[selections.it]", r"frame: .*\[0, 7\)"),
     "[selections.it]\nfollow = 1\nframe = 0": (2, "[selections.it]", "follow: .*true or false"),
@@ -333,7 +333,7 @@ MISTAKES = {  # text: line, table, and what is told
     "[[edits]]\ndo = 'vanish'\n[[edits]]\ndo = 'mov'": (4, "[[edits]] number 2", "do: .*Did you mean 'move'"),
     "[[edits]]\nselect = 'it'\ndo = 'vanish'": (2, "[[edits]] number 1", "select: .*there is none"),
     "[[edits]]\ndo = 'move'": (1, "[[edits]] number 1", "expected the key 'offset', got do"),
-    "[[edits]]\ndo = 'move'\noffset = [1]": (3, "[[edits]] number 1", "offset: .*two numbers"),
+    "[[edits]]\ndo = 'move'\noffset = [1]": (3, "[[edits]] number 1", "offset: expected 2 finite numbers"),
     "[[edits]]\ndo = 'scale'\nfactor = -1": (3, "[[edits]] number 1", "factor: .*> 0"),
     "[[edits]]\ndo = 'rotate'\ndegrees = true": (3, "[[edits]] number 1", "degrees: expected a number"),
     "[[edits]]\ndo = 'freeze'\nat = 70": (3, "[[edits]] number 1", r"at: .*\[0, 6\]"),
@@ -373,12 +373,12 @@ def test_mistakes_are_told_with_line_table_and_key(text):
     assert error(before + text).startswith(start.replace(f"line {line}", f"line {line + 3}"))
 
 
-LAYOUTS = {  # the mistake is the edit that has no "offset" of two numbers
+LAYOUTS = {  # the mistake is the "offset" of the second edit
     "arrays over lines": '[[edits]]\ndo = "multiply"\noffsets = [\n  [0.1, 0],  # ]\n  [0.2, 0],\n]\n'
     '[[edits]]\ndo = "move"\noffset = [\n1,\n]\n',
     "quoted keys": '[[ "edits" ]]\n"do" = "vanish"\n[[\'edits\']]\n\'do\' = "move"\n"offset" = [1]\n',
     "inline tables": 'edits = [{do = "vanish"},\n\n{do = "move",  "offset" = [1]} ]',
-    "a table between": '[[edits]]\ndo = "vanish"\n[camera]\noffset = 3\n[[edits]]\ndo = "move"\noffset = [1]',
+    "a table between": '[[edits]]\ndo = "vanish"\n[camera]\noffset = 3\n[[edits]]\ndo = "vanish"\noffset = [1]',
 }
 
 

@@ -208,7 +208,7 @@ def test_a_source_that_does_not_fit_its_header_is_refused(work, tmp_path):
         join_segments(tmp_path / "out.safetensors", [(0, path)])
     path.write_bytes((work / "a.safetensors").read_bytes())
     rewritten(path, lambda header, outer: header.update({"fps": float("inf")}))
-    with pytest.raises(ModelFileError, match="got one with a size or a rate out of range"):
+    with pytest.raises(ModelFileError, match="rate is out of range"):
         join_segments(tmp_path / "out.safetensors", [(0, path)])
     assert not (tmp_path / "out.safetensors").exists()
 
@@ -297,6 +297,9 @@ def setting(*keys, to):
         setting("segments", 0, "header", "fps", to="fast"),
         setting("segments", 0, "header", "compositing", to="none"),
         setting("segments", 0, "header", "options", to={"low_pass": -1.0}),
+        setting("segments", 2, "header", "envelope", to="Other"),
+        setting("segments", 2, "header", "degree", to=4),
+        lambda header, outer: outer.update({"segments.2.splats.more": outer.pop("segments.2.splats.angle_logit")}),
         setting("segments", 1, "header", "timeline", to=7),
         setting("segments", 1, "header", "layers", to=[]),
         lambda header, outer: outer.update({"more": outer.pop("segments.0.splats.loc")}),
@@ -310,7 +313,7 @@ def test_headers_that_make_no_sense_are_refused(change, work, tmp_path):
     rewritten(path, lambda header, outer: None)
     load_video_model(path)  # the writing itself is sound
     rewritten(path, change)
-    with pytest.raises(ModelFileError, match="path: expected") as caught:
+    with pytest.raises(ModelFileError, match="expected") as caught:
         load_video_model(path)
     assert len(str(caught.value)) < 600
 
@@ -326,24 +329,6 @@ def test_facts_that_make_no_sense_are_refused_of_one_segment_too(name, value, wo
     rewritten(path, setting("segments", 0, "header", name, to=value))
     with pytest.raises(ModelFileError, match="does not describe it"):
         load_video_model(path)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        setting("segments", 2, "header", "envelope", to="Other"),
-        setting("segments", 2, "header", "degree", to=4),
-        lambda header, outer: outer.update({"segments.2.splats.more": outer.pop("segments.2.splats.angle_logit")}),
-    ],
-)
-def test_a_segment_that_does_not_fit_its_header_is_refused_when_it_is_read(change, work, tmp_path):
-    path = tmp_path / "long.safetensors"
-    path.write_bytes((work / "long.safetensors").read_bytes())
-    rewritten(path, change)
-    video = load_video_model(path)
-    same(video.segments[0].model, load_video_model(work / "a.safetensors"))
-    with pytest.raises(ModelFileError, match="expected"):
-        list(video.frames())
 
 
 # ------------------------------------------------------------------------------------------------- exports

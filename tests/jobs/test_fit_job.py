@@ -5,11 +5,10 @@ import json
 import os
 import subprocess
 import sys
-import threading
 import warnings
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock, patch
 
 import numpy as np
 import pytest
@@ -54,23 +53,10 @@ def test_a_job_leaves_its_model_and_its_record_alone(done):
     assert not job.checkpoint.exists()
 
 
-class Counting:
-    """Reads clips, and counts how often."""
-
-    def __init__(self, monkeypatch):
-        self.count, self.read = 0, fitting.read_video
-        monkeypatch.setattr(fitting, "read_video", self)
-
-    def __call__(self, *given, **named):
-        self.count += 1
-        return self.read(*given, **named)
-
-
 def test_what_is_done_is_not_done_again(done, monkeypatch):
     job, record = done
-    reads = Counting(monkeypatch)
+    monkeypatch.delattr(fitting, "read_video")
     assert fit_job(job) == json.loads(json.dumps(record))
-    assert reads.count == 0
 
 
 @pytest.mark.parametrize("change", ["config", "source", "size", "model", "record"])
@@ -115,26 +101,14 @@ def test_a_stopped_job_goes_on_to_the_same_bits(done, clip, tmp_path, monkeypatc
     assert not job.checkpoint.exists()
 
 
-def test_a_job_killed_at_any_write_goes_on_to_the_same_bits(done, clip, tmp_path, monkeypatch):
+def test_a_job_killed_at_any_write_goes_on_to_the_same_bits(done, clip, tmp_path):
     """The process ends as each file is about to be written; the next does what is left."""
     job = job_of(clip, tmp_path, checkpoint_seconds=0.0)
 
-    class Killed(BaseException):
-        pass
-
-    kills = 0
     for name in ("save_checkpoint", "save_video_model", "atomic_path"):
-        with monkeypatch.context() as patch:
-
-            def dies(*given, **named):
-                raise Killed
-
-            patch.setattr(fitting, name, dies)
-            with pytest.raises(Killed):
-                fit_job(job)
-            kills += 1
+        with patch.object(fitting, name, side_effect=KeyboardInterrupt), pytest.raises(KeyboardInterrupt):
+            fit_job(job)
     fit_job(job)
-    assert kills == 3
     assert Path(job.target).read_bytes() == Path(done[0].target).read_bytes()
 
 
@@ -150,14 +124,8 @@ def test_a_compact_job_stopped_or_killed_goes_on_to_the_same_bits(clip, tmp_path
     budget = read_metadata(whole.target)["budget"]
     assert budget == {"steps": CONFIG.steps} | goal
     stopped_after(job, 9)
-    with monkeypatch.context() as patch:
-
-        def dies(*given, **named):
-            raise KeyboardInterrupt
-
-        patch.setattr(fitting, "save_compact", dies)
-        with pytest.raises(KeyboardInterrupt):
-            fit_job(job)
+    with patch.object(fitting, "save_compact", side_effect=KeyboardInterrupt), pytest.raises(KeyboardInterrupt):
+        fit_job(job)
     assert fit_job(job)["psnr"] == record["psnr"]
     assert Path(job.target).read_bytes() == Path(whole.target).read_bytes()
     assert not job.checkpoint.exists()
@@ -210,45 +178,22 @@ def test_a_job_waits_for_another_of_its_target_and_no_longer_than_it_may(clip, t
 
 
 def test_a_full_disk_at_a_checkpoint_costs_no_fit(done, clip, tmp_path, monkeypatch):
-    def full(*given, **named):
-        raise OutputError("path: expected room, got none.")
-
-    monkeypatch.setattr(fitting, "save_checkpoint", full)
+    monkeypatch.setattr(fitting, "save_checkpoint", Mock(side_effect=OutputError("path: expected room, got none.")))
     job = job_of(clip, tmp_path, checkpoint_seconds=0.0)
     fit_job(job)
     assert Path(job.target).read_bytes() == Path(done[0].target).read_bytes()
 
 
-def test_warnings_are_told_by_the_job_that_gave_them(clip, tmp_path, monkeypatch):
-    """Two at once in one process, the second of which begins later and ends first."""
-    real, begun, joined, warned, over = fitting.run_fit, *(threading.Event() for _ in range(4))
+def test_warnings_of_a_fit_are_in_its_record(clip, tmp_path, monkeypatch):
+    real = fitting.run_fit
 
-    def steps(job, *given):
-        if job.name == "second":
-            joined.set()
-            assert warned.wait(60)
-        else:
-            begun.set()
-            assert joined.wait(60)
-        warnings.warn(f"of {job.name}", stacklevel=1)
-        if job.name == "first":
-            warned.set()
-            assert over.wait(60)
-        return real(job, *given)
+    def warn(*given):
+        warnings.warn("of the\nfit", stacklevel=1)
+        warnings.warn("of the fit", stacklevel=1)
+        return real(*given)
 
-    monkeypatch.setattr(fitting, "run_fit", steps)
-    jobs = [
-        dataclasses.replace(job_of(clip, tmp_path, f"{name}.safetensors"), name=name) for name in ("first", "second")
-    ]
-    before, shown = warnings.filters.copy(), warnings.showwarning
-    with ThreadPoolExecutor(1) as pool:
-        first = pool.submit(fit_job, jobs[0])
-        assert begun.wait(60)
-        second = fit_job(jobs[1])
-        over.set()
-        records = first.result(), second
-    assert [record["warnings"] for record in records] == [["of first"], ["of second"]]
-    assert (warnings.filters, warnings.showwarning) == (before, shown)
+    monkeypatch.setattr(fitting, "run_fit", warn)
+    assert fit_job(job_of(clip, tmp_path))["warnings"] == ["of the fit"]
 
 
 def test_files_go_where_they_are_asked_to(clip, tmp_path):
@@ -262,16 +207,12 @@ def test_files_go_where_they_are_asked_to(clip, tmp_path):
 
 def test_what_was_compiled_for_many_shapes_is_forgotten(monkeypatch):
     """Else a worker that goes through a thousand clips would hold programs for each."""
-    cleared = []
-    monkeypatch.setattr(fitting.jax, "clear_caches", lambda: cleared.append(True))
-    programs = fitting._CompilationCache()
-    for length in [*range(fitting.MAX_SHAPES), 0, 1]:
-        programs.add((length, 8, 8, 3))
-    assert not cleared
-    programs.add((100, 8, 8, 3))
-    assert len(cleared) == 1
-    programs.add((0, 8, 8, 3))
-    assert len(cleared) == 1
+    cleared = Mock()
+    monkeypatch.setattr(fitting.jax, "clear_caches", cleared)
+    monkeypatch.setattr(fitting, "_SHAPES", set())
+    for length, times in [*((length, 0) for length in range(fitting.MAX_SHAPES)), (0, 0), (100, 1), (0, 1)]:
+        fitting._limit_compiled((length, 8, 8, 3))
+        assert cleared.call_count == times
 
 
 @pytest.mark.slow
@@ -301,7 +242,6 @@ def test_threads_that_share_a_processor_wait_and_a_sleeping_one_does_not():
     """
     program = """
 import os, hashlib, time
-from concurrent.futures import ThreadPoolExecutor
 from foldgauss._runtime.machine import waiting_seconds
 os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 began = waiting_seconds()

@@ -7,6 +7,7 @@ import signal
 import sys
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import distributed
 import pytest
@@ -77,24 +78,17 @@ def test_workers_make_the_same_bits_and_tell_of_what_failed(crew, clips, done_he
     assert {progress.name for progress in told if progress.fraction == 1} == {f"clip{k}.mp4" for k in range(3)}
 
 
-@pytest.mark.parametrize(("is_remote", "says"), [(True, "start some"), (False, "if __name__")])
-def test_that_no_worker_comes_is_told_with_what_to_do(monkeypatch, is_remote, says):
-    class NoCrew:
-        client, threads = None, 0
-
-        def restart_missing(self, alive):
-            assert alive == 0
-
+@pytest.mark.parametrize(("cluster", "says"), [(None, "start some"), (object(), "if __name__")])
+def test_that_no_worker_comes_is_told_with_what_to_do(monkeypatch, clips, tmp_path, cluster, says):
     monkeypatch.setattr(pool, "NO_WORKERS_SECONDS", -1.0)
-    monkeypatch.setattr(distributed, "Event", lambda *given, **named: None)
-    crew = NoCrew()
-    crew.is_remote = is_remote
+    monkeypatch.setattr(distributed, "Event", Mock())
+    client = Mock(status="running", nthreads=dict)
     with pytest.raises(SchedulerLost, match=says):
-        pool._PoolRun(crew, [], ignored, lambda: False)._submit_waiting()
+        list(run_on(pool.WorkerPool(client, cluster), jobs_into(tmp_path, clips), ignored))
 
 
 def test_two_commands_at_once_take_no_port_from_each_other(crew):
-    assert crew._cluster.scheduler.http_server.port != 8787  # dask's own, of which it warns when it is taken
+    assert crew.cluster.scheduler.http_server.port != 8787  # dask's own, of which it warns when it is taken
 
 
 def test_a_killed_worker_is_replaced_and_goes_on_from_the_checkpoint(crew, clips, done_here, tmp_path):
@@ -126,9 +120,8 @@ def test_workers_keep_what_they_do_when_asked_to_stop(crew, clips, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_job_that_kills_whoever_takes_it_is_given_up(crew, clips, tmp_path, monkeypatch):
-    """Each worker dies before it has kept anything."""
-    monkeypatch.setattr(pool, "ROUNDS", 1)
+def test_a_job_that_kills_whoever_takes_it_is_given_up(clips, tmp_path, monkeypatch):
+    monkeypatch.setattr(pool, "DEATHS", 2)
     job = dataclasses.replace(jobs_into(tmp_path, clips[1:2], LASTING)[0], checkpoint_seconds=1e9)
     killed, begun = set(), time.monotonic()
 
@@ -139,10 +132,11 @@ def test_a_job_that_kills_whoever_takes_it_is_given_up(crew, clips, tmp_path, mo
                 killed.add(child.pid)
                 os.kill(child.pid, signal.SIGKILL)
 
-    outcomes = list(run_on(crew, [job], watch))
+    with local_workers(1) as own:
+        (outcome,) = run_on(own, [job], watch)
     assert len(killed) >= pool.DEATHS
-    assert "its workers died" in outcomes[0].failure
-    assert "fewer workers" in outcomes[0].failure
+    assert "its workers died" in outcome.failure
+    assert "fewer workers" in outcome.failure
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="reads of a process what Linux tells in /proc")

@@ -1,6 +1,7 @@
-"""The type of commands: their help has examples, and errors about parameters name the command's options."""
+"""The type of commands: their help has examples, errors about parameters name the options, choices are completed."""
 
 import inspect
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import typer.core
@@ -54,6 +55,11 @@ class Command(WithExamples, typer.core.TyperCommand):
             if parameter.rpartition(".")[2] in (own.name, shown, shown.lstrip("-").replace("-", "_")):
                 return shown
         return None
+
+
+def complete_choice(choices: Iterable[str]) -> Callable[[str], list[str]]:
+    """Shell completion of one of the choices. Names of files are completed by the shell itself."""
+    return lambda incomplete: [name for name in choices if name.startswith(incomplete)]
 
 
 def _escape_help(command: Any) -> None:

@@ -57,13 +57,7 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
         "fit": (
             Example("All defaults, into holiday.fgz", "foldgauss fit holiday.mp4"),
             Example("A quick draft of the first half second", "foldgauss fit holiday.mp4 --preset draft --frames 0:12"),
-            Example(
-                "Five minutes, at 160x320 pixels",
-                "foldgauss fit holiday.mp4 --size 160x320 --minutes 5",
-            ),
             Example("A file of a given size", "foldgauss fit holiday.mp4 --size-mb 2"),
-            Example("Closer to the clip", "foldgauss fit holiday.mp4 --quality 85 --out finer.fgz"),
-            Example("With float32 parameters", "foldgauss fit holiday.mp4 --out holiday.safetensors"),
             Example("Frames as images; resume a stopped fit", "foldgauss fit frames/ --resume"),
             Example(
                 "For slow motion above all",
@@ -71,10 +65,6 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
             ),
             Example(
                 "A long clip, in segments of 10 seconds, with four processes", "foldgauss fit film.mp4 --workers 4"
-            ),
-            Example(
-                "The same on a dask cluster whose workers see these folders",
-                "foldgauss fit film.mp4 --scheduler tcp://node1:8786",
             ),
         ),
         "fit-many": (

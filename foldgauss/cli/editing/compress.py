@@ -5,9 +5,8 @@ from typing import Annotated, Any
 
 import typer
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.cli.app.application import command, warn
-from foldgauss.cli.app.completion import complete_clips
 from foldgauss.cli.shared.arguments import FittedFrames, ModelFile, Overwrite
 from foldgauss.cli.shared.clips import is_other_clip, read_fitted_clip, refuse_segments
 from foldgauss.cli.shared.fit_progress import choose_display, display_progress
@@ -34,7 +33,6 @@ def compress_command(
         Path | None,
         typer.Argument(
             help="The clip it was fitted to. Without it, nothing makes up for what is dropped and rounded.",
-            autocompletion=complete_clips,
         ),
     ] = None,
     quality: Annotated[
@@ -61,19 +59,25 @@ def compress_command(
     """
     target = Path(f"{resolve(model_path).stem}{COMPACT_SUFFIX}") if out_path is None else out_path
     check_compact_name(target, "--out")
-    if frames is not None and video is None:
-        raise invalid("--frames", expected="a VIDEO to take them from", got="none")
+    require(frames is None or video is not None, "--frames", expected="a VIDEO to take them from", got="none")
     check_output(target, overwrite, {"model": model_path, "clip": video})
     refuse_segments(model_path)
     model, about = load_video_model(model_path), read_origin(model_path)
-    if not isinstance(model, VideoModel):
-        cure = "Compress the model before it is edited, and edit that."
-        raise invalid("MODEL", expected="a plain model", got="one with edits", cure=cure)
+    require(
+        isinstance(model, VideoModel),
+        "MODEL",
+        expected="a plain model",
+        got="one with edits",
+        cure="Compress the model before it is edited, and edit that.",
+    )
     clip = None if video is None else read_fitted_clip(model, model_path, video, frames)
-    if clip is not None and is_other_clip(model_path, clip, lambda: evaluate(model, clip.frames).mean_psnr):
-        cure = "Give that clip, or none."
-        got = f"{str(video)!r}, another clip"
-        raise invalid("VIDEO", expected="the clip that the model was fitted to", got=got, cure=cure)
+    require(
+        clip is None or not is_other_clip(model_path, clip, lambda: evaluate(model, clip.frames).mean_psnr),
+        "VIDEO",
+        expected="the clip that the model was fitted to",
+        got=f"{str(video)!r}, another clip",
+        cure="Give that clip, or none.",
+    )
     about = keep_origin(about, *CLIP_NOTES, "frames_digest", "seed")
     goals = {"quality": quality, "size_mb": leave_room(size_mb, about), "psnr": psnr, "minutes": minutes}
     with display_progress(choose_display(), "Compressing") as show:

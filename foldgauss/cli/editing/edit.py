@@ -8,9 +8,8 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.cli.app.application import command, out
-from foldgauss.cli.app.completion import complete_files
 from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, parse_size
 from foldgauss.cli.shared.log_lines import print_log
 from foldgauss.cli.shared.outputs import check_images_output, check_output, name_after, refuse_huge
@@ -40,7 +39,6 @@ def edit_command(
         typer.Argument(
             metavar="SCRIPT.toml",
             help="The selections and their edits.",
-            autocompletion=complete_files(".toml"),
         ),
     ],
     out_path: Annotated[
@@ -67,8 +65,7 @@ def edit_command(
     as_model = out_path.suffix.lower() == MODEL_SUFFIX
     image_size = parse_size(size)
     for option, given, fits in (("--size", image_size, "a video or a folder"), ("--sound", sound, "a video")):
-        if as_model and given is not None:
-            raise invalid(option, expected=f"{fits} as --out", got=out_path)
+        require(not as_model or given is None, option, expected=f"{fits} as --out", got=out_path)
     check = check_output if as_model else partial(check_images_output, others=(MODEL_SUFFIX,))
     check(out_path, overwrite, inputs)
     model, about = load_video_model(model_path), read_origin(model_path)

@@ -5,9 +5,9 @@ from typing import Annotated, Any
 
 import typer
 
-from foldgauss._runtime.checks import check_one_of, invalid
+from foldgauss._runtime.checks import check_one_of, require
 from foldgauss.cli.app.application import command, out
-from foldgauss.cli.app.completion import complete_choice, complete_files
+from foldgauss.cli.app.help import complete_choice
 from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, Times, parse_size, parse_times
 from foldgauss.cli.shared.clips import Video
 from foldgauss.cli.shared.outputs import (
@@ -70,24 +70,35 @@ def export_command(
     """
     check_one_of("--format", file_format, tuple(_NAMES))
     chosen = parse_times(times)
-    if chosen is not None and file_format in ("model", "ply"):
-        raise invalid("--times", expected="ply3dgs or obj, which are of single times", got=file_format)
+    require(
+        chosen is None or file_format not in ("model", "ply"),
+        "--times",
+        expected="ply3dgs or obj, which are of single times",
+        got=file_format,
+    )
     model, about = load_video_model(model_path), read_origin(model_path)
     if segment is not None:
         model, about = _take_segment(model, about, segment)
     suffix = {"model": MODEL_SUFFIX, "ply": ".ply"}.get(file_format, "")
     if file_format == "ply" and isinstance(model, SegmentedVideo):
         suffix = ""  # each segment becomes a file
-    if file_format == "ply" and not isinstance(model, VideoModel | SegmentedVideo):
-        cure = "Its frames can be exported as ply3dgs or obj."
-        raise invalid("MODEL", expected="a plain model for ply", got="one with edits", cure=cure)
+    require(
+        file_format != "ply" or isinstance(model, VideoModel | SegmentedVideo),
+        "MODEL",
+        expected="a plain model for ply",
+        got="one with edits",
+        cure="Its frames can be exported as ply3dgs or obj.",
+    )
     single = file_format == "ply3dgs" and chosen is not None and len(chosen) == 1
     if out_path is None:
         ending = ".3dgs.ply" if single else suffix or f"-{file_format.replace('ply3', '3')}"
         out_path = name_after(model_path, ending if segment is None else f".{segment}{ending}")
-    if file_format != "ply3dgs" and out_path.suffix.lower() != suffix and not (out_path.is_dir() and not suffix):
-        expected = f"a name ending in {suffix}" if suffix else "a folder without extension"
-        raise invalid("--out", expected=expected, got=out_path)
+    require(
+        file_format == "ply3dgs" or out_path.suffix.lower() == suffix or (out_path.is_dir() and not suffix),
+        "--out",
+        expected=f"a name ending in {suffix}" if suffix else "a folder without extension",
+        got=out_path,
+    )
     refuse_inputs(out_path, {"model": model_path})
     if not out_path.is_dir():
         refuse_existing(out_path, overwrite)
@@ -108,10 +119,13 @@ def export_command(
 
 def _take_segment(video: Video, about: dict[str, Any], number: int) -> tuple[VideoModel, dict[str, Any]]:
     """The model of a segment, and its metadata: the frames of its span, and the times at which they are shown."""
-    if not isinstance(video, SegmentedVideo):
-        raise invalid("MODEL", expected="a model in segments", got="one without segments")
-    if not 0 <= number < len(video.segments):
-        raise invalid("--segment", expected=f"a whole number from 0 to {len(video.segments) - 1}", got=number)
+    require(isinstance(video, SegmentedVideo), "MODEL", expected="a model in segments", got="one without segments")
+    require(
+        0 <= number < len(video.segments),
+        "--segment",
+        expected=f"a whole number from 0 to {len(video.segments) - 1}",
+        got=number,
+    )
     segment = video.segments[number]
     begins = (about.get("frames") or [0])[0] or 0
     known = keep_origin(about, "clip", "reading", "stretched")
@@ -131,7 +145,6 @@ def import_command(
         typer.Argument(
             metavar="FILE",
             help="A .ply of VeGaS, or a folder of .obj and .ply.",
-            autocompletion=complete_files(".ply"),
         ),
     ],
     out_path: Annotated[
@@ -162,8 +175,7 @@ def import_command(
         output.check(mesh.size, mesh.num_frames)
         output.write(mesh.frames, mesh.num_frames)
         return
-    if out_path.suffix.lower() != MODEL_SUFFIX:
-        raise invalid("--out", expected=f"a name ending in {MODEL_SUFFIX}", got=out_path)
+    require(out_path.suffix.lower() == MODEL_SUFFIX, "--out", expected=f"a name ending in {MODEL_SUFFIX}", got=out_path)
     check_output(out_path, overwrite, {"file": source})
     model = import_model(source, size=image_size, fps=fps)
     save_video_model(out_path, model, metadata={"clip": source.name})

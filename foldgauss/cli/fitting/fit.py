@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from foldgauss._runtime.checks import ParameterError, invalid
+from foldgauss._runtime.checks import ParameterError, require
 from foldgauss._runtime.threads import num_threads
 from foldgauss.cli.app.application import Stopped, command, err, out, warn
 from foldgauss.cli.app.signals import note_signals
@@ -75,8 +75,8 @@ def fit(
         typer.Option(
             "--out",
             metavar="MODEL",
-            help=f"FILE{COMPACT_SUFFIX}, or FILE{MODEL_SUFFIX} with parameters as float32 [default: the clip's name, "
-            f"{COMPACT_SUFFIX}, in this folder].",
+            help=f"FILE{COMPACT_SUFFIX}, or FILE{MODEL_SUFFIX} with float32 parameters "
+            "[default: after the clip, in this folder].",
         ),
     ] = None,
     size: Size = None,
@@ -92,15 +92,13 @@ def fit(
         Path | None,
         typer.Option(
             metavar="FILE.jsonl",
-            help="Write the loss, PSNR and times of every step here, and curves of them to FILE.png (extra `plot`).",
+            help="Write the figures of every step here, and their curves to FILE.png (extra `plot`).",
             rich_help_panel=PROGRESS,
         ),
     ] = None,
     preview: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE.png", help="Write a preview image here, renewed every 10 s.", rich_help_panel=PROGRESS
-        ),
+        typer.Option(metavar="FILE.png", help="Write a preview image here every 10 s.", rich_help_panel=PROGRESS),
     ] = None,
     checkpoint_seconds: CheckpointSeconds = None,
     segment_seconds: SegmentSeconds = None,
@@ -113,7 +111,7 @@ def fit(
     """Fit a model to a clip; the first of its budgets ends the fit.
 
     A stopped fit has a checkpoint and continues with --resume. Long clips are fitted in segments, in parallel with
-    workers.
+    workers. Options for rare cases: docs/fit.md.
     """
     in_segments = not (segment_seconds is None and workers is None and scheduler is None)
     target, config = _choose_target(video, target, config)
@@ -134,8 +132,7 @@ def fit(
     begun = read_segment_seconds(target) is not None and not job.checkpoint.exists() and (resume or not overwrite)
     if begun or in_segments:
         for option, path in (("--history", history), ("--preview", preview)):
-            if path is not None:
-                raise invalid(option, expected="a fit in one piece", got="one in segments", cure="Leave it out.")
+            require(path is None, option, expected="a fit in one piece", got="one in segments", cure="Leave it out.")
         fit_in_segments(job, display, options, segment_seconds=segment_seconds, resume=resume, overwrite=overwrite)
         return
     curves = _check_records(video, history, preview, overwrite or resume)
@@ -197,9 +194,13 @@ def _choose_target(video: Path, out_path: Path | None, config: FitConfig) -> tup
     if out_path.suffix.lower() == COMPACT_SUFFIX:
         return out_path, config if config.is_compact else dataclasses.replace(config, quality=DEFAULT_QUALITY)
     check_model_name(out_path, "--out")
-    if config.size_mb is not None:
-        cure = f"Compact files end in {COMPACT_SUFFIX}."
-        raise invalid("--size-mb", expected="a compact file", got=out_path, cure=cure)
+    require(
+        config.size_mb is None,
+        "--size-mb",
+        expected="a compact file",
+        got=out_path,
+        cure=f"Compact files end in {COMPACT_SUFFIX}.",
+    )
     return out_path, config
 
 
@@ -238,11 +239,14 @@ def _check_records(video: Path, history: Path | None, preview: Path | None, over
     for option, path, suffix in records:
         if path is None:
             continue
-        if path.suffix != suffix:
-            raise invalid(option, expected=f"a name ending in {suffix}", got=path)
+        require(path.suffix == suffix, option, expected=f"a name ending in {suffix}", got=path)
         check_output(path, overwrite, {"clip": video}, option)
-    if curves is not None and preview is not None and resolve(curves) == resolve(preview):
-        raise invalid("--preview", expected="another file than the curves of --history", got=preview)
+    require(
+        curves is None or preview is None or resolve(curves) != resolve(preview),
+        "--preview",
+        expected="another file than the curves of --history",
+        got=preview,
+    )
     return curves
 
 
@@ -251,9 +255,13 @@ def _check_checkpoint(checkpoint: Path, resume: bool, overwrite: bool) -> None:
     if checkpoint.exists() and not (resume or overwrite):
         cure = "Continue it with --resume, or start over with --overwrite."
         raise ParameterError("--out", f"a stopped fit has a checkpoint, {checkpoint}. {cure}")
-    if resume and not checkpoint.exists():
-        expected, cure = f"a stopped fit in {checkpoint}", "Start it without --resume."
-        raise invalid("--resume", expected=expected, got="none", cure=cure)
+    require(
+        not resume or checkpoint.exists(),
+        "--resume",
+        expected=f"a stopped fit in {checkpoint}",
+        got="none",
+        cure="Start it without --resume.",
+    )
 
 
 def _save_model(run: FitRun) -> FitRun:

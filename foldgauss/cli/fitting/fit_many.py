@@ -9,9 +9,8 @@ import typer
 from rich.box import SIMPLE_HEAD
 from rich.table import Column, Table
 
-from foldgauss._runtime.checks import ParameterError, invalid
+from foldgauss._runtime.checks import ParameterError, require
 from foldgauss.cli.app.application import command, out, warn
-from foldgauss.cli.app.completion import complete_files
 from foldgauss.cli.fitting.job_progress import emit_json, run_jobs
 from foldgauss.cli.fitting.options import (
     CheckpointSeconds,
@@ -67,9 +66,7 @@ def fit_many(
     context: typer.Context,
     folder: Annotated[
         Path,
-        typer.Argument(
-            metavar="FOLDER", help="Folder with video files, and folders of images.", autocompletion=complete_files()
-        ),
+        typer.Argument(metavar="FOLDER", help="Folder with video files, and folders of images."),
     ],
     config: FitConfig,
     out_dir: Annotated[
@@ -91,7 +88,7 @@ def fit_many(
     """Fit a compact model to each clip of a folder, and list those that fail.
 
     Models go to DIR under the clips' names, results to DIR/summary.json. Given again, the command continues with what
-    is left, from checkpoints of stopped fits. The exit code is 1 if a clip failed.
+    is left, from checkpoints of stopped fits. The exit code is 1 if a clip failed. Options for rare cases: docs/fit.md.
     """
     if not config.is_compact:
         config = dataclasses.replace(config, quality=DEFAULT_QUALITY)
@@ -99,8 +96,12 @@ def fit_many(
     options = WorkerOptions(workers, scheduler, threads)
     found = find_clips(folder)
     out_dir = Path(f"{resolve(folder).name}-models") if out_dir is None else out_dir
-    if out_dir.exists() and resolve(out_dir) == resolve(folder):
-        raise invalid("--out", expected="another folder than the clips'", got=out_dir)
+    require(
+        not out_dir.exists() or resolve(out_dir) != resolve(folder),
+        "--out",
+        expected="another folder than the clips'",
+        got=out_dir,
+    )
     make_folder(out_dir)
     make_folder(out_dir / RECORDS)
     context.with_resource(lock_output(out_dir / SUMMARY, what="fit-many"))

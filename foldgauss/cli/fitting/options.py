@@ -13,8 +13,8 @@ import typer
 from foldgauss._runtime.checks import ParameterError
 from foldgauss._runtime.settings import setting_of, settings_by_name, type_of, walk
 from foldgauss._runtime.threads import available_cores
-from foldgauss.cli.app.completion import complete_choice
-from foldgauss.cli.shared.arguments import AlphaCutoff, SupportRadius, TransmittanceStop, override_constants
+from foldgauss.cli.app.help import complete_choice
+from foldgauss.cli.shared.arguments import override_constants
 from foldgauss.cli.shared.tables import format_count
 from foldgauss.jobs import WorkerPool, local_workers, running_cluster
 from foldgauss.video.fitting.config import BUDGET, MODEL, OPTIMIZATION, PRESETS, FitConfig
@@ -27,7 +27,7 @@ WORKERS = "Workers"
 Preset = Annotated[
     str,
     typer.Option(
-        help=f"Preset that other options modify: {', '.join(PRESETS)} (the published configuration, slow).",
+        help=f"Preset that other options modify: {', '.join(PRESETS)} (as published, slow).",
         autocompletion=complete_choice(PRESETS),
     ),
 ]
@@ -39,7 +39,8 @@ LogJson = Annotated[
 SegmentSeconds = Annotated[
     float | None,
     typer.Option(
-        help="Fit segments of about this many seconds, each with these budgets [default: 10 with workers].",
+        metavar="S",
+        help="Fit segments of about S seconds, each with these budgets [default: 10 with workers].",
         rich_help_panel=WORKERS,
     ),
 ]
@@ -48,7 +49,7 @@ CheckpointSeconds = Annotated[
     typer.Option(
         metavar="S",
         help="Seconds between two checkpoints, the most that a kill loses [default: 30].",
-        rich_help_panel=PROGRESS,
+        hidden=True,
         min=0.0,
     ),
 ]
@@ -65,7 +66,7 @@ Scheduler = Annotated[
     str | None,
     typer.Option(
         metavar="ADDRESS",
-        help="A running dask scheduler, such as tcp://host:8786, whose workers see the same folders.",
+        help="A running dask scheduler, as tcp://host:8786, with the same folders.",
         rich_help_panel=WORKERS,
     ),
 ]
@@ -83,11 +84,14 @@ Threads = Annotated[
 #: The settings of a fit that have an option: the field's name, which is that of the command's parameter, the name in
 #: `FitConfig`, and the field.
 SETTINGS = {field.name: (name, field) for name, field, _ in walk(FitConfig) if setting_of(field).option}
-_CONSTANTS = {
-    "alpha_cutoff": AlphaCutoff,
-    "support_radius": SupportRadius,
-    "transmittance_stop": TransmittanceStop,
-}
+#: Options that help does not show, since few need them: docs/fit.md lists them.
+RARE = {"power", "compositing", "batch_size", "error_fraction", "ssim_fraction"}
+RARE |= {"interpolation_fraction", "interpolation_end"}
+#: Constants of the renderer, which fits rarely change.
+_CONSTANTS = ("alpha_cutoff", "support_radius", "transmittance_stop")
+_Constant = Annotated[float | None, typer.Option(hidden=True)]
+#: How help writes the values of settings.
+_METAVARS = {int: "N", float: "X", str: "NAME"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,7 +148,7 @@ def fit_options(command: Callable[..., None]) -> Callable[..., None]:
     options = [
         inspect.Parameter("preset", _KIND, default="standard", annotation=Preset),
         *(_option(name, field) for name, field in SETTINGS.values()),
-        *(inspect.Parameter(name, _KIND, default=None, annotation=kind) for name, kind in _CONSTANTS.items()),
+        *(inspect.Parameter(name, _KIND, default=None, annotation=_Constant) for name in _CONSTANTS),
     ]
     own = list(inspect.signature(command).parameters.values())
     at = [parameter.name for parameter in own].index("config")
@@ -169,6 +173,8 @@ def _option(name: str, field: dataclasses.Field) -> inspect.Parameter:
     option = typer.Option(
         about.option,
         help=f"{about.help}{_default(name, field)}.",
+        metavar=_METAVARS.get(type_of(field)),
+        hidden=field.name in RARE,
         rich_help_panel=PANELS[about.group],
         autocompletion=complete_choice(about.choices) if about.choices else None,
     )

@@ -7,7 +7,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.cli.app.application import Stopped, err, out, warn
 from foldgauss.cli.fitting.job_progress import emit_json, run_jobs
 from foldgauss.cli.fitting.options import WorkerOptions
@@ -35,8 +35,13 @@ def fit_in_segments(
     """Plan the segments of the job's clip, fit them, join them and print the results; continues an unfinished fit."""
     begun, target = time.monotonic(), Path(job.target)
     folder = segments_folder(target)
-    if resume and not folder.is_dir():
-        raise invalid("--resume", expected=f"a stopped fit in {folder}", got="none", cure="Start it without --resume.")
+    require(
+        not resume or folder.is_dir(),
+        "--resume",
+        expected=f"a stopped fit in {folder}",
+        got="none",
+        cure="Start it without --resume.",
+    )
     restart = overwrite and not resume
     if segment_seconds is None and not restart:
         segment_seconds = read_segment_seconds(target)

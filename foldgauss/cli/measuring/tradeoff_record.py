@@ -80,8 +80,12 @@ class Record:
             rows = [{name: row[name] for name in (*MEASURED, "command")} for row in kept["points"]]
             self.rows = {f"{row['axis']} {row['value']}".rstrip(): row for row in rows}
         except (ValueError, KeyError, TypeError, RecursionError) as error:
-            expected, got = f"results of `foldgauss tradeoff` in {self.path}", f"something else ({error})"
-            raise invalid("--out", expected=expected, got=got, cure=cure) from error
+            raise invalid(
+                "--out",
+                expected=f"results of `foldgauss tradeoff` in {self.path}",
+                got=f"something else ({error})",
+                cure=cure,
+            ) from error
         changed = sorted(name for name in self.settings if before.get(name) != self.settings[name])
         if changed:
             text = ", ".join(f"{name} was {before.get(name)!r}, is {self.settings[name]!r}" for name in changed)

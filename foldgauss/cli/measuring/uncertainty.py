@@ -9,9 +9,9 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from foldgauss._runtime.checks import ParameterError, check_one_of, invalid
+from foldgauss._runtime.checks import ParameterError, check_one_of, invalid, require
 from foldgauss.cli.app.application import Stopped, command, out, warn
-from foldgauss.cli.app.completion import complete_choice
+from foldgauss.cli.app.help import complete_choice
 from foldgauss.cli.shared.arguments import FittedClip, FittedFrames, ModelFile, Overwrite
 from foldgauss.cli.shared.clips import read_fitted_clip, refuse_segments
 from foldgauss.cli.shared.outputs import make_folder, name_after, refuse_foreign, refuse_inputs
@@ -102,14 +102,21 @@ def uncertainty_command(
     wanted = _parse_only(only)
     refuse_segments(model_path)
     model = load_video_model(model_path)
-    if not isinstance(model, VideoModel):
-        cure = "Give the model before the edit, and the clip that it was fitted to."
-        raise invalid("MODEL", expected="a fitted model", got=f"{model_path}, an edited one", cure=cure)
+    require(
+        isinstance(model, VideoModel),
+        "MODEL",
+        expected="a fitted model",
+        got=f"{model_path}, an edited one",
+        cure="Give the model before the edit, and the clip that it was fitted to.",
+    )
     clip = read_fitted_clip(model, model_path, video, frames, same_number=False)
-    if clip.num_frames != model.num_frames and read_origin(model_path).get("clip") == Path(clip.source).name:
-        expected = f"the {model.num_frames} frames that the model was fitted to: its first is at 0 and its last at 1"
-        cure = "To sample the times of some of them: --only A:B."
-        raise invalid("--frames", expected=expected, got=f"{clip.num_frames} of this clip", cure=cure)
+    require(
+        clip.num_frames == model.num_frames or read_origin(model_path).get("clip") != Path(clip.source).name,
+        "--frames",
+        expected=f"the {model.num_frames} frames that the model was fitted to: its first is at 0 and its last at 1",
+        got=f"{clip.num_frames} of this clip",
+        cure="To sample the times of some of them: --only A:B.",
+    )
     _check_frames(clip.num_frames, wanted, concentration)
     check_settings(steps, ensembles, seed)
     make_folder(out_dir)
@@ -139,19 +146,20 @@ def _parse_only(text: str | None) -> list[int] | None:
     found: list[int] = []
     for part in text.split(","):
         first, colon, last = part.strip().partition(":")
-        if not first.isdecimal() or (colon and not last.isdecimal()) or (colon and int(last) - int(first) > 100_000):
-            expected = "frames as 3,5,10:20 (20 not included)"
-            raise invalid("--only", expected=expected, got=repr(text))
+        require(
+            first.isdecimal() and (not colon or last.isdecimal()) and (not colon or int(last) - int(first) <= 100_000),
+            "--only",
+            expected="frames as 3,5,10:20 (20 not included)",
+            got=repr(text),
+        )
         found += range(int(first), int(last)) if colon else [int(first)]
-    if not found:
-        raise invalid("--only", expected="at least one frame", got=repr(text))
+    require(found, "--only", expected="at least one frame", got=repr(text))
     return sorted(set(found))
 
 
 def _check_frames(num_frames: int, only: list[int] | None, concentration: float) -> None:
     """Refuse frames without times to sample, before anything is rendered."""
-    if num_frames < 3:
-        raise invalid("--frames", expected="at least 3 frames", got=num_frames)
+    require(num_frames >= 3, "--frames", expected="at least 3 frames", got=num_frames)
     try:
         Increments(np.linspace(0.0, 1.0, num_frames), only, concentration)
     except ParameterError as error:
@@ -174,8 +182,12 @@ def _sample(path: Path, overwrite: bool, show: Callable, **arguments: Any) -> Fr
         if error.parameter != "backend":
             raise
         if not overwrite:
-            expected, cure = "the draws of this model, clip and settings", "Choose another folder, or add --overwrite."
-            raise invalid("--out", expected=expected, got=f"others in {path}, or damaged ones", cure=cure) from error
+            raise invalid(
+                "--out",
+                expected="the draws of this model, clip and settings",
+                got=f"others in {path}, or damaged ones",
+                cure="Choose another folder, or add --overwrite.",
+            ) from error
         path.unlink()
         return _sample(path, overwrite, show, **arguments)
     except KeyboardInterrupt as error:

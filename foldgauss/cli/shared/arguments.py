@@ -9,8 +9,8 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from foldgauss._runtime.checks import invalid
-from foldgauss.cli.app.completion import complete_choice, complete_clips, complete_models
+from foldgauss._runtime.checks import invalid, require
+from foldgauss.cli.app.help import complete_choice
 from foldgauss.io.media.clip import DEINTERLACE
 from foldgauss.render import RenderOptions
 
@@ -20,23 +20,21 @@ MAX_TIMES = 100_000
 #: Panel of `--help` for the constants of the renderer.
 RENDERER = "Renderer"
 
-ModelFile = Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.", autocompletion=complete_models)]
-FittedClip = Annotated[
-    Path, typer.Argument(help="The clip that the model was fitted to.", autocompletion=complete_clips)
-]
+ModelFile = Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")]
+FittedClip = Annotated[Path, typer.Argument(help="The clip that the model was fitted to.")]
 NewClip = Annotated[
     Path,
-    typer.Argument(help="Video file, folder of images in natural order, or one image.", autocompletion=complete_clips),
+    typer.Argument(help="Video file, folder of images in natural order, or one image."),
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing outputs.")]
 Size = Annotated[str | None, typer.Option(metavar="HxW", help="Height x width in pixels, such as 160x320.")]
-Frames = Annotated[
-    str | None, typer.Option(metavar="A:B", help="Frames A up to, not including, B; either may be omitted.")
-]
+Frames = Annotated[str | None, typer.Option(metavar="A:B", help="Frames A to B, without B; either may be omitted.")]
 Levels = Annotated[
     int | None,
     typer.Option(
-        metavar="N", help="Value of white in a clip of 16 bits, such as 4095 for data of 12 [default: 65535]."
+        metavar="N",
+        help="Value of white in a clip of 16 bits, such as 4095 for data of 12 [default: 65535].",
+        hidden=True,
     ),
 ]
 Deinterlace = Annotated[
@@ -44,6 +42,7 @@ Deinterlace = Annotated[
     typer.Option(
         metavar="HOW",
         help="Interlaced frames: frames, each becomes one; fields, two at twice the rate; refuse.",
+        hidden=True,
         autocompletion=complete_choice(DEINTERLACE),
     ),
 ]
@@ -88,8 +87,12 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
     if text is None:
         return None
     height, cross, width = text.lower().partition("x")
-    if not (cross and height.isdecimal() and width.isdecimal() and int(height) > 0 and int(width) > 0):
-        raise invalid("--size", expected="HxW with both at least 1, as 160x320", got=repr(text))
+    require(
+        cross and height.isdecimal() and width.isdecimal() and int(height) > 0 and int(width) > 0,
+        "--size",
+        expected="HxW with both at least 1, as 160x320",
+        got=repr(text),
+    )
     return int(height), int(width)
 
 
@@ -97,8 +100,12 @@ def parse_frames(text: str | None) -> tuple[int | None, int | None] | None:
     if text is None:
         return None
     first, colon, last = text.partition(":")
-    if not colon or any(part and not part.isdecimal() for part in (first, last)):
-        raise invalid("--frames", expected="A:B with whole numbers >= 0, as 0:24", got=repr(text))
+    require(
+        colon and not any(part and not part.isdecimal() for part in (first, last)),
+        "--frames",
+        expected="A:B with whole numbers >= 0, as 0:24",
+        got=repr(text),
+    )
     return (int(first) if first else None), (int(last) if last else None)
 
 
@@ -107,9 +114,12 @@ def parse_color(text: str) -> tuple[float, float, float] | None:
     if text == "none":
         return None
     digits = text.removeprefix("#")
-    if not re.fullmatch("[0-9a-fA-F]{6}", digits):
-        expected = "none, or six hexadecimal digits RRGGBB, as ffffff for white"
-        raise invalid("--background", expected=expected, got=repr(text))
+    require(
+        re.fullmatch("[0-9a-fA-F]{6}", digits),
+        "--background",
+        expected="none, or six hexadecimal digits RRGGBB, as ffffff for white",
+        got=repr(text),
+    )
     return tuple(byte / 255 for byte in bytes.fromhex(digits))
 
 
@@ -125,8 +135,7 @@ def parse_times(text: str | None) -> np.ndarray | None:
             times = np.array([float(part) for part in text.split(",")])
     except ValueError as error:
         raise invalid("--times", expected=expected, got=text) from error
-    if not (0 < len(times) <= MAX_TIMES and ((times >= 0) & (times <= 1)).all()):
-        raise invalid("--times", expected=expected, got=text)
+    require(0 < len(times) <= MAX_TIMES and ((times >= 0) & (times <= 1)).all(), "--times", expected=expected, got=text)
     return times
 
 
@@ -148,5 +157,4 @@ def override_constants(
 def refuse_together(option: str, others: Mapping[str, object]) -> None:
     """Raise where one of the `others`, values by option, is given beside `option`."""
     for other, value in others.items():
-        if value is not None and value is not False:
-            raise invalid(option, expected=f"no {other}", got="both")
+        require(value is None or value is False, option, expected=f"no {other}", got="both")

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from foldgauss._runtime.checks import ParameterError, invalid
+from foldgauss._runtime.checks import ParameterError, invalid, require
 from foldgauss.cli.app.application import warn
 from foldgauss.cli.shared.arguments import parse_frames
 from foldgauss.cli.shared.log_lines import show_status
@@ -27,9 +27,13 @@ OTHER_CLIP_DB = 3.0
 
 def refuse_segments(model_path: Path) -> None:
     """For commands whose model must not be in segments."""
-    if is_segmented(model_path):
-        cure = f"Extract one: foldgauss export {model_path} --format model --segment 0."
-        raise invalid("MODEL", expected="a model of one piece", got="one in segments", cure=cure)
+    require(
+        not is_segmented(model_path),
+        "MODEL",
+        expected="a model of one piece",
+        got="one in segments",
+        cure=f"Extract one: foldgauss export {model_path} --format model --segment 0.",
+    )
 
 
 def read_fitted_clip(
@@ -63,8 +67,12 @@ def read_fitted_clip(
             got = "to which that does not apply"
         else:
             raise
-        expected = f"the clip that the model was fitted to, {as_fitted}"
-        raise invalid(name, expected=expected, got=f"{str(video)!r}, {got}", cure="Give that clip.") from error
+        raise invalid(
+            name,
+            expected=f"the clip that the model was fitted to, {as_fitted}",
+            got=f"{str(video)!r}, {got}",
+            cure="Give that clip.",
+        ) from error
     for note in clip.notes:
         warn(f"{clip.source}: {note}")
     if same_number and clip.num_frames != model.num_frames:

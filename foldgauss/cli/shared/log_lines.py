@@ -2,9 +2,8 @@
 
 import contextlib
 import logging
-import threading
-import time
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 
 import numpy as np
 from jaxtyping import Float
@@ -20,28 +19,12 @@ FIRST_LINE_SECONDS = 10.0
 LINE_SECONDS = 30.0
 
 
-@contextlib.contextmanager
-def show_status(text: str) -> Iterator[None]:
-    """What is being done, on a terminal; elsewhere a line now and then if it takes long."""
+def show_status(text: str) -> AbstractContextManager:
+    """What is being done: shown on a terminal while it lasts, elsewhere printed once."""
     if err.is_terminal:
-        with err.status(text):
-            yield
-        return
-    ended, begun = threading.Event(), time.monotonic()
-
-    def repeat() -> None:
-        pause = FIRST_LINE_SECONDS
-        while not ended.wait(pause):
-            pause = LINE_SECONDS
-            err.print(f"{text}: {time.monotonic() - begun:.0f} s", soft_wrap=True)
-
-    thread = threading.Thread(target=repeat, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
+        return err.status(text)
+    err.print(f"{text} ...", soft_wrap=True)
+    return contextlib.nullcontext()
 
 
 class _Printer(logging.Handler):

@@ -4,7 +4,7 @@ import os
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
-from foldgauss._runtime.checks import ParameterError, invalid
+from foldgauss._runtime.checks import ParameterError, invalid, require
 from foldgauss.io._atomic import check_replaceable, check_writable, resolve
 from foldgauss.io.media.images import IMAGE_SUFFIXES
 from foldgauss.io.media.reading import memory_limit
@@ -21,9 +21,11 @@ def name_after(source: Path, ending: str) -> Path:
 
 def refuse_huge(size: tuple[int, int] | None) -> None:
     """Refuse images that do not fit in memory: several copies are held in floating point."""
-    if size is not None and 64 * size[0] * size[1] > memory_limit():
-        got, cure = f"{size[0]}x{size[1]}", "Choose a smaller one."
-        raise invalid("--size", expected="an image that fits in memory", got=got, cure=cure)
+    if size is None:
+        return
+    got = f"{size[0]}x{size[1]}"
+    fits = 64 * size[0] * size[1] <= memory_limit()
+    require(fits, "--size", expected="an image that fits in memory", got=got, cure="Choose a smaller one.")
 
 
 def refuse_existing(path: Path, overwrite: bool, option: str = "--out") -> None:
@@ -39,12 +41,20 @@ def refuse_inputs(path: Path, inputs: Mapping[str, Path | None], option: str = "
             continue
         # os.path: a name that is too long does not exist here; creating the file reports it.
         is_source = os.path.exists(path) and path.samefile(source)
-        if path.suffix.lower() in IMAGE_SUFFIXES and resolve(path.parent) == resolve(source):
-            cure = "It would be one of its images."
-            raise invalid(option, expected=f"a place outside the {what}'s folder", got=path, cure=cure)
-        if is_source or resolve(path) in resolve(source).parents:
-            cure = "Inputs are never replaced."
-            raise invalid(option, expected=f"another path than the {what}", got=path, cure=cure)
+        require(
+            path.suffix.lower() not in IMAGE_SUFFIXES or resolve(path.parent) != resolve(source),
+            option,
+            expected=f"a place outside the {what}'s folder",
+            got=path,
+            cure="It would be one of its images.",
+        )
+        require(
+            not is_source and resolve(path) not in resolve(source).parents,
+            option,
+            expected=f"another path than the {what}",
+            got=path,
+            cure="Inputs are never replaced.",
+        )
 
 
 def check_output(path: Path, overwrite: bool, inputs: Mapping[str, Path | None], option: str = "--out") -> None:
@@ -67,8 +77,7 @@ def check_images_output(
     if path.suffix and not path.is_dir() and path.suffix.lower() not in wanted:
         is_image = path.suffix.lower() == IMAGE_SUFFIX
         cure = "One image of a model: foldgauss render MODEL --times T --out FILE.png." if is_image else ""
-        expected = ", ".join(wanted) + ", or a folder without extension"
-        raise invalid(option, expected=expected, got=path, cure=cure)
+        raise invalid(option, expected=", ".join(wanted) + ", or a folder without extension", got=path, cure=cure)
     refuse_inputs(path, inputs, option)
     if not path.is_dir() or any(path.iterdir()):
         refuse_existing(path, overwrite, option)
@@ -91,11 +100,16 @@ def refuse_foreign(
         return
     foreign, expected = sorted(names - set(own)), f"a new folder or one that a {command} wrote"
     if foreign:
-        got = f"{folder} with {foreign[0]!r} in it"
-        raise invalid("--out", expected=expected, got=got, cure="Choose another folder.")
+        raise invalid(
+            "--out", expected=expected, got=f"{folder} with {foreign[0]!r} in it", cure="Choose another folder."
+        )
     if names and not known:
-        got = f"{folder} with {min(names)!r} in it, but no {record} of a {command}"
-        raise invalid("--out", expected=expected, got=got, cure=f"Choose another folder{cure}.")
+        raise invalid(
+            "--out",
+            expected=expected,
+            got=f"{folder} with {min(names)!r} in it, but no {record} of a {command}",
+            cure=f"Choose another folder{cure}.",
+        )
 
 
 def make_folder(path: Path) -> None:
@@ -103,6 +117,7 @@ def make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        got, cure = f"{path} ({error.strerror})", "Choose another."
-        raise invalid("--out", expected="a folder that can be created", got=got, cure=cure) from error
+        raise invalid(
+            "--out", expected="a folder that can be created", got=f"{path} ({error.strerror})", cure="Choose another."
+        ) from error
     check_writable(path / "model.safetensors")

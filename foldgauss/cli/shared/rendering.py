@@ -13,9 +13,9 @@ import numpy as np
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from foldgauss._runtime.checks import ParameterError, invalid
+from foldgauss._runtime.checks import ParameterError, require
 from foldgauss.cli.app.application import err, out
-from foldgauss.cli.app.completion import complete_choice
+from foldgauss.cli.app.help import complete_choice
 from foldgauss.cli.shared.clips import Video
 from foldgauss.cli.shared.log_lines import FIRST_LINE_SECONDS, LINE_SECONDS
 from foldgauss.cli.shared.outputs import IMAGE_SUFFIX
@@ -80,19 +80,28 @@ class Output:
     def check(self, size: tuple[int, int], num: int, background: Background = BLACK) -> None:
         """Refuse options that do not fit the kind of output, before `num` images of this size are computed."""
         suffix = self._suffix
-        if suffix == IMAGE_SUFFIX and num != 1:
-            cure = "Choose it by --times T, or write to a folder (a name without extension)."
-            raise invalid("--out", expected="one image for a .png", got=f"{num:,} images", cure=cure)
+        require(
+            suffix != IMAGE_SUFFIX or num == 1,
+            "--out",
+            expected="one image for a .png",
+            got=f"{num:,} images",
+            cure="Choose it by --times T, or write to a folder (a name without extension).",
+        )
         most = MAX_GIF_FPS if suffix == ".gif" else MAX_FPS
-        if suffix and self.fps > most:
-            expected, cure = (
-                f"at most {most:g} frames per second in it",
-                "Choose a lower rate, another format or a folder.",
-            )
-            raise invalid("--out", expected=expected, got=f"{self.fps:g} for {self.path}", cure=cure)
-        if background is None and suffix in ANIMATION_SUFFIXES:
-            expected, cure = f"a color for {suffix}", "Take .webm, .mov, .mkv or a folder."
-            raise invalid("--background", expected=expected, got="none", cure=cure)
+        require(
+            not suffix or self.fps <= most,
+            "--out",
+            expected=f"at most {most:g} frames per second in it",
+            got=f"{self.fps:g} for {self.path}",
+            cure="Choose a lower rate, another format or a folder.",
+        )
+        require(
+            background is not None or suffix not in ANIMATION_SUFFIXES,
+            "--background",
+            expected=f"a color for {suffix}",
+            got="none",
+            cure="Take .webm, .mov, .mkv or a folder.",
+        )
         if suffix in VIDEO_SUFFIXES:
             shape = (*size, 4 if background is None else 3)
             try:
@@ -103,9 +112,13 @@ class Output:
                 raise ParameterError("--out", error.problem) from error
             return
         for name in ("codec", "crf", "pixel_format", "sound"):
-            if getattr(self, name) is not None:
-                cure = f"Leave it out, or write {', '.join(VIDEO_SUFFIXES[:-1])} or {VIDEO_SUFFIXES[-1]}."
-                raise invalid(name, expected="a video file for it", got=repr(self.path.name), cure=cure)
+            require(
+                getattr(self, name) is None,
+                name,
+                expected="a video file for it",
+                got=repr(self.path.name),
+                cure=f"Leave it out, or write {', '.join(VIDEO_SUFFIXES[:-1])} or {VIDEO_SUFFIXES[-1]}.",
+            )
 
     def write(self, images: Callable[[], Iterable[np.ndarray]], num: int) -> None:
         """Write `num` images; where that fails, somewhere else."""
@@ -142,11 +155,19 @@ def choose_sound(path: Path | None, timeline: Timeline, about: dict[str, Any], f
     """The sound of the fitted frames in the file `path`. `about`: the model's metadata; `fps`: of the clip."""
     if path is None:
         return None
-    if timeline.remap is not None or timeline.is_single or timeline.chosen is not None or (timeline.speed or 1.0) < 0:
-        raise invalid("--sound", expected="a constant speed forwards", got="other times", cure="Leave --sound out.")
-    if not path.is_file():
-        got = f"{str(path)!r}, which is {'none' if os.path.exists(path) else 'missing'}"
-        raise invalid("--sound", expected="a file", got=got)
+    require(
+        timeline.remap is None and not timeline.is_single and timeline.chosen is None and (timeline.speed or 1.0) >= 0,
+        "--sound",
+        expected="a constant speed forwards",
+        got="other times",
+        cure="Leave --sound out.",
+    )
+    require(
+        path.is_file(),
+        "--sound",
+        expected="a file",
+        got=f"{str(path)!r}, which is {'none' if os.path.exists(path) else 'missing'}",
+    )
     first = (about.get("frames") or (0,))[0] or 0
     return Sound(path, about.get("first_second", first / fps), timeline.playing_speed(fps))
 

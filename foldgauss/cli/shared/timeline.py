@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import invalid, require
 from foldgauss.cli.app.application import out, warn
 from foldgauss.cli.shared.arguments import MAX_TIMES, refuse_together
 from foldgauss.cli.shared.clips import Video
@@ -64,9 +64,12 @@ class Timeline:
         given = [option for option, value in self.ways.items() if value is not None]
         if len(given) > 1:
             raise invalid(given[0], expected="one way to choose times", got=" and ".join(given))
-        if self.speed is not None and not MIN_SPEED <= abs(self.speed) <= 1 / MIN_SPEED:
-            expected = f"a number from {MIN_SPEED:g} to {1 / MIN_SPEED:g}, or the same below 0"
-            raise invalid("--speed", expected=expected, got=self.speed)
+        require(
+            self.speed is None or MIN_SPEED <= abs(self.speed) <= 1 / MIN_SPEED,
+            "--speed",
+            expected=f"a number from {MIN_SPEED:g} to {1 / MIN_SPEED:g}, or the same below 0",
+            got=self.speed,
+        )
 
     @property
     def ways(self) -> dict[str, object]:
@@ -110,8 +113,7 @@ class Timeline:
             return self.chosen
         if self.frame is not None:
             num = len(frame_times)
-            if not -num <= self.frame < num:
-                raise invalid("--frame", expected=f"a frame from {-num} to {num - 1}", got=self.frame)
+            require(-num <= self.frame < num, "--frame", expected=f"a frame from {-num} to {num - 1}", got=self.frame)
             return frame_times[[self.frame]]
         if self.upsample is not None:
             self._refuse_long("--upsample", (len(frame_times) - 1) * self.upsample)
@@ -156,9 +158,7 @@ class Timeline:
             )
 
     def _refuse_long(self, option: str, num_images: float) -> None:
-        if num_images > MAX_IMAGES:
-            expected = f"at most {MAX_IMAGES:,} images"
-            raise invalid(option, expected=expected, got=f"{num_images:,.0f}")
+        require(num_images <= MAX_IMAGES, option, expected=f"at most {MAX_IMAGES:,} images", got=f"{num_images:,.0f}")
 
 
 def _seconds_played(seconds: np.ndarray, rate: float, speed: float) -> np.ndarray:
@@ -184,6 +184,9 @@ def parse_remap(text: str | None) -> list[tuple[float, float]] | None:
             raise ValueError("too long")
         remapped_positions(points, fps=1.0)
     except ValueError as error:
-        expected = "seconds shown = seconds of the clip, the former rising from 0, as 0=0,1=1,3=1,4=2"
-        raise invalid("--remap", expected=expected, got=text) from error
+        raise invalid(
+            "--remap",
+            expected="seconds shown = seconds of the clip, the former rising from 0, as 0=0,1=1,3=1,4=2",
+            got=text,
+        ) from error
     return points

@@ -2,14 +2,15 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
+import cv2
 import numpy as np
 import typer
 
-from foldgauss._runtime.checks import check_one_of, invalid
+from foldgauss._runtime.checks import check_one_of, invalid, require
 from foldgauss.cli.app.application import command, out
-from foldgauss.cli.app.completion import complete_choice
+from foldgauss.cli.app.help import complete_choice
 from foldgauss.cli.shared.arguments import (
     AlphaCutoff,
     ModelFile,
@@ -24,7 +25,7 @@ from foldgauss.cli.shared.arguments import (
     refuse_together,
 )
 from foldgauss.cli.shared.clips import Video
-from foldgauss.cli.shared.log_lines import print_shots
+from foldgauss.cli.shared.log_lines import print_log, print_shots
 from foldgauss.cli.shared.outputs import IMAGE_SUFFIX, check_images_output, name_after, refuse_huge
 from foldgauss.cli.shared.rendering import (
     CodecName,
@@ -36,15 +37,21 @@ from foldgauss.cli.shared.rendering import (
     progress_bar,
 )
 from foldgauss.cli.shared.timeline import Fps, SkipRepeats, Speed, Timeline, Upsample, parse_remap
-from foldgauss.cli.viewing.plate import make_plate
+from foldgauss.io._atomic import resolve
+from foldgauss.io.media.masks import read_masks
 from foldgauss.io.media.writing import IMAGE_FORMATS, VIDEO_SUFFIXES
 from foldgauss.io.models.video_model import load_video_model, read_frame_seconds, read_origin
+from foldgauss.video.models.background import Background
+from foldgauss.video.motion.background_plate import Alignment, Frames, Masks, fill_background
+from foldgauss.video.motion.moving_object import LEAST_FRAMES, NothingMoves, find_moving_object
 from foldgauss.video.motion.slow_motion import interpolate_frames
 from foldgauss.video.motion.stabilization import BORDERS, MAX_ZOOM, SMOOTHING, stabilize
 
 #: Panels of `--help`.
 STABILIZED = "Stabilized"
 PLATE = "Without an object"
+#: What can be done where the search finds nothing, or the wrong thing.
+_CURE = "Give masks of the object by --masks, or remove it by foldgauss edit; see docs/editing.md."
 #: How `--stabilize` moves the camera.
 CAMERAS = ("smooth", "fixed")
 
@@ -178,8 +185,7 @@ def render(
     out_path = _name_output(model_path, timeline, image_format, kind) if out_path is None else out_path
     if image_format is not None:
         check_one_of("--format", image_format, IMAGE_FORMATS)
-        if out_path.suffix and not out_path.is_dir():
-            raise invalid("--format", expected="a folder as --out", got=out_path)
+        require(not out_path.suffix or out_path.is_dir(), "--format", expected="a folder as --out", got=out_path)
     inputs = {"model": model_path, "masks": masks_path, "sound": sound}
     check_images_output(out_path, overwrite, inputs, others=() if plate else (IMAGE_SUFFIX,))
     model, about = load_video_model(model_path), read_origin(model_path)
@@ -197,7 +203,7 @@ def render(
     output = Output(out_path, rate, overwrite, stamps, image_format or "png", **encoding)
     output.check(image_size, len(shown), background_color)
     if plate:
-        make_plate(model, about, output, image_size, background_color, masks_path, save_masks, inputs)
+        _make_plate(model, about, output, image_size, background_color, masks_path, save_masks, inputs)
         return
     video = model
     if camera is not None:
@@ -223,3 +229,88 @@ def _name_output(model_path: Path, timeline: Timeline, image_format: str | None,
     path = name_after(model_path, f"{kind}{suffix}")
     clip = read_origin(model_path).get("clip", path.name)  # if unknown, it may have that name
     return name_after(model_path, f".rendered{suffix}") if path.name == clip and not kind else path
+
+
+# ------------------------------------------------------------------------------------------- without an object
+
+
+def _make_plate(
+    model: Video,
+    about: dict[str, Any],
+    output: Output,
+    size: tuple[int, int],
+    background: Background,
+    masks_path: Path | None,
+    save_masks: Path | None,
+    inputs: dict[str, Path | None],
+) -> None:
+    """Write the frames of `model` without the object of the masks, or else of what moves; and the masks if wanted."""
+    if save_masks is not None:
+        require(not save_masks.suffix, "--save-masks", expected="a folder, without extension", got=save_masks)
+        check_images_output(save_masks, output.overwrite, inputs, "--save-masks")
+        require(
+            resolve(save_masks) != resolve(output.path),
+            "--save-masks",
+            expected="another folder than --out",
+            got=save_masks,
+        )
+    require(
+        model.num_frames >= LEAST_FRAMES,
+        "MODEL",
+        expected=f"at least {LEAST_FRAMES} frames",
+        got=model.num_frames,
+        cure="Fit more frames: a plate is what other frames show behind the object.",
+    )
+    masks = None if masks_path is None else _read_masks(masks_path, model, size, about)
+    frames = np.empty((model.num_frames, *size, 3), np.uint8)
+    with progress_bar("Rendering", model.num_frames) as advance:
+        for k, frame in enumerate(model.frames(size=size, background=background)):
+            frames[k] = frame
+            advance()
+    out.print("Searching for what moves against the background ..." if masks is None else "Aligning frames ...")
+    alignment = Alignment.from_frames(frames)
+    print_shots(alignment.starts, np.asarray(model.frame_times.times()))
+    with print_log():
+        masks = _find_object(frames, alignment) if masks is None else masks
+        plate = fill_background(frames, masks, alignment=alignment)
+    output.write(lambda: plate, len(plate))
+    if save_masks is not None:
+        images = partial(map, lambda mask: np.repeat(np.uint8(255 * mask)[..., None], 3, -1), masks)
+        Output(save_masks, output.fps, output.overwrite).write(images, len(masks))
+
+
+def _read_masks(path: Path, model: Video, size: tuple[int, int], about: dict[str, Any]) -> Masks:
+    """The user's masks, one for each frame of the model, at the size of the images."""
+    masks = read_masks(path, size=model.size, stretched=about.get("stretched"))
+    masks = masks.reshape(-1, *masks.shape[-2:])  # one image is for all frames
+    first, num = (about.get("frames") or (0,))[0] or 0, model.num_frames
+    if len(masks) >= first + num:
+        masks = masks[first : first + num]  # of the whole clip
+    require(
+        len(masks) in (1, num),
+        "--masks",
+        expected=f"one mask, or one for each of {num} frames",
+        got=f"{len(masks)} masks",
+    )
+    resized = [cv2.resize(np.uint8(mask), size[::-1], interpolation=cv2.INTER_NEAREST) > 0 for mask in masks]
+    require(np.any(resized), "--masks", expected="masks that are not empty", got=path)
+    return np.broadcast_to(resized, (num, *size))
+
+
+def _find_object(frames: Frames, alignment: Alignment) -> Masks:
+    """The masks of what moves; prints how much that is, which may be a part of the object."""
+    try:
+        masks = find_moving_object(frames, shadow=True, alignment=alignment)
+    except NothingMoves as error:
+        raise invalid(
+            "MODEL", expected="an object that moves against the background", got="none", cure=_CURE
+        ) from error
+    covered = masks.mean((1, 2))[masks.any((1, 2))]
+    if len(covered):
+        size = f"{covered.min():.1%} to {covered.max():.1%}"
+        out.print(
+            f"Motion against the background covers {size} of the image, in {len(covered)} of {len(masks)} frames. "
+            "Parts that stand still are not found and stay; --masks takes masks of the whole object.",
+            soft_wrap=True,
+        )
+    return masks

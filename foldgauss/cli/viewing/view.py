@@ -7,9 +7,8 @@ from typing import Annotated
 
 import typer
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import invalid, require
 from foldgauss.cli.app.application import command, err, out
-from foldgauss.cli.app.completion import complete_clips, complete_models
 from foldgauss.cli.shared.arguments import Overwrite, refuse_together
 from foldgauss.cli.shared.clips import read_fitted_clip
 from foldgauss.cli.shared.log_lines import show_status
@@ -38,7 +37,6 @@ def view_command(
         typer.Argument(
             metavar="MODEL",
             help="Model file; without one --out writes a page that opens model files.",
-            autocompletion=complete_models,
         ),
     ] = None,
     out_path: Annotated[
@@ -52,7 +50,6 @@ def view_command(
         typer.Option(
             metavar="CLIP",
             help="The clip that the model was fitted to, to show next to it.",
-            autocompletion=complete_clips,
         ),
     ] = None,
     original_quality: Annotated[
@@ -75,14 +72,11 @@ def view_command(
     opens what is there. With --out the page is written to a file instead, which makes no requests; see docs/player.md.
     """
     if out_path is None:
-        if model_path is None:
-            raise invalid("MODEL", expected="a model file, or --out", got="neither")
-        if linked:
-            raise invalid("--linked", expected="--out too", got="--linked alone")
+        require(model_path is not None, "MODEL", expected="a model file, or --out", got="neither")
+        require(not linked, "--linked", expected="--out too", got="--linked alone")
         _serve(model_path, _read_original(model_path, original), original_quality, moving, port, browser)
         return
-    if out_path.suffix.lower() != HTML_SUFFIX:
-        raise invalid("--out", expected=f"a name ending in {HTML_SUFFIX}", got=out_path)
+    require(out_path.suffix.lower() == HTML_SUFFIX, "--out", expected=f"a name ending in {HTML_SUFFIX}", got=out_path)
     refuse_together("--out", {"--moving-object": moving, "--port": port or None})
     check_output(out_path, overwrite, {"model": model_path, "clip": original})
     if model_path is None:
@@ -121,8 +115,12 @@ def _serve(model_path: Path, original: Clip | None, quality: int, moving: bool, 
     try:
         server = PageServer(page.encode(), port, script=script, token=token)
     except OSError as error:
-        cure = "Choose another, or omit the option for a free one."
-        raise invalid("--port", expected="a free port", got=f"{port} ({error.strerror})", cure=cure) from error
+        raise invalid(
+            "--port",
+            expected="a free port",
+            got=f"{port} ({error.strerror})",
+            cure="Choose another, or omit the option for a free one.",
+        ) from error
     with server:
         out.print(f"{model_path.name}, {len(page) / 1e6:.1f} MB, until Ctrl-C at {server.url}", soft_wrap=True)
         if browser:

@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 import jax
 import numpy as np
 
-from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within, short_repr
+from foldgauss._runtime.checks import check_one_of, is_integer, is_within, require, short_repr
 from foldgauss.io._atomic import PathLike, atomic_path, check_path
 from foldgauss.io.models.model_file import (
     HEADER_ERRORS,
@@ -94,8 +94,12 @@ def leave_room(size_mb: float | None, metadata: dict) -> float | None:
 
 def check_compact_name(path: Path, parameter: str = "path") -> None:
     """Raise ValueError for a name that is not a compact file's."""
-    if path.suffix.lower() != COMPACT_SUFFIX:
-        raise invalid(parameter, expected=f"a name ending in {COMPACT_SUFFIX}", got=repr(str(path)))
+    require(
+        path.suffix.lower() == COMPACT_SUFFIX,
+        parameter,
+        expected=f"a name ending in {COMPACT_SUFFIX}",
+        got=repr(str(path)),
+    )
 
 
 def pack_compact(quantized: Quantized, metadata: dict | None = None) -> bytes:
@@ -171,8 +175,12 @@ def load_compact(path: PathLike, *, visible: tuple[float, float] = (0.0, 1.0)) -
     """
     path = check_path(path)
     right = isinstance(visible, tuple | list) and len(visible) == 2 and all(is_within(t, "[0, 1]") for t in visible)
-    if not right or visible[0] > visible[1]:
-        raise invalid("visible", expected="the first and the last time, in [0, 1]", got=short_repr(visible))
+    require(
+        right and visible[0] <= visible[1],
+        "visible",
+        expected="the first and the last time, in [0, 1]",
+        got=short_repr(visible),
+    )
     return _load(path, visible, stacklevel=3)
 
 
@@ -229,13 +237,14 @@ def _read_header(path: Path, file: BinaryIO) -> dict:
     if len(data) < _FIXED:
         raise _unreadable(path, f"one cut off after {len(data)} bytes")
     version, length, checksum = (int.from_bytes(data[k : k + 4], "little") for k in range(len(MAGIC), _FIXED, 4))
-    if version != VERSION:
-        raise model_file_error(
-            "path",
-            expected=f"a compact model of version {VERSION}, which this program reads",
-            got=f"version {version} in {str(path)!r}",
-            cure="Compress the model again." if version < VERSION else "Update foldgauss.",
-        )
+    require(
+        version == VERSION,
+        "path",
+        expected=f"a compact model of version {VERSION}, which this program reads",
+        got=f"version {version} in {str(path)!r}",
+        cure="Compress the model again." if version < VERSION else "Update foldgauss.",
+        kind=ModelFileError,
+    )
     text = file.read(min(length, _count_bytes(file)))
     if length > len(text) or zlib.crc32(text) != checksum:
         raise _unreadable(path, "one that is cut off or damaged (the checksum of its header is another)")
@@ -416,10 +425,10 @@ def _parse_rule(name: str, numbers: list) -> Rule:
 
 
 def _check(right: bool, name: str, got: Any) -> None:
-    if not right:
-        raise invalid(name, expected="what a compact model can have", got=got)
+    require(right, name, expected="what a compact model can have", got=got)
 
 
 def _unreadable(path: Path, got: str) -> ModelFileError:
-    cure = "Copy it again, or compress again."
-    return model_file_error("path", expected="a compact model", got=f"{got}: {str(path)!r}", cure=cure)
+    return model_file_error(
+        "path", expected="a compact model", got=f"{got}: {str(path)!r}", cure="Copy it again, or compress again."
+    )

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
-from foldgauss._runtime.checks import ParameterError, invalid
+from foldgauss._runtime.checks import ParameterError, invalid, require
 from foldgauss.io._atomic import PathLike, atomic_path, missing_error
 
 FORMAT = "foldgauss-model"
@@ -68,8 +68,12 @@ _KINDS: dict[str, Kind] = {}
 def register_model(kind: Kind) -> None:
     """Register a kind for saving and loading. Raises `ValueError` if its name is already that of another type."""
     known = _KINDS.setdefault(kind.name, kind)
-    if known.model_type is not kind.model_type:
-        raise invalid("kind", expected="a free name", got=f"{kind.name!r}, taken by {known.model_type.__name__}")
+    require(
+        known.model_type is kind.model_type,
+        "kind",
+        expected="a free name",
+        got=f"{kind.name!r}, taken by {known.model_type.__name__}",
+    )
     _KINDS[kind.name] = kind
 
 
@@ -87,13 +91,14 @@ def save_model(path: PathLike, model: Any, *, metadata: dict | None = None) -> P
     or a header that does not describe the model; `OutputError` where the path cannot be written.
     """
     kind = next((kind for kind in _KINDS.values() if type(model) is kind.model_type), None)
-    if kind is None:
-        raise model_file_error(
-            "model",
-            expected="one of the registered types " + ", ".join(sorted(_KINDS)),
-            got=type(model).__name__,
-            cure="Register it with register_model.",
-        )
+    require(
+        kind is not None,
+        "model",
+        expected="one of the registered types " + ", ".join(sorted(_KINDS)),
+        got=type(model).__name__,
+        cure="Register it with register_model.",
+        kind=ModelFileError,
+    )
     arrays = {key: _to_numpy(key, leaf) for key, leaf in _array_leaves(model).items()}
     header = kind.to_header(model)
     _check_described(kind, model, to_json("header", header))
@@ -125,13 +130,14 @@ def write_tensors(
         entries[key] = specs[key] | {"data_offsets": [start, end]}
     text = json.dumps(entries, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
-    if len(text) > _LONGEST_HEADER:
-        raise model_file_error(
-            "path",
-            expected=f"a header of at most {_LONGEST_HEADER:,} bytes",
-            got=f"one of {len(text):,} bytes for {len(specs):,} tensors",
-            cure="Write the clip as several files.",
-        )
+    require(
+        len(text) <= _LONGEST_HEADER,
+        "path",
+        expected=f"a header of at most {_LONGEST_HEADER:,} bytes",
+        got=f"one of {len(text):,} bytes for {len(specs):,} tensors",
+        cure="Write the clip as several files.",
+        kind=ModelFileError,
+    )
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write(len(text).to_bytes(_PREFIX, "little") + text)
         for array in tensors(order):
@@ -153,23 +159,28 @@ def _array_leaves(tree: Any) -> dict[str, Any]:
             )
         if not isinstance(leaf, jax.Array | np.ndarray | np.generic | jax.ShapeDtypeStruct):
             continue  # a function or a name, which the skeleton contains
-        if key in found or key == _RESERVED:
-            raise model_file_error(
-                key, expected="one leaf per path", got="a clash", cure="Rename the field or dictionary key."
-            )
+        require(
+            key not in found and key != _RESERVED,
+            key,
+            expected="one leaf per path",
+            got="a clash",
+            cure="Rename the field or dictionary key.",
+            kind=ModelFileError,
+        )
         found[key] = leaf
     return found
 
 
 def _to_numpy(key: str, leaf: Any) -> np.ndarray:
     """Little-endian, of a type that the format holds; nothing is converted but the byte order."""
-    if leaf.dtype.name not in _DTYPES:
-        raise model_file_error(
-            key,
-            expected="a real, integer or boolean array",
-            got=f"dtype {leaf.dtype}",
-            cure="Store complex numbers as two arrays and PRNG keys by jax.random.key_data.",
-        )
+    require(
+        leaf.dtype.name in _DTYPES,
+        key,
+        expected="a real, integer or boolean array",
+        got=f"dtype {leaf.dtype}",
+        cure="Store complex numbers as two arrays and PRNG keys by jax.random.key_data.",
+        kind=ModelFileError,
+    )
     # In any strides: tobytes gives C order.
     return np.asarray(leaf).astype(leaf.dtype.newbyteorder("<"), copy=False)
 
@@ -179,13 +190,14 @@ def _check_described(kind: Kind, model: Any, header: str) -> None:
     skeleton = kind.from_header(json.loads(header))
     _check_tensors(_get_specs(_array_leaves(model)), _get_specs(_array_leaves(skeleton)), "model")
     have, want = jax.tree_util.tree_structure(skeleton), jax.tree_util.tree_structure(model)
-    if have != want:
-        raise model_file_error(
-            "header",
-            expected=f"every static field of the model of kind {kind.name!r}",
-            got="a skeleton of another structure",
-            cure="Let to_header and from_header carry each static field.",
-        )
+    require(
+        have == want,
+        "header",
+        expected=f"every static field of the model of kind {kind.name!r}",
+        got="a skeleton of another structure",
+        cure="Let to_header and from_header carry each static field.",
+        kind=ModelFileError,
+    )
 
 
 def to_json(parameter: str, value: Any) -> str:
@@ -251,13 +263,14 @@ def load_part(path: Path, about: dict, prefix: str = "") -> Any:
 def match_kind(path: Path, about: dict) -> tuple[Kind, Any]:
     """The kind of model, and the skeleton made from the header, checked against the tensors, of which none is read."""
     kind = _KINDS.get(about["kind"])
-    if kind is None:
-        raise model_file_error(
-            "path",
-            expected="a model of kind " + " or ".join(map(repr, sorted(_KINDS))),
-            got=f"kind {about['kind']!r} in {str(path)!r}",
-            cure="Load it with the program that wrote it.",
-        )
+    require(
+        kind is not None,
+        "path",
+        expected="a model of kind " + " or ".join(map(repr, sorted(_KINDS))),
+        got=f"kind {about['kind']!r} in {str(path)!r}",
+        cure="Load it with the program that wrote it.",
+        kind=ModelFileError,
+    )
     with translate_header_errors(path, kind.name):
         skeleton = kind.from_header(about["header"])
     _check_tensors(about["tensors"], _get_specs(_array_leaves(skeleton)), str(path))
@@ -320,13 +333,14 @@ def _check_container(path: Path) -> None:
 def _check_version(path: Path, strings: dict[str, str]) -> None:
     if strings.get("format") != FORMAT:
         raise _unreadable_error(path, f"a safetensors file of format {strings.get('format', 'unknown')!r}")
-    if strings.get("version") != VERSION:
-        raise model_file_error(
-            "path",
-            expected=f"a model file of version {VERSION}, which this program reads",
-            got=f"version {strings.get('version')} in {str(path)!r}",
-            cure="Update foldgauss, or load it with the one that wrote it.",
-        )
+    require(
+        strings.get("version") == VERSION,
+        "path",
+        expected=f"a model file of version {VERSION}, which this program reads",
+        got=f"version {strings.get('version')} in {str(path)!r}",
+        cure="Update foldgauss, or load it with the one that wrote it.",
+        kind=ModelFileError,
+    )
     for name in ("kind", "header", "metadata"):
         if name not in strings:
             raise _unreadable_error(path, f"one without the field {name!r}")
@@ -353,8 +367,13 @@ def _check_tensors(kept: dict[str, dict], described: dict[str, dict], where: str
     """Raise unless the tensors have the keys, shapes and types that the header describes."""
     for key in sorted(kept.keys() | described.keys()):
         have, want = kept.get(key), described.get(key)
-        if have != want:
-            raise model_file_error(f"tensor {key!r} of {where!r}", expected=_spec_text(want), got=_spec_text(have))
+        require(
+            have == want,
+            f"tensor {key!r} of {where!r}",
+            expected=_spec_text(want),
+            got=_spec_text(have),
+            kind=ModelFileError,
+        )
 
 
 def _read_leaves(skeleton: Any, path: Path, prefix: str) -> Any:

@@ -1,7 +1,6 @@
 """Models of a clip's segments in one file, each loaded on access. The layout is in docs/formats.md."""
 
 import dataclasses
-import math
 import re
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -12,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within, short_repr
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within, require, short_repr
 from foldgauss.io._atomic import PathLike, check_path, check_writable
 from foldgauss.io.models.compact import compact_metadata, is_compact, load_compact_model
 from foldgauss.io.models.model_file import (
@@ -46,8 +45,6 @@ _FILE = "file"
 #: The properties of a compact segment's model that the header holds.
 _FACTS = ("num_gaussians", "num_frames", "degree", "num_parameters", "size", "fps", "compositing")
 _KEY = re.compile(r"segments\.(0|[1-9][0-9]{0,8})\.(.+)", re.DOTALL)
-#: Upper limit of a degree in a header, which is not trusted.
-_MAX_DEGREE = 1 << 20
 
 
 def join_segments(path: PathLike, sources: Sequence[tuple[int, PathLike]], *, metadata: dict | None = None) -> Path:
@@ -70,15 +67,10 @@ def join_segments(path: PathLike, sources: Sequence[tuple[int, PathLike]], *, me
         about = _describe_compact(file, load()) if is_compact(file) else read_header(file)
         if about["kind"] not in PARTS:
             raise _unfit(file, f"one of kind {about['kind']!r}", "Join the files that it was made of.")
-        if about["kind"] != COMPACT:
-            match_kind(file, about)
         files.append(file)
         entries.append({"first": first} | {name: about[name] for name in ("kind", "header", "metadata")})
         specs |= {f"segments.{number}.{key}": spec for key, spec in about["tensors"].items()}
-        try:
-            segments.append(_segment(entries[-1], about["tensors"], load))
-        except (KeyError, TypeError, ValueError) as error:
-            raise _unfit(file, f"one with {error}", "Fit it again.") from error
+        segments.append(_segment(file, entries[-1], about["tensors"], load))
     SegmentedVideo(segments)  # raises ValueError unless they fit together
     check_writable(path)
 
@@ -123,8 +115,12 @@ def _source(number: int, source: object) -> tuple[int, Path]:
         raise invalid(
             f"sources[{number}]", expected="(number of its first frame, model file)", got=short_repr(source)
         ) from None
-    if not is_integer(first, 0):
-        raise invalid(f"sources[{number}]", expected="the number of its first frame first", got=short_repr(first))
+    require(
+        is_integer(first, 0),
+        f"sources[{number}]",
+        expected="the number of its first frame first",
+        got=short_repr(first),
+    )
     return int(first), check_path(file, "path, sources")
 
 
@@ -171,16 +167,20 @@ def _segments(path: Path, about: dict) -> list[Segment]:
 
     @lru_cache(maxsize=MAX_PREPARED)
     def load(number: int) -> VideoModel | EditedVideo:
-        if _stamp(path) != stamp:
-            raise model_file_error(
-                "path", expected="the file as it was opened", got=f"a changed {str(path)!r}", cure="Load it again."
-            )
+        require(
+            _stamp(path) == stamp,
+            "path",
+            expected="the file as it was opened",
+            got=f"a changed {str(path)!r}",
+            cure="Load it again.",
+            kind=ModelFileError,
+        )
         if entries[number]["kind"] == COMPACT:
             named = path.with_name(f"{path.name}, segment {number + 1}")  # for messages
             return load_compact_model(named, _read_file(path, number))
         return load_part(path, entries[number] | {"tensors": own[number]}, f"segments.{number}.")
 
-    return [_segment(entry, own[number], partial(load, number)) for number, entry in enumerate(entries)]
+    return [_segment(path, entry, own[number], partial(load, number)) for number, entry in enumerate(entries)]
 
 
 def _read_file(path: Path, number: int) -> bytes:
@@ -195,58 +195,26 @@ def _stamp(path: Path) -> tuple[int, ...]:
     return found.st_ino, found.st_size, found.st_mtime_ns
 
 
-def _segment(entry: dict, tensors: dict[str, dict], load: Any) -> Segment:
-    """The segment that a header describes; its model is loaded on access.
+def _segment(path: Path, entry: dict, tensors: dict[str, dict], load: Any) -> Segment:
+    """The segment that a header describes, checked against the tensors; its model is loaded on access.
 
-    Raises ValueError, KeyError or TypeError for an invalid header, and for counts of frames or Gaussians
-    that differ from the shapes of the tensors.
+    Raises as `match_kind`, and ValueError, KeyError or TypeError for an invalid header.
     """
     check_one_of("kind", entry["kind"], PARTS)
     if not isinstance(entry["metadata"], dict):
         raise TypeError("metadata that are no dict")
-    header = entry["header"]
-    is_file = entry["kind"] == COMPACT
-    if is_file and (tensors.keys() != {_FILE} or tensors[_FILE]["dtype"] != "U8"):
+    if entry["kind"] != COMPACT:
+        _, skeleton = match_kind(path, entry | {"tensors": tensors})
+        segment = Segment.from_model(entry["first"], skeleton)
+        return dataclasses.replace(segment, load=load, metadata=entry["metadata"])
+    if tensors.keys() != {_FILE} or tensors[_FILE]["dtype"] != "U8":
         raise ValueError("other tensors than a compact file")
-    if is_file and not is_integer(header["num_parameters"], 0):
-        raise ValueError("a number of parameters that no model has")
-    if entry["kind"] in (VIDEO, COMPACT):
-        models, lead = {"": header}, ""
-    else:
-        models = {f"layers.{number}.model.": layer["model"] for number, layer in enumerate(header["layers"])}
-        lead = list(models)[header["timeline"]]
-    for prefix, model in models.items():
-        num = model["num_gaussians"] if is_file else tensors[f"{prefix}splats.loc"]["shape"][0]
-        if not (is_integer(model["num_gaussians"], 1) and model["num_gaussians"] == num):
-            raise ValueError("another number of Gaussians than are stored")
-        num_frames = model["num_frames"] if is_file else tensors[f"{prefix}frame_times.logits"]["shape"][0] + 1
-        if not (is_integer(model["num_frames"], 1) and model["num_frames"] == num_frames):
-            raise ValueError("another number of frames than are stored")
-        if not is_integer(model["degree"], 0) or model["degree"] > _MAX_DEGREE:
-            raise ValueError("a degree that no model has")
-    timeline = models[lead]
-    height, width = timeline["size"]
-    if not (is_integer(height, 1) and is_integer(width, 1)) or not is_within(timeline["fps"], "(0, inf)"):
-        raise ValueError("a size or a rate out of range")
-    compositing = timeline.get("compositing", "over")  # files from before there was another
-    check_one_of("compositing", compositing, COMPOSITINGS)
-    return Segment(
-        first=entry["first"],
-        num_frames=int(timeline["num_frames"]),
-        num_gaussians=sum(int(model["num_gaussians"]) for model in models.values()),
-        degree=max(int(model["degree"]) for model in models.values()),
-        num_parameters=header["num_parameters"] if is_file else _num_parameters(tensors, tuple(models)),
-        size=(int(height), int(width)),
-        fps=float(timeline["fps"]),
-        options=RenderOptions(**timeline["options"]),
-        compositing=compositing,
-        load=load,
-        metadata=entry["metadata"],
-    )
-
-
-def _num_parameters(tensors: dict[str, dict], models: tuple[str, ...]) -> int:
-    """As `VideoModel.num_parameters`: all but the envelope and the numbers of the paths."""
-    own = ((key, spec) for key, spec in tensors.items() if key.startswith(models) and spec["dtype"] == "F32")
-    counted = (spec for key, spec in own if ".envelope." not in key)
-    return sum(math.prod(spec["shape"]) for spec in counted)
+    facts = {name: entry["header"][name] for name in _FACTS}
+    counts = [*facts["size"], *(facts[name] for name in ("num_gaussians", "num_frames", "num_parameters"))]
+    if len(counts) != 5 or not all(is_integer(count, 1) for count in counts) or not is_integer(facts["degree"], 0):
+        raise ValueError("a size or a count out of range")
+    if not is_within(facts["fps"], "(0, inf)"):
+        raise ValueError("a rate out of range")
+    check_one_of("compositing", facts["compositing"], COMPOSITINGS)
+    facts |= {"size": tuple(facts["size"]), "options": RenderOptions(**entry["header"]["options"])}
+    return Segment(entry["first"], **facts, load=load, metadata=entry["metadata"])

@@ -9,9 +9,9 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.io._atomic import PathLike, check_path
-from foldgauss.io.models.model_file import Kind, load_model, model_file_error, read_header, register_model, save_model
+from foldgauss.io.models.model_file import Kind, ModelFileError, load_model, read_header, register_model, save_model
 from foldgauss.video.models.video_model import ONE_SEGMENT, VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 from foldgauss.video.selection.selectors import Selection
@@ -36,17 +36,21 @@ def save_selection(path: PathLike, selection: Selection, model: VideoModel) -> P
     **Example:** `save_selection("bear.selection", by_mask(model, masks), model)`.
     """
     check_path(path, "path, selection, model")
-    if not isinstance(selection, Selection):
-        raise invalid(
-            "selection",
-            expected="a Selection",
-            got=type(selection).__name__,
-            cure="The order is (path, selection, model); Selection(mask) makes one of a mask.",
-        )
+    require(
+        isinstance(selection, Selection),
+        "selection",
+        expected="a Selection",
+        got=type(selection).__name__,
+        cure="The order is (path, selection, model); Selection(mask) makes one of a mask.",
+    )
     _check_model(model, "Save the selection with the model that it was made in.")
     num = model.splats.num_gaussians
-    if selection.num_gaussians != num:
-        raise invalid("selection", expected=f"one of the model's {num:,} Gaussians", got=f"{selection.num_gaussians:,}")
+    require(
+        selection.num_gaussians == num,
+        "selection",
+        expected=f"one of the model's {num:,} Gaussians",
+        got=f"{selection.num_gaussians:,}",
+    )
     return save_model(path, _SelectionRecord(selection.mask, compute_digest(model)))
 
 
@@ -59,35 +63,41 @@ def load_selection(path: PathLike, model: VideoModel) -> Selection:
     check_path(path, "path, model")
     _check_model(model, "The order is (path, model).")
     kind = read_header(path)["kind"]
-    if kind != SELECTION:
-        raise model_file_error(
-            "path",
-            expected="a selection",
-            got=f"{kind!r} in {str(path)!r}",
-            cure="Give the file that save_selection wrote.",
-        )
+    require(
+        kind == SELECTION,
+        "path",
+        expected="a selection",
+        got=f"{kind!r} in {str(path)!r}",
+        cure="Give the file that save_selection wrote.",
+        kind=ModelFileError,
+    )
     record = load_model(path)
     num, cure = model.splats.num_gaussians, "Load it with the model that it was made for, unchanged."
-    if len(record.mask) != num:
-        raise invalid(
-            "path",
-            expected=f"a selection of the model's {num:,} Gaussians",
-            got=f"one of {len(record.mask):,} in {str(path)!r}",
-            cure=cure,
-        )
-    if record.digest != compute_digest(model):
-        raise invalid("path", expected="a selection of this model", got=f"another's in {str(path)!r}", cure=cure)
+    require(
+        len(record.mask) == num,
+        "path",
+        expected=f"a selection of the model's {num:,} Gaussians",
+        got=f"one of {len(record.mask):,} in {str(path)!r}",
+        cure=cure,
+    )
+    require(
+        record.digest == compute_digest(model),
+        "path",
+        expected="a selection of this model",
+        got=f"another's in {str(path)!r}",
+        cure=cure,
+    )
     return Selection(np.asarray(record.mask))
 
 
 def _check_model(model: object, cure: str) -> None:
-    if not isinstance(model, VideoModel):
-        raise invalid(
-            "model",
-            expected="a VideoModel",
-            got=type(model).__name__,
-            cure=ONE_SEGMENT if isinstance(model, SegmentedVideo) else cure,
-        )
+    require(
+        isinstance(model, VideoModel),
+        "model",
+        expected="a VideoModel",
+        got=type(model).__name__,
+        cure=ONE_SEGMENT if isinstance(model, SegmentedVideo) else cure,
+    )
 
 
 _INDEX_RANGE = re.compile(r"\s*([0-9]{1,9})(?:-([0-9]{1,9}))?\s*")
@@ -109,13 +119,13 @@ def parse_indices(text: str, num_gaussians: int) -> Selection:
     """
     mask = np.zeros(num_gaussians, bool)
     for first, last in parse_ranges(text):
-        if last >= num_gaussians:
-            raise invalid(
-                "indices",
-                expected=f"Gaussians from 0 to {num_gaussians - 1:,}",
-                got=f"{last:,}",
-                cure="Is it another model's script?",
-            )
+        require(
+            last < num_gaussians,
+            "indices",
+            expected=f"Gaussians from 0 to {num_gaussians - 1:,}",
+            got=f"{last:,}",
+            cure="Is it another model's script?",
+        )
         mask[first : last + 1] = True
     return Selection(mask)
 
@@ -125,8 +135,7 @@ def parse_ranges(text: str) -> Iterator[tuple[int, int]]:
     for part in text.split(","):
         found = _INDEX_RANGE.fullmatch(part)
         first, last = (int(found[1]), int(found[2] or found[1])) if found else (0, -1)
-        if last < first:
-            raise invalid("indices", expected='numbers and ranges, as "3,17,40-52"', got=repr(part[:40]))
+        require(last >= first, "indices", expected='numbers and ranges, as "3,17,40-52"', got=repr(part[:40]))
         yield first, last
 
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from foldgauss._runtime.checks import ParameterError, check_one_of, invalid, is_integer, is_within
+from foldgauss._runtime.checks import ParameterError, check_one_of, invalid, is_integer, is_within, require
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io._atomic import PathLike, check_path
 from foldgauss.io.media.clip import AS_STORED, check_frame_size, check_reading
@@ -51,11 +51,16 @@ def save_video_model(
     The name ends in .safetensors, or has no extension. Raises ValueError for another one, `ModelFileError` for edits
     that hold code: `apply`, `apply_triangles`, a camera that is a function.
     """
-    if isinstance(model, Edit):
-        raise invalid("model", expected="a video", got="a chain of edits", cure="End it with .video().")
+    require(
+        not isinstance(model, Edit), "model", expected="a video", got="a chain of edits", cure="End it with .video()."
+    )
     check_path(path, "path, model")
-    if not isinstance(model, VideoModel | EditedVideo | SegmentedVideo):
-        raise invalid("model", expected="a VideoModel, an EditedVideo or a SegmentedVideo", got=type(model).__name__)
+    require(
+        isinstance(model, VideoModel | EditedVideo | SegmentedVideo),
+        "model",
+        expected="a VideoModel, an EditedVideo or a SegmentedVideo",
+        got=type(model).__name__,
+    )
     check_model_name(path)
     if isinstance(model, SegmentedVideo):
         return save_segmented(Path(path), model, metadata)
@@ -198,7 +203,8 @@ def _video_skeleton(header: dict) -> VideoModel:
         raise ValueError(f"envelope {header['envelope']!r} is unknown here")
     num, degree, num_frames = header["num_gaussians"], header["degree"], header["num_frames"]
     height, width = header["size"]
-    if min(num, num_frames, height, width) < 1 or degree < 0 or not float(header["fps"]) > 0:
+    counts_fit = all(is_integer(count, 1) for count in (num, num_frames, height, width)) and is_integer(degree, 0)
+    if not counts_fit or not is_within(header["fps"], "(0, inf)"):
         raise ValueError("a size, count or rate is out of range")
     compositing = header.get("compositing", "over")  # files from before there was another
     check_one_of("compositing", compositing, COMPOSITINGS)
@@ -244,13 +250,14 @@ def _describe_layer(layer: Layer) -> dict:
 def _describe_camera(camera: Camera | Callable | None) -> dict | None:
     if camera is None:
         return None
-    if not isinstance(camera, Camera):
-        raise model_file_error(
-            "camera",
-            expected="a Camera, which can be saved",
-            got="a function",
-            cure="Write the images, or save with seen_from(None) and set the camera again.",
-        )
+    require(
+        isinstance(camera, Camera),
+        "camera",
+        expected="a Camera, which can be saved",
+        got="a function",
+        cure="Write the images, or save with seen_from(None) and set the camera again.",
+        kind=ModelFileError,
+    )
     about = {"aspect": camera.aspect, "dtype": camera.position.dtype.name}
     return about if camera.lens is None else about | {"lens": True}
 

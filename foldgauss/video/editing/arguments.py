@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import ArrayLike, Float64
 
-from foldgauss._runtime.checks import invalid, short_repr
+from foldgauss._runtime.checks import invalid, require, short_repr
 
 
 def check_array(parameter: str, values: object, *shape: int | None) -> Float64[np.ndarray, "..."]:
@@ -26,8 +26,7 @@ def check_array(parameter: str, values: object, *shape: int | None) -> Float64[n
             (None, 2): "pairs, as [(0.1, 0.0), (0.2, 0.0)]",
         }
         texts |= {(length,): f"{length} finite numbers" for length in shape if length is not None}
-        expected = texts.get(shape, f"finite numbers of shape {shape}")
-        raise invalid(parameter, expected=expected, got=short_repr(values))
+        raise invalid(parameter, expected=texts.get(shape, f"finite numbers of shape {shape}"), got=short_repr(values))
     return array
 
 
@@ -43,8 +42,7 @@ def check_numbers(parameter: str, values: object, length: int | None = None) -> 
 
 def check_increasing(parameter: str, values: tuple[float, ...]) -> None:
     """Raise ValueError unless `values` increase strictly."""
-    if not all(a < b for a, b in pairwise(values)):
-        raise invalid(parameter, expected="strictly increasing numbers", got=values)
+    require(all(a < b for a, b in pairwise(values)), parameter, expected="strictly increasing numbers", got=values)
 
 
 def check_one_or_more(parameter: str, values: ArrayLike) -> tuple[float, ...]:
@@ -56,16 +54,14 @@ def check_one_or_more(parameter: str, values: ArrayLike) -> tuple[float, ...]:
 def broadcast_numbers(parameter: str, values: ArrayLike, num: int) -> tuple[float, ...]:
     """`num` numbers, from `num` numbers or from one that is repeated."""
     numbers = check_one_or_more(parameter, values)
-    if len(numbers) not in (1, num):
-        raise invalid(parameter, expected=f"one number or {num}", got=f"{len(numbers)}")
+    require(len(numbers) in (1, num), parameter, expected=f"one number or {num}", got=f"{len(numbers)}")
     return numbers if len(numbers) == num else numbers * num
 
 
 def check_color(color: ArrayLike) -> tuple[float, ...]:
     """Red, green and blue. Raises ValueError unless all are in [0, 1]."""
     rgb = check_numbers("color", color, 3)
-    if min(rgb) < 0 or max(rgb) > 1:
-        raise invalid("color", expected="red, green and blue in [0, 1]", got=rgb)
+    require(min(rgb) >= 0 and max(rgb) <= 1, "color", expected="red, green and blue in [0, 1]", got=rgb)
     return rgb
 
 
@@ -88,9 +84,12 @@ def missing_attribute(chain: object, name: str, video_type: type) -> AttributeEr
 
 def check_select_arguments(selection: object, criteria: dict[str, object]) -> None:
     """Raise ValueError for a selection together with criteria."""
-    if selection is not None and criteria:
-        got = f"{type(selection).__name__} and {', '.join(criteria)}"
-        raise invalid("selection", expected="a selection or criteria", got=got)
+    require(
+        selection is None or not criteria,
+        "selection",
+        expected="a selection or criteria",
+        got=f"{type(selection).__name__} and {', '.join(criteria)}",
+    )
 
 
 def warn_if_outside_clip(parameter: str, shift: float, stretch: float, about: float, num_frames: int) -> None:

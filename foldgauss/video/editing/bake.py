@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import expit, logit
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.video.editing.overlays import Affine, Recolor
 from foldgauss.video.models.shared_paths import PathChange, change_paths
 from foldgauss.video.models.splats import SH_C0, FoldedSplats
@@ -111,9 +111,13 @@ def mean_lightness(sums: Sequence[tuple[float, float]]) -> float:
     """
     weighted, opacity = (sum(parts) for parts in zip(*sums, strict=True))
     mean = weighted / max(opacity, np.finfo(float).tiny)
-    if mean < MIN_LIGHTNESS:
-        cure = "A black object has no shading to keep: use offset=."
-        raise invalid("color", expected="an object that is not black", got=f"mean lightness {mean:g}", cure=cure)
+    require(
+        mean >= MIN_LIGHTNESS,
+        "color",
+        expected="an object that is not black",
+        got=f"mean lightness {mean:g}",
+        cure="A black object has no shading to keep: use offset=.",
+    )
     return mean
 
 

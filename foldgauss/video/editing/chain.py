@@ -10,7 +10,15 @@ from typing import Unpack
 import numpy as np
 from jaxtyping import ArrayLike, Float, Int
 
-from foldgauss._runtime.checks import check_signature, invalid, is_integer, is_within, short_repr, warn_if_degrees
+from foldgauss._runtime.checks import (
+    check_signature,
+    invalid,
+    is_integer,
+    is_within,
+    require,
+    short_repr,
+    warn_if_degrees,
+)
 from foldgauss.render import Camera
 from foldgauss.video.editing.arguments import (
     broadcast_numbers,
@@ -157,8 +165,12 @@ class Edit:
     def _layer_numbers(self, layer: int | None) -> Sequence[int]:
         """The number of one layer, or those of all."""
         num = len(self._video.layers)
-        if layer is not None and not (is_integer(layer, 0) and layer < num):
-            raise invalid("layer", expected=f"a whole number in [0, {num - 1}]", got=layer)
+        require(
+            layer is None or (is_integer(layer, 0) and layer < num),
+            "layer",
+            expected=f"a whole number in [0, {num - 1}]",
+            got=layer,
+        )
         return range(num) if layer is None else [layer]
 
     def _resolve(self, selection: object, numbers: Sequence[int]) -> list[Mask]:
@@ -184,9 +196,13 @@ class Edit:
         `about`: the fixed point (x, y); then baked without a span. None: the selection's own center at each time.
         """
         factors = check_one_or_more("factor", factor)
-        if len(factors) not in (1, 2) or min(factors) <= 0:
-            cure = "Mirror with transform(), delete with vanish()."
-            raise invalid("factor", expected="one or two numbers > 0", got=factor, cure=cure)
+        require(
+            len(factors) in (1, 2) and min(factors) > 0,
+            "factor",
+            expected="one or two numbers > 0",
+            got=factor,
+            cure="Mirror with transform(), delete with vanish().",
+        )
         return self._map(0.0, ((factors[0], 0.0), (0.0, factors[-1])), (0.0, 0.0), self._fixed_point(about), when)
 
     def rotate(self, angle: float, *, about: ArrayLike | None = None, **when: Unpack[When]) -> "Edit":
@@ -214,8 +230,13 @@ class Edit:
         rows = check_array("matrix", matrix, 2, 2)
         # By its formula: LAPACK's elimination divides by zero where a pivot is subnormal.
         determinant = rows[0, 0] * rows[1, 1] - rows[0, 1] * rows[1, 0]
-        if not abs(determinant) > 1e-12 * np.abs(rows).max() ** 2:
-            raise invalid("matrix", expected="an invertible matrix", got=rows.tolist(), cure="See vanish().")
+        require(
+            abs(determinant) > 1e-12 * np.abs(rows).max() ** 2,
+            "matrix",
+            expected="an invertible matrix",
+            got=rows.tolist(),
+            cure="See vanish().",
+        )
         offset = self._point("offset", offset)
         return self._map(*polar_decompose(rows), offset, self._fixed_point(about), when)
 
@@ -262,12 +283,11 @@ class Edit:
         about = self._fixed_point(about)
         named = (("delays", delays), ("scale", scale), ("angle", angle))
         delays, sizes, angles = (broadcast_numbers(name, values, len(shifts)) for name, values in named)
-        if not shifts:
-            raise invalid("offsets", expected="at least one pair", got="none")
-        if min(sizes) <= 0:
-            raise invalid("scale", expected="numbers > 0", got=scale, cure="Mirror with transform().")
-        if not isinstance(originals, bool | np.bool_):
-            raise invalid("originals", expected="True or False", got=short_repr(originals))
+        require(shifts, "offsets", expected="at least one pair", got="none")
+        require(min(sizes) > 0, "scale", expected="numbers > 0", got=scale, cure="Mirror with transform().")
+        require(
+            isinstance(originals, bool | np.bool_), "originals", expected="True or False", got=short_repr(originals)
+        )
         warn_if_degrees("angle", *angles)
         for delay in delays:
             warn_if_outside_clip("delays", delay, 1.0, 0.0, len(self._frame_times))
@@ -356,11 +376,19 @@ class Edit:
         **Units:** red, green and blue about [0, 1].
         """
         linear = any(x is not None for x in (gain, offset, matrix))
-        if (color is not None) + (hue is not None) + linear != 1:
-            got = "none of them, or several"
-            raise invalid("color, hue, gain", expected="color, hue, or gain, offset and matrix", got=got)
-        if hue is not None and not is_within(hue, "[0, 1]"):
-            raise invalid("hue", expected="turns in [0, 1]", got=repr(hue), cure="Degrees over 360.")
+        require(
+            (color is not None) + (hue is not None) + linear == 1,
+            "color, hue, gain",
+            expected="color, hue, or gain, offset and matrix",
+            got="none of them, or several",
+        )
+        require(
+            hue is None or is_within(hue, "[0, 1]"),
+            "hue",
+            expected="turns in [0, 1]",
+            got=repr(hue),
+            cure="Degrees over 360.",
+        )
         if color is not None:
             rgb = check_color(color)
             self._check_selected()
@@ -431,8 +459,7 @@ class Edit:
         """Hold the selection as it is at frame `at`, or at a position between two frames."""
         times = self._frame_times
         position = check_number("at", at)
-        if not 0 <= position <= len(times) - 1:
-            raise invalid("at", expected=f"a frame in [0, {len(times) - 1}]", got=at)
+        require(0 <= position <= len(times) - 1, "at", expected=f"a frame in [0, {len(times) - 1}]", got=at)
         clock = Clock.frozen(float(np.interp(position, np.arange(len(times)), times)))
         return self._retime_by_clock(clock, when, "at")
 
@@ -465,8 +492,7 @@ class Edit:
         return self._apply_function(TriangleFunction, function, "vertices", when)
 
     def _apply_function(self, kind: type[AbstractOverlay], function: object, argument: str, when: When) -> "Edit":
-        if not callable(function):
-            raise invalid("function", expected="a function", got=type(function).__name__)
+        require(callable(function), "function", expected="a function", got=type(function).__name__)
         check_signature("function", function, argument, "t")
         function = function if self._time_map is None else self._time_map.convert_function(function)
         return self._apply(partial(kind, function=function), when)
@@ -500,8 +526,12 @@ class Edit:
         **Example:** `edit(model).seen_from(lambda t: Camera.front(0.5).orbit(0.3 * t)).video()`
         """
         if isinstance(camera, Camera):
-            if camera.position.ndim != 1:
-                raise invalid("camera", expected="one camera", got=f"positions of shape {camera.position.shape}")
+            require(
+                camera.position.ndim == 1,
+                "camera",
+                expected="one camera",
+                got=f"positions of shape {camera.position.shape}",
+            )
         elif callable(camera):
             check_signature("camera", camera, "t")
             camera = camera if self._time_map is None else self._time_map.convert_function(camera)
@@ -527,9 +557,13 @@ class Edit:
         return self._edit_layers(lambda layer, mask: apply_edit(layer, make(mask, span), bake))
 
     def _check_selected(self) -> None:
-        if not len(self.selection):
-            cure = "The selection found nothing, or vanish() removed it: call select() again."
-            raise invalid("selection", expected="at least one Gaussian", got="none", cure=cure)
+        require(
+            len(self.selection),
+            "selection",
+            expected="at least one Gaussian",
+            got="none",
+            cure="The selection found nothing, or vanish() removed it: call select() again.",
+        )
 
     def _edit_layers(self, change: Callable[[Layer, Mask], Layer]) -> "Edit":
         """Replace each layer that has selected Gaussians by `change(layer, mask)`."""
@@ -574,8 +608,11 @@ class Edit:
 
 
 def _check_clock(clock: object, has_line: bool) -> None:
-    if has_line:
-        raise invalid("clock", expected="a clock, or shift, stretch and about", got="both")
-    if not isinstance(clock, Clock):
-        cure = "Clock(times, own_times) is linear between knots." if callable(clock) else ""
-        raise invalid("clock", expected="a Clock", got=type(clock).__name__, cure=cure)
+    require(not has_line, "clock", expected="a clock, or shift, stretch and about", got="both")
+    require(
+        isinstance(clock, Clock),
+        "clock",
+        expected="a Clock",
+        got=type(clock).__name__,
+        cure="Clock(times, own_times) is linear between knots." if callable(clock) else "",
+    )

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.video.editing.arguments import check_increasing, check_number, check_numbers
 
 
@@ -29,9 +29,12 @@ class Clock:
     def __post_init__(self) -> None:
         object.__setattr__(self, "times", check_numbers("times", self.times))
         object.__setattr__(self, "own_times", check_numbers("own_times", self.own_times))
-        if not self.times or len(self.times) != len(self.own_times):
-            got = f"{len(self.times)} and {len(self.own_times)}"
-            raise invalid("times, own_times", expected="as many of each, at least 1", got=got)
+        require(
+            self.times and len(self.times) == len(self.own_times),
+            "times, own_times",
+            expected="as many of each, at least 1",
+            got=f"{len(self.times)} and {len(self.own_times)}",
+        )
         check_increasing("times", self.times)
 
     @classmethod
@@ -48,8 +51,9 @@ class Clock:
         shift, stretch, about = (
             check_number(name, x) for name, x in (("shift", shift), ("stretch", stretch), ("about", about))
         )
-        if stretch == 0:
-            raise invalid("stretch", expected="a number other than 0", got=stretch, cure="To stop time: Clock.frozen.")
+        require(
+            stretch != 0, "stretch", expected="a number other than 0", got=stretch, cure="To stop time: Clock.frozen."
+        )
         knots = sorted((about + shift + stretch * (own - about), own) for own in (0.0, 1.0))
         return cls(*zip(*knots, strict=True))
 

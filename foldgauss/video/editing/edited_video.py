@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from foldgauss._runtime.checks import invalid, is_integer
+from foldgauss._runtime.checks import invalid, is_integer, require
 from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, pixels_per_unit, project
 from foldgauss.video.editing.overlays import (
     AbstractOverlay,
@@ -41,8 +41,12 @@ class Layer(eqx.Module):
         num = getattr(self.model.splats.loc, "shape", (None,))[0]
         for edit in (*self.overlays, *self.clocks):
             shape, dtype = getattr(edit.mask, "shape", None), getattr(edit.mask, "dtype", None)
-            if shape is not None and num is not None and (shape != (num,) or dtype.kind != "b"):
-                raise invalid("mask", expected=f"bool ({num},), the layer's Gaussians", got=f"{dtype} {shape}")
+            require(
+                shape is None or num is None or (shape == (num,) and dtype.kind == "b"),
+                "mask",
+                expected=f"bool ({num},), the layer's Gaussians",
+                got=f"{dtype} {shape}",
+            )
 
     @property
     def num_gaussians(self) -> int:
@@ -76,8 +80,7 @@ class EditedVideo(FollowingVideo, eqx.Module):
     timeline: int = eqx.field(static=True, default=-1)
 
     def __check_init__(self) -> None:
-        if not self.layers:
-            raise invalid("layers", expected="at least one", got="none")
+        require(self.layers, "layers", expected="at least one", got="none")
         check_timeline(self.timeline, len(self.layers), "layers")
         _check_compatible([layer.model for layer in self.layers])
 
@@ -113,13 +116,16 @@ class EditedVideo(FollowingVideo, eqx.Module):
 def stack_layers(*videos: VideoModel | EditedVideo, timeline: int = -1) -> EditedVideo:
     """The layers of several videos as one video, the front one first: see `foldgauss.video.layers`."""
     parts = [as_edited(video) for video in videos]
-    if not parts:
-        raise invalid("videos", expected="at least one", got="none")
+    require(parts, "videos", expected="at least one", got="none")
     check_timeline(timeline, len(parts), "videos")
     for part in parts:
-        if part.camera is not None:
-            cure = "Stack the layers first, then call edit(...).seen_from(camera)."
-            raise invalid("videos", expected="videos without a camera", got="one with its own", cure=cure)
+        require(
+            part.camera is None,
+            "videos",
+            expected="videos without a camera",
+            got="one with its own",
+            cure="Stack the layers first, then call edit(...).seen_from(camera).",
+        )
     timeline %= len(parts)
     before = sum(len(part.layers) for part in parts[:timeline])
     inner = parts[timeline].timeline % len(parts[timeline].layers)
@@ -141,15 +147,20 @@ def as_edited(video: VideoModel | EditedVideo) -> EditedVideo:
             "SegmentedVideo": ONE_SEGMENT,
             "StabilizedVideo": "Edit first, and stabilize the edited video.",
         }
-        got, cure = type(video).__name__, cures.get(kind, "")
-        raise invalid("video", expected="a VideoModel or an EditedVideo", got=got, cure=cure)
+        raise invalid(
+            "video", expected="a VideoModel or an EditedVideo", got=type(video).__name__, cure=cures.get(kind, "")
+        )
     return EditedVideo((Layer(video),), timeline=0)
 
 
 def check_timeline(timeline: object, num: int, items: str) -> None:
     """Raise ValueError unless it is an index into `num` items; below 0 it counts from the end."""
-    if not (is_integer(timeline, -num) and timeline < num):
-        raise invalid("timeline", expected=f"the number of one of {num} {items}", got=timeline)
+    require(
+        is_integer(timeline, -num) and timeline < num,
+        "timeline",
+        expected=f"the number of one of {num} {items}",
+        got=timeline,
+    )
 
 
 def _check_compatible(models: list[VideoModel]) -> None:
@@ -157,15 +168,22 @@ def _check_compatible(models: list[VideoModel]) -> None:
     for other in models[1:]:
         (height, width), (other_height, other_width) = first.size, other.size
         # Frames of one aspect ratio at two sizes differ by the rounding of a side.
-        if abs(height * other_width - width * other_height) > max(width, other_width, height, other_height):
-            expected = f"frames of one aspect ratio, {height}x{width} (height x width)"
-            cure = "Fit the layers from clips cropped to the same aspect."
-            raise invalid("layers", expected=expected, got=f"{other_height}x{other_width}", cure=cure)
+        require(
+            abs(height * other_width - width * other_height) <= max(width, other_width, height, other_height),
+            "layers",
+            expected=f"frames of one aspect ratio, {height}x{width} (height x width)",
+            got=f"{other_height}x{other_width}",
+            cure="Fit the layers from clips cropped to the same aspect.",
+        )
         for name in ("compositing", "options"):
             one, two = getattr(first, name), getattr(other, name)
-            if one != two:
-                cure = "All layers are composited together: fit them alike."
-                raise invalid("layers", expected=f"one {name} for all, {one!r}", got=repr(two), cure=cure)
+            require(
+                one == two,
+                "layers",
+                expected=f"one {name} for all, {one!r}",
+                got=repr(two),
+                cure="All layers are composited together: fit them alike.",
+            )
 
 
 class PreparedEditedVideo:
@@ -203,8 +221,7 @@ class PreparedEditedVideo:
         if camera is None or isinstance(camera, Camera):
             return self._front() if camera is None else camera
         camera_at_t = camera(t)
-        if not isinstance(camera_at_t, Camera):
-            raise invalid("camera(t)", expected="a Camera", got=type(camera_at_t).__name__)
+        require(isinstance(camera_at_t, Camera), "camera(t)", expected="a Camera", got=type(camera_at_t).__name__)
         return camera_at_t
 
 

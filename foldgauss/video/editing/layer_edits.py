@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Int
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.video.editing.edited_video import Layer
 from foldgauss.video.editing.overlays import (
     IDENTITY,
@@ -80,9 +80,13 @@ def _may_bake(layer: Layer, edit: TimedEdit) -> bool:
 def _check_retimes_whole_edits(layer: Layer, mask: Mask) -> None:
     """Raise ValueError if a clock is for a part of the Gaussians of an edit that depends on all of them."""
     for overlay in layer.overlays:
-        if _depends_on_all(overlay) and _overlaps_partly(overlay, mask):
-            expected = "all Gaussians of an edit about their own center, or none of them"
-            raise invalid("selection", expected=expected, got="a part of them", cure="Retime it before that edit.")
+        require(
+            not _depends_on_all(overlay) or not _overlaps_partly(overlay, mask),
+            "selection",
+            expected="all Gaussians of an edit about their own center, or none of them",
+            got="a part of them",
+            cure="Retime it before that edit.",
+        )
 
 
 def _depends_on_all(overlay: AbstractOverlay) -> bool:

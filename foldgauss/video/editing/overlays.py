@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Bool, Float, Int
 
-from foldgauss._runtime.checks import check_one_of, invalid
+from foldgauss._runtime.checks import check_one_of, invalid, require
 from foldgauss.render import Gaussians3D, Triangles
 from foldgauss.video.editing.arguments import check_array, check_number, check_numbers
 from foldgauss.video.editing.clock import Clock
@@ -130,10 +130,14 @@ class Affine(AbstractOverlay):
         if self.about is not None:
             check_numbers("about", self.about, 2)
         (first, shear), (other, second) = self.stretch
-        if shear != other:
-            raise invalid("stretch", expected="a symmetric matrix", got=self.stretch)
-        if first * second - shear**2 == 0:
-            raise invalid("stretch", expected="an invertible matrix", got=self.stretch, cure="See vanish().")
+        require(shear == other, "stretch", expected="a symmetric matrix", got=self.stretch)
+        require(
+            first * second - shear**2 != 0,
+            "stretch",
+            expected="an invertible matrix",
+            got=self.stretch,
+            cure="See vanish().",
+        )
 
     @property
     def is_translation(self) -> bool:
@@ -187,8 +191,9 @@ class Opacity(AbstractOverlay):
 
     def __check_init__(self) -> None:
         for name in ("factor", "before"):
-            if check_number(name, getattr(self, name)) < 0:
-                raise invalid(name, expected="a number >= 0", got=getattr(self, name))
+            require(
+                check_number(name, getattr(self, name)) >= 0, name, expected="a number >= 0", got=getattr(self, name)
+            )
 
     def __call__(self, gaussians, t, progress):
         by = self.before + progress * (self.factor - self.before)
@@ -332,11 +337,18 @@ def _from_triangles(vertices: Float[Array, "num 3 3"]) -> tuple[Float[Array, "nu
 
 def _check_vertices(vertices: object, shape: tuple[int, ...]) -> Float[np.ndarray, "num 3 3"]:
     array = np.asarray(vertices)
-    if array.shape != shape or array.dtype.kind not in "fiu":
-        raise invalid("vertices", expected=f"numbers of shape {shape}", got=f"{array.dtype} {array.shape}")
-    if not np.isfinite(array).all():
-        got = f"NaN or infinity in {int((~np.isfinite(array)).any((1, 2)).sum())} triangles"
-        raise invalid("vertices", expected="finite numbers", got=got)
+    require(
+        array.shape == shape and array.dtype.kind in "fiu",
+        "vertices",
+        expected=f"numbers of shape {shape}",
+        got=f"{array.dtype} {array.shape}",
+    )
+    require(
+        np.isfinite(array).all(),
+        "vertices",
+        expected="finite numbers",
+        got=f"NaN or infinity in {int((~np.isfinite(array)).any((1, 2)).sum())} triangles",
+    )
     return array
 
 
@@ -344,30 +356,47 @@ def _check_areas(factor: Float[np.ndarray, "num 3 2"]) -> None:
     collinear = np.flatnonzero(~np.isfinite(factor).all((1, 2)))
     if collinear.size:
         got = f"{collinear.size} without area, the first at index {collinear[0]}"
-        cure = "Move a vertex off the line through the other two."
-        raise invalid("vertices", expected="triangles whose three vertices span a plane", got=got, cure=cure)
+        raise invalid(
+            "vertices",
+            expected="triangles whose three vertices span a plane",
+            got=got,
+            cure="Move a vertex off the line through the other two.",
+        )
 
 
 def _check_result(before: SelectedGaussians, after: object) -> SelectedGaussians:
-    if not isinstance(after, SelectedGaussians):
-        cure = "Return dataclasses.replace(gaussians, ...)."
-        raise invalid("function", expected="SelectedGaussians back", got=type(after).__name__, cure=cure)
-    if after.index is not before.index and not np.array_equal(after.index, before.index):
-        cure = "Set opacities to 0 to hide some."
-        raise invalid("function", expected="the same Gaussians", got="other indices", cure=cure)
+    require(
+        isinstance(after, SelectedGaussians),
+        "function",
+        expected="SelectedGaussians back",
+        got=type(after).__name__,
+        cure="Return dataclasses.replace(gaussians, ...).",
+    )
+    require(
+        after.index is before.index or np.array_equal(after.index, before.index),
+        "function",
+        expected="the same Gaussians",
+        got="other indices",
+        cure="Set opacities to 0 to hide some.",
+    )
     num, dim = len(before), np.shape(after.mean)[-1] if np.ndim(after.mean) else 0
     shapes = {"mean": (num, dim), "factor": (num, dim, 2), "opacity": (num,), "color": (num, 3)}
     for name, shape in shapes.items():
         leaf = np.asarray(getattr(after, name))
-        if leaf.shape != shape or dim not in (2, 3) or leaf.dtype.kind not in "fiu" or not np.isfinite(leaf).all():
-            expected, got = f"finite numbers of shape {shape}, dim 2 or 3", f"{leaf.dtype} {leaf.shape}"
-            raise invalid(f"function's {name}", expected=expected, got=got)
-    if (
-        np.min(after.opacity, initial=0) < 0
-        or np.max(after.opacity, initial=0) > 1
-        or np.min(after.color, initial=0) < 0
-    ):
-        raise invalid("function", expected="opacity in [0, 1] and color >= 0", got="numbers outside of that")
+        require(
+            leaf.shape == shape and dim in (2, 3) and leaf.dtype.kind in "fiu" and np.isfinite(leaf).all(),
+            f"function's {name}",
+            expected=f"finite numbers of shape {shape}, dim 2 or 3",
+            got=f"{leaf.dtype} {leaf.shape}",
+        )
+    require(
+        np.min(after.opacity, initial=0) >= 0
+        and np.max(after.opacity, initial=0) <= 1
+        and np.min(after.color, initial=0) >= 0,
+        "function",
+        expected="opacity in [0, 1] and color >= 0",
+        got="numbers outside of that",
+    )
     return after
 
 
@@ -411,9 +440,13 @@ KINDS: dict[str, type[TimedEdit]] = {
 def describe_overlay(overlay: TimedEdit) -> dict:
     """An overlay without its mask as JSON values. Raises ValueError for functions, which cannot be saved."""
     names = {kind: name for name, kind in KINDS.items()}
-    if type(overlay) not in names:
-        cure = "Save the video without it and apply the function again after loading; or write a video file."
-        raise invalid("overlays", expected="edits that can be saved", got=type(overlay).__name__, cure=cure)
+    require(
+        type(overlay) in names,
+        "overlays",
+        expected="edits that can be saved",
+        got=type(overlay).__name__,
+        cure="Save the video without it and apply the function again after loading; or write a video file.",
+    )
     fields = {name: getattr(overlay, name) for name in _field_names(type(overlay))}
     fields = {name: dataclasses.asdict(x) if isinstance(x, Span | Clock) else x for name, x in fields.items()}
     return {"kind": names[type(overlay)], **fields}

@@ -9,7 +9,7 @@ from typing import TypedDict
 import numpy as np
 from jaxtyping import Float
 
-from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within, short_repr
+from foldgauss._runtime.checks import check_one_of, is_integer, is_within, require, short_repr
 from foldgauss.video.editing.arguments import check_increasing, check_number, check_numbers
 
 CURVES = ("linear", "smooth")
@@ -50,12 +50,20 @@ class Span:
             value = getattr(self, name)
             if value is not None:
                 object.__setattr__(self, name, check_number(name, value))
-        if not self._first < self._last:
-            raise invalid("start, stop", expected="a start before the stop", got=f"{self.start}, {self.stop}")
+        require(
+            self._first < self._last,
+            "start, stop",
+            expected="a start before the stop",
+            got=f"{self.start}, {self.stop}",
+        )
         object.__setattr__(self, "times", check_numbers("times", self.times))
         object.__setattr__(self, "values", check_numbers("values", self.values))
-        if len(self.times) != len(self.values) or not all(is_within(value, "[0, 1]") for value in self.values):
-            raise invalid("values", expected=f"{len(self.times)} numbers in [0, 1]", got=self.values)
+        require(
+            len(self.times) == len(self.values) and all(is_within(value, "[0, 1]") for value in self.values),
+            "values",
+            expected=f"{len(self.times)} numbers in [0, 1]",
+            got=self.values,
+        )
         check_increasing("times", self.times)
 
     @property
@@ -107,19 +115,23 @@ def make_span(
     knots = np.asarray(frame_times, np.float64)
     num_given = sum(x is not None for x in (frame, frames, times))
     check_one_of("curve", curve, CURVES)
-    if num_given > 1:
-        raise invalid("frame, frames, times", expected="one of them at most", got=f"{num_given} of them")
+    require(num_given <= 1, "frame, frames, times", expected="one of them at most", got=f"{num_given} of them")
     lengths = _check_ease(ease)
     if not num_given:
-        if lengths != (0, 0):
-            raise invalid("ease", expected="a span to ease into", got=ease, cure="Give frame=, frames= or times=.")
+        require(
+            lengths == (0, 0), "ease", expected="a span to ease into", got=ease, cure="Give frame=, frames= or times=."
+        )
         return None
     begin, end = _span_positions(knots, frame, frames, times)
     rise, fall = (length if math.isfinite(x) else 0.0 for length, x in zip(lengths, (begin, end), strict=True))
     first, last = max(begin, 0.0), min(end, len(knots) - 1.0)
-    if rise + fall > last - first:
-        expected = f"no more than the span's {last - first:g} frames, in and out together"
-        raise invalid("ease", expected=expected, got=f"{rise:g} and {fall:g}", cure="Make the span longer.")
+    require(
+        rise + fall <= last - first,
+        "ease",
+        expected=f"no more than the span's {last - first:g} frames, in and out together",
+        got=f"{rise:g} and {fall:g}",
+        cure="Make the span longer.",
+    )
     number = np.arange(len(knots))
     start, stop = (float(np.interp(x, number, knots)) if math.isfinite(x) else None for x in (begin, end))
     if not rise and not fall:
@@ -140,19 +152,26 @@ def _span_positions(knots: np.ndarray, frame, frames, times) -> tuple[float, flo
     last = len(knots) - 1
     if times is not None:
         first, stop = _check_pair("times", times)
-        if not (is_within(first, "[0, 1]") and is_within(stop, "[0, 1]") and first < stop):
-            raise invalid("times", expected="(start, stop), rising, in [0, 1]", got=times)
+        require(
+            is_within(first, "[0, 1]") and is_within(stop, "[0, 1]") and first < stop,
+            "times",
+            expected="(start, stop), rising, in [0, 1]",
+            got=times,
+        )
         begin, end = (float(np.interp(t, knots, np.arange(last + 1))) for t in (first, stop))
         return -math.inf if begin <= 0 else begin, math.inf if end >= last else end
     if frame is not None:
-        if not (is_integer(frame, 0) and frame <= last):
-            raise invalid("frame", expected=f"a whole number in [0, {last}]", got=frame)
+        require(is_integer(frame, 0) and frame <= last, "frame", expected=f"a whole number in [0, {last}]", got=frame)
         frames = (frame, frame + 1)
     first, stop = _check_pair("frames", frames)
     first, stop = 0 if first is None else first, last + 1 if stop is None else stop
-    if not (is_integer(first, 0) and is_integer(stop, 1) and first < stop <= last + 1):
-        expected = f"(first, stop), whole, 0 <= first < stop <= {last + 1}"
-        raise invalid("frames", expected=expected, got=frames, cure="None is the clip's own end.")
+    require(
+        is_integer(first, 0) and is_integer(stop, 1) and first < stop <= last + 1,
+        "frames",
+        expected=f"(first, stop), whole, 0 <= first < stop <= {last + 1}",
+        got=frames,
+        cure="None is the clip's own end.",
+    )
     return -math.inf if first == 0 else first - 0.5, math.inf if stop == last + 1 else stop - 0.5
 
 
@@ -166,14 +185,22 @@ def distinct_knots(
 
 def _check_ease(ease: object) -> tuple[float, float]:
     pair = ease if isinstance(ease, (tuple, list)) else (ease, ease)
-    if len(pair) != 2 or not all(isinstance(x, Real) and x >= 0 and math.isfinite(x) for x in pair):
-        raise invalid("ease", expected="a number of frames >= 0, or two of them", got=repr(ease))
+    require(
+        len(pair) == 2 and all(isinstance(x, Real) and x >= 0 and math.isfinite(x) for x in pair),
+        "ease",
+        expected="a number of frames >= 0, or two of them",
+        got=repr(ease),
+    )
     return float(pair[0]), float(pair[1])
 
 
 def _check_pair(parameter: str, value: object) -> Sequence:
     value = value.tolist() if isinstance(value, np.ndarray) else value
-    if not isinstance(value, (tuple, list)) or len(value) != 2:
-        cure = "For one frame give frame=k." if parameter == "frames" else ""
-        raise invalid(parameter, expected="two of them, (start, stop)", got=short_repr(value), cure=cure)
+    require(
+        isinstance(value, (tuple, list)) and len(value) == 2,
+        parameter,
+        expected="two of them, (start, stop)",
+        got=short_repr(value),
+        cure="For one frame give frame=k." if parameter == "frames" else "",
+    )
     return value

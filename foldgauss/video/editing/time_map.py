@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.video.editing.clock import Clock
 from foldgauss.video.editing.span import NEVER, Span, distinct_knots
 
@@ -92,11 +92,13 @@ class TimeMap:
             shown = clock(t)
             early = shown < first - _FRAME_TOLERANCE / steps and first > 0
             late = shown > last + _FRAME_TOLERANCE / steps and last < 1
-            if early or late:
-                expected = f"times of the segment that shows the object, frames {first * steps:g} to {last * steps:g}"
-                cure = "Give frames= that keep it within one segment, or select what only one segment shows."
-                got = f"frame {shown * steps:.6g} for frame {t * steps:.6g}, which is in another segment"
-                raise invalid(parameter, expected=expected, got=got, cure=cure)
+            require(
+                not early and not late,
+                parameter,
+                expected=f"times of the segment that shows the object, frames {first * steps:g} to {last * steps:g}",
+                got=f"frame {shown * steps:.6g} for frame {t * steps:.6g}, which is in another segment",
+                cure="Give frames= that keep it within one segment, or select what only one segment shows.",
+            )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ import numba as nb
 import numpy as np
 from jaxtyping import Bool, Float, Float16, Float32, Int, UInt8
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.video.motion.optical_flow import both_flows, match_points
@@ -114,9 +114,12 @@ def resize_frames(frames: Frames) -> UInt8[np.ndarray, "frames rows columns 3"]:
 def check_frames(frames: np.ndarray) -> None:
     """Raise ValueError unless these are three color frames at least."""
     shape, dtype = np.shape(frames), getattr(frames, "dtype", None)
-    if len(shape) != 4 or shape[0] < 3 or shape[-1] != 3 or 0 in shape or dtype != np.uint8:
-        got = f"{type(frames).__name__ if dtype is None else dtype} {shape}"
-        raise invalid("frames", expected="uint8 (num_frames, height, width, 3) of 3 frames at least", got=got)
+    require(
+        len(shape) == 4 and shape[0] >= 3 and shape[-1] == 3 and 0 not in shape and dtype == np.uint8,
+        "frames",
+        expected="uint8 (num_frames, height, width, 3) of 3 frames at least",
+        got=f"{type(frames).__name__ if dtype is None else dtype} {shape}",
+    )
 
 
 def fill_background(frames: Frames, masks: Masks, *, alignment: Alignment | None = None) -> Frames:
@@ -132,9 +135,12 @@ def fill_background(frames: Frames, masks: Masks, *, alignment: Alignment | None
     """
     check_frames(frames)
     masks = np.asarray(masks)
-    if masks.shape != frames.shape[:3] or masks.dtype != bool:
-        expected = f"bool {frames.shape[:3]}"
-        raise invalid("masks", expected=expected, got=f"{masks.dtype} {masks.shape}")
+    require(
+        masks.shape == frames.shape[:3] and masks.dtype == bool,
+        "masks",
+        expected=f"bool {frames.shape[:3]}",
+        got=f"{masks.dtype} {masks.shape}",
+    )
     alignment = Alignment.from_frames(frames) if alignment is None else alignment
     side = max(frames.shape[1:3])
     margin, edge = 2 * round(MARGIN * side) + 1, max(SOFT_EDGE * side, 0.5)

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float, UInt8
 
-from foldgauss._runtime.checks import invalid, is_within
+from foldgauss._runtime.checks import is_within, require
 from foldgauss.video.models.frame_times import is_cut
 from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer
 from foldgauss.video.motion.optical_flow import both_flows, match_points
@@ -77,8 +77,7 @@ class CameraPath:
         zooms at constant speed is left as it is. Raises ValueError unless `frames` > 0.
         Source: Liu et al. 2013, Bundled Camera Paths, without their mesh.
         """
-        if not is_within(frames, "(0, inf)"):
-            raise invalid("frames", expected="a number > 0", got=frames)
+        require(is_within(frames, "(0, inf)"), "frames", expected="a number > 0", got=frames)
         reach = int(np.ceil(REACH * frames))
         weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / frames) ** 2)
         weights /= weights.sum()

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
-from foldgauss._runtime.checks import invalid, is_within, short_repr
+from foldgauss._runtime.checks import is_within, require, short_repr
 from foldgauss.render import Splats2D, pixels_per_unit
 from foldgauss.video.models.rendered_video import FollowingVideo
 from foldgauss.video.models.renderer import RenderableVideo
@@ -57,29 +57,44 @@ def stabilize(
     number of frames, a path that a crop by `MAX_ZOOM` does not suffice for, and a filled border with compositing "sum".
     Example: `stabilize(model, border="fill").render(frame=10)`.
     """
-    if not hasattr(video, "prepare"):
-        cure = "Load one by foldgauss.io.load_video_model(path)."
-        raise invalid("video", expected="a model or another video of it", got=type(video).__name__, cure=cure)
-    if not is_within(smoothing, "(0, inf)"):
-        raise invalid("smoothing", expected="seconds > 0", got=short_repr(smoothing))
-    if not fixed and smoothing * video.fps > MAX_SMOOTHING:
-        expected = f"at most {MAX_SMOOTHING / video.fps:g} seconds ({MAX_SMOOTHING:,} frames)"
-        raise invalid("smoothing", expected=expected, got=short_repr(smoothing), cure="For a still camera: fixed.")
-    if border not in BORDERS:
-        raise invalid("border", expected=f"one of {BORDERS}", got=short_repr(border))
-    if border == "fill" and video.compositing == "sum":
-        cure = "Choose crop or keep: sums of several frames have no order in depth."
-        raise invalid("border", expected='"crop" or "keep" with compositing "sum"', got=border, cure=cure)
+    require(
+        hasattr(video, "prepare"),
+        "video",
+        expected="a model or another video of it",
+        got=type(video).__name__,
+        cure="Load one by foldgauss.io.load_video_model(path).",
+    )
+    require(is_within(smoothing, "(0, inf)"), "smoothing", expected="seconds > 0", got=short_repr(smoothing))
+    require(
+        fixed or smoothing * video.fps <= MAX_SMOOTHING,
+        "smoothing",
+        expected=f"at most {MAX_SMOOTHING / video.fps:g} seconds ({MAX_SMOOTHING:,} frames)",
+        got=short_repr(smoothing),
+        cure="For a still camera: fixed.",
+    )
+    require(border in BORDERS, "border", expected=f"one of {BORDERS}", got=short_repr(border))
+    require(
+        border != "fill" or video.compositing != "sum",
+        "border",
+        expected='"crop" or "keep" with compositing "sum"',
+        got=border,
+        cure="Choose crop or keep: sums of several frames have no order in depth.",
+    )
     path = estimate_camera_path(video, on_frame=on_frame) if path is None else path
-    if path.num_frames != video.num_frames:
-        raise invalid("path", expected=f"that of {video.num_frames} frames", got=path.num_frames)
+    require(
+        path.num_frames == video.num_frames, "path", expected=f"that of {video.num_frames} frames", got=path.num_frames
+    )
     maps = path.held() if fixed else path.smoothed(smoothing * video.fps)
     zoom = 1.0
     if border == "crop":
         zoom = _find_zoom(maps, video.size)
-        if zoom > MAX_ZOOM:
-            cure = "Fill or keep the borders" + ("." if fixed else ", or smooth less.")
-            raise invalid("border", expected=f"a path that a zoom of {MAX_ZOOM:g} suffices for", got="crop", cure=cure)
+        require(
+            zoom <= MAX_ZOOM,
+            "border",
+            expected=f"a path that a zoom of {MAX_ZOOM:g} suffices for",
+            got="crop",
+            cure="Fill or keep the borders" + ("." if fixed else ", or smooth less."),
+        )
     return StabilizedVideo(video, np.diag([zoom, zoom, 1.0]) @ maps, path, border)
 
 

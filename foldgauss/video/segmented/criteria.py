@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.video.editing.chain import Edit
 from foldgauss.video.editing.time_map import frame_times_of
 from foldgauss.video.models.video_model import VideoModel
@@ -215,9 +215,12 @@ class _RegionCriterion:
     def _propagate(self, one: Edit, number: int) -> Selection:
         """In a segment with none of the frames named: by the masks that its neighbors show."""
         first, by_layer = self._segments[number].first, self._masks[number]
-        if len(by_layer) != len(one._video.layers):
-            expected = f"{len(by_layer)} layers, as its neighbor has"
-            raise invalid(f"segments[{number}]", expected=expected, got=len(one._video.layers))
+        require(
+            len(by_layer) == len(one._video.layers),
+            f"segments[{number}]",
+            expected=f"{len(by_layer)} layers, as its neighbor has",
+            got=len(one._video.layers),
+        )
         threshold = self._arguments.get("threshold", THRESHOLD)
 
         def select(model: VideoModel, layer: int) -> Selection:

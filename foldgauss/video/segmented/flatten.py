@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import invalid, require
 from foldgauss.video.editing.edited_video import EditedVideo, Layer
 from foldgauss.video.models.shared_paths import join_paths
 from foldgauss.video.models.splats import FoldedSplats
@@ -28,11 +28,16 @@ def flatten_video(video: VideoModel | EditedVideo | SegmentedVideo) -> VideoMode
     if isinstance(video, VideoModel):
         return video
     if isinstance(video, SegmentedVideo):
-        got = f"one in {len(video.segments)} segments"
-        raise invalid("model", expected="a model without segments", got=got, cure=ONE_SEGMENT)
-    if video.camera is not None or any(layer.overlays or layer.clocks for layer in video.layers):
-        got = "one with edits that no folded model represents"
-        raise invalid("model", expected="a plain model, or edits that could be baked", got=got, cure=_CURE)
+        raise invalid(
+            "model", expected="a model without segments", got=f"one in {len(video.segments)} segments", cure=ONE_SEGMENT
+        )
+    require(
+        video.camera is None and not any(layer.overlays or layer.clocks for layer in video.layers),
+        "model",
+        expected="a plain model, or edits that could be baked",
+        got="one with edits that no folded model represents",
+        cure=_CURE,
+    )
     lead = video.layers[video.timeline].model
     _check_alike(video.layers, lead)
     if len(video.layers) == 1:
@@ -44,12 +49,27 @@ def _check_alike(layers: tuple[Layer, ...], lead: VideoModel) -> None:
     for layer in layers:
         model = layer.model
         own, other = (jax.tree.map(_unique_values, one.splats.envelope) for one in (model, lead))
-        if own != other or (len(layers) > 1 and any(len(values) > 1 for values in (own.power, own.floor))):
-            raise invalid("model", expected="layers with one envelope", got="several", cure=_CURE)
-        if model.scale_cutoff != lead.scale_cutoff:
-            raise invalid("model", expected="layers with one scale_cutoff", got="several", cure=_CURE)
-        if model is not lead and layer.holds_frames:
-            raise invalid("model", expected="layers without cuts", got="one that has its own", cure=_CURE)
+        require(
+            own == other and (len(layers) <= 1 or not any(len(values) > 1 for values in (own.power, own.floor))),
+            "model",
+            expected="layers with one envelope",
+            got="several",
+            cure=_CURE,
+        )
+        require(
+            model.scale_cutoff == lead.scale_cutoff,
+            "model",
+            expected="layers with one scale_cutoff",
+            got="several",
+            cure=_CURE,
+        )
+        require(
+            model is lead or not layer.holds_frames,
+            "model",
+            expected="layers without cuts",
+            got="one that has its own",
+            cure=_CURE,
+        )
 
 
 def _unique_values(leaf) -> tuple[float, ...]:

@@ -5,7 +5,7 @@ import functools
 
 import numpy as np
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import invalid, require
 from foldgauss.video.editing.clock import Clock
 from foldgauss.video.editing.edited_video import EditedVideo, Layer, as_edited, check_timeline, stack_layers
 from foldgauss.video.editing.layer_edits import gather_layer
@@ -43,16 +43,22 @@ def layers(*videos: Video, timeline: int = -1) -> EditedVideo | SegmentedVideo:
     check_timeline(timeline, len(videos), "videos")
     timeline %= len(videos)
     lead = videos[timeline]
-    if not isinstance(lead, SegmentedVideo):
-        cure = "Give its number as timeline=."
-        got = f"a {type(lead).__name__} beside one in segments"
-        raise invalid("timeline", expected="the number of the video in segments", got=got, cure=cure)
+    require(
+        isinstance(lead, SegmentedVideo),
+        "timeline",
+        expected="the number of the video in segments",
+        got=f"a {type(lead).__name__} beside one in segments",
+        cure="Give its number as timeline=.",
+    )
     for number, video in enumerate(videos):
         if not isinstance(video, SegmentedVideo):
             as_edited(video)
         elif _bounds(video) != _bounds(lead):
-            expected = f"the segments of video {timeline}, {_format_bounds(lead)}"
-            raise invalid("videos", expected=expected, got=f"{_format_bounds(video)} in video {number}")
+            raise invalid(
+                "videos",
+                expected=f"the segments of video {timeline}, {_format_bounds(lead)}",
+                got=f"{_format_bounds(video)} in video {number}",
+            )
 
     @functools.lru_cache(maxsize=MAX_PREPARED)
     def load(number: int) -> EditedVideo:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from foldgauss._runtime.checks import invalid, is_integer, short_repr
+from foldgauss._runtime.checks import invalid, is_integer, require, short_repr
 from foldgauss.render import RenderOptions, Splats2D
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.frame_times import check_frame_before, times_at
@@ -49,10 +49,13 @@ class Segment:
     @classmethod
     def from_model(cls, first: int, model: VideoModel | EditedVideo) -> "Segment":
         """A segment of a model in memory, from frame `first` of the clip on. Raises ValueError for other types."""
-        if not isinstance(model, VideoModel | EditedVideo):
-            cure = "End a chain of edits with .video()." if type(model).__name__ == "Edit" else ""
-            got = type(model).__name__
-            raise invalid("model", expected="a VideoModel or an EditedVideo", got=got, cure=cure)
+        require(
+            isinstance(model, VideoModel | EditedVideo),
+            "model",
+            expected="a VideoModel or an EditedVideo",
+            got=type(model).__name__,
+            cure="End a chain of edits with .video()." if type(model).__name__ == "Edit" else "",
+        )
         properties = {field.name: getattr(model, field.name) for field in dataclasses.fields(cls)[1:9]}
         return cls(first, **properties, load=lambda: model)
 
@@ -194,8 +197,12 @@ class SegmentedVideo(RenderedVideo):
 
         Raises ValueError for a position outside the clip.
         """
-        if not 0 <= position <= self.num_frames - 1:
-            raise invalid("position", expected=f"a frame position in [0, {self.num_frames - 1}]", got=position)
+        require(
+            0 <= position <= self.num_frames - 1,
+            "position",
+            expected=f"a frame position in [0, {self.num_frames - 1}]",
+            got=position,
+        )
         number = bisect.bisect_left(self.segments, position + 1, key=lambda segment: segment.first) - 1
         position, visible, left = float(position), [], 1.0
         while left > 0:  # from the last segment to earlier ones
@@ -250,24 +257,33 @@ class PreparedSegmentedVideo:
 
 def _check_segments(segments: tuple[Segment, ...]) -> None:
     """Raise unless they cover a clip in their order, at most two at a frame, and are rendered alike."""
-    if not segments:
-        raise invalid("segments", expected="at least one", got="none")
+    require(segments, "segments", expected="at least one", got="none")
     first_low, first_high, last_stop = 0, 0, 0  # of the next segment
     for number, segment in enumerate(segments):
         name = f"segments[{number}]"
-        if not isinstance(segment, Segment):
-            cure = "From models: SegmentedVideo.from_models([(first, model), ...])."
-            raise invalid(name, expected="a Segment", got=short_repr(segment), cure=cure)
-        if not (is_integer(segment.first, first_low) and segment.first <= first_high and segment.stop > last_stop):
-            expected = f"one that begins at frame {first_low} to {first_high} of the clip and ends after {last_stop}"
-            got = f"{short_repr(segment.first)}, and {segment.num_frames} frames"
-            cure = "Segments begin at frame 0, leave no gap, and at most two share a frame."
-            raise invalid(f"{name}.first", expected=expected, got=got, cure=cure)
+        require(
+            isinstance(segment, Segment),
+            name,
+            expected="a Segment",
+            got=short_repr(segment),
+            cure="From models: SegmentedVideo.from_models([(first, model), ...]).",
+        )
+        require(
+            is_integer(segment.first, first_low) and segment.first <= first_high and segment.stop > last_stop,
+            f"{name}.first",
+            expected=f"one that begins at frame {first_low} to {first_high} of the clip and ends after {last_stop}",
+            got=f"{short_repr(segment.first)}, and {segment.num_frames} frames",
+            cure="Segments begin at frame 0, leave no gap, and at most two share a frame.",
+        )
         for prop in ("size", "fps", "compositing", "options"):
             one, two = getattr(segments[0], prop), getattr(segment, prop)
-            if one != two:
-                expected, cure = f"{one!r}, as in the first segment", "They are rendered as one video: fit them alike."
-                raise invalid(f"{name}.{prop}", expected=expected, got=repr(two), cure=cure)
+            require(
+                one == two,
+                f"{name}.{prop}",
+                expected=f"{one!r}, as in the first segment",
+                got=repr(two),
+                cure="They are rendered as one video: fit them alike.",
+            )
         first_low, first_high, last_stop = max(segment.first + 1, last_stop), segment.stop, segment.stop
 
 
@@ -284,17 +300,22 @@ def plan_segments(num_frames: int, cuts: Sequence[int], *, length: int, overlap:
     **Raises:** ValueError for no frames, a length below 2, cuts outside the clip, and an overlap outside 1 to half of
     the length.
     """
-    if not is_integer(num_frames, 1):
-        raise invalid("num_frames", expected="a whole number >= 1", got=short_repr(num_frames))
-    if not is_integer(length, 2):
-        raise invalid("length", expected="a whole number of frames >= 2", got=short_repr(length))
-    if not (is_integer(overlap, 1) and 2 * overlap <= length):
-        expected = f"a whole number of frames from 1 to {length // 2}, half of the length"
-        raise invalid("overlap", expected=expected, got=short_repr(overlap))
+    require(is_integer(num_frames, 1), "num_frames", expected="a whole number >= 1", got=short_repr(num_frames))
+    require(is_integer(length, 2), "length", expected="a whole number of frames >= 2", got=short_repr(length))
+    require(
+        is_integer(overlap, 1) and 2 * overlap <= length,
+        "overlap",
+        expected=f"a whole number of frames from 1 to {length // 2}, half of the length",
+        got=short_repr(overlap),
+    )
     for cut in cuts:
-        if not (is_integer(cut, 1) and cut < num_frames):
-            expected = f"first frames of shots, from 1 to {num_frames - 1}"
-            raise invalid("cuts", expected=expected, got=short_repr(cut), cure="Count from the clip's first frame.")
+        require(
+            is_integer(cut, 1) and cut < num_frames,
+            "cuts",
+            expected=f"first frames of shots, from 1 to {num_frames - 1}",
+            got=short_repr(cut),
+            cure="Count from the clip's first frame.",
+        )
     num_frames, length, overlap = int(num_frames), int(length), int(overlap)
     ordered, spans, first = sorted(map(int, cuts)), [], 0
     while (left := num_frames - first) > length:

@@ -10,7 +10,7 @@ import numpy as np
 import skimage
 from jaxtyping import ArrayLike, Bool, Float, Float32
 
-from foldgauss._runtime.checks import check_within, invalid, is_integer, short_repr
+from foldgauss._runtime.checks import check_within, invalid, is_integer, require, short_repr
 from foldgauss.video.models.video_model import VideoModel, check_model
 
 Mask = Bool[np.ndarray, "height width"] | Float[np.ndarray, "height width"]
@@ -32,26 +32,41 @@ def region_from_mask(model: VideoModel, mask: Masks, frame: int | None, frames: 
     """From one mask for one frame or several, one mask for each of several frames, or {frame: mask}."""
     check_model(model)
     if isinstance(mask, Mapping):
-        if frame is not None or frames is not None:
-            raise invalid("mask", expected="its frames given once", got="{frame: mask}, and frame or frames as well")
+        require(
+            frame is None and frames is None,
+            "mask",
+            expected="its frames given once",
+            got="{frame: mask}, and frame or frames as well",
+        )
         found = {_check_frame(model, k): _check_mask(model, one, ndim=2) for k, one in mask.items()}
     elif isinstance(mask, str | os.PathLike):
-        cure = "Read it: mask=foldgauss.io.read_masks(path)."
-        raise invalid("mask", expected="bool (height, width)", got=f"the path {str(mask)!r}", cure=cure)
+        raise invalid(
+            "mask",
+            expected="bool (height, width)",
+            got=f"the path {str(mask)!r}",
+            cure="Read it: mask=foldgauss.io.read_masks(path).",
+        )
     else:
         mask = np.asarray(mask)
         if mask.ndim == 2 and frame is None and frames is None:
-            cure = "Name its frame: frame=k."
-            raise invalid("mask", expected=f"({model.num_frames}, height, width)", got=f"{mask.shape}", cure=cure)
+            raise invalid(
+                "mask",
+                expected=f"({model.num_frames}, height, width)",
+                got=f"{mask.shape}",
+                cure="Name its frame: frame=k.",
+            )
         numbers = resolve_frames(model, frame, frames)
         if mask.ndim not in (2, 3) or (mask.ndim == 3 and len(mask) != len(numbers)):
             expected = f"one of shape (height, width), or {len(numbers)} of them"
-            cure = "Name their frames: frame=k, frames=(first, stop) or mask={frame: mask}."
-            raise invalid("mask", expected=expected, got=f"shape {mask.shape}", cure=cure)
+            raise invalid(
+                "mask",
+                expected=expected,
+                got=f"shape {mask.shape}",
+                cure="Name their frames: frame=k, frames=(first, stop) or mask={frame: mask}.",
+            )
         _check_mask(model, mask, mask.ndim)
         found = dict(zip(numbers, mask, strict=True)) if mask.ndim == 3 else dict.fromkeys(numbers, mask)
-    if not any(one.any() for one in found.values()):
-        raise invalid("mask", expected="a mask that is not empty", got="an empty one")
+    require(any(one.any() for one in found.values()), "mask", expected="a mask that is not empty", got="an empty one")
     return Region(tuple(sorted(found)), lambda k: _resize(found[k], model.size))
 
 
@@ -61,10 +76,19 @@ def region_from_box(
     """The pixels whose centers lie in x0 <= x < x1, y0 <= y < y1."""
     check_model(model)
     edges = _as_array(box)
-    if edges.shape != (4,) or edges.dtype.kind not in "fiu" or not np.isfinite(edges).all():
-        raise invalid("box", expected="(x0, y0, x1, y1) in pixels", got=short_repr(box))
-    if not (edges[0] < edges[2] and edges[1] < edges[3]):
-        raise invalid("box", expected="x0 < x1 and y0 < y1", got=box, cure="x is right, y is down.")
+    require(
+        edges.shape == (4,) and edges.dtype.kind in "fiu" and np.isfinite(edges).all(),
+        "box",
+        expected="(x0, y0, x1, y1) in pixels",
+        got=short_repr(box),
+    )
+    require(
+        edges[0] < edges[2] and edges[1] < edges[3],
+        "box",
+        expected="x0 < x1 and y0 < y1",
+        got=box,
+        cure="x is right, y is down.",
+    )
     (height, width), (x0, y0, x1, y1) = model.size, edges
     x, y = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
     return _constant_region("box", model, (x0 <= x) & (x < x1) & (y0 <= y) & (y < y1), frame, frames)
@@ -77,8 +101,12 @@ def region_from_polygon(
     check_model(model)
     corners = _as_array(polygon)
     bad = corners.ndim != 2 or corners.shape[1:] != (2,) or len(corners) < 3 or corners.dtype.kind not in "fiu"
-    if bad or not np.isfinite(corners).all():
-        raise invalid("polygon", expected="at least 3 corners (x, y) in pixels", got=short_repr(polygon))
+    require(
+        not bad and np.isfinite(corners).all(),
+        "polygon",
+        expected="at least 3 corners (x, y) in pixels",
+        got=short_repr(polygon),
+    )
     # scikit-image has pixel centers at integers, and rows first.
     return _constant_region(
         "polygon", model, skimage.draw.polygon2mask(model.size, corners[:, ::-1] - 0.5), frame, frames
@@ -96,8 +124,7 @@ def _as_array(given: object) -> np.ndarray:
 def resolve_frames(model: VideoModel, frame: int | None, frames: tuple[int, int] | None) -> range:
     """The frame `frame`, the frames first <= k < stop, or all."""
     check_model(model)
-    if frame is not None and frames is not None:
-        raise invalid("frame, frames", expected="one of the two", got="both")
+    require(frame is None or frames is None, "frame, frames", expected="one of the two", got="both")
     if frame is not None:
         k = _check_frame(model, frame)
         return range(k, k + 1)
@@ -114,8 +141,12 @@ def check_number(name: str, value: object, bounds: str) -> float:
 def check_times(times: object) -> tuple[float, float]:
     """As floats (start, stop). Raises ValueError unless 0 <= start <= stop <= 1."""
     pair = _as_array(times)
-    if pair.shape != (2,) or pair.dtype.kind not in "fiu" or not 0 <= pair[0] <= pair[1] <= 1:
-        raise invalid("times", expected="(start, stop) with 0 <= start <= stop <= 1", got=times)
+    require(
+        pair.shape == (2,) and pair.dtype.kind in "fiu" and 0 <= pair[0] <= pair[1] <= 1,
+        "times",
+        expected="(start, stop) with 0 <= start <= stop <= 1",
+        got=times,
+    )
     return float(pair[0]), float(pair[1])
 
 
@@ -123,15 +154,23 @@ def _constant_region(name, model, inside: Bool[np.ndarray, "height width"], fram
     """The same pixels in all of the frames."""
     if not inside.any():
         height, width = model.size
-        cure = "x is right, y is down, in pixels of the model's own size."
-        raise invalid(name, expected=f"pixels of a {height}x{width} frame in it", got="none", cure=cure)
+        raise invalid(
+            name,
+            expected=f"pixels of a {height}x{width} frame in it",
+            got="none",
+            cure="x is right, y is down, in pixels of the model's own size.",
+        )
     fraction = inside.astype(np.float32)
     return Region(tuple(resolve_frames(model, frame, frames)), lambda k: fraction)
 
 
 def _check_frame(model: VideoModel, k: object) -> int:
-    if not (is_integer(k, 0) and k < model.num_frames):
-        raise invalid("frame", expected=f"a frame's number in [0, {model.num_frames})", got=repr(k))
+    require(
+        is_integer(k, 0) and k < model.num_frames,
+        "frame",
+        expected=f"a frame's number in [0, {model.num_frames})",
+        got=repr(k),
+    )
     return int(k)
 
 
@@ -139,27 +178,42 @@ def _check_range(model: VideoModel, frames: object) -> tuple[int, int]:
     pair = tuple(frames) if isinstance(frames, tuple | list | np.ndarray) else ()
     if len(pair) == 2:
         pair = tuple(end if given is None else given for given, end in zip(pair, (0, model.num_frames), strict=True))
-    if not (len(pair) == 2 and all(is_integer(k, 0) for k in pair) and pair[0] < pair[1] <= model.num_frames):
-        expected = f"(first, stop) with 0 <= first < stop <= {model.num_frames}"
-        cure = "None is the clip's own end; for one frame give frame=k."
-        raise invalid("frames", expected=expected, got=repr(frames), cure=cure)
+    require(
+        len(pair) == 2 and all(is_integer(k, 0) for k in pair) and pair[0] < pair[1] <= model.num_frames,
+        "frames",
+        expected=f"(first, stop) with 0 <= first < stop <= {model.num_frames}",
+        got=repr(frames),
+        cure="None is the clip's own end; for one frame give frame=k.",
+    )
     return int(pair[0]), int(pair[1])
 
 
 def _check_mask(model: VideoModel, mask: np.ndarray, ndim: int) -> np.ndarray:
     """A mask or a stack of masks of the model's aspect; bool, or float in [0, 1]."""
     mask = np.asarray(mask)
-    if mask.ndim != ndim or mask.size == 0 or mask.dtype.kind not in "bf":
-        cure = "From labels take those of one object: mask=(labels == 1); from gray levels, mask=(levels > 127)."
-        raise invalid("mask", expected="bool (height, width)", got=f"{mask.dtype} {mask.shape}", cure=cure)
-    if mask.dtype.kind == "f" and not ((mask >= 0) & (mask <= 1)).all():
-        raise invalid("mask", expected="bool, or fractions in [0, 1]", got="other values")
+    require(
+        mask.ndim == ndim and mask.size != 0 and mask.dtype.kind in "bf",
+        "mask",
+        expected="bool (height, width)",
+        got=f"{mask.dtype} {mask.shape}",
+        cure="From labels take those of one object: mask=(labels == 1); from gray levels, mask=(levels > 127).",
+    )
+    require(
+        mask.dtype.kind != "f" or ((mask >= 0) & (mask <= 1)).all(),
+        "mask",
+        expected="bool, or fractions in [0, 1]",
+        got="other values",
+    )
     (height, width), (rows, columns) = model.size, mask.shape[-2:]
     off = min(abs(columns * height / rows - width), abs(rows * width / columns - height))
     # The sides of a smaller mask are rounded, too.
-    if off > max(ROUNDING, 0.5 * max(height, width) / max(rows, columns)) + 1e-6:
-        got, cure = f"{rows}x{columns}", "Crop it as the frames were cropped."
-        raise invalid("mask", expected=f"the aspect of the model's {height}x{width}", got=got, cure=cure)
+    require(
+        off <= max(ROUNDING, 0.5 * max(height, width) / max(rows, columns)) + 1e-6,
+        "mask",
+        expected=f"the aspect of the model's {height}x{width}",
+        got=f"{rows}x{columns}",
+        cure="Crop it as the frames were cropped.",
+    )
     return mask
 
 

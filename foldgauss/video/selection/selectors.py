@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, Float32, Int, Int8
 
-from foldgauss._runtime.checks import invalid, is_integer, short_repr
+from foldgauss._runtime.checks import invalid, is_integer, require, short_repr
 from foldgauss.render import cpu
 from foldgauss.video.models.splats import SH_C0
 from foldgauss.video.models.video_model import VideoModel, check_model, check_time
@@ -75,9 +75,13 @@ class Selection:
 
     def __post_init__(self) -> None:
         mask = np.array(self.mask)
-        if mask.ndim != 1 or mask.dtype != bool:
-            cure = "For indices of Gaussians use Selection.of(model, indices)."
-            raise invalid("mask", expected="bool (num_gaussians,)", got=f"{mask.dtype} {mask.shape}", cure=cure)
+        require(
+            mask.ndim == 1 and mask.dtype == bool,
+            "mask",
+            expected="bool (num_gaussians,)",
+            got=f"{mask.dtype} {mask.shape}",
+            cure="For indices of Gaussians use Selection.of(model, indices).",
+        )
         mask.setflags(write=False)
         object.__setattr__(self, "mask", mask)
 
@@ -87,8 +91,12 @@ class Selection:
         check_model(model)
         indices, mask = np.asarray(indices), np.zeros(model.splats.num_gaussians, bool)
         if indices.size:
-            if indices.ndim != 1 or indices.dtype.kind not in "iu" or indices.min() < 0 or indices.max() >= len(mask):
-                raise invalid("indices", expected=f"whole numbers in [0, {len(mask)})", got=indices)
+            require(
+                indices.ndim == 1 and indices.dtype.kind in "iu" and indices.min() >= 0 and indices.max() < len(mask),
+                "indices",
+                expected=f"whole numbers in [0, {len(mask)})",
+                got=indices,
+            )
             mask[indices] = True
         return cls(mask)
 
@@ -142,18 +150,25 @@ class Selection:
     def _mask_of(self, other: "Selection") -> Bool[np.ndarray, "num_gaussians"]:
         if not isinstance(other, Selection):
             raise TypeError(f"expected a Selection, got {type(other).__name__}. Selection(mask) makes one of a mask.")
-        if other.num_gaussians != self.num_gaussians:
-            expected = f"a selection of {self.num_gaussians:,} Gaussians"
-            got, cure = f"one of {other.num_gaussians:,}", "Is it another model's?"
-            raise invalid("selection", expected=expected, got=got, cure=cure)
+        require(
+            other.num_gaussians == self.num_gaussians,
+            "selection",
+            expected=f"a selection of {self.num_gaussians:,} Gaussians",
+            got=f"one of {other.num_gaussians:,}",
+            cure="Is it another model's?",
+        )
         return other.mask
 
 
 def check_mask(selection: object, num: int) -> Mask:
     """The mask of a `Selection`, or a mask itself. Raises ValueError for anything but those of `num` Gaussians."""
-    if isinstance(selection, str | os.PathLike):
-        cure = "Read a file with foldgauss.io.load_selection(path, model)."
-        raise invalid("selection", expected="a Selection or a mask", got=repr(selection), cure=cure)
+    require(
+        not isinstance(selection, str | os.PathLike),
+        "selection",
+        expected="a Selection or a mask",
+        got=repr(selection),
+        cure="Read a file with foldgauss.io.load_selection(path, model).",
+    )
     mask = np.asarray(selection.mask if isinstance(selection, Selection) else selection)
     if mask.dtype == bool and mask.shape == (num,):
         return mask
@@ -162,8 +177,9 @@ def check_mask(selection: object, num: int) -> Mask:
         cure = "For a mask of pixels: select(mask=mask, frame=k)."
     elif mask.dtype.kind in "iu":
         cure = "For indices of Gaussians: Selection.of(model, [...])."
-    expected = f"a Selection or mask of {num:,} Gaussians"
-    raise invalid("selection", expected=expected, got=f"{mask.dtype} {mask.shape}", cure=cure)
+    raise invalid(
+        "selection", expected=f"a Selection or mask of {num:,} Gaussians", got=f"{mask.dtype} {mask.shape}", cure=cure
+    )
 
 
 def split_mask(mask: Mask, counts: Sequence[int]) -> list[Mask]:
@@ -247,19 +263,25 @@ def list_criteria(**arguments: Any) -> list[tuple[Callable[..., Selection], dict
     found = {name: {name: given[name]} for name in functions if name in given}
     if not found.keys() & {"mask", "box", "polygon", "click"} and given.keys() & {"frame", "frames"}:
         found["frames"] = {}  # a criterion of its own
-    if not found:
-        cure = "Selection.all(model) is everything."
-        raise invalid("select", expected="at least one criterion", got="none", cure=cure)
+    require(found, "select", expected="at least one criterion", got="none", cure="Selection.all(model) is everything.")
     for option in given.keys() & _OPTIONS.keys():
         users = [name for name in _OPTIONS[option] if name in found]
-        if not users:
-            cure = "For the frame of a click: frame=k." if "click" in found else ""
-            expected = f"one of {', '.join(_OPTIONS[option])} with it"
-            raise invalid(option, expected=expected, got=short_repr(given[option]), cure=cure)
+        require(
+            users,
+            option,
+            expected=f"one of {', '.join(_OPTIONS[option])} with it",
+            got=short_repr(given[option]),
+            cure="For the frame of a click: frame=k." if "click" in found else "",
+        )
         for name in users:
             found[name][option] = given[option]
-    if "click" in found and "frame" not in given:
-        raise invalid("frame", expected="the frame that was clicked in", got="none", cure="Give frame=k.")
+    require(
+        "click" not in found or "frame" in given,
+        "frame",
+        expected="the frame that was clicked in",
+        got="none",
+        cure="Give frame=k.",
+    )
     found.get("moving", {}).pop("moving", None)
     return [(functions.get(name, by_time), options) for name, options in found.items()]
 
@@ -387,8 +409,12 @@ def by_color(
     **Example:** `by_color(model, (0.9, 0.2, 0.1), tolerance=25)`. **Raises:** ValueError for an invalid color.
     """
     wanted = np.asarray(color)
-    if wanted.shape != (3,) or wanted.dtype.kind not in "fiu" or not ((wanted >= 0) & (wanted <= 1)).all():
-        raise invalid("color", expected="red, green and blue in [0, 1]", got=color)
+    require(
+        wanted.shape == (3,) and wanted.dtype.kind in "fiu" and ((wanted >= 0) & (wanted <= 1)).all(),
+        "color",
+        expected="red, green and blue in [0, 1]",
+        got=color,
+    )
     tolerance = check_number("tolerance", tolerance, "[0, inf)")
     contributions = Contributions(model)
     own = np.maximum(0.5 + SH_C0 * np.asarray(model.splats.color_dc), 0)
@@ -416,8 +442,12 @@ def by_time(
 
     **Raises:** ValueError unless exactly one valid span is given.
     """
-    if (times is not None) + (frame is not None) + (frames is not None) != 1:
-        raise invalid("times, frames, frame", expected="one of them", got="several or none")
+    require(
+        (times is not None) + (frame is not None) + (frames is not None) == 1,
+        "times, frames, frame",
+        expected="one of them",
+        got="several or none",
+    )
     contributions = Contributions(model)
     if times is not None:
         start, stop = check_times(times)
@@ -450,13 +480,16 @@ def by_click(
     """
     check_model(model)
     point, (height, width) = np.asarray(click), model.size
-    if point.shape != (2,) or point.dtype.kind not in "fiu" or not ((point >= 0) & (point < [width, height])).all():
-        raise invalid("click", expected=f"(x, y) in pixels of a {height}x{width} frame", got=click)
+    require(
+        point.shape == (2,) and point.dtype.kind in "fiu" and ((point >= 0) & (point < [width, height])).all(),
+        "click",
+        expected=f"(x, y) in pixels of a {height}x{width} frame",
+        got=click,
+    )
     tolerance = check_number("tolerance", tolerance, "[0, inf)")
     k = resolve_frames(model, frame, None)[0]
     found = grow_from_pixel(Contributions(model), (int(point[1]), int(point[0])), k, tolerance)
-    if found is None:
-        raise invalid("click", expected="a pixel where something is rendered", got=f"{click} of frame {k}")
+    require(found is not None, "click", expected="a pixel where something is rendered", got=f"{click} of frame {k}")
     return Selection(found)
 
 
@@ -491,9 +524,13 @@ def influence(model: VideoModel, selection: Selection, t: float) -> Bool[np.ndar
 def _prepare(model: VideoModel, selection: Selection) -> tuple[Contributions, Bool[np.ndarray, " num_gaussians"]]:
     """The model's contributions, and the mask of a selection checked to fit the model."""
     contributions = Contributions(model)
-    if not isinstance(selection, Selection):
-        cure = "The order is (model, selection, t); Selection(mask) makes one of a mask."
-        raise invalid("selection", expected="a Selection", got=type(selection).__name__, cure=cure)
+    require(
+        isinstance(selection, Selection),
+        "selection",
+        expected="a Selection",
+        got=type(selection).__name__,
+        cure="The order is (model, selection, t); Selection(mask) makes one of a mask.",
+    )
     return contributions, (Selection.none(model) | selection).mask
 
 
