@@ -1,68 +1,24 @@
 """The fitted video: folded splats, frame times and rendering options."""
 
 import dataclasses
-import math
-from collections.abc import Iterator
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from foldgauss._numerics.batch import concrete_value
-from foldgauss._runtime import notebook_hooks
-from foldgauss._runtime.checks import invalid, is_integer, is_within, short_repr
+from foldgauss._runtime.checks import invalid
 from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.render.splats import check_size
 from foldgauss.video.models.background import BLACK, Background, check_background
 from foldgauss.video.models.frame_times import FrameTimes, snap_to_shots
 from foldgauss.video.models.prepared import PreparedModel
-from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer
+from foldgauss.video.models.rendered_video import RenderedVideo, choose_time
 from foldgauss.video.models.splats import FoldedSplats
 
 #: Parameters of a Gaussian, without those of its fold.
 PARAMETERS = 11
 #: Advice in errors where a segmented video was given and one model is needed.
 ONE_SEGMENT = "Take one segment's own: video.segments[k].model."
-
-
-def check_time(t: float, name: str = "t", cure: str = "Frame k is at frame_times.times()[k].") -> None:
-    """Raise ValueError unless t is one time, in [0, 1] if its value is known."""
-    try:
-        time = jnp.asarray(t)
-        value = concrete_value(time)
-    except (TypeError, ValueError):
-        raise invalid(name, expected="a time in [0, 1]", got=short_repr(t)) from None
-    if time.ndim:
-        raise invalid(name, expected="one time in [0, 1]", got=short_repr(t))
-    if value is not None and not 0 <= value <= 1:
-        raise invalid(name, expected="a time in [0, 1]", got=value, cure=cure)
-
-
-def choose_time(video: RenderableVideo, time: float | None, frame: int | None, seconds: float | None) -> float:
-    """The time in [0, 1] of the one argument that is not None; `VideoModel.render` documents them and the errors."""
-    given = [name for name, value in (("time", time), ("frame", frame), ("seconds", seconds)) if value is not None]
-    if len(given) != 1:
-        raise TypeError(
-            f"render: expected exactly one of time, frame and seconds, got {' and '.join(given) or 'none'}."
-        )
-    if time is not None:
-        check_time(time, "time", "Frame k is render(frame=k), second s of the clip render(seconds=s).")
-        return time
-    num, cure = video.num_frames, "For what lies between frames use time or seconds."
-    if frame is not None:
-        if not is_integer(frame, -math.inf):
-            raise invalid("frame", expected="the number of a frame", got=short_repr(frame), cure=cure)
-        if not -num <= frame < num:
-            raise IndexError(f"frame: expected a number from {-num} to {num - 1} of {num} frames, got {frame}.")
-        position = float(frame % num)
-    else:
-        if not is_within(seconds, f"[0, {num / video.fps}]"):
-            expected = f"seconds in [0, {num / video.fps:g}], as {num} frames at {video.fps:g} a second last"
-            raise invalid("seconds", expected=expected, got=short_repr(seconds))
-        position = float(min(seconds * video.fps, num - 1))
-    times, before = video.frame_times.times(), int(position)
-    return times[before] + (position - before) * (times[min(before + 1, num - 1)] - times[before])
 
 
 def check_model(model: object) -> None:
@@ -77,7 +33,7 @@ def check_model(model: object) -> None:
         raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
 
 
-class VideoModel(eqx.Module):
+class VideoModel(RenderedVideo, eqx.Module):
     """A fitted video, as stored in a model file.
 
     `size` is (height, width) of the frames it was fitted to, `fps` their rate; `options` and `compositing` ("over" or
@@ -166,21 +122,6 @@ class VideoModel(eqx.Module):
             return render(splats, size, background=behind, **how)
         image, alpha = render(splats, size, return_alpha=True, **how)
         return jnp.concatenate([image, alpha[..., None]], axis=-1)
-
-    def frames(
-        self,
-        times: np.ndarray | None = None,
-        size: tuple[int, int] | None = None,
-        *,
-        background: Background = BLACK,
-    ) -> Iterator[np.ndarray]:
-        """Images at `times` (default: the frame times) one by one, over `background`, uint8 (height, width, 3);
-        (height, width, 4), with premultiplied colors, where it is None."""
-        yield from VideoRenderer(self, size, background=background).frames(times)
-
-    def _repr_html_(self) -> str | None:
-        """The player, in a notebook: see docs/player.md. None if its page would be too large."""
-        return notebook_hooks.show("video", self)
 
 
 @eqx.filter_jit

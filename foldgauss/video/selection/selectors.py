@@ -13,8 +13,9 @@ from jaxtyping import ArrayLike, Bool, Float, Float32, Int, Int8
 
 from foldgauss._runtime.checks import invalid, is_integer, require, short_repr
 from foldgauss.render import cpu
+from foldgauss.video.models.rendered_video import check_time
 from foldgauss.video.models.splats import SH_C0
-from foldgauss.video.models.video_model import VideoModel, check_model, check_time
+from foldgauss.video.models.video_model import VideoModel, check_model
 from foldgauss.video.motion.background_plate import SIDE
 from foldgauss.video.motion.moving_object import LEAST_FRAMES, find_moving_object, nothing_moves
 from foldgauss.video.selection.contributions import (
