@@ -10,7 +10,6 @@ import pytest
 import foldgauss
 
 ROOT = Path(foldgauss.__file__).parent
-#: Kernels: one compiled function calls many small ones, and they are read together.
 MAX_MODULES = 15
 MAX_TOP = 15
 
