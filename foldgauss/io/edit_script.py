@@ -355,8 +355,10 @@ class _TableContext:
     table: tuple[str | int, ...]
     named: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
-    def error(self, key: str | None, expected: str, got: object, cure: str = "") -> EditScriptError:
-        return self._locate(key, str(invalid(key or "table", expected=expected, got=got, cure=cure)))
+    def require(self, condition: object, key: str | None, expected: str, got: object, cure: str = "") -> None:
+        """Raise the error of `invalid` for a key, or for the table, unless `condition` is true."""
+        if not condition:
+            raise self._locate(key, str(invalid(key or "table", expected=expected, got=got, cure=cure)))
 
     def __enter__(self) -> None:
         return None
@@ -416,25 +418,23 @@ def _check_keys(
     """Raise for unknown keys, missing required keys, and values of a wrong type."""
     for key in table:
         _check_known(context, key, "one of ", key, sorted(known))
-    missing = [key for key in needed if key not in table]
-    if missing:
-        raise context.error(None, f"the key {missing[0]!r}", ", ".join(sorted(table)) or "an empty table")
+    for key in needed:
+        context.require(key in table, None, f"the key {key!r}", ", ".join(sorted(table)) or "an empty table")
     for key, value in table.items():
         kind = _KINDS.get(key, _NUMBERS)
-        if not kind.holds(value):
-            raise context.error(key, kind.expected, _truncated_repr(value))
+        context.require(kind.holds(value), key, kind.expected, _truncated_repr(value))
 
 
 def _check_known(context: _TableContext, key: str, expected: str, word: str, known: Collection[str]) -> None:
     """Raise unless a word is known; `expected` says what it is one of."""
-    if word not in known:
-        near = difflib.get_close_matches(word, known, 1)
-        raise context.error(
-            key,
-            expected + (", ".join(known) or "there is none"),
-            _truncated_repr(word),
-            f"Did you mean {near[0]!r}?" if near else "",
-        )
+    near = [] if word in known else difflib.get_close_matches(word, known, 1)
+    context.require(
+        word in known,
+        key,
+        expected + (", ".join(known) or "there is none"),
+        _truncated_repr(word),
+        f"Did you mean {near[0]!r}?" if near else "",
+    )
 
 
 def _truncated_repr(value: Any) -> str:
@@ -447,8 +447,7 @@ def _truncated_repr(value: Any) -> str:
 
 def _check_selection(context: _TableContext, table: dict[str, Any], known: Collection[str]) -> None:
     """Check a selection after those that are `known`."""
-    if not table:
-        raise context.error(None, "at least one criterion", "none")
+    context.require(table, None, "at least one criterion", "none")
     if table.keys() & set(_COMBINATION):
         _check_keys(context, table, _COMBINATION)
         for key, names in table.items():
@@ -460,14 +459,14 @@ def _check_selection(context: _TableContext, table: dict[str, Any], known: Colle
             deque(parse_ranges(table["indices"]), maxlen=0)
     else:
         _check_keys(context, table, _CRITERIA + (_MASK_FILE if "mask" in table else ()))
-        if "mask" in table and "file" in table:
-            raise context.error("file", "a mask or a file", "both", "Combine two selections with all=[...].")
+        both = "mask" in table and "file" in table
+        context.require(not both, "file", "a mask or a file", "both", "Combine two selections with all=[...].")
 
 
 def _check_edit(context: _TableContext, table: dict[str, Any], selections: Collection[str]) -> None:
     do = table.get("do")
-    if not isinstance(do, str):
-        raise context.error("do", "one of " + ", ".join(ACTIONS), "none" if do is None else _truncated_repr(do))
+    got = "none" if do is None else _truncated_repr(do)
+    context.require(isinstance(do, str), "do", "one of " + ", ".join(ACTIONS), got)
     _check_known(context, "do", "one of ", do, ACTIONS)
     _check_keys(context, table, ("do", "select", *ACTIONS[do].keys), ACTIONS[do].required)
     if "select" in table:
@@ -476,8 +475,8 @@ def _check_edit(context: _TableContext, table: dict[str, Any], selections: Colle
 
 def _check_layer(context: _TableContext, table: dict[str, Any]) -> None:
     _check_keys(context, table, ("model", "where", "freeze", "script"), ("model",))
-    if table.get("where", "behind") not in ("front", "behind"):
-        raise context.error("where", "'front' or 'behind'", repr(table["where"]))
+    where = table.get("where", "behind")
+    context.require(where in ("front", "behind"), "where", "'front' or 'behind'", repr(where))
 
 
 def _select_indices(

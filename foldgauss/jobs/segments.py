@@ -36,9 +36,8 @@ _MB_PER_SEGMENT = 0.004
 BESIDE = 8
 _PLAN = "plan.json"
 _INDEX = "index.npz"
-#: How the names of unfinished files in the folder begin, and of all of a fit.
-_UNFINISHED = (".segment-", f".{Path(_PLAN).stem}.", f".{Path(_INDEX).stem}.")
-_OWN = ("segment-", _PLAN, _INDEX, *_UNFINISHED)
+#: How the names of files of a fit in the folder begin, of unfinished ones with a dot.
+_OWN = ("segment-", _PLAN, _INDEX, ".segment-", f".{Path(_PLAN).stem}.", f".{Path(_INDEX).stem}.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,11 +102,9 @@ class LongFit:
 
     def clean_up(self) -> None:
         """Remove this fit's files, and the folder if nothing else is in it."""
-        files = [path for job in self.jobs for path in (Path(job.target), job.checkpoint, job.record)]
-        files += [self.folder / name for name in (_INDEX, _PLAN)]
-        files += [entry for entry in self.folder.iterdir() if entry.name.startswith(_UNFINISHED)]
-        for path in files:
-            path.unlink(missing_ok=True)
+        for entry in list(self.folder.iterdir()):
+            if entry.name.startswith(_OWN):
+                entry.unlink()
         with suppress(OSError):  # files of others
             self.folder.rmdir()
 

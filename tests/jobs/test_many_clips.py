@@ -30,16 +30,21 @@ def test_clips_are_videos_by_name_and_folders_of_images(tmp_path):
     assert [other.name for other in found.others] == ["empty", "notes.txt", "picture.png"]
 
 
-def test_what_has_no_clips_is_refused_in_words(tmp_path):
-    with pytest.raises(FileNotFoundError, match="missing"):
-        find_clips(tmp_path / "none")
-    with pytest.raises(ValueError, match="folder: expected a folder with clips"):
-        find_clips(made(tmp_path, "notes.txt"))
-    with pytest.raises(ValueError, match="One clip alone: foldgauss fit"):
-        find_clips(tmp_path / "notes.txt")
+@pytest.mark.parametrize(
+    ("place", "error", "message"),
+    [
+        ("none", FileNotFoundError, "missing"),
+        ("texts", ValueError, "folder: expected a folder with clips"),
+        ("texts/notes.txt", ValueError, "One clip alone: foldgauss fit"),
+        ("frames", ValueError, "Its images are one clip"),
+    ],
+)
+def test_what_has_no_clips_is_refused_in_words(tmp_path, place, error, message):
+    (tmp_path / "texts").mkdir()
+    made(tmp_path / "texts", "notes.txt")
     folder_of_images(tmp_path / "frames")
-    with pytest.raises(ValueError, match="Its images are one clip"):
-        find_clips(tmp_path / "frames")
+    with pytest.raises(error, match=message):
+        find_clips(tmp_path / place)
 
 
 def test_models_of_clips_of_one_name_are_told_apart(tmp_path):

@@ -49,12 +49,6 @@ def test_it_is_asked_as_a_model_is():
         video.render(0.3, (0, 3))
 
 
-def test_nothing_laid_over_is_the_model_to_the_bit():
-    for size in (None, (37, 50)):
-        for t in BETWEEN:
-            np.testing.assert_array_equal(picture(laid_over(MODEL), t, size), picture(MODEL, t, size))
-
-
 def test_at_any_size_the_edit_is_the_same():
     """An overlay acts in model space: at twice the size it is twice as far."""
     chain = edit(MODEL).select(OBJECT)
@@ -143,13 +137,6 @@ def test_layers_that_do_not_fit(name):
 
 
 # ------------------------------------------------------------------------------------------------------------- in space
-
-
-def test_the_front_camera_changes_nothing():
-    seen = edit(MODEL).seen_from(Camera.front(ASPECT)).video()
-    assert isinstance(seen, EditedVideo)
-    for t in BETWEEN:
-        assert apart(seen, MODEL, t) < 1e-4
 
 
 def test_any_camera_is_that_of_project():

@@ -17,7 +17,6 @@ from foldgauss.io import save_selection
 from foldgauss.render import RenderOptions
 from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.video import (
-    FitConfig,
     FrameTimes,
     Segment,
     SegmentedVideo,
@@ -26,11 +25,7 @@ from foldgauss.video import (
     compress,
     edit,
     evaluate,
-    fit,
-    interpolated_times,
     plan_segments,
-    played_positions,
-    psnr,
     times_at,
 )
 from foldgauss.video.models.frame_times import is_cut, make_time_logits
@@ -190,23 +185,6 @@ def test_three_are_seen_where_one_fade_meets_the_next():
     assert loaded == [0, 1, 2]
 
 
-def test_two_segments_of_one_clip_show_no_seam():
-    y, x = np.mgrid[0:24, 0:40]
-    waves = [128 + 90 * np.sin(0.3 * x + 0.25 * k) * np.cos(0.2 * y - 0.1 * k) for k in range(14)]
-    frames = np.repeat(np.stack(waves)[..., None], 3, -1).astype(np.uint8)
-    spans = plan_segments(14, [], length=9, overlap=4)
-    assert spans == [(0, 9), (5, 14)]
-    config = FitConfig(num_gaussians=80, steps=150, seed=0)
-    clip = SegmentedVideo.from_models([(a, fit(frames[a:b], config).model) for a, b in spans])
-    quality = np.array([psnr(*pair) for pair in zip(frames, clip.frames(), strict=True)])
-    assert quality.min() > 22
-    assert quality[5:9].mean() >= np.delete(quality, range(5, 9)).mean() - 0.2
-    positions = np.arange(4, 10.001, 0.125)
-    pictures = [at(clip, position) for position in positions]
-    jumps = np.array([np.abs(b - a).mean() for a, b in pairwise(pictures)])
-    assert jumps.max() < 2.5 * np.median(jumps)  # the way of the waves, not a step
-
-
 def test_what_is_given_for_one_time():
     clip, parts = video(), models()
     for position, number in ((4, 0), (6, 1), (20, 3)):
@@ -273,15 +251,6 @@ def test_even_times_of_a_long_clip_have_no_cuts():
     np.testing.assert_allclose(times_at(times, positions) * (len(times) - 1), positions, atol=1e-6)
 
 
-def test_upsampled_and_played_times_reach_every_frame():
-    clip = video()
-    times = clip.frame_times.times()
-    fine = interpolated_times(times, 4)
-    assert [clip.position(t) for t in fine[::4]] == list(range(NUM_FRAMES))
-    backwards = times_at(times, played_positions(NUM_FRAMES, 1.0, speed=-1.0))
-    assert [clip.position(t) for t in backwards] == list(range(NUM_FRAMES))[::-1]
-
-
 # ------------------------------------------------------------------------------------------------ loading
 
 
@@ -311,16 +280,6 @@ def test_played_through_each_segment_is_loaded_once(way):
         assert len(playback._prepared._kept) <= MAX_PREPARED
     assert loaded == [0, 1, 2, 3][::way]
     assert not alive()  # a stage needs no model
-
-
-def test_what_is_asked_for_once_loads_what_it_shows():
-    clip, loaded, _ = counted()
-    clip.render(0.0)
-    assert loaded == [0]
-    clip.render(5 / 22)
-    assert sorted(loaded) == [0, 0, 1]
-    assert clip.num_gaussians == 4 * NUM
-    assert len(loaded) == 3
 
 
 def test_speed_is_measured_of_some_segments():
@@ -387,20 +346,28 @@ def test_segments_that_do_not_cover_a_clip_are_refused(pairs, message):
         SegmentedVideo(spans(*pairs))
 
 
-def test_segments_that_do_not_go_together_are_refused():
-    lead = soft_model()
-    for name, value in (("size", (40, 80)), ("fps", 24.0), ("compositing", "sum"), ("options", RenderOptions())):
-        other = dataclasses.replace(lead, **{name: value})
-        with pytest.raises(ValueError, match=rf"^segments\[1\]\.{name}: expected .*first segment.*fit them alike"):
-            SegmentedVideo.from_models([(0, lead), (5, other)])
-    for wrong, message in (
-        ([(0, "a")], "^model: expected a VideoModel or an EditedVideo, got str"),
-        ([(0, edit(lead))], r"got Edit\. End a chain"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            SegmentedVideo.from_models(wrong)
-    with pytest.raises(ValueError, match=r"^segments\[0\]: expected a Segment"):
-        SegmentedVideo([lead])
+LEAD = soft_model()
+
+
+def beside(**changes):
+    return SegmentedVideo.from_models([(0, LEAD), (5, dataclasses.replace(LEAD, **changes))])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        *(
+            (partial(beside, **{name: value}), rf"^segments\[1\]\.{name}: expected .*first segment.*fit them alike")
+            for name, value in {"size": (40, 80), "fps": 24.0, "compositing": "sum", "options": RenderOptions()}.items()
+        ),
+        (lambda: SegmentedVideo.from_models([(0, "a")]), "^model: expected a VideoModel or an EditedVideo, got str"),
+        (lambda: SegmentedVideo.from_models([(0, edit(LEAD))]), r"got Edit\. End a chain"),
+        (lambda: SegmentedVideo([LEAD]), r"^segments\[0\]: expected a Segment"),
+    ],
+)
+def test_segments_that_do_not_go_together_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
 
 
 @pytest.mark.parametrize(

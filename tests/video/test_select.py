@@ -88,7 +88,7 @@ def test_sets_are_sets(one, other):
     ):
         assert set(found.indices.tolist()) == wanted
         assert len(found) == len(wanted)
-        assert all((k in found) == (k in wanted) for k in range(6))
+        assert all((k in found) == (k in wanted) for k in range(-2, 9))
     assert (a == b) == (sets["a"] == sets["b"])
 
 
@@ -147,14 +147,6 @@ def test_contribution_is_its_definition(compositing):
     own = Selection(rng.random(len(total)) < 0.5)
     share = by_frame[1][own.mask].sum(0) / by_frame[1].sum(0)
     np.testing.assert_allclose(matte(model, own, 0.25), share, atol=2e-3)
-
-
-def test_mattes_of_a_partition_sum_to_one():
-    parts = [matte(MODEL, truth(name), 0.37) for name in (DISC, BOX, BACKGROUND)]
-    np.testing.assert_allclose(sum(parts), 1, atol=1e-5)
-    assert all(part.min() >= 0 for part in parts)
-    assert parts[0].max() > 0.99
-    assert not matte(MODEL, Selection.none(MODEL), 0.37).any()
 
 
 @pytest.mark.parametrize("t", [0.0, 0.5, 0.77])
@@ -448,11 +440,6 @@ def test_frames_with_open_ends():
     box = (12, 10, 32, 30)
     assert by_box(model, box, frames=(2, None)) == by_box(model, box, frames=(2, 7))
     assert by_box(model, box, frames=(None, 3)) == by_box(model, box, frames=np.array([0, 3]))
-
-
-def test_indices_out_of_range_are_in_no_selection():
-    chosen = Selection(np.array([True, False, True]))
-    assert [k in chosen for k in (0, 1, 2, 3, -1)] == [True, False, True, False, False]
 
 
 BROKEN = eqx.tree_at(lambda m: m.splats.loc, MODEL, np.full_like(MODEL.splats.loc, np.nan))

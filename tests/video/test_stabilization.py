@@ -232,27 +232,43 @@ def test_half_way_between_segments_image_and_map_are_those_of_one_frame():
     np.testing.assert_allclose(video.render(2.5 / 4), clip.render(2.5 / 4), atol=1e-4)
 
 
-def test_mistakes_are_told():
-    model = scene()
-    path = standing(model)
-    far = CameraPath(np.stack([affine(shift=(0.2 * k, 0)) for k in range(NUM_FRAMES)]), np.ones(NUM_FRAMES), path.times)
-    for options, message in [
-        ({"smoothing": 0.0}, "smoothing: expected seconds > 0, got 0.0"),
-        ({"smoothing": float("nan")}, "smoothing: expected seconds > 0"),
-        ({"smoothing": 1e9}, r"smoothing: expected at most [0-9.e+]+ seconds \(100,000 frames\), got 1000000000.0"),
-        ({"border": "blur"}, "border: expected one of"),
-        ({"path": standing(scene(FrameTimes.uniform(3)))}, "path: expected that of 12 frames, got 3"),
-        ({"path": far, "fixed": True}, r"border: expected a path that a zoom of 2 suffices for.*Fill or keep"),
-    ]:
-        with pytest.raises(ValueError, match=message):
-            stabilize(model, **{"path": path} | options)
-    with pytest.raises(ValueError, match=r'border: expected "crop" or "keep" with compositing "sum"'):
-        stabilize(scene(compositing="sum"), border="fill", path=path)
-    with pytest.raises(ValueError, match="video: expected a model or another video of it, got str"):
-        stabilize("model.safetensors")
-    steady = stabilize(model, border="keep", path=path)
-    assert steady._repr_html_() is None
-    with pytest.raises(ValueError, match="Edit first, and stabilize the edited video"):
-        edit(steady)
-    with pytest.raises(ValueError, match="frames: expected a number > 0"):
-        path.smoothed(-1)
+SCENE = scene()
+STILL = standing(SCENE)
+FAR = CameraPath(np.stack([affine(shift=(0.2 * k, 0)) for k in range(NUM_FRAMES)]), np.ones(NUM_FRAMES), STILL.times)
+OTHER = standing(scene(FrameTimes.uniform(3)))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: stabilize(SCENE, path=STILL, smoothing=0.0), "smoothing: expected seconds > 0, got 0.0"),
+        (lambda: stabilize(SCENE, path=STILL, smoothing=float("nan")), "smoothing: expected seconds > 0"),
+        (
+            lambda: stabilize(SCENE, path=STILL, smoothing=1e9),
+            r"smoothing: expected at most [0-9.e+]+ seconds \(100,000 frames\), got 1000000000.0",
+        ),
+        (lambda: stabilize(SCENE, path=STILL, border="blur"), "border: expected one of"),
+        (lambda: stabilize(SCENE, path=OTHER), "path: expected that of 12 frames, got 3"),
+        (
+            lambda: stabilize(SCENE, path=FAR, fixed=True),
+            r"border: expected a path that a zoom of 2 suffices for.*Fill or keep",
+        ),
+        (
+            lambda: stabilize(scene(compositing="sum"), border="fill", path=STILL),
+            r'border: expected "crop" or "keep" with compositing "sum"',
+        ),
+        (lambda: stabilize("m.safetensors"), "video: expected a model or another video of it, got str"),
+        (
+            lambda: edit(stabilize(SCENE, border="keep", path=STILL)),
+            "Edit first, and stabilize the edited video",
+        ),
+        (lambda: STILL.smoothed(-1), "frames: expected a number > 0"),
+    ],
+)
+def test_mistakes_are_told(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_a_notebook_shows_no_player():
+    assert stabilize(SCENE, border="keep", path=STILL)._repr_html_() is None

@@ -29,8 +29,9 @@ from foldgauss.video.tradeoff import Point, Skipped, knee, pareto_front
 RECORD = "tradeoff.json"
 ROWS = "tradeoff.csv"
 PLOT = "tradeoff.png"
-BASE = "base.safetensors"
-FILES = {RECORD, ROWS, PLOT, BASE}
+#: Folder of the models, with the records of their fits.
+MODELS = "models"
+FILES = {RECORD, ROWS, PLOT, MODELS}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,14 +50,17 @@ COSTS = {
     "size": Cost("file size", "bytes", "file (bytes)", "{:,} bytes"),
     "speed": Cost("playback speed", "frames_per_second", "frames per second", "{:.0f} frames per second", True),
 }
-#: What a row of the record has.
-MEASURED = ("axis", "value", "settings", "psnr", "ssim", "seconds", "bytes", "floats", "gaussians", "frames_per_second")
-COLUMNS = (*MEASURED, "front", "knee", "command")
+COLUMNS = (
+    *("axis", "value", "settings", "psnr", "ssim", "seconds", "bytes", "floats", "gaussians", "frames_per_second"),
+    *("front", "knee", "command"),
+)
 
 
 @dataclasses.dataclass
 class Record:
-    """The results so far, in `path`: the settings, the plan and a row for each measured point.
+    """The results, in `path`: the settings, the plan and, in the end, a row for each measured point.
+
+    The fits themselves have records of their own, so that finished ones are not repeated.
 
     Raises ParameterError if `path` has results of other settings or is not a record.
     """
@@ -77,8 +81,6 @@ class Record:
         try:
             kept = json.loads(self.path.read_text())
             before, self.plan, self.machine = dict(kept["settings"]), dict(kept["plan"]), dict(kept["machine"])
-            rows = [{name: row[name] for name in (*MEASURED, "command")} for row in kept["points"]]
-            self.rows = {f"{row['axis']} {row['value']}".rstrip(): row for row in rows}
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise invalid(
                 "--out",
@@ -97,9 +99,10 @@ class Record:
         write_or_keep(self.path, lambda path: write_json(path, kept))
 
 
-def suffix_of(config: FitConfig) -> str:
-    """The extension of the file of a fit's model."""
-    return COMPACT_SUFFIX if config.is_compact else MODEL_SUFFIX
+def file_name(point: Point) -> str:
+    """The name of the file of a point's model."""
+    suffix = COMPACT_SUFFIX if point.config.is_compact else MODEL_SUFFIX
+    return point.name.replace(", ", "-").replace(" ", "-").replace("/", "_") + suffix
 
 
 def format_command(
@@ -107,10 +110,14 @@ def format_command(
 ) -> str:
     """The command line that fits the model of `point`, or evaluates that of the base, from the current folder."""
     if point.played is not None:
-        words = ["evaluate", str(folder / BASE), str(video), *_options(point.played, point.config.options)]
+        words = [
+            "evaluate",
+            str(folder / MODELS / f"base{MODEL_SUFFIX}"),
+            str(video),
+            *_options(point.played, point.config.options),
+        ]
         return shlex.join(["foldgauss", *words])
-    name = point.name.replace(", ", "-").replace(" ", "-").replace("/", "_")
-    words = ["fit", str(video), "--out", f"{name}{suffix_of(point.config)}"]
+    words = ["fit", str(video), "--out", file_name(point)]
     words += [] if size is None else ["--size", size]
     words += [] if frames is None else ["--frames", frames]
     words += [f"--{name}={value}" for name, value in reading.changed.items()]

@@ -49,9 +49,14 @@ class TimeMap:
         """The time of the whole at an own time."""
         return float(np.interp(t, self.own, self.whole))
 
-    def convert_function(self, function: Callable[..., Any]) -> "FunctionOfTime":
+    def convert_function(self, function: Callable[..., Any]) -> Callable[..., Any]:
         """A function whose last argument is a time of the whole, as a function of own time."""
-        return FunctionOfTime(function, self.to_whole)
+
+        def converted(*arguments: Any) -> Any:
+            *others, t = arguments
+            return function(*others, self.to_whole(float(t)))
+
+        return converted
 
     def convert_span(self, span: Span) -> Span:
         """The span in own time; `NEVER` if it does not reach the segment. Progress at a moment stays."""
@@ -99,15 +104,3 @@ class TimeMap:
                 got=f"frame {shown * steps:.6g} for frame {t * steps:.6g}, which is in another segment",
                 cure="Give frames= that keep it within one segment, or select what only one segment shows.",
             )
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class FunctionOfTime:
-    """A function whose last argument is a time, with that time converted before each call."""
-
-    function: Callable[..., Any]
-    convert: Callable[[float], float]
-
-    def __call__(self, *arguments: Any) -> Any:
-        *others, t = arguments
-        return self.function(*others, self.convert(float(t)))

@@ -4,7 +4,7 @@ import dataclasses
 import logging
 import operator
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,6 @@ from foldgauss.video.selection.regions import (
     resolve_frames,
 )
 from foldgauss.video.selection.selectors import (
-    THRESHOLD,
     Selection,
     by_box,
     by_click,
@@ -135,45 +134,47 @@ def _own_arguments(positions: Any, segment: Segment, one: Edit, arguments: dict[
     return {**arguments, "times": tuple(map(one._time_map.to_own, arguments["times"]))}
 
 
+#: How the regions of criteria are made, and the argument that describes them.
+_REGIONS = {
+    by_mask: (region_from_mask, "mask"),
+    by_box: (region_from_box, "box"),
+    by_polygon: (region_from_polygon, "polygon"),
+}
+
+
 class _RegionCriterion:
     """A criterion that names frames: evaluated on the segments of these, propagated over shared frames to others."""
 
     def __init__(self, context: CriteriaEvaluator, function: Callable[..., Selection], arguments: dict[str, Any]):
-        self._context, self._function, self._arguments = context, function, arguments
-        self._segments = context.segments
-        where = {name: arguments.get(name) for name in ("frame", "frames")}
+        self._context, self._function, self._segments = context, function, context.segments
+        self._options = dict(arguments)
+        where = {name: self._options.pop(name, None) for name in ("frame", "frames")}
         if function is by_click:
             self._frames = tuple(resolve_frames(context.stand_in, **where))
         else:
-            regions = {
-                by_mask: (region_from_mask, "mask"),
-                by_box: (region_from_box, "box"),
-                by_polygon: (region_from_polygon, "polygon"),
-            }
-            make, name = regions[function]
-            self._region = make(context.stand_in, arguments[name], **where)
+            make, name = _REGIONS[function]
+            self._region = make(context.stand_in, self._options.pop(name), **where)
             self._frames = self._region.frames
         #: By segment and layer: masks of what the neighbors show, by frames of the clip.
         self._masks: dict[int, list[dict[int, _Image]]] = {}
 
     def evaluate(self) -> list[Selection]:
         """The selection in each segment, breadth first from those that have the frames named."""
-        named = [number for number in range(len(self._segments)) if self._named_frames(number)]
-        waiting, found = deque(named), {}
-        reached = set(named)
+        numbers = range(len(self._segments))
+        named = [number for number in numbers if self._named_frames(number)]
+        waiting, reached, found = deque(named), set(named), {}
         while waiting:
             number = waiting.popleft()
             one = self._context.replay(number)
             found[number] = self._evaluate_named(one, number) if number in named else self._propagate(one, number)
-            for other in self._neighbors(number):
-                if other in found or other in named or not self._arguments.get("follow", True):
+            for other in sorted({number - 1, number + 1} & set(numbers) - found.keys() - set(named)):
+                if not self._options.get("follow", True):
                     continue
                 if len(found[number]) or number in named:  # an empty selection is information for the neighbor, too
                     self._render_masks(one, found[number], number, other)
                 if len(found[number]) and other not in reached:
                     reached.add(other)
                     waiting.append(other)
-        numbers = range(len(self._segments))
         return [found[k] if k in found else self._context.select_none(k) for k in numbers]
 
     def _named_frames(self, number: int) -> list[int]:
@@ -181,22 +182,27 @@ class _RegionCriterion:
         segment = self._segments[number]
         return [k for k in self._frames if segment.first <= k < segment.stop]
 
-    def _neighbors(self, number: int) -> Iterable[int]:
-        return (other for other in (number - 1, number + 1) if 0 <= other < len(self._segments))
-
     def _evaluate_named(self, one: Edit, number: int) -> Selection:
         """In a segment that has some of the frames named."""
         first, frames = self._segments[number].first, self._named_frames(number)
-        own = {name: value for name, value in self._arguments.items() if name not in ("frame", "frames")}
         if self._function is by_click:
-            own["frame"] = frames[0] - first
-        elif self._function is by_mask:
-            own["mask"] = {k - first: np.clip(self._region.at(k), 0.0, 1.0) for k in frames}  # resizing overshoots
-            if not any(mask.any() for mask in own["mask"].values()):
-                return one.selection - one.selection
-        else:
-            own["frames"] = (frames[0] - first, frames[-1] + 1 - first)
-        return self._context.evaluate_segment(one, lambda model, _: self._function(model, **own))
+            options = self._options | {"frame": frames[0] - first}
+            return self._context.evaluate_segment(one, lambda model, _: by_click(model, **options))
+        masks = {k - first: np.clip(self._region.at(k), 0.0, 1.0) for k in frames}  # resizing overshoots
+        return self._select_masks(one, lambda layer: masks, self._options)
+
+    def _select_masks(
+        self, one: Edit, masks_of: Callable[[int], dict[int, np.ndarray]], options: dict[str, Any]
+    ) -> Selection:
+        """By masks of each layer, by frames of the segment; nothing where all are empty."""
+
+        def select(model: VideoModel, layer: int) -> Selection:
+            masks = masks_of(layer)
+            if not any(mask.any() for mask in masks.values()):
+                return Selection.none(model)
+            return by_mask(model, masks, **options)
+
+        return self._context.evaluate_segment(one, select)
 
     def _render_masks(self, one: Edit, found: Selection, number: int, other: int) -> None:
         """Render the selection of a segment as masks of the frames that it shares with a neighbor."""
@@ -221,12 +227,7 @@ class _RegionCriterion:
             expected=f"{len(by_layer)} layers, as its neighbor has",
             got=len(one._video.layers),
         )
-        threshold = self._arguments.get("threshold", THRESHOLD)
-
-        def select(model: VideoModel, layer: int) -> Selection:
-            masks = {k - first: image for k, image in by_layer[layer].items()}
-            if not any(mask.any() for mask in masks.values()):
-                return Selection.none(model)
-            return by_mask(model, masks, threshold=threshold)
-
-        return self._context.evaluate_segment(one, select)
+        options = {name: value for name, value in self._options.items() if name == "threshold"}
+        return self._select_masks(
+            one, lambda layer: {k - first: image for k, image in by_layer[layer].items()}, options
+        )

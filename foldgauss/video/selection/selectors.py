@@ -467,11 +467,11 @@ def by_time(
 def by_click(
     model: VideoModel, click: tuple[float, float], *, frame: int, tolerance: float = CLICK_TOLERANCE
 ) -> Selection:
-    """The object at a click: grown from the greatest contributor at the pixel (x, y) of `frame`, along its motion.
+    """The object at a click at the pixel (x, y) of `frame`, grown along its motion, and followed as by `by_mask`.
 
-    A Gaussian is included if it *looks* like the pixel, to within `tolerance`, and is linked to it by a chain of such
-    neighbors, which touch and move alike in most of the frames in which they touch, up to the cuts of the shot. A
-    static background of one color has no boundary: intersect with a box. At most 48 frames are examined.
+    The pixels of the object are those that look like the clicked one, to within `tolerance`, and are linked to it by
+    such pixels, each of which moves as its neighbor does. A static background of one color has no boundary: intersect
+    with a box.
 
     **Units:** `click` in pixels of the model's own size, x right, y down; tolerance in CIELAB Delta E, as `by_color`.
 
@@ -489,9 +489,9 @@ def by_click(
     )
     tolerance = check_number("tolerance", tolerance, "[0, inf)")
     k = resolve_frames(model, frame, None)[0]
-    found = grow_from_pixel(Contributions(model), (int(point[1]), int(point[0])), k, tolerance)
-    require(found is not None, "click", expected="a pixel where something is rendered", got=f"{click} of frame {k}")
-    return Selection(found)
+    mask = grow_from_pixel(Contributions(model), (int(point[1]), int(point[0])), k, tolerance)
+    require(mask is not None, "click", expected="a pixel where something is rendered", got=f"{click} of frame {k}")
+    return by_mask(model, mask, frame=k)
 
 
 def matte(model: VideoModel, selection: Selection, t: float) -> Float32[np.ndarray, "height width"]:
