@@ -12,7 +12,7 @@ from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import load_video_model, read_video, save_video_model, write_video
 from foldgauss.io.models.video_model import read_metadata, read_origin
 from foldgauss.render import RenderOptions
-from foldgauss.video import FoldedSplats, FrameTimes, VideoModel, evaluate, layers
+from foldgauss.video import FoldedSplats, FrameTimes, VideoModel, evaluate
 
 SIZE, FRAMES, NUM = (32, 48), 5, 60
 
@@ -179,47 +179,6 @@ def test_a_clip_of_fewer_frames(work, tmp_path, capsys):
         told = " ".join(capsys.readouterr().err.split())
         assert "VIDEO: expected 5 frames as in the model, got 4" in told
         assert "Give the clip that it was fitted to." in told
-
-
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        (["--out", "m.zip"], "--out: expected a name ending in .fgz"),
-        (["--quality", "101"], "--quality"),
-        (["--size-mb", "0"], "--size-mb: expected a number in (0, inf)"),
-        (["--size-mb", "0.001"], "--size-mb: expected at least"),
-        (["--psnr", "nan"], "--psnr: expected a number in (0, 100]"),
-        (["--frames", "0:5"], "--frames: expected a VIDEO"),
-        (["--psnr", "30"], "--psnr: expected None without the clip"),
-        (["--minutes", "5"], "--minutes: expected None without the clip"),
-        (["nowhere.mp4"], "nowhere.mp4"),
-    ],
-)
-def test_wrong_use(work, tmp_path, capsys, monkeypatch, arguments, told):
-    monkeypatch.chdir(tmp_path)
-    assert run("compress", work / "model.safetensors", *arguments) in (1, 2)
-    assert told in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
-
-
-def test_nothing_is_replaced_unasked(work, tmp_path, capsys):
-    target = tmp_path / "m.fgz"
-    target.write_text("mine")
-    assert run("compress", work / "model.safetensors", "--out", target) == 2
-    assert "--overwrite" in capsys.readouterr().err
-    assert target.read_text() == "mine"
-    copy = tmp_path / "c.fgz"
-    copy.write_bytes((work / "model.safetensors").read_bytes())  # told by its bytes: it is a float32 model
-    assert run("compress", copy, "--out", copy, "--overwrite") == 2
-    assert "another path than the model" in capsys.readouterr().err
-
-
-def test_edited_models_are_refused(work, tmp_path, capsys):
-    model = load_video_model(work / "model.safetensors")
-    save_video_model(tmp_path / "e.safetensors", layers(model, model))
-    assert run("compress", tmp_path / "e.safetensors", "--out", tmp_path / "e.fgz") == 2
-    assert "MODEL: expected a plain model, got one with edits" in capsys.readouterr().err
-    assert not (tmp_path / "e.fgz").exists()
 
 
 def test_the_wrong_clip_is_refused(work, tmp_path, capsys, monkeypatch):

@@ -99,60 +99,6 @@ def test_what_is_written_is_what_was_drawn(work, tmp_path, name):
             assert 10 * np.log10(255**2 / np.mean(error**2)) > 30
 
 
-def test_what_edit_refuses(work, tmp_path, capsys):
-    model, baked, target = work / "model.safetensors", work / "baked.toml", tmp_path / "out.safetensors"
-
-    def refused(*arguments) -> tuple[int, str]:
-        code = run("edit", *arguments)
-        told = capsys.readouterr().err
-        assert told.startswith("error: ")
-        assert len(told.strip().splitlines()) == 1
-        assert not target.exists()
-        return code, told
-
-    code, told = refused(model, work / "none.toml", "--out", target)
-    assert code == 2
-    assert "none.toml" in told
-    code, told = refused(work / "none.safetensors", baked, "--out", target)
-    assert code == 2
-    assert "none.safetensors" in told
-    wrong = tmp_path / "wrong.toml"
-    wrong.write_text('[[edits]]\ndo = "vanish"\n\n[[edits]]\ndo = "move"\nofset = [1, 0]\n')
-    code, told = refused(model, wrong, "--out", target)
-    assert code == 1
-    assert f"{wrong}, line 6, [[edits]] number 2: ofset: expected one of" in told
-    assert "Did you mean 'offset'?" in told
-    wrong.write_text("[selections.it]\nbox = [900, 900, 901, 901]\nframe = 0")
-    code, told = refused(model, wrong, "--out", target)
-    assert code == 1
-    assert f"{wrong}, line 2, [selections.it]: box: " in told
-    code, told = refused(model, baked, "--out", target, "--size", "20x32")
-    assert code == 2
-    assert "--size" in told
-    tone = write_tone(tmp_path / "tone.wav", 1.0)
-    code, told = refused(model, baked, "--out", target, "--sound", tone)
-    assert code == 2
-    assert "--sound: expected a video as --out" in told
-    code, told = refused(model, baked, "--out", tmp_path / "images", "--sound", tone)
-    assert code == 2
-    assert "--sound: expected a video file for it, got 'images'" in told
-    code, told = refused(model, baked, "--out", tmp_path / "silent.mp4", "--sound", tmp_path / "none.wav")
-    assert code == 2
-    assert "which is missing" in told
-    assert not (tmp_path / "silent.mp4").exists()
-    code, told = refused(model, baked, "--out", tmp_path / "out.png")
-    assert code == 2
-    assert ".safetensors" in told
-    assert "foldgauss render MODEL --times T --out FILE.png" in told
-
-    target.write_bytes(b"precious")
-    assert run("edit", model, baked, "--out", target) == 2
-    assert "--overwrite" in capsys.readouterr().err
-    assert target.read_bytes() == b"precious"
-    assert run("edit", model, baked, "--out", target, "--overwrite") == 0
-    assert load_video_model(target).num_gaussians == NUM
-
-
 def test_export_and_import(work, tmp_path, capsys):
     model = work / "model.safetensors"
     assert run("export", model, "--format", "ply", "--out", tmp_path / "video.ply") == 0
@@ -182,35 +128,6 @@ def test_export_and_import(work, tmp_path, capsys):
     assert np.abs(picture.astype(int) - own).max() <= 2
     assert run("import", tmp_path / "mesh", "--out", tmp_path / "mesh.gif") == 0
     assert read_video(tmp_path / "mesh.gif").num_frames == 3
-
-
-def test_what_export_and_import_refuse(work, tmp_path, capsys):
-    model, video = work / "model.safetensors", tmp_path / "video.ply"
-    assert run("edit", model, work / "laid.toml", "--out", tmp_path / "laid.safetensors") == 0
-    capsys.readouterr()
-
-    def refused(*arguments) -> str:
-        assert run(*arguments) == 2
-        return capsys.readouterr().err
-
-    assert "one with edits" in refused("export", tmp_path / "laid.safetensors", "--format", "ply", "--out", video)
-    assert "--format" in refused("export", model, "--format", "fbx", "--out", video)
-    assert "--out" in refused("export", model, "--format", "ply", "--out", tmp_path / "folder")
-    assert "--out" in refused("export", model, "--format", "obj", "--out", video)
-    assert "--times" in refused("export", model, "--format", "ply", "--out", video, "--times", "0.5")
-    assert "times: expected one" in refused("export", model, "--format", "ply3dgs", "--out", video)
-    assert not video.exists()
-    video.write_bytes(b"precious")
-    assert "--overwrite" in refused("export", model, "--format", "ply", "--out", video)
-    assert video.read_bytes() == b"precious"
-    assert run("import", video, "--out", tmp_path / "m.safetensors") == 1
-    told = capsys.readouterr().err
-    assert "video.ply" in told
-    assert "--out" in refused("import", video, "--out", tmp_path / "m.ply")
-    assert "missing" in refused("import", tmp_path / "none.ply", "--out", tmp_path / "m.safetensors")
-    assert run("export", model, "--format", "ply", "--out", video, "--overwrite") == 0
-    assert run("import", video, "--out", tmp_path / "m.safetensors") == 0
-    assert "exists" in refused("import", video, "--out", tmp_path / "m.safetensors")
 
 
 def test_a_folder_of_masks(work, tmp_path):

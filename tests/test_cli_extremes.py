@@ -77,17 +77,6 @@ def test_one_image_file(tmp_path, capsys, monkeypatch):
     assert np.abs(again - image / 257).mean() < 5
 
 
-def test_what_one_frame_cannot_do_is_said(tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    clip = written(tmp_path / "clip", CLIPS["one"])
-    assert run("fit", clip, "--out", "m.safetensors", *QUICK) == 0
-    assert run("uncertainty", "m.safetensors", clip, "--out", "times") == 2
-    assert "at least 3 frames" in capsys.readouterr().err
-    assert run("export", "m.safetensors", "--format", "ply", "--out", "v.ply") == 1
-    assert "at least 2 frames" in capsys.readouterr().err
-    assert not (tmp_path / "v.ply").exists()
-
-
 def test_steps_that_do_not_see_all_frames_are_warned_of(tmp_path, capsys):
     clip = written(tmp_path / "clip", ramp(9, 16, 16))
     for steps, warned in ((8, True), (9, False)):

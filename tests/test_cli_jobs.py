@@ -179,26 +179,6 @@ def test_that_nobody_listens_any_more_costs_no_fit(long_clip, whole, tmp_path, m
     assert (tmp_path / "m.safetensors").read_bytes() == whole.read_bytes()
 
 
-WRONG = {
-    "history": (("--history", "h.jsonl", "--segment-seconds", "2"), "--history: expected a fit in one piece"),
-    "preview": (("--preview", "p.png", "--workers", "2"), "--preview: expected a fit in one piece"),
-    "both": (("--workers", "2", "--scheduler", "tcp://127.0.0.1:1"), "--workers: expected no --scheduler"),
-    "threads": (("--threads", "2"), "--threads: expected --workers"),
-    "seconds": (("--segment-seconds", "-1"), "--segment-seconds: expected a number of seconds > 0"),
-    "resume": (("--segment-seconds", "2", "--resume"), "--resume: expected a stopped fit in"),
-    "workers": (("--workers", "0"), "--workers"),
-}
-
-
-@pytest.mark.parametrize("case", WRONG)
-def test_options_that_do_not_go_together_are_wrong_use(case, long_clip, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    options, text = WRONG[case]
-    assert run("fit", long_clip, "--out", tmp_path / "m.safetensors", *QUICK, *options) == 2
-    assert text in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_segment_that_fails_leaves_the_others(long_clip, tmp_path, capsys, monkeypatch):
     real = fitting.read_indexed
     (first, _stop) = (13, 28)
@@ -310,18 +290,3 @@ def test_a_summary_that_cannot_be_written_stops_nothing(clips, tmp_path, capsys,
     assert "3 models in" in (told := capsys.readouterr()).out
     assert "warning: path: expected free space" in told.err
     assert len(list((tmp_path / "models").glob("*.fgz"))) == 3
-
-
-def test_names_hold_no_pictures(capsys):
-    assert run("fit-many", "no:smile:folder") == 2
-    assert "no:smile:folder" in "".join(capsys.readouterr().err.split())
-
-
-def test_many_clips_in_a_place_of_its_own(clips, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert run("fit-many", clips, "--out", clips, *QUICK) == 2
-    assert "another folder than the clips'" in capsys.readouterr().err
-    assert run("fit-many", tmp_path / "none", *QUICK) == 2
-    assert run("fit-many", clips / "clip0.mp4", *QUICK) == 2
-    assert "foldgauss fit" in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())

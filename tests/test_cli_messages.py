@@ -13,7 +13,7 @@ from commands import run
 from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.settings import setting_of
 from foldgauss.cli.app.application import load_commands
-from foldgauss.io import load_video_model, save_video_model, write_image, write_video
+from foldgauss.io import load_video_model, write_image, write_video
 from foldgauss.io.datasets import waves
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.video import FitConfig
@@ -72,25 +72,6 @@ def test_masks_of_the_whole_clip_fit_a_model_of_some_frames(work, model, tmp_pat
         '[selections]\nall = {mask = "masks"}\n[[edits]]\ndo = "move"\noffset = [0.1, 0.0]\n'
     )
     assert run("edit", model, tmp_path / "s.toml", "--out", tmp_path / "e.safetensors") == 0
-
-
-@pytest.mark.parametrize("words", [["fit"], ["evaluate", "MODEL"], ["render"]])
-def test_an_address_is_named_as_given(words, model, tmp_path, capsys):
-    words = [model if word == "MODEL" else word for word in words]
-    assert run(*words, "https://a.org/clip.mp4", "--out" if words[0] != "evaluate" else "--json", tmp_path / "o") == 2
-    assert "the address 'https://a.org/clip.mp4'. Download it first." in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("suffix", [".gif", ".webp"])
-def test_alpha_for_an_animation_is_refused_by_its_option(suffix, model, tmp_path, capsys):
-    assert run("render", model, "--background", "none", "--out", tmp_path / f"v{suffix}") == 2
-    assert f"--background: expected a color for {suffix}" in capsys.readouterr().err
-
-
-def test_a_ply_is_to_be_imported(tmp_path, capsys):
-    (tmp_path / "x.ply").write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
-    assert run("view", tmp_path / "x.ply") == 1
-    assert "foldgauss import" in capsys.readouterr().err
 
 
 def test_a_page_is_told_of_where_there_is_no_terminal(model, tmp_path, capsys, monkeypatch):
@@ -189,41 +170,6 @@ def test_a_pipe_is_refused_before_it_is_opened(words, work, model, tmp_path, mon
     inputs = {"PIPE": pipe, "MODEL": model, "CLIP": work / "clip.mp4"}
     assert run(*(inputs.get(word, word) for word in words)) in (1, 2)
     assert str(pipe) in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("words", [["fit", "LOOP"], ["compress", "LOOP"], ["edit", "MODEL", "LOOP"], ["view", "LOOP"]])
-def test_a_link_to_itself_is_told(words, model, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    Path("loop").symlink_to("loop")
-    assert run(*({"LOOP": "loop", "MODEL": model}.get(word, word) for word in words)) == 2
-    assert "got 'loop', which cannot be reached (Too many levels of symbolic links)" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("words", [["fit", ""], ["render", "m.safetensors", "--out", ""], ["render", "m", "--out="]])
-def test_an_empty_argument_is_not_the_current_folder(words, tmp_path, monkeypatch, capsys):
-    """As of a shell variable that is not set."""
-    monkeypatch.chdir(tmp_path)
-    write_image("0.png", np.zeros((8, 8, 3), np.uint8))
-    assert run(*words) == 2
-    assert "arguments: expected a value for each, got an empty one" in capsys.readouterr().err
-    assert os.listdir() == ["0.png"]
-
-
-@pytest.mark.parametrize("words", [["fit-many", "LONG"], ["render", "MODEL", "--out", "LONG"]])
-def test_an_error_of_the_system_is_told_as_others(words, model, capsys):
-    assert run(*({"LONG": 300 * "x", "MODEL": model}.get(word, word) for word in words)) == 1
-    assert "error: path: expected one that can be used, got 'xxx" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("words", [["render", "MODEL", "--plate", "--masks", "MASK"], ["edit", "MODEL", "SCRIPT"]])
-def test_a_rate_too_high_for_a_gif_is_told_without_an_option_for_it(words, model, tmp_path, capsys):
-    fast = dataclasses.replace(load_video_model(model), fps=60.0)
-    inputs = {"MODEL": save_video_model(tmp_path / "fast.safetensors", fast)}
-    inputs["MASK"] = write_image(tmp_path / "mask.png", np.full((4, 4, 3), 255, np.uint8))
-    inputs["SCRIPT"] = tmp_path / "s.toml"
-    inputs["SCRIPT"].write_text('[[edits]]\ndo = "recolor"\ngain = 0.5\n')
-    assert run(*(inputs.get(word, word) for word in words), "--out", tmp_path / "x.gif") == 2
-    assert "--out: expected at most 50 frames per second in it, got 60 for" in capsys.readouterr().err
 
 
 def test_a_folder_with_other_files_is_refused_and_nothing_is_exported(model, full, capsys):

@@ -89,12 +89,7 @@ def test_scripts_say_where_nothing_moves(model, tmp_path, monkeypatch, capsys):
     assert not list(tmp_path.iterdir())
 
 
-def test_too_few_frames_are_refused_before_the_search(tmp_path, capsys):
-    save_video_model(tmp_path / "m.safetensors", soft_model(num_frames=2))
-    assert run("render", "--plate", tmp_path / "m.safetensors", "--out", tmp_path / "images") == 2
-    told = capsys.readouterr()
-    assert "MODEL: expected at least 3 frames, got 2. Fit more frames" in told.err
-    assert "Searching" not in told.out
+def test_too_few_frames_are_refused_before_the_search():
     with pytest.raises(NothingMoves, match=r"moving: expected a video of 3 frames at least, got 2\. Select by a mask"):
         edit(soft_model(num_frames=2)).select(moving=True)
 
@@ -160,72 +155,6 @@ def write_masks(folder, masks):
     folder.mkdir()
     for k, mask in enumerate(masks):
         write_image(folder / f"{k:05d}.png", np.repeat(np.uint8(255 * mask)[..., None], 3, -1))
-
-
-@pytest.mark.parametrize(
-    ("masks", "message"),
-    [
-        (MASKS[:3], "--masks: expected one mask, or one for each of 7 frames, got 3 masks"),
-        (np.zeros_like(MASKS), "--masks: expected masks that are not empty"),
-    ],
-)
-def test_other_masks_are_refused(model, tmp_path, monkeypatch, capsys, masks, message):
-    monkeypatch.chdir(tmp_path)
-    write_masks(tmp_path / "masks", masks)
-    assert run("render", "--plate", model, "--masks", "masks") == 2
-    assert message in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--out", "x.png"], "--out: expected"),
-        (["--size", "0x3"], "--size: expected HxW"),
-        (["--save-masks", "x.png"], "--save-masks: expected a folder, without extension, got x.png"),
-        (["--codec", "divx"], "--codec: expected"),
-        (["--crf", "99"], "--crf: expected a whole number from 0 to 51 for h264, got 99."),
-        (["--crf", "20", "--out", "x.gif"], "--crf: expected a video file for it, got 'x.gif'."),
-        (["--codec", "h264", "--out", "images"], "--codec: expected a video file for it, got 'images'."),
-        (["--sound", "none.wav"], "--sound: expected a file, got 'none.wav', which is missing"),
-        (["--codec", "av1"], "--out: expected at least 64x64 for av1"),
-        (["--upsample", "2"], "--plate: expected no --upsample, got both"),
-        (["--skip-repeats"], "--plate: expected no --skip-repeats, got both"),
-        (["--background", "none"], "--plate: expected no --background none, got both"),
-        (["--out", "x", "--save-masks", "./x"], "--save-masks: expected another folder than --out, got x."),
-    ],
-)
-@pytest.mark.usefixtures("searched")
-def test_mistakes_are_told_and_nothing_is_written(model, tmp_path, monkeypatch, capsys, options, message):
-    monkeypatch.chdir(tmp_path)
-    assert run("render", "--plate", model, *options) == 2
-    told = capsys.readouterr()
-    assert message in " ".join(told.err.split())
-    assert "Searching" not in told.out
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.usefixtures("searched")
-@pytest.mark.parametrize("options", [["--save-masks", "mine"], ["--save-masks", "masks", "--out", "mine"]])
-def test_folders_of_other_files_are_refused_before_the_search(model, tmp_path, monkeypatch, capsys, options):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "notes.txt").write_text("mine")
-    assert run("render", "--plate", model, *options, "--overwrite") == 1
-    told = capsys.readouterr()
-    assert "expected an empty folder or one of numbered frames, got 'mine' with 'notes.txt' in it" in told.err
-    assert "Searching" not in told.out
-    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
-
-
-@pytest.mark.usefixtures("searched")
-def test_a_file_in_place_of_a_folder_is_refused_before_the_search(model, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine").write_text("mine")
-    assert run("render", "--plate", model, "--out", "mine", "--overwrite") == 1
-    told = capsys.readouterr()
-    assert "expected a folder for frames, got the file 'mine'" in told.err
-    assert "Searching" not in told.out
-    assert (tmp_path / "mine").read_text() == "mine"
 
 
 INPUTS = {

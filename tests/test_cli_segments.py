@@ -137,18 +137,8 @@ def test_one_segment_is_taken_out(here, work, tmp_path, capsys):
     one = load_video_model("long.1.safetensors")
     np.testing.assert_array_equal(list(one.frames()), list(soft_model(seed=1, num_frames=9).frames()))
     assert run("evaluate", "long.1.safetensors", work / "clip") == 0  # its own frames of the clip
-    told(capsys)
-    for words, message in (
-        ((here, 3), "--segment: expected a whole number from 0 to 2, got 3"),
-        (("long.1.safetensors", 0), "MODEL: expected a model in segments, got one without segments"),
-        ((here, 1), "overwrite"),
-        ((here, 1, "--out", "one.mp4"), "--out: expected a name ending in .safetensors"),
-        ((here, 0, "--out", here), "--out"),
-        ((here, 0, "--times", "0.5"), "--times: expected ply3dgs or obj"),
-    ):
-        source, number, *options = words
-        assert run("export", source, "--format", "model", "--segment", number, *options) == 2
-        assert message in told(capsys)
+    assert run("export", here, "--format", "model", "--segment", 1) == 2
+    assert "overwrite" in told(capsys)
     assert run("export", here, "--format", "ply", "--segment", 2) == 0
     assert import_model("long.2.ply", size=one.size).num_frames == 5
 
@@ -194,22 +184,6 @@ def test_edit_acts_on_all_segments(here, tmp_path, capsys):
     before = sorted(tmp_path.iterdir())
     assert run("edit", here, "still.toml") == 1
     assert "still.toml, line 4, [[edits]] number 1: at: expected times of the segment that shows" in told(capsys)
-    assert sorted(tmp_path.iterdir()) == before
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("compress", "MODEL"),
-        ("uncertainty", "MODEL", "clip"),
-    ],
-)
-def test_what_takes_one_piece_says_how_to_get_one(words, here, work, tmp_path, capsys):
-    before = sorted(tmp_path.iterdir())
-    given = {"MODEL": here, "clip": work / "clip"}
-    assert run(*(given.get(word, word) for word in words)) == 2
-    said = told(capsys)
-    assert "MODEL: expected a model of one piece, got one in segments. Extract one: foldgauss export" in said
     assert sorted(tmp_path.iterdir()) == before
 
 

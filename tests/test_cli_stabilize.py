@@ -53,33 +53,6 @@ def test_options_reach_the_video(model, tmp_path, monkeypatch, capsys):
     assert "Enlarged" not in capsys.readouterr().out  # by 1.00
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--border", "blur"], "--border: expected one of 'crop', 'fill', 'keep', got 'blur'"),
-        (["--stabilize", "no"], "--stabilize: expected one of 'smooth', 'fixed', got 'no'"),
-        (["--smoothing", "0"], "--smoothing: expected seconds > 0, got 0.0"),
-        (["--stabilize", "fixed", "--smoothing", "1"], "--stabilize fixed: expected no --smoothing, got both"),
-        (["--masks", "x.png"], "--masks: expected --plate too, got --masks alone"),
-        (["--plate"], "--plate: expected no --stabilize, got both"),
-        (["--crf", "99"], "--crf: expected"),
-        (["--background", "none"], "--out: expected RGB for h264 in .mp4"),
-        (["--background", "none", "--out", "x.gif"], "--background: expected a color for .gif, got none"),
-        (["--fps", "60", "--out", "x.gif"], "--out: expected at most 50 frames per second in it, got 60 for x.gif"),
-        (["--out", "x.png"], "--out: expected one image for a .png"),
-        (["--size", "0x3"], "--size: expected HxW"),
-    ],
-)
-def test_mistakes_are_told_and_nothing_is_written(model, tmp_path, monkeypatch, capsys, options, message):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(
-        "foldgauss.video.motion.stabilization.estimate_camera_path", None
-    )  # errors are raised before it is called
-    assert run("render", model, *(() if "--stabilize" in options else STABLE), *options) == 2
-    assert message in " ".join(capsys.readouterr().err.split())
-    assert not list(tmp_path.iterdir())
-
-
 def test_shots_are_named(tmp_path, capsys):
     """Each frame another picture: no motion is known."""
     rng = np.random.default_rng(0)

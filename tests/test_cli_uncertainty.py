@@ -13,11 +13,9 @@ import cv2
 import numpy as np
 import pytest
 from commands import run
-from tiny_clips import NUM_FRAMES, TWICE, model_of_12, write_both
+from tiny_clips import NUM_FRAMES, TWICE, write_both
 
 from foldgauss.cli.measuring import uncertainty as command
-from foldgauss.io import load_video_model, save_video_model
-from foldgauss.video import edit
 
 for name in ("emcee", "h5py", "h5netcdf", "matplotlib"):
     pytest.importorskip(name, reason="an optional extra")
@@ -189,44 +187,6 @@ def test_more_steps_go_on_and_overwriting_starts_anew(work, tmp_path, capsys, no
     (target / "chains.h5").unlink()
     assert run(*arguments(work, target, *few)) == 2
     assert "no chains.h5 of a run of uncertainty" in capsys.readouterr().err
-
-
-def test_wrong_use(work, tmp_path, capsys):
-    model, clip, target = work / "model.safetensors", work / "clip", tmp_path / "out"
-    save_video_model(tmp_path / "edited.safetensors", edit(model_of_12()).move((0.1, 0), frame=3).video())
-    (tmp_path / "file").write_text("precious")
-    (tmp_path / "bad").mkdir()
-    (tmp_path / "bad" / "chains.h5").write_text("precious")
-    cases = [
-        ([model, clip, "--out", target, "--only", "0,3"], 2, "--only: expected whole numbers from 1 to 10"),
-        ([model, clip, "--out", target, "--only", "3-5"], 2, "--only: expected frames as 3,5,10:20"),
-        ([model, clip, "--out", target, "--only", "5:5"], 2, "--only: expected at least one frame"),
-        ([model, clip, "--out", target, "--noise", "white"], 2, "--noise: expected one of 'score', 'effective'"),
-        ([model, clip, "--out", target, "--level", "c"], 2, "--level: expected one of 'splats', 'colors'"),
-        ([model, clip, "--out", target, "--concentration", "0"], 2, "--concentration: expected a number >= 1"),
-        ([model, clip, "--out", target, "--ensembles", "1"], 2, "--ensembles: expected at least 2"),
-        ([model, clip, "--out", target, "--steps", "3"], 2, "--steps: expected a whole number >= 10"),
-        ([model, clip, "--out", target, "--frames", "0:2"], 2, "--frames: expected at least 3 frames"),
-        ([model, clip, "--out", clip], 2, "a place outside the clip's folder"),
-        ([model, clip, "--out", tmp_path / "file"], 2, "--out: expected a folder"),
-        ([model, clip, "--out", tmp_path / "bad"], 2, "got others in"),
-        ([tmp_path / "none", clip, "--out", target], 2, "missing"),
-        ([tmp_path / "edited.safetensors", clip, "--out", target], 2, "an edited one"),
-    ]
-    for words, code, message in cases:
-        assert run("uncertainty", *words) == code, words
-        assert message in (told := capsys.readouterr().err), told
-        assert len(told.strip().splitlines()) == 1, told
-        assert not target.exists(), words
-    own = save_video_model(tmp_path / "own.safetensors", load_video_model(model), metadata={"clip": clip.name})
-    assert run("uncertainty", own, clip, "--out", target, "--frames", "0:5") == 2
-    assert "--only A:B" in capsys.readouterr().err
-    (tmp_path / "images").mkdir()
-    (tmp_path / "images" / "0.png").write_text("precious")
-    assert run("uncertainty", model, clip, "--out", tmp_path / "images") == 2
-    assert "a new folder or one that a run of uncertainty wrote" in capsys.readouterr().err
-    assert (tmp_path / "file").read_text() == "precious"
-    assert (tmp_path / "bad" / "chains.h5").read_text() == "precious"
 
 
 def test_a_clip_of_something_else(work, tmp_path, capsys):

@@ -20,9 +20,8 @@ from commands import run
 from tiny_clips import NUM_FRAMES, write_both
 
 from foldgauss.cli.viewing import page_server
-from foldgauss.io import html_page, load_video_model, save_video_model
+from foldgauss.io import html_page, load_video_model
 from foldgauss.io.page.player_page import script_version, with_script
-from foldgauss.video import edit
 from foldgauss.video.motion.moving_object import nothing_moves
 from foldgauss.video.selection import selectors
 
@@ -248,32 +247,3 @@ def test_the_page_is_written(work, tmp_path, capsys):
     original = ["--original", work / "clip", "--original-quality", 10, "--overwrite"]
     assert run("view", work / "model.safetensors", "--out", out, *original) == 0
     assert out.read_text(encoding="utf-8").count('id="frame-') == plain.count('id="frame-') + NUM_FRAMES
-
-
-def test_wrong_use_is_told(work, tmp_path, capsys):
-    model, out = work / "model.safetensors", tmp_path / "clip.html"
-    edited = edit(load_video_model(model)).select(np.arange(40) < 9).move((0.1, 0), times=(0.5, 1)).video()
-    late = save_video_model(tmp_path / "late.safetensors", edited)
-
-    def refused(*arguments):
-        code = run(*arguments)
-        told = capsys.readouterr().err
-        assert told.startswith("error: ")
-        assert len(told.strip().splitlines()) == 1
-        assert not out.exists()
-        return code, told
-
-    for arguments, expected, wanted in (
-        (["view", model, "--out", tmp_path / "clip.htm"], 2, "--out: expected a name ending"),
-        (["view", model, "--out", out, "--moving-object"], 2, "--out: expected no --moving-object, got both"),
-        (["view", model, "--linked"], 2, "--linked: expected --out too"),
-        (["view", "--out", out, "--original", model], 2, "--out without MODEL: expected no --original"),
-        (["view"], 2, "MODEL: expected a model file, or --out"),
-        (["view", late, "--out", out], 1, "foldgauss render"),
-        (["view", late, "--no-browser"], 1, "edits that no folded model represents"),
-        (["view", tmp_path / "none.fgz"], 2, "none.fgz"),
-        (["view", model, "--original", tmp_path / "none.mp4", "--no-browser"], 2, "none.mp4"),
-    ):
-        code, told = refused(*arguments)
-        assert code == expected, (arguments, told)
-        assert wanted in told, told

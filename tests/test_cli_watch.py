@@ -151,37 +151,3 @@ def test_a_fit_stops_at_once_before_its_first_step(number, clip, tmp_path, monke
     assert run("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK) == 1
     assert f"stopped by {number.name} before the first step" in capsys.readouterr().err
     assert list(tmp_path.glob("m.*")) == []
-
-
-def test_errors_name_the_option(clip, tmp_path, capsys):
-    for given, says in (
-        (["--gaussians", "0"], "--gaussians: expected a whole number >= 1"),
-        (["--psnr", "-1"], "--psnr: expected a number in (0, 100]"),
-        (["--quality", "101"], "--quality: expected a number in [0, 100]"),
-        (["--preset", "best"], "--preset: expected one of"),
-        (["--out", tmp_path / "m.mp4"], "--out: expected a name for the model, as "),
-        (["--size-mb", "0.001", *QUICK, "--out", tmp_path / "m.fgz"], "--size-mb: expected at least"),
-        (["--size-mb", "1", "--out", tmp_path / "m.safetensors"], "--size-mb: expected a compact file, got"),
-        (["--frames", "1:1"], "--frames: expected"),
-    ):
-        assert run("fit", clip, *given) == 2, given
-        assert says in capsys.readouterr().err
-
-
-def test_places_that_cannot_be_right(clip, tmp_path, capsys):
-    out = tmp_path / "m.safetensors"
-    for given, code, says in (
-        (["--history", tmp_path / "h.txt"], 2, "--history: expected a name ending in .jsonl"),
-        (["--preview", tmp_path / "p.jpg"], 2, "--preview: expected a name ending in .png"),
-        (
-            ["--preview", tmp_path / "h.png", "--history", tmp_path / "h.jsonl"],
-            2,
-            "--preview: .* of --history",
-        ),
-        (["--quiet", "--log-json"], 2, "--quiet: .*both"),
-    ):
-        assert run("fit", clip, "--out", out, *QUICK, *given) == code, given
-        message = capsys.readouterr().err
-        assert re.search(says, message), message
-        assert len(message.strip().splitlines()) == 1
-    assert not list(tmp_path.iterdir())

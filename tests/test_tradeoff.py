@@ -324,23 +324,6 @@ def test_minutes_become_steps(clip, tmp_path, capsys, monkeypatch, minutes, step
     assert record_of(tmp_path / "r")["plan"]["steps"] == steps
 
 
-@pytest.mark.parametrize(
-    ("options", "told"),
-    [
-        (["--axes", "time,speed"], "--axes: expected some of time, gaussians, degree"),
-        (["--axes", ","], "--axes: expected some of"),
-        (["--minutes", "0"], "--minutes: expected a number above 0"),
-        (["--minutes", "nan"], "--minutes: expected a number above 0"),
-        (["--seed", "-1"], "--seed: expected a whole number >= 0"),
-        (["--size", "9"], "--size: expected HxW"),
-    ],
-)
-def test_wrong_use(clip, tmp_path, capsys, options, told):
-    assert run("tradeoff", clip, "--out", tmp_path / "r", *options) == 2
-    assert told in " ".join(capsys.readouterr().err.split())
-    assert not (tmp_path / "r").exists()
-
-
 def test_other_settings_are_refused(done, clip, tmp_path, capsys):
     before = {path: path.read_bytes() for path in done.rglob("*.*")}
     for options, told in (
@@ -414,19 +397,6 @@ def test_options_of_fit_reach_the_fit(clip, tmp_path, monkeypatch):
     options = load_video_model(target).options
     assert (options.alpha_cutoff, options.support_radius, options.transmittance_stop) == (0.01, 2.0, 0.02)
     assert options.low_pass == FitConfig().options.low_pass
-
-
-@pytest.mark.parametrize("words", [["fit"], ["evaluate"], ["render"]])
-@pytest.mark.parametrize("option", ["alpha-cutoff", "support-radius", "transmittance-stop"])
-def test_constants_out_of_bounds(done, clip, tmp_path, capsys, words, option):
-    made = {
-        "fit": ["fit", clip, "--out", tmp_path / "x.safetensors"],
-        "evaluate": ["evaluate", done / "models" / "base.safetensors", clip, "--frames", "1:6"],
-        "render": ["render", done / "models" / "base.safetensors", "--out", tmp_path / "x.mp4"],
-    }[words[0]]
-    assert run(*made, f"--{option}", "-1") == 2
-    assert f"--{option}: expected a number in" in " ".join(capsys.readouterr().err.split())
-    assert not list(tmp_path.iterdir())
 
 
 def test_render_with_other_constants(done, tmp_path):

@@ -3,10 +3,7 @@
 import dataclasses
 import json
 import re
-import shutil
-import subprocess
 import zlib
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -14,7 +11,6 @@ import numpy as np
 import pytest
 from soft_models import SIZE, on_paths, soft_model
 
-import foldgauss.io.page
 import foldgauss.video.compression.chunks as chunks_module
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import ModelFileError, load_compact, load_video_model, save_compact, save_video_model
@@ -678,66 +674,6 @@ def test_a_path_is_the_same_from_another_time():
         return sum(place[:, k] * u[:, None] ** k for k in range(4))
 
     np.testing.assert_allclose(at(shift_path(place, shift), u + shift), at(place, np.full(5, u)), rtol=1e-9)
-
-
-@pytest.mark.skipif(shutil.which("node") is None, reason="needs node, which runs the decoder for browsers")
-@pytest.mark.parametrize(
-    "how",
-    [
-        {"degree": 0},
-        {"degree": 3, "power": 1.0},
-        {"degree": 7},
-        {"num_frames": 1},
-        "crowd",
-        "crowd of degrees",
-        "paths",
-        "paths at other times",
-        "paths of a crowd",
-        "cuts",
-        "cuts and paths",
-        "chunks",
-        "chunks of a crowd on paths",
-    ],
-)
-def test_the_decoder_for_browsers_gives_the_same_bits(tmp_path, how):
-    model = soft_model(options=RenderOptions(), **({} if isinstance(how, str) else how))
-    if isinstance(how, str) and "crowd" in how:
-        model = crowd(model)
-    if isinstance(how, str) and "cuts" in how:
-        model = with_cuts(model)
-    if isinstance(how, str) and "paths" in how:
-        if how.startswith("paths "):
-            model = eqx.tree_at(lambda m: m.frame_times.logits, model, np.float32([0, 0.1, -0.3, 0.2, -7.0, 2.5]))
-        model = on_paths(model, at_frames=how != "paths at other times")
-    if how == "crowd of degrees":
-        model = of_degrees(model)
-    quantized = compress(model, quality=90).quantized
-    if isinstance(how, str) and "chunks" in how:
-        quantized = quantize(
-            compute_columns(model), np.zeros(model.num_gaussians, np.int32), quantized.rules, thirds(model)
-        )
-    path = save_compact(tmp_path / "m.fgz", quantized)
-    decoder = Path(foldgauss.io.page.__file__).with_name("compact.js")
-    (tmp_path / "decoder.mjs").write_bytes(decoder.read_bytes())
-    (tmp_path / "run.mjs").write_text(
-        """
-        import { readFileSync, writeFileSync } from "node:fs";
-        import { decode } from "./decoder.mjs";
-        const file = readFileSync("m.fgz");
-        const { header, leaves } = decode(file.buffer.slice(file.byteOffset, file.byteOffset + file.length));
-        for (const [name, own] of Object.entries(leaves)) writeFileSync(name, new Uint8Array(own.buffer));
-        """
-    )
-    subprocess.run(["node", "run.mjs"], cwd=tmp_path, check=True, timeout=60)
-    again = load_video_model(path)
-    leaves = {field.name: getattr(again.splats, field.name) for field in dataclasses.fields(again.splats)}
-    leaves = {name: leaf for name, leaf in leaves.items() if name not in ("envelope", "path_index", "paths")}
-    if again.splats.paths is not None:
-        paths = again.splats.paths
-        leaves |= {"path_index": again.splats.path_index, "path_times": paths.times, "path_matrices": paths.matrices}
-    for name, leaf in (leaves | {"frame_times": again.frame_times.logits}).items():
-        leaf = np.asarray(leaf)
-        assert (tmp_path / name).read_bytes() == leaf.tobytes(), name
 
 
 # ------------------------------------------------------------------------------------ extremes

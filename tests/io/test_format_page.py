@@ -1,7 +1,10 @@
-"""A reader written from docs/format.md alone returns the bits that the package returns."""
+"""A reader written from docs/format.md alone, and the decoder of browsers, return the bits that the package returns."""
 
 import dataclasses
+import shutil
+import subprocess
 import warnings
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -10,6 +13,7 @@ import pytest
 from format_reader import read
 from soft_models import on_paths, soft_model
 
+import foldgauss.io.page
 from foldgauss.io import load_video_model, save_compact
 from foldgauss.video.compression.quantize import (
     FEATURES,
@@ -115,26 +119,35 @@ MODELS = {
 }
 
 
-@pytest.mark.parametrize("name", MODELS)
-def test_the_reader_returns_the_same_bits(tmp_path, name):
-    for exponent in (-0.5, -4.0, -13.0):
-        path = save_compact(tmp_path / "m.fgz", quantize_unevenly(MODELS[name](), exponent=exponent))
+DECODE = """
+import { readFileSync, writeFileSync } from "node:fs";
+import { decode } from "./compact.mjs";
+const file = readFileSync("m.fgz");
+const { header, leaves } = decode(file.buffer.slice(file.byteOffset, file.byteOffset + file.length));
+for (const [name, own] of Object.entries(leaves)) writeFileSync(name, new Uint8Array(own.buffer));
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "num_chunks"), [*((name, 1) for name in MODELS), ("several degrees", 4), ("paths at other times", 4)]
+)
+def test_the_reader_and_the_decoder_of_browsers_return_the_same_bits(tmp_path, name, num_chunks):
+    """The latter is run by node, where there is one."""
+    (tmp_path / "compact.mjs").write_bytes(Path(foldgauss.io.page.__file__).with_name("compact.js").read_bytes())
+    (tmp_path / "run.mjs").write_text(DECODE)
+    for exponent in (-0.5, -4.0, -13.0) if num_chunks == 1 else (-6.3,):
+        quantized = quantize_unevenly(MODELS[name](), exponent=exponent, num_chunks=num_chunks)
+        path = save_compact(tmp_path / "m.fgz", quantized)
         header, arrays = read(path.read_bytes())
         model = load_video_model(path)
         check_bits(arrays, model)
         assert header["num_frames"] == model.num_frames
         assert (tuple(header["size"]), header["degree"]) == (model.size, model.degree)
-        assert sum(chunk["num_gaussians"] for chunk in header["chunks"]) == model.num_gaussians
-
-
-@pytest.mark.parametrize("paths", [False, True])
-def test_chunks_are_read_in_the_order_of_the_model(tmp_path, paths):
-    model = lower_degrees(make_model(5))
-    quantized = quantize_unevenly(on_paths(model) if paths else model, num_chunks=4)
-    path = save_compact(tmp_path / "m.fgz", quantized)
-    header, arrays = read(path.read_bytes())
-    assert len(header["chunks"]) == 4
-    check_bits(arrays, load_video_model(path))
+        assert [chunk["num_gaussians"] for chunk in header["chunks"]] == [chunk.num for chunk in quantized.chunks]
+        if shutil.which("node"):
+            subprocess.run(["node", "run.mjs"], cwd=tmp_path, check=True, timeout=60)
+            for leaf, expected in leaves_of(model).items():
+                assert (tmp_path / leaf).read_bytes() == expected.tobytes(), leaf
 
 
 def test_some_chunks_are_the_rows_of_their_gaussians(tmp_path):

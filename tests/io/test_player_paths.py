@@ -9,8 +9,6 @@ import pytest
 from editor_page import (
     EDITS,
     IT,
-    LEVELS,
-    TIMES,
     WORST,
     assert_shows,
     download,
@@ -20,11 +18,12 @@ from editor_page import (
     read_script,
     select,
 )
-from soft_models import NUM, OBJECT, SIZE, on_paths, soft_model
+from soft_models import NUM, OBJECT, on_paths, soft_model
 
 from foldgauss.io import load_video_model, save_compact, save_video_model
+from foldgauss.io.edit_script import parse_edit_script
 from foldgauss.io.page.player_page import quantize_finely
-from foldgauss.render import RenderOptions, Splats2D, render
+from foldgauss.render import RenderOptions
 from foldgauss.video.models.renderer import VideoRenderer
 
 CASES = {
@@ -33,7 +32,6 @@ CASES = {
     "floor": {"degree": 2, "power": 1.0, "floor": 0.1},
     "strong": {"reach": 8.0, "thin": 4.0},
 }
-FIELDS = ("mean", "factor", "opacity", "color")
 #: Colors are in the leaves alone.
 PLACES = {name: EDITS[name] for name in EDITS if name not in ("hue", "gain", "color", "matrix", "fainter", "denser")}
 PLACES["several"] = "\n[[edits]]\n".join(
@@ -104,104 +102,14 @@ def test_damaged_paths_are_told(opened, tmp_path, what):
 # ----------------------------------------------------------------------------------------------- edits
 
 
-class Reference:
-    """A video as splats of each time, in model space, each edit exact in the frame."""
-
-    def __init__(self, model):
-        self.model, self.mask = model, np.arange(NUM) < 12
-        at = eqx.filter_jit(lambda splats, t: splats.at(t))
-        self.at = lambda t: [np.asarray(getattr(at(model.splats, jnp.float32(t)), name)) for name in FIELDS]
-
-    def edit(self, change):
-        """`change(at, t)` gives leaves; those of the selected Gaussians are taken."""
-        before, mask = self.at, self.mask
-
-        def at(t):
-            pairs = zip(change(before, t), before(t), strict=True)
-            return [np.where(mask.reshape(-1, *[1] * (old.ndim - 1)), new, old) for new, old in pairs]
-
-        self.at = at
-
-    def affine(self, matrix=((1, 0), (0, 1)), about=(0, 0), offset=(0, 0)):
-        matrix, about, offset = map(np.array, (matrix, about, offset))
-
-        def change(at, t):
-            mean, factor, *others = at(t)
-            return [(mean - about) @ matrix.T + about + offset, matrix @ factor, *others]
-
-        self.edit(change)
-
-    def gather(self, source, mask):
-        before = self.at
-        self.at, self.mask = lambda t: [own[source] for own in before(t)], mask
-
-    def apply(self, do, **keys):
-        if do == "move":
-            self.affine(offset=keys["offset"])
-        elif do == "scale":
-            self.affine(np.diag(np.broadcast_to(keys["factor"], 2)), keys["about"])
-        elif do == "rotate":
-            cos, sin = np.cos(np.radians(keys["degrees"])), np.sin(np.radians(keys["degrees"]))
-            self.affine(((cos, -sin), (sin, cos)), keys["about"])
-        elif do == "transform":
-            self.affine(keys["matrix"], keys["about"], keys.get("offset", (0, 0)))
-        elif do == "retime":
-            shift, stretch, about = (
-                keys.get(name, other) for name, other in (("shift", 0), ("stretch", 1), ("about", 0))
-            )
-            self.edit(lambda at, t: at(np.clip(about + (t - about - shift) / stretch, 0, 1)))
-        elif do == "freeze":
-            times = np.asarray(self.model.frame_times.times())
-            frozen = np.interp(keys["at"], np.arange(len(times)), times)
-            self.edit(lambda at, t: at(frozen))
-        elif do == "vanish":
-            self.gather(np.flatnonzero(~self.mask), np.zeros((~self.mask).sum(), bool))
-        elif do in ("to_front", "to_back"):
-            order = np.argsort(~self.mask if do == "to_front" else self.mask, kind="stable")
-            self.gather(order, self.mask[order])
-        elif do == "multiply":
-            self.multiply(**keys)
-        else:
-            assert do in ("recolor", "opacity")
-
-    def multiply(self, offsets, delays=0, scale=1, degrees=0, about=(0, 0), originals=False):
-        count = np.where(self.mask, len(offsets) + 1, 1)
-        copy = np.concatenate([np.arange(own) for own in count])
-        chosen = np.repeat(self.mask, count)
-        self.gather(np.repeat(np.arange(len(self.mask)), count), chosen)
-        for k, offset in enumerate(offsets):
-            self.mask = copy == k + 1
-            self.apply("scale", factor=scale, about=about)
-            self.apply("rotate", degrees=degrees, about=about)
-            self.apply("move", offset=offset)
-            self.apply("retime", shift=np.broadcast_to(delays, len(offsets))[k])
-        self.mask = chosen if originals else copy > 0
-
-    def picture(self, t):
-        splats = Splats2D(*(jnp.asarray(own, jnp.float32) for own in self.at(t))).to_pixels(SIZE)
-        how = {"compositing": self.model.compositing, "options": self.model.options, "engine": "cpu"}
-        return np.asarray(render(splats, SIZE, **how)) * 255
-
-    def assert_shown(self, page):
-        for t in TIMES:
-            far = np.abs(page.picture(t) - np.clip(self.picture(t), 0, 255))
-            assert (far.mean() < LEVELS + 0.3) & (far.max() <= WORST + 0.5), (t, far.mean(), far.max())
-
-
-def steps_of(page):
-    return [step for step in page.page.evaluate("foldgauss.player.editing.history.current") if "do" in step]
-
-
 @pytest.mark.parametrize(
     "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in PLACES]
 )
 def test_an_edit_moves_what_is_seen(opened, moving, tmp_path, name):
-    page, reference = opened(moving), Reference(load_video_model(moving))
+    page = opened(moving)
     before = page.picture(0.9)
     read_script(page, IT + PLACES[name])
-    for step in steps_of(page):
-        reference.apply(**step)
-    reference.assert_shown(page)
+    assert_shows(page, parse_edit_script(IT + PLACES[name]).apply(load_video_model(moving)))
     assert np.abs(page.picture(0.9).astype(float) - before).mean() > 0.3 or name in ("front", "back")
     if name in HOLDING:
         return
