@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from foldgauss.estimator import FoldedGaussianMixture as FoldedGaussianMixture
     from foldgauss.estimator import FoldedMixtureRegressor as FoldedMixtureRegressor
     from foldgauss.fold import CallableFold, FourierFold, PolynomialFold, SharedPathFold, SplineFold, ZeroFold
-    from foldgauss.mixture import FoldedMixture, GaussianMixture
+    from foldgauss.mixture import FoldedMixture, Mixture
 
 for _kind, _location in {
     "distribution": "foldgauss.analysis.notebook:density_png",
@@ -36,7 +36,7 @@ __all__ = [
     "FoldedMixture",
     "FourierFold",
     "Gaussian",
-    "GaussianMixture",
+    "Mixture",
     "Normal",
     "PolynomialFold",
     "SharedPathFold",
@@ -54,7 +54,7 @@ _HOMES = {
     "envelope": ("CallableEnvelope", "Constant", "TimeLikelihood", "plain_envelope"),
     "estimator": ("FoldedGaussianMixture", "FoldedMixtureRegressor"),
     "fold": ("CallableFold", "FourierFold", "PolynomialFold", "SharedPathFold", "SplineFold", "ZeroFold"),
-    "mixture": ("FoldedMixture", "GaussianMixture"),
+    "mixture": ("FoldedMixture", "Mixture"),
 }
 
 

@@ -9,14 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key
 
+from foldgauss._numerics.abstract import AbstractDistribution
 from foldgauss._numerics.batch import (
-    BatchModule,
-    align,
+    align_leaves,
     as_event,
-    as_sample_shape,
     as_value,
-    batch_shape_of,
-    broadcast,
     broadcast_leaves,
     cast,
     check_batch,
@@ -24,23 +21,21 @@ from foldgauss._numerics.batch import (
     check_positive,
     common_dtype,
     compile_eager,
-    expand_leaves,
     ranked_leaves,
+    vectorized,
 )
 from foldgauss._numerics.factor import check_loc, check_rest, marginal_tril, normalize_indices, resolve_scale_tril
-from foldgauss._numerics.triangular import join_columns, multiply_lower, solve_lower, split_columns
-from foldgauss._runtime import notebook_hooks
 from foldgauss._runtime.checks import invalid
-from foldgauss.analysis import interop, moments
+from foldgauss.analysis import moments
 from foldgauss.analysis.conditional import TimeDensity, TimeMixture, conditional_gaussian, time_density, time_mixture
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood, as_envelope, check_peak
-from foldgauss.fold import AbstractFold, ZeroFold, as_fold, evaluate_shift, restrict_fold
-from foldgauss.gaussian import Gaussian, Normal, times_exp
+from foldgauss.fold import AbstractFold, CallableFold, ZeroFold, as_fold, evaluate_shift, restrict_fold
+from foldgauss.gaussian import Gaussian, Normal, half_log_det, log_density, sample_components, unwhiten, whiten
 
 __all__ = ["FoldedGaussian", "Gaussian", "Normal"]
 
 
-class FoldedGaussian(BatchModule):
+class FoldedGaussian(AbstractDistribution):
     """The Folded-Gaussian distribution of x = (s, t), space s in R^(d-1) and time t **last**.
 
         t     ~ N(time_loc, time_scale^2)
@@ -116,23 +111,18 @@ class FoldedGaussian(BatchModule):
         # over this constructor adds in front are well defined.
         parts = [(loc, 1), (tril, 2), (time_loc, 0), (time_scale, 0)]
         batch = check_batch([*parts, *ranked_leaves(fold), *ranked_leaves(envelope)])
-        self.loc, self.scale_tril, self.time_loc, self.time_scale = broadcast(parts, batch)
+        self.loc, self.scale_tril, self.time_loc, self.time_scale = (
+            jnp.broadcast_to(x, batch + x.shape[x.ndim - rank :]) for x, rank in parts
+        )
         self.envelope = broadcast_leaves(envelope, batch)
         # Parameters of a callable (say a network) are not copied per component: they keep axes of size 1.
-        self.fold = expand_leaves(fold, len(batch)) if fold.shares_leaves else broadcast_leaves(fold, batch)
+        self.fold = align_leaves(fold, len(batch)) if fold.shares_leaves else broadcast_leaves(fold, batch)
         if validate_args:
             check_peak(self.envelope, self.time_loc, self.time_scale)
 
     @property
     def event_shape(self) -> tuple[int, ...]:
         return (self.loc.shape[-1] + 1,)
-
-    has_rsample = True  #: draws are differentiable in the parameters
-
-    @property
-    def batch_shape(self) -> tuple[int, ...]:
-        """Broadcast leading dimensions of all leaves, including those of the fold and the envelope."""
-        return batch_shape_of(ranked_leaves(self))
 
     @property
     def time_marginal(self) -> Normal:
@@ -154,63 +144,54 @@ class FoldedGaussian(BatchModule):
         **Source:** eq:cond_dens, eq:cond_proof. Far from `time_loc`, `scale_tril` may underflow to 0; the density does
         not use it, but `log_scale`.
         """
-        t = as_value(t, self.loc.dtype)
-        dist = expand_leaves(self, t.ndim)
-        (t,) = align([(t, 0)], dist.time_loc.ndim)
-        shift = evaluate_shift(dist.fold, dist.time_loc - t)
-        log_a = dist.envelope.log_a(t, time_loc=dist.time_loc, time_scale=dist.time_scale)
-        largest = float(jnp.finfo(log_a.dtype).max) * 1e-3  # log a = -inf would give inf - inf in the density
-        log_a = jnp.clip(log_a, -largest, largest)
-        return Gaussian(dist.loc + shift, dist.scale_tril, log_scale=0.5 * log_a, validate_args=False)
-
-    def log_prob(self, value: Float[Array, "*#batch d"]) -> Float[Array, "*#batch"]:
-        """log FN(x) = log N(s | t) + log N(t), by the chain rule.
-
-        **Shapes:** value (*sample, *batch, d), time last -> (*sample, *batch). **Units:** log of 1 / (space^(d-1)
-        time).
-
-        **Example:** `dist.log_prob(jnp.array([0.1, -0.2, 0.5]))`
-
-        **Source:** eq:foldgauss. **Raises:** ValueError if the last dimension of value is not d.
-        """
-        return self._log_prob(as_event("value", value, self.loc.dtype, self.event_shape))
+        loc, log_scale = self._condition_time(as_value(t, self.dtype))
+        return Gaussian(loc, self.scale_tril, log_scale=log_scale, validate_args=False)
 
     @compile_eager
-    def _log_prob(self, value: Array) -> Array:
-        s, t = value[..., :-1], value[..., -1]
-        log_time = self.time_marginal.log_prob(t)
-        overflow = jnp.isinf(self.condition_time(t).loc).any(-1)
+    @vectorized(0)
+    def _condition_time(self, t: Array) -> tuple[Array, Array]:
+        at = self._at(t)
+        return at.loc, at.log_scale
+
+    def _at(self, t: Float[Array, ""]) -> Gaussian:
+        """`condition_time` of one distribution and time."""
+        shift = evaluate_shift(self.fold, self.time_loc - t)
+        log_a = self.envelope.log_a(t, time_loc=self.time_loc, time_scale=self.time_scale)
+        largest = float(jnp.finfo(log_a.dtype).max) * 1e-3  # log a = -inf would give inf - inf in the density
+        log_a = jnp.clip(log_a, -largest, largest)
+        return Gaussian(self.loc + shift, self.scale_tril, log_scale=0.5 * log_a, validate_args=False)
+
+    @compile_eager
+    @vectorized(1)
+    def _log_prob(self, x: Array) -> Array:
+        # log FN(x) = log N(s | t) + log N(t), by the chain rule (eq:foldgauss).
+        s, t = x[:-1], x[-1]
+        log_time = self.time_marginal._log_prob(t)
+        overflow = jnp.isinf(self._at(t).loc).any()
         # Double where: at times where the fold overflows, gradients are taken at f(0) instead.
-        near, time_loc = align([(t, 0), (self.time_loc, 0)], overflow.ndim)
-        log_space = self.condition_time(jnp.where(overflow, time_loc, near)).log_prob(s)
+        log_space = log_density(self._at(jnp.where(overflow, self.time_loc, t)), s)
         unreachable = overflow | jnp.isneginf(log_space) | jnp.isneginf(log_time)
         return jnp.where(unreachable, -jnp.inf, log_space + log_time)
 
-    def pdf(self, value: Float[Array, "*#batch d"]) -> Float[Array, "*#batch"]:
-        """FN(x), shapes as in `log_prob`. **Source:** eq:foldgauss."""
-        return jnp.exp(self.log_prob(value))
-
-    def sample(self, key: Key[Array, ""], sample_shape: int | tuple[int, ...] = ()) -> Float[Array, "..."]:
-        """Random samples x = (s, t): first t, then s given t; differentiable in all parameters.
-
-        **Shapes:** -> (*sample_shape, *batch, d), time last; a number n as `sample_shape` is (n,).
-
-        **Example:** `dist.sample(jax.random.key(0), 1000)`
-
-        **Source:** eq:foldgauss, by ancestral sampling.
-        """
-        return self._sample(key, as_sample_shape(sample_shape))
-
     @compile_eager(static=("sample_shape",))
     def _sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...]) -> Array:
-        time_key, space_key = jax.random.split(key)
         # Every batch element has its own t, even where only loc or the fold has batch dimensions.
-        shape = (*sample_shape, *self.batch_shape)
-        noise = jax.random.normal(time_key, shape, self.loc.dtype)
-        noise, time_loc, time_scale = align([(noise, 0), (self.time_loc, 0), (self.time_scale, 0)])
-        t = time_loc + time_scale * noise
-        s = self.condition_time(t).sample(space_key)
-        return jnp.concatenate([s, t[..., None]], axis=-1)
+        return self._transform(self._draw_noise(key, (*sample_shape, *self.batch_shape)))
+
+    def _draw_noise(self, key: Key[Array, ""], shape: tuple[int, ...]) -> Array:
+        time_key, space_key = jax.random.split(key)
+        t = jax.random.normal(time_key, (*shape, 1), self.dtype)
+        return jnp.concatenate([jax.random.normal(space_key, (*shape, self.loc.shape[-1]), self.dtype), t], axis=-1)
+
+    @vectorized(1)
+    def _transform(self, z: Array) -> Array:
+        t = self.time_loc + self.time_scale * z[-1]
+        return jnp.append(unwhiten(self._at(t), z[:-1]), t)
+
+    def _sample_from(self, key: Key[Array, ""], sample_shape: tuple[int, ...], component: Array) -> Array:
+        # One network in each of many samples would be copied for all.
+        every = isinstance(self.fold, CallableFold)
+        return super()._sample_from(key, sample_shape, component) if every else sample_components(self, key, component)
 
     # --- whitening ------------------------------------------------------------------------------------------
 
@@ -225,15 +206,13 @@ class FoldedGaussian(BatchModule):
 
         **Source:** eq:transform_s. **Raises:** ValueError if the last dimension of x is not d.
         """
-        return self._fold_to_normal(self._broadcast_value(x))
+        return self._fold_to_normal(self._checked(x, "x"))
 
     @compile_eager
+    @vectorized(1)
     def _fold_to_normal(self, x: Array) -> tuple[Array, Array]:
-        at = self.condition_time(x[..., -1])
-        z, log_det = _whiten(at, x[..., :-1])
-        loc, scale = (jnp.broadcast_to(y, log_det.shape) for y in (self.time_loc, self.time_scale))
-        z = jnp.concatenate([z, ((x[..., -1] - loc) / scale)[..., None]], axis=-1)
-        return z, log_det - jnp.log(scale)
+        at, tau = self._at(x[-1]), (x[-1] - self.time_loc) / self.time_scale
+        return jnp.append(whiten(at, x[:-1]), tau), -half_log_det(at) - jnp.log(self.time_scale)
 
     def normal_to_fold(self, z: Float[Array, "*#batch d"]) -> tuple[Float[Array, "*#batch d"], Float[Array, "*#batch"]]:
         """The inverse of `fold_to_normal`: x, and log |dx/dz|.
@@ -244,19 +223,13 @@ class FoldedGaussian(BatchModule):
 
         **Source:** eq:transform_s. **Raises:** ValueError if the last dimension of z is not d.
         """
-        return self._normal_to_fold(self._broadcast_value(z))
+        return self._normal_to_fold(self._checked(z, "z"))
 
     @compile_eager
+    @vectorized(1)
     def _normal_to_fold(self, z: Array) -> tuple[Array, Array]:
-        loc, scale = (jnp.broadcast_to(y, z.shape[:-1]) for y in (self.time_loc, self.time_scale))
-        t = loc + scale * z[..., -1]
-        s, log_det = _unwhiten(self.condition_time(t), z[..., :-1])
-        return jnp.concatenate([s, t[..., None]], axis=-1), log_det + jnp.log(scale)
-
-    def _broadcast_value(self, x) -> Array:
-        """x, checked, with all batch dimensions."""
-        x = as_event("x", x, self.loc.dtype, self.event_shape)
-        return jnp.broadcast_to(x, (*jnp.broadcast_shapes(x.shape[:-1], self.batch_shape), *self.event_shape))
+        x = self._transform(z)
+        return x, half_log_det(self._at(x[-1])) + jnp.log(self.time_scale)
 
     # --- moments --------------------------------------------------------------------------------------------
 
@@ -275,26 +248,6 @@ class FoldedGaussian(BatchModule):
         **Source:** eq:cond_dens, by total mean and covariance.
         """
         return moments.moments(self, with_error=with_error)
-
-    @property
-    def mean(self) -> Float[Array, "*batch d"]:
-        """E x, as `moments`."""
-        return self.moments()[0]
-
-    @property
-    def variance(self) -> Float[Array, "*batch d"]:
-        """Var x per coordinate, as `moments`."""
-        return jnp.diagonal(self.moments()[1], axis1=-2, axis2=-1)
-
-    @property
-    def stddev(self) -> Float[Array, "*batch d"]:
-        """Standard deviations of the coordinates, as `moments`."""
-        return jnp.sqrt(self.variance)
-
-    @property
-    def covariance_matrix(self) -> Float[Array, "*batch d d"]:
-        """Cov x of space and time jointly, as `moments`; for space at one time use `condition_time(t)`."""
-        return self.moments()[1]
 
     @property
     def mode(self) -> Float[Array, "*batch d"]:
@@ -335,10 +288,11 @@ class FoldedGaussian(BatchModule):
         **Source:** eq:integral_proof. **Raises:** ValueError on invalid indices.
         """
         indices = normalize_indices(indices, self.event_shape[0])
-        space = tuple(i for i in indices if i != self._time_index)
+        time = self.event_shape[0] - 1
+        space = tuple(i for i in indices if i != time)
         if len(space) == len(indices):
             return time_mixture(self, space, (), jnp.zeros((0,), self.loc.dtype), keeps_time=False)
-        if indices[-1] != self._time_index:
+        if indices[-1] != time:
             raise invalid("indices", expected="time last", got=repr(indices), cure="Time is the last coordinate.")
         if not space:
             return Gaussian(self.time_loc[..., None], self.time_scale[..., None, None], validate_args=False)
@@ -366,16 +320,21 @@ class FoldedGaussian(BatchModule):
         **Source:** eq:cond_dens. **Raises:** ValueError on invalid indices, all indices, or a wrong shape of values.
         """
         indices = normalize_indices(indices, self.event_shape[0])
-        values = as_event("values", values, self.loc.dtype, (len(indices),))
-        rest = tuple(i for i in range(self._time_index) if i not in indices)
-        if self._time_index not in indices:
+        values = as_event("values", values, self.dtype, (len(indices),))
+        time = self.event_shape[0] - 1
+        rest = tuple(i for i in range(time) if i not in indices)
+        if time not in indices:
             return time_mixture(self, rest, indices, values, keeps_time=True)
         check_rest(rest)
-        where = indices.index(self._time_index)
-        given = tuple(i for i in indices if i != self._time_index)
-        ordered = self.marginal((*given, *rest, self._time_index))
-        others = values[..., np.array([k for k in range(len(indices)) if k != where], int)]
-        return conditional_gaussian(ordered, others, values[..., where])
+        given = tuple(i for i in indices if i != time)
+        others = values[..., np.array([indices.index(i) for i in given], int)]
+        return conditional_gaussian(self.marginal((*given, *rest, time)), others, values[..., indices.index(time)])
+
+    def log_evidence(self, indices: tuple[int, ...], values: Array, rest: Gaussian | TimeMixture) -> Array:
+        """The log-density of the values of these coordinates; `rest` is the distribution given them."""
+        if isinstance(rest, TimeMixture):
+            return rest.time.log_normalizer  # the integral is there already
+        return super().log_evidence(indices, values, rest)
 
     def time_given_space(self, s: Float[Array, "*#batch d-1"]) -> TimeDensity:
         """The density of time given space, by quadrature: its modes, samples, quantiles and moments.
@@ -386,42 +345,7 @@ class FoldedGaussian(BatchModule):
 
         **Source:** Bayes' rule on eq:foldgauss. **Raises:** ValueError if the last dimension of s is not d-1.
         """
-        return time_density(self, as_event("s", s, self.loc.dtype, self.loc.shape[-1:]))
-
-    @property
-    def _time_index(self) -> int:
-        return self.event_shape[0] - 1
-
-    # --- interoperability and display ---------------------------------------------------------------------------
-
-    def to_numpyro(self, *, validate_args: bool | None = None):
-        """This distribution as a numpyro distribution: see `foldgauss.analysis.interop.to_numpyro`."""
-        return interop.to_numpyro(self, validate_args=validate_args)
-
-    def to_scipy(self):
-        """This distribution as a frozen scipy distribution: see `foldgauss.analysis.interop.to_scipy`."""
-        return interop.to_scipy(self)
-
-    def _repr_png_(self) -> bytes | None:
-        """Notebook display: the density over time and space, by coordinates if there are several."""
-        return notebook_hooks.show("distribution", self)
-
-
-def _whiten(at: Gaussian, s: Array) -> tuple[Array, Array]:
-    """Standard normal coordinates of s, and log |dz/ds|."""
-    y = join_columns(solve_lower(at.base_tril, split_columns(s - at.loc)))
-    return times_exp(y, -at.log_scale[..., None]), -_log_det(at)
-
-
-def _unwhiten(at: Gaussian, z: Array) -> tuple[Array, Array]:
-    """The inverse of `_whiten`: s, and log |ds/dz|."""
-    y = join_columns(multiply_lower(at.base_tril, split_columns(z)))
-    return at.loc + times_exp(y, at.log_scale[..., None]), _log_det(at)
-
-
-def _log_det(at: Gaussian) -> Array:
-    log_diagonal = jnp.log(jnp.diagonal(at.base_tril, axis1=-2, axis2=-1)).sum(-1)
-    return jnp.broadcast_to(log_diagonal + at.loc.shape[-1] * at.log_scale, at.batch_shape)
+        return time_density(self, as_event("s", s, self.dtype, self.loc.shape[-1:]))
 
 
 def _check_fold(fold: AbstractFold, loc: Array) -> AbstractFold:

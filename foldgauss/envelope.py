@@ -20,8 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from foldgauss._numerics.batch import BatchModule, concrete_value, divide, steepest
-from foldgauss._numerics.pointwise import call_elementwise, split_parameters
+from foldgauss._numerics.batch import BatchModule, concrete_value, divide, steepest, vectorize
 from foldgauss._runtime.checks import check_signature, invalid, short_repr
 
 __all__ = ["AbstractEnvelope", "CallableEnvelope", "Constant", "TimeLikelihood", "as_envelope", "plain_envelope"]
@@ -35,8 +34,8 @@ class AbstractEnvelope(BatchModule):
 
     **Shapes:** t, time_loc, time_scale (*batch,) -> (*batch,). **Units:** the three share theirs; a has none.
 
-    To extend: return `log a <= 0`, annotate arrays with their shapes (`Float[Array, "*batch"]`), from which it is known
-    what is batch, and let batch dimensions broadcast against those of `t`.
+    To extend: return `log a <= 0`, elementwise, and annotate arrays with their shapes (`Float[Array, "*batch"]`), from
+    which it is known what is batch. In densities all arguments and parameters are single numbers.
     """
 
     #: Whether it depends on its leaves only; a user's function may also close over tracers.
@@ -129,7 +128,8 @@ class CallableEnvelope(AbstractEnvelope):
     def __init__(self, log_a: Callable[[Array, Array, Array], Array]):
         if not callable(log_a):
             raise invalid("log_a", expected="a callable (t, time_loc, time_scale) -> log a", got=repr(log_a))
-        self.parameters, self.static, self.parameter_ranks = split_parameters(log_a)
+        self.parameters, self.static = eqx.partition(log_a, eqx.is_array)
+        self.parameter_ranks = tuple(x.ndim for x in jax.tree.leaves(self.parameters))
 
     @property
     def leaf_ranks(self) -> tuple[int, ...]:
@@ -137,8 +137,8 @@ class CallableEnvelope(AbstractEnvelope):
 
     def log_a(self, t, *, time_loc, time_scale):
         dtype = jnp.result_type(t, time_loc, time_scale)
-        scalars = (jnp.asarray(x, dtype) for x in (t, time_loc, time_scale))
-        return call_elementwise(self.parameters, self.static, self.parameter_ranks, *scalars)
+        one = lambda own, *scalars: jnp.asarray(eqx.combine(own.parameters, own.static)(*scalars))  # noqa: E731
+        return vectorize(one, self, *(jnp.asarray(x, dtype) for x in (t, time_loc, time_scale)))
 
 
 def plain_envelope(a: Callable[[Array, Array, Array], Array]) -> CallableEnvelope:

@@ -14,22 +14,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from foldgauss._numerics.batch import (
     BatchModule,
-    as_value,
     check_finite,
     check_positive,
     common_dtype,
     concrete_value,
-    expand_leaves,
-    ranked_leaves,
+    vectorized,
 )
 from foldgauss._numerics.piecewise import locate
-from foldgauss._numerics.pointwise import call_elementwise, split_parameters
 from foldgauss._numerics.triangular import join_columns, split_columns
 from foldgauss._runtime.checks import check_signature, invalid, is_integer, short_repr
 
@@ -51,8 +47,8 @@ class AbstractFold(BatchModule):
     **Units:** u is time, f(u) is space.
 
     To extend: annotate arrays with their shapes (`Float[Array, "*batch degree d-1"]`), from which it is known what is
-    batch, and let batch dimensions broadcast against those of `u`. A function of one scalar needs no class: `as_fold`
-    wraps it.
+    batch. Write `__call__` for one fold and one number u; `_numerics.batch.vectorized(0)` maps it over batches. A
+    function of one scalar needs no class: `as_fold` wraps it.
     """
 
     #: Whether it depends on its leaves only; a user's function may also close over tracers.
@@ -126,13 +122,11 @@ class PolynomialFold(AbstractFold):
         """Highest power of u."""
         return self.coefficients.shape[-2]
 
+    @vectorized(0)
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
-        u = jnp.asarray(u)
-        u, coefficients = _align(u, self.coefficients)
-        batch = jnp.broadcast_shapes(u.shape[:-1], coefficients.shape[:-2])
-        shift = jnp.zeros((*batch, coefficients.shape[-1]), jnp.result_type(u, coefficients))
+        shift = jnp.zeros(self.coefficients.shape[-1], jnp.result_type(u, self.coefficients))
         for k in reversed(range(self.degree)):  # Horner's scheme
-            shift = u * (shift + coefficients[..., k, :])
+            shift = u * (shift + self.coefficients[k])
         return shift
 
 
@@ -143,8 +137,7 @@ class SplineFold(AbstractFold):
 
     Outside its domain the fold keeps its value at the end (a continued polynomial would overflow where the time
     likelihood is not yet negligible). **f(0) is not constrained to 0:** the B_i sum to 1, so shifting all c_i equals
-    shifting `loc`, and if both are fitted only their sum is determined. `centered()` subtracts the constant, so that
-    `loc` is the center at `time_loc`, as with the other folds.
+    shifting `loc`, and if both are fitted only their sum is determined.
 
     **Shapes:** `knots` (n + degree + 1,), fixed, not trained; `coefficients` (*batch, n, d-1); u (*batch,) ->
     (*batch, d-1), leading dimensions broadcast.
@@ -170,21 +163,15 @@ class SplineFold(AbstractFold):
             raise invalid("degree", expected="an integer >= 0", got=repr(degree), cure="3 is a cubic spline.")
         self.knots, self.degree = _check_knots(knots, self.coefficients.shape[-2], degree), int(degree)
 
+    @vectorized(0)
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
-        u, coefficients = _align(jnp.asarray(u), self.coefficients)
-        n, k = coefficients.shape[-2], self.degree
-        v = jnp.clip(u, self.knots[k], self.knots[n])
-        terms = [b * coefficients[..., i, :] for i, b in enumerate(_spline_basis(v, self.knots, k))]
+        v = jnp.clip(u, self.knots[self.degree], self.knots[-1 - self.degree])
+        terms = [b * c for b, c in zip(_spline_basis(v, self.knots, self.degree), self.coefficients, strict=True)]
         return sum(terms, 0 * v)  # 0 * v: a NaN propagates through degree 0, too
 
     @property
     def breaks(self) -> Float[Array, " breaks"]:
         return jnp.asarray(self.knots, self.coefficients.dtype)
-
-    def centered(self) -> "SplineFold":
-        """The fold minus its constant, f(u) - f(0); add `fold(0.0)` to `loc` to keep the distribution unchanged."""
-        here = self(jnp.zeros((), self.coefficients.dtype))
-        return eqx.tree_at(lambda fold: fold.coefficients, self, self.coefficients - here[..., None, :])
 
 
 class FourierFold(AbstractFold):
@@ -227,20 +214,17 @@ class FourierFold(AbstractFold):
         """Number of harmonics."""
         return self.sine.shape[-2]
 
+    @vectorized(0)
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
-        u = as_value(u, self.sine.dtype)
-        rank = max(u.ndim, self.period.ndim, self.sine.ndim - 2)
-        sine, cosine = (_with_rank(x, rank + 2) for x in (self.sine, self.cosine))
-        u, period = (_with_rank(x, rank)[..., None] for x in (u, self.period))
-        far = jnp.abs(u) > period / float(jnp.finfo(u.dtype).eps)
-        half_phase = jnp.pi * jnp.where(far, 0, u) / jnp.where(far, 1, period)
-        shift = jnp.zeros((), u.dtype)
+        u = u.astype(self.sine.dtype) if jnp.issubdtype(u.dtype, jnp.integer) else u
+        far = jnp.abs(u) > self.period / float(jnp.finfo(u.dtype).eps)
+        half_phase = jnp.pi * jnp.where(far, 0, u) / jnp.where(far, 1, self.period)
+        shift = jnp.zeros(self.sine.shape[-1], u.dtype)
         first = s, c = jnp.sin(half_phase), jnp.cos(half_phase)
         for k in range(self.order):
-            shift = shift + 2 * s * (c * sine[..., k, :] - s * cosine[..., k, :])  # cos - 1 without cancellation
+            shift = shift + 2 * s * (c * self.sine[k] - s * self.cosine[k])  # cos - 1 without cancellation
             s, c = s * first[1] + c * first[0], c * first[1] - s * first[0]  # the next harmonic, by one more turn
-        batch = jnp.broadcast_shapes(u.shape[:-1], period.shape[:-1], sine.shape[:-2])
-        return jnp.broadcast_to(shift, (*batch, sine.shape[-1]))
+        return shift
 
 
 class CallableFold(AbstractFold):
@@ -258,7 +242,7 @@ class CallableFold(AbstractFold):
 
     parameters: PyTree
     static: PyTree = eqx.field(static=True)
-    # Set at construction, from the leaves of a single fold, so that the axes of a later vmap are known to be batch.
+    # Set at construction, from the arrays of a single fold, so that the axes of a later vmap are known to be batch.
     parameter_ranks: tuple[int, ...] = eqx.field(static=True)
 
     shares_leaves = True
@@ -266,14 +250,16 @@ class CallableFold(AbstractFold):
     def __init__(self, function: Callable[[Float[Array, ""]], Float[Array, " d-1"]]):
         if not callable(function):
             raise invalid("function", expected="a callable u -> (d-1,)", got=repr(function))
-        self.parameters, self.static, self.parameter_ranks = split_parameters(function)
+        self.parameters, self.static = eqx.partition(function, eqx.is_array)
+        self.parameter_ranks = tuple(x.ndim for x in jax.tree.leaves(self.parameters))
 
     @property
     def leaf_ranks(self) -> tuple[int, ...]:
         return self.parameter_ranks
 
+    @vectorized(0)
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
-        return call_elementwise(self.parameters, self.static, self.parameter_ranks, u)
+        return jnp.asarray(eqx.combine(self.parameters, self.static)(u))
 
 
 class SharedPathFold(AbstractFold):
@@ -346,43 +332,29 @@ class SharedPathFold(AbstractFold):
     def is_closed(self) -> bool:
         return self.fold.is_closed
 
+    @vectorized(0)
     def maps(self, t: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1 d"]:
         """The maps A(t) of the elements at times t; the identity for those on no path."""
-        t = jnp.asarray(t)
-        own, t = self._aligned(t)
-        path = jnp.maximum(own.index - 1, 0)
-        times = jnp.take_along_axis(own.times, path[..., None, None], axis=-2)[..., 0, :]
-        before, after, fraction = locate(times, t)
-        num_paths, num_knots, *dims = own.matrices.shape[-4:]
-        flat = own.matrices.reshape(*own.matrices.shape[:-4], num_paths * num_knots, *dims)
-
-        def pick(knot: Array) -> Array:
-            return jnp.take_along_axis(flat, (path * num_knots + knot)[..., None, None, None], axis=-3)[..., 0, :, :]
-
-        fraction = fraction[..., None, None]
-        maps = (1 - fraction) * pick(before) + fraction * pick(after)
-        return jnp.where((own.index > 0)[..., None, None], maps, jnp.eye(*dims, dtype=maps.dtype))
+        path = jnp.maximum(self.index - 1, 0)
+        before, after, fraction = locate(self.times[path], t)
+        maps = (1 - fraction) * self.matrices[path, before] + fraction * self.matrices[path, after]
+        return jnp.where(self.index > 0, maps, jnp.eye(*maps.shape, dtype=maps.dtype))
 
     @property
     def home(self) -> Float[Array, "*batch d-1"]:
         """A(m_t) q, the `loc` of the Folded-Gaussian."""
         return _apply_maps(self.maps(self.time_loc), self.anchor)
 
+    @vectorized(0)
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
-        own, u = self._aligned(jnp.asarray(u))
-        shift = own.fold(u)
-        moved = _apply_maps(own.maps(own.time_loc - u), own.anchor + shift) - own.home
-        return jnp.where((own.index > 0)[..., None], moved, shift)
+        shift = self.fold(u)
+        moved = _apply_maps(self.maps(self.time_loc - u), self.anchor + shift) - self.home
+        return jnp.where(self.index > 0, moved, shift)
 
     @property
     def breaks(self) -> Float[Array, " breaks"]:
         knots = self.times[jnp.maximum(self.index - 1, 0)]
         return jnp.concatenate([self.time_loc - knots, self.fold.breaks.astype(knots.dtype)])
-
-    def _aligned(self, u: Array) -> tuple["SharedPathFold", Array]:
-        """The fold and u, with equal batch ranks."""
-        rank = max(u.ndim, *(leaf.ndim - event for leaf, event in ranked_leaves(self)))
-        return expand_leaves(self, rank), _with_rank(u, rank)
 
 
 def _apply_maps(maps: Float[Array, "*#batch d-1 d"], place: Float[Array, "*#batch d-1"]) -> Float[Array, "*#batch d-1"]:
@@ -405,8 +377,8 @@ def as_fold(fold: AbstractFold | Callable) -> AbstractFold:
     return CallableFold(fold)
 
 
-def evaluate_shift(fold: AbstractFold, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
-    """`fold(u)`, with a derivative in u that is efficient for large batches.
+def evaluate_shift(fold: AbstractFold, u: Float[Array, ""]) -> Float[Array, " d-1"]:
+    """`fold(u)` of one fold and number, with a derivative in u that is efficient for large batches.
 
     A fold is elementwise in u, so its slope is one forward derivative. Reverse-mode autodiff would sum over the d-1
     coordinates at each step of the recursion instead of once, in loops too short to be vectorized.
@@ -435,19 +407,7 @@ def _shift_jvp(structure, primals, tangents):
     if isinstance(tangents[0], SymbolicZero):
         return shift, moved
     slope = jax.jvp(lambda u: jax.tree.unflatten(structure, leaves)(u), (u,), (jnp.ones_like(u),))[1]
-    by_u = [column * tangents[0][..., None] for column in split_columns(slope)]
-    return shift, moved + join_columns(by_u)
-
-
-def _with_rank(x: Array, rank: int) -> Array:
-    """`x` with leading axes of size 1, up to `rank` dimensions."""
-    return lax.expand_dims(x, range(rank - x.ndim))
-
-
-def _align(u: Array, rows: Array) -> tuple[Array, Array]:
-    """u (*batch, 1) and rows (*batch, n, d-1), of equal batch rank."""
-    rank = max(u.ndim, rows.ndim - 2)
-    return _with_rank(u, rank)[..., None], _with_rank(rows, rank + 2)
+    return shift, moved + join_columns([column * tangents[0] for column in split_columns(slope)])
 
 
 def _coefficient_rows(name: str, x: ArrayLike, count: str, rows: str) -> Float[Array, "*batch n d-1"]:

@@ -14,23 +14,22 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.custom_derivatives import SymbolicZero
+from jax.scipy.special import ndtr, ndtri
 from jaxtyping import Array, ArrayLike, Bool, Float, Key
 
+from foldgauss._numerics.abstract import AbstractDistribution
 from foldgauss._numerics.batch import (
-    BatchModule,
     align,
     as_event,
-    as_sample_shape,
-    as_value,
-    batch_shape_of,
     check_batch,
     check_finite,
     check_positive,
     common_dtype,
     compile_eager,
     divide,
-    ranked_leaves,
     steepest,
+    vectorize,
+    vectorized,
 )
 from foldgauss._numerics.factor import check_loc, check_matrix, check_rest, check_tril, marginal_tril, normalize_indices
 from foldgauss._numerics.triangular import (
@@ -42,6 +41,7 @@ from foldgauss._numerics.triangular import (
     solve_upper,
     split_columns,
 )
+from foldgauss._runtime.checks import invalid
 
 __all__ = ["Gaussian", "Normal"]
 
@@ -50,7 +50,7 @@ _LOG_2PI = float(np.log(2 * np.pi))
 _FAR = 40.0
 
 
-class Normal(BatchModule):
+class Normal(AbstractDistribution):
     """A normal distribution on the real line: the time marginal of a Folded-Gaussian.
 
         N(loc, scale^2)(t) = exp(-((t - loc) / scale)^2 / 2) / (sqrt(2 pi) scale)
@@ -67,66 +67,42 @@ class Normal(BatchModule):
     scale: Float[Array, "*#batch"]
 
     event_shape = ()
-    has_rsample = True  #: draws are differentiable in the parameters
 
     def __init__(self, loc: ArrayLike, scale: ArrayLike, *, validate_args: bool = True):
         dtype = common_dtype(loc, scale)
-        self.loc, self.scale = align([(jnp.asarray(loc, dtype), 0), (jnp.asarray(scale, dtype), 0)])
+        loc, scale = jnp.asarray(loc, dtype), jnp.asarray(scale, dtype)
+        self.loc, self.scale = align([(loc, 0), (scale, 0)], max(loc.ndim, scale.ndim))
         if validate_args:
             check_finite("loc", self.loc)
             check_positive("scale", self.scale)
 
-    @property
-    def batch_shape(self) -> tuple[int, ...]:
-        return batch_shape_of(ranked_leaves(self))
+    def _as_gaussian(self) -> "Gaussian":
+        return Gaussian(self.loc[..., None], self.scale[..., None, None], validate_args=False)
 
-    @property
-    def mean(self) -> Float[Array, "*batch"]:
-        """`loc`, broadcast to the batch shape."""
-        return jnp.broadcast_to(self.loc, self.batch_shape)
-
-    @property
-    def stddev(self) -> Float[Array, "*batch"]:
-        """`scale`, broadcast to the batch shape."""
-        return jnp.broadcast_to(self.scale, self.batch_shape)
-
-    @property
-    def variance(self) -> Float[Array, "*batch"]:
-        return self.stddev**2
+    def moments(self) -> tuple[Float[Array, "*batch 1"], Float[Array, "*batch 1 1"]]:
+        """Mean (*batch, 1) and variance (*batch, 1, 1)."""
+        return self._as_gaussian().moments()
 
     def entropy(self) -> Float[Array, "*batch"]:
         """Differential entropy in nats, log(scale) + (1 + log 2 pi) / 2."""
-        return jnp.log(self.stddev) + 0.5 * (1 + _LOG_2PI)
+        return self._as_gaussian().entropy()
 
     def cdf(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
         """P(t <= value)."""
-        value, loc, scale = self._aligned(value)
-        far = jnp.abs(value - loc) / _FAR > scale  # there quotients overflow, whose derivatives would be NaN
-        z = jnp.where(far, jnp.sign(value - loc) * _FAR, divide(value - loc, jnp.where(far, 1, scale)))
-        return jax.scipy.special.ndtr(z)
+        return vectorize(_normal_cdf, self._checked(value), self.loc, self.scale)
 
     def icdf(self, q: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
         """The quantile t with P(t <= quantile) = q; NaN for q outside [0, 1]."""
-        q, loc, scale = self._aligned(q)
-        return loc + scale * jax.scipy.special.ndtri(q)
+        return vectorize(lambda q, loc, scale: loc + scale * ndtri(q), self._checked(q), self.loc, self.scale)
 
-    def _aligned(self, value: ArrayLike) -> list[Array]:
-        return align([(as_value(value, self.loc.dtype), 0), (self.loc, 0), (self.scale, 0)])
+    def _log_prob(self, value: Array) -> Array:
+        return self._as_gaussian()._log_prob(value[..., None])
 
-    def log_prob(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
-        """log N(loc, scale^2)(value)."""
-        return _as_gaussian(self).log_prob(as_value(value, self.loc.dtype)[..., None])
-
-    def pdf(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
-        """N(loc, scale^2)(value)."""
-        return jnp.exp(self.log_prob(value))
-
-    def sample(self, key: Key[Array, ""], sample_shape: int | tuple[int, ...] = ()) -> Float[Array, "..."]:
-        """Random samples (*sample_shape, *batch), differentiable in the parameters."""
-        return _as_gaussian(self).sample(key, sample_shape)[..., 0]
+    def _sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...]) -> Array:
+        return self._as_gaussian()._sample(key, sample_shape)[..., 0]
 
 
-class Gaussian(BatchModule):
+class Gaussian(AbstractDistribution):
     """A Gaussian in any dimension, given by a triangular factor and a scale in log space.
 
         N(loc, exp(2 log_scale) L L^T),   L = base_tril
@@ -146,8 +122,6 @@ class Gaussian(BatchModule):
     base_tril: Float[Array, "*#batch dim dim"]
     log_scale: Float[Array, "*#batch"]
 
-    has_rsample = True  #: draws are differentiable in the parameters
-
     def __init__(
         self,
         loc: ArrayLike,
@@ -165,22 +139,22 @@ class Gaussian(BatchModule):
             check_finite("log_scale", log_scale)
             check_tril(tril)
         parts = [(loc, 1), (tril, 2), (log_scale, 0)]
-        check_batch(parts)
         # Axes of size 1 instead of copies: one factor may serve a million points.
-        self.loc, self.base_tril, self.log_scale = align(parts)
+        self.loc, self.base_tril, self.log_scale = align(parts, len(check_batch(parts)))
 
     @property
     def event_shape(self) -> tuple[int, ...]:
         return self.loc.shape[-1:]
 
     @property
-    def batch_shape(self) -> tuple[int, ...]:
-        return batch_shape_of(ranked_leaves(self))
-
-    @property
     def scale_tril(self) -> Float[Array, "*#batch dim dim"]:
         """Factor of the covariance, exp(log_scale) L, which may underflow to 0."""
         return jnp.exp(self.log_scale)[..., None, None] * self.base_tril
+
+    @property
+    def mean(self) -> Float[Array, "*batch dim"]:
+        """`loc`, broadcast to the batch shape."""
+        return jnp.broadcast_to(self.loc, (*self.batch_shape, *self.event_shape))
 
     @property
     def covariance_matrix(self) -> Float[Array, "*#batch dim dim"]:
@@ -190,10 +164,10 @@ class Gaussian(BatchModule):
             return jnp.matmul(factor, jnp.swapaxes(factor, -1, -2))
         return (factor[..., :, None, :] * factor[..., None, :, :]).sum(-1)
 
-    @property
-    def mean(self) -> Float[Array, "*batch dim"]:
-        """`loc`, broadcast to the batch shape."""
-        return jnp.broadcast_to(self.loc, (*self.batch_shape, *self.event_shape))
+    def moments(self) -> tuple[Float[Array, "*batch dim"], Float[Array, "*#batch dim dim"]]:
+        """Mean (*batch, dim) and covariance matrix (*batch, dim, dim)."""
+        dim = self.event_shape[0]
+        return self.mean, jnp.broadcast_to(self.covariance_matrix, (*self.batch_shape, dim, dim))
 
     @property
     def variance(self) -> Float[Array, "*batch dim"]:
@@ -211,34 +185,43 @@ class Gaussian(BatchModule):
 
     def entropy(self) -> Float[Array, "*batch"]:
         """Differential entropy in nats, log det(Sigma) / 2 + dim (1 + log 2 pi) / 2."""
-        dim, diagonal = self.loc.shape[-1], jnp.diagonal(self.base_tril, axis1=-2, axis2=-1)
-        entropy = jnp.log(diagonal).sum(-1) + dim * self.log_scale + 0.5 * dim * (1 + _LOG_2PI)
-        return jnp.broadcast_to(entropy, self.batch_shape)
+        dim = self.loc.shape[-1]
+        return jnp.broadcast_to(half_log_det(self) + 0.5 * dim * (1 + _LOG_2PI), self.batch_shape)
 
-    def log_prob(self, value: Float[Array, "*#batch dim"]) -> Float[Array, "*#batch"]:
-        """log N(loc, Sigma)(value)."""
-        return self._log_prob(as_event("value", value, self.loc.dtype, self.event_shape))
+    def cdf(self, x: Float[Array, "*#batch 1"]) -> Float[Array, "*#batch"]:
+        """P(coordinate <= x), for a single coordinate. **Raises:** ValueError if there are several."""
+        return self._as_normal().cdf(self._checked(x)[..., 0])
+
+    def icdf(self, q: Float[Array, "*#batch"]) -> Float[Array, "*#batch 1"]:
+        """The quantile of a single coordinate, the inverse of `cdf`. **Raises:** as `cdf`."""
+        return self._as_normal().icdf(q)[..., None]
+
+    def _as_normal(self) -> Normal:
+        if self.event_shape != (1,):
+            got = f"event_shape {self.event_shape}"
+            raise invalid("cdf", expected="a single coordinate", got=got, cure="Take marginal([i]) first.")
+        stddev = self.stddev[..., 0]  # 0 where it underflows, far from a component's time
+        tiny = float(jnp.finfo(stddev.dtype).tiny)
+        return Normal(self.loc[..., 0], jnp.maximum(stddev, tiny), validate_args=False)
 
     @compile_eager
     def _log_prob(self, value: Array) -> Array:
-        parts = [(value, 1), (self.loc, 1), (self.base_tril, 2), (self.log_scale, 0)]
-        return _log_density(*align(parts))
-
-    def pdf(self, value: Float[Array, "*#batch dim"]) -> Float[Array, "*#batch"]:
-        """N(loc, Sigma)(value)."""
-        return jnp.exp(self.log_prob(value))
-
-    def sample(self, key: Key[Array, ""], sample_shape: int | tuple[int, ...] = ()) -> Float[Array, "..."]:
-        """Random samples (*sample_shape, *batch, dim), differentiable in the parameters."""
-        return self._sample(key, as_sample_shape(sample_shape))
+        return vectorize(log_density, self, (value, 1))
 
     @compile_eager(static=("sample_shape",))
     def _sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...]) -> Array:
-        shape = (*sample_shape, *self.batch_shape, *self.event_shape)
-        noise = jax.random.normal(key, shape, self.loc.dtype)
-        noise, loc, tril, log_scale = align([(noise, 1), (self.loc, 1), (self.base_tril, 2), (self.log_scale, 0)])
-        scale = jnp.exp(log_scale)[..., None]
-        return loc + join_columns([scale * y for y in multiply_lower(tril, split_columns(noise))])
+        return self._transform(self._draw_noise(key, (*sample_shape, *self.batch_shape)))
+
+    def _draw_noise(self, key: Key[Array, ""], shape: tuple[int, ...]) -> Array:
+        return jax.random.normal(key, (*shape, *self.event_shape), self.dtype)
+
+    @vectorized(1)
+    def _transform(self, noise: Array) -> Array:
+        """A standard normal point as a sample."""
+        return unwhiten(self, noise)
+
+    def _sample_from(self, key: Key[Array, ""], sample_shape: tuple[int, ...], component: Array) -> Array:
+        return sample_components(self, key, component)
 
     def marginal(self, indices) -> "Gaussian":
         """The marginal distribution of the coordinates `indices`, in this order.
@@ -259,36 +242,70 @@ class Gaussian(BatchModule):
         indices = normalize_indices(indices, self.event_shape[0])
         rest = tuple(i for i in range(self.event_shape[0]) if i not in indices)
         check_rest(rest)
-        values = as_event("values", values, self.loc.dtype, (len(indices),))
+        values = as_event("values", values, self.dtype, (len(indices),))
         return condition_on_first(self.marginal((*indices, *rest)), values)
+
+
+def sample_components(components, key: Key[Array, ""], component: Array) -> Array:
+    """A sample of each of the chosen components (*sample, *batch), by the parameters of that one only."""
+
+    def one(components, component, noise):
+        own = jax.tree.map(lambda leaf: leaf[0 if len(leaf) == 1 else component], components)
+        return own._transform(noise)
+
+    noise = components._draw_noise(key, component.shape)
+    return vectorize(one, (components, 1), component, (noise, 1))
 
 
 def condition_on_first(dist: Gaussian, values: Float[Array, "*#batch given"]) -> Gaussian:
     """The later coordinates given the first ones: `loc_k + L_kg L_gg^-1 (values - loc_g)`, and the factor L_kk."""
     given = values.shape[-1]
-    values, loc, tril, log_scale = align([(values, 1), (dist.loc, 1), (dist.base_tril, 2), (dist.log_scale, 0)])
-    z = join_columns(solve_lower(tril[..., :given, :given], split_columns(values - loc[..., :given])))
+    loc, tril = _mean_given_first(dist, values), dist.base_tril[..., given:, given:]
+    return Gaussian(loc, tril, log_scale=dist.log_scale, validate_args=False)
+
+
+@compile_eager
+@vectorized(1)
+def _mean_given_first(dist: Gaussian, values: Array) -> Array:
+    given, loc, tril = values.size, dist.loc, dist.base_tril
+    z = join_columns(solve_lower(tril[:given, :given], split_columns(values - loc[:given])))
     # One sum per coordinate instead of a matrix product: the matrices are many and small.
-    mean = loc[..., given:] + (tril[..., given:, :given] * z[..., None, :]).sum(-1)
-    return Gaussian(mean, tril[..., given:, given:], log_scale=log_scale, validate_args=False)
+    return loc[given:] + (tril[given:, :given] * z[None]).sum(-1)
 
 
 # --- densities ----------------------------------------------------------------------------------------------
 
 
-def _as_gaussian(normal: Normal) -> Gaussian:
-    return Gaussian(normal.loc[..., None], normal.scale[..., None, None], validate_args=False)
+def _normal_cdf(value: Array, loc: Array, scale: Array) -> Array:
+    far = jnp.abs(value - loc) / _FAR > scale  # there quotients overflow, whose derivatives would be NaN
+    z = jnp.where(far, jnp.sign(value - loc) * _FAR, divide(value - loc, jnp.where(far, 1, scale)))
+    return ndtr(z)
 
 
-def _log_density(value: Array, loc: Array, tril: Array, log_scale: Array) -> Array:
-    """log N(loc, exp(2 log_scale) L L^T)(value); all arrays of one batch rank."""
-    half_square = _half_mahalanobis(value, loc, tril, log_scale)
-    dim = loc.shape[-1]
-    half_log_det = jnp.log(jnp.diagonal(tril, axis1=-2, axis2=-1)).sum(-1) + dim * log_scale
+def half_log_det(dist: Gaussian) -> Array:
+    """log det(Sigma) / 2."""
+    log_diagonal = jnp.log(jnp.diagonal(dist.base_tril, axis1=-2, axis2=-1)).sum(-1)
+    return log_diagonal + dist.loc.shape[-1] * dist.log_scale
+
+
+def log_density(dist: Gaussian, value: Float[Array, " dim"]) -> Float[Array, ""]:
+    """log N(loc, exp(2 log_scale) L L^T)(value) of one Gaussian and point."""
+    half_square = _half_mahalanobis(value, dist.loc, dist.base_tril, dist.log_scale)
     unreachable = jnp.isposinf(half_square)
     # Double where: 0 for the gradient of everything where the log-density is -inf.
-    log_density = -jnp.where(unreachable, 0, half_square) - (half_log_det + 0.5 * dim * _LOG_2PI)
+    log_density = -jnp.where(unreachable, 0, half_square) - (half_log_det(dist) + 0.5 * value.size * _LOG_2PI)
     return jnp.where(unreachable, -jnp.inf, log_density)
+
+
+def whiten(dist: Gaussian, value: Float[Array, " dim"]) -> Float[Array, " dim"]:
+    """Standard normal coordinates of one point."""
+    y = join_columns(solve_lower(dist.base_tril, split_columns(value - dist.loc)))
+    return times_exp(y, -dist.log_scale)
+
+
+def unwhiten(dist: Gaussian, z: Float[Array, " dim"]) -> Float[Array, " dim"]:
+    """The inverse of `whiten`."""
+    return dist.loc + times_exp(join_columns(multiply_lower(dist.base_tril, split_columns(z))), dist.log_scale)
 
 
 @jax.custom_jvp

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from foldgauss.analysis.interop import to_numpyro, to_scipy
 from foldgauss.analysis.monte_carlo import entropy_bounds, estimate_entropy, estimate_kl_divergence
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import TimeLikelihood
@@ -95,7 +96,7 @@ def _of_integrated_given_space(m, x):
 
 def _of_time(m, x):
     time, t = m.time_given_space(x[..., :2]), x[..., 2]
-    found = [*_pairs(time, t), *_moments(time), time.stddev, time.error_estimate, time.weights]
+    found = [*_pairs(time, t), *_moments(time), time.stddev, time.components.error_estimate, time.weights]
     return [*found, time.cdf(t), time.icdf(jax.nn.sigmoid(t)), time.components.modes()]
 
 
@@ -160,13 +161,13 @@ SAMPLED = {
     "FoldedMixture": lambda m: m,
     "FoldedMixture, a network as fold": lambda m: m,
     "FoldedMixture on a path": lambda m: m,
-    "GaussianMixture at a time": lambda m: m.condition_time(0.4),
-    "GaussianMixture by condition": lambda m: m.condition(-1, 0.4),
-    "GaussianMixture given space": lambda m: m.condition([0, 2], jnp.array([0.1, 0.4])),
-    "GaussianMixture of time": lambda m: m.marginal(-1),
-    "IntegratedMixture": lambda m: m.marginal([1, 0]),
-    "IntegratedMixture given space": lambda m: m.condition(0, 0.1),
-    "TimePosterior": lambda m: m.time_given_space(jnp.array([0.1, 0.2])),
+    "Mixture at a time": lambda m: m.condition_time(0.4),
+    "Mixture by condition": lambda m: m.condition(-1, 0.4),
+    "Mixture given space": lambda m: m.condition([0, 2], jnp.array([0.1, 0.4])),
+    "Mixture of time": lambda m: m.marginal(-1),
+    "Mixture of integrals": lambda m: m.marginal([1, 0]),
+    "Mixture of integrals given space": lambda m: m.condition(0, 0.1),
+    "Mixture of TimeDensity": lambda m: m.time_given_space(jnp.array([0.1, 0.2])),
     "FoldedGaussian": lambda m: m.components,
     "Gaussian": lambda m: m.components.condition_time(0.4),
     "Normal": lambda m: m.components.time_marginal,
@@ -174,7 +175,7 @@ SAMPLED = {
     "TimeMixture given space": lambda m: m.components.condition(0, 0.1),
     "TimeDensity": lambda m: m.components.time_given_space(jnp.array([0.1, 0.2])),
 }
-BY_QUADRATURE = {"IntegratedMixture given space", "TimePosterior", "TimeMixture given space", "TimeDensity"}
+BY_QUADRATURE = {"Mixture of integrals given space", "Mixture of TimeDensity", "TimeMixture given space", "TimeDensity"}
 PATH = {"times": [[0.0, 1.0]], "matrices": [[[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], [[1.0, 0.0, 0.5], [0.0, 1.0, 0.0]]]]}
 
 
@@ -250,6 +251,6 @@ def test_entropy_and_divergence_of_one_component():
 def test_one_component_in_numpyro_and_scipy():
     pytest.importorskip("numpyro", reason="numpyro is an optional extra")
     mixture = _mixture((), 1)
-    for x in (mixture.to_scipy().rvs(9, random_state=0), mixture.to_numpyro().sample(jax.random.key(0), (9,))):
+    for x in (to_scipy(mixture).rvs(9, random_state=0), to_numpyro(mixture).sample(jax.random.key(0), (9,))):
         assert x.shape == (9, 3)
         assert len(np.unique(x, axis=0)) == 9

@@ -8,7 +8,6 @@ import pytest
 pytest.importorskip("sklearn")
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.mixture import GaussianMixture
 from sklearn.utils import estimator_checks
 
 from foldgauss.estimator import EMStatus, FoldedGaussianMixture, FoldedMixtureRegressor
@@ -132,13 +131,6 @@ def test_fit_predict_equals_fit_then_predict(max_iter, tol):
     np.testing.assert_array_equal(labels, fitted.predict(x))
     np.testing.assert_array_equal(labels, fitted.predict_proba(x).argmax(1))
     assert fitted.n_iter_ <= max_iter
-
-
-@pytest.mark.parametrize(("kind", "degree"), [("full", 1), ("diag", 0)])
-def test_number_of_parameters_is_scikit_learns(kind, degree):
-    x = np.random.default_rng(0).normal(size=(50, 5))
-    theirs = GaussianMixture(2, covariance_type=kind, random_state=0).fit(x)
-    assert _fit(x, 2, degree=degree, covariance_type=kind)._n_parameters() == theirs._n_parameters()
 
 
 def test_criteria_of_one_component_in_one_dimension_do_not_depend_on_the_kind():

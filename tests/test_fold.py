@@ -117,15 +117,6 @@ def test_spline_equals_scipy_and_is_held_outside(knots, degree):
         assert np.isnan(nan).all()
 
 
-def test_centered_spline_differs_by_a_constant():
-    fold = FOLDS["spline"]()
-    u = np.linspace(-1.5, 1.5, 7, dtype=np.float32)  # its middle is 0
-    ours, centered = (np.asarray(APPLY(f, u)) for f in (fold, fold.centered()))
-    np.testing.assert_allclose(centered, ours - ours[3], atol=1e-4)
-    np.testing.assert_allclose(centered[3], np.zeros(2), atol=1e-5)
-    assert np.abs(ours[3]).max() > 1
-
-
 def test_fourier_is_its_series_and_stays_finite_far_away():
     rng = np.random.default_rng(0)
     sine, cosine = rng.normal(size=(2, 3, 2))
@@ -147,35 +138,26 @@ def test_fourier_is_its_series_and_stays_finite_far_away():
     assert np.isnan(APPLY(far, np.array(np.nan, np.float32))).all()
 
 
-@pytest.mark.parametrize(
-    "fold",
-    [
-        SplineFold([0.0, 0.0, 1.0, 1.0], jnp.ones((5, 2, 2)), degree=1),
-        FourierFold(jnp.ones((5, 1, 2)), jnp.ones((5, 1, 2)), period=2.0),
-        FourierFold(jnp.ones((1, 2)), jnp.ones((1, 2)), period=jnp.arange(1.0, 6.0)),
-    ],
-)
-def test_batches_of_spline_and_fourier_broadcast(fold):
-    assert jax.eval_shape(fold, 0.3).shape == (5, 2)
-    assert jax.eval_shape(fold, jnp.zeros((7, 1))).shape == (7, 5, 2)
-    u = np.linspace(0.1, 0.9, 5, dtype=np.float32)
-    one = APPLY(fold, u)
-    ranks = zip(jax.tree.leaves(fold), fold.leaf_ranks, strict=True)
-    axes = [0 if x.ndim > r else None for x, r in ranks]
-    axes = jax.tree.unflatten(jax.tree.structure(fold), axes)
-    mapped = jax.jit(jax.vmap(lambda f, u: f(u), in_axes=(axes, 0)))(fold, u)
-    np.testing.assert_allclose(mapped, one, atol=1e-6)
+BATCHES = {
+    "polynomial": lambda rng, batch: PolynomialFold(rng.normal(size=(*batch, 3, 2))),
+    "spline": lambda rng, batch: SplineFold([0.0, 0.0, 1.0, 1.0], rng.normal(size=(*batch, 2, 2)), degree=1),
+    "fourier": lambda rng, batch: FourierFold(*rng.normal(size=(2, *batch, 1, 2)), period=rng.uniform(1, 2, batch)),
+    "period": lambda rng, batch: FourierFold(*np.ones((2, 1, 2)), period=rng.uniform(1, 2, batch)),
+}
 
 
 @pytest.mark.parametrize(("leading", "shape"), [((), (4,)), ((5,), ()), ((5,), (5,)), ((5, 1), (3,)), ((3,), (5, 1))])
-def test_polynomial_batches_broadcast(leading, shape):
+@pytest.mark.parametrize("kind", BATCHES)
+def test_batches_of_folds_broadcast(kind, leading, shape):
     rng, batch = np.random.default_rng(0), np.broadcast_shapes(leading, shape)
-    coefficients, u = (rng.normal(size=size).astype(np.float32) for size in ((*leading, 3, 2), shape))
-    got = np.asarray(APPLY(PolynomialFold(coefficients), u))
+    fold, u = BATCHES[kind](rng, leading), rng.uniform(size=shape).astype(np.float32)
+    got = np.asarray(APPLY(fold, u))
     assert got.shape == (*batch, 2)
-    rows = np.broadcast_to(coefficients, (*batch, 3, 2)).reshape(-1, 3, 2)
-    powers = np.broadcast_to(u, batch).reshape(-1, 1) ** np.array([[1.0, 2.0, 3.0]])
-    np.testing.assert_allclose(got.reshape(-1, 2), np.einsum("nk,nkd->nd", powers, rows), atol=1e-5)
+    ranks = zip(jax.tree.leaves(fold), fold.leaf_ranks, strict=True)
+    each = [np.broadcast_to(leaf, batch + leaf.shape[leaf.ndim - rank :]) for leaf, rank in ranks]
+    for index in np.ndindex(batch):
+        one = jax.tree.unflatten(jax.tree.structure(fold), [leaf[index] for leaf in each])
+        np.testing.assert_allclose(got[index], APPLY(one, np.broadcast_to(u, batch)[index]), atol=1e-5)
 
 
 def test_vmapped_callable_knows_where_its_batch_begins():

@@ -31,6 +31,8 @@ def test_normal_is_scipys():
         own = own() if callable(own) else own
         assert own.shape == ours.batch_shape == (2, 3)
         np.testing.assert_allclose(own, getattr(scipys, name)(), rtol=1e-12)
+    np.testing.assert_allclose(ours.log_prob(VALUES), scipys.logpdf(VALUES), rtol=1e-12)
+    np.testing.assert_allclose(ours.pdf(VALUES), scipys.pdf(VALUES), rtol=1e-9)
     np.testing.assert_allclose(CDF(ours, VALUES), scipys.cdf(VALUES), rtol=1e-10)
     q = np.array([1e-12, 0.3, 1 - 1e-9])
     np.testing.assert_allclose(ICDF(ours, q), scipys.ppf(q), rtol=1e-8, atol=1e-12)

@@ -16,7 +16,7 @@ from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import Constant
 from foldgauss.fold import PolynomialFold
 from foldgauss.gaussian import Gaussian, Normal
-from foldgauss.mixture import AbstractMixture, FoldedMixture
+from foldgauss.mixture import FoldedMixture, Mixture
 
 COVARIANCE = np.array([[0.5, 0.2], [0.2, 0.4]])
 
@@ -80,9 +80,7 @@ def test_scipy_marginals_agree_with_scipys_own(x64):
 
 def test_scipy_draws_follow_scipys_conventions():
     frozen = to_scipy(Gaussian(jnp.zeros(3), jnp.eye(3)))
-    assert frozen.rvs(random_state=0).shape == (3,)
     assert frozen.rvs(5, random_state=np.random.default_rng(0)).shape == (5, 3)
-    assert frozen.rvs((2, 4), random_state=np.random.RandomState(0)).shape == (2, 4, 3)
     np.testing.assert_array_equal(frozen.rvs(5, random_state=7), frozen.rvs(5, random_state=7))
     assert (frozen.rvs(5, random_state=7) != frozen.rvs(5, random_state=8)).any()
     assert (frozen.rvs(5) != frozen.rvs(5)).any()
@@ -104,7 +102,7 @@ def test_scipy_sizes_are_checked(size):
 
 
 def test_scipy_samples_belong_to_the_density():
-    frozen = _dist().to_scipy()
+    frozen = to_scipy(_dist())
     x = frozen.rvs(20_000, random_state=0)
     score = -frozen.logpdf(x)
     # The mean of -log p is the entropy; 5 standard errors, false alarm 6e-7.
@@ -134,17 +132,6 @@ def test_scipy_object_refuses_a_batch_and_what_is_not_there():
 
 
 # --- numpyro ------------------------------------------------------------------------------------------------
-
-
-def test_numpyro_distribution_is_the_same_distribution(numpyro):
-    dist = _dist(time_loc=jnp.array([0.2, 0.4]))
-    bridge, key = to_numpyro(dist), jax.random.key(0)
-    assert (bridge.batch_shape, bridge.event_shape) == ((2,), (3,))
-    x = SAMPLE(bridge, key, (5,))
-    np.testing.assert_array_equal(x, SAMPLE(dist, key, (5,)))
-    np.testing.assert_array_equal(LOG_PROB(bridge, x), LOG_PROB(dist, x))
-    for ours, theirs in zip(MEAN_AND_VARIANCE(dist), MEAN_AND_VARIANCE(bridge), strict=True):
-        np.testing.assert_allclose(theirs, ours)
 
 
 def _mixture(**changes):
@@ -221,6 +208,9 @@ def test_numpyro_shapes(each):
         log_probs = (expanded.log_prob(x), dist.log_prob(x)), (joint.log_prob(y), dist.log_prob(y).sum())
         return x, log_probs, hidden.log_prob(y), bridge.support(x)
 
+    np.testing.assert_array_equal(SAMPLE(bridge, key, (5,)), SAMPLE(dist, key, (5,)))
+    for ours, theirs in zip(MEAN_AND_VARIANCE(dist), MEAN_AND_VARIANCE(bridge), strict=True):
+        np.testing.assert_allclose(theirs, ours)
     x, (of_expanded, of_joint), of_hidden, supported = drawn(bridge, key)
     assert x.shape == (2, 3, *batch, *event)
     assert supported.all()
@@ -280,21 +270,10 @@ def test_numpyro_distributions_are_copied(cheap, copied):
     assert repr(cheap).startswith("<foldgauss.analysis.interop")
 
 
-def test_numpyro_distributions_pass_through_scan_and_cond(cheap):
-    """As carry and as operand, with the same structure on both sides."""
-
-    @jax.jit
-    def run(bridge):
-        carried, _ = jax.lax.scan(lambda bridge, _: (bridge, None), bridge, length=2)
-        return jax.lax.cond(True, lambda bridge: bridge, lambda bridge: bridge, carried)
-
-    _leaves_match(cheap, run(cheap))
-
-
 def test_numpyro_entropy_and_divergence(cheap):
     from numpyro.distributions import kl_divergence
 
-    if isinstance(cheap.base, AbstractMixture):
+    if isinstance(cheap.base, Mixture):
         told = "entropy: expected a distribution that has one"
         with pytest.raises(NotImplementedError, match=told):  # as numpyro's own
             cheap.entropy()
@@ -338,37 +317,6 @@ def test_numpyro_warns_out_of_the_support(cheap, value):
     to_numpyro(cheap.base, validate_args=False).log_prob(x)  # no warning, which would be an error in this suite
 
 
-def test_numpyro_log_prob_has_gradients(cheap):
-    value = cheap.sample(jax.random.key(0))
-    by_leaves, by_value = jax.jit(jax.grad(lambda bridge, x: bridge.log_prob(x).sum(), argnums=(0, 1)))(cheap, value)
-    assert by_value.shape == value.shape
-    assert all(np.isfinite(leaf).all() for leaf in [by_value, *jax.tree.leaves(by_leaves)])
-    assert np.abs(by_value).sum() > 0
-
-
-@pytest.mark.slow
-def test_numpyro_svi_finds_a_latent_folded_gaussian(numpyro):
-    """The ELBO of a guide of the right family rises to the evidence, 0 here; with reparametrized gradients."""
-    from numpyro import distributions
-    from numpyro.infer import SVI, Trace_ELBO
-
-    target = _dist(envelope=Constant())
-
-    def guide():
-        loc = numpyro.param("loc", jnp.zeros(2))
-        time_loc = numpyro.param("time_loc", 0.0)
-        time_scale = numpyro.param("time_scale", 1.0, constraint=distributions.constraints.positive)
-        fold = PolynomialFold(numpyro.param("fold", jnp.zeros((2, 2))))
-        parts = {"time_loc": time_loc, "time_scale": time_scale, "fold": fold, "envelope": Constant()}
-        numpyro.sample("x", to_numpyro(FoldedGaussian(loc, target.scale_tril, validate_args=False, **parts)))
-
-    svi = SVI(lambda: numpyro.sample("x", target.to_numpyro()), guide, numpyro.optim.Adam(0.02), Trace_ELBO(20))
-    found = svi.run(jax.random.key(0), 1500, progress_bar=False)
-    assert float(found.losses[-100:].mean()) < 0.02
-    np.testing.assert_allclose(found.params["fold"], target.fold.coefficients, atol=0.1)
-    np.testing.assert_allclose(found.params["loc"], target.loc, atol=0.05)
-
-
 @pytest.mark.slow
 def test_numpyro_model_under_nuts_finds_the_fold(numpyro):
     from numpyro import distributions
@@ -378,7 +326,7 @@ def test_numpyro_model_under_nuts_finds_the_fold(numpyro):
 
     def model(x):
         bend = numpyro.sample("bend", distributions.Normal(0, 1).expand([2, 2]).to_event(2))
-        numpyro.sample("x", _dist(fold=PolynomialFold(bend)).to_numpyro(), obs=x)
+        numpyro.sample("x", to_numpyro(_dist(fold=PolynomialFold(bend))), obs=x)
         # The same family as a latent variable, not only as a likelihood (a = 1: else it is a funnel).
         numpyro.sample("latent", to_numpyro(_dist(envelope=Constant())))
 

@@ -1,7 +1,5 @@
 """Mixtures of Folded-Gaussians: against scipy, their own components, quadrature and samples; zero weights; far out."""
 
-from types import SimpleNamespace
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,11 +8,11 @@ import pytest
 from scipy import special, stats
 
 from foldgauss import mixture as mixture_module
-from foldgauss.analysis.conditional import TimeMixture
+from foldgauss.analysis.conditional import TimeDensity, TimeMixture
 from foldgauss.distribution import FoldedGaussian, Gaussian
 from foldgauss.envelope import CallableEnvelope, Constant, TimeLikelihood
 from foldgauss.fold import CallableFold, FourierFold, PolynomialFold, SplineFold, ZeroFold
-from foldgauss.mixture import FoldedMixture, GaussianMixture, IntegratedMixture, TimePosterior
+from foldgauss.mixture import FoldedMixture, Mixture
 
 WEIGHTS = [0.5, 0.2, 0.3]
 TRIL = [[[0.3, 0.0], [0.1, 0.2]], [[0.2, 0.0], [-0.1, 0.4]], [[0.25, 0.0], [0.0, 0.3]]]
@@ -157,18 +155,8 @@ def test_chunks_hold_few_pairs_of_point_and_component(monkeypatch):
 
     monkeypatch.setattr(mixture_module, "map_in_chunks", chunks)
     monkeypatch.setattr(mixture_module, "_CHUNK", 100)
-    mixture_module._map_pairs(lambda log_weights, log_p, axis: log_p[0], _mixture(), _points(40))
+    _mixture().log_prob(_points(39))
     assert seen == [100 // 3]
-
-
-def test_evidence_of_further_values_is_a_ratio():
-    """p(given and values) / p(given), where the integrals over time are there already."""
-
-    def integrated(*log_normalizer):
-        return TimeMixture(None, jnp.zeros(1), SimpleNamespace(log_normalizer=jnp.array(log_normalizer)), True)
-
-    found = mixture_module._log_evidence(integrated(0.5, 1.0), integrated(-1.0, -jnp.inf), (0,), jnp.zeros(1))
-    np.testing.assert_array_equal(found, [-1.5, -np.inf])
 
 
 @pytest.mark.slow
@@ -274,7 +262,7 @@ def test_joint_is_marginal_times_conditional(given, x64):
     @eqx.filter_jit
     def log_prob_by_parts(mixture, x):
         first, then = mixture.marginal(order), mixture.condition(given, x[:, np.array(given)])
-        assert isinstance(then, GaussianMixture if 2 in given else IntegratedMixture)
+        assert isinstance(then.components, Gaussian if 2 in given else TimeMixture)
         stale = eqx.tree_at(lambda part: part.logits, then, jnp.broadcast_to(mixture.log_weights, then.logits.shape))
         at_first = first.log_prob(x[:, np.array(order)])
         return [at_first + part.log_prob(x[:, np.array(rest)]) for part in (then, stale)]
@@ -284,21 +272,6 @@ def test_joint_is_marginal_times_conditional(given, x64):
     np.testing.assert_allclose(log_joint, mixture.log_prob(x), rtol=tolerance, atol=tolerance)
     # Power: with the weights that were, not those that follow what is given, it fails.
     assert np.abs(wrong - mixture.log_prob(x)).max() > 1e-2
-
-
-def test_batches_have_their_own_moments_and_responsibilities(x64):
-    """Each of a batch as it is alone."""
-    loc = jnp.stack([jnp.asarray(_components().loc), 2 * jnp.asarray(_components().loc)])
-    tril = jnp.broadcast_to(jnp.asarray(TRIL), (2, 3, 2, 2))
-    batch = FoldedMixture(_components(loc=loc, scale_tril=tril), weights=WEIGHTS)
-    x = _points(2)
-    responsibilities = batch.responsibilities(x)
-    assert responsibilities.shape == (2, 3)
-    np.testing.assert_allclose(responsibilities.sum(-1), 1, rtol=1e-12)
-    for k in range(2):
-        alone = FoldedMixture(_components(loc=loc[k]), weights=WEIGHTS)
-        np.testing.assert_allclose(batch.variance[k], jnp.diagonal(alone.covariance_matrix), rtol=1e-9)
-        np.testing.assert_allclose(responsibilities[k], alone.responsibilities(x[k]), rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -324,7 +297,7 @@ def test_marginals_and_conditionals_know_their_own(x64):
     assert isinstance(plane, FoldedMixture)
     assert plane.event_shape == (2,)
     space = mixture.marginal([0, 1])
-    assert isinstance(space, IntegratedMixture)
+    assert isinstance(space.components, TimeMixture)
     np.testing.assert_allclose(space.mean, mixture.mean[:2], rtol=1e-7)
     np.testing.assert_allclose(space.covariance_matrix, mixture.covariance_matrix[:2, :2], rtol=1e-6)
     # Integrals over time, by a plain sum.
@@ -354,7 +327,7 @@ def test_time_posterior(x64):
     mixture = _mixture(envelope=TimeLikelihood(1.0, 0.05))
     s = jnp.array([[0.1, -0.2], [-0.4, 0.4]])
     when = mixture.time_given_space(s)
-    assert isinstance(when, TimePosterior)
+    assert isinstance(when.components, TimeDensity)
     assert (when.event_shape, when.batch_shape) == ((), (2,))
     t = np.linspace(-3, 4, 8001)
     density = np.asarray(when.pdf(t[:, None]))
@@ -369,7 +342,7 @@ def test_time_posterior(x64):
     q = jnp.array([[0.01], [0.5], [0.9]])
     np.testing.assert_allclose(when.cdf(when.icdf(q)), np.broadcast_to(q, (3, 2)), atol=1e-9)
     np.testing.assert_array_equal(when.icdf(jnp.array([[0.0], [1.0]])), [[-np.inf] * 2, [np.inf] * 2])
-    assert (when.error_estimate < 1e-6).all()
+    assert (when.components.error_estimate < 1e-6).all()
     draws = when.sample(jax.random.key(0), (4000,))
     assert _deviations(draws, when.mean) < ALARM
 
@@ -393,7 +366,7 @@ def test_cdf_where_standard_deviations_underflow():
 
 def test_a_mean_whose_components_are_too_far_apart():
     """Their difference exceeds float32."""
-    apart = GaussianMixture(Gaussian([[3e38], [-3e38]], np.ones((2, 1, 1), np.float32)), weights=[0.9, 0.1])
+    apart = Mixture(Gaussian([[3e38], [-3e38]], np.ones((2, 1, 1), np.float32)), weights=[0.9, 0.1])
     np.testing.assert_allclose(apart.mean, [2.4e38], rtol=1e-6)
 
 
@@ -410,7 +383,7 @@ def test_cdf_and_quantiles_of_a_gaussian_mixture(x64):
         np.array([[-1.0, 50.0, 2.0], [0.0, 0.0, 0.0]]),
         np.array([0.5, 1.0, 2]),
     )
-    one = GaussianMixture(Gaussian(loc[..., None], scale[:, None, None] * np.eye(1)), weights=np.stack([weights] * 2))
+    one = Mixture(Gaussian(loc[..., None], scale[:, None, None] * np.eye(1)), weights=np.stack([weights] * 2))
     x = np.linspace(-4.0, 6.0, 21)
     expected = (weights * stats.norm.cdf(x[:, None, None], loc, scale)).sum(-1)
     np.testing.assert_allclose(one.cdf(jnp.asarray(x)[:, None, None]), expected, rtol=1e-12)
@@ -419,7 +392,7 @@ def test_cdf_and_quantiles_of_a_gaussian_mixture(x64):
     assert quantiles.shape == (4, 2, 1)
     np.testing.assert_allclose(one.cdf(quantiles), np.broadcast_to(levels, (4, 2)), rtol=1e-9)
     assert np.isneginf(one.icdf(0.0)).all()
-    pair = GaussianMixture(Gaussian(np.zeros((2, 2)), np.eye(2)), weights=[0.5, 0.5])
+    pair = Mixture(Gaussian(np.zeros((2, 2)), np.eye(2)), weights=[0.5, 0.5])
     for function in (pair.icdf, lambda _: pair.cdf(jnp.zeros(2))):
         with pytest.raises(ValueError, match="expected a single coordinate"):
             function(0.5)
@@ -446,28 +419,6 @@ def test_a_component_without_weight_is_not_there():
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
     assert all((leaf[1] == 0).all() for leaf in jax.tree.leaves(gradient))
     assert np.abs(gradient.logits[0]) > 1e-3
-
-
-def test_gradients_are_true():
-    # Central differences in float64 would need another program: these are of float32, in steps of some thousandths.
-    mixture, x = _mixture(envelope=TimeLikelihood(1.0, 0.2)), _points(8)
-    gradient, by_x = GRADIENT((mixture, x))
-    rng = np.random.default_rng(0)
-    for part, slope in ((mixture, gradient), (x, by_x)):
-        leaves, structure = jax.tree.flatten(part)
-        step = [0.003 * rng.normal(size=leaf.shape).astype(np.float32) for leaf in leaves]
-        step = [np.tril(move) if move.shape[-2:] == (2, 2) and move.ndim == 3 else move for move in step]
-        ends = [
-            jax.tree.unflatten(structure, [a + sign * b for a, b in zip(leaves, step, strict=True)]) for sign in (1, -1)
-        ]
-        high, low = (_mixture_and_points(mixture, x, end) for end in ends)
-        expected = sum(float((a * b).sum()) for a, b in zip(jax.tree.leaves(slope), step, strict=True))
-        np.testing.assert_allclose(0.5 * (high - low), expected, rtol=0.05)
-
-
-def _mixture_and_points(mixture, x, end):
-    mixture, x = (end, x) if isinstance(end, FoldedMixture) else (mixture, end)
-    return float(np.asarray(mixture.log_prob(x), np.float64).sum())
 
 
 def test_weights_of_zero_have_finite_gradients():
@@ -519,24 +470,15 @@ def test_far_points_and_offsets():
 
 
 def test_batches_of_mixtures():
+    """Weights alone may carry the batch; one set of weights may serve all. Other laws: test_batch_shapes.py."""
     loc = np.random.default_rng(0).normal(size=(4, 3, 2))
-    mixture = FoldedMixture(_components(loc=loc), weights=np.tile(WEIGHTS, (4, 1)))
-    assert (mixture.batch_shape, mixture.event_shape, mixture.num_components) == ((4,), (3,), 3)
-    x, component = mixture.sample(jax.random.key(0), (8,), return_component=True)
-    assert (x.shape, component.shape) == ((8, 4, 3), (8, 4))
-    one = jax.tree.map(lambda leaf: leaf[2], mixture)
-    assert one.batch_shape == ()
-    np.testing.assert_allclose(mixture.log_prob(x)[:, 2], one.log_prob(x[:, 2]), rtol=1e-5)
-    np.testing.assert_allclose(mixture.mean[2], one.mean, rtol=1e-6)
-    at = mixture.condition_time(jnp.full((8, 4), 0.3))
-    assert (at.batch_shape, at.event_shape) == ((8, 4), (2,))
-    np.testing.assert_allclose(at.mean[1, 2], one.expected_space(0.3), rtol=1e-5)
-    each = jax.jit(jax.vmap(FoldedMixture.log_prob, in_axes=(0, 1), out_axes=1))(mixture, x)
-    np.testing.assert_allclose(each, mixture.log_prob(x), rtol=1e-5)
-    # Weights alone may carry the batch; one set of weights may serve all.
     by_weights = FoldedMixture(_components(), logits=np.zeros((7, 3)))
     assert jax.eval_shape(lambda: by_weights.mean).shape == (7, 3)
-    assert FoldedMixture(_components(loc=loc), logits=np.zeros(3)).log_weights.shape == (4, 3)
+    mixture = FoldedMixture(_components(loc=loc), logits=np.zeros(3))
+    assert mixture.log_weights.shape == (4, 3)
+    x = jnp.zeros((8, 4, 3))
+    each = jax.jit(jax.vmap(FoldedMixture.log_prob, in_axes=(0, 1), out_axes=1))(mixture, x)
+    np.testing.assert_allclose(each, mixture.log_prob(x), rtol=1e-5)
 
 
 def test_axes_of_size_one_broadcast_with_the_points():
@@ -572,7 +514,6 @@ def test_made_and_used_inside_transformations():
     assert len(count) == 1
 
 
-@pytest.mark.slow
 def test_gradients_are_those_of_the_definition(x64):
     mixture = _mixture(envelope=TimeLikelihood(1.0, 0.05))
     x = _points(5)
@@ -599,15 +540,6 @@ def test_float32_and_float64_are_kept():
         mixture = FoldedMixture(single, weights=WEIGHTS)
         assert mixture.logits.dtype == jnp.float32
         assert mixture.log_prob(np.zeros((2, 3), np.float32)).dtype == jnp.float32
-
-
-@pytest.mark.slow
-def test_networks_as_folds():
-    network = eqx.nn.MLP(1, 2, 4, 1, key=jax.random.key(0))
-    mixture = _mixture(fold=CallableFold(lambda u: network(u[None])))
-    x = mixture.sample(jax.random.key(1), (9,))
-    assert x.shape == (9, 3)
-    np.testing.assert_allclose(mixture.log_prob(x), _naive_log_prob(mixture, x), rtol=1e-5, atol=1e-5)
 
 
 # --- errors ---------------------------------------------------------------------------------------------------
@@ -656,55 +588,6 @@ def test_what_is_wrong_is_named(case):
 # --- bridges --------------------------------------------------------------------------------------------------
 
 
-def test_in_a_numpyro_model():
-    numpyro = pytest.importorskip("numpyro", reason="numpyro is an optional extra")
-    mixture = _mixture()
-    x = _points(40)
-    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
-        site = mixture.to_numpyro()
-        assert (site.batch_shape, site.event_shape) == ((), (3,))
-        np.testing.assert_allclose(site.log_prob(x), mixture.log_prob(x), rtol=1e-6)
-        np.testing.assert_array_equal(site.sample(jax.random.key(2), (8,)), mixture.sample(jax.random.key(2), (8,)))
-        np.testing.assert_allclose(site.mean, mixture.mean)
-        np.testing.assert_allclose(site.variance, mixture.variance)
-
-        def model(x):
-            weights = numpyro.sample("weights", numpyro.distributions.Dirichlet(jnp.ones(3)))
-            with numpyro.plate("points", len(x)):
-                numpyro.sample("x", FoldedMixture(_components(), weights=weights).to_numpyro(), obs=x)
-
-        values = {"weights": jnp.asarray(WEIGHTS)}
-        log_density, _ = numpyro.infer.util.log_density(model, (x,), {}, values)
-        np.testing.assert_allclose(log_density, np.log(2) + mixture.log_prob(x).sum(), rtol=1e-5)
-
-
-@pytest.mark.slow
-def test_nuts_finds_the_weights():
-    numpyro = pytest.importorskip("numpyro", reason="numpyro is an optional extra")
-    x = _mixture().sample(jax.random.key(1), (400,))
-    components = _components()
-
-    def model(x):
-        weights = numpyro.sample("weights", numpyro.distributions.Dirichlet(jnp.ones(3)))
-        with numpyro.plate("points", len(x)):
-            numpyro.sample("x", FoldedMixture(components, weights=weights).to_numpyro(), obs=x)
-
-    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
-        chain = numpyro.infer.MCMC(numpyro.infer.NUTS(model), num_warmup=200, num_samples=300, progress_bar=False)
-        chain.run(jax.random.key(0), x)
-        draws = np.asarray(chain.get_samples()["weights"])
-    np.testing.assert_array_less(np.abs(draws.mean(0) - WEIGHTS), 5 * draws.std(0))
-    assert draws.std(0).max() < 0.06
-
-
-def test_as_scipy_object():
-    frozen = _mixture().to_scipy()
-    x = frozen.rvs(8, random_state=0)
-    np.testing.assert_allclose(frozen.logpdf(x), _mixture().log_prob(x), rtol=1e-6)
-    assert frozen.cov.shape == (3, 3)
-    assert frozen.marginal([0, 2]).dim == 2
-
-
 def test_draws_are_of_their_component_where_the_fold_is_a_function():
     loc = np.array([[0.0, 1.0], [50.0, 2.0]])
     components = FoldedGaussian(
@@ -750,5 +633,5 @@ def test_weights_that_jax_takes_for_zero_are_refused():
 def test_weights_of_half_precision_need_not_be_normal_numbers(dtype):
     """JAX computes with them in float32."""
     components = Gaussian(jnp.zeros((2, 1), dtype), jnp.ones((2, 1, 1), dtype))
-    small = GaussianMixture(components, weights=jnp.array([1e-5, 2e-5], dtype))
+    small = Mixture(components, weights=jnp.array([1e-5, 2e-5], dtype))
     assert float(small.log_prob(jnp.zeros(1, dtype))) == pytest.approx(-0.92, abs=0.02)

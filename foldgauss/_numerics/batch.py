@@ -53,37 +53,25 @@ def _declared_ranks(cls: type) -> list[tuple[str, int | None]]:
     return found
 
 
-def _batch_rank(parts: list[tuple[Array, int]]) -> int:
-    return max(x.ndim - event for x, event in parts)
-
-
-def align(parts: list[tuple[Array, int]], rank: int | None = None) -> list[Array]:
-    """The arrays of (array, event rank) with equal batch ranks, by ones in front."""
-    rank = _batch_rank(parts) if rank is None else rank
-    return [lax.expand_dims(x, range(rank + event - x.ndim)) for x, event in parts]
-
-
-def broadcast(parts: list[tuple[Array, int]], batch: tuple[int, ...]) -> list[Array]:
-    return [jnp.broadcast_to(x, batch + x.shape[x.ndim - event :]) for x, event in parts]
-
-
 def ranked_leaves(module: eqx.Module) -> list[tuple[Array, int]]:
     """(leaf, event rank) of every leaf."""
     return list(zip(jax.tree.leaves(module), module.leaf_ranks, strict=True))
 
 
-def _map_parts(function: Callable[[tuple[Array, int]], Array], module: _ModuleT) -> _ModuleT:
-    return jax.tree.unflatten(jax.tree.structure(module), [function(part) for part in ranked_leaves(module)])
+def align(parts: list[tuple[Array, int]], rank: int) -> list[Array]:
+    """The arrays of (array, event rank) with at least `rank` batch axes, by ones in front."""
+    return [lax.expand_dims(x, range(max(rank + event - x.ndim, 0))) for x, event in parts]
 
 
-def expand_leaves(module: _ModuleT, rank: int) -> _ModuleT:
-    """`module` with at least `rank` batch dimensions on each leaf, by ones in front."""
-    return _map_parts(lambda part: align([part], max(rank, _batch_rank([part])))[0], module)
+def align_leaves(module: _ModuleT, rank: int) -> _ModuleT:
+    """`module` with at least `rank` batch axes on every leaf."""
+    return jax.tree.unflatten(jax.tree.structure(module), align(ranked_leaves(module), rank))
 
 
 def broadcast_leaves(module: _ModuleT, batch: tuple[int, ...]) -> _ModuleT:
     """`module` with every leaf broadcast to the whole batch."""
-    return _map_parts(lambda part: broadcast([part], batch)[0], module)
+    leaves = [jnp.broadcast_to(x, batch + x.shape[x.ndim - event :]) for x, event in ranked_leaves(module)]
+    return jax.tree.unflatten(jax.tree.structure(module), leaves)
 
 
 def batch_shape_of(parts: list[tuple[Array, int]]) -> tuple[int, ...]:
@@ -104,6 +92,50 @@ def flatten_points(x: Array, batch: tuple[int, ...], event: tuple[int, ...]) -> 
         return jnp.moveaxis(result.reshape(*own, *result.shape[1 + len(batch) :]), front, wide)
 
     return points.reshape(math.prod(own[: len(own) - len(batch) + len(wide)]), *batch, *event), restore
+
+
+# --- vectorization ------------------------------------------------------------------------------------------
+
+
+def _parts(item) -> tuple[eqx.Module | Array, list[tuple[Array, int]]]:
+    inner, extra = item if isinstance(item, tuple) else (item, 0)
+    inner = inner if isinstance(inner, eqx.Module) else jnp.asarray(inner)
+    parts = ranked_leaves(inner) if isinstance(inner, eqx.Module) else [(inner, 0)]
+    return inner, [(x, rank + extra) for x, rank in parts]
+
+
+def vectorize(function: Callable, *items):
+    """`function` of single items, over all their batch axes, which broadcast.
+
+    An item is a module with `leaf_ranks` or an array of numbers, or a pair of one of them and the number of further
+    axes that are not batch. An axis of size 1 is not copied for the others: one factor may serve a million points.
+    """
+    inner, own = zip(*map(_parts, items), strict=True)
+    parts = [part for more in own for part in more]
+    batch, structure = check_batch(parts), jax.tree.structure(inner)
+    leaves, wide = [], []
+    for x, rank in parts:
+        sizes = (1,) * (len(batch) + rank - x.ndim) + x.shape[: x.ndim - rank]
+        leaves.append(x.reshape(*(n for n in sizes if n != 1), *x.shape[x.ndim - rank :]))
+        wide.append([n != 1 for n, whole in zip(sizes, batch, strict=True) if whole != 1])
+    mapped = lambda *leaves: function(*jax.tree.unflatten(structure, leaves))  # noqa: E731
+    for axes in reversed(list(zip(*wide, strict=True))):
+        mapped = jax.vmap(mapped, in_axes=tuple(0 if is_wide else None for is_wide in axes))
+    rank = len(wide[0])
+    return jax.tree.map(lambda y: y.reshape(*batch, *y.shape[rank:]), mapped(*leaves))
+
+
+def vectorized(*ranks: int):
+    """Decorate a method, written for one module without batch axes and single arguments of these ranks."""
+
+    def decorate(method: Callable) -> Callable:
+        @functools.wraps(method)
+        def call(module, *arguments):
+            return vectorize(method, module, *zip(arguments, ranks, strict=True))
+
+        return call
+
+    return decorate
 
 
 # --- dtypes -------------------------------------------------------------------------------------------------
@@ -223,14 +255,15 @@ _COMPACT = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_spli
 def map_over_batch(function: Callable, *items):
     """`function` of unbatched items, mapped over all their batch dimensions; compiled.
 
-    `function` must be defined at module level, since a new closure would be compiled each time. Each item is a module
-    with `leaf_ranks`, or a pair (array, event rank).
+    `function` must be defined at module level, since a new closure would be compiled each time. Items are as those of
+    `vectorize`, of which this differs by the number and size of programs: for integrals, which compile for seconds.
     """
-    parts = [part for x in items for part in (ranked_leaves(x) if isinstance(x, eqx.Module) else [x])]
-    batch, structure = check_batch(parts), jax.tree.structure([x if isinstance(x, eqx.Module) else x[0] for x in items])
+    inner, own = zip(*map(_parts, items), strict=True)
+    parts = [part for more in own for part in more]
+    batch, structure = check_batch(parts), jax.tree.structure(inner)
     traced = any(isinstance(x, jax.core.Tracer) for x, _ in parts)
-    own, outer = jnp if traced else np, batch or (1,)  # NumPy compiles nothing
-    wide = [own.broadcast_to(own.asarray(x), (*outer, *x.shape[x.ndim - rank :])) for x, rank in parts]
+    xp, outer = jnp if traced else np, batch or (1,)  # NumPy compiles nothing
+    wide = [xp.broadcast_to(xp.asarray(x), (*outer, *x.shape[x.ndim - rank :])) for x, rank in parts]
     if traced or not math.prod(batch):
         flat = [x.reshape(math.prod(outer), *x.shape[len(outer) :]) for x in wide]
         result = _map_flat(function, structure, flat)
@@ -273,11 +306,6 @@ def _known_options() -> dict[str, bool | int] | None:
     except jax.errors.JaxRuntimeError:
         return None
     return _COMPACT
-
-
-def fill_up(x: np.ndarray, size: int) -> np.ndarray:
-    """`size` rows: those of x, then its last one again."""
-    return x[np.minimum(np.arange(size), len(x) - 1)]
 
 
 def _as_numpy(x: Array) -> Array | np.ndarray:

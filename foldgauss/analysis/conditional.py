@@ -11,17 +11,8 @@ from jax import lax
 from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Float, Key
 
-from foldgauss._numerics.batch import (
-    as_event,
-    as_sample_shape,
-    as_value,
-    batch_shape_of,
-    compile_eager,
-    concrete_value,
-    fill_up,
-    map_over_batch,
-    ranked_leaves,
-)
+from foldgauss._numerics.abstract import AbstractDistribution
+from foldgauss._numerics.batch import as_event, compile_eager, map_over_batch, vectorize, vectorized
 from foldgauss._numerics.factor import check_rest, normalize_indices
 from foldgauss._runtime.checks import invalid
 from foldgauss.analysis.narrow_crossings import ROUNDING, crossing_modes, crossing_panels, gaussian_at
@@ -49,7 +40,7 @@ _MISSED = 0.1  # quadrature missed a ridge if log of its mass exceeds log of the
 _AVERAGED = 0.1  # of the rounding at some 100 nodes across the ridge, where the residual is about 1
 
 
-class TimeDensity(eqx.Module):
+class TimeDensity(AbstractDistribution):
     """The density of t given (some of) space, p(t | s) = FN(s, t) / p(s), by quadrature.
 
     Made by `FoldedGaussian.time_given_space`. A peak narrower than the spacing of floating-point times (one space
@@ -66,88 +57,43 @@ class TimeDensity(eqx.Module):
     **Source:** Bayes' rule on eq:foldgauss.
     """
 
-    parent: eqx.Module
+    parent: AbstractDistribution
     values: Float[Array, "*#batch d-1"]
     panels: Panels
     log_normalizer: Float[Array, "*batch"]
     error_estimate: Float[Array, "*batch"]
 
-    @property
-    def event_shape(self) -> tuple[int, ...]:
-        return ()
-
-    @property
-    def batch_shape(self) -> tuple[int, ...]:
-        return self.log_normalizer.shape
-
-    def log_prob(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
-        """log p(t | s)."""
-        return self._log_prob(as_value(value, self.values.dtype))
+    event_shape = ()
+    has_rsample = False
 
     @compile_eager
-    def _log_prob(self, value: Array) -> Array:
-        shape = jnp.broadcast_shapes(value.shape, self.batch_shape)
-        value = jnp.broadcast_to(value, shape)[..., None]
-        joint = self.parent.log_prob(jnp.concatenate([_over(self.values, shape), value], axis=-1))
-        return jnp.where(jnp.isneginf(joint), -jnp.inf, joint - jnp.broadcast_to(self.log_normalizer, shape))
-
-    def pdf(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
-        """p(t | s)."""
-        return jnp.exp(self.log_prob(value))
+    @vectorized(0)
+    def _log_prob(self, t: Array) -> Array:
+        return _divide(self.parent._log_prob(jnp.append(self.values, t)), self.log_normalizer)
 
     def cdf(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
         """P(time <= t | s)."""
-        return self._elementwise(Panels.cdf, self._tau(as_value(value, self.values.dtype)))
+        return _time_cdf(self.panels, self._checked(value), self.parent.time_loc, self.parent.time_scale)
 
     def icdf(self, q: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
         """The quantile: the inverse of `cdf`, -inf at 0 and +inf at 1."""
-        return self._time(self._elementwise(Panels.icdf, as_value(q, self.values.dtype)))
+        return _time_icdf(self.panels, self._checked(q), self.parent.time_loc, self.parent.time_scale)
 
-    def sample(self, key: Key[Array, ""], sample_shape: int | tuple[int, ...] = ()) -> Float[Array, "..."]:
-        """Draws of shape (*sample_shape, *batch), by the quantile function."""
-        shape = (*as_sample_shape(sample_shape), *self.batch_shape)
-        smallest = float(jnp.finfo(self.values.dtype).tiny)  # not 0, whose quantile is -inf
-        return self.icdf(jax.random.uniform(key, shape, self.values.dtype, minval=smallest))
+    def _sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...]) -> Array:
+        smallest = float(jnp.finfo(self.dtype).tiny)  # not 0, whose quantile is -inf
+        shape = (*sample_shape, *self.batch_shape)
+        return self.icdf(jax.random.uniform(key, shape, self.dtype, minval=smallest))
 
-    @property
-    def mean(self) -> Float[Array, "*batch"]:
-        """E[t | s]."""
-        return self._time(self._moments()[0])
-
-    @property
-    def variance(self) -> Float[Array, "*batch"]:
-        """Var[t | s]."""
-        return self._moments()[1] * jnp.broadcast_to(self.parent.time_scale, self.batch_shape) ** 2
+    def moments(self) -> tuple[Float[Array, "*batch 1"], Float[Array, "*batch 1 1"]]:
+        """E[t | s] and Var[t | s]."""
+        return map_over_batch(_time_moments, self.panels, self.parent.time_loc, self.parent.time_scale)
 
     def modes(self) -> Float[Array, "*batch modes"]:
         """The local maxima of p(t | s), highest first, at most 8; NaN where there are fewer."""
         return map_over_batch(_modes, self.parent, (self.values, 1), self.panels)
 
-    def _moments(self):
-        return map_over_batch(_tau_moments, self.panels)
 
-    def _elementwise(self, function, x):
-        """function(panels, x) for x of shape (*sample, *batch), without a copy of the panels for each sample."""
-        batch, rank = self.batch_shape, len(self.batch_shape)
-        shape = jnp.broadcast_shapes(x.shape, batch)
-        flat = jnp.broadcast_to(x, shape).reshape(-1, int(np.prod(batch)))
-        count, values = len(flat), concrete_value(flat)
-        if values is not None and values.size:  # a power of two, so that few programs serve all numbers of samples
-            flat = fill_up(values, 1 << (count - 1).bit_length())
-        panels = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[rank:]), self.panels)
-        return _each(function, panels, jnp.asarray(flat))[:count].reshape(shape)
-
-    def _tau(self, t):
-        shape = jnp.broadcast_shapes(t.shape, self.batch_shape)
-        loc, scale = (jnp.broadcast_to(x, shape) for x in (self.parent.time_loc, self.parent.time_scale))
-        return (jnp.broadcast_to(t, shape) - loc) / scale
-
-    def _time(self, tau):
-        loc, scale = (jnp.broadcast_to(x, tau.shape) for x in (self.parent.time_loc, self.parent.time_scale))
-        return loc + scale * tau
-
-
-class TimeMixture(eqx.Module):
+class TimeMixture(AbstractDistribution):
     """Some coordinates of a Folded-Gaussian, given none or some of its space coordinates, t integrated numerically.
 
         p(y | g) = integral p(y | g, t) p(t | g) dt          (or without the integral, if t is one of y)
@@ -161,32 +107,20 @@ class TimeMixture(eqx.Module):
     **Source:** eq:foldgauss, integrated. **Raises:** ValueError on a wrong shape, and from `cdf` unless n is 1.
     """
 
-    parent: eqx.Module  # of (given, kept, time), in this order
+    parent: AbstractDistribution  # of (given, kept, time), in this order
     values: Float[Array, "*#batch given"]
     time: TimeDensity | None  # p(t | given); None if nothing is given, and t has its own normal
     keeps_time: bool = eqx.field(static=True)
+
+    has_rsample = False
 
     @property
     def event_shape(self) -> tuple[int, ...]:
         return (self._space_dim + int(self.keeps_time),)
 
-    @property
-    def batch_shape(self) -> tuple[int, ...]:
-        return batch_shape_of([*ranked_leaves(self.parent), (self.values, 1)])
-
-    def log_prob(self, value: Float[Array, "*#batch n"]) -> Float[Array, "*#batch"]:
-        """log p(x | given)."""
-        value = self._checked(value)
-        if self.keeps_time:
-            log_joint = self.parent.log_prob(self._with_values(value))
-        else:
-            log_joint = self._space_integral(value)[0]
-        log_given = jnp.broadcast_to(self._log_normalizer, log_joint.shape)
-        return jnp.where(jnp.isneginf(log_joint), -jnp.inf, log_joint - log_given)
-
-    def pdf(self, value: Float[Array, "*#batch n"]) -> Float[Array, "*#batch"]:
-        """p(x | given)."""
-        return jnp.exp(self.log_prob(value))
+    def _log_prob(self, value: Array) -> Array:
+        joint = self.parent.log_prob(self._join(value)) if self.keeps_time else self._integrate(value)[0]
+        return self._given(joint)
 
     def error_estimate(self, x: Float[Array, "*#batch n"]) -> Float[Array, "*#batch"]:
         """Estimated relative error of `pdf(x)`: that of its integrals over time.
@@ -196,9 +130,8 @@ class TimeMixture(eqx.Module):
         at a turning point of the curve.
         """
         x = self._checked(x)
-        shape = jnp.broadcast_shapes(x.shape[:-1], self.batch_shape)
-        given = jnp.zeros(shape, x.dtype) if self.time is None else jnp.broadcast_to(self.time.error_estimate, shape)
-        return given if self.keeps_time else given + self._space_integral(x)[1]
+        own = jnp.zeros(x.shape[:-1], self.dtype) if self.keeps_time else self._integrate(x)[1]
+        return own if self.time is None else vectorize(jnp.add, own, self.time.error_estimate)
 
     def cdf(self, value: Float[Array, "*#batch 1"]) -> Float[Array, "*#batch"]:
         """P(coordinate <= x | given), where there is only one coordinate."""
@@ -207,110 +140,81 @@ class TimeMixture(eqx.Module):
         value = self._checked(value)
         if self.keeps_time:
             return self.time.cdf(value[..., 0])
-        infinite = jnp.isinf(value)
-        log_mass = map_over_batch(_log_space_cdf, self.parent, (self._with_values(jnp.where(infinite, 0, value)), 1))
-        mass = jnp.clip(jnp.exp(log_mass - jnp.broadcast_to(self._log_normalizer, log_mass.shape)), 0, 1)
-        infinite, last = (jnp.broadcast_to(y[..., 0], mass.shape) for y in (infinite, value))
-        return jnp.where(infinite, (last > 0).astype(mass.dtype), mass)
+        near = jnp.where(jnp.isinf(value), 0, value)
+        log_mass = self._given(map_over_batch(_log_space_cdf, self.parent, (self._join(near), 1)))
 
-    def sample(self, key: Key[Array, ""], sample_shape: int | tuple[int, ...] = ()) -> Float[Array, "..."]:
-        """Draws of shape (*sample_shape, *batch, n): t first, then space given t."""
-        return self._sample(key, as_sample_shape(sample_shape))
+        def bound(value, log_mass):
+            mass = jnp.clip(jnp.exp(log_mass), 0, 1)
+            return jnp.where(jnp.isinf(value), (value > 0).astype(mass.dtype), mass)
+
+        return vectorize(bound, value[..., 0], log_mass)
 
     @compile_eager(static=("sample_shape",))
     def _sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...]) -> Array:
         time_key, space_key = jax.random.split(key)
-        shape = (*sample_shape, *self.batch_shape)
-        if self.time is None:
-            noise = jax.random.normal(time_key, shape, self.values.dtype)
-            loc, scale = (jnp.broadcast_to(x, shape) for x in (self.parent.time_loc, self.parent.time_scale))
-            t = loc + scale * noise
-        else:
-            t = self.time.sample(time_key, sample_shape)
-        time = t[..., None]
+        time = self.parent.time_marginal if self.time is None else self.time
+        t = time.sample(time_key, sample_shape)
         if not self._space_dim:
-            return time
-        s = conditional_gaussian(self.parent, _over(self.values, shape), t).sample(space_key)
-        return jnp.concatenate([s, time], axis=-1) if self.keeps_time else s
+            return t[..., None]
+        s = conditional_gaussian(self.parent, self.values, t).sample(space_key)
+        return jnp.concatenate([s, t[..., None]], axis=-1) if self.keeps_time else s
 
-    @property
-    def mean(self) -> Float[Array, "*batch n"]:
-        """E[x | given]."""
-        return self._moments()[0]
-
-    @property
-    def variance(self) -> Float[Array, "*batch n"]:
-        """Var[x | given], per coordinate."""
-        return jnp.diagonal(self._moments()[1], axis1=-2, axis2=-1)
-
-    @property
-    def covariance_matrix(self) -> Float[Array, "*batch n n"]:
-        """Cov[x | given]."""
-        return self._moments()[1]
+    def moments(self) -> tuple[Float[Array, "*batch n"], Float[Array, "*batch n n"]]:
+        """Mean and covariance matrix of x given the values."""
+        if self.time is None:
+            mean, covariance = self.parent.moments()
+        else:
+            mean, covariance = map_over_batch(_mixture_moments, self.parent, (self.values, 1), self.time.panels)
+        (end,) = self.event_shape
+        return mean[..., :end], covariance[..., :end, :end]
 
     def marginal(self, indices) -> "TimeMixture":
         """Some of the coordinates; the indices are kept."""
-        space, keeps_time = self._split(normalize_indices(indices, self.event_shape[0]))
-        keep = (*range(self._num_given), *(self._num_given + i for i in space))
-        parent = self.parent.marginal((*keep, self.parent.event_shape[0] - 1))
-        return TimeMixture(parent, self.values, self.time, keeps_time)
+        indices, dim = normalize_indices(indices, self.event_shape[0]), self._space_dim
+        if dim in indices[:-1]:
+            raise invalid("indices", expected="time last", got=repr(indices), cure="Time is the last coordinate.")
+        num_given = self.values.shape[-1]
+        keep = (*range(num_given), *(num_given + i for i in indices if i < dim), num_given + dim)
+        return TimeMixture(self.parent.marginal(keep), self.values, self.time, dim in indices)
 
     def condition(self, indices, values) -> "TimeMixture | Gaussian":
         """The other coordinates, given these: exact, a Gaussian, if time is among the given."""
-        indices = normalize_indices(indices, self.event_shape[0])
-        offset = self._num_given
-        values = as_event("values", values, self.values.dtype, (len(indices),))
-        shape = jnp.broadcast_shapes(values.shape[:-1], self.batch_shape)
-        both = jnp.concatenate([_over(self.values, shape), _over(values, shape)], axis=-1)
-        given = (*range(offset), *(offset + i for i in indices))
+        indices, num_given = normalize_indices(indices, self.event_shape[0]), self.values.shape[-1]
+        both = self._join(as_event("values", values, self.dtype, (len(indices),)))
+        given = (*range(num_given), *(num_given + i for i in indices))
         if self.keeps_time:
             return self.parent.condition(given, both)
-        kept = tuple(i for i in range(offset + self._space_dim) if i not in given)
+        kept = tuple(i for i in range(num_given + self._space_dim) if i not in given)
         check_rest(kept)
         return time_mixture(self.parent, kept, given, both, keeps_time=False)
 
-    @property
-    def _num_given(self) -> int:
-        return self.values.shape[-1]
+    def log_evidence(self, indices: tuple[int, ...], values: Array, rest: "TimeMixture | Gaussian") -> Array:
+        """The log-density of the values of these coordinates; `rest` is the distribution given them."""
+        if isinstance(rest, TimeMixture):  # holds the integral already, over these values and those given before
+            return self._given(rest.time.log_normalizer)
+        return super().log_evidence(indices, values, rest)
 
     @property
     def _space_dim(self) -> int:
-        return self.parent.event_shape[0] - 1 - self._num_given
+        return self.parent.event_shape[0] - 1 - self.values.shape[-1]
 
-    @property
-    def _log_normalizer(self) -> Array:
-        return jnp.zeros((), self.values.dtype) if self.time is None else self.time.log_normalizer
+    def _join(self, x: Array) -> Array:
+        """The values that are given, then x."""
+        return _append(self.values, x)
 
-    def _checked(self, x):
-        return as_event("value", x, self.values.dtype, self.event_shape)
+    def _integrate(self, x: Array) -> tuple[Array, Array]:
+        """log of the joint density of x and the values, and its estimated error."""
+        return map_over_batch(_log_space_density, self.parent, (self._join(x), 1))
 
-    def _with_values(self, x):
-        shape = jnp.broadcast_shapes(x.shape[:-1], self.values.shape[:-1])
-        return jnp.concatenate([_over(self.values, shape), _over(x, shape)], axis=-1)
-
-    def _space_integral(self, x):
-        return map_over_batch(_log_space_density, self.parent, (self._with_values(x), 1))
-
-    def _split(self, indices):
-        keeps_time = self.keeps_time and self._space_dim in indices
-        if keeps_time and indices[-1] != self._space_dim:
-            raise invalid("indices", expected="time last", got=repr(indices), cure="Time is the last coordinate.")
-        return indices[: len(indices) - int(keeps_time)], keeps_time
-
-    def _moments(self):
-        if self.time is None:
-            mean, covariance = self.parent.moments()
-            return mean[..., :-1], covariance[..., :-1, :-1]
-        mean, covariance = map_over_batch(_mixture_moments, self.parent, (self.values, 1), self.time.panels)
-        end = self.event_shape[0]
-        return mean[..., :end], covariance[..., :end, :end]
+    def _given(self, log_joint: Array) -> Array:
+        """log of the joint density divided by that of the values."""
+        return log_joint if self.time is None else _divide_all(log_joint, self.time.log_normalizer)
 
 
 def time_density(parent, values: Float[Array, "*#batch d-1"]) -> TimeDensity:
     """p(t | s = values) of a Folded-Gaussian."""
     panels, log_normalizer, error = map_over_batch(_space_panels, parent, (values, 1))
-    values = _over(values, log_normalizer.shape)
-    return TimeDensity(parent, values, panels, log_normalizer, error)
+    return TimeDensity(parent, _over(values, log_normalizer.shape), panels, log_normalizer, error)
 
 
 def time_mixture(parent, kept, given, values, *, keeps_time: bool) -> TimeMixture:
@@ -327,13 +231,34 @@ def conditional_gaussian(parent, values: Float[Array, "*#batch given"], t: Float
     return condition_on_first(at, values) if values.shape[-1] else at
 
 
-@eqx.filter_jit
-def _each(function, panels: Panels, x: Float[Array, "sample batch"]) -> Float[Array, "sample batch"]:
-    return jax.vmap(jax.vmap(function, in_axes=(None, 0)), in_axes=(0, 1), out_axes=1)(panels, x)
+@compile_eager
+@vectorized(0, 0, 0)
+def _time_cdf(panels: Panels, t, time_loc, time_scale) -> Array:
+    return panels.cdf((t - time_loc) / time_scale)
+
+
+@compile_eager
+@vectorized(0, 0, 0)
+def _time_icdf(panels: Panels, q, time_loc, time_scale) -> Array:
+    return time_loc + time_scale * panels.icdf(q)
+
+
+@compile_eager
+def _append(values: Array, x: Array) -> Array:
+    return vectorize(jnp.append, (values, 1), (x, 1))
+
+
+@compile_eager
+def _divide_all(log_joint: Array, log_given: Array) -> Array:
+    return vectorize(_divide, log_joint, log_given)
 
 
 def _over(x: Array, batch: tuple[int, ...]) -> Array:
     return jnp.broadcast_to(x, (*batch, x.shape[-1]))
+
+
+def _divide(log_joint: Array, log_given: Array) -> Array:
+    return jnp.where(jnp.isneginf(log_joint), -jnp.inf, log_joint - log_given)
 
 
 # --- one at a time: parents and values without batch --------------------------------------------------------
@@ -352,8 +277,7 @@ def _log_joint(parent, s):
     """tau -> log of the density of (s, tau), elementwise."""
 
     def log_f(tau):
-        t = parent.time_loc + parent.time_scale * tau
-        x = jnp.concatenate([_over(s, t.shape), t[..., None]], axis=-1)
+        x = vectorize(jnp.append, (s, 1), parent.time_loc + parent.time_scale * tau)
         return parent.log_prob(x) + jnp.log(parent.time_scale)
 
     return log_f
@@ -479,9 +403,10 @@ def _same_top(log_f, found, height):
     return (close & ~valley & earlier).any(0)
 
 
-def _tau_moments(panels: Panels):
+def _time_moments(panels: Panels, time_loc, time_scale):
     mean = panels.expectation(panels.nodes)
-    return mean, panels.expectation((panels.nodes - mean) ** 2)
+    variance = panels.expectation((panels.nodes - mean) ** 2)
+    return (time_loc + time_scale * mean)[None], (variance * time_scale**2)[None, None]
 
 
 def _log_space_density(parent, s):

@@ -7,7 +7,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from foldgauss._numerics.batch import broadcast_leaves, compile_eager, concrete_value, expand_leaves, map_over_batch
+from foldgauss._numerics.batch import broadcast_leaves, compile_eager, concrete_value, map_over_batch
 from foldgauss._runtime.checks import invalid
 from foldgauss.analysis.moments import mean_log_envelope
 from foldgauss.analysis.quadrature import (
@@ -218,7 +218,7 @@ def _tilted(p, q, sharpness, power_q):
 
 def _center_distance(p, q, t):
     """log |L_q^-1 (center_p - center_q)|^2 at t (one axis in front of the batch), and whether it is only rounding."""
-    here, there = (expand_leaves(x, t.ndim).condition_time(t).loc for x in (p, q))
+    here, there = (x.condition_time(t).loc for x in (p, q))
     difference = here - there
     size = jnp.abs(here) + jnp.abs(there) + jnp.abs(p.loc)[None] + jnp.abs(q.loc)[None]
     same = (jnp.abs(difference) <= _SAME_CURVE * jnp.finfo(size.dtype).eps * size).all(-1)

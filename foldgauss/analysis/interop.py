@@ -106,13 +106,13 @@ def _make_class(distributions) -> type:
             return _part(self.base, "mode")
 
         def entropy(self):
-            return _part(self.base, "entropy")()
+            return _part(self.base, "entropy")
 
         def cdf(self, value):
-            return _part(self.base, "cdf")(value)
+            return _part(self.base, "cdf", value)
 
         def icdf(self, q):
-            return _part(self.base, "icdf")(q)
+            return _part(self.base, "icdf", q)
 
     @promote_batch_shape.register(NumpyroDistribution)
     def _(dist):
@@ -134,12 +134,14 @@ def _blank_numpyro():
     return made.__new__(made)
 
 
-def _part(dist: Any, name: str):
-    """A method or property. Where the class of `dist` has none, raises as numpyro's distributions do."""
-    if not hasattr(type(dist), name):
-        told = f"{name}: expected a distribution that has one, got {type(dist).__name__}."
-        raise NotImplementedError(told)  # numpyro's signal that a distribution lacks a method
-    return getattr(dist, name)
+def _part(dist: Any, name: str, *arguments):
+    """A property, or the result of a method. Where `dist` has none, raises as numpyro's distributions do."""
+    try:
+        found = getattr(dist, name)
+        return found(*arguments) if callable(found) else found
+    except (AttributeError, ValueError) as error:  # numpyro's signal that a distribution lacks a method
+        told = f"{name}: expected a distribution that has one, got {type(dist).__name__}. {error}"
+        raise NotImplementedError(told) from error
 
 
 def to_scipy(dist: Any) -> "FrozenDistribution":

@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
-from foldgauss._numerics.batch import align, broadcast, broadcast_leaves, check_batch, concrete_value, ranked_leaves
+from foldgauss._numerics.batch import align, broadcast_leaves, check_batch, concrete_value, ranked_leaves
 from foldgauss._runtime.checks import invalid
 
 __all__ = [
@@ -31,7 +31,7 @@ def broadcast_weights(components, logits: ArrayLike | None, weights: ArrayLike |
         got = "none" if logits is None else "both"
         raise invalid("logits, weights", expected="exactly one of them", got=got, cure="logits are log weights.")
     name, given = ("weights", weights) if logits is None else ("logits", logits)
-    given = jnp.asarray(given, components.loc.dtype)
+    given = jnp.asarray(given, components.dtype)
     if given.shape[-1:] != components.batch_shape[-1:]:
         expected = f"shape (*batch, {components.batch_shape[-1]})"
         raise invalid(name, expected=expected, got=f"shape {given.shape}", cure="One value for each component.")
@@ -40,7 +40,7 @@ def broadcast_weights(components, logits: ArrayLike | None, weights: ArrayLike |
     batch = check_batch([*ranked_leaves(components), (given, 0)])
     if batch != components.batch_shape:
         components = broadcast_leaves(components, batch)
-    (given,) = broadcast([(given, 0)], batch)
+    given = jnp.broadcast_to(given, batch)
     return components, given if name == "logits" else _log_weights(given)
 
 

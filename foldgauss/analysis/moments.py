@@ -6,11 +6,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from foldgauss._numerics.batch import broadcast_leaves, compile_eager, concrete_value, map_over_batch
+from foldgauss._numerics.batch import broadcast_leaves, compile_eager, concrete_value, map_over_batch, vectorized
 from foldgauss._runtime.checks import invalid
-from foldgauss.analysis.quadrature import find_peaks, normal_panels, warn_of_error
+from foldgauss.analysis.quadrature import find_peaks, gauss_hermite, normal_panels, warn_of_error
 from foldgauss.envelope import Constant, TimeLikelihood
-from foldgauss.fold import FourierFold, PolynomialFold, ZeroFold
+from foldgauss.fold import FourierFold, PolynomialFold, ZeroFold, evaluate_shift
 
 __all__ = ["entropy", "mean_log_envelope", "mode", "moments"]
 
@@ -34,7 +34,7 @@ def moments(dist, *, with_error: bool = False) -> tuple[Array, ...]:
 @compile_eager
 def _moments(loc, scale_tril, time_loc, time_scale, fold, envelope) -> tuple[Array, Array, Array]:
     """Return the moments and their error. `fold` and `envelope` have closed forms, or are tuples of integrals."""
-    mean_f, cov_f, cross, error_f = fold if isinstance(fold, tuple) else _fold_moments(fold, loc, time_scale)
+    mean_f, cov_f, cross, error_f = fold if isinstance(fold, tuple) else _fold_moments(fold, time_scale)
     mean_a, error_a = envelope if isinstance(envelope, tuple) else (_mean_envelope(envelope, time_loc), 0)
     mean = jnp.concatenate([loc + mean_f, time_loc[..., None]], axis=-1)
     sigma = scale_tril @ jnp.swapaxes(scale_tril, -1, -2)
@@ -125,13 +125,26 @@ def _log_envelope(envelope, time_loc, time_scale, tau: Float[Array, "*tau"]) -> 
     return envelope.log_a(time_loc + time_scale * tau, time_loc=time_loc, time_scale=time_scale)
 
 
-def _fold_moments(fold, loc, scale):
-    """E f(u), Cov f(u), E[f(u) u] for u ~ N(0, time_scale^2), and no error, where they have closed forms."""
-    if isinstance(fold, ZeroFold):
-        return jnp.zeros_like(loc), jnp.zeros((*loc.shape, loc.shape[-1]), loc.dtype), jnp.zeros_like(loc), 0 * scale
-    if isinstance(fold, PolynomialFold):
-        return *_polynomial_moments(fold.coefficients, scale), 0 * scale
-    return *_fourier_moments(fold, scale), 0 * scale
+@vectorized(0)
+def _fold_moments(fold, scale):
+    """E f(u), Cov f(u), E[f(u) u] for u ~ N(0, time_scale^2), and no error: of one fold that has closed forms."""
+    if isinstance(fold, FourierFold):
+        return *_fourier_moments(fold, scale), 0 * scale
+    # Gauss-Hermite quadrature is exact for polynomials, here those of up to twice the degree.
+    z, weights = (jnp.asarray(x, scale.dtype) for x in gauss_hermite(getattr(fold, "degree", 0) + 1))
+    y = jax.vmap(lambda u: evaluate_shift(fold, u))(scale * z)
+    mean = weights @ y
+    centered = y - mean[None]
+    return mean, (weights[:, None] * centered).T @ centered, scale * ((weights * z) @ y), 0 * scale
+
+
+def _fourier_moments(fold: FourierFold, scale: Float[Array, ""]):
+    """Exact, by E e^(iaz) = e^(-a^2/2), with Cov(sin az, sin bz) and Cov(cos az, cos bz) without cancellation."""
+    a = 2 * jnp.pi * (scale / fold.period) * jnp.arange(1, fold.order + 1, dtype=scale.dtype)
+    product, near = a[:, None] * a[None], 0.5 * jnp.exp(-0.5 * (a[:, None] - a[None]) ** 2)
+    sines, cosines = -near * jnp.expm1(-2 * product), near * jnp.expm1(-product) ** 2
+    covariance = fold.sine.T @ sines @ fold.sine + fold.cosine.T @ cosines @ fold.cosine
+    return jnp.expm1(-0.5 * a**2) @ fold.cosine, covariance, scale * ((a * jnp.exp(-0.5 * a**2)) @ fold.sine)
 
 
 def _integrated_fold(fold, scale):
@@ -151,56 +164,6 @@ def _integrated_fold(fold, scale):
     found, error = panels.expectation(products), panels.expectation_error(products).max()
     error = jnp.maximum(error, panels.expectation_error(y).max())
     return mean, found[:, :-1] * unit[:, None] * unit[None], found[:, -1] * unit * scale, error
-
-
-def _polynomial_moments(coefficients: Float[Array, "*batch degree dim"], scale: Float[Array, "*batch"]):
-    """Exact, by E z^k = (k - 1)!! for even k, with the deviations of u^k put into the coefficients."""
-    degree, dtype = coefficients.shape[-2], coefficients.dtype
-    k = np.arange(1, degree + 1)
-    normal = np.array([_normal_moment(k) for k in range(2 * degree + 2)])
-    size = np.sqrt(normal[2 * k])
-    covariances = normal[k[:, None] + k] / size[:, None] / size - np.outer(normal[k] / size, normal[k] / size)
-    scaled = _times_powers(coefficients * jnp.asarray(size, dtype).reshape((1,) * scale.ndim + (degree, 1)), scale)
-    mean = jnp.einsum("k,...ki->...i", jnp.asarray(normal[k] / size, dtype), scaled)
-    covariance = jnp.einsum("...ki,kl,...lj->...ij", scaled, jnp.asarray(covariances, dtype), scaled)
-    cross = jnp.einsum("k,...ki->...i", jnp.asarray(normal[k + 1] / size, dtype), scaled) * scale[..., None]
-    return mean, covariance, cross
-
-
-@jax.custom_jvp
-def _times_powers(rows: Float[Array, "*batch degree dim"], scale: Float[Array, "*batch"]):
-    """Row k - 1 times scale^k, one factor at a time: the power itself overflows where a coefficient is 0 or small."""
-    scaled = []
-    for row in range(rows.shape[-2]):
-        rows = rows[..., min(row, 1) :, :] * scale[..., None, None]
-        scaled.append(rows[..., 0, :])
-    return jnp.stack(scaled, axis=-2) if scaled else rows
-
-
-@_times_powers.defjvp
-def _times_powers_jvp(primals, tangents):
-    scaled, scale = _times_powers(*primals), primals[1]
-    k = jnp.arange(1, scaled.shape[-2] + 1, dtype=scale.dtype).reshape((1,) * scale.ndim + (-1, 1))
-    return scaled, _times_powers(tangents[0], scale) + k * scaled * (tangents[1] / scale)[..., None, None]
-
-
-def _normal_moment(k: int) -> float:
-    return 0.0 if k % 2 else float(np.prod(np.arange(k - 1, 0, -2, dtype=float)))
-
-
-def _fourier_moments(fold: FourierFold, scale: Float[Array, "*batch"]):
-    """Exact, by E e^(iaz) = e^(-a^2/2), with Cov(sin az, sin bz) and Cov(cos az, cos bz) without cancellation."""
-    k = jnp.arange(1, fold.order + 1, dtype=scale.dtype)
-    a = 2 * jnp.pi * (scale / fold.period)[..., None] * k.reshape((1,) * scale.ndim + (fold.order,))
-    product, near = a[..., :, None] * a[..., None, :], 0.5 * jnp.exp(-0.5 * (a[..., :, None] - a[..., None, :]) ** 2)
-    sines, cosines = -near * jnp.expm1(-2 * product), near * jnp.expm1(-product) ** 2
-    mean = jnp.einsum("...k,...ki->...i", jnp.expm1(-0.5 * a**2), fold.cosine)
-    covariance = sum(
-        jnp.einsum("...ki,...kl,...lj->...ij", rows, matrix, rows)
-        for rows, matrix in ((fold.sine, sines), (fold.cosine, cosines))
-    )
-    cross = jnp.einsum("...k,...ki->...i", a * jnp.exp(-0.5 * a**2), fold.sine) * scale[..., None]
-    return mean, covariance, cross
 
 
 def _ridge(dist, t) -> Float[Array, "*batch d"]:

@@ -13,7 +13,7 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
-from foldgauss._numerics.batch import expand_leaves, ranked_leaves
+from foldgauss._numerics.batch import align_leaves, ranked_leaves
 from foldgauss._numerics.triangular import UNROLLED_SIZE, solve_lower
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood
 from foldgauss.gaussian import Gaussian
@@ -46,13 +46,13 @@ def move_components_first(components, rank: int):
     With the components first, sums over them are vectorized over points.
     """
     in_front = lambda leaf: jnp.expand_dims(jnp.moveaxis(leaf, rank, 0), 1)  # noqa: E731
-    return jax.tree.map(in_front, expand_leaves(components, rank + 1))
+    return jax.tree.map(in_front, align_leaves(components, rank + 1))
 
 
 def pair_log_prob(first, rows: Float[Array, "n *batch d"]) -> Float[Array, "k n *batch"]:
     """log p_k(x) of each point and component; `first` as `move_components_first` gives it."""
-    is_closed = isinstance(first, Gaussian) or (first.fold.is_closed and first.envelope.is_closed)
-    if not is_closed or rows.shape[-1] > UNROLLED_SIZE:
+    is_folded = hasattr(first, "fold") and first.fold.is_closed and first.envelope.is_closed
+    if not (is_folded or isinstance(first, Gaussian)) or rows.shape[-1] > UNROLLED_SIZE:
         return first.log_prob(rows[None])
     leaves, structure = jax.tree.flatten(first)
     return _pairs(structure, rows, *leaves)

@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -63,22 +63,13 @@ def plot_density(
     return ax
 
 
-class _Step(Protocol):
-    """The attributes of a step that are plotted: `foldgauss.video.FitInfo` has them."""
-
-    step: int
-    seconds: float
-    loss: float
-    psnr: float
-
-
-def plot_history(history: Sequence[_Step], axes: "np.ndarray | None" = None) -> np.ndarray:
+def plot_history(history: Sequence[Any], axes: "np.ndarray | None" = None) -> np.ndarray:
     """The course of a fit: PSNR above, loss below, against seconds on the left and steps on the right.
 
     A step's loss is that of its few frames: it is plotted faintly, with its running median over 2% of the history. It
     jumps where the fit changes to larger frames (by default at 20% and 60%) and to the squared error (at 70%).
 
-    **Shapes:** `history` has at least one step; `axes`, given or made, are (2, 2).
+    **Shapes:** `history` has at least one step (of `foldgauss.video.FitInfo`); `axes`, given or made, are (2, 2).
 
     **Units:** dB, seconds of fitting, the loss on a logarithmic scale unless it is 0 throughout.
 
