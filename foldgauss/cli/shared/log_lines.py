@@ -2,8 +2,8 @@
 
 import contextlib
 import logging
+import threading
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager
 
 import numpy as np
 from jaxtyping import Float
@@ -19,12 +19,19 @@ FIRST_LINE_SECONDS = 10.0
 LINE_SECONDS = 30.0
 
 
-def show_status(text: str) -> AbstractContextManager:
-    """What is being done: shown on a terminal while it lasts, elsewhere printed once."""
+@contextlib.contextmanager
+def show_status(text: str) -> Iterator[None]:
+    """What is being done: shown on a terminal while it lasts, elsewhere printed once if it takes long."""
     if err.is_terminal:
-        return err.status(text)
-    err.print(f"{text} ...", soft_wrap=True)
-    return contextlib.nullcontext()
+        with err.status(text):
+            yield
+        return
+    timer = threading.Timer(FIRST_LINE_SECONDS, lambda: err.print(f"{text} ...", soft_wrap=True))
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 class _Printer(logging.Handler):

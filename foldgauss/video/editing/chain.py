@@ -12,9 +12,9 @@ from jaxtyping import ArrayLike, Float, Int
 
 from foldgauss._runtime.checks import (
     check_signature,
+    check_within,
     invalid,
     is_integer,
-    is_within,
     require,
     short_repr,
     warn_if_degrees,
@@ -40,7 +40,7 @@ from foldgauss.video.editing.bake import (
     opacities_and_colors,
     scale_opacity,
 )
-from foldgauss.video.editing.clock import Clock
+from foldgauss.video.editing.clock import Clock, check_clock
 from foldgauss.video.editing.edited_video import EditedVideo, Layer, as_edited
 from foldgauss.video.editing.layer_edits import Bake, add_edit, apply_edit, can_delete, gather_layer
 from foldgauss.video.editing.overlays import (
@@ -382,13 +382,8 @@ class Edit:
             expected="color, hue, or gain, offset and matrix",
             got="none of them, or several",
         )
-        require(
-            hue is None or is_within(hue, "[0, 1]"),
-            "hue",
-            expected="turns in [0, 1]",
-            got=repr(hue),
-            cure="Degrees over 360.",
-        )
+        if hue is not None:
+            check_within("hue", hue, "[0, 1]", "turns in [0, 1], degrees over 360")
         if color is not None:
             rgb = check_color(color)
             self._check_selected()
@@ -429,7 +424,7 @@ class Edit:
         **Units:** times in [0, 1]; n evenly timed frames lie 1 / (n - 1) apart.
         """
         if clock is not None:
-            _check_clock(clock, (shift, stretch, about) != (0, 1, 0))
+            check_clock(clock, (shift, stretch, about) != (0, 1, 0))
             return self._retime_by_clock(clock, when, "clock")
         Clock.shifted(shift, stretch, about=about)  # checks them
         warn_if_outside_clip("shift", shift, stretch, about, len(self._frame_times))
@@ -437,7 +432,7 @@ class Edit:
 
     def _retime_by_clock(self, clock: Clock, when: When, parameter: str) -> "Edit":
         """Add a clock."""
-        span, time_map = self._clip_span(when), self._time_map
+        span, time_map = make_span(self._frame_times, **when), self._time_map
         if time_map is not None and (span is None or time_map.convert_span(span) is not NEVER):
             time_map.check_clock(clock, span, parameter, len(self._frame_times))
             clock = time_map.convert_clock(clock)
@@ -600,19 +595,5 @@ class Edit:
 
     def _span(self, when: When) -> Span | None:
         """The span in the video's own time."""
-        span = self._clip_span(when)
+        span = make_span(self._frame_times, **when)
         return span if span is None or self._time_map is None else self._time_map.convert_span(span)
-
-    def _clip_span(self, when: When) -> Span | None:
-        return make_span(self._frame_times, **when)
-
-
-def _check_clock(clock: object, has_line: bool) -> None:
-    require(not has_line, "clock", expected="a clock, or shift, stretch and about", got="both")
-    require(
-        isinstance(clock, Clock),
-        "clock",
-        expected="a Clock",
-        got=type(clock).__name__,
-        cure="Clock(times, own_times) is linear between knots." if callable(clock) else "",
-    )

@@ -60,3 +60,15 @@ class Clock:
     def __call__(self, t: float) -> float:
         """The own time at time t."""
         return float(np.interp(t, self.times, self.own_times))
+
+
+def check_clock(clock: object, has_line: bool) -> None:
+    """Raise ValueError unless `clock` is one, given without a line of times."""
+    require(not has_line, "clock", expected="a clock, or shift, stretch and about", got="both")
+    require(
+        isinstance(clock, Clock),
+        "clock",
+        expected="a Clock",
+        got=type(clock).__name__,
+        cure="Clock(times, own_times) is linear between knots." if callable(clock) else "",
+    )
