@@ -241,20 +241,6 @@ def test_many_clips_given_again_do_what_is_left(clips, tmp_path, capsys, monkeyp
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")
-def test_many_clips_stopped_in_one_go_on_there(clips, tmp_path, capsys, monkeypatch):
-    out, other = tmp_path / "models", tmp_path / "others"
-    with monkeypatch.context() as patch:
-        Stopping(patch, "clip1.mp4")
-        assert run("fit-many", clips, "--out", out, *QUICK) == 1
-    assert "stopped by SIGTERM; 1 of 4 clips are done" in capsys.readouterr().err
-    assert (out / "records" / "clip1.fgz.checkpoint").exists()
-    assert run("fit-many", clips, "--out", out, *QUICK, "--quiet") == 1
-    assert run("fit-many", clips, "--out", other, *QUICK, "--quiet") == 1
-    for path in other.glob("*.fgz"):
-        assert (out / path.name).read_bytes() == path.read_bytes()
-
-
-@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")
 def test_many_clips_begun_anew_and_stopped_go_on(clips, tmp_path, capsys, monkeypatch):
     out = tmp_path / "models"
     assert run("fit-many", clips, "--out", out, *QUICK, "--quiet") == 1

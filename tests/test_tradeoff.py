@@ -18,13 +18,11 @@ from foldgauss.analysis.plot import Panel, plot_tradeoff
 from foldgauss.cli.measuring import tradeoff as command
 from foldgauss.cli.measuring import tradeoff_record as kept
 from foldgauss.io import load_video_model, read_video, write_video
-from foldgauss.io.media.clip import AS_STORED
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.jobs import runner
 from foldgauss.video import FitConfig, FitDiverged, evaluate, tradeoff
 from foldgauss.video.tradeoff import (
     AXES,
-    LEAST_STEPS,
     Throughput,
     check_axes,
     estimate_seconds,
@@ -119,30 +117,6 @@ def test_knee(cost, quality, expected):
     # Units tell nothing: seconds or minutes, dB above whatever.
     assert knee([60 * c for c in cost], [q - 20 for q in quality]) == expected
     assert knee([c**2 for c in cost], [2 * q for q in quality]) == expected
-
-
-def test_each_variant_changes_one_setting_and_has_a_command():
-    made, left = plan_points(BASE, tuple(AXES), 132)
-    assert left == []
-    assert len({point.name for point in made}) == len(made) == 1 + sum(map(len, AXES.values()))
-    given = Path("my clip.mp4"), "320x640", "0:132", AS_STORED, Path("out")
-    lines = [kept.format_command(*given, point) for point in made]
-    assert len(set(lines)) == len(lines)
-    for point, line in zip(made, lines, strict=True):
-        changed = kept.changed_settings(point, BASE)
-        assert len(changed) == {"base": 0, "batch": 2}.get(point.axis, 1)
-        assert "my clip.mp4" in shlex.split(line)
-    assert made[0].config == BASE
-    shown = dict(zip((point.name for point in made), lines, strict=True))
-    assert shown["power 2"].split()[-2:] == ["--power", "2.0"]
-    assert shown["time 250 steps"].split()[-2:] == ["--steps", "250"]
-    assert shown["quality 50"].split()[-2:] == ["--quality", "50.0"]
-    assert shown["cutoff radius 2, fitted"].endswith("--support-radius 2.0")
-    outputs = {name: Path(shlex.split(line)[4]).suffix for name, line in shown.items() if line.split()[1] == "fit"}
-    assert {name for name, suffix in outputs.items() if suffix == ".fgz"} == {f"quality {q}" for q in (30, 50, 70, 90)}
-    assert shown["cutoff radius 2, played"] == (
-        "foldgauss evaluate out/base.safetensors 'my clip.mp4' --support-radius 2.0"
-    )
 
 
 @pytest.mark.parametrize(
@@ -311,27 +285,6 @@ def test_a_point_that_fails_is_left_out(clip, tmp_path, capsys, monkeypatch):
     assert record_of(tmp_path / "r")["left_out"] == {}
 
 
-@pytest.mark.parametrize(
-    ("minutes", "steps", "told"),
-    [
-        (1e-3, LEAST_STEPS, "warning: --minutes: 0.001 are too few for 5 points"),
-        (1.0, 1000, "about 1.0 minutes"),
-        (60.0, 3000, "5 points around a base of 3,000 steps"),
-    ],
-)
-def test_minutes_become_steps(clip, tmp_path, capsys, monkeypatch, minutes, steps, told):
-    """At a pace with which all fits take a minute if the base has 1,000 steps."""
-    work = 1 + sum(turn.work for axis in ("time", "compositing") for turn in AXES[axis])
-    pace = Throughput(start=0.0, step=60 / command.MARGIN / (work * 1000.001), evaluation=0.0)
-    monkeypatch.setattr(command._Run, "_measure_throughput", lambda self, config: pace)
-    monkeypatch.setattr(command._Run, "measure", lambda self, *given: (_ for _ in ()).throw(KeyboardInterrupt))
-    arguments = ["--axes", "time,compositing", "--minutes", minutes]
-    assert run("tradeoff", clip, "--out", tmp_path / "r", *arguments) == 1
-    shown = " ".join("".join(capsys.readouterr()).split())
-    assert told in shown
-    assert record_of(tmp_path / "r")["plan"]["steps"] == steps
-
-
 def test_other_settings_are_refused(done, clip, tmp_path, capsys):
     before = {path.name: path.read_bytes() for path in done.iterdir()}
     for options, told in (
@@ -356,26 +309,6 @@ def test_other_settings_are_refused(done, clip, tmp_path, capsys):
     (target / "mine.txt").write_text("mine")
     assert run("tradeoff", clip, "--out", target, "--axes", "compositing", *QUICK, "--overwrite") == 2
     assert "'mine.txt' in it" in " ".join(capsys.readouterr().err.split())
-
-
-@pytest.mark.parametrize(
-    ("where", "odd", "told"),
-    [(("points",), 3, "not iterable"), (("points", 0), 3, "not subscriptable"), (("plan",), 3, "not iterable")],
-)
-def test_a_record_that_was_edited_is_refused(done, clip, tmp_path, capsys, where, odd, told):
-    kept = record_of(done)
-    part = kept
-    for key in where[:-1]:
-        part = part[key]
-    part[where[-1]] = odd
-    (tmp_path / "tradeoff.json").write_text(json.dumps(kept))
-    before = (tmp_path / "tradeoff.json").read_bytes()
-    assert run("tradeoff", clip, "--out", tmp_path, "--frames", "1:6", *QUICK) == 2
-    shown = " ".join(capsys.readouterr().err.split())
-    assert "--out: expected results of `foldgauss tradeoff` in" in shown
-    assert told in shown
-    assert (tmp_path / "tradeoff.json").read_bytes() == before
-    assert os.listdir(tmp_path) == ["tradeoff.json"]
 
 
 @pytest.mark.parametrize("name", ["base.safetensors", "tradeoff.csv", "tradeoff.png"])

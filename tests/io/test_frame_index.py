@@ -164,17 +164,6 @@ def test_cuts_are_found_in_passing(long, long_index):
     assert index_video(long, find_cuts=False).cuts == []
 
 
-@pytest.mark.parametrize(
-    "name", ["bikes", *(pytest.param(name, marks=pytest.mark.slow) for name in ("bunny", "carphone"))]
-)
-def test_sample_clips(name):
-    path, stop = sample_clip(name), 33 if name == "bikes" else 12
-    clip, index = read_video(path, frames=(0, stop)), index_video(path, frames=(0, stop))
-    _described(index, clip)
-    assert index.cuts == Motion.from_frames(clip.frames).cuts == ([30] if name == "bikes" else [])
-    _as_read(index, path, [(stop - 3, stop)], size=(60, 100))
-
-
 def test_cuts_of_a_stream_are_those_of_the_clip():
     """Fast, dark and noisy clips, with a cut at every third frame."""
     shots = [read_video(sample_clip(name), size=(90, 120)).frames for name in ("bunny", "bikes", "carphone")]
