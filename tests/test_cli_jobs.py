@@ -153,23 +153,6 @@ def test_what_was_begun_in_segments_goes_on_so_without_being_told(long_clip, who
     assert target.read_bytes() == whole.read_bytes()
 
 
-@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")
-def test_what_is_begun_anew_and_stopped_is_not_begun_anew_again(long_clip, whole, tmp_path, capsys, monkeypatch):
-    target, folder = tmp_path / "m.safetensors", tmp_path / "m.safetensors.segments"
-    target.write_bytes(b"of before")
-    words = ("fit", long_clip, "--out", target, *SEGMENTS, "--overwrite")
-    stopped(monkeypatch, "segment 1", *words)
-    assert "Give the same command again with --resume added to continue." in capsys.readouterr().err
-    stamp = (folder / "segment-0000.safetensors").stat().st_mtime_ns
-    assert run("fit", tmp_path / "misspelt.mp4", *words[2:]) == 2
-    assert (folder / "segment-0000.safetensors").stat().st_mtime_ns == stamp
-    stopped(monkeypatch, "segment 2", *words, "--resume")
-    assert "Give the same command again to continue." in capsys.readouterr().err
-    assert (folder / "segment-0000.safetensors").stat().st_mtime_ns == stamp
-    assert run(*words, "--resume", "--quiet") == 0
-    assert target.read_bytes() == whole.read_bytes()
-
-
 def test_that_nobody_listens_any_more_costs_no_fit(long_clip, whole, tmp_path, monkeypatch):
     def gone(event, figures):
         raise BrokenPipeError

@@ -33,7 +33,6 @@ from foldgauss.video.compression.quantized_times import TIME_BITS
 from foldgauss.video.compression.sensitivity import estimate_sensitivities
 from foldgauss.video.models.metrics import evaluate
 from foldgauss.video.models.renderer import VideoRenderer
-from foldgauss.video.models.row_layout import shift_path
 from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.selection.contributions import Contributions
 
@@ -549,17 +548,6 @@ def test_chunks_follow_visible_spans_that_have_changed(monkeypatch):
         assert not (spans[0][within].min() < 0.5 < spans[1][within].max()) or number % 1024 == 0
 
 
-def test_many_gaussians_are_within_the_limit_of_chunks(monkeypatch):
-    monkeypatch.setattr(chunks_module, "LEAST", 2)
-    rng, num = np.random.default_rng(0), 20_000
-    first = rng.uniform(0, 1, num)
-    last = np.minimum(first + 10 ** rng.uniform(-5, 0, num), 1)
-    layers = find_layers(rng.normal(size=num))
-    assert 50 < len(np.unique(divide(layers, first, last))) < 512
-    monkeypatch.setattr(chunks_module, "_MOST", num)
-    assert len(np.unique(divide(layers, first, last))) > 1024
-
-
 @pytest.mark.parametrize("compositing", ["over", "sum"])
 def test_large_gaussians_are_behind_in_the_first_chunk(monkeypatch, compositing):
     monkeypatch.setattr(chunks_module, "LEAST", 100)
@@ -598,29 +586,6 @@ def test_a_decoded_model_by_the_same_rules_is_the_same_file(change):
     exact = compute_columns(dequantize(quantized))
     again = quantize_chunk(exact, columns["class"], quantized.rules, columns["cell"])
     assert pack_compact(dataclasses.replace(quantized, chunks=(again,))) == pack_compact(quantized)
-
-
-def test_values_on_the_grid_are_so_in_any_cell():
-    """The origin of x0, y0 and time is a multiple of the step, whichever cell it is that of."""
-    model = crowd(soft_model(degree=2, options=RenderOptions()))
-    quantized = fine(model, -6.3)
-    assert min(cells_of(quantized)) > 0
-    decoded = compute_columns(dequantize(quantized))
-    cells = np.random.default_rng(3).permutation(quantized.columns["cell"])
-    again = quantize_chunk(decoded, quantized.columns["class"], quantized.rules, cells)
-    again = dataclasses.replace(quantized, chunks=(again,))
-    assert (again.columns["x0"] != quantized.columns["x0"]).any()
-    assert_same(dequantize(again), dequantize(quantized))
-
-
-def test_a_path_is_the_same_from_another_time():
-    rng = np.random.default_rng(0)
-    place, shift, u = rng.normal(size=(5, 4, 2)), rng.normal(size=5), 0.3
-
-    def at(place, u):
-        return sum(place[:, k] * u[:, None] ** k for k in range(4))
-
-    np.testing.assert_allclose(at(shift_path(place, shift), u + shift), at(place, np.full(5, u)), rtol=1e-9)
 
 
 # ------------------------------------------------------------------------------------ extremes
