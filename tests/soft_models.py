@@ -2,6 +2,8 @@
 
 import dataclasses
 
+import equinox as eqx
+import jax
 import numpy as np
 
 from foldgauss.envelope import TimeLikelihood
@@ -64,3 +66,41 @@ def on_paths(model, *, at_frames=True, reach=1.0, seed=7) -> VideoModel:
     paths = SharedPaths(np.tile(times, (2, 1)).astype(np.float32), matrices.astype(np.float32))
     splats = dataclasses.replace(splats, path_index=index.astype(np.uint8), paths=paths)
     return dataclasses.replace(model, splats=splats)
+
+
+def of_degrees(model, seed=0) -> VideoModel:
+    """The model with folds of several degrees."""
+    degrees = np.random.default_rng(seed).integers(0, model.degree + 1, model.num_gaussians)
+    kept = (np.arange(model.degree) < degrees[:, None])[..., None]
+    leaf = np.where(kept, np.asarray(model.splats.coefficients), np.float32(0))
+    return eqx.tree_at(lambda m: m.splats.coefficients, model, leaf)
+
+
+def crowd(model, copies=10, seed=1) -> VideoModel:
+    """The model with more Gaussians, like its own."""
+    rng = np.random.default_rng(seed)
+
+    def more(leaf):
+        leaf = np.asarray(leaf)
+        if not leaf.ndim:
+            return leaf
+        return (np.repeat(leaf, copies, 0) + 0.1 * rng.normal(size=(copies * len(leaf), *leaf.shape[1:]))).astype("f4")
+
+    return eqx.tree_at(lambda m: m.splats, model, jax.tree.map(more, model.splats))
+
+
+def only(model, keep) -> VideoModel:
+    """The model with these Gaussians, in this order."""
+
+    def cut(leaf):
+        return leaf[keep] if np.ndim(leaf) else leaf
+
+    return eqx.tree_at(lambda m: m.splats, model, jax.tree.map(cut, model.splats))
+
+
+def assert_same(one, other) -> None:
+    """Trees of the same structure, whose leaves have the same bits."""
+    assert jax.tree.structure(one) == jax.tree.structure(other)
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        assert (np.asarray(a).dtype, np.shape(a)) == (np.asarray(b).dtype, np.shape(b))
+        assert np.asarray(a).tobytes() == np.asarray(b).tobytes()

@@ -327,28 +327,6 @@ def test_help_and_version(capsys):
     assert re.search(r"foldgauss 0\.1.*Python 3.*, jax .*numba .* threads$", capsys.readouterr().out.strip(), re.DOTALL)
 
 
-def test_commands_are_listed_as_one_comes_to_need_them(capsys):
-    assert run("--help") == 0
-    lines = capsys.readouterr().out.partition("─ Commands ")[2].partition("╰")[0].splitlines()[1:]
-    named = [found[1] for line in lines if (found := re.match("│ ([a-z-]+) ", line))]
-    expected = [
-        "fit",
-        "fit-many",
-        "view",
-        "render",
-        "evaluate",
-        "info",
-        "uncertainty",
-        "edit",
-    ]
-    expected += ["compress", "tradeoff", "export", "import", "demo"]
-    assert named == expected
-    assert not any("..." in line for line in lines)  # none is cut
-    assert run("evaluate", "--help") == 0
-    told = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "B of the clip, as many as the model has [default: those that it was fitted to]" in told
-
-
 def test_debug_shows_the_traceback(tmp_path):
     with pytest.raises(FileNotFoundError):
         cli.main(["info", str(tmp_path / "none"), "--debug"])

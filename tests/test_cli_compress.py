@@ -172,15 +172,6 @@ def test_a_file_that_is_no_smaller_is_told(work, tmp_path, capsys):
     assert "n.fgz is no smaller than" in capsys.readouterr().err.replace("\n", " ")
 
 
-def test_a_clip_of_fewer_frames(work, tmp_path, capsys):
-    write_video(tmp_path / "short", np.zeros((FRAMES - 1, *SIZE, 3), np.uint8), 12.0)
-    for command in ("compress", "evaluate"):
-        assert run(command, work / "model.safetensors", tmp_path / "short") == 2
-        told = " ".join(capsys.readouterr().err.split())
-        assert "VIDEO: expected 5 frames as in the model, got 4" in told
-        assert "Give the clip that it was fitted to." in told
-
-
 def test_the_wrong_clip_is_refused(work, tmp_path, capsys, monkeypatch):
     """Fitted anew to it, the model would be lost; one that a decoder changed by a little is taken."""
     monkeypatch.chdir(tmp_path)

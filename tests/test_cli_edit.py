@@ -128,18 +128,3 @@ def test_export_and_import(work, tmp_path, capsys):
     assert np.abs(picture.astype(int) - own).max() <= 2
     assert run("import", tmp_path / "mesh", "--out", tmp_path / "mesh.gif") == 0
     assert read_video(tmp_path / "mesh.gif").num_frames == 3
-
-
-def test_a_folder_of_masks(work, tmp_path):
-    """As a user has it: a mask drawn in some other program."""
-    mask = np.zeros(SIZE, np.uint8)
-    mask[10:30, 12:32] = 255
-    (tmp_path / "masks").mkdir()
-    for k in range(FRAMES):
-        assert cv2.imwrite(str(tmp_path / "masks" / f"{k}.png"), mask)
-    script = tmp_path / "edits.toml"
-    script.write_text('[selections.it]\nmask = "masks"\n[[edits]]\ndo = "vanish"\nselect = "it"')
-    assert run("edit", work / "model.safetensors", script, "--out", tmp_path / "out.safetensors") == 0
-    boxed = edit(soft_model()).select(box=(12, 10, 32, 30)).vanish().video()
-    assert 0 < boxed.num_gaussians < NUM
-    assert load_video_model(tmp_path / "out.safetensors").num_gaussians == boxed.num_gaussians

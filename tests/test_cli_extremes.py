@@ -65,18 +65,6 @@ def test_from_a_clip_to_its_pictures(tmp_path, capsys, monkeypatch, name):
     assert "nan" not in capsys.readouterr().out.lower()
 
 
-def test_one_image_file(tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    image = ramp(1, 24, 32, np.uint16)[0]
-    assert cv2.imwrite("picture.png", image[..., ::-1])
-    assert run("fit", "picture.png", "--out", "picture.safetensors", *QUICK) == 0
-    assert "1 frame of 24x32" in capsys.readouterr().out
-    assert run("render", "picture.safetensors", "--times", 0.5, "--out", "again.png") == 0
-    again = cv2.imread("again.png")[..., ::-1]
-    np.testing.assert_allclose(again, image / 257, atol=40)
-    assert np.abs(again - image / 257).mean() < 5
-
-
 def test_steps_that_do_not_see_all_frames_are_warned_of(tmp_path, capsys):
     clip = written(tmp_path / "clip", ramp(9, 16, 16))
     for steps, warned in ((8, True), (9, False)):

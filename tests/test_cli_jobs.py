@@ -153,23 +153,6 @@ def test_what_was_begun_in_segments_goes_on_so_without_being_told(long_clip, who
     assert target.read_bytes() == whole.read_bytes()
 
 
-@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")
-def test_what_is_begun_anew_and_stopped_is_not_begun_anew_again(long_clip, whole, tmp_path, capsys, monkeypatch):
-    target, folder = tmp_path / "m.safetensors", tmp_path / "m.safetensors.segments"
-    target.write_bytes(b"of before")
-    words = ("fit", long_clip, "--out", target, *SEGMENTS, "--overwrite")
-    stopped(monkeypatch, "segment 1", *words)
-    assert "Give the same command again with --resume added to continue." in capsys.readouterr().err
-    stamp = (folder / "segment-0000.safetensors").stat().st_mtime_ns
-    assert run("fit", tmp_path / "misspelt.mp4", *words[2:]) == 2
-    assert (folder / "segment-0000.safetensors").stat().st_mtime_ns == stamp
-    stopped(monkeypatch, "segment 2", *words, "--resume")
-    assert "Give the same command again to continue." in capsys.readouterr().err
-    assert (folder / "segment-0000.safetensors").stat().st_mtime_ns == stamp
-    assert run(*words, "--resume", "--quiet") == 0
-    assert target.read_bytes() == whole.read_bytes()
-
-
 def test_that_nobody_listens_any_more_costs_no_fit(long_clip, whole, tmp_path, monkeypatch):
     def gone(event, figures):
         raise BrokenPipeError
@@ -238,20 +221,6 @@ def test_many_clips_given_again_do_what_is_left(clips, tmp_path, capsys, monkeyp
     assert summary_of(out)["failed"] == 0
     assert run("fit-many", own, "--out", out, *QUICK[:-1], "2", "--overwrite", "--quiet") == 0
     assert {load_video_model(path).degree for path in out.glob("*.fgz")} == {2}
-
-
-@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")
-def test_many_clips_stopped_in_one_go_on_there(clips, tmp_path, capsys, monkeypatch):
-    out, other = tmp_path / "models", tmp_path / "others"
-    with monkeypatch.context() as patch:
-        Stopping(patch, "clip1.mp4")
-        assert run("fit-many", clips, "--out", out, *QUICK) == 1
-    assert "stopped by SIGTERM; 1 of 4 clips are done" in capsys.readouterr().err
-    assert (out / "records" / "clip1.fgz.checkpoint").exists()
-    assert run("fit-many", clips, "--out", out, *QUICK, "--quiet") == 1
-    assert run("fit-many", clips, "--out", other, *QUICK, "--quiet") == 1
-    for path in other.glob("*.fgz"):
-        assert (out / path.name).read_bytes() == path.read_bytes()
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")

@@ -170,11 +170,3 @@ def test_a_pipe_is_refused_before_it_is_opened(words, work, model, tmp_path, mon
     inputs = {"PIPE": pipe, "MODEL": model, "CLIP": work / "clip.mp4"}
     assert run(*(inputs.get(word, word) for word in words)) in (1, 2)
     assert str(pipe) in capsys.readouterr().err
-
-
-def test_a_folder_with_other_files_is_refused_and_nothing_is_exported(model, full, capsys):
-    (full / "notes.txt").touch()
-    assert run("export", model, "--format", "obj", "--out", full) == 1
-    assert "got" in (told := capsys.readouterr().err)
-    assert "It is kept" not in told
-    assert not any((full.parent / "temporary").iterdir())

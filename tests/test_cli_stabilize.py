@@ -7,7 +7,6 @@ from soft_models import soft_model
 from tiny_clips import NUM_FRAMES, model_of_12
 
 from foldgauss.cli.shared import timeline
-from foldgauss.cli.shared.log_lines import print_shots
 from foldgauss.io import load_video_model, read_video, save_video_model
 from foldgauss.video import FitConfig, fit, interpolate_frames, interpolated_times, stabilize, times_at
 
@@ -62,15 +61,6 @@ def test_shots_are_named(tmp_path, capsys):
     told = " ".join(capsys.readouterr().err.split())
     assert "shots, each on its own; they begin at frames 0, " in told
     assert "The motion of the camera was not found before frames" in told
-
-
-def test_motion_that_was_not_found_is_told_from_cuts(capsys):
-    print_shots((0, 3, 5), np.array([0, 0.05, 0.1, 0.85, 0.9, 0.95, 1.0]))
-    told = " ".join(capsys.readouterr().err.split())
-    assert "3 shots, each on its own; they begin at frames 0, 3, 5." in told
-    assert "not found before frames 5, and the model has no cut there" in told
-    print_shots((0, 3), np.array([0, 0.05, 0.1, 0.85, 0.9, 0.95, 1.0]))
-    assert "warning" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("stabilized", [False, True])

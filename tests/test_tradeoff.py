@@ -20,7 +20,6 @@ from foldgauss.analysis.plot import Panel, plot_tradeoff
 from foldgauss.cli.measuring import tradeoff as command
 from foldgauss.cli.measuring import tradeoff_record as kept
 from foldgauss.io import load_video_model, read_video, write_video
-from foldgauss.io.media.clip import AS_STORED
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.jobs import runner
 from foldgauss.video import FitConfig, FitDiverged, evaluate, tradeoff
@@ -121,30 +120,6 @@ def test_knee(cost, quality, expected):
     # Units tell nothing: seconds or minutes, dB above whatever.
     assert knee([60 * c for c in cost], [q - 20 for q in quality]) == expected
     assert knee([c**2 for c in cost], [2 * q for q in quality]) == expected
-
-
-def test_each_variant_changes_one_setting_and_has_a_command():
-    made, left = plan_points(BASE, tuple(AXES), 132)
-    assert left == []
-    assert len({point.name for point in made}) == len(made) == 1 + sum(map(len, AXES.values()))
-    given = Path("my clip.mp4"), "320x640", "0:132", AS_STORED, Path("out")
-    lines = [kept.format_command(*given, point) for point in made]
-    assert len(set(lines)) == len(lines)
-    for point, line in zip(made, lines, strict=True):
-        changed = kept.changed_settings(point, BASE)
-        assert len(changed) == {"base": 0, "batch": 2}.get(point.axis, 1)
-        assert "my clip.mp4" in shlex.split(line)
-    assert made[0].config == BASE
-    shown = dict(zip((point.name for point in made), lines, strict=True))
-    assert shown["power 2"].split()[-2:] == ["--power", "2.0"]
-    assert shown["time 250 steps"].split()[-2:] == ["--steps", "250"]
-    assert shown["quality 50"].split()[-2:] == ["--quality", "50.0"]
-    assert shown["cutoff radius 2, fitted"].endswith("--support-radius 2.0")
-    outputs = {name: Path(shlex.split(line)[4]).suffix for name, line in shown.items() if line.split()[1] == "fit"}
-    assert {name for name, suffix in outputs.items() if suffix == ".fgz"} == {f"quality {q}" for q in (30, 50, 70, 90)}
-    assert shown["cutoff radius 2, played"] == (
-        "foldgauss evaluate out/models/base.safetensors 'my clip.mp4' --support-radius 2.0"
-    )
 
 
 @pytest.mark.parametrize(

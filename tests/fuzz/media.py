@@ -3,7 +3,6 @@
 import contextlib
 import functools
 import io
-import struct
 import warnings
 from pathlib import Path
 from random import Random
@@ -104,20 +103,6 @@ def _more_images() -> list[bytes]:
     ]
 
 
-@functools.cache
-def _other_pictures() -> list[bytes]:
-    """Pages, numbers that are no levels, another size."""
-    pages, floats = io.BytesIO(), io.BytesIO()
-    page = Image.fromarray(_NUMBERS)
-    page.save(pages, "TIFF", save_all=True, append_images=[page])
-    page.convert("F").save(floats, "TIFF")
-    return [pages.getvalue(), floats.getvalue(), cv2.imencode(".jpg", np.zeros((40, 9, 3), np.uint8))[1].tobytes()]
-
-
-def _another_picture(data: bytes, random: Random) -> bytes:
-    return random.choice(_other_pictures())
-
-
 def _read_picture(path: Path) -> None:
     if chance(path) % 4 == 1:
         with contextlib.suppress(VideoError):  # which those of 8 bits raise
@@ -132,7 +117,7 @@ PICTURES = Target(
     lambda: [*_images(), *_more_images()],
     _read_picture,
     (VideoError,),
-    (png_resealed, _another_picture),
+    (png_resealed,),
     lambda data: 8,
     lambda size: 1 << 32,  # the library's own limit is 2^30 pixels
 )
@@ -168,29 +153,7 @@ def _clips() -> tuple[bytes, ...]:
         found.append(written(lambda path, how=encoding: _encode(path, frames, *how), suffix))
     uneven = [0, 0.1, 0.3, 0.32, 0.5, 1.5]
     found += [written(lambda path: write_video(path, frames, 10, times=uneven), suffix) for suffix in (".mp4", ".mkv")]
-    return (*found, _with_edits(found[4]))
-
-
-@functools.cache
-def _tiny_fields() -> bytes:
-    """An interlaced clip too small for the filter that deinterlaces."""
-    frames = np.zeros((2, 4, 4, 3), np.uint8)
-    return written(lambda path: _encode(path, frames, "mpeg2video", "yuv420p", {"flags": "+ilme+ildct"}), ".mkv")
-
-
-def _with_edits(data: bytes) -> bytes:
-    """An MP4 whose index stands last, with a list of edits in its first track that shows half of it."""
-
-    def into(parent: int, new: bytes) -> None:
-        nonlocal data
-        size = int.from_bytes(data[parent - 4 : parent], "big")
-        data = data[: parent - 4] + (size + len(new)).to_bytes(4, "big") + data[parent:]
-
-    index, track = data.rindex(b"moov"), data.rindex(b"trak")
-    edits = struct.pack(">I4sI4sIIIii", 36, b"edts", 28, b"elst", 0, 1, 100, 0, 1 << 16)
-    into(index, edits)
-    into(track, edits)
-    return data[: track + 4] + edits + data[track + 4 :]
+    return tuple(found)
 
 
 def _clip_body(data: bytes) -> int:
@@ -204,43 +167,6 @@ _WANTED = (
     {}, {"size": (8, 12), "frames": (0, 2)}, {"center_crop": (4, 4)}, {"frames": (1, 3)},
     {"fps": 12.5, "size": (4, 20)}, {"frames": (0, 1)}, {"frames": (1, None)}, {},
 )  # fmt: skip
-#: Files of other kinds.
-_OTHERS = (
-    b"ffconcat version 1.0\nfile 'a.mp4'\n", b"#EXTM3U\n#EXTINF:1,\na.ts\n", b"PK\x03\x04" + b"\0" * 40, b"%PDF-1.7\n",
-    b"\xff\xd8\xff\xe0" + b"\0" * 60, b"BM" + b"\xff" * 60, b"II*\0" + b"\0" * 40, b"\x1f\x8b" + b"\0" * 30,
-    b"RIFF\0\0\0\0WAVEfmt ", b"\x10\0\0\0\0\0\0\0{}", b"\0\0\0\x08ftyp\0\0\0\0soun", b"FLV\1\5", b"OggS\0\2",
-    b"G" + b"\0" * 187 + b"G" + b"\0" * 187 + b"G" + b"\0" * 187, b"\xff\xd8\xff\xff\xff\xc0\0\x0b\x08\0\x10\0\x10",
-)  # fmt: skip
-
-
-#: What may stand in a header, and what is asked of it.
-_MARKS = (
-    b"\x83\x81\x02",  # Matroska: the type of a track, sound
-    b"\x1f\x43\xb6\x75",  # Matroska: a cluster
-    b"\x53\xc0\x81\x01",  # Matroska: alpha beside the frames
-    b"soun",
-    b"vide",
-    b"mvex",
-    b"elst",
-    b"edts",
-    b"\0\0\0\1moov",
-    b"\0\0\0\0mdat",
-)
-
-
-def _marked(data: bytes, random: Random) -> bytes:
-    """Such a mark over what stands somewhere near the beginning, or where the index of an MP4 is."""
-    mark, changed = random.choice(_MARKS), bytearray(data)
-    first = max(data.find(b"moov"), 0) if random.random() < 0.5 else 0
-    at = first + random.randrange(600)
-    changed[at : at + len(mark)] = mark
-    return bytes(changed)
-
-
-def _another_kind(data: bytes, random: Random) -> bytes:
-    """The beginning of another file, with this one's rest or without."""
-    other = random.choice((*_OTHERS, _tiny_fields()))
-    return other + data[len(other) :] if random.random() < 0.5 else other
 
 
 def _resized_box(data: bytes, random: Random) -> bytes:
@@ -270,7 +196,7 @@ VIDEO = Target(
     lambda: list(_clips()),
     _read_clip,
     (VideoError,),
-    (by_chance, by_chance, _marked, _another_kind, _resized_box),
+    (by_chance, _resized_box),
     _clip_body,
     lambda size: 1 << 32,
 )

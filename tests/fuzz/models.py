@@ -120,33 +120,7 @@ def table_changed(data: bytes, random: Random) -> bytes:
     return by_chance(data, random) if parts is None else sealed(json_changed(parts[0], random), parts[1])
 
 
-def resized(data: bytes, random: Random) -> bytes:
-    """Another number of Gaussians, frames or powers, in the facts and in the table, with tensors to match."""
-    parts = unsealed(data)
-    if parts is None:
-        return by_chance(data, random)
-    header, tensors = parts
-    try:
-        shapes = [n for name, one in header.items() if name != "__metadata__" for n in one["shape"]]
-        old, new = random.choice(shapes), random.choice((0, 1, 2, 4, 9, 300, 2**40, 2**62))
-        entries, start = {"__metadata__": header["__metadata__"]}, 0
-        for name, one in header.items():
-            if name != "__metadata__":
-                shape = [new if n == old else n for n in one["shape"]]
-                num = {"F": 4, "I": 4, "U": 1, "B": 1}[one["dtype"][0]]
-                for n in shape:
-                    num *= n
-                entries[name] = {"dtype": one["dtype"], "shape": shape, "data_offsets": [start, start + num]}
-                start += num
-        facts = json.dumps(json.loads(header["__metadata__"]["header"]))
-        entries["__metadata__"]["header"] = facts.replace(f": {old},", f": {new},").replace(f": {old}}}", f": {new}}}")
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError, RecursionError):
-        return by_chance(data, random)
-    room = min(start, 4096)
-    return sealed(entries, (tensors * (room // max(1, len(tensors)) + 1))[:room] if tensors else bytes(room))
-
-
-_MODEL_MUTATIONS = (facts_changed, table_changed, resized)
+_MODEL_MUTATIONS = (facts_changed, table_changed)
 
 
 @functools.cache
@@ -323,52 +297,6 @@ def stream_changed(data: bytes, random: Random) -> bytes:
         return compact_resealed(changed)
 
 
-def numbers_changed(data: bytes, random: Random) -> bytes:
-    """The numbers themselves changed, and coded as the writer codes them."""
-    quantized = random.choice(_quantised())
-    number = random.randrange(len(quantized.chunks))
-    columns = {name: own.copy() for name, own in quantized.chunks[number].columns.items()}
-    values = (0, 1, -1, 2, 3, 4, 31, 255, 2**12, 2**20, 2**30 - 1, 1 - 2**30)
-    for _ in range(random.randrange(1, 4)):
-        name = random.choice(sorted(columns))
-        if name == "cell":
-            continue
-        own = columns[name]
-        if random.randrange(2):
-            own[random.randrange(len(own))] = random.choice(values)
-        else:
-            own[:] = random.choice(values)
-    rules = dict(quantized.rules)
-    if random.randrange(3) == 0:
-        name = random.choice(sorted(rules))
-        numbers = (0.0, 1.0, -1.0, 60.0, -60.0, 1e9, -1e9, 1e10, 1e-300)
-        slopes = tuple(random.choice(numbers) for _ in range(random.randrange(6)))
-        rules[name] = dataclasses.replace(
-            rules[name], origin=random.choice(numbers), exponent=random.choice(numbers), slopes=slopes
-        )
-    if random.randrange(8) == 0:  # long paths within a moment: powers beyond what single precision holds
-        for name in columns.keys() & {"duration", "x0", "y0", "x1", "y1"}:
-            columns[name][:] = -(2**29) if name == "duration" else 2**30 - 1
-            rules[name] = Rule(0.0, 60.0)
-    intervals = quantized.intervals.copy()
-    if len(intervals) and random.randrange(4) == 0:
-        intervals[random.randrange(len(intervals))] = random.choice(values)
-    chunks = list(quantized.chunks)
-    chunks[number] = dataclasses.replace(chunks[number], columns=columns)
-    changed = dataclasses.replace(quantized, chunks=tuple(chunks), rules=rules, intervals=intervals)
-    for name in ("maps", "knots"):
-        own = getattr(quantized, name)
-        if own is not None and random.randrange(3) == 0:
-            own = own.copy()
-            own.flat[random.randrange(own.size)] = random.choice(values)
-            changed = dataclasses.replace(changed, **{name: own})
-    try:
-        with np.errstate(all="ignore"):
-            return compact.pack_compact(changed, {"clip": "a"})
-    except (ValueError, IndexError, KeyError, OverflowError):
-        return stream_changed(data, random)
-
-
 def compact_header_changed(data: bytes, random: Random) -> bytes:
     """One of the header's facts, with its length and the checksum to match."""
     if random.randrange(10) == 0:
@@ -396,7 +324,7 @@ COMPACT = Target(
     ],
     _read_compact,
     (ModelFileError,),
-    (numbers_changed, stream_changed, compact_header_changed),
+    (stream_changed, compact_header_changed),
     _compact_body,
     lambda size: 4 * CONSTANT + 2_000 * size,  # a byte may hold 32 numbers: the format's own limit
 )

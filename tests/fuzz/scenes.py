@@ -74,47 +74,6 @@ def note_changed(data: bytes, random: Random) -> bytes:
     return data[: at + 18] + note + data[end:]
 
 
-def counted(data: bytes, random: Random) -> bytes:
-    """Another number of rows in the header."""
-    lines = data.split(b"\n")
-    places = [k for k, line in enumerate(lines) if line.startswith(b"element ")]
-    if not places:
-        return by_chance(data, random)
-    at = random.choice(places)
-    number = random.choice((0, 1, 2, 4, 255, 2**31, 2**40, 10**14, 10**15, 10**20, -1))
-    lines[at] = b" ".join(lines[at].split(b" ")[:2]) + b" " + str(number).encode()
-    return b"\n".join(lines)
-
-
-def columns_changed(data: bytes, random: Random) -> bytes:
-    """A property of another type or name, a list, one more or one less, with the body as it is."""
-    lines = data.split(b"\n")
-    places = [k for k, line in enumerate(lines) if line.startswith(b"property ")]
-    if not places:
-        return by_chance(data, random)
-    at = random.choice(places)
-    name = lines[at].split()[-1]
-    how = random.randrange(7)
-    if how == 0:
-        del lines[at]
-    elif how == 1:
-        kind = random.choice((b"char", b"uint8", b"double", b"short", b"int", b"quad", b"float32"))
-        lines[at] = b"property " + kind + b" " + name
-    elif how == 2:
-        lines[at] = b"property list " + random.choice((b"uchar", b"int", b"float", b"char")) + b" int " + name
-    elif how == 3:
-        lines.insert(at, lines[random.choice(places)])
-    elif how == 4:
-        lines[at] += random.choice((b"x", b"_1", b" y"))
-    elif how == 5:
-        lines.insert(
-            at, random.choice((b"", b"obj_info a", b"comment b", b"comment foldgauss {}", b"format ascii 1.0"))
-        )
-    else:
-        lines[1] = b"format " + random.choice((b"ascii", b"binary_little_endian", b"binary_big_endian", b"x")) + b" 1.0"
-    return b"\n".join(lines)
-
-
 def numbers_changed(data: bytes, random: Random) -> bytes:
     """Numbers of the rows, each whole: extremes in place of some."""
     start = _ply_body(data)
@@ -151,7 +110,7 @@ def _read_vegas(path: Path) -> None:
     assert model.num_frames >= 2
 
 
-_PLY_MUTATIONS = (numbers_changed, note_changed, counted, columns_changed)
+_PLY_MUTATIONS = (numbers_changed, note_changed)
 
 VEGAS = Target(
     "ply-vegas",

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
-from soft_models import SIZE, on_paths, soft_model
+from soft_models import SIZE, assert_same, crowd, of_degrees, on_paths, only, soft_model
 
 import foldgauss.video.compression.chunks as chunks_module
 from foldgauss.envelope import TimeLikelihood
@@ -33,7 +33,6 @@ from foldgauss.video.compression.quantized_times import TIME_BITS
 from foldgauss.video.compression.sensitivity import estimate_sensitivities
 from foldgauss.video.models.metrics import evaluate
 from foldgauss.video.models.renderer import VideoRenderer
-from foldgauss.video.models.row_layout import shift_path
 from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.selection.contributions import Contributions
 
@@ -61,13 +60,6 @@ def with_columns(quantized, **columns):
     """With other integers in its single chunk."""
     (chunk,) = quantized.chunks
     return dataclasses.replace(quantized, chunks=(dataclasses.replace(chunk, columns=chunk.columns | columns),))
-
-
-def same(one, other):
-    assert jax.tree.structure(one) == jax.tree.structure(other)
-    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        assert np.asarray(a).dtype == np.asarray(b).dtype
-        np.testing.assert_array_equal(a, b)
 
 
 def pictures(model):
@@ -132,27 +124,6 @@ def test_frames_after_cuts_keep_their_times(tmp_path):
     assert np.abs(np.asarray(again.frame_times.times()) - times).max() < 0.006 * np.median(np.diff(times))
 
 
-def of_degrees(model, seed=0):
-    """Folds of several degrees."""
-    degrees = np.random.default_rng(seed).integers(0, model.degree + 1, model.num_gaussians)
-    kept = (np.arange(model.degree) < degrees[:, None])[..., None]
-    leaf = np.where(kept, np.asarray(model.splats.coefficients), np.float32(0))
-    return eqx.tree_at(lambda m: m.splats.coefficients, model, leaf)
-
-
-def crowd(model, copies=10, seed=1):
-    """More Gaussians, like its own."""
-    rng = np.random.default_rng(seed)
-
-    def more(leaf):
-        leaf = np.asarray(leaf)
-        if not leaf.ndim:
-            return leaf
-        return (np.repeat(leaf, copies, 0) + 0.1 * rng.normal(size=(copies * len(leaf), *leaf.shape[1:]))).astype("f4")
-
-    return eqx.tree_at(lambda m: m.splats, model, jax.tree.map(more, model.splats))
-
-
 def test_degrees_are_kept(tmp_path):
     """Powers above a Gaussian's own degree stay +0."""
     model = of_degrees(soft_model(degree=3))
@@ -175,7 +146,7 @@ def test_file_with_few_gaussians_left_can_be_read(tmp_path, told):
         model = eqx.tree_at(lambda m: m.splats.opacity_logit, model, opacity)
     made = compress(model, quality=100 if told == "faint" else 0)
     assert made.model.num_gaussians < model.num_gaussians / 4
-    same(load_video_model(save_compact(tmp_path / "m.fgz", made.quantized)), made.model)
+    assert_same(load_video_model(save_compact(tmp_path / "m.fgz", made.quantized)), made.model)
 
 
 def test_power_that_saves_little_is_dropped():
@@ -205,7 +176,7 @@ def test_shared_paths_are_kept(tmp_path, at_frames):
     assert quantized.info.paths.at_frames == at_frames
     path = save_compact(tmp_path / "m.fgz", quantized)
     again = load_video_model(path)
-    same(again, dequantize(quantized))
+    assert_same(again, dequantize(quantized))
     assert pack_compact(load_compact(path)) == path.read_bytes()
     np.testing.assert_array_equal(again.splats.path_index, model.splats.path_index)
     frames = np.tile(again.frame_times.times(), (2, 1))
@@ -242,7 +213,7 @@ def test_cells_divide_the_positions_on_paths(tmp_path):
     by_frame = quantize(exact, quantized.columns["class"], quantized.rules)
     assert len(np.unique(by_frame.columns["cell"])) < 0.4 * 2 ** sum(cells_of(quantized))
     np.testing.assert_allclose(dequantize(by_frame).splats.loc, where, atol=2e-3)
-    same(load_video_model(save_compact(tmp_path / "m.fgz", by_frame)), dequantize(by_frame))
+    assert_same(load_video_model(save_compact(tmp_path / "m.fgz", by_frame)), dequantize(by_frame))
 
 
 def test_shared_paths_need_few_bytes():
@@ -270,7 +241,7 @@ def test_models_with_shared_paths_are_compressed(tmp_path, how):
     clip = clip_of(model)
     made = compress(model, clip if how else None, quality=90, **how)
     again = load_video_model(save_compact(tmp_path / "m.fgz", made.quantized))
-    same(again, made.model)
+    assert_same(again, made.model)
     assert evaluate(model, clip).mean_psnr - evaluate(again, clip).mean_psnr < 0.5
 
 
@@ -425,7 +396,7 @@ def test_chunks_do_not_change_the_model(tmp_path, how):
     one, several = fine(model, -9.0), fine(model, -9.0, thirds(model))
     assert [chunk.num for chunk in several.chunks] == [66, 67, 67]
     path = save_compact(tmp_path / "m.fgz", several)
-    same(load_video_model(path), dequantize(one))
+    assert_same(load_video_model(path), dequantize(one))
     assert pack_compact(load_compact(path)) == path.read_bytes()
 
 
@@ -502,7 +473,7 @@ def test_a_file_cut_off_after_a_chunk_is_a_smaller_model(tmp_path, chunked):
         (note,) = caught
         assert note.filename == __file__
         assert re.search(CUT_OFF, str(note.message)).groups() == (str(3 - num), str(134 * (3 - num)))
-        same(model, dequantize(dataclasses.replace(quantized, chunks=quantized.chunks[:num])))
+        assert_same(model, dequantize(dataclasses.replace(quantized, chunks=quantized.chunks[:num])))
 
 
 def test_a_damaged_chunk_is_left_out(tmp_path, chunked):
@@ -514,7 +485,7 @@ def test_a_damaged_chunk_is_left_out(tmp_path, chunked):
             own = load_compact(path)
         assert [(note.filename, "134 of 402" in str(note.message)) for note in caught] == [(__file__, True)]
         left = quantized.chunks[:number] + quantized.chunks[number + 1 :]
-        same(dequantize(own), dequantize(dataclasses.replace(quantized, chunks=left)))
+        assert_same(dequantize(own), dequantize(dataclasses.replace(quantized, chunks=left)))
 
 
 def test_a_file_without_header_motion_or_any_chunk_is_rejected(tmp_path, chunked):
@@ -526,31 +497,6 @@ def test_a_file_without_header_motion_or_any_chunk_is_rejected(tmp_path, chunked
     for start in ends[1:-1]:
         data = flipped(data, start + 3)
     refused(tmp_path, data, "one without a chunk that can be read .3 of its 3 chunks are cut off or damaged")
-
-
-def test_chunks_together_claim_no_more_than_the_file_holds(tmp_path):
-    """Each of them may use up what the header has for all of them, but not all of them."""
-    num = 2000
-    described = compute_columns(only(soft_model(degree=0), np.full(num, 20)))
-    rules = {
-        name: Rule(float(described.values.get(name, [0.0])[0]), 3.0)
-        for name in column_names(0)
-        if not is_integral(name)
-    }
-    data = pack_compact(quantize(described, np.zeros(num, np.int32), rules, np.arange(num)[::-1] // 100))
-    path = tmp_path / "m.fgz"
-    path.write_bytes(data)
-    assert load_video_model(path).num_gaussians == num
-    room = 40_000 * len(column_names(0)) // 32  # bytes
-
-    def copied(copies):
-        def change(header):
-            header["chunks"] = [header["chunks"][0] | {"num_gaussians": 40_000}] * copies
-
-        return resealed(data, change, spaces=room)
-
-    refused(tmp_path, copied(1), "damaged")
-    refused(tmp_path, copied(2), "num_gaussians: expected .* got 40000")
 
 
 def test_divide_by_size_and_by_time():
@@ -602,17 +548,6 @@ def test_chunks_follow_visible_spans_that_have_changed(monkeypatch):
         assert not (spans[0][within].min() < 0.5 < spans[1][within].max()) or number % 1024 == 0
 
 
-def test_many_gaussians_are_within_the_limit_of_chunks(monkeypatch):
-    monkeypatch.setattr(chunks_module, "LEAST", 2)
-    rng, num = np.random.default_rng(0), 20_000
-    first = rng.uniform(0, 1, num)
-    last = np.minimum(first + 10 ** rng.uniform(-5, 0, num), 1)
-    layers = find_layers(rng.normal(size=num))
-    assert 50 < len(np.unique(divide(layers, first, last))) < 512
-    monkeypatch.setattr(chunks_module, "_MOST", num)
-    assert len(np.unique(divide(layers, first, last))) > 1024
-
-
 @pytest.mark.parametrize("compositing", ["over", "sum"])
 def test_large_gaussians_are_behind_in_the_first_chunk(monkeypatch, compositing):
     monkeypatch.setattr(chunks_module, "LEAST", 100)
@@ -638,8 +573,8 @@ def test_equal_numbers_are_equal_files_and_equal_models(tmp_path):
     path = save_compact(tmp_path / "m.fgz", quantized, metadata={"clip": "x", "bad": float("nan")})
     again = load_compact(path)
     assert pack_compact(again, read_metadata(path)) == path.read_bytes()
-    same(dequantize(again), dequantize(quantized))
-    same(load_video_model(path), dequantize(quantized))
+    assert_same(dequantize(again), dequantize(quantized))
+    assert_same(load_video_model(path), dequantize(quantized))
     assert read_metadata(path) == {"clip": "x", "bad": None}
 
 
@@ -653,44 +588,14 @@ def test_a_decoded_model_by_the_same_rules_is_the_same_file(change):
     assert pack_compact(dataclasses.replace(quantized, chunks=(again,))) == pack_compact(quantized)
 
 
-def test_values_on_the_grid_are_so_in_any_cell():
-    """The origin of x0, y0 and time is a multiple of the step, whichever cell it is that of."""
-    model = crowd(soft_model(degree=2, options=RenderOptions()))
-    quantized = fine(model, -6.3)
-    assert min(cells_of(quantized)) > 0
-    decoded = compute_columns(dequantize(quantized))
-    cells = np.random.default_rng(3).permutation(quantized.columns["cell"])
-    again = quantize_chunk(decoded, quantized.columns["class"], quantized.rules, cells)
-    again = dataclasses.replace(quantized, chunks=(again,))
-    assert (again.columns["x0"] != quantized.columns["x0"]).any()
-    same(dequantize(again), dequantize(quantized))
-
-
-def test_a_path_is_the_same_from_another_time():
-    rng = np.random.default_rng(0)
-    place, shift, u = rng.normal(size=(5, 4, 2)), rng.normal(size=5), 0.3
-
-    def at(place, u):
-        return sum(place[:, k] * u[:, None] ** k for k in range(4))
-
-    np.testing.assert_allclose(at(shift_path(place, shift), u + shift), at(place, np.full(5, u)), rtol=1e-9)
-
-
 # ------------------------------------------------------------------------------------ extremes
-
-
-def only(model, keep):
-    def cut(leaf):
-        return leaf[keep] if np.ndim(leaf) else leaf
-
-    return eqx.tree_at(lambda m: m.splats, model, jax.tree.map(cut, model.splats))
 
 
 def test_one_gaussian(tmp_path):
     model = only(soft_model(options=RenderOptions()), np.array([20]))
     made = compress(model, clip_of(model), quality=90, steps=20)
     path = save_compact(tmp_path / "m.fgz", made.quantized)
-    same(load_video_model(path), made.model)
+    assert_same(load_video_model(path), made.model)
     assert path.stat().st_size < 2500
 
 

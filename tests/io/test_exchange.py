@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from soft_models import soft_model
 
-from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import (
     FormatError,
     OutputError,
@@ -24,15 +23,13 @@ from foldgauss.io import (
     write_video,
 )
 from foldgauss.render import RenderOptions
-from foldgauss.video import FrameTimes, Selection, VideoModel, edit
-from foldgauss.video.models.row_layout import pack, unpack
+from foldgauss.video import Selection, edit
+from foldgauss.video.models.row_layout import pack
 
 
 @pytest.fixture(scope="module")
 def model():
-    rows = np.random.default_rng(0).normal(size=(30, 15)).astype(np.float32)
-    splats = unpack(rows, 2, TimeLikelihood(np.float32(2), np.float32(0)))
-    return VideoModel(splats, FrameTimes.uniform(3), (40, 64), 24.0, RenderOptions())
+    return soft_model(num_frames=3, options=RenderOptions())
 
 
 def files(path):
@@ -86,7 +83,8 @@ def test_wrong_options(tmp_path, model, format, options, text):
 
 
 @pytest.mark.parametrize(
-    ("format", "name", "options"), [("ply", "v.ply", {}), ("ply3dgs", "f.ply", {"times": [0]}), ("ply3dgs", "f", {})]
+    ("format", "name", "options"),
+    [("ply", "v.ply", {}), ("ply3dgs", "f.ply", {"times": [0]}), ("ply3dgs", "f", {}), ("obj", "m", {})],
 )
 def test_existing_outputs(tmp_path, model, format, name, options):
     path = export(model, format, tmp_path / name, **options)

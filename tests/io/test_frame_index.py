@@ -11,7 +11,6 @@ import subprocess
 import sys
 import threading
 import weakref
-from functools import partial
 
 import numpy as np
 import pytest
@@ -164,17 +163,6 @@ def test_cuts_are_found_in_passing(long, long_index):
     assert index_video(long, find_cuts=False).cuts == []
 
 
-@pytest.mark.parametrize(
-    "name", ["bikes", *(pytest.param(name, marks=pytest.mark.slow) for name in ("bunny", "carphone"))]
-)
-def test_sample_clips(name):
-    path, stop = sample_clip(name), 33 if name == "bikes" else 12
-    clip, index = read_video(path, frames=(0, stop)), index_video(path, frames=(0, stop))
-    _described(index, clip)
-    assert index.cuts == Motion.from_frames(clip.frames).cuts == ([30] if name == "bikes" else [])
-    _as_read(index, path, [(stop - 3, stop)], size=(60, 100))
-
-
 def test_cuts_of_a_stream_are_those_of_the_clip():
     """Fast, dark and noisy clips, with a cut at every third frame."""
     shots = [read_video(sample_clip(name), size=(90, 120)).frames for name in ("bunny", "bikes", "carphone")]
@@ -236,23 +224,6 @@ def test_damaged_clips(tmp_path, name):
     assert index.positions[-1] < clip.num_declared
     np.testing.assert_array_equal(LazyFrames(index, first=3)[:], clip.frames[3:])
     np.testing.assert_array_equal(read_indexed(index, 10, num - 5).frames, clip.frames[10:-5])
-
-
-def test_damage_is_decoded_as_when_it_was_indexed(tmp_path, monkeypatch):
-    """What FFmpeg makes of damaged frames depends on the number of its threads, of which each machine has its own."""
-    path = encoded(tmp_path / "a.ts", _moving(120), *KINDS["stream.ts"], rate=25)
-    data = bytearray(path.read_bytes())
-    at = 6 * len(data) // 10
-    data[at : at + 2000] = np.random.default_rng(3).bytes(2000)
-    path.write_bytes(data)
-    made, real = [], decoder.VideoDecoder
-    for threads in (1, 3):
-        monkeypatch.setattr(decoder, "VideoDecoder", partial(real, threads=threads))
-        made.append((index_video(path), read_video(path)))
-    if made[0][0].digest == made[1][0].digest:
-        pytest.skip("this FFmpeg makes the same of that damage with any number of threads")
-    for index, clip in made:
-        np.testing.assert_array_equal(LazyFrames(index)[50:], clip.frames[50:])
 
 
 def test_frames_that_damage_left_out_keep_their_places(tmp_path):

@@ -70,27 +70,6 @@ def waves(num_frames=6, height=48, width=80):
     return np.stack([np.stack([one, one[:, ::-1], 255 - one], -1) for one in pictures]).astype(np.uint8)
 
 
-def many(num, seed=0):
-    """A model of a film's size: small Gaussians all over, of which a third is alive at a time."""
-    rng = np.random.default_rng(seed)
-
-    def normal(*shape, scale=1.0):
-        return (rng.normal(size=(num, *shape)) * scale).astype(np.float32)
-
-    splats = FoldedSplats(
-        loc=rng.uniform([-0.5, -0.25], [0.5, 0.25], (num, 2)).astype(np.float32),
-        log_scale=normal(2, scale=0.5) - np.float32(5),
-        angle_logit=normal(),
-        time_loc_logit=normal(scale=2),
-        log_time_scale=normal(scale=0.5) - np.float32(2.5),
-        coefficients=normal(3, 2, scale=0.05),
-        opacity_logit=normal(scale=2),
-        color_dc=normal(3),
-        envelope=TimeLikelihood(1.0),
-    )
-    return VideoModel(splats, FrameTimes.uniform(60), (160, 320), 25.0, RenderOptions())
-
-
 # ---------------------------------------------------------------------------------------------------- the page
 
 
@@ -411,21 +390,6 @@ def test_the_original_is_shown_beside_it(opened):
     assert green(shot()) < before - 0.05
 
 
-def test_a_phone_has_room_for_all_of_it(opened):
-    model, clip = soft_model(), waves(7, *SIZE)
-    for width, height in ((360, 640), (390, 844), (740, 360)):
-        page = opened(model, original=clip, viewport={"width": width, "height": height}).page
-        assert page.evaluate("document.documentElement.scrollWidth") <= width
-        small = page.evaluate(
-            """[...document.querySelectorAll("button, select")].filter((own) => own.offsetParent)
-            .map((own) => [own.id || own.textContent, own.getBoundingClientRect()])
-            .filter(([, box]) => box.width < 40 || box.height < 40 || box.left < 0 || box.right > innerWidth)
-            .map(([name, box]) => `${name} ${box.x} ${box.y} ${box.width} ${box.height}`)"""
-        )
-        assert small == []
-        assert page.locator("#canvas").bounding_box()["height"] > 0.4 * height
-
-
 def test_buttons_have_names_and_themes_change(opened):
     page = opened(soft_model(), color_scheme="light", **LARGE).page
     nameless = """[...document.querySelectorAll("button, select, input")]
@@ -626,29 +590,6 @@ def test_controls_work_on_the_whole_clip(opened):
     assert abs(int(shot[shot.shape[0] // 2, shot.shape[1] // 2, 1]) - 12 * 14) <= 4
 
 
-@pytest.mark.slow
-def test_play_goes_over_the_seams(opened):
-    page = opened(segmented(), fresh=True)
-    page.page.evaluate(
-        """() => {
-          const { player } = foldgauss, draw = player.draw;
-          window.been = [];
-          [player.loop, player.speed] = [false, 0.5]; // so that slow pictures do not leave a segment out
-          player.draw = function () {
-            draw.call(this);
-            been.push([this.position, ...this.seen.map((part) => part.number)]);
-          };
-          player.play();
-        }"""
-    )
-    page.until("!foldgauss.stats.playing")
-    been = page.page.evaluate("been")
-    positions = [own[0] for own in been]
-    assert positions == sorted(positions)
-    assert positions[-1] == WHOLE - 1
-    assert {number for own in been for number in own[1:]} == set(range(5))
-
-
 #: Segments come when the test lets them.
 _HELD_BACK = """() => {
   const { decoder, held } = foldgauss.player.segments, decode = decoder.decode.bind(decoder);
@@ -705,63 +646,6 @@ def test_a_segment_that_cannot_be_decoded_is_told(browser, tmp_path):
     assert not page.said
 
 
-@pytest.mark.slow
-def test_the_brush_acts_on_the_segment_seen(opened):
-    video = segmented()
-    page = opened(video, fresh=True, **LARGE)
-    page.until("foldgauss.stats.decoded.length === 5")
-    page.page.evaluate("foldgauss.player.segments.most = 0")
-    page.page.keyboard.press("b")
-    box = page.page.locator("#canvas").bounding_box()
-    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    page.page.evaluate("foldgauss.seek(1 / 18)")
-    before = page.picture()
-    page.page.evaluate(
-        """() => {
-          const { picker } = foldgauss.controls.tools, inCircle = picker.inCircle;
-          picker.inCircle = function (state, time, ...more) {
-            window.paintedAt = time;
-            return inCircle.call(this, state, time, ...more);
-          };
-        }"""
-    )
-    page.page.mouse.move(*middle)
-    page.page.mouse.down()
-    page.page.mouse.move(middle[0] + 40, middle[1], steps=3)
-    own = page.page.evaluate(PICKED)
-    assert own
-    assert page.page.evaluate("paintedAt") == pytest.approx(1 / 6)  # the segment's own time
-    assert page.page.locator("#picked").inner_text() == f"{len(own)} in this segment"
-    assert page.page.locator("#follow").inner_text() == "Follow through segment 1 of 5"
-    page.page.evaluate("foldgauss.seek(13 / 18)")  # with the brush down: a stroke of its own there
-    assert page.stats["picked"] == 0
-    page.page.mouse.move(middle[0] + 60, middle[1] + 30, steps=3)
-    page.page.mouse.up()
-    other = page.page.evaluate(PICKED)
-    assert other
-    page.page.click("#vanish")
-
-    def without(number, gone):
-        model = video.segments[number].model
-        left = np.ones(NUM, bool)
-        left[gone] = False
-        return VideoRenderer(edit(model).select(~left).vanish().video())
-
-    times = np.asarray(video.segments[3].model.frame_times.times())
-    assert np.abs(page.picture(13 / 18).astype(float) - without(3, other).frame(float(times[1]))).mean() < 0.5
-    page.page.evaluate("foldgauss.seek(18 / 18)")
-    page.until("foldgauss.stats.missing === undefined")
-    assert np.abs(page.picture(1 / 18).astype(float) - without(0, own).frame(1 / 6)).mean() < 0.5  # in all segments
-    for _ in range(3):  # the edit and both strokes, whichever segment is seen
-        page.page.keyboard.press("z")
-    np.testing.assert_array_equal(page.picture(), before)
-    page.page.keyboard.press("Shift+Z")
-    assert page.page.evaluate(PICKED) == own
-    page.page.click("#select-none")
-    page.page.evaluate("foldgauss.seek(13 / 18)")
-    assert page.stats["picked"] == 0  # nowhere
-
-
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node, which runs the brush's own conditioning")
 @pytest.mark.parametrize("how", [{}, {"degree": 0}, {"degree": 4, "power": 1.0, "floor": 0.1}, "paths"])
 def test_the_brush_conditions_as_the_distribution_does(tmp_path, how):
@@ -794,17 +678,3 @@ def test_the_brush_conditions_as_the_distribution_does(tmp_path, how):
     covariance = (turned * [[[one["first"], one["second"]]] for one in found]) @ turned.transpose(0, 2, 1)
     expected = np.asarray(splats.factor @ splats.factor.transpose(0, 2, 1))[which]
     np.testing.assert_allclose(covariance, expected, rtol=1e-4, atol=1e-8)
-
-
-@pytest.mark.slow
-def test_a_films_model_is_small_and_soon_there(browser, tmp_path):
-    path = write_html(tmp_path / "film.html", many(40_000))
-    assert path.stat().st_size <= 3e6
-    Opened(browser, path).ready().close()  # once, so that the browser has begun
-    seconds = []
-    while not seconds or (seconds[-1] > 2.0 and len(seconds) < 5):  # other processes may take the processor for a while
-        page = Opened(browser, path).ready().settle()
-        seconds.append(page.page.evaluate("performance.now() / 1000"))  # since the page was asked for
-        assert page.stats["total"] == 40_000
-        page.close()
-    assert min(seconds) <= 2.0, seconds

@@ -6,10 +6,10 @@ import math
 import equinox as eqx
 import numpy as np
 import pytest
+from clips import one_line
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import FormatError, frame_gaussians, read_pseudomesh, write_pseudomesh
-from foldgauss.io._atomic import OutputError
 from foldgauss.io.exchange.pseudomesh import NOTES, _axes, read_obj
 from foldgauss.render import RenderOptions
 from foldgauss.video import FrameTimes, VideoModel
@@ -37,13 +37,6 @@ def model():
 @pytest.fixture
 def folder(tmp_path, model):
     return write_pseudomesh(tmp_path / "mesh", model)
-
-
-def one_line(caught, *texts):
-    message = str(caught.value)
-    assert "\n" not in message
-    for text in texts:
-        assert text in message, message
 
 
 def test_the_frames_come_back(folder, model):
@@ -162,19 +155,6 @@ def test_a_folder_of_another_program(folder):
     again = read_pseudomesh(folder, size=(48, 80), fps=12)
     np.testing.assert_array_equal(again.vertices(2), mesh.vertices(2))
     assert again.fps == 12
-
-
-def test_existing_folders(folder, model):
-    with pytest.raises(OutputError, match="overwrite it"):
-        write_pseudomesh(folder, model)
-    write_pseudomesh(folder, model, [0.5], overwrite=True)
-    assert len(list(folder.iterdir())) == 3
-    (folder / "scene.blend").touch()
-    with pytest.raises(OutputError, match=r"scene\.blend"):
-        write_pseudomesh(folder, model, overwrite=True)
-    with pytest.raises(ValueError, match="times"):
-        write_pseudomesh(folder.parent / "other", model, [2])
-    assert not (folder.parent / "other").exists()
 
 
 # ----------------------------------------------------------------------------------------------- damage

@@ -291,9 +291,10 @@ def test_a_video_is_recorded(opened, compact, tmp_path):
 def test_small_screens_and_both_themes_show_all(opened, compact):
     for width, height, scheme in ((1280, 800, "dark"), (360, 640, "light"), (740, 360, "dark")):
         page = opened(compact, viewport={"width": width, "height": height}, color_scheme=scheme)
+        assert page.page.locator("#canvas").bounding_box()["height"] > 0.4 * height
         page.page.keyboard.press("e")
         select(page, range(12))
-        for name in ("panel", "files"):
+        for name in ("transport", "panel", "files"):
             if name == "files":
                 page.page.keyboard.press("s")
             assert page.page.evaluate("document.documentElement.scrollWidth") <= width

@@ -129,26 +129,6 @@ def count_paths(page):
     return page.page.evaluate("foldgauss.player.state.model.paths.count")
 
 
-def test_paths_are_made_where_they_are_needed(opened, tmp_path):
-    """One for each edit and path of the selection; it takes the place of one that is left without Gaussians."""
-    model = make()
-    shifts = np.array(model.splats.paths.matrices)
-    shifts[0, :, :, :2] = np.eye(2)
-    model = eqx.tree_at(lambda m: m.splats.paths.matrices, model, shifts)
-    page = opened(save_compact(tmp_path / "m.fgz", quantize_finely(model)))
-    read_script(page, IT + EDITS["move"])
-    assert count_paths(page) == 3  # the first path is a translation, too: the order does not matter
-    for name in ("rotate", "move", "later"):
-        read_script(page, IT + EDITS[name] + "\n[[edits]]\n" + EDITS["scale"])
-        assert count_paths(page) == 4, name  # those of steps between are used again
-    read_script(page, (IT + EDITS["rotate"]).replace("0-11", f"0-{NUM - 1}"))
-    assert count_paths(page) == 2
-    read_script(page, IT + EDITS["copies"] + "\n[[edits]]\n" + EDITS["rotate"])
-    assert count_paths(page) == 6
-    read_script(page, IT + EDITS["freeze"] + "\n[[edits]]\n" + EDITS["move"])
-    assert count_paths(page) == 2
-
-
 def test_tools_take_what_is_seen_there(opened, moving):
     model, page = load_video_model(moving), opened(moving)
     page.page.evaluate("foldgauss.seek(0.9)")

@@ -75,15 +75,3 @@ def test_the_bytes_are_those_of_the_format():
 
 
 EXPECTED = "7de4f9466c75820fbe54c26801f7a5ac00"
-
-
-def test_tables_are_the_logistic_function_and_its_inverse():
-    knots = 65536 / (1 + np.exp(-np.arange(-8, 8.5, 0.5)))
-    np.testing.assert_array_equal(coder.LOGISTIC[::128], np.rint(knots[:-1]))
-    straight = np.interp(np.arange(4096) / 128, np.arange(33), np.rint(knots))
-    np.testing.assert_allclose(coder.LOGISTIC, straight, rtol=0, atol=0.5)
-    place, wanted = coder.LOGIT + 2048, np.arange(4096) * 16 + 8
-    inner = (place > 0) & (place < 4095)
-    assert inner.sum() > 4080
-    assert (coder.LOGISTIC[place] >= wanted)[inner].all()
-    assert (coder.LOGISTIC[place - 1] < wanted)[inner].all()

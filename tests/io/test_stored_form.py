@@ -6,6 +6,7 @@ import pytest
 from commands import run
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from soft_models import assert_same
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import ModelFileError, load_video_model, save_video_model
@@ -29,13 +30,6 @@ def random_model(degrees, degree=None, *, seed=0) -> VideoModel:
     return VideoModel(splats, times, (48, 80), 29.97, RenderOptions(low_pass=0.123))
 
 
-def same(one, other) -> None:
-    assert jax.tree.structure(one) == jax.tree.structure(other)
-    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        assert (np.asarray(a).dtype, np.shape(a)) == (np.asarray(b).dtype, np.shape(b))
-        assert np.asarray(a).tobytes() == np.asarray(b).tobytes()
-
-
 def tensor_bytes(path) -> int:
     data = path.read_bytes()
     return len(data) - 8 - int.from_bytes(data[:8], "little")
@@ -50,7 +44,7 @@ def test_round_trip_law(tmp_path, num, degree, seed):
     np.testing.assert_array_equal(model.splats.degrees, degrees)
     path = save_video_model(tmp_path / "m", model)
     again = load_video_model(path)
-    same(model, again)
+    assert_same(model, again)
     assert (again.size, again.fps, again.options) == (model.size, model.fps, model.options)
     assert model.num_parameters == again.num_parameters == num * (11 + 2 * degree) + NUM_FRAMES - 1
     assert tensor_bytes(path) == 4 * (model.num_parameters + 2)
@@ -80,7 +74,7 @@ def test_layers_of_edited_videos(tmp_path):
     video = chain.recolor((1, 0, 0)).video()
     assert isinstance(video, EditedVideo)
     path = save_video_model(tmp_path / "m", video)
-    same(video, load_video_model(path))
+    assert_same(video, load_video_model(path))
     assert video.num_parameters == 2 * still.num_parameters + moving.num_parameters
 
 
@@ -115,4 +109,4 @@ def test_no_shape_of_a_model_is_compiled_for(tmp_path, caplog):
             found = load_video_model(tmp_path / "m.safetensors")
         assert "Compiling" not in caplog.text
         assert "tracing" in caplog.text  # of the skeleton: the log is seen
-        same(found, model)
+        assert_same(found, model)

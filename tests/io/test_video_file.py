@@ -22,7 +22,6 @@ from foldgauss.io import (
     index_video,
     read_indexed,
     read_video,
-    write_frames,
     write_image,
     write_video,
 )
@@ -710,31 +709,6 @@ def test_animations_keep_their_pace(tmp_path, name, quality, fps):
     assert sum(durations) == pytest.approx(9000 / fps, abs=5)
     assert max(durations) - min(durations) <= 10
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_existing_frames_need_overwrite(tmp_path):
-    folder = write_frames(tmp_path / "out.frames", moving(5))
-    before = sorted(folder.iterdir())
-    with pytest.raises(OutputError) as caught:
-        write_video(folder, moving(2), 25)
-    one_line(caught, "5 frames", "overwrite it")
-    assert sorted(folder.iterdir()) == before
-    write_frames(folder, moving(2), overwrite=True)
-    assert len(list(folder.iterdir())) == 2
-    assert list(tmp_path.iterdir()) == [folder]
-
-
-def test_a_folder_with_other_things_is_never_replaced(tmp_path):
-    (tmp_path / "holiday.png").write_text("precious")
-    with pytest.raises(OutputError) as caught:
-        write_frames(tmp_path, moving(2), overwrite=True)
-    one_line(caught, "holiday.png")
-    assert (tmp_path / "holiday.png").read_text() == "precious"
-
-
-def test_an_empty_folder_is_taken(tmp_path):
-    (tmp_path / "new").mkdir()
-    assert len(list(write_frames(tmp_path / "new", moving(2)).iterdir())) == 2
 
 
 def _failing():

@@ -5,16 +5,14 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+from soft_models import assert_same, soft_model
 
-from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import ModelFileError, load_video_model, save_video_model
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.io.models.model_file import save_model
-from foldgauss.render import RenderOptions
-from foldgauss.video import FitConfig, FrameTimes, VideoModel, edit, fit_steps
+from foldgauss.video import FitConfig, edit, fit_steps
 from foldgauss.video.fitting.growth import Growth
 from foldgauss.video.fitting.loop import to_model
-from foldgauss.video.models.row_layout import unpack
 
 CONFIG = FitConfig(num_gaussians=60, steps=8, degree=2)
 SOURCE = {"clip": "somewhere.mp4", "num_frames": 3, "size": [24, 32]}
@@ -22,21 +20,6 @@ SOURCE = {"clip": "somewhere.mp4", "num_frames": 3, "size": [24, 32]}
 
 def frames():
     return np.random.default_rng(0).integers(0, 256, (3, 24, 32, 3)).astype(np.uint8)
-
-
-def random_model(degree=3):
-    rng = np.random.default_rng(0)
-    rows = rng.normal(size=(50, 11 + 2 * degree)).astype(np.float32)
-    times = FrameTimes(rng.normal(size=4).astype(np.float32))
-    splats = unpack(rows, degree, TimeLikelihood(1.7, 0.01))
-    return VideoModel(splats, times, (48, 80), 29.97, RenderOptions(low_pass=0.123))
-
-
-def same(one, other):
-    assert jax.tree.structure(one) == jax.tree.structure(other)
-    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        assert np.asarray(a).dtype == np.asarray(b).dtype
-        np.testing.assert_array_equal(a, b)
 
 
 def test_checkpoint_goes_on_to_the_same_bits(tmp_path):
@@ -49,7 +32,7 @@ def test_checkpoint_goes_on_to_the_same_bits(tmp_path):
     assert kept.step == 3
     for state, _ in fit_steps(frames(), CONFIG, kept):
         pass
-    same(whole, to_model(state, CONFIG, (24, 32), 25.0))
+    assert_same(whole, to_model(state, CONFIG, (24, 32), 25.0))
 
 
 def test_checkpoint_of_a_good_state_holds_it_once(tmp_path):
@@ -80,7 +63,7 @@ def test_checkpoint_keeps_what_growth_is_decided_by(tmp_path, monkeypatch):
     assert kept.statistics.seen.any()
     for state, _ in fit_steps(frames(), config, kept):
         pass
-    same(whole, to_model(state, config, (24, 32), 25.0))
+    assert_same(whole, to_model(state, config, (24, 32), 25.0))
     save_checkpoint(path, state, config=config, source=SOURCE)  # growth is over
     assert load_checkpoint(path, config=config, source=SOURCE).statistics is None
     with pytest.raises(ValueError, match=r"resume: expected strategy\.growth="):
@@ -106,7 +89,7 @@ def test_kinds_are_not_mixed_up(tmp_path):
     save_checkpoint(tmp_path / "c", state, config=CONFIG, source=SOURCE)
     with pytest.raises(ModelFileError, match="fit-checkpoint"):
         load_video_model(tmp_path / "c")
-    save_video_model(tmp_path / "m", random_model())
+    save_video_model(tmp_path / "m", soft_model())
     with pytest.raises(ValueError, match=r"resume|kind"):
         load_checkpoint(tmp_path / "m", config=CONFIG, source=SOURCE)
 
@@ -115,15 +98,15 @@ def test_kinds_are_not_mixed_up(tmp_path):
 def test_names_of_other_formats_are_refused(tmp_path, name):
     """A model called clip.mp4 is no video, and nothing is written."""
     with pytest.raises(ValueError, match=r"^path: expected a name for the model, as m\.safetensors, got .*export\."):
-        save_video_model(tmp_path / name, random_model())
+        save_video_model(tmp_path / name, soft_model())
     assert not list(tmp_path.iterdir())
 
 
 def test_names_of_models(tmp_path):
     for name in ("m", "m.safetensors", "M.SafeTensors", "m.v2.safetensors"):
-        assert load_video_model(save_video_model(tmp_path / name, random_model())).num_frames
+        assert load_video_model(save_video_model(tmp_path / name, soft_model())).num_frames
 
 
 def test_a_chain_of_edits_is_no_video_yet(tmp_path):
     with pytest.raises(ValueError, match=r"^model: expected a video, got a chain of edits. End it with .video\(\)"):
-        save_video_model(tmp_path / "m.safetensors", edit(random_model()))
+        save_video_model(tmp_path / "m.safetensors", edit(soft_model()))

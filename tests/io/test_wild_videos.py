@@ -36,11 +36,10 @@ from clips import (
     weighed,
     with_box,
 )
-from commands import run
 from PIL import Image
 from PIL.GifImagePlugin import GifImageFile
 
-from foldgauss.io import VideoError, index_video, load_video_model, read_indexed, read_masks, read_video
+from foldgauss.io import VideoError, index_video, read_indexed, read_masks, read_video
 from foldgauss.io.media import clip as clip_module
 from foldgauss.io.media import decoder
 
@@ -890,27 +889,3 @@ def test_huge_videos_are_refused_before_a_frame_is_decoded(tmp_path, monkeypatch
 # ------------------------------------------------------------------------------------------- the commands
 
 FEW = ("--steps", 2, "--gaussians", 20, "--size", "16x16")
-
-
-def test_fit_tells_of_uneven_times_and_keeps_the_duration(tmp_path, capsys):
-    (tmp_path / "clip.mp4").write_bytes(uneven_mp4())
-    assert run("fit", tmp_path / "clip.mp4", "--out", tmp_path / "a.safetensors", *FEW) == 0
-    told = [line for line in capsys.readouterr().err.splitlines() if "shown for" in line]
-    assert len(told) == 1
-    assert told[0].startswith("warning: ")
-    model = load_video_model(tmp_path / "a.safetensors")
-    assert (model.num_frames, model.fps) == (8, pytest.approx(4.375))
-    assert run("evaluate", tmp_path / "a.safetensors", tmp_path / "clip.mp4") == 0
-
-
-@pytest.mark.parametrize("kind", OTHERS)
-def test_commands_refuse_in_one_line(tmp_path, capfd, kind):
-    """And nothing of OpenCV, FFmpeg or libjpeg stands beside it."""
-    path, model = tmp_path / "clip.mp4", tmp_path / "a.safetensors"
-    OTHERS[kind][0](path)
-    assert run("fit", path, "--out", model, *FEW) == 1
-    told = capfd.readouterr().err
-    assert told.count("\n") == 1
-    assert told.startswith("error: path: expected")
-    assert OTHERS[kind][1] in told
-    assert not model.exists()
