@@ -11,10 +11,8 @@ import pytest
 from commands import run
 
 import foldgauss.jobs.runner as fitting
-from foldgauss.cli.fitting import fit_many as many
 from foldgauss.cli.fitting import job_progress as _jobs_view
 from foldgauss.io import load_video_model, read_video, write_image, write_video
-from foldgauss.io._atomic import OutputError
 from foldgauss.jobs import Progress
 from foldgauss.video import SegmentedVideo, VideoModel, evaluate
 
@@ -248,14 +246,3 @@ def test_without_dask_nothing_is_begun(clips, tmp_path, capsys, monkeypatch, opt
     assert run("fit-many", clips, "--out", tmp_path / "models", *QUICK, *options) == 2
     assert f"{options[0]}: needs dask.distributed: pip install" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
-
-
-def test_a_summary_that_cannot_be_written_stops_nothing(clips, tmp_path, capsys, monkeypatch):
-    def full(*given):
-        raise OutputError("path: expected free space for 'summary.json', got none.")
-
-    monkeypatch.setattr(many, "write_json", full)
-    assert run("fit-many", clips, "--out", tmp_path / "models", *QUICK) == 1
-    assert "3 models in" in (told := capsys.readouterr()).out
-    assert "warning: path: expected free space" in told.err
-    assert len(list((tmp_path / "models").glob("*.fgz"))) == 3

@@ -50,12 +50,6 @@ def model(work):
     return work / "a" / "b" / "m.safetensors"
 
 
-def test_a_fit_records_its_budget(model):
-    about = read_metadata(model)
-    assert (about["steps"], about["budget"], about["frames"]) == (3, {"steps": 3}, [2, 5])
-    assert "version" in about
-
-
 def test_a_range_beyond_the_clip_ends_with_it(work, tmp_path, capsys):
     target = tmp_path / "m.safetensors"
     assert run("fit", work / "clip.mp4", "--frames", "4:100", "--out", target, *FIT) == 0

@@ -45,20 +45,6 @@ def _with_lists(data: bytes, order: str = "<") -> bytes:
     return b"\n".join(lines) + b"end_header\n" + rows + body + b"\0"
 
 
-def _rows_of_times(data: bytes) -> bytes:
-    """A VeGaS file whose times are rows of one column, not columns of one row; and of zeros in f_rest."""
-    head, _ = data.split(b"end_header\n", 1)
-    lines = [line for line in head.split(b"\n") if b"time_func" not in line]
-    lines = [b"element time 2\nproperty float w" if line.startswith(b"element time") else line for line in lines]
-    place = next(k for k, line in enumerate(lines) if line.startswith(b"element vertex")) + 1
-    lines.insert(place, b"property float f_rest_0")
-    width = sum(line.startswith(b"property") for line in lines) - 0
-    num = 3
-    rows = np.full((num, width), 0.1, np.float32)
-    rows[:, 0] = 0
-    return b"\n".join(lines) + b"end_header\n" + rows.tobytes() + np.zeros(2, "<f4").tobytes()
-
-
 def _ply_body(data: bytes) -> int:
     at = data.find(b"end_header\n")
     return at + 11 if at >= 0 else 0
@@ -117,7 +103,7 @@ VEGAS = Target(
     ".ply",
     lambda: [
         _vegas(), _text_of(_vegas()), _text_of(_vegas(), "binary_big_endian"), _with_lists(_vegas()),
-        _with_lists(_text_of(_vegas()), ""), _rows_of_times(_vegas()),
+        _with_lists(_text_of(_vegas()), ""),
     ],
     _read_vegas,
     (FormatError,),

@@ -1,6 +1,5 @@
 """Export and import by the name of a format."""
 
-import numpy as np
 import pytest
 from soft_models import soft_model
 
@@ -12,19 +11,16 @@ from foldgauss.io import (
     load_selection,
     load_video_model,
     read_masks,
-    read_pseudomesh,
     read_video,
     save_selection,
     save_video_model,
     write_3dgs_frames,
     write_3dgs_ply,
     write_pseudomesh,
-    write_vegas_ply,
     write_video,
 )
 from foldgauss.render import RenderOptions
 from foldgauss.video import Selection, edit
-from foldgauss.video.models.row_layout import pack
 
 
 @pytest.fixture(scope="module")
@@ -34,14 +30,6 @@ def model():
 
 def files(path):
     return {entry.name: entry.read_bytes() for entry in path.iterdir()} if path.is_dir() else path.read_bytes()
-
-
-def test_a_video_goes_out_and_comes_back(tmp_path, model):
-    path = export(model, "ply", tmp_path / "v.ply")
-    assert files(path) == files(write_vegas_ply(tmp_path / "w.ply", model))
-    again = import_model(path)
-    np.testing.assert_allclose(pack(again.splats), pack(model.splats), rtol=1e-6, atol=1e-6)
-    assert import_model(path, size=(20, 32), fps=12).fps == 12
 
 
 @pytest.mark.parametrize("options", [{}, {"times": [0.2, 0.7], "axes": "y-up", "sh_degree": 0, "depth_step": 0.0}])
@@ -57,12 +45,6 @@ def test_one_frame_for_viewers(tmp_path, model):
         with pytest.raises(ValueError, match="times"):
             export(model, "ply3dgs", tmp_path / "two.ply", times=times)
     assert not (tmp_path / "two.ply").exists()
-
-
-def test_frames_for_mesh_tools(tmp_path, model):
-    path = export(model, "obj", tmp_path / "mesh", times=[0.5])
-    assert files(path) == files(write_pseudomesh(tmp_path / "again", model, [0.5]))
-    assert read_pseudomesh(path).num_frames == 1
 
 
 @pytest.mark.parametrize(

@@ -506,21 +506,6 @@ def test_pictures_of_segments_are_those_of_the_engine(opened, compositing):
     assert np.abs(page.picture(5 / 18, (60, 100)).astype(float) - larger).mean() < 0.5
 
 
-@pytest.mark.slow
-def test_few_segments_are_held_whatever_the_length(opened):
-    parts = [(6 * k, soft_model(seed=k, options=RenderOptions(), num_frames=7)) for k in range(9)]
-    video = SegmentedVideo.from_models(parts)
-    page, play = opened(video), VideoRenderer(video)
-    page.until("foldgauss.stats.decoded.length === 9")  # short ones are all decoded beforehand
-    page.page.evaluate("foldgauss.player.segments.most = 0")
-    for position, held in ((27, [3, 4, 5]), (51, [0, 7, 8]), (0, [0, 1, 2]), (30, [3, 4, 5, 6]), (15, [1, 2, 3])):
-        t = position / (video.num_frames - 1)
-        assert np.abs(page.picture(t).astype(float) - play.frame(t)).mean() < 0.5
-        page.until(f"foldgauss.stats.decoded.join() === '{','.join(map(str, held))}'")
-        assert page.stats["textures"] <= 4
-        assert page.stats["total"] == 9 * NUM
-
-
 def test_a_variable_frame_rate_is_kept(opened, tmp_path):
     """Frames are shown at the clip's own times, of a model and of one in segments; a model saved has them, too."""
     for name, video in (("model.safetensors", soft_model()), ("segments.safetensors", segmented())):

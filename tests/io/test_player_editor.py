@@ -269,18 +269,6 @@ def test_a_script_that_fails_when_applied_changes_nothing(opened, compact):
     np.testing.assert_array_equal(page.settle().picture(0.5), before)
 
 
-def test_too_many_copies_by_the_panel_are_told(opened, compact):
-    page = opened(compact)
-    read_script(page, IT + f'do = "multiply"\noffsets = {[[0.1, 0.0]] * 100}\noriginals = true\n')
-    page.page.keyboard.press("e")
-    step = {"do": "multiply", "offsets": [[0.1, 0.0]] * 999}
-    page.page.evaluate("(step) => foldgauss.controls.panel.act(step)", step)
-    assert "got 1,212,028. Select fewer, or make fewer" in page.page.locator("#toast").inner_text()
-    assert page.settle().stats["undoable"] == 1
-    page.page.evaluate("foldgauss.controls.panel.duplicate()")
-    assert page.settle().stats["undoable"] == 2
-
-
 @pytest.mark.slow
 def test_what_the_browser_kept_is_discarded_if_it_cannot_be_applied(opened, compact):
     page = opened(compact)

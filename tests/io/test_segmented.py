@@ -340,12 +340,6 @@ def test_frames_go_out_as_they_are_played(tmp_path):
     assert (tmp_path / "scene.ply").read_bytes() == (tmp_path / "own.ply").read_bytes()
 
 
-def test_a_page_that_cannot_be_says_of_which_segment(work):
-    for model in (work / "long.safetensors", load_video_model(work / "long.safetensors")):
-        with pytest.raises(ValueError, match=r"segment 1: .*edits that no folded model represents"):
-            html_page(model)
-
-
 # ------------------------------------------------------------------------------------ compact segments
 
 

@@ -37,7 +37,6 @@ from clips import (
     with_box,
 )
 from PIL import Image
-from PIL.GifImagePlugin import GifImageFile
 
 from foldgauss.io import VideoError, index_video, read_indexed, read_masks, read_video
 from foldgauss.io.media import clip as clip_module
@@ -658,20 +657,6 @@ def test_a_broken_animation(tmp_path, name):
         assert clip.num_frames < clip.num_declared <= 8
         assert clip.notes[0].startswith(f"only {clip.num_frames} of {clip.num_declared} frames decode")
         np.testing.assert_array_equal(clip.frames, whole.frames[: clip.num_frames])
-
-
-def test_a_gif_whose_frames_cannot_be_counted(tmp_path, monkeypatch):
-    first, *rest = (Image.fromarray(frame) for frame in waves())
-    first.save(tmp_path / "a.gif", save_all=True, append_images=rest, duration=100)
-    whole = read_video(tmp_path / "a.gif")
-
-    def fail(animation):
-        raise EOFError
-
-    monkeypatch.setattr(GifImageFile, "n_frames", property(fail))
-    clip = read_video(tmp_path / "a.gif")
-    np.testing.assert_array_equal(clip.frames, whole.frames)
-    np.testing.assert_array_equal(read_video(tmp_path / "a.gif", frames=(2, 4)).frames, whole.frames[2:4])
 
 
 def test_pages_of_a_tiff_are_refused_whatever_it_is_called(tmp_path):
