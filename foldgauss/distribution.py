@@ -22,6 +22,7 @@ from foldgauss._numerics.batch import (
     common_dtype,
     compile_eager,
     ranked_leaves,
+    vectorize,
     vectorized,
 )
 from foldgauss._numerics.factor import check_loc, check_rest, marginal_tril, normalize_indices, resolve_scale_tril
@@ -176,17 +177,18 @@ class FoldedGaussian(AbstractDistribution):
     @compile_eager(static=("sample_shape",))
     def _sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...]) -> Array:
         # Every batch element has its own t, even where only loc or the fold has batch dimensions.
-        return self._transform(self._draw_noise(key, (*sample_shape, *self.batch_shape)))
+        noise = self._draw_noise(key, (*sample_shape, *self.batch_shape))
+        return vectorize(FoldedGaussian._transform, self, *noise)
 
-    def _draw_noise(self, key: Key[Array, ""], shape: tuple[int, ...]) -> Array:
+    def _draw_noise(self, key: Key[Array, ""], shape: tuple[int, ...]) -> list[tuple[Array, int]]:
         time_key, space_key = jax.random.split(key)
-        t = jax.random.normal(time_key, (*shape, 1), self.dtype)
-        return jnp.concatenate([jax.random.normal(space_key, (*shape, self.loc.shape[-1]), self.dtype), t], axis=-1)
+        space = jax.random.normal(space_key, (*shape, self.loc.shape[-1]), self.dtype)
+        return [(space, 1), (jax.random.normal(time_key, shape, self.dtype), 0)]
 
-    @vectorized(1)
-    def _transform(self, z: Array) -> Array:
-        t = self.time_loc + self.time_scale * z[-1]
-        return jnp.append(unwhiten(self._at(t), z[:-1]), t)
+    def _transform(self, noise: Float[Array, " d-1"], tau: Float[Array, ""]) -> Float[Array, " d"]:
+        """Standard normal numbers as a sample, of one distribution."""
+        t = self.time_loc + self.time_scale * tau
+        return jnp.append(unwhiten(self._at(t), noise), t)
 
     def _sample_from(self, key: Key[Array, ""], sample_shape: tuple[int, ...], component: Array) -> Array:
         # One network in each of many samples would be copied for all.
@@ -228,7 +230,7 @@ class FoldedGaussian(AbstractDistribution):
     @compile_eager
     @vectorized(1)
     def _normal_to_fold(self, z: Array) -> tuple[Array, Array]:
-        x = self._transform(z)
+        x = self._transform(z[:-1], z[-1])
         return x, half_log_det(self._at(x[-1])) + jnp.log(self.time_scale)
 
     # --- moments --------------------------------------------------------------------------------------------

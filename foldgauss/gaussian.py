@@ -210,14 +210,13 @@ class Gaussian(AbstractDistribution):
 
     @compile_eager(static=("sample_shape",))
     def _sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...]) -> Array:
-        return self._transform(self._draw_noise(key, (*sample_shape, *self.batch_shape)))
+        return vectorize(Gaussian._transform, self, *self._draw_noise(key, (*sample_shape, *self.batch_shape)))
 
-    def _draw_noise(self, key: Key[Array, ""], shape: tuple[int, ...]) -> Array:
-        return jax.random.normal(key, (*shape, *self.event_shape), self.dtype)
+    def _draw_noise(self, key: Key[Array, ""], shape: tuple[int, ...]) -> list[tuple[Array, int]]:
+        return [(jax.random.normal(key, (*shape, *self.event_shape), self.dtype), 1)]
 
-    @vectorized(1)
-    def _transform(self, noise: Array) -> Array:
-        """A standard normal point as a sample."""
+    def _transform(self, noise: Float[Array, " dim"]) -> Float[Array, " dim"]:
+        """A standard normal point as a sample, of one Gaussian."""
         return unwhiten(self, noise)
 
     def _sample_from(self, key: Key[Array, ""], sample_shape: tuple[int, ...], component: Array) -> Array:
@@ -249,12 +248,11 @@ class Gaussian(AbstractDistribution):
 def sample_components(components, key: Key[Array, ""], component: Array) -> Array:
     """A sample of each of the chosen components (*sample, *batch), by the parameters of that one only."""
 
-    def one(components, component, noise):
+    def one(components, component, *noise):
         own = jax.tree.map(lambda leaf: leaf[0 if len(leaf) == 1 else component], components)
-        return own._transform(noise)
+        return own._transform(*noise)
 
-    noise = components._draw_noise(key, component.shape)
-    return vectorize(one, (components, 1), component, (noise, 1))
+    return vectorize(one, (components, 1), component, *components._draw_noise(key, component.shape))
 
 
 def condition_on_first(dist: Gaussian, values: Float[Array, "*#batch given"]) -> Gaussian:
@@ -305,7 +303,8 @@ def whiten(dist: Gaussian, value: Float[Array, " dim"]) -> Float[Array, " dim"]:
 
 def unwhiten(dist: Gaussian, z: Float[Array, " dim"]) -> Float[Array, " dim"]:
     """The inverse of `whiten`."""
-    return dist.loc + times_exp(join_columns(multiply_lower(dist.base_tril, split_columns(z))), dist.log_scale)
+    columns = multiply_lower(dist.base_tril, split_columns(z))
+    return dist.loc + join_columns([times_exp(y, dist.log_scale) for y in columns])
 
 
 @jax.custom_jvp
