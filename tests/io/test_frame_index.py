@@ -14,7 +14,7 @@ import weakref
 
 import numpy as np
 import pytest
-from clips import encode, encoded, images, one_line
+from made_clips import encode, encoded, images, one_line
 from PIL import Image
 
 from foldgauss.io import (

@@ -6,7 +6,7 @@ import math
 import equinox as eqx
 import numpy as np
 import pytest
-from clips import one_line
+from made_clips import one_line
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import FormatError, frame_gaussians, read_pseudomesh, write_pseudomesh

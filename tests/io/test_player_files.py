@@ -294,7 +294,7 @@ def test_small_screens_and_both_themes_show_all(opened, compact):
         assert page.page.locator("#canvas").bounding_box()["height"] > 0.4 * height
         page.page.keyboard.press("e")
         select(page, range(12))
-        for name in ("transport", "panel", "files"):
+        for name in ("panel", "files"):
             if name == "files":
                 page.page.keyboard.press("s")
             assert page.page.evaluate("document.documentElement.scrollWidth") <= width

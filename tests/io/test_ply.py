@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from clips import one_line
+from made_clips import one_line
 from soft_models import soft_model
 
 from foldgauss.envelope import TimeLikelihood

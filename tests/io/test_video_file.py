@@ -12,7 +12,7 @@ import av
 import cv2
 import numpy as np
 import pytest
-from clips import UNEVEN, moving, one_line, rgba
+from made_clips import UNEVEN, moving, one_line, rgba
 from PIL import Image
 
 from foldgauss.io import (

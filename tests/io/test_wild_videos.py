@@ -16,7 +16,7 @@ import av
 import cv2
 import numpy as np
 import pytest
-from clips import (
+from made_clips import (
     CLIPS,
     SHOWN,
     assert_read_as,

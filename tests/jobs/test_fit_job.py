@@ -242,6 +242,7 @@ def test_threads_that_share_a_processor_wait_and_a_sleeping_one_does_not():
     """
     program = """
 import os, hashlib, time
+from concurrent.futures import ThreadPoolExecutor
 from foldgauss._runtime.machine import waiting_seconds
 os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 began = waiting_seconds()

@@ -64,7 +64,7 @@ def test_sizes_describe_all_arrays():
 
 def test_a_checkpoint_holds_every_field(tmp_path):
     state = make_state()
-    state.last_finite = make_state(Sizes(NUM + 2, WIDTH, FRAMES))
+    state.last_finite = dataclasses.replace(make_state(Sizes(NUM + 2, WIDTH, FRAMES)), step=2)
     path, config = tmp_path / "checkpoint", FitConfig()
     save_checkpoint(path, state, config=config, source={})
     assert_equal(load_checkpoint(path, config=config, source={}), state)

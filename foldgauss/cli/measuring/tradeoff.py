@@ -1,7 +1,6 @@
 """The command `tradeoff`."""
 
 import dataclasses
-import shutil
 import time
 from pathlib import Path
 from typing import Annotated
@@ -112,11 +111,10 @@ def tradeoff_command(
     clip = read_video(video, frames=parse_frames(frames), size=parse_size(size), **reading._asdict())
     for text in clip.notes:
         warn(f"{clip.source}: {text}")
-    if overwrite:
-        shutil.rmtree(out_dir / MODELS, ignore_errors=True)
-    make_folder(out_dir / MODELS)
+    make_folder(out_dir)
     own = tuple(out_dir / name for name in (ROWS, PLOT))
     context.with_resource(lock_output(out_dir / RECORD, own=own, what="tradeoff"))
+    make_folder(out_dir / MODELS)
     settings = {"axes": list(chosen), "minutes": None if steps else minutes, "steps": steps, "seed": seed}
     source = fingerprint(clip)
     record = Record(out_dir / RECORD, settings | {"version": __version__} | source, restart=overwrite)
@@ -138,6 +136,10 @@ def tradeoff_command(
         )
         for name, point in fits.items()
     ]
+    if overwrite:
+        for job in jobs:
+            for path in (Path(job.target), job.record, job.checkpoint):
+                path.unlink(missing_ok=True)
     outcomes = run_jobs(jobs, "points", choose_display(), None, cure="Run the same command again to continue.")
     for outcome in outcomes:
         if outcome.failure is not None:
