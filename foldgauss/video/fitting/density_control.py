@@ -15,7 +15,8 @@ class DensityControl(abc.ABC):
     Source: the adaptive density control of Kerbl et al. 2023, section 5.
     """
 
-    seconds: float = 0.0  #: that the longest call of `apply` took, set by the fit
+    plans_time: bool = False  #: whether `apply` takes long enough to be planned apart from the steps, by `reserve`
+    seconds: float = 0.0  #: that the longest call of `apply` took, set by the fit if it `plans_time`
 
     @abc.abstractmethod
     def is_due(self, state: FitState) -> bool:

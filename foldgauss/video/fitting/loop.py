@@ -170,15 +170,16 @@ def fit_steps(
             stepper.adopt(state)
         else:
             guard.keep_good(state)
+            before = clock()
             for control in controls:
                 if control.is_due(state):
-                    before = clock()
                     state.fetch_all()
                     control.apply(state)
                     stepper.adopt(state)
                     guard.replace_good(state)
-                    control.seconds = max(control.seconds, clock() - before)
-                    planner.skip(clock() - before, sum(one.reserve(state) for one in controls))
+                    if control.plans_time:
+                        control.seconds = max(control.seconds, clock() - before)
+                        planner.skip(clock() - before, control.reserve(state))
         state.seconds += clock() - begun
         planner.update(state)
         begun = clock()

@@ -140,6 +140,8 @@ COMPRESSION_START = 0.35
 class RateControl(DensityControl):
     """Makes the Gaussians of a running fit worth their bits."""
 
+    plans_time = True
+
     def __init__(self, frames: np.ndarray, config: FitConfig):
         self.frames, self.config = frames, config
         self.trimming = {"psnr": 0.0, "size_mb": 0.0}  # seconds that the last dropping takes for each
