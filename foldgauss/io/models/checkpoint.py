@@ -20,7 +20,7 @@ CHECKPOINT = "fit-checkpoint"
 def save_checkpoint(path: PathLike, state: FitState, *, config: FitConfig, source: dict) -> Path:
     """Write a running fit with what it must be resumed with: its settings and its frames.
 
-    The last finite state is left out where it is that of the same step: the file is then half as large.
+    The last finite state is omitted if it was taken at the same step, which halves the size of the file.
     """
     if is_known_good(state):
         state = dataclasses.replace(state, last_finite=None)
@@ -48,7 +48,7 @@ def load_checkpoint(path: PathLike, *, config: FitConfig, source: dict) -> FitSt
 
 
 def is_known_good(state: FitState) -> bool:
-    """Whether the last finite state is that of the state's own step."""
+    """Whether the last finite state was taken at the present step."""
     return state.last_finite is not None and state.last_finite.step == state.step
 
 
