@@ -207,7 +207,7 @@ class TimeMixture(AbstractDistribution):
         return map_over_batch(_log_space_density, self.parent, (self._join(x), 1))
 
     def _given(self, log_joint: Array) -> Array:
-        """log of the joint density divided by that of the values."""
+        """The logarithm of the joint density divided by the density of the values."""
         return log_joint if self.time is None else _divide_all(log_joint, self.time.log_normalizer)
 
 

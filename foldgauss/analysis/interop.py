@@ -139,9 +139,9 @@ def _part(dist: Any, name: str, *arguments):
     try:
         found = getattr(dist, name)
         return found(*arguments) if callable(found) else found
-    except (AttributeError, ValueError) as error:  # numpyro's signal that a distribution lacks a method
+    except (AttributeError, ValueError) as error:
         told = f"{name}: expected a distribution that has one, got {type(dist).__name__}. {error}"
-        raise NotImplementedError(told) from error
+        raise NotImplementedError(told) from error  # numpyro's signal that a distribution lacks a method
 
 
 def to_scipy(dist: Any) -> "FrozenDistribution":

@@ -177,10 +177,10 @@ class RateControl(DensityControl):
             else:
                 self._round(state, action)
             state.rate_actions += 1
-        state.start_errors = ()  # those of more Gaussians
+        state.start_errors = ()  # measured with more Gaussians
 
     def reserve(self, state: FitState) -> float:
-        """Those of the actions that measure Gaussians, and of what is dropped in the end."""
+        """Seconds of the remaining actions that measure Gaussians, and of the dropping at the end."""
         left = [action for action in ACTIONS[state.rate_actions :] if action.what == "drop"]
         return self.seconds * (len(left) + (not state.rules)) + sum(self.trimming.values())
 
