@@ -81,9 +81,9 @@ _LEFT_OF_ROUNDING = 0.6
 _TOLERANCE = 0.1
 #: Frames that a PSNR is estimated by.
 _SAMPLED_FRAMES = 12
-#: The most by which steps are coarser than the price of a bit that the Gaussians were chosen by.
+#: The most by which steps are coarser or finer than the price of a bit that the Gaussians were chosen by.
 _MOST_CHANGE = 1.0
-#: The least of lambda R / D that a fit to a PSNR aims at. Files of most fits have 0.7 to 1.2, as measured.
+#: The least of lambda R / D that a fit to a PSNR aims at. Most files have more.
 _LEAST_COST = 0.7
 #: By how many dB the fit aims at more than it was asked for: what is too much is given up in the end.
 _MARGIN_DB = 0.1
@@ -350,8 +350,8 @@ class RateControl(DensityControl):
         error = 255**2 * 10 ** (-0.1 * self.config.psnr) * self.frames[..., :3].size
         grid = np.arange(FINEST, COARSEST, _TOLERANCE)
         kept = [worth.are_worth(coarseness, action.extent).sum() for coarseness in grid]
-        cost = [bit_price(coarseness) * USUAL_BITS * num for coarseness, num in zip(grid, kept, strict=True)]
-        return float(grid[np.argmax(np.minimum(cost, _LEAST_COST * error))])  # the first of enough, or the most
+        costs = [bit_price(coarseness) * USUAL_BITS * num for coarseness, num in zip(grid, kept, strict=True)]
+        return float(grid[np.argmax(np.minimum(costs, _LEAST_COST * error))])  # the first of enough, or the most
 
     def _psnr(self, model: VideoModel, which: Int[np.ndarray, " some"]) -> float:
         """Mean PSNR of the frames `which`, dB."""
