@@ -86,7 +86,7 @@ _MOST_CHANGE = 1.0
 #: The least of lambda R / D that a fit to a PSNR aims at. Most files have more.
 _LEAST_COST = 0.7
 #: By how many dB the fit aims at more than it was asked for: what is too much is given up in the end.
-_MARGIN_DB = 0.1
+_MARGIN_DB = 0.2
 #: Bits of a Gaussian in a file whose number of Gaussians suits its steps, as measured.
 USUAL_BITS = 75.0
 #: The coarseness that the search for a size starts with.
