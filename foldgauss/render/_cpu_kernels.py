@@ -173,23 +173,6 @@ def fill_rows(start, stop, span, slot, fill, entries, first_slot, slot_position)
     first_slot[stop] = slot
 
 
-@kernel
-def project_and_bucket(
-    num_rows, mean, factor, opacity, color, height, width, low_pass, cutoff, support, geometry, span
-):
-    """`project` of all splats, then their rows: for few splats, calls from Python would dominate the time."""
-    num = len(opacity)
-    project(0, num, mean, factor, opacity, color, height, width, low_pass, cutoff, support, geometry, span)
-    row_start = np.zeros(num_rows + 1, np.int64)
-    count_rows(0, num, span, row_start[1:])
-    for row in range(num_rows):
-        row_start[row + 1] += row_start[row]
-    entries, slot_position = np.empty(row_start[-1], np.int32), np.empty(row_start[-1], np.int64)
-    first_slot = np.empty(num + 1, np.int64)
-    fill_rows(0, num, span, 0, row_start[:-1].copy(), entries, first_slot, slot_position)
-    return row_start, entries, first_slot, slot_position
-
-
 @inline
 def _right_edge(p, q, r, level, dy):
     """Right edge of the ellipse (p dx + q dy)^2 + (r dy)^2 = level on the line dy."""
@@ -432,10 +415,6 @@ def _is_opaque(scratch, finished):
 def _clear_tile(scratch, rows, columns):
     """Initialize the scratch of a tile: transmittance 1 on `rows` x `columns` pixels, no color."""
     scratch[:] = 0.0
-    if rows == TILE and columns == TILE:
-        for p in range(_u(PIXELS)):
-            scratch[p] = 1.0
-        return
     for y in range(rows):  # pixels outside the image have transmittance 0: no work waits for them
         scratch[y * TILE : y * TILE + columns] = 1.0
     _reorder(scratch, _u(0))
@@ -466,9 +445,6 @@ def _write_tile(scratch, background, image, transmittance, top, left):
     """Write a tile into the image; overwrites its scratch."""
     height, width = transmittance.shape
     rows, columns = min(TILE, height - top), min(TILE, width - left)
-    if rows == TILE and columns == TILE:
-        _write_whole_tile(scratch, background, image.reshape(-1), transmittance.reshape(-1), height, width, top, left)
-        return
     for plane in range(_u(1 + len(background))):
         _reorder(scratch, plane * _u(PIXELS))
     for y in range(rows):
@@ -480,44 +456,6 @@ def _write_tile(scratch, background, image, transmittance, top, left):
             behind = background[c]
             for x in range(_u(columns)):
                 out[x] = scratch[plane + x] + scratch[base + x] * behind
-
-
-@kernel
-def _write_whole_tile(scratch, background, image, transmittance, height, width, top, left):
-    """`_write_tile` for tiles within the image; `image` and `transmittance` are flat."""
-    height, width, corner = _u(height), _u(width), _u(top) * _u(width) + _u(left)
-    for band in range(_u(CELLS)):
-        at = band * _u(TILE * CELL)
-        transmitted = _load_rows(scratch, at)
-        out = corner + band * _u(CELL) * width
-        store(transmittance, out, transmitted[0])
-        store(transmittance, out + width, transmitted[1])
-        store(transmittance, out + _u(2) * width, transmitted[2])
-        store(transmittance, out + _u(3) * width, transmitted[3])
-        for c in range(_u(len(background))):
-            behind = broadcast(background[c])
-            rows = _load_rows(scratch, (c + _u(1)) * _u(PIXELS) + at)
-            store(image, out, rows[0] + transmitted[0] * behind)
-            store(image, out + width, rows[1] + transmitted[1] * behind)
-            store(image, out + _u(2) * width, rows[2] + transmitted[2] * behind)
-            store(image, out + _u(3) * width, rows[3] + transmitted[3] * behind)
-            out += height * width
-
-
-@kernel
-def _trim_lists(tile_start, listed, used):
-    """The lists without the entries that were never composited, if that is worth a copy."""
-    total = 0
-    for tile in range(len(used)):
-        total += used[tile] - tile_start[tile]
-    if 2 * total > len(listed):
-        return tile_start, listed, used
-    kept, start, stop = np.empty(total, listed.dtype), np.zeros_like(tile_start), np.empty_like(used)
-    for tile in range(len(used)):
-        stop[tile] = start[tile] + used[tile] - tile_start[tile]
-        start[tile + 1] = stop[tile]
-        kept[start[tile] : stop[tile]] = listed[tile_start[tile] : used[tile]]
-    return start, kept, stop
 
 
 @inline
@@ -549,8 +487,8 @@ def forward_rows(
     `visibility`: None, or an output for the (sum of weights, largest alpha) of every entry; `marks`, zeros, is the
     buffer of `_composite`.
 
-    Returns the tiles' lists (start, entries relative to the rows' first, stop), the transmittance of every pixel of a
-    tile at the start of each block but the first, tile after tile, and the number of entries listed.
+    Returns the tiles' lists (start, entries relative to the rows' first, the end of those composited), and the
+    transmittance of every pixel of a tile at the start of each block but the first, tile after tile.
     """
     height, width = transmittance.shape
     across = (width + TILE - 1) // TILE
@@ -585,7 +523,7 @@ def forward_rows(
             if visibility is not None:
                 _reduce_marks(part, marks, visibility[row_start[begin] : row_start[end]])
         _write_tile(scratch, background, image, transmittance, top, left)
-    return *_trim_lists(tile_start, listed, used), block_transmittances[:kept], len(listed)
+    return tile_start, listed, used, block_transmittances[:kept]
 
 
 @kernel

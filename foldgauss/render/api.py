@@ -13,7 +13,6 @@ from jaxtyping import Array, Float
 
 from foldgauss._runtime.checks import check_one_of, invalid
 from foldgauss._runtime.device import default_platform
-from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import cpu, pallas
 from foldgauss.render.reference import render_reference
 from foldgauss.render.splats import RenderOptions, Splats2D, check_size
@@ -116,7 +115,7 @@ def render(
 
 def choose_engine(options: RenderOptions, dtype: np.dtype) -> str:
     """The engine that "auto" stands for, by the options and the dtype of the splats."""
-    if default_platform() == "cpu" and _cpu_takes(options):
+    if default_platform() == "cpu" and options.tile_size in (None, cpu.TILE):
         return "cpu"
     return "pallas" if dtype == jnp.float32 and pallas.is_preferred(options) else "xla"
 
@@ -154,14 +153,6 @@ def _run_engine(splats, background, size, compositing, engine, options):
 _run_compiled = jax.jit(_run_engine, static_argnums=(2, 3, 4, 5))
 
 
-def _cpu_takes(options: RenderOptions) -> bool:
-    try:
-        cpu.check_options(options)
-    except ValueError:
-        return False
-    return True
-
-
 @jax.jit
 def _zero_nonfinite(splats: Splats2D) -> tuple[jax.Array, ...]:
     """The leaves, with zeros in place of splats that hold NaN or infinity: without opacity they are left out."""
@@ -180,7 +171,7 @@ def _render_cpu(size, compositing, options, *leaves):
 
     def fill(image, *leaves):
         trace = cpu.forward(*leaves, size, compositing=compositing, options=options)
-        _interleave(trace.image, image)
+        image[...] = cv2.merge(list(trace.image)).reshape(image.shape)  # faster than by NumPy
 
     shape = jax.ShapeDtypeStruct((*size, len(leaves[-1])), jnp.float32)
     return _call_on_host(fill, shape, *leaves)
@@ -195,7 +186,7 @@ def _render_cpu_bwd(size, compositing, options, leaves, grad_image):
 
     def differentiate(gradients, grad_image, *leaves):
         trace = cpu.forward(*leaves, size, compositing=compositing, options=options)
-        grad_image = _split_channels(grad_image)
+        grad_image = np.ascontiguousarray(np.moveaxis(grad_image, -1, 0))
         by_leaf = *cpu.backward(trace, grad_image), cpu.background_gradient(trace, grad_image)
         for out, gradient in zip(gradients, by_leaf, strict=True):
             out[...] = gradient
@@ -226,35 +217,3 @@ def _call_on_host(function: Callable, shapes, *arrays: jax.Array):
         return through_copies(*arrays)
     directly = buffer_callback(in_place, shapes, vmap_method="sequential")
     return jax.lax.platform_dependent(*arrays, cpu=directly, default=through_copies)
-
-
-PIXELS_PER_TASK = 1 << 17
-
-
-def _interleave(planes: np.ndarray, image: np.ndarray) -> None:
-    """Write planes (channels, height, width) into an image (height, width, channels)."""
-    rows = -(-PIXELS_PER_TASK // image.shape[1])
-
-    def copy_rows(top: int) -> None:
-        own = planes[:, top : top + rows]
-        if 2 <= len(planes) <= 4:
-            cv2.merge(list(own), image[top : top + rows])
-        else:
-            image[top : top + rows] = np.moveaxis(own, 0, -1)
-
-    run_tasks(copy_rows, range(0, len(image), rows))
-
-
-def _split_channels(image: np.ndarray) -> np.ndarray:
-    """The planes (channels, height, width) of an image (height, width, channels)."""
-    planes, rows = np.empty((image.shape[2], *image.shape[:2]), np.float32), -(-PIXELS_PER_TASK // image.shape[1])
-
-    def copy_rows(top: int) -> None:
-        own = planes[:, top : top + rows]
-        if 2 <= len(planes) <= 4:
-            cv2.split(image[top : top + rows], list(own))
-        else:
-            own[...] = np.moveaxis(image[top : top + rows], -1, 0)
-
-    run_tasks(copy_rows, range(0, len(image), rows))
-    return planes

@@ -118,13 +118,6 @@ class Gaussians3D(eqx.Module):
         rotation = jnp.stack([jnp.stack(row, -1) for row in rows], -2)
         return cls(mean, rotation * jnp.asarray(scale)[..., None, :], opacity, color)
 
-    def to_flat(self) -> Splats2D:
-        """The orthogonal projection on the plane z = 0: the marginal of (x, y), inverse of `from_flat`.
-
-        The covariance is recovered up to rounding, but not the factor itself.
-        """
-        return Splats2D(self.mean[..., :2], square_factor(self.factor[..., :2, :]), self.opacity, self.color)
-
 
 class Camera(eqx.Module):
     """A pinhole camera: axes right, down and forward, which are x, y and z of the front camera.

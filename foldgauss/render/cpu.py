@@ -111,14 +111,14 @@ def forward_frames(
     for frame in frames:
         _check_leaves(*frame)
     passes = [_ForwardPass(frame, size, compositing, options, visibility) for frame in frames]
-    large = [(one, start) for one in passes if len(one.chunks) > 1 for start in one.chunks]
-    run_tasks(_call, [(one.project, start) for one, start in large])
+    chunks = [(one, start) for one in passes for start in one.chunks]
+    run_tasks(_call, [(one.project, start) for one, start in chunks])
     run_tasks(_ForwardPass.bucket, passes)
-    run_tasks(_call, [(one.fill, start) for one, start in large])
+    run_tasks(_call, [(one.fill, start) for one, start in chunks])
     small = sum(one.work for one in passes) < SINGLE_TASK_NS
     run_tasks(_call, [(one.composite, part) for one in passes for part in one.split(whole=small)], serial=small)
     if visibility:
-        run_tasks(_call, [(one.gather, start) for one in passes for start in one.chunks])
+        run_tasks(_call, [(one.gather, start) for one, start in chunks])
     return [one.to_trace() for one in passes]
 
 
@@ -155,7 +155,7 @@ class _ForwardPass:
         self.mean, self.factor, self.opacity, self.color, background = map(_read_only, frame)
         self.size, self.options = size, options
         num, channels, over = len(self.opacity), len(background), compositing == "over"
-        self.chunks = range(0, num, SPLATS_PER_TASK)
+        self.chunks = range(0, max(num, 1), SPLATS_PER_TASK)
         self.num_rows = -(-size[0] // TILE)
         self.counts = np.zeros((len(self.chunks), self.num_rows), np.int64)  # entries by chunk and row of tiles
         self.geometry, self.span = np.empty((num, 8), np.float32), np.empty((num, 2), np.int32)
@@ -169,31 +169,23 @@ class _ForwardPass:
         )
 
     def project(self, start: int) -> None:
-        stop = min(start + SPLATS_PER_TASK, len(self.opacity))
-        kernels.project(start, stop, *self._projection_arguments())
-        kernels.count_rows(start, stop, self.span, self.counts[start // SPLATS_PER_TASK])
-
-    def _projection_arguments(self) -> tuple:
-        radius = self.options.support_radius
+        stop, radius = min(start + SPLATS_PER_TASK, len(self.opacity)), self.options.support_radius
         low_pass, cutoff = np.float32(self.options.low_pass), np.float32(self.options.alpha_cutoff)
         support = np.float32(math.inf if radius is None else radius**2)
         splats = (self.mean, self.factor, self.opacity, self.color)
-        return *splats, *self.size, low_pass, cutoff, support, self.geometry, self.span
+        kernels.project(start, stop, *splats, *self.size, low_pass, cutoff, support, self.geometry, self.span)
+        kernels.count_rows(start, stop, self.span, self.counts[start // SPLATS_PER_TASK])
 
     def bucket(self) -> None:
-        """Allocate the lists of the splats of each row; those of a single chunk are projected and listed here, too."""
-        if len(self.chunks) <= 1:
-            self.buckets = kernels.project_and_bucket(self.num_rows, *self._projection_arguments())
-        else:
-            # Entries are ordered by row, then by chunk; slots by chunk.
-            position = np.append(0, np.cumsum(self.counts.T))
-            self.fill_from = np.ascontiguousarray(position[:-1].reshape(self.counts.T.shape).T)
-            self.slot_from = np.append(0, np.cumsum(self.counts.sum(1)))
-            entries, slot_position = np.empty(position[-1], np.int32), np.empty(position[-1], np.int64)
-            first_slot = np.empty(len(self.opacity) + 1, np.int64)
-            row_start = np.ascontiguousarray(position[:: len(self.chunks)])
-            self.buckets = row_start, entries, first_slot, slot_position
-        self.entry_visibility = None if self.visibility is None else np.empty((len(self.buckets[1]), 2), np.float32)
+        """Allocate the lists of the splats of each row; entries are ordered by row, then by chunk; slots by chunk."""
+        position = np.append(0, np.cumsum(self.counts.T))
+        self.fill_from = position[:-1].reshape(self.counts.T.shape).T.copy(order="C")  # `fill` overwrites it
+        self.slot_from = np.append(0, np.cumsum(self.counts.sum(1)))
+        entries, slot_position = np.empty(position[-1], np.int32), np.empty(position[-1], np.int64)
+        first_slot = np.empty(len(self.opacity) + 1, np.int64)
+        row_start = np.ascontiguousarray(position[:: len(self.chunks)])
+        self.buckets = row_start, entries, first_slot, slot_position
+        self.entry_visibility = None if self.visibility is None else np.empty((len(entries), 2), np.float32)
 
     def fill(self, start: int) -> None:
         chunk, stop = start // SPLATS_PER_TASK, min(start + SPLATS_PER_TASK, len(self.opacity))
@@ -210,13 +202,12 @@ class _ForwardPass:
         self.parts = [(row, row + step) for row in range(0, self.num_rows, step)]
         self.lists: list = [()] * len(self.parts)
         self.block_transmittances: list = [None] * len(self.parts)
-        self.num_listed = [0] * len(self.parts)
         return range(len(self.parts))
 
     def composite(self, part: int) -> None:
         marks = None if self.visibility is None else np.zeros(2 * TILE * kernels.BLOCK, np.float32)
         splats, planes = (self.geometry, self.color), (self.image, self.transmittance)
-        *self.lists[part], self.block_transmittances[part], self.num_listed[part] = kernels.forward_rows(
+        *self.lists[part], self.block_transmittances[part] = kernels.forward_rows(
             *self.parts[part], *self.buckets[:2], *splats, *self.constants, *planes, self.entry_visibility, marks
         )
 
@@ -229,7 +220,7 @@ class _ForwardPass:
             self.image,
             self.transmittance,
             self.visibility,
-            sum(self.num_listed) * PIXELS,
+            sum(len(listed) for _, listed, _ in self.lists) * PIXELS,
             (self.factor, self.opacity, self.color),
             self.geometry,
             self.buckets,
@@ -245,42 +236,29 @@ def backward(trace: Trace, grad_image: np.ndarray) -> tuple[np.ndarray, ...]:
 
     That of the background is `background_gradient`. Raises ValueError if `grad_image` does not have the image's shape.
     """
-    return backward_frames([trace], [grad_image])[0]
+    if grad_image.shape != trace.image.shape:
+        raise invalid("grad_image", expected=f"the image's shape {trace.image.shape}", got=grad_image.shape)
+    grad_image, num, channels = _read_only(grad_image), len(trace.geometry), len(trace.image)
+    slots = np.empty((len(trace.buckets[1]), kernels.slot_width(channels)), np.float32)  # of every (splat, row)
+    grads = tuple(np.empty(shape, np.float32) for shape in ((num, 2), (num, 2, 2), (num,), (num, channels)))
 
-
-def backward_frames(traces: Sequence[Trace], grad_images: Sequence[np.ndarray]) -> list[tuple[np.ndarray, ...]]:
-    """Compute `backward` of several frames at once; raises ValueError as it does."""
-    for trace, grad_image in zip(traces, grad_images, strict=True):
-        if grad_image.shape != trace.image.shape:
-            raise invalid("grad_image", expected=f"the image's shape {trace.image.shape}", got=grad_image.shape)
-    jobs = [(trace, _read_only(grad), *_empty_sums(trace)) for trace, grad in zip(traces, grad_images, strict=True)]
-
-    def sum_rows(task) -> None:
-        (trace, grad_image, slots, _), part = task
+    def sum_rows(part: int) -> None:
         lists, splats = (*trace.lists[part], trace.block_transmittances[part]), (trace.geometry, trace.inputs[2])
         rows = (*trace.parts[part], *trace.buckets[:2])
         kernels.backward_rows(*rows, *lists, *splats, *trace.constants, grad_image, slots)
 
-    def gather(task) -> None:
-        (trace, _, slots, grads), start = task
-        stop = min(start + SPLATS_PER_TASK, len(trace.geometry))
+    def gather(start: int) -> None:
+        stop = min(start + SPLATS_PER_TASK, num)
         kernels.gather(start, stop, *trace.buckets[2:], slots, trace.geometry, *trace.inputs[:2], *grads)
 
-    run_tasks(sum_rows, [(job, part) for job in jobs for part in range(len(job[0].parts))])
-    run_tasks(gather, [(job, start) for job in jobs for start in range(0, len(job[0].geometry), SPLATS_PER_TASK)])
-    return [grads for *_, grads in jobs]
+    run_tasks(sum_rows, range(len(trace.parts)))
+    run_tasks(gather, range(0, num, SPLATS_PER_TASK))
+    return grads
 
 
 def background_gradient(trace: Trace, grad_image: np.ndarray) -> np.ndarray:
     """The gradient of the background, (channels,), given dL/dimage as for `backward`."""
     return np.einsum("chw,hw->c", grad_image, trace.transmittance, dtype=np.float32)
-
-
-def _empty_sums(trace: Trace) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
-    """Arrays for the gradient sums of every (splat, row), and for the gradients of the splats."""
-    num, channels = len(trace.geometry), len(trace.image)
-    slots = np.empty((len(trace.buckets[1]), kernels.slot_width(channels)), np.float32)
-    return slots, tuple(np.empty(shape, np.float32) for shape in ((num, 2), (num, 2, 2), (num,), (num, channels)))
 
 
 def raise_screen_gradients(largest: np.ndarray, trace: Trace, d_mean: np.ndarray, indices: np.ndarray) -> None:

@@ -186,7 +186,7 @@ def test_several_frames_equal_single_frames(compositing):
     frames = [[leaf[k:] for leaf in leaves[:4]] + leaves[4:] for k in (0, 20, len(leaves[0]))]
     weights = np.random.default_rng(0).normal(size=(3, 3, *size)).astype(np.float32)
     traces = cpu.forward_frames(frames, size, compositing=compositing, visibility=True)
-    grads = cpu.backward_frames(traces, weights)
+    grads = map(cpu.backward, traces, weights)
     for frame, weight, trace, grad in zip(frames, weights, traces, grads, strict=True):
         alone = results(frame, size, weight, compositing=compositing)[:-1]
         for one, two in zip(alone, [trace.image, trace.transmittance, *trace.visibility, *grad], strict=True):
@@ -195,11 +195,10 @@ def test_several_frames_equal_single_frames(compositing):
 
 def test_no_frames():
     assert cpu.forward_frames([], (8, 8)) == []
-    assert cpu.backward_frames([], []) == []
 
 
-def test_trimmed_lists_keep_the_gradient():
-    """Behind the last light nothing is kept, and nothing is lost: the gradient is that of the whole list."""
+def test_the_end_of_a_list_keeps_the_gradient():
+    """Behind the last light nothing is composited, and nothing is lost: the gradient is that of the whole list."""
     leaves, size = leaves_of("curtain")
     weights = np.ones((3, *size), np.float32)
     trace = cpu.forward(*leaves, size)

@@ -52,7 +52,7 @@ class Densification(DensityControl):
         if growth.resets_at(state.step):
             reset_opacities(state.rows, state.first, state.second, growth, config.fold_degree)
         if state.step + 1 >= growth.until_step:
-            state.statistics = None
+            state.restart_statistics(growing=False)
 
 
 def densify(

@@ -1,6 +1,6 @@
 """A model prepared for conditioning on many times, for images of one size: packed rows and their time windows."""
 
-from typing import Protocol
+from typing import Any
 
 import jax
 import numpy as np
@@ -15,23 +15,13 @@ from foldgauss.video.models.conditioning import (
     condition,
     find_windows,
 )
-from foldgauss.video.models.frame_times import FrameTimes, snap_to_shots
+from foldgauss.video.models.renderer import PreparedVideo
 from foldgauss.video.models.row_layout import pack
 from foldgauss.video.models.shared_paths import check_paths
-from foldgauss.video.models.splats import FoldedSplats
 
 
-class _Model(Protocol):
-    """The attributes needed of a `VideoModel`, which imports this module."""
-
-    splats: FoldedSplats
-    frame_times: FrameTimes
-    size: tuple[int, int]
-    scale_cutoff: float
-
-
-class PreparedModel:
-    """The Gaussians of a model, ready to be conditioned on any time, in pixels of an image of `size`.
+class PreparedModel(PreparedVideo):
+    """The Gaussians of a `VideoModel`, ready to be conditioned on any time, in pixels of an image of `size`.
 
     `aspect` is the height / width of the frame that covers the image (default: the model's).
 
@@ -41,7 +31,7 @@ class PreparedModel:
     infinities or with several envelopes.
     """
 
-    def __init__(self, model: _Model, size: tuple[int, int], *, aspect: float | None = None):
+    def __init__(self, model: Any, size: tuple[int, int], *, aspect: float | None = None):
         check_size(size)
         height, width = model.size
         self.rows = pack(model.splats)
@@ -53,7 +43,7 @@ class PreparedModel:
         own = {"aspect": aspect, "paths": paths, "scale_cutoff": model.scale_cutoff}
         self.spec = ConditioningSpec(model.splats.degree, power, floor, tuple(size), **own)
         self.window = find_windows(self.rows, self.spec)
-        self._times = np.asarray(model.frame_times.times())
+        self.times = np.asarray(model.frame_times.times())
 
     def at(self, t: float, members: np.ndarray | None = None) -> ConditionedSplats:
         """The Gaussians alive at time t, also outside [0, 1]; of `members`, bool (num_gaussians,), if given."""
@@ -63,10 +53,6 @@ class PreparedModel:
         """The splats of the Gaussians alive at time t, front to back; NumPy leaves."""
         done = self.at(t)
         return Splats2D(done.mean, done.factor, done.opacity, done.color)
-
-    def weighted_splats(self, t: float) -> list[tuple[float, Splats2D]]:
-        """A single image, see `foldgauss.video.models.renderer.PreparedVideo`."""
-        return [(1.0, self.splats(snap_to_shots(t, self._times)))]
 
 
 def _check_finite(rows: np.ndarray) -> None:

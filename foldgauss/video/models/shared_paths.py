@@ -91,26 +91,6 @@ def move_splats(splats: Splats2D, path_index: UInt8[Array, " num"], maps: Float[
     return Splats2D(mean, linear @ splats.factor, splats.opacity, splats.color, splats.depth)
 
 
-def leave_paths(splats: Any, which: Bool[np.ndarray, " num"]) -> Any:
-    """`FoldedSplats` of NumPy arrays where those of `which` are on no path, at the position and size of their m_t.
-
-    They keep their angles and folds.
-    """
-    if splats.paths is None or not (which & (splats.path_index > 0)).any():
-        return splats
-    times = 1 / (1 + np.exp(-splats.time_loc_logit.astype(float)))
-    leaving = np.where(which, splats.path_index, np.uint8(0))
-    maps = splats.paths.by_index(np.float32(times), leaving)
-    loc = np.einsum("nij,nj->ni", maps[:, :, :2], splats.loc) + maps[:, :, 2]
-    larger = 0.5 * np.log(np.abs(np.linalg.det(maps[:, :, :2].astype(float))))
-    return dataclasses.replace(
-        splats,
-        loc=loc.astype(np.float32),
-        log_scale=(splats.log_scale + larger[:, None]).astype(np.float32),
-        path_index=np.where(which, np.uint8(0), splats.path_index),
-    )
-
-
 def check_paths(splats: Any) -> None:
     """Raise ValueError unless maps and times are finite, times do not decrease, and every Gaussian's path is there.
 

@@ -12,7 +12,7 @@ from foldgauss.render.splats import check_size
 from foldgauss.video.models.background import BLACK, Background, check_background
 from foldgauss.video.models.frame_times import FrameTimes, snap_to_shots
 from foldgauss.video.models.prepared import PreparedModel
-from foldgauss.video.models.rendered_video import RenderedVideo, choose_time
+from foldgauss.video.models.renderer import RenderedVideo, choose_time
 from foldgauss.video.models.splats import FoldedSplats
 
 #: Parameters of a Gaussian, without those of its fold.

@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 
 from foldgauss._runtime.checks import is_within, require
 from foldgauss.video.models.frame_times import is_cut
-from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer
+from foldgauss.video.models.renderer import RenderedVideo, VideoRenderer
 from foldgauss.video.motion.optical_flow import both_flows, match_points
 
 #: The longer side, in pixels, of the images that flow is computed on.
@@ -91,7 +91,7 @@ class CameraPath:
         return maps
 
 
-def estimate_camera_path(video: RenderableVideo, *, on_frame: Callable[[], None] = lambda: None) -> CameraPath:
+def estimate_camera_path(video: RenderedVideo, *, on_frame: Callable[[], None] = lambda: None) -> CameraPath:
     """The path of the camera in a video, from the optical flow between its own images at the frame times.
 
     The camera is what most of the image agrees on: affine maps by RANSAC, so that objects that move on their own and

@@ -10,8 +10,7 @@ from jaxtyping import Bool, Float
 
 from foldgauss._runtime.checks import is_within, require, short_repr
 from foldgauss.render import Splats2D, pixels_per_unit
-from foldgauss.video.models.rendered_video import FollowingVideo
-from foldgauss.video.models.renderer import RenderableVideo
+from foldgauss.video.models.renderer import FollowingVideo, PreparedVideo, RenderedVideo
 from foldgauss.video.motion.camera_path import CameraPath, estimate_camera_path
 
 Affine = Float[np.ndarray, "3 3"]
@@ -33,7 +32,7 @@ UNSEEN = 3.0
 
 
 def stabilize(
-    video: RenderableVideo,
+    video: RenderedVideo,
     *,
     smoothing: float = SMOOTHING,
     fixed: bool = False,
@@ -58,7 +57,7 @@ def stabilize(
     Example: `stabilize(model, border="fill").render(frame=10)`.
     """
     require(
-        hasattr(video, "prepare"),
+        isinstance(video, RenderedVideo),
         "video",
         expected="a model or another video of it",
         got=type(video).__name__,
@@ -106,13 +105,13 @@ class StabilizedVideo(FollowingVideo):
     documents `border`.
     """
 
-    video: RenderableVideo
+    video: RenderedVideo
     maps: Float[np.ndarray, "frames 3 3"]
     path: CameraPath
     border: Border = "keep"
 
     @property
-    def _lead(self) -> RenderableVideo:
+    def _lead(self) -> RenderedVideo:
         return self.video
 
     @property
@@ -159,7 +158,7 @@ class StabilizedVideo(FollowingVideo):
         return (k + 1, 0.0) if fraction == 1 else (k, fraction)
 
 
-class PreparedStabilizedVideo:
+class PreparedStabilizedVideo(PreparedVideo):
     """A stabilized video prepared for images of `size`, see `PreparedVideo`."""
 
     def __init__(self, video: StabilizedVideo, size: tuple[int, int]):

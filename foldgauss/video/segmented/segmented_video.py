@@ -14,8 +14,7 @@ from foldgauss._runtime.checks import invalid, is_integer, require, short_repr
 from foldgauss.render import RenderOptions, Splats2D
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.frame_times import check_frame_before, times_at
-from foldgauss.video.models.rendered_video import RenderedVideo
-from foldgauss.video.models.renderer import PreparedVideo
+from foldgauss.video.models.renderer import PreparedVideo, RenderedVideo
 from foldgauss.video.models.video_model import VideoModel
 
 #: Models that are kept prepared at once; as many as are visible, where more are (between the last frame of one fade and
@@ -222,7 +221,7 @@ class SegmentedVideo(RenderedVideo):
         return min(max((position - first + 1) / (stop - first + 1), 0.0), 1.0)
 
 
-class PreparedSegmentedVideo:
+class PreparedSegmentedVideo(PreparedVideo):
     """A video in segments prepared for images of `size`, see `PreparedModel`; models are loaded when needed."""
 
     def __init__(self, video: SegmentedVideo, size: tuple[int, int]):

@@ -13,7 +13,7 @@ from jaxtyping import ArrayLike, Bool, Float, Float32, Int, Int8
 
 from foldgauss._runtime.checks import invalid, is_integer, require, short_repr
 from foldgauss.render import cpu
-from foldgauss.video.models.rendered_video import check_time
+from foldgauss.video.models.renderer import check_time
 from foldgauss.video.models.splats import SH_C0
 from foldgauss.video.models.video_model import VideoModel, check_model
 from foldgauss.video.motion.background_plate import SIDE

@@ -94,8 +94,9 @@ class CpuStepper:
         finite = update_rows(state, self.grad, touched, rates, units=config.rates.units)
         update_windows(state.rows, touched, self.window, spec)
         if config.learns_frame_times and num_frames > 2:
-            updated = update_frame_times(state.time_logits, state.time_moments, by_time, time_rate)
-            state.time_logits, state.time_moments = updated
+            moments = state.time_count, state.time_first, state.time_second
+            state.time_logits, moments = update_frame_times(state.time_logits, moments, by_time, time_rate)
+            state.time_count, state.time_first, state.time_second = moments
         if by_path.size and visited:
             path_rate = self.rates.of_paths(progress, state.backoffs)
             finite &= update_paths(state, by_path, np.array(sorted(visited)), path_rate * relative_size)
