@@ -1,5 +1,6 @@
 """Colors by sparse least squares with fixed geometry: given alpha, every pixel is linear in the colors."""
 
+import functools
 from collections.abc import Sequence
 
 import jax
@@ -42,7 +43,7 @@ def solve_colors(
     - `ridge`: lambda as a fraction of the largest row sum of sum_k A_k^T A_k, a bound on its eigenvalues as no weight
       is negative; larger values keep colors of hardly visible splats near c_0. 0 is plain least squares.
     - `tolerance`, `max_iterations`: conjugate gradients stop once the residual of the normal equations has fallen by
-      this factor in every channel, or after this many products with A and its transpose.
+      this factor, or after this many products with A and its transpose.
 
     Returns (num, channels). Raises ValueError if frames and images do not match or hold values that are not finite.
     Not for use inside `jit`: convergence is checked on the host.
@@ -88,33 +89,14 @@ def solve_colors(
     def normal(colors):
         return transpose(forward(colors)) + damping * colors
 
+    def precondition(residual):
+        scale = row_sums + damping
+        return jnp.where(scale > 0, residual / jnp.where(scale > 0, scale, 1), 0)
+
     right = transpose(jax.tree.map(jnp.subtract, images, rendered))
-    change = _solve_by_conjugate_gradients(normal, right, row_sums + damping, tolerance, max_iterations)
+    solve = functools.partial(jax.scipy.sparse.linalg.cg, maxiter=max_iterations, tol=tolerance)
+    change, _ = solve(normal, right, M=precondition)
     return (start + change).astype(dtype)
-
-
-def _solve_by_conjugate_gradients(normal, right, scale, tolerance: float, max_iterations: int):
-    """Solve normal(x) = right, (num, channels), from x = 0, each channel by itself; rows where `scale` is 0 stay 0."""
-
-    def dot(one, other):
-        return jnp.sum(one * other, axis=0, keepdims=True)
-
-    def ratio(above, below):
-        return jnp.where(below > 0, above / jnp.where(below > 0, below, 1), 0)
-
-    solution, residual = jnp.zeros_like(right), right
-    direction = ratio(residual, scale)
-    energy, goal = dot(residual, direction), tolerance**2 * dot(right, ratio(right, scale))
-    for _ in range(max_iterations):
-        if not bool(jnp.any(energy > goal)):
-            break
-        image = normal(direction)
-        length = ratio(energy, dot(direction, image))
-        solution, residual = solution + length * direction, residual - length * image
-        conditioned = ratio(residual, scale)
-        before, energy = energy, dot(residual, conditioned)
-        direction = conditioned + ratio(energy, before) * direction
-    return solution
 
 
 def _check_frames(splats, images) -> tuple[list[Splats2D], list[Array]]:

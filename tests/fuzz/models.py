@@ -184,7 +184,7 @@ def _checkpoint_seeds() -> list[bytes]:
     for sums in ({}, dict(zip(STATISTICS, (floats(num), floats(num), counts), strict=True))):
         state = FitState.create(
             floats(num, width), floats(2), counts=counts, first=floats(num, width),
-            second=floats(num, width), frame_errors=floats(3), **sums,
+            second=floats(num, width), frame_errors=floats(3), growing=bool(sums), **sums,
             step=5, plan=100, seconds=1.5, last_finite=state, start_errors=((0, 0.1),),
         )  # fmt: skip
         kept.append(written(lambda path, one=state: save_checkpoint(path, one, config=_CONFIG, source=_SOURCE)))

@@ -37,7 +37,7 @@ def random_arrays(sizes: Sizes, kinds: dict[str, StateArray]) -> dict:
 def make_state(sizes: Sizes = SIZES) -> FitState:
     counters = {"step": 3, "plan": 20, "seconds": 1.5, "best_error": 0.125, "backoffs": 2}
     counters |= {"compare_from": 9, "improve_by": 12, "start_errors": ((0, 0.5), (3, 0.25))}
-    return FitState(**random_arrays(sizes, FitState.array_fields()), **counters)
+    return FitState(**random_arrays(sizes, FitState.array_fields()), **counters, growing=sizes.growing)
 
 
 def assert_equal(one: FitState, other: FitState) -> None:

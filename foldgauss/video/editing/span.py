@@ -2,15 +2,15 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from numbers import Real
 from typing import TypedDict
 
 import numpy as np
 from jaxtyping import Float
 
-from foldgauss._runtime.checks import check_one_of, is_integer, is_within, require, short_repr
+from foldgauss._runtime.checks import check_one_of, is_within, require
 from foldgauss.video.editing.arguments import check_increasing, check_number, check_numbers
+from foldgauss.video.selection.regions import check_times, resolve_frames
 
 CURVES = ("linear", "smooth")
 
@@ -116,7 +116,14 @@ def make_span(
     num_given = sum(x is not None for x in (frame, frames, times))
     check_one_of("curve", curve, CURVES)
     require(num_given <= 1, "frame, frames, times", expected="one of them at most", got=f"{num_given} of them")
-    lengths = _check_ease(ease)
+    pair = ease if isinstance(ease, (tuple, list)) else (ease, ease)
+    require(
+        len(pair) == 2 and all(isinstance(x, Real) and x >= 0 and math.isfinite(x) for x in pair),
+        "ease",
+        expected="a number of frames >= 0, or two of them",
+        got=repr(ease),
+    )
+    lengths = float(pair[0]), float(pair[1])
     if not num_given:
         require(
             lengths == (0, 0), "ease", expected="a span to ease into", got=ease, cure="Give frame=, frames= or times=."
@@ -151,27 +158,12 @@ def _span_positions(knots: np.ndarray, frame, frames, times) -> tuple[float, flo
     """The frame positions at which a span begins and ends; infinite where it has no end."""
     last = len(knots) - 1
     if times is not None:
-        first, stop = _check_pair("times", times)
-        require(
-            is_within(first, "[0, 1]") and is_within(stop, "[0, 1]") and first < stop,
-            "times",
-            expected="(start, stop), rising, in [0, 1]",
-            got=times,
-        )
-        begin, end = (float(np.interp(t, knots, np.arange(last + 1))) for t in (first, stop))
+        first, stop = check_times(times)
+        require(first < stop, "times", expected="(start, stop), rising, in [0, 1]", got=times)
+        begin, end = np.interp((first, stop), knots, np.arange(last + 1)).tolist()
         return -math.inf if begin <= 0 else begin, math.inf if end >= last else end
-    if frame is not None:
-        require(is_integer(frame, 0) and frame <= last, "frame", expected=f"a whole number in [0, {last}]", got=frame)
-        frames = (frame, frame + 1)
-    first, stop = _check_pair("frames", frames)
-    first, stop = 0 if first is None else first, last + 1 if stop is None else stop
-    require(
-        is_integer(first, 0) and is_integer(stop, 1) and first < stop <= last + 1,
-        "frames",
-        expected=f"(first, stop), whole, 0 <= first < stop <= {last + 1}",
-        got=frames,
-        cure="None is the clip's own end.",
-    )
+    chosen = resolve_frames(last + 1, frame, frames)
+    first, stop = chosen.start, chosen.stop
     return -math.inf if first == 0 else first - 0.5, math.inf if stop == last + 1 else stop - 0.5
 
 
@@ -181,26 +173,3 @@ def distinct_knots(
     """Knots of a piecewise linear function, as tuples; of knots at equal times only the last one is kept."""
     keep = np.concatenate([np.diff(times) > 0, [True]])
     return tuple(times[keep].tolist()), tuple(values[keep].tolist())
-
-
-def _check_ease(ease: object) -> tuple[float, float]:
-    pair = ease if isinstance(ease, (tuple, list)) else (ease, ease)
-    require(
-        len(pair) == 2 and all(isinstance(x, Real) and x >= 0 and math.isfinite(x) for x in pair),
-        "ease",
-        expected="a number of frames >= 0, or two of them",
-        got=repr(ease),
-    )
-    return float(pair[0]), float(pair[1])
-
-
-def _check_pair(parameter: str, value: object) -> Sequence:
-    value = value.tolist() if isinstance(value, np.ndarray) else value
-    require(
-        isinstance(value, (tuple, list)) and len(value) == 2,
-        parameter,
-        expected="two of them, (start, stop)",
-        got=short_repr(value),
-        cure="For one frame give frame=k." if parameter == "frames" else "",
-    )
-    return value

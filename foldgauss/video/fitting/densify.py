@@ -52,7 +52,8 @@ class Densification(DensityControl):
         if growth.resets_at(state.step):
             reset_opacities(state.rows, state.first, state.second, growth, config.fold_degree)
         if state.step + 1 >= growth.until_step:
-            state.restart_statistics(growing=False)
+            state.growing = False
+            state.restart_statistics()
 
 
 def densify(

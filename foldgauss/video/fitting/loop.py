@@ -148,7 +148,7 @@ def fit_steps(
     engine = choose_engine(frames, config)
     _warm_up(frames, config, engine)
     find_motion = motion_finder(frames, motion)
-    state = _start(frames, config, None, find_motion, clock) if state is None else state
+    state = start(frames, config, None, find_motion, clock) if state is None else state
     stepper = make_stepper(engine, frames, config, state, find_motion)
     planner, time_left = StepPlanner(config), TimeLeft(state, config)
     guard = Guard(state, config, stepper.steps_per_pass, alpha=frames.shape[3] == 4)
@@ -247,18 +247,15 @@ def _warm_up(frames: np.ndarray, config: FitConfig, engine: str) -> None:
 # ------------------------------------------------------------------------------------------------ starts
 
 
-def start(frames: np.ndarray, config: FitConfig, logits: np.ndarray | None = None) -> FitState:
-    """State before the first step; frame times start at softmax weights `logits`, or by default evenly in each shot."""
-    return _start(frames, config, logits, motion_finder(frames), time.perf_counter)
-
-
-def _start(
+def start(
     frames: np.ndarray,
     config: FitConfig,
-    logits: np.ndarray | None,
-    find_motion: Callable[[], Motion],
-    clock: Callable[[], float],
+    logits: np.ndarray | None = None,
+    find_motion: Callable[[], Motion] | None = None,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> FitState:
+    """State before the first step; frame times start at softmax weights `logits`, or by default evenly in each shot."""
+    find_motion = find_motion or motion_finder(frames)
     has_alpha, frames = frames.shape[3] == 4, np.ascontiguousarray(frames[..., :3])  # as seen over black
     begun, num_frames = clock(), len(frames)
     motion = find_motion() if config.follows_motion else None
@@ -325,14 +322,13 @@ def _initialize(frames: np.ndarray, config: FitConfig, logits: np.ndarray, motio
     times = np.asarray(FrameTimes(logits).times())
     opacity = SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY
     clip = {"times": times, "motion": motion, "opacity": opacity}
-    clip["paths"] = _find_paths(motion, times, config) if config.follow_camera else None
+    if motion is not None and config.follow_camera:
+        # Also where the camera moves steadily if that takes no bits.
+        maps = find_shared_motions(motion, steady=config.is_compact)
+        clip["paths"] = (
+            maps if maps is None else SharedPaths(np.tile(np.float32(times), (len(maps), 1)), np.float32(maps))
+        )
     return initialize(frames, lambda life: choose_num(lifetime=life), envelope=envelope_of(config), **clip, **shape)
-
-
-def _find_paths(motion: Motion | None, times: np.ndarray, config: FitConfig) -> SharedPaths | None:
-    """The path of the camera and that of an object; unless they move steadily, where that takes no bits."""
-    maps = None if motion is None else find_shared_motions(motion, steady=config.is_compact)
-    return None if maps is None else SharedPaths(np.tile(np.float32(times), (len(maps), 1)), np.float32(maps))
 
 
 def _path_fields(splats: FoldedSplats, logits: np.ndarray) -> dict[str, np.ndarray]:

@@ -89,6 +89,7 @@ def _decode_rules(rows: Any) -> tuple[tuple[str, float, float, tuple[float, ...]
 
 
 #: The metadata of fields that are no arrays: `decode` restores them from JSON.
+_FLAG = {"static": True, "decode": bool}
 _COUNT = {"static": True, "decode": int}
 _NUMBER = {"static": True, "decode": float}
 _ERRORS = {"static": True, "decode": _decode_errors}
@@ -132,6 +133,7 @@ class FitState:
     screen_gradients: np.ndarray = field(metadata=_array(np.float32, "num_measured"))  # see `GradientStatistics`
     time_gradients: np.ndarray = field(metadata=_array(np.float32, "num_measured"))
     seen: np.ndarray = field(metadata=_array(np.int32, "num_measured"))
+    growing: bool = field(default=False, metadata=_FLAG)  # whether densification is still to come
     step: int = field(default=0, metadata=_COUNT)
     plan: int = field(default=0, metadata=_COUNT)  # steps of the whole fit; 0 until minutes have been planned
     planned_step: int = field(default=0, metadata=_COUNT)  # where the plan was last changed, and the fraction of the
@@ -162,10 +164,10 @@ class FitState:
         return {one.name: one.metadata["decode"] for one in dataclasses.fields(cls) if "decode" in one.metadata}
 
     @classmethod
-    def create(cls, rows: np.ndarray, time_logits: np.ndarray, *, growing: bool = False, **fields: Any) -> "FitState":
+    def create(cls, rows: np.ndarray, time_logits: np.ndarray, **fields: Any) -> "FitState":
         """A state with these Gaussians and frame times; all other arrays as a fit starts with, but for `fields`."""
         paths = fields["path_maps"].shape[1] if "path_maps" in fields else 0
-        sizes = Sizes(*rows.shape, len(time_logits) + 1, growing, paths=paths)
+        sizes = Sizes(*rows.shape, len(time_logits) + 1, fields.get("growing", False), paths)
         fields |= {"rows": rows, "time_logits": time_logits}
         arrays = {name: kind.build(sizes) for name, kind in cls.array_fields().items() if name not in fields}
         return cls(**arrays, **fields)
@@ -182,19 +184,14 @@ class FitState:
         return len(self.rows) if self.held is None else self.held.num
 
     @property
-    def growing(self) -> bool:
-        """Whether densification is still to come."""
-        return len(self.seen) > 0 if self.held is None else self.held.growing
-
-    @property
     def statistics(self) -> GradientStatistics | None:
         """The sums by which Gaussians grow; None without densification to come."""
         return GradientStatistics(*(getattr(self, name) for name in STATISTICS)) if self.growing else None
 
-    def restart_statistics(self, growing: bool) -> None:
+    def restart_statistics(self) -> None:
         """Sums begin anew; unless `growing` there are none."""
         for name in STATISTICS:
-            setattr(self, name, self.array_fields()[name].build(self.sizes._replace(growing=growing)))
+            setattr(self, name, self.array_fields()[name].build(self.sizes))
 
     @property
     def sizes(self) -> Sizes:
@@ -215,20 +212,19 @@ class FitState:
 
     def keep(self, index: np.ndarray) -> None:
         """Drop all Gaussians but those of `index`, or reorder them."""
-        growing = self.growing
         for name, kind in self.array_fields().items():
             if kind.per_gaussian:
                 setattr(self, name, getattr(self, name)[index])
-        self.restart_statistics(growing)
+        self.restart_statistics()
 
     def extend(self, rows: np.ndarray) -> None:
         """Add Gaussians at the end: their rows; in all other fields they are as at a start."""
-        growing, born = self.growing, Sizes(*rows.shape, len(self.frame_errors))
+        born = Sizes(*rows.shape, len(self.frame_errors))
         for name, kind in self.array_fields().items():
             if kind.per_gaussian:
                 new = rows if name == "rows" else kind.build(born)
                 setattr(self, name, np.concatenate([getattr(self, name), new]))
-        self.restart_statistics(growing)
+        self.restart_statistics()
 
     # --------------------------------------------------------------------------------------- copies, and devices
 

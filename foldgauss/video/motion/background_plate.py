@@ -149,7 +149,8 @@ def fill_background(frames: Frames, masks: Masks, *, alignment: Alignment | None
         k, shot = item
         if not covered[k].any():
             return
-        window = bounding_box(covered[k])
+        x, y, width, height = cv2.boundingRect(covered[k].astype(np.uint8))
+        window = slice(y, y + height), slice(x, x + width)
         plate, count = render_plate(frames, covered, alignment, k, shot, box=window)
         unknown = np.uint8(count == 0)
         num_unknown[k] = (unknown & covered[k][window]).sum()
@@ -212,12 +213,6 @@ def warp_by(image, matrix: Float[np.ndarray, "3 3"], size: tuple[int, int], bord
 def dilate(mask: Bool[np.ndarray, "height width"], diameter: int) -> Bool[np.ndarray, "height width"]:
     """The mask, grown by half of the diameter on all sides."""
     return cv2.dilate(mask.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (diameter, diameter))) > 0
-
-
-def bounding_box(mask: Bool[np.ndarray, "height width"]) -> tuple[slice, slice]:
-    """The rows and the columns in which a mask is."""
-    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
-    return slice(y, y + height), slice(x, x + width)
 
 
 def _chain(images, there, back) -> tuple[Float[np.ndarray, "frames 3 3"], tuple[int, ...]]:

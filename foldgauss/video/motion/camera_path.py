@@ -7,7 +7,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 import scipy.linalg
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from foldgauss._runtime.checks import is_within, require
 from foldgauss.video.models.frame_times import is_cut
@@ -113,27 +113,16 @@ def estimate_camera_path(video: RenderedVideo, *, on_frame: Callable[[], None] =
     for k, image in enumerate(VideoRenderer(video, size).frames(times.astype(np.float32))):
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         if k:
-            found = None if cut[k - 1] else estimate_affine(before, gray)
-            if found is None:
+            points, target, known = match_points(*both_flows(before, gray), SPACING, MISS, MISS_FRACTION)
+            found = fit_affine(points[known], target[known], INLIER, LEAST_INLIERS * len(points))
+            if cut[k - 1] or found is None:
                 starts.append(k)
             else:
-                step, inliers[k] = found
-                matrices[k] = to_model @ step @ to_pixels @ matrices[k - 1]
+                inliers[k] = found[1] / len(points)
+                matrices[k] = to_model @ found[0] @ to_pixels @ matrices[k - 1]
         before = gray
         on_frame()
     return CameraPath(matrices, inliers, times, tuple(starts))
-
-
-def estimate_affine(
-    one: UInt8[np.ndarray, "rows columns"], other: UInt8[np.ndarray, "rows columns"]
-) -> tuple[Float[np.ndarray, "3 3"], float] | None:
-    """The affine map that most points of a gray image follow to the next, in pixels, and their fraction of all points.
-
-    None where it is less than `LEAST_INLIERS`.
-    """
-    points, target, known = match_points(*both_flows(one, other), SPACING, MISS, MISS_FRACTION)
-    found = fit_affine(points[known], target[known], INLIER, LEAST_INLIERS * len(points))
-    return None if found is None else (found[0], found[1] / len(points))
 
 
 def fit_affine(

@@ -114,7 +114,7 @@ class CriteriaEvaluator:
     def _positions(self, times: Any = None, frame: Any = None, frames: Any = None, alive: bool = False) -> Any:
         """First and last frame position for `times`, else the range of frames."""
         if times is None:
-            return resolve_frames(self.stand_in, frame, frames)
+            return resolve_frames(self.stand_in.num_frames, frame, frames)
         return tuple(t * (self.stand_in.num_frames - 1) for t in check_times(times))
 
 
@@ -150,7 +150,7 @@ class _RegionCriterion:
         self._options = dict(arguments)
         where = {name: self._options.pop(name, None) for name in ("frame", "frames")}
         if function is by_click:
-            self._frames = tuple(resolve_frames(context.stand_in, **where))
+            self._frames = tuple(resolve_frames(context.stand_in.num_frames, **where))
         else:
             make, name = _REGIONS[function]
             self._region = make(context.stand_in, self._options.pop(name), **where)

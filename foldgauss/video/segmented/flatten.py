@@ -48,7 +48,7 @@ def flatten_video(video: VideoModel | EditedVideo | SegmentedVideo) -> VideoMode
 def _check_alike(layers: tuple[Layer, ...], lead: VideoModel) -> None:
     for layer in layers:
         model = layer.model
-        own, other = (jax.tree.map(_unique_values, one.splats.envelope) for one in (model, lead))
+        own, other = (jax.tree.map(lambda leaf: np.unique(leaf).tolist(), one.splats.envelope) for one in (model, lead))
         require(
             own == other and (len(layers) <= 1 or not any(len(values) > 1 for values in (own.power, own.floor))),
             "model",
@@ -70,10 +70,6 @@ def _check_alike(layers: tuple[Layer, ...], lead: VideoModel) -> None:
             got="one that has its own",
             cure=_CURE,
         )
-
-
-def _unique_values(leaf) -> tuple[float, ...]:
-    return tuple(np.unique(np.asarray(leaf)).tolist())
 
 
 def _concatenate(parts: list[FoldedSplats]) -> FoldedSplats:

@@ -139,17 +139,13 @@ def _vote(known: np.ndarray, label: np.ndarray, asked: np.ndarray) -> Int8[np.nd
 
 def _frames_outward(contributions: Contributions, frames: list[int]) -> list[int]:
     """The other frames of the shots of `frames`, nearest first."""
-    shot = _shot_numbers(contributions)
+    shot = np.concatenate([[0], np.cumsum(np.asarray(is_cut(contributions.times)))])
     distance = {}
     for k in set(range(len(shot))) - set(frames):
         same = [abs(k - one) for one in frames if shot[one] == shot[k]]
         if same:
             distance[k] = min(same)
     return sorted(distance, key=lambda k: (distance[k], k))
-
-
-def _shot_numbers(contributions: Contributions) -> Int[np.ndarray, " num_frames"]:
-    return np.concatenate([[0], np.cumsum(np.asarray(is_cut(contributions.times)))])
 
 
 # ------------------------------------------------------------------------------------------------ growing

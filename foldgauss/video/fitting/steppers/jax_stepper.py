@@ -93,7 +93,7 @@ class JaxStepper:
 
     def adopt(self, state: FitState) -> None:
         """Move a state's arrays to the device, padded to the capacity."""
-        growing, num = state.growing, state.num_gaussians
+        num = state.num_gaussians
         self.num_paths = state.path_maps.shape[1]
         capacity = self._choose_capacity(num)
         if capacity != self.capacity:
@@ -107,7 +107,7 @@ class JaxStepper:
         arrays = DeviceArrays(*(_pad(getattr(state, name), spec) for name, spec in specs.items()))
         # Copied, since arrays that are donated must be the device's own.
         arrays = jax.tree.map(lambda leaf: leaf.copy(), jax.device_put(arrays, replicated(self.program)))
-        state.hold(HeldArrays(arrays, num, growing, None))
+        state.hold(HeldArrays(arrays, num, state.growing, None))
 
     def step(self, state: FitState, progress: float) -> StepResult:
         if state.changed:  # by an observer of the fit
@@ -128,7 +128,7 @@ class JaxStepper:
         self._prepare(state, progress)
         arrays, report = compile_step(self.program)(held.arrays, self.images, control)
         report = jax.device_get(report)
-        state.hold(HeldArrays(arrays, held.num, held.growing, report))
+        state.hold(HeldArrays(arrays, held.num, state.growing, report))
         return StepResult(float(report.loss), int(report.num_alive), state.is_finite("rows"))
 
     def _interpolate(self, views: np.ndarray, chosen: list[float | None], step: int) -> InterpolatedViews | None:
