@@ -318,12 +318,11 @@ def _offsets(block, e, x, y):
 
 
 @kernel
-def _composite(num, block, first, end, shear, rise, scratch, background, over, ceiling, finished, marks):
+def _composite(num, block, first, end, shear, rise, scratch, background, over, ceiling, finished):
     """Composite a block's splats onto the tile: scratch holds transmittance, then colors, cell after cell.
 
     A cell's transmittance and first FEW colors stay in registers while the splats that reach it, one bit each, are
     composited in turn; `shear` and `rise` are buffers for P dx + Q dy and R dy at its first pixel.
-    `marks`: None, or two vectors for each splat that collect its sum of weights and its largest alphas.
     """
     attenuation, highest = broadcast(_f(1.0) if over else _f(0.0)), broadcast(ceiling)
     stop, none = broadcast(finished), broadcast(_f(0.0))
@@ -360,12 +359,6 @@ def _composite(num, block, first, end, shear, rise, scratch, background, over, c
             alpha = select(alpha < highest, alpha, highest)
             alpha = select(power >= broadcast(block[_u(_LEAST * BLOCK) + e]), alpha, none)
             weight = alpha * select(transmittance > stop, transmittance, none)
-            if marks is not None:
-                place = e * _u(2 * LANES)
-                store(marks, place, load(marks, place) + weight)
-                place += _u(LANES)
-                visible, most = select(transmittance > stop, alpha, none), load(marks, place)
-                store(marks, place, select(visible > most, visible, most))
             transmittance = transmittance - attenuation * weight
             c_0th = c_0th + weight * broadcast(block[color + e])
             if channels > _u(1):
@@ -386,19 +379,6 @@ def _composite(num, block, first, end, shear, rise, scratch, background, over, c
             store(scratch, plane + _u(2 * PIXELS), c_2nd)
         if channels > _u(3):
             store(scratch, plane + _u(3 * PIXELS), c_3rd)
-
-
-@kernel
-def _reduce_marks(listed, marks, visibility):
-    """Reduce a block's marks into its entries' (sum of weights, largest alpha), and clear them."""
-    for e in range(_u(len(listed))):
-        total, most = _f(0.0), _f(0.0)
-        for k in range(_u(LANES)):
-            total += marks[e * _u(2 * LANES) + k]
-            most = max(most, marks[e * _u(2 * LANES) + _u(LANES) + k])
-        visibility[listed[e], 0] += total
-        visibility[listed[e], 1] = max(visibility[listed[e], 1], most)
-    marks[:] = 0.0
 
 
 @kernel
@@ -478,14 +458,10 @@ def forward_rows(
     finished,
     image,
     transmittance,
-    visibility,
-    marks,
 ):
     """Composite rows begin..end of tiles into `image` (channels, height, width) and `transmittance` (height, width).
 
     `background` is a tuple of up to FEW channels, so that the loop over channels is unrolled, or an array.
-    `visibility`: None, or an output for the (sum of weights, largest alpha) of every entry; `marks`, zeros, is the
-    buffer of `_composite`.
 
     Returns the tiles' lists (start, entries relative to the rows' first, the end of those composited), and the
     transmittance of every pixel of a tile at the start of each block but the first, tile after tile.
@@ -502,8 +478,6 @@ def forward_rows(
     scratch, block = _aligned_empty((1 + len(background)) * PIXELS), _aligned_empty((_COLOR + len(background)) * BLOCK)
     first, after = np.empty(CELLS * BLOCK, np.int32), np.empty(CELLS * BLOCK, np.int32)
     shear, rise = _aligned_empty(BLOCK), _aligned_empty(BLOCK)
-    if visibility is not None:
-        visibility[row_start[begin] : row_start[end]] = 0.0
     kept = 0
     for tile in range(len(used)):
         top, left = (begin + tile // across) * TILE, tile % across * TILE
@@ -519,9 +493,7 @@ def forward_rows(
                 kept += 1
             part = listed[k : min(k + BLOCK, tile_start[tile + 1])]
             _load_block(geometry, color, background, entries, part, _f(left), _f(top), block, first, after)
-            _composite(len(part), block, first, after, shear, rise, scratch, background, over, ceiling, finished, marks)
-            if visibility is not None:
-                _reduce_marks(part, marks, visibility[row_start[begin] : row_start[end]])
+            _composite(len(part), block, first, after, shear, rise, scratch, background, over, ceiling, finished)
         _write_tile(scratch, background, image, transmittance, top, left)
     return tile_start, listed, used, block_transmittances[:kept]
 
@@ -751,17 +723,6 @@ def gather(
             by_w = total[4] * v + total[5] * w
             d_factor[i, 0, k] = c * p * by_v
             d_factor[i, 1, k] = c * (q * by_v + r * by_w)
-
-
-@kernel
-def gather_visibility(start, stop, first_slot, slot_position, visibility, contribution, largest_alpha):
-    """Sum the weights and take the largest alpha over the entries of splats start..stop."""
-    for i in range(start, stop):
-        total, most = _f(0.0), _f(0.0)
-        for s in range(first_slot[i], first_slot[i + 1]):
-            total += visibility[slot_position[s], 0]
-            most = max(most, visibility[slot_position[s], 1])
-        contribution[i], largest_alpha[i] = total, most
 
 
 @exact_kernel

@@ -30,7 +30,7 @@ class Densification(DensityControl):
         if not (state.growing and state.plan):
             return False
         growth = self.config.strategy.growth.for_plan(state.plan)
-        return growth.changes_at(state.step) or state.step + 1 >= growth.until_step
+        return growth.grows_at(state.step) or growth.resets_at(state.step) or state.step + 1 >= growth.until_step
 
     def apply(self, state: FitState) -> None:
         """What is due at the state's step; after the last, statistics end."""

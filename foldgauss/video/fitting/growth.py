@@ -111,10 +111,6 @@ class Growth:
         """Whether Gaussians are cloned, split and pruned after this step (steps count from 1)."""
         return self.from_step < step < self.until_step and step % self.every == 0
 
-    def changes_at(self, step: int) -> bool:
-        """Whether any Gaussian is added, pruned or reset after this step."""
-        return self.grows_at(step) or self.resets_at(step)
-
     def resets_at(self, step: int) -> bool:
         """Whether opacities are reset after this step."""
         return step < self.until_step and step % self.reset_every == 0

@@ -53,17 +53,6 @@ class FrameTimes(eqx.Module):
         summed = jnp.cumsum(jax.nn.softmax(jnp.asarray(self.logits)))
         return jnp.concatenate([jnp.zeros(1, summed.dtype), summed / summed[-1:]])
 
-    def cut_after(self, k: int) -> bool:
-        """Whether there is a cut between frames k and k + 1. Raises ValueError unless both are frames of the clip."""
-        check_frame_before(k, self.num_frames)
-        return bool(is_cut(self.times())[k])
-
-
-def check_frame_before(k: object, num_frames: int) -> None:
-    """Raise unless `k` is the number of a frame before the last one."""
-    if not is_integer(k, 0) or k > num_frames - 2:
-        raise invalid("k", expected=f"the number of a frame before the last of {num_frames}", got=short_repr(k))
-
 
 def make_time_logits(num_frames: int, cuts: Sequence[int]) -> Float32[np.ndarray, " intervals"]:
     """Softmax weights (num_frames - 1,) of evenly spaced frame times with a gap before each of the frames `cuts`.

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from foldgauss._runtime.checks import is_within, require
 from foldgauss.video.models.frame_times import is_cut
 from foldgauss.video.models.renderer import RenderedVideo, VideoRenderer
-from foldgauss.video.motion.optical_flow import both_flows, match_points
+from foldgauss.video.motion.optical_flow import both_flows, fit_size, match_points
 
 #: The longer side, in pixels, of the images that flow is computed on.
 SIDE = 480
@@ -101,9 +101,7 @@ def estimate_camera_path(video: RenderedVideo, *, on_frame: Callable[[], None] =
     **Example:** `estimate_camera_path(model).smoothed(frames=12)`.
     **Source:** Kroeger et al. 2016 (DIS flow); Fischler and Bolles 1981 (RANSAC).
     """
-    height, width = video.size
-    scale = min(1.0, SIDE / max(height, width))
-    size = max(16, round(height * scale)), max(16, round(width * scale))
+    size = fit_size(SIDE, *video.size)[::-1]
     times = np.asarray(video.frame_times.times(), np.float64)
     cut = np.asarray(is_cut(times))
     matrices, inliers, starts = np.tile(np.eye(3), (len(times), 1, 1)), np.ones(len(times)), [0]
