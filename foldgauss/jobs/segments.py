@@ -203,14 +203,13 @@ def plan_long_fit(
     index = _load_index(folder, plan, clip)
     if index is None:
         index = index_video(clip, frames=frames, on_frame=on_frame, **reading._asdict())
-        if plan is not None and plan["digest"] != index.digest:
-            cure = "Use that clip, or start over with --overwrite."
-            raise invalid(
-                "clip",
-                expected=f"the clip that the fit was started with, {plan['clip']!r}",
-                got=f"other frames in {str(clip)!r}",
-                cure=cure,
-            )
+        require(
+            plan is None or plan["digest"] == index.digest,
+            "clip",
+            expected=f"the clip that the fit was started with, {(plan or {}).get('clip')!r}",
+            got=f"other frames in {str(clip)!r}",
+            cure="Use that clip, or start over with --overwrite.",
+        )
     length = max(round(segment_seconds * index.fps), 2)
     overlap = max(min(overlap, length // 4), 1)  # so that no frame is in three
     spans = plan_segments(index.num_frames, index.cuts, length=length, overlap=overlap)
@@ -269,9 +268,9 @@ def _check_folder(folder: Path) -> None:
     if not folder.is_dir():
         return
     foreign = sorted(entry.name for entry in folder.iterdir() if not entry.name.startswith(_OWN))
-    if foreign:
+    for name in foreign[:1]:
         raise invalid(
-            "target", expected=f"only files of a fit in {folder}", got=f"{foreign[0]!r} in it", cure="Move it away."
+            "target", expected=f"only files of a fit in {folder}", got=f"{name!r} in it", cure="Move it away."
         )
 
 

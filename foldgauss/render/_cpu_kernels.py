@@ -24,7 +24,7 @@ from foldgauss._numerics.simd import (
     store,
     transpose_cells,
 )
-from foldgauss._runtime.kernels import exact_kernel, inline, kernel
+from foldgauss._runtime.kernels import inline, kernel
 
 TILE = 16
 PIXELS = TILE * TILE
@@ -723,12 +723,3 @@ def gather(
             by_w = total[4] * v + total[5] * w
             d_factor[i, 0, k] = c * p * by_v
             d_factor[i, 1, k] = c * (q * by_v + r * by_w)
-
-
-@exact_kernel
-def raise_screen_gradients(start, stop, d_mean, half_width, half_height, first_slot, indices, largest):
-    """`cpu.raise_screen_gradients` for splats start..stop."""
-    for i in range(start, stop):
-        if first_slot[i] < first_slot[i + 1]:
-            x, y = half_width * d_mean[i, 0], half_height * d_mean[i, 1]
-            largest[indices[i]] = max(largest[indices[i]], math.sqrt(x * x + y * y))

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from foldgauss._runtime.checks import check_one_of, invalid
+from foldgauss._runtime.checks import check_one_of, require
 from foldgauss._runtime.device import default_platform
 from foldgauss.render import cpu, pallas
 from foldgauss.render.reference import render_reference
@@ -70,25 +70,38 @@ def render(
     check_one_of("engine", engine, ENGINES)
     check_one_of("compositing", compositing, COMPOSITINGS)
     check_size(size)
-    if not isinstance(splats, Splats2D):
-        cure = "For Gaussians3D use foldgauss.render.project first."
-        raise invalid("splats", expected="Splats2D", got=type(splats).__name__, cure=cure)
-    if not isinstance(options, RenderOptions | None):
-        cure = "A preset is RenderOptions.fast(), with parentheses."
-        raise invalid("options", expected="RenderOptions or None", got=repr(options), cure=cure)
-    if splats.mean.ndim != 2:
-        raise invalid(
-            "splats", expected="mean of shape (num, 2)", got=splats.mean.shape, cure="Use jax.vmap for a batch."
-        )
-    if not jnp.issubdtype(splats.mean.dtype, jnp.floating):
-        raise invalid("splats.mean", expected="a floating dtype", got=splats.mean.dtype)
+    require(
+        isinstance(splats, Splats2D),
+        "splats",
+        expected="Splats2D",
+        got=type(splats).__name__,
+        cure="For Gaussians3D use foldgauss.render.project first.",
+    )
+    require(
+        isinstance(options, RenderOptions | None),
+        "options",
+        expected="RenderOptions or None",
+        got=repr(options),
+        cure="A preset is RenderOptions.fast(), with parentheses.",
+    )
+    require(
+        splats.mean.ndim == 2,
+        "splats",
+        expected="mean of shape (num, 2)",
+        got=splats.mean.shape,
+        cure="Use jax.vmap for a batch.",
+    )
+    require(
+        jnp.issubdtype(splats.mean.dtype, jnp.floating),
+        "splats.mean",
+        expected="a floating dtype",
+        got=splats.mean.dtype,
+    )
     options = cpu.STANDARD if options is None else options
     channels, dtype = splats.color.shape[-1], splats.mean.dtype
     background = jnp.zeros(channels, dtype) if background is None else jnp.asarray(background, dtype)
-    if channels == 0:
-        raise invalid("splats.color", expected="at least one channel", got=f"shape {splats.color.shape}")
-    if background.shape != (channels,):
-        raise invalid("background", expected=f"shape ({channels},)", got=background.shape)
+    require(channels != 0, "splats.color", expected="at least one channel", got=f"shape {splats.color.shape}")
+    require(background.shape == (channels,), "background", expected=f"shape ({channels},)", got=background.shape)
     if engine == "auto":
         engine = choose_engine(options, dtype)
     if engine == "cpu":
@@ -100,7 +113,20 @@ def render(
     how = (tuple(map(int, size)), compositing, engine, options)
     if not (return_alpha or return_depth):
         return run(splats, background, *how)
-    _check_weighted(splats, compositing, return_depth)
+    require(
+        compositing == "over",
+        "compositing",
+        expected="'over' for alpha and depth",
+        got=repr(compositing),
+        cure="A sum has no transmittance; the image of colors of 1 is the sum of its alphas.",
+    )
+    require(
+        not return_depth or splats.depth is not None,
+        "splats.depth",
+        expected="a depth of each splat, shape (num,)",
+        got=None,
+        cure="foldgauss.render.project sets them.",
+    )
     # Images of the same weights: alpha is that of color 1, and the sum of weighted depths that of color z, both over 0.
     added = [jnp.ones_like(splats.opacity), *([splats.depth] if return_depth else [])]
     color = jnp.concatenate([splats.color, jnp.stack(added, -1).astype(splats.color.dtype)], -1)
@@ -118,16 +144,6 @@ def choose_engine(options: RenderOptions, dtype: np.dtype) -> str:
     if default_platform() == "cpu" and options.tile_size in (None, cpu.TILE):
         return "cpu"
     return "pallas" if dtype == jnp.float32 and pallas.is_preferred(options) else "xla"
-
-
-def _check_weighted(splats: Splats2D, compositing: str, depth: bool) -> None:
-    """Raise unless the image has an alpha, and the splats depths if they are needed."""
-    if compositing != "over":
-        cure = "A sum has no transmittance; the image of colors of 1 is the sum of its alphas."
-        raise invalid("compositing", expected="'over' for alpha and depth", got=repr(compositing), cure=cure)
-    if depth and splats.depth is None:
-        cure = "foldgauss.render.project sets them."
-        raise invalid("splats.depth", expected="a depth of each splat, shape (num,)", got=None, cure=cure)
 
 
 def _run_engine(splats, background, size, compositing, engine, options):

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.render.api import render
 from foldgauss.render.splats import RenderOptions, Splats2D
 
@@ -53,8 +53,7 @@ def solve_colors(
     Source: Hestenes and Stiefel 1952, conjugate gradients on the normal equations (CGNR), preconditioned by row sums.
     """
     frames, images = _check_frames(splats, images)
-    if not ridge >= 0:
-        raise invalid("ridge", expected="a number >= 0", got=ridge)
+    require(ridge >= 0, "ridge", expected="a number >= 0", got=ridge)
     # Conjugate gradients need at least single precision.
     dtype = frames[0].color.dtype
     if dtype.itemsize < 4:
@@ -104,19 +103,27 @@ def _check_frames(splats, images) -> tuple[list[Splats2D], list[Array]]:
     if isinstance(splats, Splats2D):
         splats, images = [splats], [images]
     splats, images = list(splats), list(images)
-    if not splats or len(splats) != len(images):
-        raise invalid("images", expected=f"one for each of {len(splats)} frames (at least 1)", got=len(images))
+    require(
+        splats and len(splats) == len(images),
+        "images",
+        expected=f"one for each of {len(splats)} frames (at least 1)",
+        got=len(images),
+    )
     shape, dtype = splats[0].color.shape, splats[0].color.dtype
     for one in splats:
-        if one.color.shape != shape:
-            raise invalid("splats", expected=f"colors of shape {shape} in every frame", got=one.color.shape)
+        require(
+            one.color.shape == shape, "splats", expected=f"colors of shape {shape} in every frame", got=one.color.shape
+        )
     images = [jnp.asarray(image, dtype) for image in images]
     for image in images:
-        if image.ndim != 3 or image.shape[-1] != shape[-1]:
-            raise invalid("images", expected=f"shape (height, width, {shape[-1]})", got=image.shape)
+        require(
+            image.ndim == 3 and image.shape[-1] == shape[-1],
+            "images",
+            expected=f"shape (height, width, {shape[-1]})",
+            got=image.shape,
+        )
     # One NaN would end the iteration of every channel at its first step.
     for name, arrays in (("images", images), ("splats.color", [splats[0].color])):
         count = sum(int(jnp.sum(~jnp.isfinite(one))) for one in arrays)
-        if count:
-            raise invalid(name, expected="finite numbers", got=f"{count} that are NaN or infinite")
+        require(not count, name, expected="finite numbers", got=f"{count} that are NaN or infinite")
     return splats, images

@@ -20,7 +20,7 @@ import math
 
 import numpy as np
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import _cpu_kernels as kernels
 from foldgauss.render.splats import RenderOptions, check_size
@@ -54,9 +54,13 @@ class Trace:
 
 def check_options(options: RenderOptions) -> None:
     """Raise ValueError for options that this engine does not support."""
-    if options.tile_size not in (None, TILE):
-        expected, cure = f"None or {TILE} for engine 'cpu'", "engine='xla' supports other sizes."
-        raise invalid("options.tile_size", expected=expected, got=options.tile_size, cure=cure)
+    require(
+        options.tile_size in (None, TILE),
+        "options.tile_size",
+        expected=f"None or {TILE} for engine 'cpu'",
+        got=options.tile_size,
+        cure="engine='xla' supports other sizes.",
+    )
 
 
 def forward(
@@ -135,12 +139,18 @@ def _check_leaves(mean, factor, opacity, color, background) -> None:
     shapes, dtypes = [np.shape(leaf) for leaf in leaves], {getattr(leaf, "dtype", None) for leaf in leaves}
     num, channels = shapes[2][:1], shapes[4][:1]
     expected = [(*num, 2), (*num, 2, 2), num, (*num, *channels), channels]
-    if shapes != expected or channels == (0,) or not (num and channels):
-        wanted = "shapes (num, 2), (num, 2, 2), (num,), (num, channels), (channels,), at least one channel"
-        raise invalid(names, expected=wanted, got=", ".join(map(str, shapes)))
-    if dtypes != {np.dtype(np.float32)}:
-        got = ", ".join(sorted(str(dtype) for dtype in dtypes))
-        raise invalid(names, expected="float32 NumPy arrays", got=got)
+    require(
+        shapes == expected and channels != (0,) and (num and channels),
+        names,
+        expected="shapes (num, 2), (num, 2, 2), (num,), (num, channels), (channels,), at least one channel",
+        got=", ".join(map(str, shapes)),
+    )
+    require(
+        dtypes == {np.dtype(np.float32)},
+        names,
+        expected="float32 NumPy arrays",
+        got=", ".join(sorted(str(dtype) for dtype in dtypes)),
+    )
 
 
 def _read_only(array: np.ndarray) -> np.ndarray:
@@ -155,8 +165,12 @@ def backward(trace: Trace, grad_image: np.ndarray) -> tuple[np.ndarray, ...]:
 
     That of the background is `background_gradient`. Raises ValueError if `grad_image` does not have the image's shape.
     """
-    if grad_image.shape != trace.image.shape:
-        raise invalid("grad_image", expected=f"the image's shape {trace.image.shape}", got=grad_image.shape)
+    require(
+        grad_image.shape == trace.image.shape,
+        "grad_image",
+        expected=f"the image's shape {trace.image.shape}",
+        got=grad_image.shape,
+    )
     grad_image, num, channels = _read_only(grad_image), len(trace.geometry), len(trace.image)
     slots = np.empty((len(trace.buckets[1]), kernels.slot_width(channels)), np.float32)  # of every (splat, row)
     grads = tuple(np.empty(shape, np.float32) for shape in ((num, 2), (num, 2, 2), (num,), (num, channels)))
@@ -188,11 +202,7 @@ def raise_screen_gradients(largest: np.ndarray, trace: Trace, d_mean: np.ndarray
 
     Source: Kerbl et al. 2023, 3D Gaussian Splatting, section 5.2.
     """
-    half_height, half_width = np.float32(trace.image.shape[1:]) / 2
-    num, first_slot = len(d_mean), trace.buckets[2]
-
-    def work(start: int) -> None:
-        stop = min(start + SPLATS_PER_TASK, num)
-        kernels.raise_screen_gradients(start, stop, d_mean, half_width, half_height, first_slot, indices, largest)
-
-    run_tasks(work, range(0, num, SPLATS_PER_TASK))
+    x, y = (d_mean * (np.float32(trace.image.shape[:0:-1]) / 2)).T
+    reaches = np.diff(trace.buckets[2]) > 0
+    before = largest[indices]
+    largest[indices] = np.where(reaches, np.maximum(before, np.sqrt(x * x + y * y)), before)

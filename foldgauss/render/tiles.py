@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.render.footprint import compute_whitener, covariance, squared_reach
 from foldgauss.render.splats import LARGEST_CAPACITY, RenderOptions
 
@@ -83,9 +83,13 @@ def make_plan(leaves, size, compositing, options, *, tile: int, batch_pixels: in
     batch = -(-num_tiles // num_batches)
     plan = Plan(size, compositing == "over", options, tile, 1, batch)
     capacity = options.list_capacity
-    if capacity is not None and capacity < num_tiles:
-        expected = f"at least the number of tiles, {num_tiles}"
-        raise invalid("options.list_capacity", expected=expected, got=capacity, cure="None chooses it.")
+    require(
+        capacity is None or capacity >= num_tiles,
+        "options.list_capacity",
+        expected=f"at least the number of tiles, {num_tiles}",
+        got=capacity,
+        cure="None chooses it.",
+    )
     if capacity is None:
         geometry = jax.lax.stop_gradient(leaves[:3])  # concrete even under an eager `grad`
         traced = any(isinstance(leaf, jax.core.Tracer) for leaf in geometry)

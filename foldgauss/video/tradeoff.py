@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss._runtime.settings import replace_settings
 from foldgauss.render import RenderOptions
 from foldgauss.video.editing.edited_video import EditedVideo
@@ -124,12 +124,12 @@ class Skipped(NamedTuple):
 def check_axes(names: Sequence[str]) -> tuple[str, ...]:
     """The axes named, in the order of `AXES`. Raises ValueError for an unknown name, a name given twice and none."""
     unknown = [name for name in names if name not in AXES]
-    if unknown or not names or len(set(names)) < len(names):
-        raise invalid(
-            "axes",
-            expected="some of " + ", ".join(AXES) + ", each once",
-            got=", ".join(unknown) if unknown else ", ".join(names) or "none",
-        )
+    require(
+        not unknown and names and len(set(names)) == len(names),
+        "axes",
+        expected="some of " + ", ".join(AXES) + ", each once",
+        got=", ".join(unknown) if unknown else ", ".join(names) or "none",
+    )
     return tuple(name for name in AXES if name in names)
 
 

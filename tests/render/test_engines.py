@@ -99,7 +99,7 @@ def test_lists_end_where_all_pixels_are_finished():
     splats, size = scene("curtain")
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(splats)] + [np.zeros(3, np.float32)]
     trace = cpu.forward(*leaves, size)
-    assert sum(len(listed) for _, listed, *_ in trace.lists) * cpu.PIXELS < trace.num_pairs / 2
+    assert sum((stop - start[:-1]).sum() for start, _, stop, _ in trace.lists) * cpu.PIXELS < trace.num_pairs / 2
 
 
 def test_mutant_is_caught():

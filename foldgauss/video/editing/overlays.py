@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Bool, Float, Int
 
-from foldgauss._runtime.checks import check_one_of, invalid, require
+from foldgauss._runtime.checks import check_one_of, require
 from foldgauss.render import Gaussians3D, Triangles
 from foldgauss.video.editing.arguments import check_array, check_number, check_numbers
 from foldgauss.video.editing.clock import Clock
@@ -353,15 +353,14 @@ def _check_vertices(vertices: object, shape: tuple[int, ...]) -> Float[np.ndarra
 
 
 def _check_areas(factor: Float[np.ndarray, "num 3 2"]) -> None:
-    collinear = np.flatnonzero(~np.isfinite(factor).all((1, 2)))
-    if collinear.size:
-        got = f"{collinear.size} without area, the first at index {collinear[0]}"
-        raise invalid(
-            "vertices",
-            expected="triangles whose three vertices span a plane",
-            got=got,
-            cure="Move a vertex off the line through the other two.",
-        )
+    collinear = ~np.isfinite(factor).all((1, 2))
+    require(
+        not collinear.any(),
+        "vertices",
+        expected="triangles whose three vertices span a plane",
+        got=f"{collinear.sum()} without area, the first at index {np.append(collinear, True).argmax()}",
+        cure="Move a vertex off the line through the other two.",
+    )
 
 
 def _check_result(before: SelectedGaussians, after: object) -> SelectedGaussians:

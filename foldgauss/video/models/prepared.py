@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import Splats2D
 from foldgauss.render.splats import check_size
@@ -35,7 +35,14 @@ class PreparedModel(PreparedVideo):
         check_size(size)
         height, width = model.size
         self.rows = pack(model.splats)
-        _check_finite(self.rows)
+        broken = int((~np.isfinite(self.rows)).any(-1).sum())
+        require(
+            not broken,
+            "model",
+            expected="finite numbers",
+            got=f"others in {broken:,} Gaussians",
+            cure="The fit diverged, or the model was edited: fit again.",
+        )
         power, floor = (_common_value(model.splats.envelope, name) for name in ("power", "floor"))
         aspect = height / width if aspect is None else aspect
         check_paths(model.splats)
@@ -55,20 +62,14 @@ class PreparedModel(PreparedVideo):
         return Splats2D(done.mean, done.factor, done.opacity, done.color)
 
 
-def _check_finite(rows: np.ndarray) -> None:
-    broken = int((~np.isfinite(rows)).any(-1).sum())
-    if broken:
-        got, cure = (
-            f"others in {broken:,} Gaussians",
-            "The fit diverged, or the model was edited: fit again.",
-        )
-        raise invalid("model", expected="finite numbers", got=got, cure=cure)
-
-
 def _common_value(envelope: TimeLikelihood, name: str) -> float:
     """The value that all Gaussians have in common."""
     values = np.unique(np.asarray(getattr(envelope, name)))
-    if values.size != 1:
-        got, cure = f"{values.size} different ones", "Use VideoModel.render, which supports one envelope per Gaussian."
-        raise invalid(f"model.splats.envelope.{name}", expected="one number for all Gaussians", got=got, cure=cure)
+    require(
+        values.size == 1,
+        f"model.splats.envelope.{name}",
+        expected="one number for all Gaussians",
+        got=f"{values.size} different ones",
+        cure="Use VideoModel.render, which supports one envelope per Gaussian.",
+    )
     return float(values[0])

@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 
 from foldgauss._numerics.batch import concrete_value
 from foldgauss._runtime import notebook_hooks
-from foldgauss._runtime.checks import invalid, is_integer, is_within, short_repr
+from foldgauss._runtime.checks import invalid, is_integer, is_within, require, short_repr
 from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import RenderOptions, Splats2D, cpu
@@ -53,10 +53,8 @@ def check_time(t: float, name: str = "t", cure: str = "Frame k is at frame_times
         value = concrete_value(time)
     except (TypeError, ValueError):
         raise invalid(name, expected="a time in [0, 1]", got=short_repr(t)) from None
-    if time.ndim:
-        raise invalid(name, expected="one time in [0, 1]", got=short_repr(t))
-    if value is not None and not 0 <= value <= 1:
-        raise invalid(name, expected="a time in [0, 1]", got=value, cure=cure)
+    require(not time.ndim, name, expected="one time in [0, 1]", got=short_repr(t))
+    require(value is None or 0 <= value <= 1, name, expected="a time in [0, 1]", got=value, cure=cure)
 
 
 def choose_time(video: "RenderedVideo", time: float | None, frame: int | None, seconds: float | None) -> float:
@@ -71,15 +69,19 @@ def choose_time(video: "RenderedVideo", time: float | None, frame: int | None, s
         return time
     num, cure = video.num_frames, "For what lies between frames use time or seconds."
     if frame is not None:
-        if not is_integer(frame, -math.inf):
-            raise invalid("frame", expected="the number of a frame", got=short_repr(frame), cure=cure)
+        require(
+            is_integer(frame, -math.inf), "frame", expected="the number of a frame", got=short_repr(frame), cure=cure
+        )
         if not -num <= frame < num:
             raise IndexError(f"frame: expected a number from {-num} to {num - 1} of {num} frames, got {frame}.")
         position = float(frame % num)
     else:
-        if not is_within(seconds, f"[0, {num / video.fps}]"):
-            expected = f"seconds in [0, {num / video.fps:g}], as {num} frames at {video.fps:g} a second last"
-            raise invalid("seconds", expected=expected, got=short_repr(seconds))
+        require(
+            is_within(seconds, f"[0, {num / video.fps}]"),
+            "seconds",
+            expected=f"seconds in [0, {num / video.fps:g}], as {num} frames at {video.fps:g} a second last",
+            got=short_repr(seconds),
+        )
         position = float(min(seconds * video.fps, num - 1))
     times, before = video.frame_times.times(), int(position)
     return times[before] + (position - before) * (times[min(before + 1, num - 1)] - times[before])
@@ -197,9 +199,13 @@ class VideoRenderer:
         """The images at `times` (default: the model's frame times), one by one."""
         chosen = np.asarray(self.model.frame_times.times() if times is None else times)
         close = 1e-6  # rounding of summed steps
-        if chosen.ndim != 1 or chosen.dtype.kind not in "fiu" or not ((chosen >= -close) & (chosen <= 1 + close)).all():
-            cure = "Frame k is at frame_times.times()[k]."
-            raise invalid("times", expected="a list of times in [0, 1]", got=short_repr(times), cure=cure)
+        require(
+            chosen.ndim == 1 and chosen.dtype.kind in "fiu" and ((chosen >= -close) & (chosen <= 1 + close)).all(),
+            "times",
+            expected="a list of times in [0, 1]",
+            got=short_repr(times),
+            cure="Frame k is at frame_times.times()[k].",
+        )
         for t in chosen:
             yield self.frame(t)
 

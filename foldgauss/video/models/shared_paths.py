@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from foldgauss._numerics.piecewise import locate, locate_in_rows
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.render import Splats2D
 
 #: A Gaussian's path is a byte: 0 for none, else the number of the path, from 1.
@@ -99,13 +99,27 @@ def check_paths(splats: Any) -> None:
     if splats.paths is None:
         return
     times, matrices = np.asarray(splats.paths.times), np.asarray(splats.paths.matrices)
-    if not (np.isfinite(times).all() and np.isfinite(matrices).all()):
-        raise invalid("paths", expected="finite times and matrices", got="others", cure="Fit again.")
-    if (np.diff(times, axis=1) < 0).any():
-        raise invalid("paths.times", expected="times that do not decrease", got="others", cure="Sort the knots.")
+    require(
+        np.isfinite(times).all() and np.isfinite(matrices).all(),
+        "paths",
+        expected="finite times and matrices",
+        got="others",
+        cure="Fit again.",
+    )
+    require(
+        (np.diff(times, axis=1) >= 0).all(),
+        "paths.times",
+        expected="times that do not decrease",
+        got="others",
+        cure="Sort the knots.",
+    )
     largest = int(np.asarray(splats.path_index).max(initial=0))
-    if largest > splats.paths.num_paths:
-        raise invalid("path_index", expected=f"paths from 0 to {splats.paths.num_paths}", got=largest)
+    require(
+        largest <= splats.paths.num_paths,
+        "path_index",
+        expected=f"paths from 0 to {splats.paths.num_paths}",
+        got=largest,
+    )
 
 
 def to_pixel_maps(
@@ -184,7 +198,6 @@ def join_paths(parts: Sequence[Any]) -> tuple[UInt8[np.ndarray, " num"], SharedP
                 numbers.append(known[key])
         own = np.zeros(part.num_gaussians, int) if part.paths is None else np.asarray(part.path_index)
         index.append(np.array(numbers)[own])
-    if len(rows) > MAX_PATHS:
-        raise invalid("paths", expected=f"at most {MAX_PATHS} in all", got=len(rows))
+    require(len(rows) <= MAX_PATHS, "paths", expected=f"at most {MAX_PATHS} in all", got=len(rows))
     times, matrices = map(np.stack, zip(*rows, strict=True))
     return jnp.asarray(np.concatenate(index).astype(np.uint8)), SharedPaths(jnp.asarray(times), jnp.asarray(matrices))

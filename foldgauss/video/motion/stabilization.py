@@ -57,7 +57,7 @@ def stabilize(
     Example: `stabilize(model, border="fill").render(frame=10)`.
     """
     require(
-        isinstance(video, RenderedVideo),
+        hasattr(video, "prepare"),
         "video",
         expected="a model or another video of it",
         got=type(video).__name__,

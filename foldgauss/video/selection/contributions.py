@@ -42,11 +42,6 @@ class Contributions:
     def num_gaussians(self) -> int:
         return self.model.num_gaussians
 
-    @property
-    def window(self) -> Float32[np.ndarray, "num_gaussians 2"]:
-        """First and last time at which each Gaussian is rendered."""
-        return self.prepared.window
-
     def at_frame(self, k: int) -> "FrameContributions":
         return self.at(float(self.times[k]))
 
@@ -93,11 +88,6 @@ class FrameContributions:
     @functools.cached_property
     def trace(self) -> cpu.Trace:
         return self._forward(self.splats.color, self.source.background)
-
-    @property
-    def image(self) -> Float32[np.ndarray, "3 height width"]:
-        """The rendered image over the background."""
-        return self.trace.image
 
     @functools.cached_property
     def total(self) -> Float32[np.ndarray, " num_alive"]:
@@ -161,7 +151,7 @@ def average_seen_colors(
     color, total = np.zeros((contributions.num_gaussians, 3)), np.zeros((contributions.num_gaussians, 1))
     for k in range(len(contributions.times)):
         frame = contributions.at_frame(k)
-        color[frame.alive] += frame.gather(frame.image)
+        color[frame.alive] += frame.gather(frame.trace.image)
         total[frame.alive] += frame.total[:, None]
     return np.divide(color, total, out=color, where=total > 0), total[:, 0] > 0
 

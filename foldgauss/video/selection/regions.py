@@ -48,22 +48,21 @@ def region_from_mask(model: VideoModel, mask: Masks, frame: int | None, frames: 
         )
     else:
         mask = np.asarray(mask)
-        if mask.ndim == 2 and frame is None and frames is None:
-            raise invalid(
-                "mask",
-                expected=f"({model.num_frames}, height, width)",
-                got=f"{mask.shape}",
-                cure="Name its frame: frame=k.",
-            )
+        require(
+            mask.ndim != 2 or frame is not None or frames is not None,
+            "mask",
+            expected=f"({model.num_frames}, height, width)",
+            got=f"{mask.shape}",
+            cure="Name its frame: frame=k.",
+        )
         numbers = resolve_frames(model.num_frames, frame, frames)
-        if mask.ndim not in (2, 3) or (mask.ndim == 3 and len(mask) != len(numbers)):
-            expected = f"one of shape (height, width), or {len(numbers)} of them"
-            raise invalid(
-                "mask",
-                expected=expected,
-                got=f"shape {mask.shape}",
-                cure="Name their frames: frame=k, frames=(first, stop) or mask={frame: mask}.",
-            )
+        require(
+            mask.ndim == 2 or (mask.ndim == 3 and len(mask) == len(numbers)),
+            "mask",
+            expected=f"one of shape (height, width), or {len(numbers)} of them",
+            got=f"shape {mask.shape}",
+            cure="Name their frames: frame=k, frames=(first, stop) or mask={frame: mask}.",
+        )
         _check_mask(model, mask, mask.ndim)
         found = dict(zip(numbers, mask, strict=True)) if mask.ndim == 3 else dict.fromkeys(numbers, mask)
     require(any(one.any() for one in found.values()), "mask", expected="a mask that is not empty", got="an empty one")

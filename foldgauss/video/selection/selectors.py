@@ -256,8 +256,9 @@ def list_criteria(**arguments: Any) -> list[tuple[Callable[..., Selection], dict
     defaults = {name: parameter.default for name, parameter in inspect.signature(select).parameters.items()}
     arguments = {name: bool(value) if isinstance(value, np.bool_) else value for name, value in arguments.items()}
     given = {name: value for name, value in arguments.items() if value is not defaults[name]}
-    if not isinstance(given.get("moving", True), bool):
-        raise invalid("moving", expected="True or False", got=repr(given["moving"]))
+    require(
+        isinstance(given.get("moving", True), bool), "moving", expected="True or False", got=repr(given.get("moving"))
+    )
     functions = {"mask": by_mask, "box": by_box, "polygon": by_polygon, "moving": by_motion, "color": by_color}
     functions |= {"click": by_click, "times": by_time}
     found = {name: {name: given[name]} for name in functions if name in given}
@@ -458,7 +459,7 @@ def by_time(
         # A single frame covers all times.
         start, stop = np.interp(ends, np.arange(last + 1), contributions.times) if last or alive else (0.0, 1.0)
     if alive:
-        return Selection((contributions.window[:, 0] < stop) & (start < contributions.window[:, 1]))
+        return Selection((contributions.prepared.window[:, 0] < stop) & (start < contributions.prepared.window[:, 1]))
     own = contributions.own_times
     return Selection((start <= own) & (own <= stop))
 

@@ -138,13 +138,15 @@ class CpuStepper:
         if mirrored:
             for plane in target:
                 cv2.flip(plane, 1, dst=plane)
-            mean, factor = np.empty_like(mean), np.empty_like(factor)
-            mirror(done.mean, done.factor, spec.size[1], out=(mean, factor))
+            mean, factor = mirror(mean, factor, spec.size[1])
         trace = self._render(dataclasses.replace(done, mean=mean, factor=factor))
+        own_loss = LOSSES[self.config.loss.name]
         if squared:
             loss = squared_loss(trace.image, target)
+        elif own_loss is not None:
+            loss = custom_loss(trace.image, target, own_loss)
         else:
-            loss = self._compute_loss(trace.image, target)
+            loss = image_loss(trace.image, target, ssim_fraction=self.config.loss.ssim_fraction)
         if fraction is None:
             state.frame_errors[k] = loss.mean_squared_error
         gradient = loss.gradient
@@ -152,16 +154,10 @@ class CpuStepper:
         gradient *= border_weights(*gradient.shape[1:], self.config.loss.border_weight)
         gradients = cpu.backward(trace, gradient)
         if mirrored:
-            mirror(*gradients[:2], 0, out=gradients[:2])
+            gradients = *mirror(*gradients[:2], 0), *gradients[2:]
         if screen is not None:
             cpu.raise_screen_gradients(screen, trace, gradients[0], done.alive)
         return loss, done, backpropagate(rows, done, gradients, spec, self.grad, by_path)
-
-    def _compute_loss(self, image: np.ndarray, target: np.ndarray) -> ImageLoss:
-        own = LOSSES[self.config.loss.name]
-        if own is not None:
-            return custom_loss(image, target, own)
-        return image_loss(image, target, ssim_fraction=self.config.loss.ssim_fraction)
 
     def _render(self, done: ConditionedSplats) -> cpu.Trace:
         return cpu.forward(

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from foldgauss._numerics.simd import LANES, broadcast, load, select, store, window
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss._runtime.kernels import inline, kernel
 from foldgauss._runtime.threads import run_tasks
 
@@ -196,12 +196,12 @@ def image_loss(rendered: np.ndarray, target: np.ndarray, *, ssim_fraction: float
     `rendered`, `target`: float32, planar (channels, height, width), values about [0, 1].
     `ssim_fraction` in [0, 1] is the lambda of 3DGS (Kerbl et al. 2023, eq. 7). Raises ValueError on other shapes.
     """
-    if rendered.shape != target.shape or rendered.ndim != 3:
-        raise invalid(
-            "rendered, target",
-            expected="one shape (channels, height, width)",
-            got=f"{rendered.shape}, {target.shape}",
-        )
+    require(
+        rendered.shape == target.shape and rendered.ndim == 3,
+        "rendered, target",
+        expected="one shape (channels, height, width)",
+        got=f"{rendered.shape}, {target.shape}",
+    )
     if ssim_fraction == 0:
         difference = rendered - target
         gradient = np.sign(difference) * np.float32(1 / rendered.size)
