@@ -72,34 +72,36 @@ class LongFit:
                 expected, cure = f"{job.name} as it was written", "Run the same command again to fit it again."
                 raise OutputError(str(invalid("path", expected=expected, got=got, cure=cure)))
         sources = [(first, job.target) for (first, _), job in zip(self.spans, self.jobs, strict=True)]
-        scores = [(records[job.name]["psnr"], records[job.name]["ssim"]) for job in self.jobs]
-        psnr_of, ssim_of = (_join_scores(self.spans, kind) for kind in zip(*scores, strict=True))
+        scores = np.zeros((2, self.spans[-1][1]))  # shared frames take those of the later segment
+        for (first, stop), job in zip(self.spans, self.jobs, strict=True):
+            scores[:, first:stop] = records[job.name]["psnr"], records[job.name]["ssim"]
         fades = [(b, stop) for (_, stop), (b, _) in zip(self.spans[:-1], self.spans[1:], strict=True) if b < stop]
         if fades:
-            self._score_fades(_open_segments(sources), fades, psnr_of, ssim_of, on_frame)
-        joined = JoinedFit(tuple(psnr_of.tolist()), tuple(ssim_of.tolist()), self.target, tuple(fades))
+            self._score_fades(sources, fades, scores, on_frame)
+        joined = JoinedFit(*map(tuple, scores.tolist()), self.target, tuple(fades))
         if len(sources) == 1:  # an ordinary model
             with atomic_path(self.target) as temporary:
                 shutil.copyfile(sources[0][1], temporary)
-        else:
-            metadata = self.metadata | mean_scores(joined) | self._describe_fits()
-            join_segments(self.target, sources, metadata=metadata)
-        return joined
-
-    def _describe_fits(self) -> dict[str, Any]:
-        """The metadata of `describe_fit`, with the sums of the segments."""
+            return joined
         each = [read_metadata(job.target) for job in self.jobs]
         summed = [name for name in ("steps", "fit_seconds", "processor_seconds", "waiting_seconds") if name in each[0]]
-        return keep_origin(each[0], "version", "budget") | {name: sum(one[name] for one in each) for name in summed}
+        about = keep_origin(each[0], "version", "budget") | {name: sum(one[name] for one in each) for name in summed}
+        join_segments(self.target, sources, metadata=self.metadata | mean_scores(joined) | about)
+        return joined
 
-    def _score_fades(self, video: SegmentedVideo, fades, psnr_of, ssim_of, on_frame) -> None:
-        """Replace the scores of shared frames by those of the joined video."""
+    def _score_fades(self, sources, fades, scores, on_frame) -> None:
+        """Replace the scores of shared frames by those of the joined video, which loads its segments on demand."""
+        segments = []
+        for first, file in sources:
+            load = partial(load_video_model, file)
+            segments.append(dataclasses.replace(Segment.from_model(first, load()), load=load))
+        video = SegmentedVideo(segments)
         times = video.frame_times.times()
         for first, stop in fades:
             clip = read_indexed(self.index, first, stop, size=self.jobs[0].size)
             for k, image in enumerate(video.frames(times[first:stop]), first):
                 target = clip.over_black[k - first]
-                psnr_of[k], ssim_of[k] = psnr(target, image), ssim(target, image)
+                scores[:, k] = psnr(target, image), ssim(target, image)
                 on_frame()
 
     def clean_up(self) -> None:
@@ -134,23 +136,6 @@ def seam_drops(
         around = np.concatenate([scores[max(first - beside, 0) : first], scores[stop : stop + beside]])
         drops.append(around.mean() - scores[first:stop].mean())
     return np.array(drops)
-
-
-def _open_segments(sources: Sequence[tuple[int, str]]) -> SegmentedVideo:
-    """The segments' files as one video that loads them on demand."""
-    segments = []
-    for first, file in sources:
-        load = partial(load_video_model, file)
-        segments.append(dataclasses.replace(Segment.from_model(first, load()), load=load))
-    return SegmentedVideo(segments)
-
-
-def _join_scores(spans: Sequence[tuple[int, int]], scores: Sequence[Sequence[float]]) -> np.ndarray:
-    """Scores by frame of the whole clip; shared frames take those of the later segment."""
-    whole_clip = np.zeros(spans[-1][1])
-    for (first, stop), own in zip(spans, scores, strict=True):
-        whole_clip[first:stop] = own
-    return whole_clip
 
 
 def segments_folder(target: str | os.PathLike) -> Path:

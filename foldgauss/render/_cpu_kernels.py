@@ -438,12 +438,6 @@ def _write_tile(scratch, background, image, transmittance, top, left):
                 out[x] = scratch[plane + x] + scratch[base + x] * behind
 
 
-@inline
-def _num_stored_blocks(start, stop):
-    """Blocks of a tile's list but the first: the transmittance at their start is stored for the backward pass."""
-    return max((stop - start + BLOCK - 1) // BLOCK - 1, 0)
-
-
 @kernel
 def forward_rows(
     begin,
@@ -470,9 +464,9 @@ def forward_rows(
     across = (width + TILE - 1) // TILE
     tile_start, listed = _bucket_tiles(geometry, row_start, entries, begin, end, height, width)
     entries = entries[row_start[begin] : row_start[end]]
-    num_stored = 0
+    num_stored = 0  # blocks but the first of each tile: the backward pass needs the transmittance at their start
     for tile in range(len(tile_start) - 1):
-        num_stored += _num_stored_blocks(tile_start[tile], tile_start[tile + 1])
+        num_stored += max((tile_start[tile + 1] - tile_start[tile] + BLOCK - 1) // BLOCK - 1, 0)
     used = np.empty(len(tile_start) - 1, np.int64)
     block_transmittances = np.empty((num_stored if over else 0, PIXELS), np.float32)
     scratch, block = _aligned_empty((1 + len(background)) * PIXELS), _aligned_empty((_COLOR + len(background)) * BLOCK)

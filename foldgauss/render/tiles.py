@@ -207,7 +207,9 @@ def make_lists(plan: Plan, projected: Projected, mean, begin) -> tuple[Lists, In
     owner = jnp.cumsum(marks.add(1, mode="drop")) - 1
     used = number < jnp.max(jnp.where(indices(num) < end, total, 0))
     owner = jnp.where(used, owner, 0)
-    rows, columns = _tile_of_slot(projected, owner, number - first[owner])
+    local, across = number - first[owner], jnp.maximum(projected.shape[1][owner], 1)
+    down = local // across
+    rows, columns = projected.first[0][owner] + down, projected.first[1][owner] + local - down * across
     used &= _reaches_tile(plan, projected, mean, owner, rows, columns)
     tile = jnp.where(used, rows * plan.grid[1] + columns, plan.num_tiles)
     tile, splat = _sort_by_tile(tile, owner, plan.num_tiles, num)
@@ -219,13 +221,6 @@ def make_lists(plan: Plan, projected: Projected, mean, begin) -> tuple[Lists, In
     length = bounds[1:] - bounds[:-1]
     order = jnp.argsort(-length).astype(jnp.int32).reshape(plan.num_batches, plan.batch)
     return Lists(splat, bounds[:-1], length, order), end
-
-
-def _tile_of_slot(projected: Projected, owner, local):
-    """Row and column of the tile of a splat's slot `local`."""
-    columns = jnp.maximum(projected.shape[1][owner], 1)
-    down = local // columns
-    return projected.first[0][owner] + down, projected.first[1][owner] + local - down * columns
 
 
 def _reaches_tile(plan: Plan, projected: Projected, mean, owner, rows, columns) -> Bool[Array, " slots"]:

@@ -17,13 +17,11 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.video.fitting.adam import RateUnits, adam_step, sparse_adam
+from foldgauss.video.fitting.adam import adam_step
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.models.conditioning import ConditioningSpec
 from foldgauss.video.models.frame_times import FrameTimes
-from foldgauss.video.models.metrics import psnr
-from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.row_layout import columns, unpack
 from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.models.video_model import VideoModel
@@ -319,28 +317,11 @@ def measure_relative_size(state: FitState, config: FitConfig) -> float:
     return math.exp(min(mean, 0.0)) / unit if unit and math.isfinite(mean) else 1.0
 
 
-def update_rows(state: FitState, grad: np.ndarray, touched: np.ndarray, rates: np.ndarray, *, units: RateUnits) -> bool:
-    """A step of Adam on the rows `touched`, in place; `grad` becomes zero there.
-
-    Returns whether these rows are finite.
-
-    `grad` is float32 (num, width), `rates` and `units` are those of `sparse_adam`.
-    """
-    moments = state.first, state.second, state.counts
-    return sparse_adam(state.rows, grad, *moments, touched, rates, rounded=state.rounded, units=units)
-
-
 def running_psnr(state: FitState) -> float:
     """dB, by the mean squared error of the frames as last seen; at most 100, as `psnr` has for equal images."""
     seen = state.frame_errors[state.frame_errors != 0]
     errors = seen if len(seen) else [error for _, error in state.start_errors] or [0.0]
     return -10 * math.log10(max(float(np.mean(errors)), 1e-10))
-
-
-def mean_psnr(state: FitState, config: FitConfig, frames: np.ndarray) -> float:
-    """dB, mean over all frames, rendered over black."""
-    renderer = VideoRenderer(to_model(state, config, frames.shape[1:3], 1.0))
-    return float(np.mean([psnr(frame[..., :3], image) for frame, image in zip(frames, renderer.frames(), strict=True)]))
 
 
 def spec_of(config: FitConfig, size: tuple[int, int]) -> ConditioningSpec:

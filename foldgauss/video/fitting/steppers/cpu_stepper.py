@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from foldgauss.render import cpu
-from foldgauss.video.fitting.adam import update_frame_times
+from foldgauss.video.fitting.adam import sparse_adam, update_frame_times
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.losses import LOSSES
 from foldgauss.video.fitting.schedule import RateSchedule, choose_start_frames, steps_per_pass, to_planes
@@ -18,7 +18,6 @@ from foldgauss.video.fitting.state import (
     paths_of,
     spec_of,
     update_paths,
-    update_rows,
 )
 from foldgauss.video.fitting.steppers.interpolated_frames import choose_targets, make_interpolated
 from foldgauss.video.fitting.steppers.jax_loss import custom_loss
@@ -91,7 +90,9 @@ class CpuStepper:
             touched = np.arange(len(state.rows))
         relative_size = measure_relative_size(state, config) if by_path.size else 1.0
         rates, time_rate = self.rates.at(progress, state.backoffs)
-        finite = update_rows(state, self.grad, touched, rates, units=config.rates.units)
+        moments, units = (state.first, state.second, state.counts), config.rates.units
+        arrays = state.rows, self.grad, *moments, touched
+        finite = sparse_adam(*arrays, rates, rounded=state.rounded, units=units)
         update_windows(state.rows, touched, self.window, spec)
         if config.learns_frame_times and num_frames > 2:
             moments = state.time_count, state.time_first, state.time_second
