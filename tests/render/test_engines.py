@@ -420,29 +420,23 @@ def test_colors_without_a_channel_raise(engine):
         render(bare, size, engine=engine)
 
 
-def test_batches_raise():
-    splats, size = scene("plain")
-    with pytest.raises(ValueError, match="vmap"):
-        render(jax.tree.map(lambda leaf: leaf[None], splats), size)
+PLAIN = scene("plain")[0]
+FLAT = Gaussians3D.from_flat(PLAIN)
+WRONG_TYPES = [
+    (lambda: render(jax.tree.map(lambda leaf: leaf[None], PLAIN), (9, 9)), "vmap"),
+    (lambda: Splats2D(PLAIN.mean, PLAIN.factor, PLAIN.opacity[:-1], PLAIN.color), "mean, factor, opacity, color"),
+    (lambda: render(FLAT, (9, 9)), r"splats: expected Splats2D, got Gaussians3D.*project"),
+    (lambda: render(PLAIN, (9, 9), options="fast"), "parentheses"),
+    (lambda: render(PLAIN, (9, 9), options=RenderOptions.fast), "parentheses"),
+    (lambda: project(PLAIN, Camera.front(0.5), (9, 9)), "gaussians: expected Gaussians3D"),
+    (lambda: project(FLAT, None, (9, 9)), "camera: expected Camera"),
+]
 
 
-def test_mismatched_shapes_raise():
-    splats, _ = scene("plain")
-    with pytest.raises(ValueError, match="mean, factor, opacity, color"):
-        Splats2D(splats.mean, splats.factor, splats.opacity[:-1], splats.color)
-
-
-def test_other_types_raise():
-    splats, size = scene("plain")
-    with pytest.raises(ValueError, match=r"splats: expected Splats2D, got Gaussians3D.*project"):
-        render(Gaussians3D.from_flat(splats), size)
-    for options in ("fast", RenderOptions.fast):
-        with pytest.raises(ValueError, match="parentheses"):
-            render(splats, size, options=options)
-    with pytest.raises(ValueError, match="gaussians: expected Gaussians3D"):
-        project(splats, Camera.front(0.5), size)
-    with pytest.raises(ValueError, match="camera: expected Camera"):
-        project(Gaussians3D.from_flat(splats), None, size)
+@pytest.mark.parametrize(("call", "message"), WRONG_TYPES)
+def test_other_types_raise(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
 
 
 @pytest.mark.parametrize(
