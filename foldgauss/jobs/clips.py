@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from foldgauss._runtime.checks import invalid, require
+from foldgauss._runtime.checks import require
 from foldgauss.io._atomic import MissingInput, describe_missing
 from foldgauss.io.media.clip import AS_STORED, Reading
 from foldgauss.io.media.images import IMAGE_SUFFIXES, image_paths, natural_sort_key
@@ -58,16 +58,14 @@ def find_clips(folder: str | os.PathLike) -> FoundClips:
     for entry in sorted(entries, key=lambda entry: natural_sort_key(entry.name)):
         is_clip = bool(image_paths(entry)) if entry.is_dir() else entry.suffix.lower() in CLIP_SUFFIXES
         (clips if is_clip else others).append(entry)
-    if not clips:
-        images = any(entry.suffix.lower() in IMAGE_SUFFIXES for entry in others)
-        raise invalid(
-            "folder",
-            expected="a folder with clips",
-            got=f"{str(folder)!r} without any",
-            cure=f"Its images are one clip: foldgauss fit {folder}."
-            if images
-            else "Video files, or folders of images.",
-        )
+    images = any(entry.suffix.lower() in IMAGE_SUFFIXES for entry in others)
+    require(
+        clips,
+        "folder",
+        expected="a folder with clips",
+        got=f"{str(folder)!r} without any",
+        cure=f"Its images are one clip: foldgauss fit {folder}." if images else "Video files, or folders of images.",
+    )
     return FoundClips(clips, others)
 
 

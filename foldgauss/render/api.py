@@ -157,7 +157,9 @@ def _run_engine(splats, background, size, compositing, engine, options):
     # Below single precision a sum of hundreds of splats has no digits left; "xla" keeps float64.
     inner = jnp.float32 if engine in ("cpu", "pallas") or dtype.itemsize < 4 else dtype
     leaves = tuple(leaf.astype(inner) for leaf in leaves)
-    if engine == "xla":
+    if engine != "cpu" and not len(leaves[2]):
+        image = jnp.broadcast_to(leaves[4][None, None, :], (*size, len(leaves[4])))
+    elif engine == "xla":
         image = render_xla(leaves, size, compositing=compositing, options=options)
     elif engine == "pallas":
         image = pallas.render_pallas(leaves, size, compositing=compositing, options=options)

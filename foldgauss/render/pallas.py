@@ -76,9 +76,6 @@ def render_pallas(
     leaves: tuple[Array, ...], size: tuple[int, int], *, compositing: str, options: RenderOptions
 ) -> Float[Array, "height width channels"]:
     """Render (mean, factor, opacity, color, background), all float32; see `render`."""
-    num, (height, width) = len(leaves[2]), size
-    if num == 0:
-        return jnp.broadcast_to(leaves[4][None, None, :], (height, width, len(leaves[4])))
     return _render_jit(_plan(leaves, size, compositing, options), leaves)
 
 

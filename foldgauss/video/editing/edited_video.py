@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from foldgauss._runtime.checks import invalid, is_integer, require
+from foldgauss._runtime.checks import is_integer, require
 from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, pixels_per_unit, project
 from foldgauss.video.editing.overlays import (
     AbstractOverlay,
@@ -136,20 +136,23 @@ def as_edited(video: VideoModel | EditedVideo) -> EditedVideo:
     """A model as a video of one layer, an edited video as it is. Raises ValueError for anything else."""
     if isinstance(video, EditedVideo):
         return video
-    if not isinstance(video, VideoModel):
-        kind = "path" if isinstance(video, str | os.PathLike) else type(video).__name__
-        cures = {
-            "Edit": "End a chain of edits with .video().",
-            "SegmentedEdit": "End a chain of edits with .video().",
-            "list": "Stack several with layers(*videos).",
-            "tuple": "Stack several with layers(*videos).",
-            "path": "Read a file with foldgauss.io.load_video_model(path).",
-            "SegmentedVideo": ONE_SEGMENT,
-            "StabilizedVideo": "Edit first, and stabilize the edited video.",
-        }
-        raise invalid(
-            "video", expected="a VideoModel or an EditedVideo", got=type(video).__name__, cure=cures.get(kind, "")
-        )
+    kind = "path" if isinstance(video, str | os.PathLike) else type(video).__name__
+    cures = {
+        "Edit": "End a chain of edits with .video().",
+        "SegmentedEdit": "End a chain of edits with .video().",
+        "list": "Stack several with layers(*videos).",
+        "tuple": "Stack several with layers(*videos).",
+        "path": "Read a file with foldgauss.io.load_video_model(path).",
+        "SegmentedVideo": ONE_SEGMENT,
+        "StabilizedVideo": "Edit first, and stabilize the edited video.",
+    }
+    require(
+        isinstance(video, VideoModel),
+        "video",
+        expected="a VideoModel or an EditedVideo",
+        got=type(video).__name__,
+        cure=cures.get(kind, ""),
+    )
     return EditedVideo((Layer(video),), timeline=0)
 
 

@@ -130,10 +130,6 @@ class StabilizedVideo(FollowingVideo):
         """The map of the image at time t, in model space."""
         return self._interpolate(self.maps, t)
 
-    def path_at(self, t: float) -> Affine:
-        """The map of points of the first frame of the shot to the image at time t, in model space."""
-        return self._interpolate(self.path.matrices, t)
-
     def _interpolate(self, maps: Float[np.ndarray, "frames 3 3"], t: float) -> Affine:
         k, fraction = self._position(t)
         return maps[k] if fraction == 0 else (1 - fraction) * maps[k] + fraction * maps[k + 1]
@@ -193,7 +189,7 @@ class PreparedStabilizedVideo(PreparedVideo):
     def _beyond_borders(self, t: float, to_output: Affine) -> list[Splats2D]:
         """What other frames show where the image at time t, and those in front of them, have ended."""
         video, parts, in_front = self._video, [], [np.eye(3)]
-        here = np.linalg.inv(video.path_at(t))
+        here = np.linalg.inv(video._interpolate(video.path.matrices, t))
         for j in video.nearby_frames(t):
             to_frame = video.path.matrices[j] @ here  # from the image at t
             splats = _apply(np.linalg.inv(to_frame), self._seen(self._prepared.splats(float(video.path.times[j]))))
