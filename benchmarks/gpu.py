@@ -34,7 +34,8 @@ from foldgauss.io.datasets import sample_clip
 from foldgauss.render import RenderOptions, Splats2D, cpu, pallas, render, tiles, xla
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.loop import fit_steps
-from foldgauss.video.fitting.state import mean_psnr, to_model
+from foldgauss.video.fitting.state import to_model
+from foldgauss.video.models.metrics import evaluate
 from foldgauss.video.models.video_model import VideoModel
 
 ENGINES = {"xla": xla.TILE_SIZE, "pallas": pallas.TILE_SIZE}  # with the sides of their tiles
@@ -137,7 +138,8 @@ def measure_quality(frames: np.ndarray, config: FitConfig, looks: int) -> tuple[
             figures["compile_and_start_seconds"] = time.perf_counter() - begun
         share = state.seconds / (60 * config.minutes) if config.minutes else info.progress
         if share * looks >= len(courses) + 1 or info.stopped_by:
-            courses.append((state.seconds, mean_psnr(state, config, frames)))
+            model = to_model(state, config, frames.shape[1:3], 25.0)
+            courses.append((state.seconds, evaluate(model, frames).mean_psnr))
     figures |= {f"after_{seconds:.0f}_s_psnr": value for seconds, value in courses}
     figures |= {"psnr": courses[-1][1], "seconds": state.seconds, "steps": info.step}
     figures |= {"gaussians": state.num_gaussians, "ms_per_step": 1e3 * state.seconds / info.step}

@@ -216,7 +216,7 @@ def run_to_end(clip: Clip, name: str, config: FitConfig, folder: Path) -> Run:
     model = to_model(state, config, clip.size, clip.fps)
     run = scores(model, clip.frames) | {"gaussians": model.num_gaussians, "steps": info.step}
     run |= {"floats": model.num_parameters} | size_on_disk(model, clip)
-    checkpoint.remove()
+    checkpoint.path.unlink(missing_ok=True)
     return run | {"seconds": info.seconds, "cpu_hours": curve.cpu_seconds() / 3600}
 
 

@@ -42,7 +42,7 @@ from foldgauss.io.models.video_model import load_video_model, read_origin
 from foldgauss.render import Camera
 from foldgauss.video.editing.chain import Edit, edit
 from foldgauss.video.editing.edited_video import EditedVideo
-from foldgauss.video.editing.span import When
+from foldgauss.video.editing.timing import When
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.layering import layers
 from foldgauss.video.segmented.segmented_edit import SegmentedEdit

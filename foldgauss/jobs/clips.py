@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from foldgauss._runtime.checks import invalid, require
+from foldgauss._runtime.checks import require
 from foldgauss.io._atomic import MissingInput, describe_missing
 from foldgauss.io.media.clip import AS_STORED, Reading
 from foldgauss.io.media.images import IMAGE_SUFFIXES, image_paths, natural_sort_key
 from foldgauss.io.media.writing import ANIMATION_SUFFIXES
 from foldgauss.io.models.compact import COMPACT_SUFFIX
 from foldgauss.io.models.video_model import MODEL_SUFFIX
-from foldgauss.jobs.job import FitJob
+from foldgauss.jobs.job import FitJob, stamp_clip
 from foldgauss.video.fitting.config import FitConfig
 
 #: Suffixes of video files: a file with one of them is taken for a clip, whatever its content.
@@ -58,16 +58,14 @@ def find_clips(folder: str | os.PathLike) -> FoundClips:
     for entry in sorted(entries, key=lambda entry: natural_sort_key(entry.name)):
         is_clip = bool(image_paths(entry)) if entry.is_dir() else entry.suffix.lower() in CLIP_SUFFIXES
         (clips if is_clip else others).append(entry)
-    if not clips:
-        images = any(entry.suffix.lower() in IMAGE_SUFFIXES for entry in others)
-        raise invalid(
-            "folder",
-            expected="a folder with clips",
-            got=f"{str(folder)!r} without any",
-            cure=f"Its images are one clip: foldgauss fit {folder}."
-            if images
-            else "Video files, or folders of images.",
-        )
+    images = any(entry.suffix.lower() in IMAGE_SUFFIXES for entry in others)
+    require(
+        clips,
+        "folder",
+        expected="a folder with clips",
+        got=f"{str(folder)!r} without any",
+        cure=f"Its images are one clip: foldgauss fit {folder}." if images else "Video files, or folders of images.",
+    )
     return FoundClips(clips, others)
 
 
@@ -100,7 +98,7 @@ def make_jobs(
             checkpoint_seconds=checkpoint_seconds,
             reading=reading,
             folder=str(out / RECORDS),
-            source=_stamp(clip),
+            source=stamp_clip(clip),
         )
         jobs.append(job)
     return jobs
@@ -108,7 +106,7 @@ def make_jobs(
 
 def _unique_names(clips: Sequence[Path]) -> list[str]:
     """A name for each clip that no other has: its stem, or the whole name."""
-    names = [_stem(clip) for clip in clips]
+    names = [clip.name if clip.is_dir() else clip.stem for clip in clips]
     while True:
         counts = Counter(name.casefold() for name in names)
         alike = [k for k, name in enumerate(names) if counts[name.casefold()] > 1 and name != clips[k].name]
@@ -116,17 +114,3 @@ def _unique_names(clips: Sequence[Path]) -> list[str]:
             return names
         for k in alike:  # then check again: the name a.mp4 may equal the stem of a.mp4.mkv
             names[k] = clips[k].name
-
-
-def _stem(clip: Path) -> str:
-    return clip.name if clip.is_dir() else clip.stem
-
-
-def _stamp(clip: Path) -> dict[str, list[int]]:
-    """Sizes and times of a clip's files, which differ if the clip was replaced."""
-    try:
-        files = image_paths(clip) if clip.is_dir() else [clip]
-        stats = [path.stat() for path in files]
-    except OSError:
-        return {}
-    return {"bytes": [stat.st_size for stat in stats], "modified": [stat.st_mtime_ns for stat in stats]}

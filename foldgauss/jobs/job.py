@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from foldgauss.io.media.clip import AS_STORED, Reading
+from foldgauss.io.media.images import image_paths
 from foldgauss.video.fitting.config import FitConfig
 
 #: Fields of a record besides the request and the scores of each frame.
@@ -84,6 +85,22 @@ def file_digest(path: str | os.PathLike) -> str:
     """The 16-byte BLAKE2b digest of a file, hexadecimal."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, partial(hashlib.blake2b, digest_size=16)).hexdigest()
+
+
+def limit_range(frames: tuple[int | None, int | None] | None, num: int) -> tuple[int | None, int | None] | None:
+    """The range of `num` frames; it may have ended beyond the clip."""
+    if frames is None or frames[1] is None:
+        return frames
+    return frames[0], min(frames[1], (frames[0] or 0) + num)
+
+
+def stamp_clip(clip: Path) -> dict[str, list[int]]:
+    """Sizes and times of a clip's files, which differ if the clip was replaced."""
+    try:
+        stats = [path.stat() for path in (image_paths(clip) if clip.is_dir() else [clip])]
+    except OSError:
+        return {}
+    return {"bytes": [stat.st_size for stat in stats], "modified": [stat.st_mtime_ns for stat in stats]}
 
 
 def write_request(job: FitJob) -> None:

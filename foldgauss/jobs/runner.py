@@ -4,6 +4,7 @@
 """
 
 import dataclasses
+import itertools
 import json
 import os
 import sys
@@ -28,7 +29,7 @@ from foldgauss.io.models.checkpoint import is_known_good, load_checkpoint, save_
 from foldgauss.io.models.compact import COMPACT_SUFFIX, leave_room, save_compact
 from foldgauss.io.models.video_model import save_video_model
 from foldgauss.io.provenance import describe_reading, describe_source, fingerprint
-from foldgauss.jobs.job import FitJob, file_digest, read_record
+from foldgauss.jobs.job import FitJob, file_digest, limit_range, read_record
 from foldgauss.video.compression.quantize import Quantized
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.divergence import FitDiverged
@@ -83,18 +84,12 @@ class Checkpoint:
                 raise
             return None
 
-    def save(self, state: FitState) -> None:
-        save_checkpoint(self.path, state, config=self.config, source=self.source)
-
     def try_save(self, state: FitState) -> None:
         """Save the state; a full disk must not end the fit."""
         try:
-            self.save(state)
+            save_checkpoint(self.path, state, config=self.config, source=self.source)
         except OSError as error:
             self.on_error(error, state.step)
-
-    def remove(self) -> None:
-        self.path.unlink(missing_ok=True)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,14 +148,19 @@ def run_fit(
         got="others",
         cure="Give a quality, a size or a PSNR.",
     )
-    clip = read_clip(job)
+    if job.index is None:
+        clip = read_video(job.clip, frames=job.frames, size=job.size, **job.reading._asdict())
+    else:
+        clip = read_indexed(FrameIndex.load(job.index), *job.frames, size=job.size)
+        clip = dataclasses.replace(clip, fps=job.fps or clip.fps)
     _limit_compiled(clip.frames.shape)
     checkpoint = Checkpoint(job.checkpoint, job.config, fingerprint(clip), on_checkpoint_error)
     state = None if resume == "never" else checkpoint.load(required=resume == "required")
     steps = fit_steps(clip.frames, job.config, state)
-    if resume == "never":
-        steps = _replacing(checkpoint, steps)
     with observer(clip, state) as observe:
+        if resume == "never":  # an earlier fit could be resumed by mistake; its checkpoint goes once a step is taken
+            steps = itertools.chain([next(steps)], steps)
+            job.checkpoint.unlink(missing_ok=True)
         state, info = run_steps(steps, observe, checkpoint, job.checkpoint_seconds)
     room = leave_room(job.config.size_mb, _make_metadata(job, clip, state))
     model, quantized = finish(state, clip.frames, dataclasses.replace(job.config, size_mb=room), clip.fps)
@@ -202,32 +202,11 @@ def run_steps(
     return state, info
 
 
-def _replacing(checkpoint: Checkpoint, steps: Iterable[tuple[FitState, FitInfo]]) -> Iterator[tuple[FitState, FitInfo]]:
-    """The steps; the first removes the checkpoint of an earlier fit, which could be resumed by mistake."""
-    for number, step in enumerate(steps):
-        if number == 0:
-            checkpoint.remove()
-        yield step
-
-
-def read_clip(job: FitJob) -> Clip:
-    """The frames of a job."""
-    if job.index is None:
-        return read_video(job.clip, frames=job.frames, size=job.size, **job.reading._asdict())
-    index = FrameIndex.load(job.index)
-    clip = read_indexed(index, *job.frames, size=job.size)
-    return clip if job.fps is None else dataclasses.replace(clip, fps=job.fps)
-
-
 def _make_metadata(job: FitJob, clip: Clip, state: FitState) -> dict[str, Any]:
-    return fit_metadata(clip, job.config.seed, job.frames) | job.metadata | describe_fit(job.config, state)
-
-
-def fit_metadata(clip: Clip, seed: int, frames: tuple[int | None, int | None] | None) -> dict[str, Any]:
-    """Metadata of a fitted model: its clip, the range of frames, the seed, and what `describe_reading` returns."""
-    if frames is not None and frames[1] is not None:  # the range may end beyond the clip
-        frames = frames[0], min(frames[1], (frames[0] or 0) + clip.num_declared)
-    return describe_source(clip, seed) | {"frames": frames} | describe_reading(clip)
+    """Metadata of a fitted model: its clip, the range of frames, the seed, how it was read, and `describe_fit`."""
+    frames = limit_range(job.frames, clip.num_declared)
+    about = describe_source(clip, job.config.seed) | {"frames": frames} | describe_reading(clip)
+    return about | job.metadata | describe_fit(job.config, state)
 
 
 def describe_fit(config: FitConfig, state: FitState) -> dict[str, Any]:
@@ -290,21 +269,20 @@ class Progress(NamedTuple):
 Report = Callable[[Progress], bool]
 
 
-class _Reporter:
+def _make_reporter(name: str, report: Report) -> Observer:
     """An observer that reports the progress of a job now and then."""
+    reported = time.monotonic()
 
-    def __init__(self, name: str, report: Report):
-        self.name, self.report, self.reported = name, report, time.monotonic()
-
-    def __call__(self, state: FitState, info: FitInfo) -> bool:
-        now = time.monotonic()
-        if now - self.reported <= REPORT_SECONDS and info.step != 1 and info.progress < 1:
+    def observe(state: FitState, info: FitInfo) -> bool:
+        nonlocal reported
+        if time.monotonic() - reported <= REPORT_SECONDS and info.step != 1 and info.progress < 1:
             return False
-        self.reported = now
-        progress = Progress(
-            self.name, info.progress, info.psnr, info.step, info.num_gaussians, info.seconds, info.seconds_left
+        reported = time.monotonic()
+        return not report(
+            Progress(name, info.progress, info.psnr, info.step, info.num_gaussians, info.seconds, info.seconds_left)
         )
-        return not self.report(progress)
+
+    return observe
 
 
 def fit_job(job: FitJob, report: Report = lambda progress: True) -> dict[str, Any]:
@@ -342,7 +320,7 @@ def _lock_target(job: FitJob) -> Iterator[None]:
 def _fit_and_record(job: FitJob, report: Report) -> dict[str, Any]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        run = run_fit(job, lambda clip, state: nullcontext(_Reporter(job.name, report)))
+        run = run_fit(job, lambda clip, state: nullcontext(_make_reporter(job.name, report)))
     run.save_checkpoint()  # the evaluation may be interrupted
     clip, info = run.clip, run.info
     scores = evaluate(run.model, clip.frames)

@@ -21,9 +21,10 @@ from foldgauss.io.media.indexing import FrameIndex, index_video, read_indexed
 from foldgauss.io.models.segmented import join_segments
 from foldgauss.io.models.video_model import MODEL_SUFFIX, keep_origin, load_video_model, read_metadata
 from foldgauss.io.provenance import describe_reading
-from foldgauss.jobs.job import FitJob, file_digest
+from foldgauss.jobs.job import FitJob, file_digest, limit_range, stamp_clip
+from foldgauss.jobs.runner import mean_scores
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.models.metrics import psnr, ssim
+from foldgauss.video.models.metrics import Evaluation, psnr, ssim
 from foldgauss.video.segmented.segmented_video import Segment, SegmentedVideo, plan_segments
 
 #: Default length of a segment.
@@ -71,33 +72,36 @@ class LongFit:
                 expected, cure = f"{job.name} as it was written", "Run the same command again to fit it again."
                 raise OutputError(str(invalid("path", expected=expected, got=got, cure=cure)))
         sources = [(first, job.target) for (first, _), job in zip(self.spans, self.jobs, strict=True)]
-        scores = [(records[job.name]["psnr"], records[job.name]["ssim"]) for job in self.jobs]
-        psnr_of, ssim_of = (_join_scores(self.spans, kind) for kind in zip(*scores, strict=True))
+        scores = np.zeros((2, self.spans[-1][1]))  # shared frames take those of the later segment
+        for (first, stop), job in zip(self.spans, self.jobs, strict=True):
+            scores[:, first:stop] = records[job.name]["psnr"], records[job.name]["ssim"]
         fades = [(b, stop) for (_, stop), (b, _) in zip(self.spans[:-1], self.spans[1:], strict=True) if b < stop]
         if fades:
-            self._score_fades(_open_segments(sources), fades, psnr_of, ssim_of, on_frame)
+            self._score_fades(sources, fades, scores, on_frame)
+        joined = JoinedFit(*map(tuple, scores.tolist()), self.target, tuple(fades))
         if len(sources) == 1:  # an ordinary model
             with atomic_path(self.target) as temporary:
                 shutil.copyfile(sources[0][1], temporary)
-            return JoinedFit(self.target, tuple(psnr_of.tolist()), tuple(ssim_of.tolist()), ())
-        means = {"mean_psnr": round(float(psnr_of.mean()), 3), "mean_ssim": round(float(ssim_of.mean()), 4)}
-        join_segments(self.target, sources, metadata=self.metadata | means | self._describe_fits())
-        return JoinedFit(self.target, tuple(psnr_of.tolist()), tuple(ssim_of.tolist()), tuple(fades))
-
-    def _describe_fits(self) -> dict[str, Any]:
-        """The metadata of `describe_fit`, with the sums of the segments."""
+            return joined
         each = [read_metadata(job.target) for job in self.jobs]
         summed = [name for name in ("steps", "fit_seconds", "processor_seconds", "waiting_seconds") if name in each[0]]
-        return keep_origin(each[0], "version", "budget") | {name: sum(one[name] for one in each) for name in summed}
+        about = keep_origin(each[0], "version", "budget") | {name: sum(one[name] for one in each) for name in summed}
+        join_segments(self.target, sources, metadata=self.metadata | mean_scores(joined) | about)
+        return joined
 
-    def _score_fades(self, video: SegmentedVideo, fades, psnr_of, ssim_of, on_frame) -> None:
-        """Replace the scores of shared frames by those of the joined video."""
+    def _score_fades(self, sources, fades, scores, on_frame) -> None:
+        """Replace the scores of shared frames by those of the joined video, which loads its segments on demand."""
+        segments = []
+        for first, file in sources:
+            load = partial(load_video_model, file)
+            segments.append(dataclasses.replace(Segment.from_model(first, load()), load=load))
+        video = SegmentedVideo(segments)
         times = video.frame_times.times()
         for first, stop in fades:
             clip = read_indexed(self.index, first, stop, size=self.jobs[0].size)
             for k, image in enumerate(video.frames(times[first:stop]), first):
                 target = clip.over_black[k - first]
-                psnr_of[k], ssim_of[k] = psnr(target, image), ssim(target, image)
+                scores[:, k] = psnr(target, image), ssim(target, image)
                 on_frame()
 
     def clean_up(self) -> None:
@@ -110,21 +114,11 @@ class LongFit:
 
 
 @dataclasses.dataclass(frozen=True)
-class JoinedFit:
+class JoinedFit(Evaluation):
     """A joined model and its scores: `psnr` in dB and `ssim` of every frame as played; `fades`: the shared frames."""
 
     path: Path
-    psnr: tuple[float, ...]
-    ssim: tuple[float, ...]
     fades: tuple[tuple[int, int], ...]
-
-    @property
-    def mean_psnr(self) -> float:
-        return float(np.mean(self.psnr))
-
-    @property
-    def mean_ssim(self) -> float:
-        return float(np.mean(self.ssim))
 
     @property
     def seam_drop(self) -> float | None:
@@ -142,23 +136,6 @@ def seam_drops(
         around = np.concatenate([scores[max(first - beside, 0) : first], scores[stop : stop + beside]])
         drops.append(around.mean() - scores[first:stop].mean())
     return np.array(drops)
-
-
-def _open_segments(sources: Sequence[tuple[int, str]]) -> SegmentedVideo:
-    """The segments' files as one video that loads them on demand."""
-    segments = []
-    for first, file in sources:
-        load = partial(load_video_model, file)
-        segments.append(dataclasses.replace(Segment.from_model(first, load()), load=load))
-    return SegmentedVideo(segments)
-
-
-def _join_scores(spans: Sequence[tuple[int, int]], scores: Sequence[Sequence[float]]) -> np.ndarray:
-    """Scores by frame of the whole clip; shared frames take those of the later segment."""
-    whole_clip = np.zeros(spans[-1][1])
-    for (first, stop), own in zip(spans, scores, strict=True):
-        whole_clip[first:stop] = own
-    return whole_clip
 
 
 def segments_folder(target: str | os.PathLike) -> Path:
@@ -211,26 +188,29 @@ def plan_long_fit(
     index = _load_index(folder, plan, clip)
     if index is None:
         index = index_video(clip, frames=frames, on_frame=on_frame, **reading._asdict())
-        if plan is not None and plan["digest"] != index.digest:
-            cure = "Use that clip, or start over with --overwrite."
-            raise invalid(
-                "clip",
-                expected=f"the clip that the fit was started with, {plan['clip']!r}",
-                got=f"other frames in {str(clip)!r}",
-                cure=cure,
-            )
+        require(
+            plan is None or plan["digest"] == index.digest,
+            "clip",
+            expected=f"the clip that the fit was started with, {(plan or {}).get('clip')!r}",
+            got=f"other frames in {str(clip)!r}",
+            cure="Use that clip, or start over with --overwrite.",
+        )
     length = max(round(segment_seconds * index.fps), 2)
-    spans = plan_segments(index.num_frames, index.cuts, length=length, overlap=_limit_overlap(overlap, length))
-    if frames is not None and frames[1] is not None:  # the range may end beyond the clip
-        frames = frames[0], min(frames[1], (frames[0] or 0) + index.num_declared)
+    overlap = max(min(overlap, length // 4), 1)  # so that no frame is in three
+    spans = plan_segments(index.num_frames, index.cuts, length=length, overlap=overlap)
+    frames = limit_range(frames, index.num_declared)
     metadata = {"clip": clip.name, "seed": config.seed, "frames": frames, "clip_digest": index.digest}
     metadata |= describe_reading(index)
     configs = _divide_size(config, spans, metadata)
     if restart and folder.is_dir():
         shutil.rmtree(folder)  # only once the clip has been read
-    _make_folder(folder)
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        text = f"--out: cannot make the folder {folder} ({error.strerror}). Choose another place."
+        raise OutputError(text) from error
     index.save(folder / _INDEX)
-    kept = {"clip": str(clip), "digest": index.digest, "stamp": _stamp(clip), "asked": request}
+    kept = {"clip": str(clip), "digest": index.digest, "stamp": stamp_clip(clip), "asked": request}
     with atomic_path(folder / _PLAN) as temporary:
         temporary.write_text(json.dumps(kept) + "\n")
     begin = 0 if frames is None else frames[0] or 0
@@ -268,19 +248,14 @@ def _divide_size(config: FitConfig, spans: Sequence[tuple[int, int]], metadata: 
     return [dataclasses.replace(config, size_mb=size_mb * one / sum(lengths)) for one in lengths]
 
 
-def _limit_overlap(overlap: int, length: int) -> int:
-    """At most a quarter of a segment, so that no frame is in three."""
-    return max(min(overlap, length // 4), 1)
-
-
 def _check_folder(folder: Path) -> None:
     """Raise ValueError for a folder with files other than those of a fit."""
     if not folder.is_dir():
         return
     foreign = sorted(entry.name for entry in folder.iterdir() if not entry.name.startswith(_OWN))
-    if foreign:
+    for name in foreign[:1]:
         raise invalid(
-            "target", expected=f"only files of a fit in {folder}", got=f"{foreign[0]!r} in it", cure="Move it away."
+            "target", expected=f"only files of a fit in {folder}", got=f"{name!r} in it", cure="Move it away."
         )
 
 
@@ -291,15 +266,6 @@ def read_segment_seconds(target: str | os.PathLike) -> float | None:
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
     return seconds if is_within(seconds, "(0, 1e9]") else None
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"--out: cannot make the folder {folder} ({error.strerror}). Choose another place."
-        ) from error
 
 
 def _load_plan(folder: Path, request: dict[str, Any]) -> dict[str, Any] | None:
@@ -325,19 +291,10 @@ def _load_plan(folder: Path, request: dict[str, Any]) -> dict[str, Any] | None:
 
 def _load_index(folder: Path, plan: dict[str, Any] | None, clip: Path) -> FrameIndex | None:
     """The saved index, if the clip has not changed since."""
-    if plan is None or plan.get("stamp") != _stamp(clip) or plan.get("clip") != str(clip) or not clip.is_file():
+    if plan is None or plan.get("stamp") != stamp_clip(clip) or plan.get("clip") != str(clip) or not clip.is_file():
         return None
     try:
         index = FrameIndex.load(folder / _INDEX)
     except (OSError, ValueError):
         return None
     return index if index.digest == plan["digest"] else None
-
-
-def _stamp(clip: Path) -> list[int]:
-    """Size and time of a file, which change when it is written again; less reliable for a folder."""
-    try:
-        stat = clip.stat()
-    except OSError:
-        return []
-    return [stat.st_size, stat.st_mtime_ns]

@@ -202,13 +202,13 @@ def running_cluster(address: str) -> Iterator["WorkerPool"]:
     Raises `SchedulerLost` if no scheduler answers, ImportError if dask.distributed is not installed.
     """
     distributed = _import_distributed("scheduler")
-    if not _ADDRESS.fullmatch(address):  # dask would retry for long, and leave a client behind
-        raise invalid(
-            "scheduler",
-            expected="an address as tcp://host:8786",
-            got=repr(address),
-            cure="`dask scheduler` prints it when it starts.",
-        )
+    require(
+        _ADDRESS.fullmatch(address),
+        "scheduler",
+        expected="an address as tcp://host:8786",
+        got=repr(address),
+        cure="`dask scheduler` prints it when it starts.",
+    )
     with _silence_dask():
         try:
             client = distributed.Client(address, set_as_default=False, timeout=CONNECT_SECONDS)

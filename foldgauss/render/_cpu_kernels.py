@@ -24,7 +24,7 @@ from foldgauss._numerics.simd import (
     store,
     transpose_cells,
 )
-from foldgauss._runtime.kernels import exact_kernel, inline, kernel
+from foldgauss._runtime.kernels import inline, kernel
 
 TILE = 16
 PIXELS = TILE * TILE
@@ -173,23 +173,6 @@ def fill_rows(start, stop, span, slot, fill, entries, first_slot, slot_position)
     first_slot[stop] = slot
 
 
-@kernel
-def project_and_bucket(
-    num_rows, mean, factor, opacity, color, height, width, low_pass, cutoff, support, geometry, span
-):
-    """`project` of all splats, then their rows: for few splats, calls from Python would dominate the time."""
-    num = len(opacity)
-    project(0, num, mean, factor, opacity, color, height, width, low_pass, cutoff, support, geometry, span)
-    row_start = np.zeros(num_rows + 1, np.int64)
-    count_rows(0, num, span, row_start[1:])
-    for row in range(num_rows):
-        row_start[row + 1] += row_start[row]
-    entries, slot_position = np.empty(row_start[-1], np.int32), np.empty(row_start[-1], np.int64)
-    first_slot = np.empty(num + 1, np.int64)
-    fill_rows(0, num, span, 0, row_start[:-1].copy(), entries, first_slot, slot_position)
-    return row_start, entries, first_slot, slot_position
-
-
 @inline
 def _right_edge(p, q, r, level, dy):
     """Right edge of the ellipse (p dx + q dy)^2 + (r dy)^2 = level on the line dy."""
@@ -335,12 +318,11 @@ def _offsets(block, e, x, y):
 
 
 @kernel
-def _composite(num, block, first, end, shear, rise, scratch, background, over, ceiling, finished, marks):
+def _composite(num, block, first, end, shear, rise, scratch, background, over, ceiling, finished):
     """Composite a block's splats onto the tile: scratch holds transmittance, then colors, cell after cell.
 
     A cell's transmittance and first FEW colors stay in registers while the splats that reach it, one bit each, are
     composited in turn; `shear` and `rise` are buffers for P dx + Q dy and R dy at its first pixel.
-    `marks`: None, or two vectors for each splat that collect its sum of weights and its largest alphas.
     """
     attenuation, highest = broadcast(_f(1.0) if over else _f(0.0)), broadcast(ceiling)
     stop, none = broadcast(finished), broadcast(_f(0.0))
@@ -377,12 +359,6 @@ def _composite(num, block, first, end, shear, rise, scratch, background, over, c
             alpha = select(alpha < highest, alpha, highest)
             alpha = select(power >= broadcast(block[_u(_LEAST * BLOCK) + e]), alpha, none)
             weight = alpha * select(transmittance > stop, transmittance, none)
-            if marks is not None:
-                place = e * _u(2 * LANES)
-                store(marks, place, load(marks, place) + weight)
-                place += _u(LANES)
-                visible, most = select(transmittance > stop, alpha, none), load(marks, place)
-                store(marks, place, select(visible > most, visible, most))
             transmittance = transmittance - attenuation * weight
             c_0th = c_0th + weight * broadcast(block[color + e])
             if channels > _u(1):
@@ -406,19 +382,6 @@ def _composite(num, block, first, end, shear, rise, scratch, background, over, c
 
 
 @kernel
-def _reduce_marks(listed, marks, visibility):
-    """Reduce a block's marks into its entries' (sum of weights, largest alpha), and clear them."""
-    for e in range(_u(len(listed))):
-        total, most = _f(0.0), _f(0.0)
-        for k in range(_u(LANES)):
-            total += marks[e * _u(2 * LANES) + k]
-            most = max(most, marks[e * _u(2 * LANES) + _u(LANES) + k])
-        visibility[listed[e], 0] += total
-        visibility[listed[e], 1] = max(visibility[listed[e], 1], most)
-    marks[:] = 0.0
-
-
-@kernel
 def _is_opaque(scratch, finished):
     """Whether every pixel of the tile is finished: its transmittance is not above the stop."""
     stop = broadcast(finished)
@@ -432,10 +395,6 @@ def _is_opaque(scratch, finished):
 def _clear_tile(scratch, rows, columns):
     """Initialize the scratch of a tile: transmittance 1 on `rows` x `columns` pixels, no color."""
     scratch[:] = 0.0
-    if rows == TILE and columns == TILE:
-        for p in range(_u(PIXELS)):
-            scratch[p] = 1.0
-        return
     for y in range(rows):  # pixels outside the image have transmittance 0: no work waits for them
         scratch[y * TILE : y * TILE + columns] = 1.0
     _reorder(scratch, _u(0))
@@ -466,9 +425,6 @@ def _write_tile(scratch, background, image, transmittance, top, left):
     """Write a tile into the image; overwrites its scratch."""
     height, width = transmittance.shape
     rows, columns = min(TILE, height - top), min(TILE, width - left)
-    if rows == TILE and columns == TILE:
-        _write_whole_tile(scratch, background, image.reshape(-1), transmittance.reshape(-1), height, width, top, left)
-        return
     for plane in range(_u(1 + len(background))):
         _reorder(scratch, plane * _u(PIXELS))
     for y in range(rows):
@@ -480,50 +436,6 @@ def _write_tile(scratch, background, image, transmittance, top, left):
             behind = background[c]
             for x in range(_u(columns)):
                 out[x] = scratch[plane + x] + scratch[base + x] * behind
-
-
-@kernel
-def _write_whole_tile(scratch, background, image, transmittance, height, width, top, left):
-    """`_write_tile` for tiles within the image; `image` and `transmittance` are flat."""
-    height, width, corner = _u(height), _u(width), _u(top) * _u(width) + _u(left)
-    for band in range(_u(CELLS)):
-        at = band * _u(TILE * CELL)
-        transmitted = _load_rows(scratch, at)
-        out = corner + band * _u(CELL) * width
-        store(transmittance, out, transmitted[0])
-        store(transmittance, out + width, transmitted[1])
-        store(transmittance, out + _u(2) * width, transmitted[2])
-        store(transmittance, out + _u(3) * width, transmitted[3])
-        for c in range(_u(len(background))):
-            behind = broadcast(background[c])
-            rows = _load_rows(scratch, (c + _u(1)) * _u(PIXELS) + at)
-            store(image, out, rows[0] + transmitted[0] * behind)
-            store(image, out + width, rows[1] + transmitted[1] * behind)
-            store(image, out + _u(2) * width, rows[2] + transmitted[2] * behind)
-            store(image, out + _u(3) * width, rows[3] + transmitted[3] * behind)
-            out += height * width
-
-
-@kernel
-def _trim_lists(tile_start, listed, used):
-    """The lists without the entries that were never composited, if that is worth a copy."""
-    total = 0
-    for tile in range(len(used)):
-        total += used[tile] - tile_start[tile]
-    if 2 * total > len(listed):
-        return tile_start, listed, used
-    kept, start, stop = np.empty(total, listed.dtype), np.zeros_like(tile_start), np.empty_like(used)
-    for tile in range(len(used)):
-        stop[tile] = start[tile] + used[tile] - tile_start[tile]
-        start[tile + 1] = stop[tile]
-        kept[start[tile] : stop[tile]] = listed[tile_start[tile] : used[tile]]
-    return start, kept, stop
-
-
-@inline
-def _num_stored_blocks(start, stop):
-    """Blocks of a tile's list but the first: the transmittance at their start is stored for the backward pass."""
-    return max((stop - start + BLOCK - 1) // BLOCK - 1, 0)
 
 
 @kernel
@@ -540,32 +452,26 @@ def forward_rows(
     finished,
     image,
     transmittance,
-    visibility,
-    marks,
 ):
     """Composite rows begin..end of tiles into `image` (channels, height, width) and `transmittance` (height, width).
 
     `background` is a tuple of up to FEW channels, so that the loop over channels is unrolled, or an array.
-    `visibility`: None, or an output for the (sum of weights, largest alpha) of every entry; `marks`, zeros, is the
-    buffer of `_composite`.
 
-    Returns the tiles' lists (start, entries relative to the rows' first, stop), the transmittance of every pixel of a
-    tile at the start of each block but the first, tile after tile, and the number of entries listed.
+    Returns the tiles' lists (start, entries relative to the rows' first, the end of those composited), and the
+    transmittance of every pixel of a tile at the start of each block but the first, tile after tile.
     """
     height, width = transmittance.shape
     across = (width + TILE - 1) // TILE
     tile_start, listed = _bucket_tiles(geometry, row_start, entries, begin, end, height, width)
     entries = entries[row_start[begin] : row_start[end]]
-    num_stored = 0
+    num_stored = 0  # blocks but the first of each tile: the backward pass needs the transmittance at their start
     for tile in range(len(tile_start) - 1):
-        num_stored += _num_stored_blocks(tile_start[tile], tile_start[tile + 1])
+        num_stored += max((tile_start[tile + 1] - tile_start[tile] + BLOCK - 1) // BLOCK - 1, 0)
     used = np.empty(len(tile_start) - 1, np.int64)
     block_transmittances = np.empty((num_stored if over else 0, PIXELS), np.float32)
     scratch, block = _aligned_empty((1 + len(background)) * PIXELS), _aligned_empty((_COLOR + len(background)) * BLOCK)
     first, after = np.empty(CELLS * BLOCK, np.int32), np.empty(CELLS * BLOCK, np.int32)
     shear, rise = _aligned_empty(BLOCK), _aligned_empty(BLOCK)
-    if visibility is not None:
-        visibility[row_start[begin] : row_start[end]] = 0.0
     kept = 0
     for tile in range(len(used)):
         top, left = (begin + tile // across) * TILE, tile % across * TILE
@@ -581,11 +487,9 @@ def forward_rows(
                 kept += 1
             part = listed[k : min(k + BLOCK, tile_start[tile + 1])]
             _load_block(geometry, color, background, entries, part, _f(left), _f(top), block, first, after)
-            _composite(len(part), block, first, after, shear, rise, scratch, background, over, ceiling, finished, marks)
-            if visibility is not None:
-                _reduce_marks(part, marks, visibility[row_start[begin] : row_start[end]])
+            _composite(len(part), block, first, after, shear, rise, scratch, background, over, ceiling, finished)
         _write_tile(scratch, background, image, transmittance, top, left)
-    return *_trim_lists(tile_start, listed, used), block_transmittances[:kept], len(listed)
+    return tile_start, listed, used, block_transmittances[:kept]
 
 
 @kernel
@@ -813,23 +717,3 @@ def gather(
             by_w = total[4] * v + total[5] * w
             d_factor[i, 0, k] = c * p * by_v
             d_factor[i, 1, k] = c * (q * by_v + r * by_w)
-
-
-@kernel
-def gather_visibility(start, stop, first_slot, slot_position, visibility, contribution, largest_alpha):
-    """Sum the weights and take the largest alpha over the entries of splats start..stop."""
-    for i in range(start, stop):
-        total, most = _f(0.0), _f(0.0)
-        for s in range(first_slot[i], first_slot[i + 1]):
-            total += visibility[slot_position[s], 0]
-            most = max(most, visibility[slot_position[s], 1])
-        contribution[i], largest_alpha[i] = total, most
-
-
-@exact_kernel
-def raise_screen_gradients(start, stop, d_mean, half_width, half_height, first_slot, indices, largest):
-    """`cpu.raise_screen_gradients` for splats start..stop."""
-    for i in range(start, stop):
-        if first_slot[i] < first_slot[i + 1]:
-            x, y = half_width * d_mean[i, 0], half_height * d_mean[i, 1]
-            largest[indices[i]] = max(largest[indices[i]], math.sqrt(x * x + y * y))

@@ -11,9 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from foldgauss._runtime.checks import check_one_of, invalid
+from foldgauss._runtime.checks import check_one_of, require
 from foldgauss._runtime.device import default_platform
-from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import cpu, pallas
 from foldgauss.render.reference import render_reference
 from foldgauss.render.splats import RenderOptions, Splats2D, check_size
@@ -71,25 +70,38 @@ def render(
     check_one_of("engine", engine, ENGINES)
     check_one_of("compositing", compositing, COMPOSITINGS)
     check_size(size)
-    if not isinstance(splats, Splats2D):
-        cure = "For Gaussians3D use foldgauss.render.project first."
-        raise invalid("splats", expected="Splats2D", got=type(splats).__name__, cure=cure)
-    if not isinstance(options, RenderOptions | None):
-        cure = "A preset is RenderOptions.fast(), with parentheses."
-        raise invalid("options", expected="RenderOptions or None", got=repr(options), cure=cure)
-    if splats.mean.ndim != 2:
-        raise invalid(
-            "splats", expected="mean of shape (num, 2)", got=splats.mean.shape, cure="Use jax.vmap for a batch."
-        )
-    if not jnp.issubdtype(splats.mean.dtype, jnp.floating):
-        raise invalid("splats.mean", expected="a floating dtype", got=splats.mean.dtype)
+    require(
+        isinstance(splats, Splats2D),
+        "splats",
+        expected="Splats2D",
+        got=type(splats).__name__,
+        cure="For Gaussians3D use foldgauss.render.project first.",
+    )
+    require(
+        isinstance(options, RenderOptions | None),
+        "options",
+        expected="RenderOptions or None",
+        got=repr(options),
+        cure="A preset is RenderOptions.fast(), with parentheses.",
+    )
+    require(
+        splats.mean.ndim == 2,
+        "splats",
+        expected="mean of shape (num, 2)",
+        got=splats.mean.shape,
+        cure="Use jax.vmap for a batch.",
+    )
+    require(
+        jnp.issubdtype(splats.mean.dtype, jnp.floating),
+        "splats.mean",
+        expected="a floating dtype",
+        got=splats.mean.dtype,
+    )
     options = cpu.STANDARD if options is None else options
     channels, dtype = splats.color.shape[-1], splats.mean.dtype
     background = jnp.zeros(channels, dtype) if background is None else jnp.asarray(background, dtype)
-    if channels == 0:
-        raise invalid("splats.color", expected="at least one channel", got=f"shape {splats.color.shape}")
-    if background.shape != (channels,):
-        raise invalid("background", expected=f"shape ({channels},)", got=background.shape)
+    require(channels != 0, "splats.color", expected="at least one channel", got=f"shape {splats.color.shape}")
+    require(background.shape == (channels,), "background", expected=f"shape ({channels},)", got=background.shape)
     if engine == "auto":
         engine = choose_engine(options, dtype)
     if engine == "cpu":
@@ -101,7 +113,20 @@ def render(
     how = (tuple(map(int, size)), compositing, engine, options)
     if not (return_alpha or return_depth):
         return run(splats, background, *how)
-    _check_weighted(splats, compositing, return_depth)
+    require(
+        compositing == "over",
+        "compositing",
+        expected="'over' for alpha and depth",
+        got=repr(compositing),
+        cure="A sum has no transmittance; the image of colors of 1 is the sum of its alphas.",
+    )
+    require(
+        not return_depth or splats.depth is not None,
+        "splats.depth",
+        expected="a depth of each splat, shape (num,)",
+        got=None,
+        cure="foldgauss.render.project sets them.",
+    )
     # Images of the same weights: alpha is that of color 1, and the sum of weighted depths that of color z, both over 0.
     added = [jnp.ones_like(splats.opacity), *([splats.depth] if return_depth else [])]
     color = jnp.concatenate([splats.color, jnp.stack(added, -1).astype(splats.color.dtype)], -1)
@@ -116,19 +141,9 @@ def render(
 
 def choose_engine(options: RenderOptions, dtype: np.dtype) -> str:
     """The engine that "auto" stands for, by the options and the dtype of the splats."""
-    if default_platform() == "cpu" and _cpu_takes(options):
+    if default_platform() == "cpu" and options.tile_size in (None, cpu.TILE):
         return "cpu"
     return "pallas" if dtype == jnp.float32 and pallas.is_preferred(options) else "xla"
-
-
-def _check_weighted(splats: Splats2D, compositing: str, depth: bool) -> None:
-    """Raise unless the image has an alpha, and the splats depths if they are needed."""
-    if compositing != "over":
-        cure = "A sum has no transmittance; the image of colors of 1 is the sum of its alphas."
-        raise invalid("compositing", expected="'over' for alpha and depth", got=repr(compositing), cure=cure)
-    if depth and splats.depth is None:
-        cure = "foldgauss.render.project sets them."
-        raise invalid("splats.depth", expected="a depth of each splat, shape (num,)", got=None, cure=cure)
 
 
 def _run_engine(splats, background, size, compositing, engine, options):
@@ -142,7 +157,9 @@ def _run_engine(splats, background, size, compositing, engine, options):
     # Below single precision a sum of hundreds of splats has no digits left; "xla" keeps float64.
     inner = jnp.float32 if engine in ("cpu", "pallas") or dtype.itemsize < 4 else dtype
     leaves = tuple(leaf.astype(inner) for leaf in leaves)
-    if engine == "xla":
+    if engine != "cpu" and not len(leaves[2]):
+        image = jnp.broadcast_to(leaves[4][None, None, :], (*size, len(leaves[4])))
+    elif engine == "xla":
         image = render_xla(leaves, size, compositing=compositing, options=options)
     elif engine == "pallas":
         image = pallas.render_pallas(leaves, size, compositing=compositing, options=options)
@@ -152,14 +169,6 @@ def _run_engine(splats, background, size, compositing, engine, options):
 
 
 _run_compiled = jax.jit(_run_engine, static_argnums=(2, 3, 4, 5))
-
-
-def _cpu_takes(options: RenderOptions) -> bool:
-    try:
-        cpu.check_options(options)
-    except ValueError:
-        return False
-    return True
 
 
 @jax.jit
@@ -180,7 +189,7 @@ def _render_cpu(size, compositing, options, *leaves):
 
     def fill(image, *leaves):
         trace = cpu.forward(*leaves, size, compositing=compositing, options=options)
-        _interleave(trace.image, image)
+        image[...] = cv2.merge(list(trace.image)).reshape(image.shape)  # faster than by NumPy
 
     shape = jax.ShapeDtypeStruct((*size, len(leaves[-1])), jnp.float32)
     return _call_on_host(fill, shape, *leaves)
@@ -195,7 +204,7 @@ def _render_cpu_bwd(size, compositing, options, leaves, grad_image):
 
     def differentiate(gradients, grad_image, *leaves):
         trace = cpu.forward(*leaves, size, compositing=compositing, options=options)
-        grad_image = _split_channels(grad_image)
+        grad_image = np.ascontiguousarray(np.moveaxis(grad_image, -1, 0))
         by_leaf = *cpu.backward(trace, grad_image), cpu.background_gradient(trace, grad_image)
         for out, gradient in zip(gradients, by_leaf, strict=True):
             out[...] = gradient
@@ -226,35 +235,3 @@ def _call_on_host(function: Callable, shapes, *arrays: jax.Array):
         return through_copies(*arrays)
     directly = buffer_callback(in_place, shapes, vmap_method="sequential")
     return jax.lax.platform_dependent(*arrays, cpu=directly, default=through_copies)
-
-
-PIXELS_PER_TASK = 1 << 17
-
-
-def _interleave(planes: np.ndarray, image: np.ndarray) -> None:
-    """Write planes (channels, height, width) into an image (height, width, channels)."""
-    rows = -(-PIXELS_PER_TASK // image.shape[1])
-
-    def copy_rows(top: int) -> None:
-        own = planes[:, top : top + rows]
-        if 2 <= len(planes) <= 4:
-            cv2.merge(list(own), image[top : top + rows])
-        else:
-            image[top : top + rows] = np.moveaxis(own, 0, -1)
-
-    run_tasks(copy_rows, range(0, len(image), rows))
-
-
-def _split_channels(image: np.ndarray) -> np.ndarray:
-    """The planes (channels, height, width) of an image (height, width, channels)."""
-    planes, rows = np.empty((image.shape[2], *image.shape[:2]), np.float32), -(-PIXELS_PER_TASK // image.shape[1])
-
-    def copy_rows(top: int) -> None:
-        own = planes[:, top : top + rows]
-        if 2 <= len(planes) <= 4:
-            cv2.split(image[top : top + rows], list(own))
-        else:
-            own[...] = np.moveaxis(image[top : top + rows], -1, 0)
-
-    run_tasks(copy_rows, range(0, len(image), rows))
-    return planes

@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
 from foldgauss._numerics.batch import concrete_value
-from foldgauss._runtime.checks import check_one_of, invalid, short_repr, warn_if_degrees
+from foldgauss._runtime.checks import check_one_of, invalid, require, short_repr, warn_if_degrees
 from foldgauss.render.splats import Splats2D, check_aspect, check_shapes, check_size, pixels_per_unit
 
 #: Horizontal field of view of the published VeGaS and MiraGe cameras, in radians: half of it has tangent 0.36.
@@ -100,15 +100,26 @@ class Gaussians3D(eqx.Module):
         scale. Source: Kerbl et al. 2023, 3D Gaussian Splatting, eq. 6.
         """
         for name, value, width in (("quaternion", quaternion, 4), ("scale", scale, 3)):
-            if np.shape(value) != (*np.shape(mean)[:-1], width):
-                expected = f"shape (num, {width}) for means of shape {np.shape(mean)}"
-                raise invalid(name, expected=expected, got=f"shape {np.shape(value)}")
+            require(
+                np.shape(value) == (*np.shape(mean)[:-1], width),
+                name,
+                expected=f"shape (num, {width}) for means of shape {np.shape(mean)}",
+                got=f"shape {np.shape(value)}",
+            )
         turns, scales = concrete_value(quaternion), concrete_value(scale)
-        if turns is not None and (turns == 0).all(-1).any():
-            raise invalid("quaternion", expected="(w, x, y, z) of a length above 0", got="zeros")
-        if scales is not None and (scales < 0).any():
-            cure = "3DGS stores their logarithms: pass jnp.exp(scale)."
-            raise invalid("scale", expected="standard deviations >= 0", got=f"a least of {scales.min()}", cure=cure)
+        require(
+            turns is None or not (turns == 0).all(-1).any(),
+            "quaternion",
+            expected="(w, x, y, z) of a length above 0",
+            got="zeros",
+        )
+        require(
+            scales is None or not (scales < 0).any(),
+            "scale",
+            expected="standard deviations >= 0",
+            got="some below 0",
+            cure="3DGS stores their logarithms: pass jnp.exp(scale).",
+        )
         w, x, y, z = jnp.moveaxis(_unit(jnp.asarray(quaternion)), -1, 0)
         rows = [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -117,13 +128,6 @@ class Gaussians3D(eqx.Module):
         ]
         rotation = jnp.stack([jnp.stack(row, -1) for row in rows], -2)
         return cls(mean, rotation * jnp.asarray(scale)[..., None, :], opacity, color)
-
-    def to_flat(self) -> Splats2D:
-        """The orthogonal projection on the plane z = 0: the marginal of (x, y), inverse of `from_flat`.
-
-        The covariance is recovered up to rounding, but not the factor itself.
-        """
-        return Splats2D(self.mean[..., :2], square_factor(self.factor[..., :2, :]), self.opacity, self.color)
 
 
 class Camera(eqx.Module):
@@ -148,14 +152,22 @@ class Camera(eqx.Module):
         if any(shape is None for shape in shapes):
             return  # placeholders, as inside tree transformations
         batch = shapes[2]
-        if shapes != [(*batch, 3, 3), (*batch, 3), batch, (*batch, 3)][: len(shapes)]:
-            expected, got = "shapes (3, 3), (3,), (), (3,)", ", ".join(map(str, shapes))
-            raise invalid("rotation, position, fov, lens", expected=expected, got=got)
+        require(
+            shapes == [(*batch, 3, 3), (*batch, 3), batch, (*batch, 3)][: len(shapes)],
+            "rotation, position, fov, lens",
+            expected="shapes (3, 3), (3,), (), (3,)",
+            got=", ".join(map(str, shapes)),
+        )
         if self.aspect is not None:
             check_aspect(self.aspect)
         fov = concrete_value(self.fov)
-        if fov is not None and not ((fov > 0) & (fov < math.pi)).all():
-            raise invalid("fov", expected="radians in (0, pi)", got=fov, cure="For degrees use math.radians.")
+        require(
+            fov is None or ((fov > 0) & (fov < math.pi)).all(),
+            "fov",
+            expected="radians in (0, pi)",
+            got=fov,
+            cure="For degrees use math.radians.",
+        )
 
     @classmethod
     def front(cls, aspect: float, *, fov: ArrayLike = FIELD_OF_VIEW) -> "Camera":
@@ -192,17 +204,24 @@ class Camera(eqx.Module):
         Raises ValueError if eye and target coincide, or up is along the line of sight; NaN under tracing.
         """
         eye, target, up = _as_float(eye), _as_float(target), _as_float(up)
-        if not eye.shape == target.shape == up.shape == (3,):
-            got = f"shapes {eye.shape}, {target.shape}, {up.shape}"
-            raise invalid("eye, target, up", expected="(x, y, z) each", got=got, cure="Use jax.vmap for a batch.")
+        require(
+            eye.shape == target.shape == up.shape == (3,),
+            "eye, target, up",
+            expected="(x, y, z) each",
+            got=f"shapes {eye.shape}, {target.shape}, {up.shape}",
+            cure="Use jax.vmap for a batch.",
+        )
         forward = _unit(target - eye)
         across = jnp.cross(forward, _unit(up))
         # A sine of the size of rounding errors does not determine a direction.
         undetermined = ~(_length(across) > 8 * jnp.finfo(across.dtype).eps)
-        if concrete_value(undetermined) is not None and undetermined.any() and not jnp.isnan(eye + target + up).any():
-            got = f"eye {eye}, target {target}, up {up}"
-            cure = "Looking straight up or down, choose another up, such as (0, 0, 1)."
-            raise invalid("eye, target, up", expected="two points, and up not along their line", got=got, cure=cure)
+        require(
+            concrete_value(undetermined) is None or not undetermined.any() or jnp.isnan(eye + target + up).any(),
+            "eye, target, up",
+            expected="two points, and up not along their line",
+            got=f"eye {eye}, target {target}, up {up}",
+            cure="Looking straight up or down, choose another up, such as (0, 0, 1).",
+        )
         right = jnp.where(undetermined, jnp.nan, _unit(across))
         return cls(jnp.stack([right, jnp.cross(forward, right), forward]), eye, _as_float(fov), aspect)
 
@@ -249,8 +268,7 @@ class Camera(eqx.Module):
         dtype = self.position.dtype
         _check_angle("azimuth", azimuth)
         _check_angle("elevation", elevation)
-        if np.shape(target) != (3,):
-            raise invalid("target", expected="(x, y, z)", got=short_repr(target))
+        require(np.shape(target) == (3,), "target", expected="(x, y, z)", got=short_repr(target))
         (cos_a, sin_a), (cos_e, sin_e) = (_cos_sin(jnp.asarray(angle, dtype)) for angle in (azimuth, elevation))
         zero, one, target = jnp.zeros((), dtype), jnp.ones((), dtype), jnp.asarray(target, dtype)
         about_y = jnp.stack([cos_a, zero, -sin_a, zero, one, zero, sin_a, zero, cos_a]).reshape(3, 3)
@@ -318,14 +336,15 @@ def project(
     """
     check_one_of("order", order, ORDERS)
     for name, value, kind in (("gaussians", gaussians, Gaussians3D), ("camera", camera, Camera)):
-        if not isinstance(value, kind):
-            raise invalid(name, expected=kind.__name__, got=type(value).__name__)
-    if not (isinstance(near, Real) and near >= 0):
-        raise invalid("near", expected="a depth >= 0 in model units", got=near)
-    if gaussians.mean.ndim != 2 or camera.position.ndim != 1:
-        got = f"{gaussians.mean.shape} and {camera.position.shape}"
-        expected, cure = "mean of shape (num, 3) and position of shape (3,)", "Use jax.vmap for a batch."
-        raise invalid("gaussians, camera", expected=expected, got=got, cure=cure)
+        require(isinstance(value, kind), name, expected=kind.__name__, got=type(value).__name__)
+    require(isinstance(near, Real) and near >= 0, "near", expected="a depth >= 0 in model units", got=near)
+    require(
+        gaussians.mean.ndim == 2 and camera.position.ndim == 1,
+        "gaussians, camera",
+        expected="mean of shape (num, 3) and position of shape (3,)",
+        got=f"{gaussians.mean.shape} and {camera.position.shape}",
+        cure="Use jax.vmap for a batch.",
+    )
     dtype = gaussians.mean.dtype
     rotation, position = camera.rotation.astype(dtype), camera.position.astype(dtype)
     intrinsics, middle = camera.intrinsics(size).astype(dtype), jnp.asarray([size[1] / 2, size[0] / 2], dtype)
@@ -405,35 +424,53 @@ def _cos_sin(angle: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""
 
 def _check_viewmat(viewmat: Float[Array, "4 4"]) -> None:
     """Raise unless it is a rigid motion; traced values are not checked."""
-    if viewmat.shape != (4, 4):
-        cure = "Append the row (0, 0, 0, 1) to [R, t]; use jax.vmap for several cameras."
-        raise invalid("viewmat", expected="shape (4, 4)", got=f"shape {viewmat.shape}", cure=cure)
+    require(
+        viewmat.shape == (4, 4),
+        "viewmat",
+        expected="shape (4, 4)",
+        got=f"shape {viewmat.shape}",
+        cure="Append the row (0, 0, 0, 1) to [R, t]; use jax.vmap for several cameras.",
+    )
     matrix = concrete_value(viewmat)
     if matrix is None:
         return
-    if not np.allclose(matrix[3], [0, 0, 0, 1], atol=ROTATION_TOLERANCE):
-        cure = "It multiplies columns (x, y, z, 1): transpose a matrix for rows."
-        raise invalid("viewmat", expected="a last row (0, 0, 0, 1)", got=matrix[3], cure=cure)
+    require(
+        np.allclose(matrix[3], [0, 0, 0, 1], atol=ROTATION_TOLERANCE),
+        "viewmat",
+        expected="a last row (0, 0, 0, 1)",
+        got=matrix[3],
+        cure="It multiplies columns (x, y, z, 1): transpose a matrix for rows.",
+    )
     error, det = np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max(), np.linalg.det(matrix[:3, :3])
-    if not (error <= ROTATION_TOLERANCE and det > 0 and np.isfinite(matrix).all()):
-        got = f"one with max |R R^T - 1| = {error:.3g} and determinant {det:.3g}"
-        cure = "Move a scale into the Gaussians; an axis that is mirrored must be so in them, too."
-        raise invalid("viewmat", expected="a rotation R and finite numbers", got=got, cure=cure)
+    require(
+        error <= ROTATION_TOLERANCE and det > 0 and np.isfinite(matrix).all(),
+        "viewmat",
+        expected="a rotation R and finite numbers",
+        got=f"one with max |R R^T - 1| = {error:.3g} and determinant {det:.3g}",
+        cure="Move a scale into the Gaussians; an axis that is mirrored must be so in them, too.",
+    )
 
 
 def _check_intrinsics(K: Float[Array, "3 3"]) -> None:
     """Raise unless it is a pinhole without skew; traced values are not checked."""
-    if K.shape != (3, 3):
-        cure = "For several cameras use jax.vmap."
-        raise invalid("K", expected="shape (3, 3)", got=f"shape {K.shape}", cure=cure)
+    require(
+        K.shape == (3, 3),
+        "K",
+        expected="shape (3, 3)",
+        got=f"shape {K.shape}",
+        cure="For several cameras use jax.vmap.",
+    )
     matrix = concrete_value(K)
     if matrix is None:
         return
     pinhole = np.array([[matrix[0, 0], 0, matrix[0, 2]], [0, matrix[1, 1], matrix[1, 2]], [0, 0, 1]])
-    if not (np.array_equal(matrix, pinhole) and matrix[0, 0] > 0 and matrix[1, 1] > 0 and np.isfinite(matrix).all()):
-        expected = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, fx and fy above 0"
-        cure = "Undistort images with cv2.undistort and a new camera matrix without skew."
-        raise invalid("K", expected=expected, got=matrix.tolist(), cure=cure)
+    require(
+        np.array_equal(matrix, pinhole) and matrix[0, 0] > 0 and matrix[1, 1] > 0 and np.isfinite(matrix).all(),
+        "K",
+        expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, fx and fy above 0",
+        got=matrix.tolist(),
+        cure="Undistort images with cv2.undistort and a new camera matrix without skew.",
+    )
 
 
 def _check_angle(parameter: str, angle: ArrayLike) -> None:

@@ -1,12 +1,13 @@
 """Colors by sparse least squares with fixed geometry: given alpha, every pixel is linear in the colors."""
 
+import functools
 from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.render.api import render
 from foldgauss.render.splats import RenderOptions, Splats2D
 
@@ -42,7 +43,7 @@ def solve_colors(
     - `ridge`: lambda as a fraction of the largest row sum of sum_k A_k^T A_k, a bound on its eigenvalues as no weight
       is negative; larger values keep colors of hardly visible splats near c_0. 0 is plain least squares.
     - `tolerance`, `max_iterations`: conjugate gradients stop once the residual of the normal equations has fallen by
-      this factor in every channel, or after this many products with A and its transpose.
+      this factor, or after this many products with A and its transpose.
 
     Returns (num, channels). Raises ValueError if frames and images do not match or hold values that are not finite.
     Not for use inside `jit`: convergence is checked on the host.
@@ -52,8 +53,7 @@ def solve_colors(
     Source: Hestenes and Stiefel 1952, conjugate gradients on the normal equations (CGNR), preconditioned by row sums.
     """
     frames, images = _check_frames(splats, images)
-    if not ridge >= 0:
-        raise invalid("ridge", expected="a number >= 0", got=ridge)
+    require(ridge >= 0, "ridge", expected="a number >= 0", got=ridge)
     # Conjugate gradients need at least single precision.
     dtype = frames[0].color.dtype
     if dtype.itemsize < 4:
@@ -88,33 +88,14 @@ def solve_colors(
     def normal(colors):
         return transpose(forward(colors)) + damping * colors
 
+    def precondition(residual):
+        scale = row_sums + damping
+        return jnp.where(scale > 0, residual / jnp.where(scale > 0, scale, 1), 0)
+
     right = transpose(jax.tree.map(jnp.subtract, images, rendered))
-    change = _solve_by_conjugate_gradients(normal, right, row_sums + damping, tolerance, max_iterations)
+    solve = functools.partial(jax.scipy.sparse.linalg.cg, maxiter=max_iterations, tol=tolerance)
+    change, _ = solve(normal, right, M=precondition)
     return (start + change).astype(dtype)
-
-
-def _solve_by_conjugate_gradients(normal, right, scale, tolerance: float, max_iterations: int):
-    """Solve normal(x) = right, (num, channels), from x = 0, each channel by itself; rows where `scale` is 0 stay 0."""
-
-    def dot(one, other):
-        return jnp.sum(one * other, axis=0, keepdims=True)
-
-    def ratio(above, below):
-        return jnp.where(below > 0, above / jnp.where(below > 0, below, 1), 0)
-
-    solution, residual = jnp.zeros_like(right), right
-    direction = ratio(residual, scale)
-    energy, goal = dot(residual, direction), tolerance**2 * dot(right, ratio(right, scale))
-    for _ in range(max_iterations):
-        if not bool(jnp.any(energy > goal)):
-            break
-        image = normal(direction)
-        length = ratio(energy, dot(direction, image))
-        solution, residual = solution + length * direction, residual - length * image
-        conditioned = ratio(residual, scale)
-        before, energy = energy, dot(residual, conditioned)
-        direction = conditioned + ratio(energy, before) * direction
-    return solution
 
 
 def _check_frames(splats, images) -> tuple[list[Splats2D], list[Array]]:
@@ -122,19 +103,27 @@ def _check_frames(splats, images) -> tuple[list[Splats2D], list[Array]]:
     if isinstance(splats, Splats2D):
         splats, images = [splats], [images]
     splats, images = list(splats), list(images)
-    if not splats or len(splats) != len(images):
-        raise invalid("images", expected=f"one for each of {len(splats)} frames (at least 1)", got=len(images))
+    require(
+        splats and len(splats) == len(images),
+        "images",
+        expected=f"one for each of {len(splats)} frames (at least 1)",
+        got=len(images),
+    )
     shape, dtype = splats[0].color.shape, splats[0].color.dtype
     for one in splats:
-        if one.color.shape != shape:
-            raise invalid("splats", expected=f"colors of shape {shape} in every frame", got=one.color.shape)
+        require(
+            one.color.shape == shape, "splats", expected=f"colors of shape {shape} in every frame", got=one.color.shape
+        )
     images = [jnp.asarray(image, dtype) for image in images]
     for image in images:
-        if image.ndim != 3 or image.shape[-1] != shape[-1]:
-            raise invalid("images", expected=f"shape (height, width, {shape[-1]})", got=image.shape)
+        require(
+            image.ndim == 3 and image.shape[-1] == shape[-1],
+            "images",
+            expected=f"shape (height, width, {shape[-1]})",
+            got=image.shape,
+        )
     # One NaN would end the iteration of every channel at its first step.
     for name, arrays in (("images", images), ("splats.color", [splats[0].color])):
         count = sum(int(jnp.sum(~jnp.isfinite(one))) for one in arrays)
-        if count:
-            raise invalid(name, expected="finite numbers", got=f"{count} that are NaN or infinite")
+        require(not count, name, expected="finite numbers", got=f"{count} that are NaN or infinite")
     return splats, images

@@ -2,8 +2,8 @@
 
 * A *row* is a band of tiles across the image. Splats are bucketed by row in one counting pass, which keeps array
   order, hence depth order, without a sort. Each row is then one task: it buckets its splats by tile, again by counting,
-  and composites tile after tile. Rows share no data, so the result does not depend on the number of threads. The rows
-  of several frames run in one pool. A small image is a single task: a second thread would cost more than it saves.
+  and composites tile after tile. Rows share no data, so the result does not depend on the number of threads. A small
+  image is a single task: a second thread would cost more than it saves.
 * Inside a tile only the cells of 4x4 pixels that the splat's cutoff ellipse reaches are visited. A cell is one
   AVX-512 vector (`_numerics.simd`); the exponential is a polynomial and an addition to the exponent's bits.
 * The backward pass takes a tile's blocks of 64 splats from back to front, starting from the transmittance stored at the
@@ -17,12 +17,10 @@ Tiles are 16x16: with 8x8 the longer lists cost more than the skipped pixels sav
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import _cpu_kernels as kernels
 from foldgauss.render.splats import RenderOptions, check_size
@@ -39,35 +37,30 @@ PIXEL_NS = 1.5
 SINGLE_TASK_NS = 4e5
 
 
-class SplatVisibility(NamedTuple):
-    """How visible each splat is in an image; (num,) each."""
-
-    contribution: np.ndarray  # sum over pixels of alpha times transmittance, in pixels
-    largest_alpha: np.ndarray  # over the pixels where it was composited; 0 if there are none
-
-
 @dataclasses.dataclass(frozen=True)
 class Trace:
     """A rendered image, and what the backward pass needs from the forward pass."""
 
     image: np.ndarray  # (channels, height, width)
     transmittance: np.ndarray  # (height, width), behind all splats; the image's own alpha is 1 - transmittance
-    visibility: SplatVisibility | None
     num_pairs: int  # pixels times splats over the tiles' full lists: the unit in which speed is reported
     inputs: tuple[np.ndarray, ...]  # factor, opacity, color
     geometry: np.ndarray
     buckets: tuple[np.ndarray, ...]  # row_start, entries, first_slot, slot_position
     parts: list[tuple[int, int]]  # first row of tiles and the one after the last, of each task
-    lists: list[tuple[np.ndarray, ...]]  # per part: tile_start, listed, used
-    block_transmittances: list[np.ndarray]  # per part: the transmittance at the start of each block
+    lists: list[tuple[np.ndarray, ...]]  # per part: tile_start, listed, used, the transmittances at starts of blocks
     constants: tuple  # background, over, ceiling, stop
 
 
 def check_options(options: RenderOptions) -> None:
     """Raise ValueError for options that this engine does not support."""
-    if options.tile_size not in (None, TILE):
-        expected, cure = f"None or {TILE} for engine 'cpu'", "engine='xla' supports other sizes."
-        raise invalid("options.tile_size", expected=expected, got=options.tile_size, cure=cure)
+    require(
+        options.tile_size in (None, TILE),
+        "options.tile_size",
+        expected=f"None or {TILE} for engine 'cpu'",
+        got=options.tile_size,
+        cure="engine='xla' supports other sizes.",
+    )
 
 
 def forward(
@@ -80,51 +73,64 @@ def forward(
     *,
     compositing: str = "over",
     options: RenderOptions | None = None,
-    visibility: bool = False,
 ) -> Trace:
     """Render float32 splats: shapes (num, 2), (num, 2, 2), (num,), (num, channels), (channels,), in pixels.
 
-    Returns the trace: its `image` is planar, (channels, height, width); `visibility` is computed on request.
+    Returns the trace: its `image` is planar, (channels, height, width).
     A splat with a parameter that is not finite is left out and gets no gradient. One kernel is compiled for each
     number of channels from 1 to 4, and one for all larger numbers. Raises ValueError for a tile size other than this
     engine's, a size below 1, and arrays that are not float32 or whose shapes do not match.
     """
-    leaves = (mean, factor, opacity, color, background)
-    return forward_frames([leaves], size, compositing=compositing, options=options, visibility=visibility)[0]
-
-
-def forward_frames(
-    frames: Sequence[tuple[np.ndarray, ...]],
-    size: tuple[int, int],
-    *,
-    compositing: str = "over",
-    options: RenderOptions | None = None,
-    visibility: bool = False,
-) -> list[Trace]:
-    """Render several frames at once, (mean, factor, opacity, color, background) each, with fewer waits for threads.
-
-    Raises ValueError as `forward`.
-    """
     options = STANDARD if options is None else options
     check_options(options)
     check_size(size)
-    for frame in frames:
-        _check_leaves(*frame)
-    passes = [_ForwardPass(frame, size, compositing, options, visibility) for frame in frames]
-    large = [(one, start) for one in passes if len(one.chunks) > 1 for start in one.chunks]
-    run_tasks(_call, [(one.project, start) for one, start in large])
-    run_tasks(_ForwardPass.bucket, passes)
-    run_tasks(_call, [(one.fill, start) for one, start in large])
-    small = sum(one.work for one in passes) < SINGLE_TASK_NS
-    run_tasks(_call, [(one.composite, part) for one in passes for part in one.split(whole=small)], serial=small)
-    if visibility:
-        run_tasks(_call, [(one.gather, start) for one in passes for start in one.chunks])
-    return [one.to_trace() for one in passes]
+    _check_leaves(mean, factor, opacity, color, background)
+    mean, factor, opacity, color, background = map(_read_only, (mean, factor, opacity, color, background))
+    num, channels, over, radius = len(opacity), len(background), compositing == "over", options.support_radius
+    chunks, num_rows = range(0, max(num, 1), SPLATS_PER_TASK), -(-size[0] // TILE)
+    geometry, span = np.empty((num, 8), np.float32), np.empty((num, 2), np.int32)
+    counts = np.zeros((len(chunks), num_rows), np.int64)  # entries by chunk and row of tiles
+    cutoffs = np.float32([options.low_pass, options.alpha_cutoff, math.inf if radius is None else radius**2])
 
+    def project(start: int) -> None:
+        stop = min(start + SPLATS_PER_TASK, num)
+        kernels.project(start, stop, mean, factor, opacity, color, *size, *cutoffs, geometry, span)
+        kernels.count_rows(start, stop, span, counts[start // SPLATS_PER_TASK])
 
-def _call(task) -> None:
-    method, part = task
-    method(part)
+    run_tasks(project, chunks)
+    # Entries are ordered by row, then by chunk; slots by chunk.
+    position = np.append(0, np.cumsum(counts.T))
+    fill_from = position[:-1].reshape(counts.T.shape).T.copy(order="C")  # `fill_rows` overwrites it
+    slot_from = np.append(0, np.cumsum(counts.sum(1)))
+    row_start, first_slot = np.ascontiguousarray(position[:: len(chunks)]), np.empty(num + 1, np.int64)
+    entries, slot_position = np.empty(position[-1], np.int32), np.empty(position[-1], np.int64)
+    buckets = row_start, entries, first_slot, slot_position
+
+    def fill(start: int) -> None:
+        chunk, stop = start // SPLATS_PER_TASK, min(start + SPLATS_PER_TASK, num)
+        kernels.fill_rows(start, stop, span, slot_from[chunk], fill_from[chunk], *buckets[1:])
+
+    run_tasks(fill, chunks)
+    image, transmittance = np.empty((channels, *size), np.float32), np.empty(size, np.float32)
+    constants = (
+        tuple(np.asarray(background, np.float32)) if channels <= kernels.FEW else background,
+        over,
+        np.float32(options.alpha_ceiling),
+        np.float32(options.transmittance_stop if over else 0.0),
+    )
+    small = ENTRY_NS * len(entries) + PIXEL_NS * transmittance.size < SINGLE_TASK_NS
+    step = num_rows if small else 1
+    parts = [(row, row + step) for row in range(0, num_rows, step)]
+    lists: list = [()] * len(parts)
+
+    def composite(part: int) -> None:
+        planes = image, transmittance
+        lists[part] = kernels.forward_rows(*parts[part], *buckets[:2], geometry, color, *constants, *planes)
+
+    run_tasks(composite, range(len(parts)))
+    num_pairs = sum(len(listed) for _, listed, *_ in lists) * PIXELS
+    inputs = factor, opacity, color
+    return Trace(image, transmittance, num_pairs, inputs, geometry, buckets, parts, lists, constants)
 
 
 def _check_leaves(mean, factor, opacity, color, background) -> None:
@@ -133,12 +139,18 @@ def _check_leaves(mean, factor, opacity, color, background) -> None:
     shapes, dtypes = [np.shape(leaf) for leaf in leaves], {getattr(leaf, "dtype", None) for leaf in leaves}
     num, channels = shapes[2][:1], shapes[4][:1]
     expected = [(*num, 2), (*num, 2, 2), num, (*num, *channels), channels]
-    if shapes != expected or channels == (0,) or not (num and channels):
-        wanted = "shapes (num, 2), (num, 2, 2), (num,), (num, channels), (channels,), at least one channel"
-        raise invalid(names, expected=wanted, got=", ".join(map(str, shapes)))
-    if dtypes != {np.dtype(np.float32)}:
-        got = ", ".join(sorted(str(dtype) for dtype in dtypes))
-        raise invalid(names, expected="float32 NumPy arrays", got=got)
+    require(
+        shapes == expected and channels != (0,) and (num and channels),
+        names,
+        expected="shapes (num, 2), (num, 2, 2), (num,), (num, channels), (channels,), at least one channel",
+        got=", ".join(map(str, shapes)),
+    )
+    require(
+        dtypes == {np.dtype(np.float32)},
+        names,
+        expected="float32 NumPy arrays",
+        got=", ".join(sorted(str(dtype) for dtype in dtypes)),
+    )
 
 
 def _read_only(array: np.ndarray) -> np.ndarray:
@@ -148,139 +160,37 @@ def _read_only(array: np.ndarray) -> np.ndarray:
     return view
 
 
-class _ForwardPass:
-    """The forward pass of one frame. Methods run in order; all but `bucket` and `split` in parallel parts."""
-
-    def __init__(self, frame, size, compositing, options, visibility) -> None:
-        self.mean, self.factor, self.opacity, self.color, background = map(_read_only, frame)
-        self.size, self.options = size, options
-        num, channels, over = len(self.opacity), len(background), compositing == "over"
-        self.chunks = range(0, num, SPLATS_PER_TASK)
-        self.num_rows = -(-size[0] // TILE)
-        self.counts = np.zeros((len(self.chunks), self.num_rows), np.int64)  # entries by chunk and row of tiles
-        self.geometry, self.span = np.empty((num, 8), np.float32), np.empty((num, 2), np.int32)
-        self.image, self.transmittance = np.empty((channels, *size), np.float32), np.empty(size, np.float32)
-        self.visibility = SplatVisibility(*np.empty((2, num), np.float32)) if visibility else None
-        self.constants = (
-            tuple(np.asarray(background, np.float32)) if channels <= kernels.FEW else background,
-            over,
-            np.float32(options.alpha_ceiling),
-            np.float32(options.transmittance_stop if over else 0.0),
-        )
-
-    def project(self, start: int) -> None:
-        stop = min(start + SPLATS_PER_TASK, len(self.opacity))
-        kernels.project(start, stop, *self._projection_arguments())
-        kernels.count_rows(start, stop, self.span, self.counts[start // SPLATS_PER_TASK])
-
-    def _projection_arguments(self) -> tuple:
-        radius = self.options.support_radius
-        low_pass, cutoff = np.float32(self.options.low_pass), np.float32(self.options.alpha_cutoff)
-        support = np.float32(math.inf if radius is None else radius**2)
-        splats = (self.mean, self.factor, self.opacity, self.color)
-        return *splats, *self.size, low_pass, cutoff, support, self.geometry, self.span
-
-    def bucket(self) -> None:
-        """Allocate the lists of the splats of each row; those of a single chunk are projected and listed here, too."""
-        if len(self.chunks) <= 1:
-            self.buckets = kernels.project_and_bucket(self.num_rows, *self._projection_arguments())
-        else:
-            # Entries are ordered by row, then by chunk; slots by chunk.
-            position = np.append(0, np.cumsum(self.counts.T))
-            self.fill_from = np.ascontiguousarray(position[:-1].reshape(self.counts.T.shape).T)
-            self.slot_from = np.append(0, np.cumsum(self.counts.sum(1)))
-            entries, slot_position = np.empty(position[-1], np.int32), np.empty(position[-1], np.int64)
-            first_slot = np.empty(len(self.opacity) + 1, np.int64)
-            row_start = np.ascontiguousarray(position[:: len(self.chunks)])
-            self.buckets = row_start, entries, first_slot, slot_position
-        self.entry_visibility = None if self.visibility is None else np.empty((len(self.buckets[1]), 2), np.float32)
-
-    def fill(self, start: int) -> None:
-        chunk, stop = start // SPLATS_PER_TASK, min(start + SPLATS_PER_TASK, len(self.opacity))
-        kernels.fill_rows(start, stop, self.span, self.slot_from[chunk], self.fill_from[chunk], *self.buckets[1:])
-
-    @property
-    def work(self) -> float:
-        """The estimated time of compositing, in nanoseconds."""
-        return ENTRY_NS * len(self.buckets[1]) + PIXEL_NS * self.transmittance.size
-
-    def split(self, *, whole: bool) -> range:
-        """Split compositing into parts, one per row of tiles or a single one; returns their indices."""
-        step = self.num_rows if whole else 1
-        self.parts = [(row, row + step) for row in range(0, self.num_rows, step)]
-        self.lists: list = [()] * len(self.parts)
-        self.block_transmittances: list = [None] * len(self.parts)
-        self.num_listed = [0] * len(self.parts)
-        return range(len(self.parts))
-
-    def composite(self, part: int) -> None:
-        marks = None if self.visibility is None else np.zeros(2 * TILE * kernels.BLOCK, np.float32)
-        splats, planes = (self.geometry, self.color), (self.image, self.transmittance)
-        *self.lists[part], self.block_transmittances[part], self.num_listed[part] = kernels.forward_rows(
-            *self.parts[part], *self.buckets[:2], *splats, *self.constants, *planes, self.entry_visibility, marks
-        )
-
-    def gather(self, start: int) -> None:
-        stop = min(start + SPLATS_PER_TASK, len(self.opacity))
-        kernels.gather_visibility(start, stop, *self.buckets[2:], self.entry_visibility, *self.visibility)
-
-    def to_trace(self) -> Trace:
-        return Trace(
-            self.image,
-            self.transmittance,
-            self.visibility,
-            sum(self.num_listed) * PIXELS,
-            (self.factor, self.opacity, self.color),
-            self.geometry,
-            self.buckets,
-            self.parts,
-            self.lists,
-            self.block_transmittances,
-            self.constants,
-        )
-
-
 def backward(trace: Trace, grad_image: np.ndarray) -> tuple[np.ndarray, ...]:
     """Gradients of mean, factor, opacity and color, given dL/dimage, planar (channels, height, width).
 
     That of the background is `background_gradient`. Raises ValueError if `grad_image` does not have the image's shape.
     """
-    return backward_frames([trace], [grad_image])[0]
+    require(
+        grad_image.shape == trace.image.shape,
+        "grad_image",
+        expected=f"the image's shape {trace.image.shape}",
+        got=grad_image.shape,
+    )
+    grad_image, num, channels = _read_only(grad_image), len(trace.geometry), len(trace.image)
+    slots = np.empty((len(trace.buckets[1]), kernels.slot_width(channels)), np.float32)  # of every (splat, row)
+    grads = tuple(np.empty(shape, np.float32) for shape in ((num, 2), (num, 2, 2), (num,), (num, channels)))
 
+    def sum_rows(part: int) -> None:
+        rows, splats = (*trace.parts[part], *trace.buckets[:2]), (trace.geometry, trace.inputs[2])
+        kernels.backward_rows(*rows, *trace.lists[part], *splats, *trace.constants, grad_image, slots)
 
-def backward_frames(traces: Sequence[Trace], grad_images: Sequence[np.ndarray]) -> list[tuple[np.ndarray, ...]]:
-    """Compute `backward` of several frames at once; raises ValueError as it does."""
-    for trace, grad_image in zip(traces, grad_images, strict=True):
-        if grad_image.shape != trace.image.shape:
-            raise invalid("grad_image", expected=f"the image's shape {trace.image.shape}", got=grad_image.shape)
-    jobs = [(trace, _read_only(grad), *_empty_sums(trace)) for trace, grad in zip(traces, grad_images, strict=True)]
-
-    def sum_rows(task) -> None:
-        (trace, grad_image, slots, _), part = task
-        lists, splats = (*trace.lists[part], trace.block_transmittances[part]), (trace.geometry, trace.inputs[2])
-        rows = (*trace.parts[part], *trace.buckets[:2])
-        kernels.backward_rows(*rows, *lists, *splats, *trace.constants, grad_image, slots)
-
-    def gather(task) -> None:
-        (trace, _, slots, grads), start = task
-        stop = min(start + SPLATS_PER_TASK, len(trace.geometry))
+    def gather(start: int) -> None:
+        stop = min(start + SPLATS_PER_TASK, num)
         kernels.gather(start, stop, *trace.buckets[2:], slots, trace.geometry, *trace.inputs[:2], *grads)
 
-    run_tasks(sum_rows, [(job, part) for job in jobs for part in range(len(job[0].parts))])
-    run_tasks(gather, [(job, start) for job in jobs for start in range(0, len(job[0].geometry), SPLATS_PER_TASK)])
-    return [grads for *_, grads in jobs]
+    run_tasks(sum_rows, range(len(trace.parts)))
+    run_tasks(gather, range(0, num, SPLATS_PER_TASK))
+    return grads
 
 
 def background_gradient(trace: Trace, grad_image: np.ndarray) -> np.ndarray:
     """The gradient of the background, (channels,), given dL/dimage as for `backward`."""
     return np.einsum("chw,hw->c", grad_image, trace.transmittance, dtype=np.float32)
-
-
-def _empty_sums(trace: Trace) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
-    """Arrays for the gradient sums of every (splat, row), and for the gradients of the splats."""
-    num, channels = len(trace.geometry), len(trace.image)
-    slots = np.empty((len(trace.buckets[1]), kernels.slot_width(channels)), np.float32)
-    return slots, tuple(np.empty(shape, np.float32) for shape in ((num, 2), (num, 2, 2), (num,), (num, channels)))
 
 
 def raise_screen_gradients(largest: np.ndarray, trace: Trace, d_mean: np.ndarray, indices: np.ndarray) -> None:
@@ -292,11 +202,7 @@ def raise_screen_gradients(largest: np.ndarray, trace: Trace, d_mean: np.ndarray
 
     Source: Kerbl et al. 2023, 3D Gaussian Splatting, section 5.2.
     """
-    half_height, half_width = np.float32(trace.image.shape[1:]) / 2
-    num, first_slot = len(d_mean), trace.buckets[2]
-
-    def work(start: int) -> None:
-        stop = min(start + SPLATS_PER_TASK, num)
-        kernels.raise_screen_gradients(start, stop, d_mean, half_width, half_height, first_slot, indices, largest)
-
-    run_tasks(work, range(0, num, SPLATS_PER_TASK))
+    x, y = (d_mean * (np.float32(trace.image.shape[:0:-1]) / 2)).T
+    reaches = np.diff(trace.buckets[2]) > 0
+    before = largest[indices]
+    largest[indices] = np.where(reaches, np.maximum(before, np.sqrt(x * x + y * y)), before)

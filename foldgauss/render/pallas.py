@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jaxtyping import Array, Float
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss._runtime.device import default_platform
 from foldgauss.render.footprint import cap_alpha, raw_alpha, squared_distance
 from foldgauss.render.splats import RenderOptions
@@ -76,20 +76,26 @@ def render_pallas(
     leaves: tuple[Array, ...], size: tuple[int, int], *, compositing: str, options: RenderOptions
 ) -> Float[Array, "height width channels"]:
     """Render (mean, factor, opacity, color, background), all float32; see `render`."""
-    num, (height, width) = len(leaves[2]), size
-    if num == 0:
-        return jnp.broadcast_to(leaves[4][None, None, :], (height, width, len(leaves[4])))
     return _render_jit(_plan(leaves, size, compositing, options), leaves)
 
 
 def check_options(options: RenderOptions) -> None:
     """Raise ValueError for options that this engine does not support."""
     cure = "engine='xla' supports others."
-    if options.tile_size not in (None, *TILES):
-        raise invalid("options.tile_size", expected=f"None or one of {TILES}", got=options.tile_size, cure=cure)
-    if options.alpha_ceiling > HIGHEST_CEILING:
-        expected = f"at most {HIGHEST_CEILING} for engine 'pallas'"
-        raise invalid("options.alpha_ceiling", expected=expected, got=options.alpha_ceiling, cure=cure)
+    require(
+        options.tile_size in (None, *TILES),
+        "options.tile_size",
+        expected=f"None or one of {TILES}",
+        got=options.tile_size,
+        cure=cure,
+    )
+    require(
+        options.alpha_ceiling <= HIGHEST_CEILING,
+        "options.alpha_ceiling",
+        expected=f"at most {HIGHEST_CEILING} for engine 'pallas'",
+        got=options.alpha_ceiling,
+        cure=cure,
+    )
 
 
 def is_preferred(options: RenderOptions) -> bool:

@@ -21,11 +21,16 @@ def render_reference(
 ) -> Float[Array, "height width channels"]:
     """Render the splats; `foldgauss.render.render` documents the arguments."""
     centers = pixel_centers(size, splats.mean.dtype)
-    composite = {"over": _composite_over, "sum": _composite_sum}[compositing]
+    over = compositing == "over"
 
     def add(carry, splat):
+        transmittance, image = carry
         alpha = splat_alpha(splat, centers, options)
-        return composite(carry, alpha, splat.color, options), None
+        if over:
+            alpha = jnp.where(transmittance > options.transmittance_stop, alpha, jnp.zeros_like(alpha))
+        weight = alpha * transmittance  # with "sum" the background is not attenuated
+        image = image + weight[..., None] * splat.color[None, None, :]
+        return (transmittance - weight if over else transmittance, image), None
 
     start = jnp.ones(size, splats.mean.dtype), jnp.zeros((*size, splats.color.shape[-1]), splats.mean.dtype)
     (transmittance, image), _ = jax.lax.scan(add, start, splats)
@@ -41,18 +46,3 @@ def splat_alpha(
     distance = squared_distance(offset[..., 0], offset[..., 1], whitener)
     alpha = cap_alpha(raw_alpha(splat.opacity, distance, options), options)
     return jnp.where(valid, alpha, jnp.zeros_like(alpha))
-
-
-def _composite_over(carry, alpha, color, options):
-    """Alpha compositing, front to back."""
-    transmittance, image = carry
-    alpha = jnp.where(transmittance > options.transmittance_stop, alpha, jnp.zeros_like(alpha))
-    weight = alpha * transmittance
-    return transmittance - weight, image + weight[..., None] * color[None, None, :]
-
-
-def _composite_sum(carry, alpha, color, options):
-    """Accumulated blend: every splat is added, over a background that is not attenuated."""
-    del options
-    transmittance, image = carry
-    return transmittance, image + alpha[..., None] * color[None, None, :]

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 
 #: Least support radius in standard deviations: below it a splat is no longer Gaussian.
 SMALLEST_RADIUS = 0.1
@@ -40,8 +40,12 @@ class Splats2D(eqx.Module):
     def __check_init__(self) -> None:
         check_shapes(self, mean=(2,), factor=(2, 2))
         opacity, depth = (getattr(leaf, "shape", None) for leaf in (self.opacity, self.depth))
-        if None not in (opacity, depth) and depth != opacity:
-            raise invalid("depth", expected=f"shape {opacity}, that of opacity", got=f"shape {depth}")
+        require(
+            None in (opacity, depth) or depth == opacity,
+            "depth",
+            expected=f"shape {opacity}, that of opacity",
+            got=f"shape {depth}",
+        )
 
     def to_pixels(self, size: tuple[int, int], *, aspect: float | None = None) -> "Splats2D":
         """Convert from model space to pixels of an image of `size` = (height, width).
@@ -63,23 +67,34 @@ def check_shapes(splats: eqx.Module, **geometry: tuple[int, ...]) -> None:
         return  # placeholders, as inside tree transformations
     *_, num, color = shapes
     own = [(*num, *shape) for shape in geometry.values()]
-    if shapes != [*own, num, (*num, *color[-1:])] or len(color) == len(num):
-        texts = [f"(num, {', '.join(map(str, shape))})" for shape in geometry.values()]
-        expected = f"shapes {', '.join(texts)}, (num,), (num, channels)"
-        raise invalid(", ".join(names), expected=expected, got=", ".join(map(str, shapes)))
+    texts = [f"(num, {', '.join(map(str, shape))})" for shape in geometry.values()]
+    require(
+        shapes == [*own, num, (*num, *color[-1:])] and len(color) != len(num),
+        ", ".join(names),
+        expected=f"shapes {', '.join(texts)}, (num,), (num, channels)",
+        got=", ".join(map(str, shapes)),
+    )
 
 
 def check_size(size: tuple[int, int]) -> None:
     """Raise unless `size` is an image's (height, width)."""
     pair = isinstance(size, (tuple, list)) and len(size) == 2
-    if not (pair and all(isinstance(n, Integral) and n >= 1 for n in size)):
-        raise invalid("size", expected="(height, width), both whole and >= 1", got=size)
+    require(
+        pair and all(isinstance(n, Integral) and n >= 1 for n in size),
+        "size",
+        expected="(height, width), both whole and >= 1",
+        got=size,
+    )
 
 
 def check_aspect(aspect: float) -> None:
     """Raise unless `aspect` is a positive number."""
-    if not (isinstance(aspect, Real) and 0 < aspect < math.inf):
-        raise invalid("aspect", expected="a frame's height / width, one positive number", got=aspect)
+    require(
+        isinstance(aspect, Real) and 0 < aspect < math.inf,
+        "aspect",
+        expected="a frame's height / width, one positive number",
+        got=aspect,
+    )
 
 
 def pixels_per_unit(size: tuple[int, int], *, aspect: float | None = None) -> float:
@@ -134,17 +149,23 @@ class RenderOptions:
             value = getattr(self, name)
             if value is None:
                 continue
-            if not (isinstance(value, Integral) and not isinstance(value, bool) and low <= value <= high):
-                expected = f"None or a whole number in [{low}, {high}]"
-                raise invalid(f"RenderOptions.{name}", expected=expected, got=value)
+            require(
+                isinstance(value, Integral) and not isinstance(value, bool) and low <= value <= high,
+                f"RenderOptions.{name}",
+                expected=f"None or a whole number in [{low}, {high}]",
+                got=value,
+            )
             object.__setattr__(self, name, int(value))
 
     def _check(self, name: str, low: float, high: float, *, closed: bool = False) -> None:
         value = getattr(self, name)
         within = isinstance(value, Real) and low <= value and (value <= high if closed else value < high)
-        if not within:
-            expected = f"a number in [{low:g}, {high:g}{']' if closed else ')'}"
-            raise invalid(f"RenderOptions.{name}", expected=expected, got=value)
+        require(
+            within,
+            f"RenderOptions.{name}",
+            expected=f"a number in [{low:g}, {high:g}{']' if closed else ')'}",
+            got=value,
+        )
         object.__setattr__(self, name, float(value))
 
     @classmethod

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.render.footprint import compute_whitener, covariance, squared_reach
 from foldgauss.render.splats import LARGEST_CAPACITY, RenderOptions
 
@@ -83,9 +83,13 @@ def make_plan(leaves, size, compositing, options, *, tile: int, batch_pixels: in
     batch = -(-num_tiles // num_batches)
     plan = Plan(size, compositing == "over", options, tile, 1, batch)
     capacity = options.list_capacity
-    if capacity is not None and capacity < num_tiles:
-        expected = f"at least the number of tiles, {num_tiles}"
-        raise invalid("options.list_capacity", expected=expected, got=capacity, cure="None chooses it.")
+    require(
+        capacity is None or capacity >= num_tiles,
+        "options.list_capacity",
+        expected=f"at least the number of tiles, {num_tiles}",
+        got=capacity,
+        cure="None chooses it.",
+    )
     if capacity is None:
         geometry = jax.lax.stop_gradient(leaves[:3])  # concrete even under an eager `grad`
         traced = any(isinstance(leaf, jax.core.Tracer) for leaf in geometry)
@@ -203,7 +207,9 @@ def make_lists(plan: Plan, projected: Projected, mean, begin) -> tuple[Lists, In
     owner = jnp.cumsum(marks.add(1, mode="drop")) - 1
     used = number < jnp.max(jnp.where(indices(num) < end, total, 0))
     owner = jnp.where(used, owner, 0)
-    rows, columns = _tile_of_slot(projected, owner, number - first[owner])
+    local, across = number - first[owner], jnp.maximum(projected.shape[1][owner], 1)
+    down = local // across
+    rows, columns = projected.first[0][owner] + down, projected.first[1][owner] + local - down * across
     used &= _reaches_tile(plan, projected, mean, owner, rows, columns)
     tile = jnp.where(used, rows * plan.grid[1] + columns, plan.num_tiles)
     tile, splat = _sort_by_tile(tile, owner, plan.num_tiles, num)
@@ -215,13 +221,6 @@ def make_lists(plan: Plan, projected: Projected, mean, begin) -> tuple[Lists, In
     length = bounds[1:] - bounds[:-1]
     order = jnp.argsort(-length).astype(jnp.int32).reshape(plan.num_batches, plan.batch)
     return Lists(splat, bounds[:-1], length, order), end
-
-
-def _tile_of_slot(projected: Projected, owner, local):
-    """Row and column of the tile of a splat's slot `local`."""
-    columns = jnp.maximum(projected.shape[1][owner], 1)
-    down = local // columns
-    return projected.first[0][owner] + down, projected.first[1][owner] + local - down * columns
 
 
 def _reaches_tile(plan: Plan, projected: Projected, mean, owner, rows, columns) -> Bool[Array, " slots"]:

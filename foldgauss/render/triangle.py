@@ -7,7 +7,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from foldgauss._numerics.batch import concrete_value
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.render.camera import THICKNESS, Gaussians3D
 from foldgauss.render.splats import check_shapes
 
@@ -107,10 +107,13 @@ def _check_perpendicular(factor: Float[Array, "*num 3 3"]) -> None:
     third = factor[..., 2:]
     slant = np.abs(np.sum(factor[..., :2] * third, -2))
     lengths = np.linalg.norm(factor[..., :2], axis=-2) * np.linalg.norm(third, axis=-2)
-    if (slant > ACROSS * lengths).any():
-        expected = "a third column at right angles to the first two"
-        cure = "Triangles represent flat Gaussians: use Gaussians3D.from_flat, or columns R S with the thickness last."
-        raise invalid("gaussians.factor", expected=expected, got="another", cure=cure)
+    require(
+        not (slant > ACROSS * lengths).any(),
+        "gaussians.factor",
+        expected="a third column at right angles to the first two",
+        got="another",
+        cure="Triangles represent flat Gaussians: use Gaussians3D.from_flat, or columns R S with the thickness last.",
+    )
 
 
 def _check_faces(edges: Float[Array, "*num 2 3"], valid: Bool[Array, "*num 1"]) -> None:
@@ -118,10 +121,13 @@ def _check_faces(edges: Float[Array, "*num 2 3"], valid: Bool[Array, "*num 1"]) 
     if edges is None or valid is None:
         return
     bad = ~valid[..., 0] & np.isfinite(edges).all((-1, -2))  # NaN in, NaN out
-    if bad.any():
-        got = f"{bad.sum()} without area, the first at index {np.flatnonzero(bad)[0]}"
-        cure = "Move a vertex off the line through the other two, or drop the face."
-        raise invalid("edges", expected="faces whose three vertices span a plane", got=got, cure=cure)
+    require(
+        not bad.any(),
+        "edges",
+        expected="faces whose three vertices span a plane",
+        got=f"{bad.sum()} without area, the first at index {bad.argmax() if bad.size else 0}",
+        cure="Move a vertex off the line through the other two, or drop the face.",
+    )
 
 
 def _dot(a: Float[Array, "*num 3"], b: Float[Array, "*num 3"]) -> Float[Array, "*num 1"]:

@@ -37,7 +37,7 @@ def build_weight_matrix(trace: Trace) -> scipy.sparse.csr_array:
 
     def walk(part: int, *outputs) -> None:
         begin, _ = trace.parts[part]
-        lists = begin, entries[row_start[begin] :], *trace.lists[part]
+        lists = begin, entries[row_start[begin] :], *trace.lists[part][:3]
         _walk(_COLUMNS, TILE, *size, *lists, trace.geometry, *trace.constants[1:], *outputs)
 
     parts = range(len(trace.parts))

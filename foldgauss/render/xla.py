@@ -58,9 +58,6 @@ def render_xla(
     leaves: tuple[Array, ...], size: tuple[int, int], *, compositing: str, options: RenderOptions
 ) -> Float[Array, "height width channels"]:
     """Render (mean, factor, opacity, color, background), all of one floating dtype; see `render`."""
-    num, (height, width) = len(leaves[2]), size
-    if num == 0:
-        return jnp.broadcast_to(leaves[4][None, None, :], (height, width, len(leaves[4])))
     return _render_jit(_plan(leaves, size, compositing, options), leaves)
 
 

@@ -6,10 +6,9 @@ In reading order: `models` (the model, and rendering it), `motion` (optical flow
 """
 
 from foldgauss.video.editing.chain import Edit, edit
-from foldgauss.video.editing.clock import Clock
 from foldgauss.video.editing.edited_video import EditedVideo, Layer
 from foldgauss.video.editing.overlays import SelectedGaussians
-from foldgauss.video.editing.span import Span
+from foldgauss.video.editing.timing import Clock, Span
 from foldgauss.video.fitting.compress import Compressed, compress
 from foldgauss.video.fitting.config import FitConfig, LearningRates, Loss, Strategy, Views
 from foldgauss.video.fitting.density_control import DensityControl

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss._runtime.settings import replace_settings
 from foldgauss.render import RenderOptions
 from foldgauss.video.editing.edited_video import EditedVideo
@@ -49,21 +49,6 @@ class Variant:
     work: float = 1.0
 
 
-def _cutoffs() -> tuple[Variant, ...]:
-    """Options for rendering only, and for the fit those that save the most time."""
-    values = {
-        "alpha_cutoff": ("alpha", (("1/1024", 1 / 1024), ("1/64", 1 / 64), ("1/32", 1 / 32))),
-        "support_radius": ("radius", (("2.5", 2.5), ("2", 2.0))),
-        "transmittance_stop": ("stop", (("0.01", 0.01), ("0.1", 0.1))),
-    }
-    played, fitted = [], []
-    for name, (shown, each) in values.items():
-        played += [Variant(f"{shown} {text}, played", options={name: value}, played=True) for text, value in each]
-        text, value = each[1]
-        fitted.append(Variant(f"{shown} {text}, fitted", options={name: value}, work=0.85))
-    return (*played, *fitted)
-
-
 #: The axes in the order of their runs; docs/results.md lists them.
 AXES: Mapping[str, tuple[Variant, ...]] = MappingProxyType(
     {
@@ -87,7 +72,19 @@ AXES: Mapping[str, tuple[Variant, ...]] = MappingProxyType(
             Variant("2", fit={"views.batch_size": 2}, scale={"steps": 1 / 2}),
             Variant("4", fit={"views.batch_size": 4}, scale={"steps": 1 / 4}),
         ),
-        "cutoff": _cutoffs(),
+        # For rendering only; and for the fit those that save the most time.
+        "cutoff": (
+            Variant("alpha 1/1024, played", options={"alpha_cutoff": 1 / 1024}, played=True),
+            Variant("alpha 1/64, played", options={"alpha_cutoff": 1 / 64}, played=True),
+            Variant("alpha 1/32, played", options={"alpha_cutoff": 1 / 32}, played=True),
+            Variant("radius 2.5, played", options={"support_radius": 2.5}, played=True),
+            Variant("radius 2, played", options={"support_radius": 2.0}, played=True),
+            Variant("stop 0.01, played", options={"transmittance_stop": 0.01}, played=True),
+            Variant("stop 0.1, played", options={"transmittance_stop": 0.1}, played=True),
+            Variant("alpha 1/64, fitted", options={"alpha_cutoff": 1 / 64}, work=0.85),
+            Variant("radius 2, fitted", options={"support_radius": 2.0}, work=0.85),
+            Variant("stop 0.1, fitted", options={"transmittance_stop": 0.1}, work=0.85),
+        ),
         "quality": tuple(
             Variant(f"{quality}", fit={"quality": quality}, work=work)
             for quality, work in ((30, 0.8), (50, 1.1), (70, 1.4), (90, 1.6))
@@ -127,12 +124,12 @@ class Skipped(NamedTuple):
 def check_axes(names: Sequence[str]) -> tuple[str, ...]:
     """The axes named, in the order of `AXES`. Raises ValueError for an unknown name, a name given twice and none."""
     unknown = [name for name in names if name not in AXES]
-    if unknown or not names or len(set(names)) < len(names):
-        raise invalid(
-            "axes",
-            expected="some of " + ", ".join(AXES) + ", each once",
-            got=", ".join(unknown) if unknown else ", ".join(names) or "none",
-        )
+    require(
+        not unknown and names and len(set(names)) == len(names),
+        "axes",
+        expected="some of " + ", ".join(AXES) + ", each once",
+        got=", ".join(unknown) if unknown else ", ".join(names) or "none",
+    )
     return tuple(name for name in AXES if name in names)
 
 

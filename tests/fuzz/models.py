@@ -30,8 +30,7 @@ from foldgauss.video import FoldedSplats, FrameTimes, SegmentedVideo, VideoModel
 from foldgauss.video.compression.quantize import Rule, column_names, compute_columns, is_integral, quantize
 from foldgauss.video.editing.chain import edit
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.growth import GradientStatistics
-from foldgauss.video.fitting.state import FitState
+from foldgauss.video.fitting.state import STATISTICS, FitState
 from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.selection.selectors import Selection
 
@@ -182,10 +181,10 @@ def _checkpoint_seeds() -> list[bytes]:
 
     counts, width, num = np.arange(3, dtype=np.int32), 14, 3
     kept, state = [], None
-    for statistics in (None, GradientStatistics(floats(num), floats(num), counts)):
+    for sums in ({}, dict(zip(STATISTICS, (floats(num), floats(num), counts), strict=True))):
         state = FitState.create(
             floats(num, width), floats(2), counts=counts, first=floats(num, width),
-            second=floats(num, width), frame_errors=floats(3), statistics=statistics,
+            second=floats(num, width), frame_errors=floats(3), growing=bool(sums), **sums,
             step=5, plan=100, seconds=1.5, last_finite=state, start_errors=((0, 0.1),),
         )  # fmt: skip
         kept.append(written(lambda path, one=state: save_checkpoint(path, one, config=_CONFIG, source=_SOURCE)))

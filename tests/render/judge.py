@@ -14,6 +14,7 @@ from foldgauss.render.reference import render_reference, splat_alpha
 
 #: What every scene is made up to: by splats that are nowhere visible, black channels, and pixels that are cut off.
 NUM, CHANNELS, CANVAS = 150, 11, (50, 70)
+NAMES = ("mean", "factor", "opacity", "color", "background")
 
 
 def _numbers(options):
@@ -79,3 +80,13 @@ def grads_and_picture(leaves, size, weights, compositing, options):
     *geometry, color, background = map(np.asarray, grads)
     grads = [*(leaf[:num] for leaf in geometry), color[:num, :channels], background[:channels]]
     return grads, np.asarray(picture)[: size[0], : size[1], :channels]
+
+
+def check(grads, picture, avoid, true_grads, truth, *, tolerance=2e-5, band=math.inf):
+    """Assert that pictures and gradients agree; at the pixels to avoid, the picture within the band."""
+    difference = np.abs(np.asarray(picture) - truth)
+    assert difference[~avoid].max(initial=0) <= 1e-5 * max(1.0, np.abs(truth).max())
+    assert difference[avoid].max(initial=0) <= band
+    for name, one, other in zip(NAMES, jax.tree.leaves(grads), true_grads, strict=True):
+        size_of = max(1.0, np.abs(other).max(initial=0))
+        np.testing.assert_allclose(one / size_of, other / size_of, atol=tolerance, err_msg=name)

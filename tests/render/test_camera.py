@@ -19,7 +19,8 @@ SMOOTH = RenderOptions(alpha_cutoff=1e-8, transmittance_stop=0.0)
 
 #: As compiled programs: of separate operations each would be compiled for each shape. All flat scenes are of one size.
 view = jax.jit(project, static_argnames=("size", "order", "near"))
-flatten = jax.jit(Gaussians3D.to_flat)
+#: The orthogonal projection on the plane z = 0.
+flatten = jax.jit(lambda of: Splats2D(of.mean[:, :2], square_factor(of.factor[:, :2]), of.opacity, of.color))
 from_scale_angle = jax.jit(Gaussians3D.from_scale_angle)
 flat_factor = jax.jit(square_factor)
 orbit, look_at = jax.jit(Camera.orbit), jax.jit(Camera.look_at, static_argnames="aspect")

@@ -4,6 +4,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import judge
 import numpy as np
 import pytest
 from scenes import KINDS, draw, scene
@@ -19,22 +20,13 @@ CASES = [
 ]
 
 
-def check(grads, picture, judgement, tolerance=2e-5):
-    avoid, true_grads, truth = judgement
-    difference = np.abs(picture - truth)
-    assert difference[~avoid].max(initial=0) <= 1e-5 * max(1.0, np.abs(truth).max())
-    for one, other in zip(jax.tree.leaves(grads), true_grads, strict=True):
-        size_of = max(1.0, np.abs(other).max(initial=0))
-        np.testing.assert_allclose(one / size_of, other / size_of, atol=tolerance)
-
-
 @pytest.mark.parametrize(("kind", "compositing", "options"), CASES)
 def test_agrees_with_reference(kind, compositing, options):
     splats, size = scene(kind)
     judgement = judged(kind, compositing, options)
     leaves = splats, BACKGROUND, weights_for(size, judgement[0])
     grads, picture = grads_and_picture("pallas", size, compositing, OPTIONS[options], *leaves)
-    check(*jax.tree.map(np.asarray, (grads, picture)), judgement)
+    judge.check(grads, picture, *judgement)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +62,7 @@ def test_several_rounds_equal_one(tile):
     grads, picture = grads_and_picture(
         "pallas", size, "over", options, splats, BACKGROUND, weights_for(size, judgement[0])
     )
-    check(*jax.tree.map(np.asarray, (grads, picture)), judgement)
+    judge.check(grads, picture, *judgement)
 
 
 @pytest.mark.slow

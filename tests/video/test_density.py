@@ -1,5 +1,7 @@
 """Mixtures rendered as densities, and mixtures as splats."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -118,24 +120,30 @@ def test_round_covariances_and_dead_components_become_splats():
     np.testing.assert_allclose(back.components.scale_tril, mixture.components.scale_tril, rtol=1e-5, atol=1e-7)
 
 
-def test_invalid_mixtures_and_colors_are_rejected():
-    def from_mixture(**parts):
-        return FoldedSplats.from_mixture(_mixture(**parts), color=[1.0, 1.0, 1.0])
+def splats_of(color=(1.0, 1.0, 1.0), **parts):
+    return FoldedSplats.from_mixture(_mixture(**parts), color=color)
 
-    with pytest.raises(ValueError, match=r"^mixture\.components\.time_loc: expected"):
-        from_mixture(time_loc=np.full(5, 1.5))
-    with pytest.raises(ValueError, match=r"^mixture\.components\.fold: expected"):
-        from_mixture(fold=FourierFold(np.ones((1, 2)), np.ones((1, 2)), period=1.0))
-    with pytest.raises(ValueError, match=r"^mixture\.components\.envelope: expected"):
-        from_mixture(envelope=CallableEnvelope(lambda t, m, scale: -jnp.abs(t - m)))
-    with pytest.raises(ValueError, match=r"^color: expected"):
-        FoldedSplats.from_mixture(_mixture(), color=[1.0, 1.0])
-    with pytest.raises(ValueError, match=r"^color: expected"):
-        FoldedSplats.from_mixture(_mixture(), color=[1.0, 1.0, -0.1])
-    line = _mixture().marginal([0, -1])
-    with pytest.raises(ValueError, match=r"^mixture: expected"):
-        FoldedSplats.from_mixture(line, color=[1.0, 1.0, 1.0])
-    with pytest.raises(ValueError, match=r"^mixture: expected"):
-        density_image(line, 0.5, SIZE)
-    with pytest.raises(ValueError, match=r"^size: expected"):
-        density_image(_mixture(), 0.5, (0, 4))
+
+LINE = _mixture().marginal([0, -1])
+WRONG = [
+    (lambda: splats_of(time_loc=np.full(5, 1.5)), "mixture.components.time_loc"),
+    (
+        lambda: splats_of(fold=FourierFold(np.ones((1, 2)), np.ones((1, 2)), period=1.0)),
+        "mixture.components.fold",
+    ),
+    (
+        lambda: splats_of(envelope=CallableEnvelope(lambda t, m, scale: -jnp.abs(t - m))),
+        "mixture.components.envelope",
+    ),
+    (lambda: splats_of(color=[1.0, 1.0]), "color"),
+    (lambda: splats_of(color=[1.0, 1.0, -0.1]), "color"),
+    (lambda: FoldedSplats.from_mixture(LINE, color=[1.0, 1.0, 1.0]), "mixture"),
+    (lambda: density_image(LINE, 0.5, SIZE), "mixture"),
+    (lambda: density_image(_mixture(), 0.5, (0, 4)), "size"),
+]
+
+
+@pytest.mark.parametrize(("call", "parameter"), WRONG)
+def test_invalid_mixtures_and_colors_are_rejected(call, parameter):
+    with pytest.raises(ValueError, match=f"^{re.escape(parameter)}: expected"):
+        call()

@@ -618,7 +618,7 @@ WRONG = {
     "camera": (lambda: E.seen_from("left"), "camera: expected a Camera"),
     "frame": (lambda: E.move((0, 0), frame=7), r"frame: expected a whole number in \[0, 6\]"),
     "frames": (lambda: E.move((0, 0), frames=(3, 3)), "frames: expected .first, stop."),
-    "frames of one": (lambda: E.move((0, 0), frames=3), "frames: expected two of them"),
+    "frames of one": (lambda: E.move((0, 0), frames=3), "frames: expected .first, stop. .* for one frame give frame=k"),
     "times": (lambda: E.move((0, 0), times=(0.5, 0.2)), "times: expected .start, stop., rising"),
     "two whens": (lambda: E.move((0, 0), frame=1, times=(0, 1)), "frame, frames, times: expected one"),
     "ease alone": (lambda: E.move((0, 0), ease=2), "ease: expected a span"),

@@ -435,14 +435,14 @@ def test_bad_frames(frames):
 
 def test_time_left_excludes_the_start(monkeypatch):
     """A start that takes its time says nothing about the steps: those of this clip take milliseconds each."""
-    start = fit_module._start
+    start = fit_module.start
 
     def slow(*given):
         state = start(*given)
         state.seconds += 1000
         return state
 
-    monkeypatch.setattr(fit_module, "_start", slow)
+    monkeypatch.setattr(fit_module, "start", slow)
     infos = [info for _, info in fit_steps(moving_blobs(), dataclasses.replace(CONFIG, steps=20))]
     assert all(info.seconds_left == np.inf for info in infos[:5])  # not known yet
     assert all(0 < info.seconds_left < 200 for info in infos[5:-1])

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy
-from path_models import affine, moving_splats, scene
+from path_models import affine, scene
 
 from foldgauss.io import load_video_model, save_video_model
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
@@ -15,7 +15,7 @@ from foldgauss.video import FitConfig, evaluate, fit, fit_steps
 from foldgauss.video.fitting import loop
 from foldgauss.video.fitting.loop import start, start_from
 from foldgauss.video.fitting.state import paths_of, to_model
-from foldgauss.video.models.shared_paths import SharedPaths, leave_paths
+from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.motion.camera_path import fit_affine
 from foldgauss.video.motion.optical_flow import Motion
 from foldgauss.video.motion.path_coordinates import PathCoordinates, prefers_path
@@ -316,19 +316,6 @@ def test_the_longer_or_else_the_steadier_fold_is_preferred():
     chosen = prefers_path(folds, np.ones(4), 0.9 * by_camera, np.array([2.0, 0.5, 1.0, 1.0]), is_first=False)
     assert chosen.tolist() == [True, False, True, False]
     assert not prefers_path(folds, np.ones(4), 0.9 * folds, np.ones(4), is_first=False).any()
-
-
-def test_gaussians_that_leave_their_path_stay_where_they_are_at_their_time():
-    splats = moving_splats(60)
-    names = ("loc", "log_scale", "time_loc_logit", "log_time_scale", "coefficients")
-    numpy = dataclasses.replace(splats, **{name: np.asarray(getattr(splats, name)) for name in names})
-    left = leave_paths(numpy, np.arange(60) < 30)
-    np.testing.assert_array_equal(left.path_index[:30], 0)
-    np.testing.assert_array_equal(left.path_index[30:], numpy.path_index[30:])
-    times = 1 / (1 + np.exp(-numpy.time_loc_logit))
-    for n in range(60):
-        before, after = (one.at(jnp.float32(times[n])).mean[n] for one in (splats, left))
-        np.testing.assert_allclose(after, before, atol=1e-4)
 
 
 @pytest.mark.parametrize(("engine", "with_object"), [("cpu", True), ("cpu", False), ("xla", False)])

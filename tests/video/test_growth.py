@@ -11,10 +11,9 @@ from foldgauss.video import FitConfig, Loss, Strategy, Views, fit_steps
 from foldgauss.video.fitting.budget import StepPlanner
 from foldgauss.video.fitting.config import chosen_num_gaussians
 from foldgauss.video.fitting.densify import densify, reset_opacities
-from foldgauss.video.fitting.growth import EXTENT, PUBLISHED_STEPS, Growth
+from foldgauss.video.fitting.growth import EXTENT, PUBLISHED_STEPS, GradientStatistics, Growth
 from foldgauss.video.fitting.loop import start, to_model
 from foldgauss.video.fitting.schedule import choose_views
-from foldgauss.video.fitting.state import Sizes, StatisticsArray
 from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
 from foldgauss.video.models.row_layout import columns
 
@@ -34,7 +33,7 @@ def gaussians(num=5, scale=SMALL, opacity_logit=1.0):
 
 def statistics(num=5, screen=(), time=(), steps=4):
     """Means over `steps` steps: for the named Gaussians as given, 0 for others."""
-    sums = StatisticsArray().build(Sizes(num, 0, 0, growing=True))
+    sums = GradientStatistics(*np.zeros((2, num), np.float32), np.zeros(num, np.int32))
     for part, means in ((sums.screen, screen), (sums.time, time)):
         for index, mean in dict(means).items():
             part[index] = steps * mean
@@ -106,7 +105,7 @@ def test_halves_are_drawn_from_their_parent():
 
 
 def test_gradients_are_averaged_over_steps_in_which_it_was_seen():
-    sums = StatisticsArray().build(Sizes(3, 0, 0, growing=True))
+    sums = GradientStatistics(*np.zeros((2, 3), np.float32), np.zeros(3, np.int32))
     by_time = np.float32([-4e-4, 4e-4, 0])
     sums.add(np.float32([3e-4, -1, -1]), by_time)
     sums.add(np.float32([1e-4, -1, 7e-4]), -by_time)

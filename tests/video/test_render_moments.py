@@ -67,32 +67,43 @@ def test_size_is_still_the_second_argument():
         assert video.render(frame=3, size=(20, 30), background=(1, 1, 1)).shape == (20, 30, 3)
 
 
+BOTH = r"expected exactly one of time, frame and seconds, got"
+WRONG_MOMENTS = [
+    ({}, TypeError, rf"{BOTH} none\.$"),
+    ({"time": 0.0, "frame": 0}, TypeError, rf"{BOTH} time and frame\.$"),
+    ({"frame": 0, "seconds": 0}, TypeError, rf"{BOTH} frame and seconds\.$"),
+    *(
+        ({"frame": k}, IndexError, r"^frame: expected a number from -{num} to {last} of {num} frames")
+        for k in (99, -99)
+    ),
+    *(({"frame": k}, ValueError, r"^frame: expected the number of a frame, .*use time or") for k in (2.5, "1", True)),
+    *(
+        ({"seconds": s}, ValueError, r"^seconds: expected seconds in \[0, {end:g}\], as {num} frames at 8")
+        for s in (-0.1, 99.0, float("nan"), "x")
+    ),
+    ({"time": 5}, ValueError, r"^time: expected a time in \[0, 1\], got 5.*render\(frame=k\)"),
+    ({"time": [0.1, 0.2]}, ValueError, r"^time: expected one time in \[0, 1\], got \[0.1, 0.2\]"),
+]
+
+
+@pytest.mark.parametrize(("moment", "error", "message"), WRONG_MOMENTS)
 @pytest.mark.parametrize("name", ["model", "edited", "segmented"])
-def test_errors(name):
+def test_errors(name, moment, error, message):
     video = VIDEOS[name]()
     num = video.num_frames
-    with pytest.raises(TypeError, match=r"expected exactly one of time, frame and seconds, got none\.$"):
-        video.render()
-    with pytest.raises(TypeError, match=r"expected exactly one of time, frame and seconds, got time and frame\.$"):
-        video.render(0.0, frame=0)
-    with pytest.raises(TypeError, match=r"got frame and seconds\.$"):
-        video.render(frame=0, seconds=0)
-    for k in (num, -num - 1):
-        message = rf"^frame: expected a number from -{num} to {num - 1} of {num} frames, got {k}\.$"
-        with pytest.raises(IndexError, match=message):
-            video.render(frame=k)
-    for k in (2.5, "1", True):
-        with pytest.raises(ValueError, match=r"^frame: expected the number of a frame, got .*use time or seconds"):
-            video.render(frame=k)
-    for seconds in (-0.1, num / 8 + 0.01, float("nan"), "x"):
-        with pytest.raises(
-            ValueError, match=rf"^seconds: expected seconds in \[0, {num / 8:g}\], as {num} frames at 8"
-        ):
-            video.render(seconds=seconds)
-    with pytest.raises(ValueError, match=r"^time: expected a time in \[0, 1\], got 5.*render\(frame=k\)"):
-        video.render(5)
-    with pytest.raises(ValueError, match=r"^time: expected one time in \[0, 1\], got \[0.1, 0.2\]"):
-        video.render([0.1, 0.2])
+    with pytest.raises(error, match=message.format(num=num, last=num - 1, end=num / 8)):
+        video.render(**moment)
+
+
+@pytest.mark.parametrize("name", ["model", "edited", "segmented"])
+def test_frames_and_seconds_end_where_the_clip_does(name):
+    video = VIDEOS[name]()
+    num = video.num_frames
+    for beyond, error in (({"frame": num}, IndexError), ({"frame": -num - 1}, IndexError)):
+        with pytest.raises(error, match=rf"got {beyond['frame']}\.$"):
+            video.render(**beyond)
+    with pytest.raises(ValueError, match=r"^seconds: expected"):
+        video.render(seconds=num / 8 + 0.01)
 
 
 @pytest.mark.parametrize("moment", [{"frame": 2}, {"seconds": 0.3}])

@@ -546,7 +546,7 @@ def test_models_are_loaded_one_after_another_and_let_go():
         (lambda e: e.select(np.ones(NUM, bool)), "selection: expected a Selection or mask of 120 Gaussians"),
         (lambda e: e.select(Selection(OBJECT)), "selection: expected a Selection or mask of 120 Gaussians"),
         (lambda e: e.select(lambda video: 3), "selection: expected a Selection or mask of 120 Gaussians"),
-        (lambda e: e.select(box=(0, 0, 9, 9), frame=16), r"frame: expected a frame's number in \[0, 16\), got 16"),
+        (lambda e: e.select(box=(0, 0, 9, 9), frame=16), r"frame: expected a whole number in \[0, 15\], got 16"),
         (lambda e: e.select(box=(0, 0, 9, 9), frames=(3, 17)), "frames: expected .first, stop. with .* <= 16"),
         (lambda e: e.select(box=(70, 0, 90, 9), frame=6), "box: expected pixels of a 40x64 frame"),
         (lambda e: e.select(mask=np.zeros((40, 64), bool), frame=6), "mask: expected a mask that is not empty"),

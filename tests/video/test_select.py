@@ -359,7 +359,7 @@ WRONG = [
     ({"mask": np.ones((5, 48, 72), bool)}, "mask: expected one of shape .*, or 12 of them"),
     ({"mask": np.ones(5, bool), "frame": 0}, "mask: expected one of shape"),
     ({"mask": np.ones((0, 0), bool), "frame": 0}, "mask: expected bool"),
-    *(({"mask": ONES, "frame": k}, r"frame: expected a frame's number in \[0, 12\)") for k in (12, -1, True)),
+    *(({"mask": ONES, "frame": k}, r"frame: expected a whole number in \[0, 11\]") for k in (12, -1, True)),
     ({"mask": ONES, "frame": 1, "frames": (0, 2)}, "frame, frames: expected one of the two"),
     *(({"mask": ONES, "frames": k}, "frames: expected .first, stop. with") for k in ((3, 3), (0, 13), (-1, 2), (1,))),
     *(({"mask": ONES, "frames": k}, "frames: .*frame=k") for k in (3, "13", (None, 0), (1.0, 3))),

@@ -11,10 +11,9 @@ from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.video import FitConfig
 from foldgauss.video.fitting.state import (
     ARRAYS,
+    STATISTICS,
     DeviceArrays,
     FitState,
-    PerFrame,
-    PerGaussian,
     Sizes,
     StateArray,
 )
@@ -28,7 +27,7 @@ SIZES = Sizes(NUM, WIDTH, FRAMES, growing=True)
 def random_arrays(sizes: Sizes, kinds: dict[str, StateArray]) -> dict:
     """Values of all arrays, by their metadata, such that no two rows are equal by chance."""
     rng = np.random.default_rng(0)
-    fill = lambda leaf: rng.integers(0, 2, leaf.shape).astype(leaf.dtype)  # noqa: E731
+    fill = lambda leaf: np.asarray(rng.integers(0, 2, leaf.shape), leaf.dtype)  # noqa: E731
     arrays = jax.tree.map(fill, {name: kind.spec(sizes) for name, kind in kinds.items()})
     arrays["rows"] = rng.normal(size=(sizes.num_gaussians, sizes.width)).astype(np.float32)
     arrays["first"] = arrays["rows"] + 1
@@ -38,7 +37,7 @@ def random_arrays(sizes: Sizes, kinds: dict[str, StateArray]) -> dict:
 def make_state(sizes: Sizes = SIZES) -> FitState:
     counters = {"step": 3, "plan": 20, "seconds": 1.5, "best_error": 0.125, "backoffs": 2}
     counters |= {"compare_from": 9, "improve_by": 12, "start_errors": ((0, 0.5), (3, 0.25))}
-    return FitState(**random_arrays(sizes, FitState.array_fields()), **counters)
+    return FitState(**random_arrays(sizes, FitState.array_fields()), **counters, growing=sizes.growing)
 
 
 def assert_equal(one: FitState, other: FitState) -> None:
@@ -58,8 +57,8 @@ def test_sizes_describe_all_arrays():
     state = make_state()
     assert state.sizes == SIZES
     for name, kind in FitState.array_fields().items():
-        values, specs = jax.tree.leaves(getattr(state, name)), jax.tree.leaves(kind.spec(SIZES))
-        assert [(leaf.shape, leaf.dtype) for leaf in values] == [(leaf.shape, leaf.dtype) for leaf in specs], name
+        value, spec = getattr(state, name), kind.spec(SIZES)
+        assert (value.shape, value.dtype) == (spec.shape, spec.dtype), name
 
 
 def test_a_checkpoint_holds_every_field(tmp_path):
@@ -87,18 +86,16 @@ def test_restore_takes_every_array_back():
     state.restore()
     assert state.step == 17
     for name in ARRAYS:
-        jax.tree.map(np.testing.assert_array_equal, getattr(state, name), getattr(kept, name))
+        np.testing.assert_array_equal(getattr(state, name), getattr(kept, name))
 
 
 def test_keep_cuts_every_per_gaussian_array():
     state, before, index = make_state(), make_state(), np.array([5, 0, 3])
     state.keep(index)
     for name, kind in FitState.array_fields().items():
-        now, then = getattr(state, name), getattr(before, name)
-        if isinstance(kind, PerGaussian):
-            np.testing.assert_array_equal(now, then[index])
-        elif isinstance(kind, PerFrame):
-            jax.tree.map(np.testing.assert_array_equal, now, then)
+        if name not in STATISTICS:
+            then = getattr(before, name)
+            np.testing.assert_array_equal(getattr(state, name), then[index] if kind.per_gaussian else then)
     assert not any(part.any() or len(part) != 3 for part in state.statistics)
     assert state.sizes == SIZES._replace(num_gaussians=3)
 
@@ -109,7 +106,7 @@ def test_extend_fills_every_per_gaussian_array():
     state.extend(rows)
     given = {"rows": rows}
     for name, kind in FitState.array_fields().items():
-        if isinstance(kind, PerGaussian):
+        if kind.per_gaussian:
             new = given.get(name, kind.build(Sizes(2, WIDTH, FRAMES)))
             np.testing.assert_array_equal(getattr(state, name), np.concatenate([getattr(before, name), new]))
     assert state.sizes == Sizes(NUM + 2, WIDTH, FRAMES, growing=True)
@@ -120,7 +117,9 @@ def test_extend_fills_every_per_gaussian_array():
 class Extended(FitState):
     """A state with one more array, which only its own line knows."""
 
-    birthday: np.ndarray = field(default=None, metadata={"arrays": PerGaussian(np.int16, (2, "width"), fill=-1)})
+    birthday: np.ndarray = field(
+        default=None, metadata={"arrays": StateArray(np.int16, ("num_gaussians", 2, "width"), fill=-1)}
+    )
 
 
 def test_a_new_array_is_added_in_one_place():
@@ -153,7 +152,7 @@ def test_a_device_gives_every_array_back(monkeypatch, growing):
     JaxStepper(frames, config, state, "xla")
     assert state.held is not None
     for name in ARRAYS:
-        jax.tree.map(np.testing.assert_array_equal, getattr(state, name), getattr(before, name))
+        np.testing.assert_array_equal(getattr(state, name), getattr(before, name))
     copy = state.copy()
     state.rows = state.rows + 1
     assert state.changed

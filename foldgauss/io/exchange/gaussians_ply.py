@@ -16,7 +16,7 @@ from foldgauss.io._atomic import PathLike, atomic_folder
 from foldgauss.io.exchange.ply_file import NOTE, read_ply, write_ply
 from foldgauss.render import Camera, Gaussians3D, pixels_per_unit
 from foldgauss.render.camera import THICKNESS
-from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer
+from foldgauss.video.models.renderer import RenderedVideo, VideoRenderer
 from foldgauss.video.models.splats import SH_C0
 
 #: Depth between a Gaussian and the one behind it, in model units: some three steps of float32 at the distance of the
@@ -31,7 +31,7 @@ _LOGIT_MAX = 17.0
 _SMALLEST = 1e-20  # of a standard deviation, whose logarithm must be finite
 
 
-def frame_gaussians(model: RenderableVideo | VideoRenderer, t: float, *, depth_step: float = DEPTH_STEP) -> Gaussians3D:
+def frame_gaussians(model: RenderedVideo | VideoRenderer, t: float, *, depth_step: float = DEPTH_STEP) -> Gaussians3D:
     """The Gaussians that a model renders at time t, flat in space, front first, for programs that sort by depth.
 
     For many times, pass a `VideoRenderer` instead of the model, so that it is made once. Where two segments of a video
@@ -111,7 +111,7 @@ def _columns(gaussians: Gaussians3D, axes: str, sh_degree: int) -> dict[str, np.
 
 def write_3dgs_ply(
     path: PathLike,
-    model: RenderableVideo | VideoRenderer,
+    model: RenderedVideo | VideoRenderer,
     t: float,
     *,
     depth_step: float = DEPTH_STEP,
@@ -143,7 +143,7 @@ def write_3dgs_ply(
 
 def write_3dgs_frames(
     folder: PathLike,
-    model: RenderableVideo,
+    model: RenderedVideo,
     times: Sequence[float] | None = None,
     *,
     depth_step: float = DEPTH_STEP,
@@ -171,7 +171,7 @@ def write_3dgs_frames(
     return folder
 
 
-def check_times(model: RenderableVideo, times: Sequence[float] | None) -> Float[np.ndarray, " frames"]:
+def check_times(model: RenderedVideo, times: Sequence[float] | None) -> Float[np.ndarray, " frames"]:
     """The given times, or the model's frame times. Raises ValueError unless there is at least one, all in [0, 1]."""
     found = np.atleast_1d(np.asarray(model.frame_times.times() if times is None else times))
     found = found.astype(np.float64) if found.dtype.kind in "fiu" else np.zeros(0)

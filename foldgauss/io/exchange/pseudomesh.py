@@ -25,7 +25,7 @@ from foldgauss.render import COMPOSITINGS, Camera, Gaussians3D, RenderOptions, S
 from foldgauss.render.splats import check_size, pixels_per_unit
 from foldgauss.render.triangle import COLLINEAR
 from foldgauss.video.models.background import BLACK, check_background
-from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer, to_bytes
+from foldgauss.video.models.renderer import RenderedVideo, VideoRenderer, to_bytes
 
 #: Frame times, size and rate of the video, and render options, which an `.obj` cannot hold.
 NOTES = "pseudomesh.json"
@@ -113,7 +113,7 @@ def _flat_factor(edges: Float[np.ndarray, "num 2 3"]) -> Float[np.ndarray, "num 
 
 def write_pseudomesh(
     folder: PathLike,
-    model: RenderableVideo,
+    model: RenderedVideo,
     times: Sequence[float] | None = None,
     *,
     overwrite: bool = False,

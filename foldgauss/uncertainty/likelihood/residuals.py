@@ -86,13 +86,18 @@ class Residuals:
 
     def render_at(self, times: Iterable[float]) -> Iterator[Float32[np.ndarray, "3 height width"]]:
         """The images of the model at each of `times` in [0, 1], one by one."""
+        how = {"compositing": self.model.compositing, "options": self.model.options}
         for some in _batched(times):
             alive = [self.renderer.splats(float(t)) for t in some]
-            leaves = [(one.mean, one.factor, one.opacity, one.color, _behind) for one in alive]
-            for trace in cpu.forward_frames(
-                leaves, self.model.size, compositing=self.model.compositing, options=self.model.options
-            ):
-                yield trace.image
+            images = {}
+
+            def draw(k: int, alive=alive, images=images) -> None:
+                one = alive[k]
+                leaves = one.mean, one.factor, one.opacity, one.color, _behind
+                images[k] = cpu.forward(*leaves, self.model.size, **how).image
+
+            run_tasks(draw, range(len(alive)))
+            yield from (images[k] for k in range(len(alive)))
 
     def squared_errors(
         self, image: Float32[np.ndarray, "3 height width"], which: Iterable[int]

@@ -45,7 +45,8 @@ def apply_affine(splats: FoldedSplats, mask: Mask, map_: Affine) -> FoldedSplats
         loc=(loc - center) @ matrix.T + (center + shift),
         coefficients=_as_float64(splats.coefficients)[mask] @ matrix.T,
         log_scale=log_scale,
-        angle_logit=_angle_logit(angle),
+        # It is defined modulo pi; in [pi/2, 3 pi/2) its logit is best conditioned.
+        angle_logit=logit(((angle - np.pi / 2) % np.pi + np.pi / 2) / (2 * np.pi)),
     )
 
 
@@ -73,11 +74,6 @@ def _map_axes(splats: FoldedSplats, mask: Mask, matrix: Float[np.ndarray, "2 2"]
     # From the determinant: no cancellation where one axis is much shorter.
     second = np.log(abs(np.linalg.det(matrix))) + log_scale.sum(-1) - first
     return np.stack([first, second], -1), np.arctan2(axes[:, 1, 0], axes[:, 0, 0])
-
-
-def _angle_logit(angle: Float[np.ndarray, " num"]) -> Float[np.ndarray, " num"]:
-    """The angle is defined modulo pi; in [pi/2, 3 pi/2) its logit is best conditioned."""
-    return logit(((angle - np.pi / 2) % np.pi + np.pi / 2) / (2 * np.pi))
 
 
 def scale_opacity(splats: FoldedSplats, mask: Mask, factor: float) -> FoldedSplats | None:

@@ -40,7 +40,6 @@ from foldgauss.video.editing.bake import (
     opacities_and_colors,
     scale_opacity,
 )
-from foldgauss.video.editing.clock import Clock, check_clock
 from foldgauss.video.editing.edited_video import EditedVideo, Layer, as_edited
 from foldgauss.video.editing.layer_edits import Bake, add_edit, apply_edit, can_delete, gather_layer
 from foldgauss.video.editing.overlays import (
@@ -58,8 +57,7 @@ from foldgauss.video.editing.overlays import (
     TriangleFunction,
     polar_decompose,
 )
-from foldgauss.video.editing.span import NEVER, Span, When, make_span
-from foldgauss.video.editing.time_map import TimeMap, frame_times_of
+from foldgauss.video.editing.timing import NEVER, Clock, Span, TimeMap, When, check_clock, frame_times_of, make_span
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.selection.selectors import Mask, Selection, check_mask, select, split_mask
 

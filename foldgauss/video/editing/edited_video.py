@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from foldgauss._runtime.checks import invalid, is_integer, require
+from foldgauss._runtime.checks import is_integer, require
 from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, pixels_per_unit, project
 from foldgauss.video.editing.overlays import (
     AbstractOverlay,
@@ -23,7 +23,7 @@ from foldgauss.video.editing.overlays import (
 )
 from foldgauss.video.models.frame_times import is_cut, snap_to_shots
 from foldgauss.video.models.prepared import PreparedModel
-from foldgauss.video.models.rendered_video import FollowingVideo
+from foldgauss.video.models.renderer import FollowingVideo, PreparedVideo
 from foldgauss.video.models.video_model import ONE_SEGMENT, VideoModel
 
 
@@ -136,20 +136,23 @@ def as_edited(video: VideoModel | EditedVideo) -> EditedVideo:
     """A model as a video of one layer, an edited video as it is. Raises ValueError for anything else."""
     if isinstance(video, EditedVideo):
         return video
-    if not isinstance(video, VideoModel):
-        kind = "path" if isinstance(video, str | os.PathLike) else type(video).__name__
-        cures = {
-            "Edit": "End a chain of edits with .video().",
-            "SegmentedEdit": "End a chain of edits with .video().",
-            "list": "Stack several with layers(*videos).",
-            "tuple": "Stack several with layers(*videos).",
-            "path": "Read a file with foldgauss.io.load_video_model(path).",
-            "SegmentedVideo": ONE_SEGMENT,
-            "StabilizedVideo": "Edit first, and stabilize the edited video.",
-        }
-        raise invalid(
-            "video", expected="a VideoModel or an EditedVideo", got=type(video).__name__, cure=cures.get(kind, "")
-        )
+    kind = "path" if isinstance(video, str | os.PathLike) else type(video).__name__
+    cures = {
+        "Edit": "End a chain of edits with .video().",
+        "SegmentedEdit": "End a chain of edits with .video().",
+        "list": "Stack several with layers(*videos).",
+        "tuple": "Stack several with layers(*videos).",
+        "path": "Read a file with foldgauss.io.load_video_model(path).",
+        "SegmentedVideo": ONE_SEGMENT,
+        "StabilizedVideo": "Edit first, and stabilize the edited video.",
+    }
+    require(
+        isinstance(video, VideoModel),
+        "video",
+        expected="a VideoModel or an EditedVideo",
+        got=type(video).__name__,
+        cure=cures.get(kind, ""),
+    )
     return EditedVideo((Layer(video),), timeline=0)
 
 
@@ -186,7 +189,7 @@ def _check_compatible(models: list[VideoModel]) -> None:
             )
 
 
-class PreparedEditedVideo:
+class PreparedEditedVideo(PreparedVideo):
     """An edited video prepared for images of `size`, see `PreparedModel`."""
 
     def __init__(self, video: EditedVideo, size: tuple[int, int]):
@@ -194,7 +197,7 @@ class PreparedEditedVideo:
         self._size, self._camera = tuple(size), video.camera
         self._layers = [_PreparedLayer(layer, self._size, height / width) for layer in video.layers]
         self._front = partial(Camera.front, height / width)
-        self._times = np.asarray(video.frame_times.times())
+        self.times = np.asarray(video.frame_times.times())
 
     def splats(self, t: float) -> Splats2D:
         """The splats of time t, front to back; NumPy leaves."""
@@ -211,10 +214,6 @@ class PreparedEditedVideo:
         depth = np.concatenate([layer.depth for layer in layers])
         nearest_first = np.argsort(np.abs(depth - float(camera.position[2])), kind="stable")
         return jax.tree.map(lambda leaf: leaf[nearest_first], _concatenate(layers))
-
-    def weighted_splats(self, t: float) -> list[tuple[float, Splats2D]]:
-        """One image, see `PreparedVideo`; in the gap of a cut the nearer shot's."""
-        return [(1.0, self.splats(snap_to_shots(t, self._times)))]
 
     def _camera_at(self, t: float) -> Camera:
         camera = self._camera
@@ -236,7 +235,6 @@ class _PreparedLayer:
     def __init__(self, layer: Layer, size: tuple[int, int], aspect: float):
         self._model, self._layer = PreparedModel(layer.model, size, aspect=aspect), layer
         self._masks = [np.asarray(overlay.mask) for overlay in layer.overlays]
-        self._times = np.asarray(layer.model.frame_times.times())
         self._holds_frames = layer.holds_frames
         self._groups = _group_by_clocks(layer)
 
@@ -262,7 +260,7 @@ class _PreparedLayer:
     def _own_time(self, clocks: tuple[Retiming, ...], t: float) -> float:
         for clock in reversed(clocks):  # the last edit retimes the result of those before
             t = clock.own_time(t)
-        return float(snap_to_shots(t, self._times)) if self._holds_frames else t
+        return float(snap_to_shots(t, self._model.times)) if self._holds_frames else t
 
 
 def _group_by_clocks(layer: Layer) -> list[tuple[tuple[Retiming, ...], Bool[np.ndarray, " num"] | None]]:

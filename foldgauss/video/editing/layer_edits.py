@@ -29,8 +29,14 @@ def apply_edit(layer: Layer, edit: TimedEdit, bake: Bake | None = None) -> Layer
     mask = np.asarray(edit.mask)
     if not mask.any():
         return layer
-    if isinstance(edit, Retiming):
-        _check_retimes_whole_edits(layer, mask)
+    for overlay in layer.overlays if isinstance(edit, Retiming) else ():
+        require(
+            not _depends_on_all(overlay) or not _overlaps_partly(overlay, mask),
+            "selection",
+            expected="all Gaussians of an edit about their own center, or none of them",
+            got="a part of them",
+            cure="Retime it before that edit.",
+        )
     splats = bake(layer.model.splats, mask) if bake is not None and _may_bake(layer, edit) else None
     if splats is None:
         return add_edit(layer, edit)
@@ -75,18 +81,6 @@ def _may_bake(layer: Layer, edit: TimedEdit) -> bool:
         return False  # the cutoff would leave out Gaussians at other times
     earlier = layer.clocks if isinstance(edit, Retiming) else layer.overlays
     return edit.span is None and not any((np.asarray(other.mask) & edit.mask).any() for other in earlier)
-
-
-def _check_retimes_whole_edits(layer: Layer, mask: Mask) -> None:
-    """Raise ValueError if a clock is for a part of the Gaussians of an edit that depends on all of them."""
-    for overlay in layer.overlays:
-        require(
-            not _depends_on_all(overlay) or not _overlaps_partly(overlay, mask),
-            "selection",
-            expected="all Gaussians of an edit about their own center, or none of them",
-            got="a part of them",
-            cure="Retime it before that edit.",
-        )
 
 
 def _depends_on_all(overlay: AbstractOverlay) -> bool:

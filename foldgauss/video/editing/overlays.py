@@ -16,11 +16,10 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Bool, Float, Int
 
-from foldgauss._runtime.checks import check_one_of, invalid, require
+from foldgauss._runtime.checks import check_one_of, require
 from foldgauss.render import Gaussians3D, Triangles
 from foldgauss.video.editing.arguments import check_array, check_number, check_numbers
-from foldgauss.video.editing.clock import Clock
-from foldgauss.video.editing.span import Span
+from foldgauss.video.editing.timing import Clock, Span
 
 #: Luminance of red, green and blue: Rec. 709.
 LUMINANCE_WEIGHTS = np.array([0.2126, 0.7152, 0.0722])
@@ -294,12 +293,31 @@ class TriangleFunction(AbstractOverlay):
     def __call__(self, gaussians, t, progress):
         flat, size = gaussians.in_space(), padded_size(len(gaussians))
         vertices = np.asarray(_to_triangles(pad_rows(flat.mean, size), pad_rows(flat.factor, size)))[: len(flat)]
-        moved = _check_vertices(self.function(vertices.copy(), t), vertices.shape)  # a copy: it may write to it
+        moved = np.asarray(self.function(vertices.copy(), t))  # a copy: it may write to it
+        require(
+            moved.shape == vertices.shape and moved.dtype.kind in "fiu",
+            "vertices",
+            expected=f"numbers of shape {vertices.shape}",
+            got=f"{moved.dtype} {moved.shape}",
+        )
+        require(
+            np.isfinite(moved).all(),
+            "vertices",
+            expected="finite numbers",
+            got=f"NaN or infinity in {int((~np.isfinite(moved)).any((1, 2)).sum())} triangles",
+        )
         if np.array_equal(moved, vertices):
             return gaussians
         moved = vertices + progress * (moved - vertices)
         mean, factor = (np.array(leaf)[: len(flat)] for leaf in _from_triangles(pad_rows(moved, size)))
-        _check_areas(factor)
+        collinear = ~np.isfinite(factor).all((1, 2))
+        require(
+            not collinear.any(),
+            "vertices",
+            expected="triangles whose three vertices span a plane",
+            got=f"{collinear.sum()} without area, the first at index {np.append(collinear, True).argmax()}",
+            cure="Move a vertex off the line through the other two.",
+        )
         if gaussians.mean.shape[1] == 2 and not moved[..., 2].any():
             mean, factor = mean[:, :2], factor[:, :2]
         return dataclasses.replace(gaussians, mean=mean, factor=factor)
@@ -333,35 +351,6 @@ def _to_triangles(mean: Float[Array, "num 3"], factor: Float[Array, "num 3 2"]) 
 def _from_triangles(vertices: Float[Array, "num 3 3"]) -> tuple[Float[Array, "num 3"], Float[Array, "num 3 2"]]:
     flat = Triangles.from_vertices(vertices, vertices[:, 0, 0], vertices[:, 0]).to_gaussians()
     return flat.mean, flat.factor[..., :2]
-
-
-def _check_vertices(vertices: object, shape: tuple[int, ...]) -> Float[np.ndarray, "num 3 3"]:
-    array = np.asarray(vertices)
-    require(
-        array.shape == shape and array.dtype.kind in "fiu",
-        "vertices",
-        expected=f"numbers of shape {shape}",
-        got=f"{array.dtype} {array.shape}",
-    )
-    require(
-        np.isfinite(array).all(),
-        "vertices",
-        expected="finite numbers",
-        got=f"NaN or infinity in {int((~np.isfinite(array)).any((1, 2)).sum())} triangles",
-    )
-    return array
-
-
-def _check_areas(factor: Float[np.ndarray, "num 3 2"]) -> None:
-    collinear = np.flatnonzero(~np.isfinite(factor).all((1, 2)))
-    if collinear.size:
-        got = f"{collinear.size} without area, the first at index {collinear[0]}"
-        raise invalid(
-            "vertices",
-            expected="triangles whose three vertices span a plane",
-            got=got,
-            cure="Move a vertex off the line through the other two.",
-        )
 
 
 def _check_result(before: SelectedGaussians, after: object) -> SelectedGaussians:

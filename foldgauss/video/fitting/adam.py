@@ -187,7 +187,7 @@ def _rate_factors(rows, degree: int, units: RateUnits) -> Float[Array, "num widt
 
 @jax.jit
 def update_frame_times(logits, moments, by_time, rate):
-    """The softmax weights of the frame times and their moments after a step, given dL/dt_k.
+    """The softmax weights of the frame times and their moments (count, first, second) after a step, given dL/dt_k.
 
     The interval of a cut is some hundred frames long: its weight moves by as much less, as otherwise a step that moves
     other frames by a thousandth of a frame would move all frames after the cut by a tenth.
@@ -197,5 +197,5 @@ def update_frame_times(logits, moments, by_time, rate):
     slower = jnp.where(intervals > CUT_RATIO * median, median / intervals, 1)
     _, pull = jax.vjp(lambda weights: FrameTimes(weights).times(), logits)
     with jax.numpy_dtype_promotion("standard"):  # optax raises Python floats to integer counts
-        update, moments = FRAME_TIME_ADAM.update(pull(by_time)[0], moments)
-    return logits - rate * slower * update, moments
+        update, moments = FRAME_TIME_ADAM.update(pull(by_time)[0], optax.ScaleByAdamState(*moments))
+    return logits - rate * slower * update, tuple(moments)

@@ -558,11 +558,6 @@ def parameters_per_gaussian(degree: int) -> int:
     return 11 + 2 * degree
 
 
-def bytes_per_gaussian(degree: int) -> int:
-    """Of a model file."""
-    return 4 * parameters_per_gaussian(degree)
-
-
 def chosen_num_gaussians(config: FitConfig, num_frames: int, height: int, width: int, **known: float | None) -> int:
     """Number of Gaussians at the start, at most `most_gaussians`.
 

@@ -30,7 +30,7 @@ class Densification(DensityControl):
         if not (state.growing and state.plan):
             return False
         growth = self.config.strategy.growth.for_plan(state.plan)
-        return growth.changes_at(state.step) or state.step + 1 >= growth.until_step
+        return growth.grows_at(state.step) or growth.resets_at(state.step) or state.step + 1 >= growth.until_step
 
     def apply(self, state: FitState) -> None:
         """What is due at the state's step; after the last, statistics end."""
@@ -52,7 +52,8 @@ class Densification(DensityControl):
         if growth.resets_at(state.step):
             reset_opacities(state.rows, state.first, state.second, growth, config.fold_degree)
         if state.step + 1 >= growth.until_step:
-            state.statistics = None
+            state.growing = False
+            state.restart_statistics()
 
 
 def densify(

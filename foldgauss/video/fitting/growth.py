@@ -7,10 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from foldgauss._runtime.checks import invalid
-from foldgauss._runtime.kernels import exact_kernel
+from foldgauss._runtime.checks import require
 from foldgauss._runtime.settings import check_settings, setting
-from foldgauss._runtime.threads import run_tasks
 from foldgauss.render.camera import FIELD_OF_VIEW
 
 #: One unit of the published geometry in ours: there the image's half width is tan(FIELD_OF_VIEW / 2), here the longer
@@ -25,7 +23,6 @@ MIN_EVERY = 10
 #: In plans however short, opacities have so many steps to recover between resets: at the published rate, 0.025 a step,
 #: the logit of 0.01 needs 184 steps to that of 0.5.
 MIN_RESET_EVERY = 200
-CHUNK = 1 << 16  # Gaussians per task
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,13 +83,13 @@ class Growth:
 
     def __post_init__(self) -> None:
         check_settings(self, "strategy.growth.")
-        if self.reset_opacity < self.prune_opacity:
-            raise invalid(
-                "strategy.growth.reset_opacity",
-                expected=f"at least prune_opacity, {self.prune_opacity:g}",
-                got=self.reset_opacity,
-                cure="Otherwise a reset would prune every Gaussian.",
-            )
+        require(
+            self.reset_opacity >= self.prune_opacity,
+            "strategy.growth.reset_opacity",
+            expected=f"at least prune_opacity, {self.prune_opacity:g}",
+            got=self.reset_opacity,
+            cure="Otherwise a reset would prune every Gaussian.",
+        )
 
     def for_plan(self, plan: int) -> "Growth":
         """The schedule of a fit of `plan` steps: all steps scaled by plan / `PUBLISHED_STEPS`.
@@ -111,10 +108,6 @@ class Growth:
         """Whether Gaussians are cloned, split and pruned after this step (steps count from 1)."""
         return self.from_step < step < self.until_step and step % self.every == 0
 
-    def changes_at(self, step: int) -> bool:
-        """Whether any Gaussian is added, pruned or reset after this step."""
-        return self.grows_at(step) or self.resets_at(step)
-
     def resets_at(self, step: int) -> bool:
         """Whether opacities are reset after this step."""
         return step < self.until_step and step % self.reset_every == 0
@@ -132,14 +125,7 @@ class GradientStatistics(NamedTuple):
 
         `screen` is negative for Gaussians that no view shows.
         """
-        num = len(screen)
-        run_tasks(lambda start: _add(start, min(start + CHUNK, num), screen, by_time, *self), range(0, num, CHUNK))
-
-
-@exact_kernel
-def _add(start, stop, screen, by_time, screen_sum, time_sum, seen):
-    for i in range(start, stop):
-        if screen[i] >= 0:
-            screen_sum[i] += screen[i]
-            time_sum[i] += abs(by_time[i])
-            seen[i] += 1
+        shown = screen >= 0
+        np.add(self.screen, screen, out=self.screen, where=shown)
+        np.add(self.time, np.abs(by_time), out=self.time, where=shown)
+        np.add(self.seen, 1, out=self.seen, where=shown)

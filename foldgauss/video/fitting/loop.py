@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from foldgauss._runtime import notebook_hooks
-from foldgauss._runtime.checks import invalid, is_integer, is_within
+from foldgauss._runtime.checks import is_integer, is_within, require
 from foldgauss.video.compression.chunks import arrange
 from foldgauss.video.compression.quantize import Quantized, dequantize
 from foldgauss.video.fitting.budget import StepPlanner, TimeLeft, find_limit, measure_progress
@@ -106,8 +106,7 @@ def fit(
     """
     config = FitConfig() if config is None else config
     observers, history = list(observers), []
-    if not is_integer(every, 1):
-        raise invalid("every", expected="a whole number >= 1", got=repr(every))
+    require(is_integer(every, 1), "every", expected="a whole number >= 1", got=repr(every))
     check_rate("fps", fps)
     for state, info in fit_steps(frames, config, controls=controls):
         for observe in observers:
@@ -144,14 +143,28 @@ def fit_steps(
     fits beside other work are comparable.
     """
     check_frames(frames)
-    _check_alpha(frames, config)
+    has_alpha, interpolated = frames.shape[3] == 4, config.views.interpolation_fraction
+    require(
+        not has_alpha or config.compositing != "sum",
+        "compositing",
+        expected="'over' for frames with alpha",
+        got="'sum'",
+        cure="Sums are never opaque: drop the alpha, or give 'over'.",
+    )
+    require(
+        not has_alpha or not interpolated,
+        "views.interpolation_fraction",
+        expected="0 for frames with alpha",
+        got=interpolated,
+        cure="Leave it out: optical flow does not determine what is behind.",
+    )
     engine = choose_engine(frames, config)
     _warm_up(frames, config, engine)
     find_motion = motion_finder(frames, motion)
-    state = _start(frames, config, None, find_motion, clock) if state is None else state
+    state = start(frames, config, None, find_motion, clock) if state is None else state
     stepper = make_stepper(engine, frames, config, state, find_motion)
     planner, time_left = StepPlanner(config), TimeLeft(state, config)
-    guard = Guard(state, config, stepper.steps_per_pass, alpha=frames.shape[3] == 4)
+    guard = Guard(state, config, stepper.steps_per_pass, alpha=has_alpha)
     controls = [*_make_controls(frames, config, state, guard, find_motion), *controls]
     if state.step == 0 and guard.comparable and config.initialization != "uniform":
         begun = clock()
@@ -247,18 +260,15 @@ def _warm_up(frames: np.ndarray, config: FitConfig, engine: str) -> None:
 # ------------------------------------------------------------------------------------------------ starts
 
 
-def start(frames: np.ndarray, config: FitConfig, logits: np.ndarray | None = None) -> FitState:
-    """State before the first step; frame times start at softmax weights `logits`, or by default evenly in each shot."""
-    return _start(frames, config, logits, motion_finder(frames), time.perf_counter)
-
-
-def _start(
+def start(
     frames: np.ndarray,
     config: FitConfig,
-    logits: np.ndarray | None,
-    find_motion: Callable[[], Motion],
-    clock: Callable[[], float],
+    logits: np.ndarray | None = None,
+    find_motion: Callable[[], Motion] | None = None,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> FitState:
+    """State before the first step; frame times start at softmax weights `logits`, or by default evenly in each shot."""
+    find_motion = find_motion or motion_finder(frames)
     has_alpha, frames = frames.shape[3] == 4, np.ascontiguousarray(frames[..., :3])  # as seen over black
     begun, num_frames = clock(), len(frames)
     motion = find_motion() if config.follows_motion else None
@@ -288,10 +298,8 @@ def start_from(model: VideoModel, config: FitConfig, steps: int, progress: float
 
     Example: `for state, info in fit_steps(frames, config, start_from(model, config, 300, 0.7)): ...`
     """
-    if not is_integer(steps, 1):
-        raise invalid("steps", expected="a whole number >= 1", got=repr(steps))
-    if not is_within(progress, "[0, 1)"):
-        raise invalid("progress", expected="a number in [0, 1)", got=repr(progress))
+    require(is_integer(steps, 1), "steps", expected="a whole number >= 1", got=repr(steps))
+    require(is_within(progress, "[0, 1)"), "progress", expected="a number in [0, 1)", got=repr(progress))
     _check_config(model, config)
     rows, logits = pack(model.splats), np.array(model.frame_times.logits, np.float32)
     done = round(steps * progress / (1 - progress))
@@ -311,9 +319,13 @@ def _check_config(model: VideoModel, config: FitConfig) -> None:
         "strategy.scale_cutoff": (config.strategy.scale_cutoff, model.scale_cutoff),
     }
     for name, (got, expected) in pairs.items():
-        if not np.all(got == expected):
-            cure = "Give the config that the model was fitted with."
-            raise invalid(f"config.{name}", expected=f"the model's, {expected}", got=got, cure=cure)
+        require(
+            np.all(got == expected),
+            f"config.{name}",
+            expected=f"the model's, {expected}",
+            got=got,
+            cure="Give the config that the model was fitted with.",
+        )
 
 
 def _initialize(frames: np.ndarray, config: FitConfig, logits: np.ndarray, motion: Motion | None) -> FoldedSplats:
@@ -325,14 +337,13 @@ def _initialize(frames: np.ndarray, config: FitConfig, logits: np.ndarray, motio
     times = np.asarray(FrameTimes(logits).times())
     opacity = SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY
     clip = {"times": times, "motion": motion, "opacity": opacity}
-    clip["paths"] = _find_paths(motion, times, config) if config.follow_camera else None
+    if motion is not None and config.follow_camera:
+        # Also where the camera moves steadily if that takes no bits.
+        maps = find_shared_motions(motion, steady=config.is_compact)
+        clip["paths"] = (
+            maps if maps is None else SharedPaths(np.tile(np.float32(times), (len(maps), 1)), np.float32(maps))
+        )
     return initialize(frames, lambda life: choose_num(lifetime=life), envelope=envelope_of(config), **clip, **shape)
-
-
-def _find_paths(motion: Motion | None, times: np.ndarray, config: FitConfig) -> SharedPaths | None:
-    """The path of the camera and that of an object; unless they move steadily, where that takes no bits."""
-    maps = None if motion is None else find_shared_motions(motion, steady=config.is_compact)
-    return None if maps is None else SharedPaths(np.tile(np.float32(times), (len(maps), 1)), np.float32(maps))
 
 
 def _path_fields(splats: FoldedSplats, logits: np.ndarray) -> dict[str, np.ndarray]:
@@ -349,10 +360,13 @@ def _path_fields(splats: FoldedSplats, logits: np.ndarray) -> dict[str, np.ndarr
 def check_frames(frames: np.ndarray) -> None:
     """Raise ValueError unless `frames` is a uint8 array (num_frames, height, width, 3 or 4), none of them 0."""
     shape, dtype = getattr(frames, "shape", None), getattr(frames, "dtype", None)
-    if shape is None or len(shape) != 4 or shape[3] not in (3, 4) or dtype != np.uint8 or 0 in shape:
-        got = type(frames).__name__ if shape is None else f"{dtype} {shape}"
-        expected = "a uint8 array (num_frames, height, width, 3 or 4)"
-        raise invalid("frames", expected=expected, got=got, cure=_cure_of_frames(frames, shape, dtype))
+    require(
+        shape is not None and len(shape) == 4 and shape[3] in (3, 4) and dtype == np.uint8 and 0 not in shape,
+        "frames",
+        expected="a uint8 array (num_frames, height, width, 3 or 4)",
+        got=type(frames).__name__ if shape is None else f"{dtype} {shape}",
+        cure=_cure_of_frames(frames, shape, dtype),
+    )
 
 
 def _cure_of_frames(frames: object, shape: tuple[int, ...] | None, dtype: np.dtype | None) -> str:
@@ -370,16 +384,3 @@ def _cure_of_frames(frames: object, shape: tuple[int, ...] | None, dtype: np.dty
     if len(shape) == 3:
         return "One frame: frames[None]. Gray frames: np.repeat(frames[..., None], 3, axis=-1)."
     return ""
-
-
-def _check_alpha(frames: np.ndarray, config: FitConfig) -> None:
-    """Raise ValueError for frames with alpha where a setting does not support it."""
-    if frames.shape[3] != 4:
-        return
-    if config.compositing == "sum":
-        cure = "Sums are never opaque: drop the alpha, or give 'over'."
-        raise invalid("compositing", expected="'over' for frames with alpha", got="'sum'", cure=cure)
-    if config.views.interpolation_fraction:
-        cure = "Leave it out: optical flow does not determine what is behind."
-        got = config.views.interpolation_fraction
-        raise invalid("views.interpolation_fraction", expected="0 for frames with alpha", got=got, cure=cure)

@@ -132,7 +132,12 @@ def make_newborns(
     home = np.sort(rng.choice(len(frames), num, p=errors / errors.sum()))
 
     def density_of(k: int) -> np.ndarray:
-        squares = _measure_squares(state.rows, window, times[k], *_make_target(frames, k, config), spec, config)
+        # With alpha over a random color, always the same for the frame.
+        background = random_background(config.seed, k) if frames.shape[3] == 4 else np.zeros(3, np.float32)
+        done = condition(state.rows, window, times[k], spec)
+        leaves = done.mean, done.factor, done.opacity, done.color, background
+        image = cpu.forward(*leaves, spec.size, compositing=config.compositing, options=config.options).image
+        squares = ((image - to_planes(frames[k], background)) ** 2).sum(0)
         smooth = cv2.GaussianBlur(squares.astype(np.float64), (0, 0), 1.0) + 1e-12
         return smooth / smooth.sum()
 
@@ -147,27 +152,3 @@ def make_newborns(
     larger = 0.0 if paths is None else rows[:, at] + np.log(max(size))  # by the path's zoom
     rows[:, at] = np.log(SMALLER * SCALE_FACTOR * apart) + larger
     return rows
-
-
-def _make_target(
-    frames: UInt8[np.ndarray, "num_frames height width channels"], k: int, config: FitConfig
-) -> tuple[Float32[np.ndarray, "3 height width"], Float[np.ndarray, "3"]]:
-    """Frame k and the background: with alpha, a random color that is always the same for the frame."""
-    background = random_background(config.seed, k) if frames.shape[3] == 4 else np.zeros(3, np.float32)
-    return to_planes(frames[k], background), background
-
-
-def _measure_squares(
-    rows: Float32[np.ndarray, "num width"],
-    window: Float32[np.ndarray, "num 2"],
-    t: float,
-    target: Float32[np.ndarray, "3 height width"],
-    background: Float[np.ndarray, "3"],
-    spec: ConditioningSpec,
-    config: FitConfig,
-) -> Float32[np.ndarray, "height width"]:
-    """Squared errors of the pixels of the image at time t, summed over the channels."""
-    done = condition(rows, window, t, spec)
-    leaves = done.mean, done.factor, done.opacity, done.color, background
-    image = cpu.forward(*leaves, spec.size, compositing=config.compositing, options=config.options).image
-    return ((image - target) ** 2).sum(0)

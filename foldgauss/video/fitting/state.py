@@ -1,31 +1,27 @@
 """`FitState`: the arrays and counters of a running fit; and the model, the error and the PSNR that follow from them.
 
-A new array is one line in `FitState`. Its metadata, a `StateArray`, says how it is built, cut, extended and described;
+A new array is one line in `FitState`. Its metadata, a `StateArray`, says how it is built, cut and extended;
 starting, pruning, densification, copies, checkpoints and devices all go by it.
 """
 
-import abc
 import collections
 import copy
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import field
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import numpy as np
-import optax
 from jaxtyping import Float, Float32, Int
 
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.video.fitting.adam import FRAME_TIME_ADAM, RateUnits, adam_step, sparse_adam
+from foldgauss.video.fitting.adam import adam_step
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.models.conditioning import ConditioningSpec
 from foldgauss.video.models.frame_times import FrameTimes
-from foldgauss.video.models.metrics import psnr
-from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.row_layout import columns, unpack
 from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.models.video_model import VideoModel
@@ -45,91 +41,41 @@ class Sizes(NamedTuple):
     growing: bool = False  # whether there are gradient statistics
     paths: int = 0  # shared paths
 
+    @property
+    def num_intervals(self) -> int:
+        """Intervals between two frames."""
+        return self.num_frames - 1
 
-class StateArray(abc.ABC):
-    """The metadata of a field of arrays."""
-
-    per_gaussian: ClassVar[bool] = False  #: whether every leaf has one row for each Gaussian
-
-    @abc.abstractmethod
-    def spec(self, sizes: Sizes) -> Any:
-        """Shapes and types: a pytree of `jax.ShapeDtypeStruct`."""
-
-    def build(self, sizes: Sizes) -> Any:
-        """The value that a fit starts with."""
-        return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), self.spec(sizes))
-
-    def keep(self, value: Any, index: np.ndarray) -> Any:
-        """The value where only the Gaussians `index` are left."""
-        return value
-
-    def extend(self, value: Any, sizes: Sizes) -> Any:
-        """The value where as many Gaussians as `sizes` has are added."""
-        return value
+    @property
+    def num_measured(self) -> int:
+        """Gaussians with gradient statistics."""
+        return self.num_gaussians if self.growing else 0
 
 
 @dataclasses.dataclass(frozen=True)
-class PerGaussian(StateArray):
-    """An array with an entry of `shape` for each Gaussian, `fill` for a new one; strings in `shape` name `Sizes`."""
+class StateArray:
+    """The metadata of an array: its type, its shape, in which strings name `Sizes`, and the value of new entries."""
 
     dtype: type
     shape: tuple[int | str, ...] = ()
     fill: float = 0
-    per_gaussian: ClassVar[bool] = True
+
+    @property
+    def per_gaussian(self) -> bool:
+        """Whether there is one row for each Gaussian."""
+        return self.shape[:1] == ("num_gaussians",)
 
     def spec(self, sizes: Sizes) -> jax.ShapeDtypeStruct:
         shape = (getattr(sizes, length) if isinstance(length, str) else length for length in self.shape)
-        return jax.ShapeDtypeStruct((sizes.num_gaussians, *shape), self.dtype)
+        return jax.ShapeDtypeStruct(tuple(shape), self.dtype)
 
     def build(self, sizes: Sizes) -> np.ndarray:
+        """The value that a fit starts with."""
         return np.full(self.spec(sizes).shape, self.fill, self.dtype)
 
-    def keep(self, value: np.ndarray, index: np.ndarray) -> np.ndarray:
-        return value[index]
 
-    def extend(self, value: np.ndarray, sizes: Sizes) -> np.ndarray:
-        return np.concatenate([value, self.build(sizes)])
-
-
-class StatisticsArray(StateArray):
-    """`GradientStatistics`, which begin anew whenever the number of Gaussians changes; None where nothing grows."""
-
-    per_gaussian: ClassVar[bool] = True
-
-    def spec(self, sizes: Sizes) -> GradientStatistics | None:
-        floats, counts = (jax.ShapeDtypeStruct((sizes.num_gaussians,), dtype) for dtype in (np.float32, np.int32))
-        return GradientStatistics(floats, floats, counts) if sizes.growing else None
-
-    def keep(self, value: GradientStatistics | None, index: np.ndarray) -> GradientStatistics | None:
-        return jax.tree.map(lambda leaf: np.zeros_like(leaf[index]), value)
-
-    def extend(self, value: GradientStatistics | None, sizes: Sizes) -> GradientStatistics | None:
-        return jax.tree.map(lambda leaf: np.zeros(len(leaf) + sizes.num_gaussians, leaf.dtype), value)
-
-
-@dataclasses.dataclass(frozen=True)
-class PerFrame(StateArray):
-    """One number for each frame, or for each interval between two frames; with Adam's moments of these, if asked."""
-
-    dtype: type = np.float32
-    intervals: bool = False
-    moments: bool = False
-
-    def spec(self, sizes: Sizes) -> Any:
-        values = jax.ShapeDtypeStruct((sizes.num_frames - self.intervals,), self.dtype)
-        return jax.eval_shape(FRAME_TIME_ADAM.init, values) if self.moments else values
-
-
-@dataclasses.dataclass(frozen=True)
-class PathMapsArray(StateArray):
-    """The map of each shared path at each frame, (num_frames, paths, 2, 3), or a moment of these."""
-
-    def spec(self, sizes: Sizes) -> jax.ShapeDtypeStruct:
-        return jax.ShapeDtypeStruct((sizes.num_frames, sizes.paths, 2, 3), np.float32)
-
-
-def _stored(kind: StateArray) -> dict[str, Any]:
-    return {"arrays": kind}
+def _array(dtype: type, *shape: int | str) -> dict[str, Any]:
+    return {"arrays": StateArray(dtype, shape)}
 
 
 def _decode_errors(pairs: Any) -> tuple[tuple[int, float], ...]:
@@ -141,30 +87,16 @@ def _decode_rules(rows: Any) -> tuple[tuple[str, float, float, tuple[float, ...]
 
 
 #: The metadata of fields that are no arrays: `decode` restores them from JSON.
+_FLAG = {"static": True, "decode": bool}
 _COUNT = {"static": True, "decode": int}
 _NUMBER = {"static": True, "decode": float}
 _ERRORS = {"static": True, "decode": _decode_errors}
 _RULES = {"static": True, "decode": _decode_rules}
-_ROW = PerGaussian(np.float32, ("width",))
+#: The names of the sums of `GradientStatistics`.
+STATISTICS = ("screen_gradients", "time_gradients", "seen")
 
 
 # --------------------------------------------------------------------------------------------------- state
-
-
-class DeviceState(Protocol):
-    """The arrays of a fit that are on a device, fetched only where they are read."""
-
-    num: int  #: Gaussians
-    growing: bool  #: whether there are gradient statistics
-
-    def fetch(self, name: str) -> Any:
-        """A field of `FitState` as NumPy arrays, a copy."""
-
-    def is_finite(self, name: str) -> bool:
-        """Whether all values of a field are finite, as computed on the device."""
-
-    def copy(self) -> "DeviceState":
-        """A copy on the device, which later steps do not change."""
 
 
 @jax.tree_util.register_dataclass
@@ -176,23 +108,30 @@ class FitState:
     assigned is used from the next step on.
     """
 
-    rows: np.ndarray = field(metadata=_stored(_ROW))  # parameters, see `row_layout`
-    first: np.ndarray = field(metadata=_stored(_ROW))  # Adam's moments
-    second: np.ndarray = field(metadata=_stored(_ROW))
-    counts: np.ndarray = field(metadata=_stored(PerGaussian(np.int32)))  # steps each Gaussian has taken
-    rounded: np.ndarray = field(metadata=_stored(PerGaussian(np.uint8)))  # the groups of leaves that are, see `rate`
-    classes: np.ndarray = field(metadata=_stored(PerGaussian(np.int8)))  # how visible, by which steps are chosen
-    chunks: np.ndarray = field(metadata=_stored(PerGaussian(np.uint16)))  # of the file; they decrease
-    frame_errors: np.ndarray = field(metadata=_stored(PerFrame()))  # mean squared error when last seen, 0 before
-    time_logits: np.ndarray = field(metadata=_stored(PerFrame(intervals=True)))
-    time_moments: optax.OptState = field(metadata=_stored(PerFrame(intervals=True, moments=True)))
-    path_maps: np.ndarray = field(metadata=_stored(PathMapsArray()))  # of each frame, in model space
-    path_first: np.ndarray = field(metadata=_stored(PathMapsArray()))  # their moments
-    path_second: np.ndarray = field(metadata=_stored(PathMapsArray()))
-    frame_counts: np.ndarray = field(metadata=_stored(PerFrame(np.int32)))  # steps that each frame's maps have taken
-    statistics: GradientStatistics | None = field(
-        metadata=_stored(StatisticsArray())
-    )  # None without densification to come
+    rows: np.ndarray = field(metadata=_array(np.float32, "num_gaussians", "width"))  # parameters, see `row_layout`
+    first: np.ndarray = field(metadata=_array(np.float32, "num_gaussians", "width"))  # Adam's moments
+    second: np.ndarray = field(metadata=_array(np.float32, "num_gaussians", "width"))
+    counts: np.ndarray = field(metadata=_array(np.int32, "num_gaussians"))  # steps each Gaussian has taken
+    rounded: np.ndarray = field(metadata=_array(np.uint8, "num_gaussians"))  # the groups of leaves that are, see `rate`
+    classes: np.ndarray = field(metadata=_array(np.int8, "num_gaussians"))  # how visible, by which steps are chosen
+    chunks: np.ndarray = field(metadata=_array(np.uint16, "num_gaussians"))  # of the file; they decrease
+    frame_errors: np.ndarray = field(
+        metadata=_array(np.float32, "num_frames")
+    )  # mean squared error when last seen, 0 before
+    time_logits: np.ndarray = field(metadata=_array(np.float32, "num_intervals"))
+    time_count: np.ndarray = field(metadata=_array(np.int32))  # steps that the frame times have taken
+    time_first: np.ndarray = field(metadata=_array(np.float32, "num_intervals"))  # their moments
+    time_second: np.ndarray = field(metadata=_array(np.float32, "num_intervals"))
+    path_maps: np.ndarray = field(
+        metadata=_array(np.float32, "num_frames", "paths", 2, 3)
+    )  # of each frame, in model space
+    path_first: np.ndarray = field(metadata=_array(np.float32, "num_frames", "paths", 2, 3))  # their moments
+    path_second: np.ndarray = field(metadata=_array(np.float32, "num_frames", "paths", 2, 3))
+    frame_counts: np.ndarray = field(metadata=_array(np.int32, "num_frames"))  # steps that each frame's maps have taken
+    screen_gradients: np.ndarray = field(metadata=_array(np.float32, "num_measured"))  # see `GradientStatistics`
+    time_gradients: np.ndarray = field(metadata=_array(np.float32, "num_measured"))
+    seen: np.ndarray = field(metadata=_array(np.int32, "num_measured"))
+    growing: bool = field(default=False, metadata=_FLAG)  # whether densification is still to come
     step: int = field(default=0, metadata=_COUNT)
     plan: int = field(default=0, metadata=_COUNT)  # steps of the whole fit; 0 until minutes have been planned
     planned_step: int = field(default=0, metadata=_COUNT)  # where the plan was last changed, and the fraction of the
@@ -210,7 +149,7 @@ class FitState:
     improve_by: int = field(default=0, metadata=_COUNT)  # and with those of the start
     start_errors: tuple[tuple[int, float], ...] = field(default=(), metadata=_ERRORS)  # (frame, error) at the start
     last_finite: "FitState | None" = None  # the last state known to be good, which has none of its own
-    held: ClassVar[DeviceState | None] = None  # of a fit on a device, an attribute of the instance
+    held: ClassVar[Any] = None  # `HeldArrays` of a fit on a device, an attribute of the instance
 
     @classmethod
     def array_fields(cls) -> Mapping[str, StateArray]:
@@ -223,10 +162,10 @@ class FitState:
         return {one.name: one.metadata["decode"] for one in dataclasses.fields(cls) if "decode" in one.metadata}
 
     @classmethod
-    def create(cls, rows: np.ndarray, time_logits: np.ndarray, *, growing: bool = False, **fields: Any) -> "FitState":
+    def create(cls, rows: np.ndarray, time_logits: np.ndarray, **fields: Any) -> "FitState":
         """A state with these Gaussians and frame times; all other arrays as a fit starts with, but for `fields`."""
         paths = fields["path_maps"].shape[1] if "path_maps" in fields else 0
-        sizes = Sizes(*rows.shape, len(time_logits) + 1, growing, paths=paths)
+        sizes = Sizes(*rows.shape, len(time_logits) + 1, fields.get("growing", False), paths)
         fields |= {"rows": rows, "time_logits": time_logits}
         arrays = {name: kind.build(sizes) for name, kind in cls.array_fields().items() if name not in fields}
         return cls(**arrays, **fields)
@@ -243,9 +182,14 @@ class FitState:
         return len(self.rows) if self.held is None else self.held.num
 
     @property
-    def growing(self) -> bool:
-        """Whether densification is still to come."""
-        return self.statistics is not None if self.held is None else self.held.growing
+    def statistics(self) -> GradientStatistics | None:
+        """The sums by which Gaussians grow; None without densification to come."""
+        return GradientStatistics(*(getattr(self, name) for name in STATISTICS)) if self.growing else None
+
+    def restart_statistics(self) -> None:
+        """Sums begin anew; unless `growing` there are none."""
+        for name in STATISTICS:
+            setattr(self, name, self.array_fields()[name].build(self.sizes))
 
     @property
     def sizes(self) -> Sizes:
@@ -267,15 +211,18 @@ class FitState:
     def keep(self, index: np.ndarray) -> None:
         """Drop all Gaussians but those of `index`, or reorder them."""
         for name, kind in self.array_fields().items():
-            setattr(self, name, kind.keep(getattr(self, name), index))
+            if kind.per_gaussian:
+                setattr(self, name, getattr(self, name)[index])
+        self.restart_statistics()
 
     def extend(self, rows: np.ndarray) -> None:
         """Add Gaussians at the end: their rows; in all other fields they are as at a start."""
-        sizes, born = Sizes(*rows.shape, len(self.frame_errors)), {"rows": rows}
+        born = Sizes(*rows.shape, len(self.frame_errors))
         for name, kind in self.array_fields().items():
-            value = getattr(self, name)
-            new = np.concatenate([value, born[name]]) if name in born else kind.extend(value, sizes)
-            setattr(self, name, new)
+            if kind.per_gaussian:
+                new = rows if name == "rows" else kind.build(born)
+                setattr(self, name, np.concatenate([getattr(self, name), new]))
+        self.restart_statistics()
 
     # --------------------------------------------------------------------------------------- copies, and devices
 
@@ -291,9 +238,9 @@ class FitState:
         """Take the arrays of `last_finite` back, as copies."""
         self.held = None
         for name in self.array_fields():
-            setattr(self, name, jax.tree.map(np.array, getattr(self.last_finite, name)))
+            setattr(self, name, np.array(getattr(self.last_finite, name)))
 
-    def hold(self, held: DeviceState) -> None:
+    def hold(self, held: Any) -> None:
         """From now on all arrays are those of `held`."""
         for name in ARRAYS:
             self.__dict__.pop(name, None)
@@ -312,8 +259,9 @@ class FitState:
         return self.held is not None and not self.__dict__.keys().isdisjoint(ARRAYS)
 
 
-#: The names of the arrays of a `FitState`; the arrays as a pytree, as a device keeps them.
+#: The names of the arrays of a `FitState`.
 ARRAYS = tuple(FitState.array_fields())
+#: The arrays as a device keeps them.
 DeviceArrays = collections.namedtuple("DeviceArrays", ARRAYS)
 
 
@@ -369,28 +317,11 @@ def measure_relative_size(state: FitState, config: FitConfig) -> float:
     return math.exp(min(mean, 0.0)) / unit if unit and math.isfinite(mean) else 1.0
 
 
-def update_rows(state: FitState, grad: np.ndarray, touched: np.ndarray, rates: np.ndarray, *, units: RateUnits) -> bool:
-    """A step of Adam on the rows `touched`, in place; `grad` becomes zero there.
-
-    Returns whether these rows are finite.
-
-    `grad` is float32 (num, width), `rates` and `units` are those of `sparse_adam`.
-    """
-    moments = state.first, state.second, state.counts
-    return sparse_adam(state.rows, grad, *moments, touched, rates, rounded=state.rounded, units=units)
-
-
 def running_psnr(state: FitState) -> float:
     """dB, by the mean squared error of the frames as last seen; at most 100, as `psnr` has for equal images."""
     seen = state.frame_errors[state.frame_errors != 0]
     errors = seen if len(seen) else [error for _, error in state.start_errors] or [0.0]
     return -10 * math.log10(max(float(np.mean(errors)), 1e-10))
-
-
-def mean_psnr(state: FitState, config: FitConfig, frames: np.ndarray) -> float:
-    """dB, mean over all frames, rendered over black."""
-    renderer = VideoRenderer(to_model(state, config, frames.shape[1:3], 1.0))
-    return float(np.mean([psnr(frame[..., :3], image) for frame, image in zip(frames, renderer.frames(), strict=True)]))
 
 
 def spec_of(config: FitConfig, size: tuple[int, int]) -> ConditioningSpec:

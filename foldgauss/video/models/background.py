@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from foldgauss._numerics.random_streams import Stream, make_generator
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 
 BLACK = (0.0, 0.0, 0.0)
 #: Red, green and blue in [0, 1]; None: transparent, images get alpha.
@@ -37,9 +37,17 @@ def check_background(background: object, compositing: str = "over") -> Float[np.
     if background is None and compositing != "sum":
         return np.zeros(4, np.float32)
     color = np.asarray(BLACK if background is None else background)
-    if color.shape != (3,) or color.dtype.kind not in "fiu" or not ((color >= 0) & (color <= 1)).all():
-        raise invalid("background", expected="red, green and blue in [0, 1]", got=background)
-    if compositing == "sum" and (color.any() or background is None):
-        expected = "black for a model fitted with compositing 'sum'"
-        raise invalid("background", expected=expected, got=background, cure="Sums have no alpha: all of it would show.")
+    require(
+        color.shape == (3,) and color.dtype.kind in "fiu" and ((color >= 0) & (color <= 1)).all(),
+        "background",
+        expected="red, green and blue in [0, 1]",
+        got=background,
+    )
+    require(
+        compositing != "sum" or (background is not None and not color.any()),
+        "background",
+        expected="black for a model fitted with compositing 'sum'",
+        got=background,
+        cure="Sums have no alpha: all of it would show.",
+    )
     return color.astype(np.float32)

@@ -13,7 +13,7 @@ import numba as nb
 import numpy as np
 
 from foldgauss._numerics.simd import LANES, broadcast, cos_and_sin, exp, load, select, sigmoid, sqrt, store
-from foldgauss._runtime.kernels import exact_kernel, inline, kernel
+from foldgauss._runtime.kernels import inline, kernel
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import pixels_per_unit
 from foldgauss.video.models.row_layout import columns, has_path_column
@@ -369,21 +369,9 @@ def condition(
     return ConditionedSplats(alive, t, unit, mean, factor, opacity, color, kept, maps)
 
 
-def mirror(mean: np.ndarray, factor: np.ndarray, width: float, *, out: tuple[np.ndarray, np.ndarray]) -> None:
-    """Splats in pixels as the opposite camera sees them, left for right; with width 0 the transpose, for gradients.
-
-    `out`: mean and factor of the result, which may be `mean` and `factor`.
-    """
-    num, width = len(mean), np.float32(width)
-    run_tasks(lambda start: _mirror(start, min(start + CHUNK, num), mean, factor, width, *out), range(0, num, CHUNK))
-
-
-@exact_kernel
-def _mirror(start, stop, mean, factor, width, out_mean, out_factor):
-    for k in range(start, stop):
-        out_mean[k, 0], out_mean[k, 1] = width - mean[k, 0], mean[k, 1]
-        for column in range(2):
-            out_factor[k, 0, column], out_factor[k, 1, column] = -factor[k, 0, column], factor[k, 1, column]
+def mirror(mean: np.ndarray, factor: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Splats in pixels as the opposite camera sees them, left for right; with width 0 the transpose, for gradients."""
+    return np.stack([np.float32(width) - mean[:, 0], mean[:, 1]], 1), factor * np.float32([[-1], [1]])
 
 
 def backpropagate(

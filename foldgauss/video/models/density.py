@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.mixture import FoldedMixture
 from foldgauss.render import RenderOptions, Splats2D, render
 
@@ -35,13 +35,16 @@ def density_image(
     Source: eq:foldgauss, as the accumulated blend of eq:vegas_equiv_cond. Raises ValueError unless the mixture is of
     (x, y, t), and as `render`.
     """
-    if mixture.event_shape != (3,) or mixture.batch_shape != ():
-        got = f"event {mixture.event_shape}, batch {mixture.batch_shape}"
-        raise invalid("mixture", expected="points (x, y, t) and no batch", got=got, cure="Use marginal, or jax.vmap.")
+    require(
+        mixture.event_shape == (3,) and mixture.batch_shape == (),
+        "mixture",
+        expected="points (x, y, t) and no batch",
+        got=f"event {mixture.event_shape}, batch {mixture.batch_shape}",
+        cure="Use marginal, or jax.vmap.",
+    )
     components, dtype = mixture.components, mixture.components.loc.dtype
     t = jnp.asarray(t, dtype)
-    if t.ndim:
-        raise invalid("t", expected="one number", got=f"shape {t.shape}", cure="Use jax.vmap for several times.")
+    require(not t.ndim, "t", expected="one number", got=f"shape {t.shape}", cure="Use jax.vmap for several times.")
     at = components.condition_time(t)
     log_det = jnp.log(jnp.diagonal(at.base_tril, axis1=-2, axis2=-1)).sum(-1) + 2 * at.log_scale
     log_peak = mixture.log_weights + components.time_marginal.log_prob(t) - log_det - _LOG_2PI

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Float32
 
-from foldgauss._runtime.checks import invalid, is_integer, is_within, short_repr
+from foldgauss._runtime.checks import is_integer, is_within, require, short_repr
 
 #: Length of the gap between two shots, in frames: this,
 GAP = 8.0
@@ -37,8 +37,7 @@ class FrameTimes(eqx.Module):
     @classmethod
     def uniform(cls, num_frames: int) -> "FrameTimes":
         """Equally spaced times. Raises ValueError for no frames."""
-        if num_frames < 1:
-            raise invalid("num_frames", expected="at least 1", got=num_frames)
+        require(num_frames >= 1, "num_frames", expected="at least 1", got=num_frames)
         return cls(np.zeros(num_frames - 1, np.float32))
 
     @property
@@ -52,17 +51,6 @@ class FrameTimes(eqx.Module):
         """
         summed = jnp.cumsum(jax.nn.softmax(jnp.asarray(self.logits)))
         return jnp.concatenate([jnp.zeros(1, summed.dtype), summed / summed[-1:]])
-
-    def cut_after(self, k: int) -> bool:
-        """Whether there is a cut between frames k and k + 1. Raises ValueError unless both are frames of the clip."""
-        check_frame_before(k, self.num_frames)
-        return bool(is_cut(self.times())[k])
-
-
-def check_frame_before(k: object, num_frames: int) -> None:
-    """Raise unless `k` is the number of a frame before the last one."""
-    if not is_integer(k, 0) or k > num_frames - 2:
-        raise invalid("k", expected=f"the number of a frame before the last of {num_frames}", got=short_repr(k))
 
 
 def make_time_logits(num_frames: int, cuts: Sequence[int]) -> Float32[np.ndarray, " intervals"]:
@@ -104,8 +92,7 @@ def interpolated_times(times: np.ndarray, upsample: int) -> np.ndarray:
     At a cut the first half of the new frames repeats the frame before it, the second half the frame after it.
     Shape ((n - 1) * upsample + 1,). Source: VeGaS, the sentence after eq:frame_fitting.
     """
-    if not is_integer(upsample, 1):
-        raise invalid("upsample", expected="a whole number >= 1", got=short_repr(upsample))
+    require(is_integer(upsample, 1), "upsample", expected="a whole number >= 1", got=short_repr(upsample))
     return times_at(times, np.arange((len(times) - 1) * upsample + 1) / upsample)
 
 
@@ -129,8 +116,13 @@ def played_positions(num_frames: int, rate: float, *, speed: float = 1.0) -> Flo
     is included only if a step lands on it. Raises ValueError unless rate > 0 and speed is finite and not 0.
     """
     check_rate("rate", rate)
-    if not (np.isfinite(speed) and speed != 0):
-        raise invalid("speed", expected="a number other than 0", got=speed, cure="0.25 is slow motion, -1 backwards.")
+    require(
+        np.isfinite(speed) and speed != 0,
+        "speed",
+        expected="a number other than 0",
+        got=speed,
+        cure="0.25 is slow motion, -1 backwards.",
+    )
     step = abs(speed) / rate
     positions = np.arange(int(np.floor((num_frames - 1) / step + 1e-9)) + 1) * step
     return positions if speed > 0 else num_frames - 1 - positions
@@ -148,19 +140,24 @@ def remapped_positions(
     check_rate("fps", fps)
     check_rate("rate", rate)
     points = np.asarray(remap, np.float64)
-    if points.ndim != 2 or points.shape[1:] != (2,) or len(points) < 2 or not np.isfinite(points).all():
-        expected = "at least two rows (second shown, second of the clip)"
-        raise invalid("remap", expected=expected, got=f"shape {points.shape}" if np.isfinite(points).all() else remap)
+    require(
+        points.ndim == 2 and points.shape[1:] == (2,) and len(points) >= 2 and np.isfinite(points).all(),
+        "remap",
+        expected="at least two rows (second shown, second of the clip)",
+        got=f"shape {points.shape}" if np.isfinite(points).all() else remap,
+    )
     shown, of_clip = points.T
-    if shown[0] != 0 or (np.diff(shown) <= 0).any():
-        raise invalid("remap", expected="seconds shown that rise from 0", got=shown.tolist())
-    if of_clip.min() < 0:
-        raise invalid("remap", expected="seconds of the clip >= 0", got=of_clip.tolist())
+    require(
+        shown[0] == 0 and (np.diff(shown) > 0).all(),
+        "remap",
+        expected="seconds shown that rise from 0",
+        got=shown.tolist(),
+    )
+    require(of_clip.min() >= 0, "remap", expected="seconds of the clip >= 0", got=of_clip.tolist())
     seconds = np.arange(int(np.floor(shown[-1] * fps * rate + 1e-9)) + 1) / (fps * rate)
     return np.interp(seconds, shown, of_clip) * fps
 
 
 def check_rate(name: str, rate: float) -> None:
     """Raise ValueError unless a number of frames a second, or a ratio of two, is positive and finite."""
-    if not is_within(rate, "(0, inf)"):
-        raise invalid(name, expected="a number > 0", got=short_repr(rate))
+    require(is_within(rate, "(0, inf)"), name, expected="a number > 0", got=short_repr(rate))

@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import skimage
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss._runtime.threads import num_threads, run_tasks
 from foldgauss.video.models.background import BLACK, check_background, composite
-from foldgauss.video.models.renderer import RenderableVideo
+from foldgauss.video.models.renderer import RenderedVideo
 
 
 def psnr(target: np.ndarray, image: np.ndarray) -> float:
@@ -69,7 +69,7 @@ class Evaluation:
 
 
 def evaluate(
-    model: RenderableVideo,
+    model: RenderedVideo,
     frames: np.ndarray,
     on_frame: Callable[[np.ndarray], None] | None = None,
     *,
@@ -103,10 +103,13 @@ def evaluate(
     return Evaluation(*map(tuple, scores.T.tolist()))
 
 
-def check_frames(model: RenderableVideo, frames: np.ndarray) -> None:
+def check_frames(model: RenderedVideo, frames: np.ndarray) -> None:
     """Raise unless `frames` are uint8 frames of the model's number and size, with or without alpha."""
     expected = (model.num_frames, *model.size)
     shape, dtype = getattr(frames, "shape", None), getattr(frames, "dtype", None)
-    if shape is None or tuple(shape[:-1]) != expected or shape[-1] not in (3, 4) or dtype != np.uint8:
-        wanted = f"uint8 {(*expected, 3)}, or 4 with alpha"
-        raise invalid("frames", expected=wanted, got=type(frames).__name__ if shape is None else f"{dtype} {shape}")
+    require(
+        shape is not None and tuple(shape[:-1]) == expected and shape[-1] in (3, 4) and dtype == np.uint8,
+        "frames",
+        expected=f"uint8 {(*expected, 3)}, or 4 with alpha",
+        got=type(frames).__name__ if shape is None else f"{dtype} {shape}",
+    )

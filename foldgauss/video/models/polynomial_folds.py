@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import expit
 
-from foldgauss._runtime.checks import invalid, is_integer
+from foldgauss._runtime.checks import is_integer, require
 from foldgauss.video.models.splats import TAU_MAX, FoldedSplats, find_axes
 from foldgauss.video.models.video_model import VideoModel, check_model
 
@@ -48,8 +48,12 @@ def without_paths(model: VideoModel, degree: int | None = None) -> tuple[VideoMo
         return model, np.zeros(model.num_gaussians)
     on_path = np.asarray(splats.path_index) > 0
     least = max(1, int(splats.degrees[~on_path].max(initial=0)))
-    if degree is not None and not is_integer(degree, least):
-        raise invalid("degree", expected=f"a whole number from {least}", got=repr(degree))
+    require(
+        degree is None or is_integer(degree, least),
+        "degree",
+        expected=f"a whole number from {least}",
+        got=repr(degree),
+    )
     lowest = max(splats.degree, 1) if degree is None else int(degree)
     highest = max(lowest, MAX_DEGREE) if degree is None else lowest
     coefficients = np.zeros((model.num_gaussians, highest, 2))

@@ -1,11 +1,11 @@
 """A model prepared for conditioning on many times, for images of one size: packed rows and their time windows."""
 
-from typing import Protocol
+from typing import Any
 
 import jax
 import numpy as np
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import Splats2D
 from foldgauss.render.splats import check_size
@@ -15,23 +15,13 @@ from foldgauss.video.models.conditioning import (
     condition,
     find_windows,
 )
-from foldgauss.video.models.frame_times import FrameTimes, snap_to_shots
+from foldgauss.video.models.renderer import PreparedVideo
 from foldgauss.video.models.row_layout import pack
 from foldgauss.video.models.shared_paths import check_paths
-from foldgauss.video.models.splats import FoldedSplats
 
 
-class _Model(Protocol):
-    """The attributes needed of a `VideoModel`, which imports this module."""
-
-    splats: FoldedSplats
-    frame_times: FrameTimes
-    size: tuple[int, int]
-    scale_cutoff: float
-
-
-class PreparedModel:
-    """The Gaussians of a model, ready to be conditioned on any time, in pixels of an image of `size`.
+class PreparedModel(PreparedVideo):
+    """The Gaussians of a `VideoModel`, ready to be conditioned on any time, in pixels of an image of `size`.
 
     `aspect` is the height / width of the frame that covers the image (default: the model's).
 
@@ -41,11 +31,18 @@ class PreparedModel:
     infinities or with several envelopes.
     """
 
-    def __init__(self, model: _Model, size: tuple[int, int], *, aspect: float | None = None):
+    def __init__(self, model: Any, size: tuple[int, int], *, aspect: float | None = None):
         check_size(size)
         height, width = model.size
         self.rows = pack(model.splats)
-        _check_finite(self.rows)
+        broken = int((~np.isfinite(self.rows)).any(-1).sum())
+        require(
+            not broken,
+            "model",
+            expected="finite numbers",
+            got=f"others in {broken:,} Gaussians",
+            cure="The fit diverged, or the model was edited: fit again.",
+        )
         power, floor = (_common_value(model.splats.envelope, name) for name in ("power", "floor"))
         aspect = height / width if aspect is None else aspect
         check_paths(model.splats)
@@ -53,7 +50,7 @@ class PreparedModel:
         own = {"aspect": aspect, "paths": paths, "scale_cutoff": model.scale_cutoff}
         self.spec = ConditioningSpec(model.splats.degree, power, floor, tuple(size), **own)
         self.window = find_windows(self.rows, self.spec)
-        self._times = np.asarray(model.frame_times.times())
+        self.times = np.asarray(model.frame_times.times())
 
     def at(self, t: float, members: np.ndarray | None = None) -> ConditionedSplats:
         """The Gaussians alive at time t, also outside [0, 1]; of `members`, bool (num_gaussians,), if given."""
@@ -64,25 +61,15 @@ class PreparedModel:
         done = self.at(t)
         return Splats2D(done.mean, done.factor, done.opacity, done.color)
 
-    def weighted_splats(self, t: float) -> list[tuple[float, Splats2D]]:
-        """A single image, see `foldgauss.video.models.renderer.PreparedVideo`."""
-        return [(1.0, self.splats(snap_to_shots(t, self._times)))]
-
-
-def _check_finite(rows: np.ndarray) -> None:
-    broken = int((~np.isfinite(rows)).any(-1).sum())
-    if broken:
-        got, cure = (
-            f"others in {broken:,} Gaussians",
-            "The fit diverged, or the model was edited: fit again.",
-        )
-        raise invalid("model", expected="finite numbers", got=got, cure=cure)
-
 
 def _common_value(envelope: TimeLikelihood, name: str) -> float:
     """The value that all Gaussians have in common."""
     values = np.unique(np.asarray(getattr(envelope, name)))
-    if values.size != 1:
-        got, cure = f"{values.size} different ones", "Use VideoModel.render, which supports one envelope per Gaussian."
-        raise invalid(f"model.splats.envelope.{name}", expected="one number for all Gaussians", got=got, cure=cure)
+    require(
+        values.size == 1,
+        f"model.splats.envelope.{name}",
+        expected="one number for all Gaussians",
+        got=f"{values.size} different ones",
+        cure="Use VideoModel.render, which supports one envelope per Gaussian.",
+    )
     return float(values[0])

@@ -1,22 +1,27 @@
-"""Rendering of a video's frames on the CPU: 8-bit images at any times.
+"""Videos and the rendering of their frames on the CPU: images at any times.
 
-Conditioning uses the fused kernels (`conditioning`) and blending the CPU engine: no XLA, and no work for Gaussians that
-are not alive.
+`RenderedVideo` is the base class of all videos. Conditioning uses the fused kernels (`conditioning`) and blending the
+CPU engine: no XLA, and no work for Gaussians that are not alive.
 """
 
+import math
 from collections.abc import Iterator
-from typing import Protocol
+from operator import attrgetter
 
+import jax.numpy as jnp
 import numba as nb
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from foldgauss._runtime.checks import invalid, short_repr
+from foldgauss._numerics.batch import concrete_value
+from foldgauss._runtime import notebook_hooks
+from foldgauss._runtime.checks import invalid, is_integer, is_within, require, short_repr
 from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import RenderOptions, Splats2D, cpu
 from foldgauss.render.splats import check_size
 from foldgauss.video.models.background import BLACK, Background, check_background
+from foldgauss.video.models.frame_times import FrameTimes, snap_to_shots
 
 ROWS = 64  # of pixels per task
 
@@ -24,30 +29,127 @@ _f = nb.float32
 _byte = nb.uint8
 
 
-class PreparedVideo(Protocol):
-    """A video prepared for images of one size, by its `prepare(size)`."""
+class PreparedVideo:
+    """A video prepared for images of one size, by its `prepare(size)`; `times` are those of its frames."""
+
+    times: Float[np.ndarray, " frames"]
 
     def splats(self, t: float) -> Splats2D:
         """The splats of time t, front to back; NumPy leaves."""
+        raise NotImplementedError
 
     def weighted_splats(self, t: float) -> list[tuple[float, Splats2D]]:
         """The splats of the images whose weighted sum is the frame at time t, with the weights, which sum to 1.
 
         In the gap of a cut they are those of the nearer shot.
         """
+        return [(1.0, self.splats(snap_to_shots(t, self.times)))]
 
 
-class RenderableVideo(Protocol):
-    """The interface of all videos: `VideoModel`, `EditedVideo`, `SegmentedVideo`."""
+def check_time(t: float, name: str = "t", cure: str = "Frame k is at frame_times.times()[k].") -> None:
+    """Raise ValueError unless t is one time, in [0, 1] if its value is known."""
+    try:
+        time = jnp.asarray(t)
+        value = concrete_value(time)
+    except (TypeError, ValueError):
+        raise invalid(name, expected="a time in [0, 1]", got=short_repr(t)) from None
+    require(not time.ndim, name, expected="one time in [0, 1]", got=short_repr(t))
+    require(value is None or 0 <= value <= 1, name, expected="a time in [0, 1]", got=value, cure=cure)
+
+
+def choose_time(video: "RenderedVideo", time: float | None, frame: int | None, seconds: float | None) -> float:
+    """The time in [0, 1] of the one argument that is not None; `VideoModel.render` documents them and the errors."""
+    given = [name for name, value in (("time", time), ("frame", frame), ("seconds", seconds)) if value is not None]
+    if len(given) != 1:
+        raise TypeError(
+            f"render: expected exactly one of time, frame and seconds, got {' and '.join(given) or 'none'}."
+        )
+    if time is not None:
+        check_time(time, "time", "Frame k is render(frame=k), second s of the clip render(seconds=s).")
+        return time
+    num, cure = video.num_frames, "For what lies between frames use time or seconds."
+    if frame is not None:
+        require(
+            is_integer(frame, -math.inf), "frame", expected="the number of a frame", got=short_repr(frame), cure=cure
+        )
+        if not -num <= frame < num:
+            raise IndexError(f"frame: expected a number from {-num} to {num - 1} of {num} frames, got {frame}.")
+        position = float(frame % num)
+    else:
+        require(
+            is_within(seconds, f"[0, {num / video.fps}]"),
+            "seconds",
+            expected=f"seconds in [0, {num / video.fps:g}], as {num} frames at {video.fps:g} a second last",
+            got=short_repr(seconds),
+        )
+        position = float(min(seconds * video.fps, num - 1))
+    times, before = video.frame_times.times(), int(position)
+    return times[before] + (position - before) * (times[min(before + 1, num - 1)] - times[before])
+
+
+class RenderedVideo:
+    """A video, which `VideoRenderer` renders: `VideoModel`, `EditedVideo`, `SegmentedVideo`, `StabilizedVideo`."""
 
     size: tuple[int, int]
     fps: float
     options: RenderOptions
     compositing: str
     num_frames: int
+    frame_times: FrameTimes
 
     def prepare(self, size: tuple[int, int]) -> PreparedVideo:
         """Prepared for conditioning on many times, for images of `size`."""
+        raise NotImplementedError
+
+    def render(
+        self,
+        time: float | None = None,
+        size: tuple[int, int] | None = None,
+        *,
+        frame: int | None = None,
+        seconds: float | None = None,
+        background: Background = BLACK,
+    ) -> Float[np.ndarray, "height width channels"]:
+        """The image at one moment, values about [0, 1], over `background`; as `VideoRenderer`, in NumPy.
+
+        Exactly one of `time`, `frame` and `seconds` says which, as for `VideoModel.render`, which has the errors, too.
+        """
+        t = choose_time(self, time, frame, seconds)
+        return np.moveaxis(VideoRenderer(self, size, background=background).image(t), 0, -1)
+
+    def frames(
+        self,
+        times: np.ndarray | None = None,
+        size: tuple[int, int] | None = None,
+        *,
+        background: Background = BLACK,
+    ) -> Iterator[UInt8[np.ndarray, "height width channels"]]:
+        """Images at `times` (default: the frame times) one by one, over `background`, uint8 (height, width, 3);
+        (height, width, 4), with premultiplied colors, where it is None."""
+        yield from VideoRenderer(self, size, background=background).frames(times)
+
+    def at(self, t: float, size: tuple[int, int] | None = None) -> Splats2D:
+        """The splats of time t, front to back, in pixels of an image of `size` (default: its own); NumPy leaves.
+
+        In a cross-fade of segments they are those of the model with the larger weight.
+        """
+        check_time(t)
+        return self.prepare(self.size if size is None else size).splats(float(t))
+
+    def _repr_html_(self) -> str | None:
+        """The player, in a notebook; None if its page would be too large or no folded model represents the edits."""
+        return notebook_hooks.show("video", self)
+
+
+class FollowingVideo(RenderedVideo):
+    """A video whose frames are those of another, `_lead`."""
+
+    frame_times = property(attrgetter("_lead.frame_times"))
+    num_frames = property(attrgetter("_lead.num_frames"))
+    size = property(attrgetter("_lead.size"))
+    fps = property(attrgetter("_lead.fps"))
+    options = property(attrgetter("_lead.options"))
+    compositing = property(attrgetter("_lead.compositing"))
 
 
 class VideoRenderer:
@@ -67,7 +169,7 @@ class VideoRenderer:
 
     def __init__(
         self,
-        model: RenderableVideo,
+        model: RenderedVideo,
         size: tuple[int, int] | None = None,
         *,
         background: Background = BLACK,
@@ -97,9 +199,13 @@ class VideoRenderer:
         """The images at `times` (default: the model's frame times), one by one."""
         chosen = np.asarray(self.model.frame_times.times() if times is None else times)
         close = 1e-6  # rounding of summed steps
-        if chosen.ndim != 1 or chosen.dtype.kind not in "fiu" or not ((chosen >= -close) & (chosen <= 1 + close)).all():
-            cure = "Frame k is at frame_times.times()[k]."
-            raise invalid("times", expected="a list of times in [0, 1]", got=short_repr(times), cure=cure)
+        require(
+            chosen.ndim == 1 and chosen.dtype.kind in "fiu" and ((chosen >= -close) & (chosen <= 1 + close)).all(),
+            "times",
+            expected="a list of times in [0, 1]",
+            got=short_repr(times),
+            cure="Frame k is at frame_times.times()[k].",
+        )
         for t in chosen:
             yield self.frame(t)
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from foldgauss._numerics.piecewise import locate, locate_in_rows
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.render import Splats2D
 
 #: A Gaussian's path is a byte: 0 for none, else the number of the path, from 1.
@@ -91,26 +91,6 @@ def move_splats(splats: Splats2D, path_index: UInt8[Array, " num"], maps: Float[
     return Splats2D(mean, linear @ splats.factor, splats.opacity, splats.color, splats.depth)
 
 
-def leave_paths(splats: Any, which: Bool[np.ndarray, " num"]) -> Any:
-    """`FoldedSplats` of NumPy arrays where those of `which` are on no path, at the position and size of their m_t.
-
-    They keep their angles and folds.
-    """
-    if splats.paths is None or not (which & (splats.path_index > 0)).any():
-        return splats
-    times = 1 / (1 + np.exp(-splats.time_loc_logit.astype(float)))
-    leaving = np.where(which, splats.path_index, np.uint8(0))
-    maps = splats.paths.by_index(np.float32(times), leaving)
-    loc = np.einsum("nij,nj->ni", maps[:, :, :2], splats.loc) + maps[:, :, 2]
-    larger = 0.5 * np.log(np.abs(np.linalg.det(maps[:, :, :2].astype(float))))
-    return dataclasses.replace(
-        splats,
-        loc=loc.astype(np.float32),
-        log_scale=(splats.log_scale + larger[:, None]).astype(np.float32),
-        path_index=np.where(which, np.uint8(0), splats.path_index),
-    )
-
-
 def check_paths(splats: Any) -> None:
     """Raise ValueError unless maps and times are finite, times do not decrease, and every Gaussian's path is there.
 
@@ -119,13 +99,27 @@ def check_paths(splats: Any) -> None:
     if splats.paths is None:
         return
     times, matrices = np.asarray(splats.paths.times), np.asarray(splats.paths.matrices)
-    if not (np.isfinite(times).all() and np.isfinite(matrices).all()):
-        raise invalid("paths", expected="finite times and matrices", got="others", cure="Fit again.")
-    if (np.diff(times, axis=1) < 0).any():
-        raise invalid("paths.times", expected="times that do not decrease", got="others", cure="Sort the knots.")
+    require(
+        np.isfinite(times).all() and np.isfinite(matrices).all(),
+        "paths",
+        expected="finite times and matrices",
+        got="others",
+        cure="Fit again.",
+    )
+    require(
+        (np.diff(times, axis=1) >= 0).all(),
+        "paths.times",
+        expected="times that do not decrease",
+        got="others",
+        cure="Sort the knots.",
+    )
     largest = int(np.asarray(splats.path_index).max(initial=0))
-    if largest > splats.paths.num_paths:
-        raise invalid("path_index", expected=f"paths from 0 to {splats.paths.num_paths}", got=largest)
+    require(
+        largest <= splats.paths.num_paths,
+        "path_index",
+        expected=f"paths from 0 to {splats.paths.num_paths}",
+        got=largest,
+    )
 
 
 def to_pixel_maps(
@@ -204,7 +198,6 @@ def join_paths(parts: Sequence[Any]) -> tuple[UInt8[np.ndarray, " num"], SharedP
                 numbers.append(known[key])
         own = np.zeros(part.num_gaussians, int) if part.paths is None else np.asarray(part.path_index)
         index.append(np.array(numbers)[own])
-    if len(rows) > MAX_PATHS:
-        raise invalid("paths", expected=f"at most {MAX_PATHS} in all", got=len(rows))
+    require(len(rows) <= MAX_PATHS, "paths", expected=f"at most {MAX_PATHS} in all", got=len(rows))
     times, matrices = map(np.stack, zip(*rows, strict=True))
     return jnp.asarray(np.concatenate(index).astype(np.uint8)), SharedPaths(jnp.asarray(times), jnp.asarray(matrices))

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, UInt8
 
 from foldgauss._numerics.batch import concrete_value
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
 from foldgauss.fold import AbstractFold, PolynomialFold, SharedPathFold, ZeroFold
@@ -138,16 +138,22 @@ class FoldedSplats(eqx.Module):
         Example: `FoldedSplats.from_mixture(mixture, color=[1.0, 0.5, 0.0]).at(0.5)`.
         """
         components = mixture.components
-        if mixture.event_shape != (3,) or mixture.batch_shape != ():
-            got = f"event {mixture.event_shape}, batch {mixture.batch_shape}"
-            raise invalid("mixture", expected="points (x, y, t) and no batch", got=got, cure="Index its leaves.")
+        require(
+            mixture.event_shape == (3,) and mixture.batch_shape == (),
+            "mixture",
+            expected="points (x, y, t) and no batch",
+            got=f"event {mixture.event_shape}, batch {mixture.batch_shape}",
+            cure="Index its leaves.",
+        )
         time_loc, dtype, num = components.time_loc, components.loc.dtype, mixture.num_components
         outside = concrete_value((time_loc <= 0) | (time_loc >= 1))
-        if outside is not None and outside.any():
-            cure = "A video's time is [0, 1]: shift and scale the mixture's."
-            raise invalid(
-                "mixture.components.time_loc", expected="times in (0, 1)", got=concrete_value(time_loc), cure=cure
-            )
+        require(
+            outside is None or not outside.any(),
+            "mixture.components.time_loc",
+            expected="times in (0, 1)",
+            got=concrete_value(time_loc),
+            cure="A video's time is [0, 1]: shift and scale the mixture's.",
+        )
         log_scale, angle = find_axes(components.scale_tril)
         log_weights = mixture.log_weights
         log_opacity = log_weights - log_weights.max() + float(np.log(PEAK_OPACITY))
@@ -227,28 +233,38 @@ def find_axes(tril: Float[Array, "num 2 2"]) -> tuple[Float[Array, "num 2"], Flo
 def _coefficients(fold: AbstractFold, num: int, dtype) -> Float[Array, "num degree 2"]:
     if isinstance(fold, ZeroFold):
         return jnp.zeros((num, 0, 2), dtype)
-    if not isinstance(fold, PolynomialFold):
-        cure = "Splats hold polynomial folds only."
-        raise invalid("mixture.components.fold", expected="a PolynomialFold", got=type(fold).__name__, cure=cure)
+    require(
+        isinstance(fold, PolynomialFold),
+        "mixture.components.fold",
+        expected="a PolynomialFold",
+        got=type(fold).__name__,
+        cure="Splats hold polynomial folds only.",
+    )
     return fold.coefficients
 
 
 def _as_time_likelihood(envelope: AbstractEnvelope) -> TimeLikelihood:
     if isinstance(envelope, Constant):
         return TimeLikelihood(power=0.0)
-    if not isinstance(envelope, TimeLikelihood):
-        got, cure = type(envelope).__name__, "Splats hold these only."
-        expected = "a TimeLikelihood or Constant"
-        raise invalid("mixture.components.envelope", expected=expected, got=got, cure=cure)
+    require(
+        isinstance(envelope, TimeLikelihood),
+        "mixture.components.envelope",
+        expected="a TimeLikelihood or Constant",
+        got=type(envelope).__name__,
+        cure="Splats hold these only.",
+    )
     return envelope
 
 
 def _check_color(color: ArrayLike, num: int, dtype) -> Float[Array, "num 3"]:
     color = jnp.asarray(color, dtype)
-    if color.shape not in ((3,), (num, 3)):
-        got, cure = f"shape {color.shape}", "RGB in [0, 1]."
-        raise invalid("color", expected=f"shape (3,) or ({num}, 3)", got=got, cure=cure)
+    require(
+        color.shape in ((3,), (num, 3)),
+        "color",
+        expected=f"shape (3,) or ({num}, 3)",
+        got=f"shape {color.shape}",
+        cure="RGB in [0, 1].",
+    )
     values = concrete_value(color)
-    if values is not None and not (values >= 0).all():
-        raise invalid("color", expected="values >= 0", got=values.tolist())
+    require(values is None or (values >= 0).all(), "color", expected="values >= 0", got=values)
     return jnp.broadcast_to(color, (num, 3))

@@ -6,13 +6,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.render.splats import check_size
 from foldgauss.video.models.background import BLACK, Background, check_background
 from foldgauss.video.models.frame_times import FrameTimes, snap_to_shots
 from foldgauss.video.models.prepared import PreparedModel
-from foldgauss.video.models.rendered_video import RenderedVideo, choose_time
+from foldgauss.video.models.renderer import RenderedVideo, choose_time
 from foldgauss.video.models.splats import FoldedSplats
 
 #: Parameters of a Gaussian, without those of its fold.
@@ -23,14 +23,18 @@ ONE_SEGMENT = "Take one segment's own: video.segments[k].model."
 
 def check_model(model: object) -> None:
     """Raise unless it is a `VideoModel`."""
-    if not isinstance(model, VideoModel):
-        cures = {
-            "EditedVideo": "Use each layer's own model, before layers and edits are combined.",
-            "Edit": "End the chain with .video().",
-            "SegmentedVideo": ONE_SEGMENT,
-        }
-        cure = cures.get(type(model).__name__, "The model comes first.")
-        raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
+    cures = {
+        "EditedVideo": "Use each layer's own model, before layers and edits are combined.",
+        "Edit": "End the chain with .video().",
+        "SegmentedVideo": ONE_SEGMENT,
+    }
+    require(
+        isinstance(model, VideoModel),
+        "model",
+        expected="a VideoModel",
+        got=type(model).__name__,
+        cure=cures.get(type(model).__name__, "The model comes first."),
+    )
 
 
 class VideoModel(RenderedVideo, eqx.Module):

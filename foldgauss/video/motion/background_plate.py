@@ -5,12 +5,10 @@ import itertools
 import logging
 
 import cv2
-import numba as nb
 import numpy as np
 from jaxtyping import Bool, Float, Float16, Float32, Int, UInt8
 
 from foldgauss._runtime.checks import require
-from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.video.motion.optical_flow import both_flows, match_points
 
@@ -151,7 +149,8 @@ def fill_background(frames: Frames, masks: Masks, *, alignment: Alignment | None
         k, shot = item
         if not covered[k].any():
             return
-        window = bounding_box(covered[k])
+        x, y, width, height = cv2.boundingRect(covered[k].astype(np.uint8))
+        window = slice(y, y + height), slice(x, x + width)
         plate, count = render_plate(frames, covered, alignment, k, shot, box=window)
         unknown = np.uint8(count == 0)
         num_unknown[k] = (unknown & covered[k][window]).sum()
@@ -200,9 +199,10 @@ def render_plate(
         to_other = np.linalg.inv(to_image) @ alignment.between(k, j) @ to_image @ to_box
         stack[n] = warp_by(frames[j], to_other, size)
         known[n] = warp_by(255 * np.uint8(~covered[j]), to_other, size, cv2.BORDER_CONSTANT) >= 255 * UNCOVERED
-    plate, count = np.empty(stack.shape[1:], np.uint8), np.empty(known.shape[1:], np.uint8)
-    _median(stack, known, np.empty(len(others), np.uint8), plate, count)
-    return plate, count
+    count = known.sum(0, dtype=np.uint8)
+    ordered = np.sort(np.where(known[..., None], stack, 255), axis=0)  # what is unknown comes last
+    lower_median = np.take_along_axis(ordered, (np.maximum(count, 1)[None, ..., None] - 1) // 2, 0)[0]
+    return np.where(count[..., None] > 0, lower_median, np.uint8(0)), count
 
 
 def warp_by(image, matrix: Float[np.ndarray, "3 3"], size: tuple[int, int], border: int = cv2.BORDER_REPLICATE):
@@ -213,12 +213,6 @@ def warp_by(image, matrix: Float[np.ndarray, "3 3"], size: tuple[int, int], bord
 def dilate(mask: Bool[np.ndarray, "height width"], diameter: int) -> Bool[np.ndarray, "height width"]:
     """The mask, grown by half of the diameter on all sides."""
     return cv2.dilate(mask.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (diameter, diameter))) > 0
-
-
-def bounding_box(mask: Bool[np.ndarray, "height width"]) -> tuple[slice, slice]:
-    """The rows and the columns in which a mask is."""
-    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
-    return slice(y, y + height), slice(x, x + width)
 
 
 def _chain(images, there, back) -> tuple[Float[np.ndarray, "frames 3 3"], tuple[int, ...]]:
@@ -274,24 +268,3 @@ def _scale_pixels(size: tuple[int, int], to: tuple[int, int]) -> Float[np.ndarra
     """The map of pixels of images of one size to those of another, with centers at whole numbers."""
     x, y = to[1] / size[1], to[0] / size[0]
     return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1]])
-
-
-@kernel
-def _median(stack, known, sorted_, plate, count):
-    """The lower median of the known values of each pixel, by insertion; 0 where none is known."""
-    num, rows, columns, channels = stack.shape
-    for y in range(rows):
-        for x in range(columns):
-            for c in range(channels):
-                found = 0
-                for n in range(num):
-                    if not known[n, y, x]:
-                        continue
-                    value, at = stack[n, y, x, c], found
-                    while at > 0 and sorted_[at - 1] > value:
-                        sorted_[at] = sorted_[at - 1]
-                        at -= 1
-                    sorted_[at] = value
-                    found += 1
-                plate[y, x, c] = sorted_[(found - 1) // 2] if found > 0 else nb.uint8(0)
-            count[y, x] = found

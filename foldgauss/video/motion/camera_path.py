@@ -7,12 +7,12 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 import scipy.linalg
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from foldgauss._runtime.checks import is_within, require
 from foldgauss.video.models.frame_times import is_cut
-from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer
-from foldgauss.video.motion.optical_flow import both_flows, match_points
+from foldgauss.video.models.renderer import RenderedVideo, VideoRenderer
+from foldgauss.video.motion.optical_flow import both_flows, fit_size, match_points
 
 #: The longer side, in pixels, of the images that flow is computed on.
 SIDE = 480
@@ -91,7 +91,7 @@ class CameraPath:
         return maps
 
 
-def estimate_camera_path(video: RenderableVideo, *, on_frame: Callable[[], None] = lambda: None) -> CameraPath:
+def estimate_camera_path(video: RenderedVideo, *, on_frame: Callable[[], None] = lambda: None) -> CameraPath:
     """The path of the camera in a video, from the optical flow between its own images at the frame times.
 
     The camera is what most of the image agrees on: affine maps by RANSAC, so that objects that move on their own and
@@ -101,9 +101,7 @@ def estimate_camera_path(video: RenderableVideo, *, on_frame: Callable[[], None]
     **Example:** `estimate_camera_path(model).smoothed(frames=12)`.
     **Source:** Kroeger et al. 2016 (DIS flow); Fischler and Bolles 1981 (RANSAC).
     """
-    height, width = video.size
-    scale = min(1.0, SIDE / max(height, width))
-    size = max(16, round(height * scale)), max(16, round(width * scale))
+    size = fit_size(SIDE, *video.size)[::-1]
     times = np.asarray(video.frame_times.times(), np.float64)
     cut = np.asarray(is_cut(times))
     matrices, inliers, starts = np.tile(np.eye(3), (len(times), 1, 1)), np.ones(len(times)), [0]
@@ -113,27 +111,16 @@ def estimate_camera_path(video: RenderableVideo, *, on_frame: Callable[[], None]
     for k, image in enumerate(VideoRenderer(video, size).frames(times.astype(np.float32))):
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         if k:
-            found = None if cut[k - 1] else estimate_affine(before, gray)
-            if found is None:
+            points, target, known = match_points(*both_flows(before, gray), SPACING, MISS, MISS_FRACTION)
+            found = fit_affine(points[known], target[known], INLIER, LEAST_INLIERS * len(points))
+            if cut[k - 1] or found is None:
                 starts.append(k)
             else:
-                step, inliers[k] = found
-                matrices[k] = to_model @ step @ to_pixels @ matrices[k - 1]
+                inliers[k] = found[1] / len(points)
+                matrices[k] = to_model @ found[0] @ to_pixels @ matrices[k - 1]
         before = gray
         on_frame()
     return CameraPath(matrices, inliers, times, tuple(starts))
-
-
-def estimate_affine(
-    one: UInt8[np.ndarray, "rows columns"], other: UInt8[np.ndarray, "rows columns"]
-) -> tuple[Float[np.ndarray, "3 3"], float] | None:
-    """The affine map that most points of a gray image follow to the next, in pixels, and their fraction of all points.
-
-    None where it is less than `LEAST_INLIERS`.
-    """
-    points, target, known = match_points(*both_flows(one, other), SPACING, MISS, MISS_FRACTION)
-    found = fit_affine(points[known], target[known], INLIER, LEAST_INLIERS * len(points))
-    return None if found is None else (found[0], found[1] / len(points))
 
 
 def fit_affine(

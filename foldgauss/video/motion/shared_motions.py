@@ -140,16 +140,12 @@ class _Clip:
         """The maps of which as little is forgotten as `FARTHEST` allows; None if all had to be."""
         return next((maps for maps in (self.chain(steps, own) for own in FORGOTTEN) if _is_near(maps)), None)
 
-    @property
-    def corners(self) -> Float[np.ndarray, "frames 4 2"]:
-        """Four points of every frame, in model space."""
-        height, width = np.array(self.motion.size) / max(self.motion.size)
-        points = [[0.35 * x * width, 0.35 * y * height] for x in (-1, 1) for y in (-1, 1)]
-        return np.tile(points, (len(self.motion.small), 1, 1))
-
     def keep_unsteady(self, steps: Float[np.ndarray, "frames 3 3"]) -> Float[np.ndarray, "frames 3 3"]:
         """The camera's steps, with the identity where unknown and in shots whose unsteadiness is at most `STEADY`."""
-        kept, changes = _fill_unknown(steps), self.measure_changes(steps, self.corners)
+        height, width = np.array(self.motion.size) / max(self.motion.size)
+        corners = [[0.35 * x * width, 0.35 * y * height] for x in (-1, 1) for y in (-1, 1)]
+        kept = _fill_unknown(steps)
+        changes = self.measure_changes(steps, np.tile(corners, (len(steps), 1, 1)))
         for first, stop in self.shots:
             if not _are_larger(changes[first:stop], max(STEADY, LEAST_UNSTEADY / max(self.motion.size))):
                 kept[first:stop] = np.eye(3)

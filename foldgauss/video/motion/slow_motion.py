@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 
 from foldgauss.video.models.background import BLACK, Background
 from foldgauss.video.models.frame_times import is_cut
-from foldgauss.video.models.renderer import RenderableVideo, VideoRenderer
+from foldgauss.video.models.renderer import RenderedVideo, VideoRenderer
 from foldgauss.video.motion.optical_flow import Motion, both_flows, fit_size
 
 #: Weight of the prediction by optical flow where both frames agree. Its errors and those of the video's own image are
@@ -30,7 +30,7 @@ MAX_SIDE = 2**15 - 1
 
 
 def interpolate_frames(
-    video: RenderableVideo,
+    video: RenderedVideo,
     times: Float[np.ndarray, " shown"] | None = None,
     size: tuple[int, int] | None = None,
     *,
@@ -63,7 +63,7 @@ def interpolate_frames(
         yield window.average(image, fraction)
 
 
-def even_durations(video: RenderableVideo) -> Float[np.ndarray, " intervals"]:
+def even_durations(video: RenderedVideo) -> Float[np.ndarray, " intervals"]:
     """The duration of each interval, in frames, with which frames that repeat the one before do not stutter.
 
     It is 1, and where things move less than half as far as on average in the intervals before and after, in the same

@@ -10,8 +10,7 @@ from jaxtyping import Bool, Float
 
 from foldgauss._runtime.checks import is_within, require, short_repr
 from foldgauss.render import Splats2D, pixels_per_unit
-from foldgauss.video.models.rendered_video import FollowingVideo
-from foldgauss.video.models.renderer import RenderableVideo
+from foldgauss.video.models.renderer import FollowingVideo, PreparedVideo, RenderedVideo
 from foldgauss.video.motion.camera_path import CameraPath, estimate_camera_path
 
 Affine = Float[np.ndarray, "3 3"]
@@ -33,7 +32,7 @@ UNSEEN = 3.0
 
 
 def stabilize(
-    video: RenderableVideo,
+    video: RenderedVideo,
     *,
     smoothing: float = SMOOTHING,
     fixed: bool = False,
@@ -106,13 +105,13 @@ class StabilizedVideo(FollowingVideo):
     documents `border`.
     """
 
-    video: RenderableVideo
+    video: RenderedVideo
     maps: Float[np.ndarray, "frames 3 3"]
     path: CameraPath
     border: Border = "keep"
 
     @property
-    def _lead(self) -> RenderableVideo:
+    def _lead(self) -> RenderedVideo:
         return self.video
 
     @property
@@ -130,10 +129,6 @@ class StabilizedVideo(FollowingVideo):
     def map_at(self, t: float) -> Affine:
         """The map of the image at time t, in model space."""
         return self._interpolate(self.maps, t)
-
-    def path_at(self, t: float) -> Affine:
-        """The map of points of the first frame of the shot to the image at time t, in model space."""
-        return self._interpolate(self.path.matrices, t)
 
     def _interpolate(self, maps: Float[np.ndarray, "frames 3 3"], t: float) -> Affine:
         k, fraction = self._position(t)
@@ -159,7 +154,7 @@ class StabilizedVideo(FollowingVideo):
         return (k + 1, 0.0) if fraction == 1 else (k, fraction)
 
 
-class PreparedStabilizedVideo:
+class PreparedStabilizedVideo(PreparedVideo):
     """A stabilized video prepared for images of `size`, see `PreparedVideo`."""
 
     def __init__(self, video: StabilizedVideo, size: tuple[int, int]):
@@ -194,7 +189,7 @@ class PreparedStabilizedVideo:
     def _beyond_borders(self, t: float, to_output: Affine) -> list[Splats2D]:
         """What other frames show where the image at time t, and those in front of them, have ended."""
         video, parts, in_front = self._video, [], [np.eye(3)]
-        here = np.linalg.inv(video.path_at(t))
+        here = np.linalg.inv(video._interpolate(video.path.matrices, t))
         for j in video.nearby_frames(t):
             to_frame = video.path.matrices[j] @ here  # from the image at t
             splats = _apply(np.linalg.inv(to_frame), self._seen(self._prepared.splats(float(video.path.times[j]))))

@@ -12,7 +12,7 @@ from jaxtyping import Bool
 
 from foldgauss._runtime.checks import require
 from foldgauss.video.editing.chain import Edit
-from foldgauss.video.editing.time_map import frame_times_of
+from foldgauss.video.editing.timing import frame_times_of
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.motion.moving_object import NothingMoves
 from foldgauss.video.segmented.segmented_video import Segment
@@ -90,11 +90,13 @@ class CriteriaEvaluator:
         Raises `NothingMoves` if nothing moves in any of them.
         """
         positions = self._positions(**arguments) if function is by_time else None
+        is_range = isinstance(positions, range)
+        first, last = (positions[0], positions[-1]) if is_range else positions or (0, self.stand_in.num_frames)
         parts, motionless = [], []
         for number, segment in enumerate(self.segments):
             if within is not None and not len(within[number]):
                 parts.append(within[number])
-            elif positions is not None and not _overlaps(positions, segment):
+            elif first > segment.stop - 1 or segment.first > last:  # at other times
                 parts.append(self.select_none(number))
             else:
                 one = self.replay(number)
@@ -114,14 +116,8 @@ class CriteriaEvaluator:
     def _positions(self, times: Any = None, frame: Any = None, frames: Any = None, alive: bool = False) -> Any:
         """First and last frame position for `times`, else the range of frames."""
         if times is None:
-            return resolve_frames(self.stand_in, frame, frames)
+            return resolve_frames(self.stand_in.num_frames, frame, frames)
         return tuple(t * (self.stand_in.num_frames - 1) for t in check_times(times))
-
-
-def _overlaps(positions: range | tuple[float, float], segment: Segment) -> bool:
-    """Whether frames, or the interval from a first to a last position, overlap a segment."""
-    first, last = (positions.start, positions.stop - 1) if isinstance(positions, range) else positions
-    return first <= segment.stop - 1 and segment.first <= last
 
 
 def _own_arguments(positions: Any, segment: Segment, one: Edit, arguments: dict[str, Any]) -> dict[str, Any]:
@@ -150,7 +146,7 @@ class _RegionCriterion:
         self._options = dict(arguments)
         where = {name: self._options.pop(name, None) for name in ("frame", "frames")}
         if function is by_click:
-            self._frames = tuple(resolve_frames(context.stand_in, **where))
+            self._frames = tuple(resolve_frames(context.stand_in.num_frames, **where))
         else:
             make, name = _REGIONS[function]
             self._region = make(context.stand_in, self._options.pop(name), **where)

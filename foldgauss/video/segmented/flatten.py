@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from foldgauss._runtime.checks import invalid, require
+from foldgauss._runtime.checks import require
 from foldgauss.video.editing.edited_video import EditedVideo, Layer
 from foldgauss.video.models.shared_paths import join_paths
 from foldgauss.video.models.splats import FoldedSplats
@@ -27,10 +27,13 @@ def flatten_video(video: VideoModel | EditedVideo | SegmentedVideo) -> VideoMode
     """
     if isinstance(video, VideoModel):
         return video
-    if isinstance(video, SegmentedVideo):
-        raise invalid(
-            "model", expected="a model without segments", got=f"one in {len(video.segments)} segments", cure=ONE_SEGMENT
-        )
+    require(
+        not isinstance(video, SegmentedVideo),
+        "model",
+        expected="a model without segments",
+        got=repr(video),
+        cure=ONE_SEGMENT,
+    )
     require(
         video.camera is None and not any(layer.overlays or layer.clocks for layer in video.layers),
         "model",
@@ -48,7 +51,7 @@ def flatten_video(video: VideoModel | EditedVideo | SegmentedVideo) -> VideoMode
 def _check_alike(layers: tuple[Layer, ...], lead: VideoModel) -> None:
     for layer in layers:
         model = layer.model
-        own, other = (jax.tree.map(_unique_values, one.splats.envelope) for one in (model, lead))
+        own, other = (jax.tree.map(lambda leaf: np.unique(leaf).tolist(), one.splats.envelope) for one in (model, lead))
         require(
             own == other and (len(layers) <= 1 or not any(len(values) > 1 for values in (own.power, own.floor))),
             "model",
@@ -70,10 +73,6 @@ def _check_alike(layers: tuple[Layer, ...], lead: VideoModel) -> None:
             got="one that has its own",
             cure=_CURE,
         )
-
-
-def _unique_values(leaf) -> tuple[float, ...]:
-    return tuple(np.unique(np.asarray(leaf)).tolist())
 
 
 def _concatenate(parts: list[FoldedSplats]) -> FoldedSplats:

@@ -6,12 +6,10 @@ import functools
 import numpy as np
 
 from foldgauss._runtime.checks import invalid, require
-from foldgauss.video.editing.clock import Clock
 from foldgauss.video.editing.edited_video import EditedVideo, Layer, as_edited, check_timeline, stack_layers
 from foldgauss.video.editing.layer_edits import gather_layer
 from foldgauss.video.editing.overlays import AbstractOverlay, GaussianFunction, Retiming, TriangleFunction, is_active
-from foldgauss.video.editing.span import NEVER, distinct_knots
-from foldgauss.video.editing.time_map import TimeMap, frame_times_of
+from foldgauss.video.editing.timing import NEVER, Clock, TimeMap, distinct_knots, frame_times_of
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import MAX_PREPARED, SegmentedVideo
 from foldgauss.video.selection.selectors import by_time

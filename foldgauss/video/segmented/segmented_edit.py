@@ -18,8 +18,7 @@ from foldgauss.video.editing.bake import mean_lightness
 from foldgauss.video.editing.chain import Edit, edit, start_chain
 from foldgauss.video.editing.edited_video import EditedVideo, as_edited
 from foldgauss.video.editing.overlays import LUMINANCE_WEIGHTS
-from foldgauss.video.editing.span import When
-from foldgauss.video.editing.time_map import TimeMap, frame_times_of
+from foldgauss.video.editing.timing import TimeMap, When, frame_times_of
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
@@ -99,7 +98,9 @@ class SegmentedEdit:
         segment = self._video.segments[number]
         before = self._start(number)
         after = self._replay_calls(before, number, acted)
-        return segment if _is_same(after._video, before._video) else segment.with_model(after.video(), load)
+        pairs = zip(after._video.layers, before._video.layers, strict=True)  # what is edited is another object
+        same = after._video.camera is before._video.camera and all(layer is old for layer, old in pairs)
+        return segment if same else segment.with_model(after.video(), load)
 
     def __getattr__(self, name: str) -> object:
         """Raise AttributeError, with a hint for attributes of the video."""
@@ -135,14 +136,20 @@ class SegmentedEdit:
         check_select_arguments(selection, criteria)
         if criteria:
             inspect.signature(select).bind(None, **criteria)
-            return self._select_current(self._evaluator(layer).evaluate(list_criteria(**criteria)))
+            segments, stand_in = self._video.segments, self._stand_in._video.layers[0].model
+            evaluator = CriteriaEvaluator(segments, stand_in, self._replay, self._select_none, layer)
+            return self._select_current(evaluator.evaluate(list_criteria(**criteria)))
         if selection is None:
             return self._record_selection(lambda one, number: one.select(layer=layer), None)
         if callable(selection):
             check_signature("selection", selection, "video")
             video = self.video()
             return self._select_current(_split_selection(selection(video), _segment_sizes(video)))
-        counts = _segment_sizes(self._video) if layer is None else [self._layer_size(k, layer) for k in self._numbers]
+        if layer is None:
+            counts = _segment_sizes(self._video)
+        else:
+            starts = [self._start(number) for number in self._numbers]
+            counts = [sum(one._counts[k] for k in one._layer_numbers(layer)) for one in starts]
         parts = _split_selection(selection, counts)
         known = parts if self._same_indices and layer is None else None
         return self._record_selection(lambda one, number: one.select(parts[number], layer=layer), known)
@@ -155,15 +162,6 @@ class SegmentedEdit:
         call, is_empty = _Call(act, self._context, always=True), known is not None and not any(map(len, known))
         stand_in = _deselect_all(self._stand_in) if is_empty else self._stand_in.select()
         return dataclasses.replace(self, _stand_in=stand_in, _calls=(*self._calls, call), _known=known)
-
-    def _layer_size(self, number: int, layer: int) -> int:
-        """The number of Gaussians of a layer of a segment, at the start of the chain."""
-        one = self._start(number)
-        return sum(one._counts[k] for k in one._layer_numbers(layer))
-
-    def _evaluator(self, layer: int | None) -> CriteriaEvaluator:
-        stand_in = self._stand_in._video.layers[0].model
-        return CriteriaEvaluator(self._video.segments, stand_in, self._replay, self._select_none, layer)
 
     def _select_none(self, number: int) -> Selection:
         """The empty selection of a segment; its model is loaded only if the number of Gaussians may have changed."""
@@ -240,12 +238,6 @@ class SegmentedEdit:
                 one = call.act(one, number)
             acted.add(count)
         return one
-
-
-def _is_same(one: EditedVideo, other: EditedVideo) -> bool:
-    """Whether nothing was edited: an edited layer or camera is another object."""
-    pairs = zip(one.layers, other.layers, strict=True)
-    return one.camera is other.camera and all(layer is before for layer, before in pairs)
 
 
 def _segment_sizes(video: SegmentedVideo) -> list[int]:

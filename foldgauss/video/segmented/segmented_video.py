@@ -13,9 +13,8 @@ from jaxtyping import Float64
 from foldgauss._runtime.checks import invalid, is_integer, require, short_repr
 from foldgauss.render import RenderOptions, Splats2D
 from foldgauss.video.editing.edited_video import EditedVideo
-from foldgauss.video.models.frame_times import check_frame_before, times_at
-from foldgauss.video.models.rendered_video import RenderedVideo
-from foldgauss.video.models.renderer import PreparedVideo
+from foldgauss.video.models.frame_times import times_at
+from foldgauss.video.models.renderer import PreparedVideo, RenderedVideo
 from foldgauss.video.models.video_model import VideoModel
 
 #: Models that are kept prepared at once; as many as are visible, where more are (between the last frame of one fade and
@@ -81,29 +80,15 @@ class Segment:
         return model
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True)
 class SegmentedTimes:
     """Frame times of a clip in segments: evenly spaced in [0, 1]; the frame of a clip with one frame is at 0."""
 
-    segments: tuple[Segment, ...] = dataclasses.field(repr=False)
-
-    @property
-    def num_frames(self) -> int:
-        return self.segments[-1].stop
+    num_frames: int
 
     def times(self) -> Float64[np.ndarray, " num_frames"]:
         """Frame k is at k / (num_frames - 1)."""
         return np.arange(self.num_frames) / max(self.num_frames - 1, 1)
-
-    def cut_after(self, k: int) -> bool:
-        """Whether there is a cut between frames k and k + 1: between segments, or within one, whose model is loaded.
-
-        Raises ValueError unless k is a frame before the last.
-        """
-        check_frame_before(k, self.num_frames)
-        number = bisect.bisect_right(self.segments, k, key=lambda segment: segment.first) - 1
-        segment = self.segments[number]
-        return k + 1 == segment.stop or segment.model.frame_times.cut_after(k - segment.first)
 
 
 class SegmentedVideo(RenderedVideo):
@@ -164,7 +149,7 @@ class SegmentedVideo(RenderedVideo):
 
     @property
     def frame_times(self) -> SegmentedTimes:
-        return SegmentedTimes(self.segments)
+        return SegmentedTimes(self.num_frames)
 
     @property
     def cuts(self) -> list[int]:
@@ -222,7 +207,7 @@ class SegmentedVideo(RenderedVideo):
         return min(max((position - first + 1) / (stop - first + 1), 0.0), 1.0)
 
 
-class PreparedSegmentedVideo:
+class PreparedSegmentedVideo(PreparedVideo):
     """A video in segments prepared for images of `size`, see `PreparedModel`; models are loaded when needed."""
 
     def __init__(self, video: SegmentedVideo, size: tuple[int, int]):

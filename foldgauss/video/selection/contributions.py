@@ -42,11 +42,6 @@ class Contributions:
     def num_gaussians(self) -> int:
         return self.model.num_gaussians
 
-    @property
-    def window(self) -> Float32[np.ndarray, "num_gaussians 2"]:
-        """First and last time at which each Gaussian is rendered."""
-        return self.prepared.window
-
     def at_frame(self, k: int) -> "FrameContributions":
         return self.at(float(self.times[k]))
 
@@ -93,11 +88,6 @@ class FrameContributions:
     @functools.cached_property
     def trace(self) -> cpu.Trace:
         return self._forward(self.splats.color, self.source.background)
-
-    @property
-    def image(self) -> Float32[np.ndarray, "3 height width"]:
-        """The rendered image over the background."""
-        return self.trace.image
 
     @functools.cached_property
     def total(self) -> Float32[np.ndarray, " num_alive"]:
@@ -158,26 +148,12 @@ def average_seen_colors(
 ) -> tuple[Float[np.ndarray, "num_gaussians 3"], Bool[np.ndarray, " num_gaussians"]]:
     """The rendered color where each Gaussian is visible, averaged over all frames; and which are visible at all."""
 
-    def observations():
-        for k in range(len(contributions.times)):
-            frame = contributions.at_frame(k)
-            seen = frame.total > 0
-            total = frame.total[seen]
-            yield frame.alive[seen], frame.gather(frame.image)[seen] / total[:, None], total
-
-    return weighted_mean(contributions.num_gaussians, observations())
-
-
-def weighted_mean(
-    num: int, observations: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]
-) -> tuple[Float[np.ndarray, "num 3"], Bool[np.ndarray, " num"]]:
-    """Means of (index, value, weight) over frames; and which of the `num` indices occur."""
-    value, total = np.zeros((num, 3)), np.zeros((num, 1))
-    for index, own, weight in observations:
-        value[index] += weight[:, None] * own
-        total[index] += weight[:, None]
-    found = total[:, 0] > 0
-    return np.divide(value, total, out=value, where=found[:, None]), found
+    color, total = np.zeros((contributions.num_gaussians, 3)), np.zeros((contributions.num_gaussians, 1))
+    for k in range(len(contributions.times)):
+        frame = contributions.at_frame(k)
+        color[frame.alive] += frame.gather(frame.trace.image)
+        total[frame.alive] += frame.total[:, None]
+    return np.divide(color, total, out=color, where=total > 0), total[:, 0] > 0
 
 
 def render_matte(

@@ -10,7 +10,7 @@ import numpy as np
 import skimage
 from jaxtyping import ArrayLike, Bool, Float, Float32
 
-from foldgauss._runtime.checks import check_within, invalid, is_integer, require, short_repr
+from foldgauss._runtime.checks import invalid, is_integer, require, short_repr
 from foldgauss.video.models.video_model import VideoModel, check_model
 
 Mask = Bool[np.ndarray, "height width"] | Float[np.ndarray, "height width"]
@@ -38,7 +38,7 @@ def region_from_mask(model: VideoModel, mask: Masks, frame: int | None, frames: 
             expected="its frames given once",
             got="{frame: mask}, and frame or frames as well",
         )
-        found = {_check_frame(model, k): _check_mask(model, one, ndim=2) for k, one in mask.items()}
+        found = {_check_frame(model.num_frames, k): _check_mask(model, one, ndim=2) for k, one in mask.items()}
     elif isinstance(mask, str | os.PathLike):
         raise invalid(
             "mask",
@@ -48,22 +48,21 @@ def region_from_mask(model: VideoModel, mask: Masks, frame: int | None, frames: 
         )
     else:
         mask = np.asarray(mask)
-        if mask.ndim == 2 and frame is None and frames is None:
-            raise invalid(
-                "mask",
-                expected=f"({model.num_frames}, height, width)",
-                got=f"{mask.shape}",
-                cure="Name its frame: frame=k.",
-            )
-        numbers = resolve_frames(model, frame, frames)
-        if mask.ndim not in (2, 3) or (mask.ndim == 3 and len(mask) != len(numbers)):
-            expected = f"one of shape (height, width), or {len(numbers)} of them"
-            raise invalid(
-                "mask",
-                expected=expected,
-                got=f"shape {mask.shape}",
-                cure="Name their frames: frame=k, frames=(first, stop) or mask={frame: mask}.",
-            )
+        require(
+            mask.ndim != 2 or frame is not None or frames is not None,
+            "mask",
+            expected=f"({model.num_frames}, height, width)",
+            got=f"{mask.shape}",
+            cure="Name its frame: frame=k.",
+        )
+        numbers = resolve_frames(model.num_frames, frame, frames)
+        require(
+            mask.ndim == 2 or (mask.ndim == 3 and len(mask) == len(numbers)),
+            "mask",
+            expected=f"one of shape (height, width), or {len(numbers)} of them",
+            got=f"shape {mask.shape}",
+            cure="Name their frames: frame=k, frames=(first, stop) or mask={frame: mask}.",
+        )
         _check_mask(model, mask, mask.ndim)
         found = dict(zip(numbers, mask, strict=True)) if mask.ndim == 3 else dict.fromkeys(numbers, mask)
     require(any(one.any() for one in found.values()), "mask", expected="a mask that is not empty", got="an empty one")
@@ -121,21 +120,23 @@ def _as_array(given: object) -> np.ndarray:
         return np.zeros(0)
 
 
-def resolve_frames(model: VideoModel, frame: int | None, frames: tuple[int, int] | None) -> range:
-    """The frame `frame`, the frames first <= k < stop, or all."""
-    check_model(model)
+def resolve_frames(num_frames: int, frame: int | None, frames: tuple[int | None, int | None] | None) -> range:
+    """The frame `frame`, the frames first <= k < stop, or all, of a clip."""
     require(frame is None or frames is None, "frame, frames", expected="one of the two", got="both")
     if frame is not None:
-        k = _check_frame(model, frame)
+        k = _check_frame(num_frames, frame)
         return range(k, k + 1)
-    first, stop = (0, model.num_frames) if frames is None else _check_range(model, frames)
-    return range(first, stop)
-
-
-def check_number(name: str, value: object, bounds: str) -> float:
-    """As float. Raises ValueError unless it is a number within the bounds."""
-    check_within(name, value, bounds, f"a number in {bounds}")
-    return float(value)
+    pair = tuple(frames) if isinstance(frames, tuple | list | np.ndarray) else (None, None) if frames is None else ()
+    if len(pair) == 2:
+        pair = tuple(end if given is None else given for given, end in zip(pair, (0, num_frames), strict=True))
+    require(
+        len(pair) == 2 and all(is_integer(k, 0) for k in pair) and pair[0] < pair[1] <= num_frames,
+        "frames",
+        expected=f"(first, stop) with 0 <= first < stop <= {num_frames}",
+        got=repr(frames),
+        cure="None is the clip's own end; for one frame give frame=k.",
+    )
+    return range(*map(int, pair))
 
 
 def check_times(times: object) -> tuple[float, float]:
@@ -144,7 +145,7 @@ def check_times(times: object) -> tuple[float, float]:
     require(
         pair.shape == (2,) and pair.dtype.kind in "fiu" and 0 <= pair[0] <= pair[1] <= 1,
         "times",
-        expected="(start, stop) with 0 <= start <= stop <= 1",
+        expected="(start, stop), rising, in [0, 1]",
         got=times,
     )
     return float(pair[0]), float(pair[1])
@@ -161,31 +162,14 @@ def _constant_region(name, model, inside: Bool[np.ndarray, "height width"], fram
             cure="x is right, y is down, in pixels of the model's own size.",
         )
     fraction = inside.astype(np.float32)
-    return Region(tuple(resolve_frames(model, frame, frames)), lambda k: fraction)
+    return Region(tuple(resolve_frames(model.num_frames, frame, frames)), lambda k: fraction)
 
 
-def _check_frame(model: VideoModel, k: object) -> int:
+def _check_frame(num_frames: int, k: object) -> int:
     require(
-        is_integer(k, 0) and k < model.num_frames,
-        "frame",
-        expected=f"a frame's number in [0, {model.num_frames})",
-        got=repr(k),
+        is_integer(k, 0) and k < num_frames, "frame", expected=f"a whole number in [0, {num_frames - 1}]", got=repr(k)
     )
     return int(k)
-
-
-def _check_range(model: VideoModel, frames: object) -> tuple[int, int]:
-    pair = tuple(frames) if isinstance(frames, tuple | list | np.ndarray) else ()
-    if len(pair) == 2:
-        pair = tuple(end if given is None else given for given, end in zip(pair, (0, model.num_frames), strict=True))
-    require(
-        len(pair) == 2 and all(is_integer(k, 0) for k in pair) and pair[0] < pair[1] <= model.num_frames,
-        "frames",
-        expected=f"(first, stop) with 0 <= first < stop <= {model.num_frames}",
-        got=repr(frames),
-        cure="None is the clip's own end; for one frame give frame=k.",
-    )
-    return int(pair[0]), int(pair[1])
 
 
 def _check_mask(model: VideoModel, mask: np.ndarray, ndim: int) -> np.ndarray:

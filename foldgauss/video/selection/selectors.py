@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, Float32, Int, Int8
 
-from foldgauss._runtime.checks import invalid, is_integer, require, short_repr
+from foldgauss._runtime.checks import check_within, invalid, is_integer, require, short_repr
 from foldgauss.render import cpu
-from foldgauss.video.models.rendered_video import check_time
+from foldgauss.video.models.renderer import check_time
 from foldgauss.video.models.splats import SH_C0
 from foldgauss.video.models.video_model import VideoModel, check_model
 from foldgauss.video.motion.background_plate import SIDE
@@ -28,7 +28,6 @@ from foldgauss.video.selection.contributions import (
 from foldgauss.video.selection.regions import (
     Masks,
     Region,
-    check_number,
     check_times,
     region_from_box,
     region_from_mask,
@@ -257,8 +256,9 @@ def list_criteria(**arguments: Any) -> list[tuple[Callable[..., Selection], dict
     defaults = {name: parameter.default for name, parameter in inspect.signature(select).parameters.items()}
     arguments = {name: bool(value) if isinstance(value, np.bool_) else value for name, value in arguments.items()}
     given = {name: value for name, value in arguments.items() if value is not defaults[name]}
-    if not isinstance(given.get("moving", True), bool):
-        raise invalid("moving", expected="True or False", got=repr(given["moving"]))
+    require(
+        isinstance(given.get("moving", True), bool), "moving", expected="True or False", got=repr(given.get("moving"))
+    )
     functions = {"mask": by_mask, "box": by_box, "polygon": by_polygon, "moving": by_motion, "color": by_color}
     functions |= {"click": by_click, "times": by_time}
     found = {name: {name: given[name]} for name in functions if name in given}
@@ -416,7 +416,7 @@ def by_color(
         expected="red, green and blue in [0, 1]",
         got=color,
     )
-    tolerance = check_number("tolerance", tolerance, "[0, inf)")
+    check_within("tolerance", tolerance, "[0, inf)", "a number in [0, inf)")
     contributions = Contributions(model)
     own = np.maximum(0.5 + SH_C0 * np.asarray(model.splats.color_dc), 0)
     if seen:
@@ -453,13 +453,13 @@ def by_time(
     if times is not None:
         start, stop = check_times(times)
     else:
-        chosen, last = resolve_frames(model, frame, frames), model.num_frames - 1
+        chosen, last = resolve_frames(model.num_frames, frame, frames), model.num_frames - 1
         margin = 0.0 if alive else 0.5
         ends = (chosen[0] - margin, chosen[-1] + margin)
         # A single frame covers all times.
         start, stop = np.interp(ends, np.arange(last + 1), contributions.times) if last or alive else (0.0, 1.0)
     if alive:
-        return Selection((contributions.window[:, 0] < stop) & (start < contributions.window[:, 1]))
+        return Selection((contributions.prepared.window[:, 0] < stop) & (start < contributions.prepared.window[:, 1]))
     own = contributions.own_times
     return Selection((start <= own) & (own <= stop))
 
@@ -487,8 +487,8 @@ def by_click(
         expected=f"(x, y) in pixels of a {height}x{width} frame",
         got=click,
     )
-    tolerance = check_number("tolerance", tolerance, "[0, inf)")
-    k = resolve_frames(model, frame, None)[0]
+    check_within("tolerance", tolerance, "[0, inf)", "a number in [0, inf)")
+    k = resolve_frames(model.num_frames, frame, None)[0]
     mask = grow_from_pixel(Contributions(model), (int(point[1]), int(point[0])), k, tolerance)
     require(mask is not None, "click", expected="a pixel where something is rendered", got=f"{click} of frame {k}")
     return by_mask(model, mask, frame=k)
@@ -537,7 +537,8 @@ def _prepare(model: VideoModel, selection: Selection) -> tuple[Contributions, Bo
 
 def _select_region(model: VideoModel, region: Region, threshold: float, follow: bool) -> Selection:
     """The Gaussians with at least `threshold` of their contribution to the region's frames inside it, see `by_mask`."""
-    threshold, contributions = check_number("threshold", threshold, "(0, 1]"), Contributions(model)
+    check_within("threshold", threshold, "(0, 1]", "a number in (0, 1]")
+    contributions = Contributions(model)
     inside, total, best = sum_contributions(contributions, region)
     direct = np.where(inside >= threshold * total, IN, OUT).astype(np.int8)
     direct[total == 0] = UNKNOWN

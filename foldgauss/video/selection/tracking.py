@@ -51,7 +51,7 @@ def observe(contributions: Contributions, k: int) -> Observations:
     which = np.flatnonzero(frame.total > 0)
     total = frame.total[which]
     motion = frame.gather(_render_motion(contributions, k, frame))[which] / total[:, None]
-    color = to_lab(frame.gather(frame.image)[which] / total[:, None])
+    color = to_lab(frame.gather(frame.trace.image)[which] / total[:, None])
     return Observations(frame.alive[which], frame.splats.mean[which], motion, color, total)
 
 
@@ -139,17 +139,13 @@ def _vote(known: np.ndarray, label: np.ndarray, asked: np.ndarray) -> Int8[np.nd
 
 def _frames_outward(contributions: Contributions, frames: list[int]) -> list[int]:
     """The other frames of the shots of `frames`, nearest first."""
-    shot = _shot_numbers(contributions)
+    shot = np.concatenate([[0], np.cumsum(np.asarray(is_cut(contributions.times)))])
     distance = {}
     for k in set(range(len(shot))) - set(frames):
         same = [abs(k - one) for one in frames if shot[one] == shot[k]]
         if same:
             distance[k] = min(same)
     return sorted(distance, key=lambda k: (distance[k], k))
-
-
-def _shot_numbers(contributions: Contributions) -> Int[np.ndarray, " num_frames"]:
-    return np.concatenate([[0], np.cumsum(np.asarray(is_cut(contributions.times)))])
 
 
 # ------------------------------------------------------------------------------------------------ growing
@@ -166,7 +162,7 @@ def grow_from_pixel(
     frame, (row, column) = contributions.at_frame(k), pixel
     if not frame.render(np.ones((len(frame.alive), 1)))[0, row, column] > 0:
         return None
-    color = to_lab(cv2.GaussianBlur(np.moveaxis(frame.image, 0, -1), (0, 0), BLUR).reshape(-1, 3))
+    color = to_lab(cv2.GaussianBlur(np.moveaxis(frame.trace.image, 0, -1), (0, 0), BLUR).reshape(-1, 3))
     wanted = color[np.ravel_multi_index(pixel, contributions.size)]
     alike = (color_difference(color, wanted) <= tolerance).reshape(contributions.size)
     alike[row, column] = True

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from foldgauss.render import cpu
-from foldgauss.video.fitting.adam import update_frame_times
+from foldgauss.video.fitting.adam import sparse_adam, update_frame_times
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.losses import LOSSES
 from foldgauss.video.fitting.schedule import RateSchedule, choose_start_frames, steps_per_pass, to_planes
@@ -18,7 +18,6 @@ from foldgauss.video.fitting.state import (
     paths_of,
     spec_of,
     update_paths,
-    update_rows,
 )
 from foldgauss.video.fitting.steppers.interpolated_frames import choose_targets, make_interpolated
 from foldgauss.video.fitting.steppers.jax_loss import custom_loss
@@ -91,11 +90,14 @@ class CpuStepper:
             touched = np.arange(len(state.rows))
         relative_size = measure_relative_size(state, config) if by_path.size else 1.0
         rates, time_rate = self.rates.at(progress, state.backoffs)
-        finite = update_rows(state, self.grad, touched, rates, units=config.rates.units)
+        moments, units = (state.first, state.second, state.counts), config.rates.units
+        arrays = state.rows, self.grad, *moments, touched
+        finite = sparse_adam(*arrays, rates, rounded=state.rounded, units=units)
         update_windows(state.rows, touched, self.window, spec)
         if config.learns_frame_times and num_frames > 2:
-            updated = update_frame_times(state.time_logits, state.time_moments, by_time, time_rate)
-            state.time_logits, state.time_moments = updated
+            moments = state.time_count, state.time_first, state.time_second
+            state.time_logits, moments = update_frame_times(state.time_logits, moments, by_time, time_rate)
+            state.time_count, state.time_first, state.time_second = moments
         if by_path.size and visited:
             path_rate = self.rates.of_paths(progress, state.backoffs)
             finite &= update_paths(state, by_path, np.array(sorted(visited)), path_rate * relative_size)
@@ -137,13 +139,15 @@ class CpuStepper:
         if mirrored:
             for plane in target:
                 cv2.flip(plane, 1, dst=plane)
-            mean, factor = np.empty_like(mean), np.empty_like(factor)
-            mirror(done.mean, done.factor, spec.size[1], out=(mean, factor))
+            mean, factor = mirror(mean, factor, spec.size[1])
         trace = self._render(dataclasses.replace(done, mean=mean, factor=factor))
+        own_loss = LOSSES[self.config.loss.name]
         if squared:
             loss = squared_loss(trace.image, target)
+        elif own_loss is not None:
+            loss = custom_loss(trace.image, target, own_loss)
         else:
-            loss = self._compute_loss(trace.image, target)
+            loss = image_loss(trace.image, target, ssim_fraction=self.config.loss.ssim_fraction)
         if fraction is None:
             state.frame_errors[k] = loss.mean_squared_error
         gradient = loss.gradient
@@ -151,16 +155,10 @@ class CpuStepper:
         gradient *= border_weights(*gradient.shape[1:], self.config.loss.border_weight)
         gradients = cpu.backward(trace, gradient)
         if mirrored:
-            mirror(*gradients[:2], 0, out=gradients[:2])
+            gradients = *mirror(*gradients[:2], 0), *gradients[2:]
         if screen is not None:
             cpu.raise_screen_gradients(screen, trace, gradients[0], done.alive)
         return loss, done, backpropagate(rows, done, gradients, spec, self.grad, by_path)
-
-    def _compute_loss(self, image: np.ndarray, target: np.ndarray) -> ImageLoss:
-        own = LOSSES[self.config.loss.name]
-        if own is not None:
-            return custom_loss(image, target, own)
-        return image_loss(image, target, ssim_fraction=self.config.loss.ssim_fraction)
 
     def _render(self, done: ConditionedSplats) -> cpu.Trace:
         return cpu.forward(

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss._runtime.device import default_platform
 from foldgauss.render import pallas
 from foldgauss.video.fitting.config import FitConfig
@@ -26,9 +26,13 @@ def choose_engine(frames: np.ndarray, config: FitConfig) -> str:
     has_alpha = frames.shape[3] == 4
     if config.engine == "auto":
         return "cpu" if has_alpha else "pallas" if pallas.is_preferred(config.options) else "xla"
-    if has_alpha:
-        cure = "Give engine='cpu', which supports all settings."
-        raise invalid("engine", expected="'cpu' with frames that have alpha", got=repr(config.engine), cure=cure)
+    require(
+        not has_alpha,
+        "engine",
+        expected="'cpu' with frames that have alpha",
+        got=repr(config.engine),
+        cure="Give engine='cpu', which supports all settings.",
+    )
     if config.engine == "pallas":
         pallas.check_options(config.options)
     return config.engine

@@ -22,7 +22,6 @@ from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.render.tiles import find_visible
 from foldgauss.video.fitting.adam import BETA1, BETA2, EPSILON, RateUnits, masked_adam, update_frame_times
 from foldgauss.video.fitting.config import Loss
-from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.fitting.state import SIZE_STRIDE, DeviceArrays, FitState, Sizes, frame_times
 from foldgauss.video.fitting.steppers.jax_loss import compute_losses
 from foldgauss.video.fitting.steppers.loss import border_weights
@@ -131,19 +130,22 @@ def lower_step(program: Program, platforms: tuple[str, ...] | None = None) -> ja
     return traced.lower(lowering_platforms=platforms)
 
 
+def array_specs(program: Program) -> DeviceArrays:
+    """Shapes and types of the arrays."""
+    sizes = Sizes(program.capacity, program.width, program.num_frames, program.grows, paths=program.num_paths)
+    return DeviceArrays(*(kind.spec(sizes) for kind in FitState.array_fields().values()))
+
+
 def _specs(program: Program) -> tuple[DeviceArrays, jax.ShapeDtypeStruct, Control]:
     def spec(*shape: int, dtype=np.float32) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct(shape, dtype)
 
-    sizes = Sizes(program.capacity, program.width, program.num_frames, program.grows, paths=program.num_paths)
-    kinds = FitState.array_fields()
-    arrays = DeviceArrays(*(kinds[name].spec(sizes) for name in DeviceArrays._fields))
     views, num = spec(program.batch_size, dtype=np.int32), spec(dtype=np.int32)
     interpolated = None
     if program.interpolates:
         interpolated = InterpolatedViews(spec(program.batch_size), spec(program.batch_size, *program.size, 3))
     control = Control(views, num, spec(dtype=np.bool_), spec(program.num_trained), spec(), spec(), interpolated)
-    return arrays, spec(program.num_frames, *program.size, 3, dtype=np.uint8), control
+    return array_specs(program), spec(program.num_frames, *program.size, 3, dtype=np.uint8), control
 
 
 # --------------------------------------------------------------------------------------------- the step
@@ -153,10 +155,8 @@ def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames he
     """The arrays after a step, and its `Report`."""
     times = frame_times(arrays.time_logits)
     seen = _distribute(program)(arrays.rows, arrays.path_maps, times, frames, control)
-    statistics = arrays.statistics
-    if statistics is not None:
-        by_time = seen.by_rows[:, columns(program.degree)["time_loc_logit"].start]
-        statistics = _add(statistics, seen.screen, by_time)
+    if program.grows:
+        arrays = _add_statistics(arrays, seen, columns(program.degree)["time_loc_logit"].start)
     used = jnp.arange(program.capacity, dtype=jnp.int32) < control.num
     touched = seen.alive if program.sparse_updates else used
     moments, before = (arrays.first, arrays.second, arrays.counts), arrays.rows
@@ -164,9 +164,9 @@ def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames he
     rows, first, second, counts = masked_adam(
         arrays.rows, seen.by_rows, *moments, touched, rates, rounded=arrays.rounded, units=program.rate_units
     )
-    logits, time_moments = arrays.time_logits, arrays.time_moments
+    logits, of_times = arrays.time_logits, (arrays.time_count, arrays.time_first, arrays.time_second)
     if program.learns_times:
-        logits, time_moments = update_frame_times(logits, time_moments, seen.by_times, control.time_rate)
+        logits, of_times = update_frame_times(logits, of_times, seen.by_times, control.time_rate)
     errors = jnp.where(seen.errors >= 0, seen.errors, arrays.frame_errors)
     if program.num_paths:
         arrays = _update_paths(arrays, seen, control.path_rate * _relative_size(program, before, control.num))
@@ -178,8 +178,9 @@ def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames he
         frame_errors=errors,
         time_logits=logits,
     )
-    arrays = arrays._replace(rows=rows, first=first, second=second, counts=counts, statistics=statistics)
-    return arrays._replace(frame_errors=errors, time_logits=logits, time_moments=time_moments), report
+    arrays = arrays._replace(rows=rows, first=first, second=second, counts=counts, frame_errors=errors)
+    count, first, second = of_times
+    return arrays._replace(time_logits=logits, time_count=count, time_first=first, time_second=second), report
 
 
 def _relative_size(program: Program, rows, num) -> Float[Array, ""]:
@@ -336,13 +337,13 @@ def _screen_gradient(program: Program, splats: Splats2D, by_splats: Splats2D, al
     return jnp.max(jnp.where(shows & alive, size, jnp.full_like(size, -1.0)), axis=0)
 
 
-def _add(statistics: GradientStatistics, screen, by_time) -> GradientStatistics:
+def _add_statistics(arrays: DeviceArrays, seen: Gradients, time_column: int) -> DeviceArrays:
     """The twin of `GradientStatistics.add`."""
-    seen = screen >= 0
-    return GradientStatistics(
-        statistics.screen + jnp.where(seen, screen, jnp.zeros_like(screen)),
-        statistics.time + jnp.where(seen, jnp.abs(by_time), jnp.zeros_like(by_time)),
-        statistics.seen + seen.astype(jnp.int32),
+    shown, screen, time = seen.screen >= 0, seen.screen, jnp.abs(seen.by_rows[:, time_column])
+    return arrays._replace(
+        screen_gradients=arrays.screen_gradients + jnp.where(shown, screen, jnp.zeros_like(screen)),
+        time_gradients=arrays.time_gradients + jnp.where(shown, time, jnp.zeros_like(time)),
+        seen=arrays.seen + shown.astype(jnp.int32),
     )
 
 

@@ -6,7 +6,6 @@ state, and for densification and relocation, which run on the host.
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import numpy as np
@@ -14,13 +13,14 @@ import numpy as np
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, most_gaussians
 from foldgauss.video.fitting.losses import LOSSES
 from foldgauss.video.fitting.schedule import RateSchedule, choose_start_frames, find_views_in_turn, steps_per_pass
-from foldgauss.video.fitting.state import DeviceArrays, FitState, Sizes, frame_times
+from foldgauss.video.fitting.state import STATISTICS, DeviceArrays, FitState, frame_times
 from foldgauss.video.fitting.steppers.interpolated_frames import Prefetcher, choose_targets, make_interpolated
 from foldgauss.video.fitting.steppers.jax_step import (
     Control,
     InterpolatedViews,
     Program,
     Report,
+    array_specs,
     compile_error,
     compile_step,
     replicated,
@@ -39,30 +39,28 @@ _FIELDS = FitState.array_fields()
 
 
 class HeldArrays:
-    """The arrays of a `FitState` on a device, a `state.DeviceState`. The next step consumes them."""
+    """The arrays of a `FitState` on a device, fetched only where they are read. The next step consumes them."""
 
     def __init__(self, arrays: DeviceArrays, num: int, growing: bool, report: Report | None):
         self.arrays, self.num, self.growing, self.report = arrays, num, growing, report
-        self._fetched: dict[str, Any] = {}  # arrays that are small, and read after every step
 
-    def fetch(self, name: str) -> Any:
-        kind = _FIELDS[name]
-        if name == "statistics" and not self.growing:
-            return kind.build(Sizes(self.num, 0, 0))
+    def fetch(self, name: str) -> np.ndarray:
+        """A field of `FitState`, a copy."""
         if self.report is not None and name in Report._fields:
             return np.array(getattr(self.report, name))
-        if kind.per_gaussian:
-            return jax.tree.map(lambda leaf: np.asarray(leaf)[: self.num].copy(), getattr(self.arrays, name))
-        if name not in self._fetched:
-            self._fetched[name] = jax.tree.map(np.array, getattr(self.arrays, name))
-        return jax.tree.map(np.array, self._fetched[name])
+        array = np.array(getattr(self.arrays, name))
+        if name in STATISTICS:
+            return array[: self.num if self.growing else 0].copy()
+        return array[: self.num].copy() if _FIELDS[name].per_gaussian else array
 
     def is_finite(self, name: str) -> bool:
+        """Whether all values of a field are finite, as computed on the device."""
         if self.report is not None and name in ("rows", "second"):
             return bool(getattr(self.report, f"finite_{name}"))
         return bool(np.isfinite(self.fetch(name)).all())
 
     def copy(self) -> "HeldArrays":
+        """A copy on the device, which later steps do not change."""
         arrays = jax.tree.map(lambda leaf: leaf.copy(), self.arrays)
         return HeldArrays(arrays, self.num, self.growing, self.report)
 
@@ -95,7 +93,7 @@ class JaxStepper:
 
     def adopt(self, state: FitState) -> None:
         """Move a state's arrays to the device, padded to the capacity."""
-        growing, num, width = state.growing, *state.rows.shape
+        num = state.num_gaussians
         self.num_paths = state.path_maps.shape[1]
         capacity = self._choose_capacity(num)
         if capacity != self.capacity:
@@ -105,19 +103,11 @@ class JaxStepper:
             if state.step == 0 and self.config.initialization != "uniform":
                 compile_error(self.program)
         # Where growth has ended there are statistics nevertheless: without, steps would be compiled anew.
-        sizes = Sizes(num, width, self.num_frames, growing=self.config.strategy.growth is not None)
-
-        def padded(name: str) -> Any:
-            kind = _FIELDS[name]
-            value = kind.build(sizes) if name == "statistics" and not growing else getattr(state, name)
-            if not kind.per_gaussian:
-                return jax.tree.map(np.array, value)
-            return jax.tree.map(lambda leaf: _pad(leaf, capacity), value)
-
-        arrays = DeviceArrays(*map(padded, DeviceArrays._fields))
+        specs = array_specs(self.program)._asdict()
+        arrays = DeviceArrays(*(_pad(getattr(state, name), spec) for name, spec in specs.items()))
         # Copied, since arrays that are donated must be the device's own.
         arrays = jax.tree.map(lambda leaf: leaf.copy(), jax.device_put(arrays, replicated(self.program)))
-        state.hold(HeldArrays(arrays, num, growing, None))
+        state.hold(HeldArrays(arrays, num, state.growing, None))
 
     def step(self, state: FitState, progress: float) -> StepResult:
         if state.changed:  # by an observer of the fit
@@ -138,7 +128,7 @@ class JaxStepper:
         self._prepare(state, progress)
         arrays, report = compile_step(self.program)(held.arrays, self.images, control)
         report = jax.device_get(report)
-        state.hold(HeldArrays(arrays, held.num, held.growing, report))
+        state.hold(HeldArrays(arrays, held.num, state.growing, report))
         return StepResult(float(report.loss), int(report.num_alive), state.is_finite("rows"))
 
     def _interpolate(self, views: np.ndarray, chosen: list[float | None], step: int) -> InterpolatedViews | None:
@@ -218,8 +208,8 @@ class JaxStepper:
         )
 
 
-def _pad(array: np.ndarray, capacity: int) -> np.ndarray:
+def _pad(array: np.ndarray, spec: jax.ShapeDtypeStruct) -> np.ndarray:
     """The array with zero rows up to the capacity."""
-    out = np.zeros((capacity, *array.shape[1:]), array.dtype)
-    out[: len(array)] = array
+    out = np.zeros(spec.shape, spec.dtype)
+    out[tuple(map(slice, array.shape))] = array
     return out

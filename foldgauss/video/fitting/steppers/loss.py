@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from foldgauss._numerics.simd import LANES, broadcast, load, select, store, window
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss._runtime.kernels import inline, kernel
 from foldgauss._runtime.threads import run_tasks
 
@@ -190,29 +190,23 @@ def _strip(x, y, start, stop, taps, scale_l1, scale_ssim, gradient, similarity):
     return absolute, squared, total
 
 
-@kernel
-def _strip_l1(x, y, start, stop, scale, gradient):
-    """As `_strip`, with no SSIM in the loss."""
-    for r in range(start, stop):
-        for c in range(_u(x.shape[1])):
-            d = x[r, c] - y[r, c]
-            gradient[r, c] = scale if d > _f(0) else (-scale if d < _f(0) else _f(0))
-    absolute, squared = _errors(x, y, start, stop)
-    return absolute, squared, 0.0
-
-
 def image_loss(rendered: np.ndarray, target: np.ndarray, *, ssim_fraction: float = 0.2) -> ImageLoss:
     """(1 - fraction) L1 + fraction (1 - SSIM) of one image, with its gradient.
 
     `rendered`, `target`: float32, planar (channels, height, width), values about [0, 1].
     `ssim_fraction` in [0, 1] is the lambda of 3DGS (Kerbl et al. 2023, eq. 7). Raises ValueError on other shapes.
     """
-    if rendered.shape != target.shape or rendered.ndim != 3:
-        raise invalid(
-            "rendered, target",
-            expected="one shape (channels, height, width)",
-            got=f"{rendered.shape}, {target.shape}",
-        )
+    require(
+        rendered.shape == target.shape and rendered.ndim == 3,
+        "rendered, target",
+        expected="one shape (channels, height, width)",
+        got=f"{rendered.shape}, {target.shape}",
+    )
+    if ssim_fraction == 0:
+        difference = rendered - target
+        gradient = np.sign(difference) * np.float32(1 / rendered.size)
+        absolute, squared = (float(moment.mean(dtype=float)) for moment in (np.abs(difference), difference**2))
+        return ImageLoss(absolute, gradient, squared, None)
     gradient = np.empty_like(rendered)
     channels, height, _width = rendered.shape
     strips = [(c, r, min(r + STRIP, height)) for c in range(channels) for r in range(0, height, STRIP)]
@@ -222,16 +216,12 @@ def image_loss(rendered: np.ndarray, target: np.ndarray, *, ssim_fraction: float
 
     def work(k: int) -> None:
         c, start, stop = strips[k]
-        planes = rendered[c], target[c], start, stop
-        if ssim_fraction > 0:
-            sums[k] = _strip(*planes, _ALL_TAPS, by_l1, by_ssim, gradient[c], None)
-        else:
-            sums[k] = _strip_l1(*planes, by_l1, gradient[c])
+        sums[k] = _strip(rendered[c], target[c], start, stop, _ALL_TAPS, by_l1, by_ssim, gradient[c], None)
 
     run_tasks(work, range(len(strips)))
     absolute, squared, similar = sums.sum(0) / rendered.size
-    value = (1 - ssim_fraction) * absolute + (ssim_fraction * (1 - similar) if ssim_fraction > 0 else 0.0)
-    return ImageLoss(float(value), gradient, float(squared), float(similar) if ssim_fraction > 0 else None)
+    value = (1 - ssim_fraction) * absolute + ssim_fraction * (1 - similar)
+    return ImageLoss(float(value), gradient, float(squared), float(similar))
 
 
 def ssim_map(x: np.ndarray, y: np.ndarray) -> np.ndarray:
