@@ -60,8 +60,8 @@ def pictures(folder):
     ("options", "positions"),
     [
         pytest.param([], range(NUM_FRAMES), marks=pytest.mark.slow),
-        (["--upsample", 3], np.arange(52) / 3),
-        pytest.param(["--upsample", 2, "--no-flow"], np.arange(35) / 2, marks=pytest.mark.slow),
+        (["--fps", 75], np.arange(52) / 3),
+        pytest.param(["--fps", 50, "--no-flow"], np.arange(35) / 2, marks=pytest.mark.slow),
         (["--speed", "-0.5"], 17 - np.arange(35) / 2),
         (["--remap", "0=0.48,0.08=0.24"], [12, 9, 6]),
         (["--times", "0:1:5"], np.linspace(0, 17, 5)),

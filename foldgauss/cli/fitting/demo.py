@@ -66,7 +66,7 @@ def demo(
     for name, what in (
         ("comparison.png", "original, reconstruction and error side by side"),
         ("reconstruction.mp4", "the rendered model, for any player (H.264)"),
-        ("model.fgz", "the model: try `foldgauss render` with --upsample 4"),
+        ("model.fgz", "the model: try `foldgauss render` with --speed 0.25"),
         (RECORD, "the figures above, and those of each frame"),
     ):
         out.print(f"  {out_dir / name}  {what}", soft_wrap=True)

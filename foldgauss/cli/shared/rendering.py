@@ -169,7 +169,7 @@ def choose_sound(path: Path | None, timeline: Timeline, about: dict[str, Any], f
         got=f"{str(path)!r}, which is {'none' if os.path.exists(path) else 'missing'}",
     )
     first = (about.get("frames") or (0,))[0] or 0
-    return Sound(path, about.get("first_second", first / fps), timeline.playing_speed(fps))
+    return Sound(path, about.get("first_second", first / fps), timeline.speed or 1.0)
 
 
 #: Columns of a progress bar after the elapsed time.

@@ -13,10 +13,9 @@ from foldgauss.cli.shared.arguments import MAX_TIMES, refuse_together
 from foldgauss.cli.shared.clips import Video
 from foldgauss.cli.shared.log_lines import list_frames
 from foldgauss.io.media.frame_rate import MAX_FPS, MIN_FPS
-from foldgauss.video.models.frame_times import interpolated_times, played_positions, remapped_positions, times_at
+from foldgauss.video.models.frame_times import played_positions, remapped_positions, times_at
 from foldgauss.video.motion.slow_motion import even_durations
 
-MAX_UPSAMPLE = MAX_TIMES
 MAX_IMAGES = 10 * MAX_TIMES
 #: The slowest playback, and the inverse of the fastest.
 MIN_SPEED = 1e-4
@@ -24,14 +23,11 @@ MIN_SPEED = 1e-4
 MAX_SECONDS = 1e6
 MAX_EVEN_FPS = 50.0  # frames per second, the most of a GIF: a constant rate is not made higher for short intervals
 
-Upsample = Annotated[
-    int | None, typer.Option(metavar="K", help="Frames per original interval [default: 1].", min=1, max=MAX_UPSAMPLE)
-]
 Fps = Annotated[
     float | None,
     typer.Option(
         metavar="RATE",
-        help="Frames per second [default: as the clip; with --upsample K, K times as many].",
+        help="Frames per second [default: as the clip].",
         min=MIN_FPS,
         max=MAX_FPS,
     ),
@@ -53,7 +49,6 @@ class Timeline:
     and the end, where they are not evenly spaced; `fps` is their mean rate then.
     """
 
-    upsample: int | None = None
     fps: float | None = None
     speed: float | None = None
     remap: list[tuple[float, float]] | None = None
@@ -74,8 +69,7 @@ class Timeline:
     @property
     def ways(self) -> dict[str, object]:
         """The values of the options that exclude each other."""
-        ways = {"--upsample": self.upsample, "--speed": self.speed, "--remap": self.remap}
-        return ways | {"--times": self.chosen, "--frame": self.frame}
+        return {"--speed": self.speed, "--remap": self.remap, "--times": self.chosen, "--frame": self.frame}
 
     @property
     def is_single(self) -> bool:
@@ -89,23 +83,11 @@ class Timeline:
         """
         if self.fps is None and seconds is not None and (self.speed is not None or self.remap is not None):
             return max(fps, min(float(1 / np.diff(seconds).min()), MAX_EVEN_FPS))
-        return fps * (self.upsample or 1) if self.fps is None else self.fps
+        return fps if self.fps is None else self.fps
 
-    def playing_speed(self, fps: float) -> float:
-        """How many times as fast as the clip the output plays, where that is constant."""
-        return self.rate(fps) / (fps * self.upsample) if self.upsample else self.speed or 1.0
-
-    def stamps(self, fps: float, seconds: np.ndarray | None) -> np.ndarray | None:
-        """Seconds at which the output's images are shown, and the end; None where they are evenly spaced.
-
-        The clip's own frames, and those that `upsample` puts between them, stay unevenly spaced.
-        """
-        others = self.speed, self.remap, self.chosen, self.frame, None if self.upsample else self.fps
-        if seconds is None or any(other is not None for other in others):
-            return None
-        numbers, upsample = np.arange(len(seconds)), self.upsample or 1
-        shown = np.interp(np.arange((len(seconds) - 2) * upsample + 1) / upsample, numbers, seconds)
-        return np.append(shown, seconds[-1]) / self.playing_speed(fps)
+    def stamps(self, seconds: np.ndarray | None) -> np.ndarray | None:
+        """Seconds at which the output's images are shown, and the end: the clip's own, unless something is chosen."""
+        return seconds if all(value is None for value in (self.fps, *self.ways.values())) else None
 
     def times(self, frame_times: np.ndarray, fps: float, seconds: np.ndarray | None = None) -> np.ndarray:
         """The model times to render, in order."""
@@ -115,10 +97,7 @@ class Timeline:
             num = len(frame_times)
             require(-num <= self.frame < num, "--frame", expected=f"a frame from {-num} to {num - 1}", got=self.frame)
             return frame_times[[self.frame]]
-        if self.upsample is not None:
-            self._refuse_long("--upsample", (len(frame_times) - 1) * self.upsample)
-            return interpolated_times(frame_times, self.upsample)
-        if self.stamps(fps, seconds) is not None:
+        if self.stamps(seconds) is not None:
             return frame_times
         rate = self.rate(fps, seconds) / fps
         if self.remap is not None:
@@ -143,7 +122,7 @@ class Timeline:
         out.print(f"Frames that repeat the one before: {list_frames(repeats) or 'none'}.", soft_wrap=True)
         shown = np.full(video.num_frames, 1 / fps) if seconds is None else np.diff(seconds)
         shown[:-1] *= durations
-        timeline = dataclasses.replace(self, upsample=None, fps=self.rate(fps, seconds), speed=self.playing_speed(fps))
+        timeline = dataclasses.replace(self, fps=self.rate(fps, seconds))
         return timeline, np.append(0.0, np.cumsum(shown))
 
     def warn_of_end(self, num_frames: int, fps: float, seconds: np.ndarray | None) -> None:
