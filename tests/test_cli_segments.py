@@ -12,7 +12,7 @@ from commands import run
 from soft_models import NUM, soft_model
 
 from foldgauss.cli.viewing import view as viewing
-from foldgauss.io import import_model, load_video_model, read_video, save_video_model, write_image
+from foldgauss.io import load_video_model, read_vegas_ply, read_video, save_video_model, write_image
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.video import Segment, SegmentedVideo, edit, evaluate, interpolate_frames, psnr, times_at
 
@@ -140,7 +140,7 @@ def test_one_segment_is_taken_out(here, work, tmp_path, capsys):
     assert run("export", here, "--format", "model", "--segment", 1) == 2
     assert "overwrite" in told(capsys)
     assert run("export", here, "--format", "ply", "--segment", 2) == 0
-    assert import_model("long.2.ply", size=one.size).num_frames == 5
+    assert read_vegas_ply("long.2.ply", size=one.size).num_frames == 5
 
 
 def test_a_page_plays_all_segments(here, work, tmp_path, capsys, monkeypatch):

@@ -197,12 +197,3 @@ def test_davis_refuses_masks_that_do_not_fit(root):
     for k in range(4):  # all of another size, which a window cut from both would hide
         write_mask(place / f"{k:05d}.png", np.pad(labels(k), 5))
     _fails(ValueError, "masks of the size of the frames, 40x60.*50x70", root, "bear", center_crop=(20, 20))
-
-
-def test_frames_are_a_folder_of_images(root, tmp_path):
-    clip = datasets.frames(root / "JPEGImages" / "480p" / "bear", fps=12, frames=(1, 4), center_crop=(30, 30))
-    assert (clip.num_frames, clip.size, clip.fps) == (3, (30, 30), 12.0)
-    with pytest.raises(ValueError, match="folder: expected a folder of images, got the file"):
-        datasets.frames(datasets.sample_clip("carphone"))
-    with pytest.raises(FileNotFoundError, match="missing"):
-        datasets.frames(tmp_path / "none")

@@ -1,13 +1,14 @@
 """Reading and writing files; every output appears whole or not at all.
 
 Clips, images and masks (`read_video`, `write_video`, `index_video`, `read_masks`), models (`save_video_model`,
-`load_video_model`, `save_compact`), formats of other programs (`export`, `import_model`), the HTML player
-(`write_html`), scripts of edits (`read_edit_script`), and the history of a fit. Sample clips: `foldgauss.io.datasets`.
+`load_video_model`, `save_compact`), formats of other programs (`export`, `read_vegas_ply`, `read_pseudomesh`), the
+HTML player (`write_html`), scripts of edits (`read_edit_script`), and the history of a fit. Sample clips:
+`foldgauss.io.datasets`.
 """
 
 from foldgauss.io._atomic import OutputError
 from foldgauss.io.edit_script import EditScript, EditScriptError, read_edit_script
-from foldgauss.io.exchange.export_import import export, import_model
+from foldgauss.io.exchange.export import export
 from foldgauss.io.exchange.gaussians_ply import (
     frame_gaussians,
     read_3dgs_ply,
@@ -48,7 +49,6 @@ __all__ = [
     "format_indices",
     "frame_gaussians",
     "html_page",
-    "import_model",
     "index_video",
     "join_segments",
     "load_compact",

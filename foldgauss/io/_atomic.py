@@ -19,8 +19,6 @@ Result = TypeVar("Result")
 KEPT = 40
 #: Errors that free space cures: a full disk, a quota, a limit on the size of files.
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-#: Outputs that this process has locked, see `_lock.lock_output`.
-OWNED: set[Path] = set()
 
 
 class MissingInput(ParameterError, FileNotFoundError):
@@ -88,14 +86,9 @@ def _check_target(path: Path) -> None:
 
 
 def temporary_name(path: Path, suffix: str) -> Path:
-    """A new hidden name beside `path`, so that the rename stays within one file system.
-
-    It contains "own" instead of "tmp" where this process holds the lock of `path`: the next holder may then remove it
-    as a remnant of a killed process.
-    """
-    kind = "own" if path.absolute() in OWNED else "tmp"
+    """A new hidden name beside `path`, so that the rename stays within one file system."""
     # The stem is shortened: file systems limit names to 255 bytes.
-    return path.with_name(f".{path.stem[:KEPT]}.{kind}-{secrets.token_hex(4)}{suffix}")
+    return path.with_name(f".{path.stem[:KEPT]}.tmp-{secrets.token_hex(4)}{suffix}")
 
 
 def output_error(path: Path, error: OSError) -> OutputError:
@@ -113,6 +106,8 @@ def translate_output_errors(path: Path) -> Iterator[None]:
     """Raise an OSError of writing `path` in its one-line form."""
     try:
         yield
+    except OutputError:
+        raise
     except OSError as error:
         raise output_error(path, error) from error
 

@@ -4,11 +4,12 @@ import hashlib
 import re
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from foldgauss._runtime.file_lock import LockHeld, hold_lock
-from foldgauss.io._atomic import KEPT, OWNED, OutputError, check_writable, output_error
+from filelock import FileLock, Timeout
+
+from foldgauss.io._atomic import KEPT, OutputError, check_writable, translate_output_errors
 
 STALE_AGE = 3600.0
 
@@ -18,9 +19,8 @@ def lock_output(path: Path, *, own: tuple[Path, ...] = (), what: str = "fit") ->
     """Hold the lock of `path` until the block or the process ends.
 
     `own`: files that only the holder of the lock writes. Their temporary files, left by a killed process, are removed,
-    and so are those of `path` written under the lock; others of `path` once they are an hour old. `what` names the
-    holder in messages. Raises `OutputError` at once where another process holds the lock, or one of the files cannot
-    be written.
+    and those of `path` once they are an hour old. `what` names the holder in messages. Raises `OutputError` at once
+    where another process holds the lock, or one of the files cannot be written.
     """
     for target in (path, *own):
         check_writable(target)  # the lock would create a missing folder
@@ -28,32 +28,34 @@ def lock_output(path: Path, *, own: tuple[Path, ...] = (), what: str = "fit") ->
     if len(name.encode()) > 240:  # a file name has at most 255 bytes, including '.' and '.lock'
         name = hashlib.sha256(name.encode()).hexdigest()[:32]
     file = path.with_name(f".{name}.lock")
-    with ExitStack() as stack:
+    lock = FileLock(file, timeout=0)
+    with translate_output_errors(path):
         try:
-            stack.enter_context(hold_lock(file))
-        except LockHeld as error:
+            lock.acquire()
+        except Timeout as error:
             raise OutputError(
                 f"path: expected an output that no other process is writing, got {str(path)!r}, which another "
                 f"{what} is writing. Wait for it to end, or choose another name."
             ) from error
-        except OSError as error:
-            raise output_error(path, error) from error
+    try:
         for target in own:
-            _remove_unfinished(target, "tmp", held=True)
-        _remove_unfinished(path, "own", held=True)
-        _remove_unfinished(path, "tmp", held=False)
-        stack.callback(OWNED.discard, path.absolute())
-        OWNED.add(path.absolute())
+            _remove_unfinished(target, 0.0)
+        _remove_unfinished(path, STALE_AGE)
         yield
+    finally:
+        try:
+            file.unlink(missing_ok=True)  # while held, so that no other process's file is removed
+        finally:
+            lock.release()
 
 
-def _remove_unfinished(path: Path, kind: str, *, held: bool) -> None:
-    """Remove temporary files of `path`, see `temporary_name`: stale ones, or all if only the lock's holder writes them.
+def _remove_unfinished(path: Path, age: float) -> None:
+    """Remove temporary files of `path`, see `temporary_name`, that are at least `age` seconds old.
 
-    Where the names contain a part of its stem, they may belong to another output.
+    Where the names contain a part of its stem, they may belong to another output: only stale ones are removed.
     """
-    age = 0.0 if held and len(path.stem) <= KEPT else STALE_AGE
-    name = re.compile(rf"\.{re.escape(path.stem[:KEPT])}\.{kind}-[0-9a-f]{{8}}{re.escape(path.suffix)}")
+    age = age if len(path.stem) <= KEPT else STALE_AGE
+    name = re.compile(rf"\.{re.escape(path.stem[:KEPT])}\.tmp-[0-9a-f]{{8}}{re.escape(path.suffix)}")
     for found in path.parent.iterdir():
         with suppress(OSError):  # removed by another process, of another user, or a folder
             if name.fullmatch(found.name) and time.time() - found.stat().st_mtime >= age:

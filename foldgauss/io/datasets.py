@@ -1,7 +1,6 @@
-"""Sample clips: two synthetic ones, three that a package contains, DAVIS sequences, and folders of frames."""
+"""Sample clips: two synthetic ones, three that a package contains, and DAVIS sequences."""
 
 import difflib
-import os
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, files
@@ -120,29 +119,6 @@ def _pixel_indices(num_frames: int, size: Size, fps: float) -> tuple[np.ndarray,
 def _synthetic(name: str, values: np.ndarray, fps: float) -> Clip:
     frames = np.ascontiguousarray(np.clip(values, 0, 255).round().astype(np.uint8))
     return Clip(frames, float(fps), name, num_declared=len(frames))
-
-
-def frames(
-    folder: PathLike,
-    *,
-    frames: Range | None = None,
-    size: Size | None = None,
-    fps: float = 25.0,
-    center_crop: Size | None = None,
-    levels: int | None = None,
-) -> Clip:
-    """The images of a folder as a clip, in natural order (img2 before img10); the options are `read_video`'s.
-
-    Raises `FileNotFoundError` for a missing folder, ValueError for a file and for images that do not form a clip.
-    """
-    if os.path.isfile(folder):
-        raise invalid(
-            "folder",
-            expected="a folder of images",
-            got=f"the file {str(folder)!r}",
-            cure="Read a video file with foldgauss.io.read_video.",
-        )
-    return read_video(folder, frames=frames, size=size, fps=fps, center_crop=center_crop, levels=levels)
 
 
 @dataclass(frozen=True, eq=False)

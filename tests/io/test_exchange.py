@@ -7,14 +7,13 @@ from foldgauss.io import (
     FormatError,
     OutputError,
     export,
-    import_model,
     load_video_model,
     read_masks,
+    read_vegas_ply,
     read_video,
     save_video_model,
     write_3dgs_frames,
     write_3dgs_ply,
-    write_pseudomesh,
     write_video,
 )
 from foldgauss.render import RenderOptions
@@ -78,11 +77,11 @@ def test_existing_outputs(tmp_path, model, format, name, options):
 def test_what_is_no_video(tmp_path, model):
     write_3dgs_ply(tmp_path / "f.ply", model, 0.5)
     with pytest.raises(FormatError, match="read_3dgs_ply"):
-        import_model(tmp_path / "f.ply", size=(40, 64))
-    with pytest.raises(FormatError, match="read_pseudomesh"):
-        import_model(write_pseudomesh(tmp_path / "mesh", model))
+        read_vegas_ply(tmp_path / "f.ply", size=(40, 64))
+    with pytest.raises(FormatError, match="a file that can be read"):
+        read_vegas_ply(tmp_path)
     with pytest.raises(FileNotFoundError, match="missing"):
-        import_model(tmp_path / "none.ply")
+        read_vegas_ply(tmp_path / "none.ply")
 
 
 SWAPPED = {
@@ -96,7 +95,6 @@ SWAPPED = {
     "obj in a file": (lambda m, s, p: export(m, "obj", f"{p}.obj"), "out: expected a folder, got .*extension out"),
     "no times": (lambda m, s, p: export(m, "ply3dgs", p, times="x"), "times: expected one or more numbers"),
     "times of frames": (lambda m, s, p: export(m, "obj", p, times=[0, 3]), "times: expected one or more numbers"),
-    "import": (lambda m, s, p: import_model(3), "path: expected a path, got 3"),
     "masks": (
         lambda m, s, p: read_masks(s.mask),
         "path: expected a path, got .*array",

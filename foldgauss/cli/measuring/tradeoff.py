@@ -17,7 +17,6 @@ from foldgauss.cli.measuring.tradeoff_record import (
     MODELS,
     PLOT,
     RECORD,
-    ROWS,
     Record,
     changed_settings,
     file_name,
@@ -98,7 +97,7 @@ def tradeoff_command(
 ) -> None:
     """Measure time, size and speed against quality, one setting at a time.
 
-    Writes a table (tradeoff.csv, tradeoff.json) and a plot (tradeoff.png); prints the knee of each Pareto front and the
+    Writes the results (tradeoff.json) and a plot (tradeoff.png); prints the knee of each Pareto front and the
     command that reproduces each point on it. The same command continues a stopped run. See docs/results.md.
     """
     chosen = tuple(AXES) if axes is None else check_axes([name.strip() for name in axes.split(",")])
@@ -112,8 +111,7 @@ def tradeoff_command(
     for text in clip.notes:
         warn(f"{clip.source}: {text}")
     make_folder(out_dir)
-    own = tuple(out_dir / name for name in (ROWS, PLOT))
-    context.with_resource(lock_output(out_dir / RECORD, own=own, what="tradeoff"))
+    context.with_resource(lock_output(out_dir / RECORD, own=(out_dir / PLOT,), what="tradeoff"))
     make_folder(out_dir / MODELS)
     settings = {"axes": list(chosen), "minutes": None if steps else minutes, "steps": steps, "seed": seed}
     source = fingerprint(clip)

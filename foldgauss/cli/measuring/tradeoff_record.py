@@ -1,8 +1,6 @@
-"""Results of `tradeoff`: its record, the commands that reproduce points, and its tables."""
+"""Results of `tradeoff`: its record, the commands that reproduce points, and its table."""
 
-import csv
 import dataclasses
-import io
 import json
 import shlex
 from pathlib import Path
@@ -17,7 +15,7 @@ from foldgauss._runtime.settings import setting_of, settings_by_name, walk
 from foldgauss.analysis.plot import Panel
 from foldgauss.cli.app.application import out, warn
 from foldgauss.cli.shared.tables import write_json
-from foldgauss.io._atomic import atomic_path, write_or_keep
+from foldgauss.io._atomic import write_or_keep
 from foldgauss.io.figures import write_tradeoff
 from foldgauss.io.media.clip import Reading
 from foldgauss.io.models.compact import COMPACT_SUFFIX
@@ -27,11 +25,10 @@ from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.tradeoff import Point, Skipped, knee, pareto_front
 
 RECORD = "tradeoff.json"
-ROWS = "tradeoff.csv"
 PLOT = "tradeoff.png"
 #: Folder of the models, with the records of their fits.
 MODELS = "models"
-FILES = {RECORD, ROWS, PLOT, MODELS}
+FILES = {RECORD, PLOT, MODELS}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,10 +47,6 @@ COSTS = {
     "size": Cost("file size", "bytes", "file (bytes)", "{:,} bytes"),
     "speed": Cost("playback speed", "frames_per_second", "frames per second", "{:.0f} frames per second", True),
 }
-COLUMNS = (
-    *("axis", "value", "settings", "psnr", "ssim", "seconds", "bytes", "floats", "gaussians", "frames_per_second"),
-    *("front", "knee", "command"),
-)
 
 
 @dataclasses.dataclass
@@ -166,7 +159,6 @@ def report(record: Record, made: list[Point], skipped: list[Skipped]) -> None:
     record.left_out = {one.name: one.why for one in skipped}
     record.save()
     marks = [[cost for cost in COSTS if name in record.fronts[cost]["front"]] for name in names]
-    _write_csv(folder / ROWS, rows, names, marks, record.fronts)
     try:
         write_tradeoff(folder / PLOT, panels, quality, [(point.axis, point.value) for point in made])
     except ImportError as error:
@@ -183,20 +175,6 @@ def report(record: Record, made: list[Point], skipped: list[Skipped]) -> None:
     for name, row, mark in zip(names, rows, marks, strict=True):
         if mark:
             out.print(f"  {name}: {row['command']}", soft_wrap=True)
-
-
-def _write_csv(
-    path: Path, rows: list[dict[str, Any]], names: list[str], marks: list[list[str]], fronts: dict[str, Any]
-) -> None:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS)
-    writer.writeheader()
-    for row, name, front in zip(rows, names, marks, strict=True):
-        settings = "; ".join(f"{key}={value}" for key, value in row["settings"].items())
-        knees = " ".join(cost for cost in COSTS if name == fronts[cost]["knee"])
-        writer.writerow(row | {"settings": settings, "front": " ".join(front), "knee": knees})
-    with atomic_path(path) as temporary:
-        temporary.write_text(text.getvalue(), newline="")
 
 
 def _print_rows(rows: list[dict[str, Any]], names: list[str], marks: list[list[str]]) -> None:

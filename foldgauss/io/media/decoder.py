@@ -118,6 +118,7 @@ class VideoDecoder:
         self._has_sought = False
         self.stored_size = self._codec.height, self._codec.width  # which frames of another size are stretched to
         self._read_bytes = 0  # up to the end of the last packet that decodes
+        self._others: list[tuple[int, int]] = []  # after it, place and size of packets of other streams, such as sound
         self._at_end = False
         #: To 8 bits and to 16: FFmpeg takes longer to prepare a conversion than to convert a small frame.
         self._converters = VideoReformatter(), VideoReformatter()
@@ -146,11 +147,11 @@ class VideoDecoder:
 
     @property
     def unread_fraction(self) -> float:
-        """The fraction of the file after the last packet that decodes, once the end is reached; 0 where the container
-        declares frames or a duration, which tell more."""
+        """The fraction of the file after the last packet that decodes, without packets of other streams, once the end
+        is reached; 0 where the container declares frames or a duration, which tell more."""
         if not (self._at_end and self._read_bytes) or self.num_declared or self.declared_seconds is not None:
             return 0.0
-        return 1 - self._read_bytes / self._path.stat().st_size
+        return 1 - (self._read_bytes + sum(size for _, size in self._others)) / self._path.stat().st_size
 
     @property
     def size(self) -> Size:
@@ -325,16 +326,21 @@ class VideoDecoder:
             self._at_end = packet is None
             if not self._at_end:
                 self._read_bytes = max(self._read_bytes, (packet.pos or 0) + packet.size)
+                self._others = [other for other in self._others if other[0] > self._read_bytes]
             yield from map(self._set_time, found)
             if self._at_end:
                 return
 
     def _read_packets(self) -> Iterator[av.Packet]:
         """The packets of the stream, of which those that cannot be read are left out."""
-        num_errors, before = 0, (self._stream.start_time or 0) - 1
+        num_errors, before, place = 0, (self._stream.start_time or 0) - 1, 0
         while num_errors < MAX_ERRORS:
             try:
-                for packet in self._container.demux(self._stream):
+                for packet in self._container.demux():
+                    if packet.stream_index != self._stream.index:
+                        place = packet.pos or place  # several packets may stand at one place
+                        self._others.append((place, packet.size))
+                        continue
                     if packet.is_corrupt:
                         self._num_suspect = MAX_DELAY
                     if packet.size:

@@ -1,4 +1,4 @@
-"""Export and import of models, with the format chosen by name."""
+"""Export of models, with the format chosen by name."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -8,10 +8,8 @@ import numpy as np
 from foldgauss._runtime.checks import check_one_of, invalid
 from foldgauss.io._atomic import OutputRefused, PathLike, atomic_folder, check_path, check_writable
 from foldgauss.io.exchange.gaussians_ply import write_3dgs_frames, write_3dgs_ply
-from foldgauss.io.exchange.ply_file import format_error
 from foldgauss.io.exchange.pseudomesh import write_pseudomesh
-from foldgauss.io.exchange.vegas_ply import read_vegas_ply, write_vegas_ply
-from foldgauss.io.media.clip import Size
+from foldgauss.io.exchange.vegas_ply import write_vegas_ply
 from foldgauss.video.editing.chain import Edit
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.video_model import VideoModel
@@ -111,22 +109,3 @@ def _check_new(path: Path, overwrite: bool) -> None:
     if path.exists() and not overwrite:
         text = f"path: expected a new file, got {str(path)!r}, which exists."
         raise OutputRefused(f"{text} Choose another path, or overwrite it.")
-
-
-def import_model(path: PathLike, *, size: Size | None = None, fps: float | None = None) -> VideoModel:
-    """The model in a file of another program: a published VeGaS video. See `read_vegas_ply` for `size` and `fps`.
-
-    **Raises:** `FileNotFoundError`; `FormatError` for a file that is damaged or holds no video. Static 3DGS
-    scenes and pseudomeshes are not videos: use `read_3dgs_ply` and `read_pseudomesh`.
-
-    **Example:** `save_video_model("v.safetensors", import_model("point_cloud.ply", size=(480, 854), fps=24))`
-    """
-    path = check_path(path)
-    if path.is_dir() or path.suffix.lower() == ".obj":
-        raise format_error(
-            path,
-            expected="a .ply file with a video",
-            got="a folder or a mesh",
-            cure="Render frames of triangles with foldgauss.io.read_pseudomesh(FOLDER).frames().",
-        )
-    return read_vegas_ply(path, size=size, fps=fps)
