@@ -12,7 +12,7 @@ import typing
 from collections.abc import Iterator
 from typing import Any
 
-from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within, require
 
 _KEY = "setting"
 
@@ -115,14 +115,22 @@ def check_settings(settings: Any, prefix: str = "") -> None:
 
 def _checked_value(name: str, value: Any, kind: type, valid: Setting) -> Any:
     if kind is int:
-        if not is_integer(value, valid.least):
-            raise invalid(name, expected=f"a whole number >= {valid.least}", got=repr(value))
-        if valid.most is not None and value > valid.most:
-            raise invalid(name, expected=f"at most {valid.most:,}", got=f"{value:,}")
+        require(
+            is_integer(value, valid.least),
+            name,
+            expected=f"a whole number >= {valid.least}",
+            got=repr(value),
+        )
+        if valid.most is not None:
+            require(value <= valid.most, name, expected=f"at most {valid.most:,}", got=f"{value:,}")
         return int(value)
     if kind is float:
-        if not is_within(value, valid.bounds):
-            raise invalid(name, expected=f"a number in {valid.bounds}", got=repr(value))
+        require(
+            is_within(value, valid.bounds),
+            name,
+            expected=f"a number in {valid.bounds}",
+            got=repr(value),
+        )
         return float(value)
     if kind is str:
         check_one_of(name, value, valid.choices)

@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TypeVar
 
-from foldgauss._runtime.checks import ParameterError, invalid, short_repr
+from foldgauss._runtime.checks import ParameterError, invalid, require, short_repr
 
 PathLike = str | os.PathLike
 Result = TypeVar("Result")
@@ -35,8 +35,13 @@ class OutputRefused(OutputError):
 
 def check_path(path: object, order: str = "") -> Path:
     """`path` as a Path. Raises ValueError for another type, with `order`, the order of the arguments, as a hint."""
-    if not isinstance(path, PathLike):
-        raise invalid("path", expected="a path", got=short_repr(path), cure=f"The order is ({order})." if order else "")
+    require(
+        isinstance(path, PathLike),
+        "path",
+        expected="a path",
+        got=short_repr(path),
+        cure=f"The order is ({order})." if order else "",
+    )
     return Path(path)
 
 

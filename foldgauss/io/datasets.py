@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from foldgauss._numerics.random_streams import Stream, make_generator
-from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_integer
+from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_integer, require
 from foldgauss.io._atomic import MissingInput, PathLike
 from foldgauss.io.media.clip import Clip, Levels, Range, Size, format_size
 from foldgauss.io.media.images import image_paths, read_image
@@ -107,10 +107,18 @@ def ball(
 
 def _pixel_indices(num_frames: int, size: Size, fps: float) -> tuple[np.ndarray, np.ndarray]:
     """x and y of each pixel, (height, width) each, after checks of the arguments of a synthetic clip."""
-    if not is_integer(num_frames, 1):
-        raise invalid("num_frames", expected="a positive integer", got=repr(num_frames))
-    if len(size) != 2 or not all(is_integer(side, 1) for side in size):
-        raise invalid("size", expected="(height, width), positive integers", got=repr(size))
+    require(
+        is_integer(num_frames, 1),
+        "num_frames",
+        expected="a positive integer",
+        got=repr(num_frames),
+    )
+    require(
+        len(size) == 2 and all(is_integer(side, 1) for side in size),
+        "size",
+        expected="(height, width), positive integers",
+        got=repr(size),
+    )
     check_within("fps", fps, "(0, inf)", "a positive number of frames per second")
     y, x = np.mgrid[: size[0], : size[1]]
     return x, y
@@ -170,13 +178,13 @@ def davis(
     if len(found) < len(paths):
         return MaskedClip(clip, None, f"{len(found)} of {len(paths)} frames have a mask in {str(place)!r}")
     masks, whole = read_labels(paths), read_image(shown[0], Levels()).shape[:2]
-    if masks.shape[1:] != whole:
-        raise invalid(
-            "root",
-            expected=f"masks of the size of the frames, {format_size(whole)}",
-            got=f"{format_size(masks.shape[1:])} in {str(place)!r}",
-            cure="Frames and masks are of different resolutions: unpack the data set again.",
-        )
+    require(
+        masks.shape[1:] == whole,
+        "root",
+        expected=f"masks of the size of the frames, {format_size(whole)}",
+        got=f"{format_size(masks.shape[1:])} in {str(place)!r}",
+        cure="Frames and masks are of different resolutions: unpack the data set again.",
+    )
     if center_crop is not None:
         masks = np.ascontiguousarray(masks[:, *center_window(whole, center_crop)])
     return MaskedClip(clip, masks)

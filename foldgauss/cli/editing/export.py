@@ -18,7 +18,8 @@ from foldgauss.cli.shared.outputs import (
     refuse_huge,
     refuse_inputs,
 )
-from foldgauss.cli.shared.rendering import Output, progress_bar
+from foldgauss.cli.shared.progress import progress_bar
+from foldgauss.cli.shared.rendering import Output
 from foldgauss.cli.shared.tables import format_count
 from foldgauss.io._atomic import write_or_keep
 from foldgauss.io.exchange.export import export

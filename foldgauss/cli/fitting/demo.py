@@ -11,8 +11,9 @@ from foldgauss.cli.app.application import command, out
 from foldgauss.cli.fitting.fit import stop_on_signals, summarize_fit
 from foldgauss.cli.shared.arguments import Overwrite
 from foldgauss.cli.shared.contact_sheet import make_comparison_sheet
-from foldgauss.cli.shared.fit_progress import choose_display, display_progress
+from foldgauss.cli.shared.fit_progress import display_progress
 from foldgauss.cli.shared.outputs import make_folder, refuse_existing
+from foldgauss.cli.shared.progress import choose_display
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import print_figures, summarize_scores, write_json
 from foldgauss.io.datasets import sample_clip

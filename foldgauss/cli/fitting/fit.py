@@ -37,14 +37,13 @@ from foldgauss.cli.shared.arguments import (
     parse_size,
 )
 from foldgauss.cli.shared.fit_progress import (
-    Display,
     Observer,
-    choose_display,
     display_progress,
     print_json,
     save_previews,
 )
 from foldgauss.cli.shared.outputs import check_output, name_after, refuse_existing, refuse_inputs
+from foldgauss.cli.shared.progress import Display, choose_display
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.cli.shared.tables import format_count, print_figures, summarize_scores
 from foldgauss.io._atomic import OutputError, resolve, write_or_keep

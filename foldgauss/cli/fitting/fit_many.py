@@ -32,8 +32,8 @@ from foldgauss.cli.shared.arguments import (
     parse_frames,
     parse_size,
 )
-from foldgauss.cli.shared.fit_progress import choose_display
 from foldgauss.cli.shared.outputs import make_folder
+from foldgauss.cli.shared.progress import choose_display
 from foldgauss.cli.shared.tables import format_count, write_json
 from foldgauss.io._atomic import resolve
 from foldgauss.io._lock import lock_output

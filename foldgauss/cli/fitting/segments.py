@@ -11,9 +11,7 @@ from foldgauss._runtime.checks import require
 from foldgauss.cli.app.application import Stopped, err, out, warn
 from foldgauss.cli.fitting.job_progress import emit_json, run_jobs
 from foldgauss.cli.fitting.options import WorkerOptions
-from foldgauss.cli.shared.fit_progress import Display
-from foldgauss.cli.shared.log_lines import show_status
-from foldgauss.cli.shared.rendering import progress_bar
+from foldgauss.cli.shared.progress import Display, progress_bar, show_status
 from foldgauss.cli.shared.tables import format_count, print_figures
 from foldgauss.io._atomic import write_or_keep
 from foldgauss.io.media.reading import describe_crop

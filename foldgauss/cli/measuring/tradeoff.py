@@ -32,9 +32,8 @@ from foldgauss.cli.shared.arguments import (
     parse_frames,
     parse_size,
 )
-from foldgauss.cli.shared.fit_progress import choose_display
-from foldgauss.cli.shared.log_lines import show_status
 from foldgauss.cli.shared.outputs import make_folder, name_after, refuse_foreign
+from foldgauss.cli.shared.progress import choose_display, show_status
 from foldgauss.io._lock import lock_output
 from foldgauss.io.media.clip import DEINTERLACE, Clip, check_reading
 from foldgauss.io.media.reading import read_video

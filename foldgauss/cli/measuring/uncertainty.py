@@ -15,7 +15,7 @@ from foldgauss.cli.app.help import complete_choice
 from foldgauss.cli.shared.arguments import FittedClip, FittedFrames, ModelFile, Overwrite
 from foldgauss.cli.shared.clips import read_fitted_clip, refuse_segments
 from foldgauss.cli.shared.outputs import make_folder, name_after, refuse_foreign, refuse_inputs
-from foldgauss.cli.shared.rendering import progress_bars
+from foldgauss.cli.shared.progress import choose_display, show_progress
 from foldgauss.io._atomic import atomic_path, translate_output_errors, write_or_keep
 from foldgauss.io._lock import lock_output
 from foldgauss.io.models.video_model import load_video_model, read_origin
@@ -122,7 +122,7 @@ def uncertainty_command(
     make_folder(out_dir)
     own = tuple(out_dir / name for name in FILES)
     context.with_resource(lock_output(out_dir / CHAINS, own=own, what="run of uncertainty"))
-    with progress_bars() as show:
+    with show_progress(choose_display()) as show:
         profiles = likelihood_profiles(
             model, clip.frames, noise=noise, on_render=lambda done, total: show("Rendering", done, total)
         )

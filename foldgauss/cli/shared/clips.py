@@ -7,7 +7,7 @@ from typing import Any
 from foldgauss._runtime.checks import ParameterError, invalid, require
 from foldgauss.cli.app.application import warn
 from foldgauss.cli.shared.arguments import parse_frames
-from foldgauss.cli.shared.log_lines import show_status
+from foldgauss.cli.shared.progress import show_status
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.media.indexing import LazyFrames, index_video
 from foldgauss.io.media.reading import read_video

@@ -2,7 +2,6 @@
 
 import contextlib
 import logging
-import threading
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -13,25 +12,6 @@ from foldgauss.video.models.frame_times import is_cut
 
 #: So many numbers of frames are printed.
 LISTED_FRAMES = 8
-#: Seconds before the first line of a log, which is early since options may be mistyped.
-FIRST_LINE_SECONDS = 10.0
-#: Seconds between two lines of a log.
-LINE_SECONDS = 30.0
-
-
-@contextlib.contextmanager
-def show_status(text: str) -> Iterator[None]:
-    """What is being done: shown on a terminal while it lasts, elsewhere printed once if it takes long."""
-    if err.is_terminal:
-        with err.status(text):
-            yield
-        return
-    timer = threading.Timer(FIRST_LINE_SECONDS, lambda: err.print(f"{text} ...", soft_wrap=True))
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
 
 
 class _Printer(logging.Handler):

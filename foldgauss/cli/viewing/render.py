@@ -27,6 +27,7 @@ from foldgauss.cli.shared.arguments import (
 from foldgauss.cli.shared.clips import Video
 from foldgauss.cli.shared.log_lines import print_log, print_shots
 from foldgauss.cli.shared.outputs import IMAGE_SUFFIX, check_images_output, name_after, refuse_huge
+from foldgauss.cli.shared.progress import progress_bar
 from foldgauss.cli.shared.rendering import (
     CodecName,
     Crf,
@@ -34,7 +35,6 @@ from foldgauss.cli.shared.rendering import (
     PixelFormat,
     SoundFile,
     choose_sound,
-    progress_bar,
 )
 from foldgauss.cli.shared.timeline import Fps, SkipRepeats, Speed, Timeline, parse_remap
 from foldgauss.io._atomic import resolve

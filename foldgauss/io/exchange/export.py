@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from foldgauss._runtime.checks import check_one_of, invalid
+from foldgauss._runtime.checks import check_one_of, invalid, require
 from foldgauss.io._atomic import OutputRefused, PathLike, atomic_folder, check_path, check_writable
 from foldgauss.io.exchange.gaussians_ply import write_3dgs_frames, write_3dgs_ply
 from foldgauss.io.exchange.pseudomesh import write_pseudomesh
@@ -48,13 +48,13 @@ def export(
 
     **Example:** `export(load_video_model("holiday.safetensors"), "ply3dgs", "frames")`
     """
-    if not isinstance(model, VideoModel | EditedVideo | SegmentedVideo):
-        raise invalid(
-            "model",
-            expected="a VideoModel, an EditedVideo or a SegmentedVideo",
-            got=type(model).__name__,
-            cure="End the chain with .video()." if isinstance(model, Edit) else "The order is (model, format, out).",
-        )
+    require(
+        isinstance(model, VideoModel | EditedVideo | SegmentedVideo),
+        "model",
+        expected="a VideoModel, an EditedVideo or a SegmentedVideo",
+        got=type(model).__name__,
+        cure="End the chain with .video()." if isinstance(model, Edit) else "The order is (model, format, out).",
+    )
     check_one_of("format", format, FORMATS)
     out = check_path(out, "model, format, out")
     options = {"depth_step": depth_step, "axes": axes, "sh_degree": sh_degree}
@@ -69,35 +69,35 @@ def export(
         _check_new(out, overwrite)
         return write_vegas_ply(out, model)
     if format == "obj":
-        if out.suffix.lower() == ".obj" and not out.is_dir():
-            raise invalid(
-                "out",
-                expected="a folder",
-                got=repr(str(out)),
-                cure="Each frame becomes a file in it: leave the extension out.",
-            )
+        require(
+            out.suffix.lower() != ".obj" or out.is_dir(),
+            "out",
+            expected="a folder",
+            got=repr(str(out)),
+            cure="Each frame becomes a file in it: leave the extension out.",
+        )
         return write_pseudomesh(out, model, times, overwrite=overwrite, on_frame=on_frame)
     if out.suffix.lower() != ".ply" or out.is_dir():
         return write_3dgs_frames(out, model, times, overwrite=overwrite, on_frame=on_frame, **of_scenes)
-    if times is None or np.size(times) != 1:
-        raise invalid(
-            "times",
-            expected="one for a single file",
-            got="all frames" if times is None else str(np.size(times)),
-            cure="Give one time, or a folder (a name without .ply).",
-        )
+    require(
+        times is not None and np.size(times) == 1,
+        "times",
+        expected="one for a single file",
+        got="all frames" if times is None else str(np.size(times)),
+        cure="Give one time, or a folder (a name without .ply).",
+    )
     _check_new(out, overwrite)
     return write_3dgs_ply(out, model, float(np.ravel(times)[0]), **of_scenes)
 
 
 def _write_vegas_segments(folder: Path, video: SegmentedVideo, overwrite: bool) -> Path:
-    if folder.suffix.lower() == ".ply" and not folder.is_dir():
-        raise invalid(
-            "out",
-            expected="a folder",
-            got=repr(str(folder)),
-            cure="Each segment becomes a file in it: leave the extension out.",
-        )
+    require(
+        folder.suffix.lower() != ".ply" or folder.is_dir(),
+        "out",
+        expected="a folder",
+        got=repr(str(folder)),
+        cure="Each segment becomes a file in it: leave the extension out.",
+    )
     with atomic_folder(folder, overwrite, pattern=r"segment-[0-9]{3,}\.ply", what="segments") as temporary:
         for number, segment in enumerate(video.segments):
             write_vegas_ply(temporary / f"segment-{number:03d}.ply", segment.model)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from foldgauss._runtime.checks import ParameterError, check_one_of, invalid, is_integer, is_within
+from foldgauss._runtime.checks import ParameterError, check_one_of, invalid, is_integer, is_within, require
 from foldgauss.io._atomic import PathLike, check_input, check_path
 from foldgauss.io.media.frame_rate import MAX_FPS, MIN_FPS
 
@@ -62,13 +62,14 @@ class Levels:
 
         Raises `VideoError` where `white` is given, but applies to no frame of `path`, a clip of this `kind`.
         """
-        if self.white is not None and self.most < 0:
-            raise video_error(
-                "levels",
-                expected="images or videos of 16 bits, in RGB or gray",
-                got=f"{kind}, {str(path)!r}",
-                cure="Leave levels out.",
-            )
+        require(
+            self.white is None or self.most >= 0,
+            "levels",
+            expected="images or videos of 16 bits, in RGB or gray",
+            got=f"{kind}, {str(path)!r}",
+            cure="Leave levels out.",
+            kind=VideoError,
+        )
         if self.white is not None:
             clipped = f"values of up to {self.most:,} are above levels={self.white} and become white."
             return (clipped,) if self.most > self.white else ()
@@ -161,34 +162,48 @@ def check_range(frames: Range | None) -> tuple[int, int | None]:
     start, stop = (None, None) if frames is None else frames
     start = 0 if start is None else start
     got = format_range(start, stop)
-    if start < 0 or (stop is not None and stop < 0):
-        raise video_error("frames", expected="A:B counted from the start", got=got, cure="Use 0 or more.")
-    if stop is not None and stop <= start:
-        raise video_error("frames", expected="A:B with at least 1 frame", got=got, cure="Choose B > A.")
+    require(
+        start >= 0 and (stop is None or stop >= 0),
+        "frames",
+        expected="A:B counted from the start",
+        got=got,
+        cure="Use 0 or more.",
+        kind=VideoError,
+    )
+    require(
+        stop is None or stop > start,
+        "frames",
+        expected="A:B with at least 1 frame",
+        got=got,
+        cure="Choose B > A.",
+        kind=VideoError,
+    )
     return start, stop
 
 
 def check_range_within(start: int, stop: int | None, num_total: int, path: Path) -> None:
-    if start >= num_total or (stop is not None and stop > num_total):
-        raise video_error(
-            "frames",
-            expected=f"A:B within 0:{num_total}, the frames of {str(path)!r}",
-            got=format_range(start, stop),
-            cure=f"Choose B <= {num_total} and A below it.",
-        )
+    require(
+        start < num_total and (stop is None or stop <= num_total),
+        "frames",
+        expected=f"A:B within 0:{num_total}, the frames of {str(path)!r}",
+        got=format_range(start, stop),
+        cure=f"Choose B <= {num_total} and A below it.",
+        kind=VideoError,
+    )
 
 
 def check_frame_size(size: Size | None, parameter: str = "size") -> Size | None:
     if size is None:
         return None
     sides = tuple(size) if isinstance(size, tuple | list | np.ndarray) else ()
-    if len(sides) != 2 or not all(is_within(side, "[1, inf)") and side == int(side) for side in sides):
-        raise video_error(
-            parameter,
-            expected="height and width of whole pixels, at least 1",
-            got=f"{sides[0]}x{sides[1]}" if len(sides) == 2 else repr(size),
-            cure="Write it as HEIGHTxWIDTH, such as 160x320.",
-        )
+    require(
+        len(sides) == 2 and all(is_within(side, "[1, inf)") and side == int(side) for side in sides),
+        parameter,
+        expected="height and width of whole pixels, at least 1",
+        got=f"{sides[0]}x{sides[1]}" if len(sides) == 2 else repr(size),
+        cure="Write it as HEIGHTxWIDTH, such as 160x320.",
+        kind=VideoError,
+    )
     return int(sides[0]), int(sides[1])
 
 
@@ -199,19 +214,26 @@ def clamp_stop(start: int, stop: int | None, num_total: int, path: Path) -> int:
 
 
 def check_fps(fps: float) -> None:
-    if not is_within(fps, f"[{MIN_FPS}, {MAX_FPS}]"):
-        raise video_error("fps", expected=f"a rate in [{MIN_FPS:g}, {MAX_FPS:g}]", got=repr(fps), cure="Try 25.")
+    require(
+        is_within(fps, f"[{MIN_FPS}, {MAX_FPS}]"),
+        "fps",
+        expected=f"a rate in [{MIN_FPS:g}, {MAX_FPS:g}]",
+        got=repr(fps),
+        cure="Try 25.",
+        kind=VideoError,
+    )
 
 
 def check_reading(deinterlace: str, levels: int | None) -> Reading:
     check_one_of("deinterlace", deinterlace, DEINTERLACE)
-    if levels is not None and not (is_integer(levels, 1) and levels <= WHITE):
-        raise video_error(
-            "levels",
-            expected=f"the value of white, 1 to {WHITE}",
-            got=repr(levels),
-            cure="Of data of 12 bits it is 4095.",
-        )
+    require(
+        levels is None or (is_integer(levels, 1) and levels <= WHITE),
+        "levels",
+        expected=f"the value of white, 1 to {WHITE}",
+        got=repr(levels),
+        cure="Of data of 12 bits it is 4095.",
+        kind=VideoError,
+    )
     return Reading(deinterlace, levels)
 
 

@@ -15,6 +15,7 @@ from av.filter import Graph
 from av.stream import Disposition
 from av.video.reformatter import ColorRange, Colorspace, Interpolation, VideoReformatter
 
+from foldgauss._runtime.checks import require
 from foldgauss.io._atomic import resolve
 from foldgauss.io.media.clip import (
     AS_STORED,
@@ -362,22 +363,24 @@ class VideoDecoder:
         for frame in frames:
             follows = self._deinterlace == "fields" and self._has_sought  # interlaced ones before the place sought
             if graph is None and not frame.interlaced_frame and not follows:
-                if self._deinterlace == "fields":
-                    raise video_error(
-                        "deinterlace",
-                        expected="a first frame of two fields",
-                        got=f"a progressive one in {str(self._path)!r}",
-                        cure="Leave deinterlace='fields' out.",
-                    )
+                require(
+                    self._deinterlace != "fields",
+                    "deinterlace",
+                    expected="a first frame of two fields",
+                    got=f"a progressive one in {str(self._path)!r}",
+                    cure="Leave deinterlace='fields' out.",
+                    kind=VideoError,
+                )
                 yield frame
                 continue
-            if self._deinterlace == "refuse":
-                raise video_error(
-                    "path",
-                    expected="a video of progressive frames",
-                    got=f"one of interlaced fields, {str(self._path)!r}",
-                    cure="Convert it while reading, with deinterlace='frames' or 'fields'.",
-                )
+            require(
+                self._deinterlace != "refuse",
+                "path",
+                expected="a video of progressive frames",
+                got=f"one of interlaced fields, {str(self._path)!r}",
+                cure="Convert it while reading, with deinterlace='frames' or 'fields'.",
+                kind=VideoError,
+            )
             kind = frame.height, frame.width, frame.format.name
             if graph is None or kind != of_graph:
                 yield from filter_frame(graph, None)
@@ -461,13 +464,14 @@ def scan_video(
     with closing(VideoDecoder(path, reading=reading)) as decoder:
         fps = decoder.fps if 0 < decoder.fps <= MAX_FPS else DEFAULT_FPS
         kept = keep(select())
-        if not places:
-            raise video_error(
-                "path",
-                expected="a video with frames that decode",
-                got=f"none in {str(path)!r}",
-                cure="The file is damaged or its codec is unknown here; convert it with ffmpeg.",
-            )
+        require(
+            places,
+            "path",
+            expected="a video with frames that decode",
+            got=f"none in {str(path)!r}",
+            cure="The file is damaged or its codec is unknown here; convert it with ffmpeg.",
+            kind=VideoError,
+        )
         time_base, num_reached = float(decoder.time_base), places[-1] + 1
         seconds = make_increasing((np.array(ticks + following) * time_base).tolist(), fps)
         seconds, end = seconds[: len(ticks)], float(seconds[-1])
@@ -517,13 +521,14 @@ def _describe_video(decoder: VideoDecoder, path: Path, hdr: list[str], reading: 
 def open_container(path: Path, demuxers: str = DEMUXERS) -> av.container.InputContainer:
     """An open file, restricted to itself. Raises `VideoError`."""
     kind = describe_kind(read_head(path))
-    if kind == LIST:
-        raise video_error(
-            "path",
-            expected=VIDEO,
-            got=f"{kind}, {str(path)!r}",
-            cure="The files that it names are not opened: give the video itself.",
-        )
+    require(
+        kind != LIST,
+        "path",
+        expected=VIDEO,
+        got=f"{kind}, {str(path)!r}",
+        cure="The files that it names are not opened: give the video itself.",
+        kind=VideoError,
+    )
     # An absolute path, because FFmpeg takes 'name:rest' for a protocol. One local file and nothing that it refers to.
     options = {"protocol_whitelist": "file", "format_whitelist": demuxers}
     try:
@@ -543,20 +548,22 @@ def _choose_stream(container: av.container.InputContainer, path: Path) -> av.Vid
     if stream is None:
         kind = "audio" if container.streams.audio else "no video stream"
         raise video_error("path", expected=VIDEO, got=f"{str(path)!r} ({kind}), which does not open as a video")
-    if stream.codec_context is None:
-        raise video_error(
-            "path",
-            expected="a video whose codec is known here",
-            got=f"an unknown one in {str(path)!r}",
-            cure="Convert it with ffmpeg.",
-        )
-    if stream.disposition & Disposition.attached_pic:
-        raise video_error(
-            "path",
-            expected="a video",
-            got=f"audio with a cover image, {str(path)!r}",
-            cure="Give a file with moving images.",
-        )
+    require(
+        stream.codec_context is not None,
+        "path",
+        expected="a video whose codec is known here",
+        got=f"an unknown one in {str(path)!r}",
+        cure="Convert it with ffmpeg.",
+        kind=VideoError,
+    )
+    require(
+        not stream.disposition & Disposition.attached_pic,
+        "path",
+        expected="a video",
+        got=f"audio with a cover image, {str(path)!r}",
+        cure="Give a file with moving images.",
+        kind=VideoError,
+    )
     return stream
 
 
