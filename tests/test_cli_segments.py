@@ -82,7 +82,7 @@ def test_render_shows_what_the_model_does(options, positions, here, tmp_path):
 
 def test_evaluate_reads_the_clip_bit_by_bit(here, work, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(
-        "foldgauss.cli.shared.clips.read_video", lambda *_, **__: pytest.fail("the whole clip was read")
+        "foldgauss.cli.shared.files.read_video", lambda *_, **__: pytest.fail("the whole clip was read")
     )
     assert run("evaluate", here, work / "clip", "--json", tmp_path / "scores.json") == 0
     said = told(capsys)

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from foldgauss._runtime.checks import ParameterError
-from foldgauss.cli.measuring.tradeoff_record import COLUMNS, Record
+from foldgauss.cli.measuring.tradeoff import Record
 from foldgauss.io import HistoryFile, read_history, save_video_model
 from foldgauss.io.edit_script import EditScriptError, read_edit_script
 from foldgauss.io.history import info_line
@@ -287,7 +287,7 @@ APPLIED = dataclasses.replace(
 
 def _infos() -> list[FitInfo]:
     first = FitInfo(1, 0.1, 0.5, float("nan"), 10, 9, 0.2, float("inf"), None)
-    return [first, first._replace(step=2, psnr=20.5, loss=0.25), first._replace(step=5, psnr=21.5, stopped_by="steps")]
+    return [first, first._replace(step=2), first._replace(step=5, psnr=21.5, stopped_by="steps")]
 
 
 def _history() -> bytes:
@@ -306,7 +306,7 @@ def _read_history(path: Path) -> None:
     for info in read_history(path):
         assert f"{info.step:d} {info.psnr:.2f}"
     if chance(path) % 2:
-        HistoryFile(path, resumed_at=5, psnr=21.5)
+        HistoryFile(path, resumed_at=5)
 
 
 HISTORY = Target(
@@ -324,7 +324,10 @@ HISTORY = Target(
 
 def _record() -> bytes:
     texts = {"axis": "steps", "command": "a", "settings": {"steps": 100}}
-    rows = [dict.fromkeys(COLUMNS, 1) | texts | {"value": value} for value in ("100", "200")]
+    rows = [
+        dict.fromkeys(("psnr", "ssim", "seconds", "bytes", "floats", "gaussians"), 1) | texts | {"value": value}
+        for value in ("100", "200")
+    ]
     kept = {
         "settings": {"a": 1, "b": [1, 2]},
         "machine": {"cpu": "x", "cores": 2},

@@ -9,8 +9,9 @@ from foldgauss._runtime.checks import check_one_of, require
 from foldgauss.cli.app.application import command, out
 from foldgauss.cli.app.help import complete_choice
 from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, Times, parse_size, parse_times
-from foldgauss.cli.shared.clips import Video
-from foldgauss.cli.shared.outputs import (
+from foldgauss.cli.shared.console import format_count, progress_bar
+from foldgauss.cli.shared.files import (
+    Video,
     check_images_output,
     check_output,
     name_after,
@@ -18,9 +19,7 @@ from foldgauss.cli.shared.outputs import (
     refuse_huge,
     refuse_inputs,
 )
-from foldgauss.cli.shared.progress import progress_bar
 from foldgauss.cli.shared.rendering import Output
-from foldgauss.cli.shared.tables import format_count
 from foldgauss.io._atomic import write_or_keep
 from foldgauss.io.exchange.export import export
 from foldgauss.io.exchange.pseudomesh import read_pseudomesh

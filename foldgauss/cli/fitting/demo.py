@@ -10,12 +10,11 @@ from foldgauss._runtime.threads import num_threads
 from foldgauss.cli.app.application import command, out
 from foldgauss.cli.fitting.fit import stop_on_signals, summarize_fit
 from foldgauss.cli.shared.arguments import Overwrite
+from foldgauss.cli.shared.console import choose_display, print_figures, summarize_scores, write_json
 from foldgauss.cli.shared.contact_sheet import make_comparison_sheet
+from foldgauss.cli.shared.files import make_folder, refuse_existing
 from foldgauss.cli.shared.fit_progress import display_progress
-from foldgauss.cli.shared.outputs import make_folder, refuse_existing
-from foldgauss.cli.shared.progress import choose_display
 from foldgauss.cli.shared.rendering import evaluate_with_progress
-from foldgauss.cli.shared.tables import print_figures, summarize_scores, write_json
 from foldgauss.io.datasets import sample_clip
 from foldgauss.io.media.reading import read_video
 from foldgauss.io.media.writing import write_image, write_video

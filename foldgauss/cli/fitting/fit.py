@@ -36,18 +36,16 @@ from foldgauss.cli.shared.arguments import (
     parse_frames,
     parse_size,
 )
+from foldgauss.cli.shared.console import Display, choose_display, format_count, print_figures, summarize_scores
+from foldgauss.cli.shared.files import check_output, name_after, refuse_existing, refuse_inputs
 from foldgauss.cli.shared.fit_progress import (
     Observer,
     display_progress,
     print_json,
     save_previews,
 )
-from foldgauss.cli.shared.outputs import check_output, name_after, refuse_existing, refuse_inputs
-from foldgauss.cli.shared.progress import Display, choose_display
 from foldgauss.cli.shared.rendering import evaluate_with_progress
-from foldgauss.cli.shared.tables import format_count, print_figures, summarize_scores
-from foldgauss.io._atomic import OutputError, resolve, write_or_keep
-from foldgauss.io._lock import lock_output
+from foldgauss.io._atomic import OutputError, lock_output, resolve, write_or_keep
 from foldgauss.io.history import HistoryFile, read_history, write_curves
 from foldgauss.io.media.clip import DEINTERLACE, Clip, check_reading
 from foldgauss.io.models.compact import COMPACT_SUFFIX

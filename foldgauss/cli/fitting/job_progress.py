@@ -7,8 +7,8 @@ from typing import Any
 
 from foldgauss.cli.app.application import Stopped, err
 from foldgauss.cli.app.signals import note_signals
+from foldgauss.cli.shared.console import Display, show_progress
 from foldgauss.cli.shared.fit_progress import print_json
-from foldgauss.cli.shared.progress import Display, show_progress
 from foldgauss.jobs import FitJob, Outcome, Progress, WorkerPool, run_here, run_on
 from foldgauss.jobs import Stopped as JobsStopped
 

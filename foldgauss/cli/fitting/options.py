@@ -15,7 +15,7 @@ from foldgauss._runtime.settings import setting_of, settings_by_name, type_of, w
 from foldgauss._runtime.threads import available_cores
 from foldgauss.cli.app.help import complete_choice
 from foldgauss.cli.shared.arguments import override_constants
-from foldgauss.cli.shared.tables import format_count
+from foldgauss.cli.shared.console import format_count
 from foldgauss.jobs import WorkerPool, local_workers, running_cluster
 from foldgauss.video.fitting.config import BUDGET, MODEL, OPTIMIZATION, PRESETS, FitConfig
 

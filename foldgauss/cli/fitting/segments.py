@@ -11,8 +11,7 @@ from foldgauss._runtime.checks import require
 from foldgauss.cli.app.application import Stopped, err, out, warn
 from foldgauss.cli.fitting.job_progress import emit_json, run_jobs
 from foldgauss.cli.fitting.options import WorkerOptions
-from foldgauss.cli.shared.progress import Display, progress_bar, show_status
-from foldgauss.cli.shared.tables import format_count, print_figures
+from foldgauss.cli.shared.console import Display, format_count, print_figures, progress_bar, show_status
 from foldgauss.io._atomic import write_or_keep
 from foldgauss.io.media.reading import describe_crop
 from foldgauss.jobs import FitJob, JoinedFit, LongFit, Outcome, plan_long_fit, segments_folder

@@ -13,11 +13,16 @@ from foldgauss._runtime.checks import ParameterError, check_one_of, invalid, req
 from foldgauss.cli.app.application import Stopped, command, out, warn
 from foldgauss.cli.app.help import complete_choice
 from foldgauss.cli.shared.arguments import FittedClip, FittedFrames, ModelFile, Overwrite
-from foldgauss.cli.shared.clips import read_fitted_clip, refuse_segments
-from foldgauss.cli.shared.outputs import make_folder, name_after, refuse_foreign, refuse_inputs
-from foldgauss.cli.shared.progress import choose_display, show_progress
-from foldgauss.io._atomic import atomic_path, translate_output_errors, write_or_keep
-from foldgauss.io._lock import lock_output
+from foldgauss.cli.shared.console import choose_display, show_progress
+from foldgauss.cli.shared.files import (
+    make_folder,
+    name_after,
+    read_fitted_clip,
+    refuse_foreign,
+    refuse_inputs,
+    refuse_segments,
+)
+from foldgauss.io._atomic import atomic_path, lock_output, translate_output_errors, write_or_keep
 from foldgauss.io.models.video_model import load_video_model, read_origin
 from foldgauss.uncertainty import Increments, frame_time_posterior, likelihood_profiles, marginalize_colors
 from foldgauss.uncertainty.diagnostics import plots

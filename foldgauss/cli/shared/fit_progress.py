@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from foldgauss.cli.app.application import warn
+from foldgauss.cli.shared.console import Display, show_progress
 from foldgauss.cli.shared.contact_sheet import make_comparison_sheet
-from foldgauss.cli.shared.progress import Display, show_progress
 from foldgauss.io.history import HistoryFile, info_line
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.media.writing import write_image

@@ -10,8 +10,7 @@ import typer
 from foldgauss._runtime.checks import invalid, require
 from foldgauss.cli.app.application import out, warn
 from foldgauss.cli.shared.arguments import MAX_TIMES, refuse_together
-from foldgauss.cli.shared.clips import Video
-from foldgauss.cli.shared.log_lines import list_frames
+from foldgauss.cli.shared.console import Video, list_frames
 from foldgauss.io.media.frame_rate import MAX_FPS, MIN_FPS
 from foldgauss.video.models.frame_times import played_positions, remapped_positions, times_at
 from foldgauss.video.motion.slow_motion import even_durations

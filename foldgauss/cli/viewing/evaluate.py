@@ -18,10 +18,9 @@ from foldgauss.cli.shared.arguments import (
     TransmittanceStop,
     override_constants,
 )
-from foldgauss.cli.shared.clips import read_fitted_clip
-from foldgauss.cli.shared.outputs import check_output
+from foldgauss.cli.shared.console import print_figures, summarize_scores, write_json
+from foldgauss.cli.shared.files import check_output, read_fitted_clip
 from foldgauss.cli.shared.rendering import evaluate_with_progress
-from foldgauss.cli.shared.tables import print_figures, summarize_scores, write_json
 from foldgauss.io._atomic import write_or_keep
 from foldgauss.io.models.video_model import load_video_model
 from foldgauss.video.models.metrics import Evaluation

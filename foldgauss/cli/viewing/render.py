@@ -24,10 +24,8 @@ from foldgauss.cli.shared.arguments import (
     parse_times,
     refuse_together,
 )
-from foldgauss.cli.shared.clips import Video
-from foldgauss.cli.shared.log_lines import print_log, print_shots
-from foldgauss.cli.shared.outputs import IMAGE_SUFFIX, check_images_output, name_after, refuse_huge
-from foldgauss.cli.shared.progress import progress_bar
+from foldgauss.cli.shared.console import Video, print_log, print_shots, progress_bar
+from foldgauss.cli.shared.files import IMAGE_SUFFIX, check_images_output, name_after, refuse_huge
 from foldgauss.cli.shared.rendering import (
     CodecName,
     Crf,

@@ -20,6 +20,7 @@ from foldgauss.io._atomic import resolve
 from foldgauss.io.media.clip import (
     AS_STORED,
     VIDEO,
+    ClipFacts,
     Levels,
     Reading,
     Size,
@@ -31,7 +32,6 @@ from foldgauss.io.media.clip import (
     read_head,
     video_error,
 )
-from foldgauss.io.media.facts import ClipFacts
 from foldgauss.io.media.frame_rate import DEFAULT_FPS, MAX_FPS, MAX_LAST_DURATION, make_increasing
 from foldgauss.io.media.images import premultiply
 from foldgauss.io.media.tone_mapping import HDR, map_tones

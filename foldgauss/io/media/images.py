@@ -16,6 +16,7 @@ from PIL import Image
 from foldgauss._runtime.checks import require
 from foldgauss.io.media.clip import (
     MAX_PIXELS,
+    ClipFacts,
     Levels,
     VideoError,
     clamp_stop,
@@ -24,7 +25,6 @@ from foldgauss.io.media.clip import (
     no_frames_error,
     video_error,
 )
-from foldgauss.io.media.facts import ClipFacts
 from foldgauss.io.media.frame_rate import DEFAULT_FPS
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")

@@ -12,6 +12,7 @@ from foldgauss._runtime.checks import require
 from foldgauss.io._atomic import PathLike
 from foldgauss.io.media.clip import (
     Clip,
+    ClipFacts,
     Levels,
     Range,
     Reading,
@@ -27,7 +28,6 @@ from foldgauss.io.media.clip import (
     translate_os_errors,
 )
 from foldgauss.io.media.decoder import scan_video
-from foldgauss.io.media.facts import ClipFacts
 from foldgauss.io.media.images import is_bare_jpegs, is_image, scan_folder, scan_picture
 
 BLOCK_BYTES = 64 << 20
