@@ -95,9 +95,14 @@ def _check_target(path: Path) -> None:
 
 
 def temporary_name(path: Path, suffix: str) -> Path:
-    """A new hidden name beside `path`, so that the rename stays within one file system."""
+    """A new hidden name beside `path`, so that the rename stays within one file system.
+
+    It contains "own" instead of "tmp" where this process holds the lock of `path`: the next holder may then remove it
+    as a remnant of a killed process.
+    """
+    kind = "own" if path.absolute() in _LOCKED else "tmp"
     # The stem is shortened: file systems limit names to 255 bytes.
-    return path.with_name(f".{path.stem[:KEPT]}.tmp-{secrets.token_hex(4)}{suffix}")
+    return path.with_name(f".{path.stem[:KEPT]}.{kind}-{secrets.token_hex(4)}{suffix}")
 
 
 def output_error(path: Path, error: OSError) -> OutputError:
@@ -261,6 +266,8 @@ def check_replaceable(folder: Path, overwrite: bool, *, pattern: str, what: str 
 
 
 STALE_AGE = 3600.0
+#: Outputs that this process has locked, see `lock_output`.
+_LOCKED: set[Path] = set()
 
 
 @contextmanager
@@ -268,7 +275,7 @@ def lock_output(path: Path, *, own: tuple[Path, ...] = (), what: str = "fit") ->
     """Hold the lock of `path` until the block or the process ends.
 
     `own`: files that only the holder of the lock writes. Their temporary files, left by a killed process, are removed,
-    and those of `path` once they are an hour old. `what` names the holder in messages. Raises `OutputError` at once
+    and so are those of `path` written under the lock; others of `path` once they are an hour old. `what` names the holder in messages. Raises `OutputError` at once
     where another process holds the lock, or one of the files cannot be written.
     """
     for target in (path, *own):
@@ -288,23 +295,26 @@ def lock_output(path: Path, *, own: tuple[Path, ...] = (), what: str = "fit") ->
             ) from error
     try:
         for target in own:
-            _remove_unfinished(target, 0.0)
-        _remove_unfinished(path, STALE_AGE)
+            _remove_unfinished(target, "tmp", 0.0)
+        _remove_unfinished(path, "own", 0.0)
+        _remove_unfinished(path, "tmp", STALE_AGE)
+        _LOCKED.add(path.absolute())
         yield
     finally:
+        _LOCKED.discard(path.absolute())
         try:
             file.unlink(missing_ok=True)  # while held, so that no other process's file is removed
         finally:
             lock.release()
 
 
-def _remove_unfinished(path: Path, age: float) -> None:
-    """Remove temporary files of `path`, see `temporary_name`, that are at least `age` seconds old.
+def _remove_unfinished(path: Path, kind: str, age: float) -> None:
+    """Remove temporary files of `path`, see `temporary_name`, of this `kind` that are at least `age` seconds old.
 
     Where the names contain a part of its stem, they may belong to another output: only stale ones are removed.
     """
     age = age if len(path.stem) <= KEPT else STALE_AGE
-    name = re.compile(rf"\.{re.escape(path.stem[:KEPT])}\.tmp-[0-9a-f]{{8}}{re.escape(path.suffix)}")
+    name = re.compile(rf"\.{re.escape(path.stem[:KEPT])}\.{kind}-[0-9a-f]{{8}}{re.escape(path.suffix)}")
     for found in path.parent.iterdir():
         with suppress(OSError):  # removed by another process, of another user, or a folder
             if name.fullmatch(found.name) and time.time() - found.stat().st_mtime >= age:

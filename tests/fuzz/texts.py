@@ -287,7 +287,7 @@ APPLIED = dataclasses.replace(
 
 def _infos() -> list[FitInfo]:
     first = FitInfo(1, 0.1, 0.5, float("nan"), 10, 9, 0.2, float("inf"), None)
-    return [first, first._replace(step=2), first._replace(step=5, psnr=21.5, stopped_by="steps")]
+    return [first, first._replace(step=2, psnr=20.5, loss=0.25), first._replace(step=5, psnr=21.5, stopped_by="steps")]
 
 
 def _history() -> bytes:

@@ -75,10 +75,10 @@ def test_a_folder_that_is_not_there(tmp_path):
 
 def test_what_cannot_be_removed_is_no_reason_not_to_work(tmp_path):
     """Another user's file in a folder of all, or a folder of such a name."""
-    (tmp_path / ".m.tmp-01ab23cd.safetensors").mkdir()
+    (tmp_path / ".m.own-01ab23cd.safetensors").mkdir()
     with lock_output(tmp_path / "m.safetensors"):
         pass
-    assert os.listdir(tmp_path) == [".m.tmp-01ab23cd.safetensors"]
+    assert os.listdir(tmp_path) == [".m.own-01ab23cd.safetensors"]
 
 
 def _frames(folder, meanwhile, **options):
