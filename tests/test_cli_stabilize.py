@@ -6,7 +6,7 @@ from commands import run
 from soft_models import soft_model
 from tiny_clips import NUM_FRAMES, model_of_12
 
-from foldgauss.cli.shared import timeline
+from foldgauss.cli.shared import arguments
 from foldgauss.io import load_video_model, read_video, save_video_model
 from foldgauss.video import FitConfig, fit, interpolate_frames, interpolated_times, stabilize, times_at
 
@@ -64,7 +64,7 @@ def test_shots_are_named(tmp_path, capsys):
 @pytest.mark.parametrize("stabilized", [False, True])
 def test_repeated_frames_take_less_time(tmp_path, monkeypatch, capsys, stabilized):
     model, images = soft_model(), tmp_path / "images"
-    monkeypatch.setattr(timeline, "even_durations", lambda video: np.array([1, 1, 0.25, 1, 1, 1]))
+    monkeypatch.setattr(arguments, "even_durations", lambda video: np.array([1, 1, 0.25, 1, 1, 1]))
     save_video_model(tmp_path / "m.safetensors", model)
     options = [*STABLE, "--border", "keep"] if stabilized else []
     how = ["--skip-repeats", "--speed", "0.5", "--no-flow", "--out", images, *options]

@@ -12,9 +12,9 @@ import typer
 from foldgauss._runtime.checks import ParameterError, require
 from foldgauss.cli.app.application import out
 from foldgauss.cli.app.help import complete_choice
+from foldgauss.cli.shared.arguments import Timeline
 from foldgauss.cli.shared.console import Video, format_count, progress_bar
 from foldgauss.cli.shared.files import IMAGE_SUFFIX
-from foldgauss.cli.shared.timeline import Timeline
 from foldgauss.io._atomic import write_or_keep
 from foldgauss.io.media.frame_rate import MAX_FPS
 from foldgauss.io.media.indexing import LazyFrames

@@ -13,13 +13,18 @@ from foldgauss.cli.app.application import command, out
 from foldgauss.cli.app.help import complete_choice
 from foldgauss.cli.shared.arguments import (
     AlphaCutoff,
+    Fps,
     ModelFile,
     Overwrite,
     Size,
+    SkipRepeats,
+    Speed,
     SupportRadius,
+    Timeline,
     TransmittanceStop,
     override_constants,
     parse_color,
+    parse_remap,
     parse_size,
     parse_times,
     refuse_together,
@@ -34,7 +39,6 @@ from foldgauss.cli.shared.rendering import (
     SoundFile,
     choose_sound,
 )
-from foldgauss.cli.shared.timeline import Fps, SkipRepeats, Speed, Timeline, parse_remap
 from foldgauss.io._atomic import resolve
 from foldgauss.io.media.masks import read_masks
 from foldgauss.io.media.writing import IMAGE_FORMATS, VIDEO_SUFFIXES
