@@ -2,7 +2,7 @@
 
     steps: int | None = field(default=None, metadata=setting("Optimizer steps", least=1, option="--steps"))
 
-`check_settings` validates by this metadata, commands generate their options from it, and the API page its table.
+`check_settings` validates by this metadata, commands generate their options from it, and the site its tables.
 """
 
 import collections
@@ -138,15 +138,3 @@ def _checked_value(name: str, value: Any, kind: type, valid: Setting) -> Any:
         article = "an" if kind.__name__[0] in "AEIOU" else "a"
         raise invalid(name, expected=f"{article} {kind.__name__}", got=repr(value))
     return value
-
-
-def markdown_table(settings: type) -> str:
-    """The fields of a settings dataclass as a table in Markdown."""
-    rows = ["| field | default | meaning | option |", "|---|---|---|---|"]
-    for name, field, value in walk(settings):
-        about, is_plain = setting_of(field), isinstance(value, int | float | str | None)
-        default = f"`{value!r}`" if is_plain else f"`{type(value).__name__}(...)`"
-        default += f": {about.unset}" if about.unset else ""
-        option = f"`{about.option}`" if about.option else ""
-        rows.append(f"| `{name}` | {default} | {f'{about.help}. {about.details}'.rstrip()} | {option} |")
-    return "\n".join(rows)

@@ -141,11 +141,6 @@ class MaskedClip:
     masks: np.ndarray | None
     unmasked: str | None = None
 
-    @property
-    def num_objects(self) -> int:
-        """Number of distinct objects in the masks; 0 without masks."""
-        return 0 if self.masks is None else len(set(np.unique(self.masks)) - {0, 255})
-
 
 def davis(
     root: PathLike,
