@@ -7,7 +7,7 @@ from typing import Any
 
 from foldgauss.cli.app.application import Stopped, err
 from foldgauss.cli.app.signals import note_signals
-from foldgauss.cli.shared.console import Display, show_progress
+from foldgauss.cli.shared.console import Display, print_figures, show_progress
 from foldgauss.cli.shared.fit_progress import print_json
 from foldgauss.jobs import FitJob, Outcome, Progress, WorkerPool, run_here, run_on
 from foldgauss.jobs import Stopped as JobsStopped
@@ -20,6 +20,14 @@ def emit_json(event: str, figures: dict[str, Any]) -> None:
     """Print a line of JSON; a closed standard output must not end the fits."""
     with suppress(OSError):
         print_json(event, figures)
+
+
+def report_fit(display: Display, target: str, figures: dict[str, Any]) -> None:
+    """Print the results of a fit, the model `target`."""
+    if display == "json":
+        emit_json("done", {"model": target} | figures)
+    elif display != "quiet":
+        print_figures(target, figures)
 
 
 def run_jobs(

@@ -39,8 +39,13 @@ def refuse_huge(size: tuple[int, int] | None) -> None:
 
 
 def refuse_existing(path: Path, overwrite: bool, option: str = "--out") -> None:
-    if os.path.exists(path) and not overwrite:
-        raise ParameterError(option, f"{path} exists. Choose another path, or add --overwrite.")
+    require(
+        overwrite or not os.path.exists(path),
+        option,
+        expected="a new output",
+        got=f"{path}, which exists",
+        cure="Choose another path, or add --overwrite.",
+    )
 
 
 def refuse_inputs(path: Path, inputs: Mapping[str, Path | None], option: str = "--out") -> None:
