@@ -23,8 +23,8 @@ class HistoryFile:
     """Appends one line per step to `path` and flushes it, so that it can be followed and survives a killed fit.
 
     An observer of a fit, and a context manager. Each line is `info_line` of the step. An existing file is replaced at
-    the first step. With `resumed_at`, the step of the checkpoint that a fit continues from, later lines are removed
-    (the fit repeats those steps), and so is an incomplete last line.
+    the first step. With `resumed_at`, the step of the checkpoint that a fit continues from, and its running `psnr`,
+    later lines are removed (the fit repeats those steps), and so is an incomplete last line.
 
     Raises `OutputError` where the file cannot be written, ValueError where `resumed_at` is given and the file is not
     the history of that fit.
@@ -32,13 +32,14 @@ class HistoryFile:
     Example: `with HistoryFile("fit.jsonl") as history: fit(frames, observers=[history])`.
     """
 
-    def __init__(self, path: PathLike, resumed_at: int | None = None):
+    def __init__(self, path: PathLike, resumed_at: int | None = None, psnr: float | None = None):
         self.path, self._file, self._last, self._append = Path(path), None, 0, False
         if resumed_at is not None and self.path.exists():
             self._append, kept = True, [line for line in _read_lines(self.path) if line["step"] <= resumed_at]
             self._last = kept[-1]["step"] if kept else 0
+            same = psnr is None or (kept and kept[-1].get("psnr") == _to_json(psnr))
             require(
-                self._last == resumed_at,
+                self._last == resumed_at and same,
                 "history",
                 expected=f"that of the fit which is resumed at step {resumed_at}",
                 got=f"{str(self.path)!r} of another, or with that step missing",

@@ -15,6 +15,7 @@ from PIL import Image
 
 import foldgauss
 from foldgauss.io import VideoError, html_page, read_masks, read_video, save_video_model, write_video
+from foldgauss.io.history import HistoryFile
 
 from . import media, models
 from .models import sealed, tiny_model, unsealed
@@ -207,6 +208,12 @@ def test_what_once_did_harm_is_refused(name, data, outcome, tmp_path):
     target.prepare(tmp_path)
     target.path(tmp_path).write_bytes(data)
     assert judge(target, target.path(tmp_path)) == outcome
+
+
+def test_a_history_without_psnr_is_another_fits(tmp_path):
+    (tmp_path / "h.jsonl").write_text('{"step": 5}\n')
+    with pytest.raises(ValueError, match="that of the fit which is resumed"):
+        HistoryFile(tmp_path / "h.jsonl", resumed_at=5, psnr=20.0)
 
 
 @pytest.mark.parametrize("side", [2**13, 2**15])  # beyond our limit, and beyond Pillow's

@@ -306,7 +306,7 @@ def _read_history(path: Path) -> None:
     for info in read_history(path):
         assert f"{info.step:d} {info.psnr:.2f}"
     if chance(path) % 2:
-        HistoryFile(path, resumed_at=5)
+        HistoryFile(path, resumed_at=5, psnr=21.5)
 
 
 HISTORY = Target(

@@ -57,7 +57,7 @@ from foldgauss.jobs.segments import read_segment_seconds
 from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig, planned_steps
 from foldgauss.video.fitting.divergence import FitDiverged
 from foldgauss.video.fitting.loop import FitInfo
-from foldgauss.video.fitting.state import FitState
+from foldgauss.video.fitting.state import FitState, running_psnr
 from foldgauss.video.fitting.steppers.engines import choose_engine, describe_device
 
 
@@ -140,7 +140,7 @@ def fit(
         _print_plan(clip, config, display)
         recorded = None
         if history is not None:
-            recorded = HistoryFile(history, None if state is None else state.step)
+            recorded = HistoryFile(history) if state is None else HistoryFile(history, state.step, running_psnr(state))
         previews = None if preview is None else save_previews(preview, clip, config)
         with (
             display_progress(display, "Fitting", history=recorded, preview=previews) as show,
