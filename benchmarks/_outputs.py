@@ -28,7 +28,7 @@ COMMANDS = {
 }
 #: Commands that fill a folder, file by file, and go on when called again: which of its files they are killed in.
 FOLDERS = {
-    "tradeoff": (["tradeoff", "CLIP", "--axes", "degree", "--steps", "12", "--out"], (".json", ".safetensors", ".csv")),
+    "tradeoff": (["tradeoff", "CLIP", "--axes", "degree", "--steps", "12", "--out"], (".json", ".safetensors")),
     "uncertainty": (["uncertainty", "MODEL", "CLIP", "--steps", "400", "--out"], (".csv", ".nc", ".png")),
 }
 #: What files are named in folders that are written whole.

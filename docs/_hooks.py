@@ -9,7 +9,7 @@ from mkdocs.structure.files import File, Files
 from nbconvert import MarkdownExporter
 from typer.cli import get_docs_for_click
 
-from foldgauss._runtime.settings import markdown_table
+from foldgauss._runtime.settings import setting_of, walk
 from foldgauss.cli.app.application import load_commands
 
 ROOT = Path(__file__).parents[1]
@@ -42,7 +42,7 @@ def on_page_markdown(markdown: str, page, config, files) -> str:
     if _COMMANDS in markdown:
         markdown = markdown.replace(_COMMANDS, _options())
     markdown = _SETTINGS.sub(
-        lambda found: markdown_table(getattr(importlib.import_module(found[1]), found[2])), markdown
+        lambda found: _settings_table(getattr(importlib.import_module(found[1]), found[2])), markdown
     )
     up = "../" * page.file.src_uri.count("/")
     markdown = re.sub(r"\]\(\.\./notebooks/(\w+)\.ipynb", rf"]({up}notebooks/\1.md", markdown)
@@ -72,3 +72,15 @@ def _mathml(found: re.Match) -> str:
     tex = tex.replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&")
     display = "block" if kind == "div" else "inline"
     return f'<{kind} class="maths">{latex2mathml.converter.convert(tex.strip(), display=display)}</{kind}>'
+
+
+def _settings_table(settings: type) -> str:
+    """The fields of a settings dataclass as a table in Markdown."""
+    rows = ["| field | default | meaning | option |", "|---|---|---|---|"]
+    for name, field, value in walk(settings):
+        about, is_plain = setting_of(field), isinstance(value, int | float | str | None)
+        default = f"`{value!r}`" if is_plain else f"`{type(value).__name__}(...)`"
+        default += f": {about.unset}" if about.unset else ""
+        option = f"`{about.option}`" if about.option else ""
+        rows.append(f"| `{name}` | {default} | {f'{about.help}. {about.details}'.rstrip()} | {option} |")
+    return "\n".join(rows)

@@ -51,7 +51,7 @@ def test_fit_render_evaluate_info(work, tmp_path, capsys):
     assert (model.num_frames, model.size, model.fps) == (6, SIZE, 12.0)
     assert not list(work.glob("*.checkpoint"))
 
-    assert run("render", work / "model.safetensors", "--out", tmp_path / "slow.mp4", "--upsample", 4) == 0
+    assert run("render", work / "model.safetensors", "--out", tmp_path / "slow.mp4", "--fps", 48) == 0
     slow = read_video(tmp_path / "slow.mp4")
     assert (slow.num_frames, slow.size, slow.fps) == (21, SIZE, 48.0)
 
@@ -103,12 +103,12 @@ def test_render_chooses_the_encoding(work, tmp_path, capsys):
         sound.setparams((1, 2, 8000, 0, "NONE", ""))
         sound.writeframes(bytes(8000))
     heard = []
-    for slow in (("--speed", "0.5"), ("--upsample", "2", "--fps", "12"), ("--upsample", "2")):
+    for slow in (("--speed", "0.5"), ("--fps", "24")):
         out = tmp_path / "slow.mp4"
         assert run("render", model, "--out", out, *slow, "--sound", tmp_path / "sound.wav", "--overwrite") == 0
         with av.open(str(out)) as container:
             heard.append(sum(frame.samples / frame.sample_rate for frame in container.decode(audio=0)))
-    assert heard == pytest.approx([1.0, 1.0, 0.5], abs=0.1)
+    assert heard == pytest.approx([1.0, 0.5], abs=0.1)
 
 
 def test_other_rates_speeds_and_times(work, tmp_path, capsys):
@@ -128,7 +128,7 @@ def test_other_rates_speeds_and_times(work, tmp_path, capsys):
     assert shown("held", "--remap", f"0=0,{1 / 12}={1 / 12},{3 / 12}={1 / 12},{4 / 12}={2 / 12}") == [0, 1, 1, 1, 2]
     assert shown("ends", "--times", "1:0:2") == [5, 0]
     capsys.readouterr()
-    assert run("render", work / "model.safetensors", "--out", tmp_path / "v.mp4", "--upsample", 4, "--fps", 12) == 0
+    assert run("render", work / "model.safetensors", "--out", tmp_path / "v.mp4", "--speed", 0.25) == 0
     assert "21 frames at 12 frames per second" in capsys.readouterr().out
     assert read_video(tmp_path / "v.mp4").fps == pytest.approx(12)
 
@@ -150,8 +150,6 @@ def test_a_variable_frame_rate_is_kept(tmp_path, capsys):
         ("as-fitted", model),
         ("compact", tmp_path / "m.fgz"),
         ("fitted-compact", tmp_path / "f.fgz"),
-        ("twice", model, "--upsample", 2),
-        ("slow", model, "--upsample", 2, "--fps", 5),
         ("even", model, "--fps", 30),
         ("half", model, "--speed", 0.5, "--fps", 15),
         ("back", model, "--speed", -1, "--fps", 30),
@@ -160,14 +158,9 @@ def test_a_variable_frame_rate_is_kept(tmp_path, capsys):
     ):
         assert run("render", own, "--out", tmp_path / f"{name}.mp4", *options) == 0
         read[name] = read_video(tmp_path / f"{name}.mp4")
-    between, slower = np.interp(np.arange(11) / 2, np.arange(6), times), 2 * 5 / times[-1] / 5  # at 5 a second
-    for name, expected in (
-        *((name, times) for name in ("as-fitted", "compact", "fitted-compact")),
-        ("twice", between),
-        ("slow", slower * between),
-    ):
-        np.testing.assert_allclose(read[name].times, expected, atol=1e-4)
-        assert read[name].duration == pytest.approx(slower * end if name == "slow" else end, abs=1e-4)
+    for name in ("as-fitted", "compact", "fitted-compact"):
+        np.testing.assert_allclose(read[name].times, times, atol=1e-4)
+        assert read[name].duration == pytest.approx(end, abs=1e-4)
     for name, frames in (("even", 41), ("half", 41), ("back", 32), ("slower", 28), ("held", 11)):
         assert (read[name].times, read[name].num_frames) == (None, frames)
     assert read["slower"].fps == read["held"].fps == pytest.approx(10)  # the rate of the shortest interval, 0.1 s

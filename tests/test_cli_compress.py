@@ -61,7 +61,7 @@ def test_compress_and_use(work, tmp_path, capsys, monkeypatch):
     capsys.readouterr()
     assert run("info", "model.fgz") == 0
     assert "bits per pixel" in capsys.readouterr().out
-    assert run("render", "model.fgz", "--out", "slow.mp4", "--upsample", 2) == 0
+    assert run("render", "model.fgz", "--out", "slow.mp4", "--speed", 0.5) == 0
     assert read_video("slow.mp4").num_frames == 9
     assert run("export", "model.fgz", "--format", "ply", "--out", "m.ply") == 0
     (tmp_path / "edits.toml").write_text(

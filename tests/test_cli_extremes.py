@@ -54,7 +54,7 @@ def test_from_a_clip_to_its_pictures(tmp_path, capsys, monkeypatch, name):
     assert 25 < scores["mean_psnr"] <= 100
     assert all(math.isfinite(x) for x in scores["psnr"] + scores["ssim"])
     assert run("info", "m.safetensors") == 0
-    assert run("render", "m.safetensors", "--out", "slow", "--upsample", 3) == 0
+    assert run("render", "m.safetensors", "--out", "slow", "--fps", 75) == 0
     shown = read_video(tmp_path / "slow").frames
     assert shown.shape == (3 * (len(frames) - 1) + 1, *frames.shape[1:])
     assert np.abs(shown[0].astype(float) - read_video(clip).frames[0]).mean() < 12

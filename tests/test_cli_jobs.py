@@ -244,5 +244,5 @@ def test_many_clips_begun_anew_and_stopped_go_on(clips, tmp_path, capsys, monkey
 def test_without_dask_nothing_is_begun(clips, tmp_path, capsys, monkeypatch, options):
     monkeypatch.setitem(sys.modules, "distributed", None)
     assert run("fit-many", clips, "--out", tmp_path / "models", *QUICK, *options) == 2
-    assert f"{options[0]}: needs dask.distributed: pip install" in capsys.readouterr().err
+    assert f"{options[0]}: expected dask.distributed, got none. Install it: pip install" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

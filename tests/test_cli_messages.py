@@ -69,7 +69,7 @@ def test_masks_of_the_whole_clip_fit_a_model_of_some_frames(work, model, tmp_pat
 
 
 def test_a_page_is_told_of_where_there_is_no_terminal(model, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("foldgauss.cli.shared.log_lines.FIRST_LINE_SECONDS", 0.0)
+    monkeypatch.setattr("foldgauss.cli.shared.console.FIRST_LINE_SECONDS", 0.0)
     assert run("view", model, "--out", tmp_path / "new" / "p.html") == 0
     assert "Writing the page" in capsys.readouterr().err
 

@@ -12,7 +12,7 @@ from commands import run
 from soft_models import NUM, soft_model
 
 from foldgauss.cli.viewing import view as viewing
-from foldgauss.io import import_model, load_video_model, read_video, save_video_model, write_image
+from foldgauss.io import load_video_model, read_vegas_ply, read_video, save_video_model, write_image
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.video import Segment, SegmentedVideo, edit, evaluate, interpolate_frames, psnr, times_at
 
@@ -60,8 +60,8 @@ def pictures(folder):
     ("options", "positions"),
     [
         pytest.param([], range(NUM_FRAMES), marks=pytest.mark.slow),
-        (["--upsample", 3], np.arange(52) / 3),
-        pytest.param(["--upsample", 2, "--no-flow"], np.arange(35) / 2, marks=pytest.mark.slow),
+        (["--fps", 75], np.arange(52) / 3),
+        pytest.param(["--fps", 50, "--no-flow"], np.arange(35) / 2, marks=pytest.mark.slow),
         (["--speed", "-0.5"], 17 - np.arange(35) / 2),
         (["--remap", "0=0.48,0.08=0.24"], [12, 9, 6]),
         (["--times", "0:1:5"], np.linspace(0, 17, 5)),
@@ -82,7 +82,7 @@ def test_render_shows_what_the_model_does(options, positions, here, tmp_path):
 
 def test_evaluate_reads_the_clip_bit_by_bit(here, work, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(
-        "foldgauss.cli.shared.clips.read_video", lambda *_, **__: pytest.fail("the whole clip was read")
+        "foldgauss.cli.shared.files.read_video", lambda *_, **__: pytest.fail("the whole clip was read")
     )
     assert run("evaluate", here, work / "clip", "--json", tmp_path / "scores.json") == 0
     said = told(capsys)
@@ -140,7 +140,7 @@ def test_one_segment_is_taken_out(here, work, tmp_path, capsys):
     assert run("export", here, "--format", "model", "--segment", 1) == 2
     assert "overwrite" in told(capsys)
     assert run("export", here, "--format", "ply", "--segment", 2) == 0
-    assert import_model("long.2.ply", size=one.size).num_frames == 5
+    assert read_vegas_ply("long.2.ply", size=one.size).num_frames == 5
 
 
 def test_a_page_plays_all_segments(here, work, tmp_path, capsys, monkeypatch):

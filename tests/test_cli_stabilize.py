@@ -6,7 +6,7 @@ from commands import run
 from soft_models import soft_model
 from tiny_clips import NUM_FRAMES, model_of_12
 
-from foldgauss.cli.shared import timeline
+from foldgauss.cli.shared import arguments
 from foldgauss.io import load_video_model, read_video, save_video_model
 from foldgauss.video import FitConfig, fit, interpolate_frames, interpolated_times, stabilize, times_at
 
@@ -23,7 +23,7 @@ def model(tmp_path_factory):
 def test_a_camera_that_stands_still_stays(model, tmp_path, capsys):
     """Objects move in this clip, the camera does not."""
     images = tmp_path / "images"
-    assert run("render", model, *STABLE, "--out", images, "--border", "keep", "--upsample", "2") == 0
+    assert run("render", model, *STABLE, "--out", images, "--border", "keep", "--speed", "0.5") == 0
     assert "23 frames" in capsys.readouterr().out
     frames = read_video(images).frames
     assert frames.shape == (2 * NUM_FRAMES - 1, 40, 64, 3)
@@ -31,9 +31,7 @@ def test_a_camera_that_stands_still_stays(model, tmp_path, capsys):
     times = interpolated_times(np.asarray(video.frame_times.times()), 2)
     np.testing.assert_array_equal(frames, list(interpolate_frames(video, times)))
     assert (
-        run(
-            "render", model, *STABLE, "--out", images, "--border", "keep", "--upsample", "2", "--no-flow", "--overwrite"
-        )
+        run("render", model, *STABLE, "--out", images, "--border", "keep", "--speed", "0.5", "--no-flow", "--overwrite")
         == 0
     )
     np.testing.assert_array_equal(read_video(images).frames, list(video.frames(times)))
@@ -66,10 +64,10 @@ def test_shots_are_named(tmp_path, capsys):
 @pytest.mark.parametrize("stabilized", [False, True])
 def test_repeated_frames_take_less_time(tmp_path, monkeypatch, capsys, stabilized):
     model, images = soft_model(), tmp_path / "images"
-    monkeypatch.setattr(timeline, "even_durations", lambda video: np.array([1, 1, 0.25, 1, 1, 1]))
+    monkeypatch.setattr(arguments, "even_durations", lambda video: np.array([1, 1, 0.25, 1, 1, 1]))
     save_video_model(tmp_path / "m.safetensors", model)
     options = [*STABLE, "--border", "keep"] if stabilized else []
-    how = ["--skip-repeats", "--upsample", "2", "--no-flow", "--out", images, *options]
+    how = ["--skip-repeats", "--speed", "0.5", "--no-flow", "--out", images, *options]
     assert run("render", tmp_path / "m.safetensors", *how) == 0
     assert "Frames that repeat the one before: 3." in capsys.readouterr().out
     shown = np.interp(np.arange(13) / 2, [0, 1, 2, 2.25, 3.25, 4.25, 5.25], np.arange(7))

@@ -128,8 +128,8 @@ def test_json_lines_come_now_and_then_and_at_the_end(clip, tmp_path, monkeypatch
 
 def test_lines_in_a_log(clip, tmp_path, monkeypatch, capfd):
     """Standard error is no terminal here."""
-    monkeypatch.setattr(_progress, "FIRST_LINE_SECONDS", 0.0)
-    monkeypatch.setattr(_progress, "LINE_SECONDS", 0.0)
+    monkeypatch.setattr("foldgauss.cli.shared.console.FIRST_LINE_SECONDS", 0.0)
+    monkeypatch.setattr("foldgauss.cli.shared.console.LINE_SECONDS", 0.0)
     assert run("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK) == 0
     lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith("Fitting")]
     assert len(lines) == 20

@@ -56,7 +56,7 @@ def test_waves_move_by_two_pixels_a_frame():
 def test_masks_are_those_of_the_ball():
     sample = datasets.ball(5)
     assert sample.masks.shape == (5, 48, 80)
-    assert sample.num_objects == 1
+    assert set(np.unique(sample.masks)) == {0, 1}
     centers = [np.nonzero(mask)[1].mean() for mask in sample.masks]
     np.testing.assert_allclose(np.diff(centers), 0.65 * 80 / 4, atol=0.5)
     inside, outside = sample.clip.frames[sample.masks == 1], sample.clip.frames[sample.masks == 0]
@@ -133,7 +133,7 @@ def test_davis_reads_labels_beside_their_frames(root):
     assert (found.clip.frames.shape, found.clip.fps) == ((4, HEIGHT, WIDTH, 3), 24.0)
     np.testing.assert_array_equal(found.masks, [labels(k) for k in range(4)])
     assert found.masks.dtype == np.uint8
-    assert (found.num_objects, found.unmasked) == (2, None)
+    assert found.unmasked is None
 
 
 def test_davis_range_and_window_keep_frames_and_masks_together(root):
@@ -146,7 +146,6 @@ def test_davis_range_and_window_keep_frames_and_masks_together(root):
 def test_davis_without_masks_says_why(root):
     found = datasets.davis(root, "dog-agility")
     assert found.masks is None
-    assert found.num_objects == 0
     assert found.unmasked.startswith("1 of 3 frames have a mask")
 
 
@@ -164,7 +163,6 @@ def test_a_palette_with_void_alone_has_no_object(root):
         write_mask(root / "Annotations" / "480p" / "bear" / f"{k:05d}.png", labels(k) // 255 * 255)
     found = datasets.davis(root, "bear")
     assert set(np.unique(found.masks)) == {0, 255}
-    assert found.num_objects == 0
 
 
 def _fails(error, match, *arguments, **options):
@@ -197,12 +195,3 @@ def test_davis_refuses_masks_that_do_not_fit(root):
     for k in range(4):  # all of another size, which a window cut from both would hide
         write_mask(place / f"{k:05d}.png", np.pad(labels(k), 5))
     _fails(ValueError, "masks of the size of the frames, 40x60.*50x70", root, "bear", center_crop=(20, 20))
-
-
-def test_frames_are_a_folder_of_images(root, tmp_path):
-    clip = datasets.frames(root / "JPEGImages" / "480p" / "bear", fps=12, frames=(1, 4), center_crop=(30, 30))
-    assert (clip.num_frames, clip.size, clip.fps) == (3, (30, 30), 12.0)
-    with pytest.raises(ValueError, match="folder: expected a folder of images, got the file"):
-        datasets.frames(datasets.sample_clip("carphone"))
-    with pytest.raises(FileNotFoundError, match="missing"):
-        datasets.frames(tmp_path / "none")

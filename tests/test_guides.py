@@ -220,7 +220,7 @@ def _extending(names, folder):
 
 def _results(names, folder):
     assert (folder / "trade" / "tradeoff.png").exists()
-    assert (folder / "few" / "tradeoff.csv").exists()
+    assert (folder / "few" / "tradeoff.json").exists()
 
 
 def _scale(names, folder):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import recorded_fits
 
-from foldgauss.io import load_selection, load_video_model, read_vegas_ply
+from foldgauss.io import load_video_model, read_vegas_ply
 
 DATA = Path(__file__).parent / "data" / "v0.1"
 RECORDED = json.loads((DATA / "fits.json").read_text())
@@ -54,8 +54,6 @@ def test_model_file_of_an_earlier_version_renders_as_recorded(name):
     assert digest == recorded["digest"] or not same_machine
 
 
-def test_selection_and_ply_of_an_earlier_version_load():
+def test_ply_of_an_earlier_version_loads():
     model = load_video_model(DATA / "plain.safetensors")
-    selection = load_selection(DATA / "selection.safetensors", model)
-    assert 0 < np.count_nonzero(selection.mask) < model.num_gaussians
     assert read_vegas_ply(DATA / "vegas.ply").num_gaussians == model.num_gaussians

@@ -20,7 +20,7 @@ from foldgauss._runtime import kernels as _kernels
 from foldgauss.cli.fitting import fit as fitting
 from foldgauss.cli.shared import rendering as _shared
 from foldgauss.io import load_video_model, save_video_model, write_video
-from foldgauss.io._lock import lock_output
+from foldgauss.io._atomic import lock_output
 from foldgauss.io.models.model_file import load_model, read_header
 from foldgauss.jobs import runner
 

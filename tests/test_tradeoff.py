@@ -1,6 +1,5 @@
 """Speed against accuracy: fronts, knees, plans, and `foldgauss tradeoff` as a user meets it."""
 
-import csv
 import errno
 import json
 import math
@@ -18,7 +17,6 @@ from commands import run
 
 from foldgauss.analysis.plot import Panel, plot_tradeoff
 from foldgauss.cli.measuring import tradeoff as command
-from foldgauss.cli.measuring import tradeoff_record as kept
 from foldgauss.io import load_video_model, read_video, write_video
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.jobs import runner
@@ -175,22 +173,11 @@ def test_plot():
 def test_everything_is_there(done, clip):
     record = record_of(done)
     rows = {name_of(row): row for row in record["points"]}
-    assert {path.name for path in done.iterdir()} == {"models", "tradeoff.csv", "tradeoff.json", "tradeoff.png"}
+    assert {path.name for path in done.iterdir()} == {"models", "tradeoff.json", "tradeoff.png"}
     assert {row["axis"] for row in rows.values()} == {"base", *AXES}
     assert record["left_out"] == {}
     assert {"cpu", "cores", "load_average", "jax"} <= set(record["machine"])
     assert min(cv2.imread(str(done / "tradeoff.png")).shape[:2]) > 500
-    with open(done / "tradeoff.csv", newline="") as file:
-        table = list(csv.DictReader(file))
-    assert [name_of(row) for row in table] == list(rows)
-    for row in table:
-        same = rows[name_of(row)]
-        for name in ("psnr", "ssim", "seconds", "bytes", "floats", "gaussians", "frames_per_second"):
-            assert float(row[name]) == same[name]
-        assert row["command"] == same["command"]
-        for cost in kept.COSTS:
-            assert (name_of(row) in record["fronts"][cost]["front"]) == (cost in row["front"].split())
-            assert (name_of(row) == record["fronts"][cost]["knee"]) == (cost in row["knee"].split())
     # What is told is so: the model beside it is the base, and more steps are better.
     base = load_video_model(done / "models" / "base.safetensors")
     scores = evaluate(base, read_video(clip, frames=(1, 6)).frames)
@@ -227,7 +214,7 @@ def test_a_table_without_room_leaves_the_fits(clip, tmp_path, capsys, monkeypatc
     target, replace = tmp_path / "results", os.replace
 
     def replace_until_full(source, place):
-        if Path(place) == target / "tradeoff.csv":
+        if Path(place) == target / "tradeoff.png":
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         replace(source, place)
 
@@ -335,7 +322,7 @@ def test_a_record_that_was_edited_is_refused(done, clip, tmp_path, capsys):
     assert (tmp_path / "tradeoff.json").read_bytes() == before
 
 
-@pytest.mark.parametrize("name", ["models", "tradeoff.csv", "tradeoff.png"])
+@pytest.mark.parametrize("name", ["models", "tradeoff.png"])
 def test_files_of_these_names_are_none_of_its_own_without_a_record(clip, tmp_path, capsys, monkeypatch, name):
     monkeypatch.setattr(command, "read_video", None)  # before any work
     (tmp_path / name).write_text("mine")
@@ -354,7 +341,7 @@ def test_without_matplotlib_only_the_plot_is_missing(done, clip, capsys, monkeyp
     assert run("tradeoff", clip, "--out", target, "--axes", "compositing", *QUICK) == 0
     assert "no plot" in (shown := capsys.readouterr().err)
     assert "foldgauss[plot]" in shown
-    assert sorted(path.name for path in target.iterdir()) == ["models", "tradeoff.csv", "tradeoff.json"]
+    assert sorted(path.name for path in target.iterdir()) == ["models", "tradeoff.json"]
 
 
 # --------------------------------------------------------------------------------------- options of the others

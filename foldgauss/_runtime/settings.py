@@ -2,7 +2,7 @@
 
     steps: int | None = field(default=None, metadata=setting("Optimizer steps", least=1, option="--steps"))
 
-`check_settings` validates by this metadata, commands generate their options from it, and the API page its table.
+`check_settings` validates by this metadata, commands generate their options from it, and the site its tables.
 """
 
 import collections
@@ -12,7 +12,7 @@ import typing
 from collections.abc import Iterator
 from typing import Any
 
-from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within, require
 
 _KEY = "setting"
 
@@ -115,14 +115,22 @@ def check_settings(settings: Any, prefix: str = "") -> None:
 
 def _checked_value(name: str, value: Any, kind: type, valid: Setting) -> Any:
     if kind is int:
-        if not is_integer(value, valid.least):
-            raise invalid(name, expected=f"a whole number >= {valid.least}", got=repr(value))
-        if valid.most is not None and value > valid.most:
-            raise invalid(name, expected=f"at most {valid.most:,}", got=f"{value:,}")
+        require(
+            is_integer(value, valid.least),
+            name,
+            expected=f"a whole number >= {valid.least}",
+            got=repr(value),
+        )
+        if valid.most is not None:
+            require(value <= valid.most, name, expected=f"at most {valid.most:,}", got=f"{value:,}")
         return int(value)
     if kind is float:
-        if not is_within(value, valid.bounds):
-            raise invalid(name, expected=f"a number in {valid.bounds}", got=repr(value))
+        require(
+            is_within(value, valid.bounds),
+            name,
+            expected=f"a number in {valid.bounds}",
+            got=repr(value),
+        )
         return float(value)
     if kind is str:
         check_one_of(name, value, valid.choices)
@@ -130,15 +138,3 @@ def _checked_value(name: str, value: Any, kind: type, valid: Setting) -> Any:
         article = "an" if kind.__name__[0] in "AEIOU" else "a"
         raise invalid(name, expected=f"{article} {kind.__name__}", got=repr(value))
     return value
-
-
-def markdown_table(settings: type) -> str:
-    """The fields of a settings dataclass as a table in Markdown."""
-    rows = ["| field | default | meaning | option |", "|---|---|---|---|"]
-    for name, field, value in walk(settings):
-        about, is_plain = setting_of(field), isinstance(value, int | float | str | None)
-        default = f"`{value!r}`" if is_plain else f"`{type(value).__name__}(...)`"
-        default += f": {about.unset}" if about.unset else ""
-        option = f"`{about.option}`" if about.option else ""
-        rows.append(f"| `{name}` | {default} | {f'{about.help}. {about.details}'.rstrip()} | {option} |")
-    return "\n".join(rows)

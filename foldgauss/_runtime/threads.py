@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 
-from foldgauss._runtime.checks import invalid, is_integer
+from foldgauss._runtime.checks import is_integer, require
 
 _lock = threading.Lock()
 _pool: ThreadPoolExecutor | None = None
@@ -35,16 +35,24 @@ def num_threads() -> int:
     setting = os.environ.get("FOLDGAUSS_NUM_THREADS")
     if setting is None:
         return available_cores()
-    if not setting.isdecimal() or int(setting) < 1:
-        raise invalid("FOLDGAUSS_NUM_THREADS", expected="a whole number >= 1", got=repr(setting))
+    require(
+        setting.isdecimal() and int(setting) >= 1,
+        "FOLDGAUSS_NUM_THREADS",
+        expected="a whole number >= 1",
+        got=repr(setting),
+    )
     return int(setting)
 
 
 def set_num_threads(count: int | None) -> None:
     """Fix the number of kernel threads; None returns to the default."""
     global _pool, _num_threads
-    if count is not None and not is_integer(count, 1):
-        raise invalid("count", expected="a whole number >= 1, or None", got=count)
+    require(
+        count is None or is_integer(count, 1),
+        "count",
+        expected="a whole number >= 1, or None",
+        got=count,
+    )
     with _lock:
         _num_threads, _pool = count, None
 

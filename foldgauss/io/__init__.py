@@ -1,13 +1,14 @@
 """Reading and writing files; every output appears whole or not at all.
 
 Clips, images and masks (`read_video`, `write_video`, `index_video`, `read_masks`), models (`save_video_model`,
-`load_video_model`, `save_compact`), formats of other programs (`export`, `import_model`), the HTML player
-(`write_html`), scripts of edits (`read_edit_script`), and the history of a fit. Sample clips: `foldgauss.io.datasets`.
+`load_video_model`, `save_compact`), formats of other programs (`export`, `read_vegas_ply`, `read_pseudomesh`), the
+HTML player (`write_html`), scripts of edits (`read_edit_script`), and the history of a fit. Sample clips:
+`foldgauss.io.datasets`.
 """
 
 from foldgauss.io._atomic import OutputError
 from foldgauss.io.edit_script import EditScript, EditScriptError, read_edit_script
-from foldgauss.io.exchange.export_import import export, import_model
+from foldgauss.io.exchange.export import export
 from foldgauss.io.exchange.gaussians_ply import (
     frame_gaussians,
     read_3dgs_ply,
@@ -27,7 +28,7 @@ from foldgauss.io.media.writing import Sound, write_frames, write_image, write_v
 from foldgauss.io.models.compact import load_compact, save_compact
 from foldgauss.io.models.model_file import ModelFileError
 from foldgauss.io.models.segmented import join_segments
-from foldgauss.io.models.selections import load_selection, save_selection
+from foldgauss.io.models.selections import format_indices, parse_indices
 from foldgauss.io.models.video_model import load_video_model, save_video_model
 from foldgauss.io.page.player_page import html_page, write_html
 
@@ -45,14 +46,14 @@ __all__ = [
     "Sound",
     "VideoError",
     "export",
+    "format_indices",
     "frame_gaussians",
     "html_page",
-    "import_model",
     "index_video",
     "join_segments",
     "load_compact",
-    "load_selection",
     "load_video_model",
+    "parse_indices",
     "read_3dgs_ply",
     "read_edit_script",
     "read_history",
@@ -62,7 +63,6 @@ __all__ = [
     "read_vegas_ply",
     "read_video",
     "save_compact",
-    "save_selection",
     "save_video_model",
     "write_3dgs_frames",
     "write_3dgs_ply",

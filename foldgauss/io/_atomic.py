@@ -1,17 +1,21 @@
-"""Atomic writes: files and folders that appear whole or not at all."""
+"""Atomic writes: files and folders that appear whole or not at all, and locks on outputs."""
 
 import errno
+import hashlib
 import os
 import re
 import secrets
 import shutil
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TypeVar
 
-from foldgauss._runtime.checks import ParameterError, invalid, short_repr
+from filelock import FileLock, Timeout
+
+from foldgauss._runtime.checks import ParameterError, invalid, require, short_repr
 
 PathLike = str | os.PathLike
 Result = TypeVar("Result")
@@ -19,8 +23,6 @@ Result = TypeVar("Result")
 KEPT = 40
 #: Errors that free space cures: a full disk, a quota, a limit on the size of files.
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-#: Outputs that this process has locked, see `_lock.lock_output`.
-OWNED: set[Path] = set()
 
 
 class MissingInput(ParameterError, FileNotFoundError):
@@ -37,8 +39,13 @@ class OutputRefused(OutputError):
 
 def check_path(path: object, order: str = "") -> Path:
     """`path` as a Path. Raises ValueError for another type, with `order`, the order of the arguments, as a hint."""
-    if not isinstance(path, PathLike):
-        raise invalid("path", expected="a path", got=short_repr(path), cure=f"The order is ({order})." if order else "")
+    require(
+        isinstance(path, PathLike),
+        "path",
+        expected="a path",
+        got=short_repr(path),
+        cure=f"The order is ({order})." if order else "",
+    )
     return Path(path)
 
 
@@ -93,7 +100,7 @@ def temporary_name(path: Path, suffix: str) -> Path:
     It contains "own" instead of "tmp" where this process holds the lock of `path`: the next holder may then remove it
     as a remnant of a killed process.
     """
-    kind = "own" if path.absolute() in OWNED else "tmp"
+    kind = "own" if path.absolute() in _LOCKED else "tmp"
     # The stem is shortened: file systems limit names to 255 bytes.
     return path.with_name(f".{path.stem[:KEPT]}.{kind}-{secrets.token_hex(4)}{suffix}")
 
@@ -113,6 +120,8 @@ def translate_output_errors(path: Path) -> Iterator[None]:
     """Raise an OSError of writing `path` in its one-line form."""
     try:
         yield
+    except OutputError:
+        raise
     except OSError as error:
         raise output_error(path, error) from error
 
@@ -254,3 +263,60 @@ def check_replaceable(folder: Path, overwrite: bool, *, pattern: str, what: str 
             f"path: expected a new or empty folder, got {str(folder)!r} with {len(names)} {what}. "
             "Choose another folder, or overwrite it."
         )
+
+
+STALE_AGE = 3600.0
+#: Outputs that this process has locked, see `lock_output`.
+_LOCKED: set[Path] = set()
+
+
+@contextmanager
+def lock_output(path: Path, *, own: tuple[Path, ...] = (), what: str = "fit") -> Iterator[None]:
+    """Hold the lock of `path` until the block or the process ends.
+
+    `own`: files that only the holder of the lock writes. Their temporary files, left by a killed process, are removed,
+    and so are those of `path` written under the lock; others of `path` once they are an hour old. `what` names the
+    holder in messages. Raises `OutputError` at once where another process holds the lock, or one of the files cannot
+    be written.
+    """
+    for target in (path, *own):
+        check_writable(target)  # the lock would create a missing folder
+    name = path.name
+    if len(name.encode()) > 240:  # a file name has at most 255 bytes, including '.' and '.lock'
+        name = hashlib.sha256(name.encode()).hexdigest()[:32]
+    file = path.with_name(f".{name}.lock")
+    lock = FileLock(file, timeout=0)
+    with translate_output_errors(path):
+        try:
+            lock.acquire()
+        except Timeout as error:
+            raise OutputError(
+                f"path: expected an output that no other process is writing, got {str(path)!r}, which another "
+                f"{what} is writing. Wait for it to end, or choose another name."
+            ) from error
+    try:
+        for target in own:
+            _remove_unfinished(target, "tmp", 0.0)
+        _remove_unfinished(path, "own", 0.0)
+        _remove_unfinished(path, "tmp", STALE_AGE)
+        _LOCKED.add(path.absolute())
+        yield
+    finally:
+        _LOCKED.discard(path.absolute())
+        try:
+            file.unlink(missing_ok=True)  # while held, so that no other process's file is removed
+        finally:
+            lock.release()
+
+
+def _remove_unfinished(path: Path, kind: str, age: float) -> None:
+    """Remove temporary files of `path`, see `temporary_name`, of this `kind` that are at least `age` seconds old.
+
+    Where the names contain a part of its stem, they may belong to another output: only stale ones are removed.
+    """
+    age = age if len(path.stem) <= KEPT else STALE_AGE
+    name = re.compile(rf"\.{re.escape(path.stem[:KEPT])}\.{kind}-[0-9a-f]{{8}}{re.escape(path.suffix)}")
+    for found in path.parent.iterdir():
+        with suppress(OSError):  # removed by another process, of another user, or a folder
+            if name.fullmatch(found.name) and time.time() - found.stat().st_mtime >= age:
+                found.unlink()

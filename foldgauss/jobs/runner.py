@@ -20,8 +20,7 @@ import jax
 from foldgauss import __version__
 from foldgauss._runtime.checks import require
 from foldgauss._runtime.machine import waiting_seconds
-from foldgauss.io._atomic import OutputError, atomic_path, write_or_keep
-from foldgauss.io._lock import lock_output
+from foldgauss.io._atomic import OutputError, atomic_path, lock_output, write_or_keep
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.media.indexing import FrameIndex, read_indexed
 from foldgauss.io.media.reading import read_video

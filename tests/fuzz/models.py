@@ -15,10 +15,8 @@ from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import (
     ModelFileError,
     load_compact,
-    load_selection,
     load_video_model,
     save_compact,
-    save_selection,
     save_video_model,
 )
 from foldgauss.io.models import compact
@@ -202,36 +200,6 @@ CHECKPOINT = Target(
 )
 
 
-@functools.cache
-def _selected() -> VideoModel:
-    return tiny_model()
-
-
-@functools.cache
-def _in_segments() -> SegmentedVideo:
-    return SegmentedVideo.from_models([(0, _selected()), (2, _selected())])
-
-
-def _load_selection(path: Path) -> None:
-    """Now and then for what has no selections of its own."""
-    load_selection(path, {2: _edited, 3: _in_segments}.get(chance(path) % 32, _selected)())
-
-
-SELECTION = Target(
-    "selection",
-    ".selection",
-    lambda: [
-        written(lambda path, one=mask: save_selection(path, Selection(np.array(one)), _selected()))
-        for mask in ([True, False, True], [False, False, False])
-    ],
-    _load_selection,
-    (ModelFileError, ValueError),
-    _MODEL_MUTATIONS,
-    tensors_from,
-    prepare=lambda folder: (_edited(), _in_segments()),  # once, and not while memory is measured
-)
-
-
 # ---------------------------------------------------------------------------------------------- compact
 
 
@@ -328,4 +296,4 @@ COMPACT = Target(
     lambda size: 4 * CONSTANT + 2_000 * size,  # a byte may hold 32 numbers: the format's own limit
 )
 
-TARGETS = (VIDEO, CHECKPOINT, SELECTION, COMPACT)
+TARGETS = (VIDEO, CHECKPOINT, COMPACT)

@@ -11,9 +11,9 @@ import numpy as np
 
 from foldgauss.io import (
     FormatError,
-    import_model,
     read_3dgs_ply,
     read_pseudomesh,
+    read_vegas_ply,
     write_3dgs_ply,
     write_pseudomesh,
     write_vegas_ply,
@@ -92,7 +92,7 @@ def _scene() -> bytes:
 
 def _read_vegas(path: Path) -> None:
     given = {} if chance(path) % 3 else {"size": (4, 6), "fps": 12}
-    model = import_model(path, **given)
+    model = read_vegas_ply(path, **given)
     assert model.num_frames >= 2
 
 

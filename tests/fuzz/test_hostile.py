@@ -119,10 +119,6 @@ CLAIMS = {
     "model: degree": ("model", lambda: _model(degree=2**31)),
     "model: tensors": ("model", _model_of_huge_tensors),
     "model: header": ("model", _safetensors_header),
-    "selection: Gaussians": (
-        "selection",
-        lambda: TARGET["selection"].seeds()[0].replace(b'num_gaussians\\": 3', b'num_gaussians\\": 9'),
-    ),
     "compact: Gaussians": ("compact", lambda: _compact(chunk={"num_gaussians": HUGE})),
     "compact: streams": ("compact", lambda: _compact(chunk={"num_gaussians": 2**25, "streams": [2**30] * 16})),
     "compact: header": ("compact", lambda: TARGET["compact"].seeds()[0][:12] + b"\xff" * 8),

@@ -11,14 +11,13 @@ import numpy as np
 from PIL import Image
 
 from foldgauss._runtime.checks import ParameterError
-from foldgauss.cli.measuring.tradeoff_record import COLUMNS, Record
-from foldgauss.io import HistoryFile, read_history, save_selection, save_video_model
+from foldgauss.cli.measuring.tradeoff import Record
+from foldgauss.io import HistoryFile, read_history, save_video_model
 from foldgauss.io.edit_script import EditScriptError, read_edit_script
 from foldgauss.io.history import info_line
 from foldgauss.video import edit
 from foldgauss.video.fitting.loop import FitInfo
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
-from foldgauss.video.selection.selectors import Selection
 
 from .models import tiny_model, written
 from .mutate import by_chance, json_text_changed
@@ -35,7 +34,7 @@ times = [0.0, 1.0]
 alive = true
 
 [selections."two words"]
-file = "one.selection"
+indices = "0,2"
 
 [selections.both]
 any = ["one", "two words"]
@@ -103,9 +102,8 @@ mask = "mask.png"
 label = 1
 frame = 0
 [selections.f]
-file = "one.selection"
+indices = "0,2"
 [selections.g]
-file = "one.selection"
 box = [0, 0, 6, 4]
 frames = [0, 2]
 [selections.every]
@@ -186,11 +184,11 @@ _KEYS = (
     b"degrees",
     b"x",
 )
-_LINES = (b'file = "one.selection"', b"segment = 7", b"num_gaussians = 7", b"box = [90, 90, 91, 91]")
+_LINES = (b'indices = "0,2"', b"segment = 7", b"num_gaussians = 7", b"box = [90, 90, 91, 91]")
 _MADE = (
     b"[0, 1]", b'"10:"', b'"a"', b"true", b"-1", b"1e300", b"nan", b"inf", b"1979-05-27T07:32:00Z", b"[[1.0, 2.0]]",
     b"7", b"{}", b"{a.b = 1}", b"[" * 500, b"0x" + b"f" * 4000, b"1" * 4400, b'"""a\nb"""', b"'''", b'"\\u0000"',
-    b'"a\\u0000b"', b"[]", b'"one.selection"', b'"case.toml"', b'"again.toml"', b'"mask.png"', b'"none"',
+    b'"a\\u0000b"', b"[]", b'"0,2"', b'"case.toml"', b'"again.toml"', b'"mask.png"', b'"none"',
     b'"rest"', b'"/"',
     b"1_000", b'["one"]', b'["none"]', b"{ do = 1 }",
 )  # fmt: skip
@@ -244,8 +242,6 @@ def _apply_script(path: Path) -> None:
 
 def _beside_scripts(folder: Path) -> None:
     (folder / "other.safetensors").write_bytes(written(lambda path: save_video_model(path, tiny_model(seed=1))))
-    selection = written(lambda path: save_selection(path, Selection(np.array([True, False, True])), tiny_model()))
-    (folder / "one.selection").write_bytes(selection)
     more = b'[[edits]]\ndo = "vanish"\nframe = 1\n'
     (folder / "more.toml").write_bytes(more)
     (folder / "again.toml").write_bytes(more + b'[[layers]]\nmodel = "other.safetensors"\nscript = "case.toml"\n')
@@ -328,7 +324,10 @@ HISTORY = Target(
 
 def _record() -> bytes:
     texts = {"axis": "steps", "command": "a", "settings": {"steps": 100}}
-    rows = [dict.fromkeys(COLUMNS, 1) | texts | {"value": value} for value in ("100", "200")]
+    rows = [
+        dict.fromkeys(("psnr", "ssim", "seconds", "bytes", "floats", "gaussians"), 1) | texts | {"value": value}
+        for value in ("100", "200")
+    ]
     kept = {
         "settings": {"a": 1, "b": [1, 2]},
         "machine": {"cpu": "x", "cores": 2},

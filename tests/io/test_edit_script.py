@@ -2,9 +2,7 @@
 
 import math
 import re
-import tempfile
 import tomllib
-from pathlib import Path
 
 import cv2
 import jax
@@ -12,9 +10,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from soft_models import NUM, NUM_FRAMES, OBJECT, SIZE, soft_model
+from soft_models import NUM, NUM_FRAMES, SIZE, soft_model
 
-from foldgauss.io import save_selection, save_video_model
+from foldgauss.io import save_video_model
 from foldgauss.io.edit_script import ACTIONS, EditScriptError, parse_edit_script, read_edit_script
 from foldgauss.io.models.selections import format_indices, parse_indices
 from foldgauss.render import Camera
@@ -257,7 +255,6 @@ def folder(tmp_path):
     for k, mask in enumerate(masks):
         assert cv2.imwrite(str(tmp_path / "masks" / f"{k}.png"), mask)
     assert cv2.imwrite(str(tmp_path / "mask.png"), masks[3])
-    save_selection(tmp_path / "it.selection", Selection(OBJECT), MODEL)
     save_video_model(tmp_path / "other.safetensors", soft_model(seed=1))
     return tmp_path
 
@@ -268,9 +265,6 @@ def test_selections_from_files(folder):
     def left(keys):
         return made(f"[selections.it]\n{keys}" + vanish, folder=folder)
 
-    assert same(left('file = "it.selection"'), edit(MODEL).select(OBJECT).vanish().video())
-    both = Selection(OBJECT) & select(MODEL, times=(0, 0.5))
-    assert same(left('file = "it.selection"\ntimes = [0, 0.5]'), edit(MODEL).select(both).vanish().video())
     boxed = edit(MODEL).select(box=BOX, frame=FRAME).vanish().video()
     assert same(left('mask = "mask.png"\nframe = 3'), boxed)
     assert same(left('mask = "masks"\nframe = 3'), boxed)  # of masks for all frames, the one looked at
@@ -319,7 +313,6 @@ MISTAKES = {  # text: line, table, and what is told
     "[selections.it]": (1, "[selections.it]", "at least one criterion"),
     "[selections.it]\nlabel = 1\nframe = 3": (2, "[selections.it]", "label: expected one of"),
     '[selections.it]\nmask = "nowhere.png"\nframe = 1': (2, "[selections.it]", "mask: .*nowhere.png.*missing"),
-    '[selections.it]\nframe = 1\nfile = "nowhere"': (3, "[selections.it]", "file: .*nowhere.*missing"),
     '[selections.it]\nany = ["other"]': (2, "[selections.it]", "any: .*there is none.*'other'"),
     '[selections.a]\nframe=1\n[selections.ab]\nany=["a"]\nall=["b"]': (
         5,
@@ -447,10 +440,6 @@ def test_mistakes_in_segments_are_told_as_in_a_model(text):
             "[[edits]]\ndo = 'recolor'\ngain = 0\n[[edits]]\ndo = 'recolor'\ncolor = [1, 0, 0]",
             "line 6, [[edits]] number 2: color: expected an object that is not black",
         ),
-        (
-            "[selections.it]\nfile = 'it.selection'\n",
-            "line 2, [selections.it]: file: expected a model without layers or overlays, got one in segments.",
-        ),
     ],
 )
 def test_what_only_the_models_of_segments_tell_has_its_line(text, told):
@@ -494,11 +483,9 @@ def test_names_mean_the_first_gaussians_however_many_there_are_now():
     first, last, middle = (Selection.of(MODEL, np.arange(*ends)) for ends in ((0, 5), (NUM - 5, NUM), (9, 20)))
     chain = edit(MODEL).select(first).vanish().select(last).multiply([(0.1, 0)]).select(middle).to_front()
     expected = chain.select(middle).recolor(hue=0.5).video()
-    with tempfile.TemporaryDirectory() as name:
-        for key, one in (("a", first), ("b", last), ("c", middle)):
-            save_selection(Path(name) / f"{key}.selection", one, MODEL)
-        text = "".join(f'[selections.{key}]\nfile = "{key}.selection"\n' for key in "abc")
-        for do, key in (("vanish", "a"), ("multiply", "b"), ("to_front", "c"), ("recolor", "c")):
-            more = {"multiply": "offsets = [[0.1, 0]]\n", "recolor": "hue = 0.5\n"}.get(do, "")
-            text += f'[[edits]]\ndo = "{do}"\nselect = "{key}"\n{more}'
-        assert same(made(text, folder=name), expected)
+    named = {"a": first, "b": last, "c": middle}
+    text = "".join(f'[selections.{key}]\nindices = "{format_indices(one)}"\n' for key, one in named.items())
+    for do, key in (("vanish", "a"), ("multiply", "b"), ("to_front", "c"), ("recolor", "c")):
+        more = {"multiply": "offsets = [[0.1, 0]]\n", "recolor": "hue = 0.5\n"}.get(do, "")
+        text += f'[[edits]]\ndo = "{do}"\nselect = "{key}"\n{more}'
+    assert same(made(text), expected)

@@ -7,16 +7,13 @@ from foldgauss.io import (
     FormatError,
     OutputError,
     export,
-    import_model,
-    load_selection,
     load_video_model,
     read_masks,
+    read_vegas_ply,
     read_video,
-    save_selection,
     save_video_model,
     write_3dgs_frames,
     write_3dgs_ply,
-    write_pseudomesh,
     write_video,
 )
 from foldgauss.render import RenderOptions
@@ -80,22 +77,17 @@ def test_existing_outputs(tmp_path, model, format, name, options):
 def test_what_is_no_video(tmp_path, model):
     write_3dgs_ply(tmp_path / "f.ply", model, 0.5)
     with pytest.raises(FormatError, match="read_3dgs_ply"):
-        import_model(tmp_path / "f.ply", size=(40, 64))
-    with pytest.raises(FormatError, match="read_pseudomesh"):
-        import_model(write_pseudomesh(tmp_path / "mesh", model))
+        read_vegas_ply(tmp_path / "f.ply", size=(40, 64))
+    with pytest.raises(FormatError, match="a file that can be read"):
+        read_vegas_ply(tmp_path)
     with pytest.raises(FileNotFoundError, match="missing"):
-        import_model(tmp_path / "none.ply")
+        read_vegas_ply(tmp_path / "none.ply")
 
 
 SWAPPED = {
     "save": (lambda m, s, p: save_video_model(m, p), r"path: expected a path, got VideoModel\. .*\(path, model\)"),
     "save a selection as a model": (lambda m, s, p: save_video_model(p, s), "model: .*got Selection"),
     "load": (lambda m, s, p: load_video_model(m), "path: expected a path, got VideoModel"),
-    "save a selection": (lambda m, s, p: save_selection(s, p, m), r"path: .*\(path, selection, model\)"),
-    "save two, swapped": (lambda m, s, p: save_selection(p, m, s), "selection: expected a Selection, got VideoModel"),
-    "save a mask": (lambda m, s, p: save_selection(p, s.mask, m), r"selection: .*got ndarray.*Selection\(mask\)"),
-    "load a selection": (lambda m, s, p: load_selection(m, p), "path: expected a path"),
-    "load for no model": (lambda m, s, p: load_selection(p, "m"), "model: expected a VideoModel, got str"),
     "format first": (lambda m, s, p: export("ply", m, p), r"model: .*got str\. .*\(model, format, out\)"),
     "path second": (lambda m, s, p: export(m, p, "ply"), "format: expected one of"),
     "a chain": (lambda m, s, p: export(edit(m), "ply", p), r"model: .*got Edit\. End the chain with \.video"),
@@ -103,7 +95,6 @@ SWAPPED = {
     "obj in a file": (lambda m, s, p: export(m, "obj", f"{p}.obj"), "out: expected a folder, got .*extension out"),
     "no times": (lambda m, s, p: export(m, "ply3dgs", p, times="x"), "times: expected one or more numbers"),
     "times of frames": (lambda m, s, p: export(m, "obj", p, times=[0, 3]), "times: expected one or more numbers"),
-    "import": (lambda m, s, p: import_model(3), "path: expected a path, got 3"),
     "masks": (
         lambda m, s, p: read_masks(s.mask),
         "path: expected a path, got .*array",

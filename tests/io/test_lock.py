@@ -12,12 +12,11 @@ import pytest
 from soft_models import soft_model
 
 from foldgauss.io import write_3dgs_frames, write_frames, write_pseudomesh
-from foldgauss.io._atomic import OutputError, atomic_folder
-from foldgauss.io._lock import STALE_AGE, lock_output
+from foldgauss.io._atomic import STALE_AGE, OutputError, atomic_folder, lock_output
 
 HOLDING = """
 import pathlib, sys, time
-from foldgauss.io._lock import lock_output
+from foldgauss.io._atomic import lock_output
 with lock_output(pathlib.Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(60)

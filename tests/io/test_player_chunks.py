@@ -210,7 +210,7 @@ def test_the_file_of_a_linked_page_stands_beside_it(film, tmp_path, capsys):
     assert load_video_model(tmp_path / "site" / "other.page.fgz").num_gaussians == soft_model().num_gaussians
     (tmp_path / "site" / "other.html").unlink()
     assert run("view", other, "--linked", "--out", tmp_path / "site" / "other.html") == 2
-    assert "other.page.fgz exists" in capsys.readouterr().err.replace("\n", "")
+    assert "other.page.fgz, which exists" in capsys.readouterr().err.replace("\n", "")
     segments = SegmentedVideo.from_models([(0, soft_model()), (7, soft_model())])
     with pytest.raises(ValueError, match="linked: expected a single model"):
         write_html(tmp_path / "site" / "long.html", segments, linked=True)

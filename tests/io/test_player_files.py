@@ -28,8 +28,8 @@ from foldgauss.cli.viewing.page_server import PageServer, make_token
 from foldgauss.io import (
     export,
     html_page,
-    import_model,
     load_video_model,
+    read_vegas_ply,
     read_video,
     save_video_model,
     write_gaussians_ply,
@@ -51,7 +51,7 @@ def test_the_empty_page_opens_any_model(opened, compact, tmp_path):
         bare.page.evaluate("window.foldgauss.seek = null")
         drop(bare, path)
         bare.until(f"foldgauss.seek && document.title === '{path.stem}'")
-        wanted = import_model(path) if path.suffix == ".ply" else load_video_model(path)
+        wanted = read_vegas_ply(path) if path.suffix == ".ply" else load_video_model(path)
         assert_shows(bare, wanted)
         assert bare.stats["total"] == NUM
     read_script(bare, IT + EDITS["rotate"])
@@ -69,7 +69,7 @@ def test_a_vegas_file_without_a_size_is_asked_for_it(opened, tmp_path):
         bare.page.locator(f"#needed-{name}").fill(str(value))
     bare.page.click("#facts-needed [value=open]")
     bare.until("foldgauss.seek")
-    assert_shows(bare, import_model(path, size=SIZE, fps=12))
+    assert_shows(bare, read_vegas_ply(path, size=SIZE, fps=12))
     assert bare.page.locator("#whole").inner_text() == "/ 0:00.50"
 
 

@@ -20,7 +20,6 @@ from foldgauss.io import (
     read_pseudomesh,
     read_vegas_ply,
     save_compact,
-    save_selection,
     save_video_model,
 )
 from foldgauss.io.models import segmented
@@ -28,7 +27,7 @@ from foldgauss.io.models.compact import MAGIC
 from foldgauss.io.models.model_file import read_header
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.io.page.player_page import quantize_finely
-from foldgauss.video import FrameTimes, SegmentedVideo, Selection, edit, layers
+from foldgauss.video import FrameTimes, SegmentedVideo, edit, layers
 from foldgauss.video.models.renderer import VideoRenderer
 
 FIRSTS, LENGTHS = (0, 4, 13), (7, 9, 5)
@@ -178,12 +177,10 @@ def test_a_file_that_changed_since_is_told(work, tmp_path):
 
 def test_what_is_no_ordinary_model_is_refused(work, tmp_path):
     (tmp_path / "small.fgz").write_bytes(MAGIC)
-    save_selection(tmp_path / "some.selection", Selection(np.ones(NUM, bool)), soft_model())
     (tmp_path / "noise.safetensors").write_bytes(os.urandom(500))
     for name, message in (
         (work / "long.safetensors", r"got one of kind 'segmented-video'.*Join the files that it was made of"),
         (tmp_path / "small.fgz", "got one cut off after 8 bytes"),
-        (tmp_path / "some.selection", "got one of kind"),
         (tmp_path / "noise.safetensors", "expected a foldgauss-model file"),
     ):
         with pytest.raises(ModelFileError, match=message):
@@ -201,7 +198,7 @@ def test_a_source_that_does_not_fit_its_header_is_refused(work, tmp_path):
         join_segments(tmp_path / "out.safetensors", [(0, path)])
     path.write_bytes((work / "a.safetensors").read_bytes())
     rewritten(path, lambda header, outer: header.update({"fps": float("inf")}))
-    with pytest.raises(ModelFileError, match="rate is out of range"):
+    with pytest.raises(ModelFileError, match="fps: expected a rate above 0, got"):
         join_segments(tmp_path / "out.safetensors", [(0, path)])
     assert not (tmp_path / "out.safetensors").exists()
 

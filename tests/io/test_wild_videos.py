@@ -214,6 +214,24 @@ def test_a_file_that_ends_in_random_bytes_is_noted(tmp_path, name):
     assert [note for note in early if "no usable frame rate" not in note] == []
 
 
+@pytest.mark.parametrize("name", ["a.ts", "a.mpg"])
+def test_sound_that_is_longer_than_the_picture_is_no_damage(tmp_path, name):
+    with av.open(str(tmp_path / name), "w") as container:
+        video, audio = container.add_stream("mpeg2video", rate=25), container.add_stream("mp2", rate=44100)
+        video.height, video.width, video.pix_fmt, video.bit_rate = 48, 64, "yuv420p", 100_000
+        audio.layout = "stereo"
+        for image in waves(10, 48, 64):
+            container.mux(video.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        for start in range(0, 5 * 44100, 1152):
+            sound = av.AudioFrame.from_ndarray(np.zeros((1, 2 * 1152), np.int16), format="s16", layout="stereo")
+            sound.sample_rate, sound.pts = 44100, start
+            container.mux(audio.encode(sound))
+        container.mux([*video.encode(), *audio.encode()])
+    clip = read_video(tmp_path / name)
+    assert clip.num_frames == 10
+    assert not any("hold no frame" in note for note in clip.notes)
+
+
 def test_a_declared_size_that_cannot_be_converted_to_is_an_error(video):
     """Found by fuzzing a header: FFmpeg's conversion refuses to stretch so much."""
     video.stored_size = 63693, 2782

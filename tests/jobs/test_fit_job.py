@@ -16,8 +16,7 @@ from drifting import CONFIG, write_drifting
 
 import foldgauss.jobs.runner as fitting
 from foldgauss.io import index_video, load_video_model
-from foldgauss.io._atomic import OutputError
-from foldgauss.io._lock import lock_output
+from foldgauss.io._atomic import OutputError, lock_output
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.jobs import FitJob, Stopped, fit_job
 from foldgauss.jobs.job import read_record

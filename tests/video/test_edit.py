@@ -626,7 +626,7 @@ WRONG = {
     "ease": (lambda: E.move((0, 0), frames=(2, 4), ease=-1), "ease: expected a number of frames"),
     "curve": (lambda: E.move((0, 0), frame=2, curve="cubic"), "curve: expected one of"),
     "clock knots": (lambda: Clock((0, 0), (0, 1)), "times: expected strictly increasing"),
-    "file of a selection": (lambda: E.select("it.selection"), "selection: .*got 'it.selection'.*load_selection"),
+    "file of a selection": (lambda: E.select("it.selection"), "selection: .*got 'it.selection'.*parse_indices"),
     "mask of pixels": (lambda: E.select(np.ones(SIZE, bool)), r"selection: .*select\(mask=mask, frame=k\)"),
     "one pair": (lambda: E.multiply((0.2, 0)), "offsets: expected pairs"),
     "clock lengths": (lambda: Clock((0, 1), (0,)), "times, own_times: expected as many"),

@@ -11,15 +11,13 @@ from soft_models import NUM, OBJECT, SIZE, soft_model
 
 from foldgauss.io import (
     frame_gaussians,
-    load_selection,
     load_video_model,
     read_pseudomesh,
-    save_selection,
     save_video_model,
     write_pseudomesh,
 )
 from foldgauss.render import Camera, project
-from foldgauss.video import EditedVideo, SegmentedVideo, Selection, VideoModel, edit, layers, select
+from foldgauss.video import EditedVideo, SegmentedVideo, VideoModel, edit, layers, select
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.shared_paths import MAX_PATHS, SharedPaths
 from foldgauss.video.segmented.flatten import flatten_video
@@ -117,7 +115,7 @@ def test_selections_are_of_the_frame():
     assert select(model, box=box, frame=3).mask[OBJECT].mean() < 0.1
 
 
-def test_files_of_edited_videos_segments_and_selections(tmp_path):
+def test_files_of_edited_videos_and_segments(tmp_path):
     edited = edit(MODEL).select(OBJECT).move((0.1, 0), frame=2).video()
     again = load_video_model(save_video_model(tmp_path / "edited.safetensors", edited))
     long = SegmentedVideo([Segment.from_model(0, MODEL), Segment.from_model(7, path_model(seed=8))])
@@ -126,10 +124,6 @@ def test_files_of_edited_videos_segments_and_selections(tmp_path):
     for t in BETWEEN:
         np.testing.assert_array_equal(VideoRenderer(again).frame(t), VideoRenderer(edited).frame(t))
         np.testing.assert_array_equal(VideoRenderer(joined).frame(t), VideoRenderer(long).frame(t))
-    path = save_selection(tmp_path / "object.safetensors", Selection(OBJECT), MODEL)
-    np.testing.assert_array_equal(load_selection(path, MODEL).mask, OBJECT)
-    with pytest.raises(ValueError, match="a selection of this model"):
-        load_selection(path, path_model(seed=8))
 
 
 def test_frames_for_other_programs_are_those_of_the_model(tmp_path):

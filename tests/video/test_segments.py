@@ -13,7 +13,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from soft_models import NUM, SIZE, learned, soft_model, soft_segments
 
-from foldgauss.io import save_selection
 from foldgauss.render import RenderOptions
 from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.video import (
@@ -377,7 +376,6 @@ def test_segments_that_do_not_go_together_are_refused(make, message):
         lambda clip: by_color(clip, (1.0, 0.0, 0.0)),
         lambda clip: Selection.all(clip),
         lambda clip: Residuals(clip, np.zeros((NUM_FRAMES, *SIZE, 3), np.uint8)),
-        lambda clip: save_selection("never", Selection(np.ones(NUM, bool)), clip),
     ],
 )
 def test_what_takes_one_model_says_how_to_get_one(call):

@@ -77,10 +77,7 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
         "demo": (Example("Fit, render and evaluate the clip Bunny", "foldgauss demo --out first-look"),),
         "render": (
             Example("As a video, holiday.mp4", "foldgauss render holiday.fgz"),
-            Example(
-                "Four times as many frames, four times the frame rate",
-                "foldgauss render holiday.fgz --upsample 4",
-            ),
+            Example("At 100 frames per second", "foldgauss render holiday.fgz --fps 100"),
             Example(
                 "Slow motion as an animation",
                 "foldgauss render holiday.fgz --speed 0.25 --out slow.gif",

@@ -8,11 +8,10 @@ import typer
 from foldgauss._runtime.checks import require
 from foldgauss.cli.app.application import command, warn
 from foldgauss.cli.shared.arguments import FittedFrames, ModelFile, Overwrite
-from foldgauss.cli.shared.clips import is_other_clip, read_fitted_clip, refuse_segments
-from foldgauss.cli.shared.fit_progress import choose_display, display_progress
-from foldgauss.cli.shared.outputs import check_output
+from foldgauss.cli.shared.console import choose_display, print_figures
+from foldgauss.cli.shared.files import check_output, is_other_clip, read_fitted_clip, refuse_segments
+from foldgauss.cli.shared.fit_progress import display_progress
 from foldgauss.cli.shared.rendering import evaluate_with_progress
-from foldgauss.cli.shared.tables import print_figures
 from foldgauss.io._atomic import resolve, write_or_keep
 from foldgauss.io.models.compact import COMPACT_SUFFIX, check_compact_name, leave_room, save_compact
 from foldgauss.io.models.video_model import CLIP_NOTES, keep_origin, load_video_model, read_origin

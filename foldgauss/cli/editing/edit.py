@@ -10,11 +10,10 @@ import typer
 
 from foldgauss._runtime.checks import require
 from foldgauss.cli.app.application import command, out
-from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, parse_size
-from foldgauss.cli.shared.log_lines import print_log
-from foldgauss.cli.shared.outputs import check_images_output, check_output, name_after, refuse_huge
+from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, Timeline, parse_size
+from foldgauss.cli.shared.console import print_log
+from foldgauss.cli.shared.files import check_images_output, check_output, name_after, refuse_huge
 from foldgauss.cli.shared.rendering import Output, SoundFile, choose_sound
-from foldgauss.cli.shared.timeline import Timeline
 from foldgauss.io._atomic import write_or_keep
 from foldgauss.io.edit_script import read_edit_script
 from foldgauss.io.models.video_model import (

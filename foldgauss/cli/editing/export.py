@@ -9,8 +9,9 @@ from foldgauss._runtime.checks import check_one_of, require
 from foldgauss.cli.app.application import command, out
 from foldgauss.cli.app.help import complete_choice
 from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, Times, parse_size, parse_times
-from foldgauss.cli.shared.clips import Video
-from foldgauss.cli.shared.outputs import (
+from foldgauss.cli.shared.console import format_count, progress_bar
+from foldgauss.cli.shared.files import (
+    Video,
     check_images_output,
     check_output,
     name_after,
@@ -18,11 +19,11 @@ from foldgauss.cli.shared.outputs import (
     refuse_huge,
     refuse_inputs,
 )
-from foldgauss.cli.shared.rendering import Output, progress_bar
-from foldgauss.cli.shared.tables import format_count
+from foldgauss.cli.shared.rendering import Output
 from foldgauss.io._atomic import write_or_keep
-from foldgauss.io.exchange.export_import import export, import_model
+from foldgauss.io.exchange.export import export
 from foldgauss.io.exchange.pseudomesh import read_pseudomesh
+from foldgauss.io.exchange.vegas_ply import read_vegas_ply
 from foldgauss.io.media.writing import VIDEO_SUFFIXES
 from foldgauss.io.models.video_model import (
     MODEL_SUFFIX,
@@ -177,6 +178,6 @@ def import_command(
         return
     require(out_path.suffix.lower() == MODEL_SUFFIX, "--out", expected=f"a name ending in {MODEL_SUFFIX}", got=out_path)
     check_output(out_path, overwrite, {"file": source})
-    model = import_model(source, size=image_size, fps=fps)
+    model = read_vegas_ply(source, size=image_size, fps=fps)
     save_video_model(out_path, model, metadata={"clip": source.name})
     out.print(f"{out_path}: {model.num_frames} frames, {model.num_gaussians:,} Gaussians", soft_wrap=True)

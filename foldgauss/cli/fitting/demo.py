@@ -10,11 +10,11 @@ from foldgauss._runtime.threads import num_threads
 from foldgauss.cli.app.application import command, out
 from foldgauss.cli.fitting.fit import stop_on_signals, summarize_fit
 from foldgauss.cli.shared.arguments import Overwrite
+from foldgauss.cli.shared.console import choose_display, print_figures, summarize_scores, write_json
 from foldgauss.cli.shared.contact_sheet import make_comparison_sheet
-from foldgauss.cli.shared.fit_progress import choose_display, display_progress
-from foldgauss.cli.shared.outputs import make_folder, refuse_existing
+from foldgauss.cli.shared.files import make_folder, refuse_existing
+from foldgauss.cli.shared.fit_progress import display_progress
 from foldgauss.cli.shared.rendering import evaluate_with_progress
-from foldgauss.cli.shared.tables import print_figures, summarize_scores, write_json
 from foldgauss.io.datasets import sample_clip
 from foldgauss.io.media.reading import read_video
 from foldgauss.io.media.writing import write_image, write_video
@@ -66,7 +66,7 @@ def demo(
     for name, what in (
         ("comparison.png", "original, reconstruction and error side by side"),
         ("reconstruction.mp4", "the rendered model, for any player (H.264)"),
-        ("model.fgz", "the model: try `foldgauss render` with --upsample 4"),
+        ("model.fgz", "the model: try `foldgauss render` with --speed 0.25"),
         (RECORD, "the figures above, and those of each frame"),
     ):
         out.print(f"  {out_dir / name}  {what}", soft_wrap=True)

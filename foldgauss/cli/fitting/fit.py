@@ -8,11 +8,11 @@ from typing import Annotated
 
 import typer
 
-from foldgauss._runtime.checks import ParameterError, require
+from foldgauss._runtime.checks import require
 from foldgauss._runtime.threads import num_threads
 from foldgauss.cli.app.application import Stopped, command, err, out, warn
 from foldgauss.cli.app.signals import note_signals
-from foldgauss.cli.fitting.job_progress import emit_json
+from foldgauss.cli.fitting.job_progress import report_fit
 from foldgauss.cli.fitting.options import (
     PROGRESS,
     CheckpointSeconds,
@@ -36,19 +36,16 @@ from foldgauss.cli.shared.arguments import (
     parse_frames,
     parse_size,
 )
+from foldgauss.cli.shared.console import Display, choose_display, format_count, summarize_scores
+from foldgauss.cli.shared.files import check_output, name_after, refuse_existing, refuse_inputs
 from foldgauss.cli.shared.fit_progress import (
-    Display,
     Observer,
-    choose_display,
     display_progress,
     print_json,
     save_previews,
 )
-from foldgauss.cli.shared.outputs import check_output, name_after, refuse_existing, refuse_inputs
 from foldgauss.cli.shared.rendering import evaluate_with_progress
-from foldgauss.cli.shared.tables import format_count, print_figures, summarize_scores
-from foldgauss.io._atomic import OutputError, resolve, write_or_keep
-from foldgauss.io._lock import lock_output
+from foldgauss.io._atomic import OutputError, lock_output, resolve, write_or_keep
 from foldgauss.io.history import HistoryFile, read_history, write_curves
 from foldgauss.io.media.clip import DEINTERLACE, Clip, check_reading
 from foldgauss.io.models.compact import COMPACT_SUFFIX
@@ -180,10 +177,7 @@ def fit(
         warn(f"--minutes: {text}")
     figures = summarize_scores(run.model, scores) | summarize_fit(run.info) | {"stopped_by": run.info.stopped_by}
     figures |= {"file_bytes": target.stat().st_size}
-    if display == "json":
-        emit_json("done", {"model": run.job.target} | figures)
-    elif display != "quiet":
-        print_figures(run.job.target, figures)
+    report_fit(display, run.job.target, figures)
 
 
 def _choose_target(video: Path, out_path: Path | None, config: FitConfig) -> tuple[Path, FitConfig]:
@@ -252,9 +246,13 @@ def _check_records(video: Path, history: Path | None, preview: Path | None, over
 
 def _check_checkpoint(checkpoint: Path, resume: bool, overwrite: bool) -> None:
     """Refuse a checkpoint that would be lost, and --resume without one."""
-    if checkpoint.exists() and not (resume or overwrite):
-        cure = "Continue it with --resume, or start over with --overwrite."
-        raise ParameterError("--out", f"a stopped fit has a checkpoint, {checkpoint}. {cure}")
+    require(
+        resume or overwrite or not checkpoint.exists(),
+        "--out",
+        expected="a new fit",
+        got=f"a stopped one, which has a checkpoint, {checkpoint}",
+        cure="Continue it with --resume, or start over with --overwrite.",
+    )
     require(
         not resume or checkpoint.exists(),
         "--resume",

@@ -32,11 +32,9 @@ from foldgauss.cli.shared.arguments import (
     parse_frames,
     parse_size,
 )
-from foldgauss.cli.shared.fit_progress import choose_display
-from foldgauss.cli.shared.outputs import make_folder
-from foldgauss.cli.shared.tables import format_count, write_json
-from foldgauss.io._atomic import resolve
-from foldgauss.io._lock import lock_output
+from foldgauss.cli.shared.console import choose_display, format_count, write_json
+from foldgauss.cli.shared.files import make_folder
+from foldgauss.io._atomic import lock_output, resolve
 from foldgauss.io.media.clip import DEINTERLACE, check_reading
 from foldgauss.jobs import FitJob, Outcome, find_clips, make_jobs
 from foldgauss.jobs.clips import RECORDS

@@ -1,20 +1,15 @@
 """Runs jobs and displays their progress: a bar, lines in a log, or JSON."""
 
 import math
-import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
 
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
 from foldgauss.cli.app.application import Stopped, err
 from foldgauss.cli.app.signals import note_signals
-from foldgauss.cli.shared.fit_progress import Display, print_json
-from foldgauss.cli.shared.log_lines import FIRST_LINE_SECONDS, LINE_SECONDS
-from foldgauss.cli.shared.rendering import TIME_LEFT
-from foldgauss.jobs import FitJob, Outcome, WorkerPool, run_here, run_on
-from foldgauss.jobs import Progress as JobProgress
+from foldgauss.cli.shared.console import Display, print_figures, show_progress
+from foldgauss.cli.shared.fit_progress import print_json
+from foldgauss.jobs import FitJob, Outcome, Progress, WorkerPool, run_here, run_on
 from foldgauss.jobs import Stopped as JobsStopped
 
 #: Up to so many jobs, each has a line in a log.
@@ -25,6 +20,14 @@ def emit_json(event: str, figures: dict[str, Any]) -> None:
     """Print a line of JSON; a closed standard output must not end the fits."""
     with suppress(OSError):
         print_json(event, figures)
+
+
+def report_fit(display: Display, target: str, figures: dict[str, Any]) -> None:
+    """Print the results of a fit, the model `target`."""
+    if display == "json":
+        emit_json("done", {"model": target} | figures)
+    elif display != "quiet":
+        print_figures(target, figures)
 
 
 def run_jobs(
@@ -41,8 +44,8 @@ def run_jobs(
     After Ctrl-C or SIGTERM, and once checkpoints are written, raises `Stopped`, whose message ends with `cure`.
     """
     ended: dict[str, Outcome] = {}
-    view = _View(noun, len(jobs), display)
-    with note_signals() as request, view.bar:
+    with note_signals() as request, show_progress(display) as show:
+        view = _View(noun, len(jobs), display, show)
         request.stepping = True  # jobs may stop at any moment
 
         def should_stop() -> bool:
@@ -67,24 +70,16 @@ def run_jobs(
 class _View:
     """The state of the jobs, displayed as `display` says."""
 
-    def __init__(self, noun: str, total: int, display: Display):
-        self.noun, self.total, self.display, self.done, self.failed = noun, total, display, 0, 0
-        self.running: dict[str, JobProgress] = {}
-        self.due = time.monotonic() + FIRST_LINE_SECONDS
-        description = TextColumn("{task.description}", markup=False)  # file names
-        columns = description, BarColumn(bar_width=20), TimeElapsedColumn(), *TIME_LEFT
-        self.bar = Progress(*columns, console=err, disable=display != "bar")
-        self.task = self.bar.add_task(self._describe(), total=total)
+    def __init__(self, noun: str, total: int, display: Display, show: Callable[..., None]):
+        self.noun, self.total, self.display, self.show, self.done, self.failed = noun, total, display, show, 0, 0
+        self.running: dict[str, Progress] = {}
 
-    def update(self, progress: JobProgress) -> None:
+    def update(self, progress: Progress) -> None:
         self.running[progress.name] = progress
         if self.display == "json":
             known = progress._asdict().items()
             emit_json("progress", {name: value for name, value in known if value == value and value != math.inf})
-        elif self.display == "lines" and time.monotonic() >= self.due:
-            self.due = time.monotonic() + LINE_SECONDS
-            err.print(self._describe(), soft_wrap=True)
-        self._update_bar()
+        self._show()
 
     def end(self, outcome: Outcome) -> None:
         name = outcome.job.name
@@ -99,16 +94,14 @@ class _View:
         elif self.display == "lines" and self.total <= MAX_LINES:
             result = "failed" if outcome.failure is not None else f"{outcome.record['mean_psnr']:.2f} dB"
             err.print(f"{self._counts()}: {name}, {result}", soft_wrap=True)
-        self._update_bar()
+        self._show()
 
-    def _update_bar(self) -> None:
+    def _show(self) -> None:
+        """The counts, and the jobs that run."""
         completed = self.done + self.failed + sum(job.fraction for job in self.running.values())
-        self.bar.update(self.task, completed=completed, description=self._describe())
+        running = (f"{job.name} {job.fraction:.0%} ({job.psnr:.1f} dB)" for job in self.running.values())
+        text = "; ".join([self._counts(), *([", ".join(running)] if self.running else [])])
+        self.show("Fitting", completed, self.total, text)
 
     def _counts(self) -> str:
         return f"{self.done} of {self.total} {self.noun} done" + (f", {self.failed} failed" if self.failed else "")
-
-    def _describe(self) -> str:
-        """The counts, and the jobs that run."""
-        running = (f"{job.name} {job.fraction:.0%} ({job.psnr:.1f} dB)" for job in self.running.values())
-        return "; ".join([self._counts(), *([", ".join(running)] if self.running else [])])

@@ -10,12 +10,12 @@ from typing import Annotated, Any
 
 import typer
 
-from foldgauss._runtime.checks import ParameterError
+from foldgauss._runtime.checks import require
 from foldgauss._runtime.settings import setting_of, settings_by_name, type_of, walk
 from foldgauss._runtime.threads import available_cores
 from foldgauss.cli.app.help import complete_choice
 from foldgauss.cli.shared.arguments import override_constants
-from foldgauss.cli.shared.tables import format_count
+from foldgauss.cli.shared.console import format_count
 from foldgauss.jobs import WorkerPool, local_workers, running_cluster
 from foldgauss.video.fitting.config import BUDGET, MODEL, OPTIMIZATION, PRESETS, FitConfig
 
@@ -106,14 +106,27 @@ class WorkerOptions:
     threads: int | None
 
     def __post_init__(self) -> None:
-        if self.scheduler is not None and (self.workers is not None or self.threads is not None):
-            other = "--workers" if self.workers is not None else "--threads"
-            raise ParameterError(other, "expected no --scheduler, which has workers of its own. Leave one out.")
-        if self.threads is not None and self.workers is None:
-            raise ParameterError("--threads", "expected --workers too. For this process: FOLDGAUSS_NUM_THREADS.")
-        if (self.workers is not None or self.scheduler is not None) and find_spec("distributed") is None:
-            option = "--workers" if self.scheduler is None else "--scheduler"
-            raise ParameterError(option, "needs dask.distributed: pip install 'foldgauss[distributed]'.")
+        require(
+            self.scheduler is None or (self.workers is None and self.threads is None),
+            "--workers" if self.workers is not None else "--threads",
+            expected="no --scheduler, which has workers of its own",
+            got="both",
+            cure="Leave one out.",
+        )
+        require(
+            self.threads is None or self.workers is not None,
+            "--threads",
+            expected="--workers too",
+            got="--threads alone",
+            cure="For this process: FOLDGAUSS_NUM_THREADS.",
+        )
+        require(
+            (self.workers is None and self.scheduler is None) or find_spec("distributed") is not None,
+            "--workers" if self.scheduler is None else "--scheduler",
+            expected="dask.distributed",
+            got="none",
+            cure="Install it: pip install 'foldgauss[distributed]'.",
+        )
         if self.workers is not None and self.threads is None:
             object.__setattr__(self, "threads", max(1, available_cores() // self.workers))
 

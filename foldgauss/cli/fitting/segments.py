@@ -9,12 +9,9 @@ from typing import Any
 
 from foldgauss._runtime.checks import require
 from foldgauss.cli.app.application import Stopped, err, out, warn
-from foldgauss.cli.fitting.job_progress import emit_json, run_jobs
+from foldgauss.cli.fitting.job_progress import emit_json, report_fit, run_jobs
 from foldgauss.cli.fitting.options import WorkerOptions
-from foldgauss.cli.shared.fit_progress import Display
-from foldgauss.cli.shared.log_lines import show_status
-from foldgauss.cli.shared.rendering import progress_bar
-from foldgauss.cli.shared.tables import format_count, print_figures
+from foldgauss.cli.shared.console import Display, format_count, progress_bar, show_status
 from foldgauss.io._atomic import write_or_keep
 from foldgauss.io.media.reading import describe_crop
 from foldgauss.jobs import FitJob, JoinedFit, LongFit, Outcome, plan_long_fit, segments_folder
@@ -81,10 +78,7 @@ def fit_in_segments(
     fit.clean_up()
     figures = _summarize(fit, joined, outcomes, job.config)
     figures |= {"wall_seconds": round(time.monotonic() - begun, 2), "file_bytes": target.stat().st_size}
-    if display == "json":
-        emit_json("done", {"model": str(target)} | figures)
-    elif display != "quiet":
-        print_figures(str(target), figures)
+    report_fit(display, str(target), figures)
 
 
 def print_failures(failed: list[Outcome]) -> None:

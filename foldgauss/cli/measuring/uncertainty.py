@@ -13,11 +13,16 @@ from foldgauss._runtime.checks import ParameterError, check_one_of, invalid, req
 from foldgauss.cli.app.application import Stopped, command, out, warn
 from foldgauss.cli.app.help import complete_choice
 from foldgauss.cli.shared.arguments import FittedClip, FittedFrames, ModelFile, Overwrite
-from foldgauss.cli.shared.clips import read_fitted_clip, refuse_segments
-from foldgauss.cli.shared.outputs import make_folder, name_after, refuse_foreign, refuse_inputs
-from foldgauss.cli.shared.rendering import progress_bars
-from foldgauss.io._atomic import atomic_path, translate_output_errors, write_or_keep
-from foldgauss.io._lock import lock_output
+from foldgauss.cli.shared.console import choose_display, show_progress
+from foldgauss.cli.shared.files import (
+    make_folder,
+    name_after,
+    read_fitted_clip,
+    refuse_foreign,
+    refuse_inputs,
+    refuse_segments,
+)
+from foldgauss.io._atomic import atomic_path, lock_output, translate_output_errors, write_or_keep
 from foldgauss.io.models.video_model import load_video_model, read_origin
 from foldgauss.uncertainty import Increments, frame_time_posterior, likelihood_profiles, marginalize_colors
 from foldgauss.uncertainty.diagnostics import plots
@@ -122,7 +127,7 @@ def uncertainty_command(
     make_folder(out_dir)
     own = tuple(out_dir / name for name in FILES)
     context.with_resource(lock_output(out_dir / CHAINS, own=own, what="run of uncertainty"))
-    with progress_bars() as show:
+    with show_progress(choose_display()) as show:
         profiles = likelihood_profiles(
             model, clip.frames, noise=noise, on_render=lambda done, total: show("Rendering", done, total)
         )

@@ -1,4 +1,4 @@
-"""Arguments and options that several commands take, and the parsing of their texts."""
+"""Arguments and options that several commands take, their parsing, and the times that options choose."""
 
 import dataclasses
 import re
@@ -10,9 +10,14 @@ import numpy as np
 import typer
 
 from foldgauss._runtime.checks import invalid, require
+from foldgauss.cli.app.application import out, warn
 from foldgauss.cli.app.help import complete_choice
+from foldgauss.cli.shared.console import Video, list_frames
 from foldgauss.io.media.clip import DEINTERLACE
+from foldgauss.io.media.frame_rate import MAX_FPS, MIN_FPS
 from foldgauss.render import RenderOptions
+from foldgauss.video.models.frame_times import played_positions, remapped_positions, times_at
+from foldgauss.video.motion.slow_motion import even_durations
 
 #: Largest number of times, which at usual rates play for an hour.
 MAX_TIMES = 100_000
@@ -158,3 +163,158 @@ def refuse_together(option: str, others: Mapping[str, object]) -> None:
     """Raise where one of the `others`, values by option, is given beside `option`."""
     for other, value in others.items():
         require(value is None or value is False, option, expected=f"no {other}", got="both")
+
+
+MAX_IMAGES = 10 * MAX_TIMES
+#: The slowest playback, and the inverse of the fastest.
+MIN_SPEED = 1e-4
+#: The longest video that `--remap` makes.
+MAX_SECONDS = 1e6
+MAX_EVEN_FPS = 50.0  # frames per second, the most of a GIF: a constant rate is not made higher for short intervals
+
+Fps = Annotated[
+    float | None,
+    typer.Option(
+        metavar="RATE",
+        help="Frames per second [default: as the clip].",
+        min=MIN_FPS,
+        max=MAX_FPS,
+    ),
+]
+Speed = Annotated[float | None, typer.Option(help="Playback speed: 0.25 is slow motion, -1 backwards.")]
+
+
+SkipRepeats = Annotated[
+    bool,
+    typer.Option("--skip-repeats", help="Shorten intervals in which frames repeat, which stutter when slow."),
+]
+
+
+@dataclasses.dataclass(frozen=True)
+class Timeline:
+    """Chooses the rendered times and the frame rate; all but `fps` exclude each other.
+
+    In the methods `fps` is the clip's rate. `seconds`, (num_frames + 1,), are the times at which its frames are shown,
+    and the end, where they are not evenly spaced; `fps` is their mean rate then.
+    """
+
+    fps: float | None = None
+    speed: float | None = None
+    remap: list[tuple[float, float]] | None = None
+    chosen: np.ndarray | None = None
+    frame: int | None = None
+
+    def __post_init__(self) -> None:
+        given = [option for option, value in self.ways.items() if value is not None]
+        if len(given) > 1:
+            raise invalid(given[0], expected="one way to choose times", got=" and ".join(given))
+        require(
+            self.speed is None or MIN_SPEED <= abs(self.speed) <= 1 / MIN_SPEED,
+            "--speed",
+            expected=f"a number from {MIN_SPEED:g} to {1 / MIN_SPEED:g}, or the same below 0",
+            got=self.speed,
+        )
+
+    @property
+    def ways(self) -> dict[str, object]:
+        """The values of the options that exclude each other."""
+        return {"--speed": self.speed, "--remap": self.remap, "--times": self.chosen, "--frame": self.frame}
+
+    @property
+    def is_single(self) -> bool:
+        """Whether one image is asked for."""
+        return self.frame is not None or (self.chosen is not None and len(self.chosen) == 1)
+
+    def rate(self, fps: float, seconds: np.ndarray | None = None) -> float:
+        """Frames per second of the output.
+
+        With `speed` and `remap`, a clip with `seconds` gets the rate of its shortest interval, up to `MAX_EVEN_FPS`.
+        """
+        if self.fps is None and seconds is not None and (self.speed is not None or self.remap is not None):
+            return max(fps, min(float(1 / np.diff(seconds).min()), MAX_EVEN_FPS))
+        return fps if self.fps is None else self.fps
+
+    def stamps(self, seconds: np.ndarray | None) -> np.ndarray | None:
+        """Seconds at which the output's images are shown, and the end: the clip's own, unless something is chosen."""
+        return seconds if all(value is None for value in (self.fps, *self.ways.values())) else None
+
+    def times(self, frame_times: np.ndarray, fps: float, seconds: np.ndarray | None = None) -> np.ndarray:
+        """The model times to render, in order."""
+        if self.chosen is not None:
+            return self.chosen
+        if self.frame is not None:
+            num = len(frame_times)
+            require(-num <= self.frame < num, "--frame", expected=f"a frame from {-num} to {num - 1}", got=self.frame)
+            return frame_times[[self.frame]]
+        if self.stamps(seconds) is not None:
+            return frame_times
+        rate = self.rate(fps, seconds) / fps
+        if self.remap is not None:
+            self._refuse_long("--remap", self.remap[-1][0] * fps * rate)
+            positions = remapped_positions(self.remap, fps, rate)
+            return times_at(frame_times, positions if seconds is None else _place(positions / fps, seconds))
+        speed, length = self.speed or 1.0, len(frame_times) - 1 if seconds is None else seconds[-1] * fps
+        if self.speed is not None or self.fps is not None:  # otherwise it has as many frames as the clip
+            self._refuse_long("--fps" if self.speed is None else "--speed", length * rate / abs(speed))
+        if seconds is not None:
+            return times_at(frame_times, _place(_seconds_played(seconds, fps * rate, speed), seconds))
+        return times_at(frame_times, played_positions(len(frame_times), rate, speed=speed))
+
+    def without_repeats(
+        self, video: Video, seconds: np.ndarray | None, sound: Path | None
+    ) -> tuple["Timeline", np.ndarray]:
+        """The timeline at a constant rate, and the clip's seconds with less between a frame and its repetition."""
+        others = {"--times": self.chosen, "--frame": self.frame, "--remap": self.remap, "--sound": sound}
+        refuse_together("--skip-repeats", others)
+        durations, fps = even_durations(video), video.fps
+        repeats = np.flatnonzero(durations < 1) + 1
+        out.print(f"Frames that repeat the one before: {list_frames(repeats) or 'none'}.", soft_wrap=True)
+        shown = np.full(video.num_frames, 1 / fps) if seconds is None else np.diff(seconds)
+        shown[:-1] *= durations
+        timeline = dataclasses.replace(self, fps=self.rate(fps, seconds))
+        return timeline, np.append(0.0, np.cumsum(shown))
+
+    def warn_of_end(self, num_frames: int, fps: float, seconds: np.ndarray | None) -> None:
+        """Warn if `remap` exceeds the clip."""
+        last, end = 0.0, num_frames / fps if seconds is None else seconds[-1]
+        if self.remap is not None:
+            last = max(of_clip for _, of_clip in self.remap)
+        if last > end * (1 + 1e-6):
+            warn(
+                f"--remap: expected seconds up to the end of the clip, {end:.4g}, got {last:.4g}. "
+                "Its last frame is held from there on."
+            )
+
+    def _refuse_long(self, option: str, num_images: float) -> None:
+        require(num_images <= MAX_IMAGES, option, expected=f"at most {MAX_IMAGES:,} images", got=f"{num_images:,.0f}")
+
+
+def _seconds_played(seconds: np.ndarray, rate: float, speed: float) -> np.ndarray:
+    """Evenly spaced seconds of the clip, until its end; backwards from its last frame on."""
+    step = abs(speed) / rate
+    if speed > 0:
+        return np.arange(max(int(np.ceil(seconds[-1] / step - 1e-6)), 1)) * step
+    return seconds[-2] - np.arange(int(seconds[-2] / step + 1e-6) + 1) * step
+
+
+def _place(shown: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """The frame positions at seconds of the clip."""
+    return np.interp(shown, seconds[:-1], np.arange(len(seconds) - 1))
+
+
+def parse_remap(text: str | None) -> list[tuple[float, float]] | None:
+    if text is None:
+        return None
+    pairs = [part.partition("=") for part in text.split(",")]
+    try:
+        points = [(float(shown), float(of_clip)) for shown, _, of_clip in pairs]
+        if points[-1][0] > MAX_SECONDS:
+            raise ValueError("too long")
+        remapped_positions(points, fps=1.0)
+    except ValueError as error:
+        raise invalid(
+            "--remap",
+            expected="seconds shown = seconds of the clip, the former rising from 0, as 0=0,1=1,3=1,4=2",
+            got=text,
+        ) from error
+    return points

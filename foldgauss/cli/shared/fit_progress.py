@@ -5,15 +5,12 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
-from rich.progress import BarColumn, Progress, TextColumn
 
-from foldgauss._runtime.checks import ParameterError
-from foldgauss.cli.app.application import err, warn
+from foldgauss.cli.app.application import warn
+from foldgauss.cli.shared.console import Display, show_progress
 from foldgauss.cli.shared.contact_sheet import make_comparison_sheet
-from foldgauss.cli.shared.log_lines import FIRST_LINE_SECONDS, LINE_SECONDS
 from foldgauss.io.history import HistoryFile, info_line
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.media.writing import write_image
@@ -24,20 +21,9 @@ from foldgauss.video.models.metrics import psnr
 from foldgauss.video.models.renderer import VideoRenderer
 
 Observer = Callable[[FitState, FitInfo], None]
-Display = Literal["bar", "lines", "json", "quiet"]
 
-BAR_SECONDS = 0.1
 JSON_SECONDS = 1.0
 PREVIEW_SECONDS = 10.0
-
-
-def choose_display(quiet: bool = False, log_json: bool = False) -> Display:
-    """How progress is displayed: as the options say, otherwise a bar on a terminal and lines in a log."""
-    if quiet and log_json:
-        raise ParameterError("--quiet", "expected one of --quiet and --log-json, got both. Leave one out.")
-    if quiet or log_json:
-        return "quiet" if quiet else "json"
-    return "bar" if err.is_terminal else "lines"
 
 
 @contextmanager
@@ -51,15 +37,13 @@ def display_progress(
     with ExitStack() as stack:
         observers = [] if history is None else [_stop_on_error(stack.enter_context(history), "history")]
         observers += [] if preview is None else [_stop_on_error(preview, "preview")]
+        if display == "json":
+            print_line = _at_intervals(JSON_SECONDS, lambda state, info: print_json("progress", info_line(info)))
+            observers.append(_stop_on_error(print_line, "progress"))
+        show = stack.enter_context(show_progress(display))
         if display == "bar":
-            observers.append(stack.enter_context(_bar(title)))
-        elif display == "lines":
-            observers.append(
-                _at_intervals(LINE_SECONDS, lambda state, info: _print_line(title, info), FIRST_LINE_SECONDS)
-            )
-        elif display == "json":
-            show = _at_intervals(JSON_SECONDS, lambda state, info: print_json("progress", info_line(info)))
-            observers.append(_stop_on_error(show, "progress"))
+            show(title, 0.0, 1.0, "estimating the motion, compiling")
+        observers.append(lambda state, info: show(title, info.progress, 1.0, describe_step(info)))
 
         def observe(state: FitState, info: FitInfo) -> None:
             for one in observers:
@@ -90,9 +74,9 @@ def save_previews(path: Path, clip: Clip, config: FitConfig) -> Observer:
     return _at_intervals(PREVIEW_SECONDS, save)
 
 
-def _at_intervals(seconds: float, show: Observer, first: float = 0.0) -> Observer:
-    """An observer that calls `show` at most every so many `seconds`, `first` seconds from now on, and at the end."""
-    due = time.monotonic() + first
+def _at_intervals(seconds: float, show: Observer) -> Observer:
+    """An observer that calls `show` at most every so many `seconds`, and at the end."""
+    due = time.monotonic()
 
     def observe(state: FitState, info: FitInfo) -> None:
         nonlocal due
@@ -124,19 +108,3 @@ def describe_step(info: FitInfo) -> str:
     """Step, loss, PSNR, number of Gaussians and time left of a fit."""
     left = f"{info.seconds_left:.0f} s left" if 0 < info.seconds_left < np.inf else ""
     return f"{info.step} steps  loss {info.loss:.4f}  {info.psnr:.2f} dB  {info.num_gaussians:,} Gaussians  {left}"
-
-
-def _print_line(title: str, info: FitInfo) -> None:
-    err.print(f"{title} {info.progress:4.0%}  {describe_step(info)}".rstrip(), soft_wrap=True)
-
-
-@contextmanager
-def _bar(title: str) -> Iterator[Observer]:
-    columns = TextColumn("{task.description}"), BarColumn(bar_width=12), TextColumn("{task.fields[text]}")
-    with Progress(*columns, console=err) as progress:
-        task = progress.add_task(title, total=1.0, text="estimating the motion, compiling")
-
-        def show(state: FitState, info: FitInfo) -> None:
-            progress.update(task, completed=info.progress, text=describe_step(info))
-
-        yield _at_intervals(BAR_SECONDS, show)

@@ -1,26 +1,20 @@
 """Images of models: written as videos, folders or single images, and evaluated, with progress bars."""
 
 import dataclasses
-import itertools
 import os
-import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from foldgauss._runtime.checks import ParameterError, require
-from foldgauss.cli.app.application import err, out
+from foldgauss.cli.app.application import out
 from foldgauss.cli.app.help import complete_choice
-from foldgauss.cli.shared.clips import Video
-from foldgauss.cli.shared.log_lines import FIRST_LINE_SECONDS, LINE_SECONDS
-from foldgauss.cli.shared.outputs import IMAGE_SUFFIX
-from foldgauss.cli.shared.tables import format_count
-from foldgauss.cli.shared.timeline import Timeline
+from foldgauss.cli.shared.arguments import Timeline
+from foldgauss.cli.shared.console import Video, format_count, progress_bar
+from foldgauss.cli.shared.files import IMAGE_SUFFIX
 from foldgauss.io._atomic import write_or_keep
 from foldgauss.io.media.frame_rate import MAX_FPS
 from foldgauss.io.media.indexing import LazyFrames
@@ -169,40 +163,7 @@ def choose_sound(path: Path | None, timeline: Timeline, about: dict[str, Any], f
         got=f"{str(path)!r}, which is {'none' if os.path.exists(path) else 'missing'}",
     )
     first = (about.get("frames") or (0,))[0] or 0
-    return Sound(path, about.get("first_second", first / fps), timeline.playing_speed(fps))
-
-
-#: Columns of a progress bar after the elapsed time.
-TIME_LEFT = (TextColumn("left"), TimeRemainingColumn())
-
-
-@contextmanager
-def progress_bars(shown: bool = True) -> Iterator[Callable[[str, int, int], None]]:
-    """Yields show(title, done, total): a bar for each title on a terminal, elsewhere a line now and then."""
-    columns = TextColumn("{task.description}"), BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn()
-    with Progress(*columns, *TIME_LEFT, console=err, disable=not (shown and err.is_terminal)) as progress:
-        tasks: dict[str, Any] = {}
-        due = time.monotonic() + FIRST_LINE_SECONDS
-
-        def show(title: str, done: int, total: int) -> None:
-            nonlocal due
-            if title not in tasks:
-                tasks[title] = progress.add_task(title, total=total)
-            progress.update(tasks[title], completed=done, total=total)
-            if shown and not err.is_terminal and time.monotonic() > due:
-                due = time.monotonic() + LINE_SECONDS
-                err.print(f"{title}: {done:,} of {total:,}", soft_wrap=True)
-
-        yield show
-
-
-@contextmanager
-def progress_bar(title: str, total: int, shown: bool = True) -> Iterator[Callable[[], None]]:
-    """As `progress_bars`, with one bar; yields the function that advances it."""
-    done = itertools.count(1)
-    with progress_bars(shown) as show:
-        show(title, 0, total)
-        yield lambda: show(title, next(done), total)
+    return Sound(path, about.get("first_second", first / fps), timeline.speed or 1.0)
 
 
 def evaluate_with_progress(

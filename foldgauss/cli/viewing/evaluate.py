@@ -18,10 +18,9 @@ from foldgauss.cli.shared.arguments import (
     TransmittanceStop,
     override_constants,
 )
-from foldgauss.cli.shared.clips import read_fitted_clip
-from foldgauss.cli.shared.outputs import check_output
+from foldgauss.cli.shared.console import Video, print_figures, summarize_scores, write_json
+from foldgauss.cli.shared.files import check_output, read_fitted_clip
 from foldgauss.cli.shared.rendering import evaluate_with_progress
-from foldgauss.cli.shared.tables import print_figures, summarize_scores, write_json
 from foldgauss.io._atomic import write_or_keep
 from foldgauss.io.models.video_model import load_video_model
 from foldgauss.video.models.metrics import Evaluation
@@ -61,26 +60,24 @@ def evaluate_command(
         figures["mean_psnr_on_white"] = round(on_white.mean_psnr, 3)
     figures["bits_per_pixel"] = 8 * num_bytes / (model.num_frames * model.size[0] * model.size[1])
     figures["frames_per_second"] = round(measure_frame_rate(model), 1)
-    _print_segments(model, scores) if isinstance(model, SegmentedVideo) else _print_frames(scores)
+    _print_scores(model, scores)
     print_figures(str(model_path), figures)
     if json_path is not None:
         figures |= {"psnr": scores.psnr, "ssim": scores.ssim}
         write_or_keep(json_path, lambda path: write_json(path, figures))
 
 
-def _print_segments(model: SegmentedVideo, scores: Evaluation) -> None:
-    """Print a row for each segment: the frames of a long clip are too many for a table."""
-    table = Table("segment", "frames", "PSNR (dB)", "lowest", "SSIM")
-    stops = [segment.first for segment in model.segments[1:]] + [model.num_frames]
-    for number, (segment, stop) in enumerate(zip(model.segments, stops, strict=True)):
-        psnr, ssim = scores.psnr[segment.first : stop], scores.ssim[segment.first : stop]
-        quality = (f"{np.mean(psnr):.2f}", f"{min(psnr):.2f}", f"{np.mean(ssim):.4f}")
-        table.add_row(str(number), f"{segment.first:,}:{stop:,}", *quality)
-    out.print(table)
-
-
-def _print_frames(scores: Evaluation) -> None:
-    table = Table("frame", "PSNR (dB)", "SSIM")
-    for k, (psnr, ssim) in enumerate(zip(scores.psnr, scores.ssim, strict=True)):
-        table.add_row(str(k), f"{psnr:.2f}", f"{ssim:.4f}")
+def _print_scores(model: Video, scores: Evaluation) -> None:
+    """Print a row for each frame, or for each segment: the frames of a long clip are too many for a table."""
+    if not isinstance(model, SegmentedVideo):
+        table = Table("frame", "PSNR (dB)", "SSIM")
+        for k, (psnr, ssim) in enumerate(zip(scores.psnr, scores.ssim, strict=True)):
+            table.add_row(str(k), f"{psnr:.2f}", f"{ssim:.4f}")
+    else:
+        table = Table("segment", "frames", "PSNR (dB)", "lowest", "SSIM")
+        stops = [segment.first for segment in model.segments[1:]] + [model.num_frames]
+        for number, (segment, stop) in enumerate(zip(model.segments, stops, strict=True)):
+            psnr, ssim = scores.psnr[segment.first : stop], scores.ssim[segment.first : stop]
+            quality = (f"{np.mean(psnr):.2f}", f"{min(psnr):.2f}", f"{np.mean(ssim):.4f}")
+            table.add_row(str(number), f"{segment.first:,}:{stop:,}", *quality)
     out.print(table)

@@ -9,7 +9,7 @@ from rich.table import Table
 from foldgauss._runtime.checks import is_within
 from foldgauss.cli.app.application import command, out
 from foldgauss.cli.shared.arguments import ModelFile
-from foldgauss.cli.shared.clips import Video
+from foldgauss.cli.shared.console import Video
 from foldgauss.io.models.compact import is_compact, measure_chunks
 from foldgauss.io.models.video_model import load_video_model, read_frame_seconds, read_origin
 from foldgauss.video.editing.edited_video import EditedVideo, as_edited

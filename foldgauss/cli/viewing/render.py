@@ -13,20 +13,24 @@ from foldgauss.cli.app.application import command, out
 from foldgauss.cli.app.help import complete_choice
 from foldgauss.cli.shared.arguments import (
     AlphaCutoff,
+    Fps,
     ModelFile,
     Overwrite,
     Size,
+    SkipRepeats,
+    Speed,
     SupportRadius,
+    Timeline,
     TransmittanceStop,
     override_constants,
     parse_color,
+    parse_remap,
     parse_size,
     parse_times,
     refuse_together,
 )
-from foldgauss.cli.shared.clips import Video
-from foldgauss.cli.shared.log_lines import print_log, print_shots
-from foldgauss.cli.shared.outputs import IMAGE_SUFFIX, check_images_output, name_after, refuse_huge
+from foldgauss.cli.shared.console import Video, print_log, print_shots, progress_bar
+from foldgauss.cli.shared.files import IMAGE_SUFFIX, check_images_output, name_after, refuse_huge
 from foldgauss.cli.shared.rendering import (
     CodecName,
     Crf,
@@ -34,9 +38,7 @@ from foldgauss.cli.shared.rendering import (
     PixelFormat,
     SoundFile,
     choose_sound,
-    progress_bar,
 )
-from foldgauss.cli.shared.timeline import Fps, SkipRepeats, Speed, Timeline, Upsample, parse_remap
 from foldgauss.io._atomic import resolve
 from foldgauss.io.media.masks import read_masks
 from foldgauss.io.media.writing import IMAGE_FORMATS, VIDEO_SUFFIXES
@@ -68,7 +70,6 @@ def render(
         ),
     ] = None,
     size: Size = None,
-    upsample: Upsample = None,
     fps: Fps = None,
     speed: Speed = None,
     skip_repeats: SkipRepeats = False,
@@ -165,7 +166,7 @@ def render(
     transmittance_stop: TransmittanceStop = None,
 ) -> None:
     """Render a model as a video: also between its frames, stabilized, or without an object."""
-    timeline = Timeline(upsample, fps, speed, parse_remap(remap), parse_times(times), frame)
+    timeline = Timeline(fps, speed, parse_remap(remap), parse_times(times), frame)
     image_size, background_color = parse_size(size), parse_color(background)
     if camera is not None:
         check_one_of("--stabilize", camera, CAMERAS)
@@ -198,7 +199,7 @@ def render(
         timeline, seconds = timeline.without_repeats(model, seconds, sound)
     shown = timeline.times(np.asarray(model.frame_times.times()), model.fps, seconds)
     timeline.warn_of_end(model.num_frames, model.fps, seconds)
-    stamps = timeline.stamps(model.fps, seconds)
+    stamps = timeline.stamps(seconds)
     encoding = {"codec": codec, "crf": crf, "pixel_format": pixel_format, "sound": sounding}
     output = Output(out_path, rate, overwrite, stamps, image_format or "png", **encoding)
     output.check(image_size, len(shown), background_color)

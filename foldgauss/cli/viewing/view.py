@@ -10,9 +10,8 @@ import typer
 from foldgauss._runtime.checks import invalid, require
 from foldgauss.cli.app.application import command, err, out
 from foldgauss.cli.shared.arguments import Overwrite, refuse_together
-from foldgauss.cli.shared.clips import read_fitted_clip
-from foldgauss.cli.shared.log_lines import show_status
-from foldgauss.cli.shared.outputs import check_output, refuse_existing
+from foldgauss.cli.shared.console import show_status
+from foldgauss.cli.shared.files import check_output, read_fitted_clip, refuse_existing
 from foldgauss.cli.viewing.page_server import PageServer, make_token, script_path
 from foldgauss.io._atomic import atomic_path, write_or_keep
 from foldgauss.io.media.clip import Clip

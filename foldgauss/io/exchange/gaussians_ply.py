@@ -11,7 +11,7 @@ import scipy
 from jaxtyping import Float
 from scipy.special import expit, logit
 
-from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_within, short_repr
+from foldgauss._runtime.checks import check_one_of, check_within, is_within, require, short_repr
 from foldgauss.io._atomic import PathLike, atomic_folder
 from foldgauss.io.exchange.ply_file import NOTE, read_ply, write_ply
 from foldgauss.render import Camera, Gaussians3D, pixels_per_unit
@@ -51,8 +51,12 @@ def frame_gaussians(model: RenderedVideo | VideoRenderer, t: float, *, depth_ste
     **Source:** VeGaS eq:mirage (flat Gaussians), eq:vegas_equiv_cond (of one time).
     """
     check_within("depth_step", depth_step, "[0, 1]", "a depth in [0, 1] of the frame's longer side")
-    if not is_within(float(t), "[0, 1]"):
-        raise invalid("t", expected="a time in [0, 1]", got=repr(t))
+    require(
+        is_within(float(t), "[0, 1]"),
+        "t",
+        expected="a time in [0, 1]",
+        got=repr(t),
+    )
     renderer = model if isinstance(model, VideoRenderer) else VideoRenderer(model)
     splats = renderer.dominant_splats(float(t))
     seen = np.asarray(splats.opacity) > 0
@@ -91,13 +95,26 @@ def write_gaussians_ply(path: PathLike, gaussians: Gaussians3D, *, axes: str = "
 
 def _columns(gaussians: Gaussians3D, axes: str, sh_degree: int) -> dict[str, np.ndarray]:
     check_one_of("axes", axes, AXES)
-    if sh_degree not in _NUM_REST:
-        raise invalid("sh_degree", expected="0, 1, 2 or 3", got=repr(sh_degree))
+    require(
+        sh_degree in _NUM_REST,
+        "sh_degree",
+        expected="0, 1, 2 or 3",
+        got=repr(sh_degree),
+    )
     mean, factor, opacity, color = (np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(_turn(gaussians, axes)))
-    if color.shape[-1:] != (3,):
-        raise invalid("gaussians.color", expected="red, green and blue", got=f"{color.shape[-1:]} channels")
-    if not all(np.isfinite(leaf).all() for leaf in (mean, factor, opacity, color)):
-        raise invalid("gaussians", expected="finite numbers", got="NaN or infinities", cure="Drop those Gaussians.")
+    require(
+        color.shape[-1:] == (3,),
+        "gaussians.color",
+        expected="red, green and blue",
+        got=f"{color.shape[-1:]} channels",
+    )
+    require(
+        all(np.isfinite(leaf).all() for leaf in (mean, factor, opacity, color)),
+        "gaussians",
+        expected="finite numbers",
+        got="NaN or infinities",
+        cure="Drop those Gaussians.",
+    )
     scale, quaternion = _scales_and_quaternion(factor)
     zeros = np.zeros(len(mean))
     columns = {name: mean[:, c] for c, name in enumerate("xyz")} | dict.fromkeys(("nx", "ny", "nz"), zeros)
@@ -129,13 +146,13 @@ def write_3dgs_ply(
     **Example:** `write_3dgs_ply("frame.ply", model, 0.5)`
     """
     video = model.model if isinstance(model, VideoRenderer) else model
-    if video.compositing != "over":
-        raise invalid(
-            "model's compositing",
-            expected="over, as viewers blend",
-            got=video.compositing,
-            cure="Fit it with --compositing over.",
-        )
+    require(
+        video.compositing == "over",
+        "model's compositing",
+        expected="over, as viewers blend",
+        got=video.compositing,
+        cure="Fit it with --compositing over.",
+    )
     columns = _columns(frame_gaussians(model, t, depth_step=depth_step), axes, sh_degree)
     note = {"size": list(video.size), "axes": axes, "options": dataclasses.asdict(video.options)}
     return write_ply(path, {"vertex": columns}, comments=[NOTE + json.dumps(note)])
@@ -175,8 +192,12 @@ def check_times(model: RenderedVideo, times: Sequence[float] | None) -> Float[np
     """The given times, or the model's frame times. Raises ValueError unless there is at least one, all in [0, 1]."""
     found = np.atleast_1d(np.asarray(model.frame_times.times() if times is None else times))
     found = found.astype(np.float64) if found.dtype.kind in "fiu" else np.zeros(0)
-    if found.ndim != 1 or found.size == 0 or not ((found >= 0) & (found <= 1)).all():
-        raise invalid("times", expected="one or more numbers in [0, 1]", got=short_repr(times))
+    require(
+        found.ndim == 1 and found.size != 0 and ((found >= 0) & (found <= 1)).all(),
+        "times",
+        expected="one or more numbers in [0, 1]",
+        got=short_repr(times),
+    )
     return found
 
 
@@ -195,22 +216,22 @@ def read_3dgs_ply(path: PathLike, *, axes: str = "y-down") -> Gaussians3D:
     """
     check_one_of("axes", axes, AXES)
     ply = read_ply(path, ("vertex",))
-    if not ply.is_3dgs():
-        raise ply.error(
-            expected="a 3DGS scene, with f_dc_0, opacity, scale_2 and rot_3",
-            got=ply.describe_vertices(),
-            cure="For a video use read_vegas_ply." if ply.is_vegas() else "It may be a mesh or a point cloud.",
-        )
+    ply.require(
+        ply.is_3dgs(),
+        expected="a 3DGS scene, with f_dc_0, opacity, scale_2 and rot_3",
+        got=ply.describe_vertices(),
+        cure="For a video use read_vegas_ply." if ply.is_vegas() else "It may be a mesh or a point cloud.",
+    )
     spatial = ply.columns("vertex", ["x", "y", "z", "scale_0", "scale_1", "scale_2"])
     turn = ply.columns("vertex", [f"rot_{k}" for k in range(4)])
     opacity, *color = ply.columns("vertex", ["opacity", "f_dc_0", "f_dc_1", "f_dc_2"]).T
-    lengths = np.linalg.norm(turn, axis=1)
-    if (lengths < _SMALLEST).any():
-        raise ply.error(
-            expected="quaternions of nonzero length",
-            got=f"0 in vertex {np.argmax(lengths < _SMALLEST)}",
-            cure="Drop that row.",
-        )
+    short = np.flatnonzero(np.linalg.norm(turn, axis=1) < _SMALLEST)
+    ply.require(
+        not len(short),
+        expected="quaternions of nonzero length",
+        got="0 in vertex " + ", ".join(map(str, short[:9])),
+        cure="Drop that row.",
+    )
     rotation = np.empty((0, 3, 3))
     if len(turn):
         rotation = scipy.spatial.transform.Rotation.from_quat(turn[:, [1, 2, 3, 0]]).as_matrix()

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from foldgauss._runtime.checks import ParameterError, invalid
+from foldgauss._runtime.checks import ParameterError, invalid, require
 from foldgauss.io._atomic import PathLike, atomic_path, check_input
 
 _SIZES = {
@@ -69,16 +69,19 @@ class Ply:
         """Whether it is a 3DGS scene, by the columns that distinguish it from meshes and from VeGaS."""
         return {"f_dc_0", "opacity", "scale_2", "rot_3"} <= set(self.names("vertex"))
 
-    def error(self, expected: str, got: str, cure: str = "") -> FormatError:
-        """The error for what it holds."""
-        return format_error(self.path, expected=expected, got=got, cure=cure)
+    def require(self, condition: object, expected: str, got: str, cure: str = "") -> None:
+        """Raise `FormatError`, for what it holds, unless `condition` is true."""
+        require(condition, str(self.path), expected=expected, got=got, cure=cure, kind=FormatError)
 
     def to_float32(self, name: str, leaf: np.ndarray) -> np.ndarray:
         """The leaf in float32, contiguous. Raises `FormatError` where a change of units overflows it."""
         with np.errstate(over="ignore"):
             leaf = np.ascontiguousarray(leaf, np.float32)
-        if not np.isfinite(leaf).all():
-            raise self.error(f"a {name} that float32 can represent in model space", "a larger one")
+        self.require(
+            np.isfinite(leaf).all(),
+            f"a {name} that float32 can represent in model space",
+            "a larger one",
+        )
         return leaf
 
     def describe_vertices(self) -> str:
@@ -89,12 +92,12 @@ class Ply:
         """The named properties side by side, float64. Raises `FormatError` for one that is missing or not finite."""
         found = self.names(element)
         missing = [name for name in names if name not in found]
-        if missing:
-            raise self.error(
-                expected=f"properties {', '.join(missing)} of element {element!r}",
-                got="the properties " + ", ".join(found[:40]) if found else "no such element",
-                cure="It holds another kind of data.",
-            )
+        self.require(
+            not missing,
+            expected=f"properties {', '.join(missing)} of element {element!r}",
+            got="the properties " + ", ".join(found[:40]) if found else "no such element",
+            cure="It holds another kind of data.",
+        )
         rows = self.elements[element]
         columns = np.empty((len(rows), len(names)), np.float64)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -103,7 +106,8 @@ class Ply:
             wrong = np.argwhere(~np.isfinite(columns.astype(np.float32)))
         if len(wrong):
             row, place = wrong[0]
-            raise self.error(
+            raise format_error(
+                self.path,
                 expected="numbers that float32 can represent",
                 got=f"{columns[row, place]} in {names[place]} of {element} {row}",
                 cure="Drop that row.",
@@ -140,13 +144,14 @@ def read_ply(path: PathLike, wanted: Iterable[str]) -> Ply:
             )
         row = np.dtype([(column, order + code if order else "f8") for column, code in columns.items()])
         first, at = at, at + count * (row.itemsize if order else len(columns))
-        if at > len(values):
-            raise format_error(
-                path,
-                expected=f"{count} rows of element {name!r}, {at - first} {'bytes' if order else 'numbers'} or more",
-                got=str(len(values) - first),
-                cure="The file is truncated.",
-            )
+        require(
+            at <= len(values),
+            str(path),
+            expected=f"{count} rows of element {name!r}, {at - first} {'bytes' if order else 'numbers'} or more",
+            got=str(len(values) - first),
+            cure="The file is truncated.",
+            kind=FormatError,
+        )
         if name in wanted:
             rows = values[first:at] if order else _parse_numbers(path, values[first:at])
             found[name] = np.frombuffer(rows, row)
@@ -173,13 +178,14 @@ def read_bytes(path: Path) -> bytes:
 
 def _split_header(path: Path, data: bytes) -> tuple[list[str], int]:
     """The lines between "ply" and "end_header", and where the rows start."""
-    if data[:4] not in (b"ply\n", b"ply\r"):
-        raise format_error(
-            path,
-            expected="a PLY file, which starts with 'ply'",
-            got="an empty file" if not data else f"one that starts with {data[:8]!r}",
-            cure="Check the path.",
-        )
+    require(
+        data[:4] in (b"ply\n", b"ply\r"),
+        str(path),
+        expected="a PLY file, which starts with 'ply'",
+        got="an empty file" if not data else f"one that starts with {data[:8]!r}",
+        cure="Check the path.",
+        kind=FormatError,
+    )
     found = _END_OF_HEADER.search(data[:MAX_HEADER])
     if found is None:
         raise format_error(
@@ -215,8 +221,14 @@ def _parse_header(path: Path, lines: list[str]) -> tuple[str, dict[str, tuple[in
                 got=repr(line.rstrip()[:80]),
                 cure="The header is damaged.",
             )
-    if order is None:
-        raise format_error(path, expected="a line 'format ...' in the header", got="none", cure="Copy it again.")
+    require(
+        order is not None,
+        str(path),
+        expected="a line 'format ...' in the header",
+        got="none",
+        cure="Copy it again.",
+        kind=FormatError,
+    )
     empty = [name for name, (_, columns) in elements.items() if not columns]
     if empty:
         raise format_error(path, expected=f"properties of element {empty[0]!r}", got="none", cure="Copy it again.")

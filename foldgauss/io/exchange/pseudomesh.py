@@ -14,10 +14,10 @@ import jax
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from foldgauss._runtime.checks import check_one_of, check_within, invalid
+from foldgauss._runtime.checks import check_one_of, check_within, require
 from foldgauss.io._atomic import PathLike, atomic_folder, missing_error
 from foldgauss.io.exchange.gaussians_ply import check_times, frame_gaussians, read_3dgs_ply, write_gaussians_ply
-from foldgauss.io.exchange.ply_file import facts_error, format_error, read_bytes
+from foldgauss.io.exchange.ply_file import FormatError, facts_error, format_error, read_bytes
 from foldgauss.io.media.clip import Size
 from foldgauss.io.media.frame_rate import DEFAULT_FPS
 from foldgauss.io.media.images import natural_sort_key
@@ -203,13 +203,14 @@ def read_pseudomesh(
     if not os.path.exists(folder):
         raise missing_error(folder, "a folder")
     paths = sorted(folder.glob("*.obj"), key=lambda path: natural_sort_key(path.name)) if folder.is_dir() else []
-    if not paths:
-        raise format_error(
-            folder,
-            expected="a folder with .obj files",
-            got="none",
-            cure="Give the folder that write_pseudomesh or `foldgauss export --format obj` made.",
-        )
+    require(
+        paths,
+        str(folder),
+        expected="a folder with .obj files",
+        got="none",
+        cure="Give the folder that write_pseudomesh or `foldgauss export --format obj` made.",
+        kind=FormatError,
+    )
     given = {name: value for name, value in (("size", size), ("fps", fps)) if value is not None}
     facts = _check_notes(folder, _read_notes(folder, len(paths)) | given, len(paths))
     return Pseudomesh(tuple(_read_frame(path, axes) for path in paths), **facts)
@@ -226,32 +227,39 @@ def _read_notes(folder: Path, num_frames: int) -> dict:
         return defaults
     except (ValueError, RecursionError, OSError) as error:
         raise format_error(path, expected="JSON", got="other text", cure="Remove it, and give size.") from error
-    if not isinstance(found, dict):
-        raise format_error(path, expected="an object", got=type(found).__name__, cure="Remove it, and give size.")
+    require(
+        isinstance(found, dict),
+        str(path),
+        expected="an object",
+        got=type(found).__name__,
+        cure="Remove it, and give size.",
+        kind=FormatError,
+    )
     return defaults | {name: value for name, value in found.items() if name in defaults}
 
 
 def _check_notes(folder: Path, notes: dict, num_frames: int) -> dict:
-    if notes["size"] is None:
-        raise format_error(
-            folder,
-            expected=f"a size in {NOTES}",
-            got="none",
-            cure="Give the size of the video, such as size=(480, 854).",
-        )
+    require(
+        notes["size"] is not None,
+        str(folder),
+        expected=f"a size in {NOTES}",
+        got="none",
+        cure="Give the size of the video, such as size=(480, 854).",
+        kind=FormatError,
+    )
     try:
         times, size, fps = np.asarray(notes["times"], np.float64), tuple(notes["size"]), float(notes["fps"])
         options = RenderOptions(**notes["options"])
         check_one_of("compositing", notes["compositing"], COMPOSITINGS)
         check_size(size)
         check_within("fps", fps, "(0, inf)", "a positive rate")
-        if times.shape != (num_frames,) or not ((times >= 0) & (times <= 1)).all():
-            raise invalid(
-                "times",
-                expected=f"{num_frames} numbers in [0, 1], one for each .obj",
-                got=f"shape {times.shape}",
-                cure="A frame was added or removed: correct the list too, or remove the file and give size.",
-            )
+        require(
+            times.shape == (num_frames,) and ((times >= 0) & (times <= 1)).all(),
+            "times",
+            expected=f"{num_frames} numbers in [0, 1], one for each .obj",
+            got=f"shape {times.shape}",
+            cure="A frame was added or removed: correct the list too, or remove the file and give size.",
+        )
     except (TypeError, ValueError, OverflowError) as error:
         raise facts_error(folder / NOTES, error) from error
     return notes | {"times": times, "size": (int(size[0]), int(size[1])), "fps": fps, "options": options}
@@ -259,20 +267,22 @@ def _check_notes(folder: Path, notes: dict, num_frames: int) -> dict:
 
 def _read_frame(path: Path, axes: str) -> Triangles:
     beside = path.with_suffix(".ply")
-    if not beside.exists():
-        raise format_error(
-            path.parent,
-            expected="a .ply with opacity and color beside every .obj",
-            got=f"{path.name!r} without {beside.name!r}",
-        )
+    require(
+        beside.exists(),
+        str(path.parent),
+        expected="a .ply with opacity and color beside every .obj",
+        got=f"{path.name!r} without {beside.name!r}",
+        kind=FormatError,
+    )
     look, vertices = read_3dgs_ply(beside), read_obj(path)  # both are empty where no Gaussian was visible
-    if len(vertices) != len(look.opacity):
-        raise format_error(
-            path,
-            expected=f"{len(look.opacity)} faces, a face for each Gaussian of {beside.name!r}",
-            got=str(len(vertices)),
-            cure="Faces were added or removed: keep them all, and hide Gaussians by opacity instead.",
-        )
+    require(
+        len(vertices) == len(look.opacity),
+        str(path),
+        expected=f"{len(look.opacity)} faces, a face for each Gaussian of {beside.name!r}",
+        got=str(len(vertices)),
+        cure="Faces were added or removed: keep them all, and hide Gaussians by opacity instead.",
+        kind=FormatError,
+    )
     if axes == "y-up":
         vertices = vertices * _AXES_TURN
     edges = vertices[:, 1:] - vertices[:, :1]
@@ -319,13 +329,14 @@ def read_obj(path: PathLike) -> Float[np.ndarray, "faces 3 3"]:
         elif kind == "f":
             num_faces += 1
             _check_face(f"{path}, line {number}", words, num_faces)
-    if len(vertices) != 3 * num_faces:
-        raise format_error(
-            path,
-            expected="3 vertices of its own for each face",
-            got=f"{len(vertices)} vertices for {num_faces} faces: a tool merged, split or dropped some",
-            cure=_KEEP_ORDER,
-        )
+    require(
+        len(vertices) == 3 * num_faces,
+        str(path),
+        expected="3 vertices of its own for each face",
+        got=f"{len(vertices)} vertices for {num_faces} faces: a tool merged, split or dropped some",
+        cure=_KEEP_ORDER,
+        kind=FormatError,
+    )
     return np.array(vertices).reshape(-1, 3, 3)
 
 

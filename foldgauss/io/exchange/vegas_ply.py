@@ -10,10 +10,10 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from foldgauss._runtime.checks import check_within, invalid
+from foldgauss._runtime.checks import check_within, invalid, require
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io._atomic import PathLike
-from foldgauss.io.exchange.ply_file import NOTE, Ply, facts_error, read_ply, write_ply
+from foldgauss.io.exchange.ply_file import NOTE, Ply, facts_error, format_error, read_ply, write_ply
 from foldgauss.io.media.clip import Size, check_fps
 from foldgauss.io.media.frame_rate import DEFAULT_FPS
 from foldgauss.render import RenderOptions
@@ -68,8 +68,12 @@ def read_vegas_ply(path: PathLike, *, size: Size | None = None, fps: float | Non
     _check_is_vegas(ply)
     size, fps, options, scale_cutoff, power = _fill_in(ply, size, fps)
     num_weights = sum(name.startswith("w1_") for name in ply.names("vertex"))
-    if num_weights % 2:
-        raise ply.error("an even number of w1 columns, pairs (x, z)", str(num_weights), "The file is damaged.")
+    ply.require(
+        not num_weights % 2,
+        "an even number of w1 columns, pairs (x, z)",
+        str(num_weights),
+        "The file is damaged.",
+    )
     names = ["x", "z", "scale_0", "scale_2", "rot_0", "m_0", "sigma_0", "opacity", "f_dc_0", "f_dc_1", "f_dc_2"]
     columns = ply.columns("vertex", [*names, *(f"w1_{k}" for k in range(num_weights))])
     unit = _vegas_unit(size)
@@ -160,45 +164,57 @@ def _vegas_unit(size: Size) -> float:
 
 
 def _check_is_vegas(ply: Ply) -> None:
-    if not ply.is_vegas():
-        raise ply.error(
-            expected="a VeGaS video, with m_0, sigma_0 and rot_0",
-            got=ply.describe_vertices(),
-            cure="For a still scene use read_3dgs_ply." if ply.is_3dgs() else "Check that it is the right file.",
-        )
-    if "time" not in ply.elements:
-        raise ply.error(
-            expected="an element 'time' with the frames' weights",
-            got="none",
-            cure="It may be of another version of the published code.",
-        )
-    if len(ply.elements["vertex"]) == 0:
-        raise ply.error(expected="Gaussians", got="none")
+    ply.require(
+        ply.is_vegas(),
+        expected="a VeGaS video, with m_0, sigma_0 and rot_0",
+        got=ply.describe_vertices(),
+        cure="For a still scene use read_3dgs_ply." if ply.is_3dgs() else "Check that it is the right file.",
+    )
+    ply.require(
+        "time" in ply.elements,
+        expected="an element 'time' with the frames' weights",
+        got="none",
+        cure="It may be of another version of the published code.",
+    )
+    ply.require(
+        len(ply.elements["vertex"]) != 0,
+        expected="Gaussians",
+        got="none",
+    )
     rest = [name for name in ply.names("vertex") if name.startswith("f_rest_")]
-    if rest and np.any(ply.columns("vertex", rest)):
-        raise ply.error(expected="colors of degree 0, as VeGaS has them", got="f_rest columns that are not 0")
+    ply.require(
+        not rest or not np.any(ply.columns("vertex", rest)),
+        expected="colors of degree 0, as VeGaS has them",
+        got="f_rest columns that are not 0",
+    )
 
 
 def _time_logits(ply: Ply) -> Float[np.ndarray, " intervals"]:
     """The weights of the frame times: columns of one row, or rows of one column."""
     names = sorted(ply.names("time"), key=lambda name: (len(name), name))
     weights = ply.columns("time", names)
-    if 1 not in weights.shape or weights.size == 0:
-        raise ply.error("one row of weights in element 'time'", f"{weights.shape[0]} rows of {weights.shape[1]}")
-    if weights.shape[0] == 1 and names != [f"time_func_{k}" for k in range(len(names))]:
-        raise ply.error("time_func_0, time_func_1, ... in element 'time'", ", ".join(names[:9]))
+    ply.require(
+        1 in weights.shape and weights.size != 0,
+        "one row of weights in element 'time'",
+        f"{weights.shape[0]} rows of {weights.shape[1]}",
+    )
+    ply.require(
+        weights.shape[0] != 1 or names == [f"time_func_{k}" for k in range(len(names))],
+        "time_func_0, time_func_1, ... in element 'time'",
+        ", ".join(names[:9]),
+    )
     return weights.astype(np.float32).ravel()
 
 
 def _fill_in(ply: Ply, size: Size | None, fps: float | None) -> tuple[Size, float, RenderOptions, float, float]:
     """Size, rate, options, cutoff and power: as given, else as recorded in the file, else the published defaults."""
     note = _read_note(ply)
-    if size is None and "size" not in note:
-        raise ply.error(
-            expected="a size, which a VeGaS file does not hold",
-            got="none",
-            cure="Give the size of the video that it was made from, such as size=(480, 854).",
-        )
+    ply.require(
+        size is not None or "size" in note,
+        expected="a size, which a VeGaS file does not hold",
+        got="none",
+        cure="Give the size of the video that it was made from, such as size=(480, 854).",
+    )
     try:
         options = RenderOptions(**note.get("options", {}))
         size = note["size"] if size is None else size
@@ -222,7 +238,9 @@ def _read_note(ply: Ply) -> dict:
     except (ValueError, RecursionError):
         note = None
     if not isinstance(note, dict) or not isinstance(note.get("options", {}), dict):
-        raise ply.error(expected="metadata in the comment 'foldgauss'", got=texts[0][:60], cure="Remove it.")
+        raise format_error(
+            ply.path, expected="metadata in the comment 'foldgauss'", got=texts[0][:60], cure="Remove it."
+        )
     return note
 
 
@@ -232,31 +250,39 @@ def _check_writable_as_vegas(model: VideoModel) -> None:
         if isinstance(model, SegmentedVideo):
             cure = "export(model, 'ply', FOLDER) writes one for each segment."
         raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
-    if model.num_frames < 2:
-        raise invalid(
-            "model",
-            expected="at least 2 frames, as a VeGaS file stores the intervals between frames",
-            got="1",
-            cure="Write the picture as a still scene, ply3dgs.",
-        )
+    require(
+        model.num_frames >= 2,
+        "model",
+        expected="at least 2 frames, as a VeGaS file stores the intervals between frames",
+        got="1",
+        cure="Write the picture as a still scene, ply3dgs.",
+    )
     floors = np.unique(model.splats.envelope.floor)
-    if not (floors == 0).all():
-        raise invalid(
-            "model's floor",
-            expected="0.0, the only one in a VeGaS file",
-            got=", ".join(map(str, floors[:3])),
-            cure="Fit it without a floor.",
-        )
-    if model.compositing != "over":
-        raise invalid(
-            "model's compositing",
-            expected="over, the only one in a VeGaS file",
-            got=model.compositing,
-            cure="Fit it with --compositing over.",
-        )
-    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model)):
-        raise invalid("model", expected="finite numbers", got="NaN or infinities", cure="The fit diverged: fit again.")
-    if not (np.asarray(model.splats.envelope.power) > 0).all():
-        raise invalid(
-            "model's power", expected="above 0, as VeGaS files require", got="0", cure="Fit it with another --power."
-        )
+    require(
+        (floors == 0).all(),
+        "model's floor",
+        expected="0.0, the only one in a VeGaS file",
+        got=", ".join(map(str, floors[:3])),
+        cure="Fit it without a floor.",
+    )
+    require(
+        model.compositing == "over",
+        "model's compositing",
+        expected="over, the only one in a VeGaS file",
+        got=model.compositing,
+        cure="Fit it with --compositing over.",
+    )
+    require(
+        all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model)),
+        "model",
+        expected="finite numbers",
+        got="NaN or infinities",
+        cure="The fit diverged: fit again.",
+    )
+    require(
+        (np.asarray(model.splats.envelope.power) > 0).all(),
+        "model's power",
+        expected="above 0, as VeGaS files require",
+        got="0",
+        cure="Fit it with another --power.",
+    )

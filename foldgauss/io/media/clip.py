@@ -1,16 +1,17 @@
-"""Clips in memory, and the error and argument checks that readers and writers of clips share."""
+"""Clips in memory, what a pass through a clip finds, and the checks that readers and writers of clips share."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from jaxtyping import Int
 
-from foldgauss._runtime.checks import ParameterError, check_one_of, invalid, is_integer, is_within
+from foldgauss._runtime.checks import ParameterError, check_one_of, invalid, is_integer, is_within, require
 from foldgauss.io._atomic import PathLike, check_input, check_path
-from foldgauss.io.media.frame_rate import MAX_FPS, MIN_FPS
+from foldgauss.io.media.frame_rate import MAX_FPS, MIN_FPS, FrameRate, describe_rate, estimate_rate, make_increasing
 
 HEAD_BYTES = 1 << 16  # by which the format of a file is detected
 MAX_PIXELS = 178_956_970  # of one image, Pillow's limit: a header may claim any size
@@ -62,13 +63,14 @@ class Levels:
 
         Raises `VideoError` where `white` is given, but applies to no frame of `path`, a clip of this `kind`.
         """
-        if self.white is not None and self.most < 0:
-            raise video_error(
-                "levels",
-                expected="images or videos of 16 bits, in RGB or gray",
-                got=f"{kind}, {str(path)!r}",
-                cure="Leave levels out.",
-            )
+        require(
+            self.white is None or self.most >= 0,
+            "levels",
+            expected="images or videos of 16 bits, in RGB or gray",
+            got=f"{kind}, {str(path)!r}",
+            cure="Leave levels out.",
+            kind=VideoError,
+        )
         if self.white is not None:
             clipped = f"values of up to {self.most:,} are above levels={self.white} and become white."
             return (clipped,) if self.most > self.white else ()
@@ -161,34 +163,48 @@ def check_range(frames: Range | None) -> tuple[int, int | None]:
     start, stop = (None, None) if frames is None else frames
     start = 0 if start is None else start
     got = format_range(start, stop)
-    if start < 0 or (stop is not None and stop < 0):
-        raise video_error("frames", expected="A:B counted from the start", got=got, cure="Use 0 or more.")
-    if stop is not None and stop <= start:
-        raise video_error("frames", expected="A:B with at least 1 frame", got=got, cure="Choose B > A.")
+    require(
+        start >= 0 and (stop is None or stop >= 0),
+        "frames",
+        expected="A:B counted from the start",
+        got=got,
+        cure="Use 0 or more.",
+        kind=VideoError,
+    )
+    require(
+        stop is None or stop > start,
+        "frames",
+        expected="A:B with at least 1 frame",
+        got=got,
+        cure="Choose B > A.",
+        kind=VideoError,
+    )
     return start, stop
 
 
 def check_range_within(start: int, stop: int | None, num_total: int, path: Path) -> None:
-    if start >= num_total or (stop is not None and stop > num_total):
-        raise video_error(
-            "frames",
-            expected=f"A:B within 0:{num_total}, the frames of {str(path)!r}",
-            got=format_range(start, stop),
-            cure=f"Choose B <= {num_total} and A below it.",
-        )
+    require(
+        start < num_total and (stop is None or stop <= num_total),
+        "frames",
+        expected=f"A:B within 0:{num_total}, the frames of {str(path)!r}",
+        got=format_range(start, stop),
+        cure=f"Choose B <= {num_total} and A below it.",
+        kind=VideoError,
+    )
 
 
 def check_frame_size(size: Size | None, parameter: str = "size") -> Size | None:
     if size is None:
         return None
     sides = tuple(size) if isinstance(size, tuple | list | np.ndarray) else ()
-    if len(sides) != 2 or not all(is_within(side, "[1, inf)") and side == int(side) for side in sides):
-        raise video_error(
-            parameter,
-            expected="height and width of whole pixels, at least 1",
-            got=f"{sides[0]}x{sides[1]}" if len(sides) == 2 else repr(size),
-            cure="Write it as HEIGHTxWIDTH, such as 160x320.",
-        )
+    require(
+        len(sides) == 2 and all(is_within(side, "[1, inf)") and side == int(side) for side in sides),
+        parameter,
+        expected="height and width of whole pixels, at least 1",
+        got=f"{sides[0]}x{sides[1]}" if len(sides) == 2 else repr(size),
+        cure="Write it as HEIGHTxWIDTH, such as 160x320.",
+        kind=VideoError,
+    )
     return int(sides[0]), int(sides[1])
 
 
@@ -199,19 +215,26 @@ def clamp_stop(start: int, stop: int | None, num_total: int, path: Path) -> int:
 
 
 def check_fps(fps: float) -> None:
-    if not is_within(fps, f"[{MIN_FPS}, {MAX_FPS}]"):
-        raise video_error("fps", expected=f"a rate in [{MIN_FPS:g}, {MAX_FPS:g}]", got=repr(fps), cure="Try 25.")
+    require(
+        is_within(fps, f"[{MIN_FPS}, {MAX_FPS}]"),
+        "fps",
+        expected=f"a rate in [{MIN_FPS:g}, {MAX_FPS:g}]",
+        got=repr(fps),
+        cure="Try 25.",
+        kind=VideoError,
+    )
 
 
 def check_reading(deinterlace: str, levels: int | None) -> Reading:
     check_one_of("deinterlace", deinterlace, DEINTERLACE)
-    if levels is not None and not (is_integer(levels, 1) and levels <= WHITE):
-        raise video_error(
-            "levels",
-            expected=f"the value of white, 1 to {WHITE}",
-            got=repr(levels),
-            cure="Of data of 12 bits it is 4095.",
-        )
+    require(
+        levels is None or (is_integer(levels, 1) and levels <= WHITE),
+        "levels",
+        expected=f"the value of white, 1 to {WHITE}",
+        got=repr(levels),
+        cure="Of data of 12 bits it is 4095.",
+        kind=VideoError,
+    )
     return Reading(deinterlace, levels)
 
 
@@ -247,3 +270,74 @@ def format_size(shape: tuple) -> str:
 def format_num_bytes(path: Path) -> str:
     size = path.stat().st_size
     return "an empty file" if size == 0 else f"{size} bytes"
+
+
+@dataclass(frozen=True, eq=False)
+class ClipFacts:
+    """What a pass finds; positions count the frames of the file, those lost to damage included.
+
+    `kind`: a video, a folder of images, or an animation or one image ("pictures"). `fps`: the rate that the clip
+    declares, or a default; None where its frames have durations of their own. `num_total`: the number of frames, lost
+    ones included. Of all frames decoded, from the first of the file on, `positions`, and `stamps` in units of
+    `time_base` seconds. `end`: when the last of these ends, in seconds; 0 where that is unknown. `notes`: about the
+    whole clip. `threads`: of the decoder. `damaged`, `resized`: the positions of frames that decode with errors, and of
+    those of another size than the video. `stretched`: as of `Clip`. `names`: of the images of a folder.
+    """
+
+    kind: Literal["video", "folder", "pictures"]
+    fps: float | None
+    num_total: int
+    positions: Int[np.ndarray, " num_decoded"]
+    stamps: Int[np.ndarray, " num_decoded"]
+    time_base: float
+    end: float = 0.0
+    notes: list[str] = field(default_factory=list)
+    threads: int = 0
+    damaged: list[int] = field(default_factory=list)
+    resized: list[int] = field(default_factory=list)
+    stretched: Stretch | None = None
+    names: list[str] = field(default_factory=list)
+
+    def describe_span(
+        self, first: int, end: int, start: int, stop: int | None, fps: float | None = None
+    ) -> tuple[int, FrameRate, tuple[str, ...]]:
+        """Number of frames that the clip has from position `start` up to `stop`, their rate, unless `fps` is given, and
+        notes. Those that decode are the numbers `first` up to `end` of all frames decoded."""
+        stop_within = self.num_total if stop is None else min(stop, self.num_total)
+        places, num_declared, notes = self.positions[first:end], stop_within - start, []
+        if stop is not None and stop > stop_within:
+            used = f"the clip ends at {stop_within}: {format_range(start, stop_within)} are used."
+            notes.append(f"frames {format_range(start, stop)} were asked for, and {used}")
+        if end - first < num_declared:
+            notes.append(f"only {end - first} of {num_declared} frames decode; those are used.")
+        notes += self.notes
+        lost = np.setdiff1d(np.arange(start, places[-1]), places).tolist()
+        within = range(places[0], places[-1] + 1)
+        notes += _describe_few(lost, "lost to damage and left out; what follows may show artifacts")
+        notes += _describe_few([one for one in self.damaged if one in within], "damaged, and may show artifacts")
+        resized = [one for one in self.resized if one in within]
+        notes += _describe_few(resized, "of another size than the video, and stretched to it")
+        rate = self._find_rate(first, end) if fps is None else FrameRate(fps)
+        return num_declared, rate, (*notes, *describe_rate(rate))
+
+    def _find_rate(self, first: int, end: int) -> FrameRate:
+        """The rate of the frames with the numbers `first` up to `end`."""
+        seconds, last = make_increasing((self.stamps * self.time_base).tolist(), self.fps), self.end
+        if end < len(seconds):  # until the next one is shown, unless others were lost before it
+            last = float(seconds[end]) if self.positions[end] == self.positions[end - 1] + 1 else 0.0
+        fps = self.fps or (end - first) / (last - seconds[first])
+        rate = estimate_rate(seconds[first:end], fps, last)
+        if self.kind == "video":
+            rate = rate._replace(first_second=float(seconds[first] - seconds[0]))
+        if np.ptp(self.stamps[:end]) == 0 and end > 1:  # a raw stream: the rate is FFmpeg's guess
+            rate = rate._replace(guessed=True)
+        return rate
+
+
+def _describe_few(positions: list[int], what: str) -> tuple[str, ...]:
+    """A note about frames at these positions; `what`: their property, as a predicate without its verb."""
+    if not positions:
+        return ()
+    which = f"frame {positions[0]} is"
+    which = which if len(positions) == 1 else f"{len(positions):,} frames, the first of them {positions[0]}, are"
+    return (f"{which} {what}.",)

@@ -15,10 +15,12 @@ from av.filter import Graph
 from av.stream import Disposition
 from av.video.reformatter import ColorRange, Colorspace, Interpolation, VideoReformatter
 
+from foldgauss._runtime.checks import require
 from foldgauss.io._atomic import resolve
 from foldgauss.io.media.clip import (
     AS_STORED,
     VIDEO,
+    ClipFacts,
     Levels,
     Reading,
     Size,
@@ -30,7 +32,6 @@ from foldgauss.io.media.clip import (
     read_head,
     video_error,
 )
-from foldgauss.io.media.facts import ClipFacts
 from foldgauss.io.media.frame_rate import DEFAULT_FPS, MAX_FPS, MAX_LAST_DURATION, make_increasing
 from foldgauss.io.media.images import premultiply
 from foldgauss.io.media.tone_mapping import HDR, map_tones
@@ -118,6 +119,7 @@ class VideoDecoder:
         self._has_sought = False
         self.stored_size = self._codec.height, self._codec.width  # which frames of another size are stretched to
         self._read_bytes = 0  # up to the end of the last packet that decodes
+        self._others: list[tuple[int, int]] = []  # after it, place and size of packets of other streams, such as sound
         self._at_end = False
         #: To 8 bits and to 16: FFmpeg takes longer to prepare a conversion than to convert a small frame.
         self._converters = VideoReformatter(), VideoReformatter()
@@ -146,11 +148,11 @@ class VideoDecoder:
 
     @property
     def unread_fraction(self) -> float:
-        """The fraction of the file after the last packet that decodes, once the end is reached; 0 where the container
-        declares frames or a duration, which tell more."""
+        """The fraction of the file after the last packet that decodes, without packets of other streams, once the end
+        is reached; 0 where the container declares frames or a duration, which tell more."""
         if not (self._at_end and self._read_bytes) or self.num_declared or self.declared_seconds is not None:
             return 0.0
-        return 1 - self._read_bytes / self._path.stat().st_size
+        return 1 - (self._read_bytes + sum(size for _, size in self._others)) / self._path.stat().st_size
 
     @property
     def size(self) -> Size:
@@ -325,16 +327,21 @@ class VideoDecoder:
             self._at_end = packet is None
             if not self._at_end:
                 self._read_bytes = max(self._read_bytes, (packet.pos or 0) + packet.size)
+                self._others = [other for other in self._others if other[0] > self._read_bytes]
             yield from map(self._set_time, found)
             if self._at_end:
                 return
 
     def _read_packets(self) -> Iterator[av.Packet]:
         """The packets of the stream, of which those that cannot be read are left out."""
-        num_errors, before = 0, (self._stream.start_time or 0) - 1
+        num_errors, before, place = 0, (self._stream.start_time or 0) - 1, 0
         while num_errors < MAX_ERRORS:
             try:
-                for packet in self._container.demux(self._stream):
+                for packet in self._container.demux():
+                    if packet.stream_index != self._stream.index:
+                        place = packet.pos or place  # several packets may stand at one place
+                        self._others.append((place, packet.size))
+                        continue
                     if packet.is_corrupt:
                         self._num_suspect = MAX_DELAY
                     if packet.size:
@@ -356,22 +363,24 @@ class VideoDecoder:
         for frame in frames:
             follows = self._deinterlace == "fields" and self._has_sought  # interlaced ones before the place sought
             if graph is None and not frame.interlaced_frame and not follows:
-                if self._deinterlace == "fields":
-                    raise video_error(
-                        "deinterlace",
-                        expected="a first frame of two fields",
-                        got=f"a progressive one in {str(self._path)!r}",
-                        cure="Leave deinterlace='fields' out.",
-                    )
+                require(
+                    self._deinterlace != "fields",
+                    "deinterlace",
+                    expected="a first frame of two fields",
+                    got=f"a progressive one in {str(self._path)!r}",
+                    cure="Leave deinterlace='fields' out.",
+                    kind=VideoError,
+                )
                 yield frame
                 continue
-            if self._deinterlace == "refuse":
-                raise video_error(
-                    "path",
-                    expected="a video of progressive frames",
-                    got=f"one of interlaced fields, {str(self._path)!r}",
-                    cure="Convert it while reading, with deinterlace='frames' or 'fields'.",
-                )
+            require(
+                self._deinterlace != "refuse",
+                "path",
+                expected="a video of progressive frames",
+                got=f"one of interlaced fields, {str(self._path)!r}",
+                cure="Convert it while reading, with deinterlace='frames' or 'fields'.",
+                kind=VideoError,
+            )
             kind = frame.height, frame.width, frame.format.name
             if graph is None or kind != of_graph:
                 yield from filter_frame(graph, None)
@@ -455,13 +464,14 @@ def scan_video(
     with closing(VideoDecoder(path, reading=reading)) as decoder:
         fps = decoder.fps if 0 < decoder.fps <= MAX_FPS else DEFAULT_FPS
         kept = keep(select())
-        if not places:
-            raise video_error(
-                "path",
-                expected="a video with frames that decode",
-                got=f"none in {str(path)!r}",
-                cure="The file is damaged or its codec is unknown here; convert it with ffmpeg.",
-            )
+        require(
+            places,
+            "path",
+            expected="a video with frames that decode",
+            got=f"none in {str(path)!r}",
+            cure="The file is damaged or its codec is unknown here; convert it with ffmpeg.",
+            kind=VideoError,
+        )
         time_base, num_reached = float(decoder.time_base), places[-1] + 1
         seconds = make_increasing((np.array(ticks + following) * time_base).tolist(), fps)
         seconds, end = seconds[: len(ticks)], float(seconds[-1])
@@ -511,13 +521,14 @@ def _describe_video(decoder: VideoDecoder, path: Path, hdr: list[str], reading: 
 def open_container(path: Path, demuxers: str = DEMUXERS) -> av.container.InputContainer:
     """An open file, restricted to itself. Raises `VideoError`."""
     kind = describe_kind(read_head(path))
-    if kind == LIST:
-        raise video_error(
-            "path",
-            expected=VIDEO,
-            got=f"{kind}, {str(path)!r}",
-            cure="The files that it names are not opened: give the video itself.",
-        )
+    require(
+        kind != LIST,
+        "path",
+        expected=VIDEO,
+        got=f"{kind}, {str(path)!r}",
+        cure="The files that it names are not opened: give the video itself.",
+        kind=VideoError,
+    )
     # An absolute path, because FFmpeg takes 'name:rest' for a protocol. One local file and nothing that it refers to.
     options = {"protocol_whitelist": "file", "format_whitelist": demuxers}
     try:
@@ -537,20 +548,22 @@ def _choose_stream(container: av.container.InputContainer, path: Path) -> av.Vid
     if stream is None:
         kind = "audio" if container.streams.audio else "no video stream"
         raise video_error("path", expected=VIDEO, got=f"{str(path)!r} ({kind}), which does not open as a video")
-    if stream.codec_context is None:
-        raise video_error(
-            "path",
-            expected="a video whose codec is known here",
-            got=f"an unknown one in {str(path)!r}",
-            cure="Convert it with ffmpeg.",
-        )
-    if stream.disposition & Disposition.attached_pic:
-        raise video_error(
-            "path",
-            expected="a video",
-            got=f"audio with a cover image, {str(path)!r}",
-            cure="Give a file with moving images.",
-        )
+    require(
+        stream.codec_context is not None,
+        "path",
+        expected="a video whose codec is known here",
+        got=f"an unknown one in {str(path)!r}",
+        cure="Convert it with ffmpeg.",
+        kind=VideoError,
+    )
+    require(
+        not stream.disposition & Disposition.attached_pic,
+        "path",
+        expected="a video",
+        got=f"audio with a cover image, {str(path)!r}",
+        cure="Give a file with moving images.",
+        kind=VideoError,
+    )
     return stream
 
 

@@ -13,8 +13,10 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from foldgauss._runtime.checks import require
 from foldgauss.io.media.clip import (
     MAX_PIXELS,
+    ClipFacts,
     Levels,
     VideoError,
     clamp_stop,
@@ -23,7 +25,6 @@ from foldgauss.io.media.clip import (
     no_frames_error,
     video_error,
 )
-from foldgauss.io.media.facts import ClipFacts
 from foldgauss.io.media.frame_rate import DEFAULT_FPS
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -60,13 +61,14 @@ def silence_opencv() -> Iterator[None]:
 def choose_images(folder: Path, start: int, stop: int | None) -> list[Path]:
     """The images of a folder from `start` up to `stop`. Raises `VideoError` where there are none."""
     images = image_paths(folder)
-    if not images:
-        raise video_error(
-            "path",
-            expected="a folder with images (" + ", ".join(s[1:] for s in IMAGE_SUFFIXES) + ")",
-            got=f"{str(folder)!r} without any",
-            cure="Give the folder that holds the frames, or a video file.",
-        )
+    require(
+        images,
+        "path",
+        expected="a folder with images (" + ", ".join(s[1:] for s in IMAGE_SUFFIXES) + ")",
+        got=f"{str(folder)!r} without any",
+        cure="Give the folder that holds the frames, or a video file.",
+        kind=VideoError,
+    )
     return images[start : clamp_stop(start, stop, len(images), folder)]
 
 
@@ -122,13 +124,14 @@ def read_images(paths: list[Path], levels: Levels) -> Iterator[np.ndarray]:
     for path in paths:
         image = read_image(path, levels)
         first_shape = first_shape or image.shape[:2]
-        if image.shape[:2] != first_shape:
-            raise video_error(
-                "path",
-                expected=f"images of one size, {format_size(first_shape)} as in {paths[0].name!r}",
-                got=f"{format_size(image.shape)} in {path.name!r}",
-                cure="Resize the images, or choose others with frames=(A, B).",
-            )
+        require(
+            image.shape[:2] == first_shape,
+            "path",
+            expected=f"images of one size, {format_size(first_shape)} as in {paths[0].name!r}",
+            got=f"{format_size(image.shape)} in {path.name!r}",
+            cure="Resize the images, or choose others with frames=(A, B).",
+            kind=VideoError,
+        )
         yield image
 
 
@@ -176,13 +179,14 @@ def read_image(path: Path, levels: Levels) -> np.ndarray:
         raise undecodable_error(path)
     if image.dtype == np.uint16:
         image = levels.convert(image)
-    if image.dtype != np.uint8:
-        raise video_error(
-            "path",
-            expected="images of 8 or 16 bits",
-            got=f"{image.dtype} in {str(path)!r}",
-            cure="Convert it to an 8-bit PNG.",
-        )
+    require(
+        image.dtype == np.uint8,
+        "path",
+        expected="images of 8 or 16 bits",
+        got=f"{image.dtype} in {str(path)!r}",
+        cure="Convert it to an 8-bit PNG.",
+        kind=VideoError,
+    )
     if image.ndim == 2:
         return cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     # OpenCV returns colors times alpha for a TIFF that declares it, unless it is straight and of 16 bits.
@@ -225,13 +229,14 @@ def scan_picture(
         num = 0  # of images; unknown in a damaged GIF, whose frames are counted by reading them
         with suppress(Exception):
             num = getattr(image, "n_frames", 1)
-        if image.format == "TIFF" and num > 1:
-            raise video_error(
-                "path",
-                expected="one image in a TIFF",
-                got=f"{num} in {str(path)!r}",
-                cure="Unpack it to a folder of images.",
-            )
+        require(
+            image.format != "TIFF" or num <= 1,
+            "path",
+            expected="one image in a TIFF",
+            got=f"{num} in {str(path)!r}",
+            cure="Unpack it to a folder of images.",
+            kind=VideoError,
+        )
         if image.format == "GIF" or (image.format in ("PNG", "WEBP") and num > 1):
             return _scan_animation(image, num, path, start, stop, keep, levels)
     clamp_stop(start, stop, 1, path)

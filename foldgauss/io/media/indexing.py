@@ -21,6 +21,7 @@ from foldgauss._runtime.checks import short_repr
 from foldgauss.io._atomic import PathLike, atomic_path, check_path
 from foldgauss.io.media.clip import (
     Clip,
+    ClipFacts,
     Levels,
     Range,
     Reading,
@@ -36,7 +37,6 @@ from foldgauss.io.media.clip import (
     video_error,
 )
 from foldgauss.io.media.decoder import VideoDecoder
-from foldgauss.io.media.facts import ClipFacts
 from foldgauss.io.media.images import read_images
 from foldgauss.io.media.reading import describe_crop, resize_frame, scan_clip, stack_frames
 from foldgauss.video.motion.optical_flow import CutFinder

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from foldgauss._runtime.checks import check_within, invalid, is_integer
+from foldgauss._runtime.checks import check_within, is_integer, require
 from foldgauss.io._atomic import PathLike, check_input, check_path
 from foldgauss.io.media.clip import Range, Size, Stretch, check_frame_size, check_range, format_size
 from foldgauss.io.media.images import IMAGE_SUFFIXES, choose_images, open_image, undecodable_error
@@ -51,25 +51,38 @@ def read_masks(
     """
     path = check_path(path)
     check_input(path, "an image, a folder or a video")
-    if label is not None and not (is_integer(label, 1) and label < VOID):
-        raise invalid("label", expected=f"an object's label, 1 to {VOID - 1}", got=repr(label))
+    require(
+        label is None or (is_integer(label, 1) and label < VOID),
+        "label",
+        expected=f"an object's label, 1 to {VOID - 1}",
+        got=repr(label),
+    )
     is_image = path.suffix.lower() in IMAGE_SUFFIXES
-    if level != MASK_LEVEL and (path.is_dir() or is_image):
-        raise invalid("level", expected="a video with it", got=f"images, {str(path)!r}", cure="They have labels.")
+    require(
+        level == MASK_LEVEL or not (path.is_dir() or is_image),
+        "level",
+        expected="a video with it",
+        got=f"images, {str(path)!r}",
+        cure="They have labels.",
+    )
     if path.is_dir():
         masks = _select_label(choose_images(path, *check_range(frames)), label, path)
     elif is_image:
-        if frames is not None:
-            raise invalid("frames", expected="a folder or a video with them", got=f"the image {str(path)!r}")
+        require(
+            frames is None,
+            "frames",
+            expected="a folder or a video with them",
+            got=f"the image {str(path)!r}",
+        )
         masks = _select_label([path], label, path)[0]
     else:
-        if label is not None:
-            raise invalid(
-                "label",
-                expected="images with labels",
-                got=f"the video {str(path)!r}",
-                cure="Leave label out, or give a folder of PNGs.",
-            )
+        require(
+            label is None,
+            "label",
+            expected="images with labels",
+            got=f"the video {str(path)!r}",
+            cure="Leave label out, or give a folder of PNGs.",
+        )
         check_within("level", level, "(0, 1]", "a fraction of white in (0, 1]")
         clip = read_video(path, frames=frames)
         for note in clip.notes:
@@ -88,12 +101,12 @@ def read_masks(
 def _select_label(paths: list[Path], label: int | None, source: Path) -> Bool[np.ndarray, "num_frames height width"]:
     labels = read_labels(paths)
     present = sorted(set(np.unique(labels).tolist()) - {0, VOID})
-    if label is not None and label not in present:
-        raise invalid(
-            "label",
-            expected=f"one of {present} in {str(source)!r}" if present else f"masks with objects in {str(source)!r}",
-            got=label,
-        )
+    require(
+        label is None or label in present,
+        "label",
+        expected=f"one of {present} in {str(source)!r}" if present else f"masks with objects in {str(source)!r}",
+        got=label,
+    )
     return (labels != 0) & (labels != VOID) if label is None else labels == label
 
 
@@ -112,24 +125,25 @@ def read_labels(paths: Sequence[Path]) -> UInt8[np.ndarray, "num_masks height wi
     for path in paths:
         mask, mode = _read_label_image(path)
         modes.add(mode)
-        if masks and mask.shape != masks[0].shape:
-            raise invalid(
-                "path",
-                expected=f"masks of one size, {format_size(masks[0].shape)} as in {paths[0].name!r}",
-                got=f"{format_size(mask.shape)} in {str(path)!r}",
-            )
+        shape = masks[0].shape if masks else mask.shape
+        require(
+            mask.shape == shape,
+            "path",
+            expected=f"masks of one size, {format_size(shape)} as in {paths[0].name!r}",
+            got=f"{format_size(mask.shape)} in {str(path)!r}",
+        )
         masks.append(mask)
     labels = np.stack(masks)
     values = np.unique(labels).tolist()
     if "P" not in modes and values[-1] >= VOID and set(values) <= {0, values[-1]}:
         return (labels > 0).astype(np.uint8)
-    if values[-1] > VOID:
-        raise invalid(
-            "path",
-            expected=f"masks with labels up to {VOID}",
-            got=f"labels up to {values[-1]:,} in {str(paths[0].parent)!r}",
-            cure="Renumber them, or store one object in black and white.",
-        )
+    require(
+        values[-1] <= VOID,
+        "path",
+        expected=f"masks with labels up to {VOID}",
+        got=f"labels up to {values[-1]:,} in {str(paths[0].parent)!r}",
+        cure="Renumber them, or store one object in black and white.",
+    )
     return labels.astype(np.uint8)
 
 
@@ -144,11 +158,11 @@ def _read_label_image(path: Path) -> tuple[np.ndarray, str]:
     channels = _COLOR_MODES.get(mode)  # grayscale as paint programs store it, and one mask of bear in DAVIS
     if channels is not None and (pixels[..., :channels] == pixels[..., :1]).all():
         mode, pixels = "L", pixels[..., 0]
-    if mode not in _LABEL_MODES:
-        raise invalid(
-            "path",
-            expected="masks with a label per pixel (palette or grayscale)",
-            got=f"an image of mode {mode!r} in {str(path)!r}",
-            cure="Its colors were stored in place of the labels; use the original PNG.",
-        )
+    require(
+        mode in _LABEL_MODES,
+        "path",
+        expected="masks with a label per pixel (palette or grayscale)",
+        got=f"an image of mode {mode!r} in {str(path)!r}",
+        cure="Its colors were stored in place of the labels; use the original PNG.",
+    )
     return pixels * np.uint8(VOID) if mode == "1" else pixels, mode

@@ -8,13 +8,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from foldgauss._runtime.checks import require
 from foldgauss.io._atomic import PathLike
 from foldgauss.io.media.clip import (
     Clip,
+    ClipFacts,
     Levels,
     Range,
     Reading,
     Size,
+    VideoError,
     check_fps,
     check_frame_size,
     check_range,
@@ -23,10 +26,8 @@ from foldgauss.io.media.clip import (
     format_size,
     read_head,
     translate_os_errors,
-    video_error,
 )
 from foldgauss.io.media.decoder import scan_video
-from foldgauss.io.media.facts import ClipFacts
 from foldgauss.io.media.images import is_bare_jpegs, is_image, scan_folder, scan_picture
 
 BLOCK_BYTES = 64 << 20
@@ -103,13 +104,14 @@ def scan_clip(
     head = b"" if path.is_dir() else read_head(path)
     if not path.is_dir() and (not is_image(head) or is_bare_jpegs(path, head)):
         return scan_video(path, start, stop, keep, reading)
-    if reading.deinterlace == "fields":
-        raise video_error(
-            "deinterlace",
-            expected="a video of interlaced frames",
-            got=f"images, {str(path)!r}",
-            cure="Leave deinterlace='fields' out.",
-        )
+    require(
+        reading.deinterlace != "fields",
+        "deinterlace",
+        expected="a video of interlaced frames",
+        got=f"images, {str(path)!r}",
+        cure="Leave deinterlace='fields' out.",
+        kind=VideoError,
+    )
     scan = scan_folder if path.is_dir() else scan_picture
     return scan(path, start, stop, keep, Levels(reading.levels))
 
@@ -128,13 +130,14 @@ def memory_limit() -> int:
 def check_memory(num: int, shape: tuple[int, int, int]) -> None:
     """Raise `VideoError` where so many frames of a `shape` take more than `memory_limit()`."""
     limit = memory_limit()
-    if num * math.prod(shape) > limit:
-        raise video_error(
-            "size",
-            expected=f"a clip of at most {limit / 2**30:.1f} GiB, a third of this machine's memory",
-            got=f"more, at frame {num} of {shape[0]}x{shape[1]}",
-            cure="Take fewer frames or a smaller size.",
-        )
+    require(
+        num * math.prod(shape) <= limit,
+        "size",
+        expected=f"a clip of at most {limit / 2**30:.1f} GiB, a third of this machine's memory",
+        got=f"more, at frame {num} of {shape[0]}x{shape[1]}",
+        cure="Take fewer frames or a smaller size.",
+        kind=VideoError,
+    )
 
 
 def resize_frame(image: np.ndarray, size: Size | None, crop: Size | None = None) -> np.ndarray:
@@ -174,13 +177,14 @@ def describe_crop(sizes: Iterable[Size], want: Size) -> tuple[str, ...]:
 
 def center_window(have: Size, window: Size) -> tuple[slice, slice]:
     """Rows and columns of the central (height, width) `window`. Raises `VideoError` where it does not fit."""
-    if window[0] > have[0] or window[1] > have[1]:
-        raise video_error(
-            "center_crop",
-            expected=f"at most the frame's {format_size(have)}",
-            got=f"{window[0]}x{window[1]}",
-            cure="Crop a smaller window, or enlarge with size=(height, width) instead.",
-        )
+    require(
+        window[0] <= have[0] and window[1] <= have[1],
+        "center_crop",
+        expected=f"at most the frame's {format_size(have)}",
+        got=f"{window[0]}x{window[1]}",
+        cure="Crop a smaller window, or enlarge with size=(height, width) instead.",
+        kind=VideoError,
+    )
     top, left = (have[0] - window[0]) // 2, (have[1] - window[1]) // 2
     return slice(top, top + window[0]), slice(left, left + window[1])
 

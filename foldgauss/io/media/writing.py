@@ -19,7 +19,7 @@ from av.filter import Graph
 from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc, VideoReformatter
 from PIL import Image
 
-from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_integer, short_repr
+from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_integer, require, short_repr
 from foldgauss.io._atomic import PathLike, atomic_folder, atomic_path, check_path, output_error
 from foldgauss.io.media.clip import VideoError, check_fps, check_readable, format_size, video_error
 from foldgauss.io.media.decoder import (
@@ -155,18 +155,23 @@ def write_video(
     """
     path = check_path(path, "path, frames, fps")
     check_fps(fps)
-    if not isinstance(frames, Iterable):
-        raise video_error(
-            "frames", expected="an iterable of images", got=type(frames).__name__, cure="For a model: model.frames()."
-        )
+    require(
+        isinstance(frames, Iterable),
+        "frames",
+        expected="an iterable of images",
+        got=type(frames).__name__,
+        cure="For a model: model.frames().",
+        kind=VideoError,
+    )
     check_one_of("image_format", image_format, IMAGE_FORMATS)
     if times is not None:
-        if not are_rising_seconds(times):
-            raise video_error(
-                "times",
-                expected=f"seconds that rise from 0 to at most {MAX_SECONDS:,.0f}, one for each frame",
-                got=short_repr(times),
-            )
+        require(
+            are_rising_seconds(times),
+            "times",
+            expected=f"seconds that rise from 0 to at most {MAX_SECONDS:,.0f}, one for each frame",
+            got=short_repr(times),
+            kind=VideoError,
+        )
         times = np.array(times, np.float64)
         frames = _match_times(frames, len(times))
     suffix = path.suffix.lower()
@@ -180,13 +185,14 @@ def write_video(
         return write_frames(path, frames, overwrite=overwrite, image_format=image_format)
     if suffix in ANIMATION_SUFFIXES:
         return _write_animation(path, suffix, frames, float(fps), times)
-    if suffix not in VIDEO_SUFFIXES:
-        raise video_error(
-            "path",
-            expected="a name ending in .mp4, .webm, .mov, .mkv, .gif or .webp, or a folder (no extension) for images",
-            got=repr(path.name),
-            cure="For one image: write_image." if suffix == ".png" else "Rename the output.",
-        )
+    require(
+        suffix in VIDEO_SUFFIXES,
+        "path",
+        expected="a name ending in .mp4, .webm, .mov, .mkv, .gif or .webp, or a folder (no extension) for images",
+        got=repr(path.name),
+        cure="For one image: write_image." if suffix == ".png" else "Rename the output.",
+        kind=VideoError,
+    )
     frames = _check_frames(frames)
     first = next(frames)
     encoding = choose_encoding(suffix, codec, crf, pixel_format, first.shape)
@@ -237,8 +243,14 @@ def write_image(path: PathLike, image: np.ndarray) -> Path:
     Raises `VideoError` for another extension or kind of array, `OutputError` where it cannot be written.
     """
     path = Path(path)
-    if path.suffix.lower() != ".png":
-        raise video_error("path", expected="a name ending in .png", got=repr(path.name), cure="Rename the output.")
+    require(
+        path.suffix.lower() == ".png",
+        "path",
+        expected="a name ending in .png",
+        got=repr(path.name),
+        cure="Rename the output.",
+        kind=VideoError,
+    )
     data = _encode_image(_check_frame(image, None, "image"))
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
@@ -251,12 +263,13 @@ def _match_times(frames: Iterable[np.ndarray], num: int) -> Iterator[np.ndarray]
     for count, frame in enumerate(islice(frames, num + 1), 1):
         if count <= num:
             yield frame
-    if not num - 1 <= count <= num:
-        raise video_error(
-            "frames",
-            expected=f"{num}, as many as times, or one fewer",
-            got=f"more than {num}" if count > num else f"{count}",
-        )
+    require(
+        num - 1 <= count <= num,
+        "frames",
+        expected=f"{num}, as many as times, or one fewer",
+        got=f"more than {num}" if count > num else f"{count}",
+        kind=VideoError,
+    )
 
 
 def _check_frames(frames: Iterable[np.ndarray], channels: tuple[int, ...] = (3, 4)) -> Iterator[np.ndarray]:
@@ -265,8 +278,13 @@ def _check_frames(frames: Iterable[np.ndarray], channels: tuple[int, ...] = (3, 
         frame = _check_frame(frame, shape, f"frames[{number}]", channels)
         shape = frame.shape
         yield frame
-    if shape is None:
-        raise video_error("frames", expected="at least 1 frame", got="none")
+    require(
+        shape is not None,
+        "frames",
+        expected="at least 1 frame",
+        got="none",
+        kind=VideoError,
+    )
 
 
 def _check_frame(frame: np.ndarray, shape: tuple | None, parameter: str, channels=(3, 4)) -> np.ndarray:
@@ -289,13 +307,14 @@ def _check_frame(frame: np.ndarray, shape: tuple | None, parameter: str, channel
 
 def _encode_image(frame: np.ndarray, image_format: str = "png") -> bytes:
     """Without loss; with alpha, colors become straight."""
-    if image_format == "webp" and max(frame.shape[:2]) > MAX_WEBP_SIDE:
-        raise video_error(
-            "frames",
-            expected=f"sides of at most {MAX_WEBP_SIDE:,} for WebP",
-            got=format_size(frame.shape),
-            cure="Take PNG.",
-        )
+    require(
+        image_format != "webp" or max(frame.shape[:2]) <= MAX_WEBP_SIDE,
+        "frames",
+        expected=f"sides of at most {MAX_WEBP_SIDE:,} for WebP",
+        got=format_size(frame.shape),
+        cure="Take PNG.",
+        kind=VideoError,
+    )
     rgba = frame.shape[2] == 4
     image = cv2.cvtColor(straighten(frame), cv2.COLOR_RGBA2BGRA) if rgba else cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
     quality = [cv2.IMWRITE_WEBP_QUALITY, 101] if image_format == "webp" else []  # above 100: lossless
@@ -309,13 +328,14 @@ def _write_animation(
     path: Path, suffix: str, frames: Iterable[np.ndarray], fps: float, times: np.ndarray | None
 ) -> Path:
     """Write an animated GIF or WebP that repeats forever."""
-    if suffix == ".gif" and fps > MAX_GIF_FPS:
-        raise video_error(
-            "fps",
-            expected=f"at most {MAX_GIF_FPS:g} for a GIF",
-            got=f"{fps:g}",
-            cure="Take fewer frames, or a .webp or .webm.",
-        )
+    require(
+        suffix != ".gif" or fps <= MAX_GIF_FPS,
+        "fps",
+        expected=f"at most {MAX_GIF_FPS:g} for a GIF",
+        got=f"{fps:g}",
+        cure="Take fewer frames, or a .webp or .webm.",
+        kind=VideoError,
+    )
     with atomic_path(path) as temporary:
         images = map(Image.fromarray, _check_frames(frames, channels=(3,)))
         first, *rest = (image.quantize(256) for image in images) if suffix == ".gif" else images
@@ -375,10 +395,18 @@ def choose_encoding(
         expected, got = f"at least {chosen.min_side}x{chosen.min_side} for {name}", f"{shape[0]}x{shape[1]}"
         raise video_error("frames", expected=expected, got=f"{got} (height x width)", cure="Take h264, vp9 or ffv1.")
     if crf is not None:
-        if chosen.crf is None:
-            raise invalid("crf", expected=f"none for {name}, which has no such factor", got=f"{crf}")
-        if not (is_integer(crf, 0) and crf <= chosen.crf[1]):
-            raise invalid("crf", expected=f"a whole number from 0 to {chosen.crf[1]} for {name}", got=repr(crf))
+        require(
+            chosen.crf is not None,
+            "crf",
+            expected=f"none for {name}, which has no such factor",
+            got=f"{crf}",
+        )
+        require(
+            is_integer(crf, 0) and crf <= chosen.crf[1],
+            "crf",
+            expected=f"a whole number from 0 to {chosen.crf[1]} for {name}",
+            got=repr(crf),
+        )
     with_alpha = [one for one in chosen.pixel_formats if av.VideoFormat(one).components[-1].is_alpha]
     if pixel_format is None:
         pixel_format = (with_alpha if has_alpha and with_alpha else chosen.pixel_formats)[0]
@@ -525,10 +553,13 @@ def _decode_sound(source: av.container.InputContainer, stream: av.AudioStream) -
 
 def check_sound(sound: Sound) -> None:
     """Raise `VideoError` for a file without sound, ValueError for other values that are refused."""
-    if not isinstance(sound, Sound):
-        raise invalid(
-            "sound", expected="a foldgauss.io.Sound", got=type(sound).__name__, cure="Write Sound('clip.mp4')."
-        )
+    require(
+        isinstance(sound, Sound),
+        "sound",
+        expected="a foldgauss.io.Sound",
+        got=type(sound).__name__,
+        cure="Write Sound('clip.mp4').",
+    )
     check_within("sound.start", sound.start, "[0, 1e9]", "seconds from 0 to 1e9")
     check_within("sound.speed", sound.speed, "[0.01, 100]", "a speed from 0.01 to 100")
     got = f"{str(sound.path)!r}, which does not open"

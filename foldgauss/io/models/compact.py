@@ -192,8 +192,8 @@ def load_compact_model(path: Path, data: bytes | None = None) -> VideoModel:
     """
     with np.errstate(over="ignore", invalid="ignore"):
         model = dequantize(_load(path, (0.0, 1.0), data, stacklevel=4))
-    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model)):
-        raise _unreadable(path, "one with values beyond float32")
+    finite = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model))
+    _check_file(finite, path, "one with values beyond float32")
     return model
 
 
@@ -230,12 +230,9 @@ def measure_chunks(path: Path) -> tuple[list[int], int]:
 def _read_header(path: Path, file: BinaryIO) -> dict:
     """The header, once its checksum is verified; `file` is then at the first stream."""
     data = file.read(_FIXED)
-    if not data.startswith(MAGIC):
-        raise _unreadable(
-            path, "one that a transfer as text has changed" if data.startswith(MAGIC[:4]) else "a file of another kind"
-        )
-    if len(data) < _FIXED:
-        raise _unreadable(path, f"one cut off after {len(data)} bytes")
+    other = "one that a transfer as text has changed" if data.startswith(MAGIC[:4]) else "a file of another kind"
+    _check_file(data.startswith(MAGIC), path, other)
+    _check_file(len(data) == _FIXED, path, f"one cut off after {len(data)} bytes")
     version, length, checksum = (int.from_bytes(data[k : k + 4], "little") for k in range(len(MAGIC), _FIXED, 4))
     require(
         version == VERSION,
@@ -246,8 +243,8 @@ def _read_header(path: Path, file: BinaryIO) -> dict:
         kind=ModelFileError,
     )
     text = file.read(min(length, _count_bytes(file)))
-    if length > len(text) or zlib.crc32(text) != checksum:
-        raise _unreadable(path, "one that is cut off or damaged (the checksum of its header is another)")
+    is_whole = length == len(text) and zlib.crc32(text) == checksum
+    _check_file(is_whole, path, "one that is cut off or damaged (the checksum of its header is another)")
     try:
         header = json.loads(text, parse_constant=_reject_constant)
         if not isinstance(header, dict) or not isinstance(header["metadata"], dict):
@@ -276,8 +273,7 @@ def _decode(path: Path, header: dict, file: BinaryIO, visible: tuple[float, floa
     _check_blocks(header, info)
     start = _FIXED + header["header_bytes"]
     motion = _read_streams(file, header["motion"], start)
-    if motion is None:
-        raise _unreadable(path, "one whose frame times are cut off or damaged")
+    _check_file(motion is not None, path, "one whose frame times are cut off or damaged")
     intervals = range_coder.decode(motion[0], range_coder.Column.without_contexts(num_frames - 1))
     paths = {} if info.paths is None else _decode_paths(info.paths, *motion[1:])
     rules = _parse_rules(header["rules"], info)
@@ -294,8 +290,7 @@ def _decode(path: Path, header: dict, file: BinaryIO, visible: tuple[float, floa
         else:
             chunks.append(_decode_chunk(streams, rules, info, own))
     lost = _describe_missing(header["chunks"], missing)
-    if not chunks:
-        raise _unreadable(path, f"one without a chunk that can be read ({lost})")
+    _check_file(chunks, path, f"one without a chunk that can be read ({lost})")
     note = f"{str(path)!r}: {lost}. Copy it again." if missing else ""
     return Quantized(info, rules, tuple(chunks), intervals, **paths), note
 
@@ -426,6 +421,12 @@ def _parse_rule(name: str, numbers: list) -> Rule:
 
 def _check(right: bool, name: str, got: Any) -> None:
     require(right, name, expected="what a compact model can have", got=got)
+
+
+def _check_file(right: object, path: Path, got: str) -> None:
+    """Raise `ModelFileError` unless the file is `right`; `got` describes it."""
+    if not right:
+        raise _unreadable(path, got)
 
 
 def _unreadable(path: Path, got: str) -> ModelFileError:

@@ -150,13 +150,14 @@ def _array_leaves(tree: Any) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for keys, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         key = jax.tree_util.keystr(keys, simple=True, separator=".")
-        if isinstance(leaf, bool | int | float | complex) and not isinstance(leaf, np.generic):
-            raise model_file_error(
-                key,
-                expected="an array or a static field",
-                got=f"the plain number {leaf!r}",
-                cure="Make it an array, or a static field that the header holds.",
-            )
+        require(
+            not isinstance(leaf, bool | int | float | complex) or isinstance(leaf, np.generic),
+            key,
+            expected="an array or a static field",
+            got=f"the plain number {leaf!r}",
+            cure="Make it an array, or a static field that the header holds.",
+            kind=ModelFileError,
+        )
         if not isinstance(leaf, jax.Array | np.ndarray | np.generic | jax.ShapeDtypeStruct):
             continue  # a function or a name, which the skeleton contains
         require(
@@ -385,8 +386,8 @@ def _read_leaves(skeleton: Any, path: Path, prefix: str) -> Any:
                 return leaf
             key = jax.tree_util.keystr(keys, simple=True, separator=".")
             array = file.get_tensor(prefix + key)
-            if array.dtype == np.bool_ and array.size and array.view(np.uint8).max() > 1:
-                raise model_file_error(key, expected="booleans 0 or 1", got=f"the byte {array.view(np.uint8).max()}")
+            most = array.view(np.uint8).max(initial=0) if array.dtype == np.bool_ else 0
+            require(most <= 1, key, expected="booleans 0 or 1", got=f"the byte {most}", kind=ModelFileError)
             if jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype:
                 return jax.device_put(array)  # jnp.asarray compiles, and keeps, a program for every shape
             return np.array(array)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within, require, short_repr
+from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_integer, require, short_repr
 from foldgauss.io._atomic import PathLike, check_path, check_writable
 from foldgauss.io.models.compact import compact_metadata, is_compact, load_compact_model
 from foldgauss.io.models.model_file import (
@@ -155,8 +155,7 @@ def load_segmented(path: Path, about: dict) -> SegmentedVideo:
 
 def _segments(path: Path, about: dict) -> list[Segment]:
     entries = about["header"]["segments"]
-    if not isinstance(entries, list):
-        raise TypeError("no list of segments")
+    require(isinstance(entries, list), "segments", expected="a list", got=short_repr(entries))
     own: list[dict[str, dict]] = [{} for _ in entries]
     for key, spec in about["tensors"].items():
         found = _KEY.fullmatch(key)
@@ -201,20 +200,18 @@ def _segment(path: Path, entry: dict, tensors: dict[str, dict], load: Any) -> Se
     Raises as `match_kind`, and ValueError, KeyError or TypeError for an invalid header.
     """
     check_one_of("kind", entry["kind"], PARTS)
-    if not isinstance(entry["metadata"], dict):
-        raise TypeError("metadata that are no dict")
+    require(isinstance(entry["metadata"], dict), "metadata", expected="a dict", got=short_repr(entry["metadata"]))
     if entry["kind"] != COMPACT:
         _, skeleton = match_kind(path, entry | {"tensors": tensors})
         segment = Segment.from_model(entry["first"], skeleton)
         return dataclasses.replace(segment, load=load, metadata=entry["metadata"])
-    if tensors.keys() != {_FILE} or tensors[_FILE]["dtype"] != "U8":
-        raise ValueError("other tensors than a compact file")
+    is_file = tensors.keys() == {_FILE} and tensors[_FILE]["dtype"] == "U8"
+    require(is_file, "tensors", expected="a compact file", got=short_repr(tensors))
     facts = {name: entry["header"][name] for name in _FACTS}
     counts = [*facts["size"], *(facts[name] for name in ("num_gaussians", "num_frames", "num_parameters"))]
-    if len(counts) != 5 or not all(is_integer(count, 1) for count in counts) or not is_integer(facts["degree"], 0):
-        raise ValueError("a size or a count out of range")
-    if not is_within(facts["fps"], "(0, inf)"):
-        raise ValueError("a rate out of range")
+    right = len(counts) == 5 and all(is_integer(count, 1) for count in counts) and is_integer(facts["degree"], 0)
+    require(right, "size", expected="a size and counts above 0", got=short_repr(facts))
+    check_within("fps", facts["fps"], "(0, inf)", "a rate above 0")
     check_one_of("compositing", facts["compositing"], COMPOSITINGS)
     facts |= {"size": tuple(facts["size"]), "options": RenderOptions(**entry["header"]["options"])}
     return Segment(entry["first"], **facts, load=load, metadata=entry["metadata"])

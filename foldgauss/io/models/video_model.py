@@ -10,7 +10,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from foldgauss._runtime.checks import ParameterError, check_one_of, invalid, is_integer, is_within, require
+from foldgauss._runtime.checks import (
+    ParameterError,
+    check_one_of,
+    check_within,
+    invalid,
+    is_integer,
+    is_within,
+    require,
+    short_repr,
+)
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io._atomic import PathLike, check_path
 from foldgauss.io.media.clip import AS_STORED, check_frame_size, check_reading
@@ -199,21 +208,24 @@ def _describe_video(model: VideoModel) -> dict:
 
 
 def _video_skeleton(header: dict) -> VideoModel:
-    if header["envelope"] != "TimeLikelihood":
-        raise ValueError(f"envelope {header['envelope']!r} is unknown here")
+    check_one_of("envelope", header["envelope"], ("TimeLikelihood",))
     num, degree, num_frames = header["num_gaussians"], header["degree"], header["num_frames"]
     height, width = header["size"]
     counts_fit = all(is_integer(count, 1) for count in (num, num_frames, height, width)) and is_integer(degree, 0)
-    if not counts_fit or not is_within(header["fps"], "(0, inf)"):
-        raise ValueError("a size, count or rate is out of range")
+    require(counts_fit, "size", expected="sizes and counts above 0", got=short_repr(header))
+    check_within("fps", header["fps"], "(0, inf)", "a rate above 0")
     compositing = header.get("compositing", "over")  # files from before there was another
     check_one_of("compositing", compositing, COMPOSITINGS)
-    if not is_within(header.get("scale_cutoff", 0.0), "[0, 1]"):
-        raise ValueError("the cutoff of scales is out of range")
+    check_within("scale_cutoff", header.get("scale_cutoff", 0.0), "[0, 1]", "a number in [0, 1]")
     row_width = columns(degree)["coefficients"].stop
     num_paths, num_knots = header.get("paths", (0, 0))
-    if num_paths and not (is_integer(num_paths, 1) and num_paths <= MAX_PATHS and is_integer(num_knots, 1)):
-        raise ValueError("a number of paths or of their maps is out of range")
+    paths_fit = not num_paths or (is_integer(num_paths, 1) and num_paths <= MAX_PATHS and is_integer(num_knots, 1))
+    require(
+        paths_fit,
+        "paths",
+        expected="numbers of paths and of their maps",
+        got=f"{num_paths}, {num_knots}",
+    )
 
     def build() -> VideoModel:
         times, maps = (jnp.zeros((num_paths, num_knots, *shape), jnp.float32) for shape in ((), (2, 3)))

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from foldgauss._runtime.checks import invalid, is_integer, short_repr
+from foldgauss._runtime.checks import is_integer, require, short_repr
 from foldgauss.io._atomic import PathLike, atomic_path, check_path
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.compact import COMPACT_SUFFIX, is_compact, pack_compact
@@ -87,8 +87,12 @@ def write_html(
     Example: `write_html("clip.html", model, original=clip.frames)`.
     """
     path = check_path(path, "path, model")
-    if path.suffix.lower() != HTML_SUFFIX:
-        raise invalid("path", expected=f"a name ending in {HTML_SUFFIX}", got=repr(str(path)))
+    require(
+        path.suffix.lower() == HTML_SUFFIX,
+        "path",
+        expected=f"a name ending in {HTML_SUFFIX}",
+        got=repr(str(path)),
+    )
     file = linked_file(path, model) if linked else None
     title, name = path.stem if title is None else title, None if file is None else file.name
     page = html_page(model, original=original, quality=quality, title=title, linked=name)
@@ -171,8 +175,12 @@ def html_page(
 
     Example: `html_page(model, title="holiday")`.
     """
-    if not (is_integer(quality, 1) and quality <= 100):
-        raise invalid("quality", expected="a whole number from 1 to 100", got=quality)
+    require(
+        is_integer(quality, 1) and quality <= 100,
+        "quality",
+        expected="a whole number from 1 to 100",
+        got=quality,
+    )
     plain, name, metadata = _load(model)
     pictures = [] if original is None else list(_encode_original(original, plain, quality))
     models = _encode_model(model, plain, metadata) if linked is None else [_link(plain, linked)]
@@ -216,13 +224,13 @@ def _load(model: Model) -> tuple[Loaded, str, dict]:
         if read_frame_seconds(about, loaded.num_frames) is not None:
             kept |= keep_origin(about, "frame_seconds")
         return loaded, about.get("clip", path.stem), kept
-    if not isinstance(model, Loaded):
-        raise invalid(
-            "model",
-            expected="a VideoModel or an EditedVideo",
-            got=short_repr(model),
-            cure="End the chain with .video()." if type(model).__name__ == "Edit" else "The model comes first.",
-        )
+    require(
+        isinstance(model, Loaded),
+        "model",
+        expected="a VideoModel or an EditedVideo",
+        got=short_repr(model),
+        cure="End the chain with .video()." if type(model).__name__ == "Edit" else "The model comes first.",
+    )
     return model, "foldgauss", {}
 
 
@@ -255,8 +263,13 @@ def _pack(model: Model, loaded: VideoModel | EditedVideo, metadata: dict) -> byt
 
 def _link(loaded: Loaded, name: str) -> str:
     """The page's block of a model in a file beside it."""
-    if isinstance(loaded, SegmentedVideo):
-        raise invalid("linked", expected="a single model", got="one in segments", cure="Leave linked out.")
+    require(
+        not isinstance(loaded, SegmentedVideo),
+        "linked",
+        expected="a single model",
+        got="one in segments",
+        cure="Leave linked out.",
+    )
     url = urllib.parse.quote(os.fsencode(name), safe="")
     return f'<script type="application/octet-stream" id="model" data-url="{url}"></script>'
 
@@ -311,18 +324,22 @@ def _encode_original(original: Frames, model: Loaded, quality: int) -> Iterator[
     """The page's data blocks of the original's frames, as WebP."""
     frames = original.frames if isinstance(original, Clip) else original
     shape, dtype, own = np.shape(frames), getattr(frames, "dtype", None), (model.num_frames, *model.size, 3)
-    if len(shape) != 4 or shape[:3] != own[:3] or shape[3] not in (3, 4) or dtype != np.uint8:
-        raise invalid(
-            "original",
-            expected=f"frames uint8 {own}, those of the model",
-            got=f"{dtype} {shape}",
-            cure="Read them with read_video(path, size=model.size).",
-        )
+    require(
+        len(shape) == 4 and shape[:3] == own[:3] and shape[3] in (3, 4) and dtype == np.uint8,
+        "original",
+        expected=f"frames uint8 {own}, those of the model",
+        got=f"{dtype} {shape}",
+        cure="Read them with read_video(path, size=model.size).",
+    )
     for number, frame in enumerate(frames):
         bgr = frame[..., 2::-1]  # premultiplied colors without their alpha are the image over black
         done, data = cv2.imencode(".webp", bgr, [cv2.IMWRITE_WEBP_QUALITY, quality])
-        if not done:
-            raise invalid("original", expected="frames that WebP can hold, up to 16,383 pixels a side", got=frame.shape)
+        require(
+            done,
+            "original",
+            expected="frames that WebP can hold, up to 16,383 pixels a side",
+            got=frame.shape,
+        )
         yield _block(f"frame-{number}", data.tobytes())
 
 

@@ -167,7 +167,7 @@ def check_mask(selection: object, num: int) -> Mask:
         "selection",
         expected="a Selection or a mask",
         got=repr(selection),
-        cure="Read a file with foldgauss.io.load_selection(path, model).",
+        cure="Read indices with foldgauss.io.parse_indices(text, num_gaussians).",
     )
     mask = np.asarray(selection.mask if isinstance(selection, Selection) else selection)
     if mask.dtype == bool and mask.shape == (num,):

@@ -1,17 +1,15 @@
-"""Export and import of models, with the format chosen by name."""
+"""Export of models, with the format chosen by name."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from foldgauss._runtime.checks import check_one_of, invalid
+from foldgauss._runtime.checks import check_one_of, invalid, require
 from foldgauss.io._atomic import OutputRefused, PathLike, atomic_folder, check_path, check_writable
 from foldgauss.io.exchange.gaussians_ply import write_3dgs_frames, write_3dgs_ply
-from foldgauss.io.exchange.ply_file import format_error
 from foldgauss.io.exchange.pseudomesh import write_pseudomesh
-from foldgauss.io.exchange.vegas_ply import read_vegas_ply, write_vegas_ply
-from foldgauss.io.media.clip import Size
+from foldgauss.io.exchange.vegas_ply import write_vegas_ply
 from foldgauss.video.editing.chain import Edit
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.video_model import VideoModel
@@ -50,13 +48,13 @@ def export(
 
     **Example:** `export(load_video_model("holiday.safetensors"), "ply3dgs", "frames")`
     """
-    if not isinstance(model, VideoModel | EditedVideo | SegmentedVideo):
-        raise invalid(
-            "model",
-            expected="a VideoModel, an EditedVideo or a SegmentedVideo",
-            got=type(model).__name__,
-            cure="End the chain with .video()." if isinstance(model, Edit) else "The order is (model, format, out).",
-        )
+    require(
+        isinstance(model, VideoModel | EditedVideo | SegmentedVideo),
+        "model",
+        expected="a VideoModel, an EditedVideo or a SegmentedVideo",
+        got=type(model).__name__,
+        cure="End the chain with .video()." if isinstance(model, Edit) else "The order is (model, format, out).",
+    )
     check_one_of("format", format, FORMATS)
     out = check_path(out, "model, format, out")
     options = {"depth_step": depth_step, "axes": axes, "sh_degree": sh_degree}
@@ -71,35 +69,35 @@ def export(
         _check_new(out, overwrite)
         return write_vegas_ply(out, model)
     if format == "obj":
-        if out.suffix.lower() == ".obj" and not out.is_dir():
-            raise invalid(
-                "out",
-                expected="a folder",
-                got=repr(str(out)),
-                cure="Each frame becomes a file in it: leave the extension out.",
-            )
+        require(
+            out.suffix.lower() != ".obj" or out.is_dir(),
+            "out",
+            expected="a folder",
+            got=repr(str(out)),
+            cure="Each frame becomes a file in it: leave the extension out.",
+        )
         return write_pseudomesh(out, model, times, overwrite=overwrite, on_frame=on_frame)
     if out.suffix.lower() != ".ply" or out.is_dir():
         return write_3dgs_frames(out, model, times, overwrite=overwrite, on_frame=on_frame, **of_scenes)
-    if times is None or np.size(times) != 1:
-        raise invalid(
-            "times",
-            expected="one for a single file",
-            got="all frames" if times is None else str(np.size(times)),
-            cure="Give one time, or a folder (a name without .ply).",
-        )
+    require(
+        times is not None and np.size(times) == 1,
+        "times",
+        expected="one for a single file",
+        got="all frames" if times is None else str(np.size(times)),
+        cure="Give one time, or a folder (a name without .ply).",
+    )
     _check_new(out, overwrite)
     return write_3dgs_ply(out, model, float(np.ravel(times)[0]), **of_scenes)
 
 
 def _write_vegas_segments(folder: Path, video: SegmentedVideo, overwrite: bool) -> Path:
-    if folder.suffix.lower() == ".ply" and not folder.is_dir():
-        raise invalid(
-            "out",
-            expected="a folder",
-            got=repr(str(folder)),
-            cure="Each segment becomes a file in it: leave the extension out.",
-        )
+    require(
+        folder.suffix.lower() != ".ply" or folder.is_dir(),
+        "out",
+        expected="a folder",
+        got=repr(str(folder)),
+        cure="Each segment becomes a file in it: leave the extension out.",
+    )
     with atomic_folder(folder, overwrite, pattern=r"segment-[0-9]{3,}\.ply", what="segments") as temporary:
         for number, segment in enumerate(video.segments):
             write_vegas_ply(temporary / f"segment-{number:03d}.ply", segment.model)
@@ -111,22 +109,3 @@ def _check_new(path: Path, overwrite: bool) -> None:
     if path.exists() and not overwrite:
         text = f"path: expected a new file, got {str(path)!r}, which exists."
         raise OutputRefused(f"{text} Choose another path, or overwrite it.")
-
-
-def import_model(path: PathLike, *, size: Size | None = None, fps: float | None = None) -> VideoModel:
-    """The model in a file of another program: a published VeGaS video. See `read_vegas_ply` for `size` and `fps`.
-
-    **Raises:** `FileNotFoundError`; `FormatError` for a file that is damaged or holds no video. Static 3DGS
-    scenes and pseudomeshes are not videos: use `read_3dgs_ply` and `read_pseudomesh`.
-
-    **Example:** `save_video_model("v.safetensors", import_model("point_cloud.ply", size=(480, 854), fps=24))`
-    """
-    path = check_path(path)
-    if path.is_dir() or path.suffix.lower() == ".obj":
-        raise format_error(
-            path,
-            expected="a .ply file with a video",
-            got="a folder or a mesh",
-            cure="Render frames of triangles with foldgauss.io.read_pseudomesh(FOLDER).frames().",
-        )
-    return read_vegas_ply(path, size=size, fps=fps)
