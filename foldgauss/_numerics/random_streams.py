@@ -33,7 +33,6 @@ class Stream(enum.IntEnum):
     RANK_BAND = 23
     THINNING = 24
     EM_JITTER = 25
-    CROSS_VALIDATION = 26
     SYNTHETIC_NOISE = 27
 
 
