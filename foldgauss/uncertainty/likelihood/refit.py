@@ -1,42 +1,35 @@
 r"""Uncertainty of frame times by refitting splats and times together.
 
 The posterior given likelihood profiles takes the splats as known. Here they are refitted together with the times: to
-resampled frames (method="pixels"), to all frames but some (method="frames"), or once more (method="order").
+resampled frames (method="pixels"), or once more to the same frames (method="order").
 
 Times are not identified absolutely: for any increasing g, times g(t_k) and splats whose m_t, sigma_t and folds follow g
 show the same frames. Only $t_0 = 0$ and $t_{n-1} = 1$ are fixed, so absolute times spread the more the longer the fit;
 `RefitTimes.local` measures what a smooth warp hardly changes, each frame's time relative to its neighbors. The number
-of Gaussians is held, too, and with start="model" their depth order. From scratch most of the spread is due to the
-order of steps: compare "order".
+of Gaussians and their depth order are held, too.
 """
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 
 import numpy as np
 import scipy.stats
-from jaxtyping import Bool, Float, Float32, Float64, UInt8
+from jaxtyping import Float, Float64, UInt8
 
 from foldgauss._numerics.random_streams import Stream, make_generator, seed_sequence
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
 from foldgauss.uncertainty.likelihood.likelihood_profiles import check_explained
 from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.video.fitting.config import FitConfig, planned_steps
-from foldgauss.video.fitting.loop import FitState, fit_steps, start_from, to_model
-from foldgauss.video.fitting.loop import start as start_anew
+from foldgauss.video.fitting.loop import fit_steps, start_from, to_model
 from foldgauss.video.models.video_model import VideoModel
 
-METHODS = ("pixels", "frames", "order")
-STARTS = ("model", "scratch")
-#: A refit that starts at the model repeats the schedule from this fraction on, with its last learning rates and loss.
+METHODS = ("pixels", "order")
+#: A refit repeats the schedule from this fraction on, with its last learning rates and loss.
 START_AT = 0.7
 #: The least `LearningRates.cooldown` of refits: the spread is that of the estimate, not of its last steps.
 COOLDOWN_FRACTION = 0.2
-#: Grid search for the time of a left-out frame: points per grid.
-GRID_POINTS = 33
-#: Number of ever finer grids.
-GRID_ROUNDS = 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -320,39 +313,7 @@ def resample_blocks(
     return rng.choice(np.array([-1, 1], residual.dtype), shape)[tile] * residual
 
 
-def _leave_out_frames(model: VideoModel, video: np.ndarray, config: FitConfig, number: int, folds: int) -> Refit:
-    """Leave out every `folds`-th frame, refit, and estimate their times."""
-    unseen = np.zeros(len(video), bool)
-    unseen[number + 1 : -1 : folds] = True
-    kept = np.ascontiguousarray(video[~unseen])
-    state = start_anew(kept, config, merge_logits(np.asarray(model.frame_times.logits), unseen))
-    fitted, psnr = _fit(kept, config, model.fps, state)
-    times, residuals = np.empty(len(video)), Residuals(fitted, video)
-    times[~unseen] = np.asarray(fitted.frame_times.times(), np.float64)
-    for k in np.flatnonzero(unseen):
-        times[k] = _best_time(residuals, k, times[k - 1], times[k + 1])
-    return Refit(number, times, unseen, fitted, psnr)
-
-
 def _fit(frames: np.ndarray, config: FitConfig, fps: float, state: FitState | None) -> tuple[VideoModel, float]:
     *_, (state, info) = fit_steps(frames, config, state)  # every step yields the same state
     return to_model(state, config, frames.shape[1:3], fps), info.psnr
 
-
-def merge_logits(
-    logits: Float[np.ndarray, " intervals"], unseen: Bool[np.ndarray, " num_frames"]
-) -> Float32[np.ndarray, " fewer"]:
-    """Softmax weights of all frames but the `unseen` ones, at unchanged times."""
-    kept = np.flatnonzero(~unseen)
-    return np.logaddexp.reduceat(np.asarray(logits, np.float64), kept[:-1]).astype(np.float32)
-
-
-def _best_time(residuals: Residuals, k: int, low: float, high: float) -> float:
-    """The time in [low, high] whose image has the least squared error to frame k; the middle one of ties."""
-    for _ in range(GRID_ROUNDS):
-        times = np.linspace(low, high, GRID_POINTS)
-        errors = np.array([residuals.squared_errors(image, [k])[0] for image in residuals.render_at(times)])
-        ties = np.flatnonzero(errors == errors.min())
-        best = ties[len(ties) // 2]
-        low, high = times[max(best - 1, 0)], times[min(best + 1, GRID_POINTS - 1)]
-    return float(times[best])
