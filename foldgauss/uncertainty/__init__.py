@@ -21,7 +21,7 @@ from foldgauss.uncertainty.likelihood.color_marginalization import marginalize_c
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles, likelihood_profiles
 from foldgauss.uncertainty.likelihood.noise import FrameNoise
 from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves
-from foldgauss.uncertainty.likelihood.refit import Refit, RefitTimes, iter_refits, refit_frame_times
+from foldgauss.uncertainty.likelihood.refit import RefitTimes, refit_frame_times
 from foldgauss.uncertainty.posterior.exact import ExactPosterior, exact_posterior
 from foldgauss.uncertainty.posterior.increments import Increments
 from foldgauss.uncertainty.posterior.log_prob import FrameTimeLogProb, frame_time_log_prob, rendered_log_likelihood
@@ -38,7 +38,6 @@ __all__ = [
     "Irregularity",
     "LikelihoodProfiles",
     "ProfileCurves",
-    "Refit",
     "RefitTimes",
     "SimulatedRanks",
     "TimesComparison",
@@ -51,7 +50,6 @@ __all__ = [
     "frame_time_posterior",
     "increment_intervals",
     "irregularities",
-    "iter_refits",
     "likelihood_profiles",
     "marginalize_colors",
     "refit_frame_times",
