@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import _common
+from benchmarks._calibration import SimulatedRanks, ecdf_band, simulated_ranks
 from benchmarks._clips import clip_path
 from benchmarks._common import console
 from foldgauss.envelope import TimeLikelihood
@@ -32,12 +33,9 @@ from foldgauss.render import RenderOptions
 from foldgauss.uncertainty import (
     FrameNoise,
     Increments,
-    SimulatedRanks,
-    ecdf_band,
     exact_posterior,
     frame_time_posterior,
     likelihood_profiles,
-    simulated_ranks,
 )
 from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.video import FitConfig, FoldedSplats, FrameTimes, VideoModel, fit

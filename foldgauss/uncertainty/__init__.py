@@ -2,12 +2,10 @@
 
 `likelihood_profiles` renders the model at many times and gives the log-likelihood of each frame as a function of its
 time; `frame_time_posterior` samples the times from their posterior by emcee, beside the exact marginals
-(`exact_posterior`); `irregularities`, `summary` and `frame_table` report on it;
-`simulated_ranks` checks the calibration and `refit_frame_times` refits splats and times together. Sampling needs the
-extra `uncertainty`.
+(`exact_posterior`); `irregularities`, `summary` and `frame_table` report on it; `refit_frame_times` refits splats and
+times together. Sampling needs the extra `uncertainty`.
 """
 
-from foldgauss.uncertainty.diagnostics.calibration import SimulatedRanks, coverage, ecdf_band, simulated_ranks
 from foldgauss.uncertainty.diagnostics.irregularities import (
     IncrementIntervals,
     Irregularity,
@@ -39,11 +37,8 @@ __all__ = [
     "LikelihoodProfiles",
     "ProfileCurves",
     "RefitTimes",
-    "SimulatedRanks",
     "TimesComparison",
     "compare_times",
-    "coverage",
-    "ecdf_band",
     "exact_posterior",
     "frame_table",
     "frame_time_log_prob",
@@ -54,6 +49,5 @@ __all__ = [
     "marginalize_colors",
     "refit_frame_times",
     "rendered_log_likelihood",
-    "simulated_ranks",
     "summary",
 ]
