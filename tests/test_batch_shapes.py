@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from foldgauss.analysis.interop import to_numpyro, to_scipy
-from foldgauss.analysis.monte_carlo import entropy_bounds, estimate_entropy, estimate_kl_divergence
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.fold import CallableFold, PolynomialFold, SharedPathFold, ZeroFold
@@ -65,7 +64,7 @@ def _of_mixture_at_times(m, x):
     s, t = x[..., :2], x[..., 2]
     found = []
     for given in (m.condition_time(t), m.condition(-1, x[..., 2:])):
-        found += [*_pairs(given, s), *_moments(given), given.stddev, given.weights, *entropy_bounds(given)]
+        found += [*_pairs(given, s), *_moments(given), given.stddev, given.weights]
     for line in (m.condition([2, 0], x[..., [2, 0]]), m.condition_time(t).condition(0, x[..., :1])):
         found += [*_pairs(line, s[..., 1:]), *_moments(line), line.cdf(s[..., 1:]), line.icdf(jax.nn.sigmoid(t))]
     return found
@@ -103,7 +102,7 @@ def _of_time(m, x):
 def _in_batch(m):
     space, time, folded = m.marginal([0, 1]), m.marginal(-1), m.components
     found = [*_moments(m), m.stddev, m.weights, m.log_weights, *_moments(time), time.weights]
-    found += [*_moments(space), space.weights, *entropy_bounds(m)]
+    found += [*_moments(space), space.weights]
     return [*found, *_moments(folded), folded.mode, folded.entropy(), folded.time_marginal.entropy()]
 
 
@@ -235,17 +234,6 @@ def test_samples_are_of_their_component(num):
     assert component.shape == (DRAWS, *batch)
     place = np.take_along_axis(np.broadcast_to(far, (DRAWS, *far.shape)), np.asarray(component)[..., None], -1)[..., 0]
     assert np.abs(np.asarray(x[..., 2]) - place).max() < 50
-
-
-def test_entropy_and_divergence_of_one_component():
-    mixture = _mixture((1,), 1)
-    (low, high), found = entropy_bounds(mixture), estimate_entropy(mixture, jax.random.key(0), DRAWS)
-    np.testing.assert_allclose(low, high)
-    assert found.value.shape == (1,)
-    assert (np.abs(found.value - low) < ALARM * found.standard_error).all()
-    divergence = estimate_kl_divergence(mixture, _mixture((4, 1), 1), jax.random.key(0), DRAWS)
-    assert divergence.value.shape == (4, 1)
-    assert (divergence.standard_error > 0).all()
 
 
 def test_one_component_in_numpyro_and_scipy():
