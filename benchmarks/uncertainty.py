@@ -151,7 +151,6 @@ def calibration(replicates: int, seed: int, plot: Path | None) -> dict[str, floa
         "8 bits": {"eight_bits": True},
         "8 bits, measured": {"eight_bits": True, "assumed_noise": "independent"},
         "smoothed, independent": {"assumed_noise": "independent", "correlation": 1.0},
-        "smoothed, effective": {"assumed_noise": "effective", "correlation": 1.0},
         "smoothed, score": {"assumed_noise": "score", "correlation": 1.0},
     }
     found: dict[str, SimulatedRanks] = {}

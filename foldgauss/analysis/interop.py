@@ -5,7 +5,6 @@ in time, and nothing is reflected. Neither library is imported before it is aske
 """
 
 import functools
-import math
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
@@ -84,7 +83,7 @@ def _make_class(distributions) -> type:
 
         @property
         def support(self):
-            return distributions.constraints.real_vector if self.event_shape else distributions.constraints.real
+            return distributions.constraints.real_vector
 
         def sample(self, key, sample_shape=()):
             return self.base.sample(key, sample_shape)
@@ -179,7 +178,7 @@ class FrozenDistribution:
     @property
     def dim(self) -> int:
         """Number of coordinates."""
-        return math.prod(self._base.event_shape)
+        return self._base.event_shape[0]
 
     def logpdf(self, x) -> np.ndarray:
         """Log-density at x (*points, d); for one coordinate, numbers are points, as in scipy."""
@@ -194,12 +193,12 @@ class FrozenDistribution:
     def rvs(self, size=(), random_state=None) -> np.ndarray:
         """Random draws: (d,) by default, else (*size, d) without axes of size 1, as scipy has it.
 
-        For a distribution on the line (`event_shape == ()`) the shape is `size`. `random_state`: None, an int, or a
+        `random_state`: None, an int, or a
         NumPy generator. **Raises:** ValueError unless `size` is a whole number >= 0, or a tuple of them.
         """
         seed = int(np.random.default_rng(random_state).integers(2**31))
         draws = np.asarray(self._base.sample(jax.random.key(seed), () if size is None else size))
-        return draws.squeeze()[()] if self._base.event_shape else draws[()]
+        return draws.squeeze()[()]
 
     def entropy(self) -> np.ndarray:
         """Differential entropy in nats."""
@@ -210,9 +209,6 @@ class FrozenDistribution:
 
     def marginal(self, dimensions) -> "FrozenDistribution":
         """The distribution of some coordinates alone, frozen too; time is the last one."""
-        if not hasattr(self._base, "marginal"):
-            cure = "Take all coordinates of interest from the joint distribution at once."
-            raise invalid("dimensions", expected="a distribution with marginals", got=repr(self), cure=cure)
         return FrozenDistribution(self._base.marginal(dimensions))
 
     @property
@@ -221,8 +217,8 @@ class FrozenDistribution:
 
     @property
     def cov(self) -> np.ndarray:
-        """The matrix; for a distribution on the line, as in scipy's `norm`, the variance."""
-        return _numpy(self._base.covariance_matrix if self._base.event_shape else self._base.variance)
+        """The matrix."""
+        return _numpy(self._base.covariance_matrix)
 
 
 # Jitted once: called eagerly, a density is a hundred small kernels.
