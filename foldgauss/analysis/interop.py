@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.optional_imports import import_optional
 from foldgauss.analysis.divergence import kl_divergence
 
 if TYPE_CHECKING:
@@ -46,16 +47,8 @@ def to_numpyro(dist: Any, *, validate_args: bool | None = None) -> "numpyro.dist
 
     **Source:** eq:foldgauss. **Raises:** ImportError that names the extra if numpyro is missing.
     """
-    return _numpyro_class()(dist, validate_args=validate_args)
-
-
-def _numpyro_class() -> type:
-    """The class, made on first use: numpyro must be imported to have its base."""
-    try:
-        import numpyro
-    except ImportError as error:
-        raise ImportError("to_numpyro needs numpyro: pip install 'foldgauss[numpyro]'.") from error
-    return _make_class(numpyro.distributions)
+    distributions = import_optional("numpyro", "numpyro").distributions
+    return _make_class(distributions)(dist, validate_args=validate_args)
 
 
 @functools.cache
@@ -129,7 +122,7 @@ def _make_class(distributions) -> type:
 
 def _blank_numpyro():
     """An instance without state, for pickle."""
-    made = _numpyro_class()
+    made = _make_class(import_optional("numpyro", "numpyro").distributions)
     return made.__new__(made)
 
 
