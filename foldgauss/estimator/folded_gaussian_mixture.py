@@ -36,7 +36,7 @@ from foldgauss.estimator.parameter_checks import (
 )
 from foldgauss.estimator.precisions import replace_initial
 from foldgauss.estimator.prediction import (
-    FittedParameters,
+    FittedMixture,
     predict_components,
     predict_log_prob,
     predict_responsibilities,
@@ -362,6 +362,8 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         params = Parameters(*(np.asarray(z) for z in run.params))
         self._params = params
         with enable_dtype(params.curve.dtype):
+            unscaled = Scaling(np.zeros(len(self._scaling.scale)), np.ones(len(self._scaling.scale)))
+            self._scaled = jax.tree.map(np.asarray, to_mixture(params, unscaled, self._envelope))
             mixture = to_mixture(params, self._scaling, self._envelope)
             means, covariances = mixture.components.moments()
             order = self._order_columns(means.shape[-1])
@@ -410,8 +412,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
     def _evaluate(self, function, X, dtype=None, columns: bool = False):
         """Apply `function(fitted, x)` to the rows, or to each chunk; `dtype` and `columns` describe its results."""
         check_is_fitted(self)
-        envelope = jax.tree.map(lambda z: np.asarray(z) if isinstance(z, jax.Array) else z, self._envelope)
-        fitted = FittedParameters(self._params, envelope, self._scaling, self._order_columns(self.n_features_in_))
+        fitted = FittedMixture(self._scaled, self._scaling, self._order_columns(self.n_features_in_))
         if is_chunked(X):
             chunks, num = open_chunks(X, width=self.n_features_in_), len(self.weights_) if columns else None
             return chunks.map(function, fitted, num_columns=num, dtype=dtype)

@@ -92,10 +92,6 @@ class Residuals:
         """Values per frame: pixels times channels."""
         return int(np.prod(self.frames.shape[1:]))
 
-    def render(self, t: float) -> Float32[np.ndarray, "3 height width"]:
-        """The image of the model at time t in [0, 1]."""
-        return next(self.render_at([t]))
-
     def render_at(self, times: Iterable[float]) -> Iterator[Float32[np.ndarray, "3 height width"]]:
         """The images of the model at each of `times` in [0, 1], one by one."""
         for some in _batched(times):

@@ -65,11 +65,6 @@ class FrameTimePosterior:
         """All draws of all ensembles."""
         return self.times.reshape(-1, self.times.shape[-1])
 
-    @property
-    def logits(self) -> Float64[np.ndarray, "ensembles steps walkers intervals"]:
-        """The model's softmax weights w of all draws, centered."""
-        return logits_of(self.times)
-
     def mean(self) -> Float64[np.ndarray, " num_frames"]:
         return self.times.mean((0, 1, 2))
 
