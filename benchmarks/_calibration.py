@@ -13,7 +13,6 @@ import scipy.ndimage
 import scipy.stats
 from jaxtyping import Bool, Float32, Float64, Int
 
-from foldgauss._numerics.random_streams import Stream, make_generator, seed_sequence
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles, ProfileBuilder
 from foldgauss.uncertainty.likelihood.noise import FrameNoise
 from foldgauss.uncertainty.likelihood.residuals import Residuals
@@ -29,6 +28,10 @@ DRAWS = 99
 STEPS = 600
 #: Simulated sets of ranks per envelope: the standard error of its level is 0.1%.
 ENVELOPES = 10_000
+#: Keys of the random streams of replicates, of envelopes, and of the choice among emcee's draws.
+_REPLICATE = 22
+_BAND = 23
+_THINNING = 24
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,7 +103,7 @@ def simulated_ranks(
     increments = Increments(np.linspace(0.0, 1.0, num_frames), None, concentration)
     images = _CachedImages(model)
     ranks, true, converged = [], [], 0
-    for seeds in seed_sequence(Stream.CALIBRATION, seed=seed).spawn(replicates):
+    for seeds in np.random.SeedSequence(seed, spawn_key=(_REPLICATE,)).spawn(replicates):
         rng = np.random.default_rng(seeds)
         times = increments.draw_prior(rng, 1)[0]
         clean = np.stack(list(images.residuals.render_at(times)))
@@ -139,7 +142,7 @@ def ecdf_band(replicates: int, num_ranks: int, level: float = 0.99) -> Float64[n
 
     **Source:** Saeilynoja, Buerkner and Vehtari 2022, algorithm 1.
     """
-    rng = make_generator(Stream.RANK_BAND)
+    rng = np.random.default_rng(np.random.SeedSequence(0, spawn_key=(_BAND,)))
     fractions = np.arange(1, num_ranks) / num_ranks  # all ranks are at most the last
     counts = rng.multinomial(replicates, np.full(num_ranks, 1 / num_ranks), ENVELOPES)[:, :-1].cumsum(1)
     # Two-sided tail probabilities of all possible counts.
@@ -199,5 +202,6 @@ def _sample_by_emcee(
     profiles: LikelihoodProfiles, concentration: float, draws: int, steps: int, seed: int
 ) -> tuple[Float64[np.ndarray, "draws num_frames"], bool]:
     found = frame_time_posterior(profiles, concentration=concentration, steps=steps, ensembles=2, seed=seed)
-    which = make_generator(Stream.THINNING, seed=seed).choice(len(found.draws), draws, replace=False)
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_THINNING,)))
+    which = rng.choice(len(found.draws), draws, replace=False)
     return found.draws[which], found.converged

@@ -29,9 +29,6 @@ class Stream(enum.IntEnum):
     RESAMPLED_FRAME = 19
     WALKERS = 20
     POSTERIOR_DRAW = 21
-    CALIBRATION = 22
-    RANK_BAND = 23
-    THINNING = 24
     EM_JITTER = 25
     SYNTHETIC_NOISE = 27
 
