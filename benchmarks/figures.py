@@ -96,7 +96,7 @@ def marginals() -> plt.Figure:
     fig, axes = plt.subplots(2, 2, figsize=(7.4, 4.6), width_ratios=(4, 1.2), height_ratios=(1.2, 4))
     plot_density(dist, axes[1, 0], slices=())
     t, s = np.linspace(*axes[1, 0].get_xlim(), 300), np.linspace(*axes[1, 0].get_ylim(), 300)
-    of_time = np.exp(np.asarray(dist.time_marginal.log_prob(jnp.asarray(t))))
+    of_time = np.exp(np.asarray(dist.marginal([-1]).log_prob(jnp.asarray(t)[:, None])))
     of_space = np.exp(np.asarray(dist.marginal([0]).log_prob(jnp.asarray(s)[:, None])))
     axes[0, 0].fill_between(t, of_time, color=BLUE, alpha=0.3, lw=0)
     axes[0, 0].plot(t, of_time, color=BLUE)

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import _common
+from benchmarks._calibration import SimulatedRanks, ecdf_band, simulated_ranks
 from benchmarks._clips import clip_path
 from benchmarks._common import console
 from foldgauss.envelope import TimeLikelihood
@@ -32,12 +33,9 @@ from foldgauss.render import RenderOptions
 from foldgauss.uncertainty import (
     FrameNoise,
     Increments,
-    SimulatedRanks,
-    ecdf_band,
     exact_posterior,
     frame_time_posterior,
     likelihood_profiles,
-    simulated_ranks,
 )
 from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.video import FitConfig, FoldedSplats, FrameTimes, VideoModel, fit
@@ -153,7 +151,6 @@ def calibration(replicates: int, seed: int, plot: Path | None) -> dict[str, floa
         "8 bits": {"eight_bits": True},
         "8 bits, measured": {"eight_bits": True, "assumed_noise": "independent"},
         "smoothed, independent": {"assumed_noise": "independent", "correlation": 1.0},
-        "smoothed, effective": {"assumed_noise": "effective", "correlation": 1.0},
         "smoothed, score": {"assumed_noise": "score", "correlation": 1.0},
     }
     found: dict[str, SimulatedRanks] = {}

@@ -11,7 +11,7 @@ from foldgauss._runtime import notebook_hooks
 
 if TYPE_CHECKING:
     from foldgauss.analysis.divergence import kl_divergence
-    from foldgauss.distribution import FoldedGaussian, Gaussian, Normal
+    from foldgauss.distribution import FoldedGaussian, Gaussian
     from foldgauss.envelope import CallableEnvelope, Constant, TimeLikelihood, plain_envelope
     from foldgauss.estimator import FoldedGaussianMixture as FoldedGaussianMixture
     from foldgauss.estimator import FoldedMixtureRegressor as FoldedMixtureRegressor
@@ -37,7 +37,6 @@ __all__ = [
     "FourierFold",
     "Gaussian",
     "Mixture",
-    "Normal",
     "PolynomialFold",
     "SharedPathFold",
     "SplineFold",
@@ -49,7 +48,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "distribution": ("FoldedGaussian", "Gaussian", "Normal"),
+    "distribution": ("FoldedGaussian", "Gaussian"),
     "analysis.divergence": ("kl_divergence",),
     "envelope": ("CallableEnvelope", "Constant", "TimeLikelihood", "plain_envelope"),
     "estimator": ("FoldedGaussianMixture", "FoldedMixtureRegressor"),

@@ -28,12 +28,12 @@ from foldgauss._numerics.batch import (
 from foldgauss._numerics.factor import check_loc, check_rest, marginal_tril, normalize_indices, resolve_scale_tril
 from foldgauss._runtime.checks import invalid
 from foldgauss.analysis import moments
-from foldgauss.analysis.conditional import TimeDensity, TimeMixture, conditional_gaussian, time_density, time_mixture
+from foldgauss.analysis.conditional import TimeMixture, conditional_gaussian, time_mixture
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood, as_envelope, check_peak
 from foldgauss.fold import AbstractFold, CallableFold, ZeroFold, as_fold, evaluate_shift, restrict_fold
-from foldgauss.gaussian import Gaussian, Normal, half_log_det, log_density, sample_components, unwhiten, whiten
+from foldgauss.gaussian import Gaussian, half_log_det, log_density, sample_components, unwhiten, whiten
 
-__all__ = ["FoldedGaussian", "Gaussian", "Normal"]
+__all__ = ["FoldedGaussian", "Gaussian"]
 
 
 class FoldedGaussian(AbstractDistribution):
@@ -125,14 +125,6 @@ class FoldedGaussian(AbstractDistribution):
     def event_shape(self) -> tuple[int, ...]:
         return (self.loc.shape[-1] + 1,)
 
-    @property
-    def time_marginal(self) -> Normal:
-        """The distribution of t alone, N(time_loc, time_scale^2): a `Normal`, with `event_shape == ()`.
-
-        **Source:** eq:integral_proof.
-        """
-        return Normal(self.time_loc, self.time_scale, validate_args=False)
-
     def condition_time(self, t: Float[Array, "*#batch"]) -> Gaussian:
         """The Gaussian of space at time t. The fold equation is implemented here only.
 
@@ -167,7 +159,7 @@ class FoldedGaussian(AbstractDistribution):
     def _log_prob(self, x: Array) -> Array:
         # log FN(x) = log N(s | t) + log N(t), by the chain rule (eq:foldgauss).
         s, t = x[:-1], x[-1]
-        log_time = self.time_marginal._log_prob(t)
+        log_time = log_density(self.marginal([-1]), t[None])
         overflow = jnp.isinf(self._at(t).loc).any()
         # Double where: at times where the fold overflows, gradients are taken at f(0) instead.
         log_space = log_density(self._at(jnp.where(overflow, self.time_loc, t)), s)
@@ -280,8 +272,8 @@ class FoldedGaussian(AbstractDistribution):
     def marginal(self, indices) -> "FoldedGaussian | Gaussian | TimeMixture":
         """The marginal distribution of the coordinates `indices`.
 
-        If time is among them it is exact, a FoldedGaussian (time alone: a Gaussian); otherwise it is outside the
-        family: a `TimeMixture`, integrated numerically.
+        If time is among them it is exact, a FoldedGaussian, or a Gaussian of one coordinate for time alone; otherwise
+        it is outside the family: a `TimeMixture`, integrated numerically.
 
         **Shapes:** `indices`: integers in the order of the result, time last; -1 is time.
 
@@ -291,6 +283,8 @@ class FoldedGaussian(AbstractDistribution):
         """
         indices = normalize_indices(indices, self.event_shape[0])
         time = self.event_shape[0] - 1
+        if indices == tuple(range(time + 1)):
+            return self
         space = tuple(i for i in indices if i != time)
         if len(space) == len(indices):
             return time_mixture(self, space, (), jnp.zeros((0,), self.loc.dtype), keeps_time=False)
@@ -338,16 +332,16 @@ class FoldedGaussian(AbstractDistribution):
             return rest.time.log_normalizer  # the integral is there already
         return super().log_evidence(indices, values, rest)
 
-    def time_given_space(self, s: Float[Array, "*#batch d-1"]) -> TimeDensity:
+    def time_given_space(self, s: Float[Array, "*#batch d-1"]) -> TimeMixture:
         """The density of time given space, by quadrature: its modes, samples, quantiles and moments.
 
-        **Shapes:** s (*batch, d-1); the result has `event_shape == ()`.
+        **Shapes:** s (*batch, d-1); the result has `event_shape == (1,)`.
 
         **Example:** `dist.time_given_space([0.1, -0.4]).modes()`
 
         **Source:** Bayes' rule on eq:foldgauss. **Raises:** ValueError if the last dimension of s is not d-1.
         """
-        return time_density(self, as_event("s", s, self.dtype, self.loc.shape[-1:]))
+        return self.condition(range(self.loc.shape[-1]), as_event("s", s, self.dtype, self.loc.shape[-1:]))
 
 
 def _check_fold(fold: AbstractFold, loc: Array) -> AbstractFold:

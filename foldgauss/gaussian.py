@@ -21,9 +21,9 @@ from foldgauss._numerics.abstract import AbstractDistribution
 from foldgauss._numerics.batch import (
     align,
     as_event,
+    as_value,
     check_batch,
     check_finite,
-    check_positive,
     common_dtype,
     compile_eager,
     divide,
@@ -43,63 +43,11 @@ from foldgauss._numerics.triangular import (
 )
 from foldgauss._runtime.checks import invalid
 
-__all__ = ["Gaussian", "Normal"]
+__all__ = ["Gaussian"]
 
 _LOG_2PI = float(np.log(2 * np.pi))
 #: Standard deviations from the mean beyond which the cdf is 0 or 1 in float64.
 _FAR = 40.0
-
-
-class Normal(AbstractDistribution):
-    """A normal distribution on the real line: the time marginal of a Folded-Gaussian.
-
-        N(loc, scale^2)(t) = exp(-((t - loc) / scale)^2 / 2) / (sqrt(2 pi) scale)
-
-    **Shapes:** `loc`, `scale` (*batch,), broadcast; `event_shape == ()`, so values have shape (*sample,
-    *batch).
-
-    **Example:** `Normal(0.0, 1.0).log_prob(0.0)  # -0.9189`
-
-    **Source:** eq:normal_pdf. **Raises:** ValueError if `scale` is not positive, or a number is not finite.
-    """
-
-    loc: Float[Array, "*#batch"]
-    scale: Float[Array, "*#batch"]
-
-    event_shape = ()
-
-    def __init__(self, loc: ArrayLike, scale: ArrayLike, *, validate_args: bool = True):
-        dtype = common_dtype(loc, scale)
-        loc, scale = jnp.asarray(loc, dtype), jnp.asarray(scale, dtype)
-        self.loc, self.scale = align([(loc, 0), (scale, 0)], max(loc.ndim, scale.ndim))
-        if validate_args:
-            check_finite("loc", self.loc)
-            check_positive("scale", self.scale)
-
-    def _as_gaussian(self) -> "Gaussian":
-        return Gaussian(self.loc[..., None], self.scale[..., None, None], validate_args=False)
-
-    def moments(self) -> tuple[Float[Array, "*batch 1"], Float[Array, "*batch 1 1"]]:
-        """Mean (*batch, 1) and variance (*batch, 1, 1)."""
-        return self._as_gaussian().moments()
-
-    def entropy(self) -> Float[Array, "*batch"]:
-        """Differential entropy in nats, log(scale) + (1 + log 2 pi) / 2."""
-        return self._as_gaussian().entropy()
-
-    def cdf(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
-        """P(t <= value)."""
-        return vectorize(_normal_cdf, self._checked(value), self.loc, self.scale)
-
-    def icdf(self, q: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
-        """The quantile t with P(t <= quantile) = q; NaN for q outside [0, 1]."""
-        return vectorize(lambda q, loc, scale: loc + scale * ndtri(q), self._checked(q), self.loc, self.scale)
-
-    def _log_prob(self, value: Array) -> Array:
-        return self._as_gaussian()._log_prob(value[..., None])
-
-    def _sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...]) -> Array:
-        return self._as_gaussian()._sample(key, sample_shape)[..., 0]
 
 
 class Gaussian(AbstractDistribution):
@@ -190,19 +138,20 @@ class Gaussian(AbstractDistribution):
 
     def cdf(self, x: Float[Array, "*#batch 1"]) -> Float[Array, "*#batch"]:
         """P(coordinate <= x), for a single coordinate. **Raises:** ValueError if there are several."""
-        return self._as_normal().cdf(self._checked(x)[..., 0])
+        return vectorize(_normal_cdf, self._checked(x)[..., 0], *self._of_line())
 
     def icdf(self, q: Float[Array, "*#batch"]) -> Float[Array, "*#batch 1"]:
-        """The quantile of a single coordinate, the inverse of `cdf`. **Raises:** as `cdf`."""
-        return self._as_normal().icdf(q)[..., None]
+        """The quantile of a single coordinate, the inverse of `cdf`; NaN for q outside [0, 1]. **Raises:** as `cdf`."""
+        quantile = vectorize(lambda q, loc, scale: loc + scale * ndtri(q), as_value(q, self.dtype), *self._of_line())
+        return quantile[..., None]
 
-    def _as_normal(self) -> Normal:
+    def _of_line(self) -> tuple[Float[Array, "*#batch"], Float[Array, "*#batch"]]:
+        """Mean and standard deviation of the single coordinate."""
         if self.event_shape != (1,):
             got = f"event_shape {self.event_shape}"
             raise invalid("cdf", expected="a single coordinate", got=got, cure="Take marginal([i]) first.")
         stddev = self.stddev[..., 0]  # 0 where it underflows, far from a component's time
-        tiny = float(jnp.finfo(stddev.dtype).tiny)
-        return Normal(self.loc[..., 0], jnp.maximum(stddev, tiny), validate_args=False)
+        return self.loc[..., 0], jnp.maximum(stddev, float(jnp.finfo(stddev.dtype).tiny))
 
     @compile_eager
     def _log_prob(self, value: Array) -> Array:

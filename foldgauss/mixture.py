@@ -10,7 +10,7 @@ of the paper, arXiv:2411.11024. The results are of the class `Mixture`, with com
 | `condition`, else | `TimeMixture` | `Gaussian` | `TimeMixture` |
 | `marginal`, time kept | a `FoldedMixture` (of time alone: `Gaussian`) | | `TimeMixture` |
 | `marginal`, else | `TimeMixture` | `Gaussian` | `TimeMixture` |
-| `time_given_space` | `TimeDensity` | | |
+| `time_given_space` | `TimeMixture` | | |
 """
 
 import math
@@ -269,15 +269,14 @@ class FoldedMixture(Mixture):
 
         `weights` are P(k | s). If p_k(s) diverges for some components, these share all the weight equally.
 
-        **Shapes:** s (*batch, d-1); the result has `event_shape == ()`: values have shape (*sample, *batch).
+        **Shapes:** s (*batch, d-1); the result has `event_shape == (1,)`.
 
         **Example:** `mixture.time_given_space([0.1, -0.4]).mean`
 
         **Source:** Bayes' rule on eq:foldgauss. **Raises:** ValueError if the last dimension of s is not d-1.
         """
-        s = as_event("s", s, self.dtype, (self.event_shape[0] - 1,))
-        components = self.components.time_given_space(s[..., None, :])
-        return _mixture_of(components, posterior_logits(self.log_weights, components.log_normalizer))
+        dim = self.event_shape[0] - 1
+        return self.condition(range(dim), as_event("s", s, self.dtype, (dim,)))
 
 
 def _mixture_of(components: AbstractDistribution, logits: Array) -> Mixture:
@@ -314,13 +313,13 @@ def _map_pairs(function, mixture: Mixture, x: Array) -> Array:
 
 
 def _add_component_axis(mixture: Mixture, x: Array) -> Array:
-    return jnp.expand_dims(x, x.ndim - len(mixture.event_shape))
+    return x[..., None, :]
 
 
 @eqx.filter_jit
 def _at_time(mixture: FoldedMixture, t: Array) -> Mixture:
     t = t[..., None]
-    logits = posterior_logits(mixture.log_weights, mixture.components.time_marginal.log_prob(t))
+    logits = posterior_logits(mixture.log_weights, mixture.components.marginal([-1]).log_prob(t[..., None]))
     return Mixture(mixture.components.condition_time(t), logits=logits, validate_args=False)
 
 
@@ -332,9 +331,7 @@ def _cdf(mixture: Mixture, x: Array) -> Array:
 @eqx.filter_jit
 def _icdf(mixture: Mixture, q: Array) -> Array:
     """Bisection between the least and the greatest of the components' quantiles."""
-    weights, event = mixture.weights, mixture.event_shape
-    quantiles = lax.stop_gradient(mixture.components.icdf(q[..., None]))
-    quantiles = quantiles[..., 0] if event else quantiles
+    weights, quantiles = mixture.weights, lax.stop_gradient(mixture.components.icdf(q[..., None]))[..., 0]
 
     def ends(weights, quantiles):
         low, high = jnp.where(weights > 0, quantiles, jnp.inf).min(), jnp.where(weights > 0, quantiles, -jnp.inf).max()
@@ -346,14 +343,13 @@ def _icdf(mixture: Mixture, q: Array) -> Array:
     def halve(_, bounds):
         low, high = bounds
         middle = low + 0.5 * (high - low)
-        below = _cdf(mixture, middle.reshape(*middle.shape, *event)) < q
+        below = _cdf(mixture, middle[..., None]) < q
         return jnp.where(below, middle, low), jnp.where(below, high, middle)
 
     steps = jnp.finfo(q.dtype).nmant + 8
     inner = jnp.isfinite(low) & jnp.isfinite(high)
     found = lax.fori_loop(0, steps, halve, (jnp.where(inner, low, 0), jnp.where(inner, high, 0)))[1]
-    found = lax.stop_gradient(jnp.where(is_nan, jnp.nan, jnp.where(inner, found, low)))
-    return found.reshape(*found.shape, *event)
+    return lax.stop_gradient(jnp.where(is_nan, jnp.nan, jnp.where(inner, found, low)))[..., None]
 
 
 @eqx.filter_jit

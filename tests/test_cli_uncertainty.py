@@ -83,9 +83,9 @@ def test_everything_is_there(done):
 
 
 def test_arviz_reads_the_draws(done):
-    from foldgauss.uncertainty.posterior.optional_imports import import_optional
+    from foldgauss._runtime.optional_imports import import_optional
 
-    data = import_optional("arviz").from_netcdf(str(done / "posterior.nc"))
+    data = import_optional("arviz", "uncertainty").from_netcdf(str(done / "posterior.nc"))
     t = data.posterior["t"]
     assert set(t["ensemble"].values) == {0, 1}
     assert t.sizes["chain"] > 20  # one for each walker

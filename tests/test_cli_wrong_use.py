@@ -268,10 +268,10 @@ WRONG = [
     (f"{TRADEOFF} --seed -1", 2, "--seed: expected a whole number >= 0"),
     (f"{TRADEOFF} --size 9", 2, "--size: expected HxW"),
     # uncertainty
-    (f"{TIMES} o --only 0,3", 2, "--only: expected whole numbers from 1 to 10"),
+    (f"{TIMES} o --only 0,3", 2, "--only: expected different frames from 1 to 10"),
     (f"{TIMES} o --only 3-5", 2, "--only: expected frames as 3,5,10:20"),
     (f"{TIMES} o --only 5:5", 2, "--only: expected at least one frame"),
-    (f"{TIMES} o --noise white", 2, "--noise: expected one of 'score', 'effective'"),
+    (f"{TIMES} o --noise white", 2, "--noise: expected one of 'score', 'independent'"),
     (f"{TIMES} o --level c", 2, "--level: expected one of 'splats', 'colors'"),
     (f"{TIMES} o --concentration 0", 2, "--concentration: expected a number >= 1"),
     (f"{TIMES} o --ensembles 1", 2, "--ensembles: expected at least 2"),

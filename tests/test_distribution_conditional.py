@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from foldgauss.analysis.conditional import TimeDensity, TimeMixture, _mixture_moments, _nearer
+from foldgauss.analysis.conditional import TimeMixture, _mixture_moments, _nearer
 from foldgauss.analysis.quadrature import SEARCH_GRID, adaptive_panels, find_peaks, gauss_hermite, normal_panels
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import CallableEnvelope, TimeLikelihood
@@ -108,7 +108,7 @@ def test_marginal_with_time_is_a_folded_gaussian(fold):
     np.testing.assert_allclose(part.loc, at.loc[np.array([2, 0])], rtol=1e-14)
     np.testing.assert_allclose(part.covariance_matrix, at.covariance_matrix[np.ix_([2, 0], [2, 0])], rtol=1e-13)
     assert isinstance(dist.marginal([3]), Gaussian)
-    np.testing.assert_allclose(dist.marginal([3]).log_prob(jnp.array([0.5])), dist.time_marginal.log_prob(0.5))
+    np.testing.assert_allclose(dist.marginal([3]).log_prob(0.5), stats.norm(0.4, 0.3).logpdf(0.5))
 
 
 def test_conditioning_with_time_is_the_gaussian_of_the_book():
@@ -148,20 +148,20 @@ def test_time_given_space_integrates_to_one(dim, cases):
         # just above -0.16, where it turns back, the density has a flat top.
         s = jnp.concatenate([_points(dist, MANY - 3)[:, :-1], jnp.outer(jnp.array([1.5, 1.95, -0.15]), jnp.ones(dim))])
         density = dist.time_given_space(s)
-        assert isinstance(density, TimeDensity)
-        assert (density.error_estimate < 1e-9).all()
+        assert isinstance(density, TimeMixture)
+        assert (density.time.error_estimate < 1e-9).all()
         modes = np.asarray(density.modes())
         edges = np.stack([_edges(m[np.isfinite(m)]) for m in modes], axis=-1)
         half = 0.5 * np.diff(edges, axis=0)[:, None]
         t = edges[:-1, None] + half * (1 + nodes[:, None])
-        log_p = np.asarray(LOG_PROB(density, jnp.concatenate([t.reshape(-1, MANY), modes.T])))
+        log_p = np.asarray(LOG_PROB(density, jnp.concatenate([t.reshape(-1, MANY), modes.T])[..., None]))
         for own, height in zip(modes, log_p[-modes.shape[1] :].T, strict=True):  # highest first, and apart
             assert (np.diff(height[height > -20]) < 0.01).all()
             assert (np.diff(np.sort(own[np.isfinite(own)])) > 1e-4).all()
         p = np.exp(log_p[: -modes.shape[1]]).reshape(t.shape)
         np.testing.assert_allclose((half * weights[:, None] * p).sum((0, 1)), 1, rtol=1e-8)
         assert power == 0 or dim == 2 or (np.isfinite(modes).sum(-1) > 1).any()  # bimodal ones are among them
-        np.testing.assert_allclose(density.panels.probabilities.sum(-1), 1, atol=1e-12)
+        np.testing.assert_allclose(density.time.panels.probabilities.sum(-1), 1, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -172,9 +172,9 @@ def test_time_given_space_by_plain_quadrature():
     edges = np.linspace(-2.0, 2.8, 2001)
     half = 0.5 * (edges[1] - edges[0])
     t = (edges[:-1, None] + half * (1 + nodes)).ravel()
-    mass = half * np.tile(weights, 2000)[:, None] * np.exp(LOG_PROB(density, jnp.asarray(t)[:, None]))
+    mass = half * np.tile(weights, 2000)[:, None] * np.exp(LOG_PROB(density, jnp.asarray(t)[:, None, None]))
     np.testing.assert_allclose(mass.sum(0), 1, atol=1e-8)
-    np.testing.assert_allclose(density.mean, t @ mass, atol=1e-8)
+    np.testing.assert_allclose(density.mean[:, 0], t @ mass, atol=1e-8)
     np.testing.assert_allclose(density.cdf(edges[900]), mass[: 900 * 20].sum(0), atol=1e-8)
 
 
@@ -185,10 +185,7 @@ def test_chain_rule_both_ways():
     space, time = dist.marginal([0, 1]), dist.time_given_space(x[:, :2])
     assert isinstance(space, TimeMixture)
     expected = LOG_PROB(dist, x)
-    np.testing.assert_allclose(LOG_PROB(space, x[:, :2]) + LOG_PROB(time, x[:, 2]), expected, rtol=1e-12, atol=1e-12)
-    as_mixture = dist.condition([0, 1], x[:, :2])
-    np.testing.assert_allclose(as_mixture.log_prob(x[:, 2:]), time.log_prob(x[:, 2]), rtol=1e-12)
-    np.testing.assert_allclose(as_mixture.cdf(x[:, 2:]), time.cdf(x[:, 2]), rtol=1e-12)
+    np.testing.assert_allclose(LOG_PROB(space, x[:, :2]) + LOG_PROB(time, x[:, 2:]), expected, rtol=1e-12, atol=1e-12)
 
 
 def test_nearest_times_are_refined_by_short_steps_only():
@@ -204,10 +201,10 @@ def test_moments_with_an_own_envelope_equal_those_with_the_same_built_in():
     """An own envelope may depend on t itself, so that times are not centered."""
     own = CallableEnvelope(lambda t, m, scale: -0.5 * ((t - m) / scale) ** 2)
     density = _dist(1).time_given_space(_repeated(0.3))
-    panels = jax.tree.map(lambda leaf: leaf[0], density.panels)
+    panels = jax.tree.map(lambda leaf: leaf[0], density.time.panels)
     mean, covariance = eqx.filter_jit(_mixture_moments)(_dist(1, envelope=own), jnp.array([0.3]), panels)
-    np.testing.assert_allclose(mean, density.mean[:1], rtol=1e-12)
-    np.testing.assert_allclose(covariance[0], density.variance[:1], rtol=1e-9)
+    np.testing.assert_allclose(mean, density.mean[0], rtol=1e-12)
+    np.testing.assert_allclose(covariance[0], density.variance[0], rtol=1e-9)
 
 
 def test_modes_of_time_are_where_the_parabola_passes():
@@ -220,7 +217,7 @@ def test_modes_of_time_are_where_the_parabola_passes():
     # Accurate to the square root of rounding.
     np.testing.assert_allclose(np.sort(modes[:, :2]), 0.4 + away * np.array([[-1, 1]]), atol=2e-7)
     assert np.isnan(modes[:, 2:]).all()
-    np.testing.assert_allclose(density.cdf(jnp.full((7, 1), 0.4)), 0.5, atol=1e-10)
+    np.testing.assert_allclose(density.cdf(jnp.full((7, 1, 1), 0.4)), 0.5, atol=1e-10)
     np.testing.assert_allclose(density.mean, 0.4, atol=1e-10)
 
 
@@ -230,16 +227,16 @@ def test_quantiles_and_samples_of_time():
     density = dist.time_given_space(jnp.array([[0.09], [0.0], [1.0]]))
     q = jnp.linspace(0.001, 0.999, 50)[:, None]
     t = density.icdf(q)
-    assert t.shape == (50, 3)
+    assert t.shape == (50, 3, 1)
     np.testing.assert_allclose(density.cdf(t), jnp.broadcast_to(q, (50, 3)), atol=1e-10)
-    draws = SAMPLE(density, jax.random.key(1), 50_000)
+    draws = SAMPLE(density, jax.random.key(1), 50_000)[..., 0]
     for i in range(3):
-        cdf = lambda x, i=i: np.asarray(density.cdf(jnp.asarray(x)[:, None]))[:, i]  # noqa: E731
+        cdf = lambda x, i=i: np.asarray(density.cdf(jnp.asarray(x)[:, None, None]))[:, i]  # noqa: E731
         assert stats.kstest(np.asarray(draws[:, i]), cdf).pvalue > 1e-4
-        shifted = np.asarray(draws[:, i]) + 0.03 * np.sqrt(density.variance[i])
+        shifted = np.asarray(draws[:, i]) + 0.03 * np.sqrt(density.variance[i, 0])
         assert stats.kstest(shifted, cdf).pvalue < 1e-4  # it has power
-    np.testing.assert_allclose(draws.mean(0), density.mean, atol=0.01)
-    np.testing.assert_allclose(draws.var(0), density.variance, rtol=0.03)
+    np.testing.assert_allclose(draws.mean(0), density.mean[:, 0], atol=0.01)
+    np.testing.assert_allclose(draws.var(0), density.variance[:, 0], rtol=0.03)
 
 
 # --- time integrated out ----------------------------------------------------------------------------------
@@ -403,7 +400,7 @@ def test_time_where_space_tells_it_to_the_last_digit(dtype, scale, s):
     given = _repeated(s)
     density, root = dist.time_given_space(given), np.sqrt(s)
     eps = float(np.finfo(dtype).eps)
-    assert (density.error_estimate < 5e4 * eps).all()
+    assert (density.time.error_estimate < 5e4 * eps).all()
     near = {"rtol": 20 * eps, "atol": 20 * eps * root}
     modes = np.sort(density.modes()[:, :2])
     np.testing.assert_allclose(modes, np.broadcast_to([0.4 - root, 0.4 + root], modes.shape), **near)
@@ -412,10 +409,10 @@ def test_time_where_space_tells_it_to_the_last_digit(dtype, scale, s):
     small = 100 * eps * (1 + root)
     t = np.array([-np.inf, 0.4 - root - small, 0.4 - root + small, 0.4, 0.4 + root - small, 0.4 + root + small, np.inf])
     t, share = jnp.asarray(t, dtype)[:, None], np.array([0, 0, 0.5, 0.5, 0.5, 1, 1])[:, None]
-    np.testing.assert_allclose(density.cdf(t), np.repeat(share, MANY, 1), atol=1e2 * eps)
+    np.testing.assert_allclose(density.cdf(t[..., None]), np.repeat(share, MANY, 1), atol=1e2 * eps)
     q = np.array([0, 0.1, 0.4, 0.6, 0.9, 1])
     places = np.array([-np.inf, 0.4 - root, 0.4 - root, 0.4 + root, 0.4 + root, np.inf])
-    quantiles = density.icdf(jnp.asarray(np.tile(q, 8), dtype)[:, None])
+    quantiles = density.icdf(jnp.asarray(np.tile(q, 8), dtype)[:, None])[..., 0]
     np.testing.assert_allclose(quantiles, np.tile(places, (MANY, 8)).T, **near)
     draws = np.asarray(density.sample(jax.random.key(0), (48,)))
     np.testing.assert_allclose(np.abs(draws - 0.4), root, rtol=20 * eps * (1 + 1 / root))
@@ -444,7 +441,9 @@ def test_points_on_a_curve_to_rounding_are_said_to_be():
     for scale, low, high in [(0.1, 0, 1e-9), (1e-17, 1.0, np.inf)]:
         dist = _dist(2, scale_tril=scale * np.eye(2))
         x = _points(dist, 5)
-        errors = np.r_[dist.marginal([0, 1]).error_estimate(x[:, :2]), dist.time_given_space(x[:, :2]).error_estimate]
+        errors = np.r_[
+            dist.marginal([0, 1]).error_estimate(x[:, :2]), dist.time_given_space(x[:, :2]).time.error_estimate
+        ]
         assert ((errors >= low) & (errors <= high)).all()
     # At a distance from the curve nothing does, but for the digits of log p, -1e32.
     marginal, off = dist.marginal([0, 1]), x[:, :2] + 0.1
@@ -462,16 +461,15 @@ def test_far_points():
     marginal, far, t = dist.marginal([0]), jnp.array([[50.0], [-1e4], [1e6]]), jnp.full((3, 1), 0.3)
     log_prob, time = LOG_PROB(marginal, far), dist.time_given_space(far)
     assert np.isfinite(log_prob).all()
-    np.testing.assert_allclose(time.log_normalizer, log_prob, rtol=1e-12)
+    np.testing.assert_allclose(time.time.log_normalizer, log_prob, rtol=1e-12)
     # Not at the modes: there the curve is narrower than times lie apart, and the density hangs on their rounding.
-    log_time = LOG_PROB(time, t[:, 0])
+    log_time = LOG_PROB(time, t)
     assert np.isfinite(log_time).all()
-    np.testing.assert_allclose(LOG_PROB(dist.condition([0], far), t), log_time, rtol=1e-12)
     np.testing.assert_allclose(log_prob + log_time, LOG_PROB(dist, jnp.concatenate([far, t], -1)), rtol=1e-12)
-    assert np.isfinite([time.mean, time.variance, time.icdf(jnp.array(0.5))]).all()
+    assert np.isfinite([time.mean, time.variance, time.icdf(0.5)]).all()
     near = jnp.array([[0.3], [3.0]])
     assert (marginal.error_estimate(near) < 1e-9).all()
-    assert (dist.time_given_space(near).error_estimate < 1e-9).all()
+    assert (dist.time_given_space(near).time.error_estimate < 1e-9).all()
 
 
 def test_without_fold_density_is_gaussian_or_diverges():
@@ -493,11 +491,11 @@ def _far_quantities(dist, s, tau):
     t = dist.time_loc + dist.time_scale * tau
     in_tau = lambda t: (t - dist.time_loc[None]) / dist.time_scale[None]  # noqa: E731
     return {
-        "log p": time.log_normalizer,
-        "error": time.error_estimate,
-        "mean": in_tau(time.mean),
-        "median": in_tau(time.icdf(0.5)),
-        "cdf": time.cdf(t),
+        "log p": time.time.log_normalizer,
+        "error": time.time.error_estimate,
+        "mean": in_tau(time.mean[..., 0]),
+        "median": in_tau(time.icdf(0.5)[..., 0]),
+        "cdf": time.cdf(t[..., None]),
         "first": first.log_prob(s[..., :1]),
         "first error": first.error_estimate(s[..., :1]),
         "first cdf": first.cdf(s[..., :1]),
@@ -608,12 +606,12 @@ def test_points_at_infinity():
     for sign in (-1, 1):
         assert np.isneginf(LOG_PROB(line, jnp.array([sign * jnp.inf])))
         assert np.isneginf(LOG_PROB(space, jnp.array([0.3, sign * jnp.inf])))
-        assert np.isneginf(LOG_PROB(time, jnp.asarray(sign * jnp.inf)))
+        assert np.isneginf(LOG_PROB(time, sign * jnp.inf))
         assert np.isneginf(LOG_PROB(dist.condition([0], [0.3]), jnp.array([sign * jnp.inf, 0.5])))
         assert float(CDF(line, jnp.array([sign * jnp.inf]))) == (sign > 0)
         assert float(CDF(dist.condition([0], [0.3]).marginal([0]), jnp.array([sign * jnp.inf]))) == (sign > 0)
-        assert float(CDF(time, jnp.asarray(sign * jnp.inf))) == (sign > 0)
-    np.testing.assert_array_equal(time.icdf(jnp.array([0.0, 1.0, -0.1, 1.1])), [-np.inf, np.inf, np.nan, np.nan])
+        assert float(CDF(time, sign * jnp.inf)) == (sign > 0)
+    np.testing.assert_array_equal(time.icdf(jnp.array([0.0, 1.0, -0.1, 1.1]))[:, 0], [-np.inf, np.inf, np.nan, np.nan])
     assert np.isfinite(time.icdf(jnp.array([1e-300, 1 - 1e-16]))).all()
 
 
@@ -674,5 +672,7 @@ def test_bad_requests_are_refused():
         dist.time_given_space([0.0])
     with pytest.raises(ValueError, match=r"^cdf: expected one coordinate, got 2"):
         dist.marginal([0, 1]).cdf(jnp.zeros(2))
+    with pytest.raises(ValueError, match=r"^modes: expected the distribution of time given space, got 2 coordinates"):
+        dist.marginal([0, 1]).modes()
     with pytest.raises(ValueError, match=r"^value: expected shape "):
         dist.marginal([0, 1]).log_prob(jnp.zeros(3))

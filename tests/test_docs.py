@@ -18,7 +18,7 @@ from markdown_it import MarkdownIt
 DOCS = ROOT / "docs"
 _NAMES = (
     *("distribution", "mixture", "fold", "envelope", "estimator", "estimator.likelihood"),
-    *(f"analysis.{name}" for name in ("moments", "divergence", "monte_carlo", "interop", "plot")),
+    *(f"analysis.{name}" for name in ("moments", "divergence", "interop", "plot")),
     *("render", "video", "io", "io.datasets", "uncertainty", "jobs"),
 )
 #: Modules that have an API page.

@@ -18,7 +18,6 @@ from foldgauss.estimator.em.m_step import (
     profile_log_likelihood,
     update_components,
 )
-from foldgauss.estimator.em.online import change_reference
 from foldgauss.estimator.em.scaling import Scaling, to_mixture
 from foldgauss.estimator.em.statistics import (
     Times,
@@ -206,15 +205,6 @@ def test_newton_step_matches_finite_differences(x64, covariance):
         step = np.linalg.solve(negative + lift * np.eye(2), slopes[:, k])
         step *= min(1, _MAX_STEP / np.abs(step).max())
         np.testing.assert_allclose(steps[:, k], step, rtol=1e-5, atol=1e-7)
-
-
-def test_changing_the_reference_equals_recomputing(x64):
-    """A linear map of the sums equals sums made there, with the same shares."""
-    here, there, points = _params(), _params(seed=5), make_points(_data(), np.ones(N), K)
-    shares = jnp.asarray(np.random.default_rng(3).dirichlet(np.ones(K), points.x.shape[:3]))
-    made = eqx.filter_jit(lambda params: accumulate(params, Constant(), points, responsibilities=shares))
-    mapped = jax.jit(change_reference)(made(here), here, there)._replace(log_likelihood=made(there).log_likelihood)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), mapped, made(there))
 
 
 # --- laws ---------------------------------------------------------------------------------------------------

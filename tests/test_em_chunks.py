@@ -15,7 +15,6 @@ from foldgauss.estimator import chunks as _chunks
 from foldgauss.estimator.chunks import is_chunked, open_chunks, summarize_rows, weighted_moments
 from foldgauss.estimator.em import initialization, loop, statistics
 from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
-from foldgauss.estimator.model_selection import select_mixture
 
 N, CUTS = 600, (1, 1, 90, 91, 350, 595)  # a chunk of one row, one of none
 #: One set for nearly all tests: they share its programs.
@@ -233,16 +232,6 @@ def test_predictions_of_chunks_equal_those_of_rows():
     np.testing.assert_array_equal(np.concatenate(list(labels)), fitted.predict(x))
 
 
-def test_select_mixture_takes_chunks():
-    x = _tracks()
-    options = {"n_components": [3], "degrees": [2]}
-    estimator = FoldedGaussianMixture(**OPTIONS)
-    chosen = select_mixture(estimator, np.split(x, CUTS), **options)
-    np.testing.assert_allclose(chosen.scores, select_mixture(estimator, x, **options).scores, rtol=1e-9)
-    with pytest.raises(ValueError, match=r'criterion: expected "bic" or "aic" for chunks'):
-        select_mixture(estimator, [x], criterion="cv", **options)
-
-
 # --- dask -----------------------------------------------------------------------------------------------------
 
 
@@ -395,8 +384,6 @@ def test_prediction_checks_chunks():
         fitted.bic(_Files([]))
     with pytest.raises(ValueError, match="X: expected 2 columns, got 1"):
         fitted.predict(_dask().from_array(X[:, :1]))
-    with pytest.raises(ValueError, match=r"X: expected one batch of rows, got chunks. fit takes chunks"):
-        fitted.partial_fit([X])
 
 
 def test_rows_and_chunks_are_told_apart():

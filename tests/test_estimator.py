@@ -378,29 +378,6 @@ def test_degrees_of_a_constant_column_and_of_exact_data():
         assert _quiet(FoldedGaussianMixture(1, max_degree=2, random_state=0), x).degrees_.tolist() == [1]
 
 
-@pytest.mark.slow
-def test_unequal_batches_approach_fit():
-    x = _blobs(n=4000)
-    groups = [x[k::K] for k in range(K)]
-    start = {
-        "means_init": np.stack([group.mean(0) for group in groups]),
-        "precisions_init": np.stack([np.linalg.inv(np.cov(group.T)) for group in groups]),
-    }
-    x = x[np.random.default_rng(1).permutation(4000)]
-    options = {"degree": 1, "tol": 1e-5, "max_iter": 300} | start
-    whole, online = FoldedGaussianMixture(K, **options).fit(x), FoldedGaussianMixture(K, **options)
-    ends = np.cumsum([500, 250, 17, 400, 60, 512, 1, 300, 450, 200, 512, 500, 298])
-    batches = np.split(x, ends)[:-1]
-    assert ends[-1] == len(x)
-    first = online.partial_fit(batches[0]).score(x)
-    for batch in batches[1:]:
-        online.partial_fit(batch)
-    best = whole.score(x)
-    assert online.n_iter_ == len(batches)
-    assert best - first > 0.005  # there is something to learn
-    assert best - online.score(x) < 0.3 * (best - first)
-
-
 def test_warm_start_continues():
     x = _blobs()
     options = {"degree": 1, "random_state": 0, "tol": 1e-4}
@@ -454,19 +431,6 @@ def test_float32_fits_high_degrees(degree):
     at = np.quantile(t, np.linspace(0.05, 0.95, 7))
     powers = (single.time_means_[0] - at)[:, None] ** np.arange(1, degree + 1)
     np.testing.assert_allclose(single.locs_[0, 0] + powers @ single.fold_coefficients_[0, :, 0], curve(at), atol=2e-3)
-    if degree > 6:
-        online = FoldedGaussianMixture(1, degree=degree).partial_fit(x).partial_fit(x)
-        assert online.score(x) == pytest.approx(best, abs=0.01)
-
-
-def test_small_batches_have_small_effect():
-    x = _blobs(n=256)  # padded as a batch of one row is
-    online = FoldedGaussianMixture(1, degree=1).partial_fit(x)
-    with pytest.raises(ValueError, match="envelope"):
-        FoldedGaussianMixture(1, envelope="time_likelihood").partial_fit(x)
-    before = online.means_.copy()
-    moved = np.abs(online.partial_fit(x.max(0)[None] + 5).means_ - before).max()
-    assert 0 < moved < 0.5
 
 
 @pytest.mark.slow

@@ -11,7 +11,6 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import estimator_checks
 
 from foldgauss.estimator import EMStatus, FoldedGaussianMixture, FoldedMixtureRegressor
-from foldgauss.estimator.model_selection import select_mixture
 from foldgauss.estimator.rows import warn_smooth
 
 K, N = 3, 300
@@ -245,9 +244,6 @@ def test_groups_keep_components_from_collapsing_onto_one_curve():
     assert plain.score(held) < grouped.score(held) - 2
     with pytest.warns(ConvergenceWarning, match=r"of 12 components are as narrow as the gap.*Lower n_components"):
         FoldedGaussianMixture(12, degree=3, time_column=0, random_state=0).fit(x, groups=groups)
-    base = FoldedGaussianMixture(time_column=0, random_state=0)
-    with pytest.warns(ConvergenceWarning, match=r"of 12 components are as narrow as the gap"):  # of the fit it returns
-        select_mixture(base, x, n_components=[12], degrees=[3], groups=groups)
 
 
 @pytest.mark.parametrize(

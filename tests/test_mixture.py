@@ -8,7 +8,7 @@ import pytest
 from scipy import special, stats
 
 from foldgauss import mixture as mixture_module
-from foldgauss.analysis.conditional import TimeDensity, TimeMixture
+from foldgauss.analysis.conditional import TimeMixture
 from foldgauss.distribution import FoldedGaussian, Gaussian
 from foldgauss.envelope import CallableEnvelope, Constant, TimeLikelihood
 from foldgauss.fold import CallableFold, FourierFold, PolynomialFold, SplineFold, ZeroFold
@@ -327,22 +327,22 @@ def test_time_posterior(x64):
     mixture = _mixture(envelope=TimeLikelihood(1.0, 0.05))
     s = jnp.array([[0.1, -0.2], [-0.4, 0.4]])
     when = mixture.time_given_space(s)
-    assert isinstance(when.components, TimeDensity)
-    assert (when.event_shape, when.batch_shape) == ((), (2,))
+    assert isinstance(when.components, TimeMixture)
+    assert (when.event_shape, when.batch_shape) == ((1,), (2,))
     t = np.linspace(-3, 4, 8001)
-    density = np.asarray(when.pdf(t[:, None]))
+    density = np.asarray(when.pdf(t[:, None, None]))
     step = t[1] - t[0]
     np.testing.assert_allclose(density.sum(0) * step, 1, rtol=1e-6)
     mean = (t[:, None] * density).sum(0) * step
-    np.testing.assert_allclose(when.mean, mean, rtol=1e-6)
-    np.testing.assert_allclose(when.variance, ((t[:, None] - mean) ** 2 * density).sum(0) * step, rtol=1e-6)
+    np.testing.assert_allclose(when.mean[:, 0], mean, rtol=1e-6)
+    np.testing.assert_allclose(when.variance[:, 0], ((t[:, None] - mean) ** 2 * density).sum(0) * step, rtol=1e-6)
     assert when.covariance_matrix.shape == (2, 1, 1)
-    below = np.asarray(when.cdf(jnp.array([[0.4], [1e3], [-1e3]])))
+    below = np.asarray(when.cdf(jnp.array([[[0.4]], [[1e3]], [[-1e3]]])))
     np.testing.assert_allclose(below, [(density[t < 0.4]).sum(0) * step, [1, 1], [0, 0]], atol=2e-3)
     q = jnp.array([[0.01], [0.5], [0.9]])
     np.testing.assert_allclose(when.cdf(when.icdf(q)), np.broadcast_to(q, (3, 2)), atol=1e-9)
-    np.testing.assert_array_equal(when.icdf(jnp.array([[0.0], [1.0]])), [[-np.inf] * 2, [np.inf] * 2])
-    assert (when.components.error_estimate < 1e-6).all()
+    np.testing.assert_array_equal(when.icdf(jnp.array([[0.0], [1.0]]))[..., 0], [[-np.inf] * 2, [np.inf] * 2])
+    assert (when.error_estimate(0.5) < 1e-6).all()
     draws = when.sample(jax.random.key(0), (4000,))
     assert _deviations(draws, when.mean) < ALARM
 

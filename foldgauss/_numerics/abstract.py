@@ -26,7 +26,7 @@ class AbstractDistribution(BatchModule):
     @property
     @abstractmethod
     def event_shape(self) -> tuple[int, ...]:
-        """The shape of one point: (d,), or () for a number."""
+        """The shape of one point, (d,)."""
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -64,13 +64,12 @@ class AbstractDistribution(BatchModule):
 
     @abstractmethod
     def moments(self) -> tuple[Float[Array, "*batch n"], Float[Array, "*batch n n"]]:
-        """Mean and covariance matrix; n is 1 for numbers."""
+        """Mean and covariance matrix."""
 
     @property
     def mean(self) -> Float[Array, "..."]:
         """E x, as `moments`."""
-        mean = self.moments()[0]
-        return mean if self.event_shape else mean[..., 0]
+        return self.moments()[0]
 
     @property
     def covariance_matrix(self) -> Float[Array, "*batch n n"]:
@@ -80,8 +79,7 @@ class AbstractDistribution(BatchModule):
     @property
     def variance(self) -> Float[Array, "..."]:
         """Var x per coordinate, as `moments`."""
-        variance = jnp.diagonal(self.covariance_matrix, axis1=-2, axis2=-1)
-        return variance if self.event_shape else variance[..., 0]
+        return jnp.diagonal(self.covariance_matrix, axis1=-2, axis2=-1)
 
     @property
     def stddev(self) -> Float[Array, "..."]:
@@ -99,8 +97,7 @@ class AbstractDistribution(BatchModule):
     def _sample_from(self, key: Key[Array, ""], sample_shape: tuple[int, ...], component: Array) -> Array:
         """A sample of one of the components, which are the last batch axis: here of those that all are drawn from."""
         every = self._sample(key, sample_shape)
-        index = component.reshape(*component.shape, 1, *(1 for _ in self.event_shape))
-        return jnp.take_along_axis(every, index, axis=component.ndim).squeeze(component.ndim)
+        return jnp.take_along_axis(every, component[..., None, None], axis=component.ndim).squeeze(component.ndim)
 
     def _repr_png_(self) -> bytes | None:
         """Notebook display: the density over time and space, by coordinates if there are several."""

@@ -182,7 +182,7 @@ def as_event(name: str, x: ArrayLike, dtype, event_shape: tuple[int, ...]) -> Ar
     """`as_value` of shape (*batch, *event_shape), checked; a single coordinate may be a number."""
     value = as_value(x, dtype)
     value = value.reshape(1) if value.ndim == 0 and event_shape == (1,) else value
-    if event_shape and value.shape[-1:] != event_shape:
+    if value.shape[-1:] != event_shape:
         expected = f"shape (*batch, {event_shape[0]})"
         raise invalid(name, expected=expected, got=f"shape {value.shape}", cure="Time, if any, is last.")
     return value

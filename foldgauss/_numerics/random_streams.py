@@ -29,11 +29,7 @@ class Stream(enum.IntEnum):
     RESAMPLED_FRAME = 19
     WALKERS = 20
     POSTERIOR_DRAW = 21
-    CALIBRATION = 22
-    RANK_BAND = 23
-    THINNING = 24
     EM_JITTER = 25
-    CROSS_VALIDATION = 26
     SYNTHETIC_NOISE = 27
 
 

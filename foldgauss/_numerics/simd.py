@@ -70,12 +70,6 @@ def _constant(numbers):
 
 
 @intrinsic
-def lane_indices(typing_context):
-    """The vector (0, 1, ..., 15)."""
-    return _constant([float(k) for k in range(LANES)])
-
-
-@intrinsic
 def cell_columns(typing_context):
     """The vector (0, 1, 2, 3, 0, 1, ...): the pixels' columns in a cell of 4 x 4, row by row."""
     return _constant([float(k % 4) for k in range(LANES)])

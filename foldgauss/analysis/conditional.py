@@ -12,7 +12,15 @@ from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Float, Key
 
 from foldgauss._numerics.abstract import AbstractDistribution
-from foldgauss._numerics.batch import as_event, compile_eager, map_over_batch, vectorize, vectorized
+from foldgauss._numerics.batch import (
+    BatchModule,
+    as_event,
+    as_value,
+    compile_eager,
+    map_over_batch,
+    vectorize,
+    vectorized,
+)
 from foldgauss._numerics.factor import check_rest, normalize_indices
 from foldgauss._runtime.checks import invalid
 from foldgauss.analysis.narrow_crossings import ROUNDING, crossing_modes, crossing_panels, gaussian_at
@@ -28,7 +36,7 @@ from foldgauss.analysis.quadrature import (
 from foldgauss.envelope import Constant, TimeLikelihood
 from foldgauss.gaussian import Gaussian, condition_on_first
 
-__all__ = ["TimeDensity", "TimeMixture", "conditional_gaussian", "time_density", "time_mixture"]
+__all__ = ["TimeMixture", "conditional_gaussian", "time_mixture"]
 
 _HALF_LOG_2PI = 0.5 * float(np.log(2 * np.pi))
 _CROSSINGS = 24  # candidate times at which the ridge comes near
@@ -40,57 +48,12 @@ _MISSED = 0.1  # quadrature missed a ridge if log of its mass exceeds log of the
 _AVERAGED = 0.1  # of the rounding at some 100 nodes across the ridge, where the residual is about 1
 
 
-class TimeDensity(AbstractDistribution):
-    """The density of t given (some of) space, p(t | s) = FN(s, t) / p(s), by quadrature.
+class TimeIntegral(BatchModule):
+    """p(t | values) of a Folded-Gaussian, by quadrature over tau = (t - time_loc) / time_scale."""
 
-    Made by `FoldedGaussian.time_given_space`. A peak narrower than the spacing of floating-point times (one space
-    coordinate and a small `scale_tril` or a large |tau|) counts with its whole mass in probabilities, quantiles and
-    moments; `pdf(t)` is the density at exactly t, and may miss it.
-
-    **Shapes:** `event_shape == ()`: values have shape (*sample, *batch). `log_normalizer` (*batch,) is log p(s),
-    +inf where p(s) diverges (`power (d-1) >= 2` and s on a static ridge). `error_estimate` (*batch,) is the estimated
-    relative error of p(s), and so of every density and probability: large where p(s) depends on the rounding of s,
-    `inf` where it diverges or log p(s) is -inf; quantiles and moments are then NaN.
-
-    **Example:** `dist.time_given_space([0.3, 0.1]).mean`
-
-    **Source:** Bayes' rule on eq:foldgauss.
-    """
-
-    parent: AbstractDistribution
-    values: Float[Array, "*#batch d-1"]
     panels: Panels
-    log_normalizer: Float[Array, "*batch"]
-    error_estimate: Float[Array, "*batch"]
-
-    event_shape = ()
-    has_rsample = False
-
-    @compile_eager
-    @vectorized(0)
-    def _log_prob(self, t: Array) -> Array:
-        return _divide(self.parent._log_prob(jnp.append(self.values, t)), self.log_normalizer)
-
-    def cdf(self, value: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
-        """P(time <= t | s)."""
-        return _time_cdf(self.panels, self._checked(value), self.parent.time_loc, self.parent.time_scale)
-
-    def icdf(self, q: Float[Array, "*#batch"]) -> Float[Array, "*#batch"]:
-        """The quantile: the inverse of `cdf`, -inf at 0 and +inf at 1."""
-        return _time_icdf(self.panels, self._checked(q), self.parent.time_loc, self.parent.time_scale)
-
-    def _sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...]) -> Array:
-        smallest = float(jnp.finfo(self.dtype).tiny)  # not 0, whose quantile is -inf
-        shape = (*sample_shape, *self.batch_shape)
-        return self.icdf(jax.random.uniform(key, shape, self.dtype, minval=smallest))
-
-    def moments(self) -> tuple[Float[Array, "*batch 1"], Float[Array, "*batch 1 1"]]:
-        """E[t | s] and Var[t | s]."""
-        return map_over_batch(_time_moments, self.panels, self.parent.time_loc, self.parent.time_scale)
-
-    def modes(self) -> Float[Array, "*batch modes"]:
-        """The local maxima of p(t | s), highest first, at most 8; NaN where there are fewer."""
-        return map_over_batch(_modes, self.parent, (self.values, 1), self.panels)
+    log_normalizer: Float[Array, "*batch"]  # log p(values), +inf where it diverges
+    error_estimate: Float[Array, "*batch"]  # relative, of p(values); inf where it diverges or log p(values) is -inf
 
 
 class TimeMixture(AbstractDistribution):
@@ -98,18 +61,22 @@ class TimeMixture(AbstractDistribution):
 
         p(y | g) = integral p(y | g, t) p(t | g) dt          (or without the integral, if t is one of y)
 
-    Made by `FoldedGaussian.marginal` (time dropped) and `FoldedGaussian.condition` (time not given).
+    Made by `FoldedGaussian.marginal` (time dropped), `condition` (time not given) and `time_given_space`. A peak of
+    p(t | s) narrower than the spacing of floating-point times (one space coordinate and a small `scale_tril` or a large
+    |tau|) counts with its whole mass in probabilities, quantiles and moments; the density at exactly t may miss it.
+    Where p(g) diverges (`power (d-1) >= 2` and g on a static ridge) or underflows, quantiles and moments are NaN.
 
     **Shapes:** `event_shape == (n,)`, n coordinates kept, time (if kept) last.
 
     **Example:** `dist.marginal([0]).cdf(jnp.array([0.3]))`
 
-    **Source:** eq:foldgauss, integrated. **Raises:** ValueError on a wrong shape, and from `cdf` unless n is 1.
+    **Source:** eq:foldgauss, integrated. **Raises:** ValueError on a wrong shape, and from `cdf`
+    unless n is 1, from `icdf` and `modes` unless time is the only coordinate.
     """
 
     parent: AbstractDistribution  # of (given, kept, time), in this order
     values: Float[Array, "*#batch given"]
-    time: TimeDensity | None  # p(t | given); None if nothing is given, and t has its own normal
+    time: TimeIntegral | None  # p(t | given); None if nothing is given, and t has its own normal
     keeps_time: bool = eqx.field(static=True)
 
     has_rsample = False
@@ -139,7 +106,7 @@ class TimeMixture(AbstractDistribution):
             raise invalid("cdf", expected="one coordinate", got=f"{self.event_shape[0]}", cure="Use marginal([i]).cdf.")
         value = self._checked(value)
         if self.keeps_time:
-            return self.time.cdf(value[..., 0])
+            return _time_cdf(self.time.panels, value[..., 0], self.parent.time_loc, self.parent.time_scale)
         near = jnp.where(jnp.isinf(value), 0, value)
         log_mass = self._given(map_over_batch(_log_space_cdf, self.parent, (self._join(near), 1)))
 
@@ -149,11 +116,32 @@ class TimeMixture(AbstractDistribution):
 
         return vectorize(bound, value[..., 0], log_mass)
 
+    def icdf(self, q: Float[Array, "*#batch"]) -> Float[Array, "*#batch 1"]:
+        """The quantile of time given space, the inverse of `cdf`: -inf at 0 and +inf at 1."""
+        self._check_time_alone("icdf")
+        q = as_value(q, self.dtype)
+        return _time_icdf(self.time.panels, q, self.parent.time_loc, self.parent.time_scale)[..., None]
+
+    def modes(self) -> Float[Array, "*batch modes"]:
+        """The local maxima of p(t | s), highest first, at most 8; NaN where there are fewer."""
+        self._check_time_alone("modes")
+        return map_over_batch(_modes, self.parent, (self.values, 1), self.time.panels)
+
+    def _check_time_alone(self, name: str) -> None:
+        if not self.keeps_time or self._space_dim:
+            raise invalid(
+                name, expected="the distribution of time given space", got=f"{self.event_shape[0]} coordinates"
+            )
+
     @compile_eager(static=("sample_shape",))
     def _sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...]) -> Array:
         time_key, space_key = jax.random.split(key)
-        time = self.parent.time_marginal if self.time is None else self.time
-        t = time.sample(time_key, sample_shape)
+        if self.time is None:
+            t = self.parent.marginal([-1]).sample(time_key, sample_shape)[..., 0]
+        else:
+            smallest = float(jnp.finfo(self.dtype).tiny)  # not 0, whose quantile is -inf
+            q = jax.random.uniform(time_key, (*sample_shape, *self.batch_shape), self.dtype, minval=smallest)
+            t = _time_icdf(self.time.panels, q, self.parent.time_loc, self.parent.time_scale)
         if not self._space_dim:
             return t[..., None]
         s = conditional_gaussian(self.parent, self.values, t).sample(space_key)
@@ -211,18 +199,14 @@ class TimeMixture(AbstractDistribution):
         return log_joint if self.time is None else _divide_all(log_joint, self.time.log_normalizer)
 
 
-def time_density(parent, values: Float[Array, "*#batch d-1"]) -> TimeDensity:
-    """p(t | s = values) of a Folded-Gaussian."""
-    panels, log_normalizer, error = map_over_batch(_space_panels, parent, (values, 1))
-    return TimeDensity(parent, _over(values, log_normalizer.shape), panels, log_normalizer, error)
-
-
 def time_mixture(parent, kept, given, values, *, keeps_time: bool) -> TimeMixture:
     """The distribution of the space coordinates `kept` (and of time) given `values` of the coordinates `given`."""
     time = parent.event_shape[0] - 1
     ordered = parent.marginal((*given, *kept, time))
-    density = time_density(parent.marginal((*given, time)), values) if given else None
-    return TimeMixture(ordered, values, density, keeps_time)
+    if not given:
+        return TimeMixture(ordered, values, None, keeps_time)
+    found = TimeIntegral(*map_over_batch(_space_panels, parent.marginal((*given, time)), (values, 1)))
+    return TimeMixture(ordered, _over(values, found.log_normalizer.shape), found, keeps_time)
 
 
 def conditional_gaussian(parent, values: Float[Array, "*#batch given"], t: Float[Array, "*#batch"]) -> Gaussian:
@@ -401,12 +385,6 @@ def _same_top(log_f, found, height):
     close = jnp.abs(a - b) < eps**0.25 * (1 + jnp.abs(b))
     earlier = jnp.arange(found.size)[:, None] < jnp.arange(found.size)[None]
     return (close & ~valley & earlier).any(0)
-
-
-def _time_moments(panels: Panels, time_loc, time_scale):
-    mean = panels.expectation(panels.nodes)
-    variance = panels.expectation((panels.nodes - mean) ** 2)
-    return (time_loc + time_scale * mean)[None], (variance * time_scale**2)[None, None]
 
 
 def _log_space_density(parent, s):

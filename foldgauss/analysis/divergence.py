@@ -21,7 +21,7 @@ from foldgauss.analysis.quadrature import (
 )
 from foldgauss.envelope import Constant, TimeLikelihood
 from foldgauss.fold import PolynomialFold, ZeroFold
-from foldgauss.gaussian import Gaussian, Normal, times_exp
+from foldgauss.gaussian import Gaussian, times_exp
 
 __all__ = ["kl_divergence"]
 
@@ -46,15 +46,13 @@ def kl_divergence(p, q, *, with_error: bool = False) -> Array | tuple[Array, Arr
 
     **Shapes:** batches broadcast -> (*batch,). **Example:** `kl_divergence(dist, dist)  # 0.`
 
-    **Source:** the chain rule of eq:foldgauss. **Raises:** ValueError unless both are FoldedGaussian, both Gaussian
-    or both Normal, of one dimension.
+    **Source:** the chain rule of eq:foldgauss. **Raises:** ValueError unless both are FoldedGaussian or both Gaussian,
+    of one dimension.
     """
     _check_pair(p, q)
     batch = jnp.broadcast_shapes(p.batch_shape, q.batch_shape)
     p, q = broadcast_leaves(p, batch), broadcast_leaves(q, batch)
-    if isinstance(p, Normal):
-        value, error = _kl_normal(p.loc, p.scale, q.loc, q.scale), 0
-    elif isinstance(p, Gaussian):
+    if isinstance(p, Gaussian):
         value, error = _kl_gaussian(p, q), 0
     else:
         value, error = _kl_folded(*_from_time_zero(p, q))
@@ -66,21 +64,21 @@ def kl_divergence(p, q, *, with_error: bool = False) -> Array | tuple[Array, Arr
 def _kl_folded(p, q):
     """The divergence and its estimated error."""
     found, errors = _expectations(p, q)
-    return _chain_rule(p.time_marginal, q.time_marginal, p.scale_tril, q.scale_tril, found, errors)
+    return _chain_rule(p.marginal([-1]), q.marginal([-1]), p.scale_tril, q.scale_tril, found, errors)
 
 
 @compile_eager
-def _chain_rule(time_p: Normal, time_q: Normal, tril_p, tril_q, found, errors):
+def _chain_rule(time_p: Gaussian, time_q: Gaussian, tril_p, tril_q, found, errors):
     """Return the divergence and its estimated error. `found` are expectations over time, with `errors`."""
     dim, (ratio, mahalanobis, log_ratio) = tril_p.shape[-1], found
     trace, log_det = _trace_and_log_det(tril_p, tril_q)
     space = 0.5 * (trace * ratio - dim + log_det + dim * log_ratio + mahalanobis)
     error = 0.5 * (trace * errors[0] + errors[1] + dim * errors[2])
-    return _kl_normal(time_p.loc, time_p.scale, time_q.loc, time_q.scale) + space, error
+    return _kl_gaussian(time_p, time_q) + space, error
 
 
 def _check_pair(p, q) -> None:
-    same = any(isinstance(p, k) and isinstance(q, k) for k in (Gaussian, Normal)) or (_is_folded(p) and _is_folded(q))
+    same = (isinstance(p, Gaussian) and isinstance(q, Gaussian)) or (_is_folded(p) and _is_folded(q))
     if same and p.event_shape == q.event_shape:
         return
     got = " and ".join(f"{type(x).__name__} of {getattr(x, 'event_shape', 'no')} coordinates" for x in (p, q))
@@ -99,11 +97,6 @@ def _from_time_zero(p, q):
         return p, q
     moved = lambda x: eqx.tree_at(lambda dist: dist.time_loc, x, x.time_loc - p.time_loc)  # noqa: E731
     return moved(p), moved(q)
-
-
-def _kl_normal(loc_p, scale_p, loc_q, scale_q):
-    ratio = scale_p / scale_q
-    return 0.5 * (ratio**2 - 1 + ((loc_p - loc_q) / scale_q) ** 2) - jnp.log(ratio)
 
 
 def _kl_gaussian(p: Gaussian, q: Gaussian):

@@ -5,7 +5,6 @@ in time, and nothing is reflected. Neither library is imported before it is aske
 """
 
 import functools
-import math
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
@@ -13,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.optional_imports import import_optional
 from foldgauss.analysis.divergence import kl_divergence
 
 if TYPE_CHECKING:
@@ -47,16 +47,8 @@ def to_numpyro(dist: Any, *, validate_args: bool | None = None) -> "numpyro.dist
 
     **Source:** eq:foldgauss. **Raises:** ImportError that names the extra if numpyro is missing.
     """
-    return _numpyro_class()(dist, validate_args=validate_args)
-
-
-def _numpyro_class() -> type:
-    """The class, made on first use: numpyro must be imported to have its base."""
-    try:
-        import numpyro
-    except ImportError as error:
-        raise ImportError("to_numpyro needs numpyro: pip install 'foldgauss[numpyro]'.") from error
-    return _make_class(numpyro.distributions)
+    distributions = import_optional("numpyro", "numpyro").distributions
+    return _make_class(distributions)(dist, validate_args=validate_args)
 
 
 @functools.cache
@@ -84,7 +76,7 @@ def _make_class(distributions) -> type:
 
         @property
         def support(self):
-            return distributions.constraints.real_vector if self.event_shape else distributions.constraints.real
+            return distributions.constraints.real_vector
 
         def sample(self, key, sample_shape=()):
             return self.base.sample(key, sample_shape)
@@ -130,7 +122,7 @@ def _make_class(distributions) -> type:
 
 def _blank_numpyro():
     """An instance without state, for pickle."""
-    made = _numpyro_class()
+    made = _make_class(import_optional("numpyro", "numpyro").distributions)
     return made.__new__(made)
 
 
@@ -179,7 +171,7 @@ class FrozenDistribution:
     @property
     def dim(self) -> int:
         """Number of coordinates."""
-        return math.prod(self._base.event_shape)
+        return self._base.event_shape[0]
 
     def logpdf(self, x) -> np.ndarray:
         """Log-density at x (*points, d); for one coordinate, numbers are points, as in scipy."""
@@ -194,12 +186,12 @@ class FrozenDistribution:
     def rvs(self, size=(), random_state=None) -> np.ndarray:
         """Random draws: (d,) by default, else (*size, d) without axes of size 1, as scipy has it.
 
-        For a distribution on the line (`event_shape == ()`) the shape is `size`. `random_state`: None, an int, or a
+        `random_state`: None, an int, or a
         NumPy generator. **Raises:** ValueError unless `size` is a whole number >= 0, or a tuple of them.
         """
         seed = int(np.random.default_rng(random_state).integers(2**31))
         draws = np.asarray(self._base.sample(jax.random.key(seed), () if size is None else size))
-        return draws.squeeze()[()] if self._base.event_shape else draws[()]
+        return draws.squeeze()[()]
 
     def entropy(self) -> np.ndarray:
         """Differential entropy in nats."""
@@ -210,9 +202,6 @@ class FrozenDistribution:
 
     def marginal(self, dimensions) -> "FrozenDistribution":
         """The distribution of some coordinates alone, frozen too; time is the last one."""
-        if not hasattr(self._base, "marginal"):
-            cure = "Take all coordinates of interest from the joint distribution at once."
-            raise invalid("dimensions", expected="a distribution with marginals", got=repr(self), cure=cure)
         return FrozenDistribution(self._base.marginal(dimensions))
 
     @property
@@ -221,8 +210,8 @@ class FrozenDistribution:
 
     @property
     def cov(self) -> np.ndarray:
-        """The matrix; for a distribution on the line, as in scipy's `norm`, the variance."""
-        return _numpy(self._base.covariance_matrix if self._base.event_shape else self._base.variance)
+        """The matrix."""
+        return _numpy(self._base.covariance_matrix)
 
 
 # Jitted once: called eagerly, a density is a hundred small kernels.

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.optional_imports import import_optional
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,7 +52,7 @@ def plot_density(
     `dist` is not a single distribution in the plane.
     """
     _check_plane(dist)
-    pyplot = import_pyplot("plot_density")
+    pyplot = import_optional("matplotlib.pyplot", "plot")
     ax = pyplot.subplots()[1] if ax is None else ax
     loc, scale = _time_moments(dist)
     t_limits = (loc - _REACH * scale, loc + _REACH * scale) if t_limits is None else t_limits
@@ -80,7 +81,9 @@ def plot_history(history: Sequence[Any], axes: "np.ndarray | None" = None) -> np
     if not len(history):
         raise invalid("history", expected="at least one step", got="none")
     if axes is None:
-        axes = import_pyplot("plot_history").subplots(2, 2, sharex="col", sharey="row", layout="constrained")[1]
+        axes = import_optional("matplotlib.pyplot", "plot").subplots(
+            2, 2, sharex="col", sharey="row", layout="constrained"
+        )[1]
     drawn = history[:: max(len(history) // _STEPS_DRAWN, 1)]
     steps, seconds, loss, psnr = np.array([(i.step, i.seconds, i.loss, i.psnr) for i in drawn], float).T
     for x, name, (upper, lower) in ((seconds, "seconds", axes[:, 0]), (steps, "steps", axes[:, 1])):
@@ -127,7 +130,9 @@ def plot_tradeoff(
     **Raises:** ImportError that names the extra if matplotlib is missing.
     """
     if axes is None:
-        made = import_pyplot("plot_tradeoff").subplots(1, len(panels), sharey=True, squeeze=False, layout="constrained")
+        made = import_optional("matplotlib.pyplot", "plot").subplots(
+            1, len(panels), sharey=True, squeeze=False, layout="constrained"
+        )
         axes = made[1][0]
     axes = np.atleast_1d(axes)
     groups = list(dict.fromkeys(axis for axis, _ in names))
@@ -285,11 +290,3 @@ def _check_plane(dist) -> None:
         got = f"batch_shape {dist.batch_shape} and event_shape {dist.event_shape}"
         cure = "Take one element of a batch, or a marginal of one space coordinate and time."
         raise invalid("dist", expected="batch_shape () and event_shape (2,)", got=got, cure=cure)
-
-
-def import_pyplot(caller: str):
-    try:
-        from matplotlib import pyplot
-    except ImportError as error:
-        raise ImportError(f"{caller} needs matplotlib: pip install 'foldgauss[plot]'.") from error
-    return pyplot

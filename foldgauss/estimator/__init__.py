@@ -1,9 +1,9 @@
 """Estimation of Folded-Gaussians and their mixtures from points.
 
-`FoldedGaussianMixture` fits mixtures by EM as a scikit-learn estimator, `FoldedMixtureRegressor` predicts by the
-conditional distribution of one, and `model_selection.select_mixture` chooses their size; `likelihood.fit` fits a single
-Folded-Gaussian by maximum likelihood, and `gradient_fit.fit_gradient` a mixture with any fold and envelope by gradient
-ascent. `em` is the algorithm on arrays. Names are imported when first used: `likelihood` does not need scikit-learn.
+`FoldedGaussianMixture` fits mixtures by EM as a scikit-learn estimator, and `FoldedMixtureRegressor` predicts by the
+conditional distribution of one; `likelihood.fit` fits a single Folded-Gaussian by maximum likelihood, and
+`gradient_fit.fit_gradient` a mixture with any fold and envelope by gradient ascent. `em` is the algorithm on arrays.
+Names are imported when first used: `likelihood` does not need scikit-learn.
 """
 
 import importlib

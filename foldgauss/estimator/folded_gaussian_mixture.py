@@ -24,17 +24,9 @@ from foldgauss.estimator.em.components import Parameters
 from foldgauss.estimator.em.initialization import INITIALIZERS, draw_subset, initialize, restrict_covariances
 from foldgauss.estimator.em.loop import EMStatus, Run, run_em, select_best
 from foldgauss.estimator.em.m_step import Model
-from foldgauss.estimator.em.online import FORGETTING, update_online
 from foldgauss.estimator.em.prune import count_parameters, drop_unused, prune_mixture
 from foldgauss.estimator.em.scaling import Scaling, check_export, compute_scaling, to_mixture
-from foldgauss.estimator.em.statistics import (
-    Blocks,
-    Points,
-    SufficientStatistics,
-    accumulate,
-    enable_dtype,
-    sum_over_points,
-)
+from foldgauss.estimator.em.statistics import Blocks, Points, enable_dtype
 from foldgauss.estimator.parameter_checks import (
     check_column,
     check_parameters,
@@ -44,7 +36,7 @@ from foldgauss.estimator.parameter_checks import (
 )
 from foldgauss.estimator.precisions import replace_initial
 from foldgauss.estimator.prediction import (
-    FittedParameters,
+    FittedMixture,
     predict_components,
     predict_log_prob,
     predict_responsibilities,
@@ -234,14 +226,14 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         """Fit, and return the most likely component of each row, as `predict`."""
         return self.fit(X, y, sample_weight, groups).predict(X)
 
-    def _check_rows(self, X, sample_weight, reset: bool = True) -> tuple[Rows, Bool[np.ndarray, " n"] | None]:
+    def _check_rows(self, X, sample_weight) -> tuple[Rows, Bool[np.ndarray, " n"] | None]:
         """The rows after a first pass over them, and which of them have weight; None for chunks."""
         if chunked := is_chunked(X):
             vars(self).pop("feature_names_in_", None)
             chunks, present = open_chunks(X, sample_weight), None
         else:
             check_real("X", X)
-            options = {"dtype": [np.float64, np.float32], "ensure_min_samples": 2 if reset else 1, "reset": reset}
+            options = {"dtype": [np.float64, np.float32], "ensure_min_samples": 2}
             X = validate_data(self, X, ensure_all_finite=sample_weight is None, **options)
             weights = _check_sample_weight(sample_weight, X, dtype=X.dtype, ensure_non_negative=True)
             chunks, present = open_chunks([X], weights), weights > 0
@@ -249,7 +241,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         if chunked and summary.num_rows < 2:
             raise invalid("X", expected="at least 2 rows", got=summary.num_rows)
         width = chunks.width
-        least = 1 if self.n_components == "auto" or not reset else self.n_components
+        least = 1 if self.n_components == "auto" else self.n_components
         check_sizes(width, summary.size, summary.total, least)
         self.n_features_in_ = width
         dtype = np.dtype(np.float32 if summary.single else np.float64)
@@ -301,9 +293,8 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         )
         if auto and warm is None and run.status != EMStatus.NOT_FINITE:
             run, model = self._prune(run, points, envelope, model, total)
-        self._scaling, self._envelope, self._floor = scaling, envelope, floor
+        self._scaling, self._envelope = scaling, envelope
         warn_narrow(run.params.tril, gaps)
-        vars(self).pop("_online", None)
         self._fitted_with = self.covariance_type, self._time_index(num_columns)
         return run, model
 
@@ -371,6 +362,8 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         params = Parameters(*(np.asarray(z) for z in run.params))
         self._params = params
         with enable_dtype(params.curve.dtype):
+            unscaled = Scaling(np.zeros(len(self._scaling.scale)), np.ones(len(self._scaling.scale)))
+            self._scaled = jax.tree.map(np.asarray, to_mixture(params, unscaled, self._envelope))
             mixture = to_mixture(params, self._scaling, self._envelope)
             means, covariances = mixture.components.moments()
             order = self._order_columns(means.shape[-1])
@@ -387,64 +380,6 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         self.status_, self.converged_ = run.status, run.status == EMStatus.CONVERGED
         self.n_iter_, self.lower_bound_ = len(run.history), run.log_likelihood - self._scaling.log_volume
         self.lower_bounds_ = [value - self._scaling.log_volume for value in run.history]
-
-    def partial_fit(self, X, y=None, sample_weight=None):
-        """Update the mixture by online EM with one batch after another, for data larger than memory.
-
-        The first batch is fitted by `fit` (it should have at least some hundred points per component), determines the
-        regularization, and replaces any earlier fit. Each later batch takes one step, weighted by its fraction of all
-        weight so far to the power 0.7: earlier batches, whose statistics are of poorer components, decay slowly.
-        `n_iter_` counts batches; `lower_bound_` is that of the last batch before its step.
-
-        **Source:** Cappé and Moulines 2009. **Raises:** as `fit`; ValueError for an envelope other than "constant",
-        whose statistics do not remain sufficient when the times change.
-        """
-        if is_chunked(X):
-            cure = "fit takes chunks; or call partial_fit with one after another."
-            raise invalid("X", expected="one batch of rows", got="chunks", cure=cure)
-        if not hasattr(self, "_online"):
-            return self._fit_first_batch(X, sample_weight)
-        check_parameters(self)
-        sums, seen, history, model = self._online
-        with enable_dtype(self._params.curve.dtype):
-            new, total = self._sum_batch(X, sample_weight)
-            value, fraction = float(new.log_likelihood) / total, (total / (seen + total)) ** FORGETTING
-            if not np.isfinite(value):
-                expected, got = "a batch near the components", "densities that underflow"
-                raise invalid("X", expected=expected, got=got, cure="Shuffle the data.")
-            fraction = jnp.asarray(fraction, self._params.curve.dtype)
-            params, sums = update_online(self._arrays(), sums, new, model, fraction)
-        history = [*history, value]
-        self._set_fitted(Run(params, history, EMStatus.NOT_CONVERGED), model)
-        self._online = sums, seen + total, history, model
-        return self
-
-    def _fit_first_batch(self, X, sample_weight):
-        if not isinstance(make_envelope(self.envelope), Constant):
-            cure = "Use fit, or gradient_fit.fit_gradient with batch_size."
-            raise invalid("envelope", expected='"constant" for partial_fit', got=repr(self.envelope), cure=cure)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ConvergenceWarning)
-            self.fit(X, sample_weight=sample_weight)
-        if self.status_ in (EMStatus.NOT_FINITE, EMStatus.SINGULAR):
-            warnings.warn(
-                f"The first batch ended as {self.status_.name}. {_CURES[self.status_]}",
-                ConvergenceWarning,
-                stacklevel=3,
-            )
-        dtype = self._params.curve.dtype
-        with enable_dtype(dtype):
-            sums, total = self._sum_batch(X, sample_weight)
-            model = Model(jnp.asarray(self.degrees_), jnp.asarray(self._floor, dtype), self.covariance_type)
-        self._online, self.n_iter_ = (sums, total, [self.lower_bound_ + self._scaling.log_volume], model), 1
-        return self
-
-    def _sum_batch(self, X, sample_weight) -> tuple[SufficientStatistics, float]:
-        """The sufficient statistics of a batch, and its weight."""
-        data = self._check_rows(X, sample_weight, reset=False)[0]
-        data = data._replace(dtype=self._params.curve.dtype, scaling=self._scaling)
-        points = data.to_points(len(self.weights_), self.devices)
-        return sum_over_points(accumulate, points, self._arrays(), Constant()), data.total
 
     # --- prediction: for chunks an iterator of arrays, for a dask array another, lazy one ----------------------
 
@@ -477,8 +412,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
     def _evaluate(self, function, X, dtype=None, columns: bool = False):
         """Apply `function(fitted, x)` to the rows, or to each chunk; `dtype` and `columns` describe its results."""
         check_is_fitted(self)
-        envelope = jax.tree.map(lambda z: np.asarray(z) if isinstance(z, jax.Array) else z, self._envelope)
-        fitted = FittedParameters(self._params, envelope, self._scaling, self._order_columns(self.n_features_in_))
+        fitted = FittedMixture(self._scaled, self._scaling, self._order_columns(self.n_features_in_))
         if is_chunked(X):
             chunks, num = open_chunks(X, width=self.n_features_in_), len(self.weights_) if columns else None
             return chunks.map(function, fitted, num_columns=num, dtype=dtype)
@@ -562,9 +496,6 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         with enable_dtype(self._params.curve.dtype):  # times far from zero need float64
             mixture = self.to_mixture().condition([order.index(column) for column in columns], values)
         return jax.tree.map(lambda z: jnp.asarray(z, jax.dtypes.canonicalize_dtype(z.dtype)), mixture)
-
-    def _arrays(self) -> Parameters:
-        return Parameters(*map(jnp.asarray, self._params))
 
 
 def _print_progress(number: int, values: np.ndarray) -> None:

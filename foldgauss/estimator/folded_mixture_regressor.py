@@ -5,14 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, clone
-from sklearn.utils import _safe_indexing
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from foldgauss._runtime.checks import invalid
 from foldgauss.estimator.em.statistics import enable_dtype
 from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
 from foldgauss.estimator.parameter_checks import check_column, check_real
-from foldgauss.estimator.rows import check_groups, order_columns
+from foldgauss.estimator.rows import order_columns
 
 __all__ = ["FoldedMixtureRegressor"]
 
@@ -59,16 +58,6 @@ class FoldedMixtureRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         (ConvergenceWarning) if EM did not converge, see `mixture_.status_`.
         """
         check_real("X", X)
-        sample_weight = None if sample_weight is None else np.asarray(sample_weight)
-        if (
-            np.ndim(sample_weight) == 1 and not np.all(sample_weight) and len(sample_weight) == len(y)
-        ):  # rows of weight 0 may hold NaN
-            check_groups(groups, np.ones(len(y), bool))  # before the rows are taken
-            present = np.flatnonzero(sample_weight)
-            if not len(present):
-                raise invalid("sample_weight", expected="a positive sum", got="only zeros", cure="0 leaves a row out.")
-            X, y, sample_weight = (_safe_indexing(z, present) for z in (X, y, sample_weight))
-            groups = None if groups is None else np.asarray(groups)[present]
         X, y = validate_data(self, X, y, dtype=np.float64, multi_output=True, y_numeric=True, ensure_min_samples=2)
         mixture = FoldedGaussianMixture() if self.mixture is None else clone(self.mixture)
         column = check_column(mixture.time_column, X.shape[1], getattr(self, "feature_names_in_", None))

@@ -16,23 +16,22 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key
 
 from foldgauss._numerics.batch import cast
-from foldgauss._numerics.regression import hermite, hermite_to_powers
+from foldgauss._numerics.regression import Regression, hermite, hermite_to_powers, weighted_regression
 from foldgauss._numerics.triangular import solve_upper_matrix
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer
 from foldgauss.distribution import FoldedGaussian
-from foldgauss.envelope import AbstractEnvelope, TimeLikelihood
+from foldgauss.envelope import AbstractEnvelope
 from foldgauss.estimator.em.scaling import check_time_resolution
 from foldgauss.estimator.parameter_checks import check_real, make_envelope
-from foldgauss.estimator.profile_likelihood import Profile, Space, maximize
 from foldgauss.fold import PolynomialFold
 
 __all__ = ["CenterParameters", "Fit", "FitStatus", "Replicates", "bootstrap", "fit"]
 
-_MAX_STEPS = 200  # trial steps of the maximization over time; it takes 5 to 20
+_LOG_2PI = 1.8378770664093453
 
 
 class FitStatus(IntEnum):
-    """How a fit ended. With any status but OK and NOT_CONVERGED all parameters are NaN."""
+    """How a fit ended. With any status but OK all parameters are NaN."""
 
     OK = 0
     NOT_FINITE = 1
@@ -40,7 +39,6 @@ class FitStatus(IntEnum):
     SINGULAR_TIME = 3
     SINGULAR_DESIGN = 4
     SINGULAR_COVARIANCE = 5
-    NOT_CONVERGED = 6
 
 
 _CURES = {
@@ -50,7 +48,6 @@ _CURES = {
     FitStatus.SINGULAR_DESIGN: "the times do not determine the polynomial (too few distinct ones). Lower degree.",
     FitStatus.SINGULAR_COVARIANCE: "the points lie on the curve, or a space coordinate is determined by the others. "
     "Drop it, use covariance_type='diag', or lower degree.",
-    FitStatus.NOT_CONVERGED: "the maximization over time_loc and time_scale stopped early. Scale x, or raise floor.",
 }
 
 
@@ -85,11 +82,10 @@ class Fit(eqx.Module):
     log_likelihood: Float[Array, ""]
     num_points: Float[Array, ""]
     status: Int[Array, ""]
-    steps: Int[Array, ""]
     # Cov of the Hermite coefficients of column j is residual_scale_j^2 triangle^-1 triangle^-T.
     triangle_inverse: Float[Array, "k k"]
     residual_scale: Float[Array, " d-1"]
-    time: str = eqx.field(static=True)
+    time_given: bool = eqx.field(static=True)
     covariance_type: str = eqx.field(static=True)
 
     def _repr_png_(self) -> bytes | None:
@@ -110,7 +106,7 @@ class Fit(eqx.Module):
         """Free parameters: the curve, Sigma, and time unless it was given."""
         dim = self.residual_scale.shape[-1]
         of_sigma = dim if self.covariance_type == "diag" else dim * (dim + 1) // 2
-        return (self.degree + 1) * dim + of_sigma + (0 if self.time == "given" else 2)
+        return (self.degree + 1) * dim + of_sigma + (0 if self.time_given else 2)
 
     @property
     def bic(self) -> Float[Array, ""]:
@@ -171,7 +167,6 @@ def fit(
     *,
     degree: int = 1,
     envelope: AbstractEnvelope | Callable | str = "constant",
-    time: str = "own",
     time_loc: ArrayLike | None = None,
     time_scale: ArrayLike | None = None,
     weights: Float[ArrayLike, " n"] | None = None,
@@ -182,16 +177,14 @@ def fit(
         maximize sum_i w_i [ log N(s_i | loc + f(u_i), a(t_i) Sigma) + log N(t_i | time_loc, time_scale^2) ]
 
     Given time, `loc`, `f` and `Sigma` are weighted least squares (weights `w / a`) in closed form, by QR in
-    Hermite polynomials of `u / time_scale`. The parameters of time are
-
-    * fixed, if `time_loc` and `time_scale` are passed;
-    * for `time="own"` their marginal estimates, weighted mean and standard deviation of t;
-    * for `time="joint"` a local maximum of the joint likelihood, by BFGS from those estimates; there may be several.
+    Hermite polynomials of `u / time_scale`. The parameters of time are fixed if `time_loc` and `time_scale` are passed,
+    else their marginal estimates, weighted mean and standard deviation of t. For the maximum of the joint likelihood,
+    which is another one unless a = 1, fit a `FoldedGaussianMixture` of one component.
 
     `envelope` is "constant", "time_likelihood" (`TimeLikelihood(power=1, floor=1e-3)`), any envelope, or a
     function as in `as_envelope`. It is not fitted. Why the default is not the paper's: see `foldgauss.envelope`. A
     floor is a *modeling* choice, and kept in the fitted distribution: without one the density on the ridge is unbounded
-    where `power (d-1) > 2`, and outlying times make a joint likelihood degenerate.
+    where `power (d-1) > 2`.
 
     **Shapes:** x (n, d), time last; `weights` (n,), frequency weights: 2 repeats a point, 0 leaves it out (such a row
     may hold NaN). A single fit; use `jax.vmap` for many. `covariance_type` is "full" or "diag" (the paper's).
@@ -200,22 +193,17 @@ def fit(
 
     **Example:** `fit(x, degree=2).check().distribution`
 
-    **Source:** eq:foldgauss. **Raises:** ValueError on unknown options, wrong shapes, negative weights, and a joint fit
-    with floor 0 where it is unbounded. Problems of the *data* do not raise but set `Fit.status`, also under `jit` and
-    `vmap`; see `Fit.check`.
+    **Source:** eq:foldgauss. **Raises:** ValueError on unknown options, wrong shapes, and negative weights. Problems of
+    the *data* do not raise but set `Fit.status`, also under `jit` and `vmap`; see `Fit.check`.
     """
     if not is_integer(degree, 0):
         raise invalid("degree", expected="a whole number >= 0", got=repr(degree))
-    check_one_of("time", time, ("own", "joint"))
     check_one_of("covariance_type", covariance_type, ("full", "diag"))
     x = _check_points(x)
     weights = _check_weights(weights, x)
     envelope = cast(make_envelope(envelope), x.dtype)
     given = _check_time(time_loc, time_scale, x.dtype)
-    if given is None and time == "joint":
-        _check_bounded(envelope, x.shape[1])
-    time = time if given is None else "given"
-    return _fit(_Plan(x, weights, given, envelope, int(degree), time, covariance_type))
+    return _fit(_Plan(x, weights, given, envelope, int(degree), covariance_type))
 
 
 # --- the fit ------------------------------------------------------------------------------------------------
@@ -242,8 +230,16 @@ class _Plan(eqx.Module):
     given: tuple[Float[Array, ""], Float[Array, ""]] | None
     envelope: AbstractEnvelope
     degree: int = eqx.field(static=True)
-    time: str = eqx.field(static=True)
     covariance_type: str = eqx.field(static=True)
+
+
+class _Space(NamedTuple):
+    """The maximum over space given time; `exp(2 log_unit) tril tril'` is the covariance."""
+
+    regression: Regression
+    tril: Float[Array, "d-1 d-1"]
+    value: Float[Array, ""]  # log-likelihood per point
+    singular: Bool[Array, ""]
 
 
 @eqx.filter_jit
@@ -252,17 +248,37 @@ def _fit(plan: _Plan) -> Fit:
     time_loc, time_scale = _estimate_time(data) if plan.given is None else plan.given
     singular_time = ~(time_scale > 0)
     time_scale = jnp.where(singular_time, 1, time_scale)
-    diagonal = plan.covariance_type == "diag"
-    profile = Profile(data.t, data.y, data.weights, plan.envelope, plan.degree, diagonal)
-    converged, steps = jnp.array(True), jnp.zeros((), jnp.int32)
-    if plan.time == "joint":
-        time_loc, time_scale, ascent = maximize(profile, time_loc, time_scale, _MAX_STEPS)
-        converged, steps = ascent.converged(slack=4.0), ascent.steps
-    space = profile.space(time_loc, time_scale)
-    status = _status(data, space, plan.degree + (2 if diagonal else plan.x.shape[1]), singular_time, converged)
-    result = _assemble_fit(plan, data, space, (time_loc, time_scale), status, steps)
-    failed = (status != FitStatus.OK) & (status != FitStatus.NOT_CONVERGED)
+    space = _maximize_over_space(plan, data, time_loc, time_scale)
+    needed = plan.degree + (2 if plan.covariance_type == "diag" else plan.x.shape[1])
+    status = _status(data, space, needed, singular_time)
+    result, failed = _assemble_fit(plan, data, space, (time_loc, time_scale), status), status != FitStatus.OK
     return jax.tree.map(lambda leaf: jnp.where(failed, jnp.nan, leaf) if eqx.is_inexact_array(leaf) else leaf, result)
+
+
+def _maximize_over_space(plan: _Plan, data: _Data, time_loc, time_scale) -> _Space:
+    """Fold, loc and Sigma by weighted least squares, and the log-likelihood there (eq:foldgauss)."""
+    log_a, tau = plan.envelope.log_a(data.t, time_loc=time_loc, time_scale=time_scale), (time_loc - data.t) / time_scale
+    regression = weighted_regression(tau, data.y, log_a, data.weights, plan.degree)
+    root = jnp.where(data.weights > 0, jnp.exp(-0.5 * log_a - regression.log_unit), 0)[:, None]
+    tril, singular = _factorize(root * (data.y - regression.fitted), root * data.y, data.weights, plan.covariance_type)
+    dim, mean = data.y.shape[1], lambda z: (data.weights * z).sum()
+    log_det = 2 * jnp.log(jnp.where(singular, 1, jnp.diagonal(tril))).sum() + 2 * regression.log_unit * dim
+    value = -0.5 * mean(tau * tau) - jnp.log(time_scale) - 0.5 * _LOG_2PI
+    value = value - 0.5 * dim * (mean(log_a) + _LOG_2PI + 1) - 0.5 * log_det
+    return _Space(regression, tril, value, singular)
+
+
+def _factorize(residual, total, weights, covariance_type: str) -> tuple[Float[Array, "d-1 d-1"], Bool[Array, ""]]:
+    """Cholesky factor of the residuals' covariance, and whether that is singular to working precision."""
+    eps = jnp.finfo(residual.dtype).eps
+    variance, size = ((weights[:, None] * z * z).sum(0) for z in (residual, total))
+    singular = (variance <= (64 * eps) ** 2 * size).any()
+    scale = jnp.sqrt(jnp.where(singular, 1, variance))
+    if covariance_type == "diag":
+        return jnp.diag(scale), singular
+    z = jnp.sqrt(weights)[:, None] * residual / scale[None]
+    tril = jnp.linalg.cholesky(jnp.matmul(z.T, z))
+    return scale[:, None] * tril, singular | ~(jnp.diagonal(tril) ** 2 > 64 * eps).all()  # true for NaN pivots
 
 
 def _prepare_data(x, weights, degree: int) -> _Data:
@@ -298,7 +314,7 @@ def _estimate_time(data: _Data):
     return loc, jnp.where(flat, 0, scale)
 
 
-def _status(data: _Data, space: Space, needed: int, singular_time, converged) -> Int[Array, ""]:
+def _status(data: _Data, space: _Space, needed: int, singular_time) -> Int[Array, ""]:
     """The first problem found; later ones follow from it."""
     problems = [
         (~data.finite, FitStatus.NOT_FINITE),
@@ -307,13 +323,12 @@ def _status(data: _Data, space: Space, needed: int, singular_time, converged) ->
         (space.regression.rank_deficient, FitStatus.SINGULAR_DESIGN),
         (space.singular, FitStatus.SINGULAR_COVARIANCE),
         (~jnp.isfinite(space.value), FitStatus.NOT_FINITE),
-        (~converged, FitStatus.NOT_CONVERGED),
     ]
     conditions, codes = zip(*problems, strict=True)
     return jnp.select(conditions, [jnp.int32(code) for code in codes], jnp.int32(FitStatus.OK))
 
 
-def _assemble_fit(plan: _Plan, data: _Data, space: Space, when, status, steps) -> Fit:
+def _assemble_fit(plan: _Plan, data: _Data, space: _Space, when, status) -> Fit:
     """The fit in the units of the points."""
     time_loc, time_scale = when
     to_powers = jnp.asarray(hermite_to_powers(plan.degree), data.t.dtype)
@@ -335,10 +350,9 @@ def _assemble_fit(plan: _Plan, data: _Data, space: Space, when, status, steps) -
         log_likelihood=data.total * (space.value - jnp.log(data.scale).sum()),
         num_points=data.total,
         status=status,
-        steps=steps,
         triangle_inverse=solve_upper_matrix(triangle, jnp.eye(len(triangle), dtype=triangle.dtype)),
         residual_scale=unbiased * jnp.linalg.norm(space.tril, axis=-1) * data.scale,
-        time=plan.time,
+        time_given=plan.given is not None,
         covariance_type=plan.covariance_type,
     )
 
@@ -412,15 +426,14 @@ def bootstrap(result: Fit, key: Key[Array, ""], num_replicates: int = 200, *, ba
 
     **Shapes:** `num_replicates` fits of `round(sum of weights)` points, `batch_size` of them at a time in memory.
 
-    **Example:** `bootstrap(fit(x, time="joint"), jax.random.key(0)).standard_errors["time_loc"]`
+    **Example:** `bootstrap(fit(x), jax.random.key(0)).standard_errors["time_loc"]`
 
     **Source:** Efron and Tibshirani, An Introduction to the Bootstrap, section 6.5.
     **Raises:** ValueError if the fit failed, or `num_replicates` is below 2.
     """
     if not is_integer(num_replicates, 2):
         raise invalid("num_replicates", expected="a whole number >= 2", got=num_replicates, cure="200 is usual.")
-    if int(result.status) not in (FitStatus.OK, FitStatus.NOT_CONVERGED):
-        result.check()
+    result.check()
     keys, num_points = jax.random.split(key, num_replicates), max(round(float(result.num_points)), 1)
     return _bootstrap(result, keys, num_points, min(batch_size, num_replicates))
 
@@ -428,13 +441,12 @@ def bootstrap(result: Fit, key: Key[Array, ""], num_replicates: int = 200, *, ba
 @eqx.filter_jit
 def _bootstrap(result: Fit, keys, num_points: int, batch_size: int) -> Replicates:
     dist, degree = result.distribution, result.degree
-    given = (dist.time_loc, dist.time_scale) if result.time == "given" else None
+    given = (dist.time_loc, dist.time_scale) if result.time_given else None
     weights = jnp.ones(num_points, dist.loc.dtype)
 
     def replicate(key):
         x = dist.sample(key, (num_points,))
-        plan = _Plan(x, weights, given, dist.envelope, degree, result.time, result.covariance_type)
-        refit = _fit(plan)
+        refit = _fit(_Plan(x, weights, given, dist.envelope, degree, result.covariance_type))
         return Replicates(refit.distribution, refit.status)
 
     return lax.map(replicate, keys, batch_size=batch_size)
@@ -470,19 +482,9 @@ def _check_weights(weights, x) -> Float[Array, " n"]:
 def _check_time(time_loc, time_scale, dtype):
     if (time_loc is None) != (time_scale is None):
         got = "time_loc alone" if time_scale is None else "time_scale alone"
-        cure = "Pass both, or none and time='own' or 'joint'."
+        cure = "Pass both, or none for those of the times themselves."
         raise invalid("time_loc, time_scale", expected="both or none", got=got, cure=cure)
     return None if time_loc is None else tuple(jnp.asarray(z).astype(dtype) for z in (time_loc, time_scale))
-
-
-def _check_bounded(envelope: AbstractEnvelope, dim: int) -> None:
-    if not isinstance(envelope, TimeLikelihood):
-        return
-    if any(isinstance(value, jax.core.Tracer) for value in (envelope.floor, envelope.power)):
-        return
-    if np.any((np.asarray(envelope.floor) == 0) & (np.asarray(envelope.power) * (dim - 1) > 2)):
-        cure = "The likelihood is unbounded on the ridge: pass TimeLikelihood(power, floor=1e-3), or time='own'."
-        raise invalid("envelope", expected="a floor above 0 where power (d-1) > 2", got="floor 0", cure=cure)
 
 
 def _check_level(level: float) -> float:

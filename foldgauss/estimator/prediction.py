@@ -1,77 +1,53 @@
 """Evaluation of a fitted mixture at rows of X, in a form that can be sent to workers."""
 
+import math
+from collections.abc import Callable
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
-from foldgauss.envelope import AbstractEnvelope
-from foldgauss.estimator.em.components import Parameters, evaluate_densities
 from foldgauss.estimator.em.scaling import Scaling
-from foldgauss.estimator.em.statistics import Points, enable_dtype, make_blocks, map_chunks
+from foldgauss.estimator.em.statistics import enable_dtype
+from foldgauss.mixture import FoldedMixture
 
-__all__ = ["FittedParameters", "predict_components", "predict_log_prob", "predict_responsibilities"]
+__all__ = ["FittedMixture", "predict_components", "predict_log_prob", "predict_responsibilities"]
+
+#: Rows are evaluated in blocks of a power of 2 from the first to the second, so that chunks of any size share programs.
+_LEAST_ROWS = 2**8
+_MOST_ROWS = 2**16
 
 
-class FittedParameters(NamedTuple):
-    """A fitted mixture in NumPy arrays."""
+class FittedMixture(NamedTuple):
+    """A mixture of scaled rows, in NumPy arrays, and how rows of X become such."""
 
-    params: Parameters
-    envelope: AbstractEnvelope
+    mixture: FoldedMixture
     scaling: Scaling
     order: Int[np.ndarray, " d"]
 
 
-def predict_log_prob(fitted: FittedParameters, x: np.ndarray) -> np.ndarray:
-    value = _evaluate_rows(_log_densities, fitted, x)
-    return (value if len(x) else value[:, 0]) - value.dtype.type(fitted.scaling.log_volume)
+def predict_log_prob(fitted: FittedMixture, x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
+    value = _evaluate_rows(FoldedMixture.log_prob, fitted, x)
+    return value - value.dtype.type(fitted.scaling.log_volume)
 
 
-def predict_responsibilities(fitted: FittedParameters, x: np.ndarray) -> np.ndarray:
-    return _evaluate_rows(_responsibilities, fitted, x)
+def predict_responsibilities(fitted: FittedMixture, x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n k"]:
+    return _evaluate_rows(FoldedMixture.responsibilities, fitted, x)
 
 
-def predict_components(fitted: FittedParameters, x: np.ndarray) -> np.ndarray:
+def predict_components(fitted: FittedMixture, x: Float[np.ndarray, "n d"]) -> Int[np.ndarray, " n"]:
     return predict_responsibilities(fitted, x).argmax(1)
 
 
-def _evaluate_rows(function, fitted: FittedParameters, x: np.ndarray) -> np.ndarray:
-    """Apply a compiled function of points to rows of X, in blocks of few shapes, so that all chunks share programs."""
-    y = fitted.scaling.apply(x[:, fitted.order].astype(np.result_type(x, fitted.params.curve)))
-    num = len(fitted.params.time_loc)
+def _evaluate_rows(method: Callable, fitted: FittedMixture, x: np.ndarray) -> np.ndarray:
+    """A method of the mixture at rows of X."""
+    y = fitted.scaling.apply(x[:, fitted.order].astype(np.result_type(x, fitted.mixture.logits)))
+    rows = min(max(2 ** math.ceil(math.log2(max(len(y), 1))), _LEAST_ROWS), _MOST_ROWS)
+    num_blocks = max(math.ceil(len(y) / rows), 1)
+    padded = np.pad(y, ((0, num_blocks * rows - len(y)), (0, 0)))
     with enable_dtype(y.dtype):
-        params = Parameters(*(jnp.asarray(z, y.dtype) for z in fitted.params))
-        blocks = make_blocks([(y, np.ones(len(y), y.dtype))], len(y), num)
-        values = [np.asarray(function(params, fitted.envelope, block)) for block in blocks]
-    return np.concatenate(values)[: len(y)] if values else np.zeros((0, num), y.dtype)
-
-
-def _over_points(function):
-    """The compiled function of points from one of the log-densities (n, k) of a chunk and the log-weights (k,)."""
-
-    @eqx.filter_jit
-    def of_points(params: Parameters, envelope: AbstractEnvelope, points: Points):
-        def of_chunk(x):
-            return function(evaluate_densities(params, envelope, x).log_density, params.log_weights)
-
-        value = map_chunks(of_chunk, points.x)
-        return value.reshape(-1, *value.shape[3:])
-
-    return of_points
-
-
-@_over_points
-def _log_densities(log_density, log_weights):
-    return jax.nn.logsumexp(log_density, axis=-1)
-
-
-@_over_points
-def _responsibilities(log_density, log_weights):
-    """P(component | x); the weights where all densities underflow."""
-    total = jax.nn.logsumexp(log_density, axis=-1, keepdims=True)
-    reached = jnp.isfinite(total)
-    responsibilities = jnp.exp(log_density - jnp.where(reached, total, 0))
-    return jnp.where(reached, responsibilities, jnp.exp(log_weights)[None])
+        mixture = jax.tree.map(lambda z: jnp.asarray(z, y.dtype), fitted.mixture)
+        blocks = [np.asarray(method(mixture, block)) for block in np.split(padded, num_blocks)]
+    return np.concatenate(blocks)[: len(y)]

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from foldgauss._runtime.optional_imports import import_optional
 from foldgauss.analysis.plot import Panel, plot_tradeoff
 from foldgauss.io._atomic import PathLike, atomic_path
 
@@ -15,11 +16,8 @@ def write_figure(path: PathLike, draw: Callable[[Any], object], size: tuple[floa
 
     Raises ImportError without matplotlib (`foldgauss[plot]`).
     """
-    try:
-        from matplotlib.figure import Figure  # not pyplot, which may need a display
-    except ImportError as error:
-        raise ImportError("Curves and plots need matplotlib: pip install 'foldgauss[plot]'.") from error
-    figure = Figure(figsize=size, dpi=DPI, layout="constrained")
+    figures = import_optional("matplotlib.figure", "plot")  # not pyplot, which may need a display
+    figure = figures.Figure(figsize=size, dpi=DPI, layout="constrained")
     draw(figure)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=DPI)

@@ -2,12 +2,10 @@
 
 `likelihood_profiles` renders the model at many times and gives the log-likelihood of each frame as a function of its
 time; `frame_time_posterior` samples the times from their posterior by emcee, beside the exact marginals
-(`exact_posterior`); `irregularities`, `summary` and `frame_table` report on it;
-`simulated_ranks` checks the calibration and `refit_frame_times` refits splats and times together. Sampling needs the
-extra `uncertainty`.
+(`exact_posterior`); `irregularities`, `summary` and `frame_table` report on it; `refit_frame_times` refits splats and
+times together. Sampling needs the extra `uncertainty`.
 """
 
-from foldgauss.uncertainty.diagnostics.calibration import SimulatedRanks, coverage, ecdf_band, simulated_ranks
 from foldgauss.uncertainty.diagnostics.irregularities import (
     IncrementIntervals,
     Irregularity,
@@ -21,7 +19,7 @@ from foldgauss.uncertainty.likelihood.color_marginalization import marginalize_c
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles, likelihood_profiles
 from foldgauss.uncertainty.likelihood.noise import FrameNoise
 from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves
-from foldgauss.uncertainty.likelihood.refit import Refit, RefitTimes, iter_refits, refit_frame_times
+from foldgauss.uncertainty.likelihood.refit import RefitTimes, refit_frame_times
 from foldgauss.uncertainty.posterior.exact import ExactPosterior, exact_posterior
 from foldgauss.uncertainty.posterior.increments import Increments
 from foldgauss.uncertainty.posterior.log_prob import FrameTimeLogProb, frame_time_log_prob, rendered_log_likelihood
@@ -38,24 +36,18 @@ __all__ = [
     "Irregularity",
     "LikelihoodProfiles",
     "ProfileCurves",
-    "Refit",
     "RefitTimes",
-    "SimulatedRanks",
     "TimesComparison",
     "compare_times",
-    "coverage",
-    "ecdf_band",
     "exact_posterior",
     "frame_table",
     "frame_time_log_prob",
     "frame_time_posterior",
     "increment_intervals",
     "irregularities",
-    "iter_refits",
     "likelihood_profiles",
     "marginalize_colors",
     "refit_frame_times",
     "rendered_log_likelihood",
-    "simulated_ranks",
     "summary",
 ]

@@ -7,7 +7,8 @@ import pytest
 import scipy.stats
 from time_clips import SCALE, model, white
 
-from foldgauss.uncertainty import FrameNoise, Increments, coverage, ecdf_band, simulated_ranks
+from benchmarks._calibration import SimulatedRanks, ecdf_band, simulated_ranks
+from foldgauss.uncertainty import FrameNoise, Increments
 
 REPLICATES, FRAMES = 300, 6
 #: Each run checks some six quantities against 99% envelopes with a fixed seed: 1 in 20 correct runs would fail.
@@ -139,34 +140,6 @@ def test_the_envelope_is_pointwise_binomial():
 
 
 def test_coverage_counts_central_ranks():
-    every = np.arange(100)[:, None]
+    every = SimulatedRanks(np.arange(100)[:, None], 100, [], np.zeros(0), 1.0)
     for level in (0.5, 0.9, 0.98):
-        assert coverage(every, 100, level)[0] == pytest.approx(level)
-
-
-@pytest.mark.parametrize(
-    ("change", "word"),
-    [
-        ({"sampler": "nuts"}, "sampler"),
-        ({"num_frames": 2}, "num_frames"),
-        ({"replicates": 0}, "replicates"),
-        ({"draws": 0}, "draws"),
-        ({"correlation": 0.0}, "correlation"),
-        ({"assumed_noise": "loud"}, "assumed_noise"),
-        ({"concentration": -1.0}, "concentration"),
-        ({"assumed_noise": FrameNoise(np.full(3, 0.1), 1.0)}, "scale"),
-        ({"sampler": "emcee", "steps": 20, "draws": 5000, "num_frames": 4}, "steps"),
-    ],
-)
-def test_what_is_refused(change, word):
-    with pytest.raises(ValueError, match=word):
-        simulated_ranks(model(), white(), **{"num_frames": 5, "replicates": 2, **change})
-
-
-def test_levels_without_whole_ranks_are_refused():
-    for wrong in (0.999, 0.0, 1.0, 0.55):
-        with pytest.raises(ValueError, match="level"):
-            coverage(np.zeros((3, 1), int), 20, wrong)
-    for settings in ((0, 10), (10, 1), (10, 10, 1.0)):
-        with pytest.raises(ValueError, match=r"replicates|level"):
-            ecdf_band(*settings)
+        assert every.coverage(level)[0] == pytest.approx(level)

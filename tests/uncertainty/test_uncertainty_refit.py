@@ -1,4 +1,4 @@
-"""Refitted frame times: bootstrap residuals, left-out frames, and statistics of the replicates."""
+"""Refitted frame times: bootstrap residuals, and statistics of the replicates."""
 
 import dataclasses
 
@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from foldgauss.uncertainty import RefitTimes, iter_refits, likelihood_profiles, refit_frame_times
-from foldgauss.uncertainty.likelihood.refit import Refit, merge_logits, resample_blocks, resample_frames
+from foldgauss.uncertainty import RefitTimes, likelihood_profiles, refit_frame_times
+from foldgauss.uncertainty.likelihood.refit import resample_blocks, resample_frames
 from foldgauss.uncertainty.likelihood.residuals import Residuals
-from foldgauss.video import FitConfig, FrameTimes, LearningRates, Views, fit
+from foldgauss.video import FitConfig, LearningRates, Views, fit
 
 CONFIG = FitConfig(num_gaussians=150, steps=200, degree=2, views=Views(interpolation_fraction=0.0))
 #: Learning rates with which only the frame times are fitted.
@@ -97,82 +97,38 @@ def test_frames_spread_around_the_models_pictures(model, frames):
     assert np.abs(np.corrcoef(one.ravel() != 0, other.ravel() != 0)[0, 1]) < 0.3  # frames are independent
 
 
-# Left-out frames
-
-
-def test_merged_logits_keep_the_other_times():
-    logits = np.random.default_rng(1).normal(0, 1, 9)
-    unseen = np.array([0, 1, 0, 0, 1, 1, 0, 0, 1, 0], bool)
-    kept = np.asarray(FrameTimes(merge_logits(logits, unseen)).times())
-    np.testing.assert_allclose(kept, np.asarray(FrameTimes(logits.astype(np.float32)).times())[~unseen], atol=1e-6)
-
-
-def test_every_frame_is_unseen_once(model, frames):
-    config, completed = dataclasses.replace(CONFIG, steps=150), []
-    found = refit_frame_times(model, frames, config, replicates=3, method="frames", on_replicate=completed.append)
-    assert [each.number for each in completed] == [0, 1, 2]
-    assert [each.model.num_frames for each in completed] == [5, 5, 6]
-    np.testing.assert_array_equal(found.unseen.sum(0), [0, 1, 1, 1, 1, 1, 0])
-    assert (np.diff(found.times) >= 0).all()
-    assert (found.times[:, 0] == 0).all()
-    assert (found.times[:, -1] == 1).all()
-    assert found.by_frames
-    assert found.freedom == 5
-    assert 0 < found.spread[1] < 0.6  # near its neighbors, but not at the fitted time
-    np.testing.assert_array_equal(found.std[1:-1], found.std[1])
-    assert found.std[0] == found.std[-1] == 0
-    np.testing.assert_array_equal(found.mean[[1, 4]], found.times[0, [1, 4]])
-
-
 # Replicates
 
 
-@pytest.fixture(scope="module")
-def replicates(model, frames):
-    return list(iter_refits(model, frames, CONFIG, replicates=3, steps=40, seed=4, block=8))
+def test_replicates_depend_on_the_seed_and_their_number(model, frames):
+    def run(replicates=2, **how):
+        models = []
+        found = refit_frame_times(
+            model, frames, CONFIG, steps=40, block=8, replicates=replicates, **how,
+            on_replicate=lambda number, refitted: models.append((number, refitted)),
+        )  # fmt: skip
+        assert [number for number, _ in models] == list(range(replicates))
+        np.testing.assert_array_equal([own_times(each) for _, each in models], found.times)
+        return found
 
-
-def test_times_of_replicates(model, replicates):
-    found = RefitTimes.from_refits(model, replicates)
-    assert found.times.shape == (3, 7)
+    found = run(3, seed=4)
     assert (np.diff(found.times) > 0).all()
-    assert (found.times[:, 0] == 0).all()
-    assert (found.times[:, -1] == 1).all()
-    assert not found.by_frames
+    assert (found.times[:, [0, -1]] == [0, 1]).all()
     assert (found.std[1:-1] > 0).all()
     assert found.spread.max() < 0.2
-    assert all(each.psnr > 25 for each in replicates)
-
-
-def test_seeds_reproduce_and_replicates_are_independent(model, frames, replicates):
-    how = {"replicates": 3, "steps": 40, "block": 8}
-    again = list(iter_refits(model, frames, CONFIG, seed=4, first=1, **how))
-    assert [each.number for each in again] == [1, 2]
-    for one, other in zip(replicates[1:], again, strict=True):
-        np.testing.assert_array_equal(one.times, other.times)
-    another = next(iter_refits(model, frames, CONFIG, seed=5, **how))
-    assert not np.array_equal(another.times, replicates[0].times)
-    assert not np.array_equal(replicates[0].times, replicates[1].times)
-
-
-@pytest.mark.parametrize(
-    "how",
-    [{"start": "scratch"}, {"method": "order"}, {"method": "order", "start": "scratch"}],
-    ids=str,
-)
-def test_every_method_works(model, frames, how):
-    found = refit_frame_times(model, frames, CONFIG, replicates=2, steps=30, **how)
-    assert (np.diff(found.times) > 0).all()
-    assert (found.std[1:-1] > 0).all()
+    np.testing.assert_array_equal(run(seed=4).times, found.times[:2])
+    for other in (run(seed=5), run(seed=4, method="order")):
+        assert (other.times[:, 1:-1] != found.times[:2, 1:-1]).all()
 
 
 def test_default_steps_are_the_end_of_the_schedule(model, frames):
-    config, steps = dataclasses.replace(CONFIG, steps=100, minutes=5.0, quality=10.0), []
+    config = dataclasses.replace(CONFIG, steps=100, minutes=5.0, quality=10.0)
     original = dataclasses.replace(CONFIG, steps=30)
-    for each in (config, original):
-        how = {"replicates": 1, "method": "order", "steps": None if each is config else 30}
-        steps.append(next(iter_refits(model, frames, each, **how)).times)
-    np.testing.assert_array_equal(*steps)  # 30% of 100 steps, independent of minutes and quality
+    ended, given = (
+        refit_frame_times(model, frames, each, replicates=2, method="order", steps=steps).times
+        for each, steps in ((config, None), (original, 30))
+    )
+    np.testing.assert_array_equal(ended, given)  # 30% of 100 steps, independent of minutes and quality
 
 
 @pytest.mark.slow
@@ -197,15 +153,10 @@ def test_spread_with_held_splats_matches_the_profiles():
 # Statistics of replicates
 
 
-def made(times, own, unseen=None):
-    unseen = np.zeros(times.shape, bool) if unseen is None else unseen
-    return RefitTimes(times, unseen, own)
-
-
 def test_ratio_intervals_and_spread():
     rng, own = np.random.default_rng(2), np.linspace(0, 1, 41)
     std = np.where((own > 0) & (own < 1), 0.001 + 0.002 * own, 0.0)
-    found = made(own + 3 * std * rng.normal(size=(50, 41)), own)
+    found = RefitTimes(own + 3 * std * rng.normal(size=(50, 41)), own)
     assert abs(found.ratio_to(std) - 3) < 0.2  # 1911 degrees of freedom: 4 standard errors
     assert abs(found.ratio_to(np.where(std > 0, 0.002, 0)) - 3) < 0.6
     np.testing.assert_allclose(found.mean, found.times.mean(0))
@@ -222,10 +173,10 @@ def test_ratio_intervals_and_spread():
 def test_local_ignores_smooth_warps():
     rng, own = np.random.default_rng(2), np.linspace(0, 1, 41)
     bump = np.sin(np.pi * own)
-    warped = made(own + 0.01 * rng.normal(size=(50, 1)) * bump, own)
+    warped = RefitTimes(own + 0.01 * rng.normal(size=(50, 1)) * bump, own)
     assert warped.local[1:-1].max() < 0.005 * warped.std.max()
     inner = (own > 0) & (own < 1)
-    rough = made(own + 0.01 * rng.normal(size=(200, 41)) * inner, own)
+    rough = RefitTimes(own + 0.01 * rng.normal(size=(200, 41)) * inner, own)
     np.testing.assert_allclose(rough.local[2:-2], 0.01 * np.sqrt(1.5), rtol=0.2)
     assert rough.local[0] == rough.local[-1] == 0
 
@@ -233,89 +184,49 @@ def test_local_ignores_smooth_warps():
 def test_spread_counts_frames_where_times_are_uneven():
     own = np.array([0.0, 0.1, 0.5, 1.0])
     times = own + np.array([[0, 0.04, 0, 0], [0, -0.01, 0, 0], [0, 0, 0, 0]])
-    found = made(times, own)
+    found = RefitTimes(times, own)
     np.testing.assert_allclose(found.spread[1], np.std([1.1, 0.9, 1.0], ddof=1))
 
 
 def test_equal_float32_times_give_finite_spread():
     own = np.array([0.0, 0.5, 0.5, 1.0])
-    assert np.isfinite(made(np.stack([own, own]), own).spread).all()
-
-
-def test_left_out_frames_share_one_deviation():
-    own = np.linspace(0, 1, 5)
-    unseen = np.array([[0, 1, 0, 1, 0], [0, 0, 1, 0, 0]], bool)
-    times = own + np.array([[0, 0.03, 0.9, 0, 0], [0, 0, -0.04, 0, 0]])
-    found = made(times, own, unseen)
-    rms = np.sqrt((0.03**2 + 0.04**2) / 3)
-    np.testing.assert_allclose(found.std, [0, rms, rms, rms, 0])
-    np.testing.assert_allclose(found.ratio_to(np.array([0, 0.01, 0.02, 0.01, 0])), np.sqrt((3**2 + 2**2) / 3))
-    np.testing.assert_allclose(found.mean, own + np.array([0, 0.03, -0.04, 0, 0]))
-
-
-# Errors
-
-
-def ended(model, frames, config=CONFIG, **how):
-    return next(iter_refits(model, frames, config, **({"steps": 5} | how)))
+    assert np.isfinite(RefitTimes(np.stack([own, own]), own).spread).all()
 
 
 @pytest.mark.parametrize(
-    ("how", "told"),
+    ("change", "told"),
     [
         ({"method": "rows"}, "method: expected one of"),
-        ({"start": "middle"}, "start: expected one of"),
-        ({"method": "frames", "start": "model"}, "start: expected 'scratch'"),
-        ({"method": "frames", "replicates": 6}, "replicates: expected from 2 to 5"),
-        ({"method": "frames", "replicates": 1}, "replicates: expected from 2 to 5"),
-        ({"replicates": 0}, "replicates: expected"),
+        ({"replicates": 1}, "replicates: expected a whole number >= 2"),
         ({"replicates": 2.0}, "replicates: expected"),
-        ({"first": -1}, "first: expected"),
         ({"seed": -1}, "seed: expected"),
         ({"block": 0}, "block: expected a whole number from 1 to 24"),
         ({"block": 25}, "block: expected a whole number from 1 to 24"),
         ({"steps": 0}, "steps: expected"),
+        ({"video": lambda frames: frames[:-1]}, "video: expected the 7 frames"),
+        ({"video": lambda frames: frames[:, :-1]}, "video: expected uint8"),
+        ({"video": lambda frames: np.random.default_rng(1).integers(0, 256, frames.shape, np.uint8)}, "explains"),
+        ({"video": lambda frames: np.insert(frames, 3, 255, axis=-1)}, "without alpha"),
+        ({"config": CONFIG.replace(**{"rates.frame_times": 0.0})}, r"rates\.frame_times"),
+        ({"config": dataclasses.replace(CONFIG, steps=None, minutes=1.0), "steps": None}, "ends by the clock"),
+        ({"config": dataclasses.replace(CONFIG, degree=3)}, r"config\.degree"),
     ],
-    ids=str,
 )
-def test_settings_out_of_range(model, frames, how, told):
+def test_arguments_that_do_not_fit_raise(model, frames, change, told):
+    given = {"config": CONFIG, "steps": 5} | change
     with pytest.raises(ValueError, match=told):
-        ended(model, frames, **how)
+        refit_frame_times(model, given.pop("video", np.asarray)(frames), **given)
 
 
-def test_videos_of_other_models_are_refused(model, frames):
-    with pytest.raises(ValueError, match="video: expected the 7 frames"):
-        ended(model, frames[:-1])
-    with pytest.raises(ValueError, match="video: expected uint8"):
-        ended(model, frames[:, :-1])
-    noise = np.random.default_rng(1).integers(0, 256, frames.shape, dtype=np.uint8)
-    with pytest.raises(ValueError, match="explains"):
-        ended(model, noise)
-    clear = np.concatenate([frames, np.full((*frames.shape[:3], 1), 255, np.uint8)], -1)
-    with pytest.raises(ValueError, match="without alpha"):
-        ended(model, clear)
-    assert np.isfinite(ended(model, clear, method="order").times).all()
+def test_alpha_can_be_refitted_in_another_order(model, frames):
+    opaque = np.insert(frames, 3, 255, axis=-1)
+    found = refit_frame_times(model, opaque, CONFIG, method="order", replicates=2, steps=5)
+    assert np.isfinite(found.times).all()
 
 
-def test_configs_that_do_not_fit(model, frames):
-    with pytest.raises(ValueError, match=r"rates\.frame_times"):
-        ended(model, frames, CONFIG.replace(**{"rates.frame_times": 0.0}))
-    with pytest.raises(ValueError, match="ends by the clock"):
-        ended(model, frames, dataclasses.replace(CONFIG, steps=None, minutes=1.0), steps=None)
-    for start in ("model", "scratch"):
-        with pytest.raises(ValueError, match=r"config\.degree"):
-            ended(model, frames, dataclasses.replace(CONFIG, degree=3), start=start)
-
-
-def test_too_few_refits_and_wrong_arguments_raise(model, frames):
-    own = own_times(model)
-    one = Refit(0, own, np.zeros(7, bool), model, 30.0)
-    for few in ([], [one], [one, one]):
-        with pytest.raises(ValueError, match="refits: expected two or more"):
-            RefitTimes.from_refits(model, few)
-    with pytest.raises(ValueError, match="replicates: expected a whole number >= 2"):
-        refit_frame_times(model, frames, CONFIG, replicates=1)
-    found = made(np.stack([own, own]), own)
+def test_wrong_arguments_of_statistics_raise():
+    own = np.linspace(0, 1, 7)
+    found = RefitTimes(np.stack([own, own]), own)
     for level in (0, 1, np.nan, "0.9"):
         with pytest.raises(ValueError, match="level: expected"):
             found.interval(level)
@@ -329,14 +240,10 @@ def test_longer_refits_spread_more_and_order_less():
     """The documented effects of time warps and of the optimizer, on a sufficiently large clip."""
     clip, config = passing(12, 48, 80), FitConfig(num_gaussians=800, steps=1000)
     whole = fit(clip, config).model
+    runs = {"short": {"steps": 100}, "long": {"steps": 1000}, "order": {"steps": 1000, "method": "order"}}
     spread = {}
-    for name, how in {
-        "short": {"steps": 100},
-        "long": {"steps": 1000},
-        "order": {"steps": 1000, "method": "order"},
-        "scratch": {"start": "scratch"},
-    }.items():
+    for name, how in runs.items():
         found = refit_frame_times(whole, clip, config, replicates=10, **how)
         spread[name] = np.sqrt(np.mean(found.spread[1:-1] ** 2))
-    assert spread["short"] < spread["long"] < spread["scratch"]
+    assert spread["short"] < spread["long"]
     assert spread["order"] < spread["long"]

@@ -10,6 +10,7 @@ import numpy as np
 import typer
 
 from foldgauss._runtime.checks import ParameterError, check_one_of, invalid, require
+from foldgauss._runtime.optional_imports import import_optional
 from foldgauss.cli.app.application import Stopped, command, out, warn
 from foldgauss.cli.app.help import complete_choice
 from foldgauss.cli.shared.arguments import FittedClip, FittedFrames, ModelFile, Overwrite
@@ -29,7 +30,6 @@ from foldgauss.uncertainty.diagnostics import plots
 from foldgauss.uncertainty.diagnostics.irregularities import irregularities
 from foldgauss.uncertainty.diagnostics.report import frame_table, summary
 from foldgauss.uncertainty.likelihood.noise import NOISES
-from foldgauss.uncertainty.posterior.optional_imports import import_optional
 from foldgauss.uncertainty.posterior.result import FrameTimePosterior
 from foldgauss.uncertainty.posterior.sampling import check_settings
 from foldgauss.video.models.video_model import VideoModel
@@ -97,7 +97,7 @@ def uncertainty_command(
     continues a stopped run, or with more --steps a finished one.
     """
     for name in ("matplotlib", "emcee", "h5py", "h5netcdf", "arviz"):
-        import_optional(name)
+        import_optional(name, "uncertainty")
     check_one_of("--noise", noise, NOISES)
     check_one_of("--level", level, LEVELS)
     out_dir = name_after(model_path, "-uncertainty") if out_dir is None else out_dir

@@ -1,5 +1,4 @@
 """What is done with a posterior of frame times.
 
-`irregularities` finds duplicated and dropped frames, `report` and `plots` present the posterior, and `calibration`
-checks the method by simulation.
+`irregularities` finds duplicated and dropped frames, and `report` and `plots` present the posterior.
 """

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.analysis.plot import import_pyplot
+from foldgauss._runtime.optional_imports import import_optional
 from foldgauss.uncertainty.diagnostics.irregularities import (
     Irregularity,
     even_times,
@@ -55,7 +55,7 @@ def plot_times(
     if fitted is not None and np.shape(fitted) != (num_frames,):
         raise invalid("fitted", expected=f"{num_frames} times", got=f"shape {np.shape(fitted)}")
     if axes is None:
-        pyplot = import_pyplot("plot_times")
+        pyplot = import_optional("matplotlib.pyplot", "plot")
         axes = pyplot.subplots(2, 1, sharex=True, layout="constrained", figsize=(9, 6))[1]
     flagged = irregularities(posterior) if flagged is None else flagged
     frames, (even, unit) = np.arange(num_frames), even_times(posterior)
@@ -112,7 +112,7 @@ def plot_increments(
 
     Cuts are omitted. Raises as `plot_times` and `increment_intervals` do.
     """
-    ax = _axes(ax, "plot_increments", (9, 4))
+    ax = _axes(ax, (9, 4))
     flagged = irregularities(posterior) if flagged is None else flagged
     found = increment_intervals(posterior, level)
     shown = np.flatnonzero(~find_cuts(posterior))
@@ -147,7 +147,7 @@ def plot_correlation(profiles: LikelihoodProfiles, ax: Any = None) -> Any:
 
     White noise would fall from 1 to 0 within a pixel. **Units:** pixels.
     """
-    ax = _axes(ax, "plot_correlation", (6, 3.6))
+    ax = _axes(ax, (6, 3.6))
     correlation = np.asarray(profiles.residual_correlation)
     below = np.flatnonzero(correlation < LAST_CORRELATION)
     reach = int(below[0]) if below.size else len(correlation) - 1
@@ -164,8 +164,10 @@ def plot_correlation(profiles: LikelihoodProfiles, ax: Any = None) -> Any:
     return ax
 
 
-def _axes(ax, caller: str, size: tuple[float, float]):
-    return import_pyplot(caller).subplots(layout="constrained", figsize=size)[1] if ax is None else ax
+def _axes(ax, size: tuple[float, float]):
+    if ax is not None:
+        return ax
+    return import_optional("matplotlib.pyplot", "plot").subplots(layout="constrained", figsize=size)[1]
 
 
 def _bar_width(num: int) -> float:

@@ -18,7 +18,7 @@ from foldgauss._runtime.checks import invalid, is_integer, is_within
 from foldgauss.uncertainty.likelihood.color_normal_equations import ColorEquations, FrameAt, solve_conjugate_gradient
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles
 from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves
-from foldgauss.uncertainty.likelihood.residuals import Residuals
+from foldgauss.uncertainty.likelihood.residuals import Residuals, check_frames
 from foldgauss.video.models.video_model import VideoModel
 
 #: Profiles extend until the base has fallen by so many nats,
@@ -81,7 +81,7 @@ def marginalize_colors(
     residuals = Residuals(model, video)
     num_frames = len(residuals.frames)
     _check(base, num_frames, prior_scale, most_dense, probes)
-    chosen = _check_frames(frames, num_frames)
+    chosen = check_frames(frames, num_frames)
     times = base.curves.modes()
     times[[0, -1]] = np.asarray(model.frame_times.times(), np.float64)[[0, -1]]
     equations = ColorEquations(residuals, base.noise, times, float(prior_scale))
@@ -118,16 +118,6 @@ def _check(base: LikelihoodProfiles, num_frames: int, prior_scale: float, most_d
     for name, value, least in (("most_dense", most_dense, 0), ("probes", probes, 1)):
         if not is_integer(value, least):
             raise invalid(name, expected=f"a whole number >= {least}", got=value)
-
-
-def _check_frames(frames: Sequence[int] | None, num_frames: int) -> list[int]:
-    if frames is None:
-        return list(range(1, num_frames - 1))
-    chosen = list(frames)
-    if not all(is_integer(k, 1) and k < num_frames - 1 for k in chosen) or len({*chosen}) < len(chosen):
-        cure = "The first and the last frame's times are fixed."
-        raise invalid("frames", expected=f"different frames from 1 to {num_frames - 2}", got=chosen, cure=cure)
-    return [int(k) for k in chosen]
 
 
 def _neighbor_times(times: Float64[np.ndarray, " num_frames"], k: int) -> tuple[float, float]:

@@ -14,7 +14,6 @@ from foldgauss.uncertainty.likelihood.noise import (
     FrameNoise,
     autocorrelation,
     covariances,
-    effective_fraction,
     rings,
     score_fraction,
 )
@@ -89,7 +88,7 @@ def likelihood_profiles(
     times, or only within `reach` frame times of its own (default for more than 400 frames: 100, widened as needed). But
     its first frame is at time 0 of the model and its last at 1; a warning is given if that does not fit, if the
     model may be of another clip of the same scene, and if Gaussians follow shared paths, which may absorb the times.
-    `noise`: "effective" or "score" (see `effective_fraction`, `score_fraction`), "independent", or a `FrameNoise`.
+    `noise`: "score" (see `score_fraction`), "independent", or a `FrameNoise`.
     `on_render` is called with the numbers of images rendered and planned so far.
 
     Raises ValueError for a video of another size, one that the model does not explain, one that does not identify its
@@ -207,8 +206,6 @@ class ProfileBuilder:
             covariance = covariances(residual)
             together = together + covariance / scale[k] ** 2
             correlations = correlations + rings(autocorrelation(covariance))
-            if kind == "effective":
-                fraction[k] = effective_fraction(covariance)
         if kind == "score":
             step = self.finest * SLOPE_STEP
             times = [np.clip([t - step, t, t + step], 0.0, 1.0) for t in modes]

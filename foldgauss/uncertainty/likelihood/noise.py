@@ -1,7 +1,7 @@
 """The noise model: residual scale per frame, and the power to which the likelihood is tempered.
 
 Residuals of neighboring pixels are correlated, so a Gaussian likelihood of independent pixels is far too narrow. The
-log-likelihood is therefore multiplied by a fraction below 1, of which there are two estimates with different biases.
+log-likelihood is therefore multiplied by a fraction below 1.
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ from jaxtyping import Float, Float64
 from foldgauss._runtime.checks import invalid
 
 #: Names that `likelihood_profiles` accepts for `noise`, besides a FrameNoise.
-NOISES = ("score", "effective", "independent")
+NOISES = ("score", "independent")
 #: Lags are summed until the mean correlation on a ring falls below this.
 LAST_CORRELATION = 0.02
 #: Standard deviation in pixels of the local residual power: residuals are largest at edges, which also determine time.
@@ -134,26 +134,6 @@ def correlated_reach(covariance: _Covariance) -> int:
     return int(below[0]) if below.size else len(correlation)
 
 
-def effective_fraction(covariance: _Covariance) -> float:
-    r"""Effective number of independent values per value, at most 1, by the sum of the residuals' autocorrelation.
-
-    The residuals' `covariances`, summed over lags up to `correlated_reach`, are a matrix over channels; the fraction is
-    the mean variance over its largest eigenvalue. Exact for statistics that depend on the mean of many neighboring
-    residuals of the leading color, and conservative for those that depend on details.
-
-    **Source:** the variance of the mean of a stationary process; e.g. Priestley 1981, section 5.3.
-    """
-    most = covariance.shape[-1] // 2
-    power = np.einsum("cc->", covariance[..., most, most]) / len(covariance)
-    if power == 0:
-        return 1.0
-    lags = np.arange(-most, most + 1)
-    inside = np.rint(np.hypot(lags[:, None], lags[None, :])) < correlated_reach(covariance)
-    together = covariance[..., inside].sum(-1)
-    inflation = float(np.linalg.eigvalsh((together + together.T) / 2)[-1] / power)
-    return min(1.0, 1.0 / inflation) if inflation > 0 else 1.0
-
-
 def score_fraction(
     residual: Float[np.ndarray, "channels height width"],
     slope: Float[np.ndarray, "channels height width"],
@@ -190,7 +170,7 @@ def score_fraction(
     local = np.sqrt(scipy.ndimage.gaussian_filter((residual**2).mean(0), LOCAL))
     variance = float((weights * covariance[..., near, near] * _lagged_products(local * slope, reach)).sum() / power)
     variance = max(variance, _own_variance((residual * slope).sum(0), weights))
-    return min(1.0, plain / variance) if variance > 0 else effective_fraction(covariance)
+    return min(1.0, plain / variance) if variance > 0 else 1.0
 
 
 def _own_variance(score: np.ndarray, weights: np.ndarray) -> float:

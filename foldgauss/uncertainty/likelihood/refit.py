@@ -1,111 +1,64 @@
 r"""Uncertainty of frame times by refitting splats and times together.
 
 The posterior given likelihood profiles takes the splats as known. Here they are refitted together with the times: to
-resampled frames (method="pixels"), to all frames but some (method="frames"), or once more (method="order").
+resampled frames (method="pixels"), or once more to the same frames (method="order").
 
 Times are not identified absolutely: for any increasing g, times g(t_k) and splats whose m_t, sigma_t and folds follow g
 show the same frames. Only $t_0 = 0$ and $t_{n-1} = 1$ are fixed, so absolute times spread the more the longer the fit;
 `RefitTimes.local` measures what a smooth warp hardly changes, each frame's time relative to its neighbors. The number
-of Gaussians is held, too, and with start="model" their depth order. From scratch most of the spread is due to the
-order of steps: compare "order".
+of Gaussians and their depth order are held, too.
 """
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 
 import numpy as np
 import scipy.stats
-from jaxtyping import Bool, Float, Float32, Float64, UInt8
+from jaxtyping import Float, Float64, UInt8
 
 from foldgauss._numerics.random_streams import Stream, make_generator, seed_sequence
-from foldgauss._runtime.checks import check_one_of, invalid, is_integer, is_within
+from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_integer
 from foldgauss.uncertainty.likelihood.likelihood_profiles import check_explained
 from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.video.fitting.config import FitConfig, planned_steps
-from foldgauss.video.fitting.loop import FitState, fit_steps, start_from, to_model
-from foldgauss.video.fitting.loop import start as start_anew
+from foldgauss.video.fitting.loop import fit_steps, start_from, to_model
 from foldgauss.video.models.video_model import VideoModel
 
-METHODS = ("pixels", "frames", "order")
-STARTS = ("model", "scratch")
-#: A refit that starts at the model repeats the schedule from this fraction on, with its last learning rates and loss.
+METHODS = ("pixels", "order")
+#: A refit repeats the schedule from this fraction on, with its last learning rates and loss.
 START_AT = 0.7
 #: The least `LearningRates.cooldown` of refits: the spread is that of the estimate, not of its last steps.
 COOLDOWN_FRACTION = 0.2
-#: Grid search for the time of a left-out frame: points per grid.
-GRID_POINTS = 33
-#: Number of ever finer grids.
-GRID_ROUNDS = 3
-
-
-@dataclasses.dataclass(frozen=True)
-class Refit:
-    """One replicate: the refitted model and its frame times.
-
-    `times` (num_frames,): times of all frames of the video, in [0, 1] and never decreasing; `unseen` (num_frames,):
-    the frames that were left out, whose times were found afterwards. `psnr`: dB over the fitted frames, as the last
-    steps of the fit report it.
-    """
-
-    number: int
-    times: Float64[np.ndarray, " num_frames"]
-    unseen: Bool[np.ndarray, " num_frames"]
-    model: VideoModel
-    psnr: float
 
 
 @dataclasses.dataclass(frozen=True)
 class RefitTimes:
     """Frame times of all replicates, and the model's own.
 
-    **Shapes:** `times`, `unseen` (replicates, num_frames), see `Refit`; `own` (num_frames,). **Units:** times of the
-    model, [0, 1].
-
-    A frame's `std` is the standard deviation of its times over the replicates; with frames left out, all frames share
-    one: the root mean square difference from the model's times, of which most is the splats' error without that frame.
+    **Shapes:** `times` (replicates, num_frames), never decreasing; `own` (num_frames,). **Units:** times of the model,
+    [0, 1].
     """
 
     times: Float64[np.ndarray, "replicates num_frames"]
-    unseen: Bool[np.ndarray, "replicates num_frames"]
     own: Float64[np.ndarray, " num_frames"]
-
-    @classmethod
-    def from_refits(cls, model: VideoModel, refits: Sequence[Refit]) -> "RefitTimes":
-        """Collect replicates of `iter_refits`. Raises ValueError for fewer than two, or duplicates."""
-        numbers = [each.number for each in refits]
-        if len(numbers) < 2 or len(set(numbers)) < len(numbers):
-            raise invalid("refits", expected="two or more, without duplicates", got=f"numbers {numbers}")
-        own = np.asarray(model.frame_times.times(), np.float64)
-        return cls(np.stack([each.times for each in refits]), np.stack([each.unseen for each in refits]), own)
-
-    @property
-    def replicates(self) -> int:
-        return len(self.times)
-
-    @property
-    def by_frames(self) -> bool:
-        """Whether frames were left out."""
-        return bool(self.unseen.any())
 
     @property
     def mean(self) -> Float64[np.ndarray, " num_frames"]:
-        """Mean time of each frame; with frames left out, the time found where it was unseen."""
-        if not self.by_frames:
-            return self.times.mean(0)
-        return np.where(self.unseen.any(0), np.where(self.unseen, self.times, 0).sum(0), self.own)
+        """Mean time of each frame."""
+        return self.times.mean(0)
 
     @property
     def std(self) -> Float64[np.ndarray, " num_frames"]:
         """Standard deviation of each frame's time, 0 for the first and the last."""
-        return self._std(self.times, self.own)
+        return self.times.std(0, ddof=1)
 
     @property
     def spread(self) -> Float64[np.ndarray, " num_frames"]:
         """`std` in frames: of the times interpolated to positions among the model's own times."""
         places = np.arange(len(self.own), dtype=np.float64)
         increasing = self.own + places * np.finfo(np.float64).eps  # float32 times may coincide
-        return self._std(np.interp(self.times, increasing, places), places)
+        return np.interp(self.times, increasing, places).std(0, ddof=1)
 
     @property
     def local(self) -> Float64[np.ndarray, " num_frames"]:
@@ -113,27 +66,17 @@ class RefitTimes:
 
         For independent times of standard deviation sigma it is sqrt(3/2) sigma. 0 for the first and last frame.
         """
-        return self._std(_second_difference(self.times), _second_difference(self.own))
-
-    def _std(self, values: np.ndarray, own: np.ndarray) -> np.ndarray:
-        if not self.by_frames:
-            return values.std(0, ddof=1)
-        found = self.unseen.any(0)
-        return np.where(found, np.sqrt(np.mean((values - own)[self.unseen] ** 2)), 0.0)
-
-    @property
-    def freedom(self) -> int:
-        """Degrees of freedom of each standard deviation."""
-        return int(self.unseen.sum()) if self.by_frames else self.replicates - 1
+        difference = np.zeros_like(self.times)
+        difference[:, 1:-1] = self.times[:, 1:-1] - (self.times[:, :-2] + self.times[:, 2:]) / 2
+        return difference.std(0, ddof=1)
 
     def interval(self, level: float = 0.95) -> tuple[Float64[np.ndarray, " num_frames"], ...]:
         """(low, high) of each frame's time, in [0, 1]: the model's own less and plus Student's quantile times `std`.
 
         Raises ValueError for a level outside (0, 1).
         """
-        if not is_within(level, "(0, 1)"):
-            raise invalid("level", expected="a number in (0, 1)", got=repr(level))
-        reach = scipy.stats.t.ppf((1 + level) / 2, self.freedom) * self.std
+        check_within("level", level, "(0, 1)", "a number in (0, 1)")
+        reach = scipy.stats.t.ppf((1 + level) / 2, len(self.times) - 1) * self.std
         return np.clip(self.own - reach, 0.0, 1.0), np.clip(self.own + reach, 0.0, 1.0)
 
     def ratio_to(self, std: Float[np.ndarray, " num_frames"]) -> float:
@@ -145,18 +88,8 @@ class RefitTimes:
         if std.shape not in ((), self.own.shape) or not (np.broadcast_to(std, self.own.shape)[1:-1] > 0).all():
             expected = f"values > 0, one or {len(self.own)}"
             raise invalid("std", expected=expected, got=f"shape {std.shape}" if std.ndim else std)
-        std = np.broadcast_to(std, self.own.shape)
-        if self.by_frames:
-            missed = (self.times - self.own) / np.where(std > 0, std, 1.0)
-            return float(np.sqrt(np.mean(missed[self.unseen] ** 2)))
-        return float(np.sqrt(np.mean((self.std[1:-1] / std[1:-1]) ** 2)))
-
-
-def _second_difference(times: np.ndarray) -> np.ndarray:
-    """Times less the mean of their neighbors', 0 at both ends."""
-    found = np.zeros_like(times)
-    found[..., 1:-1] = times[..., 1:-1] - (times[..., :-2] + times[..., 2:]) / 2
-    return found
+        inner = np.broadcast_to(std, self.own.shape)[1:-1]
+        return float(np.sqrt(np.mean((self.std[1:-1] / inner) ** 2)))
 
 
 def refit_frame_times(
@@ -169,90 +102,43 @@ def refit_frame_times(
     block: int = 16,
     seed: int = 0,
     steps: int | None = None,
-    start: str | None = None,
-    on_replicate: Callable[[Refit], None] | None = None,
+    on_replicate: Callable[[int, VideoModel], None] | None = None,
 ) -> RefitTimes:
-    """Frame times of `replicates` refits; arguments and errors as for `iter_refits`.
+    """Frame times of `replicates` refits, which continue from the model with the learning rates of the schedule's end.
 
-    `on_replicate` is called with every `Refit` once it is complete. Example:
-    `refit_frame_times(model, frames, config, replicates=8).ratio_to(std_given_the_splats)`.
-    """
-    if not is_integer(replicates, 2):
-        raise invalid("replicates", expected="a whole number >= 2", got=repr(replicates))
-    found = []
-    how = {"method": method, "block": block, "seed": seed, "steps": steps, "start": start}
-    for each in iter_refits(model, video, config, replicates=replicates, **how):
-        if on_replicate is not None:
-            on_replicate(each)
-        found.append(dataclasses.replace(each, model=model))  # do not keep all models in memory
-    return RefitTimes.from_refits(model, found)
-
-
-def iter_refits(
-    model: VideoModel,
-    video: UInt8[np.ndarray, "num_frames height width channels"],
-    config: FitConfig,
-    *,
-    replicates: int = 20,
-    first: int = 0,
-    method: str = "pixels",
-    block: int = 16,
-    seed: int = 0,
-    steps: int | None = None,
-    start: str | None = None,
-) -> Iterator[Refit]:
-    """Refit the model `replicates` times, from replicate `first` on, and yield each result.
-
-    Replicate i depends on `seed` and i only, so that saved replicates need not be repeated.
-
-    * method="pixels": residual bootstrap; the model's images plus resampled residuals, see `resample_frames`. The
+    * method="pixels": residual bootstrap; to the model's images plus resampled residuals, see `resample_frames`. The
       times spread around the model's own, which are the truth of the bootstrap.
-    * method="frames": cross-validation; without frames i + 1, i + 1 + replicates, ... Their times are afterwards
-      estimated, between their neighbors, by maximum likelihood given the refitted splats. Frame times start at the
-      model's own, all else from scratch.
-    * method="order": to the unchanged frames. The order of frames differs and, from scratch, the initial Gaussians:
-      this is the spread of the optimizer, which the other methods include.
+    * method="order": to the unchanged frames, in another order. This is the spread of the optimizer, which the other
+      method includes.
 
-    `video`: the clip that `model` was fitted to with `config`. `start`: "model" continues from it with the learning
-    rates of the end of the schedule (`START_AT`), the default for pixels and order; "scratch" is a whole fit with
-    another seed, the only option for frames. `steps` of each: by default those of `config`, or of the end of its
-    schedule; `config.minutes` and a compact model that it asks for are ignored.
+    `video`: the clip that `model` was fitted to with `config`. `steps` of each refit: by default those of the end of
+    the schedule of `config` (from `START_AT` on); `config.minutes` and a compact model that it asks for are ignored.
+    Replicate i depends on `seed` and i only. `on_replicate` is called with the number of every replicate and its model.
 
     Source: Wu 1986 (random signs), Efron and Tibshirani 1993, chapters 9 and 17.
     Raises ValueError for a video that is not the model's, a config that could not have fitted it, and settings out of
-    range.
+    range. Example: `refit_frame_times(model, frames, config, replicates=8).ratio_to(std_given_the_splats)`.
     """
     check_one_of("method", method, METHODS)
-    start = ("scratch" if method == "frames" else "model") if start is None else start
-    check_one_of("start", start, STARTS)
-    if method == "frames" and start == "model":
-        cure = "The model was fitted to the frames that are to be left out."
-        raise invalid("start", expected="'scratch' for frames", got=repr(start), cure=cure)
-    for name, value, least in (("replicates", replicates, 1), ("first", first, 0), ("seed", seed, 0)):
+    for name, value, least in (("replicates", replicates, 2), ("seed", seed, 0)):
         if not is_integer(value, least):
             raise invalid(name, expected=f"a whole number >= {least}", got=repr(value))
     video = np.asarray(video)
     residuals = _check_video(model, video, method)
-    if method == "frames" and not 2 <= replicates <= len(video) - 2:
-        cure = "Each frame but the first and the last is left out once."
-        raise invalid("replicates", expected=f"from 2 to {len(video) - 2} for frames", got=replicates, cure=cure)
     if not is_integer(block, 1) or block > min(model.size):
         raise invalid("block", expected=f"a whole number from 1 to {min(model.size)}", got=repr(block))
-    config = _fix_steps(config, len(video), start, steps)
-    start_from(model, config, 1)  # raises if the config does not match the model
-    for number in range(first, replicates):
+    config = _fix_steps(config, len(video), steps)
+    times = []
+    for number in range(replicates):
         own = dataclasses.replace(config, seed=int(seed_sequence(Stream.REFIT, number, seed=seed).generate_state(1)[0]))
-        if method == "frames":
-            yield _leave_out_frames(model, video, own, number, replicates)
-            continue
-        frames = video
-        if method == "pixels":
-            rng = make_generator(Stream.RESAMPLED_FRAME, number, seed=seed)
-            frames = resample_frames(residuals, block, rng)
-        state = start_from(model, own, own.steps, START_AT) if start == "model" else None
-        fitted, psnr = _fit(frames, own, model.fps, state)
-        times = np.asarray(fitted.frame_times.times(), np.float64)
-        yield Refit(number, times, np.zeros(len(times), bool), fitted, psnr)
+        rng = make_generator(Stream.RESAMPLED_FRAME, number, seed=seed)
+        frames = resample_frames(residuals, block, rng) if method == "pixels" else video
+        *_, (state, _) = fit_steps(frames, own, start_from(model, own, own.steps, START_AT))  # steps share one state
+        refitted = to_model(state, own, model.size, model.fps)
+        times.append(np.asarray(refitted.frame_times.times(), np.float64))
+        if on_replicate is not None:
+            on_replicate(number, refitted)
+    return RefitTimes(np.stack(times), np.asarray(model.frame_times.times(), np.float64))
 
 
 def _check_video(model: VideoModel, video: np.ndarray, method: str) -> Residuals:
@@ -264,7 +150,7 @@ def _check_video(model: VideoModel, video: np.ndarray, method: str) -> Residuals
         cure = "The first frame is at time 0 and the last at 1; others are needed."
         raise invalid("video", expected="at least 3 frames", got=len(video), cure=cure)
     if method == "pixels" and video.shape[3] == 4:
-        cure = "Fit it without alpha, or leave frames out."
+        cure = 'Fit it without alpha, or use method="order".'
         raise invalid(
             "video", expected="frames without alpha for pixels", got=f"{video.dtype} {video.shape}", cure=cure
         )
@@ -275,7 +161,7 @@ def _check_video(model: VideoModel, video: np.ndarray, method: str) -> Residuals
     return residuals
 
 
-def _fix_steps(config: FitConfig, num_frames: int, start: str, steps: int | None) -> FitConfig:
+def _fix_steps(config: FitConfig, num_frames: int, steps: int | None) -> FitConfig:
     """The config with the fixed number of steps of a refit."""
     if not config.learns_frame_times:
         raise invalid(
@@ -285,8 +171,8 @@ def _fix_steps(config: FitConfig, num_frames: int, start: str, steps: int | None
         if config.steps is None and config.minutes is not None:
             cure = "A fit that ends by the clock cannot be repeated."
             raise invalid("steps", expected="a number for a config with minutes alone", got=None, cure=cure)
-        steps = planned_steps(dataclasses.replace(config, minutes=None), num_frames)
-        steps = steps if start == "scratch" else max(1, round((1 - START_AT) * steps))
+        planned = planned_steps(dataclasses.replace(config, minutes=None), num_frames)
+        steps = max(1, round((1 - START_AT) * planned))
     rates = dataclasses.replace(config.rates, cooldown=max(config.rates.cooldown, COOLDOWN_FRACTION))
     float32 = {"quality": None, "size_mb": None, "psnr": None}
     return dataclasses.replace(config, steps=steps, minutes=None, rates=rates, **float32)
@@ -318,41 +204,3 @@ def resample_blocks(
     tile = (row // block)[:, None], (column // block)[None, :]
     shape = tile[0].max() + 1, tile[1].max() + 1
     return rng.choice(np.array([-1, 1], residual.dtype), shape)[tile] * residual
-
-
-def _leave_out_frames(model: VideoModel, video: np.ndarray, config: FitConfig, number: int, folds: int) -> Refit:
-    """Leave out every `folds`-th frame, refit, and estimate their times."""
-    unseen = np.zeros(len(video), bool)
-    unseen[number + 1 : -1 : folds] = True
-    kept = np.ascontiguousarray(video[~unseen])
-    state = start_anew(kept, config, merge_logits(np.asarray(model.frame_times.logits), unseen))
-    fitted, psnr = _fit(kept, config, model.fps, state)
-    times, residuals = np.empty(len(video)), Residuals(fitted, video)
-    times[~unseen] = np.asarray(fitted.frame_times.times(), np.float64)
-    for k in np.flatnonzero(unseen):
-        times[k] = _best_time(residuals, k, times[k - 1], times[k + 1])
-    return Refit(number, times, unseen, fitted, psnr)
-
-
-def _fit(frames: np.ndarray, config: FitConfig, fps: float, state: FitState | None) -> tuple[VideoModel, float]:
-    *_, (state, info) = fit_steps(frames, config, state)  # every step yields the same state
-    return to_model(state, config, frames.shape[1:3], fps), info.psnr
-
-
-def merge_logits(
-    logits: Float[np.ndarray, " intervals"], unseen: Bool[np.ndarray, " num_frames"]
-) -> Float32[np.ndarray, " fewer"]:
-    """Softmax weights of all frames but the `unseen` ones, at unchanged times."""
-    kept = np.flatnonzero(~unseen)
-    return np.logaddexp.reduceat(np.asarray(logits, np.float64), kept[:-1]).astype(np.float32)
-
-
-def _best_time(residuals: Residuals, k: int, low: float, high: float) -> float:
-    """The time in [low, high] whose image has the least squared error to frame k; the middle one of ties."""
-    for _ in range(GRID_ROUNDS):
-        times = np.linspace(low, high, GRID_POINTS)
-        errors = np.array([residuals.squared_errors(image, [k])[0] for image in residuals.render_at(times)])
-        ties = np.flatnonzero(errors == errors.min())
-        best = ties[len(ties) // 2]
-        low, high = times[max(best - 1, 0)], times[min(best + 1, GRID_POINTS - 1)]
-    return float(times[best])

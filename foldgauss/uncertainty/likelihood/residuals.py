@@ -1,14 +1,14 @@
 """Residuals of a video: its frames less the images that a model renders at given times."""
 
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import numba as nb
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from foldgauss._numerics.random_streams import Stream, make_generator
-from foldgauss._runtime.checks import invalid, short_repr
+from foldgauss._runtime.checks import invalid, is_integer, short_repr
 from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.render import cpu
@@ -45,6 +45,18 @@ def check_model(model: VideoModel) -> None:
     raise invalid("model", expected="a VideoModel", got=short_repr(model), cure=cure)
 
 
+def check_frames(frames: Sequence[int] | None, num_frames: int) -> list[int]:
+    """Different frames between the first and the last one, whose times are fixed; None: all of them."""
+    inner = range(1, num_frames - 1)
+    if frames is None:
+        return list(inner)
+    chosen = list(frames) if isinstance(frames, Sequence | np.ndarray) else []
+    if not chosen or not all(is_integer(k, 1) and k in inner for k in chosen) or len({*chosen}) < len(chosen):
+        cure = "The first frame is at 0 and the last at 1. One frame is `[k]`."
+        raise invalid("frames", expected=f"different frames from 1 to {inner[-1]}", got=short_repr(frames), cure=cure)
+    return chosen
+
+
 class Residuals:
     """A model and the frames it is compared with, both composited over black.
 
@@ -79,10 +91,6 @@ class Residuals:
     def num_values(self) -> int:
         """Values per frame: pixels times channels."""
         return int(np.prod(self.frames.shape[1:]))
-
-    def render(self, t: float) -> Float32[np.ndarray, "3 height width"]:
-        """The image of the model at time t in [0, 1]."""
-        return next(self.render_at([t]))
 
     def render_at(self, times: Iterable[float]) -> Iterator[Float32[np.ndarray, "3 height width"]]:
         """The images of the model at each of `times` in [0, 1], one by one."""

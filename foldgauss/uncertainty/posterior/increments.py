@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Float, Float64
 from scipy.special import gammaln
 
-from foldgauss._runtime.checks import invalid, is_integer, is_within, short_repr
+from foldgauss._runtime.checks import invalid, is_within, short_repr
+from foldgauss.uncertainty.likelihood.residuals import check_frames
 
 #: Increments below this fraction are replaced by it before logarithms are taken: float64 does not resolve smaller ones.
 LEAST_FRACTION = 1e-16
@@ -34,7 +35,7 @@ class Increments:
             raise invalid("concentration", expected="a number >= 1", got=short_repr(concentration), cure=cure)
         self.concentration = float(concentration)
         self.free = np.zeros(self.num_frames, bool)
-        self.free[_check_frames(frames, self.num_frames)] = True
+        self.free[check_frames(frames, self.num_frames)] = True
         self._check_held()
         edge = np.diff(np.concatenate([[0], self.free.astype(int), [0]]))
         #: First and last frame of each run.
@@ -111,15 +112,3 @@ def _as_times(held) -> np.ndarray:
     if times.ndim != 1 or len(times) < 3:
         raise invalid("held", expected="at least 3 times", got=f"shape {times.shape}")
     return times
-
-
-def _check_frames(frames: Sequence[int] | None, num_frames: int) -> list[int]:
-    """Frames between the first and the last one."""
-    inner = range(1, num_frames - 1)
-    if frames is None:
-        return list(inner)
-    chosen = list(frames) if isinstance(frames, Sequence | np.ndarray) else []
-    if not chosen or not all(is_integer(k, 1) and k in inner for k in chosen):
-        cure = "The first frame is at 0 and the last at 1. One frame is `[k]`."
-        raise invalid("frames", expected=f"whole numbers from 1 to {num_frames - 2}", got=short_repr(frames), cure=cure)
-    return chosen

@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Float64
 
 from foldgauss._runtime.checks import check_within
+from foldgauss._runtime.optional_imports import import_optional
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles
 from foldgauss.uncertainty.posterior.exact import ExactPosterior
 from foldgauss.uncertainty.posterior.increments import logits_of
 from foldgauss.uncertainty.posterior.log_prob import FrameTimeLogProb
-from foldgauss.uncertainty.posterior.optional_imports import import_optional
 
 if TYPE_CHECKING:
     import arviz
@@ -65,11 +65,6 @@ class FrameTimePosterior:
         """All draws of all ensembles."""
         return self.times.reshape(-1, self.times.shape[-1])
 
-    @property
-    def logits(self) -> Float64[np.ndarray, "ensembles steps walkers intervals"]:
-        """The model's softmax weights w of all draws, centered."""
-        return logits_of(self.times)
-
     def mean(self) -> Float64[np.ndarray, " num_frames"]:
         return self.times.mean((0, 1, 2))
 
@@ -107,7 +102,7 @@ class FrameTimePosterior:
         coordinate `ensemble` (chain) tells which walkers belong together. Consecutive draws of a chain are consecutive
         steps, as ArviZ's ESS presupposes. Its R-hat takes walkers as independent, `r_hat` takes ensembles.
         """
-        arviz, xarray = import_optional("arviz"), import_optional("xarray")
+        arviz, xarray = import_optional("arviz", "uncertainty"), import_optional("xarray", "uncertainty")
         ensembles, steps, walkers, num_frames = self.times.shape
         times = np.moveaxis(self.times, 2, 1).reshape(ensembles * walkers, steps, num_frames)
         attrs = {"converged": int(self.converged), "message": self.message}

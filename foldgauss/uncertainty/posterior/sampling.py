@@ -13,10 +13,10 @@ from jaxtyping import Float64
 
 from foldgauss._numerics.random_streams import Stream, seed_sequence
 from foldgauss._runtime.checks import invalid, is_integer, short_repr
+from foldgauss._runtime.optional_imports import import_optional
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles
 from foldgauss.uncertainty.posterior.exact import exact_posterior
 from foldgauss.uncertainty.posterior.log_prob import FrameTimeLogProb, frame_time_log_prob
-from foldgauss.uncertainty.posterior.optional_imports import import_optional
 from foldgauss.uncertainty.posterior.result import FrameTimePosterior
 
 #: Convergence: at least so many autocorrelation times are kept,
@@ -67,8 +67,8 @@ def frame_time_posterior(
 
     Example: `frame_time_posterior(likelihood_profiles(model, frames)).interval(0.9)`.
     """
-    import_optional("emcee")
-    import_optional("arviz")
+    import_optional("emcee", "uncertainty")
+    import_optional("arviz", "uncertainty")
     check_settings(steps, ensembles, seed)
     log_prob = frame_time_log_prob(profiles, frames=frames, concentration=concentration)
     return _Run(log_prob, profiles, ensembles, seed, _check_backend(backend)).sample_until_converged(
@@ -91,7 +91,7 @@ def _check_backend(backend: str | os.PathLike | None) -> Path | None:
     """A path that can be written."""
     if backend is None:
         return None
-    import_optional("h5py")
+    import_optional("h5py", "uncertainty")
     path = Path(backend)
     if path.is_dir() or not os.access(path.parent, os.W_OK):
         raise invalid("backend", expected="a file in a folder that can be written to", got=str(path))
@@ -221,7 +221,7 @@ def _open_draws(path: Path, fingerprint: str) -> None:
     _check_space(path, 0)
     existed = path.exists()
     try:
-        with import_optional("h5py").File(path, "a") as file:
+        with import_optional("h5py", "uncertainty").File(path, "a") as file:
             found = file.attrs.setdefault("fingerprint", "" if existed else fingerprint)
     except OSError as error:
         if error.errno is not None and error.errno != errno.EINVAL:
@@ -250,5 +250,5 @@ def _autocorrelation_time(times: Float64[np.ndarray, "steps walkers"]) -> float:
 
 def _r_hat(times: Float64[np.ndarray, "ensembles steps walkers"]) -> float:
     """Split rank R-hat, with one chain per ensemble."""
-    arviz = import_optional("arviz")
+    arviz = import_optional("arviz", "uncertainty")
     return float(arviz.rhat(np.ascontiguousarray(times).reshape(len(times), -1), method="rank"))

@@ -47,7 +47,7 @@ def density_image(
     require(not t.ndim, "t", expected="one number", got=f"shape {t.shape}", cure="Use jax.vmap for several times.")
     at = components.condition_time(t)
     log_det = jnp.log(jnp.diagonal(at.base_tril, axis1=-2, axis2=-1)).sum(-1) + 2 * at.log_scale
-    log_peak = mixture.log_weights + components.time_marginal.log_prob(t) - log_det - _LOG_2PI
+    log_peak = mixture.log_weights + components.marginal([-1]).log_prob(t[..., None]) - log_det - _LOG_2PI
     # Peaks of any size are colors: opacities cannot exceed 1.
     highest = float(np.log(jnp.finfo(dtype).max)) - 1  # an infinite color would not be rendered
     peak = jnp.exp(jnp.minimum(log_peak, highest))

@@ -13,25 +13,25 @@ import scipy.ndimage
 import scipy.stats
 from jaxtyping import Bool, Float32, Float64, Int
 
-from foldgauss._numerics.random_streams import Stream, make_generator, seed_sequence
-from foldgauss._runtime.checks import invalid
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles, ProfileBuilder
-from foldgauss.uncertainty.likelihood.noise import NOISES, FrameNoise
+from foldgauss.uncertainty.likelihood.noise import FrameNoise
 from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.uncertainty.posterior.exact import exact_posterior
 from foldgauss.uncertainty.posterior.increments import Increments
 from foldgauss.uncertainty.posterior.log_prob import FrameTimeLogProb
+from foldgauss.uncertainty.posterior.sampling import frame_time_posterior
 from foldgauss.video.models.video_model import VideoModel
 
-SAMPLERS = ("exact", "emcee")
-#: Default number of draws: 99 give 100 ranks, of which 5% and 25% are integers.
+#: Draws of each posterior: 99 give 100 ranks, of which 5% and 25% are integers.
 DRAWS = 99
-#: Default steps of emcee per replicate: enough for about a hundred independent draws.
+#: Steps of emcee per replicate: enough for about a hundred independent draws.
 STEPS = 600
-#: Bytes of rendered images that are cached between replicates.
-CACHE_BYTES = 2**30
 #: Simulated sets of ranks per envelope: the standard error of its level is 0.1%.
 ENVELOPES = 10_000
+#: Keys of the random streams of replicates, of envelopes, and of the choice among emcee's draws.
+_REPLICATE = 22
+_BAND = 23
+_THINNING = 24
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,8 +62,12 @@ class SimulatedRanks:
         return ((fractions >= low - 1e-12) & (fractions <= high + 1e-12)).all(1)
 
     def coverage(self, level: float) -> Float64[np.ndarray, " quantities"]:
-        """See `coverage`."""
-        return coverage(self.ranks, self.num_ranks, level)
+        """Fraction of replicates in which the central interval with the fraction `level` of the draws has the truth.
+
+        `level` must leave an integer number of ranks on either side.
+        """
+        tail = round((1 - level) / 2 * self.num_ranks)
+        return ((self.ranks >= tail) & (self.ranks < self.num_ranks - tail)).mean(0)
 
 
 def simulated_ranks(
@@ -86,39 +90,30 @@ def simulated_ranks(
     Frames are images of `model` plus Gaussian noise of standard deviation `noise.scale`: white, or smoothed by a
     Gaussian of `correlation` pixels' standard deviation and rescaled. They are neither rounded nor clipped, or with
     `eight_bits` both, as those of a video; noise clipped at black or white is no longer centered, which shifts times a
-    little. Profiles are computed as by `likelihood_profiles` with `assumed_noise`: "effective", "score" or
-    "independent", which estimate it, or a FrameNoise (default: `noise`). `sampler`: "exact", or "emcee" with `steps`
-    steps.
-
-    Images are cached between replicates, up to 1 GB: with exact sampling small models take milliseconds per replicate.
+    little. Profiles are computed as by `likelihood_profiles` with `assumed_noise` (default: `noise`). `sampler`:
+    "exact", or "emcee" with `steps` steps.
 
     **Source:** Talts, Betancourt, Simpson, Vehtari and Gelman 2018; the log-likelihood as a quantity: Modrak et al.
     2023.
-    **Raises:** ValueError for settings out of range, and the errors of the posterior.
-
-    **Example:** `simulated_ranks(model, FrameNoise(0.02, 1.0), num_frames=10, replicates=300).inside()`.
     """
-    _check_simulation(num_frames, replicates, sampler, draws, correlation)
-    if not isinstance(noise, FrameNoise):
-        raise invalid("noise", expected="a FrameNoise", got=noise, cure="As FrameNoise(0.02, 1.0).")
     noise = noise.for_frames(num_frames)
     assumed = noise if assumed_noise is None else assumed_noise
     if isinstance(assumed, FrameNoise):
         assumed = assumed.for_frames(num_frames)
-    elif assumed not in NOISES:
-        raise invalid("assumed_noise", expected=f"one of {', '.join(NOISES)}, or a FrameNoise", got=assumed_noise)
     increments = Increments(np.linspace(0.0, 1.0, num_frames), None, concentration)
-    cache = _RenderCache(model)
+    images = _CachedImages(model)
     ranks, true, converged = [], [], 0
-    for seeds in seed_sequence(Stream.CALIBRATION, seed=seed).spawn(replicates):
+    for seeds in np.random.SeedSequence(seed, spawn_key=(_REPLICATE,)).spawn(replicates):
         rng = np.random.default_rng(seeds)
         times = increments.draw_prior(rng, 1)[0]
-        frames = cache.simulate_frames(times, noise.scale, correlation, rng)
+        clean = np.stack(list(images.residuals.render_at(times)))
+        scale = noise.scale[:, None, None, None].astype(np.float32)
+        frames = clean + scale * _draw_noise(clean.shape, correlation, rng)
         if eight_bits:
             rounded = np.rint(255 * np.moveaxis(frames, 1, -1)).clip(0, 255).astype(np.uint8)
             builder = ProfileBuilder(Residuals(model, rounded))
         else:
-            builder = ProfileBuilder(_SimulatedResiduals(cache, frames))
+            builder = ProfileBuilder(_SimulatedResiduals(images, frames))
         builder.compare_coarse()
         profiles = builder.build(assumed)
         log_prob = FrameTimeLogProb(profiles.curves, increments)
@@ -127,34 +122,27 @@ def simulated_ranks(
             sample, success = exact_posterior(profiles.curves, increments).sample(draws, seed_of_draws), True
         else:
             sample, success = _sample_by_emcee(profiles, concentration, draws, steps, seed_of_draws)
+        below = (sample < times).sum(0)
         any_frame = int(rng.integers(1, num_frames - 1))
-        ranks.append(_ranks(log_prob, times, sample, any_frame))
+        # The likelihood alone is finite at the true times, which the profiles cover.
+        likelihood = (log_prob.log_likelihood(sample) < log_prob.log_likelihood(times)).sum()
+        ranks.append([*below[1:-1], below[any_frame], likelihood])
         true.append(times)
         converged += success
     names = [f"frame {k}" for k in range(1, num_frames - 1)] + ["any frame", "log-likelihood"]
     return SimulatedRanks(np.array(ranks), draws + 1, names, np.array(true), converged / replicates)
 
 
-def ecdf_band(
-    replicates: int, num_ranks: int, level: float = 0.99, *, seed: int = 0
-) -> Float64[np.ndarray, "2 num_ranks"]:
+@functools.cache
+def ecdf_band(replicates: int, num_ranks: int, level: float = 0.99) -> Float64[np.ndarray, "2 num_ranks"]:
     """Simultaneous envelope of the empirical CDF of uniform ranks, at 1, 2, ..., `num_ranks`.
 
     The ECDF of `replicates` independent uniform ranks stays entirely within it with probability `level`. It consists
     of pointwise binomial intervals, whose pointwise level is calibrated by simulation.
 
-    **Source:** Saeilynoja, Buerkner and Vehtari 2022, algorithm 1. **Raises:** ValueError for settings out of range.
+    **Source:** Saeilynoja, Buerkner and Vehtari 2022, algorithm 1.
     """
-    if replicates < 1 or num_ranks < 2:
-        raise invalid("replicates", expected="at least 1, and 2 ranks", got=f"{replicates}, {num_ranks}")
-    if not 0 < level < 1:
-        raise invalid("level", expected="a number in (0, 1)", got=level)
-    return _band(int(replicates), int(num_ranks), float(level), int(seed)).copy()
-
-
-@functools.lru_cache(maxsize=32)
-def _band(replicates: int, num_ranks: int, level: float, seed: int) -> np.ndarray:
-    rng = make_generator(Stream.RANK_BAND, seed=seed)
+    rng = np.random.default_rng(np.random.SeedSequence(0, spawn_key=(_BAND,)))
     fractions = np.arange(1, num_ranks) / num_ranks  # all ranks are at most the last
     counts = rng.multinomial(replicates, np.full(num_ranks, 1 / num_ranks), ENVELOPES)[:, :-1].cumsum(1)
     # Two-sided tail probabilities of all possible counts.
@@ -170,45 +158,18 @@ def _band(replicates: int, num_ranks: int, level: float, seed: int) -> np.ndarra
     return np.stack([np.append(low, replicates), np.append(high, replicates)]) / replicates
 
 
-def coverage(
-    ranks: Int[np.ndarray, "replicates quantities"], num_ranks: int, level: float
-) -> Float64[np.ndarray, " quantities"]:
-    """Fraction of replicates in which the central interval with the fraction `level` of the draws contains the truth.
-
-    Raises ValueError if `level` does not leave an integer number of ranks on either side.
-    """
-    tail = (1 - level) / 2 * num_ranks
-    if not 0 < level < 1 or abs(tail - round(tail)) > 1e-6 or round(tail) < 1:
-        cure = "With 99 draws there are 100 ranks, and 0.5 and 0.9 are valid."
-        raise invalid(
-            "level", expected=f"a fraction that leaves an integer number of {num_ranks} ranks", got=level, cure=cure
-        )
-    tail, ranks = round(tail), np.asarray(ranks)
-    return ((ranks >= tail) & (ranks < num_ranks - tail)).mean(0)
-
-
-class _RenderCache:
-    """Rendered images of a model by time, kept up to `CACHE_BYTES`."""
+class _CachedImages:
+    """Rendered images of a model by time."""
 
     def __init__(self, model: VideoModel):
         self.residuals = Residuals(model, np.zeros((3, *model.size, 3), np.uint8))
         self.kept: dict[float, np.ndarray] = {}
-        self.most = max(CACHE_BYTES // (12 * model.size[0] * model.size[1]), 1)
 
     def __call__(self, times: Iterable[float]) -> Iterator[Float32[np.ndarray, "3 height width"]]:
         times = [float(t) for t in times]
         missing = [t for t in dict.fromkeys(times) if t not in self.kept]
-        new = dict(zip(missing, self.residuals.render_at(missing), strict=True))
-        for t in missing[: max(self.most - len(self.kept), 0)]:
-            self.kept[t] = new[t]
-        for t in times:
-            yield self.kept[t] if t in self.kept else new[t]
-
-    def simulate_frames(
-        self, times: np.ndarray, scale: np.ndarray, correlation: float | None, rng: np.random.Generator
-    ) -> Float32[np.ndarray, "num_frames 3 height width"]:
-        images = np.stack(list(self.residuals.render_at(times)))
-        return images + scale[:, None, None, None].astype(np.float32) * _draw_noise(images.shape, correlation, rng)
+        self.kept |= zip(missing, self.residuals.render_at(missing), strict=True)
+        yield from (self.kept[t] for t in times)
 
 
 def _draw_noise(shape: tuple[int, ...], correlation: float | None, rng: np.random.Generator) -> np.ndarray:
@@ -226,8 +187,8 @@ def _draw_noise(shape: tuple[int, ...], correlation: float | None, rng: np.rando
 class _SimulatedResiduals:
     """Stands in for `Residuals`, with cached images and frames that are not rounded to 8 bits."""
 
-    def __init__(self, cache: _RenderCache, frames: Float32[np.ndarray, "num_frames 3 height width"]):
-        self.frames, self.model, self.render_at = frames, cache.residuals.model, cache
+    def __init__(self, images: _CachedImages, frames: Float32[np.ndarray, "num_frames 3 height width"]):
+        self.frames, self.model, self.render_at = frames, images.residuals.model, images
 
     def squared_errors(self, image: np.ndarray, which: Iterable[int]) -> np.ndarray:
         misses = (self.frames[np.asarray(which)] - image).reshape(len(which), -1)
@@ -240,27 +201,7 @@ class _SimulatedResiduals:
 def _sample_by_emcee(
     profiles: LikelihoodProfiles, concentration: float, draws: int, steps: int, seed: int
 ) -> tuple[Float64[np.ndarray, "draws num_frames"], bool]:
-    from foldgauss.uncertainty.posterior.sampling import frame_time_posterior
-
     found = frame_time_posterior(profiles, concentration=concentration, steps=steps, ensembles=2, seed=seed)
-    if len(found.draws) < draws:
-        raise invalid("steps", expected=f"enough steps for {draws} kept draws", got=steps)
-    which = make_generator(Stream.THINNING, seed=seed).choice(len(found.draws), draws, replace=False)
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_THINNING,)))
+    which = rng.choice(len(found.draws), draws, replace=False)
     return found.draws[which], found.converged
-
-
-def _ranks(log_prob: FrameTimeLogProb, true: np.ndarray, draws: np.ndarray, any_frame: int) -> np.ndarray:
-    below = (draws < true).sum(0)
-    # The likelihood alone is finite at the true times, which the profiles cover.
-    likelihood = (log_prob.log_likelihood(draws) < log_prob.log_likelihood(true)).sum()
-    return np.array([*below[1:-1], below[any_frame], likelihood])
-
-
-def _check_simulation(num_frames, replicates, sampler, draws, correlation) -> None:
-    for name, value, least in (("num_frames", num_frames, 3), ("replicates", replicates, 1), ("draws", draws, 1)):
-        if value < least:
-            raise invalid(name, expected=f"at least {least}", got=value)
-    if sampler not in SAMPLERS:
-        raise invalid("sampler", expected=f"one of {', '.join(SAMPLERS)}", got=sampler)
-    if correlation is not None and not (np.isfinite(correlation) and correlation > 0):
-        raise invalid("correlation", expected="pixels > 0, or None for white noise", got=correlation)

@@ -1,4 +1,4 @@
-"""Choosing size and degree, and fits by gradient."""
+"""Fits of mixtures by gradient."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,6 @@ pytest.importorskip("sklearn")
 from foldgauss import CallableFold, FoldedGaussian, PolynomialFold, TimeLikelihood
 from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
 from foldgauss.estimator.gradient_fit import fit_gradient
-from foldgauss.estimator.model_selection import _assign_folds, select_mixture
 from foldgauss.mixture import FoldedMixture
 
 
@@ -18,38 +17,6 @@ def _two_parabolas(n=300, seed=0):
     rng = np.random.default_rng(seed)
     t, label = rng.normal(size=n), np.arange(n) % 2
     return np.stack([np.where(label, 4 + t**2, -t * t) + 0.1 * rng.normal(size=n), t], 1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("criterion", ["bic", "aic", "cv"])
-def test_size_and_degree_are_found(criterion):
-    estimator = FoldedGaussianMixture(n_init=2, random_state=0)
-    choice = select_mixture(estimator, _two_parabolas(), n_components=[1, 2], degrees=[1, 2], criterion=criterion)
-    assert (choice.estimator.n_components, choice.estimator.degree) == (2, 2)
-    assert choice.scores.shape == (2, 2)
-    assert choice.scores.min() == choice.scores[1, 1]
-
-
-def test_groups_stay_in_one_fold():
-    groups = np.repeat(np.arange(10), 7)
-    parts = _assign_folds(70, 5, groups)
-    assert all(len(set(parts[groups == g])) == 1 for g in range(10))
-    assert (np.bincount(parts) == 14).all()
-
-
-@pytest.mark.parametrize(
-    ("match", "options"),
-    [
-        ("criterion", {"criterion": "best"}),
-        ("n_components", {"n_components": []}),
-        ("degrees", {"degrees": [-1]}),
-        ("folds", {"criterion": "cv", "folds": 1000}),
-        ("groups", {"criterion": "cv", "groups": np.zeros(3)}),
-    ],
-)
-def test_invalid_arguments_raise(match, options):
-    with pytest.raises(ValueError, match=match):
-        select_mixture(FoldedGaussianMixture(), _two_parabolas(), **({"n_components": [1], "degrees": [1]} | options))
 
 
 def _start(fold=None):
@@ -105,11 +72,3 @@ def test_diverging_gradient_fit_returns_last_finite_mixture():
         result = fit_gradient(_start(), x, steps=20, optimizer=optax.sgd(rate))
         assert np.isfinite(result.mixture.log_prob(x).mean())
         assert np.isfinite(result.mixture.components.time_scale).all()
-
-
-def test_selected_fit_is_the_scored_one():
-    x = _two_parabolas()
-    choice = select_mixture(FoldedGaussianMixture(max_iter=3), x, n_components=[2], degrees=[1])
-    assert choice.estimator.bic(x) == pytest.approx(choice.scores.min())
-    with pytest.raises(ValueError, match="n_components: expected at most"):
-        select_mixture(FoldedGaussianMixture(), x[:4], n_components=[5], degrees=[0])
