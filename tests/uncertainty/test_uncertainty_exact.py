@@ -169,8 +169,8 @@ def test_many_flat_profiles_need_few_grid_points():
     assert_near(found, [150], [scipy.stats.beta(150, 149)], [0], [1])
 
 
-# Draws of a concentration other than 1 take milliseconds each. Of 500 draws the test of an increment finds half of the errors of
-# its distribution function of 0.09, of 3,000 those of 0.04.
+# Draws of a concentration other than 1 take long. Of 500 draws the test of an increment finds half of the errors of its
+# distribution function of 0.09, of 3,000 draws half of those of 0.04.
 @pytest.mark.parametrize(
     ("concentration", "many"),
     [(1.0, 3000), (1.5, 500), *(pytest.param(c, 3000, marks=pytest.mark.slow) for c in (1.5, 3.0, 20.0))],
