@@ -16,7 +16,7 @@ Commands run in this process, where kernels are compiled once, with the argument
 
 - `CHEAPER` adds options that reduce the number of steps of long commands, unless the command has them itself.
 - `foldgauss.video.fit` takes as many steps as stated, or `STEPS` for more than `SHORT` minutes or no budget.
-- `foldgauss demo` takes all its steps on one page, README, and `STEPS` on others.
+- `foldgauss demo` takes all its steps on one page, README, and `STEPS` of 600 Gaussians at `SIZE` on others.
 - Workers are tested elsewhere: with `--workers` and `--scheduler` this process does the work; the options of `dask` are
   looked up.
 - `foldgauss view` makes its page and its server, opens no browser, and ends as by Ctrl-C.
@@ -73,7 +73,7 @@ CHEAPER = {
     "uncertainty": ["--steps", 100],
     "compress": ["--minutes", 0.02],
 }
-#: The page whose `foldgauss demo` takes all its steps; on others it takes `STEPS`.
+#: The page whose `foldgauss demo` takes all its steps; on others it is small.
 WHOLE_DEMO = "README.md"
 #: One axis for `tradeoff` without axes, instead of all nine, which have their own tests.
 ONE_AXIS = ["--axes", "power"]
@@ -122,7 +122,8 @@ def run_page(page: str, folder: Path, monkeypatch) -> dict:
     monkeypatch.chdir(folder)
     monkeypatch.setattr(video, "fit", _fit)
     if page != WHOLE_DEMO:
-        monkeypatch.setattr(demo, "CONFIG", dataclasses.replace(demo.CONFIG, steps=STEPS))
+        monkeypatch.setattr(demo, "CONFIG", dataclasses.replace(demo.CONFIG, steps=STEPS, num_gaussians=600))
+        monkeypatch.setattr(demo, "SIZE", SIZE)
     names = {"__name__": "guide"}
     # As a reader has JAX: the suite's own rules are stricter.
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):

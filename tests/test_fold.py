@@ -314,7 +314,7 @@ def test_distributions_on_paths():
         expected += -0.5 * (u / 0.2) ** 2 - np.log(0.2) - 0.5 * np.log(2 * np.pi)
         np.testing.assert_allclose(got, expected, rtol=1e-10)
         # each alone, mapped over the constructor
-        alone = jax.vmap(lambda k: jax.tree.map(lambda leaf: leaf[k], dist).log_prob(x[0, 0]))(jnp.arange(5))
+        alone = jax.jit(jax.vmap(lambda k: jax.tree.map(lambda leaf: leaf[k], dist).log_prob(x[0, 0])))(jnp.arange(5))
         np.testing.assert_allclose(alone, got[0], rtol=1e-10)
         kept = dist.marginal([1, -1])
         np.testing.assert_allclose(kept.condition_time(0.3).loc, dist.condition_time(0.3).loc[:, 1:], rtol=1e-12)

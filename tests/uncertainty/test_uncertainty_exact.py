@@ -169,10 +169,15 @@ def test_many_flat_profiles_need_few_grid_points():
     assert_near(found, [150], [scipy.stats.beta(150, 149)], [0], [1])
 
 
-@pytest.mark.parametrize("concentration", [1.0, 1.5, *(pytest.param(c, marks=pytest.mark.slow) for c in (3.0, 20.0))])
+# Draws of a concentration other than 1 take long. Of 500 draws the test of an increment finds half of the errors of its
+# distribution function of 0.09, of 3,000 draws half of those of 0.04.
+@pytest.mark.parametrize(
+    ("concentration", "many"),
+    [(1.0, 3000), (1.5, 500), *(pytest.param(c, 3000, marks=pytest.mark.slow) for c in (1.5, 3.0, 20.0))],
+)
 @pytest.mark.parametrize("known", [(), (5,)])
-def test_increments_of_draws_follow_the_prior(concentration, known):
-    num, many = 12, 3000
+def test_increments_of_draws_follow_the_prior(concentration, many, known):
+    num = 12
     draws = exact_posterior(flat_except(num, known), free_times(num, concentration)).sample(many, 5)
     steps = np.diff(draws)
     assert (steps > 0).all()

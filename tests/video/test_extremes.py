@@ -295,7 +295,9 @@ def test_ssim_of_small_pictures(size):
     assert ssim(one.swapaxes(0, 1), other.swapaxes(0, 1)) == pytest.approx(ssim(one, other))
 
 
-@pytest.mark.parametrize(("degree", "steps"), [(3, 200), (None, 600)])  # degree 1 needs more steps here
+@pytest.mark.parametrize(  # degree 1, the default, needs more steps here
+    ("degree", "steps"), [(3, 200), pytest.param(None, 600, marks=pytest.mark.slow)]
+)
 def test_exact_frames_cost_the_others_no_bits(degree, steps):
     """Half of the frames are black: the others are about as good as alone, in files that are hardly larger."""
     blobs, scores = moving_blobs(3, *SIZE), []

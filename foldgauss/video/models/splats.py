@@ -80,7 +80,8 @@ class FoldedSplats(eqx.Module):
         num = self.num_gaussians
 
         def index(leaf: Array) -> Array:  # an envelope may have one parameter for all Gaussians
-            return jnp.asarray(np.asarray(leaf)[which]) if np.shape(leaf)[:1] == (num,) else leaf
+            # Not `jnp.asarray`, which compiles a program for each number of Gaussians.
+            return jax.device_put(np.asarray(leaf)[which]) if np.shape(leaf)[:1] == (num,) else leaf
 
         return dataclasses.replace(jax.tree.map(index, dataclasses.replace(self, paths=None)), paths=self.paths)
 
