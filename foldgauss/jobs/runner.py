@@ -224,8 +224,9 @@ def describe_fit(config: FitConfig, state: FitState) -> dict[str, Any]:
 
 
 def missed_psnr(config: FitConfig, psnr: float) -> list[str]:
-    """A warning that the model of a fit is worse than it was asked to be, if it is."""
-    if config.psnr is None or psnr >= config.psnr - TOLERATED_DB:
+    """A warning that the model of a fit is worse than it was asked to be, if that is its only goal."""
+    is_limited = config.quality is not None or config.size_mb is not None
+    if config.psnr is None or is_limited or psnr >= config.psnr - TOLERATED_DB:
         return []
     return [f"expected {config.psnr:g} dB, got {psnr:.2f}."]
 

@@ -237,13 +237,40 @@ def test_a_larger_size_is_used_for_a_better_model():
         assert 0.8 * (1e6 * size - HEADER_BYTES) < count_bytes(one.quantized) - HEADER_BYTES
 
 
-def test_a_psnr_within_reach_is_reached_by_a_file_that_is_hardly_larger_than_that_of_a_quality():
+def texture(level):
+    """A moving texture of low contrast, uint8."""
+    tile = np.kron(np.random.default_rng(0).normal(0, 1, (6, 8, 3)), np.ones((4, 4, 1)))
+    return np.stack([np.rint(128 + level * np.roll(tile, k // 2, 1)).astype(np.uint8) for k in range(8)])
+
+
+def silhouette():
+    """A black disk that moves, and is clear elsewhere."""
+    y, x = np.mgrid[:32, :48]
+    alphas = [255 * ((x - 12 - 2 * k) ** 2 + (y - 16) ** 2 < 64) for k in range(10)]
+    return np.stack([np.stack([*[np.zeros_like(alpha)] * 3, alpha], -1) for alpha in alphas]).astype(np.uint8)
+
+
+def over_white(model, frames):
+    return evaluate(model, frames, background=(1.0, 1.0, 1.0)).mean_psnr
+
+
+@pytest.mark.parametrize("clip", ["usual", "half of it black", "low contrast"])
+def test_a_psnr_within_reach_is_reached_by_a_file_that_is_hardly_larger_than_that_of_a_quality(clip):
+    frames = texture(6) if clip == "low contrast" else FRAMES.copy()
+    frames[: 4 if clip == "half of it black" else 0] = 0
     config = dataclasses.replace(CONFIG, steps=400)
-    given = fit(FRAMES, config)
-    wanted = evaluate(given.model, FRAMES).mean_psnr
-    made = fit(FRAMES, dataclasses.replace(config, quality=None, psnr=wanted))
-    assert evaluate(made.model, FRAMES).mean_psnr >= wanted
+    given = fit(frames, config)
+    wanted = evaluate(given.model, frames).mean_psnr - 1
+    made = fit(frames, dataclasses.replace(config, quality=None, psnr=wanted))
+    assert evaluate(made.model, frames).mean_psnr >= wanted
     assert count_bytes(made.quantized) < 1.1 * count_bytes(given.quantized)
+
+
+def test_a_psnr_is_that_over_any_background():
+    frames = silhouette()
+    config = FitConfig(steps=400, num_gaussians=150)
+    whole = over_white(fit(frames, config).model, frames)
+    assert over_white(fit(frames, dataclasses.replace(config, psnr=35.0)).model, frames) > whole - 2
 
 
 def test_the_smallest_of_two_goals_wins(by_quality):
@@ -469,6 +496,17 @@ def test_compress_to_a_psnr(fitted):
     made = compress(fitted, FRAMES, psnr=25.0, steps=60)
     assert evaluate(made.model, FRAMES).mean_psnr >= 25
     assert count_bytes(made.quantized) < count_bytes(compress(fitted, FRAMES, quality=100, steps=60).quantized)
+
+
+def test_compress_without_the_clip_keeps_alpha():
+    frames = silhouette()
+    model = fit(frames, FitConfig(steps=100, num_gaussians=150)).model
+    assert over_white(compress(model).model, frames) > over_white(model, frames) - 0.5
+
+
+def test_a_size_with_room_for_all_drops_none():
+    made = fit(FRAMES, dataclasses.replace(CONFIG, num_gaussians=10, quality=None, size_mb=100.0))
+    assert made.model.num_gaussians == 10
 
 
 @pytest.mark.parametrize("given", [{"psnr": 30.0}, {"steps": 5}, {"minutes": 1.0}], ids=str)

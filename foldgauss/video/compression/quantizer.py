@@ -65,8 +65,11 @@ class Worth:
         return kept
 
     def coarseness_for(self, num: float, fraction: float = 1.0) -> float:
-        """The coarseness at which about `num` Gaussians are worth this fraction of the price of their bits."""
-        place = min(max(round(num), 1), len(self.removal))
+        """The coarseness at which about `num` Gaussians are worth this fraction of the price of their bits; -inf for
+        all."""
+        if num >= len(self.removal):
+            return -math.inf
+        place = max(round(num), 1)
         least = max(float(np.sort(self.removal)[-place]), _MIN_SENSITIVITY)
         return 0.5 * math.log2(least / (fraction * BITS_PER_GAUSSIAN * bit_price(0.0)))
 

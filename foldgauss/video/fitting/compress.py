@@ -12,6 +12,7 @@ from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig, Strategy,
 from foldgauss.video.fitting.loop import FitInfo, check_frames, finish, fit_steps, start_from
 from foldgauss.video.fitting.rate import COMPRESSION_START, RateControl
 from foldgauss.video.fitting.state import FitState
+from foldgauss.video.models.background import BLACK
 from foldgauss.video.models.metrics import check_frames as check_frames_of
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.video_model import VideoModel, check_model
@@ -97,7 +98,8 @@ def _make_config(model: VideoModel, **goals: float | None) -> FitConfig:
 def _round_only(model: VideoModel, config: FitConfig) -> Compressed:
     if not config.is_compact:
         config = dataclasses.replace(config, quality=ROUNDING_QUALITY)
-    control = RateControl(np.stack(list(VideoRenderer(model).frames())), config)
+    background = None if model.compositing == "over" else BLACK  # alpha is kept, whatever clip the model is of
+    control = RateControl(np.stack(list(VideoRenderer(model, background=background).frames())), config)
     state = start_from(model, config, 1)
     control.check_size(state)
     control.round_only(state)

@@ -48,7 +48,7 @@ from foldgauss.video.fitting.budget import measure_progress
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.density_control import DensityControl
 from foldgauss.video.fitting.state import FitState, running_psnr, to_model
-from foldgauss.video.models.background import BLACK, composite
+from foldgauss.video.models.background import BLACK, WHITE, Background, composite
 from foldgauss.video.models.metrics import psnr as psnr_of
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.row_layout import COLOR, GROUPS, SHAPE, TRAJECTORY, columns, pack
@@ -60,6 +60,8 @@ COARSEST = 11.0
 FINEST = 1.0
 #: Bytes of a file beside its streams: its header, and what is known of the clip.
 HEADER_BYTES = 3000
+#: Bytes of the header for each degree of the folds above 1.
+BYTES_PER_DEGREE = 80
 #: Bytes of the header for each chunk.
 BYTES_PER_CHUNK = 110
 #: Bytes of the header for the length of a stream.
@@ -81,12 +83,20 @@ _LEFT_OF_ROUNDING = 0.6
 _TOLERANCE = 0.1
 #: Frames that a PSNR is estimated by.
 _SAMPLED_FRAMES = 12
-#: The most by which steps are coarser or finer than the price of a bit that the Gaussians were chosen by.
+#: The most by which steps are coarser than the price of a bit that the Gaussians were chosen by.
 _MOST_CHANGE = 1.0
+#: Steps are not so fine that rounding adds less than this fraction of the error that is asked for.
+_LEAST_ROUNDING = 0.03
+#: How many dB dropping for a PSNR may cost before the rest of the fit makes up for it, where that reaches the PSNR.
+_MOST_DROPPED_DB = 4.0
+#: The same where it is not known yet whether the fit reaches it.
+_MOST_RISKED_DB = 0.5
+#: About how many dB a finished model gains by further training.
+_GAIN_OF_GIVEN = 0.2
 #: The least of lambda R / D that a fit to a PSNR aims at. Most files have more.
 _LEAST_COST = 0.7
 #: By how many dB the fit aims at more than it was asked for: what is too much is given up in the end.
-_MARGIN_DB = 0.2
+_MARGIN_DB = 0.3
 #: Bits of a Gaussian in a file whose number of Gaussians suits its steps, as measured.
 USUAL_BITS = 75.0
 #: The coarseness that the search for a size starts with.
@@ -311,60 +321,85 @@ class RateControl(DensityControl):
 
         The rest of the fit makes up for a part of the error that this adds, and reduces the other error.
         """
-        aim, now, adaptation = self.config.psnr + _MARGIN_DB, running_psnr(state), self._adaptation(state)
-        adaptation = adaptation if action.progress < 1 else 0.0  # the fit may end before its plan
-        left = 10 ** (-0.1 * (now + (0.0 if _is_given(state) else adaptation * action.gain)))
-        remaining = _LEFT_OF_ROUNDING if state.rules or action.what != "drop" else _LEFT_OF_DROPPING
+        adaptation = self._adaptation(state) if action.progress < 1 else 0.0  # the fit may end before its plan
+        gain = adaptation * (_GAIN_OF_GIVEN if _is_given(state) else action.gain)
+        aim = self.config.psnr + (0.0 if _is_given(state) else _MARGIN_DB)
+        left = 10 ** (-0.1 * (self._typical_psnr(state) + gain))
+        drops = action.what == "drop"
+        remaining = _LEFT_OF_ROUNDING if state.rules or not drops else _LEFT_OF_DROPPING
         remaining = 1 - adaptation * (1 - remaining)
         model = self._model(state)
-        before = 10 ** (-0.1 * self._psnr(model, self.sampled))
+        before = self._psnr(model, self.sampled)
 
-        def reached(coarseness: float) -> float:
-            if action.what == "drop":
-                changed = dataclasses.replace(
-                    model, splats=model.splats.take(measured.are_worth(coarseness, action.extent))
-                )
+        def cost(coarseness: float) -> float:
+            """dB that the actions cost at once."""
+            if drops:
+                kept = measured.are_worth(coarseness, action.extent)
+                changed = dataclasses.replace(model, splats=model.splats.take(kept))
             else:
                 changed = dequantize(measured.quantize(coarseness))
-            more = 10 ** (-0.1 * self._psnr(changed, self.sampled)) - before
-            return -10 * math.log10(left + remaining * max(more, 0.0))
+            return before - self._psnr(changed, self.sampled)
+
+        def reaches(coarseness: float) -> bool:
+            db = cost(coarseness)
+            more = max(10 ** (0.1 * db) - 1, 0.0) * 10 ** (-0.1 * before)
+            return -10 * math.log10(left + remaining * more) >= aim and not (drops and db > _MOST_DROPPED_DB)
 
         low, high = FINEST, COARSEST
-        if action.what == "drop" and not (state.rules or _is_given(state)):
-            low = self._least_coarseness(measured, action)
-        elif action.what != "drop" and state.coarseness:
-            low, high = max(state.coarseness - _MOST_CHANGE, low), min(state.coarseness + _MOST_CHANGE, high)
-        if reached(high) >= aim:
-            return high
-        while high - low > _TOLERANCE:
-            middle = (low + high) / 2
-            low, high = (middle, high) if reached(middle) >= aim else (low, middle)
-        return low
+        if not drops:
+            low = self._finest_rounding(state)
+            high = min(state.coarseness + _MOST_CHANGE, high) if state.coarseness else high
+        elif not (state.rules or _is_given(state)):
+            usual = self._usual_coarseness(state, measured, action)
+            low = usual if cost(usual) <= _MOST_RISKED_DB else _last(lambda c: cost(c) <= _MOST_RISKED_DB, low, usual)
+        return max(low, _last(reaches, low, high))
 
-    def _least_coarseness(self, worth: Worth, action: Action) -> float:
+    def _finest_rounding(self, state: FitState) -> float:
+        """The coarseness at which rounding adds `_LEAST_ROUNDING` of the error that is asked for."""
+        num_values = state.num_gaussians * len(column_names(self.config.fold_degree))
+        return 0.5 * math.log2(12 * _LEAST_ROUNDING * self._error_of_goal(state) / num_values)
+
+    def _usual_coarseness(self, state: FitState, worth: Worth, action: Action) -> float:
         """The coarseness at which the bits of what is kept cost `_LEAST_COST` times the error that is asked for.
 
-        Where the error falls as a power of the bits, D ~ R^-b, the best file has lambda R = b D. A fit that falls short
-        of its PSNR would not come nearer with finer steps: more Gaussians leave it fewer passes.
+        Where the error falls as a power of the bits, D ~ R^-b, the best file has lambda R = b D. More Gaussians would
+        also leave fewer passes to a fit by minutes.
         """
-        error = 255**2 * 10 ** (-0.1 * self.config.psnr) * self.frames[..., :3].size
         grid = np.arange(FINEST, COARSEST, _TOLERANCE)
         kept = [worth.are_worth(coarseness, action.extent).sum() for coarseness in grid]
         costs = [bit_price(coarseness) * USUAL_BITS * num for coarseness, num in zip(grid, kept, strict=True)]
-        return float(grid[np.argmax(np.minimum(costs, _LEAST_COST * error))])  # the first of enough, or the most
+        limit = _LEAST_COST * self._error_of_goal(state)
+        return float(grid[np.argmax(np.minimum(costs, limit))])  # the first of enough, or the most
+
+    def _error_of_goal(self, state: FitState) -> float:
+        """The squared error of a clip with the PSNR that is asked for, if all frames improve by as many dB."""
+        uneven = 10 ** (0.1 * (self._typical_psnr(state) - running_psnr(state)))
+        return 255**2 * 10 ** (-0.1 * self.config.psnr) * uneven * self.frames[..., :3].size
+
+    def _typical_psnr(self, state: FitState) -> float:
+        """The mean PSNR of the frames as last seen, dB; each at most 100."""
+        errors = state.frame_errors.astype(float)
+        # After two passes, 0 is the error of a perfect frame; before, that of a frame which was not seen yet.
+        is_seen = (errors != 0) | (state.step * self.config.views.batch_size >= 2 * len(errors))
+        seen = -10 * np.log10(np.maximum(errors[is_seen], 1e-10))
+        return float(seen.mean()) if len(seen) else running_psnr(state)
 
     def _psnr(self, model: VideoModel, which: Int[np.ndarray, " some"]) -> float:
-        """Mean PSNR of the frames `which`, dB."""
+        """Mean PSNR of the frames `which`, dB; with alpha the lower one of each over black and over white."""
         begun = time.perf_counter()
-        images = VideoRenderer(model).frames(np.asarray(model.frame_times.times())[which])
-        found = float(np.mean([psnr_of(self._target(k), image) for k, image in zip(which, images, strict=True)]))
+        times = np.asarray(model.frame_times.times())[which]
+        found = []
+        for background in (BLACK, WHITE) if self.frames.shape[-1] == 4 else (BLACK,):
+            images = VideoRenderer(model, background=background).frames(times)
+            targets = (self._target(k, background) for k in which)
+            found.append([psnr_of(target, image) for target, image in zip(targets, images, strict=True)])
         each = (time.perf_counter() - begun) / len(which)
         self.trimming["psnr"] = _TRIALS * each * len(self.frames)
-        return found
+        return float(np.min(found, axis=0).mean())
 
-    def _target(self, k: int) -> np.ndarray:
+    def _target(self, k: int, background: Background) -> np.ndarray:
         frame = self.frames[k]
-        return frame if frame.shape[-1] == 3 else composite(frame, np.float32(BLACK))
+        return frame if frame.shape[-1] == 3 else composite(frame, np.float32(background))
 
 
 def coarseness_of(quality: float) -> float:
@@ -378,12 +413,23 @@ def count_bytes(quantized: Quantized) -> int:
     for chunk in quantized.chunks:
         streams += encode_chunk(chunk, quantized.rules, info)
     per_chunk = BYTES_PER_CHUNK + BYTES_PER_STREAM * len(info.column_names)
-    return HEADER_BYTES + per_chunk * len(quantized.chunks) + sum(map(len, streams))
+    header = HEADER_BYTES + BYTES_PER_DEGREE * max(info.degree - 1, 0)
+    return header + per_chunk * len(quantized.chunks) + sum(map(len, streams))
 
 
 def count_past(progress: float) -> int:
     """The number of actions before a fraction of the plan."""
     return sum(action.progress < progress for action in ACTIONS)
+
+
+def _last(holds: Callable[[float], bool], low: float, high: float) -> float:
+    """About the largest number from `low` to `high` up to which a condition holds; `low` if it does nowhere."""
+    if high <= low or holds(high):
+        return max(low, high)
+    while high - low > _TOLERANCE:
+        middle = (low + high) / 2
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return low
 
 
 def _is_given(state: FitState) -> bool:

@@ -13,6 +13,7 @@ from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.checks import require
 
 BLACK = (0.0, 0.0, 0.0)
+WHITE = (1.0, 1.0, 1.0)
 #: Red, green and blue in [0, 1]; None: transparent, images get alpha.
 Background = tuple[float, float, float] | None
 
