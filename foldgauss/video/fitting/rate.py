@@ -83,10 +83,10 @@ _LEFT_OF_ROUNDING = 0.6
 _TOLERANCE = 0.1
 #: Frames that a PSNR is estimated by.
 _SAMPLED_FRAMES = 12
-#: The most by which steps are coarser than the price of a bit that the Gaussians were chosen by.
-_MOST_CHANGE = 1.0
-#: Steps are not so fine that rounding adds less than this fraction of the error that is asked for.
+#: Rounding for a PSNR adds at least and at most these fractions of the error that is asked for: files of a quality have
+#: 0.02 to 0.2, as estimated.
 _LEAST_ROUNDING = 0.03
+_MOST_ROUNDING = 0.3
 #: How many dB dropping for a PSNR may cost before the rest of the fit makes up for it, where that reaches the PSNR.
 _MOST_DROPPED_DB = 4.0
 #: The same where it is not known yet whether the fit reaches it.
@@ -323,7 +323,7 @@ class RateControl(DensityControl):
         """
         adaptation = self._adaptation(state) if action.progress < 1 else 0.0  # the fit may end before its plan
         gain = adaptation * (_GAIN_OF_GIVEN if _is_given(state) else action.gain)
-        aim = self.config.psnr + (0.0 if _is_given(state) else _MARGIN_DB)
+        aim = self.config.psnr + _MARGIN_DB
         left = 10 ** (-0.1 * (self._typical_psnr(state) + gain))
         drops = action.what == "drop"
         remaining = _LEFT_OF_ROUNDING if state.rules or not drops else _LEFT_OF_DROPPING
@@ -347,17 +347,16 @@ class RateControl(DensityControl):
 
         low, high = FINEST, COARSEST
         if not drops:
-            low = self._finest_rounding(state)
-            high = min(state.coarseness + _MOST_CHANGE, high) if state.coarseness else high
+            low, high = (self._rounding_that_adds(part, state) for part in (_LEAST_ROUNDING, _MOST_ROUNDING))
         elif not (state.rules or _is_given(state)):
             usual = self._usual_coarseness(state, measured, action)
             low = usual if cost(usual) <= _MOST_RISKED_DB else _last(lambda c: cost(c) <= _MOST_RISKED_DB, low, usual)
         return max(low, _last(reaches, low, high))
 
-    def _finest_rounding(self, state: FitState) -> float:
-        """The coarseness at which rounding adds `_LEAST_ROUNDING` of the error that is asked for."""
+    def _rounding_that_adds(self, part: float, state: FitState) -> float:
+        """The coarseness at which rounding adds this fraction of the error that is asked for."""
         num_values = state.num_gaussians * len(column_names(self.config.fold_degree))
-        return 0.5 * math.log2(12 * _LEAST_ROUNDING * self._error_of_goal(state) / num_values)
+        return 0.5 * math.log2(12 * part * self._error_of_goal(state) / num_values)
 
     def _usual_coarseness(self, state: FitState, worth: Worth, action: Action) -> float:
         """The coarseness at which the bits of what is kept cost `_LEAST_COST` times the error that is asked for.
