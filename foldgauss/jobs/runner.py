@@ -112,7 +112,11 @@ class FitRun:
 
     def save(self, scores: Evaluation | None = None) -> None:
         """Write the model, with its mean scores once they are measured."""
-        metadata = _make_metadata(self.job, self.clip, self.state) | ({} if scores is None else mean_scores(scores))
+        metadata = (
+            _describe_clip(self.job, self.clip)
+            | describe_fit(self.job.config, self.state)
+            | ({} if scores is None else mean_scores(scores))
+        )
         if Path(self.job.target).suffix.lower() == COMPACT_SUFFIX:
             save_compact(self.job.target, self.quantized, metadata=metadata)
         else:
@@ -155,14 +159,15 @@ def run_fit(
     _limit_compiled(clip.frames.shape)
     checkpoint = Checkpoint(job.checkpoint, job.config, fingerprint(clip), on_checkpoint_error)
     state = None if resume == "never" else checkpoint.load(required=resume == "required")
-    steps = fit_steps(clip.frames, job.config, state)
+    room = leave_room(job.config.size_mb, _describe_clip(job, clip))
+    config = dataclasses.replace(job.config, size_mb=room)
+    steps = fit_steps(clip.frames, config, state)
     with observer(clip, state) as observe:
         if resume == "never":  # an earlier fit could be resumed by mistake; its checkpoint goes once a step is taken
             steps = itertools.chain([next(steps)], steps)
             job.checkpoint.unlink(missing_ok=True)
         state, info = run_steps(steps, observe, checkpoint, job.checkpoint_seconds)
-    room = leave_room(job.config.size_mb, _make_metadata(job, clip, state))
-    model, quantized = finish(state, clip.frames, dataclasses.replace(job.config, size_mb=room), clip.fps)
+    model, quantized = finish(state, clip.frames, config, clip.fps)
     return FitRun(job, clip, model, state, info, checkpoint, quantized)
 
 
@@ -201,11 +206,10 @@ def run_steps(
     return state, info
 
 
-def _make_metadata(job: FitJob, clip: Clip, state: FitState) -> dict[str, Any]:
-    """Metadata of a fitted model: its clip, the range of frames, the seed, how it was read, and `describe_fit`."""
+def _describe_clip(job: FitJob, clip: Clip) -> dict[str, Any]:
+    """Metadata of a fitted model: its clip, the range of frames, the seed, and how it was read."""
     frames = limit_range(job.frames, clip.num_declared)
-    about = describe_source(clip, job.config.seed) | {"frames": frames} | describe_reading(clip)
-    return about | job.metadata | describe_fit(job.config, state)
+    return describe_source(clip, job.config.seed) | {"frames": frames} | describe_reading(clip) | job.metadata
 
 
 def describe_fit(config: FitConfig, state: FitState) -> dict[str, Any]:

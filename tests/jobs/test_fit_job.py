@@ -130,6 +130,12 @@ def test_a_compact_job_stopped_or_killed_goes_on_to_the_same_bits(clip, tmp_path
     assert not job.checkpoint.exists()
 
 
+def test_a_size_is_kept_with_long_metadata(clip, tmp_path):
+    config = dataclasses.replace(CONFIG, num_gaussians=600, size_mb=0.009)
+    record = fit_job(job_of(clip, tmp_path, "m.fgz", config=config, metadata={"note": "a" * 4000}))
+    assert 7000 < record["file_bytes"] <= 9000
+
+
 def test_a_compact_file_needs_a_goal(clip, tmp_path):
     with pytest.raises(
         ValueError, match=r"config: expected one of a compact model .* Give a quality, a size or a PSNR"
