@@ -113,11 +113,12 @@ class Gaussians3D(eqx.Module):
             expected="(w, x, y, z) of a length above 0",
             got="zeros",
         )
+        least = 0.0 if scales is None else float(scales.min(initial=0.0))
         require(
-            scales is None or not (scales < 0).any(),
+            not least < 0,
             "scale",
             expected="standard deviations >= 0",
-            got="some below 0",
+            got=f"{least:g}",
             cure="3DGS stores their logarithms: pass jnp.exp(scale).",
         )
         w, x, y, z = jnp.moveaxis(_unit(jnp.asarray(quaternion)), -1, 0)
