@@ -308,7 +308,7 @@ MISTAKES = {  # text: line, table, and what is told
     "[selections.it]\nbox = [1, 2, 3]": (2, "[selections.it]", r"box: expected \(x0, y0, x1, y1\)"),
     "[selections.it]\nbox = [1, 2, 3, nan]": (2, "[selections.it]", "box: .*numbers"),
     "[selections.it]\nframe = 0\nbox = [900, 2, 1000, 9]": (3, "[selections.it]", "box: .*40x64"),
-    "[selections.it]\nframe = 99": (2, "[selections.it]", r"frame: .*\[0, 7\)"),
+    "[selections.it]\nframe = 99": (2, "[selections.it]", r"frame: .*\[0, 6\], got 99"),
     "[selections.it]\nfollow = 1\nframe = 0": (2, "[selections.it]", "follow: .*true or false"),
     "[selections.it]": (1, "[selections.it]", "at least one criterion"),
     "[selections.it]\nlabel = 1\nframe = 3": (2, "[selections.it]", "label: expected one of"),

@@ -55,6 +55,8 @@ MAP_BYTES = 256e6
 MAP_FRACTION = 0.25
 #: Bytes of a cell of the maps.
 BYTES_PER_CELL = 11
+#: With fewer points than this per frame on average, the points of all frames are sampled at once.
+FEW_POINTS = 16
 #: There is a cut between two frames where less than this fraction of the points can be tracked.
 CUT_FRACTION = 0.15
 #: The longer side, in pixels, of images for the fast flow that rules out a cut.
@@ -430,6 +432,8 @@ def _sample(stack, index, position, size) -> np.ndarray:
     scaled = position * np.float32([columns / size[1], rows / size[0]]) - np.float32(0.5)
     order = np.argsort(index, kind="stable")
     frames, starts = np.unique(index[order], return_index=True)
+    if len(index) < FEW_POINTS * len(frames):
+        return _gather(stack, index, scaled)
     samples = np.empty((len(index), channels), np.float32)
     stops = np.append(starts[1:], len(order))
 
@@ -443,6 +447,21 @@ def _sample(stack, index, position, size) -> np.ndarray:
 
     run_tasks(sample, range(len(frames)))
     return samples
+
+
+def _gather(stack, index, scaled) -> np.ndarray:
+    """As `_sample`, at positions in pixels of the maps, for all frames at once: reads only the samples' own pixels."""
+    _, rows, columns, _ = stack.shape
+    inside = np.clip(scaled, 0, np.float32([columns - 1, rows - 1]))
+    left, top = np.minimum(inside.astype(np.int64), [columns - 2, rows - 2]).T
+    right, low = (inside - np.stack([left, top], -1)).astype(np.float32).T[..., None]
+
+    def row(y) -> np.ndarray:
+        one, other = (stack[index, y, x].astype(np.float32) for x in (left, left + 1))
+        return one + right * (other - one)
+
+    above, below = row(top), row(top + 1)
+    return above + low * (below - above)
 
 
 #: Ridge on the coefficients, in frames at the edge of the window: a weak prior for rest, a stronger one against
