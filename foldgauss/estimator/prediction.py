@@ -18,6 +18,8 @@ __all__ = ["FittedMixture", "predict_components", "predict_log_prob", "predict_r
 #: Rows are evaluated in blocks of a power of 2 from the first to the second, so that chunks of any size share programs.
 _LEAST_ROWS = 2**8
 _MOST_ROWS = 2**16
+#: Blocks at least, where they are not the smallest: the last one is filled up.
+_NUM_BLOCKS = 8
 
 
 class FittedMixture(NamedTuple):
@@ -44,7 +46,7 @@ def predict_components(fitted: FittedMixture, x: Float[np.ndarray, "n d"]) -> In
 def _evaluate_rows(method: Callable, fitted: FittedMixture, x: np.ndarray) -> np.ndarray:
     """A method of the mixture at rows of X."""
     y = fitted.scaling.apply(x[:, fitted.order].astype(np.result_type(x, fitted.mixture.logits)))
-    rows = min(max(2 ** math.ceil(math.log2(max(len(y), 1))), _LEAST_ROWS), _MOST_ROWS)
+    rows = min(max(2 ** math.ceil(math.log2(max(len(y) / _NUM_BLOCKS, 1))), _LEAST_ROWS), _MOST_ROWS)
     num_blocks = max(math.ceil(len(y) / rows), 1)
     padded = np.pad(y, ((0, num_blocks * rows - len(y)), (0, 0)))
     with enable_dtype(y.dtype):
