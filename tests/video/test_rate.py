@@ -15,6 +15,7 @@ from foldgauss.io import load_compact, load_video_model, save_compact
 from foldgauss.io.datasets import ball
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.io.models.compact import pack_compact
+from foldgauss.jobs.runner import TOLERATED_DB
 from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, Growth, compress, evaluate, fit, fit_steps, start_from
 from foldgauss.video.compression import chunks
@@ -262,7 +263,7 @@ def test_a_psnr_within_reach_is_reached_by_a_file_that_is_hardly_larger_than_tha
     given = fit(frames, config)
     wanted = evaluate(given.model, frames).mean_psnr - 1
     made = fit(frames, dataclasses.replace(config, quality=None, psnr=wanted))
-    assert evaluate(made.model, frames).mean_psnr >= wanted
+    assert evaluate(made.model, frames).mean_psnr >= wanted - TOLERATED_DB
     assert count_bytes(made.quantized) < 1.1 * count_bytes(given.quantized)
 
 
