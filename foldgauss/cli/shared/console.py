@@ -25,7 +25,7 @@ from foldgauss.video.models.metrics import Evaluation
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
-#: So many numbers of frames are printed.
+#: Most frame numbers that a message prints.
 LISTED_FRAMES = 8
 
 

@@ -75,7 +75,7 @@ def save_previews(path: Path, clip: Clip, config: FitConfig) -> Observer:
 
 
 def _at_intervals(seconds: float, show: Observer) -> Observer:
-    """An observer that calls `show` at most every so many `seconds`, and at the end."""
+    """An observer that calls `show` at most once in `seconds`, and at the end."""
     due = time.monotonic()
 
     def observe(state: FitState, info: FitInfo) -> None:

@@ -36,7 +36,7 @@ class PreparedVideo:
 
     def splats(self, t: float) -> Splats2D:
         """The splats of time t, front to back; NumPy leaves."""
-        raise NotImplementedError
+        raise NotImplementedError  # a base class: every kind of video has its own
 
     def weighted_splats(self, t: float) -> list[tuple[float, Splats2D]]:
         """The splats of the images whose weighted sum is the frame at time t, with the weights, which sum to 1.
@@ -99,7 +99,7 @@ class RenderedVideo:
 
     def prepare(self, size: tuple[int, int]) -> PreparedVideo:
         """Prepared for conditioning on many times, for images of `size`."""
-        raise NotImplementedError
+        raise NotImplementedError  # a base class: every kind of video has its own
 
     def render(
         self,
