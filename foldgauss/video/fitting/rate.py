@@ -20,7 +20,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.checks import invalid
@@ -75,9 +75,9 @@ _TRIES = 8
 _TOLERANCE_LOG2 = 0.02
 #: By how much the binary logarithm of a size falls for each unit of coarseness, as measured.
 _SLOPE_LOG2 = 0.8
-#: The fraction of the error of dropping that remains after the rest of the fit, as measured.
+#: The least fraction of the error of dropping that is expected to remain after many passes.
 _LEFT_OF_DROPPING = 0.2
-#: That of the error of rounding, or of dropping where shapes are rounded.
+#: That of the error of rounding.
 _LEFT_OF_ROUNDING = 0.6
 #: How finely the coarseness is searched for a PSNR.
 _TOLERANCE = 0.1
@@ -87,8 +87,9 @@ _SAMPLED_FRAMES = 12
 #: 0.02 to 0.2, as estimated.
 _LEAST_ROUNDING = 0.03
 _MOST_ROUNDING = 0.3
-#: How many dB dropping for a PSNR may cost before the rest of the fit makes up for it, where that reaches the PSNR.
-_MOST_DROPPED_DB = 4.0
+#: How many dB dropping for a PSNR may cost before the rest of the fit makes up for it, where that reaches the PSNR and
+#: the fit has made up for all of the last dropping.
+_MOST_DROPPED_DB = 6.0
 #: The same where it is not known yet whether the fit reaches it.
 _MOST_RISKED_DB = 0.5
 #: About how many dB a finished model gains by further training.
@@ -119,7 +120,7 @@ class Action(NamedTuple):
     """What is done after a fraction of the plan: "drop", "sort", "divide" into chunks, or the group of leaves to round.
 
     `extent`: the fraction of the price of a bit at which Gaussians are dropped, or of the Gaussians that are rounded.
-    `gain`: about how many dB the running PSNR rises from then to the end of the fit, rounding included, if nothing is
+    `gain`: about how many dB the PSNR rises from then to the end of the fit, rounding included, if nothing is
     dropped any more; rather too few.
     """
 
@@ -130,11 +131,11 @@ class Action(NamedTuple):
 
 
 ACTIONS = (
-    Action(0.1, "drop", 0.04, 4.0),
-    Action(0.2, "drop", 0.16, 3.0),
-    Action(0.3, "drop", 0.36, 2.1),
-    Action(0.42, "drop", 0.64, 1.3),
-    Action(0.55, "drop", 1.0, 0.7),
+    Action(0.1, "drop", 0.04, 3.0),
+    Action(0.2, "drop", 0.16, 2.2),
+    Action(0.3, "drop", 0.36, 1.6),
+    Action(0.42, "drop", 0.64, 1.0),
+    Action(0.55, "drop", 1.0, 0.6),
     Action(0.55, "sort"),
     Action(0.7, SHAPE, 0.4, 0.4),
     Action(0.78, SHAPE, 0.75),
@@ -184,7 +185,7 @@ class RateControl(DensityControl):
                 self._keep_in_chunks(state, *divide_anew(self._model(state), state.chunks))
             elif action.what == "sort":
                 error = float(state.frame_errors.mean()) * self.frames[..., :3].size
-                budget = _ORDERING * self._adaptation(state) * error
+                budget = _ORDERING * self._adaptation(state, action) * error
                 self._keep_in_chunks(state, *arrange(self._model(state), budget))
             else:
                 self._round(state, action)
@@ -205,7 +206,7 @@ class RateControl(DensityControl):
         while True:
             kept = worth.are_worth(coarseness, fraction)
             fewer = dataclasses.replace(model, splats=model.splats.take(kept))
-            added = 10 ** (-0.1 * self._psnr(fewer, np.arange(len(self.frames)))) * 255**2 * self.frames[..., :3].size
+            added = _error_at(self._psnr(fewer, np.arange(len(self.frames)))) * 255**2 * self.frames[..., :3].size
             if (
                 kept.all()
                 or added <= (~kept).sum() * BITS_PER_GAUSSIAN * bit_price(coarseness)
@@ -244,8 +245,10 @@ class RateControl(DensityControl):
             dropped = min(_bracket(lambda num: count_bytes(without(num)) > 1e6 * self.config.size_mb, most)[1], most)
         return without(dropped) if dropped else whole
 
-    def _adaptation(self, state: FitState) -> float:
+    def _adaptation(self, state: FitState, action: Action) -> float:
         """How much of what an action costs the rest of the fit makes up for, compared with many passes, 0 to 1."""
+        if action.progress == 1:
+            return 0.0  # although the fit may end before its plan
         passes = (state.plan - state.step) * self.config.views.batch_size / len(self.frames)
         return min(passes / _PASSES, 1.0)
 
@@ -257,7 +260,8 @@ class RateControl(DensityControl):
         state.chunks = chunks.astype(np.uint16)
 
     def _drop(self, state: FitState, action: Action) -> None:
-        worth = Worth(self._model(state), self.background)
+        model = self._model(state)
+        worth = Worth(model, self.background)
         coarseness = self._choose_coarseness(state, worth, action)
         if not (state.rules or _is_given(state)):
             state.coarseness = coarseness
@@ -265,6 +269,8 @@ class RateControl(DensityControl):
         least = math.ceil(_LEAST_KEPT * len(kept))
         kept[np.argsort(worth.removal, kind="stable")[-least:]] = True
         state.keep(np.flatnonzero(kept))
+        if self.config.psnr is not None:
+            state.last_drop = tuple(self._psnr(one, self.sampled) for one in (model, self._model(state)))
 
     def _round(self, state: FitState, action: Action) -> None:
         """Round a fraction of the Gaussians; those that are rounded already are among them."""
@@ -321,29 +327,29 @@ class RateControl(DensityControl):
 
         The rest of the fit makes up for a part of the error that this adds, and reduces the other error.
         """
-        adaptation = self._adaptation(state) if action.progress < 1 else 0.0  # the fit may end before its plan
-        gain = adaptation * (_GAIN_OF_GIVEN if _is_given(state) else action.gain)
         aim = self.config.psnr + _MARGIN_DB
-        left = 10 ** (-0.1 * (self._typical_psnr(state) + gain))
+        adaptation = self._adaptation(state, action)
+        gain = adaptation * (_GAIN_OF_GIVEN if _is_given(state) else action.gain)
         drops = action.what == "drop"
-        remaining = _LEFT_OF_ROUNDING if state.rules or not drops else _LEFT_OF_DROPPING
+        before = self._psnr(self._with_only(state, np.ones(state.num_gaussians, bool)), self.sampled)
+        left = _error_at(before + gain)
+        not_replaced = _left_of_dropping(state, before)
+        most = _MOST_DROPPED_DB * (1 - not_replaced) ** 2
+        remaining = max(not_replaced, _LEFT_OF_DROPPING) if drops else _LEFT_OF_ROUNDING
         remaining = 1 - adaptation * (1 - remaining)
-        model = self._model(state)
-        before = self._psnr(model, self.sampled)
 
         def cost(coarseness: float) -> float:
             """dB that the actions cost at once."""
             if drops:
-                kept = measured.are_worth(coarseness, action.extent)
-                changed = dataclasses.replace(model, splats=model.splats.take(kept))
+                changed = self._with_only(state, measured.are_worth(coarseness, action.extent))
             else:
                 changed = dequantize(measured.quantize(coarseness))
             return before - self._psnr(changed, self.sampled)
 
         def reaches(coarseness: float) -> bool:
             db = cost(coarseness)
-            more = max(10 ** (0.1 * db) - 1, 0.0) * 10 ** (-0.1 * before)
-            return -10 * math.log10(left + remaining * more) >= aim and not (drops and db > _MOST_DROPPED_DB)
+            more = max(_error_at(before - db) - _error_at(before), 0.0)
+            return -10 * math.log10(left + remaining * more) >= aim and not (drops and db > most)
 
         low, high = FINEST, COARSEST
         if not drops:
@@ -352,6 +358,14 @@ class RateControl(DensityControl):
             usual = self._usual_coarseness(state, measured, action)
             low = usual if cost(usual) <= _MOST_RISKED_DB else _last(lambda c: cost(c) <= _MOST_RISKED_DB, low, usual)
         return max(low, _last(reaches, low, high))
+
+    def _with_only(self, state: FitState, kept: Bool[np.ndarray, " num"]) -> VideoModel:
+        """The model of some Gaussians, as rounded as it will be once the rules are chosen."""
+        model = self._model(state)
+        if not state.rules:
+            return dataclasses.replace(model, splats=model.splats.take(kept))
+        classes, rules = state.classes[kept].astype(np.int32), _decode_rules(state)
+        return dequantize(quantize(select_rows(compute_columns(model), kept), classes, rules))
 
     def _rounding_that_adds(self, part: float, state: FitState) -> float:
         """The coarseness at which rounding adds this fraction of the error that is asked for."""
@@ -373,7 +387,7 @@ class RateControl(DensityControl):
     def _error_of_goal(self, state: FitState) -> float:
         """The squared error of a clip with the PSNR that is asked for, if all frames improve by as many dB."""
         uneven = 10 ** (0.1 * (self._typical_psnr(state) - running_psnr(state)))
-        return 255**2 * 10 ** (-0.1 * self.config.psnr) * uneven * self.frames[..., :3].size
+        return 255**2 * _error_at(self.config.psnr) * uneven * self.frames[..., :3].size
 
     def _typical_psnr(self, state: FitState) -> float:
         """The mean PSNR of the frames as last seen, dB; each at most 100."""
@@ -429,6 +443,19 @@ def _last(holds: Callable[[float], bool], low: float, high: float) -> float:
         middle = (low + high) / 2
         low, high = (middle, high) if holds(middle) else (low, middle)
     return low
+
+
+def _error_at(psnr: float) -> float:
+    return 10 ** (-0.1 * psnr)
+
+
+def _left_of_dropping(state: FitState, psnr: float) -> float:
+    """The fraction of the error of dropping that remains, by the last dropping and the PSNR that it has led to."""
+    if not state.last_drop:
+        return _LEFT_OF_DROPPING
+    before, after = map(_error_at, state.last_drop)
+    left = (_error_at(psnr) - before) / max(after - before, 1e-12)
+    return min(max(left, 0.0), 1.0)
 
 
 def _is_given(state: FitState) -> bool:

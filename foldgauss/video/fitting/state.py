@@ -92,6 +92,7 @@ _COUNT = {"static": True, "decode": int}
 _NUMBER = {"static": True, "decode": float}
 _ERRORS = {"static": True, "decode": _decode_errors}
 _RULES = {"static": True, "decode": _decode_rules}
+_NUMBERS = {"static": True, "decode": tuple}
 #: The names of the sums of `GradientStatistics`.
 STATISTICS = ("screen_gradients", "time_gradients", "seen")
 
@@ -138,6 +139,8 @@ class FitState:
     planned_progress: float = field(default=0.0, metadata=_NUMBER)  # fit that was over there
     rate_actions: int = field(default=0, metadata=_COUNT)  # actions of `rate` that are done
     coarseness: float = field(default=0.0, metadata=_NUMBER)  # of the steps of rounding; 0 before it is chosen
+    # For a fit to a PSNR: that of some frames before and after Gaussians were last dropped.
+    last_drop: tuple[float, ...] = field(default=(), metadata=_NUMBERS)
     rules: tuple[tuple, ...] = field(default=(), metadata=_RULES)  # by which parameters are rounded, once any are
     seconds: float = field(default=0.0, metadata=_NUMBER)
     processor_seconds: float = field(default=0.0, metadata=_NUMBER)  # of all threads, where `jobs` runs the fit
