@@ -1,9 +1,12 @@
 """The command as the tests call it."""
 
+import io
 import math
 import re
 import wave
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+from typing import NamedTuple
 
 import av
 import numpy as np
@@ -28,6 +31,24 @@ def run(*arguments):
             cli.main(words)
     assert not _find_foreign_options(words, texts)
     return done.value.code or 0
+
+
+class Output(NamedTuple):
+    """What a command wrote."""
+
+    out: str
+    err: str
+
+
+def call(*arguments, code=0, out=(), err=()) -> Output:
+    """Output of the command, which ends with this code and writes these texts, wherever its lines are broken."""
+    with redirect_stdout(io.StringIO()) as shown, redirect_stderr(io.StringIO()) as told:
+        assert run(*arguments) == code, told.getvalue()
+    for stream, texts in ((shown, out), (told, err)):
+        written = " ".join(stream.getvalue().split())
+        for text in [texts] if isinstance(texts, str) else texts:
+            assert text in written, written
+    return Output(shown.getvalue(), told.getvalue())
 
 
 def _find_foreign_options(words, texts):

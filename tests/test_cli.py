@@ -14,7 +14,7 @@ import av
 import cv2
 import numpy as np
 import pytest
-from commands import run
+from commands import call, run
 
 from foldgauss import cli
 from foldgauss.cli.fitting import demo as demonstration
@@ -70,13 +70,10 @@ def test_fit_render_evaluate_info(work, tmp_path, capsys):
     assert scores["bits_per_pixel"] == pytest.approx(8 * num_bytes / (6 * 48 * 64))
     assert "bits per pixel" in capsys.readouterr().out
 
-    assert run("info", work / "model.safetensors") == 0
-    told = capsys.readouterr().out
-    assert "400" in told
-    assert "power 1" in told
+    call("info", work / "model.safetensors", out=["400", "power 1"])
 
 
-def test_render_of_one_frame(work, tmp_path, capsys, monkeypatch):
+def test_render_of_one_frame(work, tmp_path, monkeypatch):
     model = work / "model.safetensors"
     images = list(load_video_model(model).frames())
     for k in (0, 3, -1):
@@ -87,7 +84,7 @@ def test_render_of_one_frame(work, tmp_path, capsys, monkeypatch):
     assert (tmp_path / "model.png").exists()
 
 
-def test_render_chooses_the_encoding(work, tmp_path, capsys):
+def test_render_chooses_the_encoding(work, tmp_path):
     model = work / "model.safetensors"
     sizes = []
     for crf in (0, 40):
@@ -111,7 +108,7 @@ def test_render_chooses_the_encoding(work, tmp_path, capsys):
     assert heard == pytest.approx([1.0, 0.5], abs=0.1)
 
 
-def test_other_rates_speeds_and_times(work, tmp_path, capsys):
+def test_other_rates_speeds_and_times(work, tmp_path):
     """The clip has 6 frames, 12 a second; which frame is which is told by the model's own pictures."""
     model = load_video_model(work / "model.safetensors")
     own = list(model.frames())
@@ -127,20 +124,31 @@ def test_other_rates_speeds_and_times(work, tmp_path, capsys):
     assert shown("rate", "--fps", 24) == [0, None, 1, None, 2, None, 3, None, 4, None, 5]
     assert shown("held", "--remap", f"0=0,{1 / 12}={1 / 12},{3 / 12}={1 / 12},{4 / 12}={2 / 12}") == [0, 1, 1, 1, 2]
     assert shown("ends", "--times", "1:0:2") == [5, 0]
-    capsys.readouterr()
-    assert run("render", work / "model.safetensors", "--out", tmp_path / "v.mp4", "--speed", 0.25) == 0
-    assert "21 frames at 12 frames per second" in capsys.readouterr().out
+    call(
+        "render",
+        work / "model.safetensors",
+        "--out",
+        tmp_path / "v.mp4",
+        "--speed",
+        0.25,
+        out="21 frames at 12 frames per second",
+    )
     assert read_video(tmp_path / "v.mp4").fps == pytest.approx(12)
 
 
-def test_a_variable_frame_rate_is_kept(tmp_path, capsys):
+def test_a_variable_frame_rate_is_kept(tmp_path):
     """Frames are shown at the times of the clip's; at another speed or rate, its seconds are divided evenly."""
     times, end, model = np.array([0, 3, 6, 14, 17, 31]) / 30, 41 / 30, tmp_path / "m.safetensors"
     write_video(tmp_path / "clip.mp4", blobs(), 5.0, times=[*times, end])
-    assert run("fit", tmp_path / "clip.mp4", "--out", model, *QUICK) == 0
-    assert "shown for 0.1 to 0.467 s, 4.839 per second on average" in capsys.readouterr().err
-    assert run("info", model) == 0
-    told = capsys.readouterr().out.replace("\n", " ")
+    call(
+        "fit",
+        tmp_path / "clip.mp4",
+        "--out",
+        model,
+        *QUICK,
+        err="shown for 0.1 to 0.467 s, 4.839 per second on average",
+    )
+    told = call("info", model).out.replace("\n", " ")
     assert "4.39 per second on average" in told
     assert "frame_seconds" not in told
     assert run("compress", model, "--out", tmp_path / "m.fgz") == 0
@@ -172,30 +180,45 @@ def test_a_variable_frame_rate_is_kept(tmp_path, capsys):
     assert np.abs(read["held"].frames.astype(int) - fitted[3]).mean() < 2
 
 
-def test_how_a_clip_was_read_is_kept(tmp_path, capsys):
+def test_how_a_clip_was_read_is_kept(tmp_path):
     """Images with the values of 12 bits are dark; with their level of white, every command reads them so."""
     clip, model = tmp_path / "clips" / "clip", tmp_path / "m.safetensors"
     few = ("--gaussians", 400, "--steps", 5)
     clip.mkdir(parents=True)
     for k, frame in enumerate(blobs()):
         cv2.imwrite(str(clip / f"{k}.png"), frame[..., ::-1].astype(np.uint16) * 16)
-    assert run("fit", clip, "--out", model, *few) == 0
-    assert "the largest value is 4,080 of 65,535, as in data of 12 bits, which look dark" in capsys.readouterr().err
-    assert run("evaluate", model, clip) == 0
-    assert "the largest value is 4,080" in capsys.readouterr().err
+    call(
+        "fit",
+        clip,
+        "--out",
+        model,
+        *few,
+        err="the largest value is 4,080 of 65,535, as in data of 12 bits, which look dark",
+    )
+    call("evaluate", model, clip, err="the largest value is 4,080")
     write_video(tmp_path / "8.mp4", blobs(), 10.0)
     for options in ((), ("--segment-seconds", 0.1)):
         assert run("fit", clip, "--out", model, "--overwrite", "--levels", 4080, *options, *few) == 0
         assert read_metadata(model)["reading"] == {"levels": 4080}
         assert load_video_model(model).render(0.5).max() > 0.8
-        capsys.readouterr()
-        assert run("evaluate", model, clip) == 0
-        assert "warning" not in capsys.readouterr().err
-        assert run("evaluate", model, tmp_path / "8.mp4") == 2
-        told = capsys.readouterr().err
-        assert "VIDEO: expected the clip that the model was fitted to, clip read with levels=4080, got" in told
-        assert run("view", model, "--out", tmp_path / "p.html", "--original", tmp_path / "8.mp4") == 2
-        assert "--original: expected the clip that the model was fitted to, clip read with" in capsys.readouterr().err
+        assert "warning" not in call("evaluate", model, clip).err
+        call(
+            "evaluate",
+            model,
+            tmp_path / "8.mp4",
+            code=2,
+            err="VIDEO: expected the clip that the model was fitted to, clip read with levels=4080, got",
+        )
+        call(
+            "view",
+            model,
+            "--out",
+            tmp_path / "p.html",
+            "--original",
+            tmp_path / "8.mp4",
+            code=2,
+            err="--original: expected the clip that the model was fitted to, clip read with",
+        )
     assert {"reading"} <= set(CLIP_NOTES)  # which edit and compress keep
     assert run("fit-many", tmp_path / "clips", "--out", tmp_path / "models", "--levels", 4080, *few) == 0
     assert read_metadata(tmp_path / "models" / "clip.fgz")["reading"] == {"levels": 4080}
@@ -222,60 +245,51 @@ def test_sound_of_a_range_begins_with_it(tmp_path):
     assert 0.03 < loud[-1] < 0.08
 
 
-def test_one_picture(work, tmp_path, capsys):
+def test_one_picture(work, tmp_path):
     """A .png takes one time, and no more."""
     model, target = work / "model.safetensors", tmp_path / "one.png"
-    assert run("render", model, "--out", target, "--times", "0.5", "--size", "24x32") == 0
-    assert f"{target}: one image" in capsys.readouterr().out.replace("\n", "")
+    assert f"{target}: one image" in call(
+        "render", model, "--out", target, "--times", "0.5", "--size", "24x32"
+    ).out.replace("\n", "")
     video, time = load_video_model(model), np.array([0.5])
     np.testing.assert_array_equal(cv2.imread(str(target))[..., ::-1], next(interpolate_frames(video, time, (24, 32))))
     alone = ("--times", "0.5", "--size", "24x32", "--no-flow", "--overwrite")
     assert run("render", model, "--out", target, *alone) == 0
     np.testing.assert_array_equal(cv2.imread(str(target))[..., ::-1], next(video.frames(time, (24, 32))))
-    capsys.readouterr()
-    assert run("render", model, "--out", target, "--times", "0.5") == 2
-    assert "--overwrite" in capsys.readouterr().err
-    assert run("render", model, "--out", tmp_path / "folder", "--times", "0.5") == 0
-    assert "1 frame at" in capsys.readouterr().out
+    call("render", model, "--out", target, "--times", "0.5", code=2, err="--overwrite")
+    call("render", model, "--out", tmp_path / "folder", "--times", "0.5", out="1 frame at")
 
 
-def test_remapping_beyond_the_end_is_said(work, tmp_path, capsys):
+def test_remapping_beyond_the_end_is_said(work, tmp_path):
     """6 frames, 12 a second, last half a second."""
     model = work / "model.safetensors"
-    assert run("render", model, "--out", tmp_path / "whole", "--remap", "0=0,0.5=0.5") == 0
-    assert "warning" not in capsys.readouterr().err
-    assert run("render", model, "--out", tmp_path / "beyond", "--remap", "0=0,0.5=2,1=0") == 0
-    told = capsys.readouterr().err
+    assert "warning" not in call("render", model, "--out", tmp_path / "whole", "--remap", "0=0,0.5=0.5").err
+    told = call("render", model, "--out", tmp_path / "beyond", "--remap", "0=0,0.5=2,1=0").err
     assert "warning: --remap: expected seconds up to the end of the clip, 0.5, got 2. Its last frame is held" in told
     assert len(told.strip().splitlines()) == 1
     assert read_video(tmp_path / "beyond").num_frames == 13
 
 
-def test_frames_size_and_default_name(work, tmp_path, monkeypatch, capsys):
+def test_frames_size_and_default_name(work, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert run("fit", work / "clip.mp4", "--frames", "1:5", "--size", "24x32", *QUICK) == 0
     model = load_video_model(tmp_path / "clip.fgz")
     assert (model.num_frames, model.size) == (4, (24, 32))
     assert read_metadata(tmp_path / "clip.fgz")["budget"] == {"steps": 30, "quality": 70.0}
     # The frames it was fitted to are remembered.
-    capsys.readouterr()
-    assert run("evaluate", "clip.fgz", work / "clip.mp4") == 0
-    assert "warning" not in capsys.readouterr().err
+    assert "warning" not in call("evaluate", "clip.fgz", work / "clip.mp4").err
     assert run("evaluate", "clip.fgz", work / "clip.mp4", "--frames", "0:3") == 2
 
 
-def test_evaluation_of_another_clip_is_said(work, tmp_path, capsys):
+def test_evaluation_of_another_clip_is_said(work, tmp_path):
     write_video(tmp_path / "other.mp4", blobs()[::-1], 12.0)
-    assert run("evaluate", work / "model.safetensors", tmp_path / "other.mp4") == 0
-    message = capsys.readouterr().err
+    message = call("evaluate", work / "model.safetensors", tmp_path / "other.mp4").err
     assert re.search(r"warning: the frames of .*other.mp4 are not those .* fitted to \(clip.mp4\)", message)
     (tmp_path / "renamed.mp4").write_bytes((work / "clip.mp4").read_bytes())
-    assert run("evaluate", work / "model.safetensors", tmp_path / "renamed.mp4") == 0
-    assert "warning" not in capsys.readouterr().err
+    assert "warning" not in call("evaluate", work / "model.safetensors", tmp_path / "renamed.mp4").err
     model = load_video_model(work / "model.safetensors")
     save_video_model(tmp_path / "bare.safetensors", model)  # nothing is known of its frames
-    assert run("evaluate", tmp_path / "bare.safetensors", tmp_path / "other.mp4") == 0
-    assert "warning" not in capsys.readouterr().err
+    assert "warning" not in call("evaluate", tmp_path / "bare.safetensors", tmp_path / "other.mp4").err
 
 
 def test_clip_with_alpha(tmp_path, capsys):
@@ -287,8 +301,7 @@ def test_clip_with_alpha(tmp_path, capsys):
         alpha[8:40, 8:56] = 255
         cv2.imwrite(str(folder / f"{k}.png"), np.concatenate([frame[..., ::-1], alpha], -1))
     arguments = ["--gaussians", "400", "--steps", "120", "--preview", tmp_path / "p.png"]
-    assert run("fit", folder, "--out", target, *arguments) == 0
-    assert "48x64 with alpha" in capsys.readouterr().out
+    call("fit", folder, "--out", target, *arguments, out="48x64 with alpha")
     assert run("evaluate", target, folder, "--json", tmp_path / "f.json") == 0
     figures = json.loads((tmp_path / "f.json").read_text())
     assert "PSNR over white" in capsys.readouterr().out
@@ -303,21 +316,20 @@ def test_clip_with_alpha(tmp_path, capsys):
     assert black[:4].mean() < 30
 
 
-def test_damaged_video_uses_the_frames_that_decode(tmp_path, capsys):
+def test_damaged_video_uses_the_frames_that_decode(tmp_path):
     noise = np.random.default_rng(0).integers(0, 256, (12, 48, 64, 3)).astype(np.uint8)
     write_video(tmp_path / "whole.webm", noise, 10)
     data = (tmp_path / "whole.webm").read_bytes()
     (tmp_path / "cut.webm").write_bytes(data[: len(data) * 3 // 4])
-    assert run("fit", tmp_path / "cut.webm", "--out", tmp_path / "m.safetensors", *QUICK) == 0
-    assert re.search(r"only \d+ of 12 frames", capsys.readouterr().err)
+    assert re.search(
+        r"only \d+ of 12 frames", call("fit", tmp_path / "cut.webm", "--out", tmp_path / "m.safetensors", *QUICK).err
+    )
     assert 2 <= load_video_model(tmp_path / "m.safetensors").num_frames < 12
 
 
-def test_help_and_version(capsys):
-    assert run("fit", "--help") == 0
-    assert "[default:" in capsys.readouterr().out  # brackets are not eaten as markup
-    assert run("--version") == 0
-    assert re.search(r"foldgauss 0\.1.*Python 3.*, jax .*numba .* threads$", capsys.readouterr().out.strip(), re.DOTALL)
+def test_help_and_version():
+    call("fit", "--help", out="[default:")
+    assert re.search(r"foldgauss 0\.1.*Python 3.*, jax .*numba .* threads$", call("--version").out.strip(), re.DOTALL)
 
 
 def test_debug_shows_the_traceback(tmp_path):
@@ -325,13 +337,12 @@ def test_debug_shows_the_traceback(tmp_path):
         cli.main(["info", str(tmp_path / "none"), "--debug"])
 
 
-def test_demo_without_the_samples(tmp_path, monkeypatch, capsys):
+def test_demo_without_the_samples(tmp_path, monkeypatch):
     def missing(name):
         raise FileNotFoundError('Try: pip install "foldgauss[samples]"')
 
     monkeypatch.setattr(demonstration, "sample_clip", missing)
-    assert run("demo", "--out", tmp_path / "demo") == 2
-    assert "foldgauss[samples]" in capsys.readouterr().err
+    call("demo", "--out", tmp_path / "demo", code=2, err="foldgauss[samples]")
     assert not (tmp_path / "demo").exists()
 
 
@@ -347,8 +358,7 @@ def test_demo_end_to_end(tmp_path, monkeypatch, capsys):
     assert len(figures["psnr"]) == 6
     assert read_video(tmp_path / "reconstruction.mp4").frames.shape == (6, 160, 320, 3)
     assert "mean PSNR" in capsys.readouterr().out
-    assert run("demo", "--out", tmp_path) == 2
-    assert "exists. Choose another path, or add --overwrite." in capsys.readouterr().err
+    call("demo", "--out", tmp_path, code=2, err="exists. Choose another path, or add --overwrite.")
 
 
 @pytest.mark.slow
@@ -470,30 +480,29 @@ def test_presets(work, tmp_path, monkeypatch):
     assert load_video_model(model).splats.num_gaussians == 200
 
 
-def test_names_with_brackets_are_names(tmp_path, capsys):
+def test_names_with_brackets_are_names(tmp_path):
     folder = tmp_path / "x[red]"
     folder.mkdir()
     write_video(folder / "show [x264] [b].mp4", blobs(), 12.0)
-    assert run("fit", folder / "show [x264] [b].mp4", "--out", folder / "m [b].safetensors", *QUICK) == 0
-    assert "show [x264] [b].mp4" in capsys.readouterr().out
+    call(
+        "fit", folder / "show [x264] [b].mp4", "--out", folder / "m [b].safetensors", *QUICK, out="show [x264] [b].mp4"
+    )
     assert run("info", folder / "m [b].safetensors") == 0
-    assert run("info", folder / "none[/b].safetensors") == 2
-    assert "none[/b]" in capsys.readouterr().err
+    call("info", folder / "none[/b].safetensors", code=2, err="none[/b]")
 
 
-def test_an_unforeseen_error_is_one_line(work, tmp_path, monkeypatch, capsys):
+def test_an_unforeseen_error_is_one_line(work, tmp_path, monkeypatch):
     def broken(*arguments, **options):
         raise RuntimeError("surprise\nand more")
 
     monkeypatch.setattr(drawing, "load_video_model", broken)
-    assert run("info", work / "model.safetensors") == 1
-    message = capsys.readouterr().err
+    message = call("info", work / "model.safetensors", code=1).err
     assert "RuntimeError: surprise and more" in message
     assert "--debug" in message
     assert "Traceback" not in message
 
 
-def test_the_history_of_another_fit_is_left_alone(work, tmp_path, capsys, interrupted):
+def test_the_history_of_another_fit_is_left_alone(work, tmp_path, interrupted):
     target, other = tmp_path / "m.safetensors", tmp_path / "other.jsonl"
     quick = ["fit", work / "clip.mp4", "--gaussians", "400", "--quiet"]
     assert run(*quick, "--steps", "50", "--seed", "1", "--out", tmp_path / "o.safetensors", "--history", other) == 0
@@ -502,8 +511,7 @@ def test_the_history_of_another_fit_is_left_alone(work, tmp_path, capsys, interr
     assert run(*quick, "--steps", "80", "--out", target, "--history", tmp_path / "own.jsonl") == 1
     disarm()
     resumed = [*quick, "--steps", "80", "--out", target, "--resume", "--history"]
-    assert run(*resumed, other) == 2
-    assert "history: expected that of the fit which is resumed at step 40" in capsys.readouterr().err
+    call(*resumed, other, code=2, err="history: expected that of the fit which is resumed at step 40")
     assert other.read_bytes() == before
     assert run(*resumed, tmp_path / "own.jsonl") == 0
     assert [json.loads(line)["step"] for line in (tmp_path / "own.jsonl").read_text().splitlines()] == [*range(1, 81)]

@@ -5,7 +5,7 @@ import json
 import cv2
 import numpy as np
 import pytest
-from commands import run, seconds_heard, write_tone
+from commands import call, run, seconds_heard, write_tone
 from PIL import Image
 from soft_models import NUM, SIZE, soft_model
 
@@ -31,22 +31,33 @@ def work(tmp_path_factory):
     return folder
 
 
-def test_an_edited_model_is_a_model(work, tmp_path, capsys):
+def test_an_edited_model_is_a_model(work, tmp_path):
     """Baked it is a plain one, else one with edits: told about, drawn, compared and edited again."""
-    assert run("edit", work / "model.safetensors", work / "baked.toml", "--out", tmp_path / "plain.safetensors") == 0
-    assert "a plain model, 40 Gaussians" in capsys.readouterr().out
+    call(
+        "edit",
+        work / "model.safetensors",
+        work / "baked.toml",
+        "--out",
+        tmp_path / "plain.safetensors",
+        out="a plain model, 40 Gaussians",
+    )
     plain = load_video_model(tmp_path / "plain.safetensors")
     assert isinstance(plain, VideoModel)
     wanted = edit(soft_model()).select(box=(12, 10, 32, 30), frame=3).move((0.2, 0)).video()
     np.testing.assert_array_equal(plain.splats.loc, wanted.splats.loc)
 
-    assert run("edit", tmp_path / "plain.safetensors", work / "laid.toml", "--out", tmp_path / "two.safetensors") == 0
-    assert "a model with edits" in capsys.readouterr().out
+    call(
+        "edit",
+        tmp_path / "plain.safetensors",
+        work / "laid.toml",
+        "--out",
+        tmp_path / "two.safetensors",
+        out="a model with edits",
+    )
     both = load_video_model(tmp_path / "two.safetensors")
     assert isinstance(both, EditedVideo)
 
-    assert run("info", tmp_path / "two.safetensors") == 0
-    told = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    told = " ".join(call("info", tmp_path / "two.safetensors").out.replace("│", " ").split())
     assert "edits 1 on 40 of 40 Gaussians; those baked into the parameters are not counted" in told
     assert "laid.toml" in told
 
@@ -63,11 +74,18 @@ def test_an_edited_model_is_a_model(work, tmp_path, capsys):
     assert len(load_video_model(tmp_path / "three.safetensors").layers[0].overlays) == 2
 
 
-def test_pictures_of_an_edit(work, tmp_path, capsys):
+def test_pictures_of_an_edit(work, tmp_path):
     for name, size in (("edited.gif", None), ("edited.mp4", "20x32"), ("edited", "20x32")):
         options = [] if size is None else ["--size", size]
-        assert run("edit", work / "model.safetensors", work / "baked.toml", "--out", tmp_path / name, *options) == 0
-        assert "7 frames at 25 frames per second" in capsys.readouterr().out
+        call(
+            "edit",
+            work / "model.safetensors",
+            work / "baked.toml",
+            "--out",
+            tmp_path / name,
+            *options,
+            out="7 frames at 25 frames per second",
+        )
         clip = read_video(tmp_path / name)
         assert (clip.num_frames, clip.size) == (FRAMES, (20, 32) if size else SIZE)
     edited = edit(soft_model()).select(box=(12, 10, 32, 30), frame=3).move((0.2, 0)).video()
@@ -101,11 +119,9 @@ def test_what_is_written_is_what_was_drawn(work, tmp_path, name):
 
 def test_export_and_import(work, tmp_path, capsys):
     model = work / "model.safetensors"
-    assert run("export", model, "--format", "ply", "--out", tmp_path / "video.ply") == 0
-    told = capsys.readouterr().out.replace("\n", "")
+    told = call("export", model, "--format", "ply", "--out", tmp_path / "video.ply").out.replace("\n", "")
     assert told == f"{tmp_path / 'video.ply'}: VeGaS video (ply), 7 frames, {NUM} Gaussians"
-    assert run("import", tmp_path / "video.ply", "--out", tmp_path / "again.safetensors") == 0
-    assert f"7 frames, {NUM} Gaussians" in capsys.readouterr().out
+    call("import", tmp_path / "video.ply", "--out", tmp_path / "again.safetensors", out=f"7 frames, {NUM} Gaussians")
     again = load_video_model(tmp_path / "again.safetensors")
     assert (again.size, again.fps) == (SIZE, 25.0)
     np.testing.assert_allclose(again.splats.loc, soft_model().splats.loc, atol=1e-6)

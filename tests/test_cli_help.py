@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import typer
-from commands import run
+from commands import call, run
 from soft_models import soft_model
 
 from foldgauss.cli.app.application import app, load_commands
@@ -46,10 +46,9 @@ def test_every_command_has_examples_that_parse(name):
 
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("name", NAMES)
-def test_help_shows_options_defaults_and_examples(name, width, capsys, monkeypatch):
+def test_help_shows_options_defaults_and_examples(name, width, monkeypatch):
     monkeypatch.setenv("COLUMNS", str(width))
-    assert run(*name.split(), "--help") == 0
-    told = capsys.readouterr().out
+    told = call(*name.split(), "--help").out
     for example in EXAMPLES[name]:
         assert f"     {example.line}\n" in told  # whole, to be copied
     panels = told.partition(" Examples\n")[0]
@@ -61,10 +60,9 @@ def test_help_shows_options_defaults_and_examples(name, width, capsys, monkeypat
     assert "\\[" not in text  # brackets are told as they are
 
 
-def test_help_of_a_fit_fits_on_two_screens(capsys, monkeypatch):
+def test_help_of_a_fit_fits_on_two_screens(monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
-    assert run("fit", "--help") == 0
-    assert len(capsys.readouterr().out.splitlines()) <= 100
+    assert len(call("fit", "--help").out.splitlines()) <= 100
 
 
 def test_the_list_of_commands_says_what_each_says_of_itself():
@@ -73,10 +71,9 @@ def test_the_list_of_commands_says_what_each_says_of_itself():
         assert command.help.partition("\n\n")[0] == COMMANDS[name].summary
 
 
-def test_defaults_are_told_in_brackets(capsys, monkeypatch):
+def test_defaults_are_told_in_brackets(monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
-    assert run("fit", "--help") == 0
-    told = capsys.readouterr().out
+    told = call("fit", "--help").out
     for text in ("[default: standard]", "[default: 10,000,000]", "in this folder]"):
         assert text in told
 

@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 import pytest
-from commands import run
+from commands import call, run
 
 import foldgauss.jobs.runner as fitting
 from foldgauss.cli.fitting import job_progress as _jobs_view
@@ -57,10 +57,11 @@ def whole(long_clip, tmp_path_factory):
     return target
 
 
-def test_a_fit_in_segments_is_one_model(long_clip, whole, tmp_path, capsys):
+def test_a_fit_in_segments_is_one_model(long_clip, whole, tmp_path):
     target = tmp_path / "m.safetensors"
-    assert run("fit", long_clip, "--out", target, *SEGMENTS, "--log-json") == 0
-    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    events = [
+        json.loads(line) for line in call("fit", long_clip, "--out", target, *SEGMENTS, "--log-json").out.splitlines()
+    ]
     start, done = events[0], events[-1]
     video = load_video_model(target)
     assert isinstance(video, SegmentedVideo)
@@ -73,9 +74,8 @@ def test_a_fit_in_segments_is_one_model(long_clip, whole, tmp_path, capsys):
     assert target.read_bytes() == whole.read_bytes()
 
 
-def test_the_plan_and_the_figures_are_told(long_clip, tmp_path, capsys):
-    assert run("fit", long_clip, "--out", tmp_path / "m.safetensors", *SEGMENTS) == 0
-    told = capsys.readouterr()
+def test_the_plan_and_the_figures_are_told(long_clip, tmp_path):
+    told = call("fit", long_clip, "--out", tmp_path / "m.safetensors", *SEGMENTS)
     assert "39 frames of 24x32 in 3 segments of" in told.out
     assert "each with 40 Gaussians of degree 1, 12 steps, by this process" in told.out
     assert "PSNR lost where segments meet" in told.out
@@ -105,23 +105,19 @@ def test_a_stopped_fit_goes_on_when_the_command_is_given_again(long_clip, whole,
         assert run("fit", long_clip, "--out", target, *SEGMENTS) == 1
     assert "stopped by SIGTERM; 1 of 3 segments are done" in capsys.readouterr().err
     assert (folder / "segment-0001.safetensors.checkpoint").exists()
-    assert run("fit", long_clip, "--out", target, *SEGMENTS[:-1], "2") == 2  # not with other options
-    assert "segment_seconds=1.5" in capsys.readouterr().err
-    assert run("fit", long_clip, "--out", target, *SEGMENTS, "--resume") == 0
-    assert "continuing: 1 of 3 segments done, 1 begun" in capsys.readouterr().err
+    call("fit", long_clip, "--out", target, *SEGMENTS[:-1], "2", code=2, err="segment_seconds=1.5")
+    call("fit", long_clip, "--out", target, *SEGMENTS, "--resume", err="continuing: 1 of 3 segments done, 1 begun")
     assert target.read_bytes() == whole.read_bytes()
     assert not folder.exists()
 
 
-def test_begun_anew_and_left_alone(long_clip, whole, tmp_path, capsys):
+def test_begun_anew_and_left_alone(long_clip, whole, tmp_path):
     target, folder = tmp_path / "m.safetensors", tmp_path / "m.safetensors.segments"
     shutil.copyfile(whole, target)
-    assert run("fit", long_clip, "--out", target, *SEGMENTS) == 2
-    assert "add --overwrite" in capsys.readouterr().err
+    call("fit", long_clip, "--out", target, *SEGMENTS, code=2, err="add --overwrite")
     folder.mkdir()
     (folder / "mine.txt").write_text("not of a fit")
-    assert run("fit", long_clip, "--out", target, *SEGMENTS, "--overwrite") == 2
-    assert "mine.txt" in capsys.readouterr().err
+    call("fit", long_clip, "--out", target, *SEGMENTS, "--overwrite", code=2, err="mine.txt")
     (folder / "mine.txt").rename(folder / "segment-0000.safetensors")
     assert run("fit", long_clip, "--out", target, *SEGMENTS, "--overwrite") == 0
     assert target.read_bytes() == whole.read_bytes()
@@ -134,20 +130,30 @@ def stopped(monkeypatch, where, *words):
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")
-def test_what_was_begun_in_segments_goes_on_so_without_being_told(long_clip, whole, tmp_path, capsys, monkeypatch):
+def test_what_was_begun_in_segments_goes_on_so_without_being_told(long_clip, whole, tmp_path, monkeypatch):
     target = tmp_path / "m.safetensors"
     stopped(monkeypatch, "segment 1", "fit", long_clip, "--out", target, *SEGMENTS)
-    capsys.readouterr()
-    assert run("fit", long_clip, "--out", target, *QUICK, "--preview", tmp_path / "p.png") == 2
-    assert "--preview: expected a fit in one piece" in capsys.readouterr().err
-    assert run("fit", long_clip, "--out", target, *QUICK, "--log-json") == 0
-    assert json.loads(capsys.readouterr().out.splitlines()[0])["spans"] == [[0, 15], [12, 27], [24, 39]]
+    call(
+        "fit",
+        long_clip,
+        "--out",
+        target,
+        *QUICK,
+        "--preview",
+        tmp_path / "p.png",
+        code=2,
+        err="--preview: expected a fit in one piece",
+    )
+    assert json.loads(call("fit", long_clip, "--out", target, *QUICK, "--log-json").out.splitlines()[0])["spans"] == [
+        [0, 15],
+        [12, 27],
+        [24, 39],
+    ]
     checkpoint = tmp_path / "m.safetensors.checkpoint"
     (tmp_path / "m.safetensors.segments").mkdir()
     (tmp_path / "m.safetensors.segments" / "plan.json").write_text('{"asked": {"segment_seconds": 1.5}}')
     checkpoint.write_bytes(b"of a fit in one piece")
-    assert run("fit", long_clip, "--out", target, *QUICK, "--overwrite", "--resume") == 1
-    assert checkpoint.name in capsys.readouterr().err
+    assert checkpoint.name in call("fit", long_clip, "--out", target, *QUICK, "--overwrite", "--resume", code=1).err
     assert target.read_bytes() == whole.read_bytes()
 
 
@@ -187,10 +193,9 @@ def summary_of(folder):
     return json.loads((folder / "summary.json").read_text())
 
 
-def test_many_clips_make_a_model_each_and_failures_are_listed(clips, tmp_path, capsys):
+def test_many_clips_make_a_model_each_and_failures_are_listed(clips, tmp_path):
     out = tmp_path / "models"
-    assert run("fit-many", clips, "--out", out, *QUICK) == 1
-    told = capsys.readouterr()
+    told = call("fit-many", clips, "--out", out, *QUICK, code=1)
     assert "skipped, not clips: notes.txt" in told.out
     assert "3 models in" in told.out
     assert "1 failed" in told.out
@@ -205,16 +210,14 @@ def test_many_clips_make_a_model_each_and_failures_are_listed(clips, tmp_path, c
     assert (summary_of(out)["done"], summary_of(out)["failed"]) == (3, 1)
 
 
-def test_many_clips_given_again_do_what_is_left(clips, tmp_path, capsys, monkeypatch):
+def test_many_clips_given_again_do_what_is_left(clips, tmp_path, monkeypatch):
     own, out = tmp_path / "clips", tmp_path / "models"
     shutil.copytree(clips, own)
     assert run("fit-many", own, "--out", out, *QUICK, "--quiet") == 1
     stamps = {path.name: path.stat().st_mtime_ns for path in out.glob("*.fgz")}
-    assert run("fit-many", own, "--out", out, *QUICK[:-1], "2") == 2  # not in place of others
-    assert "with other settings" in capsys.readouterr().err
+    call("fit-many", own, "--out", out, *QUICK[:-1], "2", code=2, err="with other settings")
     shutil.copyfile(own / "clip0.mp4", own / "broken.mp4")  # mended
-    assert run("fit-many", own, "--out", out, *QUICK) == 0
-    assert "4 clips, 3 of them done already" in capsys.readouterr().out
+    call("fit-many", own, "--out", out, *QUICK, out="4 clips, 3 of them done already")
     assert all((out / name).stat().st_mtime_ns == stamp for name, stamp in stamps.items())
     assert summary_of(out)["failed"] == 0
     assert run("fit-many", own, "--out", out, *QUICK[:-1], "2", "--overwrite", "--quiet") == 0
@@ -228,21 +231,27 @@ def test_many_clips_begun_anew_and_stopped_go_on(clips, tmp_path, capsys, monkey
     other = (*QUICK[:-1], "2")
     stopped(monkeypatch, "clip1.mp4", "fit-many", clips, "--out", out, *other, "--overwrite")
     assert "Give the command again without --overwrite to continue." in capsys.readouterr().err
-    assert run("fit-many", clips, "--out", out, *QUICK) == 2  # what is kept is of other settings
-    assert "exists, with other settings" in capsys.readouterr().err
+    call("fit-many", clips, "--out", out, *QUICK, code=2, err="exists, with other settings")
     kept = out / "records" / "clip1.fgz.checkpoint"
     before, stamp = kept.read_bytes(), (out / "clip0.fgz").stat().st_mtime_ns
     assert run("fit-many", clips, "--out", out, *other[:-1], "3") == 2
     assert kept.read_bytes() == before
-    assert run("fit-many", clips, "--out", out, *other) == 1
-    assert "4 clips, 1 of them done already" in capsys.readouterr().out
+    call("fit-many", clips, "--out", out, *other, code=1, out="4 clips, 1 of them done already")
     assert (out / "clip0.fgz").stat().st_mtime_ns == stamp
     assert {load_video_model(path).degree for path in out.glob("*.fgz")} == {2}
 
 
 @pytest.mark.parametrize("options", [("--workers", "2"), ("--scheduler", "tcp://127.0.0.1:1")])
-def test_without_dask_nothing_is_begun(clips, tmp_path, capsys, monkeypatch, options):
+def test_without_dask_nothing_is_begun(clips, tmp_path, monkeypatch, options):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    assert run("fit-many", clips, "--out", tmp_path / "models", *QUICK, *options) == 2
-    assert f"{options[0]}: expected dask.distributed, got none. Install it: pip install" in capsys.readouterr().err
+    call(
+        "fit-many",
+        clips,
+        "--out",
+        tmp_path / "models",
+        *QUICK,
+        *options,
+        code=2,
+        err=f"{options[0]}: expected dask.distributed, got none. Install it: pip install",
+    )
     assert not list(tmp_path.iterdir())

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import run
+from commands import call, run
 
 from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.settings import setting_of
@@ -50,10 +50,18 @@ def model(work):
     return work / "a" / "b" / "m.safetensors"
 
 
-def test_a_range_beyond_the_clip_ends_with_it(work, tmp_path, capsys):
+def test_a_range_beyond_the_clip_ends_with_it(work, tmp_path):
     target = tmp_path / "m.safetensors"
-    assert run("fit", work / "clip.mp4", "--frames", "4:100", "--out", target, *FIT) == 0
-    assert "frames 4:100 were asked for, and the clip ends at 6: 4:6 are used." in capsys.readouterr().err
+    call(
+        "fit",
+        work / "clip.mp4",
+        "--frames",
+        "4:100",
+        "--out",
+        target,
+        *FIT,
+        err="frames 4:100 were asked for, and the clip ends at 6: 4:6 are used.",
+    )
     assert (load_video_model(target).num_frames, read_metadata(target)["frames"]) == (2, [4, 6])
 
 
@@ -68,10 +76,9 @@ def test_masks_of_the_whole_clip_fit_a_model_of_some_frames(work, model, tmp_pat
     assert run("edit", model, tmp_path / "s.toml", "--out", tmp_path / "e.safetensors") == 0
 
 
-def test_a_page_is_told_of_where_there_is_no_terminal(model, tmp_path, capsys, monkeypatch):
+def test_a_page_is_told_of_where_there_is_no_terminal(model, tmp_path, monkeypatch):
     monkeypatch.setattr("foldgauss.cli.shared.console.FIRST_LINE_SECONDS", 0.0)
-    assert run("view", model, "--out", tmp_path / "new" / "p.html") == 0
-    assert "Writing the page" in capsys.readouterr().err
+    call("view", model, "--out", tmp_path / "new" / "p.html", err="Writing the page")
 
 
 #: Commands that write after long work, by what they write; CLIP, MODEL, MASK and SCRIPT are inputs, OUT is the output.

@@ -4,7 +4,7 @@ import shutil
 
 import numpy as np
 import pytest
-from commands import run, seconds_heard, write_tone
+from commands import call, run, seconds_heard, write_tone
 from soft_models import soft_model
 
 from foldgauss.cli.viewing import render as plate
@@ -35,12 +35,11 @@ def searched(monkeypatch):
 
 
 @pytest.mark.usefixtures("searched")
-def test_scripts_select_what_moves(model, tmp_path, capsys):
+def test_scripts_select_what_moves(model, tmp_path):
     wanted = edit(MODEL).select(by_mask(MODEL, MASKS)).vanish().video()
     assert parse_edit_script(SCRIPT).apply(MODEL).num_gaussians == wanted.num_gaussians < MODEL.num_gaussians
     (tmp_path / "edits.toml").write_text(SCRIPT)
-    assert run("edit", model, tmp_path / "edits.toml", "--out", tmp_path / "gone.safetensors") == 0
-    told = capsys.readouterr().out
+    told = call("edit", model, tmp_path / "edits.toml", "--out", tmp_path / "gone.safetensors").out
     assert f"{wanted.num_gaussians} Gaussians" in told
     assert told.startswith("Searching for what moves against the background ...\n")
     assert f"The moving object has {MODEL.num_gaussians - wanted.num_gaussians} of 40 Gaussians." in told
@@ -70,7 +69,7 @@ def test_masks_as_stored_are_those_of_the_stretched_clip(command, tmp_path):
     np.testing.assert_array_equal(*made)
 
 
-def test_scripts_say_where_nothing_moves(model, tmp_path, monkeypatch, capsys):
+def test_scripts_say_where_nothing_moves(model, tmp_path, monkeypatch):
     def search(frames, **options):
         raise nothing_moves("an object that moves against the background", "none")
 
@@ -82,10 +81,18 @@ def test_scripts_say_where_nothing_moves(model, tmp_path, monkeypatch, capsys):
         parse_edit_script(SCRIPT.replace("true", "false"))
     with pytest.raises(NothingMoves):
         edit(MODEL).select(moving=True)
-    assert run("render", "--plate", model, "--out", tmp_path / "images") == 2
-    told = capsys.readouterr().err
-    assert "MODEL: expected an object that moves against the background, got none." in told
-    assert "Give masks of the object by --masks, or remove it by foldgauss edit" in told
+    call(
+        "render",
+        "--plate",
+        model,
+        "--out",
+        tmp_path / "images",
+        code=2,
+        err=[
+            "MODEL: expected an object that moves against the background, got none.",
+            "Give masks of the object by --masks, or remove it by foldgauss edit",
+        ],
+    )
     assert not list(tmp_path.iterdir())
 
 
@@ -106,10 +113,9 @@ def test_an_object_without_gaussians_is_told(monkeypatch):
 
 
 @pytest.mark.usefixtures("searched")
-def test_the_plate_and_its_masks_are_written(model, tmp_path, monkeypatch, capsys):
+def test_the_plate_and_its_masks_are_written(model, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert run("render", "--plate", model, "--save-masks", "masks", "--out", "images") == 0
-    told = capsys.readouterr().out
+    told = call("render", "--plate", model, "--save-masks", "masks", "--out", "images").out
     assert "Motion against the background covers 15.6% to 15.6% of the image, in 7 of 7 frames." in told
     assert "Parts that stand still are not found and stay" in told
     assert "7 frames at 25 frames per second" in told
@@ -120,10 +126,8 @@ def test_the_plate_and_its_masks_are_written(model, tmp_path, monkeypatch, capsy
     assert run("render", "--plate", model, "--sound", write_tone(tmp_path / "tone.wav", 1.0)) == 0
     assert read_video("m.plate.mp4").frames.shape == frames.shape
     assert seconds_heard("m.plate.mp4") == pytest.approx(len(frames) / 25, abs=0.03)
-    capsys.readouterr()
     for options in ([], ["--save-masks", "masks", "--out", "p.mp4"], ["--out", "images"]):
-        assert run("render", "--plate", model, *options) == 2
-        told = capsys.readouterr()
+        told = call("render", "--plate", model, *options, code=2)
         assert "exists. Choose another path, or add --overwrite." in told.err
         assert "Searching" not in told.out
     assert not (tmp_path / "p.mp4").exists()
@@ -132,22 +136,30 @@ def test_the_plate_and_its_masks_are_written(model, tmp_path, monkeypatch, capsy
 
 
 @pytest.mark.parametrize("form", ["folder", "image", "whole clip"])
-def test_own_masks_are_used_and_stay(model, tmp_path, monkeypatch, capsys, form):
+def test_own_masks_are_used_and_stay(model, tmp_path, monkeypatch, form):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(plate, "find_moving_object", None)  # nothing is searched for
     given = {"folder": MASKS, "image": MASKS[:1], "whole clip": np.concatenate([MASKS, MASKS])}[form]
     write_masks(tmp_path / "masks", given)
     masks = "masks/00000.png" if form == "image" else "masks"
-    assert run("render", "--plate", model, "--masks", masks, "--out", "images", "--save-masks", "used") == 0
-    told = capsys.readouterr()
+    told = call("render", "--plate", model, "--masks", masks, "--out", "images", "--save-masks", "used")
     assert "Searching" not in told.out
     assert "% of the removed area is shown by no frame" in told.err
     assert "It is a smear: take more frames" in told.err
     np.testing.assert_array_equal(read_masks("used"), MASKS)
     np.testing.assert_array_equal(read_masks("masks"), given)
     for options in (["--out", "masks"], ["--save-masks", "masks"]):
-        assert run("render", "--plate", model, "--masks", "masks", *options, "--overwrite") == 2
-        assert f"{options[0]}: expected another path than the masks, got masks." in capsys.readouterr().err
+        call(
+            "render",
+            "--plate",
+            model,
+            "--masks",
+            "masks",
+            *options,
+            "--overwrite",
+            code=2,
+            err=f"{options[0]}: expected another path than the masks, got masks.",
+        )
     np.testing.assert_array_equal(read_masks("masks"), given)
 
 
@@ -185,7 +197,7 @@ INPUTS = {
 
 
 @pytest.mark.parametrize("name", INPUTS)
-def test_no_command_replaces_its_inputs(model, tmp_path, monkeypatch, capsys, name):
+def test_no_command_replaces_its_inputs(model, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     shutil.copy(model, "m.safetensors")
     (tmp_path / "in").mkdir()
@@ -193,6 +205,5 @@ def test_no_command_replaces_its_inputs(model, tmp_path, monkeypatch, capsys, na
         (tmp_path / own).write_bytes(b"mine")
     (tmp_path / "s.toml").write_text('[selections.it]\nmask = "in"\n[[layers]]\nmodel = "in.safetensors"\n')
     files = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    assert run(*INPUTS[name], "--overwrite") == 2
-    assert "Inputs are never replaced." in " ".join(capsys.readouterr().err.split())
+    call(*INPUTS[name], "--overwrite", code=2, err="Inputs are never replaced.")
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == files

@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from commands import run
+from commands import call, run
 from tiny_clips import NUM_FRAMES, TWICE, write_both
 
 from foldgauss.cli.measuring import uncertainty as command
@@ -96,17 +96,13 @@ def test_arviz_reads_the_draws(done):
     assert data.posterior.attrs.get("message", data.attrs.get("message"))
 
 
-def test_a_finished_run_says_so_and_others_are_kept(work, done, capsys, no_pictures):
+def test_a_finished_run_says_so_and_others_are_kept(work, done, no_pictures):
     before = (done / "chains.h5").read_bytes()
-    assert run(*arguments(work, done, *SHORT)) == 0
-    assert "was complete: nothing was sampled" in capsys.readouterr().out
+    call(*arguments(work, done, *SHORT), out="was complete: nothing was sampled")
     assert (done / "chains.h5").read_bytes() == before
     for other in (["--seed", "1"], ["--concentration", "2"], ["--noise", "independent"]):
         table = (done / "frame_times.csv").read_bytes()
-        assert run(*arguments(work, done, *SHORT, *other)) == 2
-        message = capsys.readouterr().err
-        assert "--out: expected" in message
-        assert "--overwrite" in message
+        call(*arguments(work, done, *SHORT, *other), code=2, err=["--out: expected", "--overwrite"])
         assert (done / "frame_times.csv").read_bytes() == table
         assert (done / "chains.h5").read_bytes() == before
     assert {path.name for path in done.iterdir()} == FILES
@@ -130,7 +126,7 @@ def test_tables_for_a_full_disk_are_kept(work, done, tmp_path, capsys, monkeypat
 
 
 @pytest.mark.slow
-def test_a_killed_run_goes_on_to_the_same_draws(work, done, tmp_path, capsys, no_pictures):
+def test_a_killed_run_goes_on_to_the_same_draws(work, done, tmp_path, no_pictures):
     """Killed without warning once something is kept; called again, it draws what it would have drawn."""
     target = tmp_path / "killed"
     code = (
@@ -151,8 +147,7 @@ def test_a_killed_run_goes_on_to_the_same_draws(work, done, tmp_path, capsys, no
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     assert len(draws_of(target)[0]) < 70
     assert not (target / "frame_times.csv").exists()
-    assert run(*words) == 0
-    assert "was continued" in capsys.readouterr().out
+    call(*words, out="was continued")
     for one, other in zip(draws_of(target), draws_of(done), strict=True):
         np.testing.assert_array_equal(one, other)
     assert table_of(target) == table_of(done)
@@ -171,11 +166,10 @@ def test_without_colors_less_is_known(work, done, tmp_path, no_pictures):
     assert max(wider) > 1.02
 
 
-def test_more_steps_go_on_and_overwriting_starts_anew(work, tmp_path, capsys, no_pictures):
+def test_more_steps_go_on_and_overwriting_starts_anew(work, tmp_path, no_pictures):
     target = tmp_path / "results"
     few = ["--steps", "60", "--ensembles", "2", "--only", "6,7"]
-    assert run(*arguments(work, target, *few)) == 0
-    assert "Not converged after 60 steps" in capsys.readouterr().err
+    call(*arguments(work, target, *few), err="Not converged after 60 steps")
     first = draws_of(target)
     assert run(*arguments(work, target, *few, "--steps", "100")) == 0
     for one, other in zip(first, draws_of(target), strict=True):
@@ -185,17 +179,23 @@ def test_more_steps_go_on_and_overwriting_starts_anew(work, tmp_path, capsys, no
     assert run(*arguments(work, target, *few, "--seed", "5", "--overwrite")) == 0
     assert not np.array_equal(draws_of(target)[0], first[0])
     (target / "chains.h5").unlink()
-    assert run(*arguments(work, target, *few)) == 2
-    assert "no chains.h5 of a run of uncertainty" in capsys.readouterr().err
+    call(*arguments(work, target, *few), code=2, err="no chains.h5 of a run of uncertainty")
 
 
-def test_a_clip_of_something_else(work, tmp_path, capsys):
+def test_a_clip_of_something_else(work, tmp_path):
     from foldgauss.io import write_image
 
     clip = tmp_path / "clip"
     clip.mkdir()
     for k, frame in enumerate(np.random.default_rng(0).integers(0, 255, (12, 40, 64, 3))):
         write_image(clip / f"{k:02}.png", frame.astype(np.uint8))
-    assert run("uncertainty", work / "model.safetensors", clip, "--out", tmp_path / "out") == 2
-    assert "VIDEO: expected frames of which the model explains 20%" in capsys.readouterr().err
+    call(
+        "uncertainty",
+        work / "model.safetensors",
+        clip,
+        "--out",
+        tmp_path / "out",
+        code=2,
+        err="VIDEO: expected frames of which the model explains 20%",
+    )
     assert os.listdir(tmp_path / "out") == []

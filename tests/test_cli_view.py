@@ -16,7 +16,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from commands import run
+from commands import call, run
 from tiny_clips import NUM_FRAMES, write_both
 
 from foldgauss.cli.viewing import page_server
@@ -202,15 +202,14 @@ def test_view_saves_beside_the_model(served, work, tmp_path):
     assert "connect-src" not in html_page(model)
 
 
-def test_without_a_model_the_page_opens_files(tmp_path, capsys):
+def test_without_a_model_the_page_opens_files(tmp_path):
     out = tmp_path / "site" / "index.html"
     assert run("view", "--out", out) == 0
     page = out.read_text(encoding="utf-8")
     assert "default-src 'none'" in page
     assert 'id="model"' not in page
     assert "connect-src" not in page
-    assert run("view", "--out", out) == 2
-    assert "--overwrite" in capsys.readouterr().err
+    call("view", "--out", out, code=2, err="--overwrite")
     assert run("view", "--out", out, "--overwrite") == 0
 
 
@@ -237,13 +236,11 @@ def test_a_signal_ends_it_well(work, number, code):
     assert (process.returncode, last, told) == (code, "Stopped.\n", "")
 
 
-def test_the_page_is_written(work, tmp_path, capsys):
+def test_the_page_is_written(work, tmp_path):
     out = tmp_path / "clip.html"
-    assert run("view", work / "model.safetensors", "--out", out) == 0
-    assert "a page of 0." in capsys.readouterr().out
+    call("view", work / "model.safetensors", "--out", out, out="a page of 0.")
     plain = out.read_text(encoding="utf-8")
-    assert run("view", work / "model.safetensors", "--out", out) == 2
-    assert "--overwrite" in capsys.readouterr().err
+    call("view", work / "model.safetensors", "--out", out, code=2, err="--overwrite")
     original = ["--original", work / "clip", "--original-quality", 10, "--overwrite"]
     assert run("view", work / "model.safetensors", "--out", out, *original) == 0
     assert out.read_text(encoding="utf-8").count('id="frame-') == plain.count('id="frame-') + NUM_FRAMES

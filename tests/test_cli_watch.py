@@ -8,7 +8,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
-from commands import run
+from commands import call, run
 
 from foldgauss.cli.fitting import fit as fitting
 from foldgauss.cli.shared import fit_progress as _progress
@@ -49,11 +49,12 @@ def test_history_and_its_curves(clip, tmp_path):
     assert len(read_history(path)) == 10
 
 
-def test_without_matplotlib_only_the_curves_are_missing(clip, tmp_path, monkeypatch, capsys):
+def test_without_matplotlib_only_the_curves_are_missing(clip, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    assert run("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK, "--history", tmp_path / "h.jsonl") == 0
-    assert "warning: no curves" in (message := capsys.readouterr().err)
+    assert "warning: no curves" in (
+        message := call("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK, "--history", tmp_path / "h.jsonl").err
+    )
     assert "foldgauss[plot]" in message
     assert sorted(path.name for path in tmp_path.iterdir()) == ["h.jsonl", "m.safetensors"]
 
@@ -141,13 +142,20 @@ def test_lines_in_a_log(clip, tmp_path, monkeypatch, capfd):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_fit_stops_at_once_before_its_first_step(number, clip, tmp_path, monkeypatch, capsys):
+def test_a_fit_stops_at_once_before_its_first_step(number, clip, tmp_path, monkeypatch):
     def starting(*given):
         signal.raise_signal(number)
         raise AssertionError("went on")
         yield
 
     monkeypatch.setattr(runner, "fit_steps", starting)
-    assert run("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK) == 1
-    assert f"stopped by {number.name} before the first step" in capsys.readouterr().err
+    call(
+        "fit",
+        clip,
+        "--out",
+        tmp_path / "m.safetensors",
+        *QUICK,
+        code=1,
+        err=f"stopped by {number.name} before the first step",
+    )
     assert list(tmp_path.glob("m.*")) == []

@@ -7,7 +7,7 @@ import shlex
 import cv2
 import numpy as np
 import pytest
-from commands import run, write_tone
+from commands import call, write_tone
 from soft_models import soft_model, soft_segments
 from tiny_clips import model_of_12, write_both
 
@@ -289,14 +289,13 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("words", "code", "says"), WRONG, ids=lambda value: str(value)[:90])
-def test_wrong_use_is_told_in_one_line_before_any_work(inputs, monkeypatch, capsys, words, code, says):
+def test_wrong_use_is_told_in_one_line_before_any_work(inputs, monkeypatch, words, code, says):
     if words.startswith("uncertainty"):
         pytest.importorskip("emcee", reason="draws need foldgauss[uncertainty]")
     monkeypatch.chdir(inputs)
     monkeypatch.setattr("foldgauss.video.motion.stabilization.estimate_camera_path", None)  # nothing gets so far
     before = contents_of(inputs)
-    assert run(*shlex.split(words)) == code
-    shown, told = capsys.readouterr()
+    shown, told = call(*shlex.split(words), code=code)
     assert re.search(says, " ".join(told.split())), told
     assert "Traceback" not in told
     assert "Searching" not in shown

@@ -13,7 +13,7 @@ from unittest.mock import Mock
 import cv2
 import numpy as np
 import pytest
-from commands import run
+from commands import call, run
 
 from foldgauss.analysis.plot import Panel, plot_tradeoff
 from foldgauss.cli.measuring import tradeoff as command
@@ -227,7 +227,7 @@ def test_a_table_without_room_leaves_the_fits(clip, tmp_path, capsys, monkeypatc
     assert run(*arguments) == 0
 
 
-def test_stopped_by_hand(clip, tmp_path, capsys, monkeypatch):
+def test_stopped_by_hand(clip, tmp_path, monkeypatch):
     steps = runner.fit_steps
 
     def stopping(frames, config, state=None):
@@ -238,10 +238,17 @@ def test_stopped_by_hand(clip, tmp_path, capsys, monkeypatch):
 
     target = tmp_path / "results"
     monkeypatch.setattr(runner, "fit_steps", stopping)
-    assert run("tradeoff", clip, "--out", target, "--axes", "time", *QUICK) == 1
-    told = " ".join(capsys.readouterr().err.split())
-    assert "stopped by SIGINT; 1 of 4 points are done" in told
-    assert "Run the same command again to continue." in told
+    call(
+        "tradeoff",
+        clip,
+        "--out",
+        target,
+        "--axes",
+        "time",
+        *QUICK,
+        code=1,
+        err=["stopped by SIGINT; 1 of 4 points are done", "Run the same command again to continue."],
+    )
     assert record_of(target)["points"] == []
 
 
@@ -273,20 +280,19 @@ def test_a_point_that_fails_is_left_out(clip, tmp_path, capsys, monkeypatch):
         (60.0, 3000, "5 points around a base of 3,000 steps"),
     ],
 )
-def test_minutes_become_steps(clip, tmp_path, capsys, monkeypatch, minutes, steps, told):
+def test_minutes_become_steps(clip, tmp_path, monkeypatch, minutes, steps, told):
     """At a pace with which all fits take a minute if the base has 1,000 steps."""
     work = 1 + sum(turn.work for axis in ("time", "compositing") for turn in AXES[axis])
     pace = Throughput(start=0.0, step=60 / command.MARGIN / (work * 1000.001), evaluation=0.0)
     monkeypatch.setattr(command, "_measure_throughput", lambda clip, config: pace)
     monkeypatch.setattr(command, "run_jobs", Mock(side_effect=OSError("no fits here")))
     arguments = ["--axes", "time,compositing", "--minutes", minutes]
-    assert run("tradeoff", clip, "--out", tmp_path / "r", *arguments) == 1
-    shown = " ".join("".join(capsys.readouterr()).split())
+    shown = " ".join("".join(call("tradeoff", clip, "--out", tmp_path / "r", *arguments, code=1)).split())
     assert told in shown
     assert record_of(tmp_path / "r")["plan"]["steps"] == steps
 
 
-def test_other_settings_are_refused(done, clip, tmp_path, capsys):
+def test_other_settings_are_refused(done, clip, tmp_path):
     before = {path: path.read_bytes() for path in done.rglob("*.*")}
     for options, told in (
         (["--frames", "1:6", "--steps", "13"], "steps was 12, is 13"),
@@ -294,8 +300,7 @@ def test_other_settings_are_refused(done, clip, tmp_path, capsys):
         (QUICK, "num_frames was 5, is 6"),
         (["--frames", "1:6", *QUICK, "--axes", "time"], "axes was"),
     ):
-        assert run("tradeoff", clip, "--out", done, *options) == 2
-        shown = " ".join(capsys.readouterr().err.split())
+        shown = " ".join(call("tradeoff", clip, "--out", done, *options, code=2).err.split())
         assert told in shown
         assert "--overwrite" in shown
     assert {path: path.read_bytes() for path in done.rglob("*.*")} == before
@@ -303,43 +308,63 @@ def test_other_settings_are_refused(done, clip, tmp_path, capsys):
     target = tmp_path / "r"
     target.mkdir()
     (target / "tradeoff.json").write_text('{"points": [{"axis": "base"}], "settings": {}}')
-    assert run("tradeoff", clip, "--out", target, "--axes", "time", *QUICK) == 2
-    assert "got something else" in " ".join(capsys.readouterr().err.split())
+    call("tradeoff", clip, "--out", target, "--axes", "time", *QUICK, code=2, err="got something else")
     assert run("tradeoff", clip, "--out", target, "--axes", "compositing", *QUICK, "--overwrite") == 0
     assert len(record_of(target)["points"]) == 2
     (target / "mine.txt").write_text("mine")
-    assert run("tradeoff", clip, "--out", target, "--axes", "compositing", *QUICK, "--overwrite") == 2
-    assert "'mine.txt' in it" in " ".join(capsys.readouterr().err.split())
+    call(
+        "tradeoff",
+        clip,
+        "--out",
+        target,
+        "--axes",
+        "compositing",
+        *QUICK,
+        "--overwrite",
+        code=2,
+        err="'mine.txt' in it",
+    )
 
 
-def test_a_record_that_was_edited_is_refused(done, clip, tmp_path, capsys):
+def test_a_record_that_was_edited_is_refused(done, clip, tmp_path):
     (tmp_path / "tradeoff.json").write_text(json.dumps(record_of(done) | {"plan": 3}))
     before = (tmp_path / "tradeoff.json").read_bytes()
-    assert run("tradeoff", clip, "--out", tmp_path, "--frames", "1:6", *QUICK) == 2
-    shown = " ".join(capsys.readouterr().err.split())
-    assert "--out: expected results of `foldgauss tradeoff` in" in shown
-    assert "not iterable" in shown
+    call(
+        "tradeoff",
+        clip,
+        "--out",
+        tmp_path,
+        "--frames",
+        "1:6",
+        *QUICK,
+        code=2,
+        err=["--out: expected results of `foldgauss tradeoff` in", "not iterable"],
+    )
     assert (tmp_path / "tradeoff.json").read_bytes() == before
 
 
 @pytest.mark.parametrize("name", ["models", "tradeoff.png"])
-def test_files_of_these_names_are_none_of_its_own_without_a_record(clip, tmp_path, capsys, monkeypatch, name):
+def test_files_of_these_names_are_none_of_its_own_without_a_record(clip, tmp_path, monkeypatch, name):
     monkeypatch.setattr(command, "read_video", None)  # before any work
     (tmp_path / name).write_text("mine")
-    assert run("tradeoff", clip, "--out", tmp_path, *QUICK) == 2
-    told = " ".join(capsys.readouterr().err.split())
-    assert f"with {name!r} in it, but no tradeoff.json of a tradeoff. Choose another folder, or start over" in told
+    call(
+        "tradeoff",
+        clip,
+        "--out",
+        tmp_path,
+        *QUICK,
+        code=2,
+        err=f"with {name!r} in it, but no tradeoff.json of a tradeoff. Choose another folder, or start over",
+    )
     assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
-    assert run("tradeoff", clip, "--out", tmp_path, *QUICK, "--overwrite") == 1
-    assert "NoneType" in capsys.readouterr().err
+    call("tradeoff", clip, "--out", tmp_path, *QUICK, "--overwrite", code=1, err="NoneType")
 
 
-def test_without_matplotlib_only_the_plot_is_missing(done, clip, capsys, monkeypatch, tmp_path):
+def test_without_matplotlib_only_the_plot_is_missing(done, clip, monkeypatch, tmp_path):
     for name in ("matplotlib", "matplotlib.figure"):
         monkeypatch.setitem(sys.modules, name, None)
     target = tmp_path / "r"
-    assert run("tradeoff", clip, "--out", target, "--axes", "compositing", *QUICK) == 0
-    assert "no plot" in (shown := capsys.readouterr().err)
+    assert "no plot" in (shown := call("tradeoff", clip, "--out", target, "--axes", "compositing", *QUICK).err)
     assert "foldgauss[plot]" in shown
     assert sorted(path.name for path in target.iterdir()) == ["models", "tradeoff.json"]
 

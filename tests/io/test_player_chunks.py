@@ -12,7 +12,7 @@ from itertools import accumulate
 import numpy as np
 import pytest
 from browser import Opened
-from commands import run
+from commands import call, run
 from editor_page import assert_shows, drop
 from soft_models import soft_model
 
@@ -195,7 +195,7 @@ def test_a_linked_page_on_the_disk_says_what_to_do(browser, tmp_path):
     page.close()
 
 
-def test_the_file_of_a_linked_page_stands_beside_it(film, tmp_path, capsys):
+def test_the_file_of_a_linked_page_stands_beside_it(film, tmp_path):
     path = save_compact(tmp_path / "film.fgz", film)
     page = write_html(tmp_path / "page.html", path, linked=True).read_text(encoding="utf-8")
     assert 'data-url="film.fgz"' in page
@@ -209,8 +209,9 @@ def test_the_file_of_a_linked_page_stands_beside_it(film, tmp_path, capsys):
     assert run("view", other, "--linked", "--out", tmp_path / "site" / "other.html") == 0
     assert load_video_model(tmp_path / "site" / "other.page.fgz").num_gaussians == soft_model().num_gaussians
     (tmp_path / "site" / "other.html").unlink()
-    assert run("view", other, "--linked", "--out", tmp_path / "site" / "other.html") == 2
-    assert "other.page.fgz, which exists" in capsys.readouterr().err.replace("\n", "")
+    assert "other.page.fgz, which exists" in call(
+        "view", other, "--linked", "--out", tmp_path / "site" / "other.html", code=2
+    ).err.replace("\n", "")
     segments = SegmentedVideo.from_models([(0, soft_model()), (7, soft_model())])
     with pytest.raises(ValueError, match="linked: expected a single model"):
         write_html(tmp_path / "site" / "long.html", segments, linked=True)
