@@ -2,9 +2,11 @@
 
 import io
 import math
+import os
 import re
+import signal
 import wave
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,6 +16,7 @@ import pytest
 
 from foldgauss import cli
 from foldgauss.cli.app import application
+from foldgauss.jobs import runner
 
 
 def run(*arguments):
@@ -67,6 +70,22 @@ def _find_foreign_options(words, texts):
     named = [(text, found) for text in texts for found in re.finditer(r"(?<![\w/-])--[a-z][a-z0-9-]+", text)]
     elsewhere = re.compile(r"(\bfit\b[^.;:]*|foldgauss [a-z]+ [^:;]*|dask [^.;:]*|pip [^.;:]*)$", re.IGNORECASE)
     return [text for text, found in named if found[0] not in own and not elsewhere.search(text[: found.start()])]
+
+
+@contextmanager
+def interrupted_fit(step, number=signal.SIGINT):
+    """A fit sends its own process this signal after a step."""
+    steps = runner.fit_steps
+
+    def stepping(*arguments):
+        for state, info in steps(*arguments):
+            if info.step == step:
+                os.kill(os.getpid(), number)
+            yield state, info
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runner, "fit_steps", stepping)
+        yield
 
 
 def write_tone(path: Path, seconds: float) -> Path:

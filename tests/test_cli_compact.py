@@ -2,7 +2,6 @@
 
 import os
 import re
-import signal
 from pathlib import Path
 
 import jax
@@ -14,7 +13,6 @@ from foldgauss.io import load_video_model, save_compact, write_video
 from foldgauss.io.datasets import ball
 from foldgauss.io.models.compact import is_compact
 from foldgauss.io.models.video_model import read_metadata
-from foldgauss.jobs import runner
 from foldgauss.video import FitConfig, fit
 from foldgauss.video.compression.quantize import Rule, compute_columns, is_integral, quantize
 
@@ -79,29 +77,6 @@ def test_float32_parameters_on_demand(clip):
     one, other = (jax.tree.leaves(load_video_model(name)) for name in ("decoded.safetensors", "ball.fgz"))
     for a, b in zip(one, other, strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")
-@pytest.mark.parametrize("step", [20, 57])
-def test_stopped_and_resumed(clip, tmp_path, monkeypatch, capsys, step):
-    """Before and between the steps of rounding: the file equals that of a fit that was never stopped."""
-    steps = runner.fit_steps
-
-    def stepping(*arguments):
-        for state, info in steps(*arguments):
-            if info.step == step:
-                os.kill(os.getpid(), signal.SIGTERM)
-            yield state, info
-
-    with monkeypatch.context() as patch:
-        patch.setattr(runner, "fit_steps", stepping)
-        assert run("fit", clip, *QUICK) == 1
-    assert "--resume" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["ball.fgz.checkpoint"]
-    assert run("fit", clip, *QUICK, "--quality", 60, "--resume") == 2  # not with another goal
-    assert run("fit", clip, *QUICK, "--resume") == 0
-    assert run("fit", clip, *QUICK, "--out", "whole.fgz") == 0
-    assert (tmp_path / "ball.fgz").read_bytes() == (tmp_path / "whole.fgz").read_bytes()
 
 
 @pytest.mark.filterwarnings("default:.*chunks is cut off")

@@ -372,20 +372,6 @@ def test_without_matplotlib_only_the_plot_is_missing(done, clip, monkeypatch, tm
 # --------------------------------------------------------------------------------------- options of the others
 
 
-def test_options_of_fit_reach_the_fit(clip, tmp_path, monkeypatch):
-    seen, steps = [], runner.fit_steps
-    monkeypatch.setattr(runner, "fit_steps", lambda frames, config, state: seen.append(config) or steps(frames, config))
-    options = ["--ssim-fraction", 0.3, "--error-fraction", 0.1]
-    options += ["--alpha-cutoff", 0.01, "--support-radius", 2, "--transmittance-stop", 0.02]
-    target = tmp_path / "m.safetensors"
-    assert run("fit", clip, "--out", target, "--gaussians", 50, "--steps", 2, *options, "--quiet") == 0
-    (config,) = seen
-    assert (config.loss.ssim_fraction, config.views.error_fraction) == (0.3, 0.1)
-    options = load_video_model(target).options
-    assert (options.alpha_cutoff, options.support_radius, options.transmittance_stop) == (0.01, 2.0, 0.02)
-    assert options.low_pass == FitConfig().options.low_pass
-
-
 def test_render_with_other_constants(done, tmp_path):
     for name, options in (("own", []), ("fast", ["--support-radius", 1])):
         path = tmp_path / f"{name}.png"

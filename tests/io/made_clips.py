@@ -6,6 +6,7 @@ import shutil
 import struct
 import subprocess
 from collections.abc import Callable
+from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from typing import NamedTuple
@@ -260,12 +261,6 @@ NEAR = np.array([0, 1e-7, 2e-7, 0.1, 0.2, 0.5, 0.6, 0.7])
 RED = np.broadcast_to(np.uint8([200, 0, 0]), (4, 32, 32, 3))
 COUNTED = {"num_frames": 8, "num_declared": 8}
 EVEN = {"times": None, "duration": None, "notes": ()}
-HELD = {
-    "num_frames": 8,
-    "num_declared": 8,
-    "duration": pytest.approx(1.7),
-    "times": pytest.approx(0.1 * np.arange(8), abs=1e-3),
-}
 _PALE = np.repeat(np.arange(0, 256, 4, dtype=np.uint8)[None, None, :, None], 3, -1).repeat(48, 1).repeat(2, 0)
 _LUMA = np.tile(np.linspace(16, 235, 64).round(), (1, 48, 1))
 _RATES = (20, 24000 / 1001, 30)
@@ -592,16 +587,17 @@ def assert_read_as(clip, made):
             assert found == value, name
 
 
-def one_line(caught, *words):
+@contextmanager
+def one_line(error, *words):
+    """What is in it raises an error of one line, with these words."""
+    with pytest.raises(error) as caught:
+        yield
     text = str(caught.value)
     assert "\n" not in text
-    for word in words:
-        assert word in text, text
-    return text
+    assert [word for word in words if word not in text] == [], text
 
 
 def refused(path, *words):
-    """The one line with which reading a path fails."""
-    with pytest.raises(VideoError) as caught:
+    """Reading a path fails with one line."""
+    with one_line(VideoError, "expected", *words):
         read_video(path)
-    return one_line(caught, "expected", *words)

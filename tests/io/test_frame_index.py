@@ -3,6 +3,7 @@
 Clips are made with ffmpeg, and skipped where there is none.
 """
 
+import io
 import json
 import os
 import pickle
@@ -467,9 +468,8 @@ def test_a_file_that_is_another_is_refused(tmp_path, long):
     index = index_video(path, find_cuts=False)
     for other in (_moving(700)[::-1], _moving(30)):
         encoded(path, other, *LONG, rate=25)
-        with pytest.raises(VideoError) as caught:
+        with one_line(VideoError, "expected the file that was indexed", "frame 500 differs", "index it again"):
             read_indexed(index, 500, 503)
-        one_line(caught, "expected the file that was indexed", "frame 500 differs", "index it again")
         with pytest.raises(VideoError, match="differs"):
             LazyFrames(index)[500]
     path.write_text("no video")
@@ -511,28 +511,41 @@ def test_an_index_with_times_is_saved(tmp_path):
     _same(read_indexed(again, 50, 70), read_indexed(index, 50, 70))
 
 
-def test_what_is_no_index_is_refused(tmp_path, long_index):
-    path = long_index.save(tmp_path / "good.npz")
-    data = path.read_bytes()
-    others = {"empty": b"", "text": b"no index", "cut": data[: len(data) // 2], "zip": b"PK\x03\x04" + bytes(50)}
-    for name, content in others.items():
-        (tmp_path / name).write_bytes(content)
-    np.savez(tmp_path / "other.npz", about=np.zeros(3, np.uint8))
-    np.savez(tmp_path / "pickled.npz", about=np.array([None]))
-    np.save(tmp_path / "array.npy", np.zeros(3))
-    with np.load(path) as file:
-        arrays = dict(file)
-    np.savez(tmp_path / "short.npz", **arrays | {"digests": arrays["digests"][:, :8]})
-    about = json.dumps(json.loads(arrays["about"].tobytes()) | {"format": 99}).encode()
-    np.savez(tmp_path / "later.npz", **arrays | {"about": np.frombuffer(about, np.uint8)})
-    for name in [*others, "other.npz", "pickled.npz", "array.npy", "short.npz", "later.npz"]:
-        with pytest.raises(VideoError) as caught:
-            FrameIndex.load(tmp_path / name)
-        one_line(caught, "expected an index of a clip", "index_video")
-    with pytest.raises(FileNotFoundError):
-        FrameIndex.load(tmp_path / "missing")
+def with_array(data, **changes):
+    """The file of an index with other arrays."""
+    file = io.BytesIO()
+    with np.load(io.BytesIO(data)) as arrays:
+        np.savez(file, **{name: changes.get(name, lambda own: own)(own) for name, own in arrays.items()})
+    return file.getvalue()
+
+
+def _of_later_format(about):
+    return np.frombuffer(json.dumps(json.loads(about.tobytes()) | {"format": 99}).encode(), np.uint8)
+
+
+#: The file of an index, changed into none.
+NO_INDEX = {
+    "empty": lambda data: b"",
+    "text": lambda data: b"no index",
+    "cut": lambda data: data[: len(data) // 2],
+    "zip": lambda data: b"PK\x03\x04" + bytes(50),
+    "other": lambda data: with_array(data, about=lambda about: np.zeros(3, np.uint8)),
+    "pickled": lambda data: with_array(data, about=lambda about: np.array([None])),
+    "short": lambda data: with_array(data, digests=lambda digests: digests[:, :8]),
+    "later": lambda data: with_array(data, about=_of_later_format),
+}
+
+
+@pytest.mark.parametrize("name", NO_INDEX)
+def test_what_is_no_index_is_refused(tmp_path, long_index, name):
+    path = long_index.save(tmp_path / "i.npz")
     with pytest.raises(OutputError):
         long_index.save(path / "a.npz")
+    path.write_bytes(NO_INDEX[name](path.read_bytes()))
+    with one_line(VideoError, "expected an index of a clip", "index_video"):
+        FrameIndex.load(path)
+    with pytest.raises(FileNotFoundError):
+        FrameIndex.load(tmp_path / "missing")
 
 
 # ------------------------------------------------------------------------------------------ as an array
@@ -583,26 +596,34 @@ def test_a_decoder_may_be_closed_while_it_is_read(long):
     assert list(frames) == []  # FFmpeg would read memory that is freed
 
 
-def test_what_arrays_refuse_is_refused(long_index):
-    lazy = LazyFrames(long_index, first=600)
-    for which in (20, -21):
-        with pytest.raises(IndexError, match="20 frames"):
-            lazy[which]
-    for which in ("a", 1.5, (1, 2), [1, 2]):
-        with pytest.raises(ValueError, match="expected the number of a frame, or a slice"):
-            lazy[which]
-    for span, expected in (
-        ((0, 621), "within 0:620, .* got 0:621"),
-        ((620, 621), "within 0:620, .* got 620:621"),
-        ((5, 5), "with at least 1 frame, got 5:5"),
-        ((0, 0), "with at least 1 frame, got 0:0"),
-        ((-2, 3), "counted from the start, got -2:3"),
-    ):
-        with pytest.raises(VideoError, match=f"frames: expected A:B {expected}"):
-            long_index.span(*span)
-    for options in ({"first": 5, "stop": 5}, {"stop": 621}, {"first": -1}, {"size": (0, 5)}):
-        with pytest.raises(VideoError, match="expected"):
-            LazyFrames(long_index, **options)
+#: What is done with an index of 620 frames and an array of its last 20, and the error.
+WRONG = [
+    *((lambda index, lazy, k=k: lazy[k], IndexError, "20 frames") for k in (20, -21)),
+    *(
+        (lambda index, lazy, k=k: lazy[k], ValueError, "expected the number of a frame, or a slice")
+        for k in ("a", 1.5, (1, 2), [1, 2])
+    ),
+    *(
+        (lambda index, lazy, span=span: index.span(*span), VideoError, f"frames: expected A:B {text}")
+        for span, text in (
+            ((0, 621), "within 0:620, .* got 0:621"),
+            ((620, 621), "within 0:620, .* got 620:621"),
+            ((5, 5), "with at least 1 frame, got 5:5"),
+            ((0, 0), "with at least 1 frame, got 0:0"),
+            ((-2, 3), "counted from the start, got -2:3"),
+        )
+    ),
+    *(
+        (lambda index, lazy, options=options: LazyFrames(index, **options), VideoError, "expected")
+        for options in ({"first": 5, "stop": 5}, {"stop": 621}, {"first": -1}, {"size": (0, 5)})
+    ),
+]
+
+
+@pytest.mark.parametrize(("do", "error", "text"), WRONG)
+def test_what_arrays_refuse_is_refused(long_index, do, error, text):
+    with pytest.raises(error, match=text):
+        do(long_index, LazyFrames(long_index, first=600))
 
 
 _PEAK = """

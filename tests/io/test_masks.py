@@ -130,28 +130,29 @@ def test_masks_as_stored_are_stretched_as_the_clip(tmp_path, aspect, turn, stret
             assert np.mean(mask != shown) < 0.03
 
 
-def test_refused(folder, tmp_path):
-    def fails(match, *arguments, error=ValueError, **options):
-        with pytest.raises(error, match=match) as caught:
-            read_masks(*arguments, **options)
-        assert "\n" not in str(caught.value)
+#: Below `folder`: a path, options of `read_masks`, and the error.
+REFUSED = [
+    ("none", {}, "missing"),
+    ("", {"label": 3}, r"label: expected one of \[1, 2\] .*, got 3"),
+    *(("", {"label": label}, "label: expected an object's label, 1 to 254") for label in (0, 255, 1.5, True)),
+    ("", {"frames": (12, 13)}, "frames: expected A:B within 0:12, .* got 12:"),
+    ("", {"frames": (5, 5)}, "frames: expected A:B with at least 1 frame"),
+    ("mask0.png", {"frames": (0, 1)}, "frames: expected a folder or a video"),
+    ("", {"size": (0, 5)}, "size: expected"),
+    ("other", {}, "path: expected a folder with images"),
+    ("other/colors/0.png", {}, "label per pixel.*'RGB'"),
+    ("other/v.mp4", {"label": 1}, "label: expected images with labels, got the video"),
+    *(("other/v.mp4", {"level": level}, "level: expected a fraction of white") for level in (0, 1.5, None)),
+    ("other/text.mp4", {}, "does not open as a video"),
+]
 
-    fails("missing", folder / "none", error=FileNotFoundError)
-    fails(r"label: expected one of \[1, 2\] .*, got 3", folder, label=3)
-    for label in (0, 255, 1.5, True):
-        fails("label: expected an object's label, 1 to 254", folder, label=label)
-    fails("frames: expected A:B within 0:12, .* got 12:", folder, frames=(12, 13))
+
+def test_refused(folder):
+    (folder / "other" / "colors").mkdir(parents=True)
+    write_image(folder / "other" / "colors" / "0.png", np.full((*SIZE, 3), (1, 2, 3), np.uint8))
+    write_video(folder / "other" / "v.mp4", [np.zeros((*SIZE, 3), np.uint8)] * 2, 25)
+    (folder / "other" / "text.mp4").write_text("none")
+    for name, options, text in REFUSED:
+        with pytest.raises((ValueError, FileNotFoundError), match=rf"^[^\n]*{text}[^\n]*$"):
+            read_masks(folder / name, **options)
     assert len(read_masks(folder, frames=(10, 99))) == 2
-    fails("frames: expected A:B with at least 1 frame", folder, frames=(5, 5))
-    fails("frames: expected a folder or a video", folder / "mask0.png", frames=(0, 1))
-    fails("size: expected", folder, size=(0, 5))
-    (folder / "empty").mkdir()
-    fails("path: expected a folder with images", folder / "empty")
-    write_image(folder / "colors.png", np.full((*SIZE, 3), (1, 2, 3), np.uint8))
-    fails("label per pixel.*'RGB'", folder / "colors.png")
-    video = write_video(tmp_path / "v.mp4", [np.zeros((*SIZE, 3), np.uint8)] * 2, 25)
-    fails("label: expected images with labels, got the video", video, label=1)
-    for level in (0, 1.5, None):
-        fails("level: expected a fraction of white", video, level=level)
-    (folder / "text.mp4").write_text("none")
-    fails("does not open as a video", folder / "text.mp4")

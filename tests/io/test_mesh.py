@@ -144,9 +144,8 @@ def test_sums_go_out_and_come_back(tmp_path):
 
 def test_a_folder_of_another_program(folder):
     (folder / NOTES).unlink()
-    with pytest.raises(FormatError) as caught:
+    with one_line(FormatError, "size=(480, 854)"):
         read_pseudomesh(folder)
-    one_line(caught, "size=(480, 854)")
     mesh = read_pseudomesh(folder, size=(48, 80))
     assert (mesh.fps, mesh.options, mesh.times.tolist()) == (25.0, RenderOptions(), [0, 0.5, 1])
     for kind in ("obj", "ply"):
@@ -185,9 +184,8 @@ def test_damaged_objects(tmp_path, kind):
     text, expected = DAMAGED[kind]
     path = tmp_path / "x.obj"
     path.write_text(text)
-    with pytest.raises(FormatError) as caught:
+    with one_line(FormatError, expected, "x.obj"):
         read_obj(path)
-    one_line(caught, expected, "x.obj")
 
 
 def test_forms_of_an_object(tmp_path):
@@ -207,24 +205,26 @@ def test_forms_of_an_object(tmp_path):
 )
 def test_faces_that_are_lost_or_flat(folder, change, text):
     edited(folder / "frame_0002.obj", change)
-    with pytest.raises(FormatError) as caught:
+    with one_line(FormatError, "frame_0002.obj", text):
         read_pseudomesh(folder)
-    one_line(caught, "frame_0002.obj", text)
 
 
-def test_incomplete_folders(folder):
-    with pytest.raises(FileNotFoundError, match="missing"):
-        read_pseudomesh(folder / "none")
+@pytest.mark.parametrize(
+    ("gone", "read", "error", "text"),
+    [
+        ([], "none", FileNotFoundError, "missing"),
+        ([], "frame_0000.obj", FormatError, r"\.obj"),
+        (["frame_0001.ply"], "", FormatError, r"frame_0001\.ply"),
+        (["frame_0001.ply", "frame_0001.obj"], "", FormatError, "times"),
+    ],
+)
+def test_incomplete_folders(folder, gone, read, error, text):
+    for name in gone:
+        (folder / name).unlink()
+    with pytest.raises(error, match=text):
+        read_pseudomesh(folder / read)
     with pytest.raises(FileNotFoundError, match="missing"):
         read_obj(folder / "none.obj")
-    with pytest.raises(FormatError, match=r"\.obj"):
-        read_pseudomesh(folder / "frame_0000.obj")
-    (folder / "frame_0001.ply").unlink()
-    with pytest.raises(FormatError, match=r"frame_0001\.ply"):
-        read_pseudomesh(folder)
-    (folder / "frame_0001.obj").unlink()
-    with pytest.raises(FormatError, match="times"):
-        read_pseudomesh(folder)
 
 
 @pytest.mark.parametrize(
@@ -235,9 +235,8 @@ def test_incomplete_folders(folder):
 )  # fmt: skip
 def test_notes_that_are_none(folder, notes):
     (folder / NOTES).write_text(notes)
-    with pytest.raises(FormatError) as caught:
+    with one_line(FormatError, NOTES):
         read_pseudomesh(folder)
-    one_line(caught, NOTES)
 
 
 def test_unknown_notes_do_no_harm(folder):
