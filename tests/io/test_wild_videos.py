@@ -29,11 +29,9 @@ from made_clips import (
     png,
     put,
     refused,
-    rgba,
     uneven_mp4,
     waves,
     webm,
-    weighed,
     with_box,
 )
 from PIL import Image
@@ -41,20 +39,6 @@ from PIL import Image
 from foldgauss.io import VideoError, index_video, read_indexed, read_masks, read_video
 from foldgauss.io.media import clip as clip_module
 from foldgauss.io.media import decoder
-
-FLAT = np.array(
-    [
-        [200, 30, 30],
-        [30, 200, 30],
-        [30, 30, 200],
-        [128, 128, 128],
-        [250, 250, 250],
-        [5, 5, 5],
-        [220, 180, 40],
-        [90, 20, 140],
-    ],
-    np.uint8,
-)
 
 
 @pytest.mark.parametrize("name", CLIPS)
@@ -216,17 +200,17 @@ def test_a_file_that_ends_in_random_bytes_is_noted(tmp_path, name):
 
 @pytest.mark.parametrize("name", ["a.ts", "a.mpg"])
 def test_sound_that_is_longer_than_the_picture_is_no_damage(tmp_path, name):
-    with av.open(str(tmp_path / name), "w") as container:
-        video, audio = container.add_stream("mpeg2video", rate=25), container.add_stream("mp2", rate=44100)
-        video.height, video.width, video.pix_fmt, video.bit_rate = 48, 64, "yuv420p", 100_000
-        audio.layout = "stereo"
-        for image in waves(10, 48, 64):
-            container.mux(video.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
-        for start in range(0, 5 * 44100, 1152):
-            sound = av.AudioFrame.from_ndarray(np.zeros((1, 2 * 1152), np.int16), format="s16", layout="stereo")
-            sound.sample_rate, sound.pts = 44100, start
-            container.mux(audio.encode(sound))
-        container.mux([*video.encode(), *audio.encode()])
+    sound, context = ("mp2", np.zeros(5 * 48_000)), {"bit_rate": 100_000}
+    encode(
+        tmp_path / name,
+        waves(10),
+        "mpeg2video",
+        "yuv420p",
+        given="rgb24",
+        context=context,
+        rate=25,
+        sound=sound,
+    )
     clip = read_video(tmp_path / name)
     assert clip.num_frames == 10
     assert not any("hold no frame" in note for note in clip.notes)
@@ -412,55 +396,6 @@ def test_hdr_is_tone_mapped(tmp_path, transfer, kind, primaries, limited, declar
 # --------------------------------------------------------------------------------------- gray, alpha, depth
 
 
-@pytest.mark.parametrize(
-    ("name", "options", "near"),
-    [
-        ("a.mkv", ("-c:v", "ffv1", "-pix_fmt", "yuv444p"), 2),
-        ("a.mkv", ("-c:v", "ffv1", "-pix_fmt", "yuv420p10le"), 3),
-        ("a.mkv", ("-c:v", "ffv1", "-pix_fmt", "yuv420p16le"), 3),
-        ("a.mkv", ("-c:v", "ffv1", "-pix_fmt", "gbrp10le"), 1),
-        ("a.mkv", ("-c:v", "ffv1", "-pix_fmt", "rgb48le"), 1),
-        ("a.mov", ("-c:v", "prores_ks", "-pix_fmt", "yuv422p10le"), 3),
-        ("a.mp4", ("-c:v", "libx264", "-crf", "1", "-pix_fmt", "yuv420p10le"), 3),
-        ("a.mp4", ("-c:v", "libx265", "-crf", "1", "-pix_fmt", "yuv420p10le", "-x265-params", "log-level=none"), 3),
-        ("a.webm", ("-c:v", "libvpx-vp9", "-crf", "1", "-pix_fmt", "yuv420p10le"), 3),
-        ("full.mkv", ("-vf", "scale=out_range=full", "-color_range", "pc", "-c:v", "ffv1", "-pix_fmt", "yuv420p"), 3),
-        ("hd.mkv", ("-vf", "scale=out_color_matrix=bt709", "-colorspace", "bt709", "-c:v", "ffv1"), None),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, tuple) else str(value),
-)
-def test_levels_of_depths_and_ranges(tmp_path, name, options, near):
-    """Ten bits are not clipped, a full range not stretched; colors are those of their matrix."""
-    frames = np.repeat(np.repeat(np.repeat(FLAT[None, None], 48, 1), 16, 2), 2, 0)
-    ffmpeg(*options, tmp_path / name, frames=frames)
-    found = read_video(tmp_path / name).frames[1]
-    for number, color in enumerate(FLAT):
-        patch = found[5:43, 16 * number + 5 : 16 * number + 11].astype(int)
-        assert np.abs(patch - color).max() <= (3 if near is None else near)
-
-
-@pytest.mark.parametrize(
-    ("name", "options"),
-    [
-        ("a.webm", ("-c:v", "libvpx-vp9", "-pix_fmt", "yuva420p")),
-        ("a.mov", ("-c:v", "qtrle", "-pix_fmt", "argb")),
-        ("a.mov", ("-c:v", "png", "-pix_fmt", "rgba")),
-        ("a.mov", ("-c:v", "prores_ks", "-profile:v", "4444", "-pix_fmt", "yuva444p10le")),
-        ("a.mkv", ("-c:v", "ffv1", "-pix_fmt", "bgra")),
-        ("a.mkv", ("-c:v", "ffv1", "-pix_fmt", "yuva420p")),
-        ("a.avi", ("-c:v", "utvideo", "-pix_fmt", "gbrap")),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, tuple) else value,
-)
-def test_alpha_of_videos_is_kept(tmp_path, name, options):
-    ffmpeg(*options, tmp_path / name, frames=rgba(waves(4)))
-    clip = read_video(tmp_path / name)
-    expected = weighed(rgba(waves(4)))
-    assert clip.has_alpha
-    assert np.abs(clip.frames - expected).mean() < 3
-    assert not clip.frames[:, 40:].any()  # transparent, so their colors are gone
-
-
 @pytest.mark.parametrize("kind", ["bgra", "yuva444p", "yuva444p10le", "rgba64le"])
 def test_alpha_of_hdr_is_kept(video, kind):
     """Of 8 bits, too, which tone mapping leaves out."""
@@ -593,31 +528,6 @@ def test_a_matroska_with_sound_that_breaks_off(tmp_path):
     whole, half = read_video(tmp_path / "a.mkv"), read_video(tmp_path / "b.mkv")
     assert (whole.num_frames, whole.num_declared) == (8, 8)
     assert 2 <= half.num_frames < half.num_declared == 8
-
-
-@pytest.mark.parametrize("name", ["a.mjpeg", "a"])
-def test_bare_sequences_of_jpegs_are_videos(tmp_path, name):
-    packets = [cv2.imencode(".jpg", frame)[1].tobytes() for frame in waves(3)]
-    (tmp_path / name).write_bytes(b"".join(packets))
-    assert np.abs(read_video(tmp_path / name).frames - waves(3).astype(int)).mean() < 4
-    (tmp_path / name).write_bytes(packets[0] + b"more")
-    assert read_video(tmp_path / name).num_frames == 1
-    (tmp_path / "photo.jpg").write_bytes(b"".join(packets))  # a camera's, with what it keeps beside the picture
-    assert read_video(tmp_path / "photo.jpg").num_frames == 1
-
-
-@pytest.mark.parametrize("codec", ["mjpeg", "mpeg4"])
-def test_frames_that_an_avi_repeats_are_not_missed(tmp_path, codec):
-    """Frame 4 is shown for four tenths; the file counts 12, and stores 9."""
-    kept = np.array([0, 1, 2, 3, 7, 8, 9, 10, 11])
-    kind = "yuvj420p" if codec == "mjpeg" else "yuv420p"
-    encode(tmp_path / "a.avi", waves(12)[kept], codec, kind, given="rgb24", times=kept, options={"q": "2"})
-    clip = read_video(tmp_path / "a.avi")
-    assert (clip.num_frames, clip.num_declared, clip.duration) == (9, 9, pytest.approx(1.2))
-    np.testing.assert_allclose(clip.times, kept / 10, atol=1e-6)
-    assert [note for note in clip.notes if "decode" in note] == []
-    with pytest.raises(VideoError, match="A:B within 0:9"):
-        read_video(tmp_path / "a.avi", frames=(9, 12))
 
 
 def test_an_unknown_matrix_is_named(tmp_path):
@@ -887,8 +797,3 @@ def test_huge_videos_are_refused_before_a_frame_is_decoded(tmp_path, monkeypatch
     monkeypatch.setattr(clip_module, "MAX_PIXELS", 48 * 64 - 1)
     monkeypatch.setattr(decoder.VideoDecoder, "frames", None)
     refused(tmp_path / "a.mp4", "at most 3,071 pixels", "48x64", "a.mp4")
-
-
-# ------------------------------------------------------------------------------------------- the commands
-
-FEW = ("--steps", 2, "--gaussians", 20, "--size", "16x16")
