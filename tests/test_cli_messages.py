@@ -137,37 +137,3 @@ def test_a_result_for_a_full_disk_is_kept(name, work, full, capsys):
     assert last.startswith("error: ")
     assert f"It is kept in {kept}" in last
     assert not (full / name).exists()
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["info", "PIPE"],
-        ["view", "PIPE"],
-        ["render", "PIPE"],
-        ["view", "PIPE", "--out", "p.html"],
-        ["uncertainty", "PIPE", "CLIP"],
-        ["evaluate", "MODEL", "PIPE"],
-        ["fit", "PIPE"],
-        ["edit", "MODEL", "PIPE"],
-        ["render", "MODEL", "--plate", "--masks", "PIPE"],
-        ["render", "MODEL", "--sound", "PIPE"],
-        ["import", "PIPE"],
-    ],
-    ids=" ".join,
-)
-def test_a_pipe_is_refused_before_it_is_opened(words, work, model, tmp_path, monkeypatch, capsys):
-    """To open it would wait for a program that writes to it."""
-    pipe, read = tmp_path / "pipe.png", open
-    os.mkfifo(pipe)
-
-    def open_other(path, *arguments, **options):
-        assert str(path) != str(pipe), "opened"
-        return read(path, *arguments, **options)
-
-    monkeypatch.setattr("builtins.open", open_other)
-    monkeypatch.setattr("io.open", open_other)
-    monkeypatch.chdir(tmp_path)
-    inputs = {"PIPE": pipe, "MODEL": model, "CLIP": work / "clip.mp4"}
-    assert run(*(inputs.get(word, word) for word in words)) in (1, 2)
-    assert str(pipe) in capsys.readouterr().err

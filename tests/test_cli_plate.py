@@ -1,7 +1,5 @@
 """`foldgauss render --plate`, and edit scripts that select by motion."""
 
-import shutil
-
 import numpy as np
 import pytest
 from commands import call, run, seconds_heard, write_tone
@@ -96,11 +94,6 @@ def test_scripts_say_where_nothing_moves(model, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_too_few_frames_are_refused_before_the_search():
-    with pytest.raises(NothingMoves, match=r"moving: expected a video of 3 frames at least, got 2\. Select by a mask"):
-        edit(soft_model(num_frames=2)).select(moving=True)
-
-
 def test_an_object_without_gaussians_is_told(monkeypatch):
     few = np.zeros_like(MASKS)
     few[2, 0, :3] = True
@@ -167,43 +160,3 @@ def write_masks(folder, masks):
     folder.mkdir()
     for k, mask in enumerate(masks):
         write_image(folder / f"{k:05d}.png", np.repeat(np.uint8(255 * mask)[..., None], 3, -1))
-
-
-INPUTS = {
-    "render, sound": ["render", "m.safetensors", "--sound", "in.mp4", "--out", "in.mp4"],
-    "plate, sound": ["render", "--plate", "m.safetensors", "--sound", "in.mp4", "--out", "in.mp4"],
-    "plate, masks": ["render", "--plate", "m.safetensors", "--masks", "in.mp4", "--out", "in.mp4"],
-    "plate, folder": [
-        "render",
-        "--plate",
-        "m.safetensors",
-        "--masks",
-        "in/0.png",
-        "--out",
-        "out.mp4",
-        "--save-masks",
-        "in",
-    ],
-    "edit, sound": ["edit", "m.safetensors", "s.toml", "--sound", "in.mp4", "--out", "in.mp4"],
-    "edit, mask": ["edit", "m.safetensors", "s.toml", "--out", "in"],
-    "edit, layer": ["edit", "m.safetensors", "s.toml", "--out", "in.safetensors"],
-    "view": ["view", "m.safetensors", "--original", "in.html", "--out", "in.html"],
-    "compress": ["compress", "m.safetensors", "in.fgz", "--out", "in.fgz"],
-    "evaluate": ["evaluate", "m.safetensors", "in.json", "--json", "in.json"],
-    "evaluate, model": ["evaluate", "in.safetensors", "in.mp4", "--json", "in.safetensors"],
-    "edit": ["edit", "in.safetensors", "s.toml", "--out", "in.safetensors"],
-    "fit": ["fit", "in.safetensors", "--out", "in.safetensors"],
-}
-
-
-@pytest.mark.parametrize("name", INPUTS)
-def test_no_command_replaces_its_inputs(model, tmp_path, monkeypatch, name):
-    monkeypatch.chdir(tmp_path)
-    shutil.copy(model, "m.safetensors")
-    (tmp_path / "in").mkdir()
-    for own in ("in.mp4", "in.safetensors", "in.html", "in.fgz", "in.json", "in.png", "in/0.png"):
-        (tmp_path / own).write_bytes(b"mine")
-    (tmp_path / "s.toml").write_text('[selections.it]\nmask = "in"\n[[layers]]\nmodel = "in.safetensors"\n')
-    files = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    call(*INPUTS[name], "--overwrite", code=2, err="Inputs are never replaced.")
-    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == files

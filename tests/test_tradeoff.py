@@ -343,23 +343,6 @@ def test_a_record_that_was_edited_is_refused(done, clip, tmp_path):
     assert (tmp_path / "tradeoff.json").read_bytes() == before
 
 
-@pytest.mark.parametrize("name", ["models", "tradeoff.png"])
-def test_files_of_these_names_are_none_of_its_own_without_a_record(clip, tmp_path, monkeypatch, name):
-    monkeypatch.setattr(command, "read_video", None)  # before any work
-    (tmp_path / name).write_text("mine")
-    call(
-        "tradeoff",
-        clip,
-        "--out",
-        tmp_path,
-        *QUICK,
-        code=2,
-        err=f"with {name!r} in it, but no tradeoff.json of a tradeoff. Choose another folder, or start over",
-    )
-    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
-    call("tradeoff", clip, "--out", tmp_path, *QUICK, "--overwrite", code=1, err="NoneType")
-
-
 def test_without_matplotlib_only_the_plot_is_missing(done, clip, monkeypatch, tmp_path):
     for name in ("matplotlib", "matplotlib.figure"):
         monkeypatch.setitem(sys.modules, name, None)

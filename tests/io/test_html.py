@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from browser import Opened
-from editor_page import drop
+from editor_page import PICKED, drop, pull
 from soft_models import NUM, OBJECT, SIZE, on_paths, soft_model
 
 from foldgauss.envelope import TimeLikelihood
@@ -28,8 +28,6 @@ from foldgauss.video.compression.quantize import dequantize
 from foldgauss.video.models.frame_times import make_time_logits
 from foldgauss.video.models.renderer import VideoRenderer
 
-#: Indices of the selected Gaussians, as an expression in the page.
-PICKED = "Array.from(foldgauss.player.state.selected.keys()).filter((i) => foldgauss.player.state.selected[i])"
 #: What the brush is made of.
 MODULES = ("gaussians", "paths", "timeline")
 
@@ -249,15 +247,14 @@ def test_positions_are_the_learned_times(opened):
     logits = np.log([1.0, 2.0, 1.0, 3.0, 1.5, 1.0]).astype(np.float32)
     model = _with(soft_model(), frame_times=FrameTimes(logits))
     page, times = opened(model), np.asarray(model.frame_times.times())
-    page.page.keyboard.press(".")
+    page.press(".")
     assert page.stats["time"] == pytest.approx(float(times[1]), abs=1e-3)  # logits are rounded to 2^-10
-    for _ in range(5):
-        page.page.keyboard.press("Shift+ArrowRight")
+    page.press(*5 * ["Shift+ArrowRight"])
     assert page.stats["position"] == pytest.approx(1.5)
     assert page.stats["time"] == pytest.approx(float(times[1] + times[2]) / 2, abs=1e-3)
-    page.page.keyboard.press(",")
+    page.press(",")
     assert page.stats["position"] == 1
-    page.page.keyboard.press("End")
+    page.press("End")
     assert (page.stats["position"], page.stats["time"]) == (6, 1.0)
 
 
@@ -295,7 +292,7 @@ def test_keys_do_what_the_help_says(opened):
 def test_it_plays_and_stops_at_the_end(opened):
     page = opened(soft_model(), reduced_motion="no-preference")
     assert page.stats["playing"]
-    page.page.keyboard.press("l")
+    page.press("l")
     assert page.until("!foldgauss.stats.playing").stats["position"] == 6
     assert not opened(soft_model(), reduced_motion="reduce").stats["playing"]
 
@@ -304,17 +301,14 @@ def test_what_is_brushed_can_vanish_and_come_back(opened):
     model = soft_model(options=RenderOptions())
     page = opened(model, **LARGE)
     before = page.picture(0.5)
-    page.page.keyboard.press("b")
+    page.press("b")
     box = page.page.locator("#canvas").bounding_box()
     scale = min(box["width"] / SIZE[1], box["height"] / SIZE[0])
     middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     seen = eqx.filter_jit(lambda own: own.at(jnp.float32(0.5)).mean)(model)
     x, y = map(float, np.median(np.asarray(seen)[OBJECT], axis=0))
     at = (middle[0] + (x - SIZE[1] / 2) * scale, middle[1] + (y - SIZE[0] / 2) * scale)
-    page.page.mouse.move(*at)
-    page.page.mouse.down()
-    page.page.mouse.move(at[0] + 40, at[1] + 20, steps=4)
-    page.page.mouse.up()
+    pull(page, at, (40, 20))
     picked = page.page.evaluate(PICKED)
     assert page.stats["picked"] == len(picked) >= 4
     assert OBJECT[picked].mean() > 0.7
@@ -325,10 +319,9 @@ def test_what_is_brushed_can_vanish_and_come_back(opened):
     left[picked] = False
     wanted = VideoRenderer(edit(model).select(~left).vanish().video()).frame(0.5)
     assert np.abs(gone.astype(float) - wanted).mean() < 0.5
-    page.page.keyboard.press("z")
+    page.press("z")
     assert page.stats["picked"] == len(picked)
-    page.page.keyboard.press("z")
-    page.page.keyboard.press("e")
+    page.press("z", "e")
     assert page.stats["picked"] == 0
     np.testing.assert_array_equal(page.picture(), before)
 
@@ -347,8 +340,8 @@ def test_what_is_brushed_is_followed_through_the_clip(opened):
         envelope=TimeLikelihood(1.0),
     )
     page = opened(VideoModel(splats, FrameTimes.uniform(9), SIZE, 25.0, RenderOptions()))
-    page.page.evaluate("foldgauss.seek(0)")
-    page.page.keyboard.press("b")
+    page.seek(0)
+    page.press("b")
     found = "foldgauss.controls.tools.picker.inCircle(foldgauss.player.state, 0, -0.1, 0, 0.03)"
     page.page.evaluate(f"foldgauss.controls.tools.select({found}, 'new')")
     assert page.page.evaluate(PICKED) == [0]
@@ -372,7 +365,7 @@ def test_the_original_is_shown_beside_it(opened):
 
     shares = {}
     for key, mode in enumerate(("model", "original", "slider", "side"), start=1):
-        page.page.keyboard.press(str(key))
+        page.press(str(key))
         for _ in range(40):
             shares[mode] = green(shot())
             if mode == "model" or shares[mode] > 0.05:
@@ -382,11 +375,10 @@ def test_the_original_is_shown_beside_it(opened):
     assert shares["original"] > 0.6
     assert 0.3 < shares["slider"] / shares["original"] < 0.6
     assert shares["side"] > 0.1
-    page.page.keyboard.press("3")
+    page.press("3")
     page.page.locator("#divider").focus()
     before = green(shot())
-    for _ in range(10):
-        page.page.keyboard.press("ArrowLeft")
+    page.press(*10 * ["ArrowLeft"])
     assert green(shot()) < before - 0.05
 
 
@@ -500,7 +492,7 @@ def test_pictures_of_segments_are_those_of_the_engine(opened, compositing):
       const one = foldgauss.pixels(64, 40), other = foldgauss.pixels(64, 40);
       return one.every((value, k) => value === other[k]);
     }"""
-    page.page.evaluate("foldgauss.seek(6.5 / 18)")
+    page.seek(6.5 / 18)
     assert page.page.evaluate(twice)
     larger = VideoRenderer(video, (60, 100)).frame(5 / 18)
     assert np.abs(page.picture(5 / 18, (60, 100)).astype(float) - larger).mean() < 0.5
@@ -590,7 +582,7 @@ def test_play_waits_for_a_segment_that_is_not_decoded(opened):
     page, play = opened(video), VideoRenderer(video)
     page.until("foldgauss.stats.decoded.length === 5")
     page.page.evaluate(_HELD_BACK)
-    page.page.evaluate("foldgauss.seek(2 / 18)")
+    page.seek(2 / 18)
     before = page.picture()
     page.page.evaluate("void (sought = foldgauss.seek(12 / 18))")
     assert (page.stats["missing"], page.stats["segment"]) == (3, 0)
@@ -624,8 +616,8 @@ def test_a_segment_that_cannot_be_decoded_is_told(browser, tmp_path):
     told = page.page.locator("#notice-text").inner_text()
     assert told
     with pytest.raises(Exception, match=re.escape(told[:30])):
-        page.page.evaluate("foldgauss.seek(13 / 18)")
-    page.page.keyboard.press("Space")
+        page.seek(13 / 18)
+    page.press("Space")
     page.settle()
     page.close()
     assert not page.said

@@ -128,11 +128,11 @@ def test_chunks_of_the_time_shown_come_first(browser, film, whole, tmp_path):
         assert page.stats["total"] == whole.num_gaussians
         assert np.abs(page.picture().astype(float) - VideoRenderer(coarse).frame(0.0)).mean() < 0.1
         assert "Loading" in page.page.locator("#stats").inner_text()
-        page.page.keyboard.press("e")
-        assert "once all of it has arrived" in page.page.locator("#toast").inner_text()
-        page.page.keyboard.press("s")
+        page.press("e")
+        assert "once all of it has arrived" in page.toast
+        page.press("s")
         assert not page.page.locator("#download-model").is_visible()
-        page.page.keyboard.press("Escape")
+        page.press("Escape")
         before = page.stats["loaded"]
         page.page.evaluate(f"void (sought = foldgauss.seek({TIMES[2]}))")
         server.gate.set()
@@ -144,7 +144,7 @@ def test_chunks_of_the_time_shown_come_first(browser, film, whole, tmp_path):
         assert sum(stop - start for start, stop in server.ranges) == page.stats["bytesRead"] == path.stat().st_size
         assert_shows(page, whole, TIMES)
         assert "Loading" not in page.page.locator("#stats").inner_text()
-        page.page.keyboard.press("e")
+        page.press("e")
         assert page.stats["editing"]
         page.check(server.url)
     page.close()
@@ -157,7 +157,7 @@ def test_without_ranges_the_file_is_read_as_it_comes(browser, film, tmp_path):
     with serving(tmp_path, ranges=False) as server:
         page = Opened(browser, server.url + write_linked(tmp_path, path)).ready()
         page.until("foldgauss.stats.loaded === 5 && !document.getElementById('toast').hidden")
-        assert "2 of its 7 chunks are damaged or missing" in page.page.locator("#toast").inner_text()
+        assert "2 of its 7 chunks are damaged or missing" in page.toast
         with pytest.warns(UserWarning, match="2 of its 7 chunks"):
             assert_shows(page, load_video_model(path), (*TIMES, 1.5 / PARTS))
         assert [url.endswith(".fgz") for url in page.asked].count(True) == 1
@@ -181,7 +181,7 @@ def test_a_file_from_the_disk_comes_in_chunks(opened, film, whole, tmp_path):
     bare.page.evaluate("void (Worker = null)")  # as where no worker is allowed
     drop(bare, again)
     bare.until("document.title === 'other' && !document.getElementById('toast').hidden")
-    assert "1 of its 7 chunks is damaged" in bare.page.locator("#toast").inner_text()
+    assert "1 of its 7 chunks is damaged" in bare.toast
     with pytest.warns(UserWarning, match="1 of its 7 chunks"):
         assert_shows(bare, load_video_model(again), TIMES[:1])
 
