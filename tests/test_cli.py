@@ -252,8 +252,15 @@ def test_remapping_beyond_the_end_is_said(work, tmp_path):
     """6 frames, 12 a second, last half a second."""
     model = work / "model.safetensors"
     assert "warning" not in call("render", model, "--out", tmp_path / "whole", "--remap", "0=0,0.5=0.5").err
-    told = call("render", model, "--out", tmp_path / "beyond", "--remap", "0=0,0.5=2,1=0").err
-    assert "warning: --remap: expected seconds up to the end of the clip, 0.5, got 2. Its last frame is held" in told
+    told = call(
+        "render",
+        model,
+        "--out",
+        tmp_path / "beyond",
+        "--remap",
+        "0=0,0.5=2,1=0",
+        err="warning: --remap: expected seconds up to the end of the clip, 0.5, got 2. Its last frame is held",
+    ).err
     assert len(told.strip().splitlines()) == 1
     assert read_video(tmp_path / "beyond").num_frames == 13
 

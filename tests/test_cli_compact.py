@@ -32,8 +32,7 @@ def here(tmp_path, monkeypatch):
 
 
 def test_the_default_is_a_compact_file(clip, tmp_path):
-    told = call("fit", clip, *QUICK)
-    assert "60 steps, quality 70" in told.out
+    call("fit", clip, *QUICK, out="60 steps, quality 70")
     assert [path.name for path in tmp_path.iterdir()] == ["ball.fgz"]
     assert is_compact("ball.fgz")
     about = read_metadata("ball.fgz")

@@ -75,11 +75,19 @@ def test_a_fit_in_segments_is_one_model(long_clip, whole, tmp_path):
 
 
 def test_the_plan_and_the_figures_are_told(long_clip, tmp_path):
-    told = call("fit", long_clip, "--out", tmp_path / "m.safetensors", *SEGMENTS)
-    assert "39 frames of 24x32 in 3 segments of" in told.out
-    assert "each with 40 Gaussians of degree 1, 12 steps, by this process" in told.out
-    assert "PSNR lost where segments meet" in told.out
-    assert "1 of 3 segments done: segment 0" in told.err
+    call(
+        "fit",
+        long_clip,
+        "--out",
+        tmp_path / "m.safetensors",
+        *SEGMENTS,
+        out=[
+            "39 frames of 24x32 in 3 segments of",
+            "each with 40 Gaussians of degree 1, 12 steps, by this process",
+            "PSNR lost where segments meet",
+        ],
+        err="1 of 3 segments done: segment 0",
+    )
 
 
 class Stopping:
@@ -98,12 +106,11 @@ class Stopping:
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")
-def test_a_stopped_fit_goes_on_when_the_command_is_given_again(long_clip, whole, tmp_path, capsys, monkeypatch):
+def test_a_stopped_fit_goes_on_when_the_command_is_given_again(long_clip, whole, tmp_path, monkeypatch):
     target, folder = tmp_path / "m.safetensors", tmp_path / "m.safetensors.segments"
     with monkeypatch.context() as patch:
         Stopping(patch, "segment 1")
-        assert run("fit", long_clip, "--out", target, *SEGMENTS) == 1
-    assert "stopped by SIGTERM; 1 of 3 segments are done" in capsys.readouterr().err
+        call("fit", long_clip, "--out", target, *SEGMENTS, code=1, err="stopped by SIGTERM; 1 of 3 segments are done")
     assert (folder / "segment-0001.safetensors.checkpoint").exists()
     call("fit", long_clip, "--out", target, *SEGMENTS[:-1], "2", code=2, err="segment_seconds=1.5")
     call("fit", long_clip, "--out", target, *SEGMENTS, "--resume", err="continuing: 1 of 3 segments done, 1 begun")
@@ -166,7 +173,7 @@ def test_that_nobody_listens_any_more_costs_no_fit(long_clip, whole, tmp_path, m
     assert (tmp_path / "m.safetensors").read_bytes() == whole.read_bytes()
 
 
-def test_a_segment_that_fails_leaves_the_others(long_clip, tmp_path, capsys, monkeypatch):
+def test_a_segment_that_fails_leaves_the_others(long_clip, tmp_path, monkeypatch):
     real = fitting.read_indexed
     (first, _stop) = (13, 28)
 
@@ -178,10 +185,15 @@ def test_a_segment_that_fails_leaves_the_others(long_clip, tmp_path, capsys, mon
     target = tmp_path / "m.safetensors"
     with monkeypatch.context() as patch:
         patch.setattr(fitting, "read_indexed", fails)
-        assert run("fit", long_clip, "--out", target, *SEGMENTS) == 1
-    told = capsys.readouterr().err
-    assert "the disk has gone" in told
-    assert "segments failed; the others are kept" in told
+        call(
+            "fit",
+            long_clip,
+            "--out",
+            target,
+            *SEGMENTS,
+            code=1,
+            err=["the disk has gone", "segments failed; the others are kept"],
+        )
     assert not target.exists()
     assert run("fit", long_clip, "--out", target, *SEGMENTS) == 0
 
@@ -195,11 +207,16 @@ def summary_of(folder):
 
 def test_many_clips_make_a_model_each_and_failures_are_listed(clips, tmp_path):
     out = tmp_path / "models"
-    told = call("fit-many", clips, "--out", out, *QUICK, code=1)
-    assert "skipped, not clips: notes.txt" in told.out
-    assert "3 models in" in told.out
-    assert "1 failed" in told.out
-    assert "failed: broken.mp4: path: expected a video file" in told.err
+    call(
+        "fit-many",
+        clips,
+        "--out",
+        out,
+        *QUICK,
+        code=1,
+        out=["skipped, not clips: notes.txt", "3 models in", "1 failed"],
+        err="failed: broken.mp4: path: expected a video file",
+    )
     models = sorted(out.glob("*.fgz"))
     assert [path.name for path in models] == ["clip0.fgz", "clip1.fgz", "frames.fgz"]
     for path, source in zip(models, ("clip0.mp4", "clip1.mp4", "frames"), strict=True):

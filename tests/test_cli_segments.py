@@ -8,7 +8,7 @@ import re
 import cv2
 import numpy as np
 import pytest
-from commands import run
+from commands import call, run
 from soft_models import NUM, soft_model
 
 from foldgauss.cli.viewing import view as viewing
@@ -93,15 +93,13 @@ def test_evaluate_reads_the_clip_bit_by_bit(here, work, tmp_path, capsys, monkey
     assert kept["num_gaussians"] == 3 * NUM
     assert f"│ 1 │ 4:13 │ {np.mean(expected.psnr[4:13]):.2f} │ {min(expected.psnr[4:13]):.2f} │" in said
     assert "warning" not in said
-    assert run("evaluate", here, work / "clip", "--frames", "0:4") == 2
-    assert "expected 18 frames as in the model, got 4" in told(capsys)
+    call("evaluate", here, work / "clip", "--frames", "0:4", code=2, err="expected 18 frames as in the model, got 4")
 
 
-def test_evaluate_knows_another_clip(here, work, tmp_path, capsys):
+def test_evaluate_knows_another_clip(here, work, tmp_path):
     digest = "0" * 32
     save_video_model("noted.safetensors", video(), metadata={"clip": "clip", "frames": [2, 20], "clip_digest": digest})
-    assert run("evaluate", "noted.safetensors", work / "clip") == 0
-    assert "are not those that the model was fitted to (clip)" in told(capsys)
+    call("evaluate", "noted.safetensors", work / "clip", err="are not those that the model was fitted to (clip)")
     assert run("evaluate", here, work / "clip", "--frames", "0:18") == 0
 
 
@@ -117,36 +115,40 @@ def test_info_tells_the_segments_and_loads_none(here, capsys, monkeypatch):
         assert text in said
 
 
-def test_exports(here, capsys, tmp_path):
+def test_exports(here, tmp_path):
     assert run("export", here, "--format", "ply") == 0
     assert len(list((tmp_path / "long-ply").iterdir())) == 3
     assert run("export", here, "--format", "ply") != 0
     assert run("export", here, "--format", "ply", "--overwrite") == 0
-    assert run("export", here, "--format", "ply", "--out", "one.ply") == 2
-    assert "expected a folder without extension" in told(capsys)
+    call("export", here, "--format", "ply", "--out", "one.ply", code=2, err="expected a folder without extension")
     assert run("export", here, "--format", "obj", "--times", "0:1:4") == 0
     assert len(list((tmp_path / "long-obj").glob("*.obj"))) == 4
     assert run("export", here, "--format", "ply3dgs", "--times", "0.9") == 0
     assert (tmp_path / "long.3dgs.ply").exists()
 
 
-def test_one_segment_is_taken_out(here, work, tmp_path, capsys):
-    assert run("export", here, "--format", "model", "--segment", 1) == 0
-    assert "long.1.safetensors: foldgauss (model), 9 frames, 40 Gaussians" in told(capsys)
+def test_one_segment_is_taken_out(here, work, tmp_path):
+    call(
+        "export",
+        here,
+        "--format",
+        "model",
+        "--segment",
+        1,
+        out="long.1.safetensors: foldgauss (model), 9 frames, 40 Gaussians",
+    )
     assert read_metadata("long.1.safetensors") == {"clip": "clip", "frames": [6, 15], "mean_psnr": 31.5, "seed": 3}
     one = load_video_model("long.1.safetensors")
     np.testing.assert_array_equal(list(one.frames()), list(soft_model(seed=1, num_frames=9).frames()))
     assert run("evaluate", "long.1.safetensors", work / "clip") == 0  # its own frames of the clip
-    assert run("export", here, "--format", "model", "--segment", 1) == 2
-    assert "overwrite" in told(capsys)
+    call("export", here, "--format", "model", "--segment", 1, code=2, err="overwrite")
     assert run("export", here, "--format", "ply", "--segment", 2) == 0
     assert read_vegas_ply("long.2.ply", size=one.size).num_frames == 5
 
 
-def test_a_page_plays_all_segments(here, work, tmp_path, capsys, monkeypatch):
+def test_a_page_plays_all_segments(here, work, tmp_path, monkeypatch):
     out = tmp_path / "long.html"
-    assert run("view", here, "--out", out, "--original", work / "clip") == 0
-    assert "long.html: a page of 0.3 MB" in told(capsys)
+    call("view", here, "--out", out, "--original", work / "clip", out="long.html: a page of 0.3 MB")
     page = out.read_text(encoding="utf-8")
     assert page.count('id="model-') == 3
     assert page.count('id="frame-') == NUM_FRAMES
@@ -165,11 +167,10 @@ def test_a_page_plays_all_segments(here, work, tmp_path, capsys, monkeypatch):
 NIGHT = '[[edits]]\ndo = "recolor"\ngain = 0.5\nframes = "4:14"\nease = 3\n'
 
 
-def test_edit_acts_on_all_segments(here, tmp_path, capsys):
+def test_edit_acts_on_all_segments(here, tmp_path):
     """Into a model, which is edited again and rendered, and into pictures."""
     (tmp_path / "night.toml").write_text(NIGHT)
-    assert run("edit", here, "night.toml") == 0
-    assert f"a model in segments, {3 * NUM} Gaussians" in told(capsys)
+    call("edit", here, "night.toml", out=f"a model in segments, {3 * NUM} Gaussians")
     wanted = edit(video()).recolor(gain=0.5, frames=(4, 14), ease=3).video()
     made = load_video_model(tmp_path / "long.night.safetensors")
     assert isinstance(made, SegmentedVideo)
@@ -179,11 +180,15 @@ def test_edit_acts_on_all_segments(here, tmp_path, capsys):
     assert run("edit", "long.night.safetensors", "night.toml", "--out", "twice") == 0
     twice = edit(wanted).recolor(gain=0.5, frames=(4, 14), ease=3).video()
     np.testing.assert_array_equal(pictures(tmp_path / "twice"), list(twice.frames()))
-    capsys.readouterr()
     (tmp_path / "still.toml").write_text('# one\n[[edits]]\ndo = "freeze"\nat = 2\n')
     before = sorted(tmp_path.iterdir())
-    assert run("edit", here, "still.toml") == 1
-    assert "still.toml, line 4, [[edits]] number 1: at: expected times of the segment that shows" in told(capsys)
+    call(
+        "edit",
+        here,
+        "still.toml",
+        code=1,
+        err="still.toml, line 4, [[edits]] number 1: at: expected times of the segment that shows",
+    )
     assert sorted(tmp_path.iterdir()) == before
 
 
