@@ -1,10 +1,12 @@
 """The command as the tests call it."""
 
+import errno
 import io
 import math
 import os
 import re
 import signal
+import threading
 import wave
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -86,6 +88,34 @@ def interrupted_fit(step, number=signal.SIGINT):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(runner, "fit_steps", stepping)
         yield
+
+
+@contextmanager
+def full_disk(is_full):
+    """There is no space left for files whose path is such."""
+    replace = os.replace
+
+    def replace_or_fail(source, target):
+        if is_full(Path(target)):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        replace(source, target)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("os.replace", replace_or_fail)
+        yield
+
+
+@contextmanager
+def running(server):
+    """A server in a thread."""
+    with server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield server
+        finally:
+            server.shutdown()
+            thread.join()
 
 
 def write_tone(path: Path, seconds: float) -> Path:

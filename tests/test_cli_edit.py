@@ -95,26 +95,15 @@ def test_pictures_of_an_edit(work, tmp_path):
     assert seconds_heard(tmp_path / "heard.mp4") == pytest.approx(FRAMES / 25, abs=0.03)
 
 
-@pytest.mark.parametrize("name", ["out.gif", "out.webp", "pngs", "webps"])
-def test_what_is_written_is_what_was_drawn(work, tmp_path, name):
-    """Read back by another program: how many frames, of what size, how fast, and the pictures."""
-    options = ["--format", "webp"] if name == "webps" else []
-    out = tmp_path / name
-    assert run("render", work / "model.safetensors", "--out", out, "--size", "32x52", "--fps", 12.5, *options) == 0
+@pytest.mark.parametrize("kind", ["png", "webp"])
+def test_what_is_written_is_what_was_drawn(work, tmp_path, kind):
+    """Read back by another program: how many images, and the pictures."""
+    options = ("--size", "32x52", "--fps", 12.5, "--format", kind)
+    assert run("render", work / "model.safetensors", "--out", tmp_path / "out", *options) == 0
     own = np.stack(list(soft_model().frames(np.linspace(0, 1, 7)[::2], (32, 52))))  # 25 a second, every other one
-    if out.is_dir():
-        suffix = name.removesuffix("s")
-        assert sorted(path.name for path in out.iterdir()) == [f"{k:05d}.{suffix}" for k in range(4)]
-        images = [Image.open(path) for path in sorted(out.iterdir())]
-        np.testing.assert_array_equal([np.asarray(image.convert("RGB")) for image in images], own)
-        return
-    with Image.open(out) as image:
-        assert (image.n_frames, image.size, image.info["loop"]) == (4, (52, 32), 0)
-        for k in range(4):
-            image.seek(k)
-            error = np.asarray(image.convert("RGB")).astype(float) - own[k]
-            assert image.info["duration"] == 80
-            assert 10 * np.log10(255**2 / np.mean(error**2)) > 30
+    paths = sorted((tmp_path / "out").iterdir())
+    assert [path.name for path in paths] == [f"{k:05d}.{kind}" for k in range(4)]
+    np.testing.assert_array_equal([np.asarray(Image.open(path).convert("RGB")) for path in paths], own)
 
 
 def test_export_and_import(work, tmp_path, capsys):

@@ -1,14 +1,11 @@
 """What commands say of inputs that they do not read, and where outputs go."""
 
 import dataclasses
-import errno
-import os
 import pickle
-from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import call, run
+from commands import call, full_disk, run
 
 from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.settings import setting_of
@@ -107,17 +104,10 @@ def full(tmp_path, monkeypatch):
     """A folder on a full disk, and another for temporary files."""
     (tmp_path / "full").mkdir()
     (tmp_path / "temporary").mkdir()
-    replace = os.replace
-
-    def replace_outside(source, target):
-        if Path(target).parent == tmp_path / "full":
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        replace(source, target)
-
-    monkeypatch.setattr("os.replace", replace_outside)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
     monkeypatch.chdir(tmp_path)
-    return tmp_path / "full"
+    with full_disk(lambda path: path.parent == tmp_path / "full"):
+        yield tmp_path / "full"
 
 
 def write_to_full(name, work, full):

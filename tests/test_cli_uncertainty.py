@@ -1,7 +1,6 @@
 """`foldgauss uncertainty`: what it leaves, what it refuses, and that a killed run loses nothing."""
 
 import csv
-import errno
 import os
 import shutil
 import signal
@@ -12,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from commands import call, run
+from commands import call, full_disk, run
 from tiny_clips import NUM_FRAMES, TWICE, write_both
 
 from foldgauss.cli.measuring import uncertainty as command
@@ -108,20 +107,13 @@ def test_a_finished_run_says_so_and_others_are_kept(work, done, no_pictures):
     assert {path.name for path in done.iterdir()} == FILES
 
 
-def test_tables_for_a_full_disk_are_kept(work, done, tmp_path, capsys, monkeypatch, no_pictures):
-    target, replace = tmp_path / "short", os.replace
-    shutil.copytree(done, target)
-
-    def replace_outside(source, place):
-        if Path(place).parent == target and Path(place).name != "chains.h5":
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        replace(source, place)
-
-    monkeypatch.setattr("os.replace", replace_outside)
+def test_tables_for_a_full_disk_are_kept(work, done, tmp_path, monkeypatch, no_pictures):
+    target = shutil.copytree(done, tmp_path / "short")
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    assert run(*arguments(work, target, *SHORT)) == 1
+    with full_disk(lambda path: path.parent == target and path.name != "chains.h5"):
+        told = call(*arguments(work, target, *SHORT), code=1)
     (kept,) = tmp_path.glob("foldgauss-*/short")
-    assert f"It is kept in {kept}" in " ".join(capsys.readouterr().err.split())
+    assert f"It is kept in {kept}" in " ".join(told.err.split())
     assert table_of(kept) == table_of(done)
 
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from browser import Opened
-from editor_page import PICKED, drop, pull
+from editor_page import PICKED, drop, pull, screen_at
 from soft_models import NUM, OBJECT, SIZE, on_paths, soft_model
 
 from foldgauss.envelope import TimeLikelihood
@@ -302,13 +302,8 @@ def test_what_is_brushed_can_vanish_and_come_back(opened):
     page = opened(model, **LARGE)
     before = page.picture(0.5)
     page.press("b")
-    box = page.page.locator("#canvas").bounding_box()
-    scale = min(box["width"] / SIZE[1], box["height"] / SIZE[0])
-    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    seen = eqx.filter_jit(lambda own: own.at(jnp.float32(0.5)).mean)(model)
-    x, y = map(float, np.median(np.asarray(seen)[OBJECT], axis=0))
-    at = (middle[0] + (x - SIZE[1] / 2) * scale, middle[1] + (y - SIZE[0] / 2) * scale)
-    pull(page, at, (40, 20))
+    seen = eqx.filter_jit(lambda own: own.splats.at(jnp.float32(0.5)).mean)(model)
+    pull(page, screen_at(page, *map(float, np.median(np.asarray(seen)[OBJECT], axis=0))), (40, 20))
     picked = page.page.evaluate(PICKED)
     assert page.stats["picked"] == len(picked) >= 4
     assert OBJECT[picked].mean() > 0.7

@@ -6,13 +6,12 @@ import http.server
 import json
 import re
 import threading
-from contextlib import contextmanager
 from itertools import accumulate
 
 import numpy as np
 import pytest
 from browser import Opened
-from commands import call, run
+from commands import call, run, running
 from editor_page import assert_shows, drop
 from soft_models import soft_model
 
@@ -104,18 +103,11 @@ class _Files(http.server.SimpleHTTPRequestHandler):
         pass
 
 
-@contextmanager
 def serving(folder, *, ranges=True):
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(_Files, directory=folder)) as server:
-        server.gate, server.ranges = threading.Event() if ranges else None, []
-        server.url = f"http://127.0.0.1:{server.server_port}/"
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            yield server
-        finally:
-            server.shutdown()
-            thread.join()
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(_Files, directory=folder))
+    server.gate, server.ranges = threading.Event() if ranges else None, []
+    server.url = f"http://127.0.0.1:{server.server_port}/"
+    return running(server)
 
 
 def test_chunks_of_the_time_shown_come_first(browser, film, whole, tmp_path):

@@ -2,7 +2,6 @@
 
 import dataclasses
 import re
-import threading
 from contextlib import contextmanager
 
 import cv2
@@ -10,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from browser import Opened
+from commands import running
 from editor_page import (
     EDITS,
     IT,
@@ -174,17 +174,10 @@ def test_damaged_models_are_told(opened, compact, tmp_path):
         assert "damaged" in bare.toast
 
 
-@contextmanager
-def serving(page, script, token):
+def serving(model, script, token):
     """The server of `foldgauss view`, in a thread."""
-    with PageServer(page.encode(), 0, script=script, token=token) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            yield server.url
-        finally:
-            server.shutdown()
-            thread.join()
+    page = html_page(model, save_to=SaveTarget(script.name, token))
+    return running(PageServer(page.encode(), 0, script=script, token=token))
 
 
 def test_view_saves_to_disk_and_takes_it_up_again(browser, compact, tmp_path):
@@ -192,9 +185,9 @@ def test_view_saves_to_disk_and_takes_it_up_again(browser, compact, tmp_path):
 
     @contextmanager
     def shown():
-        with serving(html_page(compact, save_to=SaveTarget(script.name, token)), script, token) as url:
-            yield page.go(url).ready()
-            page.check(url)
+        with serving(compact, script, token) as server:
+            yield page.go(server.url).ready()
+            page.check(server.url)
 
     with shown():
         read_script(page, IT + EDITS["move"])
@@ -220,11 +213,11 @@ def test_view_saves_to_disk_and_takes_it_up_again(browser, compact, tmp_path):
 @pytest.mark.slow
 def test_view_keeps_what_others_wrote_to_the_script(browser, compact, tmp_path):
     script, token = tmp_path / "clip.edit.toml", make_token()
-    with serving(html_page(compact, save_to=SaveTarget(script.name, token)), script, token) as url:
-        first = Opened(browser, url).ready()
+    with serving(compact, script, token) as server:
+        first = Opened(browser, server.url).ready()
         read_script(first, IT + EDITS["move"])
         second = first.context.new_page()
-        second.goto(url)
+        second.goto(server.url)
         second.evaluate("foldgauss.ready")
         first.page.evaluate("foldgauss.files.save()")
         saved = script.read_text()
