@@ -5,6 +5,8 @@ import os
 import shutil
 import signal
 import sys
+from contextlib import contextmanager
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -90,26 +92,27 @@ def test_the_plan_and_the_figures_are_told(long_clip, tmp_path):
     )
 
 
-class Stopping:
-    """Sends a signal to this process once a segment tells of itself for the second time."""
+@contextmanager
+def stopped(name):
+    """A signal is sent to this process once a job tells of itself for the second time."""
+    seen, update = [], _jobs_view._View.update
 
-    def __init__(self, monkeypatch, name):
-        self.name, self.seen, self.watch = name, 0, _jobs_view._View.update
-        monkeypatch.setattr(fitting, "REPORT_SECONDS", 0.0)
-        monkeypatch.setattr(_jobs_view._View, "update", lambda view, share: self(view, share))
+    def watch(view, share: Progress):
+        update(view, share)
+        seen.extend([share] * (share.name == name))
+        if len(seen) == 2:
+            seen.append(os.kill(os.getpid(), signal.SIGTERM))
 
-    def __call__(self, view, share: Progress):
-        self.watch(view, share)
-        self.seen += share.name == self.name
-        if self.seen == 2:
-            os.kill(os.getpid(), signal.SIGTERM)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fitting, "REPORT_SECONDS", 0.0)
+        patch.setattr(_jobs_view._View, "update", watch)
+        yield
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")
-def test_a_stopped_fit_goes_on_when_the_command_is_given_again(long_clip, whole, tmp_path, monkeypatch):
+def test_a_stopped_fit_goes_on_when_the_command_is_given_again(long_clip, whole, tmp_path):
     target, folder = tmp_path / "m.safetensors", tmp_path / "m.safetensors.segments"
-    with monkeypatch.context() as patch:
-        Stopping(patch, "segment 1")
+    with stopped("segment 1"):
         call("fit", long_clip, "--out", target, *SEGMENTS, code=1, err="stopped by SIGTERM; 1 of 3 segments are done")
     assert (folder / "segment-0001.safetensors.checkpoint").exists()
     call("fit", long_clip, "--out", target, *SEGMENTS[:-1], "2", code=2, err="segment_seconds=1.5")
@@ -130,16 +133,11 @@ def test_begun_anew_and_left_alone(long_clip, whole, tmp_path):
     assert target.read_bytes() == whole.read_bytes()
 
 
-def stopped(monkeypatch, where, *words):
-    with monkeypatch.context() as patch:
-        Stopping(patch, where)
-        assert run(*words) == 1
-
-
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")
-def test_what_was_begun_in_segments_goes_on_so_without_being_told(long_clip, whole, tmp_path, monkeypatch):
+def test_what_was_begun_in_segments_goes_on_so_without_being_told(long_clip, whole, tmp_path):
     target = tmp_path / "m.safetensors"
-    stopped(monkeypatch, "segment 1", "fit", long_clip, "--out", target, *SEGMENTS)
+    with stopped("segment 1"):
+        assert run("fit", long_clip, "--out", target, *SEGMENTS) == 1
     call(
         "fit",
         long_clip,
@@ -165,35 +163,23 @@ def test_what_was_begun_in_segments_goes_on_so_without_being_told(long_clip, who
 
 
 def test_that_nobody_listens_any_more_costs_no_fit(long_clip, whole, tmp_path, monkeypatch):
-    def gone(event, figures):
-        raise BrokenPipeError
-
-    monkeypatch.setattr(_jobs_view, "print_json", gone)
+    monkeypatch.setattr(_jobs_view, "print_json", Mock(side_effect=BrokenPipeError))
     assert run("fit", long_clip, "--out", tmp_path / "m.safetensors", *SEGMENTS, "--log-json") == 0
     assert (tmp_path / "m.safetensors").read_bytes() == whole.read_bytes()
 
 
 def test_a_segment_that_fails_leaves_the_others(long_clip, tmp_path, monkeypatch):
-    real = fitting.read_indexed
-    (first, _stop) = (13, 28)
+    read, target = fitting.read_indexed, tmp_path / "m.safetensors"
 
     def fails(index, low, high, **named):
-        if low <= first < high:
+        if low <= 13 < high:
             raise OSError("the disk has gone")
-        return real(index, low, high, **named)
+        return read(index, low, high, **named)
 
-    target = tmp_path / "m.safetensors"
     with monkeypatch.context() as patch:
         patch.setattr(fitting, "read_indexed", fails)
-        call(
-            "fit",
-            long_clip,
-            "--out",
-            target,
-            *SEGMENTS,
-            code=1,
-            err=["the disk has gone", "segments failed; the others are kept"],
-        )
+        told = ["the disk has gone", "segments failed; the others are kept"]
+        call("fit", long_clip, "--out", target, *SEGMENTS, code=1, err=told)
     assert not target.exists()
     assert run("fit", long_clip, "--out", target, *SEGMENTS) == 0
 
@@ -242,12 +228,13 @@ def test_many_clips_given_again_do_what_is_left(clips, tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")
-def test_many_clips_begun_anew_and_stopped_go_on(clips, tmp_path, capsys, monkeypatch):
+def test_many_clips_begun_anew_and_stopped_go_on(clips, tmp_path):
     out = tmp_path / "models"
     assert run("fit-many", clips, "--out", out, *QUICK, "--quiet") == 1
     other = (*QUICK[:-1], "2")
-    stopped(monkeypatch, "clip1.mp4", "fit-many", clips, "--out", out, *other, "--overwrite")
-    assert "Give the command again without --overwrite to continue." in capsys.readouterr().err
+    with stopped("clip1.mp4"):
+        told = "Give the command again without --overwrite to continue."
+        call("fit-many", clips, "--out", out, *other, "--overwrite", code=1, err=told)
     call("fit-many", clips, "--out", out, *QUICK, code=2, err="exists, with other settings")
     kept = out / "records" / "clip1.fgz.checkpoint"
     before, stamp = kept.read_bytes(), (out / "clip0.fgz").stat().st_mtime_ns

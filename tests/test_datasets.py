@@ -6,7 +6,7 @@ from importlib.metadata import PackageNotFoundError
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from tiny_clips import MASK_SIZE, PALETTE, labels, write_mask
 
 from foldgauss.io import datasets
 
@@ -90,27 +90,7 @@ def test_arguments_of_synthetic_clips_are_checked(options, name):
         datasets.ball(noise=-1)
 
 
-HEIGHT, WIDTH = 40, 60
-#: DAVIS' own first colors: an OpenCV reader sees 128s where the labels are 1 and 2.
-PALETTE = [0, 0, 0, 128, 0, 0, 0, 128, 0, 128, 128, 0]
-
-
-def labels(k):
-    """Object 1 walks to the right, object 2 stands, a corner is void."""
-    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
-    mask[10:20, 10 + k : 20 + k] = 1
-    mask[25:35, 40:50] = 2
-    mask[:2, :2] = 255
-    return mask
-
-
-def write_mask(path, mask, palette=PALETTE):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    image = Image.fromarray(mask)
-    if palette is not None:
-        image = image.convert("L")
-        image.putpalette(palette + [0, 0, 0] * (256 - len(palette) // 3))
-    image.save(path)
+HEIGHT, WIDTH = MASK_SIZE
 
 
 @pytest.fixture

@@ -289,6 +289,7 @@ _RAMP = np.broadcast_to(np.arange(256, dtype=np.uint8), (2, 64, 256))
 _LEVELS = np.stack([_RAMP // 2, _RAMP // 2, _RAMP // 2, _RAMP], -1)
 _BLACK = np.broadcast_to(np.uint8(0), (1, 3000, 3000, 3))
 _ALPHA = np.concatenate([moving(4), moving(4)[..., :1]], -1)
+_CRF_5 = ("libx264", "-crf", "5", "-pix_fmt", "yuv420p")
 _ALL = np.arange(65536, dtype=np.uint16).reshape(256, 256)
 #: Errors where nothing may be seen.
 _CLEAR = np.where(np.arange(48) < 40, 255, 0)[:, None, None]
@@ -474,6 +475,26 @@ CLIPS = {
         )
         for kind, scale in (("gray", 1), ("gray10le", 4))
         for limited in (True, False)
+    },
+    # MPEG-2 stores only a few aspects of the image, which is 4:3 or 16:9 then: 64 columns of 4/3 each.
+    **{
+        f"pixels of {aspect} become square: {name} {codec}": Made(
+            lambda folder, name=name, aspect=aspect, options=(codec, *quality), rate=rate: encoded(
+                folder / name, waves(), "-vf", f"setsar={aspect}", "-c:v", *options, rate=rate
+            ),
+            np.array([cv2.resize(frame, size[::-1], interpolation=cv2.INTER_LINEAR) for frame in waves()]),
+            {"notes": [f"times as wide as high; frames are {shown}", *notes]},
+            mean=3,
+        )
+        for name, (codec, *quality), aspect, size, rate, shown, *notes in (
+            ("a.mkv", ("ffv1",), "2/1", (48, 128), 10, "stretched to 48x128"),
+            ("a.mkv", ("ffv1",), "16/15", (48, 68), 10, "stretched to 48x68"),
+            ("a.mp4", _CRF_5, "16/15", (48, 68), 10, "stretched to 48x68"),
+            ("a.mp4", _CRF_5, "1/2", (96, 64), 10, "stretched to 96x64"),
+            ("a.mp4", _CRF_5, "30/1", (48, 64), 10, "kept as stored"),
+            ("a.h264", _CRF_5, "2/1", (48, 128), 10, "stretched to 48x128", "no usable frame rate"),
+            ("a.ts", ("mpeg2video", "-q:v", "1"), "4/3", (48, 85), 25, "stretched to 48x85"),
+        )
     },
     # Ten bits are not clipped, a full range not stretched; colors are those of their matrix.
     **{

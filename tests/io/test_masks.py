@@ -8,32 +8,22 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from tiny_clips import MASK_SIZE as SIZE
+from tiny_clips import labels, write_mask
 
 from foldgauss.io import index_video, read_indexed, read_masks, read_video, write_image, write_video
 from foldgauss.io.media.indexing import FrameIndex
 from foldgauss.io.provenance import describe_reading
 
-SIZE = (40, 60)
 #: Display matrices of MP4, as it is and turned by 90 degrees clockwise.
 _UPRIGHT = [1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30]
 _TURNED = [0, 1 << 16, 0, -(1 << 16), 0, 0, SIZE[0] << 16, 0, 1 << 30]
 
 
-def labels(k):
-    """Object 1 walks to the right, object 2 stands, a corner is void."""
-    found = np.zeros(SIZE, np.uint8)
-    found[10:20, 10 + k : 20 + k] = 1
-    found[25:35, 40:50] = 2
-    found[:2, :2] = 255
-    return found
-
-
 @pytest.fixture
 def folder(tmp_path):
     for k in range(12):
-        image = Image.fromarray(labels(k)).convert("L")
-        image.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0] + [0] * 759)
-        image.save(tmp_path / f"mask{k}.png")
+        write_mask(tmp_path / f"mask{k}.png", labels(k))
     return tmp_path
 
 

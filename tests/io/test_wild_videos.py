@@ -36,7 +36,7 @@ from made_clips import (
 )
 from PIL import Image
 
-from foldgauss.io import VideoError, index_video, read_indexed, read_masks, read_video
+from foldgauss.io import FrameIndex, VideoError, index_video, read_indexed, read_video
 from foldgauss.io.media import clip as clip_module
 from foldgauss.io.media import decoder
 
@@ -51,7 +51,8 @@ def test_a_clip_is_read_as_the_table_says_and_its_spans_are_those_of_the_whole(t
     first, stop = clip.num_frames // 3, min(clip.num_frames, clip.num_frames // 3 + 4)
     part, span = read_video(path, frames=index.span(first, stop)), read_indexed(index, first, stop)
     assert index.notes == clip.notes
-    for found, expected in ((index, clip), (span, part)):
+    saved = FrameIndex.load(index.save(tmp_path / "index.npz"))
+    for found, expected in ((index, clip), (saved, index), (span, part)):
         for fact in ("num_frames", "fps", "num_declared", "has_alpha", "duration"):
             assert getattr(found, fact) == getattr(expected, fact), fact
         np.testing.assert_array_equal(found.times, expected.times)
@@ -221,37 +222,6 @@ def test_a_declared_size_that_cannot_be_converted_to_is_an_error(video):
     video.stored_size = 63693, 2782
     with pytest.raises(VideoError, match=r"expected frames that FFmpeg converts to RGB, got .* 63693x2782\)"):
         video.to_array(av.VideoFrame(24, 16, "yuv420p"))
-
-
-@pytest.mark.parametrize(
-    ("name", "codec", "aspect", "size"),
-    [
-        ("a.mkv", "ffv1", "2/1", (48, 128)),
-        ("a.mkv", "ffv1", "16/15", (48, 68)),
-        ("a.mp4", "libx264", "16/15", (48, 68)),
-        ("a.mp4", "libx264", "1/2", (96, 64)),
-        ("a.mp4", "libx264", "30/1", (48, 64)),
-        ("a.h264", "libx264", "2/1", (48, 128)),
-        ("a.ts", "mpeg2video", "4/3", (48, 85)),  # 64 columns of 4/3 each, 16:9
-    ],
-)
-@pytest.mark.filterwarnings("ignore::UserWarning")  # of the masks
-def test_pixels_become_square(tmp_path, name, codec, aspect, size):
-    """MPEG-2 stores only a few aspects of the image, which is 4:3 or 16:9 then."""
-    quality = {"ffv1": (), "libx264": ("-crf", "5", "-pix_fmt", "yuv420p"), "mpeg2video": ("-q:v", "1")}[codec]
-    rate = 25 if codec == "mpeg2video" else 10
-    ffmpeg("-vf", f"setsar={aspect}", "-c:v", codec, *quality, tmp_path / name, frames=waves(), rate=rate)
-    clip = read_video(tmp_path / name)
-    assert clip.size == size
-    told = "kept as stored" if size == (48, 64) else f"stretched to {size[0]}x{size[1]}"
-    assert "times as wide as high" in clip.notes[0]
-    assert told in clip.notes[0]
-    expected = [cv2.resize(frame, size[::-1], interpolation=cv2.INTER_LINEAR) for frame in waves()]
-    assert np.abs(clip.frames - np.array(expected, int)).mean() < 3
-    assert read_masks(tmp_path / name).shape == clip.frames.shape[:3]
-    index = index_video(tmp_path / name)
-    assert index.size == size
-    np.testing.assert_array_equal(read_indexed(index, 2, 4).frames, clip.frames[2:4])
 
 
 @pytest.mark.parametrize("pixel_format", ["gray16le", "rgb48le"])
