@@ -118,9 +118,10 @@ def running(server):
             thread.join()
 
 
-def write_tone(path: Path, seconds: float) -> Path:
-    """A .wav file of 8000 samples per second; returns its path."""
-    samples = 20_000 * np.sin(np.arange(math.ceil(8000 * seconds)))
+def write_tone(path: Path, seconds: float, start: float = 0.0) -> Path:
+    """A .wav file of 8000 samples per second, silent before `start`; returns its path."""
+    number = np.arange(math.ceil(8000 * seconds))
+    samples = np.where(number < 8000 * start, 0, 20_000 * np.sin(number))
     with wave.open(str(path), "wb") as sound:
         sound.setparams((1, 2, 8000, 0, "NONE", ""))
         sound.writeframes(samples.astype(np.int16).tobytes())

@@ -26,6 +26,7 @@ Commands run in this process, where kernels are compiled once, with the argument
 
 import argparse
 import dataclasses
+import functools
 import importlib
 import re
 import shlex
@@ -47,8 +48,8 @@ from PIL import Image
 from foldgauss import video
 from foldgauss.cli.fitting import demo
 from foldgauss.cli.viewing import view as viewing
-from foldgauss.io import Sound, datasets, export, save_video_model, write_image, write_video
-from foldgauss.video import FitConfig, fit
+from foldgauss.io import Sound, datasets, export, save_video_model, write_frames, write_video
+from foldgauss.video import FitConfig, VideoModel, fit
 
 ROOT = Path(__file__).parents[1]
 #: All pages of the documentation.
@@ -256,8 +257,14 @@ _TOOLS = {
 # What pages take for granted.
 
 
+@functools.cache
 def _clip() -> np.ndarray:
     return datasets.bikes(frames=(30, 30 + NUM_FRAMES), size=SIZE).frames  # something moves
+
+
+@functools.cache
+def _fitted() -> VideoModel:
+    return fit(_clip(), FitConfig(num_gaussians=600, steps=STEPS), fps=25.0).model
 
 
 def _video(name: str):
@@ -271,30 +278,25 @@ def _video(name: str):
 
 def _model(name: str):
     def make(folder: Path) -> None:
-        model = fit(_clip(), FitConfig(num_gaussians=600, steps=STEPS), fps=25.0).model
-        save_video_model(folder / name, model)
+        save_video_model(folder / name, _fitted())
 
     return make
 
 
 def _images(name: str):
     def make(folder: Path) -> None:
-        (folder / name).mkdir(parents=True)
-        for k, frame in enumerate(_clip()):
-            write_image(folder / name / f"{k:05}.png", frame)
+        (folder / name).parent.mkdir(parents=True)
+        write_frames(folder / name, _clip())
 
     return make
 
 
-def ball_masks() -> np.ndarray:
-    """Of something that rolls to the right, one for each frame."""
-    y, x = np.mgrid[0 : SIZE[0], 0 : SIZE[1]] + 0.5
-    return np.stack([(x - 20 - 3 * k) ** 2 + (y - 24) ** 2 < 90 for k in range(NUM_FRAMES)])
-
-
 def _masks(folder: Path) -> None:
+    """Of something that rolls to the right, one for each frame."""
     (folder / "masks").mkdir()
-    for k, mask in enumerate(ball_masks()):
+    y, x = np.mgrid[0 : SIZE[0], 0 : SIZE[1]] + 0.5
+    for k in range(NUM_FRAMES):
+        mask = (x - 20 - 3 * k) ** 2 + (y - 24) ** 2 < 90
         Image.fromarray(255 * mask.astype(np.uint8)).save(folder / "masks" / f"{k:05}.png")
 
 

@@ -5,7 +5,6 @@ import itertools
 import json
 import re
 import signal
-import wave
 from unittest.mock import Mock
 
 import av
@@ -216,11 +215,7 @@ def test_sound_of_a_range_begins_with_it(tmp_path):
     """Frame 3 is shown at 0.5 s, which no rate tells; a click is heard there."""
     times, model = np.array([0, 0.1, 0.2, 0.5, 0.6, 1.0]), tmp_path / "m.safetensors"
     write_video(tmp_path / "clip.mp4", blobs(), 5.0, times=times)
-    samples = np.zeros(16_000, np.int16)
-    samples[4000:4400] = 20_000 * np.sin(np.arange(400))
-    with wave.open(str(tmp_path / "click.wav"), "wb") as sound:
-        sound.setparams((1, 2, 8000, 0, "NONE", ""))
-        sound.writeframes(samples.tobytes())
+    write_tone(tmp_path / "click.wav", 0.55, start=0.5)
     assert run("fit", tmp_path / "clip.mp4", "--frames", "3:6", "--out", model, *QUICK) == 0
     assert (
         run("render", model, "--sound", tmp_path / "click.wav", "--out", tmp_path / "out.mov", "--codec", "h264") == 0

@@ -9,7 +9,7 @@ from commands import call, run, seconds_heard, write_tone
 from PIL import Image
 from soft_models import NUM, SIZE, soft_model
 
-from foldgauss.io import load_video_model, read_video, save_video_model, write_image
+from foldgauss.io import load_video_model, read_video, save_video_model, write_frames
 from foldgauss.video import EditedVideo, VideoModel, edit
 
 FRAMES = 7
@@ -23,9 +23,7 @@ def work(tmp_path_factory):
     folder = tmp_path_factory.mktemp("work")
     model = soft_model()
     save_video_model(folder / "model.safetensors", model, metadata={"clip": "clip", "frames": None})
-    (folder / "clip").mkdir()
-    for k, frame in enumerate(model.frames()):
-        write_image(folder / "clip" / f"{k}.png", frame)
+    write_frames(folder / "clip", model.frames())
     (folder / "baked.toml").write_text(BAKED)
     (folder / "laid.toml").write_text(LAID_OVER)
     return folder
@@ -106,7 +104,7 @@ def test_what_is_written_is_what_was_drawn(work, tmp_path, kind):
     np.testing.assert_array_equal([np.asarray(Image.open(path).convert("RGB")) for path in paths], own)
 
 
-def test_export_and_import(work, tmp_path, capsys):
+def test_export_and_import(work, tmp_path):
     model = work / "model.safetensors"
     told = call("export", model, "--format", "ply", "--out", tmp_path / "video.ply").out.replace("\n", "")
     assert told == f"{tmp_path / 'video.ply'}: VeGaS video (ply), 7 frames, {NUM} Gaussians"
@@ -117,16 +115,17 @@ def test_export_and_import(work, tmp_path, capsys):
     assert run("import", tmp_path / "video.ply", "--out", tmp_path / "fast.safetensors", "--fps", 50) == 0
     assert load_video_model(tmp_path / "fast.safetensors").fps == 50
 
-    assert run("export", model, "--format", "ply3dgs", "--out", tmp_path / "scenes") == 0
+    export = ("export", model, "--format")
+    several, one = f"7 frames, up to {NUM} Gaussians each", f"1 frame, up to {NUM} Gaussians"
+    call(*export, "ply3dgs", "--out", tmp_path / "scenes", out=f"3DGS scenes (ply3dgs), {several}")
     assert len(list((tmp_path / "scenes").glob("*.ply"))) == FRAMES
-    assert f"3DGS scenes (ply3dgs), 7 frames, up to {NUM} Gaussians each" in capsys.readouterr().out
-    assert run("export", model, "--format", "ply3dgs", "--out", tmp_path / "one.ply", "--times", "0.5") == 0
+    told = call(
+        *export, "ply3dgs", "--out", tmp_path / "one.ply", "--times", "0.5", out=f"3DGS scenes (ply3dgs), {one}"
+    )
+    assert "each" not in told.out
     assert (tmp_path / "one.ply").read_bytes().startswith(b"ply\n")
-    assert f"3DGS scenes (ply3dgs), 1 frame, up to {NUM} Gaussians\n" in capsys.readouterr().out
-
-    assert run("export", model, "--format", "obj", "--out", tmp_path / "mesh", "--times", "0:1:3") == 0
+    call(*export, "obj", "--out", tmp_path / "mesh", "--times", "0:1:3", out=f"triangles (obj), 3{several[1:]}")
     assert len(list((tmp_path / "mesh").glob("*.obj"))) == 3
-    assert f"triangles (obj), 3 frames, up to {NUM} Gaussians each" in capsys.readouterr().out
     assert run("import", tmp_path / "mesh", "--out", tmp_path / "pictures") == 0
     picture = cv2.imread(str(sorted((tmp_path / "pictures").iterdir())[1]))[..., ::-1]
     own = next(soft_model().frames(np.array([0.5])))

@@ -14,7 +14,7 @@ from commands import call, run
 
 import foldgauss.jobs.runner as fitting
 from foldgauss.cli.fitting import job_progress as _jobs_view
-from foldgauss.io import load_video_model, read_video, write_image, write_video
+from foldgauss.io import load_video_model, read_video, write_frames, write_video
 from foldgauss.jobs import Progress
 from foldgauss.video import SegmentedVideo, VideoModel, evaluate
 
@@ -40,9 +40,7 @@ def clips(tmp_path_factory):
     folder = tmp_path_factory.mktemp("clips")
     for k in range(2):
         write_video(folder / f"clip{k}.mp4", pictures(15, k), 10.0)  # as many as a segment of the long one has
-    (folder / "frames").mkdir()
-    for k, picture in enumerate(pictures(15, 5.0)):
-        write_image(folder / "frames" / f"{k}.png", picture)
+    write_frames(folder / "frames", pictures(15, 5.0))
     (folder / "broken.mp4").write_text("no video at all")
     (folder / "notes.txt").write_text("about these clips")
     return folder
@@ -55,7 +53,9 @@ def clips(tmp_path_factory):
 def whole(long_clip, tmp_path_factory):
     """The model of a fit that nothing disturbed."""
     target = tmp_path_factory.mktemp("whole") / "m.safetensors"
-    assert run("fit", long_clip, "--out", target, *SEGMENTS, "--quiet") == 0
+    told = ["39 frames of 24x32 in 3 segments of", "each with 40 Gaussians of degree 1, 12 steps, by this process"]
+    told += ["PSNR lost where segments meet"]
+    call("fit", long_clip, "--out", target, *SEGMENTS, out=told, err="1 of 3 segments done: segment 0")
     return target
 
 
@@ -74,22 +74,6 @@ def test_a_fit_in_segments_is_one_model(long_clip, whole, tmp_path):
     assert done["peak_mib"] > 50
     assert [entry.name for entry in tmp_path.iterdir()] == ["m.safetensors"]
     assert target.read_bytes() == whole.read_bytes()
-
-
-def test_the_plan_and_the_figures_are_told(long_clip, tmp_path):
-    call(
-        "fit",
-        long_clip,
-        "--out",
-        tmp_path / "m.safetensors",
-        *SEGMENTS,
-        out=[
-            "39 frames of 24x32 in 3 segments of",
-            "each with 40 Gaussians of degree 1, 12 steps, by this process",
-            "PSNR lost where segments meet",
-        ],
-        err="1 of 3 segments done: segment 0",
-    )
 
 
 @contextmanager
@@ -213,35 +197,27 @@ def test_many_clips_make_a_model_each_and_failures_are_listed(clips, tmp_path):
     assert (summary_of(out)["done"], summary_of(out)["failed"]) == (3, 1)
 
 
-def test_many_clips_given_again_do_what_is_left(clips, tmp_path, monkeypatch):
-    own, out = tmp_path / "clips", tmp_path / "models"
-    shutil.copytree(clips, own)
-    assert run("fit-many", own, "--out", out, *QUICK, "--quiet") == 1
-    stamps = {path.name: path.stat().st_mtime_ns for path in out.glob("*.fgz")}
-    call("fit-many", own, "--out", out, *QUICK[:-1], "2", code=2, err="with other settings")
-    shutil.copyfile(own / "clip0.mp4", own / "broken.mp4")  # mended
-    call("fit-many", own, "--out", out, *QUICK, out="4 clips, 3 of them done already")
-    assert all((out / name).stat().st_mtime_ns == stamp for name, stamp in stamps.items())
-    assert summary_of(out)["failed"] == 0
-    assert run("fit-many", own, "--out", out, *QUICK[:-1], "2", "--overwrite", "--quiet") == 0
-    assert {load_video_model(path).degree for path in out.glob("*.fgz")} == {2}
-
-
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")
-def test_many_clips_begun_anew_and_stopped_go_on(clips, tmp_path):
-    out = tmp_path / "models"
-    assert run("fit-many", clips, "--out", out, *QUICK, "--quiet") == 1
-    other = (*QUICK[:-1], "2")
+def test_many_clips_given_again_do_what_is_left(clips, tmp_path):
+    """With other settings only if asked to, and from where they were stopped."""
+    own, out, other = shutil.copytree(clips, tmp_path / "clips"), tmp_path / "models", (*QUICK[:-1], "2")
+    fit = ("fit-many", own, "--out", out)
+    assert run(*fit, *QUICK, "--quiet") == 1
+    stamps = {path: path.stat().st_mtime_ns for path in out.glob("*.fgz")}
+    call(*fit, *other, code=2, err="exists, with other settings")
+    shutil.copyfile(own / "clip0.mp4", own / "broken.mp4")  # mended
+    call(*fit, *QUICK, out="4 clips, 3 of them done already")
+    assert all(path.stat().st_mtime_ns == stamp for path, stamp in stamps.items())
+    assert summary_of(out)["failed"] == 0
     with stopped("clip1.mp4"):
         told = "Give the command again without --overwrite to continue."
-        call("fit-many", clips, "--out", out, *other, "--overwrite", code=1, err=told)
-    call("fit-many", clips, "--out", out, *QUICK, code=2, err="exists, with other settings")
-    kept = out / "records" / "clip1.fgz.checkpoint"
-    before, stamp = kept.read_bytes(), (out / "clip0.fgz").stat().st_mtime_ns
-    assert run("fit-many", clips, "--out", out, *other[:-1], "3") == 2
-    assert kept.read_bytes() == before
-    call("fit-many", clips, "--out", out, *other, code=1, out="4 clips, 1 of them done already")
-    assert (out / "clip0.fgz").stat().st_mtime_ns == stamp
+        call(*fit, *other, "--overwrite", code=1, err=told)
+    kept = {path: path.read_bytes() for path in out.rglob("*") if path.is_file() and path.name != "summary.json"}
+    for settings in (QUICK, (*QUICK[:-1], "3")):  # what is kept is of others
+        call(*fit, *settings, code=2, err="exists, with other settings")
+    assert out / "records" / "clip1.fgz.checkpoint" in kept
+    assert {path: path.read_bytes() for path in kept} == kept
+    call(*fit, *other, out="4 clips, 2 of them done already")
     assert {load_video_model(path).degree for path in out.glob("*.fgz")} == {2}
 
 

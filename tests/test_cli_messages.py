@@ -10,7 +10,7 @@ from commands import call, full_disk, run
 from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.settings import setting_of
 from foldgauss.cli.app.application import load_commands
-from foldgauss.io import load_video_model, write_image, write_video
+from foldgauss.io import load_video_model, write_frames, write_image, write_video
 from foldgauss.io.datasets import waves
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.video import FitConfig
@@ -64,9 +64,7 @@ def test_a_range_beyond_the_clip_ends_with_it(work, tmp_path):
 
 def test_masks_of_the_whole_clip_fit_a_model_of_some_frames(work, model, tmp_path):
     size = load_video_model(model).size
-    (tmp_path / "masks").mkdir()
-    for k in range(6):
-        write_image(tmp_path / "masks" / f"{k}.png", np.full((*size, 3), 255, np.uint8))
+    write_frames(tmp_path / "masks", [np.full((*size, 3), 255, np.uint8)] * 6)
     (tmp_path / "s.toml").write_text(
         '[selections]\nall = {mask = "masks"}\n[[edits]]\ndo = "move"\noffset = [0.1, 0.0]\n'
     )

@@ -8,7 +8,7 @@ from commands import call, run, seconds_heard, write_tone
 from soft_models import soft_model
 
 from foldgauss.cli.viewing import render as plate
-from foldgauss.io import load_video_model, read_masks, read_video, save_video_model, write_image
+from foldgauss.io import load_video_model, read_masks, read_video, save_video_model, write_frames, write_image
 from foldgauss.io.edit_script import EditScriptError, parse_edit_script
 from foldgauss.video import NothingMoves, by_mask, edit
 from foldgauss.video.motion.moving_object import nothing_moves
@@ -142,7 +142,7 @@ def test_own_masks_are_used_and_stay(model, tmp_path, monkeypatch, form):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(plate, "find_moving_object", None)  # nothing is searched for
     given = {"folder": MASKS, "image": MASKS[:1], "whole clip": np.concatenate([MASKS, MASKS])}[form]
-    write_masks(tmp_path / "masks", given)
+    write_frames(tmp_path / "masks", np.repeat(np.uint8(255 * given)[..., None], 3, -1))
     masks = "masks/00000.png" if form == "image" else "masks"
     told = call("render", "--plate", model, "--masks", masks, "--out", "images", "--save-masks", "used")
     assert "Searching" not in told.out
@@ -163,9 +163,3 @@ def test_own_masks_are_used_and_stay(model, tmp_path, monkeypatch, form):
             err=f"{options[0]}: expected another path than the masks, got masks.",
         )
     np.testing.assert_array_equal(read_masks("masks"), given)
-
-
-def write_masks(folder, masks):
-    folder.mkdir()
-    for k, mask in enumerate(masks):
-        write_image(folder / f"{k:05d}.png", np.repeat(np.uint8(255 * mask)[..., None], 3, -1))

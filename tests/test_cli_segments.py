@@ -12,7 +12,7 @@ from commands import call, run
 from soft_models import NUM, soft_model
 
 from foldgauss.cli.viewing import view as viewing
-from foldgauss.io import load_video_model, read_vegas_ply, read_video, save_video_model, write_image
+from foldgauss.io import load_video_model, read_vegas_ply, read_video, save_video_model, write_frames
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.video import Segment, SegmentedVideo, edit, evaluate, interpolate_frames, psnr, times_at
 
@@ -31,12 +31,10 @@ def video():
 def work(tmp_path_factory):
     """long.safetensors, and what it was fitted to: frames 2 to 19 of the images in clip."""
     folder = tmp_path_factory.mktemp("work")
-    (folder / "clip").mkdir()
     frames = np.stack(list(video().frames()))
     noise = np.random.default_rng(0).standard_normal(frames.shape) * np.linspace(2, 9, NUM_FRAMES)[:, None, None, None]
     noisy = np.clip(np.rint(frames + noise), 0, 255).astype(np.uint8)
-    for k, frame in enumerate([noisy[0], noisy[0], *noisy, noisy[-1]]):
-        write_image(folder / "clip" / f"{k:03}.png", frame)
+    write_frames(folder / "clip", [noisy[0], noisy[0], *noisy, noisy[-1]])
     save_video_model(folder / "long.safetensors", video(), metadata={"clip": "clip", "frames": [2, 20]})
     return folder
 

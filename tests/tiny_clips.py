@@ -4,7 +4,7 @@ import numpy as np
 from PIL import Image
 from soft_models import soft_model
 
-from foldgauss.io import save_video_model, write_image
+from foldgauss.io import save_video_model, write_frames
 from foldgauss.video import FrameTimes, VideoModel
 
 NUM_FRAMES, TWICE = 12, 6
@@ -29,9 +29,7 @@ def write_both(folder, **options) -> None:
     """`model.safetensors` and the images `clip/` in `folder`."""
     model = model_of_12()
     save_video_model(folder / "model.safetensors", model)
-    (folder / "clip").mkdir()
-    for k, frame in enumerate(clip_of(model, **options)):
-        write_image(folder / "clip" / f"{k:02}.png", frame)
+    write_frames(folder / "clip", clip_of(model, **options))
 
 
 MASK_SIZE = (40, 60)

@@ -144,7 +144,7 @@ SOUND_RATE = 48_000
 def mux_sound(container, stream, samples, start=0.0):
     """Encode one channel of samples, in as many as the stream has."""
     channels = np.float32(samples)[None].repeat(stream.channels, 0)
-    frame = av.AudioFrame.from_ndarray(channels, format="fltp", layout=stream.layout)
+    frame = av.AudioFrame.from_ndarray(channels, format="fltp", layout=stream.layout.name)
     frame.sample_rate, frame.pts = stream.rate, round(stream.rate * start)
     container.mux([*stream.encode(frame), *stream.encode()])
 

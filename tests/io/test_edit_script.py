@@ -457,22 +457,31 @@ def test_a_selection_of_nothing_names_itself():
     assert error(gone).startswith("script, line 7, [[edits]] number 2: selection: expected at least one Gaussian")
 
 
-def test_files(tmp_path):
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        # As editors of Windows write it.
+        (b"\xef\xbb\xbf[[edits]]\r\ndo = 'vanish'\r\nfrme = 1", r"^{path}, line 3, \[\[edits\]\] number 1: frme: "),
+        (b"do = '\xff'", r"UTF-8.* at 6. Is it a model"),
+        (
+            b'[selections.it]\nmask = "mask.png"\nframe = 0',
+            r"line 2, \[selections.it\]: mask: |line 1, \[selections.it\]: ",
+        ),
+    ],
+)
+def test_files(tmp_path, content, told):
+    path = tmp_path / "edits.toml"
+    path.write_bytes(content)
+    (tmp_path / "mask.png").write_bytes(b"no image")
+    with pytest.raises(EditScriptError, match=told.replace("{path}", re.escape(str(path)))):
+        read_edit_script(path).apply(MODEL)
+
+
+def test_missing_scripts_and_folders_are_told(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"script: .*none.toml.*missing"):
         read_edit_script(tmp_path / "none.toml")
-    path = tmp_path / "edits.toml"
-    path.write_bytes(b"\xef\xbb\xbf[[edits]]\r\ndo = 'vanish'\r\nfrme = 1")  # as editors of Windows write it
-    with pytest.raises(EditScriptError, match=rf"^{re.escape(str(path))}, line 3, \[\[edits\]\] number 1: frme: "):
-        read_edit_script(path)
-    path.write_bytes(b"do = '\xff'")
-    with pytest.raises(EditScriptError, match=r"UTF-8.* at 6. Is it a model"):
-        read_edit_script(path)
     with pytest.raises(EditScriptError, match="got a folder"):
         read_edit_script(tmp_path)
-    (tmp_path / "mask.png").write_bytes(b"no image")
-    path.write_text('[selections.it]\nmask = "mask.png"\nframe = 0')
-    with pytest.raises(EditScriptError, match=r"line 2, \[selections.it\]: mask: |line 1, \[selections.it\]: "):
-        read_edit_script(path).apply(MODEL)
 
 
 # ------------------------------------------------------------------------------------------------------------- whatever

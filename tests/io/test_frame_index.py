@@ -228,27 +228,6 @@ def test_damaged_clips(tmp_path, name):
     np.testing.assert_array_equal(read_indexed(index, 10, num - 5).frames, clip.frames[10:-5])
 
 
-def test_frames_that_damage_left_out_keep_their_places(tmp_path):
-    """`span` gives the range of places, as `read_video` has it, of frames counted as they decode."""
-    frames = _moving(40)
-    path = encoded(tmp_path / "a.avi", frames, "-c:v", "png", rate=25)
-    data = path.read_bytes()
-    starts = [at for at in range(len(data)) if data.startswith(b"\x89PNG", at)]
-    broken = bytearray(data)
-    for k in (10, 11):
-        broken[starts[k] : starts[k] + 30] = bytes(30)
-    path.write_bytes(broken)
-    clip, index = read_video(path), index_video(path)
-    assert index.positions.tolist() == [
-        *range(10),
-        *range(13, 40),
-    ]  # FFmpeg's parser passes by the one after a broken one, too
-    _as_read(index, path, [(8, 12), (10, 11), (27, 37)])
-    assert index.span(9, 12) == (9, 15)
-    np.testing.assert_array_equal(read_indexed(index, 9, 12).frames, clip.frames[9:12])
-    np.testing.assert_array_equal(LazyFrames(index)[9:12], clip.frames[9:12])
-
-
 def test_where_nothing_moves(tmp_path):
     """Frames are alike to the bit, then move: a seek is not led astray."""
     frames = np.concatenate([np.repeat(_moving(1), 60, 0), _moving(40)])

@@ -3,10 +3,10 @@
 import json
 from fractions import Fraction
 
-import av
 import cv2
 import numpy as np
 import pytest
+from made_clips import encode
 from PIL import Image
 from tiny_clips import MASK_SIZE as SIZE
 from tiny_clips import labels, write_mask
@@ -92,13 +92,8 @@ def test_masks_as_stored_are_stretched_as_the_clip(tmp_path, aspect, turn, stret
     """A disc of the clip, and its mask at the size of the frames as stored, upright."""
     y, x = np.mgrid[: SIZE[0], : SIZE[1]]
     disc = (np.hypot(y - 12, x - 20) < 9)[..., None].repeat(3, -1)
-    with av.open(str(tmp_path / "clip.mp4"), "w") as out:
-        stream = out.add_stream("mpeg4", rate=10)
-        stream.height, stream.width, stream.pix_fmt = *SIZE, "yuv420p"
-        stream.codec_context.sample_aspect_ratio = Fraction(aspect)
-        stream.codec_context.bit_rate = 2_000_000
-        frame = av.VideoFrame.from_ndarray(np.uint8(255 * disc), format="rgb24")
-        out.mux([*stream.encode(frame), *stream.encode()])
+    context = {"sample_aspect_ratio": Fraction(aspect), "bit_rate": 2_000_000}
+    encode(tmp_path / "clip.mp4", np.uint8(255 * disc)[None], "mpeg4", "yuv420p", given="rgb24", context=context)
     if turn:
         data = (tmp_path / "clip.mp4").read_bytes()
         one, turned = (np.array(rows, ">i4").tobytes() for rows in (_UPRIGHT, _TURNED))

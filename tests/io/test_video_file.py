@@ -14,7 +14,6 @@ from made_clips import UNEVEN, encode, images, moving, mux_sound, one_line, rgba
 from PIL import Image
 
 from foldgauss.io import (
-    Clip,
     Sound,
     VideoError,
     index_video,
@@ -61,18 +60,6 @@ def test_center_crop_cuts_first_and_resizes_then(clip_file):
 
 
 # ------------------------------------------------------------------------------------- reading a video
-
-
-def test_sample_clip_is_cut_as_in_the_paper():
-    whole = read_video(sample_clip("bunny"), frames=(3, 5))
-    small = read_video(sample_clip("bunny"), frames=(3, 5), size=(160, 320))
-    assert isinstance(whole, Clip)
-    assert (whole.size, whole.fps, whole.num_declared) == ((720, 1280), 25.0, 2)
-    assert (small.frames.shape, small.frames.dtype) == ((2, 160, 320, 3), np.uint8)
-    assert small.frames.flags.c_contiguous
-    # Rows 40 to 680, then the mean of each 4x4 block.
-    blocks = whole.frames[:, 40:680].reshape(2, 160, 4, 320, 4, 3).mean((2, 4))
-    assert np.abs(small.frames - blocks).max() <= 0.5 + 1e-6
 
 
 @pytest.mark.parametrize(

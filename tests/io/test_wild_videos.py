@@ -6,9 +6,9 @@ an encoder makes is made with ffmpeg, and skipped where there is none.
 
 import contextlib
 import gc
+import itertools
 import os
 import struct
-import wave
 import zipfile
 import zlib
 
@@ -16,6 +16,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+from commands import write_tone
 from made_clips import (
     CLIPS,
     SHOWN,
@@ -36,7 +37,7 @@ from made_clips import (
 )
 from PIL import Image
 
-from foldgauss.io import FrameIndex, VideoError, index_video, read_indexed, read_video
+from foldgauss.io import FrameIndex, LazyFrames, VideoError, index_video, read_indexed, read_video
 from foldgauss.io.media import clip as clip_module
 from foldgauss.io.media import decoder
 
@@ -535,6 +536,14 @@ def test_broken_frames_are_left_out(tmp_path, broken):
     shown = np.array(sound) / 10
     if np.ptp(np.diff(sound)):  # there is a gap in the middle
         np.testing.assert_allclose(clip.times, shown - shown[0], atol=1e-3)
+    index = index_video(tmp_path / "a.avi")
+    assert index.positions.tolist() == sound
+    for first, stop in itertools.combinations(range(len(sound) + 1), 2):
+        places = index.span(first, stop)
+        assert places == (sound[first], sound[stop - 1] + 1)
+        np.testing.assert_array_equal(read_video(tmp_path / "a.avi", frames=places).frames, clip.frames[first:stop])
+        np.testing.assert_array_equal(read_indexed(index, first, stop).frames, clip.frames[first:stop])
+    np.testing.assert_array_equal(LazyFrames(index)[1:], clip.frames[1:])
     late = read_video(tmp_path / "a.avi", frames=(6, 7))  # frames keep their numbers
     assert late.notes == ()
     np.testing.assert_array_equal(late.frames, noise()[6:7])
@@ -566,12 +575,6 @@ def test_pages_of_a_tiff_are_refused_whatever_it_is_called(tmp_path):
 # ------------------------------------------------------------------------------------------- other things
 
 
-def _wav(path):
-    with wave.open(str(path), "wb") as sound:
-        sound.setparams((1, 2, 8000, 0, "NONE", ""))
-        sound.writeframes(bytes(800))
-
-
 def _zip(path):
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("a.txt", "text")
@@ -581,7 +584,7 @@ OTHERS = {
     "nothing": (lambda path: path.write_bytes(b""), "an empty file"),
     "zeros": (lambda path: path.write_bytes(bytes(5000)), "5000 bytes"),
     "text": (lambda path: path.write_text("Dear diary,\n" * 40), "a text"),
-    "audio": (_wav, "audio"),
+    "audio": (lambda path: write_tone(path, 0.1), "audio"),
     "zip": (_zip, "a zip archive"),
     "model": (lambda path: path.write_bytes(struct.pack("<Q", 2) + b"{}"), "a model"),
     "list": (lambda path: path.write_text("#EXTM3U\nother.ts\n"), "a list of other files"),
