@@ -132,7 +132,8 @@ class Opened:
 
     @property
     def toast(self):
-        """The message that is shown."""
+        """The message that is shown, or will be."""
+        self.page.locator("#toast").wait_for()
         return self.page.locator("#toast").inner_text()
 
     @property

@@ -77,8 +77,7 @@ def test_a_file_that_is_cut_off_is_shown_with_a_warning(clip):
     Path("cut.fgz").write_bytes(data[:-1])
     note = "warning: 'cut.fgz': 1 of its 3 chunks is cut off or damaged; 30 of 90 Gaussians are missing. Copy it again."
     for command in (["info", "cut.fgz"], ["evaluate", "cut.fgz", clip]):
-        told = call(*command)
-        assert told.err.splitlines() == [note]
+        assert call(*command).err.splitlines() == [note]
     Path("cut.fgz").write_bytes(data[:200])
     (line,) = call("info", "cut.fgz", code=1).err.splitlines()
     assert line.startswith("error: path: expected a compact model, got one")

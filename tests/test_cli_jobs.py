@@ -61,10 +61,8 @@ def whole(long_clip, tmp_path_factory):
 
 def test_a_fit_in_segments_is_one_model(long_clip, whole, tmp_path):
     target = tmp_path / "m.safetensors"
-    events = [
-        json.loads(line) for line in call("fit", long_clip, "--out", target, *SEGMENTS, "--log-json").out.splitlines()
-    ]
-    start, done = events[0], events[-1]
+    shown = call("fit", long_clip, "--out", target, *SEGMENTS, "--log-json").out
+    start, *events, done = map(json.loads, shown.splitlines())
     video = load_video_model(target)
     assert isinstance(video, SegmentedVideo)
     assert start["spans"] == [[part.first, part.stop] for part in video.segments]

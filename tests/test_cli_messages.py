@@ -108,20 +108,15 @@ def full(tmp_path, monkeypatch):
         yield tmp_path / "full"
 
 
-def write_to_full(name, work, full):
-    """The exit code of the command that writes this file."""
-    write_image(full.parent / "mask.png", np.full((4, 4, 3), 255, np.uint8))
-    (full.parent / "s.toml").write_text('[[edits]]\ndo = "recolor"\ngain = 0.5\n')
-    inputs = {"CLIP": work / "clip.mp4", "MODEL": work / "a" / "b" / "m.safetensors", "OUT": full / name}
-    inputs |= {"MASK": full.parent / "mask.png", "SCRIPT": full.parent / "s.toml"}
-    return run(*(inputs.get(word, word) for word in WRITING[name]))
-
-
 @pytest.mark.parametrize("name", WRITING)
-def test_a_result_for_a_full_disk_is_kept(name, work, full, capsys):
-    assert write_to_full(name, work, full) == 1
+def test_a_result_for_a_full_disk_is_kept(name, work, full):
+    mask, script = full.parent / "mask.png", full.parent / "s.toml"
+    write_image(mask, np.full((4, 4, 3), 255, np.uint8))
+    script.write_text('[[edits]]\ndo = "recolor"\ngain = 0.5\n')
+    model = work / "a" / "b" / "m.safetensors"
+    inputs = {"CLIP": work / "clip.mp4", "MODEL": model, "MASK": mask, "SCRIPT": script, "OUT": full / name}
+    last = call(*(inputs.get(word, word) for word in WRITING[name]), code=1).err.strip().splitlines()[-1]
     (kept,) = full.parent.glob(f"temporary/*/{name}")
-    last = capsys.readouterr().err.strip().splitlines()[-1]
     assert last.startswith("error: ")
     assert f"It is kept in {kept}" in last
     assert not (full / name).exists()

@@ -36,11 +36,11 @@ def test_a_camera_that_stands_still_stays(model, tmp_path):
     np.testing.assert_array_equal(read_video(images).frames, list(video.frames(times)))
 
 
-def test_options_reach_the_video(model, tmp_path, monkeypatch, capsys):
+def test_options_reach_the_video(model, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert run("render", model, "--stabilize", "fixed", "--border", "fill", "--size", "80x128", "--fps", "12.5") == 0
+    options = ("--stabilize", "fixed", "--border", "fill", "--size", "80x128", "--fps", "12.5")
+    call("render", model, *options, out="12.5 frames per second")
     assert read_video(tmp_path / "m.stable.mp4").frames.shape[1:] == (80, 128, 3)
-    assert "12.5 frames per second" in capsys.readouterr().out
     call("render", model, *STABLE, code=2, err="exists. Choose another path, or add --overwrite.")
     call("render", model, *STABLE, "--overwrite", "--smoothing", "0.2", out="Enlarged by 1.0")
     assert "Enlarged" not in call("render", model, *STABLE, "--overwrite", "--smoothing", "0.001").out  # by 1.00

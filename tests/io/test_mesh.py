@@ -1,37 +1,30 @@
 """Frames as triangles: out, through a mesh tool, and back; and what a tool may have done to them."""
 
+import dataclasses
 import json
 import math
 
-import equinox as eqx
 import numpy as np
 import pytest
 from made_clips import one_line
+from random_models import random_model
 
-from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import FormatError, frame_gaussians, read_pseudomesh, write_pseudomesh
 from foldgauss.io.exchange.pseudomesh import NOTES, _axes, read_obj
 from foldgauss.render import RenderOptions
-from foldgauss.video import FrameTimes, VideoModel
+from foldgauss.video import FrameTimes
 from foldgauss.video.models.renderer import VideoRenderer
-from foldgauss.video.models.row_layout import unpack
 
 NUM, FRAMES, SIZE = 40, 3, (48, 80)
 
 
-def random_model(num=NUM, size=SIZE, compositing="over"):
-    rng = np.random.default_rng(0)
-    rows = rng.normal(size=(num, 15)).astype(np.float32)
-    splats = unpack(rows, 2, TimeLikelihood(np.float32(2), np.float32(0)))
-    leaves = rng.uniform(-4, -2, (num, 2)).astype(np.float32), rng.uniform(-0.5, 0.5, (num, 2)).astype(np.float32)
-    splats = eqx.tree_at(lambda s: (s.log_scale, s.loc), splats, leaves)
-    options = RenderOptions(low_pass=0.1)
-    return VideoModel(splats, FrameTimes.uniform(FRAMES), size, 29.97, options, compositing)
+def evenly(model):
+    return dataclasses.replace(model, frame_times=FrameTimes.uniform(FRAMES))
 
 
 @pytest.fixture(scope="module")
 def model():
-    return random_model()
+    return evenly(random_model(NUM, degree=2))
 
 
 @pytest.fixture
@@ -136,7 +129,7 @@ def test_other_axes(folder):
 
 
 def test_sums_go_out_and_come_back(tmp_path):
-    model = random_model(compositing="sum")
+    model = evenly(random_model(NUM, degree=2, compositing="sum"))
     mesh = read_pseudomesh(write_pseudomesh(tmp_path / "mesh", model, [0.5]))
     assert mesh.compositing == "sum"
     assert np.abs(mesh.frame(0).astype(int) - VideoRenderer(model).frame(0.5)).max() <= 1

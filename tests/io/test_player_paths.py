@@ -125,10 +125,6 @@ def test_an_edit_moves_what_is_seen(opened, moving, tmp_path, name):
     assert np.abs(bare.picture(0.9).astype(float) - edited).max() <= WORST
 
 
-def count_paths(page):
-    return page.page.evaluate("foldgauss.player.state.model.paths.count")
-
-
 def test_tools_take_what_is_seen_there(opened, moving):
     model, page = load_video_model(moving), opened(moving)
     page.seek(0.9)
@@ -153,7 +149,7 @@ def test_copies_beyond_what_can_be_held_are_refused(opened, moving, tmp_path):
     page = opened(moving)
     offsets = [[round(0.001 * k, 3), 0.0] for k in range(150)]
     read_script(page, IT + f'do = "multiply"\noffsets = {offsets}\n')
-    assert count_paths(page) == 300  # the first copy stays where it is
+    assert page.page.evaluate("foldgauss.player.state.model.paths.count") == 300  # the first copy stays where it is
     page.page.evaluate("foldgauss.files.downloadModel()")
     assert "model file holds 255" in page.toast
     page.page.evaluate("foldgauss.player.state.model.paths.knots = 1e6")

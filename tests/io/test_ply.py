@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from made_clips import one_line
+from random_models import random_model, time_weights
 from soft_models import soft_model
 
 from foldgauss.envelope import TimeLikelihood
@@ -52,10 +53,6 @@ def vegas_columns(seed=0, num=NUM, degree=DEGREE):
     columns |= {"sigma_0": np.log(rng.uniform(0.15, 0.8, num))}
     columns |= {f"w1_{k}": rng.normal(0, 0.2, num) for k in range(2 * degree)}
     return {name: column.astype(np.float32) for name, column in columns.items()}
-
-
-def time_weights(seed=0):
-    return np.random.default_rng(seed).normal(0, 0.5, FRAMES - 1).astype(np.float32)
 
 
 def write_raw(path, columns, weights=None, *, layout="binary_little_endian", code="f", between=""):
@@ -116,15 +113,6 @@ def drawn(splats, size, model):
     """Float picture by the CPU engine."""
     leaves = (np.asarray(leaf, np.float32) for leaf in (splats.mean, splats.factor, splats.opacity, splats.color))
     return cpu.forward(*leaves, np.zeros(3, np.float32), size, options=model.options).image.transpose(1, 2, 0)
-
-
-def random_model(seed=0, size=(48, 80), degree=DEGREE, num=NUM, power=2.0, floor=0.0):
-    rng = np.random.default_rng(seed)
-    rows = rng.normal(size=(num, 11 + 2 * degree)).astype(np.float32)
-    splats = unpack(rows, degree, TimeLikelihood(np.float32(power), np.float32(floor)))
-    splats = eqx.tree_at(lambda s: s.log_scale, splats, rng.uniform(-4, -2, (num, 2)).astype(np.float32))
-    splats = eqx.tree_at(lambda s: s.loc, splats, rng.uniform(-0.5, 0.5, (num, 2)).astype(np.float32))
-    return VideoModel(splats, FrameTimes(time_weights(seed)), size, 29.97, RenderOptions(low_pass=0.1))
 
 
 # ------------------------------------------------------------------------------------------------ VeGaS
@@ -211,7 +199,7 @@ def test_powers_of_their_own_are_one_in_the_file(tmp_path):
 @pytest.mark.parametrize("power", [0.7, 1.0, 2.0])
 def test_what_lasts_lasts_in_every_format(tmp_path, power):
     """Gaussians without beginning and end come back, and are in every frame as they are."""
-    model = random_model(power=power, num=20)
+    model = random_model(20, power=power)
     rows = pack(model.splats)
     place = columns_of(DEGREE)
     rows[::2, place["time_loc_logit"]], rows[::2, place["log_time_scale"]] = 0, np.log(1024)
@@ -260,7 +248,7 @@ def test_the_cutoff_of_scales_is_one(tmp_path):
 
 @pytest.mark.parametrize(("power", "floor"), [(1.0, 0.0), (2.0, 0.1), (0.0, 0.0)])
 def test_the_cutoff_of_scales_with_any_envelope(power, floor):
-    model = random_model(power=power, floor=floor, num=300)
+    model = random_model(300, power=power, floor=floor)
     model = eqx.tree_at(lambda m: m.splats.log_scale, model, model.splats.log_scale - 3)
     model = dataclasses.replace(model, scale_cutoff=1e-3)
     for t in (0.1, 0.7):
@@ -386,9 +374,9 @@ def write_changed(path, name, change):
 REFUSED = {
     "power 0": (lambda path: write_vegas_ply(path, random_model(power=0.0)), "expected .*--power"),
     "floor": (lambda path: write_vegas_ply(path, random_model(floor=0.01)), "expected .*floor"),
-    "sum": (lambda path: write_vegas_ply(path, dataclasses.replace(random_model(), compositing="sum")), "sum"),
+    "sum": (lambda path: write_vegas_ply(path, random_model(compositing="sum")), "sum"),
     "3DGS of a sum": (
-        lambda path: write_3dgs_ply(path, dataclasses.replace(random_model(), compositing="sum"), 0.5),
+        lambda path: write_3dgs_ply(path, random_model(compositing="sum"), 0.5),
         "sum",
     ),
     "NaN": (

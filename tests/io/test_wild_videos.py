@@ -88,27 +88,25 @@ def test_uneven_times_are_told_and_no_frame_is_lost(tmp_path, options, times, fp
 # ---------------------------------------------------------------------------------------- sizes and turns
 
 
+def turned(*matrix):
+    """The clip with another matrix of its track (tkhd)."""
+    return with_box(mp4(), b"tkhd", lambda content: content[:40] + struct.pack(">9i", *matrix) + content[76:])
+
+
 @pytest.mark.parametrize(("turns", "across"), [(1, 1), (2, 1), (3, 1), (0, -1), (1, -1), (2, -1), (3, -1)])
 def test_videos_are_turned_upright(tmp_path, turns, across):
-    """The matrix of a track (tkhd) turns it clockwise, by quarters, and may mirror it; phones write that."""
+    """The matrix turns it clockwise, by quarters, and may mirror it; phones write that."""
     cos, sin = ((1, 0), (0, 1), (-1, 0), (0, -1))[turns]
     matrix = (across * cos << 16, sin << 16, 0, across * -sin << 16, cos << 16, 0, 0, 0, 1 << 30)
-    matrix = struct.pack(">9i", *matrix)
-    turned = with_box(mp4(), b"tkhd", lambda content: content[:40] + matrix + content[76:])
-    (tmp_path / "a.mp4").write_bytes(mp4())
-    (tmp_path / "turned.mp4").write_bytes(turned)
-    stored = read_video(tmp_path / "a.mp4").frames
-    np.testing.assert_array_equal(
-        read_video(tmp_path / "turned.mp4").frames, np.rot90(stored, -turns, (1, 2))[:, :, ::across]
-    )
+    found = read_video(put(tmp_path / "turned.mp4", turned(*matrix))).frames
+    stored = read_video(put(tmp_path / "a.mp4", mp4())).frames
+    np.testing.assert_array_equal(found, np.rot90(stored, -turns, (1, 2))[:, :, ::across])
 
 
 @pytest.mark.parametrize(("degrees", "beyond"), [(30, 30), (80, -10), (-30, -30)])
 def test_other_rotations_are_told(tmp_path, degrees, beyond):
     cos, sin = (round(65536 * one(np.radians(degrees))) for one in (np.cos, np.sin))
-    matrix = struct.pack(">9i", cos, sin, 0, -sin, cos, 0, 0, 0, 1 << 30)
-    (tmp_path / "a.mp4").write_bytes(with_box(mp4(), b"tkhd", lambda content: content[:40] + matrix + content[76:]))
-    clip = read_video(tmp_path / "a.mp4")
+    clip = read_video(put(tmp_path / "a.mp4", turned(cos, sin, 0, -sin, cos, 0, 0, 0, 1 << 30)))
     assert clip.size == ((48, 64) if abs(degrees) < 45 else (64, 48))
     assert clip.notes == (f"the file asks for a rotation by {beyond} degrees beyond multiples of 90; it is left out.",)
 
