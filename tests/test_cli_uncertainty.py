@@ -11,6 +11,7 @@ from commands import call, full_disk, run
 from tiny_clips import NUM_FRAMES, TWICE, write_both
 
 from foldgauss.cli.measuring import uncertainty as command
+from foldgauss.io import write_frames
 
 for name in ("emcee", "h5py", "h5netcdf", "matplotlib"):
     pytest.importorskip(name, reason="an optional extra")
@@ -141,19 +142,8 @@ def test_more_steps_go_on_and_overwriting_starts_anew(work, tmp_path, no_picture
 
 
 def test_a_clip_of_something_else(work, tmp_path):
-    from foldgauss.io import write_image
-
-    clip = tmp_path / "clip"
-    clip.mkdir()
-    for k, frame in enumerate(np.random.default_rng(0).integers(0, 255, (12, 40, 64, 3))):
-        write_image(clip / f"{k:02}.png", frame.astype(np.uint8))
-    call(
-        "uncertainty",
-        work / "model.safetensors",
-        clip,
-        "--out",
-        tmp_path / "out",
-        code=2,
-        err="VIDEO: expected frames of which the model explains 20%",
-    )
-    assert os.listdir(tmp_path / "out") == []
+    noise = np.random.default_rng(0).integers(0, 255, (12, 40, 64, 3)).astype(np.uint8)
+    clip, out = write_frames(tmp_path / "clip", noise), tmp_path / "out"
+    told = "VIDEO: expected frames of which the model explains 20%"
+    call("uncertainty", work / "model.safetensors", clip, "--out", out, code=2, err=told)
+    assert os.listdir(out) == []

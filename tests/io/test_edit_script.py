@@ -366,27 +366,26 @@ def test_mistakes_are_told_with_line_table_and_key(text):
     assert error(before + text).startswith(start.replace(f"line {line}", f"line {line + 3}"))
 
 
-LAYOUTS = {  # the mistake is the "offset" of the second edit
-    "arrays over lines": '[[edits]]\ndo = "multiply"\noffsets = [\n  [0.1, 0],  # ]\n  [0.2, 0],\n]\n'
-    '[[edits]]\ndo = "move"\noffset = [\n1,\n]\n',
-    "quoted keys": '[[ "edits" ]]\n"do" = "vanish"\n[[\'edits\']]\n\'do\' = "move"\n"offset" = [1]\n',
-    "inline tables": 'edits = [{do = "vanish"},\n\n{do = "move",  "offset" = [1]} ]',
-    "a table between": '[[edits]]\ndo = "vanish"\n[camera]\noffset = 3\n[[edits]]\ndo = "vanish"\noffset = [1]',
+LAYOUTS = {  # the mistake is the "offset" of the second edit, but in the last two
+    '[[edits]]\ndo = "multiply"\noffsets = [\n  [0.1, 0],  # ]\n  [0.2, 0],\n]\n'
+    '[[edits]]\ndo = "move"\noffset = [\n1,\n]\n': "line 9, [[edits]] number 2: offset: ",
+    '[[ "edits" ]]\n"do" = "vanish"\n[[\'edits\']]\n\'do\' = "move"\n"offset" = [1]\n': (
+        "line 5, [[edits]] number 2: offset: "
+    ),
+    # The line is that of what the inline table stands in.
+    'edits = [{do = "vanish"},\n\n{do = "move",  "offset" = [1]} ]': "line 1, [[edits]] number 2: offset: ",
+    '[[edits]]\ndo = "vanish"\n[camera]\noffset = 3\n[[edits]]\ndo = "vanish"\noffset = [1]': (
+        "line 7, [[edits]] number 2: offset: "
+    ),
+    "selections.it.box = [1]": "line 1, [selections.it]: box: ",
+    # Only a line feed ends a line of TOML: editors that know count like this.
+    '# \u2028 \x85\n[[edits]]\ndo = "mov"': "line 3, ",
 }
 
 
-def test_the_line_is_right_in_every_layout():
-    told = {name: error(text) for name, text in LAYOUTS.items()}
-    assert told["arrays over lines"].startswith("script, line 9, [[edits]] number 2: offset: ")
-    assert told["quoted keys"].startswith("script, line 5, [[edits]] number 2: offset: ")
-    assert told["inline tables"].startswith("script, line 1, [[edits]] number 2: offset: ")  # of what it stands in
-    assert told["a table between"].startswith("script, line 7, [[edits]] number 2: offset: ")
-
-
-def test_dotted_keys_and_strange_line_ends():
-    assert error("selections.it.box = [1]").startswith("script, line 1, [selections.it]: box: ")
-    # Only a line feed ends a line of TOML: editors that know count like this.
-    assert error('# \u2028 \x85\n[[edits]]\ndo = "mov"').startswith("script, line 3, ")
+@pytest.mark.parametrize("text", LAYOUTS)
+def test_the_line_is_right_in_every_layout(text):
+    assert error(text).startswith(f"script, {LAYOUTS[text]}")
 
 
 def in_one(text):

@@ -81,14 +81,18 @@ def test_existing_outputs(tmp_path, model, format, name, options):
     assert export(model, format, path, overwrite=True, **options) == path
 
 
-def test_what_is_no_video(tmp_path, model):
+@pytest.mark.parametrize(
+    ("name", "error", "text"),
+    [
+        ("f.ply", FormatError, "read_3dgs_ply"),
+        ("", FormatError, "a file that can be read"),
+        ("none.ply", FileNotFoundError, "missing"),
+    ],
+)
+def test_what_is_no_video(tmp_path, model, name, error, text):
     write_3dgs_ply(tmp_path / "f.ply", model, 0.5)
-    with pytest.raises(FormatError, match="read_3dgs_ply"):
-        read_vegas_ply(tmp_path / "f.ply", size=(40, 64))
-    with pytest.raises(FormatError, match="a file that can be read"):
-        read_vegas_ply(tmp_path)
-    with pytest.raises(FileNotFoundError, match="missing"):
-        read_vegas_ply(tmp_path / "none.ply")
+    with pytest.raises(error, match=text):
+        read_vegas_ply(tmp_path / name, size=(40, 64))
 
 
 SWAPPED = {
