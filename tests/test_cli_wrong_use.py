@@ -95,6 +95,7 @@ WRONG = [
             "fit in.safetensors --out in.safetensors",
         )
     ),
+    ("render model.safetensors --sound pipe.png", 2, "pipe.png"),
     # To open a pipe would wait for a program that writes to it.
     *(
         (words, 1, "pipe.png")
@@ -108,7 +109,6 @@ WRONG = [
             "fit pipe.png",
             "edit model.safetensors pipe.png",
             f"{PLATE} --masks pipe.png",
-            "render model.safetensors --sound pipe.png",
             "import pipe.png",
         )
     ),
