@@ -101,7 +101,7 @@ SWAPPED = {
     **{
         f"save as {name}": (
             lambda m, s, p, name=name: save_video_model(p + name, m),
-            r"path: expected a name for the model, as m\.safetensors, got .*export\.",
+            r"path: expected a name for the model, as out\.safetensors, got .*export\.",
         )
         for name in (".mp4", ".png", ".ply", ".v2")
     },
