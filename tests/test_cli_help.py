@@ -159,12 +159,11 @@ def here(work, tmp_path, monkeypatch):
     ],
 )
 def test_outputs_are_named_after_inputs(words, made, here):
-    before = {path: path.read_bytes() for path in here.rglob("*.*")}
-    inputs = {path.name for path in here.iterdir()}
+    inputs, before = {*here.iterdir()}, {path: path.read_bytes() for path in here.rglob("*.*")}
     call(*words.split(), out=made)  # its name is told
-    assert {path.name for path in here.iterdir()} - inputs == {made}
-    code = 1 if made.endswith(("-3dgs", "-obj")) else 2
-    call(*words.split(), code=code, err=[made, "overwrite"])  # and not replaced
+    assert {*here.iterdir()} - inputs == {here / made}
+    is_folder = made.endswith(("-3dgs", "-obj"))
+    call(*words.split(), code=1 if is_folder else 2, err=[made, "overwrite"])  # and not replaced
     assert run(*words.split(), "--overwrite") == 0
     assert {path: path.read_bytes() for path in before} == before
 
