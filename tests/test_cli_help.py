@@ -162,8 +162,8 @@ def test_outputs_are_named_after_inputs(words, made, here):
     inputs, before = {*here.iterdir()}, {path: path.read_bytes() for path in here.rglob("*.*")}
     call(*words.split(), out=made)  # its name is told
     assert {*here.iterdir()} - inputs == {here / made}
-    is_folder = made.endswith(("-3dgs", "-obj"))
-    call(*words.split(), code=1 if is_folder else 2, err=[made, "overwrite"])  # and not replaced
+    # And it is not replaced.
+    call(*words.split(), code=1 if made.endswith(("-3dgs", "-obj")) else 2, err=[made, "overwrite"])
     assert run(*words.split(), "--overwrite") == 0
     assert {path: path.read_bytes() for path in before} == before
 
