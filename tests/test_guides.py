@@ -99,7 +99,7 @@ FACTS = {
         "picture.shape == (*guides.SIZE, 3)",
         "isinstance(more, EditedVideo)",
         "len(rider) > 0",
-        "{'holiday.safetensors', 'slow.mp4', 'times', 'holiday.fgz'} <= {*files}",
+        "{'steady.safetensors', 'slow.mp4', 'times', 'holiday.fgz'} <= {*files}",
         "{'trade', 'more.mp4', 'foldgauss-demo'} <= {*files}",
         "posterior.mean().shape == (guides.NUM_FRAMES,)",
     ],
