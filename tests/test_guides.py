@@ -156,7 +156,7 @@ FACTS = {
         "np.allclose(same.weights, mixture.weights, rtol=1e-5, atol=0)",
         "np.allclose(image.sum() / pixels_per_unit((90, 160)) ** 2, mixture.marginal([-1]).pdf(np.float32([0.5])),"
         " rtol=1e-2, atol=0)",
-        "(choice.estimator.n_components, choice.estimator.degree) == (2, 2)",
+        "(best.n_components, best.degree) == (2, 2)",
         "np.allclose(mcmc.get_samples()['weights'].mean(0), [0.3, 0.7], rtol=0, atol=0.06)",
     ],
     "docs/player.md": [
