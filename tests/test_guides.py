@@ -8,7 +8,6 @@ from PIL import Image
 from foldgauss.io import load_video_model
 from foldgauss.io.edit_script import parse_edit_script
 from foldgauss.video import EditedVideo, evaluate
-from foldgauss.video.models.renderer import VideoRenderer
 
 #: Extras that a page needs; all are part of the extra `test`.
 NEEDS = {
@@ -72,9 +71,9 @@ def test_every_check_has_its_page():
 def check_edits(names, folder):
     """The edits of docs/editing.md are seen, and its scripts can be applied to its model."""
     for video in ("night", "jump", "there_and_back", "still", "stacked", "popped", "orbit", "waving", "grown", "again"):
-        picture = VideoRenderer(names[video]).image(0.4)  # nothing is compiled for each of them
+        picture = names[video].render(0.4)
         assert np.isfinite(picture).all()
-        assert np.abs(picture - VideoRenderer(names["model"]).image(0.4)).max() > 0.02
+        assert np.abs(picture - names["model"].render(0.4)).max() > 0.02
     # The script, as it stands there.
     (folder / "masks").mkdir()
     Image.fromarray(255 * names["masks"][0].astype(np.uint8)).save(folder / "masks" / "ball.png")
