@@ -121,6 +121,21 @@ class Opened:
         )
         return self
 
+    def press(self, *keys):
+        for key in keys:
+            self.page.keyboard.press(key)
+        return self
+
+    def seek(self, time):
+        self.page.evaluate("(time) => foldgauss.seek(time)", time)
+        return self
+
+    @property
+    def toast(self):
+        """The message that is shown, or will be."""
+        self.page.locator("#toast").wait_for()
+        return self.page.locator("#toast").inner_text()
+
     @property
     def stats(self):
         return self.page.evaluate("foldgauss.stats")

@@ -1,9 +1,16 @@
 """The command as the tests call it."""
 
+import errno
+import io
 import math
+import os
 import re
+import signal
+import threading
 import wave
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
+from typing import NamedTuple
 
 import av
 import numpy as np
@@ -11,6 +18,7 @@ import pytest
 
 from foldgauss import cli
 from foldgauss.cli.app import application
+from foldgauss.jobs import runner
 
 
 def run(*arguments):
@@ -28,6 +36,24 @@ def run(*arguments):
             cli.main(words)
     assert not _find_foreign_options(words, texts)
     return done.value.code or 0
+
+
+class Output(NamedTuple):
+    """What a command wrote."""
+
+    out: str
+    err: str
+
+
+def call(*arguments, code=0, out=(), err=()) -> Output:
+    """Output of the command, which ends with this code and writes these texts, wherever its lines are broken."""
+    with redirect_stdout(io.StringIO()) as shown, redirect_stderr(io.StringIO()) as told:
+        assert run(*arguments) == code, told.getvalue()
+    for stream, texts in ((shown, out), (told, err)):
+        written = " ".join(stream.getvalue().split())
+        for text in [texts] if isinstance(texts, str) else texts:
+            assert text in written, written
+    return Output(shown.getvalue(), told.getvalue())
 
 
 def _find_foreign_options(words, texts):
@@ -48,9 +74,54 @@ def _find_foreign_options(words, texts):
     return [text for text, found in named if found[0] not in own and not elsewhere.search(text[: found.start()])]
 
 
-def write_tone(path: Path, seconds: float) -> Path:
-    """A .wav file of 8000 samples per second; returns its path."""
-    samples = 20_000 * np.sin(np.arange(math.ceil(8000 * seconds)))
+@contextmanager
+def interrupted_fit(step, number=signal.SIGINT):
+    """A fit sends its own process this signal after a step."""
+    steps = runner.fit_steps
+
+    def stepping(*arguments):
+        for state, info in steps(*arguments):
+            if info.step == step:
+                os.kill(os.getpid(), number)
+            yield state, info
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runner, "fit_steps", stepping)
+        yield
+
+
+@contextmanager
+def full_disk(is_full):
+    """There is no space left for files whose path is such."""
+    replace = os.replace
+
+    def replace_or_fail(source, target):
+        if is_full(Path(target)):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        replace(source, target)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("os.replace", replace_or_fail)
+        yield
+
+
+@contextmanager
+def running(server):
+    """A server in a thread."""
+    with server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield server
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def write_tone(path: Path, seconds: float, start: float = 0.0) -> Path:
+    """A .wav file of 8000 samples per second, silent before `start`; returns its path."""
+    number = np.arange(math.ceil(8000 * seconds))
+    samples = np.where(number < 8000 * start, 0, 20_000 * np.sin(number))
     with wave.open(str(path), "wb") as sound:
         sound.setparams((1, 2, 8000, 0, "NONE", ""))
         sound.writeframes(samples.astype(np.int16).tobytes())

@@ -36,6 +36,25 @@ def select(page, indices, how="new"):
     page.page.evaluate(
         "([indices, how]) => foldgauss.controls.tools.select(indices, how)", [list(map(int, indices)), how]
     )
+    return page
+
+
+def begin_edit(page, indices=(), at=None):
+    """Open the editor, at a time, with these Gaussians selected."""
+    if at is not None:
+        page.seek(at)
+    page.press("e")
+    return select(page, indices) if len(indices) else page
+
+
+def pull(page, start, *steps):
+    """Drag with the mouse from a point of the screen, by these steps."""
+    (x, y), mouse = start, page.page.mouse
+    mouse.move(x, y)
+    mouse.down()
+    for right, down in steps:
+        mouse.move(x + right, y + down, steps=5)
+    mouse.up()
 
 
 def download(page, button, path):

@@ -20,21 +20,20 @@ Commands run in this process, where kernels are compiled once, with the argument
 - Workers are tested elsewhere: with `--workers` and `--scheduler` this process does the work; the options of `dask` are
   looked up.
 - `foldgauss view` makes its page and its server, opens no browser, and ends as by Ctrl-C.
-- `git clone ADDRESS FOLDER` and `cd FOLDER` are not run: FOLDER must be the project's name.
-- `pip`, `pytest`, `ruff` and so on are not run: what they name (extras, files, markers, tools) is looked up. `python
-  -m benchmarks...` has its arguments parsed by the benchmark's own parser and goes no
-  further.
+- `git`, `cd`, `pip`, `pytest`, `ruff` and so on are not run: what they name (extras, files, markers) is looked up.
+  `python -m benchmarks...` has its arguments parsed by the benchmark's own parser and goes no further.
 """
 
 import argparse
 import dataclasses
+import functools
 import importlib
 import re
 import shlex
 import tomllib
 import warnings
-import wave
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -42,15 +41,15 @@ import cv2
 import jax
 import numpy as np
 import pytest
-from commands import run
+from commands import run, write_tone
 from markdown_it import MarkdownIt
 from PIL import Image
 
 from foldgauss import video
 from foldgauss.cli.fitting import demo
 from foldgauss.cli.viewing import view as viewing
-from foldgauss.io import Sound, datasets, export, save_video_model, write_image, write_video
-from foldgauss.video import FitConfig, fit
+from foldgauss.io import Sound, datasets, export, save_video_model, write_frames, write_video
+from foldgauss.video import FitConfig, VideoModel, fit
 
 ROOT = Path(__file__).parents[1]
 #: All pages of the documentation.
@@ -201,39 +200,26 @@ def _ended(server) -> None:
     raise KeyboardInterrupt
 
 
-def _git(words: list[str], where: str) -> None:
-    assert words == ["clone", "ADDRESS", PROJECT], where
-
-
-def _cd(words: list[str], where: str) -> None:
-    assert words == [PROJECT], where
+def _look_up(words: list[str], where: str) -> None:
+    """What a command names is there: extras of this project, files, and markers of the suite."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    names = [word for word in words if word.partition("[")[0] in (".", PROJECT)]
+    extras = {extra for name in names for extra in re.findall(r"\w+", name.partition("[")[2])}
+    assert extras <= project["project"]["optional-dependencies"].keys(), f"{where}: {extras}"
+    markers = {marker.partition(":")[0] for marker in project["tool"]["pytest"]["ini_options"]["markers"]}
+    for option, value in pairwise(["", *words]):
+        assert option != "-m" or value in markers, f"{where}: no marker {value!r}"
+        assert option != "-c" or (ROOT / value).exists(), f"{where}: {value}"
+        is_file = value.startswith((".ci/", "tests/"))
+        assert not is_file or (ROOT / value.partition("::")[0]).exists(), f"{where}: {value}"
 
 
 def _pip(words: list[str], where: str) -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    asked = [word for word in words[1:] if not word.startswith("-")]
-    if "-c" in words:
-        constraints = words[words.index("-c") + 1]
-        assert (ROOT / constraints).exists(), f"{where}: {constraints}"
-        asked.remove(constraints)
+    asked = [word for option, word in pairwise(words) if "-c" not in (option, word) and word != "-e"]
     assert words[0] == "install"
     assert asked, where
-    for requirement in asked:
-        name, extras = re.fullmatch(r"([\w.-]+?)(?:\[([\w,]+)\])?", requirement).groups()
-        assert name in (".", PROJECT), f"{where}: {requirement}"
-        for extra in (extras or "").split(","):
-            assert not extra or extra in project["optional-dependencies"], f"{where}: no extra {extra!r}"
-
-
-def _pytest(words: list[str], where: str) -> None:
-    markers = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["pytest"]["ini_options"]["markers"]
-    known = {marker.partition(":")[0] for marker in markers}
-    for option, value in zip(words[::2], words[1::2], strict=False):
-        if option == "-m":
-            assert value in known, f"{where}: no marker {value!r}"
-    for word in words:
-        if word.startswith("tests"):
-            assert (ROOT / word.partition("::")[0]).exists(), f"{where}: {word}"
+    assert all(re.fullmatch(rf"(\.|{PROJECT})(\[[\w,]+\])?", word) for word in asked), f"{where}: {asked}"
+    _look_up(words, where)
 
 
 def check_benchmark(words: list[str], where: str) -> None:
@@ -259,51 +245,31 @@ def check_benchmark(words: list[str], where: str) -> None:
     pytest.fail(f"{where}: {words[1]} parses no arguments")
 
 
-def _developer_tool(name: str):
-    """A tool that an extra installs."""
-
-    def check(words: list[str], where: str) -> None:
-        del words
-        extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-        named = {re.split(r"[\[<>=]", requirement)[0] for extra in extras.values() for requirement in extra}
-        assert name in named, f"{where}: no extra installs {name}"
-
-    return check
-
-
-def _bash(words: list[str], where: str) -> None:
-    assert (ROOT / words[0]).exists(), f"{where}: {words[0]}"
-
-
 _TOOLS = {
     "foldgauss": _foldgauss,
-    "git": _git,
-    "cd": _cd,
     "pip": _pip,
-    "pytest": _pytest,
     "benchmarks": check_benchmark,
-    "ruff": _developer_tool("ruff"),
-    "lint-imports": _developer_tool("import-linter"),
-    "mkdocs": _developer_tool("mkdocs"),
-    "jupyter": _developer_tool("jupyterlab"),
-    "bash": _bash,
     "dask": _dask,
+    **dict.fromkeys(("git", "cd", "pytest", "bash", "ruff", "lint-imports", "mkdocs", "jupyter"), _look_up),
 }
 
 
 # What pages take for granted.
 
 
+@functools.cache
 def _clip() -> np.ndarray:
     return datasets.bikes(frames=(30, 30 + NUM_FRAMES), size=SIZE).frames  # something moves
 
 
+@functools.cache
+def _fitted() -> VideoModel:
+    return fit(_clip(), FitConfig(num_gaussians=600, steps=STEPS), fps=25.0).model
+
+
 def _video(name: str):
     def make(folder: Path) -> None:
-        silence = folder / "silence.wav"
-        with wave.open(str(silence), "wb") as sound:
-            sound.setparams((1, 2, 8000, 0, "NONE", ""))
-            sound.writeframes(bytes(16_000))
+        silence = write_tone(folder / "tone.wav", 1.0)
         write_video(folder / name, _clip(), 25.0, sound=Sound(silence))
         silence.unlink()
 
@@ -312,30 +278,25 @@ def _video(name: str):
 
 def _model(name: str):
     def make(folder: Path) -> None:
-        model = fit(_clip(), FitConfig(num_gaussians=600, steps=STEPS), fps=25.0).model
-        save_video_model(folder / name, model)
+        save_video_model(folder / name, _fitted())
 
     return make
 
 
 def _images(name: str):
     def make(folder: Path) -> None:
-        (folder / name).mkdir(parents=True)
-        for k, frame in enumerate(_clip()):
-            write_image(folder / name / f"{k:05}.png", frame)
+        (folder / name).parent.mkdir(parents=True)
+        write_frames(folder / name, _clip())
 
     return make
 
 
-def ball_masks() -> np.ndarray:
-    """Of something that rolls to the right, one for each frame."""
-    y, x = np.mgrid[0 : SIZE[0], 0 : SIZE[1]] + 0.5
-    return np.stack([(x - 20 - 3 * k) ** 2 + (y - 24) ** 2 < 90 for k in range(NUM_FRAMES)])
-
-
 def _masks(folder: Path) -> None:
+    """Of something that rolls to the right, one for each frame."""
     (folder / "masks").mkdir()
-    for k, mask in enumerate(ball_masks()):
+    y, x = np.mgrid[0 : SIZE[0], 0 : SIZE[1]] + 0.5
+    for k in range(NUM_FRAMES):
+        mask = (x - 20 - 3 * k) ** 2 + (y - 24) ** 2 < 90
         Image.fromarray(255 * mask.astype(np.uint8)).save(folder / "masks" / f"{k:05}.png")
 
 

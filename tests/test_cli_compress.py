@@ -6,7 +6,7 @@ import re
 import equinox as eqx
 import numpy as np
 import pytest
-from commands import run
+from commands import call, run
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import load_video_model, read_video, save_video_model, write_video
@@ -43,10 +43,9 @@ def work(tmp_path_factory):
     return folder
 
 
-def test_compress_and_use(work, tmp_path, capsys, monkeypatch):
+def test_compress_and_use(work, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert run("compress", work / "model.safetensors", work / "clip", "--quality", 80) == 0
-    shown, progress = capsys.readouterr()
+    shown, progress = call("compress", work / "model.safetensors", work / "clip", "--quality", 80)
     assert re.search(r"^Compressing 100%  \d+ steps  loss .* dB  \d+ Gaussians$", progress, re.MULTILINE)
     assert re.search(r"compression factor\s*│ \d+\.\d\d", shown)
     about = read_metadata("model.fgz")
@@ -58,9 +57,7 @@ def test_compress_and_use(work, tmp_path, capsys, monkeypatch):
         scores.append(json.loads((tmp_path / "s.json").read_text())["mean_psnr"])
     assert scores[1] > scores[0] - 1.5
     assert scores[1] == pytest.approx(about["mean_psnr"], abs=2e-3)
-    capsys.readouterr()
-    assert run("info", "model.fgz") == 0
-    assert "bits per pixel" in capsys.readouterr().out
+    call("info", "model.fgz", out="bits per pixel")
     assert run("render", "model.fgz", "--out", "slow.mp4", "--speed", 0.5) == 0
     assert read_video("slow.mp4").num_frames == 9
     assert run("export", "model.fgz", "--format", "ply", "--out", "m.ply") == 0
@@ -103,7 +100,7 @@ ODD = [
 @pytest.mark.parametrize(
     "odd", [*ODD[::4], *(pytest.param(odd, marks=pytest.mark.slow) for odd in ODD if odd not in ODD[::4])], ids=str
 )
-def test_notes_of_another_kind_are_none(work, tmp_path, capsys, odd):
+def test_notes_of_another_kind_are_none(work, tmp_path, odd):
     """Files come from strangers: what is no note of a fit is not there, for no command."""
     path, made = tmp_path / "m.safetensors", tmp_path / "m.fgz"
     about = {"clip": "clip", "mean_psnr": 33.3, "frames": [0, FRAMES], "frames_digest": "another's", "mine": [1]} | odd
@@ -114,26 +111,25 @@ def test_notes_of_another_kind_are_none(work, tmp_path, capsys, odd):
     assert not odd.keys() & read_metadata(made).keys() - {"mean_psnr"}
     assert run("evaluate", path, work / "clip") == 0
     assert run("info", path) == 0
-    assert run("view", path, "--out", tmp_path / "m.html") == 0
-    assert "Traceback" not in capsys.readouterr().err
+    assert "Traceback" not in call("view", path, "--out", tmp_path / "m.html").err
 
 
-def test_an_edit_that_is_fitted_away_is_told(work, tmp_path, capsys):
+def test_an_edit_that_is_fitted_away_is_told(work, tmp_path):
     """Baked edits leave a plain model; fitted anew to the clip as it was, it becomes that again."""
     model = load_video_model(work / "model.safetensors")
     bright = eqx.tree_at(lambda m: m.splats.color_dc, model, np.asarray(model.splats.color_dc) + 1)
     path = save_video_model(tmp_path / "bright.safetensors", bright)
     clip = work / "clip", "--quality", 90
-    assert run("compress", path, *clip, "--out", tmp_path / "bright.fgz") == 0
-    assert re.search(r"warning: the compact model is \d+\.\d dB closer to the clip", capsys.readouterr().err)
-    assert run("compress", path, "--out", tmp_path / "rounded.fgz") == 0
-    assert "closer" not in capsys.readouterr().err
+    assert re.search(
+        r"warning: the compact model is \d+\.\d dB closer to the clip",
+        call("compress", path, *clip, "--out", tmp_path / "bright.fgz").err,
+    )
+    assert "closer" not in call("compress", path, "--out", tmp_path / "rounded.fgz").err
 
 
-def test_without_the_clip(work, tmp_path, capsys):
+def test_without_the_clip(work, tmp_path):
     """Parameters are rounded, and the pictures stay about what they were."""
-    assert run("compress", work / "model.safetensors", "--out", tmp_path / "m.fgz") == 0
-    shown, told = capsys.readouterr()
+    shown, told = call("compress", work / "model.safetensors", "--out", tmp_path / "m.fgz")
     assert "PSNR" not in shown  # of what is not known
     assert "no smaller" not in told
     made, model = load_video_model(tmp_path / "m.fgz"), load_video_model(work / "model.safetensors")
@@ -156,23 +152,22 @@ def test_the_size_is_kept_with_long_metadata(work, tmp_path, clip):
     assert read_metadata(tmp_path / "m.fgz")["clip"] == about["clip"]
 
 
-def test_a_psnr_is_reached(work, tmp_path, capsys):
-    clip = work / "clip", "--psnr", 25  # by steps: the machine may be busy
-    assert run("compress", work / "model.safetensors", *clip, "--out", tmp_path / "m.fgz") == 0
+def test_a_psnr_is_reached(work, tmp_path):
+    goal = (work / "model.safetensors", work / "clip", "--psnr", 25)  # by steps: the machine may be busy
+    assert "--psnr" not in call("compress", *goal, "--out", tmp_path / "m.fgz").err
     assert read_metadata(tmp_path / "m.fgz")["mean_psnr"] >= 25
-    assert "--psnr" not in capsys.readouterr().err
-    clip = work / "clip", "--psnr", 90, "--minutes", 0.01
-    assert run("compress", work / "model.safetensors", *clip, "--out", tmp_path / "n.fgz") == 0
-    assert re.search(r"warning: --psnr: expected 90 dB, got \d+\.\d\d\.", " ".join(capsys.readouterr().err.split()))
+    told = call("compress", *goal[:-1], 90, "--minutes", 0.01, "--out", tmp_path / "n.fgz").err
+    assert re.search(r"warning: --psnr: expected 90 dB, got \d+\.\d\d\.", " ".join(told.split()))
 
 
-def test_a_file_that_is_no_smaller_is_told(work, tmp_path, capsys):
+def test_a_file_that_is_no_smaller_is_told(work, tmp_path):
     assert run("compress", work / "model.safetensors", "--quality", 40, "--out", tmp_path / "m.fgz") == 0
-    assert run("compress", tmp_path / "m.fgz", "--quality", 100, "--out", tmp_path / "n.fgz") == 0
-    assert "n.fgz is no smaller than" in capsys.readouterr().err.replace("\n", " ")
+    assert "n.fgz is no smaller than" in call(
+        "compress", tmp_path / "m.fgz", "--quality", 100, "--out", tmp_path / "n.fgz"
+    ).err.replace("\n", " ")
 
 
-def test_the_wrong_clip_is_refused(work, tmp_path, capsys, monkeypatch):
+def test_the_wrong_clip_is_refused(work, tmp_path, monkeypatch):
     """Fitted anew to it, the model would be lost; one that a decoder changed by a little is taken."""
     monkeypatch.chdir(tmp_path)
     model, frames = load_video_model(work / "model.safetensors"), read_video(work / "clip").frames
@@ -180,11 +175,9 @@ def test_the_wrong_clip_is_refused(work, tmp_path, capsys, monkeypatch):
     save_video_model("m.safetensors", model, metadata=about)
     write_video("gray", np.full_like(frames, 90), 12.0)
     write_video("short", frames[:3], 12.0)
-    assert run("compress", "m.safetensors", "gray") == 2
-    assert "VIDEO: expected the clip that the model was fitted to" in " ".join(capsys.readouterr().err.split())
-    assert run("compress", "m.safetensors", "short") == 2
+    call("compress", "m.safetensors", "gray", code=2, err="VIDEO: expected the clip that the model was fitted to")
     assert "VIDEO: expected 5 frames as in the model, got 3 of 'short'. Give the clip" in " ".join(
-        capsys.readouterr().err.split()
+        call("compress", "m.safetensors", "short", code=2).err.split()
     )
     assert not list(tmp_path.glob("*.fgz"))
     assert run("compress", "m.safetensors", work / "clip", "--minutes", 0.001) == 0

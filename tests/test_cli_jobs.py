@@ -5,14 +5,16 @@ import os
 import shutil
 import signal
 import sys
+from contextlib import contextmanager
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from commands import run
+from commands import call, run
 
 import foldgauss.jobs.runner as fitting
 from foldgauss.cli.fitting import job_progress as _jobs_view
-from foldgauss.io import load_video_model, read_video, write_image, write_video
+from foldgauss.io import load_video_model, read_video, write_frames, write_video
 from foldgauss.jobs import Progress
 from foldgauss.video import SegmentedVideo, VideoModel, evaluate
 
@@ -38,9 +40,7 @@ def clips(tmp_path_factory):
     folder = tmp_path_factory.mktemp("clips")
     for k in range(2):
         write_video(folder / f"clip{k}.mp4", pictures(15, k), 10.0)  # as many as a segment of the long one has
-    (folder / "frames").mkdir()
-    for k, picture in enumerate(pictures(15, 5.0)):
-        write_image(folder / "frames" / f"{k}.png", picture)
+    write_frames(folder / "frames", pictures(15, 5.0))
     (folder / "broken.mp4").write_text("no video at all")
     (folder / "notes.txt").write_text("about these clips")
     return folder
@@ -53,15 +53,16 @@ def clips(tmp_path_factory):
 def whole(long_clip, tmp_path_factory):
     """The model of a fit that nothing disturbed."""
     target = tmp_path_factory.mktemp("whole") / "m.safetensors"
-    assert run("fit", long_clip, "--out", target, *SEGMENTS, "--quiet") == 0
+    told = ["39 frames of 24x32 in 3 segments of", "each with 40 Gaussians of degree 1, 12 steps, by this process"]
+    told += ["PSNR lost where segments meet"]
+    call("fit", long_clip, "--out", target, *SEGMENTS, out=told, err="1 of 3 segments done: segment 0")
     return target
 
 
-def test_a_fit_in_segments_is_one_model(long_clip, whole, tmp_path, capsys):
+def test_a_fit_in_segments_is_one_model(long_clip, whole, tmp_path):
     target = tmp_path / "m.safetensors"
-    assert run("fit", long_clip, "--out", target, *SEGMENTS, "--log-json") == 0
-    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    start, done = events[0], events[-1]
+    shown = call("fit", long_clip, "--out", target, *SEGMENTS, "--log-json").out
+    start, *events, done = map(json.loads, shown.splitlines())
     video = load_video_model(target)
     assert isinstance(video, SegmentedVideo)
     assert start["spans"] == [[part.first, part.stop] for part in video.segments]
@@ -73,109 +74,94 @@ def test_a_fit_in_segments_is_one_model(long_clip, whole, tmp_path, capsys):
     assert target.read_bytes() == whole.read_bytes()
 
 
-def test_the_plan_and_the_figures_are_told(long_clip, tmp_path, capsys):
-    assert run("fit", long_clip, "--out", tmp_path / "m.safetensors", *SEGMENTS) == 0
-    told = capsys.readouterr()
-    assert "39 frames of 24x32 in 3 segments of" in told.out
-    assert "each with 40 Gaussians of degree 1, 12 steps, by this process" in told.out
-    assert "PSNR lost where segments meet" in told.out
-    assert "1 of 3 segments done: segment 0" in told.err
+@contextmanager
+def stopped(name):
+    """A signal is sent to this process once a job tells of itself for the second time."""
+    seen, update = [], _jobs_view._View.update
 
-
-class Stopping:
-    """Sends a signal to this process once a segment tells of itself for the second time."""
-
-    def __init__(self, monkeypatch, name):
-        self.name, self.seen, self.watch = name, 0, _jobs_view._View.update
-        monkeypatch.setattr(fitting, "REPORT_SECONDS", 0.0)
-        monkeypatch.setattr(_jobs_view._View, "update", lambda view, share: self(view, share))
-
-    def __call__(self, view, share: Progress):
-        self.watch(view, share)
-        self.seen += share.name == self.name
-        if self.seen == 2:
+    def watch(view, share: Progress):
+        update(view, share)
+        seen.append(share.name)
+        if seen.count(name) == 2:
             os.kill(os.getpid(), signal.SIGTERM)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fitting, "REPORT_SECONDS", 0.0)
+        patch.setattr(_jobs_view._View, "update", watch)
+        yield
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")
-def test_a_stopped_fit_goes_on_when_the_command_is_given_again(long_clip, whole, tmp_path, capsys, monkeypatch):
+def test_a_stopped_fit_goes_on_when_the_command_is_given_again(long_clip, whole, tmp_path):
     target, folder = tmp_path / "m.safetensors", tmp_path / "m.safetensors.segments"
-    with monkeypatch.context() as patch:
-        Stopping(patch, "segment 1")
-        assert run("fit", long_clip, "--out", target, *SEGMENTS) == 1
-    assert "stopped by SIGTERM; 1 of 3 segments are done" in capsys.readouterr().err
+    with stopped("segment 1"):
+        call("fit", long_clip, "--out", target, *SEGMENTS, code=1, err="stopped by SIGTERM; 1 of 3 segments are done")
     assert (folder / "segment-0001.safetensors.checkpoint").exists()
-    assert run("fit", long_clip, "--out", target, *SEGMENTS[:-1], "2") == 2  # not with other options
-    assert "segment_seconds=1.5" in capsys.readouterr().err
-    assert run("fit", long_clip, "--out", target, *SEGMENTS, "--resume") == 0
-    assert "continuing: 1 of 3 segments done, 1 begun" in capsys.readouterr().err
+    call("fit", long_clip, "--out", target, *SEGMENTS[:-1], "2", code=2, err="segment_seconds=1.5")
+    call("fit", long_clip, "--out", target, *SEGMENTS, "--resume", err="continuing: 1 of 3 segments done, 1 begun")
     assert target.read_bytes() == whole.read_bytes()
     assert not folder.exists()
 
 
-def test_begun_anew_and_left_alone(long_clip, whole, tmp_path, capsys):
+def test_begun_anew_and_left_alone(long_clip, whole, tmp_path):
     target, folder = tmp_path / "m.safetensors", tmp_path / "m.safetensors.segments"
     shutil.copyfile(whole, target)
-    assert run("fit", long_clip, "--out", target, *SEGMENTS) == 2
-    assert "add --overwrite" in capsys.readouterr().err
+    call("fit", long_clip, "--out", target, *SEGMENTS, code=2, err="add --overwrite")
     folder.mkdir()
     (folder / "mine.txt").write_text("not of a fit")
-    assert run("fit", long_clip, "--out", target, *SEGMENTS, "--overwrite") == 2
-    assert "mine.txt" in capsys.readouterr().err
+    call("fit", long_clip, "--out", target, *SEGMENTS, "--overwrite", code=2, err="mine.txt")
     (folder / "mine.txt").rename(folder / "segment-0000.safetensors")
     assert run("fit", long_clip, "--out", target, *SEGMENTS, "--overwrite") == 0
     assert target.read_bytes() == whole.read_bytes()
 
 
-def stopped(monkeypatch, where, *words):
-    with monkeypatch.context() as patch:
-        Stopping(patch, where)
-        assert run(*words) == 1
-
-
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")
-def test_what_was_begun_in_segments_goes_on_so_without_being_told(long_clip, whole, tmp_path, capsys, monkeypatch):
+def test_what_was_begun_in_segments_goes_on_so_without_being_told(long_clip, whole, tmp_path):
     target = tmp_path / "m.safetensors"
-    stopped(monkeypatch, "segment 1", "fit", long_clip, "--out", target, *SEGMENTS)
-    capsys.readouterr()
-    assert run("fit", long_clip, "--out", target, *QUICK, "--preview", tmp_path / "p.png") == 2
-    assert "--preview: expected a fit in one piece" in capsys.readouterr().err
-    assert run("fit", long_clip, "--out", target, *QUICK, "--log-json") == 0
-    assert json.loads(capsys.readouterr().out.splitlines()[0])["spans"] == [[0, 15], [12, 27], [24, 39]]
+    with stopped("segment 1"):
+        assert run("fit", long_clip, "--out", target, *SEGMENTS) == 1
+    call(
+        "fit",
+        long_clip,
+        "--out",
+        target,
+        *QUICK,
+        "--preview",
+        tmp_path / "p.png",
+        code=2,
+        err="--preview: expected a fit in one piece",
+    )
+    assert json.loads(call("fit", long_clip, "--out", target, *QUICK, "--log-json").out.splitlines()[0])["spans"] == [
+        [0, 15],
+        [12, 27],
+        [24, 39],
+    ]
     checkpoint = tmp_path / "m.safetensors.checkpoint"
     (tmp_path / "m.safetensors.segments").mkdir()
     (tmp_path / "m.safetensors.segments" / "plan.json").write_text('{"asked": {"segment_seconds": 1.5}}')
     checkpoint.write_bytes(b"of a fit in one piece")
-    assert run("fit", long_clip, "--out", target, *QUICK, "--overwrite", "--resume") == 1
-    assert checkpoint.name in capsys.readouterr().err
+    assert checkpoint.name in call("fit", long_clip, "--out", target, *QUICK, "--overwrite", "--resume", code=1).err
     assert target.read_bytes() == whole.read_bytes()
 
 
 def test_that_nobody_listens_any_more_costs_no_fit(long_clip, whole, tmp_path, monkeypatch):
-    def gone(event, figures):
-        raise BrokenPipeError
-
-    monkeypatch.setattr(_jobs_view, "print_json", gone)
+    monkeypatch.setattr(_jobs_view, "print_json", Mock(side_effect=BrokenPipeError))
     assert run("fit", long_clip, "--out", tmp_path / "m.safetensors", *SEGMENTS, "--log-json") == 0
     assert (tmp_path / "m.safetensors").read_bytes() == whole.read_bytes()
 
 
-def test_a_segment_that_fails_leaves_the_others(long_clip, tmp_path, capsys, monkeypatch):
-    real = fitting.read_indexed
-    (first, _stop) = (13, 28)
+def test_a_segment_that_fails_leaves_the_others(long_clip, tmp_path, monkeypatch):
+    read, target = fitting.read_indexed, tmp_path / "m.safetensors"
 
     def fails(index, low, high, **named):
-        if low <= first < high:
+        if low <= 13 < high:
             raise OSError("the disk has gone")
-        return real(index, low, high, **named)
+        return read(index, low, high, **named)
 
-    target = tmp_path / "m.safetensors"
     with monkeypatch.context() as patch:
         patch.setattr(fitting, "read_indexed", fails)
-        assert run("fit", long_clip, "--out", target, *SEGMENTS) == 1
-    told = capsys.readouterr().err
-    assert "the disk has gone" in told
-    assert "segments failed; the others are kept" in told
+        told = ["the disk has gone", "segments failed; the others are kept"]
+        call("fit", long_clip, "--out", target, *SEGMENTS, code=1, err=told)
     assert not target.exists()
     assert run("fit", long_clip, "--out", target, *SEGMENTS) == 0
 
@@ -187,14 +173,18 @@ def summary_of(folder):
     return json.loads((folder / "summary.json").read_text())
 
 
-def test_many_clips_make_a_model_each_and_failures_are_listed(clips, tmp_path, capsys):
+def test_many_clips_make_a_model_each_and_failures_are_listed(clips, tmp_path):
     out = tmp_path / "models"
-    assert run("fit-many", clips, "--out", out, *QUICK) == 1
-    told = capsys.readouterr()
-    assert "skipped, not clips: notes.txt" in told.out
-    assert "3 models in" in told.out
-    assert "1 failed" in told.out
-    assert "failed: broken.mp4: path: expected a video file" in told.err
+    call(
+        "fit-many",
+        clips,
+        "--out",
+        out,
+        *QUICK,
+        code=1,
+        out=["skipped, not clips: notes.txt", "3 models in", "1 failed"],
+        err="failed: broken.mp4: path: expected a video file",
+    )
     models = sorted(out.glob("*.fgz"))
     assert [path.name for path in models] == ["clip0.fgz", "clip1.fgz", "frames.fgz"]
     for path, source in zip(models, ("clip0.mp4", "clip1.mp4", "frames"), strict=True):
@@ -205,44 +195,41 @@ def test_many_clips_make_a_model_each_and_failures_are_listed(clips, tmp_path, c
     assert (summary_of(out)["done"], summary_of(out)["failed"]) == (3, 1)
 
 
-def test_many_clips_given_again_do_what_is_left(clips, tmp_path, capsys, monkeypatch):
-    own, out = tmp_path / "clips", tmp_path / "models"
-    shutil.copytree(clips, own)
-    assert run("fit-many", own, "--out", out, *QUICK, "--quiet") == 1
-    stamps = {path.name: path.stat().st_mtime_ns for path in out.glob("*.fgz")}
-    assert run("fit-many", own, "--out", out, *QUICK[:-1], "2") == 2  # not in place of others
-    assert "with other settings" in capsys.readouterr().err
-    shutil.copyfile(own / "clip0.mp4", own / "broken.mp4")  # mended
-    assert run("fit-many", own, "--out", out, *QUICK) == 0
-    assert "4 clips, 3 of them done already" in capsys.readouterr().out
-    assert all((out / name).stat().st_mtime_ns == stamp for name, stamp in stamps.items())
-    assert summary_of(out)["failed"] == 0
-    assert run("fit-many", own, "--out", out, *QUICK[:-1], "2", "--overwrite", "--quiet") == 0
-    assert {load_video_model(path).degree for path in out.glob("*.fgz")} == {2}
-
-
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")
-def test_many_clips_begun_anew_and_stopped_go_on(clips, tmp_path, capsys, monkeypatch):
-    out = tmp_path / "models"
-    assert run("fit-many", clips, "--out", out, *QUICK, "--quiet") == 1
-    other = (*QUICK[:-1], "2")
-    stopped(monkeypatch, "clip1.mp4", "fit-many", clips, "--out", out, *other, "--overwrite")
-    assert "Give the command again without --overwrite to continue." in capsys.readouterr().err
-    assert run("fit-many", clips, "--out", out, *QUICK) == 2  # what is kept is of other settings
-    assert "exists, with other settings" in capsys.readouterr().err
-    kept = out / "records" / "clip1.fgz.checkpoint"
-    before, stamp = kept.read_bytes(), (out / "clip0.fgz").stat().st_mtime_ns
-    assert run("fit-many", clips, "--out", out, *other[:-1], "3") == 2
-    assert kept.read_bytes() == before
-    assert run("fit-many", clips, "--out", out, *other) == 1
-    assert "4 clips, 1 of them done already" in capsys.readouterr().out
-    assert (out / "clip0.fgz").stat().st_mtime_ns == stamp
+def test_many_clips_given_again_do_what_is_left(clips, tmp_path):
+    """With other settings only if asked to, and from where they were stopped."""
+    own, out, other = shutil.copytree(clips, tmp_path / "clips"), tmp_path / "models", (*QUICK[:-1], "2")
+    fit = ("fit-many", own, "--out", out)
+    assert run(*fit, *QUICK, "--quiet") == 1
+    stamps = {path: path.stat().st_mtime_ns for path in out.glob("*.fgz")}
+    call(*fit, *other, code=2, err="exists, with other settings")
+    shutil.copyfile(own / "clip0.mp4", own / "broken.mp4")  # mended
+    call(*fit, *QUICK, out="4 clips, 3 of them done already")
+    assert all(path.stat().st_mtime_ns == stamp for path, stamp in stamps.items())
+    assert summary_of(out)["failed"] == 0
+    with stopped("clip1.mp4"):
+        told = "Give the command again without --overwrite to continue."
+        call(*fit, *other, "--overwrite", code=1, err=told)
+    kept = {path: path.read_bytes() for path in out.rglob("*") if path.is_file() and path.name != "summary.json"}
+    for settings in (QUICK, (*QUICK[:-1], "3")):  # what is kept is of others
+        call(*fit, *settings, code=2, err="exists, with other settings")
+    assert out / "records" / "clip1.fgz.checkpoint" in kept
+    assert {path: path.read_bytes() for path in kept} == kept
+    call(*fit, *other, out="4 clips, 2 of them done already")
     assert {load_video_model(path).degree for path in out.glob("*.fgz")} == {2}
 
 
 @pytest.mark.parametrize("options", [("--workers", "2"), ("--scheduler", "tcp://127.0.0.1:1")])
-def test_without_dask_nothing_is_begun(clips, tmp_path, capsys, monkeypatch, options):
+def test_without_dask_nothing_is_begun(clips, tmp_path, monkeypatch, options):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    assert run("fit-many", clips, "--out", tmp_path / "models", *QUICK, *options) == 2
-    assert f"{options[0]}: expected dask.distributed, got none. Install it: pip install" in capsys.readouterr().err
+    call(
+        "fit-many",
+        clips,
+        "--out",
+        tmp_path / "models",
+        *QUICK,
+        *options,
+        code=2,
+        err=f"{options[0]}: expected dask.distributed, got none. Install it: pip install",
+    )
     assert not list(tmp_path.iterdir())

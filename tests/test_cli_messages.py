@@ -1,19 +1,16 @@
 """What commands say of inputs that they do not read, and where outputs go."""
 
 import dataclasses
-import errno
-import os
 import pickle
-from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import run
+from commands import call, full_disk, run
 
 from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.settings import setting_of
 from foldgauss.cli.app.application import load_commands
-from foldgauss.io import load_video_model, write_image, write_video
+from foldgauss.io import load_video_model, write_frames, write_image, write_video
 from foldgauss.io.datasets import waves
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.video import FitConfig
@@ -50,28 +47,33 @@ def model(work):
     return work / "a" / "b" / "m.safetensors"
 
 
-def test_a_range_beyond_the_clip_ends_with_it(work, tmp_path, capsys):
+def test_a_range_beyond_the_clip_ends_with_it(work, tmp_path):
     target = tmp_path / "m.safetensors"
-    assert run("fit", work / "clip.mp4", "--frames", "4:100", "--out", target, *FIT) == 0
-    assert "frames 4:100 were asked for, and the clip ends at 6: 4:6 are used." in capsys.readouterr().err
+    call(
+        "fit",
+        work / "clip.mp4",
+        "--frames",
+        "4:100",
+        "--out",
+        target,
+        *FIT,
+        err="frames 4:100 were asked for, and the clip ends at 6: 4:6 are used.",
+    )
     assert (load_video_model(target).num_frames, read_metadata(target)["frames"]) == (2, [4, 6])
 
 
 def test_masks_of_the_whole_clip_fit_a_model_of_some_frames(work, model, tmp_path):
     size = load_video_model(model).size
-    (tmp_path / "masks").mkdir()
-    for k in range(6):
-        write_image(tmp_path / "masks" / f"{k}.png", np.full((*size, 3), 255, np.uint8))
+    write_frames(tmp_path / "masks", [np.full((*size, 3), 255, np.uint8)] * 6)
     (tmp_path / "s.toml").write_text(
         '[selections]\nall = {mask = "masks"}\n[[edits]]\ndo = "move"\noffset = [0.1, 0.0]\n'
     )
     assert run("edit", model, tmp_path / "s.toml", "--out", tmp_path / "e.safetensors") == 0
 
 
-def test_a_page_is_told_of_where_there_is_no_terminal(model, tmp_path, capsys, monkeypatch):
+def test_a_page_is_told_of_where_there_is_no_terminal(model, tmp_path, monkeypatch):
     monkeypatch.setattr("foldgauss.cli.shared.console.FIRST_LINE_SECONDS", 0.0)
-    assert run("view", model, "--out", tmp_path / "new" / "p.html") == 0
-    assert "Writing the page" in capsys.readouterr().err
+    call("view", model, "--out", tmp_path / "new" / "p.html", err="Writing the page")
 
 
 #: Commands that write after long work, by what they write; CLIP, MODEL, MASK and SCRIPT are inputs, OUT is the output.
@@ -100,67 +102,21 @@ def full(tmp_path, monkeypatch):
     """A folder on a full disk, and another for temporary files."""
     (tmp_path / "full").mkdir()
     (tmp_path / "temporary").mkdir()
-    replace = os.replace
-
-    def replace_outside(source, target):
-        if Path(target).parent == tmp_path / "full":
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        replace(source, target)
-
-    monkeypatch.setattr("os.replace", replace_outside)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
     monkeypatch.chdir(tmp_path)
-    return tmp_path / "full"
-
-
-def write_to_full(name, work, full):
-    """The exit code of the command that writes this file."""
-    write_image(full.parent / "mask.png", np.full((4, 4, 3), 255, np.uint8))
-    (full.parent / "s.toml").write_text('[[edits]]\ndo = "recolor"\ngain = 0.5\n')
-    inputs = {"CLIP": work / "clip.mp4", "MODEL": work / "a" / "b" / "m.safetensors", "OUT": full / name}
-    inputs |= {"MASK": full.parent / "mask.png", "SCRIPT": full.parent / "s.toml"}
-    return run(*(inputs.get(word, word) for word in WRITING[name]))
+    with full_disk(lambda path: path.parent == tmp_path / "full"):
+        yield tmp_path / "full"
 
 
 @pytest.mark.parametrize("name", WRITING)
-def test_a_result_for_a_full_disk_is_kept(name, work, full, capsys):
-    assert write_to_full(name, work, full) == 1
+def test_a_result_for_a_full_disk_is_kept(name, work, full):
+    mask, script = full.parent / "mask.png", full.parent / "s.toml"
+    write_image(mask, np.full((4, 4, 3), 255, np.uint8))
+    script.write_text('[[edits]]\ndo = "recolor"\ngain = 0.5\n')
+    model = work / "a" / "b" / "m.safetensors"
+    inputs = {"CLIP": work / "clip.mp4", "MODEL": model, "MASK": mask, "SCRIPT": script, "OUT": full / name}
+    last = call(*(inputs.get(word, word) for word in WRITING[name]), code=1).err.strip().splitlines()[-1]
     (kept,) = full.parent.glob(f"temporary/*/{name}")
-    last = capsys.readouterr().err.strip().splitlines()[-1]
     assert last.startswith("error: ")
     assert f"It is kept in {kept}" in last
     assert not (full / name).exists()
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["info", "PIPE"],
-        ["view", "PIPE"],
-        ["render", "PIPE"],
-        ["view", "PIPE", "--out", "p.html"],
-        ["uncertainty", "PIPE", "CLIP"],
-        ["evaluate", "MODEL", "PIPE"],
-        ["fit", "PIPE"],
-        ["edit", "MODEL", "PIPE"],
-        ["render", "MODEL", "--plate", "--masks", "PIPE"],
-        ["render", "MODEL", "--sound", "PIPE"],
-        ["import", "PIPE"],
-    ],
-    ids=" ".join,
-)
-def test_a_pipe_is_refused_before_it_is_opened(words, work, model, tmp_path, monkeypatch, capsys):
-    """To open it would wait for a program that writes to it."""
-    pipe, read = tmp_path / "pipe.png", open
-    os.mkfifo(pipe)
-
-    def open_other(path, *arguments, **options):
-        assert str(path) != str(pipe), "opened"
-        return read(path, *arguments, **options)
-
-    monkeypatch.setattr("builtins.open", open_other)
-    monkeypatch.setattr("io.open", open_other)
-    monkeypatch.chdir(tmp_path)
-    inputs = {"PIPE": pipe, "MODEL": model, "CLIP": work / "clip.mp4"}
-    assert run(*(inputs.get(word, word) for word in words)) in (1, 2)
-    assert str(pipe) in capsys.readouterr().err

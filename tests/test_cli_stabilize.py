@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from commands import run
+from commands import call, run
 from soft_models import soft_model
 from tiny_clips import NUM_FRAMES, model_of_12
 
@@ -20,11 +20,10 @@ def model(tmp_path_factory):
     return path
 
 
-def test_a_camera_that_stands_still_stays(model, tmp_path, capsys):
+def test_a_camera_that_stands_still_stays(model, tmp_path):
     """Objects move in this clip, the camera does not."""
     images = tmp_path / "images"
-    assert run("render", model, *STABLE, "--out", images, "--border", "keep", "--speed", "0.5") == 0
-    assert "23 frames" in capsys.readouterr().out
+    call("render", model, *STABLE, "--out", images, "--border", "keep", "--speed", "0.5", out="23 frames")
     frames = read_video(images).frames
     assert frames.shape == (2 * NUM_FRAMES - 1, 40, 64, 3)
     video = stabilize(load_video_model(model), border="keep")
@@ -37,42 +36,53 @@ def test_a_camera_that_stands_still_stays(model, tmp_path, capsys):
     np.testing.assert_array_equal(read_video(images).frames, list(video.frames(times)))
 
 
-def test_options_reach_the_video(model, tmp_path, monkeypatch, capsys):
+def test_options_reach_the_video(model, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert run("render", model, "--stabilize", "fixed", "--border", "fill", "--size", "80x128", "--fps", "12.5") == 0
+    options = ("--stabilize", "fixed", "--border", "fill", "--size", "80x128", "--fps", "12.5")
+    call("render", model, *options, out="12.5 frames per second")
     assert read_video(tmp_path / "m.stable.mp4").frames.shape[1:] == (80, 128, 3)
-    assert "12.5 frames per second" in capsys.readouterr().out
-    assert run("render", model, *STABLE) == 2  # exists
-    assert "exists. Choose another path, or add --overwrite." in capsys.readouterr().err
-    assert run("render", model, *STABLE, "--overwrite", "--smoothing", "0.2") == 0
-    assert "Enlarged by 1.0" in capsys.readouterr().out
-    assert run("render", model, *STABLE, "--overwrite", "--smoothing", "0.001") == 0
-    assert "Enlarged" not in capsys.readouterr().out  # by 1.00
+    call("render", model, *STABLE, code=2, err="exists. Choose another path, or add --overwrite.")
+    call("render", model, *STABLE, "--overwrite", "--smoothing", "0.2", out="Enlarged by 1.0")
+    assert "Enlarged" not in call("render", model, *STABLE, "--overwrite", "--smoothing", "0.001").out  # by 1.00
 
 
-def test_shots_are_named(tmp_path, capsys):
+def test_shots_are_named(tmp_path):
     """Each frame another picture: no motion is known."""
     rng = np.random.default_rng(0)
     frames = rng.integers(0, 256, (3, 40, 64, 3), np.uint8)
     save_video_model(tmp_path / "m.safetensors", fit(frames, FitConfig(num_gaussians=200, steps=20), fps=5.0).model)
-    assert run("render", tmp_path / "m.safetensors", *STABLE, "--out", tmp_path / "images") == 0
-    told = " ".join(capsys.readouterr().err.split())
-    assert "shots, each on its own; they begin at frames 0, " in told
-    assert "The motion of the camera was not found before frames" in told
+    call(
+        "render",
+        tmp_path / "m.safetensors",
+        *STABLE,
+        "--out",
+        tmp_path / "images",
+        err=[
+            "shots, each on its own; they begin at frames 0, ",
+            "The motion of the camera was not found before frames",
+        ],
+    )
 
 
 @pytest.mark.parametrize("stabilized", [False, True])
-def test_repeated_frames_take_less_time(tmp_path, monkeypatch, capsys, stabilized):
+def test_repeated_frames_take_less_time(tmp_path, monkeypatch, stabilized):
     model, images = soft_model(), tmp_path / "images"
     monkeypatch.setattr(arguments, "even_durations", lambda video: np.array([1, 1, 0.25, 1, 1, 1]))
     save_video_model(tmp_path / "m.safetensors", model)
     options = [*STABLE, "--border", "keep"] if stabilized else []
     how = ["--skip-repeats", "--speed", "0.5", "--no-flow", "--out", images, *options]
-    assert run("render", tmp_path / "m.safetensors", *how) == 0
-    assert "Frames that repeat the one before: 3." in capsys.readouterr().out
+    call("render", tmp_path / "m.safetensors", *how, out="Frames that repeat the one before: 3.")
     shown = np.interp(np.arange(13) / 2, [0, 1, 2, 2.25, 3.25, 4.25, 5.25], np.arange(7))
     video = stabilize(model, border="keep") if stabilized else model
     wanted = list(video.frames(times_at(np.asarray(model.frame_times.times()), shown)))
     np.testing.assert_allclose(read_video(images).frames, wanted, atol=1)
-    assert run("render", tmp_path / "m.safetensors", *how, "--overwrite", "--sound", tmp_path / "m.safetensors") == 2
-    assert "--skip-repeats: expected no --sound" in capsys.readouterr().err
+    call(
+        "render",
+        tmp_path / "m.safetensors",
+        *how,
+        "--overwrite",
+        "--sound",
+        tmp_path / "m.safetensors",
+        code=2,
+        err="--skip-repeats: expected no --sound",
+    )

@@ -9,14 +9,13 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 import webbrowser
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from commands import run
+from commands import call, run, running
 from tiny_clips import NUM_FRAMES, write_both
 
 from foldgauss.cli.viewing import page_server
@@ -85,9 +84,7 @@ def test_view_serves_a_page_and_opens_it(served, work):
 @contextmanager
 def serving(**how):
     """A server in a thread, and a function that sends it a request and gives status, body and headers of its answer."""
-    with page_server.PageServer(b"the page", 0, **how) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
+    with running(page_server.PageServer(b"the page", 0, **how)) as server:
 
         def ask(method="GET", path="/", body=None, **headers):
             connection = http.client.HTTPConnection("127.0.0.1", server.server_address[1], timeout=10)
@@ -98,24 +95,22 @@ def serving(**how):
             connection.close()
             return found
 
-        try:
-            yield server, ask
-        finally:
-            server.shutdown()
-            thread.join()
+        yield server, ask
 
 
 def test_the_server_answers_this_machine_about_its_page_only():
     with serving() as (server, ask):
-        port = server.server_address[1]
-        assert ask()[:2] == (200, b"the page")
-        assert ask()[2]["Cache-Control"] == "no-store"
-        assert ask(Host=f"localhost:{port}", path="/?again")[0] == 200
-        assert ask(Host="evil.example")[0] == 403
-        assert ask(path="/etc/passwd")[0] == 404
-        assert ask("POST")[0] == 501
-        assert ask("OPTIONS", "/script")[0] == 501  # no other origin may send the token's header
-        assert ask("PUT", "/script", "x", X_Foldgauss_Token="")[0] == 404  # it saves nothing
+        status, page, headers = ask()
+        assert (status, page, headers["Cache-Control"]) == (200, b"the page", "no-store")
+        for status, request in (
+            (200, {"Host": f"localhost:{server.server_address[1]}", "path": "/?again"}),
+            (403, {"Host": "evil.example"}),
+            (404, {"path": "/etc/passwd"}),
+            (501, {"method": "POST"}),
+            (501, {"method": "OPTIONS", "path": "/script"}),  # no other origin may send the token's header
+            (404, {"method": "PUT", "path": "/script", "body": "x", "X_Foldgauss_Token": ""}),  # it saves nothing
+        ):
+            assert ask(**request)[0] == status, request
 
 
 SCRIPT = '[selections.it]\nindices = "0-3"\n\n[[edits]]\nselect = "it"\ndo = "vanish"\n'
@@ -202,15 +197,14 @@ def test_view_saves_beside_the_model(served, work, tmp_path):
     assert "connect-src" not in html_page(model)
 
 
-def test_without_a_model_the_page_opens_files(tmp_path, capsys):
+def test_without_a_model_the_page_opens_files(tmp_path):
     out = tmp_path / "site" / "index.html"
     assert run("view", "--out", out) == 0
     page = out.read_text(encoding="utf-8")
     assert "default-src 'none'" in page
     assert 'id="model"' not in page
     assert "connect-src" not in page
-    assert run("view", "--out", out) == 2
-    assert "--overwrite" in capsys.readouterr().err
+    call("view", "--out", out, code=2, err="--overwrite")
     assert run("view", "--out", out, "--overwrite") == 0
 
 
@@ -237,13 +231,11 @@ def test_a_signal_ends_it_well(work, number, code):
     assert (process.returncode, last, told) == (code, "Stopped.\n", "")
 
 
-def test_the_page_is_written(work, tmp_path, capsys):
+def test_the_page_is_written(work, tmp_path):
     out = tmp_path / "clip.html"
-    assert run("view", work / "model.safetensors", "--out", out) == 0
-    assert "a page of 0." in capsys.readouterr().out
+    call("view", work / "model.safetensors", "--out", out, out="a page of 0.")
     plain = out.read_text(encoding="utf-8")
-    assert run("view", work / "model.safetensors", "--out", out) == 2
-    assert "--overwrite" in capsys.readouterr().err
+    call("view", work / "model.safetensors", "--out", out, code=2, err="--overwrite")
     original = ["--original", work / "clip", "--original-quality", 10, "--overwrite"]
     assert run("view", work / "model.safetensors", "--out", out, *original) == 0
     assert out.read_text(encoding="utf-8").count('id="frame-') == plain.count('id="frame-') + NUM_FRAMES

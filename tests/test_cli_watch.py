@@ -8,7 +8,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
-from commands import run
+from commands import call, run
 
 from foldgauss.cli.fitting import fit as fitting
 from foldgauss.cli.shared import fit_progress as _progress
@@ -49,16 +49,15 @@ def test_history_and_its_curves(clip, tmp_path):
     assert len(read_history(path)) == 10
 
 
-def test_without_matplotlib_only_the_curves_are_missing(clip, tmp_path, monkeypatch, capsys):
+def test_without_matplotlib_only_the_curves_are_missing(clip, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    assert run("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK, "--history", tmp_path / "h.jsonl") == 0
-    assert "warning: no curves" in (message := capsys.readouterr().err)
-    assert "foldgauss[plot]" in message
+    told, history = ["warning: no curves", "foldgauss[plot]"], tmp_path / "h.jsonl"
+    call("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK, "--history", history, err=told)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["h.jsonl", "m.safetensors"]
 
 
-def test_a_full_disk_ends_the_history_and_not_the_fit(clip, tmp_path, monkeypatch, capsys):
+def test_a_full_disk_ends_the_history_and_not_the_fit(clip, tmp_path, monkeypatch):
     target, write = tmp_path / "m.safetensors", fitting.HistoryFile.__call__
 
     def full(self, state, info):
@@ -67,12 +66,11 @@ def test_a_full_disk_ends_the_history_and_not_the_fit(clip, tmp_path, monkeypatc
         write(self, state, info)
 
     monkeypatch.setattr(fitting.HistoryFile, "__call__", full)
-    assert run("fit", clip, "--out", target, *QUICK, "--history", tmp_path / "h.jsonl") == 0
+    history = ("--history", tmp_path / "h.jsonl")
+    told = call("fit", clip, "--out", target, *QUICK, *history, err="no more history from step 5 on").err
     assert target.exists()
     assert len(read_history(tmp_path / "h.jsonl")) == 4
-    message = capsys.readouterr().err
-    assert message.count("No space left") == 1
-    assert "no more history from step 5 on" in message
+    assert told.count("No space left") == 1
 
 
 def test_preview_is_renewed_and_always_whole(clip, tmp_path, monkeypatch):
@@ -95,20 +93,18 @@ def test_preview_is_renewed_and_always_whole(clip, tmp_path, monkeypatch):
     assert run("fit", clip, "--out", tmp_path / "2.safetensors", *QUICK, "--preview", path) == 2  # it exists
 
 
-def test_quiet_says_nothing(clip, tmp_path, capfd):
-    assert run("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK, "--quiet") == 0
-    assert capfd.readouterr() == ("", "")
-    assert run("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK, "--quiet") == 2
-    assert capfd.readouterr().err.startswith("error: --out")
+def test_quiet_says_nothing(clip, tmp_path):
+    fit = ("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK, "--quiet")
+    assert call(*fit) == ("", "")
+    assert call(*fit, code=2).err.startswith("error: --out")
 
 
-def test_log_json_is_json_line_by_line(clip, tmp_path, monkeypatch, capfd):
+def test_log_json_is_json_line_by_line(clip, tmp_path, monkeypatch):
     monkeypatch.setattr(_progress, "JSON_SECONDS", 0.0)
     target = tmp_path / "m :car: [b].safetensors"
-    assert run("fit", clip, "--out", target, *QUICK, "--log-json") == 0
-    told = capfd.readouterr()
-    assert told.err == ""
-    start, *progress, done = map(json.loads, told.out.splitlines())
+    shown, told = call("fit", clip, "--out", target, *QUICK, "--log-json")
+    start, *progress, done = map(json.loads, shown.splitlines())
+    assert told == ""
     assert (start["event"], start["num_frames"], start["most_gaussians"]) == ("start", 6, 300)
     assert {line["event"] for line in progress} == {"progress"}
     assert [line["step"] for line in progress] == list(range(1, 21))
@@ -119,11 +115,10 @@ def test_log_json_is_json_line_by_line(clip, tmp_path, monkeypatch, capfd):
     assert done["mean_psnr"] > 15
 
 
-def test_json_lines_come_now_and_then_and_at_the_end(clip, tmp_path, monkeypatch, capfd):
+def test_json_lines_come_now_and_then_and_at_the_end(clip, tmp_path, monkeypatch):
     monkeypatch.setattr(_progress, "JSON_SECONDS", 1e9)
-    assert run("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK, "--log-json") == 0
-    lines = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
-    assert [line.get("step") for line in lines] == [None, 1, 20, None]
+    shown = call("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK, "--log-json").out
+    assert [json.loads(line).get("step") for line in shown.splitlines()] == [None, 1, 20, None]
 
 
 def test_lines_in_a_log(clip, tmp_path, monkeypatch, capfd):
@@ -141,13 +136,20 @@ def test_lines_in_a_log(clip, tmp_path, monkeypatch, capfd):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_fit_stops_at_once_before_its_first_step(number, clip, tmp_path, monkeypatch, capsys):
+def test_a_fit_stops_at_once_before_its_first_step(number, clip, tmp_path, monkeypatch):
     def starting(*given):
         signal.raise_signal(number)
         raise AssertionError("went on")
         yield
 
     monkeypatch.setattr(runner, "fit_steps", starting)
-    assert run("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK) == 1
-    assert f"stopped by {number.name} before the first step" in capsys.readouterr().err
+    call(
+        "fit",
+        clip,
+        "--out",
+        tmp_path / "m.safetensors",
+        *QUICK,
+        code=1,
+        err=f"stopped by {number.name} before the first step",
+    )
     assert list(tmp_path.glob("m.*")) == []

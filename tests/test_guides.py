@@ -55,45 +55,21 @@ def test_page_runs(page, tmp_path, monkeypatch):
     if "matplotlib" in NEEDS.get(page, ()):
         pytest.importorskip("matplotlib").use("Agg")
     names = guides.run_page(page, tmp_path, monkeypatch)
-    CHECKS.get(page, lambda names, folder: None)(names, tmp_path)
+    names |= {"files": {path.name: path for path in tmp_path.iterdir()}, "np": np, "guides": guides}
+    names |= {"evaluate": evaluate, "load_video_model": load_video_model, "EditedVideo": EditedVideo}
+    for fact in FACTS.get(page, ()):
+        assert eval(fact, names), fact
+    if page == "docs/editing.md":
+        check_edits(names, tmp_path)
 
 
 def test_every_check_has_its_page():
-    for known in (NEEDS, SLOW, CHECKS, guides.GIVEN):
+    for known in (NEEDS, SLOW, FACTS, guides.GIVEN):
         assert known <= set(guides.PAGES) if isinstance(known, set) else known.keys() <= set(guides.PAGES)
 
 
-# Expected results of the programs.
-
-
-def _readme(names, folder):
-    assert names["x"].shape == (1000, 3)
-    assert names["picture"].shape == (*guides.SIZE, 3)
-    assert isinstance(names["more"], EditedVideo)
-    assert len(names["rider"]) > 0
-    made = {"holiday.safetensors", "slow.mp4", "times", "holiday.fgz", "trade", "more.mp4", "foldgauss-demo"}
-    assert made <= {path.name for path in folder.iterdir()}
-    assert names["posterior"].mean().shape == (guides.NUM_FRAMES,)
-
-
-def _commands(names, folder):
-    made = {"middle.png", "figures.json", "trip.html"}
-    assert made <= {path.name for path in folder.iterdir()}
-
-
-def _concepts(names, folder):
-    np.testing.assert_allclose(names["at"].mean, [0.1 + 3 * 0.0625 - 9 * 0.25**3], rtol=1e-5)
-
-
-def _distribution(names, folder):
-    assert int(np.argmin([result.bic for result in names["fits"]])) == 2
-    assert names["kl_divergence"](names["dist"], names["dist"]) == 0
-
-
-def _editing(names, folder):
-    assert len(names["ball"]) > 5
-    assert names["gone"].num_gaussians == names["model"].num_gaussians - len(names["ball"])
-    assert names["picture"].shape == (48, 80, 3)
+def check_edits(names, folder):
+    """The edits of docs/editing.md are seen, and its scripts can be applied to its model."""
     for video in ("night", "jump", "there_and_back", "still", "stacked", "popped", "orbit", "waving", "grown", "again"):
         picture = names[video].render(0.4)
         assert np.isfinite(picture).all()
@@ -114,163 +90,131 @@ def _editing(names, folder):
     assert np.abs(on_plate.render(0.4) - load_video_model(folder / "plate.safetensors").render(0.4)).max() > 0.02
 
 
-def _estimator(names, folder):
-    assert names["mixture"].converged_
-    assert names["mixture"].score(names["x"]) > 0.5
-    np.testing.assert_array_equal(np.concatenate(names["labels"]), names["mixture"].predict(names["x"]))
-    assert names["regressor"].score(names["times"], names["heights"]) > 0.85
-    assert ((names["low"] < names["heights"]) & (names["heights"] < names["high"])).mean() > 0.85
-
-
-def _fit(names, folder):
-    assert names["picture"].shape == (90, 160, 3)
-    assert names["small"].num_frames == 24
-    assert names["bear"].masks.shape == (4, 480, 480)
-    assert load_video_model(folder / "trip.safetensors").degree == 5
-
-
-def _format(names, folder):
-    assert {path.name for path in folder.iterdir()} == {"holiday.fgz", "holiday.mp4", "holiday.safetensors"}
-
-
-def _formats(names, folder):
-    np.testing.assert_allclose(names["again"].splats.loc, names["model"].splats.loc, atol=1e-6)
-    np.testing.assert_array_equal(names["loaded"].splats.coefficients, names["model"].splats.coefficients)
-    assert len(names["gaussians"].mean) > 10
-    assert names["vertices"].shape[1:] == (3, 3)
-    made = {"edited.webm", "frames", "loop.gif", "mesh", "middle.ply", "pictures", "video.ply", "waves.safetensors"}
-    made |= {"scenes", "theirs.safetensors", "holiday.safetensors", "point_cloud.ply"}
-    assert {path.name for path in folder.iterdir()} == made
-
-
-def _mixture(names, folder):
-    assert names["x"].shape == (1000, 3)
-    assert names["curve"].shape == (50, 2)
-    np.testing.assert_allclose(names["same"].weights, names["mixture"].weights, rtol=1e-5)
-    mass = names["image"].sum() / names["pixels_per_unit"]((90, 160)) ** 2
-    np.testing.assert_allclose(mass, names["mixture"].marginal([-1]).pdf(np.float32([0.5])), rtol=1e-2)
-    assert (names["choice"].estimator.n_components, names["choice"].estimator.degree) == (2, 2)
-    np.testing.assert_allclose(names["mcmc"].get_samples()["weights"].mean(0), [0.3, 0.7], atol=0.06)
-
-
-def _quickstart(names, folder):
-    made = {"foldgauss-demo", "holiday.fgz", "slow.mp4", "short.safetensors"}
-    assert made <= {path.name for path in folder.iterdir()}
-    assert names["picture"].shape == (*guides.SIZE, 3)
-
-
-def _rendering(names, folder):
-    image, target = names["image"], names["target"]
-    assert image.shape == (90, 160, 3)
-    assert names["features"].shape == (90, 160, 7)
-    # Equal but for a splat at the very cutoff, and the perspective's own rounding.
-    np.testing.assert_allclose(names["exact"], image, atol=1 / 255)
-    np.testing.assert_allclose(names["pair"][0], image, atol=1e-6)
-    np.testing.assert_allclose(names["same"], image, atol=0.02)
-    np.testing.assert_allclose(names["mirrored"], names["same"][:, ::-1], atol=1e-3)
-    np.testing.assert_allclose(names["trace"].image, np.moveaxis(image, -1, 0), atol=1e-6)
-    np.testing.assert_allclose(1 - names["trace"].transmittance, names["alpha"], atol=1e-6)
-    assert np.mean((names["better"] - target) ** 2) < 0.5 * np.mean((image - target) ** 2)
-    np.testing.assert_allclose(names["white"], np.asarray(image) + 1 - np.asarray(names["alpha"])[..., None], atol=1e-6)
-    np.testing.assert_allclose(names["camera"].intrinsics((90, 160)), names["K"], rtol=1e-5)
-    seen = np.asarray(names["opaque"]) > 0.1
-    assert 1 < np.asarray(names["depth"])[seen].min() < 4 < np.asarray(names["depth"])[seen].max() < 7
-    for other in ("added", "sharp", "soft", "aside", "from_above"):
-        assert np.isfinite(names[other]).all()
-        assert np.abs(names[other] - image).max() > 0.05
-
-
-def _slow_motion(names, folder):
-    assert len(names["slow"]) == 4 * (guides.NUM_FRAMES - 1) + 1
-    assert len(names["large"]) == 2 * guides.NUM_FRAMES - 1
-    assert names["large"][0].shape == (96, 160, 3)
-
-
-def _player(names, folder):
-    assert "<title>Waves</title>" in names["page"]
-    assert (folder / "waves.html").read_text(encoding="utf-8").count('id="frame-') == len(names["clip"])
-
-
-def _uncertainty(names, folder):
-    assert (folder / "chains.h5").exists()
-    assert names["posterior"].converged
-    assert [(one.frames, one.kind) for one in names["found"]] == [((4, 5), "duplicated"), ((11, 12), "dropped")]
-    assert names["some"].free.tolist() == [4, 5, 6]
-    assert names["row"].name == "even"
-
-
-def _compress(names, folder):
-    assert names["made"].model.num_gaussians == names["made"].quantized.num_gaussians
-    sizes = {path.name: path.stat().st_size for path in folder.iterdir()}
-    assert sizes["holiday.fgz"] < sizes["holiday.safetensors"]
-
-
-def _extending(names, folder):
-    assert np.abs(names["gradient"].fold.parameters.layers[0].weight).max() > 0
-    assert np.isfinite(names["jump"].log_prob(names["x"])).all()
-    assert names["wide"] > 2 * names["narrow"]
-    assert names["frame"].shape == (48, 80, 3)
-    assert np.abs(names["slope"].fold.sine).max() > 0
-    assert names["left_error"](names["better"]) < 0.8 * names["left_error"](names["model"])
-    before = names["model"].render(0.8)
-    for video in ("swirled", "later"):
-        assert np.abs(names[video].render(0.8) - before).max() > 0.02
-    np.testing.assert_allclose(names["later"].render(0.0), names["model"].render(0.0), atol=1e-5)
-
-
-def _results(names, folder):
-    assert (folder / "trade" / "tradeoff.png").exists()
-    assert (folder / "few" / "tradeoff.json").exists()
-
-
-def _scale(names, folder):
-    assert names["joined"].mean_psnr > 15
-    assert names["spans"] == [(0, 12), (9, 20)]
-    assert names["part"].num_frames == 11
-    made = {"slow.mp4", "waves-ply", "second.safetensors", "second.fgz", "long.safetensors"}
-    assert made <= {path.name for path in folder.iterdir()}
-    first = names["video"].segments[0].num_gaussians
-    assert all(part.any() for part in np.split(names["left"].selection.mask, [first]))
-    assert np.abs(names["darker"].render(0.5) - names["video"].render(0.5)).max() > 0.1
-
-
-def _tutorial_points(names, folder):
-    assert names["best"] == 2
-    assert names["mixture"].score(names["points"]) > 0.5
-    assert names["curve"].shape == (50, 1)
-
-
-def _tutorial_video(names, folder):
-    assert evaluate(names["model"], names["frames"]).mean_psnr > 25
-    ball, model = names["ball"], names["model"]
-    assert 5 < len(ball) < model.num_gaussians / 2
-    assert names["gone"].num_gaussians == model.num_gaussians - len(ball)
-    assert {"copies.safetensors", "copies.mp4", "ball.html"} <= {path.name for path in folder.iterdir()}
-    assert load_video_model(folder / "copies.safetensors").num_gaussians > model.num_gaussians
-
-
-CHECKS = {
-    "README.md": _readme,
-    "docs/commands.md": _commands,
-    "docs/compress.md": _compress,
-    "docs/concepts.md": _concepts,
-    "docs/distribution.md": _distribution,
-    "docs/editing.md": _editing,
-    "docs/estimator.md": _estimator,
-    "docs/extending.md": _extending,
-    "docs/fit.md": _fit,
-    "docs/format.md": _format,
-    "docs/formats.md": _formats,
-    "docs/mixture.md": _mixture,
-    "docs/player.md": _player,
-    "docs/quickstart.md": _quickstart,
-    "docs/rendering.md": _rendering,
-    "docs/results.md": _results,
-    "docs/scale.md": _scale,
-    "docs/slow-motion.md": _slow_motion,
-    "docs/tutorial-points.md": _tutorial_points,
-    "docs/tutorial-video.md": _tutorial_video,
-    "docs/uncertainty.md": _uncertainty,
+#: What holds when the programs of a page have run: expressions of the names that they leave and of `files`, the paths
+#: in their folder by name.
+FACTS = {
+    "README.md": [
+        "x.shape == (1000, 3)",
+        "picture.shape == (*guides.SIZE, 3)",
+        "isinstance(more, EditedVideo)",
+        "len(rider) > 0",
+        "{'steady.safetensors', 'slow.mp4', 'times', 'holiday.fgz'} <= {*files}",
+        "{'trade', 'more.mp4', 'foldgauss-demo'} <= {*files}",
+        "posterior.mean().shape == (guides.NUM_FRAMES,)",
+    ],
+    "docs/commands.md": ["{'middle.png', 'figures.json', 'trip.html'} <= {*files}"],
+    "docs/compress.md": [
+        "made.model.num_gaussians == made.quantized.num_gaussians",
+        "files['holiday.fgz'].stat().st_size < files['holiday.safetensors'].stat().st_size",
+    ],
+    "docs/concepts.md": ["np.allclose(at.mean, [0.1 + 3 * 0.0625 - 9 * 0.25**3], rtol=1e-5, atol=0)"],
+    "docs/distribution.md": [
+        "np.argmin([result.bic for result in fits]) == 2",
+        "kl_divergence(dist, dist) == 0",
+    ],
+    "docs/editing.md": [
+        "len(ball) > 5",
+        "gone.num_gaussians == model.num_gaussians - len(ball)",
+        "picture.shape == (48, 80, 3)",
+    ],
+    "docs/estimator.md": [
+        "mixture.converged_",
+        "mixture.score(x) > 0.5",
+        "np.array_equal(np.concatenate(labels), mixture.predict(x))",
+        "regressor.score(times, heights) > 0.85",
+        "((low < heights) & (heights < high)).mean() > 0.85",
+    ],
+    "docs/extending.md": [
+        "abs(gradient.fold.parameters.layers[0].weight).max() > 0",
+        "np.isfinite(jump.log_prob(x)).all()",
+        "wide > 2 * narrow",
+        "frame.shape == (48, 80, 3)",
+        "abs(slope.fold.sine).max() > 0",
+        "left_error(better) < 0.8 * left_error(model)",
+        "all(abs(video.render(0.8) - model.render(0.8)).max() > 0.02 for video in (swirled, later))",
+        "np.allclose(later.render(0.0), model.render(0.0), rtol=0, atol=1e-5)",
+    ],
+    "docs/fit.md": [
+        "picture.shape == (90, 160, 3)",
+        "small.num_frames == 24",
+        "bear.masks.shape == (4, 480, 480)",
+        "load_video_model(files['trip.safetensors']).degree == 5",
+    ],
+    "docs/format.md": ["{*files} == {'holiday.fgz', 'holiday.mp4', 'holiday.safetensors'}"],
+    "docs/formats.md": [
+        "np.allclose(again.splats.loc, model.splats.loc, rtol=0, atol=1e-6)",
+        "np.array_equal(loaded.splats.coefficients, model.splats.coefficients)",
+        "len(gaussians.mean) > 10",
+        "vertices.shape[1:] == (3, 3)",
+        "{*files} == {'edited.webm', 'frames', 'loop.gif', 'mesh', 'middle.ply', 'pictures', 'video.ply', 'scenes',"
+        " 'waves.safetensors', 'theirs.safetensors', 'holiday.safetensors', 'point_cloud.ply'}",
+    ],
+    "docs/mixture.md": [
+        "x.shape == (1000, 3)",
+        "curve.shape == (50, 2)",
+        "np.allclose(same.weights, mixture.weights, rtol=1e-5, atol=0)",
+        "np.allclose(image.sum() / pixels_per_unit((90, 160)) ** 2, mixture.marginal([-1]).pdf(np.float32([0.5])),"
+        " rtol=1e-2, atol=0)",
+        "(best.n_components, best.degree) == (2, 2)",
+        "np.allclose(mcmc.get_samples()['weights'].mean(0), [0.3, 0.7], rtol=0, atol=0.06)",
+    ],
+    "docs/player.md": [
+        "'<title>Waves</title>' in page",
+        "files['waves.html'].read_text(encoding='utf-8').count('id=\"frame-') == len(clip)",
+    ],
+    "docs/quickstart.md": [
+        "{'foldgauss-demo', 'holiday.fgz', 'slow.mp4', 'short.safetensors'} <= {*files}",
+        "picture.shape == (*guides.SIZE, 3)",
+    ],
+    "docs/rendering.md": [
+        "image.shape == (90, 160, 3)",
+        "features.shape == (90, 160, 7)",
+        # Equal but for a splat at the very cutoff, and the perspective's own rounding.
+        "np.allclose(exact, image, rtol=0, atol=1 / 255)",
+        "np.allclose(pair[0], image, rtol=0, atol=1e-6)",
+        "np.allclose(same, image, rtol=0, atol=0.02)",
+        "np.allclose(mirrored, same[:, ::-1], rtol=0, atol=1e-3)",
+        "np.allclose(trace.image, np.moveaxis(image, -1, 0), rtol=0, atol=1e-6)",
+        "np.allclose(1 - trace.transmittance, alpha, rtol=0, atol=1e-6)",
+        "np.mean((better - target) ** 2) < 0.5 * np.mean((image - target) ** 2)",
+        "np.allclose(white, np.asarray(image) + 1 - np.asarray(alpha)[..., None], rtol=0, atol=1e-6)",
+        "np.allclose(camera.intrinsics((90, 160)), K, rtol=1e-5, atol=0)",
+        "1 < depth[opaque > 0.1].min() < 4 < depth[opaque > 0.1].max() < 7",
+        "all(np.isfinite(other).all() for other in (added, sharp, soft, aside, from_above))",
+        "all(abs(other - image).max() > 0.05 for other in (added, sharp, soft, aside, from_above))",
+    ],
+    "docs/results.md": [
+        "files['trade'].joinpath('tradeoff.png').exists()",
+        "files['few'].joinpath('tradeoff.json').exists()",
+    ],
+    "docs/scale.md": [
+        "joined.mean_psnr > 15",
+        "spans == [(0, 12), (9, 20)]",
+        "part.num_frames == 11",
+        "{'slow.mp4', 'waves-ply', 'second.safetensors', 'second.fgz', 'long.safetensors'} <= {*files}",
+        "all(own.any() for own in np.split(left.selection.mask, [video.segments[0].num_gaussians]))",
+        "abs(darker.render(0.5) - video.render(0.5)).max() > 0.1",
+    ],
+    "docs/slow-motion.md": [
+        "len(slow) == 4 * (guides.NUM_FRAMES - 1) + 1",
+        "len(large) == 2 * guides.NUM_FRAMES - 1",
+        "large[0].shape == (96, 160, 3)",
+    ],
+    "docs/tutorial-points.md": ["best == 2", "mixture.score(points) > 0.5", "curve.shape == (50, 1)"],
+    "docs/tutorial-video.md": [
+        "evaluate(model, frames).mean_psnr > 25",
+        "5 < len(ball) < model.num_gaussians / 2",
+        "gone.num_gaussians == model.num_gaussians - len(ball)",
+        "{'copies.safetensors', 'copies.mp4', 'ball.html'} <= {*files}",
+        "load_video_model(files['copies.safetensors']).num_gaussians > model.num_gaussians",
+    ],
+    "docs/uncertainty.md": [
+        "'chains.h5' in files",
+        "posterior.converged",
+        "[(one.frames, one.kind) for one in found] == [((4, 5), 'duplicated'), ((11, 12), 'dropped')]",
+        "some.free.tolist() == [4, 5, 6]",
+        "row.name == 'even'",
+    ],
 }
 
 

@@ -1,6 +1,5 @@
 """Speed against accuracy: fronts, knees, plans, and `foldgauss tradeoff` as a user meets it."""
 
-import errno
 import json
 import math
 import os
@@ -13,7 +12,7 @@ from unittest.mock import Mock
 import cv2
 import numpy as np
 import pytest
-from commands import run
+from commands import call, full_disk, run
 
 from foldgauss.analysis.plot import Panel, plot_tradeoff
 from foldgauss.cli.measuring import tradeoff as command
@@ -210,24 +209,15 @@ def test_commands_reproduce_their_points(done, tmp_path, monkeypatch):
         assert psnr == pytest.approx(rows[name]["psnr"], abs=0.01), name
 
 
-def test_a_table_without_room_leaves_the_fits(clip, tmp_path, capsys, monkeypatch):
-    target, replace = tmp_path / "results", os.replace
-
-    def replace_until_full(source, place):
-        if Path(place) == target / "tradeoff.png":
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        replace(source, place)
-
-    arguments = ["tradeoff", clip, "--out", target, "--axes", "compositing", *QUICK]
-    with monkeypatch.context() as full:
-        full.setattr("os.replace", replace_until_full)
-        assert run(*arguments) == 1
-    assert "No space left" in " ".join(capsys.readouterr().err.split())
+def test_a_table_without_room_leaves_the_fits(clip, tmp_path, monkeypatch):
+    arguments = ["tradeoff", clip, "--out", tmp_path / "results", "--axes", "compositing", *QUICK]
+    with full_disk(lambda path: path == tmp_path / "results" / "tradeoff.png"):
+        call(*arguments, code=1, err="No space left")
     monkeypatch.delattr(runner, "fit_steps")
     assert run(*arguments) == 0
 
 
-def test_stopped_by_hand(clip, tmp_path, capsys, monkeypatch):
+def test_stopped_by_hand(clip, tmp_path, monkeypatch):
     steps = runner.fit_steps
 
     def stopping(frames, config, state=None):
@@ -238,15 +228,22 @@ def test_stopped_by_hand(clip, tmp_path, capsys, monkeypatch):
 
     target = tmp_path / "results"
     monkeypatch.setattr(runner, "fit_steps", stopping)
-    assert run("tradeoff", clip, "--out", target, "--axes", "time", *QUICK) == 1
-    told = " ".join(capsys.readouterr().err.split())
-    assert "stopped by SIGINT; 1 of 4 points are done" in told
-    assert "Run the same command again to continue." in told
+    call(
+        "tradeoff",
+        clip,
+        "--out",
+        target,
+        "--axes",
+        "time",
+        *QUICK,
+        code=1,
+        err=["stopped by SIGINT; 1 of 4 points are done", "Run the same command again to continue."],
+    )
     assert record_of(target)["points"] == []
 
 
-def test_a_point_that_fails_is_left_out(clip, tmp_path, capsys, monkeypatch):
-    steps = runner.fit_steps
+def test_a_point_that_fails_is_left_out(clip, tmp_path, monkeypatch):
+    steps, arguments = runner.fit_steps, ["tradeoff", clip, "--out", tmp_path / "r", "--axes", "quality", *QUICK]
 
     def failing(frames, config, state):
         if config.quality is not None:
@@ -255,38 +252,35 @@ def test_a_point_that_fails_is_left_out(clip, tmp_path, capsys, monkeypatch):
 
     with monkeypatch.context() as broken:
         broken.setattr(runner, "fit_steps", failing)
-        assert run("tradeoff", clip, "--out", tmp_path / "r", "--axes", "quality", *QUICK) == 0
-    assert "quality 30 is left out: FitDiverged: the loss is NaN" in " ".join(capsys.readouterr().err.split())
+        call(*arguments, err="quality 30 is left out: FitDiverged: the loss is NaN")
     record = record_of(tmp_path / "r")
     assert [name_of(row) for row in record["points"]] == ["base"]
     assert set(record["left_out"]) == {f"quality {quality}" for quality in (30, 50, 70, 90)}
-    assert run("tradeoff", clip, "--out", tmp_path / "r", "--axes", "quality", *QUICK) == 0  # tried again
+    assert run(*arguments) == 0  # tried again
     assert len(record_of(tmp_path / "r")["points"]) == 5
     assert record_of(tmp_path / "r")["left_out"] == {}
 
 
 @pytest.mark.parametrize(
-    ("minutes", "steps", "told"),
+    ("minutes", "steps", "out", "err"),
     [
-        (1e-3, LEAST_STEPS, "warning: --minutes: 0.001 are too few for 5 points"),
-        (1.0, 1000, "about 1.0 minutes"),
-        (60.0, 3000, "5 points around a base of 3,000 steps"),
+        (1e-3, LEAST_STEPS, (), "warning: --minutes: 0.001 are too few for 5 points"),
+        (1.0, 1000, "about 1.0 minutes", ()),
+        (60.0, 3000, "5 points around a base of 3,000 steps", ()),
     ],
 )
-def test_minutes_become_steps(clip, tmp_path, capsys, monkeypatch, minutes, steps, told):
+def test_minutes_become_steps(clip, tmp_path, monkeypatch, minutes, steps, out, err):
     """At a pace with which all fits take a minute if the base has 1,000 steps."""
     work = 1 + sum(turn.work for axis in ("time", "compositing") for turn in AXES[axis])
     pace = Throughput(start=0.0, step=60 / command.MARGIN / (work * 1000.001), evaluation=0.0)
     monkeypatch.setattr(command, "_measure_throughput", lambda clip, config: pace)
     monkeypatch.setattr(command, "run_jobs", Mock(side_effect=OSError("no fits here")))
     arguments = ["--axes", "time,compositing", "--minutes", minutes]
-    assert run("tradeoff", clip, "--out", tmp_path / "r", *arguments) == 1
-    shown = " ".join("".join(capsys.readouterr()).split())
-    assert told in shown
+    call("tradeoff", clip, "--out", tmp_path / "r", *arguments, code=1, out=out, err=err)
     assert record_of(tmp_path / "r")["plan"]["steps"] == steps
 
 
-def test_other_settings_are_refused(done, clip, tmp_path, capsys):
+def test_other_settings_are_refused(done, clip, tmp_path):
     before = {path: path.read_bytes() for path in done.rglob("*.*")}
     for options, told in (
         (["--frames", "1:6", "--steps", "13"], "steps was 12, is 13"),
@@ -294,71 +288,57 @@ def test_other_settings_are_refused(done, clip, tmp_path, capsys):
         (QUICK, "num_frames was 5, is 6"),
         (["--frames", "1:6", *QUICK, "--axes", "time"], "axes was"),
     ):
-        assert run("tradeoff", clip, "--out", done, *options) == 2
-        shown = " ".join(capsys.readouterr().err.split())
-        assert told in shown
-        assert "--overwrite" in shown
+        call("tradeoff", clip, "--out", done, *options, code=2, err=[told, "--overwrite"])
     assert {path: path.read_bytes() for path in done.rglob("*.*")} == before
     # With it they are replaced; what is no result is not.
     target = tmp_path / "r"
     target.mkdir()
     (target / "tradeoff.json").write_text('{"points": [{"axis": "base"}], "settings": {}}')
-    assert run("tradeoff", clip, "--out", target, "--axes", "time", *QUICK) == 2
-    assert "got something else" in " ".join(capsys.readouterr().err.split())
+    call("tradeoff", clip, "--out", target, "--axes", "time", *QUICK, code=2, err="got something else")
     assert run("tradeoff", clip, "--out", target, "--axes", "compositing", *QUICK, "--overwrite") == 0
     assert len(record_of(target)["points"]) == 2
     (target / "mine.txt").write_text("mine")
-    assert run("tradeoff", clip, "--out", target, "--axes", "compositing", *QUICK, "--overwrite") == 2
-    assert "'mine.txt' in it" in " ".join(capsys.readouterr().err.split())
+    call(
+        "tradeoff",
+        clip,
+        "--out",
+        target,
+        "--axes",
+        "compositing",
+        *QUICK,
+        "--overwrite",
+        code=2,
+        err="'mine.txt' in it",
+    )
 
 
-def test_a_record_that_was_edited_is_refused(done, clip, tmp_path, capsys):
+def test_a_record_that_was_edited_is_refused(done, clip, tmp_path):
     (tmp_path / "tradeoff.json").write_text(json.dumps(record_of(done) | {"plan": 3}))
     before = (tmp_path / "tradeoff.json").read_bytes()
-    assert run("tradeoff", clip, "--out", tmp_path, "--frames", "1:6", *QUICK) == 2
-    shown = " ".join(capsys.readouterr().err.split())
-    assert "--out: expected results of `foldgauss tradeoff` in" in shown
-    assert "not iterable" in shown
+    call(
+        "tradeoff",
+        clip,
+        "--out",
+        tmp_path,
+        "--frames",
+        "1:6",
+        *QUICK,
+        code=2,
+        err=["--out: expected results of `foldgauss tradeoff` in", "not iterable"],
+    )
     assert (tmp_path / "tradeoff.json").read_bytes() == before
 
 
-@pytest.mark.parametrize("name", ["models", "tradeoff.png"])
-def test_files_of_these_names_are_none_of_its_own_without_a_record(clip, tmp_path, capsys, monkeypatch, name):
-    monkeypatch.setattr(command, "read_video", None)  # before any work
-    (tmp_path / name).write_text("mine")
-    assert run("tradeoff", clip, "--out", tmp_path, *QUICK) == 2
-    told = " ".join(capsys.readouterr().err.split())
-    assert f"with {name!r} in it, but no tradeoff.json of a tradeoff. Choose another folder, or start over" in told
-    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
-    assert run("tradeoff", clip, "--out", tmp_path, *QUICK, "--overwrite") == 1
-    assert "NoneType" in capsys.readouterr().err
-
-
-def test_without_matplotlib_only_the_plot_is_missing(done, clip, capsys, monkeypatch, tmp_path):
+def test_without_matplotlib_only_the_plot_is_missing(done, clip, monkeypatch, tmp_path):
     for name in ("matplotlib", "matplotlib.figure"):
         monkeypatch.setitem(sys.modules, name, None)
     target = tmp_path / "r"
-    assert run("tradeoff", clip, "--out", target, "--axes", "compositing", *QUICK) == 0
-    assert "no plot" in (shown := capsys.readouterr().err)
-    assert "foldgauss[plot]" in shown
+    told = ["no plot", "foldgauss[plot]"]
+    call("tradeoff", clip, "--out", target, "--axes", "compositing", *QUICK, err=told)
     assert sorted(path.name for path in target.iterdir()) == ["models", "tradeoff.json"]
 
 
 # --------------------------------------------------------------------------------------- options of the others
-
-
-def test_options_of_fit_reach_the_fit(clip, tmp_path, monkeypatch):
-    seen, steps = [], runner.fit_steps
-    monkeypatch.setattr(runner, "fit_steps", lambda frames, config, state: seen.append(config) or steps(frames, config))
-    options = ["--ssim-fraction", 0.3, "--error-fraction", 0.1]
-    options += ["--alpha-cutoff", 0.01, "--support-radius", 2, "--transmittance-stop", 0.02]
-    target = tmp_path / "m.safetensors"
-    assert run("fit", clip, "--out", target, "--gaussians", 50, "--steps", 2, *options, "--quiet") == 0
-    (config,) = seen
-    assert (config.loss.ssim_fraction, config.views.error_fraction) == (0.3, 0.1)
-    options = load_video_model(target).options
-    assert (options.alpha_cutoff, options.support_radius, options.transmittance_stop) == (0.01, 2.0, 0.02)
-    assert options.low_pass == FitConfig().options.low_pass
 
 
 def test_render_with_other_constants(done, tmp_path):

@@ -1,9 +1,10 @@
-"""A small model and a clip of it, one frame of which is shown twice: for what is said of frame times."""
+"""A small model and a clip of it, one frame of which is shown twice, for what is said of frame times; and masks."""
 
 import numpy as np
+from PIL import Image
 from soft_models import soft_model
 
-from foldgauss.io import save_video_model, write_image
+from foldgauss.io import save_video_model, write_frames
 from foldgauss.video import FrameTimes, VideoModel
 
 NUM_FRAMES, TWICE = 12, 6
@@ -28,6 +29,27 @@ def write_both(folder, **options) -> None:
     """`model.safetensors` and the images `clip/` in `folder`."""
     model = model_of_12()
     save_video_model(folder / "model.safetensors", model)
-    (folder / "clip").mkdir()
-    for k, frame in enumerate(clip_of(model, **options)):
-        write_image(folder / "clip" / f"{k:02}.png", frame)
+    write_frames(folder / "clip", clip_of(model, **options))
+
+
+MASK_SIZE = (40, 60)
+#: DAVIS' own first colors: an OpenCV reader sees 128s where the labels are 1 and 2.
+PALETTE = [0, 0, 0, 128, 0, 0, 0, 128, 0, 128, 128, 0]
+
+
+def labels(k):
+    """A mask: object 1 walks to the right, object 2 stands, a corner is void."""
+    mask = np.zeros(MASK_SIZE, np.uint8)
+    mask[10:20, 10 + k : 20 + k] = 1
+    mask[25:35, 40:50] = 2
+    mask[:2, :2] = 255
+    return mask
+
+
+def write_mask(path, mask, palette=PALETTE):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image = Image.fromarray(mask)
+    if palette is not None:
+        image = image.convert("L")
+        image.putpalette(palette + [0, 0, 0] * (256 - len(palette) // 3))
+    image.save(path)

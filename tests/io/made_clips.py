@@ -2,10 +2,12 @@
 
 import functools
 import io
+import math
 import shutil
 import struct
 import subprocess
 from collections.abc import Callable
+from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from typing import NamedTuple
@@ -59,9 +61,13 @@ def premultiplied(frames):
 # ------------------------------------------------------------------------------------------------ writers
 
 
+def bgr(frame):
+    """An image as OpenCV has it."""
+    return frame if frame.ndim == 2 else frame[..., [2, 1, 0, 3][: frame.shape[-1]]]
+
+
 def png(frame):
-    order = [2, 1, 0, 3][: frame.shape[-1]] if frame.ndim == 3 else ...
-    return cv2.imencode(".png", frame[..., order])[1].tobytes()
+    return cv2.imencode(".png", bgr(frame))[1].tobytes()
 
 
 def avi(packets, height, width, *, num=None, fourcc=b"MPNG"):
@@ -108,8 +114,11 @@ def with_box(data, name, change):
     return made
 
 
-def encode(path, frames, codec, pixel_format, *, given=None, times=None, context=None, rate=10, **options):
-    """Encode by PyAV. `given`: the format of `frames`; `times`: in units of a frame; `context`: of the codec."""
+def encode(path, frames, codec, pixel_format, *, given=None, times=None, context=None, rate=10, sound=None, **options):
+    """Encode by PyAV. `given`: the format of `frames`; `times`: in units of a frame; `context`: of the codec.
+
+    `sound`: a codec, samples in [-1, 1] of one channel, 48,000 a second, and the second of the first of them.
+    """
     with av.open(path if isinstance(path, io.BytesIO) else str(path), "w", format=options.pop("format", None)) as out:
         stream = out.add_stream(codec, rate=rate, **options)
         stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], pixel_format
@@ -117,13 +126,27 @@ def encode(path, frames, codec, pixel_format, *, given=None, times=None, context
             setattr(stream.codec_context, name, value)
         if codec == "libsvtav1":
             open_with_own_priority(stream.codec_context)
+        heard = sound and out.add_stream(sound[0], rate=SOUND_RATE, layout="mono")
         for number, image in enumerate(frames):
             frame = av.VideoFrame.from_ndarray(image, format=given or pixel_format)
             if times is not None:
                 frame.pts, frame.time_base = int(times[number]), Fraction(1, rate)
             out.mux(stream.encode(frame))
         out.mux(stream.encode())
+        if sound:
+            mux_sound(out, heard, *sound[1:])
     return path
+
+
+SOUND_RATE = 48_000
+
+
+def mux_sound(container, stream, samples, start=0.0):
+    """Encode one channel of samples, in as many as the stream has."""
+    channels = np.float32(samples)[None].repeat(stream.channels, 0)
+    frame = av.AudioFrame.from_ndarray(channels, format="fltp", layout=stream.layout.name)
+    frame.sample_rate, frame.pts = stream.rate, round(stream.rate * start)
+    container.mux([*stream.encode(frame), *stream.encode()])
 
 
 @functools.cache
@@ -231,8 +254,7 @@ def images(folder, frames, suffix=".png"):
     """A folder of images by OpenCV."""
     folder.mkdir(exist_ok=True)
     for number, frame in enumerate(frames):
-        order = [2, 1, 0, 3][: frame.shape[-1]]
-        assert cv2.imwrite(str(folder / f"{number}{suffix}"), frame[..., order])
+        assert cv2.imwrite(str(folder / f"{number}{suffix}"), bgr(frame))
     return folder
 
 
@@ -245,9 +267,9 @@ class Made(NamedTuple):
     write: Callable[[Path], Path]
     frames: np.ndarray | None
     facts: dict
-    #: Largest error in levels, of each channel or all; and the mean error, where only that is bounded.
-    near: float | list[float] = 0
-    mean: float | None = None
+    #: Largest error in levels, of each channel, each pixel or all; by default 0, and any where the mean is bounded.
+    near: float | list[float] | np.ndarray | None = None
+    mean: float = math.inf
 
 
 TICKS = [1, 1, 1, 1, 4, 4, 4, 4]  # of 0.1 s, which each frame lasts
@@ -260,12 +282,6 @@ NEAR = np.array([0, 1e-7, 2e-7, 0.1, 0.2, 0.5, 0.6, 0.7])
 RED = np.broadcast_to(np.uint8([200, 0, 0]), (4, 32, 32, 3))
 COUNTED = {"num_frames": 8, "num_declared": 8}
 EVEN = {"times": None, "duration": None, "notes": ()}
-HELD = {
-    "num_frames": 8,
-    "num_declared": 8,
-    "duration": pytest.approx(1.7),
-    "times": pytest.approx(0.1 * np.arange(8), abs=1e-3),
-}
 _PALE = np.repeat(np.arange(0, 256, 4, dtype=np.uint8)[None, None, :, None], 3, -1).repeat(48, 1).repeat(2, 0)
 _LUMA = np.tile(np.linspace(16, 235, 64).round(), (1, 48, 1))
 _RATES = (20, 24000 / 1001, 30)
@@ -273,6 +289,18 @@ _RAMP = np.broadcast_to(np.arange(256, dtype=np.uint8), (2, 64, 256))
 _LEVELS = np.stack([_RAMP // 2, _RAMP // 2, _RAMP // 2, _RAMP], -1)
 _BLACK = np.broadcast_to(np.uint8(0), (1, 3000, 3000, 3))
 _ALPHA = np.concatenate([moving(4), moving(4)[..., :1]], -1)
+_CRF_5 = ("libx264", "-crf", "5", "-pix_fmt", "yuv420p")
+_ALL = np.arange(65536, dtype=np.uint16).reshape(256, 256)
+#: Errors where nothing may be seen.
+_CLEAR = np.where(np.arange(48) < 40, 255, 0)[:, None, None]
+_COLORS = [[200, 30, 30], [30, 200, 30], [30, 30, 200], [128, 128, 128], [250, 250, 250], [5, 5, 5]]
+_COLORS = np.array([*_COLORS, [220, 180, 40], [90, 20, 140]], np.uint8)
+_BANDS = np.broadcast_to(_COLORS.repeat(16, 0), (2, 48, 128, 3))
+#: Within a band, in the second frame.
+_INSIDE = np.zeros((2, 48, 128, 1), bool)
+_INSIDE[1, 5:43] = ((np.arange(128) % 16 >= 5) & (np.arange(128) % 16 < 11))[:, None]
+#: Of 12 frames, those that a file stores which repeats frame 3 three times.
+_KEPT = np.array([0, 1, 2, 3, 7, 8, 9, 10, 11])
 
 CLIPS = {
     # Times. Matroska does not count its frames: 22 were once promised of these 8.
@@ -362,6 +390,36 @@ CLIPS = {
         None,
         {"num_frames": 8, "notes": ["records no usable frame rate"]},
     ),
+    **{
+        f"the last frame is held: {name} {hold}": Made(
+            lambda folder, name=name, hold=hold: write_video(
+                folder / name, moving(), 10, times=[*(0.1 * np.arange(8)), 0.7 + hold]
+            ),
+            None,
+            COUNTED
+            | {"duration": None if hold == 0.1 else pytest.approx(1.7)}
+            | ({} if name.endswith((".gif", ".webp")) else {"fps": pytest.approx(10)}),
+        )
+        for name in ("a.mp4", "a.webm", "a.mov", "a.mkv", "a.gif", "a.webp")
+        for hold in (0.1, 1.0)
+    },
+    # Frame 3 is shown for four tenths; the file counts 12, and stores 9.
+    **{
+        f"frames that an AVI repeats: {codec}": Made(
+            lambda folder, codec=codec, kind=kind: encode(
+                folder / "a.avi", waves(12)[_KEPT], codec, kind, given="rgb24", times=_KEPT, options={"q": "2"}
+            ),
+            None,
+            {
+                "num_frames": 9,
+                "num_declared": 9,
+                "duration": pytest.approx(1.2),
+                "times": pytest.approx(_KEPT / 10, abs=1e-6),
+                "notes": ["shown for"],
+            },
+        )
+        for codec, kind in (("mjpeg", "yuvj420p"), ("mpeg4", "yuv420p"))
+    },
     # Sizes and colors.
     **{
         f"size {size}": Made(
@@ -418,6 +476,53 @@ CLIPS = {
         for kind, scale in (("gray", 1), ("gray10le", 4))
         for limited in (True, False)
     },
+    # MPEG-2 stores only a few aspects of the image, which is 4:3 or 16:9 then: 64 columns of 4/3 each.
+    **{
+        f"pixels of {aspect} become square: {name} {codec}": Made(
+            lambda folder, name=name, aspect=aspect, options=(codec, *quality), rate=rate: encoded(
+                folder / name, waves(), "-vf", f"setsar={aspect}", "-c:v", *options, rate=rate
+            ),
+            np.array([cv2.resize(frame, size[::-1], interpolation=cv2.INTER_LINEAR) for frame in waves()]),
+            {"notes": [f"times as wide as high; frames are {shown}", *notes]},
+            mean=3,
+        )
+        for name, (codec, *quality), aspect, size, rate, shown, *notes in (
+            ("a.mkv", ("ffv1",), "2/1", (48, 128), 10, "stretched to 48x128"),
+            ("a.mkv", ("ffv1",), "16/15", (48, 68), 10, "stretched to 48x68"),
+            ("a.mp4", _CRF_5, "16/15", (48, 68), 10, "stretched to 48x68"),
+            ("a.mp4", _CRF_5, "1/2", (96, 64), 10, "stretched to 96x64"),
+            ("a.mp4", _CRF_5, "30/1", (48, 64), 10, "kept as stored"),
+            ("a.h264", _CRF_5, "2/1", (48, 128), 10, "stretched to 48x128", "no usable frame rate"),
+            ("a.ts", ("mpeg2video", "-q:v", "1"), "4/3", (48, 85), 25, "stretched to 48x85"),
+        )
+    },
+    # Ten bits are not clipped, a full range not stretched; colors are those of their matrix.
+    **{
+        f"bands of color: {name} {' '.join(options)}": Made(
+            lambda folder, name=name, options=options: encoded(folder / name, _BANDS, *options),
+            _BANDS,
+            {},
+            near=np.where(_INSIDE, near, 255),
+        )
+        for name, near, options in (
+            ("a.mkv", 2, ("-c:v", "ffv1", "-pix_fmt", "yuv444p")),
+            ("a.mkv", 3, ("-c:v", "ffv1", "-pix_fmt", "yuv420p10le")),
+            ("a.mkv", 3, ("-c:v", "ffv1", "-pix_fmt", "yuv420p16le")),
+            ("a.mkv", 1, ("-c:v", "ffv1", "-pix_fmt", "gbrp10le")),
+            ("a.mkv", 1, ("-c:v", "ffv1", "-pix_fmt", "rgb48le")),
+            ("a.mov", 3, ("-c:v", "prores_ks", "-pix_fmt", "yuv422p10le")),
+            ("a.mp4", 3, ("-c:v", "libx264", "-crf", "1", "-pix_fmt", "yuv420p10le")),
+            ("a.mp4", 3, ("-c:v", "libx265", "-crf", "1", "-pix_fmt", "yuv420p10le", "-x265-params", "log-level=none")),
+            ("a.webm", 3, ("-c:v", "libvpx-vp9", "-crf", "1", "-pix_fmt", "yuv420p10le")),
+            ("a.mkv", 3, ("-vf", "scale=out_range=full", "-color_range", "pc", "-c:v", "ffv1", "-pix_fmt", "yuv420p")),
+            ("a.mkv", 3, ("-vf", "scale=out_color_matrix=bt709", "-colorspace", "bt709", "-c:v", "ffv1")),
+        )
+    },
+    "images of 16 bits": Made(
+        lambda folder: images(folder / "a", [_ALL, _ALL[..., None].repeat(3, -1)]),
+        np.broadcast_to(np.rint(_ALL / 257)[..., None], (2, 256, 256, 3)),
+        {},
+    ),
     "ten bits of gray": Made(
         lambda folder: encoded(folder / "a.mkv", _PALE, "-c:v", "ffv1", "-pix_fmt", "gray10le"), _PALE, {}, near=2
     ),
@@ -442,6 +547,39 @@ CLIPS = {
             ("a.mov", {}), ("a.mkv", {}), ("a.webm", {"crf": 0}), ("a.mov", {"pixel_format": "yuva444p10le"})
         )
     },
+    **{
+        f"alpha of videos: {name} {' '.join(options)}": Made(
+            lambda folder, name=name, options=options: encoded(folder / name, rgba(waves(4)), *options),
+            weighed(rgba(waves(4))),
+            {"has_alpha": True},
+            near=_CLEAR,
+            mean=3,
+        )
+        for name, options in (
+            ("a.webm", ("-c:v", "libvpx-vp9", "-pix_fmt", "yuva420p")),
+            ("a.mov", ("-c:v", "qtrle", "-pix_fmt", "argb")),
+            ("a.mov", ("-c:v", "png", "-pix_fmt", "rgba")),
+            ("a.mov", ("-c:v", "prores_ks", "-profile:v", "4444", "-pix_fmt", "yuva444p10le")),
+            ("a.mkv", ("-c:v", "ffv1", "-pix_fmt", "bgra")),
+            ("a.mkv", ("-c:v", "ffv1", "-pix_fmt", "yuva420p")),
+            ("a.avi", ("-c:v", "utvideo", "-pix_fmt", "gbrap")),
+        )
+    },
+    **{
+        f"alpha of images: {depth}": Made(
+            lambda folder, depth=depth, scale=scale: images(folder / "a", rgba(moving(3)).astype(depth) * scale),
+            weighed(rgba(moving(3))),
+            {"has_alpha": True},
+            near=[0.51, 0.51, 0.51, 0],
+        )
+        for depth, scale in (("uint8", 1), ("uint16", 257))
+    },
+    "one image with alpha and 16 bits": Made(
+        lambda folder: images(folder / "a", rgba(moving(1)).astype(np.uint16) * 257) / "0.png",
+        weighed(rgba(moving(1))),
+        {"has_alpha": True, "fps": 25.0, "num_declared": 1},
+        near=[0.51, 0.51, 0.51, 0],
+    ),
     "alpha of 254 everywhere": Made(
         lambda folder: write_video(folder / "a.mov", np.full_like(_LEVELS, 254), 10),
         np.full_like(_LEVELS, 254),
@@ -571,6 +709,24 @@ CLIPS = {
         for kind in ("PNG", "JPEG", "GIF", "WEBP", "TIFF")
     },
     **{
+        f"a sequence of JPEGs called {name}": Made(
+            lambda folder, name=name: put(folder / name, b"".join(packets_of(waves(3), ".jpg"))), waves(3), {}, mean=4
+        )
+        for name in ("a.mjpeg", "a")
+    },
+    **{
+        f"a JPEG and more called {name}": Made(
+            lambda folder, name=name: put(folder / name, packets_of(waves(1), ".jpg")[0] + b"more"),
+            waves(1),
+            {},
+            mean=4,
+        )
+        for name in ("a.mjpeg", "a")
+    },
+    "a photo with another in its file": Made(
+        lambda folder: put(folder / "photo.jpg", b"".join(packets_of(waves(3), ".jpg"))), waves(1), {}, mean=4
+    ),
+    **{
         f"a video called {name}": Made(lambda folder, name=name: put(folder / name, mp4()), None, COUNTED)
         for name in ("a.png", "a.gif", "a.safetensors", "a.txt", "a")
     },
@@ -582,7 +738,9 @@ def assert_read_as(clip, made):
     if made.frames is not None:
         assert clip.frames.shape == made.frames.shape
         error = np.abs(clip.frames.astype(float) - made.frames)
-        assert error.mean() < made.mean if made.mean else (error <= made.near).all()
+        assert error.mean() < made.mean
+        near = (0 if made.mean == math.inf else 255) if made.near is None else made.near
+        assert (error <= near).all()
     for name, value in made.facts.items():
         found = getattr(clip, name)
         if name == "notes" and value:
@@ -592,16 +750,17 @@ def assert_read_as(clip, made):
             assert found == value, name
 
 
-def one_line(caught, *words):
+@contextmanager
+def one_line(error, *words):
+    """What is in it raises an error of one line, with these words."""
+    with pytest.raises(error) as caught:
+        yield
     text = str(caught.value)
     assert "\n" not in text
-    for word in words:
-        assert word in text, text
-    return text
+    assert [word for word in words if word not in text] == [], text
 
 
 def refused(path, *words):
-    """The one line with which reading a path fails."""
-    with pytest.raises(VideoError) as caught:
+    """Reading a path fails with one line."""
+    with one_line(VideoError, "expected", *words):
         read_video(path)
-    return one_line(caught, "expected", *words)

@@ -366,27 +366,26 @@ def test_mistakes_are_told_with_line_table_and_key(text):
     assert error(before + text).startswith(start.replace(f"line {line}", f"line {line + 3}"))
 
 
-LAYOUTS = {  # the mistake is the "offset" of the second edit
-    "arrays over lines": '[[edits]]\ndo = "multiply"\noffsets = [\n  [0.1, 0],  # ]\n  [0.2, 0],\n]\n'
-    '[[edits]]\ndo = "move"\noffset = [\n1,\n]\n',
-    "quoted keys": '[[ "edits" ]]\n"do" = "vanish"\n[[\'edits\']]\n\'do\' = "move"\n"offset" = [1]\n',
-    "inline tables": 'edits = [{do = "vanish"},\n\n{do = "move",  "offset" = [1]} ]',
-    "a table between": '[[edits]]\ndo = "vanish"\n[camera]\noffset = 3\n[[edits]]\ndo = "vanish"\noffset = [1]',
+LAYOUTS = {  # the mistake is the "offset" of the second edit, but in the last two
+    '[[edits]]\ndo = "multiply"\noffsets = [\n  [0.1, 0],  # ]\n  [0.2, 0],\n]\n'
+    '[[edits]]\ndo = "move"\noffset = [\n1,\n]\n': "line 9, [[edits]] number 2: offset: ",
+    '[[ "edits" ]]\n"do" = "vanish"\n[[\'edits\']]\n\'do\' = "move"\n"offset" = [1]\n': (
+        "line 5, [[edits]] number 2: offset: "
+    ),
+    # The line is that of what the inline table stands in.
+    'edits = [{do = "vanish"},\n\n{do = "move",  "offset" = [1]} ]': "line 1, [[edits]] number 2: offset: ",
+    '[[edits]]\ndo = "vanish"\n[camera]\noffset = 3\n[[edits]]\ndo = "vanish"\noffset = [1]': (
+        "line 7, [[edits]] number 2: offset: "
+    ),
+    "selections.it.box = [1]": "line 1, [selections.it]: box: ",
+    # Only a line feed ends a line of TOML: editors that know count like this.
+    '# \u2028 \x85\n[[edits]]\ndo = "mov"': "line 3, ",
 }
 
 
-def test_the_line_is_right_in_every_layout():
-    told = {name: error(text) for name, text in LAYOUTS.items()}
-    assert told["arrays over lines"].startswith("script, line 9, [[edits]] number 2: offset: ")
-    assert told["quoted keys"].startswith("script, line 5, [[edits]] number 2: offset: ")
-    assert told["inline tables"].startswith("script, line 1, [[edits]] number 2: offset: ")  # of what it stands in
-    assert told["a table between"].startswith("script, line 7, [[edits]] number 2: offset: ")
-
-
-def test_dotted_keys_and_strange_line_ends():
-    assert error("selections.it.box = [1]").startswith("script, line 1, [selections.it]: box: ")
-    # Only a line feed ends a line of TOML: editors that know count like this.
-    assert error('# \u2028 \x85\n[[edits]]\ndo = "mov"').startswith("script, line 3, ")
+@pytest.mark.parametrize("text", LAYOUTS)
+def test_the_line_is_right_in_every_layout(text):
+    assert error(text).startswith(f"script, {LAYOUTS[text]}")
 
 
 def in_one(text):
@@ -457,22 +456,31 @@ def test_a_selection_of_nothing_names_itself():
     assert error(gone).startswith("script, line 7, [[edits]] number 2: selection: expected at least one Gaussian")
 
 
-def test_files(tmp_path):
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        # As editors of Windows write it.
+        (b"\xef\xbb\xbf[[edits]]\r\ndo = 'vanish'\r\nfrme = 1", r"^{path}, line 3, \[\[edits\]\] number 1: frme: "),
+        (b"do = '\xff'", r"UTF-8.* at 6. Is it a model"),
+        (
+            b'[selections.it]\nmask = "mask.png"\nframe = 0',
+            r"line 2, \[selections.it\]: mask: |line 1, \[selections.it\]: ",
+        ),
+    ],
+)
+def test_files(tmp_path, content, told):
+    path = tmp_path / "edits.toml"
+    path.write_bytes(content)
+    (tmp_path / "mask.png").write_bytes(b"no image")
+    with pytest.raises(EditScriptError, match=told.replace("{path}", re.escape(str(path)))):
+        read_edit_script(path).apply(MODEL)
+
+
+def test_missing_scripts_and_folders_are_told(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"script: .*none.toml.*missing"):
         read_edit_script(tmp_path / "none.toml")
-    path = tmp_path / "edits.toml"
-    path.write_bytes(b"\xef\xbb\xbf[[edits]]\r\ndo = 'vanish'\r\nfrme = 1")  # as editors of Windows write it
-    with pytest.raises(EditScriptError, match=rf"^{re.escape(str(path))}, line 3, \[\[edits\]\] number 1: frme: "):
-        read_edit_script(path)
-    path.write_bytes(b"do = '\xff'")
-    with pytest.raises(EditScriptError, match=r"UTF-8.* at 6. Is it a model"):
-        read_edit_script(path)
     with pytest.raises(EditScriptError, match="got a folder"):
         read_edit_script(tmp_path)
-    (tmp_path / "mask.png").write_bytes(b"no image")
-    path.write_text('[selections.it]\nmask = "mask.png"\nframe = 0')
-    with pytest.raises(EditScriptError, match=r"line 2, \[selections.it\]: mask: |line 1, \[selections.it\]: "):
-        read_edit_script(path).apply(MODEL)
 
 
 # ------------------------------------------------------------------------------------------------------------- whatever

@@ -1,5 +1,6 @@
 """Export and import by the name of a format."""
 
+import numpy as np
 import pytest
 from soft_models import soft_model
 
@@ -11,11 +12,13 @@ from foldgauss.io import (
     read_masks,
     read_vegas_ply,
     read_video,
+    save_compact,
     save_video_model,
     write_3dgs_frames,
     write_3dgs_ply,
     write_video,
 )
+from foldgauss.io.page.player_page import quantize_finely
 from foldgauss.render import RenderOptions
 from foldgauss.video import Selection, edit
 
@@ -29,10 +32,14 @@ def files(path):
     return {entry.name: entry.read_bytes() for entry in path.iterdir()} if path.is_dir() else path.read_bytes()
 
 
-@pytest.mark.parametrize("options", [{}, {"times": [0.2, 0.7], "axes": "y-up", "sh_degree": 0, "depth_step": 0.0}])
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"times": 0.5}, {"times": [0.2, 0.7], "axes": "y-up", "sh_degree": 0, "depth_step": 0.0}],
+)
 def test_frames_for_viewers(tmp_path, model, options):
     path = export(model, "ply3dgs", tmp_path / "frames", **options)
-    assert files(path) == files(write_3dgs_frames(tmp_path / "again", model, **options))
+    listed = options | ({"times": np.atleast_1d(options["times"])} if options else {})
+    assert files(path) == files(write_3dgs_frames(tmp_path / "again", model, **listed))
 
 
 def test_one_frame_for_viewers(tmp_path, model):
@@ -74,19 +81,39 @@ def test_existing_outputs(tmp_path, model, format, name, options):
     assert export(model, format, path, overwrite=True, **options) == path
 
 
-def test_what_is_no_video(tmp_path, model):
+@pytest.mark.parametrize(
+    ("name", "error", "text"),
+    [
+        ("f.ply", FormatError, "read_3dgs_ply"),
+        ("", FormatError, "a file that can be read"),
+        ("none.ply", FileNotFoundError, "missing"),
+    ],
+)
+def test_what_is_no_video(tmp_path, model, name, error, text):
     write_3dgs_ply(tmp_path / "f.ply", model, 0.5)
-    with pytest.raises(FormatError, match="read_3dgs_ply"):
-        read_vegas_ply(tmp_path / "f.ply", size=(40, 64))
-    with pytest.raises(FormatError, match="a file that can be read"):
-        read_vegas_ply(tmp_path)
-    with pytest.raises(FileNotFoundError, match="missing"):
-        read_vegas_ply(tmp_path / "none.ply")
+    with pytest.raises(error, match=text):
+        read_vegas_ply(tmp_path / name, size=(40, 64))
 
 
 SWAPPED = {
     "save": (lambda m, s, p: save_video_model(m, p), r"path: expected a path, got VideoModel\. .*\(path, model\)"),
     "save a selection as a model": (lambda m, s, p: save_video_model(p, s), "model: .*got Selection"),
+    **{
+        f"save as {name}": (
+            lambda m, s, p, name=name: save_video_model(p + name, m),
+            r"path: expected a name for the model, as out\.safetensors, got .*export\.",
+        )
+        for name in (".mp4", ".png", ".ply", ".v2")
+    },
+    "save as a compact model": (lambda m, s, p: save_video_model(f"{p}.fgz", m), "path: .*foldgauss compress"),
+    "save a compact model as a plain one": (
+        lambda m, s, p: save_compact(f"{p}.safetensors", quantize_finely(m)),
+        "path: expected a name ending in .fgz",
+    ),
+    "save a chain": (
+        lambda m, s, p: save_video_model(p, edit(m)),
+        r"model: expected a video, got a chain of edits. End it with .video\(\)",
+    ),
     "load": (lambda m, s, p: load_video_model(m), "path: expected a path, got VideoModel"),
     "format first": (lambda m, s, p: export("ply", m, p), r"model: .*got str\. .*\(model, format, out\)"),
     "path second": (lambda m, s, p: export(m, p, "ply"), "format: expected one of"),
@@ -114,11 +141,6 @@ def test_swapped_arguments(tmp_path, name):
     with pytest.raises(ValueError, match=f"^({message})"):
         call(model, Selection.all(model), str(tmp_path / "out"))
     assert not list(tmp_path.iterdir())
-
-
-def test_one_time_needs_no_list(tmp_path):
-    export(soft_model(), "ply3dgs", tmp_path / "frames", times=0.5)
-    assert len(list((tmp_path / "frames").iterdir())) == 1
 
 
 @pytest.mark.parametrize("format", ["ply3dgs", "obj"])

@@ -3,15 +3,13 @@
 import dataclasses
 import shutil
 import subprocess
-import warnings
 from pathlib import Path
 
 import equinox as eqx
-import jax
 import numpy as np
 import pytest
 from format_reader import read
-from soft_models import on_paths, soft_model
+from soft_models import crowd, of_degrees, on_paths, soft_model
 
 import foldgauss.io.page
 from foldgauss.io import load_video_model, save_compact
@@ -50,23 +48,7 @@ def make_model(copies=1, **options):
     coefficients = np.array(model.splats.coefficients)
     coefficients[::13, :1] *= 1e13
     leaves = durations.astype(np.float32), coefficients
-    model = eqx.tree_at(lambda m: (m.splats.log_time_scale, m.splats.coefficients), model, leaves)
-
-    def repeat(leaf):
-        leaf = np.asarray(leaf)
-        if not leaf.ndim:
-            return leaf
-        return (np.repeat(leaf, copies, 0) + 0.1 * rng.normal(size=(copies * len(leaf), *leaf.shape[1:]))).astype("f4")
-
-    return eqx.tree_at(lambda m: m.splats, model, jax.tree.map(repeat, model.splats))
-
-
-def lower_degrees(model):
-    """Trajectories of several degrees."""
-    degrees = np.random.default_rng(0).integers(0, model.degree + 1, model.num_gaussians)
-    kept = (np.arange(model.degree) < degrees[:, None])[..., None]
-    leaf = np.where(kept, np.asarray(model.splats.coefficients), np.float32(0))
-    return eqx.tree_at(lambda m: m.splats.coefficients, model, leaf)
+    return crowd(eqx.tree_at(lambda m: (m.splats.log_time_scale, m.splats.coefficients), model, leaves), copies)
 
 
 def change_times(model, *, cut):
@@ -105,7 +87,7 @@ MODELS = {
     "degree 3": lambda: make_model(3),
     "degree 7": lambda: make_model(degree=7),
     "degree 15": lambda: make_model(degree=15),
-    "several degrees": lambda: lower_degrees(make_model(5)),
+    "several degrees": lambda: of_degrees(make_model(5)),
     "portrait": lambda: make_model(2, size=(64, 40)),
     "static": lambda: make_model(num_frames=1),
     "uneven times": lambda: change_times(make_model(), cut=False),
@@ -113,7 +95,7 @@ MODELS = {
     "cut": lambda: change_times(make_model(), cut=True),
     "paths at the frames": lambda: on_paths(change_times(make_model(3), cut=False)),
     "paths at the frames, cut": lambda: on_paths(change_times(make_model(), cut=True)),
-    "paths at other times": lambda: on_paths(lower_degrees(make_model(3)), at_frames=False),
+    "paths at other times": lambda: on_paths(of_degrees(make_model(3)), at_frames=False),
     "paths that lead far": lambda: on_paths(make_model(2), reach=30.0),
     "path of one frame": lambda: on_paths(make_model(num_frames=1)),
 }
@@ -167,8 +149,7 @@ def test_damaged_chunks_are_left_out(tmp_path):
     lengths = [sum(chunk["streams"]) for chunk in header["chunks"]]
     data[-lengths[2] - 5] ^= 1  # in the second chunk
     path.write_bytes(data)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with pytest.warns(UserWarning, match="1 of its 3 chunks"):
         model = load_video_model(path)
     check_bits(read(bytes(data))[1], model)
     assert model.num_gaussians == sum(header["chunks"][k]["num_gaussians"] for k in (0, 2))

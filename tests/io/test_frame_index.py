@@ -3,9 +3,11 @@
 Clips are made with ffmpeg, and skipped where there is none.
 """
 
+import io
 import json
 import os
 import pickle
+import re
 import shutil
 import subprocess
 import sys
@@ -226,27 +228,6 @@ def test_damaged_clips(tmp_path, name):
     np.testing.assert_array_equal(read_indexed(index, 10, num - 5).frames, clip.frames[10:-5])
 
 
-def test_frames_that_damage_left_out_keep_their_places(tmp_path):
-    """`span` gives the range of places, as `read_video` has it, of frames counted as they decode."""
-    frames = _moving(40)
-    path = encoded(tmp_path / "a.avi", frames, "-c:v", "png", rate=25)
-    data = path.read_bytes()
-    starts = [at for at in range(len(data)) if data.startswith(b"\x89PNG", at)]
-    broken = bytearray(data)
-    for k in (10, 11):
-        broken[starts[k] : starts[k] + 30] = bytes(30)
-    path.write_bytes(broken)
-    clip, index = read_video(path), index_video(path)
-    assert index.positions.tolist() == [
-        *range(10),
-        *range(13, 40),
-    ]  # FFmpeg's parser passes by the one after a broken one, too
-    _as_read(index, path, [(8, 12), (10, 11), (27, 37)])
-    assert index.span(9, 12) == (9, 15)
-    np.testing.assert_array_equal(read_indexed(index, 9, 12).frames, clip.frames[9:12])
-    np.testing.assert_array_equal(LazyFrames(index)[9:12], clip.frames[9:12])
-
-
 def test_where_nothing_moves(tmp_path):
     """Frames are alike to the bit, then move: a seek is not led astray."""
     frames = np.concatenate([np.repeat(_moving(1), 60, 0), _moving(40)])
@@ -257,8 +238,9 @@ def test_where_nothing_moves(tmp_path):
 
 
 def test_a_part_of_a_clip_counts_from_its_first_frame(long, counting):
-    index = index_video(long, frames=(100, 460))
-    clip = read_video(long, frames=(100, 460))
+    told, clip = [], read_video(long, frames=(100, 460))
+    index = index_video(long, frames=(100, 460), on_frame=lambda: told.append(1))
+    assert len(told) == 360
     _described(index, clip)
     assert index.cuts == [300]
     _as_read(index, long, [(0, 5), (200, 220), (350, 360)], start=100)
@@ -274,12 +256,6 @@ def test_a_rate_that_is_given_holds_for_spans(tmp_path):
     clip = read_indexed(index, 50, 70)
     assert (index.fps, index.times, clip.fps, clip.times) == (10, None, 10, None)
     _same(clip, read_video(path, frames=(50, 70), fps=10))
-
-
-def test_each_frame_is_told(long):
-    told = []
-    index_video(long, frames=(0, 30), find_cuts=False, on_frame=lambda: told.append(1))
-    assert len(told) == 30
 
 
 def _clear(num_frames, which):
@@ -447,18 +423,12 @@ def _bad(tmp_path):
 
 
 def test_what_is_refused_is_refused_alike(tmp_path, long):
-    for path in _bad(tmp_path):
+    wrong = [{"frames": (5, 3)}, {"frames": (700, 800)}, {"frames": (-1, 3)}, {"fps": 0}, {"fps": np.nan}]
+    for path, options in [*((path, {}) for path in _bad(tmp_path)), *((long, options) for options in wrong)]:
         with pytest.raises((VideoError, FileNotFoundError)) as expected:
-            read_video(path)
-        with pytest.raises(expected.type) as caught:
-            index_video(path)
-        assert str(caught.value) == str(expected.value)
-    for options in ({"frames": (5, 3)}, {"frames": (700, 800)}, {"frames": (-1, 3)}, {"fps": 0}, {"fps": np.nan}):
-        with pytest.raises(VideoError) as expected:
-            read_video(long, **options)
-        with pytest.raises(VideoError) as caught:
-            index_video(long, **options)
-        assert str(caught.value) == str(expected.value)
+            read_video(path, **options)
+        with pytest.raises(expected.type, match=f"^{re.escape(str(expected.value))}$"):
+            index_video(path, **options)
 
 
 def test_a_file_that_is_another_is_refused(tmp_path, long):
@@ -467,9 +437,8 @@ def test_a_file_that_is_another_is_refused(tmp_path, long):
     index = index_video(path, find_cuts=False)
     for other in (_moving(700)[::-1], _moving(30)):
         encoded(path, other, *LONG, rate=25)
-        with pytest.raises(VideoError) as caught:
+        with one_line(VideoError, "expected the file that was indexed", "frame 500 differs", "index it again"):
             read_indexed(index, 500, 503)
-        one_line(caught, "expected the file that was indexed", "frame 500 differs", "index it again")
         with pytest.raises(VideoError, match="differs"):
             LazyFrames(index)[500]
     path.write_text("no video")
@@ -503,36 +472,41 @@ def test_an_index_is_saved_and_sent(tmp_path, monkeypatch, long, long_index):
         np.testing.assert_array_equal(read_indexed(other, 300, 305).frames, read_indexed(index, 300, 305).frames)
 
 
-def test_an_index_with_times_is_saved(tmp_path):
-    path = encoded(tmp_path / "a.mp4", _moving(120), *KINDS["uneven.mp4"], rate=25)
-    index = index_video(path)
-    again = FrameIndex.load(index.save(tmp_path / "index.npz"))
-    np.testing.assert_array_equal(again.times, index.times)
-    _same(read_indexed(again, 50, 70), read_indexed(index, 50, 70))
+def with_array(data, **changes):
+    """The file of an index with other arrays."""
+    file = io.BytesIO()
+    with np.load(io.BytesIO(data)) as arrays:
+        np.savez(file, **{name: changes.get(name, lambda own: own)(own) for name, own in arrays.items()})
+    return file.getvalue()
 
 
-def test_what_is_no_index_is_refused(tmp_path, long_index):
-    path = long_index.save(tmp_path / "good.npz")
-    data = path.read_bytes()
-    others = {"empty": b"", "text": b"no index", "cut": data[: len(data) // 2], "zip": b"PK\x03\x04" + bytes(50)}
-    for name, content in others.items():
-        (tmp_path / name).write_bytes(content)
-    np.savez(tmp_path / "other.npz", about=np.zeros(3, np.uint8))
-    np.savez(tmp_path / "pickled.npz", about=np.array([None]))
-    np.save(tmp_path / "array.npy", np.zeros(3))
-    with np.load(path) as file:
-        arrays = dict(file)
-    np.savez(tmp_path / "short.npz", **arrays | {"digests": arrays["digests"][:, :8]})
-    about = json.dumps(json.loads(arrays["about"].tobytes()) | {"format": 99}).encode()
-    np.savez(tmp_path / "later.npz", **arrays | {"about": np.frombuffer(about, np.uint8)})
-    for name in [*others, "other.npz", "pickled.npz", "array.npy", "short.npz", "later.npz"]:
-        with pytest.raises(VideoError) as caught:
-            FrameIndex.load(tmp_path / name)
-        one_line(caught, "expected an index of a clip", "index_video")
-    with pytest.raises(FileNotFoundError):
-        FrameIndex.load(tmp_path / "missing")
+def _of_later_format(about):
+    return np.frombuffer(json.dumps(json.loads(about.tobytes()) | {"format": 99}).encode(), np.uint8)
+
+
+#: The file of an index, changed into none.
+NO_INDEX = {
+    "empty": lambda data: b"",
+    "text": lambda data: b"no index",
+    "cut": lambda data: data[: len(data) // 2],
+    "zip": lambda data: b"PK\x03\x04" + bytes(50),
+    "other": lambda data: with_array(data, about=lambda about: np.zeros(3, np.uint8)),
+    "pickled": lambda data: with_array(data, about=lambda about: np.array([None])),
+    "short": lambda data: with_array(data, digests=lambda digests: digests[:, :8]),
+    "later": lambda data: with_array(data, about=_of_later_format),
+}
+
+
+@pytest.mark.parametrize("name", NO_INDEX)
+def test_what_is_no_index_is_refused(tmp_path, long_index, name):
+    path = long_index.save(tmp_path / "i.npz")
     with pytest.raises(OutputError):
         long_index.save(path / "a.npz")
+    path.write_bytes(NO_INDEX[name](path.read_bytes()))
+    with one_line(VideoError, "expected an index of a clip", "index_video"):
+        FrameIndex.load(path)
+    with pytest.raises(FileNotFoundError):
+        FrameIndex.load(tmp_path / "missing")
 
 
 # ------------------------------------------------------------------------------------------ as an array
@@ -583,26 +557,34 @@ def test_a_decoder_may_be_closed_while_it_is_read(long):
     assert list(frames) == []  # FFmpeg would read memory that is freed
 
 
-def test_what_arrays_refuse_is_refused(long_index):
-    lazy = LazyFrames(long_index, first=600)
-    for which in (20, -21):
-        with pytest.raises(IndexError, match="20 frames"):
-            lazy[which]
-    for which in ("a", 1.5, (1, 2), [1, 2]):
-        with pytest.raises(ValueError, match="expected the number of a frame, or a slice"):
-            lazy[which]
-    for span, expected in (
-        ((0, 621), "within 0:620, .* got 0:621"),
-        ((620, 621), "within 0:620, .* got 620:621"),
-        ((5, 5), "with at least 1 frame, got 5:5"),
-        ((0, 0), "with at least 1 frame, got 0:0"),
-        ((-2, 3), "counted from the start, got -2:3"),
-    ):
-        with pytest.raises(VideoError, match=f"frames: expected A:B {expected}"):
-            long_index.span(*span)
-    for options in ({"first": 5, "stop": 5}, {"stop": 621}, {"first": -1}, {"size": (0, 5)}):
-        with pytest.raises(VideoError, match="expected"):
-            LazyFrames(long_index, **options)
+#: What is done with an index of 620 frames and an array of its last 20, and the error.
+WRONG = [
+    *((lambda index, lazy, k=k: lazy[k], IndexError, "20 frames") for k in (20, -21)),
+    *(
+        (lambda index, lazy, k=k: lazy[k], ValueError, "expected the number of a frame, or a slice")
+        for k in ("a", 1.5, (1, 2), [1, 2])
+    ),
+    *(
+        (lambda index, lazy, span=span: index.span(*span), VideoError, f"frames: expected A:B {text}")
+        for span, text in (
+            ((0, 621), "within 0:620, .* got 0:621"),
+            ((620, 621), "within 0:620, .* got 620:621"),
+            ((5, 5), "with at least 1 frame, got 5:5"),
+            ((0, 0), "with at least 1 frame, got 0:0"),
+            ((-2, 3), "counted from the start, got -2:3"),
+        )
+    ),
+    *(
+        (lambda index, lazy, options=options: LazyFrames(index, **options), VideoError, "expected")
+        for options in ({"first": 5, "stop": 5}, {"stop": 621}, {"first": -1}, {"size": (0, 5)})
+    ),
+]
+
+
+@pytest.mark.parametrize(("do", "error", "text"), WRONG)
+def test_what_arrays_refuse_is_refused(long_index, do, error, text):
+    with pytest.raises(error, match=text):
+        do(long_index, LazyFrames(long_index, first=600))
 
 
 _PEAK = """

@@ -1,6 +1,7 @@
 """The player's page: whole in itself, closed to the network, and its pictures those of the CPU engine."""
 
 import base64
+import dataclasses
 import hashlib
 import json
 import re
@@ -14,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from browser import Opened
-from editor_page import drop
+from editor_page import PICKED, drop, pull, screen_at
+from made_clips import moving as waves
 from soft_models import NUM, OBJECT, SIZE, on_paths, soft_model
 
 from foldgauss.envelope import TimeLikelihood
@@ -28,8 +30,6 @@ from foldgauss.video.compression.quantize import dequantize
 from foldgauss.video.models.frame_times import make_time_logits
 from foldgauss.video.models.renderer import VideoRenderer
 
-#: Indices of the selected Gaussians, as an expression in the page.
-PICKED = "Array.from(foldgauss.player.state.selected.keys()).filter((i) => foldgauss.player.state.selected[i])"
 #: What the brush is made of.
 MODULES = ("gaussians", "paths", "timeline")
 
@@ -62,12 +62,6 @@ class _Elements(HTMLParser):
 
 def data_of(page, name="model"):
     return base64.b64decode(_Elements(page).text("script", id=name))
-
-
-def waves(num_frames=6, height=48, width=80):
-    y, x = np.mgrid[0:height, 0:width]
-    pictures = [128 + 100 * np.sin(0.15 * x + 0.3 * k) * np.cos(0.1 * y + k / 9) for k in range(num_frames)]
-    return np.stack([np.stack([one, one[:, ::-1], 255 - one], -1) for one in pictures]).astype(np.uint8)
 
 
 # ---------------------------------------------------------------------------------------------------- the page
@@ -149,6 +143,14 @@ def _two_envelopes(model):
     [
         (lambda m: html_page(_late(m)), "edits that no folded model represents.*foldgauss render"),
         (lambda m: html_page(_two_envelopes(m)), "envelope: expected one for all"),
+        (
+            lambda m: html_page(SegmentedVideo.from_models([(0, m), (5, _late(m))])),
+            "segment 1: .*edits that no folded model represents",
+        ),
+        (
+            lambda m: html_page(segmented(), original=waves(7, *SIZE)),
+            "original: expected frames uint8 .19, 40, 64, 3.",
+        ),
         (lambda m: html_page(edit(m)), r"model: expected a VideoModel or an EditedVideo.*\.video\(\)"),
         (lambda m: html_page(m, quality=0), "quality: expected a whole number from 1 to 100, got 0"),
         (lambda m: html_page(m, original=waves(7, 41, 64)), "original: expected frames uint8 .7, 40, 64, 3."),
@@ -211,17 +213,13 @@ MODELS = {
     "power 2, exact": lambda fitted: soft_model(power=2.0),
     "power 1, floor, no path": lambda fitted: soft_model(power=1.0, floor=0.1, degree=0, options=RenderOptions()),
     "degree 4, round": lambda fitted: soft_model(degree=4, options=RenderOptions(support_radius=1.5)),
-    "scale cutoff": lambda fitted: _with(soft_model(options=RenderOptions()), scale_cutoff=0.03),
-    "cut": lambda fitted: _with(soft_model(options=RenderOptions()), frame_times=FrameTimes(make_time_logits(7, (3,)))),
+    "scale cutoff": lambda fitted: dataclasses.replace(soft_model(options=RenderOptions()), scale_cutoff=0.03),
+    "cut": lambda fitted: dataclasses.replace(
+        soft_model(options=RenderOptions()), frame_times=FrameTimes(make_time_logits(7, (3,)))
+    ),
     "tall": lambda fitted: soft_model(size=(64, 36), options=RenderOptions()),
     "one frame": lambda fitted: soft_model(num_frames=1, options=RenderOptions()),
 }
-
-
-def _with(model, **fields):
-    own = {"scale_cutoff": model.scale_cutoff, "frame_times": model.frame_times} | fields
-    shared = (model.size, model.fps, model.options, model.compositing)
-    return VideoModel(model.splats, own["frame_times"], *shared, own["scale_cutoff"])
 
 
 #: A setting each of conditioning, compositing and the clip; the long runs take the rest.
@@ -247,17 +245,16 @@ def test_pictures_are_those_of_the_engine(opened, fitted, name):
 def test_positions_are_the_learned_times(opened):
     """A frame on is the next frame's own time, and half a frame on is half way to it."""
     logits = np.log([1.0, 2.0, 1.0, 3.0, 1.5, 1.0]).astype(np.float32)
-    model = _with(soft_model(), frame_times=FrameTimes(logits))
+    model = dataclasses.replace(soft_model(), frame_times=FrameTimes(logits))
     page, times = opened(model), np.asarray(model.frame_times.times())
-    page.page.keyboard.press(".")
+    page.press(".")
     assert page.stats["time"] == pytest.approx(float(times[1]), abs=1e-3)  # logits are rounded to 2^-10
-    for _ in range(5):
-        page.page.keyboard.press("Shift+ArrowRight")
+    page.press(*5 * ["Shift+ArrowRight"])
     assert page.stats["position"] == pytest.approx(1.5)
     assert page.stats["time"] == pytest.approx(float(times[1] + times[2]) / 2, abs=1e-3)
-    page.page.keyboard.press(",")
+    page.press(",")
     assert page.stats["position"] == 1
-    page.page.keyboard.press("End")
+    page.press("End")
     assert (page.stats["position"], page.stats["time"]) == (6, 1.0)
 
 
@@ -295,7 +292,7 @@ def test_keys_do_what_the_help_says(opened):
 def test_it_plays_and_stops_at_the_end(opened):
     page = opened(soft_model(), reduced_motion="no-preference")
     assert page.stats["playing"]
-    page.page.keyboard.press("l")
+    page.press("l")
     assert page.until("!foldgauss.stats.playing").stats["position"] == 6
     assert not opened(soft_model(), reduced_motion="reduce").stats["playing"]
 
@@ -304,17 +301,9 @@ def test_what_is_brushed_can_vanish_and_come_back(opened):
     model = soft_model(options=RenderOptions())
     page = opened(model, **LARGE)
     before = page.picture(0.5)
-    page.page.keyboard.press("b")
-    box = page.page.locator("#canvas").bounding_box()
-    scale = min(box["width"] / SIZE[1], box["height"] / SIZE[0])
-    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    seen = eqx.filter_jit(lambda own: own.at(jnp.float32(0.5)).mean)(model)
-    x, y = map(float, np.median(np.asarray(seen)[OBJECT], axis=0))
-    at = (middle[0] + (x - SIZE[1] / 2) * scale, middle[1] + (y - SIZE[0] / 2) * scale)
-    page.page.mouse.move(*at)
-    page.page.mouse.down()
-    page.page.mouse.move(at[0] + 40, at[1] + 20, steps=4)
-    page.page.mouse.up()
+    page.press("b")
+    seen = eqx.filter_jit(lambda own: own.splats.at(jnp.float32(0.5)).mean)(model)
+    pull(page, screen_at(page, *map(float, np.median(np.asarray(seen)[OBJECT], axis=0))), (40, 20))
     picked = page.page.evaluate(PICKED)
     assert page.stats["picked"] == len(picked) >= 4
     assert OBJECT[picked].mean() > 0.7
@@ -325,10 +314,9 @@ def test_what_is_brushed_can_vanish_and_come_back(opened):
     left[picked] = False
     wanted = VideoRenderer(edit(model).select(~left).vanish().video()).frame(0.5)
     assert np.abs(gone.astype(float) - wanted).mean() < 0.5
-    page.page.keyboard.press("z")
+    page.press("z")
     assert page.stats["picked"] == len(picked)
-    page.page.keyboard.press("z")
-    page.page.keyboard.press("e")
+    page.press("z", "e")
     assert page.stats["picked"] == 0
     np.testing.assert_array_equal(page.picture(), before)
 
@@ -347,8 +335,8 @@ def test_what_is_brushed_is_followed_through_the_clip(opened):
         envelope=TimeLikelihood(1.0),
     )
     page = opened(VideoModel(splats, FrameTimes.uniform(9), SIZE, 25.0, RenderOptions()))
-    page.page.evaluate("foldgauss.seek(0)")
-    page.page.keyboard.press("b")
+    page.seek(0)
+    page.press("b")
     found = "foldgauss.controls.tools.picker.inCircle(foldgauss.player.state, 0, -0.1, 0, 0.03)"
     page.page.evaluate(f"foldgauss.controls.tools.select({found}, 'new')")
     assert page.page.evaluate(PICKED) == [0]
@@ -372,7 +360,7 @@ def test_the_original_is_shown_beside_it(opened):
 
     shares = {}
     for key, mode in enumerate(("model", "original", "slider", "side"), start=1):
-        page.page.keyboard.press(str(key))
+        page.press(str(key))
         for _ in range(40):
             shares[mode] = green(shot())
             if mode == "model" or shares[mode] > 0.05:
@@ -382,11 +370,10 @@ def test_the_original_is_shown_beside_it(opened):
     assert shares["original"] > 0.6
     assert 0.3 < shares["slider"] / shares["original"] < 0.6
     assert shares["side"] > 0.1
-    page.page.keyboard.press("3")
+    page.press("3")
     page.page.locator("#divider").focus()
     before = green(shot())
-    for _ in range(10):
-        page.page.keyboard.press("ArrowLeft")
+    page.press(*10 * ["ArrowLeft"])
     assert green(shot()) < before - 0.05
 
 
@@ -443,8 +430,8 @@ FIRSTS, LENGTHS, WHOLE = (0, 4, 7, 12, 16), (7, 6, 5, 4, 3), 19
 def segmented(**how):
     parts = [soft_model(seed=k, num_frames=num, options=RenderOptions(), **how) for k, num in enumerate(LENGTHS)]
     logits = np.log([1.0, 2.0, 1.0, 3.0, 1.5]).astype(np.float32)
-    parts[1] = _with(parts[1], frame_times=FrameTimes(logits))  # of its own, learned times
-    parts[3] = _with(parts[3], frame_times=FrameTimes(make_time_logits(4, (2,))))  # a cut within it
+    parts[1] = dataclasses.replace(parts[1], frame_times=FrameTimes(logits))  # of its own, learned times
+    parts[3] = dataclasses.replace(parts[3], frame_times=FrameTimes(make_time_logits(4, (2,))))  # a cut within it
     return SegmentedVideo.from_models(list(zip(FIRSTS, parts, strict=True)))
 
 
@@ -467,12 +454,7 @@ def test_a_page_of_segments_has_a_model_of_each(tmp_path):
 
 
 def test_segments_that_no_page_holds_are_told(monkeypatch):
-    late = SegmentedVideo.from_models([(0, soft_model()), (5, _late(soft_model()))])
-    with pytest.raises(ValueError, match=r"segment 1: .*edits that no folded model represents"):
-        html_page(late)
-    assert late._repr_html_() is None
-    with pytest.raises(ValueError, match=r"original: expected frames uint8 .19, 40, 64, 3."):
-        html_page(segmented(), original=waves(7, *SIZE))
+    assert SegmentedVideo.from_models([(0, soft_model()), (5, _late(soft_model()))])._repr_html_() is None
     video, made = segmented(), []
     (frame,) = [one for tag, one in _Elements(video._repr_html_()).tags if tag == "iframe"]
     assert frame["srcdoc"] == html_page(video, title="foldgauss")
@@ -500,7 +482,7 @@ def test_pictures_of_segments_are_those_of_the_engine(opened, compositing):
       const one = foldgauss.pixels(64, 40), other = foldgauss.pixels(64, 40);
       return one.every((value, k) => value === other[k]);
     }"""
-    page.page.evaluate("foldgauss.seek(6.5 / 18)")
+    page.seek(6.5 / 18)
     assert page.page.evaluate(twice)
     larger = VideoRenderer(video, (60, 100)).frame(5 / 18)
     assert np.abs(page.picture(5 / 18, (60, 100)).astype(float) - larger).mean() < 0.5
@@ -590,7 +572,7 @@ def test_play_waits_for_a_segment_that_is_not_decoded(opened):
     page, play = opened(video), VideoRenderer(video)
     page.until("foldgauss.stats.decoded.length === 5")
     page.page.evaluate(_HELD_BACK)
-    page.page.evaluate("foldgauss.seek(2 / 18)")
+    page.seek(2 / 18)
     before = page.picture()
     page.page.evaluate("void (sought = foldgauss.seek(12 / 18))")
     assert (page.stats["missing"], page.stats["segment"]) == (3, 0)
@@ -624,8 +606,8 @@ def test_a_segment_that_cannot_be_decoded_is_told(browser, tmp_path):
     told = page.page.locator("#notice-text").inner_text()
     assert told
     with pytest.raises(Exception, match=re.escape(told[:30])):
-        page.page.evaluate("foldgauss.seek(13 / 18)")
-    page.page.keyboard.press("Space")
+        page.seek(13 / 18)
+    page.press("Space")
     page.settle()
     page.close()
     assert not page.said

@@ -3,37 +3,27 @@
 import json
 from fractions import Fraction
 
-import av
 import cv2
 import numpy as np
 import pytest
+from made_clips import encode
 from PIL import Image
+from tiny_clips import MASK_SIZE as SIZE
+from tiny_clips import labels, write_mask
 
 from foldgauss.io import index_video, read_indexed, read_masks, read_video, write_image, write_video
 from foldgauss.io.media.indexing import FrameIndex
 from foldgauss.io.provenance import describe_reading
 
-SIZE = (40, 60)
 #: Display matrices of MP4, as it is and turned by 90 degrees clockwise.
 _UPRIGHT = [1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30]
 _TURNED = [0, 1 << 16, 0, -(1 << 16), 0, 0, SIZE[0] << 16, 0, 1 << 30]
 
 
-def labels(k):
-    """Object 1 walks to the right, object 2 stands, a corner is void."""
-    found = np.zeros(SIZE, np.uint8)
-    found[10:20, 10 + k : 20 + k] = 1
-    found[25:35, 40:50] = 2
-    found[:2, :2] = 255
-    return found
-
-
 @pytest.fixture
 def folder(tmp_path):
     for k in range(12):
-        image = Image.fromarray(labels(k)).convert("L")
-        image.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0] + [0] * 759)
-        image.save(tmp_path / f"mask{k}.png")
+        write_mask(tmp_path / f"mask{k}.png", labels(k))
     return tmp_path
 
 
@@ -102,13 +92,8 @@ def test_masks_as_stored_are_stretched_as_the_clip(tmp_path, aspect, turn, stret
     """A disc of the clip, and its mask at the size of the frames as stored, upright."""
     y, x = np.mgrid[: SIZE[0], : SIZE[1]]
     disc = (np.hypot(y - 12, x - 20) < 9)[..., None].repeat(3, -1)
-    with av.open(str(tmp_path / "clip.mp4"), "w") as out:
-        stream = out.add_stream("mpeg4", rate=10)
-        stream.height, stream.width, stream.pix_fmt = *SIZE, "yuv420p"
-        stream.codec_context.sample_aspect_ratio = Fraction(aspect)
-        stream.codec_context.bit_rate = 2_000_000
-        frame = av.VideoFrame.from_ndarray(np.uint8(255 * disc), format="rgb24")
-        out.mux([*stream.encode(frame), *stream.encode()])
+    context = {"sample_aspect_ratio": Fraction(aspect), "bit_rate": 2_000_000}
+    encode(tmp_path / "clip.mp4", np.uint8(255 * disc)[None], "mpeg4", "yuv420p", given="rgb24", context=context)
     if turn:
         data = (tmp_path / "clip.mp4").read_bytes()
         one, turned = (np.array(rows, ">i4").tobytes() for rows in (_UPRIGHT, _TURNED))
@@ -130,28 +115,29 @@ def test_masks_as_stored_are_stretched_as_the_clip(tmp_path, aspect, turn, stret
             assert np.mean(mask != shown) < 0.03
 
 
-def test_refused(folder, tmp_path):
-    def fails(match, *arguments, error=ValueError, **options):
-        with pytest.raises(error, match=match) as caught:
-            read_masks(*arguments, **options)
-        assert "\n" not in str(caught.value)
+#: Below `folder`: a path, options of `read_masks`, and the error.
+REFUSED = [
+    ("none", {}, "missing"),
+    ("", {"label": 3}, r"label: expected one of \[1, 2\] .*, got 3"),
+    *(("", {"label": label}, "label: expected an object's label, 1 to 254") for label in (0, 255, 1.5, True)),
+    ("", {"frames": (12, 13)}, "frames: expected A:B within 0:12, .* got 12:"),
+    ("", {"frames": (5, 5)}, "frames: expected A:B with at least 1 frame"),
+    ("mask0.png", {"frames": (0, 1)}, "frames: expected a folder or a video"),
+    ("", {"size": (0, 5)}, "size: expected"),
+    ("other", {}, "path: expected a folder with images"),
+    ("other/colors/0.png", {}, "label per pixel.*'RGB'"),
+    ("other/v.mp4", {"label": 1}, "label: expected images with labels, got the video"),
+    *(("other/v.mp4", {"level": level}, "level: expected a fraction of white") for level in (0, 1.5, None)),
+    ("other/text.mp4", {}, "does not open as a video"),
+]
 
-    fails("missing", folder / "none", error=FileNotFoundError)
-    fails(r"label: expected one of \[1, 2\] .*, got 3", folder, label=3)
-    for label in (0, 255, 1.5, True):
-        fails("label: expected an object's label, 1 to 254", folder, label=label)
-    fails("frames: expected A:B within 0:12, .* got 12:", folder, frames=(12, 13))
+
+def test_refused(folder):
+    (folder / "other" / "colors").mkdir(parents=True)
+    write_image(folder / "other" / "colors" / "0.png", np.full((*SIZE, 3), (1, 2, 3), np.uint8))
+    write_video(folder / "other" / "v.mp4", [np.zeros((*SIZE, 3), np.uint8)] * 2, 25)
+    (folder / "other" / "text.mp4").write_text("none")
+    for name, options, text in REFUSED:
+        with pytest.raises((ValueError, FileNotFoundError), match=rf"^[^\n]*{text}[^\n]*$"):
+            read_masks(folder / name, **options)
     assert len(read_masks(folder, frames=(10, 99))) == 2
-    fails("frames: expected A:B with at least 1 frame", folder, frames=(5, 5))
-    fails("frames: expected a folder or a video", folder / "mask0.png", frames=(0, 1))
-    fails("size: expected", folder, size=(0, 5))
-    (folder / "empty").mkdir()
-    fails("path: expected a folder with images", folder / "empty")
-    write_image(folder / "colors.png", np.full((*SIZE, 3), (1, 2, 3), np.uint8))
-    fails("label per pixel.*'RGB'", folder / "colors.png")
-    video = write_video(tmp_path / "v.mp4", [np.zeros((*SIZE, 3), np.uint8)] * 2, 25)
-    fails("label: expected images with labels, got the video", video, label=1)
-    for level in (0, 1.5, None):
-        fails("level: expected a fraction of white", video, level=level)
-    (folder / "text.mp4").write_text("none")
-    fails("does not open as a video", folder / "text.mp4")

@@ -1,37 +1,30 @@
 """Frames as triangles: out, through a mesh tool, and back; and what a tool may have done to them."""
 
+import dataclasses
 import json
 import math
 
-import equinox as eqx
 import numpy as np
 import pytest
 from made_clips import one_line
+from random_models import random_model
 
-from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import FormatError, frame_gaussians, read_pseudomesh, write_pseudomesh
 from foldgauss.io.exchange.pseudomesh import NOTES, _axes, read_obj
 from foldgauss.render import RenderOptions
-from foldgauss.video import FrameTimes, VideoModel
+from foldgauss.video import FrameTimes
 from foldgauss.video.models.renderer import VideoRenderer
-from foldgauss.video.models.row_layout import unpack
 
 NUM, FRAMES, SIZE = 40, 3, (48, 80)
 
 
-def random_model(num=NUM, size=SIZE, compositing="over"):
-    rng = np.random.default_rng(0)
-    rows = rng.normal(size=(num, 15)).astype(np.float32)
-    splats = unpack(rows, 2, TimeLikelihood(np.float32(2), np.float32(0)))
-    leaves = rng.uniform(-4, -2, (num, 2)).astype(np.float32), rng.uniform(-0.5, 0.5, (num, 2)).astype(np.float32)
-    splats = eqx.tree_at(lambda s: (s.log_scale, s.loc), splats, leaves)
-    options = RenderOptions(low_pass=0.1)
-    return VideoModel(splats, FrameTimes.uniform(FRAMES), size, 29.97, options, compositing)
+def evenly(model):
+    return dataclasses.replace(model, frame_times=FrameTimes.uniform(FRAMES))
 
 
 @pytest.fixture(scope="module")
 def model():
-    return random_model()
+    return evenly(random_model(NUM, degree=2))
 
 
 @pytest.fixture
@@ -136,7 +129,7 @@ def test_other_axes(folder):
 
 
 def test_sums_go_out_and_come_back(tmp_path):
-    model = random_model(compositing="sum")
+    model = evenly(random_model(NUM, degree=2, compositing="sum"))
     mesh = read_pseudomesh(write_pseudomesh(tmp_path / "mesh", model, [0.5]))
     assert mesh.compositing == "sum"
     assert np.abs(mesh.frame(0).astype(int) - VideoRenderer(model).frame(0.5)).max() <= 1
@@ -144,9 +137,8 @@ def test_sums_go_out_and_come_back(tmp_path):
 
 def test_a_folder_of_another_program(folder):
     (folder / NOTES).unlink()
-    with pytest.raises(FormatError) as caught:
+    with one_line(FormatError, "size=(480, 854)"):
         read_pseudomesh(folder)
-    one_line(caught, "size=(480, 854)")
     mesh = read_pseudomesh(folder, size=(48, 80))
     assert (mesh.fps, mesh.options, mesh.times.tolist()) == (25.0, RenderOptions(), [0, 0.5, 1])
     for kind in ("obj", "ply"):
@@ -185,9 +177,8 @@ def test_damaged_objects(tmp_path, kind):
     text, expected = DAMAGED[kind]
     path = tmp_path / "x.obj"
     path.write_text(text)
-    with pytest.raises(FormatError) as caught:
+    with one_line(FormatError, expected, "x.obj"):
         read_obj(path)
-    one_line(caught, expected, "x.obj")
 
 
 def test_forms_of_an_object(tmp_path):
@@ -207,24 +198,26 @@ def test_forms_of_an_object(tmp_path):
 )
 def test_faces_that_are_lost_or_flat(folder, change, text):
     edited(folder / "frame_0002.obj", change)
-    with pytest.raises(FormatError) as caught:
+    with one_line(FormatError, "frame_0002.obj", text):
         read_pseudomesh(folder)
-    one_line(caught, "frame_0002.obj", text)
 
 
-def test_incomplete_folders(folder):
-    with pytest.raises(FileNotFoundError, match="missing"):
-        read_pseudomesh(folder / "none")
+@pytest.mark.parametrize(
+    ("gone", "read", "error", "text"),
+    [
+        ([], "none", FileNotFoundError, "missing"),
+        ([], "frame_0000.obj", FormatError, r"\.obj"),
+        (["frame_0001.ply"], "", FormatError, r"frame_0001\.ply"),
+        (["frame_0001.ply", "frame_0001.obj"], "", FormatError, "times"),
+    ],
+)
+def test_incomplete_folders(folder, gone, read, error, text):
+    for name in gone:
+        (folder / name).unlink()
+    with pytest.raises(error, match=text):
+        read_pseudomesh(folder / read)
     with pytest.raises(FileNotFoundError, match="missing"):
         read_obj(folder / "none.obj")
-    with pytest.raises(FormatError, match=r"\.obj"):
-        read_pseudomesh(folder / "frame_0000.obj")
-    (folder / "frame_0001.ply").unlink()
-    with pytest.raises(FormatError, match=r"frame_0001\.ply"):
-        read_pseudomesh(folder)
-    (folder / "frame_0001.obj").unlink()
-    with pytest.raises(FormatError, match="times"):
-        read_pseudomesh(folder)
 
 
 @pytest.mark.parametrize(
@@ -235,9 +228,8 @@ def test_incomplete_folders(folder):
 )  # fmt: skip
 def test_notes_that_are_none(folder, notes):
     (folder / NOTES).write_text(notes)
-    with pytest.raises(FormatError) as caught:
+    with one_line(FormatError, NOTES):
         read_pseudomesh(folder)
-    one_line(caught, NOTES)
 
 
 def test_unknown_notes_do_no_harm(folder):

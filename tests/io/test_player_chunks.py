@@ -6,13 +6,12 @@ import http.server
 import json
 import re
 import threading
-from contextlib import contextmanager
 from itertools import accumulate
 
 import numpy as np
 import pytest
 from browser import Opened
-from commands import run
+from commands import call, run, running
 from editor_page import assert_shows, drop
 from soft_models import soft_model
 
@@ -104,18 +103,11 @@ class _Files(http.server.SimpleHTTPRequestHandler):
         pass
 
 
-@contextmanager
 def serving(folder, *, ranges=True):
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(_Files, directory=folder)) as server:
-        server.gate, server.ranges = threading.Event() if ranges else None, []
-        server.url = f"http://127.0.0.1:{server.server_port}/"
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            yield server
-        finally:
-            server.shutdown()
-            thread.join()
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(_Files, directory=folder))
+    server.gate, server.ranges = threading.Event() if ranges else None, []
+    server.url = f"http://127.0.0.1:{server.server_port}/"
+    return running(server)
 
 
 def test_chunks_of_the_time_shown_come_first(browser, film, whole, tmp_path):
@@ -128,11 +120,11 @@ def test_chunks_of_the_time_shown_come_first(browser, film, whole, tmp_path):
         assert page.stats["total"] == whole.num_gaussians
         assert np.abs(page.picture().astype(float) - VideoRenderer(coarse).frame(0.0)).mean() < 0.1
         assert "Loading" in page.page.locator("#stats").inner_text()
-        page.page.keyboard.press("e")
-        assert "once all of it has arrived" in page.page.locator("#toast").inner_text()
-        page.page.keyboard.press("s")
+        page.press("e")
+        assert "once all of it has arrived" in page.toast
+        page.press("s")
         assert not page.page.locator("#download-model").is_visible()
-        page.page.keyboard.press("Escape")
+        page.press("Escape")
         before = page.stats["loaded"]
         page.page.evaluate(f"void (sought = foldgauss.seek({TIMES[2]}))")
         server.gate.set()
@@ -144,7 +136,7 @@ def test_chunks_of_the_time_shown_come_first(browser, film, whole, tmp_path):
         assert sum(stop - start for start, stop in server.ranges) == page.stats["bytesRead"] == path.stat().st_size
         assert_shows(page, whole, TIMES)
         assert "Loading" not in page.page.locator("#stats").inner_text()
-        page.page.keyboard.press("e")
+        page.press("e")
         assert page.stats["editing"]
         page.check(server.url)
     page.close()
@@ -157,7 +149,7 @@ def test_without_ranges_the_file_is_read_as_it_comes(browser, film, tmp_path):
     with serving(tmp_path, ranges=False) as server:
         page = Opened(browser, server.url + write_linked(tmp_path, path)).ready()
         page.until("foldgauss.stats.loaded === 5 && !document.getElementById('toast').hidden")
-        assert "2 of its 7 chunks are damaged or missing" in page.page.locator("#toast").inner_text()
+        assert "2 of its 7 chunks are damaged or missing" in page.toast
         with pytest.warns(UserWarning, match="2 of its 7 chunks"):
             assert_shows(page, load_video_model(path), (*TIMES, 1.5 / PARTS))
         assert [url.endswith(".fgz") for url in page.asked].count(True) == 1
@@ -181,7 +173,7 @@ def test_a_file_from_the_disk_comes_in_chunks(opened, film, whole, tmp_path):
     bare.page.evaluate("void (Worker = null)")  # as where no worker is allowed
     drop(bare, again)
     bare.until("document.title === 'other' && !document.getElementById('toast').hidden")
-    assert "1 of its 7 chunks is damaged" in bare.page.locator("#toast").inner_text()
+    assert "1 of its 7 chunks is damaged" in bare.toast
     with pytest.warns(UserWarning, match="1 of its 7 chunks"):
         assert_shows(bare, load_video_model(again), TIMES[:1])
 
@@ -195,7 +187,7 @@ def test_a_linked_page_on_the_disk_says_what_to_do(browser, tmp_path):
     page.close()
 
 
-def test_the_file_of_a_linked_page_stands_beside_it(film, tmp_path, capsys):
+def test_the_file_of_a_linked_page_stands_beside_it(film, tmp_path):
     path = save_compact(tmp_path / "film.fgz", film)
     page = write_html(tmp_path / "page.html", path, linked=True).read_text(encoding="utf-8")
     assert 'data-url="film.fgz"' in page
@@ -209,8 +201,9 @@ def test_the_file_of_a_linked_page_stands_beside_it(film, tmp_path, capsys):
     assert run("view", other, "--linked", "--out", tmp_path / "site" / "other.html") == 0
     assert load_video_model(tmp_path / "site" / "other.page.fgz").num_gaussians == soft_model().num_gaussians
     (tmp_path / "site" / "other.html").unlink()
-    assert run("view", other, "--linked", "--out", tmp_path / "site" / "other.html") == 2
-    assert "other.page.fgz, which exists" in capsys.readouterr().err.replace("\n", "")
+    assert "other.page.fgz, which exists" in call(
+        "view", other, "--linked", "--out", tmp_path / "site" / "other.html", code=2
+    ).err.replace("\n", "")
     segments = SegmentedVideo.from_models([(0, soft_model()), (7, soft_model())])
     with pytest.raises(ValueError, match="linked: expected a single model"):
         write_html(tmp_path / "site" / "long.html", segments, linked=True)

@@ -11,6 +11,7 @@ from editor_page import (
     PICKED,
     TIMES,
     assert_shows,
+    begin_edit,
     download,
     drop,
     read_script,
@@ -42,7 +43,7 @@ def test_an_edit_shows_what_foldgauss_edit_gives(opened, compact, name):
     assert np.abs(page.picture(0.9).astype(float) - before).mean() > 0.3 or name in ("front", "back")
     own = script_of(page)  # what the page writes means the same
     assert_shows(page, parse_edit_script(own).apply(model), (0.5,))
-    page.page.keyboard.press("z")
+    page.press("z")
     np.testing.assert_array_equal(page.picture(0.9), before)
 
 
@@ -90,10 +91,10 @@ def test_a_model_that_no_file_holds_is_told(opened, compact):
         read_script(page, IT + f'do = "retime"\n{edit}\n')
         page.page.click("#files-open")
         page.page.click("#download-model")
-        told = page.page.locator("#toast").inner_text()
+        told = page.toast
         assert re.search(r"^\d+ Gaussians were moved in time, .* which no model file holds", told)
         assert "foldgauss edit MODEL SCRIPT --out edited.mp4" in told
-        page.page.keyboard.press("Escape")
+        page.press("Escape")
 
 
 def test_what_no_image_has_is_left_out_of_the_model(opened, tmp_path):
@@ -120,7 +121,7 @@ def test_messages_stand_above_the_dialog(opened, compact):
         box = page.page.locator("#toast").bounding_box()
         middle = [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2]
         assert page.page.evaluate("(at) => document.elementFromPoint(...at).id", middle) == "toast"
-        page.page.keyboard.press("Escape")
+        page.press("Escape")
         page.settle()
         assert page.page.locator("#toast").is_visible()  # it stays when the dialog is closed
 
@@ -128,9 +129,7 @@ def test_messages_stand_above_the_dialog(opened, compact):
 def test_a_change_of_color_is_shown_without_the_tint(opened, compact):
     page = opened(compact)
     plain = page.picture(0.4)
-    page.page.keyboard.press("e")
-    select(page, range(12))
-    tinted = page.picture()
+    tinted = begin_edit(page, range(12)).picture()
     assert np.abs(tinted.astype(float) - plain).mean() > 0.5
     for name, value in (("gain", "1.01"), ("opacity", "0.99")):
         page.page.locator(f"#{name}").fill(value)
@@ -141,7 +140,7 @@ def test_a_change_of_color_is_shown_without_the_tint(opened, compact):
 
 def test_undo_and_redo_go_through_all_steps(opened, compact):
     page = opened(compact)
-    page.page.keyboard.press("e")
+    page.press("e")
     pictures = [page.picture(0.4)]
     for action in (
         lambda: select(page, range(12)),
@@ -162,31 +161,27 @@ def test_undo_and_redo_go_through_all_steps(opened, compact):
     np.testing.assert_array_equal(pictures[-1], pictures[0])
     steps = page.stats["undoable"]
     for k in range(len(pictures) - 2, -1, -1):
-        page.page.keyboard.press("Control+z")
+        page.press("Control+z")
         np.testing.assert_array_equal(page.picture(0.4), pictures[k], str(k))
     assert page.page.locator("#undo").is_disabled()
     for k in range(1, len(pictures)):
-        page.page.keyboard.press("Control+Shift+z")
+        page.press("Control+Shift+z")
         np.testing.assert_array_equal(page.picture(0.4), pictures[k], str(k))
     assert (page.stats["undoable"], page.stats["redoable"]) == (steps, 0)
 
 
 def test_the_edit_is_there_again_when_the_page_is(opened, compact):
     page = opened(compact)
-    read_script(page, IT + EDITS["move"])
-    page.page.keyboard.press("e")
-    select(page, [20, 21])
+    begin_edit(read_script(page, IT + EDITS["move"]), [20, 21])
     before, text = page.picture(0.4), script_of(page)
     assert "20-21" in text
     page.page.reload()
-    page.ready()
-    page.page.keyboard.press("e")
+    page.ready().press("e")
     np.testing.assert_array_equal(page.picture(0.4), before)
     assert script_of(page) == text
-    page.page.keyboard.press("z")
-    page.page.keyboard.press("z")
+    page.press("z", "z")
     assert page.stats["steps"] == []
-    page.page.keyboard.press("Shift+z")
+    page.press("Shift+z")
     assert len(page.stats["steps"]) == 2
     page.page.evaluate("foldgauss.files.discard()")
     page.page.reload()
@@ -238,7 +233,7 @@ def test_a_script_comes_back_by_drop_and_by_the_button(opened, compact, tmp_path
 def test_scripts_that_the_page_cannot_do_are_told(opened, compact, text, message):
     page = opened(compact)
     read_script(page, text, "own.toml")
-    told = page.page.locator("#toast").inner_text()
+    told = page.toast
     assert told.startswith("own.toml: ")
     assert message in told
     assert page.stats["undoable"] == 0
@@ -256,15 +251,12 @@ def test_a_script_that_fails_when_applied_changes_nothing(opened, compact):
     read_script(page, IT + EDITS["hue"])
     before = page.picture(0.5)
     read_script(page, IT + EDITS["color"], "own.toml")
-    assert "own.toml: color: expected an object that is not black" in page.page.locator("#toast").inner_text()
+    assert "own.toml: color: expected an object that is not black" in page.toast
     many = "\n[[edits]]\n".join(
         f'do = "multiply"\noffsets = {[[0.1, 0.0]] * num}\noriginals = true\n' for num in (100, 999)
     )
     read_script(page, IT + many)
-    assert (
-        "expected at most 1,000,000 Gaussians with the copies, got 1,212,028"
-        in page.page.locator("#toast").inner_text()
-    )
+    assert "expected at most 1,000,000 Gaussians with the copies, got 1,212,028" in page.toast
     assert page.stats["undoable"] == 1
     np.testing.assert_array_equal(page.settle().picture(0.5), before)
 
@@ -285,7 +277,7 @@ def test_what_the_browser_kept_is_discarded_if_it_cannot_be_applied(opened, comp
     )
     page.page.reload()
     assert page.ready().stats["steps"] == []
-    assert "The edit that the browser kept is discarded: offsets: exp" in page.page.locator("#toast").inner_text()
+    assert "The edit that the browser kept is discarded: offsets: exp" in page.toast
     assert page.page.evaluate("Object.keys(localStorage)") == []
 
 
@@ -306,7 +298,7 @@ def test_an_edit_that_the_browser_cannot_keep_leaves_no_older_one(opened, compac
     )
     read_script(page, IT + EDITS["several"])
     page.page.evaluate("foldgauss.files.storage.flush()")
-    assert "does not keep this edit, nor its earlier state" in page.page.locator("#toast").inner_text()
+    assert "does not keep this edit, nor its earlier state" in page.toast
     assert page.page.evaluate("Object.keys(localStorage).every((name) => name.startsWith('filler'))")
 
 
@@ -329,19 +321,13 @@ def test_selections_of_scripts_are_combined(opened, compact):
 def test_segments_are_edited_by_one_script(opened):
     parts = [(6 * k, soft_model(seed=k, options=RenderOptions(), num_frames=7)) for k in range(2)]
     video = SegmentedVideo.from_models(parts)
-    page = opened(video)
-    page.until("foldgauss.stats.decoded.length === 2")
-    page.page.evaluate("foldgauss.seek(0.2)")
-    select(page, range(12))
-    page.page.evaluate("foldgauss.seek(0.9)")
-    select(page, range(12, 20))
-    page.page.keyboard.press("e")
+    page = opened(video).until("foldgauss.stats.decoded.length === 2")
+    select(page.seek(0.2), range(12))
+    begin_edit(page, range(12, 20), at=0.9)
     page.page.locator("#move-x").fill("10")
     assert page.page.locator("#freeze").is_disabled()
-    page.page.keyboard.press("Escape")
-    text = script_of(page)
-    edited = VideoRenderer(parse_edit_script(text).apply(video))
-    plain = VideoRenderer(video)
+    page.press("Escape")
+    edited, plain = (VideoRenderer(own) for own in (parse_edit_script(script_of(page)).apply(video), video))
     for t in (0.2, 0.9):
         far = np.abs(page.picture(t).astype(float) - edited.frame(t)).mean()
         assert far < 0.5 < np.abs(page.picture(t).astype(float) - plain.frame(t)).mean()

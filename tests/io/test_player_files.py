@@ -2,7 +2,6 @@
 
 import dataclasses
 import re
-import threading
 from contextlib import contextmanager
 
 import cv2
@@ -10,17 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from browser import Opened
+from commands import running
 from editor_page import (
     EDITS,
     IT,
     LEVELS,
     WORST,
     assert_shows,
+    begin_edit,
     download,
     drop,
     read_script,
     script_of,
-    select,
 )
 from soft_models import NUM, SIZE, soft_model
 
@@ -83,8 +83,7 @@ def test_a_3dgs_frame_looks_like_the_frame_it_was_exported_from(opened, tmp_path
     assert (far.mean() < LEVELS) & (far.max() <= WORST)
     assert bare.page.locator("#toast").is_hidden()
     assert "still image" in bare.page.locator("#facts").inner_text()
-    bare.page.keyboard.press("e")
-    select(bare, range(5))
+    begin_edit(bare, range(5))
     assert bare.page.locator("#shift").is_disabled()  # a still image has no time
     bare.page.locator("#gain").fill("3")
     download(bare, "#download-model", tmp_path / "still.safetensors")
@@ -105,7 +104,7 @@ def test_a_3dgs_scene_is_seen_along_z(opened, tmp_path):
     bare = opened(None, fresh=True)
     drop(bare, write_gaussians_ply(tmp_path / "scene.ply", scene))
     bare.until("foldgauss.seek")
-    assert "as a still image along its z-axis" in bare.page.locator("#toast").inner_text()
+    assert "as a still image along its z-axis" in bare.toast
     bulk = np.sort(mean, axis=0)[[2, -3]]  # of 300, 1% at either end
     box = bulk[1] - bulk[0]
     side = max(box[:2])
@@ -153,8 +152,7 @@ def test_files_that_cannot_be_opened_are_told(opened, tmp_path, name, content, m
     bare = opened(None)
     (tmp_path / name).write_bytes(content)
     drop(bare, tmp_path / name)
-    bare.page.locator("#toast").wait_for()
-    assert message in bare.page.locator("#toast").inner_text()
+    assert message in bare.toast
     assert bare.page.locator("#notice-open").is_visible()
 
 
@@ -171,21 +169,13 @@ def test_damaged_models_are_told(opened, compact, tmp_path):
         (tmp_path / name).write_bytes(content)
         bare.page.evaluate("document.getElementById('toast').hidden = true")
         drop(bare, tmp_path / name)
-        bare.page.locator("#toast").wait_for()
-        assert "damaged" in bare.page.locator("#toast").inner_text()
+        assert "damaged" in bare.toast
 
 
-@contextmanager
-def serving(page, script, token):
+def serving(model, script, token):
     """The server of `foldgauss view`, in a thread."""
-    with PageServer(page.encode(), 0, script=script, token=token) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            yield server.url
-        finally:
-            server.shutdown()
-            thread.join()
+    page = html_page(model, save_to=SaveTarget(script.name, token))
+    return running(PageServer(page.encode(), 0, script=script, token=token))
 
 
 def test_view_saves_to_disk_and_takes_it_up_again(browser, compact, tmp_path):
@@ -193,13 +183,13 @@ def test_view_saves_to_disk_and_takes_it_up_again(browser, compact, tmp_path):
 
     @contextmanager
     def shown():
-        with serving(html_page(compact, save_to=SaveTarget(script.name, token)), script, token) as url:
-            yield page.go(url).ready()
-            page.check(url)
+        with serving(compact, script, token) as server:
+            yield page.go(server.url).ready()
+            page.check(server.url)
 
     with shown():
         read_script(page, IT + EDITS["move"])
-        page.page.keyboard.press("Control+s")
+        page.press("Control+s")
         page.page.get_by_text("Saved as holiday.edit.toml").wait_for()
         assert script.read_text() == script_of(page)
         wanted = page.picture(0.4)
@@ -211,8 +201,8 @@ def test_view_saves_to_disk_and_takes_it_up_again(browser, compact, tmp_path):
         assert_shows(page, read_edit_script(script).apply(load_video_model(compact)))
     script.write_text("[selections.it]\nbox = [0, 0, 9, 9]\nframe = 0\n")
     with shown():
-        assert "box: expected indices" in page.page.locator("#toast").inner_text()
-        page.page.keyboard.press("s")
+        assert "box: expected indices" in page.toast
+        page.press("s")
         assert page.page.locator("#save-disk").is_disabled()
         assert "left alone" in page.page.locator("#save-about").inner_text()
     page.close()
@@ -221,11 +211,11 @@ def test_view_saves_to_disk_and_takes_it_up_again(browser, compact, tmp_path):
 @pytest.mark.slow
 def test_view_keeps_what_others_wrote_to_the_script(browser, compact, tmp_path):
     script, token = tmp_path / "clip.edit.toml", make_token()
-    with serving(html_page(compact, save_to=SaveTarget(script.name, token)), script, token) as url:
-        first = Opened(browser, url).ready()
+    with serving(compact, script, token) as server:
+        first = Opened(browser, server.url).ready()
         read_script(first, IT + EDITS["move"])
         second = first.context.new_page()
-        second.goto(url)
+        second.goto(server.url)
         second.evaluate("foldgauss.ready")
         first.page.evaluate("foldgauss.files.save()")
         saved = script.read_text()
@@ -235,7 +225,7 @@ def test_view_keeps_what_others_wrote_to_the_script(browser, compact, tmp_path):
         second.close()
         wait = "Promise.all([foldgauss.files.save(), foldgauss.files.save()])"
         first.page.evaluate(wait)  # again, by the version that it saved
-        assert "Saved as" in first.page.locator("#toast").inner_text()
+        assert "Saved as" in first.toast
         first.page.reload()
         assert [step["do"] for step in first.ready().stats["steps"] if "do" in step] == ["move"]
         script.write_text(IT + EDITS["hue"])  # by hand: it comes before what the browser kept
@@ -255,22 +245,18 @@ def test_view_keeps_what_others_wrote_to_the_script(browser, compact, tmp_path):
 
 
 def test_a_picture_is_what_is_shown(opened, compact, tmp_path):
-    page = opened(compact)
-    page.page.evaluate("foldgauss.seek(0.5)")
-    page.page.keyboard.press("e")
-    select(page, range(12))
-    page.page.keyboard.press("s")
+    page = begin_edit(opened(compact), range(12), at=0.5).press("s")
     page.page.locator("#record-height").fill("80")
     assert download(page, "#picture", tmp_path / "frame.png") == "clip-3.png"
     saved = cv2.imread(str(tmp_path / "frame.png"))[..., ::-1]
-    page.page.keyboard.press("e")
+    page.press("e")
     np.testing.assert_array_equal(saved, page.picture(size=(80, 128)))  # without the marks of the selection
 
 
 @pytest.mark.slow
 def test_a_video_is_recorded(opened, compact, tmp_path):
     page = opened(compact)
-    page.page.keyboard.press("s")
+    page.press("s")
     for name, value in (("height", 80), ("speed", 0.25), ("first", 1), ("last", 5)):
         page.page.locator(f"#record-{name}").fill(str(value))
     with page.page.expect_download() as waited:
@@ -292,11 +278,10 @@ def test_small_screens_and_both_themes_show_all(opened, compact):
     for width, height, scheme in ((1280, 800, "dark"), (360, 640, "light"), (740, 360, "dark")):
         page = opened(compact, viewport={"width": width, "height": height}, color_scheme=scheme)
         assert page.page.locator("#canvas").bounding_box()["height"] > 0.4 * height
-        page.page.keyboard.press("e")
-        select(page, range(12))
+        begin_edit(page, range(12))
         for name in ("panel", "files"):
             if name == "files":
-                page.page.keyboard.press("s")
+                page.press("s")
             assert page.page.evaluate("document.documentElement.scrollWidth") <= width
             outside = page.page.evaluate(
                 """(name) => [...document.getElementById(name).querySelectorAll("button, input:not([type=file])")]

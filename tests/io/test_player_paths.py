@@ -96,7 +96,7 @@ def test_damaged_paths_are_told(opened, tmp_path, what):
         path.write_bytes(path.read_bytes().replace(b'\\"paths\\": [2, 7]', b'\\"paths\\": [2, 6]'))
     drop(bare, path)
     bare.until("!document.getElementById('toast').hidden")
-    assert "damaged" in bare.page.locator("#toast").inner_text()
+    assert "damaged" in bare.toast
 
 
 # ----------------------------------------------------------------------------------------------- edits
@@ -117,7 +117,7 @@ def test_an_edit_moves_what_is_seen(opened, moving, tmp_path, name):
     again = load_video_model(tmp_path / "own.safetensors")
     assert_shows(page, again)  # what is downloaded is what is seen
     edited = page.picture(0.9)
-    page.page.keyboard.press("z")
+    page.press("z")
     np.testing.assert_array_equal(page.picture(0.9), before)
     bare = opened(None, fresh=True)
     drop(bare, tmp_path / "own.safetensors")
@@ -125,13 +125,9 @@ def test_an_edit_moves_what_is_seen(opened, moving, tmp_path, name):
     assert np.abs(bare.picture(0.9).astype(float) - edited).max() <= WORST
 
 
-def count_paths(page):
-    return page.page.evaluate("foldgauss.player.state.model.paths.count")
-
-
 def test_tools_take_what_is_seen_there(opened, moving):
     model, page = load_video_model(moving), opened(moving)
-    page.page.evaluate("foldgauss.seek(0.9)")
+    page.seek(0.9)
     page.page.click("#edit")
     page.page.click("[data-tool=rectangle]")
     box = (-0.3, -0.2, 0.2, 0.25)
@@ -153,9 +149,9 @@ def test_copies_beyond_what_can_be_held_are_refused(opened, moving, tmp_path):
     page = opened(moving)
     offsets = [[round(0.001 * k, 3), 0.0] for k in range(150)]
     read_script(page, IT + f'do = "multiply"\noffsets = {offsets}\n')
-    assert count_paths(page) == 300  # the first copy stays where it is
+    assert page.page.evaluate("foldgauss.player.state.model.paths.count") == 300  # the first copy stays where it is
     page.page.evaluate("foldgauss.files.downloadModel()")
-    assert "model file holds 255" in page.page.locator("#toast").inner_text()
+    assert "model file holds 255" in page.toast
     page.page.evaluate("foldgauss.player.state.model.paths.knots = 1e6")
     with pytest.raises(Exception, match="expected fewer copies of 300 shared paths"):
         page.page.evaluate("foldgauss.player.editing.edit({ do: 'multiply', offsets: [[0, 0]] })")

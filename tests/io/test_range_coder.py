@@ -61,17 +61,3 @@ def test_what_is_near_saves_bits():
     before = np.arange(-1, len(walk) - 1, dtype=np.int32)[:, None]
     near = len(coder.encode(walk, dataclasses.replace(plain, near=before)))
     assert near < 0.9 * len(coder.encode(walk, plain))
-
-
-def test_the_bytes_are_those_of_the_format():
-    """Another implementation must come to these: docs/format.md."""
-    values = np.array([0, 1, -1, 5, -300, 70_000, 0, 0, 2**30 - 1], np.int32)
-    contexts = np.array([0, 0, 1, 1, 2, 2, 31, 0, 0], np.uint8)
-    near = np.array([-1, 0, 1, 2, 3, 4, 5, 6, 7], np.int32)[:, None]
-    column = dataclasses.replace(
-        coder.Column.without_contexts(9), contexts=np.stack([contexts, contexts[::-1]], 1), near=near
-    )
-    assert coder.encode(values, column).hex() == EXPECTED
-
-
-EXPECTED = "7de4f9466c75820fbe54c26801f7a5ac00"

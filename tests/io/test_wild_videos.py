@@ -6,9 +6,9 @@ an encoder makes is made with ffmpeg, and skipped where there is none.
 
 import contextlib
 import gc
+import itertools
 import os
 import struct
-import wave
 import zipfile
 import zlib
 
@@ -16,6 +16,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+from commands import write_tone
 from made_clips import (
     CLIPS,
     SHOWN,
@@ -29,32 +30,16 @@ from made_clips import (
     png,
     put,
     refused,
-    rgba,
     uneven_mp4,
     waves,
     webm,
-    weighed,
     with_box,
 )
 from PIL import Image
 
-from foldgauss.io import VideoError, index_video, read_indexed, read_masks, read_video
+from foldgauss.io import FrameIndex, LazyFrames, VideoError, index_video, read_indexed, read_video
 from foldgauss.io.media import clip as clip_module
 from foldgauss.io.media import decoder
-
-FLAT = np.array(
-    [
-        [200, 30, 30],
-        [30, 200, 30],
-        [30, 30, 200],
-        [128, 128, 128],
-        [250, 250, 250],
-        [5, 5, 5],
-        [220, 180, 40],
-        [90, 20, 140],
-    ],
-    np.uint8,
-)
 
 
 @pytest.mark.parametrize("name", CLIPS)
@@ -67,7 +52,8 @@ def test_a_clip_is_read_as_the_table_says_and_its_spans_are_those_of_the_whole(t
     first, stop = clip.num_frames // 3, min(clip.num_frames, clip.num_frames // 3 + 4)
     part, span = read_video(path, frames=index.span(first, stop)), read_indexed(index, first, stop)
     assert index.notes == clip.notes
-    for found, expected in ((index, clip), (span, part)):
+    saved = FrameIndex.load(index.save(tmp_path / "index.npz"))
+    for found, expected in ((index, clip), (saved, index), (span, part)):
         for fact in ("num_frames", "fps", "num_declared", "has_alpha", "duration"):
             assert getattr(found, fact) == getattr(expected, fact), fact
         np.testing.assert_array_equal(found.times, expected.times)
@@ -102,27 +88,25 @@ def test_uneven_times_are_told_and_no_frame_is_lost(tmp_path, options, times, fp
 # ---------------------------------------------------------------------------------------- sizes and turns
 
 
+def turned(*matrix):
+    """The clip with another matrix of its track (tkhd)."""
+    return with_box(mp4(), b"tkhd", lambda content: content[:40] + struct.pack(">9i", *matrix) + content[76:])
+
+
 @pytest.mark.parametrize(("turns", "across"), [(1, 1), (2, 1), (3, 1), (0, -1), (1, -1), (2, -1), (3, -1)])
 def test_videos_are_turned_upright(tmp_path, turns, across):
-    """The matrix of a track (tkhd) turns it clockwise, by quarters, and may mirror it; phones write that."""
+    """The matrix turns it clockwise, by quarters, and may mirror it; phones write that."""
     cos, sin = ((1, 0), (0, 1), (-1, 0), (0, -1))[turns]
     matrix = (across * cos << 16, sin << 16, 0, across * -sin << 16, cos << 16, 0, 0, 0, 1 << 30)
-    matrix = struct.pack(">9i", *matrix)
-    turned = with_box(mp4(), b"tkhd", lambda content: content[:40] + matrix + content[76:])
-    (tmp_path / "a.mp4").write_bytes(mp4())
-    (tmp_path / "turned.mp4").write_bytes(turned)
-    stored = read_video(tmp_path / "a.mp4").frames
-    np.testing.assert_array_equal(
-        read_video(tmp_path / "turned.mp4").frames, np.rot90(stored, -turns, (1, 2))[:, :, ::across]
-    )
+    found = read_video(put(tmp_path / "turned.mp4", turned(*matrix))).frames
+    stored = read_video(put(tmp_path / "a.mp4", mp4())).frames
+    np.testing.assert_array_equal(found, np.rot90(stored, -turns, (1, 2))[:, :, ::across])
 
 
 @pytest.mark.parametrize(("degrees", "beyond"), [(30, 30), (80, -10), (-30, -30)])
 def test_other_rotations_are_told(tmp_path, degrees, beyond):
     cos, sin = (round(65536 * one(np.radians(degrees))) for one in (np.cos, np.sin))
-    matrix = struct.pack(">9i", cos, sin, 0, -sin, cos, 0, 0, 0, 1 << 30)
-    (tmp_path / "a.mp4").write_bytes(with_box(mp4(), b"tkhd", lambda content: content[:40] + matrix + content[76:]))
-    clip = read_video(tmp_path / "a.mp4")
+    clip = read_video(put(tmp_path / "a.mp4", turned(cos, sin, 0, -sin, cos, 0, 0, 0, 1 << 30)))
     assert clip.size == ((48, 64) if abs(degrees) < 45 else (64, 48))
     assert clip.notes == (f"the file asks for a rotation by {beyond} degrees beyond multiples of 90; it is left out.",)
 
@@ -216,17 +200,17 @@ def test_a_file_that_ends_in_random_bytes_is_noted(tmp_path, name):
 
 @pytest.mark.parametrize("name", ["a.ts", "a.mpg"])
 def test_sound_that_is_longer_than_the_picture_is_no_damage(tmp_path, name):
-    with av.open(str(tmp_path / name), "w") as container:
-        video, audio = container.add_stream("mpeg2video", rate=25), container.add_stream("mp2", rate=44100)
-        video.height, video.width, video.pix_fmt, video.bit_rate = 48, 64, "yuv420p", 100_000
-        audio.layout = "stereo"
-        for image in waves(10, 48, 64):
-            container.mux(video.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
-        for start in range(0, 5 * 44100, 1152):
-            sound = av.AudioFrame.from_ndarray(np.zeros((1, 2 * 1152), np.int16), format="s16", layout="stereo")
-            sound.sample_rate, sound.pts = 44100, start
-            container.mux(audio.encode(sound))
-        container.mux([*video.encode(), *audio.encode()])
+    sound, context = ("mp2", np.zeros(5 * 48_000)), {"bit_rate": 100_000}
+    encode(
+        tmp_path / name,
+        waves(10),
+        "mpeg2video",
+        "yuv420p",
+        given="rgb24",
+        context=context,
+        rate=25,
+        sound=sound,
+    )
     clip = read_video(tmp_path / name)
     assert clip.num_frames == 10
     assert not any("hold no frame" in note for note in clip.notes)
@@ -237,37 +221,6 @@ def test_a_declared_size_that_cannot_be_converted_to_is_an_error(video):
     video.stored_size = 63693, 2782
     with pytest.raises(VideoError, match=r"expected frames that FFmpeg converts to RGB, got .* 63693x2782\)"):
         video.to_array(av.VideoFrame(24, 16, "yuv420p"))
-
-
-@pytest.mark.parametrize(
-    ("name", "codec", "aspect", "size"),
-    [
-        ("a.mkv", "ffv1", "2/1", (48, 128)),
-        ("a.mkv", "ffv1", "16/15", (48, 68)),
-        ("a.mp4", "libx264", "16/15", (48, 68)),
-        ("a.mp4", "libx264", "1/2", (96, 64)),
-        ("a.mp4", "libx264", "30/1", (48, 64)),
-        ("a.h264", "libx264", "2/1", (48, 128)),
-        ("a.ts", "mpeg2video", "4/3", (48, 85)),  # 64 columns of 4/3 each, 16:9
-    ],
-)
-@pytest.mark.filterwarnings("ignore::UserWarning")  # of the masks
-def test_pixels_become_square(tmp_path, name, codec, aspect, size):
-    """MPEG-2 stores only a few aspects of the image, which is 4:3 or 16:9 then."""
-    quality = {"ffv1": (), "libx264": ("-crf", "5", "-pix_fmt", "yuv420p"), "mpeg2video": ("-q:v", "1")}[codec]
-    rate = 25 if codec == "mpeg2video" else 10
-    ffmpeg("-vf", f"setsar={aspect}", "-c:v", codec, *quality, tmp_path / name, frames=waves(), rate=rate)
-    clip = read_video(tmp_path / name)
-    assert clip.size == size
-    told = "kept as stored" if size == (48, 64) else f"stretched to {size[0]}x{size[1]}"
-    assert "times as wide as high" in clip.notes[0]
-    assert told in clip.notes[0]
-    expected = [cv2.resize(frame, size[::-1], interpolation=cv2.INTER_LINEAR) for frame in waves()]
-    assert np.abs(clip.frames - np.array(expected, int)).mean() < 3
-    assert read_masks(tmp_path / name).shape == clip.frames.shape[:3]
-    index = index_video(tmp_path / name)
-    assert index.size == size
-    np.testing.assert_array_equal(read_indexed(index, 2, 4).frames, clip.frames[2:4])
 
 
 @pytest.mark.parametrize("pixel_format", ["gray16le", "rgb48le"])
@@ -412,55 +365,6 @@ def test_hdr_is_tone_mapped(tmp_path, transfer, kind, primaries, limited, declar
 # --------------------------------------------------------------------------------------- gray, alpha, depth
 
 
-@pytest.mark.parametrize(
-    ("name", "options", "near"),
-    [
-        ("a.mkv", ("-c:v", "ffv1", "-pix_fmt", "yuv444p"), 2),
-        ("a.mkv", ("-c:v", "ffv1", "-pix_fmt", "yuv420p10le"), 3),
-        ("a.mkv", ("-c:v", "ffv1", "-pix_fmt", "yuv420p16le"), 3),
-        ("a.mkv", ("-c:v", "ffv1", "-pix_fmt", "gbrp10le"), 1),
-        ("a.mkv", ("-c:v", "ffv1", "-pix_fmt", "rgb48le"), 1),
-        ("a.mov", ("-c:v", "prores_ks", "-pix_fmt", "yuv422p10le"), 3),
-        ("a.mp4", ("-c:v", "libx264", "-crf", "1", "-pix_fmt", "yuv420p10le"), 3),
-        ("a.mp4", ("-c:v", "libx265", "-crf", "1", "-pix_fmt", "yuv420p10le", "-x265-params", "log-level=none"), 3),
-        ("a.webm", ("-c:v", "libvpx-vp9", "-crf", "1", "-pix_fmt", "yuv420p10le"), 3),
-        ("full.mkv", ("-vf", "scale=out_range=full", "-color_range", "pc", "-c:v", "ffv1", "-pix_fmt", "yuv420p"), 3),
-        ("hd.mkv", ("-vf", "scale=out_color_matrix=bt709", "-colorspace", "bt709", "-c:v", "ffv1"), None),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, tuple) else str(value),
-)
-def test_levels_of_depths_and_ranges(tmp_path, name, options, near):
-    """Ten bits are not clipped, a full range not stretched; colors are those of their matrix."""
-    frames = np.repeat(np.repeat(np.repeat(FLAT[None, None], 48, 1), 16, 2), 2, 0)
-    ffmpeg(*options, tmp_path / name, frames=frames)
-    found = read_video(tmp_path / name).frames[1]
-    for number, color in enumerate(FLAT):
-        patch = found[5:43, 16 * number + 5 : 16 * number + 11].astype(int)
-        assert np.abs(patch - color).max() <= (3 if near is None else near)
-
-
-@pytest.mark.parametrize(
-    ("name", "options"),
-    [
-        ("a.webm", ("-c:v", "libvpx-vp9", "-pix_fmt", "yuva420p")),
-        ("a.mov", ("-c:v", "qtrle", "-pix_fmt", "argb")),
-        ("a.mov", ("-c:v", "png", "-pix_fmt", "rgba")),
-        ("a.mov", ("-c:v", "prores_ks", "-profile:v", "4444", "-pix_fmt", "yuva444p10le")),
-        ("a.mkv", ("-c:v", "ffv1", "-pix_fmt", "bgra")),
-        ("a.mkv", ("-c:v", "ffv1", "-pix_fmt", "yuva420p")),
-        ("a.avi", ("-c:v", "utvideo", "-pix_fmt", "gbrap")),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, tuple) else value,
-)
-def test_alpha_of_videos_is_kept(tmp_path, name, options):
-    ffmpeg(*options, tmp_path / name, frames=rgba(waves(4)))
-    clip = read_video(tmp_path / name)
-    expected = weighed(rgba(waves(4)))
-    assert clip.has_alpha
-    assert np.abs(clip.frames - expected).mean() < 3
-    assert not clip.frames[:, 40:].any()  # transparent, so their colors are gone
-
-
 @pytest.mark.parametrize("kind", ["bgra", "yuva444p", "yuva444p10le", "rgba64le"])
 def test_alpha_of_hdr_is_kept(video, kind):
     """Of 8 bits, too, which tone mapping leaves out."""
@@ -595,31 +499,6 @@ def test_a_matroska_with_sound_that_breaks_off(tmp_path):
     assert 2 <= half.num_frames < half.num_declared == 8
 
 
-@pytest.mark.parametrize("name", ["a.mjpeg", "a"])
-def test_bare_sequences_of_jpegs_are_videos(tmp_path, name):
-    packets = [cv2.imencode(".jpg", frame)[1].tobytes() for frame in waves(3)]
-    (tmp_path / name).write_bytes(b"".join(packets))
-    assert np.abs(read_video(tmp_path / name).frames - waves(3).astype(int)).mean() < 4
-    (tmp_path / name).write_bytes(packets[0] + b"more")
-    assert read_video(tmp_path / name).num_frames == 1
-    (tmp_path / "photo.jpg").write_bytes(b"".join(packets))  # a camera's, with what it keeps beside the picture
-    assert read_video(tmp_path / "photo.jpg").num_frames == 1
-
-
-@pytest.mark.parametrize("codec", ["mjpeg", "mpeg4"])
-def test_frames_that_an_avi_repeats_are_not_missed(tmp_path, codec):
-    """Frame 4 is shown for four tenths; the file counts 12, and stores 9."""
-    kept = np.array([0, 1, 2, 3, 7, 8, 9, 10, 11])
-    kind = "yuvj420p" if codec == "mjpeg" else "yuv420p"
-    encode(tmp_path / "a.avi", waves(12)[kept], codec, kind, given="rgb24", times=kept, options={"q": "2"})
-    clip = read_video(tmp_path / "a.avi")
-    assert (clip.num_frames, clip.num_declared, clip.duration) == (9, 9, pytest.approx(1.2))
-    np.testing.assert_allclose(clip.times, kept / 10, atol=1e-6)
-    assert [note for note in clip.notes if "decode" in note] == []
-    with pytest.raises(VideoError, match="A:B within 0:9"):
-        read_video(tmp_path / "a.avi", frames=(9, 12))
-
-
 def test_an_unknown_matrix_is_named(tmp_path):
     """That of its frames in the H.264 stream, YCgCo."""
     options = {"x264-params": "colormatrix=YCgCo"}
@@ -655,6 +534,14 @@ def test_broken_frames_are_left_out(tmp_path, broken):
     shown = np.array(sound) / 10
     if np.ptp(np.diff(sound)):  # there is a gap in the middle
         np.testing.assert_allclose(clip.times, shown - shown[0], atol=1e-3)
+    index = index_video(tmp_path / "a.avi")
+    assert index.positions.tolist() == sound
+    for first, stop in itertools.combinations(range(len(sound) + 1), 2):
+        places = index.span(first, stop)
+        assert places == (sound[first], sound[stop - 1] + 1)
+        np.testing.assert_array_equal(read_video(tmp_path / "a.avi", frames=places).frames, clip.frames[first:stop])
+        np.testing.assert_array_equal(read_indexed(index, first, stop).frames, clip.frames[first:stop])
+    np.testing.assert_array_equal(LazyFrames(index)[1:], clip.frames[1:])
     late = read_video(tmp_path / "a.avi", frames=(6, 7))  # frames keep their numbers
     assert late.notes == ()
     np.testing.assert_array_equal(late.frames, noise()[6:7])
@@ -686,12 +573,6 @@ def test_pages_of_a_tiff_are_refused_whatever_it_is_called(tmp_path):
 # ------------------------------------------------------------------------------------------- other things
 
 
-def _wav(path):
-    with wave.open(str(path), "wb") as sound:
-        sound.setparams((1, 2, 8000, 0, "NONE", ""))
-        sound.writeframes(bytes(800))
-
-
 def _zip(path):
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("a.txt", "text")
@@ -701,7 +582,7 @@ OTHERS = {
     "nothing": (lambda path: path.write_bytes(b""), "an empty file"),
     "zeros": (lambda path: path.write_bytes(bytes(5000)), "5000 bytes"),
     "text": (lambda path: path.write_text("Dear diary,\n" * 40), "a text"),
-    "audio": (_wav, "audio"),
+    "audio": (lambda path: write_tone(path, 0.1), "audio"),
     "zip": (_zip, "a zip archive"),
     "model": (lambda path: path.write_bytes(struct.pack("<Q", 2) + b"{}"), "a model"),
     "list": (lambda path: path.write_text("#EXTM3U\nother.ts\n"), "a list of other files"),
@@ -887,8 +768,3 @@ def test_huge_videos_are_refused_before_a_frame_is_decoded(tmp_path, monkeypatch
     monkeypatch.setattr(clip_module, "MAX_PIXELS", 48 * 64 - 1)
     monkeypatch.setattr(decoder.VideoDecoder, "frames", None)
     refused(tmp_path / "a.mp4", "at most 3,071 pixels", "48x64", "a.mp4")
-
-
-# ------------------------------------------------------------------------------------------- the commands
-
-FEW = ("--steps", 2, "--gaussians", 20, "--size", "16x16")
