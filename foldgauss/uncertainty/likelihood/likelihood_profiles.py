@@ -61,13 +61,15 @@ AWAY = 0.5
 class LikelihoodProfiles:
     """Log-likelihood curves of all frames as functions of their times, and the noise that they assume.
 
-    `residual_correlation` (lags,): correlation of residuals by distance in pixels, averaged over frames.
-    `num_rendered`: number of rendered images. `level`: "splats" if all splats are held, "colors" if their colors are
-    integrated out. `notes`: texts of the warnings.
+    `log_likelihood` (num_frames,): of each frame at the mode of its curve, where the curve is 0, in nats, without the
+    normalizing constant of the noise. `residual_correlation` (lags,): correlation of residuals by distance in pixels,
+    averaged over frames. `num_rendered`: number of rendered images. `level`: "splats" if all splats are held, "colors"
+    if their colors are integrated out. `notes`: texts of the warnings.
     """
 
     curves: ProfileCurves
     noise: FrameNoise
+    log_likelihood: Float64[np.ndarray, " num_frames"]
     residual_correlation: Float64[np.ndarray, " lags"]
     num_rendered: int
     level: str = "splats"
@@ -179,7 +181,8 @@ class ProfileBuilder:
         if not isinstance(kind, FrameNoise):  # again, with the residuals at the refined modes
             noise, correlation = self.estimate_noise(kind)
             self.refine(noise)
-        return LikelihoodProfiles(self.curves(noise), noise, correlation, self.num_rendered)
+        best = -noise.weight * np.array([each.errors.min() for each in self.samples])
+        return LikelihoodProfiles(self.curves(noise), noise, best, correlation, self.num_rendered)
 
     def refine(self, noise: FrameNoise) -> None:
         """Insert nodes into the profiles of all frames but the first and the last, whose times are fixed."""
