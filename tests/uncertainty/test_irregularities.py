@@ -104,8 +104,6 @@ def test_intervals_cover():
         ("dropped", 1.0),
         ("dropped", np.nan),
         ("probability", 0),
-        ("reach", 0),
-        ("reach", 1.5),
     ],
 )
 def test_settings_out_of_range(setting, value):

@@ -186,14 +186,9 @@ def test_gaussians_on_shared_paths_warn():
     assert len(found.notes) == 1
 
 
-def test_a_reach_that_is_too_short_is_widened_or_refused(monkeypatch):
+def test_a_reach_that_is_too_short_is_widened(monkeypatch):
     times = np.linspace(0, 1, 9) ** 3
     whole = likelihood_profiles(model(), clip(times), noise=white(0.02))
-    with pytest.raises(ValueError, match="reach"):
-        likelihood_profiles(model(), clip(times), noise=white(0.02), reach=1)
-    dense = clip(np.linspace(0, 1, 70))  # most of these frames have no time of the model within reach
-    with pytest.raises(ValueError, match="reach"):
-        likelihood_profiles(model(), dense, noise=white(0.02), reach=1)
     monkeypatch.setattr(drawing, "MOST_EVERYWHERE", 3)
     monkeypatch.setattr(drawing, "REACH", 1)
     widened = likelihood_profiles(model(), clip(times), noise=white(0.02))

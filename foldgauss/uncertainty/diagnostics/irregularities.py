@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from foldgauss._runtime.checks import check_within, invalid, is_integer
+from foldgauss._runtime.checks import check_within
 from foldgauss.uncertainty.posterior.result import FrameTimePosterior
 from foldgauss.video.models.frame_times import is_cut
 
@@ -73,25 +73,22 @@ def irregularities(
     dropped: float = 1.75,
     *,
     probability: float = 0.5,
-    reach: int = REACH,
 ) -> list[Irregularity]:
     """Intervals below `duplicate` or above `dropped` times the local median in at least `probability` of the draws.
 
-    The local median is that of the `reach` intervals before and after within the shot, in the same draw, so a speed
+    The local median is that of the four intervals before and after within the shot, in the same draw, so a speed
     that changes smoothly is regular. Cuts (`frame_times.is_cut`) are not reported and limit the neighborhood. Intervals
     of frames that are not identified (`FrameTimePosterior.identified`) are not assessed.
 
-    Raises ValueError for bounds that are not 0 < duplicate < 1 < dropped, a probability outside (0, 1], reach < 1.
+    Raises ValueError for bounds that are not 0 < duplicate < 1 < dropped, and a probability outside (0, 1].
 
     **Example:** `[one.frames for one in irregularities(posterior) if one.kind == "duplicated"]`.
     """
     check_within("duplicate", duplicate, "(0, 1)", "a number in (0, 1)")
     check_within("dropped", dropped, "(1, inf)", "a number > 1")
     check_within("probability", probability, "(0, 1]", "a number in (0, 1]")
-    if not is_integer(reach, 1):
-        raise invalid("reach", expected="a whole number >= 1", got=reach)
     steps, assessable, found = np.diff(_thin_draws(posterior), axis=1), is_assessable(posterior), []
-    for k, near in _neighbors(find_cuts(posterior), reach):
+    for k, near in _neighbors(find_cuts(posterior)):
         if not assessable[k]:
             continue
         size = steps[:, k] / np.median(steps[:, near], axis=1)
@@ -127,11 +124,11 @@ def even_times(posterior: FrameTimePosterior) -> tuple[Float64[np.ndarray, " num
     return even, float(np.diff(mean)[~cut].mean())
 
 
-def _neighbors(cut: np.ndarray, reach: int) -> Iterator[tuple[int, list[int]]]:
+def _neighbors(cut: np.ndarray) -> Iterator[tuple[int, list[int]]]:
     """Each interval that is not a cut, with those near it in the same shot, if there are at least two."""
     shot = np.cumsum(cut)
     for k in np.flatnonzero(~cut):
-        around = range(max(k - reach, 0), min(k + reach + 1, len(cut)))
+        around = range(max(k - REACH, 0), min(k + REACH + 1, len(cut)))
         near = [j for j in around if j != k and not cut[j] and shot[j] == shot[k]]
         if len(near) >= 2:
             yield int(k), near

@@ -1,7 +1,7 @@
 r"""Uncertainty of frame times by refitting splats and times together.
 
-The posterior given likelihood profiles takes the splats as known. Here they are refitted together with the times: to
-resampled frames (method="pixels"), or once more to the same frames (method="order").
+The posterior given likelihood profiles takes the splats as known. Here they are refitted together with the times, to
+resampled frames.
 
 Times are not identified absolutely: for any increasing g, times g(t_k) and splats whose m_t, sigma_t and folds follow g
 show the same frames. Only $t_0 = 0$ and $t_{n-1} = 1$ are fixed, so absolute times spread the more the longer the fit;
@@ -18,14 +18,13 @@ import scipy.stats
 from jaxtyping import Float, Float64, UInt8
 
 from foldgauss._numerics.random_streams import Stream, make_generator, seed_sequence
-from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_integer
+from foldgauss._runtime.checks import check_within, invalid, is_integer
 from foldgauss.uncertainty.likelihood.likelihood_profiles import check_explained
 from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.video.fitting.config import FitConfig, planned_steps
 from foldgauss.video.fitting.loop import fit_steps, start_from, to_model
 from foldgauss.video.models.video_model import VideoModel
 
-METHODS = ("pixels", "order")
 #: A refit repeats the schedule from this fraction on, with its last learning rates and loss.
 START_AT = 0.7
 #: The least `LearningRates.cooldown` of refits: the spread is that of the estimate, not of its last steps.
@@ -98,7 +97,6 @@ def refit_frame_times(
     config: FitConfig,
     *,
     replicates: int = 20,
-    method: str = "pixels",
     block: int = 16,
     seed: int = 0,
     steps: int | None = None,
@@ -106,10 +104,8 @@ def refit_frame_times(
 ) -> RefitTimes:
     """Frame times of `replicates` refits, which continue from the model with the learning rates of the schedule's end.
 
-    * method="pixels": residual bootstrap; to the model's images plus resampled residuals, see `resample_frames`. The
-      times spread around the model's own, which are the truth of the bootstrap.
-    * method="order": to the unchanged frames, in another order. This is the spread of the optimizer, which the other
-      method includes.
+    A residual bootstrap: each refit is to the model's images plus resampled residuals, see `resample_frames`. The times
+    spread around the model's own, which are the truth of the bootstrap. The optimizer's own spread is included.
 
     `video`: the clip that `model` was fitted to with `config`. `steps` of each refit: by default those of the end of
     the schedule of `config` (from `START_AT` on); `config.minutes` and a compact model that it asks for are ignored.
@@ -119,12 +115,11 @@ def refit_frame_times(
     Raises ValueError for a video that is not the model's, a config that could not have fitted it, and settings out of
     range. Example: `refit_frame_times(model, frames, config, replicates=8).ratio_to(std_given_the_splats)`.
     """
-    check_one_of("method", method, METHODS)
     for name, value, least in (("replicates", replicates, 2), ("seed", seed, 0)):
         if not is_integer(value, least):
             raise invalid(name, expected=f"a whole number >= {least}", got=repr(value))
     video = np.asarray(video)
-    residuals = _check_video(model, video, method)
+    residuals = _check_video(model, video)
     if not is_integer(block, 1) or block > min(model.size):
         raise invalid("block", expected=f"a whole number from 1 to {min(model.size)}", got=repr(block))
     config = _fix_steps(config, len(video), steps)
@@ -132,7 +127,7 @@ def refit_frame_times(
     for number in range(replicates):
         own = dataclasses.replace(config, seed=int(seed_sequence(Stream.REFIT, number, seed=seed).generate_state(1)[0]))
         rng = make_generator(Stream.RESAMPLED_FRAME, number, seed=seed)
-        frames = resample_frames(residuals, block, rng) if method == "pixels" else video
+        frames = resample_frames(residuals, block, rng)
         *_, (state, _) = fit_steps(frames, own, start_from(model, own, own.steps, START_AT))  # steps share one state
         refitted = to_model(state, own, model.size, model.fps)
         times.append(np.asarray(refitted.frame_times.times(), np.float64))
@@ -141,7 +136,7 @@ def refit_frame_times(
     return RefitTimes(np.stack(times), np.asarray(model.frame_times.times(), np.float64))
 
 
-def _check_video(model: VideoModel, video: np.ndarray, method: str) -> Residuals:
+def _check_video(model: VideoModel, video: np.ndarray) -> Residuals:
     residuals = Residuals(model, video)
     if len(video) != model.num_frames:
         expected = f"the {model.num_frames} frames that the model was fitted to"
@@ -149,11 +144,9 @@ def _check_video(model: VideoModel, video: np.ndarray, method: str) -> Residuals
     if len(video) < 3:
         cure = "The first frame is at time 0 and the last at 1; others are needed."
         raise invalid("video", expected="at least 3 frames", got=len(video), cure=cure)
-    if method == "pixels" and video.shape[3] == 4:
-        cure = 'Fit it without alpha, or use method="order".'
-        raise invalid(
-            "video", expected="frames without alpha for pixels", got=f"{video.dtype} {video.shape}", cure=cure
-        )
+    if video.shape[3] == 4:
+        got = f"{video.dtype} {video.shape}"
+        raise invalid("video", expected="frames without alpha", got=got, cure="Fit it without alpha.")
     images = residuals.render_at(np.asarray(model.frame_times.times()))
     left = sum(float(np.square(residuals.residual(k, each), dtype=np.float64).sum()) for k, each in enumerate(images))
     variation = sum(float(frame.var(axis=(0, 1)).sum()) for frame in residuals.frames) * math.prod(model.size) / 255**2
