@@ -15,14 +15,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, ArrayLike, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from foldgauss._numerics.batch import (
     BatchModule,
+    FunctionModule,
     check_finite,
     check_positive,
     common_dtype,
     concrete_value,
+    jvp_of_moving,
     vectorized,
 )
 from foldgauss._numerics.piecewise import locate
@@ -227,7 +229,7 @@ class FourierFold(AbstractFold):
         return shift
 
 
-class CallableFold(AbstractFold):
+class CallableFold(FunctionModule, AbstractFold):
     """Any function of one scalar, with or without parameters, as a fold: `f(u) = function(u)`.
 
     **Shapes:** `function` maps one scalar u to (d-1,); this class vmaps it, u (*batch,) -> (*batch, d-1).
@@ -240,26 +242,16 @@ class CallableFold(AbstractFold):
     callable.
     """
 
-    parameters: PyTree
-    static: PyTree = eqx.field(static=True)
-    # Set at construction, from the arrays of a single fold, so that the axes of a later vmap are known to be batch.
-    parameter_ranks: tuple[int, ...] = eqx.field(static=True)
-
     shares_leaves = True
 
     def __init__(self, function: Callable[[Float[Array, ""]], Float[Array, " d-1"]]):
         if not callable(function):
             raise invalid("function", expected="a callable u -> (d-1,)", got=repr(function))
-        self.parameters, self.static = eqx.partition(function, eqx.is_array)
-        self.parameter_ranks = tuple(x.ndim for x in jax.tree.leaves(self.parameters))
-
-    @property
-    def leaf_ranks(self) -> tuple[int, ...]:
-        return self.parameter_ranks
+        super().__init__(function)
 
     @vectorized(0)
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
-        return jnp.asarray(eqx.combine(self.parameters, self.static)(u))
+        return self.evaluate(u)
 
 
 class SharedPathFold(AbstractFold):
@@ -397,13 +389,7 @@ def _shift(structure, u, *leaves):
 @partial(_shift.defjvp, symbolic_zeros=True)
 def _shift_jvp(structure, primals, tangents):
     u, *leaves = primals
-    moving = [i for i, tangent in enumerate(tangents[1:]) if not isinstance(tangent, SymbolicZero)]
-
-    def of_leaves(*moved):
-        every = {**dict(enumerate(leaves)), **dict(zip(moving, moved, strict=True))}
-        return jax.tree.unflatten(structure, [every[i] for i in range(len(leaves))])(u)
-
-    shift, moved = jax.jvp(of_leaves, [leaves[i] for i in moving], [tangents[1 + i] for i in moving])
+    shift, moved = jvp_of_moving(lambda *leaves: jax.tree.unflatten(structure, leaves)(u), leaves, tangents[1:])
     if isinstance(tangents[0], SymbolicZero):
         return shift, moved
     slope = jax.jvp(lambda u: jax.tree.unflatten(structure, leaves)(u), (u,), (jnp.ones_like(u),))[1]

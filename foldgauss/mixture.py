@@ -22,7 +22,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Float, Int, Key
 
 from foldgauss._numerics.abstract import AbstractDistribution
-from foldgauss._numerics.batch import as_event, as_sample_shape, as_value, flatten_points, vectorize
+from foldgauss._numerics.batch import as_event, as_sample_shape, as_value, bisect, flatten_points, vectorize
 from foldgauss._numerics.factor import normalize_indices
 from foldgauss._runtime.checks import invalid
 from foldgauss.analysis.conditional import TimeMixture
@@ -340,15 +340,9 @@ def _icdf(mixture: Mixture, q: Array) -> Array:
     low, high, is_nan = vectorize(ends, (weights, 1), (quantiles, 1))
     q = jnp.broadcast_to(q, low.shape)
 
-    def halve(_, bounds):
-        low, high = bounds
-        middle = low + 0.5 * (high - low)
-        below = _cdf(mixture, middle[..., None]) < q
-        return jnp.where(below, middle, low), jnp.where(below, high, middle)
-
-    steps = jnp.finfo(q.dtype).nmant + 8
     inner = jnp.isfinite(low) & jnp.isfinite(high)
-    found = lax.fori_loop(0, steps, halve, (jnp.where(inner, low, 0), jnp.where(inner, high, 0)))[1]
+    ends = (jnp.where(inner, end, 0) for end in (low, high))
+    found = bisect(lambda x: _cdf(mixture, x[..., None]) < q, *ends, jnp.finfo(q.dtype).nmant + 8)[1]
     return lax.stop_gradient(jnp.where(is_nan, jnp.nan, jnp.where(inner, found, low)))[..., None]
 
 

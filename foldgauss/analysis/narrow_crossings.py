@@ -11,6 +11,7 @@ from jax import lax
 from jax.scipy.special import logsumexp
 from jaxtyping import Array
 
+from foldgauss._numerics.batch import bisect
 from foldgauss.analysis.quadrature import KRONROD_NODES, REACH, SEARCH_GRID, Panels
 from foldgauss.gaussian import Gaussian
 
@@ -111,13 +112,7 @@ def _roots(function, edges, count: int, rank) -> tuple[Array, Array]:
     best, taken = lax.top_k(ranks, count)
     low, high, rises = edges[:-1][taken], edges[1:][taken], below[:-1][taken]
 
-    def halve(_, bounds):
-        low, high = bounds
-        middle = 0.5 * (low + high)
-        before = (function(middle) < 0) == rises
-        return jnp.where(before, middle, low), jnp.where(before, high, middle)
-
-    low, high = lax.fori_loop(0, jnp.finfo(edges.dtype).nmant + 10, halve, (low, high))
+    low, high = bisect(lambda x: (function(x) < 0) == rises, low, high, jnp.finfo(edges.dtype).nmant + 10)
     return jnp.where(jnp.isneginf(best), jnp.nan, 0.5 * (low + high)), ranks.at[taken].set(-jnp.inf)
 
 

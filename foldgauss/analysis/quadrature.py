@@ -16,7 +16,7 @@ from jax import lax
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float
 
-from foldgauss._numerics.batch import BatchModule, concrete_value
+from foldgauss._numerics.batch import BatchModule, bisect, concrete_value
 
 __all__ = [
     "KRONROD_NODES",
@@ -398,15 +398,8 @@ def _series(coefficients: Float[Array, "16"], y: Array) -> Array:
 
 def _solved(coefficients: Float[Array, "16"], value: Array) -> Array:
     """y in [-1, 1] where an increasing Legendre series has the value: bisection, and a Newton step for derivatives."""
-
-    def halve(_, bounds):
-        low, high = bounds
-        middle = 0.5 * (low + high)
-        above = _series(coefficients, middle) > value
-        return jnp.where(above, low, middle), jnp.where(above, middle, high)
-
     one = jnp.ones_like(value)
-    low, high = lax.fori_loop(0, 50, halve, (-one, one))
+    low, high = bisect(lambda y: ~(_series(coefficients, y) > value), -one, one, 50)
     y = lax.stop_gradient(0.5 * (low + high))
     slope = lax.stop_gradient(jax.jvp(partial(_series, coefficients), (y,), (one,))[1])
     step = (value - _series(coefficients, y)) / jnp.where(slope > 0, slope, 1)

@@ -57,7 +57,7 @@ def is_chunked(X) -> bool:
 def open_chunks(X, sample_weight=None, width: int | None = None) -> "IterableChunks | DaskChunks":
     """The source of the chunks X; `width` is the number of columns if it is known.
 
-    `sample_weight` is chunked as X is, or an array of one weight a row.
+    `sample_weight` is chunked as X is; that of a dask array may be one array.
 
     **Raises:** ValueError if X can be iterated only once, or is a dask array whose chunks are unknown or split rows.
     """
@@ -76,10 +76,9 @@ class IterableChunks:
 
     def __init__(self, X, sample_weight, width):
         _check_iterable("X", X)
-        if sample_weight is not None and not _is_array(sample_weight):
+        if sample_weight is not None:
             _check_iterable("sample_weight", sample_weight)
-        self._weights = np.asarray(sample_weight) if _is_array(sample_weight) else sample_weight
-        self._chunks, self.width, self._num_rows = X, width, None
+        self._chunks, self._weights, self.width, self._num_rows = X, sample_weight, width, None
 
     def run(self, task, *arguments, each=None):
         own = () if each is None else (each[0],)
@@ -90,20 +89,14 @@ class IterableChunks:
 
     def _read(self) -> Iterator[Piece]:
         """The pieces of all chunks, after checking that weights match and that passes have equal numbers of rows."""
-        row, own, one_array = 0, None, isinstance(self._weights, np.ndarray)
-        of_chunks = iter(() if self._weights is None else self._weights)
+        row, of_chunks = 0, iter(() if self._weights is None else self._weights)
         for number, x in enumerate(self._chunks):
-            if one_array:
-                own = self._weights[row : row + len(x)]
-            elif self._weights is not None:
-                own = next(of_chunks, ())
+            own = None if self._weights is None else next(of_chunks, ())
             for piece in _split_chunk(number, x, own, self.width):
                 self.width = piece.x.shape[1]
                 yield piece
             row += len(x)
-        if one_array and len(self._weights) != row:
-            raise invalid("sample_weight", expected=f"{row} weights, one for each row", got=len(self._weights))
-        if not one_array and next(of_chunks, None) is not None:
+        if next(of_chunks, None) is not None:
             raise invalid("sample_weight", expected="as many chunks as X", got="more")
         if self._num_rows not in (None, row):
             got, cure = f"{self._num_rows} at first and {row} now", f"Each pass reads them anew. {_SOURCES}"
@@ -195,18 +188,13 @@ def _check_iterable(name: str, chunks) -> None:
         raise invalid(name, expected="chunks that can be read again in each pass", got=got, cure=_SOURCES)
 
 
-def _is_array(weights) -> bool:
-    """Whether these are weights of rows, such as a list of numbers, rather than chunks of weights."""
-    is_list = isinstance(weights, Sequence) and len(weights) > 0 and np.ndim(weights[0]) == 0
-    return is_list or (hasattr(weights, "__array__") and np.ndim(weights) == 1)
-
-
 def _split_chunk(number: int, x, weights, width: int | None) -> Iterator[Piece]:
     """Split a chunk to pieces of checked values; weights of None are 1."""
     name = f"X, chunk {number}"
     check_real(name, x)
-    if weights is not None and len(weights) != len(x):
-        raise invalid(f"sample_weight, chunk {number}", expected=f"{len(x)} weights", got=len(weights))
+    if weights is not None and np.shape(weights)[:1] != (len(x),):
+        got = f"{len(weights)}" if np.ndim(weights) else "a number"
+        raise invalid(f"sample_weight, chunk {number}", expected=f"{len(x)} weights", got=got)
     for row in range(0, len(x), _PIECE_ROWS):
         rows = slice(row, row + _PIECE_ROWS)
         part = check_array(x[rows], dtype=[np.float64, np.float32], ensure_all_finite=False, input_name=name)

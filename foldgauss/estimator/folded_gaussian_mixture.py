@@ -77,7 +77,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
 
     **Data larger than memory:** in place of rows (n, d), X may be chunks of rows: an iterable of arrays (n_i, d) that
     can be iterated repeatedly (such as a list), or a dask array chunked along its rows. `sample_weight` is then chunked
-    likewise, or one array of n weights. Every iteration reads all chunks once (twice with an envelope other than
+    likewise. Every iteration reads all chunks once (twice with an envelope other than
     "constant"): those of an iterable one after another, each chunk of a dask array as a task of dask's scheduler, on
     workers if a `dask.distributed` client is active. The result equals that of the rows in one array, up to rounding.
 
@@ -236,7 +236,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
             options = {"dtype": [np.float64, np.float32], "ensure_min_samples": 2}
             X = validate_data(self, X, ensure_all_finite=sample_weight is None, **options)
             weights = _check_sample_weight(sample_weight, X, dtype=X.dtype, ensure_non_negative=True)
-            chunks, present = open_chunks([X], weights), weights > 0
+            chunks, present = open_chunks([X], [weights]), weights > 0
         summary, sizes = summarize_rows(chunks)
         if chunked and summary.num_rows < 2:
             raise invalid("X", expected="at least 2 rows", got=summary.num_rows)

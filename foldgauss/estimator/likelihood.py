@@ -88,10 +88,6 @@ class Fit(eqx.Module):
     time_given: bool = eqx.field(static=True)
     covariance_type: str = eqx.field(static=True)
 
-    def _repr_png_(self) -> bytes | None:
-        """The distribution's image, which notebooks show."""
-        return self.distribution._repr_png_()
-
     @property
     def degree(self) -> int:
         return self.triangle_inverse.shape[-1] - 1
