@@ -5,6 +5,7 @@ kernel then stay in registers over any loops. Arithmetic is `+`, `-`, `*`, `/`; 
 Numba's fast-math flags apply. Kernels are cached by their own file's date: after a change here, remove the cache.
 """
 
+import functools
 import math
 import operator
 
@@ -57,43 +58,44 @@ def _broadcast(builder, scalar, vector=_FLOATS):
 
 
 def _generates(typed, **options):
-    """Decorate a generator of LLVM code as an intrinsic; `typed` gives its signature for the types of its arguments."""
+    """Decorate a generator of LLVM code as an intrinsic. `typed` gives its signature, for Numba's typing context and the
+    types of its arguments, whose names are those of the intrinsic."""
 
     def decorate(generate):
-        def define(typing_context, *arguments):
-            return typed(*arguments), generate
+        @functools.wraps(typed)
+        def define(context, *arguments):
+            return typed(context, *arguments), generate
 
-        define.__name__ = generate.__name__
         return intrinsic(**options)(define)
 
     return decorate
 
 
-@_generates(lambda scalar: VECTOR(types.float32))
+@_generates(lambda context, scalar: VECTOR(types.float32))
 def broadcast(context, builder, signature, args):
     """A vector of one float32, 16 times."""
     return _broadcast(builder, args[0])
 
 
-@_generates(lambda: VECTOR())
+@_generates(lambda context: VECTOR())
 def cell_columns(context, builder, signature, args):
     """The vector (0, 1, 2, 3, 0, 1, ...): the pixels' columns in a cell of 4 x 4, row by row."""
     return ir.Constant(_FLOATS, [float(k % 4) for k in range(LANES)])
 
 
-@_generates(lambda: VECTOR())
+@_generates(lambda context: VECTOR())
 def cell_rows(context, builder, signature, args):
     """The vector (0, 0, 0, 0, 1, 1, ...): likewise their rows."""
     return ir.Constant(_FLOATS, [float(k // 4) for k in range(LANES)])
 
 
-@_generates(lambda array, index: VECTOR(array, types.uint64))
+@_generates(lambda context, array, index: VECTOR(array, types.uint64))
 def load(context, builder, signature, args):
     """16 floats of a contiguous float32 array, from an index on; no bounds are checked."""
     return builder.load(_place(context, builder, signature.args[0], *args), align=4)
 
 
-@_generates(lambda array, index, vector: types.none(array, types.uint64, VECTOR))
+@_generates(lambda context, array, index, vector: types.none(array, types.uint64, VECTOR))
 def store(context, builder, signature, args):
     """Write 16 floats into a contiguous float32 array, from an index on; no bounds are checked."""
     builder.store(args[2], _place(context, builder, signature.args[0], *args[:2]), align=4)
@@ -101,7 +103,7 @@ def store(context, builder, signature, args):
 
 
 def _arithmetic(name):
-    @_generates(lambda a, b: VECTOR(VECTOR, VECTOR))
+    @_generates(lambda context, a, b: VECTOR(VECTOR, VECTOR))
     def operation(context, builder, signature, args):
         return getattr(builder, name)(*args)
 
@@ -109,7 +111,7 @@ def _arithmetic(name):
 
 
 def _comparison(sign):
-    @_generates(lambda a, b: MASK(VECTOR, VECTOR))
+    @_generates(lambda context, a, b: MASK(VECTOR, VECTOR))
     def operation(context, builder, signature, args):
         """False where a number is NaN."""
         return builder.fcmp_ordered(sign, *args)
@@ -117,7 +119,7 @@ def _comparison(sign):
     return operation
 
 
-@_generates(lambda a, b: MASK(MASK, MASK))
+@_generates(lambda context, a, b: MASK(MASK, MASK))
 def _both(context, builder, signature, args):
     return builder.and_(*args)
 
@@ -142,20 +144,20 @@ for _symbol, _sign in ((operator.ge, ">="), (operator.gt, ">"), (operator.lt, "<
 _on_operator(operator.and_, _Mask, _both)
 
 
-@_generates(lambda mask, a, b: VECTOR(MASK, VECTOR, VECTOR))
+@_generates(lambda context, mask, a, b: VECTOR(MASK, VECTOR, VECTOR))
 def select(context, builder, signature, args):
     """The first vector where the mask is set, else the second."""
     return builder.select(*args)
 
 
-@_generates(lambda mask: types.boolean(MASK))
+@_generates(lambda context, mask: types.boolean(MASK))
 def any_set(context, builder, signature, args):
     """Whether any bit is set."""
     bits = builder.bitcast(args[0], ir.IntType(LANES))
     return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(LANES), 0))
 
 
-@_generates(lambda first, last, index, number: types.uint64(first, last, types.uint64, types.int32))
+@_generates(lambda context, first, last, index, number: types.uint64(first, last, types.uint64, types.int32))
 def range_mask(context, builder, signature, args):
     """The 16 lowest bits: in which of 16 places from an index on first <= number < last; int32 arrays and number."""
     ends = (_place(context, builder, signature.args[k], args[k], args[2], _INTS) for k in (0, 1))
@@ -165,13 +167,13 @@ def range_mask(context, builder, signature, args):
     return builder.zext(builder.bitcast(bits, ir.IntType(LANES)), ir.IntType(64))
 
 
-@_generates(lambda bits: types.uint64(types.uint64))
+@_generates(lambda context, bits: types.uint64(types.uint64))
 def lowest_bit(context, builder, signature, args):
     """The place of the lowest bit that is set; there must be one."""
     return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
 
 
-@_generates(lambda x: types.UniTuple(VECTOR, 2)(VECTOR))
+@_generates(lambda context, x: types.UniTuple(VECTOR, 2)(VECTOR))
 def split_exponent(context, builder, signature, args):
     """(whole, part): x rounded to whole, moved to the place of a float's exponent, and what is left, in [-0.5, 0.5]."""
     rint = cgutils.get_or_insert_function(builder.module, ir.FunctionType(_FLOATS, [_FLOATS]), "llvm.rint.v16f32")
@@ -181,13 +183,13 @@ def split_exponent(context, builder, signature, args):
     return context.make_tuple(builder, signature.return_type, (builder.bitcast(whole, _FLOATS), part))
 
 
-@_generates(lambda value, whole: VECTOR(VECTOR, VECTOR))
+@_generates(lambda context, value, whole: VECTOR(VECTOR, VECTOR))
 def scale_by_power(context, builder, signature, args):
     """A value times 2 to the power `whole` from `split_exponent`, within float32's normal range."""
     return builder.bitcast(builder.add(*(builder.bitcast(arg, _INTS) for arg in args)), _FLOATS)
 
 
-@_generates(lambda x: VECTOR(VECTOR))
+@_generates(lambda context, x: VECTOR(VECTOR))
 def sqrt(context, builder, signature, args):
     """The square root."""
     kind = ir.FunctionType(_FLOATS, [_FLOATS])
@@ -255,14 +257,14 @@ def _shuffled(builder, a, b, picks):
     return builder.shuffle_vector(a, b, ir.Constant(_INTS, picks))
 
 
-@_generates(lambda a, b, start: VECTOR(VECTOR, VECTOR, start), prefer_literal=True)
+@_generates(lambda context, a, b, start: VECTOR(VECTOR, VECTOR, start), prefer_literal=True)
 def window(context, builder, signature, args):
     """Of the 32 lanes of two vectors one after another, the 16 from a constant `start` on."""
     first = signature.args[2].literal_value
     return _shuffled(builder, *args[:2], [*range(first, first + LANES)])
 
 
-@_generates(lambda array, indices, start: types.UniTuple(VECTOR, 8)(array, indices, types.uint64))
+@_generates(lambda context, array, indices, start: types.UniTuple(VECTOR, 8)(array, indices, types.uint64))
 def gather_columns(context, builder, signature, args):
     """The 8 columns of 16 rows of a contiguous float32 array (num, 8): of rows indices[start : start + 16], int32."""
     data = context.make_array(signature.args[0])(context, builder, args[0]).data
@@ -283,7 +285,7 @@ def gather_columns(context, builder, signature, args):
     return context.make_tuple(builder, signature.return_type, pairs)
 
 
-@_generates(lambda a, b, c, d: types.UniTuple(VECTOR, 4)(VECTOR, VECTOR, VECTOR, VECTOR))
+@_generates(lambda context, a, b, c, d: types.UniTuple(VECTOR, 4)(VECTOR, VECTOR, VECTOR, VECTOR))
 def transpose_cells(context, builder, signature, args):
     """Four vectors as a 4 x 4 matrix of groups of 4 lanes, transposed: four cells of pixels become four rows of 16."""
     low = [*range(4), *range(16, 20), *range(4, 8), *range(20, 24)]
@@ -294,7 +296,7 @@ def transpose_cells(context, builder, signature, args):
     return context.make_tuple(builder, signature.return_type, rows)
 
 
-@_generates(lambda a, b, width: VECTOR(VECTOR, VECTOR, width), prefer_literal=True)
+@_generates(lambda context, a, b, width: VECTOR(VECTOR, VECTOR, width), prefer_literal=True)
 def add_lanes(context, builder, signature, args):
     """Halfway to the sums of many vectors at once: neighboring groups of `width` lanes (1, 2, 4, 8) added.
 
