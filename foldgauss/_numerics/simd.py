@@ -58,8 +58,7 @@ def _broadcast(builder, scalar, vector=_FLOATS):
 
 
 def _generates(typed, **options):
-    """Decorate a generator of LLVM code as an intrinsic. `typed` gives its signature, for Numba's typing context and the
-    types of its arguments, whose names are those of the intrinsic."""
+    """Decorate a generator of LLVM code as an intrinsic; `typed` gives its signature for the types of its arguments."""
 
     def decorate(generate):
         @functools.wraps(typed)

@@ -163,18 +163,11 @@ def plot_tradeoff(
 
 def _few_ticks(ax, cost: np.ndarray) -> None:
     """Plain tick labels; also at 2 and 5 times powers of ten if the range is less than 100."""
-    from matplotlib.ticker import FuncFormatter, LogLocator
+    from matplotlib.ticker import LogLocator
 
     subs = (1, 2, 5) if cost.max() < 100 * cost.min() else (1,)
     ax.xaxis.set_major_locator(LogLocator(subs=subs))
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: _short(x)))
-
-
-def _short(number: float) -> str:
-    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if number >= size:
-            return f"{number / size:g} {letter}"
-    return f"{number:g}"
+    ax.xaxis.set_major_formatter("{x:,g}")
 
 
 def _name_points(ax, panel: Panel, quality: np.ndarray, names: Sequence[str]) -> None:
