@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from foldgauss._numerics.batch import BatchModule, FunctionModule, concrete_value, divide, steepest, vectorize
-from foldgauss._runtime.checks import check_signature, invalid, short_repr
+from foldgauss._runtime.checks import check_signature, invalid, require, short_repr
 
 __all__ = ["AbstractEnvelope", "CallableEnvelope", "Constant", "TimeLikelihood", "as_envelope", "plain_envelope"]
 
@@ -94,11 +94,20 @@ class TimeLikelihood(AbstractEnvelope):
 
     def __init__(self, power: ArrayLike = 1.0, floor: ArrayLike = 0.0):
         self.power, self.floor = _float_array(power), _float_array(floor)
-        if _any(self.power, lambda x: ~((x >= 0) & (x < np.inf))):
-            cure = "The paper's text has 1, its code 2."
-            raise invalid("power", expected="a finite number >= 0", got=power, cure=cure)
-        if _any(self.floor, lambda x: ~((x >= 0) & (x < 1))):
-            raise invalid("floor", expected="a number in [0, 1)", got=floor, cure="For a = 1 use Constant().")
+        require(
+            not _any(self.power, lambda x: ~((x >= 0) & (x < np.inf))),
+            "power",
+            expected="a finite number >= 0",
+            got=power,
+            cure="The paper's text has 1, its code 2.",
+        )
+        require(
+            not _any(self.floor, lambda x: ~((x >= 0) & (x < 1))),
+            "floor",
+            expected="a number in [0, 1)",
+            got=floor,
+            cure="For a = 1 use Constant().",
+        )
 
     def log_a(self, t, *, time_loc, time_scale):
         t, time_loc, time_scale, power, floor = jnp.broadcast_arrays(t, time_loc, time_scale, self.power, self.floor)

@@ -14,7 +14,7 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, PyTree
 
-from foldgauss._runtime.checks import invalid, is_integer, short_repr
+from foldgauss._runtime.checks import invalid, is_integer, require, short_repr
 
 _ModuleT = TypeVar("_ModuleT", bound=eqx.Module)
 
@@ -204,9 +204,13 @@ def as_event(name: str, x: ArrayLike, dtype, event_shape: tuple[int, ...]) -> Ar
     """`as_value` of shape (*batch, *event_shape), checked; a single coordinate may be a number."""
     value = as_value(x, dtype)
     value = value.reshape(1) if value.ndim == 0 and event_shape == (1,) else value
-    if value.shape[-1:] != event_shape:
-        expected = f"shape (*batch, {event_shape[0]})"
-        raise invalid(name, expected=expected, got=f"shape {value.shape}", cure="Time, if any, is last.")
+    require(
+        value.shape[-1:] == event_shape,
+        name,
+        expected=f"shape (*batch, {event_shape[0]})",
+        got=f"shape {value.shape}",
+        cure="Time, if any, is last.",
+    )
     return value
 
 

@@ -22,7 +22,7 @@ from foldgauss._numerics.batch import (
     vectorized,
 )
 from foldgauss._numerics.factor import check_rest, normalize_indices
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.analysis.narrow_crossings import ROUNDING, crossing_modes, crossing_panels, gaussian_at
 from foldgauss.analysis.quadrature import (
     REACH,
@@ -102,8 +102,13 @@ class TimeMixture(AbstractDistribution):
 
     def cdf(self, value: Float[Array, "*#batch 1"]) -> Float[Array, "*#batch"]:
         """P(coordinate <= x | given), where there is only one coordinate."""
-        if self.event_shape != (1,):
-            raise invalid("cdf", expected="one coordinate", got=f"{self.event_shape[0]}", cure="Use marginal([i]).cdf.")
+        require(
+            self.event_shape == (1,),
+            "cdf",
+            expected="one coordinate",
+            got=f"{self.event_shape[0]}",
+            cure="Use marginal([i]).cdf.",
+        )
         value = self._checked(value)
         if self.keeps_time:
             return _time_cdf(self.time.panels, value[..., 0], self.parent.time_loc, self.parent.time_scale)
@@ -128,10 +133,12 @@ class TimeMixture(AbstractDistribution):
         return map_over_batch(_modes, self.parent, (self.values, 1), self.time.panels)
 
     def _check_time_alone(self, name: str) -> None:
-        if not self.keeps_time or self._space_dim:
-            raise invalid(
-                name, expected="the distribution of time given space", got=f"{self.event_shape[0]} coordinates"
-            )
+        require(
+            self.keeps_time and not self._space_dim,
+            name,
+            expected="the distribution of time given space",
+            got=f"{self.event_shape[0]} coordinates",
+        )
 
     @compile_eager(static=("sample_shape",))
     def _sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...]) -> Array:
@@ -159,8 +166,13 @@ class TimeMixture(AbstractDistribution):
     def marginal(self, indices) -> "TimeMixture":
         """Some of the coordinates; the indices are kept."""
         indices, dim = normalize_indices(indices, self.event_shape[0]), self._space_dim
-        if dim in indices[:-1]:
-            raise invalid("indices", expected="time last", got=repr(indices), cure="Time is the last coordinate.")
+        require(
+            dim not in indices[:-1],
+            "indices",
+            expected="time last",
+            got=repr(indices),
+            cure="Time is the last coordinate.",
+        )
         num_given = self.values.shape[-1]
         keep = (*range(num_given), *(num_given + i for i in indices if i < dim), num_given + dim)
         return TimeMixture(self.parent.marginal(keep), self.values, self.time, dim in indices)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss._runtime.optional_imports import import_optional
 
 if TYPE_CHECKING:
@@ -76,8 +76,7 @@ def plot_history(history: Sequence[Any], axes: "np.ndarray | None" = None) -> np
 
     **Raises:** ImportError that names the extra if matplotlib is missing; ValueError for an empty history.
     """
-    if not len(history):
-        raise invalid("history", expected="at least one step", got="none")
+    require(len(history), "history", expected="at least one step", got="none")
     if axes is None:
         axes = import_optional("matplotlib.pyplot", "plot").subplots(
             2, 2, sharex="col", sharey="row", layout="constrained"
@@ -258,7 +257,10 @@ def _space_limits(dist, t_limits) -> tuple[float, float]:
 
 
 def _check_plane(dist) -> None:
-    if dist.batch_shape != () or dist.event_shape != (2,):
-        got = f"batch_shape {dist.batch_shape} and event_shape {dist.event_shape}"
-        cure = "Take one element of a batch, or a marginal of one space coordinate and time."
-        raise invalid("dist", expected="batch_shape () and event_shape (2,)", got=got, cure=cure)
+    require(
+        dist.batch_shape == () and dist.event_shape == (2,),
+        "dist",
+        expected="batch_shape () and event_shape (2,)",
+        got=f"batch_shape {dist.batch_shape} and event_shape {dist.event_shape}",
+        cure="Take one element of a batch, or a marginal of one space coordinate and time.",
+    )

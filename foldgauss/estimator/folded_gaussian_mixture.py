@@ -17,7 +17,7 @@ from sklearn.utils import check_random_state
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
 
-from foldgauss._runtime.checks import invalid, is_integer
+from foldgauss._runtime.checks import invalid, is_integer, require
 from foldgauss.envelope import Constant, TimeLikelihood
 from foldgauss.estimator.chunks import is_chunked, open_chunks, summarize_rows
 from foldgauss.estimator.em.components import Parameters
@@ -238,8 +238,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
             weights = _check_sample_weight(sample_weight, X, dtype=X.dtype, ensure_non_negative=True)
             chunks, present = open_chunks([X], [weights]), weights > 0
         summary, sizes = summarize_rows(chunks)
-        if chunked and summary.num_rows < 2:
-            raise invalid("X", expected="at least 2 rows", got=summary.num_rows)
+        require(not chunked or summary.num_rows >= 2, "X", expected="at least 2 rows", got=summary.num_rows)
         width = chunks.width
         least = 1 if self.n_components == "auto" else self.n_components
         check_sizes(width, summary.size, summary.total, least)
@@ -401,8 +400,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
 
     def transform(self, X) -> Float[np.ndarray, "n k"]:
         """`predict_proba` of rows, as features named foldedgaussianmixture0, ... in the container of `set_output`."""
-        if is_chunked(X):
-            raise invalid("X", expected="rows", got="chunks", cure="predict_proba takes chunks.")
+        require(not is_chunked(X), "X", expected="rows", got="chunks", cure="predict_proba takes chunks.")
         return self.predict_proba(X)
 
     @property
@@ -425,8 +423,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         parts = [values] if hasattr(values, "shape") else values
         sums = np.array([(float(part.sum(dtype=np.float64)), len(part)) for part in parts]).reshape(-1, 2)
         total, num = sums.sum(0)
-        if not num:
-            raise invalid("X", expected="at least one chunk with rows", got="none")
+        require(num, "X", expected="at least one chunk with rows", got="none")
         which = check_groups(groups, None if is_chunked(X) else np.ones(int(num), bool))
         return float(total / num), int(num) if which is None else int(which.max()) + 1
 
@@ -455,8 +452,12 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         out of its range.
         """
         check_is_fitted(self)
-        if time_origin != 0 and not isinstance(self._envelope, Constant | TimeLikelihood):
-            raise invalid("time_origin", expected="0 with a function as envelope", got=time_origin)
+        require(
+            time_origin == 0 or isinstance(self._envelope, Constant | TimeLikelihood),
+            "time_origin",
+            expected="0 with a function as envelope",
+            got=time_origin,
+        )
         dtype = jax.dtypes.canonicalize_dtype(self._params.curve.dtype)
         if dtype != self._params.curve.dtype:
             check_export(self._params, self._scaling, dtype, time_origin)
@@ -465,8 +466,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
 
     def sample(self, n_samples=1) -> tuple[Float[np.ndarray, "n d"], Int[np.ndarray, " n"]]:
         """(X, components): draws from the fitted mixture; deterministic for an integer `random_state`."""
-        if not is_integer(n_samples, 1):
-            raise invalid("n_samples", expected="a whole number >= 1", got=repr(n_samples))
+        require(is_integer(n_samples, 1), "n_samples", expected="a whole number >= 1", got=repr(n_samples))
         check_is_fitted(self)
         seed = check_random_state(self.random_state).randint(np.iinfo(np.int32).max)
         with enable_dtype(self._params.curve.dtype):

@@ -18,7 +18,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key
 from foldgauss._numerics.batch import cast
 from foldgauss._numerics.regression import Regression, hermite, hermite_to_powers, weighted_regression
 from foldgauss._numerics.triangular import solve_upper_matrix
-from foldgauss._runtime.checks import check_one_of, invalid, is_integer
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer, require
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope
 from foldgauss.estimator.em.scaling import check_time_resolution
@@ -192,8 +192,7 @@ def fit(
     **Source:** eq:foldgauss. **Raises:** ValueError on unknown options, wrong shapes, and negative weights. Problems of
     the *data* do not raise but set `Fit.status`, also under `jit` and `vmap`; see `Fit.check`.
     """
-    if not is_integer(degree, 0):
-        raise invalid("degree", expected="a whole number >= 0", got=repr(degree))
+    require(is_integer(degree, 0), "degree", expected="a whole number >= 0", got=repr(degree))
     check_one_of("covariance_type", covariance_type, ("full", "diag"))
     x = _check_points(x)
     weights = _check_weights(weights, x)
@@ -403,8 +402,13 @@ def bootstrap(result: Fit, key: Key[Array, ""], num_replicates: int = 200, *, ba
     **Source:** Efron and Tibshirani, An Introduction to the Bootstrap, section 6.5.
     **Raises:** ValueError if the fit failed, or `num_replicates` is below 2.
     """
-    if not is_integer(num_replicates, 2):
-        raise invalid("num_replicates", expected="a whole number >= 2", got=num_replicates, cure="200 is usual.")
+    require(
+        is_integer(num_replicates, 2),
+        "num_replicates",
+        expected="a whole number >= 2",
+        got=num_replicates,
+        cure="200 is usual.",
+    )
     result.check()
     keys, num_points = jax.random.split(key, num_replicates), max(round(float(result.num_points)), 1)
     return _bootstrap(result, keys, num_points, min(batch_size, num_replicates))
@@ -432,9 +436,13 @@ def _check_points(x) -> Float[Array, "n d"]:
     check_time_resolution("x", x, jax.dtypes.canonicalize_dtype(getattr(x, "dtype", float)))
     x = jnp.asarray(x)
     x = x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
-    if x.ndim != 2 or x.shape[1] < 2:
-        cure = "Rows are points, time is the last column; for many sets of points use jax.vmap."
-        raise invalid("x", expected="shape (n, d) with d >= 2", got=f"shape {x.shape}", cure=cure)
+    require(
+        x.ndim == 2 and x.shape[1] >= 2,
+        "x",
+        expected="shape (n, d) with d >= 2",
+        got=f"shape {x.shape}",
+        cure="Rows are points, time is the last column; for many sets of points use jax.vmap.",
+    )
     return x
 
 
@@ -442,24 +450,29 @@ def _check_weights(weights, x) -> Float[Array, " n"]:
     if weights is None:
         return jnp.ones(x.shape[0], x.dtype)
     weights = jnp.asarray(weights).astype(x.dtype)
-    if weights.shape != x.shape[:1]:
-        raise invalid(
-            "weights", expected=f"shape {x.shape[:1]}", got=f"shape {weights.shape}", cure="One per row of x."
-        )
+    require(
+        weights.shape == x.shape[:1],
+        "weights",
+        expected=f"shape {x.shape[:1]}",
+        got=f"shape {weights.shape}",
+        cure="One per row of x.",
+    )
     if not isinstance(weights, jax.core.Tracer) and (np.asarray(weights) < 0).any():
         raise invalid("weights", expected="numbers >= 0", got=f"a least of {weights.min()}", cure="0 drops a row.")
     return weights
 
 
 def _check_time(time_loc, time_scale, dtype):
-    if (time_loc is None) != (time_scale is None):
-        got = "time_loc alone" if time_scale is None else "time_scale alone"
-        cure = "Pass both, or none for those of the times themselves."
-        raise invalid("time_loc, time_scale", expected="both or none", got=got, cure=cure)
+    require(
+        (time_loc is None) == (time_scale is None),
+        "time_loc, time_scale",
+        expected="both or none",
+        got="time_loc alone" if time_scale is None else "time_scale alone",
+        cure="Pass both, or none for those of the times themselves.",
+    )
     return None if time_loc is None else tuple(jnp.asarray(z).astype(dtype) for z in (time_loc, time_scale))
 
 
 def _check_level(level: float) -> float:
-    if not 0 < level < 1:
-        raise invalid("level", expected="a number between 0 and 1", got=level, cure="0.95 is usual.")
+    require(0 < level < 1, "level", expected="a number between 0 and 1", got=level, cure="0.95 is usual.")
     return level

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import invalid, require
 from foldgauss.envelope import Constant
 from foldgauss.estimator.em.components import Parameters
 from foldgauss.estimator.em.initialization import params_from_gaussians
@@ -51,8 +51,11 @@ def _invert_precisions(precisions, kind: str, num: int, dim: int) -> np.ndarray:
         precisions = precisions[:, :, None] * eye
     precisions = np.broadcast_to(precisions, (num, dim, dim))
     symmetric = np.allclose(precisions, precisions.swapaxes(-1, -2))
-    if not (symmetric and (np.linalg.eigvalsh(precisions) > 0).all()):
-        raise invalid(
-            "precisions_init", expected="symmetric and positive definite", got="others", cure="Invert covariances."
-        )
+    require(
+        symmetric and (np.linalg.eigvalsh(precisions) > 0).all(),
+        "precisions_init",
+        expected="symmetric and positive definite",
+        got="others",
+        cure="Invert covariances.",
+    )
     return np.linalg.inv(precisions)

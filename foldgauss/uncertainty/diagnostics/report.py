@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.uncertainty.diagnostics.irregularities import Irregularity, even_times, irregularities, is_assessable
 from foldgauss.uncertainty.posterior.result import FrameTimePosterior
 
@@ -21,8 +21,7 @@ def frame_table(
     """
     num_frames = posterior.times.shape[-1]
     fitted = np.full(num_frames, np.nan) if fitted is None else np.asarray(fitted, np.float64)
-    if fitted.shape != (num_frames,):
-        raise invalid("fitted", expected=f"{num_frames} times", got=f"shape {fitted.shape}")
+    require(fitted.shape == (num_frames,), "fitted", expected=f"{num_frames} times", got=f"shape {fitted.shape}")
     inner, outer = posterior.interval(0.5), posterior.interval(0.9)
     columns = {
         "frame": np.arange(num_frames),

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import invalid, require
 from foldgauss.uncertainty.likelihood.noise import (
     NOISES,
     FrameNoise,
@@ -97,9 +97,13 @@ def likelihood_profiles(
     """
     residuals = Residuals(model, video)
     num_frames = len(residuals.frames)
-    if num_frames < 3:
-        cure = "The first frame is at time 0 and the last at 1: others are needed."
-        raise invalid("video", expected="at least 3 frames", got=num_frames, cure=cure)
+    require(
+        num_frames >= 3,
+        "video",
+        expected="at least 3 frames",
+        got=num_frames,
+        cure="The first frame is at time 0 and the last at 1: others are needed.",
+    )
     if isinstance(noise, FrameNoise):
         noise = noise.for_frames(num_frames)
     elif not isinstance(noise, str) or noise not in NOISES:
@@ -265,17 +269,24 @@ class _Samples:
 
 def _check_changes(frames: np.ndarray) -> None:
     first = frames[0]
-    if all(np.array_equal(first, frame) for frame in frames[1:]):
-        cure = "Times cannot be inferred where nothing changes."
-        raise invalid("video", expected="frames that differ", got=f"{len(frames)} equal frames", cure=cure)
+    require(
+        not all(np.array_equal(first, frame) for frame in frames[1:]),
+        "video",
+        expected="frames that differ",
+        got=f"{len(frames)} equal frames",
+        cure="Times cannot be inferred where nothing changes.",
+    )
 
 
 def check_explained(left: float, variance: float) -> None:
     """Raise ValueError unless the model's squared error `left` is small enough beside the frames' variance."""
-    if left > (1 - EXPLAINED) * variance:
-        got = f"a model that explains {100 * (1 - left / variance) if variance else 0:.0f}% of their variance"
-        expected = f"frames of which the model explains {100 * EXPLAINED:.0f}%"
-        raise invalid("video", expected=expected, got=got, cure=_RIGHT_MODEL)
+    require(
+        not left > (1 - EXPLAINED) * variance,
+        "video",
+        expected=f"frames of which the model explains {100 * EXPLAINED:.0f}%",
+        got=f"a model that explains {(100 * (1 - left / variance) if variance else 0):.0f}% of their variance",
+        cure=_RIGHT_MODEL,
+    )
 
 
 def _check_explained(frames: np.ndarray, builder: ProfileBuilder) -> list[str]:

@@ -18,7 +18,7 @@ import scipy.stats
 from jaxtyping import Float, Float64, UInt8
 
 from foldgauss._numerics.random_streams import Stream, make_generator, seed_sequence
-from foldgauss._runtime.checks import check_within, invalid, is_integer
+from foldgauss._runtime.checks import check_within, is_integer, require
 from foldgauss.uncertainty.likelihood.likelihood_profiles import check_explained
 from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.video.fitting.config import FitConfig, planned_steps
@@ -84,9 +84,12 @@ class RefitTimes:
         `std` (num_frames,), or one number, in the model's time: for instance the posterior's given the splats.
         """
         std = np.asarray(std, np.float64)
-        if std.shape not in ((), self.own.shape) or not (np.broadcast_to(std, self.own.shape)[1:-1] > 0).all():
-            expected = f"values > 0, one or {len(self.own)}"
-            raise invalid("std", expected=expected, got=f"shape {std.shape}" if std.ndim else std)
+        require(
+            std.shape in ((), self.own.shape) and (np.broadcast_to(std, self.own.shape)[1:-1] > 0).all(),
+            "std",
+            expected=f"values > 0, one or {len(self.own)}",
+            got=f"shape {std.shape}" if std.ndim else std,
+        )
         inner = np.broadcast_to(std, self.own.shape)[1:-1]
         return float(np.sqrt(np.mean((self.std[1:-1] / inner) ** 2)))
 
@@ -116,12 +119,15 @@ def refit_frame_times(
     range. Example: `refit_frame_times(model, frames, config, replicates=8).ratio_to(std_given_the_splats)`.
     """
     for name, value, least in (("replicates", replicates, 2), ("seed", seed, 0)):
-        if not is_integer(value, least):
-            raise invalid(name, expected=f"a whole number >= {least}", got=repr(value))
+        require(is_integer(value, least), name, expected=f"a whole number >= {least}", got=repr(value))
     video = np.asarray(video)
     residuals = _check_video(model, video)
-    if not is_integer(block, 1) or block > min(model.size):
-        raise invalid("block", expected=f"a whole number from 1 to {min(model.size)}", got=repr(block))
+    require(
+        is_integer(block, 1) and block <= min(model.size),
+        "block",
+        expected=f"a whole number from 1 to {min(model.size)}",
+        got=repr(block),
+    )
     config = _fix_steps(config, len(video), steps)
     times = []
     for number in range(replicates):
@@ -138,15 +144,26 @@ def refit_frame_times(
 
 def _check_video(model: VideoModel, video: np.ndarray) -> Residuals:
     residuals = Residuals(model, video)
-    if len(video) != model.num_frames:
-        expected = f"the {model.num_frames} frames that the model was fitted to"
-        raise invalid("video", expected=expected, got=f"{len(video)} frames")
-    if len(video) < 3:
-        cure = "The first frame is at time 0 and the last at 1; others are needed."
-        raise invalid("video", expected="at least 3 frames", got=len(video), cure=cure)
-    if video.shape[3] == 4:
-        got = f"{video.dtype} {video.shape}"
-        raise invalid("video", expected="frames without alpha", got=got, cure="Fit it without alpha.")
+    require(
+        len(video) == model.num_frames,
+        "video",
+        expected=f"the {model.num_frames} frames that the model was fitted to",
+        got=f"{len(video)} frames",
+    )
+    require(
+        len(video) >= 3,
+        "video",
+        expected="at least 3 frames",
+        got=len(video),
+        cure="The first frame is at time 0 and the last at 1; others are needed.",
+    )
+    require(
+        video.shape[3] != 4,
+        "video",
+        expected="frames without alpha",
+        got=f"{video.dtype} {video.shape}",
+        cure="Fit it without alpha.",
+    )
     images = residuals.render_at(np.asarray(model.frame_times.times()))
     left = sum(float(np.square(residuals.residual(k, each), dtype=np.float64).sum()) for k, each in enumerate(images))
     variation = sum(float(frame.var(axis=(0, 1)).sum()) for frame in residuals.frames) * math.prod(model.size) / 255**2
@@ -156,14 +173,21 @@ def _check_video(model: VideoModel, video: np.ndarray) -> Residuals:
 
 def _fix_steps(config: FitConfig, num_frames: int, steps: int | None) -> FitConfig:
     """The config with the fixed number of steps of a refit."""
-    if not config.learns_frame_times:
-        raise invalid(
-            "config.rates.frame_times", expected="a number > 0", got=0, cure="Fixed frame times have no spread."
-        )
+    require(
+        config.learns_frame_times,
+        "config.rates.frame_times",
+        expected="a number > 0",
+        got=0,
+        cure="Fixed frame times have no spread.",
+    )
     if steps is None:
-        if config.steps is None and config.minutes is not None:
-            cure = "A fit that ends by the clock cannot be repeated."
-            raise invalid("steps", expected="a number for a config with minutes alone", got=None, cure=cure)
+        require(
+            config.steps is not None or config.minutes is None,
+            "steps",
+            expected="a number for a config with minutes alone",
+            got=None,
+            cure="A fit that ends by the clock cannot be repeated.",
+        )
         planned = planned_steps(dataclasses.replace(config, minutes=None), num_frames)
         steps = max(1, round((1 - START_AT) * planned))
     rates = dataclasses.replace(config.rates, cooldown=max(config.rates.cooldown, COOLDOWN_FRACTION))

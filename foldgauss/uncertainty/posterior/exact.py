@@ -19,7 +19,7 @@ from jaxtyping import Float64
 from scipy.special import betainc, betaincc
 
 from foldgauss._numerics.random_streams import Stream, make_generator
-from foldgauss._runtime.checks import check_within, invalid
+from foldgauss._runtime.checks import check_within, invalid, require
 from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves
 from foldgauss.uncertainty.posterior.increments import check_prior
 
@@ -117,14 +117,16 @@ def likelihood_cells(
     """Cells for the likelihood of frame k alone in [0, 1], and their masses; likelihoods of 0 are left out."""
     nodes, _ = curves.nodes_and_values(k)
     low, high = max(0.0, nodes[0]), min(1.0, nodes[-1])
-    if not low < high:
-        got = f"frame {k} from {nodes[0]:.4g} to {nodes[-1]:.4g}"
-        raise invalid("curves", expected="curves that extend between 0 and 1", got=got)
+    require(
+        low < high,
+        "curves",
+        expected="curves that extend between 0 and 1",
+        got=f"frame {k} from {nodes[0]:.4g} to {nodes[-1]:.4g}",
+    )
     edges = np.concatenate([[low], nodes[(nodes > low) & (nodes < high)], [high]])
     for _ in range(2):
         heights = curves[k](middles(edges)[:, None])[:, 0]
-        if np.isnan(heights).any():
-            raise invalid("curves", expected="log-likelihoods without NaN", got=f"NaN for frame {k}")
+        require(not np.isnan(heights).any(), "curves", expected="log-likelihoods without NaN", got=f"NaN for frame {k}")
         some = np.flatnonzero(heights > heights.max() - UNDERFLOW)
         hull = slice(max(some[0] - 1, 0), some[-1] + 2)
         edges, heights = edges[hull.start : hull.stop + 1], heights[hull]

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 from scipy.special import gammaln
 
-from foldgauss._runtime.checks import invalid, is_within, short_repr
+from foldgauss._runtime.checks import is_within, require, short_repr
 
 #: Increments below this fraction are replaced by it before logarithms are taken: float64 does not resolve smaller ones.
 LEAST_FRACTION = 1e-16
@@ -12,12 +12,20 @@ LEAST_FRACTION = 1e-16
 
 def check_prior(num_frames: int, concentration: float) -> None:
     """Raise ValueError for fewer than 3 frames, and a concentration below 1."""
-    if num_frames < 3:
-        cure = "The first frame is at time 0 and the last at 1: others are needed."
-        raise invalid("curves", expected="at least 3 frames", got=num_frames, cure=cure)
-    if not is_within(concentration, "[1, inf)"):
-        cure = "1 is uniform over all ordered times; larger values favor equal spacing."
-        raise invalid("concentration", expected="a number >= 1", got=short_repr(concentration), cure=cure)
+    require(
+        num_frames >= 3,
+        "curves",
+        expected="at least 3 frames",
+        got=num_frames,
+        cure="The first frame is at time 0 and the last at 1: others are needed.",
+    )
+    require(
+        is_within(concentration, "[1, inf)"),
+        "concentration",
+        expected="a number >= 1",
+        got=short_repr(concentration),
+        cure="1 is uniform over all ordered times; larger values favor equal spacing.",
+    )
 
 
 def log_prior(times: Float[np.ndarray, "*batch num_frames"], concentration: float) -> Float64[np.ndarray, "*batch"]:

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Float64
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves
 from foldgauss.uncertainty.posterior.increments import check_prior, log_prior
 
@@ -28,16 +28,24 @@ class FrameTimeLogProb:
     def __call__(self, free: Float[np.ndarray, "*batch num_free"]) -> Float64[np.ndarray, "*batch"]:
         times = self.times(free)
         found = self.log_likelihood(times) + log_prior(times, self.concentration)
-        if np.isnan(found).any():
-            cure = "Check curves and times for NaN."
-            raise invalid("free", expected="times with a log-density", got="NaN", cure=cure)
+        require(
+            not np.isnan(found).any(),
+            "free",
+            expected="times with a log-density",
+            got="NaN",
+            cure="Check curves and times for NaN.",
+        )
         return found
 
     def times(self, free: Float[np.ndarray, "*batch num_free"]) -> Float64[np.ndarray, "*batch num_frames"]:
         """The times of all frames."""
         free = np.asarray(free, np.float64)
-        if free.shape[-1:] != (self.num_free,):
-            raise invalid("free", expected=f"shape (..., {self.num_free})", got=f"shape {free.shape}")
+        require(
+            free.shape[-1:] == (self.num_free,),
+            "free",
+            expected=f"shape (..., {self.num_free})",
+            got=f"shape {free.shape}",
+        )
         return np.pad(free, [*[(0, 0)] * (free.ndim - 1), (1, 1)], constant_values=(0.0, 1.0))
 
     def log_likelihood(self, times: Float[np.ndarray, "*batch num_frames"]) -> Float64[np.ndarray, "*batch"]:

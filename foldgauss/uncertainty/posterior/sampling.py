@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from foldgauss._numerics.random_streams import Stream, seed_sequence
-from foldgauss._runtime.checks import invalid, is_integer, short_repr
+from foldgauss._runtime.checks import invalid, is_integer, require, short_repr
 from foldgauss._runtime.optional_imports import import_optional
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles
 from foldgauss.uncertainty.posterior.exact import exact_posterior
@@ -79,13 +79,14 @@ def frame_time_posterior(
 
 def check_settings(steps: int, ensembles: int, seed: int) -> None:
     """ValueError for settings of `frame_time_posterior` that are out of range."""
-    if not is_integer(ensembles, 2):
-        expected = "at least 2 (a whole number), better 4: R-hat compares them"
-        raise invalid("ensembles", expected=expected, got=short_repr(ensembles))
-    if not is_integer(steps, THIN):
-        raise invalid("steps", expected=f"a whole number >= {THIN}", got=short_repr(steps))
-    if not is_integer(seed, 0):
-        raise invalid("seed", expected="a whole number >= 0", got=short_repr(seed))
+    require(
+        is_integer(ensembles, 2),
+        "ensembles",
+        expected="at least 2 (a whole number), better 4: R-hat compares them",
+        got=short_repr(ensembles),
+    )
+    require(is_integer(steps, THIN), "steps", expected=f"a whole number >= {THIN}", got=short_repr(steps))
+    require(is_integer(seed, 0), "seed", expected="a whole number >= 0", got=short_repr(seed))
 
 
 def _check_backend(backend: str | os.PathLike | None) -> Path | None:
@@ -228,9 +229,13 @@ def _open_draws(path: Path, fingerprint: str) -> None:
             raise
         cure = "Remove it, or choose another."
         raise invalid("backend", expected="a file of draws, or none yet", got=f"{path}, damaged", cure=cure) from error
-    if found != fingerprint:
-        cure = "Choose another file, or give the same model, video and settings."
-        raise invalid("backend", expected="the file of this very run", got=f"{path}, of another run", cure=cure)
+    require(
+        found == fingerprint,
+        "backend",
+        expected="the file of this very run",
+        got=f"{path}, of another run",
+        cure="Choose another file, or give the same model, video and settings.",
+    )
 
 
 def _check_space(path: Path, num_bytes: int) -> None:
