@@ -10,8 +10,6 @@ from jaxtyping import Array, Float, Key
 
 from foldgauss._numerics.batch import BatchModule, as_event, as_sample_shape, batch_shape_of, ranked_leaves
 
-__all__ = ["AbstractDistribution"]
-
 
 class AbstractDistribution(BatchModule):
     """A distribution with leading batch dimensions, of points with the shape `event_shape`.

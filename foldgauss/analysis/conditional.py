@@ -36,8 +36,6 @@ from foldgauss.analysis.quadrature import (
 from foldgauss.envelope import Constant, TimeLikelihood
 from foldgauss.gaussian import Gaussian, condition_on_first
 
-__all__ = ["TimeMixture", "conditional_gaussian", "time_mixture"]
-
 _HALF_LOG_2PI = 0.5 * float(np.log(2 * np.pi))
 _CROSSINGS = 24  # candidate times at which the ridge comes near
 _BEST = 10  # of them, around which panels are refined

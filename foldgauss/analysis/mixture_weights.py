@@ -13,17 +13,6 @@ from jaxtyping import Array, ArrayLike
 from foldgauss._numerics.batch import align, broadcast_leaves, check_batch, concrete_value, ranked_leaves
 from foldgauss._runtime.checks import invalid, require
 
-__all__ = [
-    "broadcast_weights",
-    "choose_components",
-    "log_component_densities",
-    "log_density",
-    "mixture_moments",
-    "posterior_logits",
-    "responsibilities",
-    "weighted_sum",
-]
-
 
 def broadcast_weights(components, logits: ArrayLike | None, weights: ArrayLike | None, validate: bool):
     """Components and logits, both broadcast to the common batch shape."""

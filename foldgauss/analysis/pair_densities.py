@@ -17,8 +17,6 @@ from foldgauss._numerics.triangular import UNROLLED_SIZE, solve_lower
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood
 from foldgauss.gaussian import Gaussian
 
-__all__ = ["map_in_chunks", "move_components_first", "pair_log_prob"]
-
 _HALF_LOG_2PI = 0.5 * float(np.log(2 * np.pi))
 
 

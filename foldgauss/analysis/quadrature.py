@@ -18,18 +18,6 @@ from jaxtyping import Array, Float
 
 from foldgauss._numerics.batch import BatchModule, bisect, concrete_value
 
-__all__ = [
-    "KRONROD_NODES",
-    "Panels",
-    "adaptive_panels",
-    "diverges",
-    "find_peaks",
-    "gauss_hermite",
-    "is_within_any",
-    "normal_panels",
-    "warn_of_error",
-]
-
 _Log = Callable[[Float[Array, "..."]], Float[Array, "..."]]
 
 # Gauss-Kronrod: half of the 15 nodes with their weights, and the weights of the 7 Gauss nodes among them.

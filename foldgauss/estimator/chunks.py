@@ -19,18 +19,6 @@ from sklearn.utils import assert_all_finite, check_array
 from foldgauss._runtime.checks import invalid, require
 from foldgauss.estimator.parameter_checks import check_real
 
-__all__ = [
-    "DaskChunks",
-    "IterableChunks",
-    "Piece",
-    "RowSummary",
-    "collect_rows",
-    "is_chunked",
-    "open_chunks",
-    "summarize_rows",
-    "weighted_moments",
-]
-
 #: The largest number of rows of a piece: it bounds temporary arrays, whatever the chunks are.
 _PIECE_ROWS = 2**16
 _SOURCES = "Pass a list of arrays, or an object whose __iter__ reads files."

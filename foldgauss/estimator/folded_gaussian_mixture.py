@@ -53,8 +53,6 @@ from foldgauss.estimator.rows import (
 )
 from foldgauss.mixture import FoldedMixture
 
-__all__ = ["EMStatus", "FoldedGaussianMixture"]
-
 _CURES = {
     EMStatus.NOT_CONVERGED: "Raise max_iter or tol, or scale the data.",
     EMStatus.NOT_FINITE: "A component collapsed, or the densities of a point underflow: raise reg_covar or the "

@@ -13,8 +13,6 @@ from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
 from foldgauss.estimator.parameter_checks import check_column, check_real
 from foldgauss.estimator.rows import order_columns
 
-__all__ = ["FoldedMixtureRegressor"]
-
 #: Rows predicted together, the last block padded: one compiled program for any number of rows.
 _BLOCK = 1024
 

@@ -15,8 +15,6 @@ from foldgauss.estimator.em.scaling import check_time_resolution
 from foldgauss.estimator.parameter_checks import check_real
 from foldgauss.mixture import FoldedMixture
 
-__all__ = ["GradientFit", "fit_gradient"]
-
 _LEARNING_RATE = 1e-2
 
 

@@ -8,15 +8,6 @@ import numpy as np
 from foldgauss._runtime.checks import check_one_of, invalid, short_repr
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood, as_envelope, check_peak
 
-__all__ = [
-    "check_array",
-    "check_column",
-    "check_parameters",
-    "check_real",
-    "check_sizes",
-    "make_envelope",
-]
-
 _ENVELOPES = {"constant": Constant, "time_likelihood": lambda: TimeLikelihood(power=1.0, floor=1e-3)}
 
 

@@ -9,8 +9,6 @@ from foldgauss.estimator.em.initialization import params_from_gaussians
 from foldgauss.estimator.em.scaling import Scaling, to_mixture
 from foldgauss.estimator.parameter_checks import check_array
 
-__all__ = ["replace_initial"]
-
 
 def replace_initial(estimator, params: Parameters, scaling: Scaling, degree: int) -> Parameters:
     """Replace the initial values that `weights_init`, `means_init` and `precisions_init` of the estimator define."""

@@ -14,8 +14,6 @@ from foldgauss.estimator.em.scaling import Scaling
 from foldgauss.estimator.em.statistics import enable_dtype
 from foldgauss.mixture import FoldedMixture
 
-__all__ = ["FittedMixture", "predict_components", "predict_log_prob", "predict_responsibilities"]
-
 #: Rows are evaluated in blocks of a power of 2 from the first to the second, so that chunks of any size share programs.
 _LEAST_ROWS = 2**8
 _MOST_ROWS = 2**16

@@ -14,17 +14,6 @@ from foldgauss.estimator.chunks import DaskChunks, IterableChunks, Piece, RowSum
 from foldgauss.estimator.em.scaling import Scaling
 from foldgauss.estimator.em.statistics import Blocks, Points, make_points
 
-__all__ = [
-    "SMOOTH_ROWS",
-    "Rows",
-    "check_groups",
-    "choose_dtype",
-    "measure_gaps",
-    "order_columns",
-    "warn_narrow",
-    "warn_smooth",
-]
-
 #: The highest degree fitted in float32. Beyond, with times far from normal, a curve's normal equations lose more digits
 #: than float32 has: up to 1 nat a point at degree 10.
 _MAX_SINGLE_DEGREE = 6

@@ -14,15 +14,6 @@ from foldgauss.estimator.em.components import Parameters
 from foldgauss.estimator.em.m_step import Model, update_components
 from foldgauss.estimator.em.statistics import Points, accumulate, make_points
 
-__all__ = [
-    "INITIALIZERS",
-    "draw_subset",
-    "initialize",
-    "params_from_gaussians",
-    "params_from_responsibilities",
-    "restrict_covariances",
-]
-
 #: The largest subset of points that an initialization uses; EM itself uses all points.
 _MAX_POINTS = 20_000
 #: Beyond this many points, NumPy's draw without replacement, a permutation of all of them, would need much memory.

@@ -13,8 +13,6 @@ from foldgauss.estimator.em.components import Parameters
 from foldgauss.fold import PolynomialFold
 from foldgauss.mixture import FoldedMixture
 
-__all__ = ["Scaling", "check_export", "check_time_resolution", "compute_scaling", "to_mixture"]
-
 #: Spacings of floating-point times up to this fraction of a spread are harmless.
 _MAX_SPACING = 0.01
 _COARSE_CURE = "Subtract an offset from the time column, or enable float64: jax.config.update('jax_enable_x64', True)."

@@ -23,8 +23,6 @@ from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfi
 from foldgauss.uncertainty.likelihood.noise import LAST_CORRELATION
 from foldgauss.uncertainty.posterior.result import FrameTimePosterior
 
-__all__ = ["plot_correlation", "plot_increments", "plot_times"]
-
 _BLUE = "#1f4e79"
 _RED = "#d1242f"
 _GRAY = "#57606a"
