@@ -63,7 +63,7 @@ _LADDER = 20.0 * 4.0 ** -np.arange(13)  # distances of panel edges around each p
 _ROUNDS = 24
 #: Panels halved in each round.
 _SPLITS = 16
-_HALF_LOG_2PI = 0.5 * float(np.log(2 * np.pi))
+HALF_LOG_2PI = 0.5 * float(np.log(2 * np.pi))
 _GOLDEN = float((np.sqrt(5) - 1) / 2)
 
 
@@ -198,7 +198,7 @@ def normal_panels(
 
     def panels_of(left, right):
         nodes = _nodes(left, right)
-        return Panels(left, right, nodes, _log_width(left, right), -0.5 * nodes**2 - _HALF_LOG_2PI)
+        return Panels(left, right, nodes, _log_width(left, right), -0.5 * nodes**2 - HALF_LOG_2PI)
 
     def values_at(panels, density):
         nodes = jnp.where(density > 0, panels.nodes, 0)  # the function may overflow elsewhere
