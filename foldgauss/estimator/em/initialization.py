@@ -45,7 +45,7 @@ def draw_subset(num: int, rng) -> Int[np.ndarray, " m"] | None:
     if num <= _MAX_POINTS:
         return None
     # Not by `rng`, which would permute all indices.
-    return np.random.default_rng(rng.randint(2**31)).choice(num, _MAX_POINTS, replace=False)
+    return np.random.default_rng(rng.randint(np.iinfo(np.int32).max)).choice(num, _MAX_POINTS, replace=False)
 
 
 def params_from_responsibilities(y, weights, responsibilities, model: Model, degree: int) -> Parameters:
