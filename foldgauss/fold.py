@@ -420,9 +420,13 @@ def _check_knots(knots: ArrayLike, n: int, degree: int) -> tuple[float, ...]:
         got=f"{knots.shape}",
         cure="There are n coefficients, n > degree; repeat the end knots degree + 1 times to clamp the ends.",
     )
-    if not (np.isfinite(knots).all() and (np.diff(knots) >= 0).all() and knots[degree] < knots[n]):
-        cure = "Sort them, with knots[degree] < knots[n]."
-        raise invalid("knots", expected="finite, non-decreasing values", got=knots.tolist(), cure=cure)
+    require(
+        np.isfinite(knots).all() and (np.diff(knots) >= 0).all() and (knots[degree] < knots[n]),
+        "knots",
+        expected="finite, non-decreasing values",
+        got=knots.tolist(),
+        cure="Sort them, with knots[degree] < knots[n].",
+    )
     return tuple(knots.tolist())
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from sklearn.utils import assert_all_finite, check_array
 
-from foldgauss._runtime.checks import invalid, require
+from foldgauss._runtime.checks import require
 from foldgauss.estimator.parameter_checks import check_real
 
 #: The largest number of rows of a piece: it bounds temporary arrays, whatever the chunks are.
@@ -219,9 +219,13 @@ def _split_chunk(number: int, x, weights, width: int | None) -> Iterator[Piece]:
             cure="All chunks have the columns of the first, or of the fit.",
         )
         own = np.ones(len(part), part.dtype) if weights is None else np.asarray(weights[rows], part.dtype)
-        if not (np.isfinite(own) & (own >= 0)).all():
-            got, cure = f"between {own.min()} and {own.max()}", "0 leaves a row out."
-            raise invalid(f"sample_weight, chunk {number}", expected="finite numbers >= 0", got=got, cure=cure)
+        require(
+            (np.isfinite(own) & (own >= 0)).all(),
+            f"sample_weight, chunk {number}",
+            expected="finite numbers >= 0",
+            got=f"between {own.min()} and {own.max()}",
+            cure="0 leaves a row out.",
+        )
         assert_all_finite(part[own > 0], input_name=name)
         width = part.shape[1]
         yield Piece(part, own)

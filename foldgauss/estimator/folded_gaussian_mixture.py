@@ -17,7 +17,7 @@ from sklearn.utils import check_random_state
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
 
-from foldgauss._runtime.checks import invalid, is_integer, require
+from foldgauss._runtime.checks import is_integer, require
 from foldgauss.envelope import Constant, TimeLikelihood
 from foldgauss.estimator.chunks import is_chunked, open_chunks, summarize_rows
 from foldgauss.estimator.em.components import Parameters
@@ -489,8 +489,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
             check_export(self._params, self._scaling, jax.dtypes.canonicalize_dtype(self._params.curve.dtype), None)
         order = self._order_columns(num).tolist()
         values = np.atleast_1d(np.asarray(values, np.float64))
-        if not np.isfinite(values).all():
-            raise invalid("values", expected="finite numbers", got=values.tolist())
+        require(np.isfinite(values).all(), "values", expected="finite numbers", got=values.tolist())
         with enable_dtype(self._params.curve.dtype):  # times far from zero need float64
             mixture = self.to_mixture().condition([order.index(column) for column in columns], values)
         return jax.tree.map(lambda z: jnp.asarray(z, jax.dtypes.canonicalize_dtype(z.dtype)), mixture)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from foldgauss._runtime.checks import invalid, require
+from foldgauss._runtime.checks import require
 from foldgauss.envelope import Constant
 from foldgauss.estimator.em.components import Parameters
 from foldgauss.estimator.em.initialization import params_from_gaussians
@@ -23,10 +23,13 @@ def replace_initial(estimator, params: Parameters, scaling: Scaling, degree: int
     order = estimator._order_columns(dim)
     if estimator.weights_init is not None:
         weights = check_array("weights_init", estimator.weights_init, (num,))
-        if not ((weights >= 0).all() and np.isclose(weights.sum(), 1)):
-            raise invalid(
-                "weights_init", expected="weights with sum 1", got=weights.tolist(), cure="Divide by the sum."
-            )
+        require(
+            (weights >= 0).all() and np.isclose(weights.sum(), 1),
+            "weights_init",
+            expected="weights with sum 1",
+            got=weights.tolist(),
+            cure="Divide by the sum.",
+        )
     if estimator.means_init is not None:
         means = check_array("means_init", estimator.means_init, (num, dim))[:, order]
     if estimator.precisions_init is not None:

@@ -11,7 +11,7 @@ import scipy.fft
 import scipy.ndimage
 from jaxtyping import Float, Float64
 
-from foldgauss._runtime.checks import invalid, require
+from foldgauss._runtime.checks import require
 
 #: Names that `likelihood_profiles` accepts for `noise`, besides a FrameNoise.
 NOISES = ("score", "independent")
@@ -44,8 +44,13 @@ class FrameNoise:
         }
         for name, (limit, expected, cure) in limits.items():
             values = np.asarray(getattr(self, name), np.float64)
-            if not (np.isfinite(values).all() and (values > 0).all() and (values <= limit).all()):
-                raise invalid(name, expected=expected, got=values.tolist(), cure=cure)
+            require(
+                np.isfinite(values).all() and (values > 0).all() and (values <= limit).all(),
+                name,
+                expected=expected,
+                got=values.tolist(),
+                cure=cure,
+            )
             object.__setattr__(self, name, values)
 
     def for_frames(self, num_frames: int) -> "FrameNoise":

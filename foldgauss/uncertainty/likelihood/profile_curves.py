@@ -42,8 +42,12 @@ class ProfileCurves:
         Raises ValueError for other shapes, times that do not increase, and log-likelihoods that are not finite.
         """
         count = np.array([len(each) for each in nodes])
-        if len(nodes) != len(values) or not len(nodes) or (count < 3).any():
-            raise invalid("nodes", expected="for each frame at least three, and as many values", got=count.tolist())
+        require(
+            len(nodes) == len(values) and len(nodes) and (count >= 3).all(),
+            "nodes",
+            expected="for each frame at least three, and as many values",
+            got=count.tolist(),
+        )
         table = np.full((3, len(count), count.max()), np.nan)
         for k, (times, height) in enumerate(zip(nodes, values, strict=True)):
             times, height = np.asarray(times, np.float64), np.asarray(height, np.float64)

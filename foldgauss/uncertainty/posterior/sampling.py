@@ -95,8 +95,12 @@ def _check_backend(backend: str | os.PathLike | None) -> Path | None:
         return None
     import_optional("h5py", "uncertainty")
     path = Path(backend)
-    if path.is_dir() or not os.access(path.parent, os.W_OK):
-        raise invalid("backend", expected="a file in a folder that can be written to", got=str(path))
+    require(
+        not path.is_dir() and os.access(path.parent, os.W_OK),
+        "backend",
+        expected="a file in a folder that can be written to",
+        got=str(path),
+    )
     return path
 
 
