@@ -113,7 +113,7 @@ def clip_posterior(options: argparse.Namespace) -> dict[str, float]:
         frames = read_video(clip_path(options.clip), size=model.size).frames[: model.frame_times.num_frames]
     with warnings.catch_warnings():  # what is compiled once is not timed
         warnings.simplefilter("ignore")
-        likelihood_profiles(model, frames[: max(3, len(frames) // 40)], noise="score", reach=1)
+        likelihood_profiles(model, frames[: max(3, len(frames) // 40)], noise="score")
     clock = [time.perf_counter()]
     profiles = likelihood_profiles(model, frames, noise="score")
     clock.append(time.perf_counter())

@@ -57,7 +57,7 @@ def _broadcast(builder, scalar, vector=_FLOATS):
     return builder.shuffle_vector(one, empty, ir.Constant(_INTS, [0] * LANES))
 
 
-def _generates(typed, **options):
+def _generates(typed, prefer_literal=False):
     """Decorate a generator of LLVM code as an intrinsic; `typed` gives its signature for the types of its arguments."""
 
     def decorate(generate):
@@ -65,7 +65,7 @@ def _generates(typed, **options):
         def define(context, *arguments):
             return typed(context, *arguments), generate
 
-        return intrinsic(**options)(define)
+        return intrinsic(prefer_literal=prefer_literal)(define)
 
     return decorate
 
