@@ -353,8 +353,9 @@ def _powers(time_scale, degree: int) -> Float[Array, "degree 1"]:
 
 def _student_quantile(level: float, freedom):
     """Half-width of the central interval of Student's t, in standard errors; NaN unless freedom > 0."""
-    quantile = lambda n: np.asarray(scipy.stats.t.ppf(0.5 + 0.5 * level, n), n.dtype)  # noqa: E731
     freedom = lax.stop_gradient(freedom)
+    # Of this dtype by name: JAX may call on a thread in which float64 is not enabled.
+    quantile = lambda n: np.asarray(scipy.stats.t.ppf(0.5 + 0.5 * level, n), freedom.dtype)  # noqa: E731
     return jax.pure_callback(quantile, freedom, freedom, vmap_method="expand_dims")
 
 

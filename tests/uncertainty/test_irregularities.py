@@ -124,8 +124,6 @@ def test_models_are_compared_under_one_noise():
     )
     noise = FrameNoise(4 / 255, 1.0)
     profiles = [likelihood_profiles(one, clip, noise=noise) for one in (even, learned)]
-    own, other = (one.log_likelihood.sum() for one in profiles)
-    assert own == pytest.approx(other, rel=1e-6)  # at the modes, which depend on the splats alone
     at_even, at_truth = (profiles[0].curves(each).sum() for each in (np.linspace(0, 1, NUM_FRAMES), truth))
     assert at_truth > at_even + 100
     one, other = (each.log_likelihood.sum() + exact_posterior(each.curves).log_evidence for each in profiles)
