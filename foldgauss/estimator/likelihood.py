@@ -5,17 +5,17 @@ Not the |X| "folded normal" of scipy and numpyro: here a Gaussian's *center* fol
 
 from collections.abc import Callable
 from enum import IntEnum
+from statistics import NormalDist
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.stats
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key
 
-from foldgauss._numerics.batch import cast
+from foldgauss._numerics.batch import bisect, cast
 from foldgauss._numerics.regression import Regression, hermite, hermite_to_powers, weighted_regression
 from foldgauss._numerics.triangular import solve_upper_matrix
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, require
@@ -353,10 +353,22 @@ def _powers(time_scale, degree: int) -> Float[Array, "degree 1"]:
 
 def _student_quantile(level: float, freedom):
     """Half-width of the central interval of Student's t, in standard errors; NaN unless freedom > 0."""
-    freedom = lax.stop_gradient(freedom)
-    # Of this dtype by name: JAX may call on a thread in which float64 is not enabled.
-    quantile = lambda n: np.asarray(scipy.stats.t.ppf(0.5 + 0.5 * level, n), freedom.dtype)  # noqa: E731
-    return jax.pure_callback(quantile, freedom, freedom, vmap_method="expand_dims")
+    many = freedom > 300  # where the incomplete beta function loses digits, and the series has 9
+    n = jnp.where((freedom > 0) & ~many, freedom, 1)
+    # P(|T| > q) = I_x(n/2, 1/2) with x = n / (n + q^2): bisection over log q.
+    tail = lambda z: jax.scipy.special.betainc(0.5 * n, 0.5 * jnp.ones_like(n), n / (n + jnp.exp(2 * z)))  # noqa: E731
+
+    low, _ = bisect(lambda z: tail(z) > 1 - level, jnp.full_like(n, -20), jnp.full_like(n, 40), 60)
+    quantile = jnp.exp(low)
+    quantile = jnp.where(many, _student_series(level, jnp.where(many, freedom, 1)), quantile)
+    return jnp.where(freedom > 0, quantile, jnp.nan)
+
+
+def _student_series(level: float, n):
+    """The same for many degrees of freedom (Abramowitz and Stegun 26.7.5)."""
+    z = NormalDist().inv_cdf(0.5 + 0.5 * level)
+    first, second = (z**3 + z) / 4, (5 * z**5 + 16 * z**3 + 3 * z) / 96
+    return z + (first + (second + (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384 / n) / n) / n
 
 
 # --- bootstrap ----------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from foldgauss._numerics.regression import hermite_to_powers
 from foldgauss.estimator.em.cholesky import cholesky, inverse_lower, log_det
 from foldgauss.estimator.em.components import Parameters, change_variable, to_powers
-from foldgauss.estimator.em.statistics import SufficientStatistics, Times, differentiate, step_times
+from foldgauss.estimator.em.statistics import SufficientStatistics, Times, step_times
 
 #: Longest step: half a time_scale for time_loc, a factor exp(0.5) for time_scale.
 _MAX_STEP = 0.5
@@ -48,7 +48,7 @@ def update_components(
     else:
         time_loc, time_scale = step_times(Times(params.time_loc, params.time_scale), steps)
         time_scale = jnp.maximum(time_scale, jnp.sqrt(model.floor[-1]))
-    change, scatter = _solve_regression(sums.gram[0], model, params.degree)
+    change, scatter, _ = _solve_regression(sums.gram[0], model, params.degree)
     curve = params.curve + jnp.einsum("kjb,kab->kja", to_powers(change), params.tril)
     curve = change_variable(curve, (params.time_loc - time_loc) / params.time_scale, time_scale / params.time_scale)
     tril = _update_factor(params.tril, scatter, sums.mass, mass, model)
@@ -74,7 +74,8 @@ def residual_scatter(sums: SufficientStatistics, params: Parameters, model: Mode
 
 
 def _solve_regression(gram, model: Model, degree: int):
-    """The change of the curve (k, q+1, p), in whitened Hermite polynomials, and the residuals' scatter (k, p, p)."""
+    """The change of the curve (k, q+1, p), in Hermite polynomials and whitened space; the residuals' scatter (k, p, p);
+    and the inverse of the design's Cholesky factor, 0 for powers above a component's degree."""
     active = jnp.arange(degree + 1, dtype=model.degrees.dtype)[None] <= model.degrees[:, None]
     pairs = active[:, :, None] & active[:, None]
     design = jnp.where(pairs, gram[:, : degree + 1, : degree + 1], 0)
@@ -91,7 +92,7 @@ def _solve_regression(gram, model: Model, degree: int):
     change = jnp.where(jnp.isfinite(change).all((1, 2), keepdims=True), change, 0)
     both = jnp.einsum("kja,kjb->kab", change, cross)
     scatter = total - both - jnp.swapaxes(both, 1, 2) + jnp.einsum("kia,kij,kjb->kab", change, design, change)
-    return change, scatter
+    return change, scatter, jnp.where(active[:, None, :], inverse, 0)
 
 
 def _update_factor(tril, scatter, true_mass, mass, model: Model) -> Float[Array, "k p p"]:
@@ -124,7 +125,7 @@ def profile_log_likelihood(
     `gram` and `log_a` are those at the stepped times. A tied Sigma is fixed, as a single component cannot change it.
     """
     mass = jnp.where(sums.mass > 0, sums.mass, 1)
-    _, scatter = _solve_regression(gram, model, degree)
+    _, scatter, _ = _solve_regression(gram, model, degree)
     dim = scatter.shape[-1]
     square = jnp.exp(-2 * steps[1]) * (sums.second + 2 * steps[0] * sums.first + steps[0] ** 2 * sums.mass)
     value = -0.5 * square - sums.mass * steps[1] - 0.5 * dim * log_a
@@ -142,7 +143,7 @@ def newton_step(
     sums: SufficientStatistics, model: Model, degree: int
 ) -> tuple[Float[Array, "2 k"], Float[Array, " k"]]:
     """The Newton step of the times, and the gain that the profile predicts; 0 where it is undetermined."""
-    _, g0, g1, h00, h01, h11 = _profile_derivatives(sums, model, degree)
+    (g0, g1), (h00, h01, h11) = _profile_derivatives(sums, model, degree)
     a, b, c = -h00, -h01, -h11
     least = 0.5 * (a + c) - jnp.hypot(0.5 * (a - c), b)  # the smaller eigenvalue
     lift = jnp.maximum(_MIN_CURVATURE * sums.mass - least, 0)
@@ -157,13 +158,43 @@ def newton_step(
     return steps, jnp.where(usable, g0 * steps[0] + g1 * steps[1], 0)
 
 
-def _profile_derivatives(sums: SufficientStatistics, model: Model, degree: int) -> list[Float[Array, " k"]]:
-    """`profile_log_likelihood` at 0, and its first and second derivatives by the steps."""
+def _profile_derivatives(sums: SufficientStatistics, model: Model, degree: int):
+    """First and second derivatives of `profile_log_likelihood` by the steps, at 0.
 
-    def profile(steps):
-        d0, d1 = steps
-        powers = jnp.stack([jnp.ones_like(d0), d0, d1, 0.5 * d0 * d0, d0 * d1, 0.5 * d1 * d1])  # Taylor's
-        gram, log_a = jnp.einsum("ok,okab->kab", powers, sums.gram), (powers * sums.log_a).sum(0)
-        return profile_log_likelihood(sums, model, degree, steps, gram, log_a)
+    The scatter is the Schur complement M' G M of the gram, M = (-change, I). As the change is a minimum, its first
+    derivative is M' G_i M, and the second M' G_ij M - B_i' D^-1 B_j - B_j' D^-1 B_i, B_i the design's rows of G_i M.
+    """
+    mass, dim = jnp.where(sums.mass > 0, sums.mass, 1), sums.gram.shape[-1] - degree - 1
+    change, scatter, inverse = _solve_regression(sums.gram[0], model, degree)
+    eye = jnp.broadcast_to(jnp.eye(dim, dtype=change.dtype), (*change.shape[:1], dim, dim))
+    complement = jnp.concatenate([-change, eye], axis=1)
+    of_design = jnp.einsum("okab,kbc->okac", sums.gram[1:], complement)
+    rows = jnp.einsum("kij,okjc->okic", inverse, of_design[:2, :, : degree + 1])
+    first = jnp.einsum("kab,okac->okbc", complement, of_design)
+    twice = [2 * jnp.einsum("kia,kib->kab", rows[i], rows[j]) for i, j in ((0, 0), (0, 1), (1, 1))]
+    second = first[2:] - 0.5 * jnp.stack([x + jnp.swapaxes(x, 1, 2) for x in twice])
+    first, second = (_relative_change(s, scatter, mass, model) for s in (first[:2], second))
+    trace = lambda s: jnp.diagonal(s, axis1=-2, axis2=-1).sum(-1)  # noqa: E731
+    slopes = -0.5 * mass[None] * trace(first) - 0.5 * dim * sums.log_a[1:3]
+    curvatures = trace(second)
+    if model.covariance != "tied":  # the second derivative of the logarithm itself
+        product = lambda i, j: (first[i] * first[j]).sum((-2, -1))  # noqa: E731
+        curvatures = curvatures - jnp.stack([product(0, 0), product(0, 1), product(1, 1)])
+    curvatures = -0.5 * mass[None] * curvatures - 0.5 * dim * sums.log_a[3:]
+    slopes = slopes + jnp.stack([-sums.first, sums.second - sums.mass])
+    return slopes, curvatures + jnp.stack([-sums.mass, 2 * sums.first, -2 * sums.second])
 
-    return differentiate(profile, jnp.zeros((2, *sums.mass.shape), sums.mass.dtype))
+
+def _relative_change(change, scatter, mass, model: Model):
+    """Changes of the scatter relative to the scatter, restricted to the kind of covariance."""
+    if model.covariance == "tied":
+        return change / mass[None, :, None, None]
+    diagonal = jnp.diagonal(scatter, axis1=-2, axis2=-1)
+    eye = jnp.eye(scatter.shape[-1], dtype=scatter.dtype)[None, None]
+    if model.covariance == "diag":
+        return change * eye / diagonal[None, :, :, None]
+    if model.covariance == "spherical":
+        traces = jnp.diagonal(change, axis1=-2, axis2=-1).sum(-1) / diagonal.sum(-1)[None]
+        return traces[..., None, None] * eye
+    whitening = inverse_lower(cholesky(scatter))
+    return jnp.einsum("kab,okbc,kdc->okad", whitening, change, whitening)

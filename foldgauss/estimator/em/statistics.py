@@ -282,18 +282,12 @@ def _log_a_derivatives(envelope, t, times: Times, order: int) -> list[Float[Arra
         return envelope.log_a(t, time_loc=at.loc[None], time_scale=at.scale[None])
 
     zero = jnp.zeros((2, *times.loc.shape), times.loc.dtype)
-    return [value(zero)] if order == 0 else differentiate(value, zero)
-
-
-def differentiate(function: Callable, zero: Float[Array, "2 k"]) -> list[Array]:
-    """A function of steps of the times at `zero`, and its derivatives by d0, d1, d00, d01, d11.
-
-    Each component's result depends on its own steps only.
-    """
+    if order == 0:
+        return [value(zero)]
     directions = [zero.at[j].set(1) for j in range(2)]
-    slope = lambda j: lambda steps: jax.jvp(function, (steps,), (directions[j],))[1]  # noqa: E731
+    slope = lambda j: lambda steps: jax.jvp(value, (steps,), (directions[j],))[1]  # noqa: E731
     curvature = lambda i, j: jax.jvp(slope(i), (zero,), (directions[j],))[1]  # noqa: E731
-    return [function(zero), slope(0)(zero), slope(1)(zero), curvature(0, 0), curvature(0, 1), curvature(1, 1)]
+    return [value(zero), slope(0)(zero), slope(1)(zero), curvature(0, 0), curvature(0, 1), curvature(1, 1)]
 
 
 def _divide_by_a(mass, log_a) -> list[Float[Array, "n k"]]:
