@@ -112,7 +112,6 @@ class Gaussian(AbstractDistribution):
             return jnp.matmul(factor, jnp.swapaxes(factor, -1, -2))
         return (factor[..., :, None, :] * factor[..., None, :, :]).sum(-1)
 
-    @compile_eager
     def moments(self) -> tuple[Float[Array, "*batch dim"], Float[Array, "*#batch dim dim"]]:
         """Mean (*batch, dim) and covariance matrix (*batch, dim, dim)."""
         dim = self.event_shape[0]
