@@ -17,7 +17,6 @@ from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfi
 from foldgauss.uncertainty.likelihood.noise import FrameNoise
 from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.uncertainty.posterior.exact import exact_posterior
-from foldgauss.uncertainty.posterior.increments import Increments
 from foldgauss.uncertainty.posterior.log_prob import FrameTimeLogProb
 from foldgauss.uncertainty.posterior.sampling import frame_time_posterior
 from foldgauss.video.models.video_model import VideoModel
@@ -100,12 +99,11 @@ def simulated_ranks(
     assumed = noise if assumed_noise is None else assumed_noise
     if isinstance(assumed, FrameNoise):
         assumed = assumed.for_frames(num_frames)
-    increments = Increments(np.linspace(0.0, 1.0, num_frames), None, concentration)
     images = _CachedImages(model)
     ranks, true, converged = [], [], 0
     for seeds in np.random.SeedSequence(seed, spawn_key=(_REPLICATE,)).spawn(replicates):
         rng = np.random.default_rng(seeds)
-        times = increments.draw_prior(rng, 1)[0]
+        times = draw_times(num_frames, concentration, rng)
         clean = np.stack(list(images.residuals.render_at(times)))
         scale = noise.scale[:, None, None, None].astype(np.float32)
         frames = clean + scale * _draw_noise(clean.shape, correlation, rng)
@@ -116,10 +114,10 @@ def simulated_ranks(
             builder = ProfileBuilder(_SimulatedResiduals(images, frames))
         builder.compare_coarse()
         profiles = builder.build(assumed)
-        log_prob = FrameTimeLogProb(profiles.curves, increments)
+        log_prob = FrameTimeLogProb(profiles.curves, concentration)
         seed_of_draws = int(rng.integers(2**31))
         if sampler == "exact":
-            sample, success = exact_posterior(profiles.curves, increments).sample(draws, seed_of_draws), True
+            sample, success = exact_posterior(profiles.curves, concentration).sample(draws, seed_of_draws), True
         else:
             sample, success = _sample_by_emcee(profiles, concentration, draws, steps, seed_of_draws)
         below = (sample < times).sum(0)
@@ -131,6 +129,12 @@ def simulated_ranks(
         converged += success
     names = [f"frame {k}" for k in range(1, num_frames - 1)] + ["any frame", "log-likelihood"]
     return SimulatedRanks(np.array(ranks), draws + 1, names, np.array(true), converged / replicates)
+
+
+def draw_times(num_frames: int, concentration: float, rng: np.random.Generator) -> np.ndarray:
+    """Frame times drawn from their prior."""
+    steps = rng.dirichlet(np.full(num_frames - 1, concentration))
+    return np.minimum(np.append(0.0, np.cumsum(steps)), 1.0)  # rounding may exceed it
 
 
 @functools.cache

@@ -32,7 +32,6 @@ from foldgauss.io.figures import write_figure
 from foldgauss.render import RenderOptions
 from foldgauss.uncertainty import (
     FrameNoise,
-    Increments,
     exact_posterior,
     frame_time_posterior,
     likelihood_profiles,
@@ -114,7 +113,7 @@ def clip_posterior(options: argparse.Namespace) -> dict[str, float]:
         frames = read_video(clip_path(options.clip), size=model.size).frames[: model.frame_times.num_frames]
     with warnings.catch_warnings():  # what is compiled once is not timed
         warnings.simplefilter("ignore")
-        likelihood_profiles(model, frames[: max(3, len(frames) // 40)], noise="score", reach=1)
+        likelihood_profiles(model, frames[: max(3, len(frames) // 40)], noise="score")
     clock = [time.perf_counter()]
     profiles = likelihood_profiles(model, frames, noise="score")
     clock.append(time.perf_counter())
@@ -218,7 +217,7 @@ def retimed(seed: int) -> dict[str, float]:
 def measured(model: VideoModel, frames: np.ndarray, truth: np.ndarray, noise: FrameNoise | str) -> list[float]:
     """`MEASURES`: fractions of true times in intervals; median miss and std; root mean square of their quotient."""
     profiles = likelihood_profiles(model, frames, noise=noise)
-    found = exact_posterior(profiles.curves, Increments(np.linspace(0, 1, len(frames))))
+    found = exact_posterior(profiles.curves)
     covered = [inside(found.interval(level), truth) for level in LEVELS]
     miss, std, last = (found.mean() - truth)[1:-1], found.std()[1:-1], len(truth) - 1
     z = np.sqrt(np.mean((miss / std) ** 2))

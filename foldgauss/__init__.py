@@ -18,12 +18,7 @@ if TYPE_CHECKING:
     from foldgauss.fold import CallableFold, FourierFold, PolynomialFold, SharedPathFold, SplineFold, ZeroFold
     from foldgauss.mixture import FoldedMixture, Mixture
 
-for _kind, _location in {
-    "distribution": "foldgauss.analysis.notebook:density_png",
-    "history": "foldgauss.analysis.notebook:history_png",
-    "video": "foldgauss.io.page.player_page:make_notebook_iframe",
-}.items():
-    notebook_hooks.register(_kind, _location)
+notebook_hooks.register("video", "foldgauss.io.page.player_page:make_notebook_iframe")
 
 __version__ = "0.1.0"
 

@@ -26,7 +26,7 @@ from foldgauss._numerics.batch import (
     vectorized,
 )
 from foldgauss._numerics.factor import check_loc, check_rest, marginal_tril, normalize_indices, resolve_scale_tril
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.analysis import moments
 from foldgauss.analysis.conditional import TimeMixture, conditional_gaussian, time_mixture
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood, as_envelope, check_peak
@@ -288,8 +288,9 @@ class FoldedGaussian(AbstractDistribution):
         space = tuple(i for i in indices if i != time)
         if len(space) == len(indices):
             return time_mixture(self, space, (), jnp.zeros((0,), self.loc.dtype), keeps_time=False)
-        if indices[-1] != time:
-            raise invalid("indices", expected="time last", got=repr(indices), cure="Time is the last coordinate.")
+        require(
+            indices[-1] == time, "indices", expected="time last", got=repr(indices), cure="Time is the last coordinate."
+        )
         if not space:
             return Gaussian(self.time_loc[..., None], self.time_scale[..., None, None], validate_args=False)
         return FoldedGaussian(
@@ -346,7 +347,11 @@ class FoldedGaussian(AbstractDistribution):
 
 def _check_fold(fold: AbstractFold, loc: Array) -> AbstractFold:
     shape = jax.eval_shape(fold, jax.ShapeDtypeStruct((), loc.dtype)).shape
-    if shape[-1:] != loc.shape[-1:]:
-        expected = f"shifts of shape (*batch, {loc.shape[-1]})"
-        raise invalid("fold", expected=expected, got=f"shape {shape}", cure="It maps u to d-1 space coordinates.")
+    require(
+        shape[-1:] == loc.shape[-1:],
+        "fold",
+        expected=f"shifts of shape (*batch, {loc.shape[-1]})",
+        got=f"shape {shape}",
+        cure="It maps u to d-1 space coordinates.",
+    )
     return fold

@@ -18,10 +18,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, PyTree
+from jaxtyping import Array, ArrayLike, Float
 
-from foldgauss._numerics.batch import BatchModule, concrete_value, divide, steepest, vectorize
-from foldgauss._runtime.checks import check_signature, invalid, short_repr
+from foldgauss._numerics.batch import BatchModule, FunctionModule, concrete_value, divide, steepest, vectorize
+from foldgauss._runtime.checks import check_signature, invalid, require, short_repr
 
 __all__ = ["AbstractEnvelope", "CallableEnvelope", "Constant", "TimeLikelihood", "as_envelope", "plain_envelope"]
 
@@ -94,11 +94,20 @@ class TimeLikelihood(AbstractEnvelope):
 
     def __init__(self, power: ArrayLike = 1.0, floor: ArrayLike = 0.0):
         self.power, self.floor = _float_array(power), _float_array(floor)
-        if _any(self.power, lambda x: ~((x >= 0) & (x < np.inf))):
-            cure = "The paper's text has 1, its code 2."
-            raise invalid("power", expected="a finite number >= 0", got=power, cure=cure)
-        if _any(self.floor, lambda x: ~((x >= 0) & (x < 1))):
-            raise invalid("floor", expected="a number in [0, 1)", got=floor, cure="For a = 1 use Constant().")
+        require(
+            not _any(self.power, lambda x: ~((x >= 0) & (x < np.inf))),
+            "power",
+            expected="a finite number >= 0",
+            got=power,
+            cure="The paper's text has 1, its code 2.",
+        )
+        require(
+            not _any(self.floor, lambda x: ~((x >= 0) & (x < 1))),
+            "floor",
+            expected="a number in [0, 1)",
+            got=floor,
+            cure="For a = 1 use Constant().",
+        )
 
     def log_a(self, t, *, time_loc, time_scale):
         t, time_loc, time_scale, power, floor = jnp.broadcast_arrays(t, time_loc, time_scale, self.power, self.floor)
@@ -108,7 +117,7 @@ class TimeLikelihood(AbstractEnvelope):
         return _log_floored(0.5 * power * tau * tau, floor)
 
 
-class CallableEnvelope(AbstractEnvelope):
+class CallableEnvelope(FunctionModule, AbstractEnvelope):
     """Any function that returns log a, with or without parameters, as an envelope.
 
         log a(t) = log_a(t, time_loc, time_scale)
@@ -121,24 +130,15 @@ class CallableEnvelope(AbstractEnvelope):
     **Source:** the "suitably chosen" a of eq:cond_dens. **Raises:** ValueError if `log_a` is not callable.
     """
 
-    parameters: PyTree
-    static: PyTree = eqx.field(static=True)
-    parameter_ranks: tuple[int, ...] = eqx.field(static=True)  # set at construction, as in CallableFold
-
     def __init__(self, log_a: Callable[[Array, Array, Array], Array]):
         if not callable(log_a):
             raise invalid("log_a", expected="a callable (t, time_loc, time_scale) -> log a", got=repr(log_a))
-        self.parameters, self.static = eqx.partition(log_a, eqx.is_array)
-        self.parameter_ranks = tuple(x.ndim for x in jax.tree.leaves(self.parameters))
-
-    @property
-    def leaf_ranks(self) -> tuple[int, ...]:
-        return self.parameter_ranks
+        super().__init__(log_a)
 
     def log_a(self, t, *, time_loc, time_scale):
         dtype = jnp.result_type(t, time_loc, time_scale)
-        one = lambda own, *scalars: jnp.asarray(eqx.combine(own.parameters, own.static)(*scalars))  # noqa: E731
-        return vectorize(one, self, *(jnp.asarray(x, dtype) for x in (t, time_loc, time_scale)))
+        scalars = (jnp.asarray(x, dtype) for x in (t, time_loc, time_scale))
+        return vectorize(CallableEnvelope.evaluate, self, *scalars)
 
 
 def plain_envelope(a: Callable[[Array, Array, Array], Array]) -> CallableEnvelope:

@@ -15,19 +15,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, ArrayLike, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from foldgauss._numerics.batch import (
     BatchModule,
+    FunctionModule,
     check_finite,
     check_positive,
     common_dtype,
     concrete_value,
+    jvp_of_moving,
     vectorized,
 )
 from foldgauss._numerics.piecewise import locate
 from foldgauss._numerics.triangular import join_columns, split_columns
-from foldgauss._runtime.checks import check_signature, invalid, is_integer, short_repr
+from foldgauss._runtime.checks import check_signature, invalid, is_integer, require, short_repr
 
 __all__ = [
     "AbstractFold",
@@ -81,8 +83,7 @@ class ZeroFold(AbstractFold):
     is_closed = True
 
     def __init__(self, dim: int):
-        if not is_integer(dim, 1):
-            raise invalid("dim", expected="an integer >= 1", got=repr(dim), cure="It is d - 1.")
+        require(is_integer(dim, 1), "dim", expected="an integer >= 1", got=repr(dim), cure="It is d - 1.")
         self.dim = int(dim)
 
     def __call__(self, u: Float[Array, "*batch"]) -> Float[Array, "*batch d-1"]:
@@ -159,8 +160,9 @@ class SplineFold(AbstractFold):
 
     def __init__(self, knots: ArrayLike, coefficients: ArrayLike, *, degree: int = 3):
         self.coefficients = _coefficient_rows("coefficients", coefficients, "n", "Row i holds c_i")
-        if not is_integer(degree, 0):
-            raise invalid("degree", expected="an integer >= 0", got=repr(degree), cure="3 is a cubic spline.")
+        require(
+            is_integer(degree, 0), "degree", expected="an integer >= 0", got=repr(degree), cure="3 is a cubic spline."
+        )
         self.knots, self.degree = _check_knots(knots, self.coefficients.shape[-2], degree), int(degree)
 
     @vectorized(0)
@@ -202,11 +204,13 @@ class FourierFold(AbstractFold):
         self.sine = _coefficient_rows("sine", sine, "order", "Row k-1 holds s_k")
         self.cosine = _coefficient_rows("cosine", cosine, "order", "Row k-1 holds c_k").astype(self.sine.dtype)
         self.period = jnp.asarray(period, self.sine.dtype)
-        if self.sine.shape != self.cosine.shape:
-            got = f"shapes {self.sine.shape} and {self.cosine.shape}"
-            raise invalid(
-                "cosine", expected="the shape of sine", got=got, cure="Pass zeros for the one that is not used."
-            )
+        require(
+            self.sine.shape == self.cosine.shape,
+            "cosine",
+            expected="the shape of sine",
+            got=f"shapes {self.sine.shape} and {self.cosine.shape}",
+            cure="Pass zeros for the one that is not used.",
+        )
         check_positive("period", self.period, cure="It is a duration.")
 
     @property
@@ -227,7 +231,7 @@ class FourierFold(AbstractFold):
         return shift
 
 
-class CallableFold(AbstractFold):
+class CallableFold(FunctionModule, AbstractFold):
     """Any function of one scalar, with or without parameters, as a fold: `f(u) = function(u)`.
 
     **Shapes:** `function` maps one scalar u to (d-1,); this class vmaps it, u (*batch,) -> (*batch, d-1).
@@ -240,26 +244,16 @@ class CallableFold(AbstractFold):
     callable.
     """
 
-    parameters: PyTree
-    static: PyTree = eqx.field(static=True)
-    # Set at construction, from the arrays of a single fold, so that the axes of a later vmap are known to be batch.
-    parameter_ranks: tuple[int, ...] = eqx.field(static=True)
-
     shares_leaves = True
 
     def __init__(self, function: Callable[[Float[Array, ""]], Float[Array, " d-1"]]):
         if not callable(function):
             raise invalid("function", expected="a callable u -> (d-1,)", got=repr(function))
-        self.parameters, self.static = eqx.partition(function, eqx.is_array)
-        self.parameter_ranks = tuple(x.ndim for x in jax.tree.leaves(self.parameters))
-
-    @property
-    def leaf_ranks(self) -> tuple[int, ...]:
-        return self.parameter_ranks
+        super().__init__(function)
 
     @vectorized(0)
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
-        return jnp.asarray(eqx.combine(self.parameters, self.static)(u))
+        return self.evaluate(u)
 
 
 class SharedPathFold(AbstractFold):
@@ -397,13 +391,7 @@ def _shift(structure, u, *leaves):
 @partial(_shift.defjvp, symbolic_zeros=True)
 def _shift_jvp(structure, primals, tangents):
     u, *leaves = primals
-    moving = [i for i, tangent in enumerate(tangents[1:]) if not isinstance(tangent, SymbolicZero)]
-
-    def of_leaves(*moved):
-        every = {**dict(enumerate(leaves)), **dict(zip(moving, moved, strict=True))}
-        return jax.tree.unflatten(structure, [every[i] for i in range(len(leaves))])(u)
-
-    shift, moved = jax.jvp(of_leaves, [leaves[i] for i in moving], [tangents[1 + i] for i in moving])
+    shift, moved = jvp_of_moving(lambda *leaves: jax.tree.unflatten(structure, leaves)(u), leaves, tangents[1:])
     if isinstance(tangents[0], SymbolicZero):
         return shift, moved
     slope = jax.jvp(lambda u: jax.tree.unflatten(structure, leaves)(u), (u,), (jnp.ones_like(u),))[1]
@@ -412,23 +400,33 @@ def _shift_jvp(structure, primals, tangents):
 
 def _coefficient_rows(name: str, x: ArrayLike, count: str, rows: str) -> Float[Array, "*batch n d-1"]:
     x = jnp.asarray(x)
-    if x.ndim < 2 or x.shape[-1] < 1:
-        cure = f"{rows}; a single space coordinate still needs its own axis."
-        raise invalid(name, expected=f"shape (*batch, {count}, d-1)", got=f"shape {x.shape}", cure=cure)
+    require(
+        x.ndim >= 2 and x.shape[-1] >= 1,
+        name,
+        expected=f"shape (*batch, {count}, d-1)",
+        got=f"shape {x.shape}",
+        cure=f"{rows}; a single space coordinate still needs its own axis.",
+    )
     check_finite(name, x)
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
 
 
 def _check_knots(knots: ArrayLike, n: int, degree: int) -> tuple[float, ...]:
     knots = np.asarray(knots, np.float64)
-    if knots.shape != (n + degree + 1,) or n <= degree:
-        cure = "There are n coefficients, n > degree; repeat the end knots degree + 1 times to clamp the ends."
-        raise invalid(
-            "knots", expected=f"shape (n + degree + 1,) = ({n + degree + 1},)", got=f"{knots.shape}", cure=cure
-        )
-    if not (np.isfinite(knots).all() and (np.diff(knots) >= 0).all() and knots[degree] < knots[n]):
-        cure = "Sort them, with knots[degree] < knots[n]."
-        raise invalid("knots", expected="finite, non-decreasing values", got=knots.tolist(), cure=cure)
+    require(
+        knots.shape == (n + degree + 1,) and n > degree,
+        "knots",
+        expected=f"shape (n + degree + 1,) = ({n + degree + 1},)",
+        got=f"{knots.shape}",
+        cure="There are n coefficients, n > degree; repeat the end knots degree + 1 times to clamp the ends.",
+    )
+    require(
+        np.isfinite(knots).all() and (np.diff(knots) >= 0).all() and (knots[degree] < knots[n]),
+        "knots",
+        expected="finite, non-decreasing values",
+        got=knots.tolist(),
+        cure="Sort them, with knots[degree] < knots[n].",
+    )
     return tuple(knots.tolist())
 
 

@@ -41,7 +41,7 @@ from foldgauss._numerics.triangular import (
     solve_upper,
     split_columns,
 )
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 
 __all__ = ["Gaussian"]
 
@@ -147,9 +147,13 @@ class Gaussian(AbstractDistribution):
 
     def _of_line(self) -> tuple[Float[Array, "*#batch"], Float[Array, "*#batch"]]:
         """Mean and standard deviation of the single coordinate."""
-        if self.event_shape != (1,):
-            got = f"event_shape {self.event_shape}"
-            raise invalid("cdf", expected="a single coordinate", got=got, cure="Take marginal([i]) first.")
+        require(
+            self.event_shape == (1,),
+            "cdf",
+            expected="a single coordinate",
+            got=f"event_shape {self.event_shape}",
+            cure="Take marginal([i]) first.",
+        )
         stddev = self.stddev[..., 0]  # 0 where it underflows, far from a component's time
         return self.loc[..., 0], jnp.maximum(stddev, float(jnp.finfo(stddev.dtype).tiny))
 

@@ -22,9 +22,9 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Float, Int, Key
 
 from foldgauss._numerics.abstract import AbstractDistribution
-from foldgauss._numerics.batch import as_event, as_sample_shape, as_value, flatten_points, vectorize
+from foldgauss._numerics.batch import as_event, as_sample_shape, as_value, bisect, flatten_points, vectorize
 from foldgauss._numerics.factor import normalize_indices
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.analysis.conditional import TimeMixture
 from foldgauss.analysis.mixture_weights import (
     broadcast_weights,
@@ -73,9 +73,13 @@ class Mixture(AbstractDistribution):
         weights: ArrayLike | None = None,
         validate_args: bool = True,
     ):
-        if components.batch_shape[-1:] in ((), (0,)):
-            cure = "Give its parameters a leading dimension of k: jax.tree.map(lambda *x: jnp.stack(x), *components)."
-            raise invalid("components", expected="batch shape (*batch, k)", got=components.batch_shape, cure=cure)
+        require(
+            components.batch_shape[-1:] not in ((), (0,)),
+            "components",
+            expected="batch shape (*batch, k)",
+            got=components.batch_shape,
+            cure="Give its parameters a leading dimension of k: jax.tree.map(lambda *x: jnp.stack(x), *components).",
+        )
         self.components, self.logits = broadcast_weights(components, logits, weights, validate_args)
 
     @property
@@ -223,9 +227,13 @@ class FoldedMixture(Mixture):
     components: FoldedGaussian
 
     def __check_init__(self):
-        if not isinstance(self.components, FoldedGaussian):
-            got, cure = type(self.components).__name__, "Mixture takes components of any class."
-            raise invalid("components", expected="one FoldedGaussian of batch shape (*batch, k)", got=got, cure=cure)
+        require(
+            isinstance(self.components, FoldedGaussian),
+            "components",
+            expected="one FoldedGaussian of batch shape (*batch, k)",
+            got=type(self.components).__name__,
+            cure="Mixture takes components of any class.",
+        )
 
     def condition_time(self, t: Float[Array, "*#batch"]) -> Mixture:
         """Space at time t: the components at t, each with weight `w_k N(t; m_k, sigma_k^2)`, normalized.
@@ -340,15 +348,9 @@ def _icdf(mixture: Mixture, q: Array) -> Array:
     low, high, is_nan = vectorize(ends, (weights, 1), (quantiles, 1))
     q = jnp.broadcast_to(q, low.shape)
 
-    def halve(_, bounds):
-        low, high = bounds
-        middle = low + 0.5 * (high - low)
-        below = _cdf(mixture, middle[..., None]) < q
-        return jnp.where(below, middle, low), jnp.where(below, high, middle)
-
-    steps = jnp.finfo(q.dtype).nmant + 8
     inner = jnp.isfinite(low) & jnp.isfinite(high)
-    found = lax.fori_loop(0, steps, halve, (jnp.where(inner, low, 0), jnp.where(inner, high, 0)))[1]
+    ends = (jnp.where(inner, end, 0) for end in (low, high))
+    found = bisect(lambda x: _cdf(mixture, x[..., None]) < q, *ends, jnp.finfo(q.dtype).nmant + 8)[1]
     return lax.stop_gradient(jnp.where(is_nan, jnp.nan, jnp.where(inner, found, low)))[..., None]
 
 

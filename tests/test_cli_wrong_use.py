@@ -312,9 +312,6 @@ WRONG = [
         for folder, name in (("left", "models"), ("plot", "tradeoff.png"))
     ),
     # uncertainty
-    (f"{TIMES} o --only 0,3", 2, "--only: expected different frames from 1 to 10"),
-    (f"{TIMES} o --only 3-5", 2, "--only: expected frames as 3,5,10:20"),
-    (f"{TIMES} o --only 5:5", 2, "--only: expected at least one frame"),
     (f"{TIMES} o --noise white", 2, "--noise: expected one of 'score', 'independent'"),
     (f"{TIMES} o --level c", 2, "--level: expected one of 'splats', 'colors'"),
     (f"{TIMES} o --concentration 0", 2, "--concentration: expected a number >= 1"),
@@ -325,7 +322,7 @@ WRONG = [
     (f"{TIMES} file", 2, "--out: expected a folder"),
     (f"{TIMES} bad", 2, "got others in"),
     (f"{TIMES} three", 2, "a new folder or one that a run of uncertainty wrote"),
-    ("uncertainty own.safetensors clip --out o --frames 0:5", 2, "--only A:B"),
+    ("uncertainty own.safetensors clip --out o --frames 0:5", 2, "Give all of them"),
     ("uncertainty none clip --out o", 2, "missing"),
     ("uncertainty edited.safetensors clip --out o", 2, "an edited one"),
     ("uncertainty one.safetensors mask.png --out o", 2, "at least 3 frames"),

@@ -1,4 +1,4 @@
-"""The numpyro and scipy bridges: the same numbers in other clothes, and a short NUTS through one of them."""
+"""The numpyro bridge: the same numbers in other clothes, and a short NUTS through it; scipy's twins."""
 
 import copy
 import pickle
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from foldgauss.analysis.interop import to_numpyro, to_scipy
+from foldgauss.analysis.interop import to_numpyro
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import Constant
 from foldgauss.fold import PolynomialFold
@@ -56,78 +56,18 @@ def _plain():
 # --- scipy --------------------------------------------------------------------------------------------------
 
 
-def test_scipy_object_agrees_with_scipys_own(x64):
+def test_methods_agree_with_their_twins_in_scipy(x64):
     dist, twin = _plain()
-    frozen, x = to_scipy(dist), twin.rvs(50, random_state=0)
-    np.testing.assert_allclose(frozen.logpdf(x), twin.logpdf(x), rtol=1e-12)
-    np.testing.assert_allclose(frozen.pdf(x[0]), twin.pdf(x[0]), rtol=1e-12)
-    np.testing.assert_allclose(frozen.entropy(), twin.entropy(), rtol=1e-12)
-    np.testing.assert_allclose(frozen.mean, twin.mean, rtol=1e-12)
-    np.testing.assert_allclose(frozen.cov, twin.cov, rtol=1e-12, atol=1e-14)
-    assert frozen.dim == twin.dim == 3
-    assert isinstance(frozen.logpdf(x), np.ndarray)
-    assert np.shape(frozen.entropy()) == ()
-
-
-def test_scipy_marginals_agree_with_scipys_own(x64):
-    dist, twin = _plain()
+    x = twin.rvs(50, random_state=0)
+    np.testing.assert_allclose(dist.log_prob(x), twin.logpdf(x), rtol=1e-12)
+    np.testing.assert_allclose(dist.pdf(x[0]), twin.pdf(x[0]), rtol=1e-12)
+    np.testing.assert_allclose(dist.entropy(), twin.entropy(), rtol=1e-12)
+    np.testing.assert_allclose(dist.mean, twin.mean, rtol=1e-12)
+    np.testing.assert_allclose(dist.covariance_matrix, twin.cov, rtol=1e-12, atol=1e-14)
     for indices in ([0], [2], [1, 2], [-1]):  # time integrated out, time alone, both
-        frozen, x = to_scipy(dist).marginal(indices), twin.rvs(20, random_state=1)[:, indices]
         own = stats.multivariate_normal(twin.mean[indices], twin.cov[np.ix_(indices, indices)])
-        points = x[:, 0] if len(indices) == 1 else x
-        np.testing.assert_allclose(frozen.logpdf(points), own.logpdf(points), rtol=1e-7)
-
-
-def test_scipy_draws_follow_scipys_conventions():
-    frozen = to_scipy(Gaussian(jnp.zeros(3), jnp.eye(3)))
-    assert frozen.rvs(5, random_state=np.random.default_rng(0)).shape == (5, 3)
-    np.testing.assert_array_equal(frozen.rvs(5, random_state=7), frozen.rvs(5, random_state=7))
-    assert (frozen.rvs(5, random_state=7) != frozen.rvs(5, random_state=8)).any()
-    assert (frozen.rvs(5) != frozen.rvs(5)).any()
-
-
-@pytest.mark.parametrize("size", [None, (), 0, 1, (1,), 5, (2, 1), (1, 3), (2, 3)])
-@pytest.mark.parametrize("dim", [1, 3])
-def test_scipy_sizes_are_those_of_scipy(size, dim):
-    twin, frozen = stats.multivariate_normal(np.zeros(dim)), to_scipy(Gaussian(jnp.zeros(dim), jnp.eye(dim)))
-    assert np.shape(frozen.rvs(size, random_state=0)) == np.shape(twin.rvs(size, random_state=0))
-
-
-@pytest.mark.parametrize("size", [-1, 2.5, (2, -1), True, "3", np.nan])
-def test_scipy_sizes_are_checked(size):
-    with pytest.raises(ValueError, match="sample_shape: expected whole numbers >= 0"):
-        to_scipy(Gaussian([0.0], [[1.0]])).rvs(size)
-
-
-def test_scipy_samples_belong_to_the_density():
-    frozen = to_scipy(_dist())
-    x = frozen.rvs(20_000, random_state=0)
-    score = -frozen.logpdf(x)
-    # The mean of -log p is the entropy; 5 standard errors, false alarm 6e-7.
-    assert abs(score.mean() - frozen.entropy()) < 5 * score.std() / np.sqrt(len(x))
-    # Power: draws of a fold of the other sign must be caught.
-    other = to_scipy(_dist(fold=PolynomialFold(jnp.array([[-0.8, 0.5], [0.6, 0.9]])))).rvs(20_000, random_state=0)
-    assert abs(-frozen.logpdf(other).mean() - frozen.entropy()) > 50 * score.std() / np.sqrt(len(x))
-
-
-def test_gaussians_are_frozen_too(x64):
-    normal, gaussian = (
-        to_scipy(Gaussian([0.5], [[2.0]])),
-        to_scipy(Gaussian([0.0, 1.0], jnp.linalg.cholesky(COVARIANCE))),
-    )
-    np.testing.assert_allclose(normal.entropy(), stats.norm(0.5, 2.0).entropy(), rtol=1e-12)
-    np.testing.assert_allclose(normal.pdf(0.3), stats.norm(0.5, 2.0).pdf(0.3), rtol=1e-12)
-    np.testing.assert_allclose(gaussian.entropy(), stats.multivariate_normal(cov=COVARIANCE).entropy(), rtol=1e-12)
-    assert normal.rvs(4, random_state=0).shape == (4,)
-
-
-def test_scipy_object_refuses_a_batch_and_what_is_not_there():
-    with pytest.raises(ValueError, match=r"dist: expected batch_shape \(\), got \(3,\)"):
-        to_scipy(_dist(time_loc=jnp.zeros(3)))
-    with pytest.raises(ValueError, match="indices: expected numbers from -3 to 2"):
-        to_scipy(_dist()).marginal([5])
-    with pytest.raises(ValueError, match="entropy: expected a distribution with an entropy"):
-        to_scipy(_mixture()).entropy()
+        points = x[:20, indices]
+        np.testing.assert_allclose(dist.marginal(indices).log_prob(points), own.logpdf(points), rtol=1e-7)
 
 
 # --- numpyro ------------------------------------------------------------------------------------------------

@@ -134,5 +134,5 @@ def test_a_missing_scikit_learn_is_reported_with_its_remedy(monkeypatch):
     for name in [name for name in sys.modules if name.startswith(("sklearn", "foldgauss.estimator.folded_"))]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "sklearn", None)
-    with pytest.raises(ImportError, match=r"needs scikit-learn: pip install 'foldgauss\[sklearn\]'"):
+    with pytest.raises(ImportError, match=r"sklearn is needed here: pip install 'foldgauss\[sklearn\]'"):
         foldgauss.estimator.__getattr__("FoldedMixtureRegressor")

@@ -309,7 +309,6 @@ FORKED = """
     import numpy as np, jax, jax.numpy as jnp
     from concurrent.futures import ProcessPoolExecutor
     import foldgauss as fg
-    from foldgauss.analysis.interop import to_scipy
     from foldgauss.estimator import FoldedGaussianMixture, likelihood
     from foldgauss.estimator.gradient_fit import fit_gradient
     from foldgauss.io import load_video_model, save_video_model
@@ -358,7 +357,6 @@ FORKED = """
         "entropy": dist.entropy,
         "marginal": lambda: dist.marginal([0]),
         "condition": lambda: dist.condition([2], [0.3]),
-        "to_scipy": lambda: to_scipy(mixture).pdf(x),
         "kl": lambda: fg.kl_divergence(dist, dist),
         "likelihood.fit": lambda: likelihood.fit(x),
         "mixture.log_prob": lambda: mixture.log_prob(x),

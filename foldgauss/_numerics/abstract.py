@@ -9,9 +9,6 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from foldgauss._numerics.batch import BatchModule, as_event, as_sample_shape, batch_shape_of, ranked_leaves
-from foldgauss._runtime import notebook_hooks
-
-__all__ = ["AbstractDistribution"]
 
 
 class AbstractDistribution(BatchModule):
@@ -98,7 +95,3 @@ class AbstractDistribution(BatchModule):
         """A sample of one of the components, which are the last batch axis: here of those that all are drawn from."""
         every = self._sample(key, sample_shape)
         return jnp.take_along_axis(every, component[..., None, None], axis=component.ndim).squeeze(component.ndim)
-
-    def _repr_png_(self) -> bytes | None:
-        """Notebook display: the density over time and space, by coordinates if there are several."""
-        return notebook_hooks.show("distribution", self)

@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, ArrayLike, PyTree
 
-from foldgauss._runtime.checks import invalid, is_integer, short_repr
+from foldgauss._runtime.checks import invalid, is_integer, require, short_repr
 
 _ModuleT = TypeVar("_ModuleT", bound=eqx.Module)
 
@@ -51,6 +52,27 @@ def _declared_ranks(cls: type) -> list[tuple[str, int | None]]:
             names = [name for kind in kinds for name in kind.dim_str.split() if not name.startswith(("*", "..."))]
             found.append((field.name, len(names) if kinds else None))
     return found
+
+
+class FunctionModule(BatchModule):
+    """A user's function of scalars, with or without parameters: arrays inside it (a pytree) are leaves."""
+
+    parameters: PyTree
+    static: PyTree = eqx.field(static=True)
+    # Set at construction, from the arrays of a single function, so that the axes of a later vmap are known to be batch.
+    parameter_ranks: tuple[int, ...] = eqx.field(static=True)
+
+    def __init__(self, function: Callable):
+        self.parameters, self.static = eqx.partition(function, eqx.is_array)
+        self.parameter_ranks = tuple(x.ndim for x in jax.tree.leaves(self.parameters))
+
+    @property
+    def leaf_ranks(self) -> tuple[int, ...]:
+        return self.parameter_ranks
+
+    def evaluate(self, *scalars: Array) -> Array:
+        """The function's value, of one set of parameters."""
+        return jnp.asarray(eqx.combine(self.parameters, self.static)(*scalars))
 
 
 def ranked_leaves(module: eqx.Module) -> list[tuple[Array, int]]:
@@ -182,9 +204,13 @@ def as_event(name: str, x: ArrayLike, dtype, event_shape: tuple[int, ...]) -> Ar
     """`as_value` of shape (*batch, *event_shape), checked; a single coordinate may be a number."""
     value = as_value(x, dtype)
     value = value.reshape(1) if value.ndim == 0 and event_shape == (1,) else value
-    if value.shape[-1:] != event_shape:
-        expected = f"shape (*batch, {event_shape[0]})"
-        raise invalid(name, expected=expected, got=f"shape {value.shape}", cure="Time, if any, is last.")
+    require(
+        value.shape[-1:] == event_shape,
+        name,
+        expected=f"shape (*batch, {event_shape[0]})",
+        got=f"shape {value.shape}",
+        cure="Time, if any, is last.",
+    )
     return value
 
 
@@ -211,6 +237,21 @@ def check_positive(name: str, x: Array, cure: str = "It is a standard deviation.
     value = concrete_value(x)
     if value is not None and (value <= 0).any():
         raise invalid(name, expected="positive numbers", got=f"a least of {value.min()}", cure=cure)
+
+
+# --- searching ------------------------------------------------------------------------------------------------
+
+
+def bisect(is_below: Callable[[Array], Array], low: Array, high: Array, steps: int) -> tuple[Array, Array]:
+    """Halve the intervals from `low`, where `is_below` is true, to `high`, where it is not."""
+
+    def halve(_, bounds):
+        low, high = bounds
+        middle = low + 0.5 * (high - low)
+        below = is_below(middle)
+        return jnp.where(below, middle, low), jnp.where(below, high, middle)
+
+    return lax.fori_loop(0, steps, halve, (low, high))
 
 
 # --- compilation ----------------------------------------------------------------------------------------------
@@ -327,6 +368,16 @@ def _map_flat(function: Callable, structure, flat: list[Array]):
     fill = [lax.stop_gradient(jnp.broadcast_to(x[-1:], (-size % _CHUNK, *x.shape[1:]))) for x in flat]
     full = [jnp.concatenate(pair) for pair in zip(flat, fill, strict=True)]
     return jax.tree.map(lambda x: x[:size], lax.map(one, full, batch_size=_CHUNK))
+
+
+def jvp_of_moving(function: Callable, primals, tangents):
+    """`jax.jvp`, where arguments whose tangents are `SymbolicZero` are constants."""
+    moving = [i for i, tangent in enumerate(tangents) if not isinstance(tangent, SymbolicZero)]
+
+    def of_moving(*moved):
+        return function(*(moved[moving.index(i)] if i in moving else x for i, x in enumerate(primals)))
+
+    return jax.jvp(of_moving, [primals[i] for i in moving], [tangents[i] for i in moving])
 
 
 def steepest(dtype) -> float:

@@ -6,7 +6,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
 from foldgauss._numerics.batch import check_finite, check_positive, concrete_value
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import invalid, require
 
 
 def resolve_scale_tril(given: dict[str, ArrayLike | None], *, dim: int, dtype, validate: bool) -> Array:
@@ -38,21 +38,33 @@ def _the_one_given(given: dict[str, ArrayLike | None]) -> tuple[str, ArrayLike]:
 
 
 def check_loc(loc: Array) -> None:
-    if loc.ndim < 1 or loc.shape[-1] < 1:
-        cure = "A single space coordinate still needs its own axis."
-        raise invalid("loc", expected="shape (*batch, d-1)", got=f"shape {loc.shape}", cure=cure)
+    require(
+        loc.ndim >= 1 and loc.shape[-1] >= 1,
+        "loc",
+        expected="shape (*batch, d-1)",
+        got=f"shape {loc.shape}",
+        cure="A single space coordinate still needs its own axis.",
+    )
 
 
 def check_matrix(name: str, matrix: Array, dim: int) -> None:
-    if matrix.ndim < 2 or matrix.shape[-2:] != (dim, dim):
-        cure = "Its size must be that of loc; scales per coordinate are `scale`."
-        raise invalid(name, expected=f"shape (*batch, {dim}, {dim})", got=f"shape {matrix.shape}", cure=cure)
+    require(
+        matrix.ndim >= 2 and matrix.shape[-2:] == (dim, dim),
+        name,
+        expected=f"shape (*batch, {dim}, {dim})",
+        got=f"shape {matrix.shape}",
+        cure="Its size must be that of loc; scales per coordinate are `scale`.",
+    )
 
 
 def _diagonal(scale: Array, dim: int, validate: bool) -> Array:
-    if scale.ndim < 1 or scale.shape[-1] != dim:
-        cure = "It is a standard deviation for each coordinate of loc."
-        raise invalid("scale", expected=f"shape (*batch, {dim})", got=f"shape {scale.shape}", cure=cure)
+    require(
+        scale.ndim >= 1 and scale.shape[-1] == dim,
+        "scale",
+        expected=f"shape (*batch, {dim})",
+        got=f"shape {scale.shape}",
+        cure="It is a standard deviation for each coordinate of loc.",
+    )
     if validate:
         check_positive("scale", scale)
     # Where, not times: an infinite scale must not put NaN off the diagonal.
@@ -64,10 +76,13 @@ def check_tril(tril: Array) -> None:
     tril = concrete_value(tril)
     if tril is None:
         return
-    if (np.triu(tril, 1) != 0).any():
-        cure = "Take jnp.tril of it, or pass covariance_matrix."
-        got = "entries above the diagonal"
-        raise invalid("scale_tril", expected="lower-triangular matrices", got=got, cure=cure)
+    require(
+        (np.triu(tril, 1) == 0).all(),
+        "scale_tril",
+        expected="lower-triangular matrices",
+        got="entries above the diagonal",
+        cure="Take jnp.tril of it, or pass covariance_matrix.",
+    )
     diagonal = np.diagonal(tril, axis1=-2, axis2=-1)
     if (diagonal <= 0).any():
         cure = "Flip the sign of its column: Sigma stays the same."
@@ -82,12 +97,20 @@ def check_and_factorize(name: str, covariance: Array, validate: bool) -> Array:
     check_finite(name, covariance)
     # Asymmetry of the size of rounding is allowed.
     tolerance = 1e3 * np.finfo(value.dtype).eps * np.abs(value).max((-1, -2), initial=0, keepdims=True)
-    if (np.abs(value - np.swapaxes(value, -1, -2)) > tolerance).any():
-        cure = "For a factor use scale_tril; against rounding use (C + C.T) / 2."
-        raise invalid(name, expected="symmetric matrices", got="another", cure=cure)
-    if np.isnan(np.asarray(tril)).any():
-        cure = "Add a small multiple of the identity, or drop a coordinate that the others determine."
-        raise invalid(name, expected="positive definite matrices", got="another", cure=cure)
+    require(
+        (np.abs(value - np.swapaxes(value, -1, -2)) <= tolerance).all(),
+        name,
+        expected="symmetric matrices",
+        got="another",
+        cure="For a factor use scale_tril; against rounding use (C + C.T) / 2.",
+    )
+    require(
+        not np.isnan(np.asarray(tril)).any(),
+        name,
+        expected="positive definite matrices",
+        got="another",
+        cure="Add a small multiple of the identity, or drop a coordinate that the others determine.",
+    )
     return tril
 
 
@@ -109,18 +132,31 @@ def normalize_indices(indices, dim: int) -> tuple[int, ...]:
         given = [int(i) for i in given if i == int(i)] if given.dtype != bool else None  # a mask is not indices
     except (TypeError, ValueError, OverflowError):
         given = None
-    if given is None or len(given) != np.size(indices) or not given:
-        raise invalid("indices", expected="whole numbers, at least one", got=repr(indices), cure=cure)
-    if any(not -dim <= i < dim for i in given):
-        raise invalid("indices", expected=f"numbers from {-dim} to {dim - 1}", got=repr(indices), cure=cure)
+    require(
+        given and len(given) == np.size(indices),
+        "indices",
+        expected="whole numbers, at least one",
+        got=repr(indices),
+        cure=cure,
+    )
+    require(
+        not any(not -dim <= i < dim for i in given),
+        "indices",
+        expected=f"numbers from {-dim} to {dim - 1}",
+        got=repr(indices),
+        cure=cure,
+    )
     result = tuple(i % dim for i in given)
-    if len(set(result)) != len(result):
-        raise invalid("indices", expected="each coordinate once", got=repr(indices), cure=cure)
+    require(len(set(result)) == len(result), "indices", expected="each coordinate once", got=repr(indices), cure=cure)
     return result
 
 
 def check_rest(rest: tuple[int, ...]) -> None:
     """Raise unless some coordinates are left once others are given."""
-    if not rest:
-        expected, cure = "at least one coordinate that is not given", "For the density use log_prob."
-        raise invalid("indices", expected=expected, got="all", cure=cure)
+    require(
+        rest,
+        "indices",
+        expected="at least one coordinate that is not given",
+        got="all",
+        cure="For the density use log_prob.",
+    )

@@ -10,8 +10,6 @@ from numpy.polynomial import hermite_e
 
 from foldgauss._numerics.triangular import solve_upper_matrix
 
-__all__ = ["Regression", "hermite", "hermite_columns", "hermite_to_powers", "weighted_regression"]
-
 _Points = Float[Array, "n d-1"]
 
 

@@ -5,6 +5,7 @@ kernel then stay in registers over any loops. Arithmetic is `+`, `-`, `*`, `/`; 
 Numba's fast-math flags apply. Kernels are cached by their own file's date: after a change here, remove the cache.
 """
 
+import functools
 import math
 import operator
 
@@ -56,72 +57,70 @@ def _broadcast(builder, scalar, vector=_FLOATS):
     return builder.shuffle_vector(one, empty, ir.Constant(_INTS, [0] * LANES))
 
 
-@intrinsic
-def broadcast(typing_context, scalar):
+def _generates(typed, prefer_literal=False):
+    """Decorate a generator of LLVM code as an intrinsic; `typed` gives its signature for the types of its arguments."""
+
+    def decorate(generate):
+        @functools.wraps(typed)
+        def define(context, *arguments):
+            return typed(context, *arguments), generate
+
+        return intrinsic(prefer_literal=prefer_literal)(define)
+
+    return decorate
+
+
+@_generates(lambda context, scalar: VECTOR(types.float32))
+def broadcast(context, builder, signature, args):
     """A vector of one float32, 16 times."""
-    return VECTOR(types.float32), lambda context, builder, signature, args: _broadcast(builder, args[0])
+    return _broadcast(builder, args[0])
 
 
-def _constant(numbers):
-    def generate(context, builder, signature, args):
-        return ir.Constant(_FLOATS, numbers)
-
-    return VECTOR(), generate
-
-
-@intrinsic
-def cell_columns(typing_context):
+@_generates(lambda context: VECTOR())
+def cell_columns(context, builder, signature, args):
     """The vector (0, 1, 2, 3, 0, 1, ...): the pixels' columns in a cell of 4 x 4, row by row."""
-    return _constant([float(k % 4) for k in range(LANES)])
+    return ir.Constant(_FLOATS, [float(k % 4) for k in range(LANES)])
 
 
-@intrinsic
-def cell_rows(typing_context):
+@_generates(lambda context: VECTOR())
+def cell_rows(context, builder, signature, args):
     """The vector (0, 0, 0, 0, 1, 1, ...): likewise their rows."""
-    return _constant([float(k // 4) for k in range(LANES)])
+    return ir.Constant(_FLOATS, [float(k // 4) for k in range(LANES)])
 
 
-@intrinsic
-def load(typing_context, array, index):
-    """16 floats of a contiguous float32 array, from `index` on; no bounds are checked."""
-
-    def generate(context, builder, signature, args):
-        return builder.load(_place(context, builder, signature.args[0], *args), align=4)
-
-    return VECTOR(array, types.uint64), generate
+@_generates(lambda context, array, index: VECTOR(array, types.uint64))
+def load(context, builder, signature, args):
+    """16 floats of a contiguous float32 array, from an index on; no bounds are checked."""
+    return builder.load(_place(context, builder, signature.args[0], *args), align=4)
 
 
-@intrinsic
-def store(typing_context, array, index, vector):
-    """Write 16 floats into a contiguous float32 array, from `index` on; no bounds are checked."""
-
-    def generate(context, builder, signature, args):
-        builder.store(args[2], _place(context, builder, signature.args[0], *args[:2]), align=4)
-        return context.get_dummy_value()
-
-    return types.none(array, types.uint64, VECTOR), generate
+@_generates(lambda context, array, index, vector: types.none(array, types.uint64, VECTOR))
+def store(context, builder, signature, args):
+    """Write 16 floats into a contiguous float32 array, from an index on; no bounds are checked."""
+    builder.store(args[2], _place(context, builder, signature.args[0], *args[:2]), align=4)
+    return context.get_dummy_value()
 
 
 def _arithmetic(name):
-    @intrinsic
-    def operation(typing_context, a, b):
-        return VECTOR(VECTOR, VECTOR), lambda context, builder, signature, args: getattr(builder, name)(*args)
+    @_generates(lambda context, a, b: VECTOR(VECTOR, VECTOR))
+    def operation(context, builder, signature, args):
+        return getattr(builder, name)(*args)
 
     return operation
 
 
 def _comparison(sign):
-    @intrinsic
-    def operation(typing_context, a, b):
+    @_generates(lambda context, a, b: MASK(VECTOR, VECTOR))
+    def operation(context, builder, signature, args):
         """False where a number is NaN."""
-        return MASK(VECTOR, VECTOR), lambda context, builder, signature, args: builder.fcmp_ordered(sign, *args)
+        return builder.fcmp_ordered(sign, *args)
 
     return operation
 
 
-@intrinsic
-def _both(typing_context, a, b):
-    return MASK(MASK, MASK), lambda context, builder, signature, args: builder.and_(*args)
+@_generates(lambda context, a, b: MASK(MASK, MASK))
+def _both(context, builder, signature, args):
+    return builder.and_(*args)
 
 
 def _on_operator(symbol, kind, operation):
@@ -144,81 +143,56 @@ for _symbol, _sign in ((operator.ge, ">="), (operator.gt, ">"), (operator.lt, "<
 _on_operator(operator.and_, _Mask, _both)
 
 
-@intrinsic
-def select(typing_context, mask, a, b):
-    """`a` where the mask is set, else `b`."""
-    return VECTOR(MASK, VECTOR, VECTOR), lambda context, builder, signature, args: builder.select(*args)
+@_generates(lambda context, mask, a, b: VECTOR(MASK, VECTOR, VECTOR))
+def select(context, builder, signature, args):
+    """The first vector where the mask is set, else the second."""
+    return builder.select(*args)
 
 
-@intrinsic
-def any_set(typing_context, mask):
+@_generates(lambda context, mask: types.boolean(MASK))
+def any_set(context, builder, signature, args):
     """Whether any bit is set."""
-
-    def generate(context, builder, signature, args):
-        bits = builder.bitcast(args[0], ir.IntType(LANES))
-        return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(LANES), 0))
-
-    return types.boolean(MASK), generate
+    bits = builder.bitcast(args[0], ir.IntType(LANES))
+    return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(LANES), 0))
 
 
-@intrinsic
-def range_mask(typing_context, first, last, index, number):
-    """The 16 lowest bits: in which of the 16 places from `index` on first <= number < last; int32 arrays and number."""
-
-    def generate(context, builder, signature, args):
-        ends = (_place(context, builder, signature.args[k], args[k], args[2], _INTS) for k in (0, 1))
-        low, high = (builder.load(end, align=4) for end in ends)
-        wanted = _broadcast(builder, args[3], _INTS)
-        bits = builder.and_(builder.icmp_signed("<=", low, wanted), builder.icmp_signed("<", wanted, high))
-        return builder.zext(builder.bitcast(bits, ir.IntType(LANES)), ir.IntType(64))
-
-    return types.uint64(first, last, types.uint64, types.int32), generate
+@_generates(lambda context, first, last, index, number: types.uint64(first, last, types.uint64, types.int32))
+def range_mask(context, builder, signature, args):
+    """The 16 lowest bits: in which of 16 places from an index on first <= number < last; int32 arrays and number."""
+    ends = (_place(context, builder, signature.args[k], args[k], args[2], _INTS) for k in (0, 1))
+    low, high = (builder.load(end, align=4) for end in ends)
+    wanted = _broadcast(builder, args[3], _INTS)
+    bits = builder.and_(builder.icmp_signed("<=", low, wanted), builder.icmp_signed("<", wanted, high))
+    return builder.zext(builder.bitcast(bits, ir.IntType(LANES)), ir.IntType(64))
 
 
-@intrinsic
-def lowest_bit(typing_context, bits):
+@_generates(lambda context, bits: types.uint64(types.uint64))
+def lowest_bit(context, builder, signature, args):
     """The place of the lowest bit that is set; there must be one."""
-
-    def generate(context, builder, signature, args):
-        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
-
-    return types.uint64(types.uint64), generate
+    return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
 
 
-@intrinsic
-def split_exponent(typing_context, x):
+@_generates(lambda context, x: types.UniTuple(VECTOR, 2)(VECTOR))
+def split_exponent(context, builder, signature, args):
     """(whole, part): x rounded to whole, moved to the place of a float's exponent, and what is left, in [-0.5, 0.5]."""
-
-    def generate(context, builder, signature, args):
-        rint = cgutils.get_or_insert_function(builder.module, ir.FunctionType(_FLOATS, [_FLOATS]), "llvm.rint.v16f32")
-        near = builder.call(rint, args)
-        whole = builder.shl(builder.fptosi(near, _INTS), ir.Constant(_INTS, [23] * LANES))
-        part = builder.fsub(args[0], near)
-        return context.make_tuple(builder, signature.return_type, (builder.bitcast(whole, _FLOATS), part))
-
-    return types.UniTuple(VECTOR, 2)(VECTOR), generate
+    rint = cgutils.get_or_insert_function(builder.module, ir.FunctionType(_FLOATS, [_FLOATS]), "llvm.rint.v16f32")
+    near = builder.call(rint, args)
+    whole = builder.shl(builder.fptosi(near, _INTS), ir.Constant(_INTS, [23] * LANES))
+    part = builder.fsub(args[0], near)
+    return context.make_tuple(builder, signature.return_type, (builder.bitcast(whole, _FLOATS), part))
 
 
-@intrinsic
-def scale_by_power(typing_context, value, whole):
-    """`value` times 2 to the power `whole` from `split_exponent`, within float32's normal range."""
-
-    def generate(context, builder, signature, args):
-        total = builder.add(*(builder.bitcast(arg, _INTS) for arg in args))
-        return builder.bitcast(total, _FLOATS)
-
-    return VECTOR(VECTOR, VECTOR), generate
+@_generates(lambda context, value, whole: VECTOR(VECTOR, VECTOR))
+def scale_by_power(context, builder, signature, args):
+    """A value times 2 to the power `whole` from `split_exponent`, within float32's normal range."""
+    return builder.bitcast(builder.add(*(builder.bitcast(arg, _INTS) for arg in args)), _FLOATS)
 
 
-@intrinsic
-def sqrt(typing_context, x):
+@_generates(lambda context, x: VECTOR(VECTOR))
+def sqrt(context, builder, signature, args):
     """The square root."""
-
-    def generate(context, builder, signature, args):
-        kind = ir.FunctionType(_FLOATS, [_FLOATS])
-        return builder.call(cgutils.get_or_insert_function(builder.module, kind, "llvm.sqrt.v16f32"), args)
-
-    return VECTOR(VECTOR), generate
+    kind = ir.FunctionType(_FLOATS, [_FLOATS])
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, "llvm.sqrt.v16f32"), args)
 
 
 _f = nb.float32
@@ -282,71 +256,55 @@ def _shuffled(builder, a, b, picks):
     return builder.shuffle_vector(a, b, ir.Constant(_INTS, picks))
 
 
-@intrinsic(prefer_literal=True)
-def window(typing_context, a, b, start):
-    """Of the 32 lanes of a and b one after another, the 16 from the constant `start` on."""
-    first = start.literal_value
-
-    def generate(context, builder, signature, args):
-        return _shuffled(builder, *args[:2], [*range(first, first + LANES)])
-
-    return VECTOR(VECTOR, VECTOR, start), generate
+@_generates(lambda context, a, b, start: VECTOR(VECTOR, VECTOR, start), prefer_literal=True)
+def window(context, builder, signature, args):
+    """Of the 32 lanes of two vectors one after another, the 16 from a constant `start` on."""
+    first = signature.args[2].literal_value
+    return _shuffled(builder, *args[:2], [*range(first, first + LANES)])
 
 
-@intrinsic
-def gather_columns(typing_context, array, indices, start):
+@_generates(lambda context, array, indices, start: types.UniTuple(VECTOR, 8)(array, indices, types.uint64))
+def gather_columns(context, builder, signature, args):
     """The 8 columns of 16 rows of a contiguous float32 array (num, 8): of rows indices[start : start + 16], int32."""
-
-    def generate(context, builder, signature, args):
-        data = context.make_array(signature.args[0])(context, builder, args[0]).data
-        index = context.make_array(signature.args[1])(context, builder, args[1]).data
-        half, word = ir.VectorType(ir.FloatType(), 8), ir.IntType(64)
-        rows = []
-        for k in range(LANES):
-            place = builder.gep(index, [builder.add(args[2], ir.Constant(word, k))])
-            row = builder.mul(builder.sext(builder.load(place), word), ir.Constant(word, 8))
-            rows.append(builder.load(builder.bitcast(builder.gep(data, [row]), half.as_pointer()), align=4))
-        pairs = [_shuffled(builder, rows[k], rows[k + 8], [*range(LANES)]) for k in range(8)]
-        for bit in (1, 2, 4):  # lanes and rows change places, one bit of their numbers after another
-            for k in (k for k in range(8) if not k & bit):
-                low, high = pairs[k], pairs[k | bit]
-                from_low = [lane if not lane & bit else lane - bit + LANES for lane in range(LANES)]
-                from_high = [lane + bit if not lane & bit else lane + LANES for lane in range(LANES)]
-                pairs[k], pairs[k | bit] = (_shuffled(builder, low, high, picks) for picks in (from_low, from_high))
-        return context.make_tuple(builder, signature.return_type, pairs)
-
-    return types.UniTuple(VECTOR, 8)(array, indices, types.uint64), generate
+    data = context.make_array(signature.args[0])(context, builder, args[0]).data
+    index = context.make_array(signature.args[1])(context, builder, args[1]).data
+    half, word = ir.VectorType(ir.FloatType(), 8), ir.IntType(64)
+    rows = []
+    for k in range(LANES):
+        place = builder.gep(index, [builder.add(args[2], ir.Constant(word, k))])
+        row = builder.mul(builder.sext(builder.load(place), word), ir.Constant(word, 8))
+        rows.append(builder.load(builder.bitcast(builder.gep(data, [row]), half.as_pointer()), align=4))
+    pairs = [_shuffled(builder, rows[k], rows[k + 8], [*range(LANES)]) for k in range(8)]
+    for bit in (1, 2, 4):  # lanes and rows change places, one bit of their numbers after another
+        for k in (k for k in range(8) if not k & bit):
+            low, high = pairs[k], pairs[k | bit]
+            from_low = [lane if not lane & bit else lane - bit + LANES for lane in range(LANES)]
+            from_high = [lane + bit if not lane & bit else lane + LANES for lane in range(LANES)]
+            pairs[k], pairs[k | bit] = (_shuffled(builder, low, high, picks) for picks in (from_low, from_high))
+    return context.make_tuple(builder, signature.return_type, pairs)
 
 
-@intrinsic
-def transpose_cells(typing_context, a, b, c, d):
+@_generates(lambda context, a, b, c, d: types.UniTuple(VECTOR, 4)(VECTOR, VECTOR, VECTOR, VECTOR))
+def transpose_cells(context, builder, signature, args):
     """Four vectors as a 4 x 4 matrix of groups of 4 lanes, transposed: four cells of pixels become four rows of 16."""
-
-    def generate(context, builder, signature, args):
-        low = [*range(4), *range(16, 20), *range(4, 8), *range(20, 24)]
-        high = [*range(8, 12), *range(24, 28), *range(12, 16), *range(28, 32)]
-        pairs = [[_shuffled(builder, *two, picks) for picks in (low, high)] for two in (args[:2], args[2:])]
-        left, right = [*range(8), *range(16, 24)], [*range(8, 16), *range(24, 32)]
-        rows = [_shuffled(builder, pairs[0][k], pairs[1][k], picks) for k in range(2) for picks in (left, right)]
-        return context.make_tuple(builder, signature.return_type, rows)
-
-    return types.UniTuple(VECTOR, 4)(VECTOR, VECTOR, VECTOR, VECTOR), generate
+    low = [*range(4), *range(16, 20), *range(4, 8), *range(20, 24)]
+    high = [*range(8, 12), *range(24, 28), *range(12, 16), *range(28, 32)]
+    pairs = [[_shuffled(builder, *two, picks) for picks in (low, high)] for two in (args[:2], args[2:])]
+    left, right = [*range(8), *range(16, 24)], [*range(8, 16), *range(24, 32)]
+    rows = [_shuffled(builder, pairs[0][k], pairs[1][k], picks) for k in range(2) for picks in (left, right)]
+    return context.make_tuple(builder, signature.return_type, rows)
 
 
-@intrinsic(prefer_literal=True)
-def add_lanes(typing_context, a, b, width):
+@_generates(lambda context, a, b, width: VECTOR(VECTOR, VECTOR, width), prefer_literal=True)
+def add_lanes(context, builder, signature, args):
     """Halfway to the sums of many vectors at once: neighboring groups of `width` lanes (1, 2, 4, 8) added.
 
-    Of each pair of groups, the sum for `a` takes the first one's place, that for `b` the second one's. After widths
-    1, 2, 4, 8 over a tree of 16 vectors, lane k of the last holds the sum of vector k.
+    Of each pair of groups, the sum for the first vector takes the first one's place, that for the second vector the
+    second one's. After widths 1, 2, 4, 8 over a tree of 16 vectors, lane k of the last holds the sum of vector k.
     """
-    number = width.literal_value
-
-    def generate(context, builder, signature, args):
-        first = [k for k in range(LANES) if not k & number]
-        even = sorted([(k, k) for k in first] + [(k + number, k + LANES) for k in first])
-        odd = sorted([(k, k + number) for k in first] + [(k + number, k + number + LANES) for k in first])
-        sides = [_shuffled(builder, *args[:2], [pick for _, pick in picks]) for picks in (even, odd)]
-        return builder.fadd(*sides)
-
-    return VECTOR(VECTOR, VECTOR, width), generate
+    number = signature.args[2].literal_value
+    first = [k for k in range(LANES) if not k & number]
+    even = sorted([(k, k) for k in first] + [(k + number, k + LANES) for k in first])
+    odd = sorted([(k, k + number) for k in first] + [(k + number, k + number + LANES) for k in first])
+    sides = [_shuffled(builder, *args[:2], [pick for _, pick in picks]) for picks in (even, odd)]
+    return builder.fadd(*sides)

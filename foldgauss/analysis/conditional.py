@@ -22,9 +22,10 @@ from foldgauss._numerics.batch import (
     vectorized,
 )
 from foldgauss._numerics.factor import check_rest, normalize_indices
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.analysis.narrow_crossings import ROUNDING, crossing_modes, crossing_panels, gaussian_at
 from foldgauss.analysis.quadrature import (
+    HALF_LOG_2PI,
     REACH,
     SEARCH_GRID,
     Panels,
@@ -36,9 +37,6 @@ from foldgauss.analysis.quadrature import (
 from foldgauss.envelope import Constant, TimeLikelihood
 from foldgauss.gaussian import Gaussian, condition_on_first
 
-__all__ = ["TimeMixture", "conditional_gaussian", "time_mixture"]
-
-_HALF_LOG_2PI = 0.5 * float(np.log(2 * np.pi))
 _CROSSINGS = 24  # candidate times at which the ridge comes near
 _BEST = 10  # of them, around which panels are refined
 _MAXIMA = 6  # peaks of the density around which panels are refined
@@ -102,8 +100,13 @@ class TimeMixture(AbstractDistribution):
 
     def cdf(self, value: Float[Array, "*#batch 1"]) -> Float[Array, "*#batch"]:
         """P(coordinate <= x | given), where there is only one coordinate."""
-        if self.event_shape != (1,):
-            raise invalid("cdf", expected="one coordinate", got=f"{self.event_shape[0]}", cure="Use marginal([i]).cdf.")
+        require(
+            self.event_shape == (1,),
+            "cdf",
+            expected="one coordinate",
+            got=f"{self.event_shape[0]}",
+            cure="Use marginal([i]).cdf.",
+        )
         value = self._checked(value)
         if self.keeps_time:
             return _time_cdf(self.time.panels, value[..., 0], self.parent.time_loc, self.parent.time_scale)
@@ -128,10 +131,12 @@ class TimeMixture(AbstractDistribution):
         return map_over_batch(_modes, self.parent, (self.values, 1), self.time.panels)
 
     def _check_time_alone(self, name: str) -> None:
-        if not self.keeps_time or self._space_dim:
-            raise invalid(
-                name, expected="the distribution of time given space", got=f"{self.event_shape[0]} coordinates"
-            )
+        require(
+            self.keeps_time and not self._space_dim,
+            name,
+            expected="the distribution of time given space",
+            got=f"{self.event_shape[0]} coordinates",
+        )
 
     @compile_eager(static=("sample_shape",))
     def _sample(self, key: Key[Array, ""], sample_shape: tuple[int, ...]) -> Array:
@@ -159,8 +164,13 @@ class TimeMixture(AbstractDistribution):
     def marginal(self, indices) -> "TimeMixture":
         """Some of the coordinates; the indices are kept."""
         indices, dim = normalize_indices(indices, self.event_shape[0]), self._space_dim
-        if dim in indices[:-1]:
-            raise invalid("indices", expected="time last", got=repr(indices), cure="Time is the last coordinate.")
+        require(
+            dim not in indices[:-1],
+            "indices",
+            expected="time last",
+            got=repr(indices),
+            cure="Time is the last coordinate.",
+        )
         num_given = self.values.shape[-1]
         keep = (*range(num_given), *(num_given + i for i in indices if i < dim), num_given + dim)
         return TimeMixture(self.parent.marginal(keep), self.values, self.time, dim in indices)
@@ -270,7 +280,7 @@ def _log_joint(parent, s):
 def _log_joint_frozen(parent, s):
     """The same without derivatives, and less to compile."""
     parent, s = lax.stop_gradient((parent, s))
-    return lambda tau: gaussian_at(parent, tau).log_prob(_over(s, tau.shape)) - 0.5 * tau**2 - _HALF_LOG_2PI
+    return lambda tau: gaussian_at(parent, tau).log_prob(_over(s, tau.shape)) - 0.5 * tau**2 - HALF_LOG_2PI
 
 
 def _guides(parent, s, log_f):
@@ -341,14 +351,14 @@ def _rounding(parent, s, near, spikes: Panels | None, log_total):
     z, q = length(residual, inverse) * sharp, eps * length(size, jnp.abs(inverse)) * sharp
     rate = length(speed, inverse)
     log_width = jnp.minimum(0, log_scale - jnp.log(jnp.where(rate > 0, rate, 1)))
-    log_det = jnp.log(jnp.diagonal(tril)).sum() + s.size * (log_scale + _HALF_LOG_2PI)
+    log_det = jnp.log(jnp.diagonal(tril)).sum() + s.size * (log_scale + HALF_LOG_2PI)
     close, change = z <= 2 * q, q * (z + q + _AVERAGED)
     if s.size == 1:  # a crossing that rounding moves stays one, but where the curve turns back
         change = jnp.where(close, jnp.minimum(1, change), change)
     # log_share is log of the mass near this point divided by p(s). Points that may be on the ridge count as on it.
     # The mass of a narrow ridge is that of a Gaussian. A wide ridge may have less mass, since the curve bends.
     log_share = -0.5 * (tau**2 + jnp.where(close, 0, z) ** 2) - log_det + log_width - log_total
-    log_share = log_share - jnp.where(log_width < _LOG_NARROW, 0, _HALF_LOG_2PI)
+    log_share = log_share - jnp.where(log_width < _LOG_NARROW, 0, HALF_LOG_2PI)
     # Quadrature may find q times the mass of a ridge, since rounded residuals are 0 over q times its width.
     reach = log_share + jnp.where(close, jnp.log(jnp.maximum(1, q)), 2 * change)
     error = change * jnp.exp(jnp.minimum(0, reach)) + jnp.where(close & (log_share > _MISSED), log_share, 0)
@@ -406,7 +416,7 @@ def _log_space_cdf(parent, s):
 
     def make(log_joint, parent, s):
         if not given:
-            return lambda tau: log_share(parent, s, tau) - 0.5 * tau**2 - _HALF_LOG_2PI
+            return lambda tau: log_share(parent, s, tau) - 0.5 * tau**2 - HALF_LOG_2PI
         first = log_joint(parent.marginal(keep), s[:-1])
         return lambda tau: log_share(parent, s, tau) + first(tau)
 

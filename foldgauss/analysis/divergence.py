@@ -3,7 +3,6 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
@@ -11,6 +10,7 @@ from foldgauss._numerics.batch import broadcast_leaves, compile_eager, concrete_
 from foldgauss._runtime.checks import invalid
 from foldgauss.analysis.moments import mean_log_envelope
 from foldgauss.analysis.quadrature import (
+    HALF_LOG_2PI,
     SEARCH_GRID,
     adaptive_panels,
     diverges,
@@ -28,7 +28,6 @@ __all__ = ["kl_divergence"]
 # Centers closer than this many roundings of their own size are one curve, written in two ways.
 _SAME_CURVE = 64
 _PEAKS = 8
-_HALF_LOG_2PI = 0.5 * float(np.log(2 * np.pi))
 
 
 def kl_divergence(p, q, *, with_error: bool = False) -> Array | tuple[Array, Array]:
@@ -183,7 +182,7 @@ def _integrated_distance(p, q, mean, scale):
     def log_term(p, q, mean, scale):
         def log_f(z):
             log_square, _ = _center_distance(p, q, (mean + scale * z).ravel())
-            return log_square.reshape(z.shape) - 0.5 * z**2 - _HALF_LOG_2PI
+            return log_square.reshape(z.shape) - 0.5 * z**2 - HALF_LOG_2PI
 
         return log_f
 
@@ -229,7 +228,7 @@ def _integrals(p, q):
 
     def functions(p, q):
         time = lambda tau: p.time_loc + p.time_scale * tau  # noqa: E731
-        log_over_q = lambda tau: -0.5 * tau**2 - _HALF_LOG_2PI - log_a(q, time(tau))  # noqa: E731
+        log_over_q = lambda tau: -0.5 * tau**2 - HALF_LOG_2PI - log_a(q, time(tau))  # noqa: E731
 
         def log_ratio(tau):
             return log_a(p, time(tau)) - log_a(q, time(tau))

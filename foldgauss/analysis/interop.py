@@ -1,24 +1,19 @@
-"""Folded-Gaussians as numpyro and as scipy objects. This is not the |X| folded normal of scipy and numpyro.
+"""Folded-Gaussians as numpyro objects. This is not the |X| folded normal of scipy and numpyro.
 
 Their `foldnorm` and `FoldedDistribution` reflect a variable at 0. Here a Gaussian's *center* is bent along a curve
-in time, and nothing is reflected. Neither library is imported before it is asked for.
+in time, and nothing is reflected. numpyro is imported when it is asked for.
 """
 
 import functools
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import jax
-import jax.numpy as jnp
-import numpy as np
-
-from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.optional_imports import import_optional
 from foldgauss.analysis.divergence import kl_divergence
 
 if TYPE_CHECKING:
     import numpyro
 
-__all__ = ["FrozenDistribution", "to_numpyro", "to_scipy"]
+__all__ = ["to_numpyro"]
 
 
 def to_numpyro(dist: Any, *, validate_args: bool | None = None) -> "numpyro.distributions.Distribution":
@@ -134,90 +129,3 @@ def _part(dist: Any, name: str, *arguments):
     except (AttributeError, ValueError) as error:
         told = f"{name}: expected a distribution that has one, got {type(dist).__name__}. {error}"
         raise NotImplementedError(told) from error  # numpyro's signal that a distribution lacks a method
-
-
-def to_scipy(dist: Any) -> "FrozenDistribution":
-    """`dist` as a frozen distribution with the methods of `scipy.stats.multivariate_normal(...)`: NumPy in and out.
-
-    **Shapes:** no batch dimensions, as scipy's frozen objects have none.
-
-    **Example:** `to_scipy(dist).rvs(1000, random_state=0)  # (1000, d)`
-
-    **Source:** eq:foldgauss. **Raises:** ValueError if `dist` has batch dimensions.
-    """
-    if dist.batch_shape != ():
-        cure = "Take one element first: jax.tree.map(lambda leaf: leaf[0], dist)."
-        raise invalid("dist", expected="batch_shape ()", got=dist.batch_shape, cure=cure)
-    return FrozenDistribution(dist)
-
-
-class FrozenDistribution:
-    """A distribution as scipy would freeze it: `pdf`, `logpdf`, `rvs`, `entropy`, `marginal`, `mean`, `cov`.
-
-    **Shapes:** points (..., d) as NumPy arrays, time last; of one coordinate (...) will do. `rvs(size)` is
-    (size, d), or (size,) if d is 1.
-
-    **Example:** `to_scipy(dist).marginal([0]).pdf(0.3)`
-
-    **Source:** the interface of scipy's frozen multivariate distributions.
-    """
-
-    def __init__(self, base: Any):
-        self._base = base
-
-    def __repr__(self) -> str:
-        return f"FrozenDistribution({type(self._base).__name__}, dim={self.dim})"
-
-    @property
-    def dim(self) -> int:
-        """Number of coordinates."""
-        return self._base.event_shape[0]
-
-    def logpdf(self, x) -> np.ndarray:
-        """Log-density at x (*points, d); for one coordinate, numbers are points, as in scipy."""
-        x = jnp.asarray(x, jax.tree.leaves(self._base)[0].dtype)
-        x = x[..., None] if self._base.event_shape == (1,) and x.shape[-1:] != (1,) else x
-        return _numpy(_LOG_PROB(self._base, x))
-
-    def pdf(self, x) -> np.ndarray:
-        """Density at x (*points, d)."""
-        return np.exp(self.logpdf(x))
-
-    def rvs(self, size=(), random_state=None) -> np.ndarray:
-        """Random draws: (d,) by default, else (*size, d) without axes of size 1, as scipy has it.
-
-        `random_state`: None, an int, or a
-        NumPy generator. **Raises:** ValueError unless `size` is a whole number >= 0, or a tuple of them.
-        """
-        seed = int(np.random.default_rng(random_state).integers(2**31))
-        draws = np.asarray(self._base.sample(jax.random.key(seed), () if size is None else size))
-        return draws.squeeze()[()]
-
-    def entropy(self) -> np.ndarray:
-        """Differential entropy in nats."""
-        if not hasattr(self._base, "entropy"):
-            cure = "Average -logpdf over rvs."
-            raise invalid("entropy", expected="a distribution with an entropy", got=repr(self), cure=cure)
-        return _numpy(self._base.entropy())
-
-    def marginal(self, dimensions) -> "FrozenDistribution":
-        """The distribution of some coordinates alone, frozen too; time is the last one."""
-        return FrozenDistribution(self._base.marginal(dimensions))
-
-    @property
-    def mean(self) -> np.ndarray:
-        return _numpy(self._base.mean)
-
-    @property
-    def cov(self) -> np.ndarray:
-        """The matrix."""
-        return _numpy(self._base.covariance_matrix)
-
-
-# Jitted once: called eagerly, a density is a hundred small kernels.
-_LOG_PROB = jax.jit(lambda dist, x: dist.log_prob(x))
-
-
-def _numpy(x) -> np.ndarray:
-    """As NumPy; a scalar as a NumPy scalar, like scipy's."""
-    return np.asarray(x)[()]

@@ -11,30 +11,27 @@ from jax import lax
 from jaxtyping import Array, ArrayLike
 
 from foldgauss._numerics.batch import align, broadcast_leaves, check_batch, concrete_value, ranked_leaves
-from foldgauss._runtime.checks import invalid
-
-__all__ = [
-    "broadcast_weights",
-    "choose_components",
-    "log_component_densities",
-    "log_density",
-    "mixture_moments",
-    "posterior_logits",
-    "responsibilities",
-    "weighted_sum",
-]
+from foldgauss._runtime.checks import invalid, require
 
 
 def broadcast_weights(components, logits: ArrayLike | None, weights: ArrayLike | None, validate: bool):
     """Components and logits, both broadcast to the common batch shape."""
-    if (logits is None) == (weights is None):
-        got = "none" if logits is None else "both"
-        raise invalid("logits, weights", expected="exactly one of them", got=got, cure="logits are log weights.")
+    require(
+        (logits is None) != (weights is None),
+        "logits, weights",
+        expected="exactly one of them",
+        got="none" if logits is None else "both",
+        cure="logits are log weights.",
+    )
     name, given = ("weights", weights) if logits is None else ("logits", logits)
     given = jnp.asarray(given, components.dtype)
-    if given.shape[-1:] != components.batch_shape[-1:]:
-        expected = f"shape (*batch, {components.batch_shape[-1]})"
-        raise invalid(name, expected=expected, got=f"shape {given.shape}", cure="One value for each component.")
+    require(
+        given.shape[-1:] == components.batch_shape[-1:],
+        name,
+        expected=f"shape (*batch, {components.batch_shape[-1]})",
+        got=f"shape {given.shape}",
+        cure="One value for each component.",
+    )
     if validate:
         _check_weights(name, given)
     batch = check_batch([*ranked_leaves(components), (given, 0)])
@@ -53,8 +50,13 @@ def _check_weights(name: str, given: Array) -> None:
         expected = "finite values >= 0" if name == "weights" else "values below infinity"
         cure = "A component without weight has weight 0, or a logit of -inf."
         raise invalid(name, expected=expected, got=given.tolist(), cure=cure)
-    if not (given > least).any(-1).all():
-        raise invalid(name, expected="a positive weight", got="none", cure="Weights are relative: all equal means 1/k.")
+    require(
+        (given > least).any(-1).all(),
+        name,
+        expected="a positive weight",
+        got="none",
+        cure="Weights are relative: all equal means 1/k.",
+    )
     # JAX computes with those below as with 0; with float16 and bfloat16 it computes in float32.
     normal = float(min(jnp.finfo(given.dtype).tiny, jnp.finfo(jnp.float32).tiny))
     if name == "weights" and not (given >= normal).any(-1).all():

@@ -7,7 +7,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from foldgauss._numerics.batch import broadcast_leaves, compile_eager, concrete_value, map_over_batch, vectorized
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import invalid, require
 from foldgauss.analysis.quadrature import find_peaks, gauss_hermite, normal_panels, warn_of_error
 from foldgauss.envelope import Constant, TimeLikelihood
 from foldgauss.fold import FourierFold, PolynomialFold, ZeroFold, evaluate_shift
@@ -151,7 +151,7 @@ def _integrated_fold(fold, scale):
     """As `_fold_moments`, of one fold of any kind, by quadrature, with the estimated error in standard deviations."""
 
     def values(z):
-        return fold((z * scale).ravel()).reshape(*z.shape, -1)
+        return jax.vmap(fold)((z * scale).ravel()).reshape(*z.shape, -1)
 
     edges = fold.breaks.astype(scale.dtype) / scale
     panels = normal_panels(lambda z: lax.stop_gradient(values(z)), edges, scale.dtype)
@@ -192,9 +192,13 @@ def _highest_time(dist) -> Float[Array, "*batch"]:
     """The time of the highest point of the ridge for any envelope, searched for in tau from -40 to 40."""
     tau, tied = map_over_batch(_highest_tau, dist)
     refused = concrete_value(tied)
-    if refused is not None and refused.any():
-        got = "an envelope whose ridge is as high, or higher, elsewhere"
-        raise invalid("mode", expected="a unique mode", got=got, cure="Use mean.")
+    require(
+        refused is None or not refused.any(),
+        "mode",
+        expected="a unique mode",
+        got="an envelope whose ridge is as high, or higher, elsewhere",
+        cure="Use mean.",
+    )
     return dist.time_loc + dist.time_scale * jnp.where(tied, jnp.nan, tau)
 
 

@@ -11,10 +11,10 @@ from jax import lax
 from jax.scipy.special import logsumexp
 from jaxtyping import Array
 
-from foldgauss.analysis.quadrature import KRONROD_NODES, REACH, SEARCH_GRID, Panels
+from foldgauss._numerics.batch import bisect
+from foldgauss.analysis.quadrature import HALF_LOG_2PI, KRONROD_NODES, REACH, SEARCH_GRID, Panels
 from foldgauss.gaussian import Gaussian
 
-_HALF_LOG_2PI = 0.5 * float(np.log(2 * np.pi))
 _TURNS = 8  # turning points of a curve
 _SPIKES = 12  # narrow crossings of the curve, each on its own panels
 _SPIKE_PANELS = 7  # odd: the middle is a node
@@ -59,7 +59,7 @@ def crossing_panels(parent, s) -> tuple[Panels, Array]:
     at, _ = newton((parent, s), at, narrow)  # one step gives derivatives to first order, two to third
     at, slope = newton((parent, s), at, narrow)
     at = jnp.where(narrow, at, REACH)
-    log_values = -0.5 * (z**2 + at**2) - 2 * _HALF_LOG_2PI - jnp.log(jnp.abs(slope))
+    log_values = -0.5 * (z**2 + at**2) - 2 * HALF_LOG_2PI - jnp.log(jnp.abs(slope))
     shape = (tau.size, _SPIKE_PANELS, KRONROD_NODES.size)
     nodes, log_values = (x[:, ends.size : -1].reshape(shape) for x in (lax.stop_gradient(at), log_values))
     edges = lax.cummax(lax.stop_gradient(at)[:, : ends.size], axis=1)
@@ -93,7 +93,7 @@ def _crossings(parent, s) -> tuple[Array, Array]:
 
     def log_mass(low, high, before, after):
         rate = jnp.abs((after - before) / jnp.where(high > low, high - low, 1))
-        return -0.5 * jnp.minimum(jnp.abs(low), jnp.abs(high)) ** 2 - _HALF_LOG_2PI - jnp.log(rate)
+        return -0.5 * jnp.minimum(jnp.abs(low), jnp.abs(high)) ** 2 - HALF_LOG_2PI - jnp.log(rate)
 
     tau, others = _roots(gap, edges, _SPIKES, log_mass)
     return tau, logsumexp(others)
@@ -111,13 +111,7 @@ def _roots(function, edges, count: int, rank) -> tuple[Array, Array]:
     best, taken = lax.top_k(ranks, count)
     low, high, rises = edges[:-1][taken], edges[1:][taken], below[:-1][taken]
 
-    def halve(_, bounds):
-        low, high = bounds
-        middle = 0.5 * (low + high)
-        before = (function(middle) < 0) == rises
-        return jnp.where(before, middle, low), jnp.where(before, high, middle)
-
-    low, high = lax.fori_loop(0, jnp.finfo(edges.dtype).nmant + 10, halve, (low, high))
+    low, high = bisect(lambda x: (function(x) < 0) == rises, low, high, jnp.finfo(edges.dtype).nmant + 10)
     return jnp.where(jnp.isneginf(best), jnp.nan, 0.5 * (low + high)), ranks.at[taken].set(-jnp.inf)
 
 
@@ -142,5 +136,5 @@ def crossing_modes(parent, s, spikes: Panels):
     log_scale, growth = jax.jvp(lambda tau: gaussian_at(parent, tau).log_scale, (tau,), (jnp.ones_like(tau),))
     per_z = jnp.exp(log_scale) * parent.scale_tril[0, 0] / jnp.where(slope == 0, 1, jnp.abs(slope))
     move = -(tau + growth) * per_z
-    height = -0.5 * tau**2 + 0.5 * move**2 - 2 * _HALF_LOG_2PI - log_scale - jnp.log(parent.scale_tril[0, 0])
+    height = -0.5 * tau**2 + 0.5 * move**2 - 2 * HALF_LOG_2PI - log_scale - jnp.log(parent.scale_tril[0, 0])
     return tau + move * per_z, jnp.where(jnp.isneginf(spikes.log_half[:, 0]), -jnp.inf, height)

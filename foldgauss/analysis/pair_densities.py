@@ -10,15 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
-from foldgauss._numerics.batch import align_leaves, ranked_leaves
+from foldgauss._numerics.batch import align_leaves, jvp_of_moving, ranked_leaves
 from foldgauss._numerics.triangular import UNROLLED_SIZE, solve_lower
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood
 from foldgauss.gaussian import Gaussian
-
-__all__ = ["map_in_chunks", "move_components_first", "pair_log_prob"]
 
 _HALF_LOG_2PI = 0.5 * float(np.log(2 * np.pi))
 
@@ -101,14 +98,8 @@ def _nan_of(parts: list[tuple[Array, int]]) -> Array:
 
 @functools.partial(_pairs.defjvp, symbolic_zeros=True)
 def _pairs_jvp(structure, primals, tangents):
-    moving = [i for i, tangent in enumerate(tangents) if not isinstance(tangent, SymbolicZero)]
-
-    def own(*moved):
-        rows, *leaves = (moved[moving.index(i)] if i in moving else x for i, x in enumerate(primals))
-        return jax.tree.unflatten(structure, leaves).log_prob(rows[None])
-
-    tangent = jax.jvp(own, [primals[i] for i in moving], [tangents[i] for i in moving])[1]
-    return _pairs(structure, *primals), tangent
+    own = lambda rows, *leaves: jax.tree.unflatten(structure, leaves).log_prob(rows[None])  # noqa: E731
+    return _pairs(structure, *primals), jvp_of_moving(own, primals, tangents)[1]
 
 
 def map_in_chunks(pairs, finish, rows: Float[Array, "n ..."], size: int) -> Array:

@@ -1,6 +1,5 @@
 """Figures of a Folded-Gaussian, of a fit's history and of speed against accuracy; matplotlib is imported on use."""
 
-import itertools
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -9,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss._runtime.optional_imports import import_optional
 
 if TYPE_CHECKING:
@@ -24,7 +23,6 @@ _MASS = (0.3, 0.6, 0.9)  # probability inside the contour lines
 _GRID = 240
 _REACH = 3.2  # time shown, in time_scales on either side
 _MARKERS = "osD^vPX"  # of axes, colors being ten
-_SIDES = ((-1, 1), (0, 1), (-1, 0), (1, -1), (1, 0), (0, -1), (1, 1), (-1, -1))  # of a name, the best first
 _STEPS_DRAWN = 5000  # of a history: more than a picture has columns
 _LOG_PROB = jax.jit(lambda dist, x: dist.log_prob(x))
 
@@ -78,8 +76,7 @@ def plot_history(history: Sequence[Any], axes: "np.ndarray | None" = None) -> np
 
     **Raises:** ImportError that names the extra if matplotlib is missing; ValueError for an empty history.
     """
-    if not len(history):
-        raise invalid("history", expected="at least one step", got="none")
+    require(len(history), "history", expected="at least one step", got="none")
     if axes is None:
         axes = import_optional("matplotlib.pyplot", "plot").subplots(
             2, 2, sharex="col", sharey="row", layout="constrained"
@@ -117,8 +114,8 @@ def plot_tradeoff(
 ) -> np.ndarray:
     """Quality against cost, a panel for each kind of cost, with the Pareto front as a line and a ring at its knee.
 
-    Each axis has a color; points of the axis "base" are stars. Points of a Pareto front are labeled where they fit, the
-    knee always.
+    Each axis has a color; points of the axis "base" are stars. Points of a Pareto front are labeled where labels do
+    not overlap, the knee always.
 
     **Shapes:** `quality` and every cost have one number per point, `names` its axis and value; `axes`, given or made,
     are (len(panels),).
@@ -165,51 +162,25 @@ def plot_tradeoff(
 
 def _few_ticks(ax, cost: np.ndarray) -> None:
     """Plain tick labels; also at 2 and 5 times powers of ten if the range is less than 100."""
-    from matplotlib.ticker import FuncFormatter, LogLocator
+    from matplotlib.ticker import LogLocator
 
     subs = (1, 2, 5) if cost.max() < 100 * cost.min() else (1,)
     ax.xaxis.set_major_locator(LogLocator(subs=subs))
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: _short(x)))
-
-
-def _short(number: float) -> str:
-    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if number >= size:
-            return f"{number / size:g} {letter}"
-    return f"{number:g}"
+    ax.xaxis.set_major_formatter("{x:,g}")
 
 
 def _name_points(ax, panel: Panel, quality: np.ndarray, names: Sequence[str]) -> None:
-    """Label points of the front without overlaps; the knee first, and always."""
-    from matplotlib.text import Text
-    from matplotlib.transforms import Bbox
-
-    places = ax.transData.transform(np.stack([np.asarray(panel.cost, float), quality], 1))
-    taken = [Bbox.from_extents(*(place - 5), *(place + 5)) for place in places]
-    line = places[list(panel.front)]
-    for one, other in itertools.pairwise(line):
-        along = one + np.linspace(0, 1, 20)[1:-1, None] * (other - one)
-        taken += [Bbox.from_extents(*(place - 4), *(place + 4)) for place in along]
+    """Label points of the front, the knee first; a label that would overlap an earlier one is left out."""
+    taken = []
     for k in sorted(panel.front, key=lambda k: (k != panel.knee, -quality[k])):
-        is_knee = k == panel.knee
-        text = f"knee: {names[k]}" if is_knee else names[k]
-        font = {"fontsize": 10, "color": _RED, "fontweight": "bold"} if is_knee else {"fontsize": 9, "color": "0.15"}
-        for distance, (x, y) in itertools.product((9, 15, 24, 36, 50), _SIDES):
-            how = font | {"ha": ("right", "center", "left")[x + 1], "va": ("top", "center", "bottom")[y + 1]}
-            if distance > 20:
-                how["arrowprops"] = {"arrowstyle": "-", "color": "0.6", "linewidth": 0.7}
-            offset = (distance + 5 * is_knee) * np.array([x, y]) / np.hypot(x, y)
-            place = float(panel.cost[k]), float(quality[k])
-            note = ax.annotate(text, place, offset, textcoords="offset points", in_layout=False, zorder=5, **how)
-            note.get_window_extent()  # places the text; the note's own extent includes its line
-            box = Text.get_window_extent(note)
-            if ax.bbox.contains(*box.min) and ax.bbox.contains(*box.max) and not box.count_overlaps(taken):
-                taken.append(box)
-                break
+        text, color = (f"knee: {names[k]}", _RED) if k == panel.knee else (names[k], "0.15")
+        place = float(panel.cost[k]), float(quality[k])
+        how = {"textcoords": "offset points", "in_layout": False, "va": "top", "fontsize": 9, "zorder": 5}
+        note = ax.annotate(text, place, (8, -8), color=color, **how)
+        if note.get_window_extent().count_overlaps(taken):
             note.remove()
         else:
-            if is_knee:  # overlapping, but labeled
-                ax.annotate(text, place, (0, 14), textcoords="offset points", in_layout=False, ha="center", **font)
+            taken.append(note.get_window_extent())
 
 
 def _running_median(values: np.ndarray) -> np.ndarray:
@@ -286,7 +257,10 @@ def _space_limits(dist, t_limits) -> tuple[float, float]:
 
 
 def _check_plane(dist) -> None:
-    if dist.batch_shape != () or dist.event_shape != (2,):
-        got = f"batch_shape {dist.batch_shape} and event_shape {dist.event_shape}"
-        cure = "Take one element of a batch, or a marginal of one space coordinate and time."
-        raise invalid("dist", expected="batch_shape () and event_shape (2,)", got=got, cure=cure)
+    require(
+        dist.batch_shape == () and dist.event_shape == (2,),
+        "dist",
+        expected="batch_shape () and event_shape (2,)",
+        got=f"batch_shape {dist.batch_shape} and event_shape {dist.event_shape}",
+        cure="Take one element of a batch, or a marginal of one space coordinate and time.",
+    )

@@ -16,19 +16,7 @@ from jax import lax
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float
 
-from foldgauss._numerics.batch import BatchModule, concrete_value
-
-__all__ = [
-    "KRONROD_NODES",
-    "Panels",
-    "adaptive_panels",
-    "diverges",
-    "find_peaks",
-    "gauss_hermite",
-    "is_within_any",
-    "normal_panels",
-    "warn_of_error",
-]
+from foldgauss._numerics.batch import BatchModule, bisect, concrete_value
 
 _Log = Callable[[Float[Array, "..."]], Float[Array, "..."]]
 
@@ -75,7 +63,7 @@ _LADDER = 20.0 * 4.0 ** -np.arange(13)  # distances of panel edges around each p
 _ROUNDS = 24
 #: Panels halved in each round.
 _SPLITS = 16
-_HALF_LOG_2PI = 0.5 * float(np.log(2 * np.pi))
+HALF_LOG_2PI = 0.5 * float(np.log(2 * np.pi))
 _GOLDEN = float((np.sqrt(5) - 1) / 2)
 
 
@@ -210,7 +198,7 @@ def normal_panels(
 
     def panels_of(left, right):
         nodes = _nodes(left, right)
-        return Panels(left, right, nodes, _log_width(left, right), -0.5 * nodes**2 - _HALF_LOG_2PI)
+        return Panels(left, right, nodes, _log_width(left, right), -0.5 * nodes**2 - HALF_LOG_2PI)
 
     def values_at(panels, density):
         nodes = jnp.where(density > 0, panels.nodes, 0)  # the function may overflow elsewhere
@@ -398,15 +386,8 @@ def _series(coefficients: Float[Array, "16"], y: Array) -> Array:
 
 def _solved(coefficients: Float[Array, "16"], value: Array) -> Array:
     """y in [-1, 1] where an increasing Legendre series has the value: bisection, and a Newton step for derivatives."""
-
-    def halve(_, bounds):
-        low, high = bounds
-        middle = 0.5 * (low + high)
-        above = _series(coefficients, middle) > value
-        return jnp.where(above, low, middle), jnp.where(above, middle, high)
-
     one = jnp.ones_like(value)
-    low, high = lax.fori_loop(0, 50, halve, (-one, one))
+    low, high = bisect(lambda y: ~(_series(coefficients, y) > value), -one, one, 50)
     y = lax.stop_gradient(0.5 * (low + high))
     slope = lax.stop_gradient(jax.jvp(partial(_series, coefficients), (y,), (one,))[1])
     step = (value - _series(coefficients, y)) / jnp.where(slope > 0, slope, 1)

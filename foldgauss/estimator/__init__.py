@@ -9,6 +9,8 @@ Names are imported when first used: `likelihood` does not need scikit-learn.
 import importlib
 from typing import TYPE_CHECKING
 
+from foldgauss._runtime.optional_imports import import_optional
+
 if TYPE_CHECKING:
     from foldgauss.estimator.em.loop import EMStatus
     from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
@@ -25,10 +27,6 @@ _HOMES = {
 
 def __getattr__(name: str) -> object:
     if name in _HOMES:
-        try:
-            return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
-        except ModuleNotFoundError as error:
-            if (error.name or "").partition(".")[0] != "sklearn":
-                raise
-            raise ImportError(f"{name} needs scikit-learn: pip install 'foldgauss[sklearn]'.") from error
+        import_optional("sklearn", "sklearn")
+        return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -16,20 +16,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from sklearn.utils import assert_all_finite, check_array
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.estimator.parameter_checks import check_real
-
-__all__ = [
-    "DaskChunks",
-    "IterableChunks",
-    "Piece",
-    "RowSummary",
-    "collect_rows",
-    "is_chunked",
-    "open_chunks",
-    "summarize_rows",
-    "weighted_moments",
-]
 
 #: The largest number of rows of a piece: it bounds temporary arrays, whatever the chunks are.
 _PIECE_ROWS = 2**16
@@ -57,7 +45,7 @@ def is_chunked(X) -> bool:
 def open_chunks(X, sample_weight=None, width: int | None = None) -> "IterableChunks | DaskChunks":
     """The source of the chunks X; `width` is the number of columns if it is known.
 
-    `sample_weight` is chunked as X is, or an array of one weight a row.
+    `sample_weight` is chunked as X is; that of a dask array may be one array.
 
     **Raises:** ValueError if X can be iterated only once, or is a dask array whose chunks are unknown or split rows.
     """
@@ -76,10 +64,9 @@ class IterableChunks:
 
     def __init__(self, X, sample_weight, width):
         _check_iterable("X", X)
-        if sample_weight is not None and not _is_array(sample_weight):
+        if sample_weight is not None:
             _check_iterable("sample_weight", sample_weight)
-        self._weights = np.asarray(sample_weight) if _is_array(sample_weight) else sample_weight
-        self._chunks, self.width, self._num_rows = X, width, None
+        self._chunks, self._weights, self.width, self._num_rows = X, sample_weight, width, None
 
     def run(self, task, *arguments, each=None):
         own = () if each is None else (each[0],)
@@ -90,24 +77,21 @@ class IterableChunks:
 
     def _read(self) -> Iterator[Piece]:
         """The pieces of all chunks, after checking that weights match and that passes have equal numbers of rows."""
-        row, own, one_array = 0, None, isinstance(self._weights, np.ndarray)
-        of_chunks = iter(() if self._weights is None else self._weights)
+        row, of_chunks = 0, iter(() if self._weights is None else self._weights)
         for number, x in enumerate(self._chunks):
-            if one_array:
-                own = self._weights[row : row + len(x)]
-            elif self._weights is not None:
-                own = next(of_chunks, ())
+            own = None if self._weights is None else next(of_chunks, ())
             for piece in _split_chunk(number, x, own, self.width):
                 self.width = piece.x.shape[1]
                 yield piece
             row += len(x)
-        if one_array and len(self._weights) != row:
-            raise invalid("sample_weight", expected=f"{row} weights, one for each row", got=len(self._weights))
-        if not one_array and next(of_chunks, None) is not None:
-            raise invalid("sample_weight", expected="as many chunks as X", got="more")
-        if self._num_rows not in (None, row):
-            got, cure = f"{self._num_rows} at first and {row} now", f"Each pass reads them anew. {_SOURCES}"
-            raise invalid("X", expected="the same rows in each pass", got=got, cure=cure)
+        require(next(of_chunks, None) is None, "sample_weight", expected="as many chunks as X", got="more")
+        require(
+            self._num_rows in (None, row),
+            "X",
+            expected="the same rows in each pass",
+            got=f"{self._num_rows} at first and {row} now",
+            cure=f"Each pass reads them anew. {_SOURCES}",
+        )
         self._num_rows = row
 
 
@@ -124,11 +108,17 @@ class DaskChunks:
         import dask.array
 
         _check_dask(X)
-        if width not in (None, X.shape[1]):
-            raise invalid("X", expected=f"{width} columns", got=X.shape[1], cure="Pass the columns of the fit.")
+        require(
+            width in (None, X.shape[1]),
+            "X",
+            expected=f"{width} columns",
+            got=X.shape[1],
+            cure="Pass the columns of the fit.",
+        )
         weights = dask.array.ones(len(X)) if sample_weight is None else dask.array.asanyarray(sample_weight)
-        if weights.shape != X.shape[:1]:
-            raise invalid("sample_weight", expected=f"shape {X.shape[:1]}", got=f"shape {weights.shape}")
+        require(
+            weights.shape == X.shape[:1], "sample_weight", expected=f"shape {X.shape[:1]}", got=f"shape {weights.shape}"
+        )
         self._array, self.width = X, X.shape[1]
         pairs = (X.to_delayed().ravel(), weights.rechunk(X.chunks[:1]).to_delayed())
         self._delayed = list(zip(*pairs, strict=True))
@@ -161,18 +151,28 @@ def _is_dask(X) -> bool:
 def _check_dask(X) -> None:
     import dask.array
 
-    if not isinstance(X, dask.array.Array):
-        cure = "For a dask DataFrame: .to_dask_array(lengths=True)."
-        raise invalid("X", expected="a dask array", got=f"dask's {type(X).__name__}", cure=cure)
-    if X.ndim != 2:
-        raise invalid("X", expected="a dask array (n, d)", got=f"{X.ndim} dimensions")
-    if np.isnan(X.shape).any():
-        raise invalid(
-            "X", expected="a dask array of known chunks", got="unknown sizes", cure="X.compute_chunk_sizes() first."
-        )
-    if X.numblocks[1] != 1:
-        got, cure = f"{X.numblocks[1]} chunks along the columns", "X.rechunk({1: -1}) makes rows whole."
-        raise invalid("X", expected="a dask array chunked along rows alone", got=got, cure=cure)
+    require(
+        isinstance(X, dask.array.Array),
+        "X",
+        expected="a dask array",
+        got=f"dask's {type(X).__name__}",
+        cure="For a dask DataFrame: .to_dask_array(lengths=True).",
+    )
+    require(X.ndim == 2, "X", expected="a dask array (n, d)", got=f"{X.ndim} dimensions")
+    require(
+        not np.isnan(X.shape).any(),
+        "X",
+        expected="a dask array of known chunks",
+        got="unknown sizes",
+        cure="X.compute_chunk_sizes() first.",
+    )
+    require(
+        X.numblocks[1] == 1,
+        "X",
+        expected="a dask array chunked along rows alone",
+        got=f"{X.numblocks[1]} chunks along the columns",
+        cure="X.rechunk({1: -1}) makes rows whole.",
+    )
 
 
 def _run_part(task, number, width, own, arguments, x, weights):
@@ -188,35 +188,44 @@ def _map_block(function, fitted, width, x, block_info=None):
 
 def _check_iterable(name: str, chunks) -> None:
     """Raise unless `chunks` can be iterated repeatedly."""
-    if not isinstance(chunks, Iterable):
-        raise invalid(name, expected="chunks of rows", got=type(chunks).__name__, cure=_SOURCES)
-    if iter(chunks) is chunks:
-        got = f"{type(chunks).__name__}, which can be read only once"
-        raise invalid(name, expected="chunks that can be read again in each pass", got=got, cure=_SOURCES)
-
-
-def _is_array(weights) -> bool:
-    """Whether these are weights of rows, such as a list of numbers, rather than chunks of weights."""
-    is_list = isinstance(weights, Sequence) and len(weights) > 0 and np.ndim(weights[0]) == 0
-    return is_list or (hasattr(weights, "__array__") and np.ndim(weights) == 1)
+    require(isinstance(chunks, Iterable), name, expected="chunks of rows", got=type(chunks).__name__, cure=_SOURCES)
+    require(
+        iter(chunks) is not chunks,
+        name,
+        expected="chunks that can be read again in each pass",
+        got=f"{type(chunks).__name__}, which can be read only once",
+        cure=_SOURCES,
+    )
 
 
 def _split_chunk(number: int, x, weights, width: int | None) -> Iterator[Piece]:
     """Split a chunk to pieces of checked values; weights of None are 1."""
     name = f"X, chunk {number}"
     check_real(name, x)
-    if weights is not None and len(weights) != len(x):
-        raise invalid(f"sample_weight, chunk {number}", expected=f"{len(x)} weights", got=len(weights))
+    require(
+        weights is None or np.shape(weights)[:1] == (len(x),),
+        f"sample_weight, chunk {number}",
+        expected=f"{len(x)} weights",
+        got=f"{len(weights)}" if np.ndim(weights) else "a number",
+    )
     for row in range(0, len(x), _PIECE_ROWS):
         rows = slice(row, row + _PIECE_ROWS)
         part = check_array(x[rows], dtype=[np.float64, np.float32], ensure_all_finite=False, input_name=name)
-        if width not in (None, part.shape[1]):
-            cure = "All chunks have the columns of the first, or of the fit."
-            raise invalid(name, expected=f"{width} columns", got=part.shape[1], cure=cure)
+        require(
+            width in (None, part.shape[1]),
+            name,
+            expected=f"{width} columns",
+            got=part.shape[1],
+            cure="All chunks have the columns of the first, or of the fit.",
+        )
         own = np.ones(len(part), part.dtype) if weights is None else np.asarray(weights[rows], part.dtype)
-        if not (np.isfinite(own) & (own >= 0)).all():
-            got, cure = f"between {own.min()} and {own.max()}", "0 leaves a row out."
-            raise invalid(f"sample_weight, chunk {number}", expected="finite numbers >= 0", got=got, cure=cure)
+        require(
+            (np.isfinite(own) & (own >= 0)).all(),
+            f"sample_weight, chunk {number}",
+            expected="finite numbers >= 0",
+            got=f"between {own.min()} and {own.max()}",
+            cure="0 leaves a row out.",
+        )
         assert_all_finite(part[own > 0], input_name=name)
         width = part.shape[1]
         yield Piece(part, own)
@@ -255,8 +264,7 @@ def summarize_rows(chunks: IterableChunks | DaskChunks) -> tuple[RowSummary, lis
     """Summarize all rows in one pass; also the number of rows of positive weight in each part."""
     parts = list(chunks.run(_summarize))
     pieces = list(itertools.chain(*parts))
-    if not pieces:
-        raise invalid("X", expected="at least one chunk with rows", got="none", cure=_SOURCES)
+    require(pieces, "X", expected="at least one chunk with rows", got="none", cure=_SOURCES)
     num_rows, sizes, totals, means, variances, single = map(np.array, zip(*pieces, strict=True))
     total = totals.sum()
     fractions = totals / total if total > 0 else totals

@@ -17,7 +17,7 @@ from sklearn.utils import check_random_state
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
 
-from foldgauss._runtime.checks import invalid, is_integer
+from foldgauss._runtime.checks import is_integer, require
 from foldgauss.envelope import Constant, TimeLikelihood
 from foldgauss.estimator.chunks import is_chunked, open_chunks, summarize_rows
 from foldgauss.estimator.em.components import Parameters
@@ -53,8 +53,6 @@ from foldgauss.estimator.rows import (
 )
 from foldgauss.mixture import FoldedMixture
 
-__all__ = ["EMStatus", "FoldedGaussianMixture"]
-
 _CURES = {
     EMStatus.NOT_CONVERGED: "Raise max_iter or tol, or scale the data.",
     EMStatus.NOT_FINITE: "A component collapsed, or the densities of a point underflow: raise reg_covar or the "
@@ -77,7 +75,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
 
     **Data larger than memory:** in place of rows (n, d), X may be chunks of rows: an iterable of arrays (n_i, d) that
     can be iterated repeatedly (such as a list), or a dask array chunked along its rows. `sample_weight` is then chunked
-    likewise, or one array of n weights. Every iteration reads all chunks once (twice with an envelope other than
+    likewise. Every iteration reads all chunks once (twice with an envelope other than
     "constant"): those of an iterable one after another, each chunk of a dask array as a task of dask's scheduler, on
     workers if a `dask.distributed` client is active. The result equals that of the rows in one array, up to rounding.
 
@@ -236,10 +234,9 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
             options = {"dtype": [np.float64, np.float32], "ensure_min_samples": 2}
             X = validate_data(self, X, ensure_all_finite=sample_weight is None, **options)
             weights = _check_sample_weight(sample_weight, X, dtype=X.dtype, ensure_non_negative=True)
-            chunks, present = open_chunks([X], weights), weights > 0
+            chunks, present = open_chunks([X], [weights]), weights > 0
         summary, sizes = summarize_rows(chunks)
-        if chunked and summary.num_rows < 2:
-            raise invalid("X", expected="at least 2 rows", got=summary.num_rows)
+        require(not chunked or summary.num_rows >= 2, "X", expected="at least 2 rows", got=summary.num_rows)
         width = chunks.width
         least = 1 if self.n_components == "auto" else self.n_components
         check_sizes(width, summary.size, summary.total, least)
@@ -401,8 +398,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
 
     def transform(self, X) -> Float[np.ndarray, "n k"]:
         """`predict_proba` of rows, as features named foldedgaussianmixture0, ... in the container of `set_output`."""
-        if is_chunked(X):
-            raise invalid("X", expected="rows", got="chunks", cure="predict_proba takes chunks.")
+        require(not is_chunked(X), "X", expected="rows", got="chunks", cure="predict_proba takes chunks.")
         return self.predict_proba(X)
 
     @property
@@ -425,8 +421,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         parts = [values] if hasattr(values, "shape") else values
         sums = np.array([(float(part.sum(dtype=np.float64)), len(part)) for part in parts]).reshape(-1, 2)
         total, num = sums.sum(0)
-        if not num:
-            raise invalid("X", expected="at least one chunk with rows", got="none")
+        require(num, "X", expected="at least one chunk with rows", got="none")
         which = check_groups(groups, None if is_chunked(X) else np.ones(int(num), bool))
         return float(total / num), int(num) if which is None else int(which.max()) + 1
 
@@ -455,8 +450,12 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         out of its range.
         """
         check_is_fitted(self)
-        if time_origin != 0 and not isinstance(self._envelope, Constant | TimeLikelihood):
-            raise invalid("time_origin", expected="0 with a function as envelope", got=time_origin)
+        require(
+            time_origin == 0 or isinstance(self._envelope, Constant | TimeLikelihood),
+            "time_origin",
+            expected="0 with a function as envelope",
+            got=time_origin,
+        )
         dtype = jax.dtypes.canonicalize_dtype(self._params.curve.dtype)
         if dtype != self._params.curve.dtype:
             check_export(self._params, self._scaling, dtype, time_origin)
@@ -465,8 +464,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
 
     def sample(self, n_samples=1) -> tuple[Float[np.ndarray, "n d"], Int[np.ndarray, " n"]]:
         """(X, components): draws from the fitted mixture; deterministic for an integer `random_state`."""
-        if not is_integer(n_samples, 1):
-            raise invalid("n_samples", expected="a whole number >= 1", got=repr(n_samples))
+        require(is_integer(n_samples, 1), "n_samples", expected="a whole number >= 1", got=repr(n_samples))
         check_is_fitted(self)
         seed = check_random_state(self.random_state).randint(np.iinfo(np.int32).max)
         with enable_dtype(self._params.curve.dtype):
@@ -491,8 +489,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
             check_export(self._params, self._scaling, jax.dtypes.canonicalize_dtype(self._params.curve.dtype), None)
         order = self._order_columns(num).tolist()
         values = np.atleast_1d(np.asarray(values, np.float64))
-        if not np.isfinite(values).all():
-            raise invalid("values", expected="finite numbers", got=values.tolist())
+        require(np.isfinite(values).all(), "values", expected="finite numbers", got=values.tolist())
         with enable_dtype(self._params.curve.dtype):  # times far from zero need float64
             mixture = self.to_mixture().condition([order.index(column) for column in columns], values)
         return jax.tree.map(lambda z: jnp.asarray(z, jax.dtypes.canonicalize_dtype(z.dtype)), mixture)

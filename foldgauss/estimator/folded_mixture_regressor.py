@@ -7,13 +7,11 @@ from jaxtyping import ArrayLike
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, clone
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.estimator.em.statistics import enable_dtype
 from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
 from foldgauss.estimator.parameter_checks import check_column, check_real
 from foldgauss.estimator.rows import order_columns
-
-__all__ = ["FoldedMixtureRegressor"]
 
 #: Rows predicted together, the last block padded: one compiled program for any number of rows.
 _BLOCK = 1024
@@ -82,10 +80,13 @@ class FoldedMixtureRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         **Raises:** ValueError on levels outside (0, 1).
         """
         levels = np.asarray(quantiles, np.float64)
-        if not ((levels > 0) & (levels < 1)).all():
-            raise invalid(
-                "quantiles", expected="levels between 0 and 1", got=levels.tolist(), cure="0.5 is the median."
-            )
+        require(
+            ((levels > 0) & (levels < 1)).all(),
+            "quantiles",
+            expected="levels between 0 and 1",
+            got=levels.tolist(),
+            cure="0.5 is the median.",
+        )
         (values,) = self._evaluate(_quantiles, X, levels.ravel())
         return values.reshape(-1, *self._target_shape, *levels.shape)
 

@@ -9,13 +9,11 @@ import numpy as np
 import optax
 from jaxtyping import Array, ArrayLike, Bool, Float, Key
 
-from foldgauss._runtime.checks import invalid, is_integer
+from foldgauss._runtime.checks import is_integer, require
 from foldgauss.envelope import CallableEnvelope
 from foldgauss.estimator.em.scaling import check_time_resolution
 from foldgauss.estimator.parameter_checks import check_real
 from foldgauss.mixture import FoldedMixture
-
-__all__ = ["GradientFit", "fit_gradient"]
 
 _LEARNING_RATE = 1e-2
 
@@ -58,25 +56,39 @@ def fit_gradient(
     **Source:** eq:foldgauss; Kingma and Ba 2015. **Raises:** ValueError naming the parameter. A loss that is not finite
     ends the fit without `success`.
     """
-    if not isinstance(mixture, FoldedMixture) or mixture.logits.ndim != 1:
-        raise invalid("mixture", expected="one FoldedMixture", got=type(mixture).__name__, cure="No batch of mixtures.")
-    if not is_integer(steps, 1):
-        raise invalid("steps", expected="a whole number >= 1", got=repr(steps))
+    require(
+        isinstance(mixture, FoldedMixture) and mixture.logits.ndim == 1,
+        "mixture",
+        expected="one FoldedMixture",
+        got=type(mixture).__name__,
+        cure="No batch of mixtures.",
+    )
+    require(is_integer(steps, 1), "steps", expected="a whole number >= 1", got=repr(steps))
     dtype = mixture.logits.dtype
     check_real("x", x)
     check_time_resolution("x", x, dtype)
     x = jnp.asarray(x, dtype)
-    if x.ndim != 2 or x.shape[1:] != mixture.event_shape:
-        raise invalid(
-            "x", expected=f"shape (n, {mixture.event_shape[0]})", got=f"shape {x.shape}", cure="Time is last."
-        )
-    if not len(x):
-        raise invalid("x", expected="at least one point", got="none")
+    require(
+        x.ndim == 2 and x.shape[1:] == mixture.event_shape,
+        "x",
+        expected=f"shape (n, {mixture.event_shape[0]})",
+        got=f"shape {x.shape}",
+        cure="Time is last.",
+    )
+    require(len(x), "x", expected="at least one point", got="none")
     weights = jnp.ones(len(x), dtype) if sample_weight is None else jnp.asarray(sample_weight, dtype)
-    if weights.shape != x.shape[:1] or not bool((weights >= 0).all()) or not bool(weights.sum() > 0):
-        raise invalid("sample_weight", expected=f"{len(x)} numbers >= 0, not all 0", got=f"shape {weights.shape}")
-    if batch_size is not None and not is_integer(batch_size, 1):
-        raise invalid("batch_size", expected="a whole number >= 1 or None", got=repr(batch_size))
+    require(
+        weights.shape == x.shape[:1] and bool((weights >= 0).all()) and bool(weights.sum() > 0),
+        "sample_weight",
+        expected=f"{len(x)} numbers >= 0, not all 0",
+        got=f"shape {weights.shape}",
+    )
+    require(
+        batch_size is None or is_integer(batch_size, 1),
+        "batch_size",
+        expected="a whole number >= 1 or None",
+        got=repr(batch_size),
+    )
     optimizer = optax.adam(_LEARNING_RATE) if optimizer is None else optimizer
     key = jax.random.key(0) if key is None else key
     raw = _init_raw(mixture)

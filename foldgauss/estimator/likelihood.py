@@ -15,10 +15,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key
 
-from foldgauss._numerics.batch import cast
+from foldgauss._numerics.batch import bisect, cast
 from foldgauss._numerics.regression import Regression, hermite, hermite_to_powers, weighted_regression
 from foldgauss._numerics.triangular import solve_upper_matrix
-from foldgauss._runtime.checks import check_one_of, invalid, is_integer
+from foldgauss._runtime.checks import check_one_of, invalid, is_integer, require
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope
 from foldgauss.estimator.em.scaling import check_time_resolution
@@ -87,10 +87,6 @@ class Fit(eqx.Module):
     residual_scale: Float[Array, " d-1"]
     time_given: bool = eqx.field(static=True)
     covariance_type: str = eqx.field(static=True)
-
-    def _repr_png_(self) -> bytes | None:
-        """The distribution's image, which notebooks show."""
-        return self.distribution._repr_png_()
 
     @property
     def degree(self) -> int:
@@ -196,14 +192,13 @@ def fit(
     **Source:** eq:foldgauss. **Raises:** ValueError on unknown options, wrong shapes, and negative weights. Problems of
     the *data* do not raise but set `Fit.status`, also under `jit` and `vmap`; see `Fit.check`.
     """
-    if not is_integer(degree, 0):
-        raise invalid("degree", expected="a whole number >= 0", got=repr(degree))
+    require(is_integer(degree, 0), "degree", expected="a whole number >= 0", got=repr(degree))
     check_one_of("covariance_type", covariance_type, ("full", "diag"))
     x = _check_points(x)
     weights = _check_weights(weights, x)
     envelope = cast(make_envelope(envelope), x.dtype)
     given = _check_time(time_loc, time_scale, x.dtype)
-    return _fit(_Plan(x, weights, given, envelope, int(degree), covariance_type))
+    return _fit(x, weights, given, envelope, int(degree), covariance_type)
 
 
 # --- the fit ------------------------------------------------------------------------------------------------
@@ -222,17 +217,6 @@ class _Data(NamedTuple):
     finite: Bool[Array, ""]
 
 
-class _Plan(eqx.Module):
-    """The checked arguments of `fit`, in the dtype of x."""
-
-    x: Float[Array, "n d"]
-    weights: Float[Array, " n"]
-    given: tuple[Float[Array, ""], Float[Array, ""]] | None
-    envelope: AbstractEnvelope
-    degree: int = eqx.field(static=True)
-    covariance_type: str = eqx.field(static=True)
-
-
 class _Space(NamedTuple):
     """The maximum over space given time; `exp(2 log_unit) tril tril'` is the covariance."""
 
@@ -243,24 +227,35 @@ class _Space(NamedTuple):
 
 
 @eqx.filter_jit
-def _fit(plan: _Plan) -> Fit:
-    data = _prepare_data(plan.x, plan.weights, plan.degree)
-    time_loc, time_scale = _estimate_time(data) if plan.given is None else plan.given
+def _fit(x, weights, given, envelope: AbstractEnvelope, degree: int, covariance_type: str) -> Fit:
+    data = _prepare_data(x, weights, degree)
+    time_loc, time_scale = _estimate_time(data) if given is None else given
     singular_time = ~(time_scale > 0)
     time_scale = jnp.where(singular_time, 1, time_scale)
-    space = _maximize_over_space(plan, data, time_loc, time_scale)
-    needed = plan.degree + (2 if plan.covariance_type == "diag" else plan.x.shape[1])
+    space = _maximize_over_space(data, time_loc, time_scale, envelope, degree, covariance_type)
+    needed = degree + (2 if covariance_type == "diag" else x.shape[1])
     status = _status(data, space, needed, singular_time)
-    result, failed = _assemble_fit(plan, data, space, (time_loc, time_scale), status), status != FitStatus.OK
+    triangle = space.regression.triangle
+    result = Fit(
+        distribution=_to_distribution(data, space, time_loc, time_scale, envelope),
+        log_likelihood=data.total * (space.value - jnp.log(data.scale).sum()),
+        num_points=data.total,
+        status=status,
+        triangle_inverse=solve_upper_matrix(triangle, jnp.eye(degree + 1, dtype=triangle.dtype)),
+        residual_scale=_residual_scale(data, space, degree),
+        time_given=given is not None,
+        covariance_type=covariance_type,
+    )
+    failed = status != FitStatus.OK
     return jax.tree.map(lambda leaf: jnp.where(failed, jnp.nan, leaf) if eqx.is_inexact_array(leaf) else leaf, result)
 
 
-def _maximize_over_space(plan: _Plan, data: _Data, time_loc, time_scale) -> _Space:
+def _maximize_over_space(data: _Data, time_loc, time_scale, envelope, degree: int, covariance_type: str) -> _Space:
     """Fold, loc and Sigma by weighted least squares, and the log-likelihood there (eq:foldgauss)."""
-    log_a, tau = plan.envelope.log_a(data.t, time_loc=time_loc, time_scale=time_scale), (time_loc - data.t) / time_scale
-    regression = weighted_regression(tau, data.y, log_a, data.weights, plan.degree)
+    log_a, tau = envelope.log_a(data.t, time_loc=time_loc, time_scale=time_scale), (time_loc - data.t) / time_scale
+    regression = weighted_regression(tau, data.y, log_a, data.weights, degree)
     root = jnp.where(data.weights > 0, jnp.exp(-0.5 * log_a - regression.log_unit), 0)[:, None]
-    tril, singular = _factorize(root * (data.y - regression.fitted), root * data.y, data.weights, plan.covariance_type)
+    tril, singular = _factorize(root * (data.y - regression.fitted), root * data.y, data.weights, covariance_type)
     dim, mean = data.y.shape[1], lambda z: (data.weights * z).sum()
     log_det = 2 * jnp.log(jnp.where(singular, 1, jnp.diagonal(tril))).sum() + 2 * regression.log_unit * dim
     value = -0.5 * mean(tau * tau) - jnp.log(time_scale) - 0.5 * _LOG_2PI
@@ -328,33 +323,27 @@ def _status(data: _Data, space: _Space, needed: int, singular_time) -> Int[Array
     return jnp.select(conditions, [jnp.int32(code) for code in codes], jnp.int32(FitStatus.OK))
 
 
-def _assemble_fit(plan: _Plan, data: _Data, space: _Space, when, status) -> Fit:
-    """The fit in the units of the points."""
-    time_loc, time_scale = when
-    to_powers = jnp.asarray(hermite_to_powers(plan.degree), data.t.dtype)
-    powers = jnp.matmul(to_powers, space.regression.coefficients) * data.scale[None]
-    dist = FoldedGaussian(
+def _to_distribution(data: _Data, space: _Space, time_loc, time_scale, envelope) -> FoldedGaussian:
+    """The maximum in the units of the points."""
+    coefficients = space.regression.coefficients
+    degree = len(coefficients) - 1
+    powers = jnp.matmul(jnp.asarray(hermite_to_powers(degree), data.t.dtype), coefficients) * data.scale[None]
+    return FoldedGaussian(
         data.shift + powers[0],
         jnp.exp(space.regression.log_unit) * space.tril * data.scale[:, None],
         time_loc=time_loc,
         time_scale=time_scale,
-        fold=PolynomialFold(powers[1:] / _powers(time_scale, plan.degree)),
-        envelope=plan.envelope,
+        fold=PolynomialFold(powers[1:] / _powers(time_scale, degree)),
+        envelope=envelope,
         validate_args=False,
     )
-    freedom = data.total - (plan.degree + 1)
+
+
+def _residual_scale(data: _Data, space: _Space, degree: int) -> Float[Array, " d-1"]:
+    """Unbiased standard deviations at a = exp(-2 log_unit), in the units of the points; NaN without freedom."""
+    freedom = data.total - (degree + 1)
     unbiased = jnp.sqrt(jnp.where(freedom > 0, 1 / jnp.where(freedom > 0, freedom, 1), jnp.nan))
-    triangle = space.regression.triangle
-    return Fit(
-        distribution=dist,
-        log_likelihood=data.total * (space.value - jnp.log(data.scale).sum()),
-        num_points=data.total,
-        status=status,
-        triangle_inverse=solve_upper_matrix(triangle, jnp.eye(len(triangle), dtype=triangle.dtype)),
-        residual_scale=unbiased * jnp.linalg.norm(space.tril, axis=-1) * data.scale,
-        time_given=plan.given is not None,
-        covariance_type=plan.covariance_type,
-    )
+    return unbiased * jnp.linalg.norm(space.tril, axis=-1) * data.scale
 
 
 def _powers(time_scale, degree: int) -> Float[Array, "degree 1"]:
@@ -369,13 +358,8 @@ def _student_quantile(level: float, freedom):
     # P(|T| > q) = I_x(n/2, 1/2) with x = n / (n + q^2): bisection over log q.
     tail = lambda z: jax.scipy.special.betainc(0.5 * n, 0.5 * jnp.ones_like(n), n / (n + jnp.exp(2 * z)))  # noqa: E731
 
-    def halve(_, ends):
-        middle = 0.5 * (ends[0] + ends[1])
-        below = tail(middle) > 1 - level
-        return jnp.where(below, middle, ends[0]), jnp.where(below, ends[1], middle)
-
-    ends = (jnp.full_like(n, -20), jnp.full_like(n, 40))
-    quantile = jnp.exp(lax.fori_loop(0, 60, halve, ends)[0])
+    low, _ = bisect(lambda z: tail(z) > 1 - level, jnp.full_like(n, -20), jnp.full_like(n, 40), 60)
+    quantile = jnp.exp(low)
     quantile = jnp.where(many, _student_series(level, jnp.where(many, freedom, 1)), quantile)
     return jnp.where(freedom > 0, quantile, jnp.nan)
 
@@ -431,8 +415,13 @@ def bootstrap(result: Fit, key: Key[Array, ""], num_replicates: int = 200, *, ba
     **Source:** Efron and Tibshirani, An Introduction to the Bootstrap, section 6.5.
     **Raises:** ValueError if the fit failed, or `num_replicates` is below 2.
     """
-    if not is_integer(num_replicates, 2):
-        raise invalid("num_replicates", expected="a whole number >= 2", got=num_replicates, cure="200 is usual.")
+    require(
+        is_integer(num_replicates, 2),
+        "num_replicates",
+        expected="a whole number >= 2",
+        got=num_replicates,
+        cure="200 is usual.",
+    )
     result.check()
     keys, num_points = jax.random.split(key, num_replicates), max(round(float(result.num_points)), 1)
     return _bootstrap(result, keys, num_points, min(batch_size, num_replicates))
@@ -446,7 +435,7 @@ def _bootstrap(result: Fit, keys, num_points: int, batch_size: int) -> Replicate
 
     def replicate(key):
         x = dist.sample(key, (num_points,))
-        refit = _fit(_Plan(x, weights, given, dist.envelope, degree, result.covariance_type))
+        refit = _fit(x, weights, given, dist.envelope, degree, result.covariance_type)
         return Replicates(refit.distribution, refit.status)
 
     return lax.map(replicate, keys, batch_size=batch_size)
@@ -460,9 +449,13 @@ def _check_points(x) -> Float[Array, "n d"]:
     check_time_resolution("x", x, jax.dtypes.canonicalize_dtype(getattr(x, "dtype", float)))
     x = jnp.asarray(x)
     x = x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
-    if x.ndim != 2 or x.shape[1] < 2:
-        cure = "Rows are points, time is the last column; for many sets of points use jax.vmap."
-        raise invalid("x", expected="shape (n, d) with d >= 2", got=f"shape {x.shape}", cure=cure)
+    require(
+        x.ndim == 2 and x.shape[1] >= 2,
+        "x",
+        expected="shape (n, d) with d >= 2",
+        got=f"shape {x.shape}",
+        cure="Rows are points, time is the last column; for many sets of points use jax.vmap.",
+    )
     return x
 
 
@@ -470,24 +463,29 @@ def _check_weights(weights, x) -> Float[Array, " n"]:
     if weights is None:
         return jnp.ones(x.shape[0], x.dtype)
     weights = jnp.asarray(weights).astype(x.dtype)
-    if weights.shape != x.shape[:1]:
-        raise invalid(
-            "weights", expected=f"shape {x.shape[:1]}", got=f"shape {weights.shape}", cure="One per row of x."
-        )
+    require(
+        weights.shape == x.shape[:1],
+        "weights",
+        expected=f"shape {x.shape[:1]}",
+        got=f"shape {weights.shape}",
+        cure="One per row of x.",
+    )
     if not isinstance(weights, jax.core.Tracer) and (np.asarray(weights) < 0).any():
         raise invalid("weights", expected="numbers >= 0", got=f"a least of {weights.min()}", cure="0 drops a row.")
     return weights
 
 
 def _check_time(time_loc, time_scale, dtype):
-    if (time_loc is None) != (time_scale is None):
-        got = "time_loc alone" if time_scale is None else "time_scale alone"
-        cure = "Pass both, or none for those of the times themselves."
-        raise invalid("time_loc, time_scale", expected="both or none", got=got, cure=cure)
+    require(
+        (time_loc is None) == (time_scale is None),
+        "time_loc, time_scale",
+        expected="both or none",
+        got="time_loc alone" if time_scale is None else "time_scale alone",
+        cure="Pass both, or none for those of the times themselves.",
+    )
     return None if time_loc is None else tuple(jnp.asarray(z).astype(dtype) for z in (time_loc, time_scale))
 
 
 def _check_level(level: float) -> float:
-    if not 0 < level < 1:
-        raise invalid("level", expected="a number between 0 and 1", got=level, cure="0.95 is usual.")
+    require(0 < level < 1, "level", expected="a number between 0 and 1", got=level, cure="0.95 is usual.")
     return level

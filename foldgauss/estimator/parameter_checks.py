@@ -5,17 +5,8 @@ from numbers import Integral
 import jax
 import numpy as np
 
-from foldgauss._runtime.checks import check_one_of, invalid, short_repr
+from foldgauss._runtime.checks import check_one_of, invalid, require, short_repr
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood, as_envelope, check_peak
-
-__all__ = [
-    "check_array",
-    "check_column",
-    "check_parameters",
-    "check_real",
-    "check_sizes",
-    "make_envelope",
-]
 
 _ENVELOPES = {"constant": Constant, "time_likelihood": lambda: TimeLikelihood(power=1.0, floor=1e-3)}
 
@@ -28,26 +19,32 @@ def check_parameters(estimator) -> None:
         expected, cure = f"at most {len(jax.devices())}", "See jax.devices()."
         raise invalid("devices", expected=expected, got=estimator.devices, cure=cure)
     initial = (estimator.weights_init, estimator.means_init, estimator.precisions_init)
-    if estimator.n_components == "auto" and any(value is not None for value in initial):
-        raise invalid(
-            "n_components", expected="a number where initial values are given", got='"auto"', cure="Pass their number."
-        )
+    require(
+        estimator.n_components != "auto" or all(value is None for value in initial),
+        "n_components",
+        expected="a number where initial values are given",
+        got='"auto"',
+        cure="Pass their number.",
+    )
 
 
 def check_sizes(num_columns: int, num_points: int, total: float, least: int) -> None:
     """Raise unless there are a time and a space column, positive weights, and at least `least` points."""
-    if num_columns < 2:
-        cure = "One column is time; at least one of space is needed."
-        raise invalid("X", expected="at least 2 columns", got=f"n_features = {num_columns}", cure=cure)
-    if not total > 0:
-        raise invalid("sample_weight", expected="a positive sum", got="0", cure="Rows of weight 0 are left out.")
-    if num_points < least:
-        raise invalid(
-            "n_components",
-            expected=f"at most the number of points (n_samples = {num_points})",
-            got=least,
-            cure='Fewer components, or n_components="auto".',
-        )
+    require(
+        num_columns >= 2,
+        "X",
+        expected="at least 2 columns",
+        got=f"n_features = {num_columns}",
+        cure="One column is time; at least one of space is needed.",
+    )
+    require(total > 0, "sample_weight", expected="a positive sum", got="0", cure="Rows of weight 0 are left out.")
+    require(
+        num_points >= least,
+        "n_components",
+        expected=f"at most the number of points (n_samples = {num_points})",
+        got=least,
+        cure='Fewer components, or n_components="auto".',
+    )
 
 
 def check_column(column, num_columns: int, names=None, parameter: str = "time_column") -> int:
@@ -64,18 +61,26 @@ def check_real(name: str, X) -> None:
     """Raise if rows hold dates, durations or complex numbers, which other libraries convert or report at length."""
     of_list = np.asarray(X).dtype if isinstance(X, list | tuple) else None
     for kind in map(str, np.ravel(np.asarray(getattr(X, "dtypes", getattr(X, "dtype", of_list)), object))):
-        if kind.lower().startswith(("date", "time", "duration", "complex")):
-            cure = "Convert times to seconds, from an origin near them. Complex data not supported: pass two columns."
-            raise invalid(name, expected="real numbers", got=kind, cure=cure)
+        require(
+            not kind.lower().startswith(("date", "time", "duration", "complex")),
+            name,
+            expected="real numbers",
+            got=kind,
+            cure="Convert times to seconds, from an origin near them. Complex data not supported: pass two columns.",
+        )
 
 
 def check_array(name: str, value, shape: tuple[int, ...]) -> np.ndarray:
     """`value` as a finite float64 array of this shape."""
     value = np.asarray(value, np.float64)
-    if not np.isfinite(value).all():
-        raise invalid(name, expected="finite numbers", got="NaN or infinity")
-    if value.shape != shape:
-        raise invalid(name, expected=f"shape {shape}", got=f"shape {value.shape}", cure="One entry per component.")
+    require(np.isfinite(value).all(), name, expected="finite numbers", got="NaN or infinity")
+    require(
+        value.shape == shape,
+        name,
+        expected=f"shape {shape}",
+        got=f"shape {value.shape}",
+        cure="One entry per component.",
+    )
     return value
 
 

@@ -2,14 +2,12 @@
 
 import numpy as np
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.envelope import Constant
 from foldgauss.estimator.em.components import Parameters
 from foldgauss.estimator.em.initialization import params_from_gaussians
 from foldgauss.estimator.em.scaling import Scaling, to_mixture
 from foldgauss.estimator.parameter_checks import check_array
-
-__all__ = ["replace_initial"]
 
 
 def replace_initial(estimator, params: Parameters, scaling: Scaling, degree: int) -> Parameters:
@@ -25,10 +23,13 @@ def replace_initial(estimator, params: Parameters, scaling: Scaling, degree: int
     order = estimator._order_columns(dim)
     if estimator.weights_init is not None:
         weights = check_array("weights_init", estimator.weights_init, (num,))
-        if not ((weights >= 0).all() and np.isclose(weights.sum(), 1)):
-            raise invalid(
-                "weights_init", expected="weights with sum 1", got=weights.tolist(), cure="Divide by the sum."
-            )
+        require(
+            (weights >= 0).all() and np.isclose(weights.sum(), 1),
+            "weights_init",
+            expected="weights with sum 1",
+            got=weights.tolist(),
+            cure="Divide by the sum.",
+        )
     if estimator.means_init is not None:
         means = check_array("means_init", estimator.means_init, (num, dim))[:, order]
     if estimator.precisions_init is not None:
@@ -51,8 +52,11 @@ def _invert_precisions(precisions, kind: str, num: int, dim: int) -> np.ndarray:
         precisions = precisions[:, :, None] * eye
     precisions = np.broadcast_to(precisions, (num, dim, dim))
     symmetric = np.allclose(precisions, precisions.swapaxes(-1, -2))
-    if not (symmetric and (np.linalg.eigvalsh(precisions) > 0).all()):
-        raise invalid(
-            "precisions_init", expected="symmetric and positive definite", got="others", cure="Invert covariances."
-        )
+    require(
+        symmetric and (np.linalg.eigvalsh(precisions) > 0).all(),
+        "precisions_init",
+        expected="symmetric and positive definite",
+        got="others",
+        cure="Invert covariances.",
+    )
     return np.linalg.inv(precisions)

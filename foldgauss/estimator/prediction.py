@@ -1,5 +1,6 @@
 """Evaluation of a fitted mixture at rows of X, in a form that can be sent to workers."""
 
+import functools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -12,8 +13,6 @@ from jaxtyping import Float, Int
 from foldgauss.estimator.em.scaling import Scaling
 from foldgauss.estimator.em.statistics import enable_dtype
 from foldgauss.mixture import FoldedMixture
-
-__all__ = ["FittedMixture", "predict_components", "predict_log_prob", "predict_responsibilities"]
 
 #: Rows are evaluated in blocks of a power of 2 from the first to the second, so that chunks of any size share programs.
 _LEAST_ROWS = 2**8
@@ -51,5 +50,11 @@ def _evaluate_rows(method: Callable, fitted: FittedMixture, x: np.ndarray) -> np
     padded = np.pad(y, ((0, num_blocks * rows - len(y)), (0, 0)))
     with enable_dtype(y.dtype):
         mixture = jax.tree.map(lambda z: jnp.asarray(z, y.dtype), fitted.mixture)
-        blocks = [np.asarray(method(mixture, block)) for block in np.split(padded, num_blocks)]
-    return np.concatenate(blocks)[: len(y)]
+        blocks = [_call(method, mixture, block) for block in np.split(padded, num_blocks)]
+        return np.concatenate([np.asarray(block) for block in blocks])[: len(y)]
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _call(method: Callable, mixture: FoldedMixture, x: np.ndarray):
+    """A method as one program, which is called with less overhead than its parts."""
+    return method(mixture, x)

@@ -9,21 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from sklearn.exceptions import ConvergenceWarning
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import invalid, require
 from foldgauss.estimator.chunks import DaskChunks, IterableChunks, Piece, RowSummary, collect_rows
 from foldgauss.estimator.em.scaling import Scaling
 from foldgauss.estimator.em.statistics import Blocks, Points, make_points
-
-__all__ = [
-    "SMOOTH_ROWS",
-    "Rows",
-    "check_groups",
-    "choose_dtype",
-    "measure_gaps",
-    "order_columns",
-    "warn_narrow",
-    "warn_smooth",
-]
 
 #: The highest degree fitted in float32. Beyond, with times far from normal, a curve's normal equations lose more digits
 #: than float32 has: up to 1 nat a point at degree 10.
@@ -118,16 +107,21 @@ def check_groups(groups, present: Bool[np.ndarray, " n"] | None) -> Int[np.ndarr
     """The number of the group of each row that is present; `present` is None for chunks of rows, which have none."""
     if groups is None:
         return None
-    if present is None:
-        raise invalid("groups", expected="None for chunks of rows", got="groups", cure="Or pass one array.")
-    if np.shape(groups) != present.shape:
-        raise invalid("groups", expected=f"shape {present.shape}", got=f"shape {np.shape(groups)}", cure="One per row.")
+    require(present is not None, "groups", expected="None for chunks of rows", got="groups", cure="Or pass one array.")
+    require(
+        np.shape(groups) == present.shape,
+        "groups",
+        expected=f"shape {present.shape}",
+        got=f"shape {np.shape(groups)}",
+        cure="One per row.",
+    )
     try:
         names, which = np.unique(np.asarray(groups)[present], return_inverse=True)
     except TypeError as error:  # None among strings
         raise invalid("groups", expected="numbers or strings", got="a mixture", cure="Name each track.") from error
-    if len(names) < 2:
-        raise invalid("groups", expected="at least 2 groups", got=len(names), cure="Add tracks, or leave groups out.")
+    require(
+        len(names) >= 2, "groups", expected="at least 2 groups", got=len(names), cure="Add tracks, or leave groups out."
+    )
     return which
 
 

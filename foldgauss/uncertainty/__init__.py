@@ -9,8 +9,6 @@ times together. Sampling needs the extra `uncertainty`.
 from foldgauss.uncertainty.diagnostics.irregularities import (
     IncrementIntervals,
     Irregularity,
-    TimesComparison,
-    compare_times,
     increment_intervals,
     irregularities,
 )
@@ -21,8 +19,7 @@ from foldgauss.uncertainty.likelihood.noise import FrameNoise
 from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves
 from foldgauss.uncertainty.likelihood.refit import RefitTimes, refit_frame_times
 from foldgauss.uncertainty.posterior.exact import ExactPosterior, exact_posterior
-from foldgauss.uncertainty.posterior.increments import Increments
-from foldgauss.uncertainty.posterior.log_prob import FrameTimeLogProb, frame_time_log_prob, rendered_log_likelihood
+from foldgauss.uncertainty.posterior.log_prob import FrameTimeLogProb
 from foldgauss.uncertainty.posterior.result import FrameTimePosterior
 from foldgauss.uncertainty.posterior.sampling import frame_time_posterior
 
@@ -32,22 +29,17 @@ __all__ = [
     "FrameTimeLogProb",
     "FrameTimePosterior",
     "IncrementIntervals",
-    "Increments",
     "Irregularity",
     "LikelihoodProfiles",
     "ProfileCurves",
     "RefitTimes",
-    "TimesComparison",
-    "compare_times",
     "exact_posterior",
     "frame_table",
-    "frame_time_log_prob",
     "frame_time_posterior",
     "increment_intervals",
     "irregularities",
     "likelihood_profiles",
     "marginalize_colors",
     "refit_frame_times",
-    "rendered_log_likelihood",
     "summary",
 ]

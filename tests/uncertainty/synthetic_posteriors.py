@@ -6,16 +6,13 @@ from foldgauss.uncertainty import (
     FrameNoise,
     FrameTimeLogProb,
     FrameTimePosterior,
-    Increments,
     LikelihoodProfiles,
     ProfileCurves,
     exact_posterior,
 )
 
 
-def posterior_about(
-    times, std=0.02, *, frames=None, concentration=1.0, shape=(4, 25, 10), seed=0
-) -> FrameTimePosterior:
+def posterior_about(times, std=0.02, *, concentration=1.0, shape=(4, 25, 10), seed=0) -> FrameTimePosterior:
     """Likelihoods of frames are Gaussians about `times` of standard deviation `std` frames (one, or one per frame)."""
     num = len(times)
     std = np.broadcast_to(np.asarray(std, float), num) / (num - 1)
@@ -23,12 +20,12 @@ def posterior_about(
              for t, s in zip(times, std, strict=True)]  # fmt: skip
     values = [-0.5 * ((at - t) / s) ** 2 for at, t, s in zip(nodes, times, std, strict=True)]
     noise = FrameNoise(np.full(num, 0.02), np.full(num, 0.1))
-    profiles = LikelihoodProfiles(ProfileCurves.from_nodes(nodes, values), noise, 0.7 ** np.arange(12.0), 100)
-    increments = Increments(np.asarray(times, float), frames, concentration)
-    exact = exact_posterior(profiles.curves, increments)
+    curves = ProfileCurves.from_nodes(nodes, values)
+    profiles = LikelihoodProfiles(curves, noise, np.zeros(num), 0.7 ** np.arange(12.0), 100)
+    exact = exact_posterior(curves, concentration)
     draws = exact.sample(int(np.prod(shape)), seed).reshape(*shape, num)
-    ones = np.ones(increments.num_free)
+    ones = np.ones(num - 2)
     return FrameTimePosterior(
-        FrameTimeLogProb(profiles.curves, increments), profiles, exact, draws, np.full(shape[0], 0.3), 40 * ones,
+        FrameTimeLogProb(curves, concentration), profiles, exact, draws, np.full(shape[0], 0.3), 40 * ones,
         1.001 * ones, 1000 * ones, True, "Converged.",
     )  # fmt: skip

@@ -5,14 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 from synthetic_posteriors import posterior_about
+from time_clips import rendered_log_likelihood
 from tiny_clips import NUM_FRAMES, TWICE, clip_of, model_of_12
 
 from foldgauss.uncertainty import (
     FrameNoise,
-    compare_times,
+    exact_posterior,
     increment_intervals,
     irregularities,
-    rendered_log_likelihood,
+    likelihood_profiles,
 )
 from foldgauss.uncertainty.diagnostics.irregularities import even_times
 from foldgauss.video import FrameTimes, VideoModel
@@ -66,13 +67,6 @@ def test_flat_likelihoods_give_no_irregularities():
     assert irregularities(posterior, probability=0.05) == []  # they are not assessed
 
 
-def test_intervals_between_held_frames_are_not_assessed():
-    steps = np.ones(20)
-    steps[[5, 14]] = 0.01
-    posterior = posterior_about(times_of(steps), frames=[13, 14, 15])
-    assert kinds(irregularities(posterior)) == [(14, "duplicated")]
-
-
 def test_a_long_step_beside_a_duplicate_is_explained():
     from foldgauss.uncertainty import summary
 
@@ -110,8 +104,6 @@ def test_intervals_cover():
         ("dropped", 1.0),
         ("dropped", np.nan),
         ("probability", 0),
-        ("reach", 0),
-        ("reach", 1.5),
     ],
 )
 def test_settings_out_of_range(setting, value):
@@ -131,27 +123,14 @@ def test_models_are_compared_under_one_noise():
         even.splats, FrameTimes(np.log(np.diff(truth)).astype(np.float32)), even.size, even.fps, even.options
     )
     noise = FrameNoise(4 / 255, 1.0)
-    rows = compare_times({"even": even, "learned": learned}, clip, noise=noise)
-    assert [row.name for row in rows] == ["even", "learned"]
-    one, other = rows
-    assert one.at_own == pytest.approx(one.at_even, rel=1e-6)
-    assert other.at_even == pytest.approx(one.at_even, rel=1e-6)
-    assert other.at_own > one.at_own + 100
-    assert one.log_evidence == pytest.approx(other.log_evidence, abs=0.5)
-    assert other.mean_psnr > one.mean_psnr
+    profiles = [likelihood_profiles(one, clip, noise=noise) for one in (even, learned)]
+    at_even, at_truth = (profiles[0].curves(each).sum() for each in (np.linspace(0, 1, NUM_FRAMES), truth))
+    assert at_truth > at_even + 100
+    one, other = (each.log_likelihood.sum() + exact_posterior(each.curves).log_evidence for each in profiles)
+    assert one == pytest.approx(other, abs=0.5)
     # The evidence is an average of likelihoods: below the maximum, here about that of the truth.
-    best = rendered_log_likelihood(even, clip, truth, noise.for_frames(NUM_FRAMES)).sum()
-    assert best - 80 < one.log_evidence < best + 5
-    again = compare_times({"learned": learned}, clip)[0]  # a noise estimated from the same residuals
-    assert again.at_own == pytest.approx(other.at_own, rel=0.1)
-
-
-def test_compare_times_refuses_no_models_and_other_lengths():
-    model = model_of_12()
-    with pytest.raises(ValueError, match=r"^models: expected at least one"):
-        compare_times({}, np.zeros((12, 40, 64, 3), np.uint8))
-    with pytest.raises(ValueError, match=r"models\['a'\]: expected 7 frames"):
-        compare_times({"a": model}, np.zeros((7, 40, 64, 3), np.uint8))
+    best = rendered_log_likelihood(even, clip, truth, noise).sum()
+    assert best - 80 < one < best + 5
 
 
 def test_summary_names_frames_that_are_not_identified():

@@ -7,8 +7,9 @@ import pytest
 import scipy.stats
 from time_clips import SCALE, model, white
 
+from benchmarks import _calibration
 from benchmarks._calibration import SimulatedRanks, ecdf_band, simulated_ranks
-from foldgauss.uncertainty import FrameNoise, Increments
+from foldgauss.uncertainty import FrameNoise
 
 REPLICATES, FRAMES = 300, 6
 #: Each run checks some six quantities against 99% envelopes with a fixed seed: 1 in 20 correct runs would fail.
@@ -82,12 +83,9 @@ def test_correlated_noise_needs_tempering():
 
 @slow
 def test_wrong_prior_is_detected(monkeypatch):
-    right = Increments.draw_prior
-
-    def wrong(self, rng, num):
-        return right(Increments(self.held, None, 4 * self.concentration), rng, num)
-
-    monkeypatch.setattr(Increments, "draw_prior", wrong)
+    right = _calibration.draw_times
+    wrong = lambda num_frames, concentration, rng: right(num_frames, 4 * concentration, rng)  # noqa: E731
+    monkeypatch.setattr(_calibration, "draw_times", wrong)
     settings = {"num_frames": 4, "replicates": REPLICATES}
     assert not simulated_ranks(model(), white(4.0), **settings).inside(0.99).all()
     monkeypatch.undo()

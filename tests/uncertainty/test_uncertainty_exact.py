@@ -6,9 +6,9 @@ import scipy.special
 import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from time_clips import free_times, parabolas
+from time_clips import parabolas
 
-from foldgauss.uncertainty import FrameTimeLogProb, Increments, ProfileCurves, exact_posterior
+from foldgauss.uncertainty import FrameTimeLogProb, ProfileCurves, exact_posterior
 
 #: Far from each other, in standard deviations: the order does not constrain them, and the posterior is Gaussian.
 FAR = np.array([0.2, 0.4, 0.55, 0.8]), np.array([0.01, 0.02, 0.015, 0.01])
@@ -34,14 +34,14 @@ def assert_near(found, frames, priors, starts, lengths):
         )
 
 
-def by_quadrature(curves, increments, far: float, points: int):
+def by_quadrature(curves, concentration, far: float, points: int):
     """Mean and covariance of the free times, and the log-evidence, by sums over a grid of log-ratios of increments."""
-    num = increments.num_free
+    num = curves.num_frames - 2
     z = np.linspace(-far, far, points)
     grid = np.stack(np.meshgrid(*[z] * num, indexing="ij"), -1).reshape(-1, num)
     fractions = scipy.special.softmax(np.concatenate([grid, np.zeros((len(grid), 1))], 1), axis=1)
     times = np.cumsum(fractions, axis=1)[:, :-1]
-    heights = FrameTimeLogProb(curves, increments)(times) + np.log(fractions).sum(1)  # the Jacobian
+    heights = FrameTimeLogProb(curves, concentration)(times) + np.log(fractions).sum(1)  # the Jacobian
     weights = np.exp(heights - heights.max())
     mean = weights @ times / weights.sum()
     covariance = (times - mean).T @ ((times - mean) * weights[:, None]) / weights.sum()
@@ -52,9 +52,9 @@ def by_quadrature(curves, increments, far: float, points: int):
 @pytest.mark.parametrize("means", [(0.4, 0.6), (0.5, 0.52), (0.62, 0.45), (0.1, 0.9)])
 def test_two_frames_agree_with_quadrature(concentration, means):
     # Also where frames are so near, or so far out of order, that only their order separates them.
-    curves, increments = parabolas(means, (0.06, 0.1), 401), free_times(4, concentration)
-    mean, covariance, likelihood_profiles = by_quadrature(curves, increments, 14, 501)
-    found = exact_posterior(curves, increments)
+    curves = parabolas(means, (0.06, 0.1), 401)
+    mean, covariance, likelihood_profiles = by_quadrature(curves, concentration, 14, 501)
+    found = exact_posterior(curves, concentration)
     std = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(found.mean()[1:-1], mean, atol=2e-3 * std.min())
     np.testing.assert_allclose(found.std()[1:-1], std, rtol=2e-3)
@@ -63,9 +63,9 @@ def test_two_frames_agree_with_quadrature(concentration, means):
 
 @pytest.mark.parametrize("concentration", [1.0, 4.0])
 def test_three_frames_agree_with_quadrature(concentration):
-    curves, increments = parabolas((0.3, 0.42, 0.6), (0.06, 0.08, 0.07), 401), free_times(5, concentration)
-    mean, covariance, likelihood_profiles = by_quadrature(curves, increments, 10.0, 91)
-    found = exact_posterior(curves, increments)
+    curves = parabolas((0.3, 0.42, 0.6), (0.06, 0.08, 0.07), 401)
+    mean, covariance, likelihood_profiles = by_quadrature(curves, concentration, 10.0, 91)
+    found = exact_posterior(curves, concentration)
     std = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(found.mean()[1:-1], mean, atol=2e-3 * std.min())
     np.testing.assert_allclose(found.std()[1:-1], std, rtol=2e-3)
@@ -73,9 +73,9 @@ def test_three_frames_agree_with_quadrature(concentration):
 
 
 def test_draws_have_the_quadratures_covariance():
-    curves, increments = parabolas((0.5, 0.52), (0.06, 0.1), 401), free_times(4)
-    _, covariance, _ = by_quadrature(curves, increments, 14, 501)
-    draws = exact_posterior(curves, increments).sample(10_000, 1)[:, 1:-1]
+    curves = parabolas((0.5, 0.52), (0.06, 0.1), 401)
+    _, covariance, _ = by_quadrature(curves, 1.0, 14, 501)
+    draws = exact_posterior(curves).sample(10_000, 1)[:, 1:-1]
     found = np.corrcoef(draws.T)[0, 1]
     assert found == pytest.approx(covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]), abs=0.02)
     np.testing.assert_allclose(np.cov(draws.T).diagonal(), covariance.diagonal(), rtol=0.03)
@@ -84,7 +84,7 @@ def test_draws_have_the_quadratures_covariance():
 
 def test_frames_far_apart_are_gaussian():
     means, widths = FAR
-    found = exact_posterior(parabolas(*FAR, 801), free_times(6))
+    found = exact_posterior(parabolas(*FAR, 801))
     np.testing.assert_allclose(found.mean()[1:-1], means, atol=1e-5)
     np.testing.assert_allclose(found.std()[1:-1], widths, rtol=2e-3)
     normal = scipy.stats.norm(means, widths)
@@ -99,7 +99,7 @@ def test_frames_far_apart_are_gaussian():
 
 def test_draws_follow_the_known_marginals():
     means, widths = FAR
-    found = exact_posterior(parabolas(*FAR, 801), free_times(6))
+    found = exact_posterior(parabolas(*FAR, 801))
     draws = found.sample(5000, 3)
     for k in range(4):  # false-alarm rate 1e-3 each; power: a width wrong by a fifth fails
         assert scipy.stats.kstest(draws[:, k + 1], scipy.stats.norm(means[k], widths[k]).cdf).pvalue > 1e-3
@@ -110,7 +110,7 @@ def test_draws_follow_the_known_marginals():
 
 @pytest.mark.parametrize("concentration", [1.0, 4.0, 20.0])
 def test_draws_follow_the_exact_marginals_where_order_ties(concentration):
-    found = exact_posterior(parabolas((0.45, 0.47, 0.6), (0.08, 0.08, 0.1), 401), free_times(5, concentration))
+    found = exact_posterior(parabolas((0.45, 0.47, 0.6), (0.08, 0.08, 0.1), 401), concentration)
     draws = found.sample(4000, 0)
     for n, (edges, masses) in enumerate(zip(found.edges, found.masses, strict=True)):
         summed = np.concatenate([[0], np.cumsum(masses)])
@@ -126,7 +126,7 @@ LONG = [pytest.param(150, a, marks=pytest.mark.slow) for a in (1.0, 3.0, 20.0)]
 
 @pytest.mark.parametrize(("num", "concentration"), [*[(n, a) for n in (4, 30) for a in (1.0, 3.0, 20.0)], *LONG])
 def test_flat_profiles_give_the_prior(num, concentration):
-    found = exact_posterior(flat_except(num), free_times(num, concentration))
+    found = exact_posterior(flat_except(num), concentration)
     frames = sorted({1, 2, num // 3, num // 2, num - 2})
     priors = [scipy.stats.beta(concentration * k, concentration * (num - 1 - k)) for k in frames]
     assert_near(found, frames, priors, [0] * len(frames), [1] * len(frames))
@@ -137,7 +137,7 @@ def test_flat_profiles_give_the_prior(num, concentration):
 def test_known_frame_splits_the_prior_in_two(concentration):
     # Its time is known to 1e-6, all others are flat: Beta densities on both sides.
     num, known = 12, 5
-    found = exact_posterior(flat_except(num, (known,)), free_times(num, concentration))
+    found = exact_posterior(flat_except(num, (known,)), concentration)
     before, after = [1, 2, known - 1], [known + 1, known + 2, num - 2]
     priors = [scipy.stats.beta(concentration * k, concentration * (known - k)) for k in before]
     assert_near(found, before, priors, [0] * 3, [0.4] * 3)
@@ -156,7 +156,7 @@ def test_evidence_of_increments_that_the_prior_hardly_allows(concentration, gap)
     flat = flat_except(num)
     curves = [parts[k - known] if k in (known, known + 1) else flat[k] for k in range(num)]
     curves = ProfileCurves.from_nodes(*zip(*(each.nodes_and_values(0) for each in curves), strict=True))
-    found = exact_posterior(curves, free_times(num, concentration))
+    found = exact_posterior(curves, concentration)
     grouped = concentration * np.array([known, 1, num - 2 - known])
     expected = scipy.stats.dirichlet.logpdf([0.4, gap, 0.6 - gap], grouped) + 2 * np.log(width * np.sqrt(2 * np.pi))
     assert found.log_evidence == pytest.approx(expected, abs=0.02)
@@ -164,7 +164,7 @@ def test_evidence_of_increments_that_the_prior_hardly_allows(concentration, gap)
 
 
 def test_many_flat_profiles_need_few_grid_points():
-    found = exact_posterior(flat_except(300), free_times(300))
+    found = exact_posterior(flat_except(300))
     assert max(map(len, found.edges)) < 1000
     assert_near(found, [150], [scipy.stats.beta(150, 149)], [0], [1])
 
@@ -178,7 +178,7 @@ def test_many_flat_profiles_need_few_grid_points():
 @pytest.mark.parametrize("known", [(), (5,)])
 def test_increments_of_draws_follow_the_prior(concentration, many, known):
     num = 12
-    draws = exact_posterior(flat_except(num, known), free_times(num, concentration)).sample(many, 5)
+    draws = exact_posterior(flat_except(num, known), concentration).sample(many, 5)
     steps = np.diff(draws)
     assert (steps > 0).all()
     for k in (0, 1, 3, 7, 10):
@@ -195,7 +195,7 @@ def test_increments_of_draws_follow_the_prior(concentration, many, known):
 
 
 def test_levels_are_checked():
-    found = exact_posterior(parabolas(np.array([0.5]), np.array([0.1])), free_times(3, 1.0))
+    found = exact_posterior(parabolas(np.array([0.5]), np.array([0.1])), 1.0)
     with pytest.raises(ValueError, match=r"^level: expected a number in \[0, 1\], got 1.5"):
         found.interval(1.5)
 
@@ -206,7 +206,7 @@ def test_densities_integrate_to_one_and_means_increase(seed, concentration):
     rng = np.random.default_rng(seed)
     num = int(rng.integers(1, 6))
     curves = parabolas(np.sort(rng.uniform(0.1, 0.9, num)), rng.uniform(0.02, 0.3, num))
-    found = exact_posterior(curves, free_times(num + 2, concentration))
+    found = exact_posterior(curves, concentration)
     for edges, masses in zip(found.edges, found.masses, strict=True):
         assert (masses >= 0).all()
         assert masses.sum() == pytest.approx(1)
@@ -217,21 +217,12 @@ def test_densities_integrate_to_one_and_means_increase(seed, concentration):
     assert (np.diff(found.sample(20)) >= 0).all()
 
 
-def test_runs_are_independent():
-    held = np.array([0, 0.2, 0.4, 0.55, 0.8, 1])
-    curves = parabolas(*FAR, 801)
-    part = exact_posterior(curves, Increments(held, [1, 3, 4]))
-    np.testing.assert_allclose(part.std()[[0, 2, 5]], 0)
-    np.testing.assert_allclose(part.std()[[1, 3, 4]], FAR[1][[0, 2, 3]], rtol=5e-3)
-    np.testing.assert_array_equal(part.sample(5)[:, 2], 0.4)
-
-
 def test_narrow_profiles_out_of_order_raise():
     with pytest.raises(ValueError, match="order"):
-        exact_posterior(parabolas((0.7, 0.3), (1e-3, 1e-3), 2001), free_times(4))
+        exact_posterior(parabolas((0.7, 0.3), (1e-3, 1e-3), 2001))
 
 
 def test_probabilities_of_quantiles_are_checked():
-    found = exact_posterior(parabolas([0.5], [0.1]), free_times(3))
+    found = exact_posterior(parabolas([0.5], [0.1]))
     with pytest.raises(ValueError, match="probability"):
         found.quantile(1.5)

@@ -7,24 +7,20 @@ import numpy as np
 import pytest
 import scipy.interpolate
 from soft_models import soft_model
-from time_clips import NUM_FRAMES, SCALE, SIZE, clip, model, parabolas, uneven, white
+from time_clips import NUM_FRAMES, SCALE, SIZE, clip, model, parabolas, rendered_log_likelihood, uneven, white
 
 from foldgauss.uncertainty import (
     FrameNoise,
     FrameTimeLogProb,
-    Increments,
     LikelihoodProfiles,
     ProfileCurves,
     exact_posterior,
-    frame_time_log_prob,
     likelihood_profiles,
-    rendered_log_likelihood,
 )
 from foldgauss.uncertainty.likelihood import likelihood_profiles as drawing
 from foldgauss.uncertainty.likelihood.residuals import Sketches
+from foldgauss.uncertainty.posterior.increments import log_prior
 from foldgauss.video.models.shared_paths import SharedPaths
-
-FREE = Increments(np.linspace(0, 1, NUM_FRAMES))
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +59,7 @@ def test_curves_match_rendered_log_likelihoods(profiles):
     modes[[0, -1]] = times[[0, -1]]
     best = rendered_log_likelihood(model(), clip(times), modes, white())
     noise = profiles.noise
-    std = exact_posterior(profiles.curves, FREE).std()
+    std = exact_posterior(profiles.curves).std()
     for _ in range(10):
         t = np.clip(modes + 2.5 * std * rng.standard_normal(NUM_FRAMES), 0, 1)
         drawn = rendered_log_likelihood(model(), clip(times), t, noise) - best
@@ -73,11 +69,12 @@ def test_curves_match_rendered_log_likelihoods(profiles):
 
 
 def test_log_prob_is_the_sum_over_frames(profiles):
-    log_prob = FrameTimeLogProb(profiles.curves, FREE)
+    log_prob = FrameTimeLogProb(profiles.curves)
     total = rendered_log_likelihood(model(), clip(uneven()), uneven(), white()).sum()
     best = rendered_log_likelihood(model(), clip(uneven()), profiles.curves.modes(), white()).sum()
-    prior = log_prob.increments.log_prior(uneven())
+    prior = log_prior(uneven(), 1.0)
     assert log_prob(uneven()[1:-1]) - prior == pytest.approx(total - best, abs=1.0)
+    assert profiles.log_likelihood.sum() == pytest.approx(best, rel=1e-6)
 
 
 def test_profile_is_refined_between_equal_coarse_nodes():
@@ -93,7 +90,7 @@ def test_profile_is_refined_between_equal_coarse_nodes():
 def test_profiles_recover_scale_and_times(profiles):
     measured = likelihood_profiles(model(), clip(uneven()), noise="independent")
     np.testing.assert_allclose(measured.noise.scale, SCALE, rtol=0.1)
-    spread = exact_posterior(profiles.curves, FREE)
+    spread = exact_posterior(profiles.curves)
     miss = (spread.mean() - uneven())[1:-1] / spread.std()[1:-1]
     assert np.abs(miss).max() < 4
     assert (miss**2).mean() < 2.5
@@ -110,16 +107,9 @@ def test_alpha_is_composited_over_black():
 
 def test_flat_profile_keeps_its_prior():
     curves = parabolas([0.25, 0.5, 0.75], [0.02, 10.0, 0.02])
-    found = exact_posterior(curves, Increments(np.linspace(0, 1, 5)))
+    found = exact_posterior(curves)
     assert found.std()[2] > 0.8 * 0.5 / np.sqrt(12)
     assert found.std()[1] == pytest.approx(0.02, rel=0.02)
-
-
-def test_held_frames_stay_at_their_medians(profiles):
-    increments = frame_time_log_prob(profiles, frames=[2, 3, 7]).increments
-    medians = exact_posterior(profiles.curves, FREE).quantile(0.5)
-    held = np.setdiff1d(np.arange(NUM_FRAMES), [2, 3, 7])
-    np.testing.assert_allclose(increments.times(np.zeros(3))[held], medians[held])
 
 
 def test_a_clip_of_another_size_or_type_is_refused():
@@ -150,7 +140,7 @@ def test_too_large_noise_raises():
 
 def test_frames_backwards_are_refused():
     with pytest.warns(UserWarning, match="held at time"), pytest.raises(ValueError, match="order"):
-        exact_posterior(likelihood_profiles(model(), clip(uneven(), scale=0.0)[::-1], noise=white(0.0012)).curves, FREE)
+        exact_posterior(likelihood_profiles(model(), clip(uneven(), scale=0.0)[::-1], noise=white(0.0012)).curves)
 
 
 @pytest.mark.parametrize("noise", ["loud", "", None, 1.0])
@@ -196,14 +186,9 @@ def test_gaussians_on_shared_paths_warn():
     assert len(found.notes) == 1
 
 
-def test_a_reach_that_is_too_short_is_widened_or_refused(monkeypatch):
+def test_a_reach_that_is_too_short_is_widened(monkeypatch):
     times = np.linspace(0, 1, 9) ** 3
     whole = likelihood_profiles(model(), clip(times), noise=white(0.02))
-    with pytest.raises(ValueError, match="reach"):
-        likelihood_profiles(model(), clip(times), noise=white(0.02), reach=1)
-    dense = clip(np.linspace(0, 1, 70))  # most of these frames have no time of the model within reach
-    with pytest.raises(ValueError, match="reach"):
-        likelihood_profiles(model(), dense, noise=white(0.02), reach=1)
     monkeypatch.setattr(drawing, "MOST_EVERYWHERE", 3)
     monkeypatch.setattr(drawing, "REACH", 1)
     widened = likelihood_profiles(model(), clip(times), noise=white(0.02))

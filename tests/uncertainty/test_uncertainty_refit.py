@@ -117,15 +117,14 @@ def test_replicates_depend_on_the_seed_and_their_number(model, frames):
     assert (found.std[1:-1] > 0).all()
     assert found.spread.max() < 0.2
     np.testing.assert_array_equal(run(seed=4).times, found.times[:2])
-    for other in (run(seed=5), run(seed=4, method="order")):
-        assert (other.times[:, 1:-1] != found.times[:2, 1:-1]).all()
+    assert (run(seed=5).times[:, 1:-1] != found.times[:2, 1:-1]).all()
 
 
 def test_default_steps_are_the_end_of_the_schedule(model, frames):
     config = dataclasses.replace(CONFIG, steps=100, minutes=5.0, quality=10.0)
     original = dataclasses.replace(CONFIG, steps=30)
     ended, given = (
-        refit_frame_times(model, frames, each, replicates=2, method="order", steps=steps).times
+        refit_frame_times(model, frames, each, replicates=2, steps=steps).times
         for each, steps in ((config, None), (original, 30))
     )
     np.testing.assert_array_equal(ended, given)  # 30% of 100 steps, independent of minutes and quality
@@ -196,7 +195,6 @@ def test_equal_float32_times_give_finite_spread():
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        ({"method": "rows"}, "method: expected one of"),
         ({"replicates": 1}, "replicates: expected a whole number >= 2"),
         ({"replicates": 2.0}, "replicates: expected"),
         ({"seed": -1}, "seed: expected"),
@@ -218,12 +216,6 @@ def test_arguments_that_do_not_fit_raise(model, frames, change, told):
         refit_frame_times(model, given.pop("video", np.asarray)(frames), **given)
 
 
-def test_alpha_can_be_refitted_in_another_order(model, frames):
-    opaque = np.insert(frames, 3, 255, axis=-1)
-    found = refit_frame_times(model, opaque, CONFIG, method="order", replicates=2, steps=5)
-    assert np.isfinite(found.times).all()
-
-
 def test_wrong_arguments_of_statistics_raise():
     own = np.linspace(0, 1, 7)
     found = RefitTimes(np.stack([own, own]), own)
@@ -236,14 +228,9 @@ def test_wrong_arguments_of_statistics_raise():
 
 
 @pytest.mark.slow
-def test_longer_refits_spread_more_and_order_less():
-    """The documented effects of time warps and of the optimizer, on a sufficiently large clip."""
+def test_longer_refits_spread_more():
+    """The documented effect of time warps, on a sufficiently large clip."""
     clip, config = passing(12, 48, 80), FitConfig(num_gaussians=800, steps=1000)
     whole = fit(clip, config).model
-    runs = {"short": {"steps": 100}, "long": {"steps": 1000}, "order": {"steps": 1000, "method": "order"}}
-    spread = {}
-    for name, how in runs.items():
-        found = refit_frame_times(whole, clip, config, replicates=10, **how)
-        spread[name] = np.sqrt(np.mean(found.spread[1:-1] ** 2))
-    assert spread["short"] < spread["long"]
-    assert spread["order"] < spread["long"]
+    short, long = (refit_frame_times(whole, clip, config, replicates=10, steps=steps) for steps in (100, 1000))
+    assert np.mean(short.spread[1:-1] ** 2) < np.mean(long.spread[1:-1] ** 2)

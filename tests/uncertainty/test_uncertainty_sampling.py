@@ -6,22 +6,18 @@ import emcee
 import numpy as np
 import pytest
 import scipy.stats
-from time_clips import clip, free_times, model, parabolas, uneven, white
+from time_clips import parabolas
 
 from foldgauss._runtime.optional_imports import import_optional
 from foldgauss.uncertainty import (
     ExactPosterior,
     FrameNoise,
-    Increments,
     LikelihoodProfiles,
     ProfileCurves,
     exact_posterior,
-    frame_time_log_prob,
     frame_time_posterior,
-    likelihood_profiles,
-    rendered_log_likelihood,
 )
-from foldgauss.uncertainty.posterior import moves
+from foldgauss.uncertainty.posterior import increments, log_prob, moves
 
 #: Two of the three are so near that their order constrains them.
 NEAR = (0.3, 0.34, 0.7), (0.03, 0.05, 0.04)
@@ -35,7 +31,7 @@ def toy(means, widths, nodes: int = 401) -> LikelihoodProfiles:
 
 def profiles_of(curves: ProfileCurves) -> LikelihoodProfiles:
     noise = FrameNoise(np.full(curves.num_frames, 0.02), np.ones(curves.num_frames))
-    return LikelihoodProfiles(curves, noise, np.ones(3), 9)
+    return LikelihoodProfiles(curves, noise, np.zeros(curves.num_frames), np.ones(3), 9)
 
 
 def sampled(profiles, **settings):
@@ -84,19 +80,15 @@ def test_few_frames_sample_the_known_posterior(near):
     np.testing.assert_allclose(near.interval(0.9), near.exact.interval(0.9), atol=0.15 * near.exact.std().max())
     assert worst_ks(near, exact_cdfs(near)) > 1e-3
     wide = toy(NEAR[0], np.array(NEAR[1]) * 1.2)
-    wrong = dataclasses.replace(near, exact=exact_posterior(wide.curves, near.log_prob.increments))
+    wrong = dataclasses.replace(near, exact=exact_posterior(wide.curves))
     assert worst_ks(near, exact_cdfs(wrong)) < 1e-3
 
 
 def test_wrong_prior_is_detected(monkeypatch):
     # One power of every increment too many in the density that a move of emcee samples, not in the exact posterior.
     monkeypatch.setattr(moves, "FrameSweep", lambda log_prob: emcee.moves.DEMove())
-    right = Increments.log_prior
-
-    def wrong(self, times):
-        return right(Increments(self.held, np.flatnonzero(self.free), self.concentration + 1), times)
-
-    monkeypatch.setattr(Increments, "log_prior", wrong)
+    wrong = lambda times, concentration: increments.log_prior(times, concentration + 1)  # noqa: E731
+    monkeypatch.setattr(log_prob, "log_prior", wrong)
     assert not agrees(sampled(toy(*NEAR)))
 
 
@@ -113,7 +105,7 @@ def test_sweeps_sample_the_known_posterior(concentration):
     assert found.converged
     assert agrees(found)
     assert found.acceptance.min() > 0.6
-    others = exact_posterior(found.log_prob.curves, free_times(7, concentration + 1))
+    others = exact_posterior(found.log_prob.curves, concentration + 1)
     assert not agrees(dataclasses.replace(found, exact=others))
 
 
@@ -153,7 +145,7 @@ def test_few_frames_change_modes(two_modes):
 def test_ensembles_that_all_miss_a_mode_have_not_converged(two_modes, monkeypatch):
     # Started at one mode, emcee's moves stay there: tau and R-hat do not detect the other one.
     monkeypatch.setattr(moves, "FrameSweep", lambda log_prob: emcee.moves.DEMove())
-    draws = exact_posterior(two_modes.curves, free_times(5)).sample(400)
+    draws = exact_posterior(two_modes.curves).sample(400)
     monkeypatch.setattr(ExactPosterior, "sample", lambda self, num, seed: draws[draws[:, 2] < 0.5][:num])
     found = sampled(two_modes, steps=1500)
     assert (found.r_hat < 1.01).all()
@@ -169,13 +161,11 @@ def test_message_counts_identified_frames():
     assert found.message.endswith(" 2 of 3 frame times are identified.")
 
 
-@pytest.mark.parametrize(("num", "frames"), [pytest.param(5, [3], marks=pytest.mark.slow), (7, [1, 3, 4]), (3, None)])
-def test_single_frames_between_held_ones(num, frames):
-    means = np.linspace(0, 1, num)
-    found = sampled(profiles_of(parabolas(means[1:-1], np.full(num - 2, 0.2 / num))), frames=frames)
+def test_a_single_frame_between_the_first_and_the_last():
+    found = sampled(toy([0.5], [0.2 / 3]))
     assert found.converged
     assert agrees(found)
-    np.testing.assert_array_equal(found.free, np.arange(1, num - 1) if frames is None else frames)
+    np.testing.assert_array_equal(found.free, [1])
 
 
 def test_seeds_reproduce_to_the_bit():
@@ -237,7 +227,6 @@ def test_file_of_another_run_is_refused(tmp_path):
         *[({name: value}, name) for name in ("ensembles", "steps", "seed") for value in (32.0, "9", np.nan)],
         ({"seed": -1}, "seed"),
         ({"profiles": 3}, "profiles"),
-        ({"frames": [9]}, "frames"),
         ({"concentration": 0.5}, "concentration"),
         ({"backend": "none/run.h5"}, "backend"),
         ({"backend": "."}, "backend"),
@@ -246,21 +235,6 @@ def test_file_of_another_run_is_refused(tmp_path):
 def test_what_is_refused(change, word):
     with pytest.raises(ValueError, match=f"^{word}"):
         frame_time_posterior(**{"profiles": toy(*NEAR), **change})
-
-
-def test_other_frames_are_held_at_their_medians():
-    profiles = toy(*NEAR)
-    medians = exact_posterior(profiles.curves, free_times(5)).quantile(0.5)
-    increments = frame_time_log_prob(profiles, frames=[2], concentration=2).increments
-    np.testing.assert_array_equal(increments.held, exact_posterior(profiles.curves, free_times(5, 2)).quantile(0.5))
-    assert (increments.held != medians).any()
-
-
-def test_rendered_log_likelihood_checks_arguments():
-    frames = clip(uneven())
-    for times in (uneven()[:3], uneven() + 1):
-        with pytest.raises(ValueError, match="times"):
-            rendered_log_likelihood(model(), frames, times, white())
 
 
 @pytest.mark.parametrize("level", [0, 1, 2, "a", np.nan])
@@ -277,18 +251,6 @@ def test_statistics_of_many_frames_use_all_draws():
     np.testing.assert_allclose(found.mean(), flat.mean(0), rtol=1e-12)
     np.testing.assert_allclose(found.std(), flat.std(0), rtol=1e-12)
     np.testing.assert_allclose(found.interval(0.5), np.quantile(flat, [0.25, 0.75], axis=0), rtol=1e-12)
-
-
-@pytest.mark.slow
-def test_some_frames_of_a_clip():
-    found = frame_time_posterior(likelihood_profiles(model(), clip(uneven()), noise=white()), frames=[3, 4])
-    assert found.converged
-    assert agrees(found)
-    np.testing.assert_array_equal(found.free, [3, 4])
-    assert (found.std()[[1, 2, 5, 6]] < 1e-12).all()
-    miss = (found.mean() - uneven())[[3, 4]] / found.std()[[3, 4]]
-    assert np.abs(miss).max() < 4
-    assert found.identified().all()
 
 
 def test_progress_is_reported():

@@ -5,7 +5,7 @@ import functools
 import numpy as np
 from soft_models import soft_model
 
-from foldgauss.uncertainty import FrameNoise, Increments, ProfileCurves
+from foldgauss.uncertainty import FrameNoise, ProfileCurves
 from foldgauss.uncertainty.likelihood.residuals import Residuals
 
 SIZE, NUM_FRAMES, SCALE = (24, 32), 10, 0.02
@@ -16,10 +16,6 @@ def parabolas(means, widths, num_nodes: int = 201) -> ProfileCurves:
     nodes, flat = np.linspace(0, 1, num_nodes), np.zeros(num_nodes)
     inner = [-((nodes - m) ** 2) / (2 * w**2) for m, w in zip(means, widths, strict=True)]
     return ProfileCurves.from_nodes([nodes] * (len(inner) + 2), [flat, *inner, flat])
-
-
-def free_times(num_frames: int, concentration: float = 1.0) -> Increments:
-    return Increments(np.linspace(0, 1, num_frames), None, concentration)
 
 
 @functools.cache
@@ -44,3 +40,10 @@ def clip(times, scale: float = SCALE, seed: int = 0, of=None) -> np.ndarray:
 
 def white(scale: float = SCALE) -> FrameNoise:
     return FrameNoise(scale, 1.0)
+
+
+def rendered_log_likelihood(of, video, times, noise: FrameNoise) -> np.ndarray:
+    """Log-likelihoods of the frames at `times` from rendered images, without interpolation."""
+    residuals = Residuals(of, video)
+    errors = [residuals.squared_errors(image, [k])[0] for k, image in enumerate(residuals.render_at(times))]
+    return -noise.for_frames(len(video)).weight * np.array(errors)

@@ -146,8 +146,8 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
                 "foldgauss uncertainty steady.safetensors holiday.mp4",
             ),
             Example(
-                "Frames 10 to 19 only, with unknown colors",
-                "foldgauss uncertainty steady.safetensors holiday.mp4 --only 10:20 --level colors",
+                "With unknown colors",
+                "foldgauss uncertainty steady.safetensors holiday.mp4 --level colors",
             ),
         ),
         "tradeoff": (

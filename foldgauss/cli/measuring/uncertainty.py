@@ -25,11 +25,12 @@ from foldgauss.cli.shared.files import (
 )
 from foldgauss.io._atomic import atomic_path, lock_output, translate_output_errors, write_or_keep
 from foldgauss.io.models.video_model import load_video_model, read_origin
-from foldgauss.uncertainty import Increments, frame_time_posterior, likelihood_profiles, marginalize_colors
+from foldgauss.uncertainty import frame_time_posterior, likelihood_profiles, marginalize_colors
 from foldgauss.uncertainty.diagnostics import plots
 from foldgauss.uncertainty.diagnostics.irregularities import irregularities
 from foldgauss.uncertainty.diagnostics.report import frame_table, summary
 from foldgauss.uncertainty.likelihood.noise import NOISES
+from foldgauss.uncertainty.posterior.increments import check_prior
 from foldgauss.uncertainty.posterior.result import FrameTimePosterior
 from foldgauss.uncertainty.posterior.sampling import check_settings
 from foldgauss.video.models.video_model import VideoModel
@@ -57,13 +58,6 @@ def uncertainty_command(
         ),
     ] = None,
     frames: FittedFrames = None,
-    only: Annotated[
-        str | None,
-        typer.Option(
-            metavar="K,A:B,..",
-            help="Sample the times of these frames, with the others fixed [default: all but the first and last].",
-        ),
-    ] = None,
     noise: Annotated[
         str,
         typer.Option(
@@ -104,7 +98,6 @@ def uncertainty_command(
     refuse_inputs(out_dir / PLOTS[0], {"clip": video})  # plots would be frames there
     known, cure = overwrite or (out_dir / CHAINS).exists(), ", or start over with --overwrite"
     refuse_foreign(out_dir, (*FILES, CHAINS), "run of uncertainty", record=CHAINS, known=known, cure=cure)
-    wanted = _parse_only(only)
     refuse_segments(model_path)
     model = load_video_model(model_path)
     require(
@@ -120,9 +113,10 @@ def uncertainty_command(
         "--frames",
         expected=f"the {model.num_frames} frames that the model was fitted to: its first is at 0 and its last at 1",
         got=f"{clip.num_frames} of this clip",
-        cure="To sample the times of some of them: --only A:B.",
+        cure="Give all of them; the tables have a row for each.",
     )
-    _check_frames(clip.num_frames, wanted, concentration)
+    require(clip.num_frames >= 3, "--frames", expected="at least 3 frames", got=clip.num_frames)
+    check_prior(clip.num_frames, concentration)
     check_settings(steps, ensembles, seed)
     make_folder(out_dir)
     own = tuple(out_dir / name for name in FILES)
@@ -133,42 +127,15 @@ def uncertainty_command(
         )
         if level == "colors":
             on_frame = lambda done, total: show("Integrating colors", done, total)  # noqa: E731
-            profiles = marginalize_colors(model, clip.frames, profiles, frames=wanted, on_frame=on_frame)
+            profiles = marginalize_colors(model, clip.frames, profiles, on_frame=on_frame)
         settings = {"concentration": concentration, "ensembles": ensembles, "steps": steps, "seed": seed}
-        posterior = _sample(out_dir / CHAINS, overwrite, show, profiles=profiles, frames=wanted, **settings)
+        posterior = _sample(out_dir / CHAINS, overwrite, show, profiles=profiles, **settings)
     fitted = np.asarray(model.frame_times.times(), np.float64) if model.num_frames == clip.num_frames else None
     title = f"{model_path.name}, by {Path(clip.source).name}"
     written = write_or_keep(out_dir, lambda folder: _write(folder, posterior, fitted, title))
     out.print((written / "summary.md").read_text(), soft_wrap=True)
     if not posterior.converged:
         warn(f"{posterior.message} The draws so far are in {written}.")
-
-
-def _parse_only(text: str | None) -> list[int] | None:
-    """Frames as 3,5,10:20."""
-    if text is None:
-        return None
-    found: list[int] = []
-    for part in text.split(","):
-        first, colon, last = part.strip().partition(":")
-        require(
-            first.isdecimal() and (not colon or last.isdecimal()) and (not colon or int(last) - int(first) <= 100_000),
-            "--only",
-            expected="frames as 3,5,10:20 (20 not included)",
-            got=repr(text),
-        )
-        found += range(int(first), int(last)) if colon else [int(first)]
-    require(found, "--only", expected="at least one frame", got=repr(text))
-    return sorted(set(found))
-
-
-def _check_frames(num_frames: int, only: list[int] | None, concentration: float) -> None:
-    """Refuse frames without times to sample, before anything is rendered."""
-    require(num_frames >= 3, "--frames", expected="at least 3 frames", got=num_frames)
-    try:
-        Increments(np.linspace(0.0, 1.0, num_frames), only, concentration)
-    except ParameterError as error:
-        raise ParameterError("--only" if error.parameter == "frames" else error.parameter, error.problem) from error
 
 
 def _sample(path: Path, overwrite: bool, show: Callable, **arguments: Any) -> FrameTimePosterior:

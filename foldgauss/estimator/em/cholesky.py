@@ -9,8 +9,6 @@ from jaxtyping import Array, Float
 
 from foldgauss._numerics.triangular import UNROLLED_SIZE, Matrix
 
-__all__ = ["cholesky", "inverse_lower", "log_det"]
-
 
 def cholesky(matrix: Matrix) -> Matrix:
     """L with L L' = matrix, column by column; NaN where a pivot is not positive."""

@@ -21,8 +21,6 @@ from foldgauss._numerics.triangular import UNROLLED_SIZE
 from foldgauss.envelope import AbstractEnvelope, Constant
 from foldgauss.estimator.em.cholesky import inverse_lower, log_det
 
-__all__ = ["Densities", "Parameters", "change_variable", "evaluate_densities", "to_powers"]
-
 _LOG_2PI = math.log(2 * math.pi)
 
 

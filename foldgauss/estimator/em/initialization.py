@@ -14,19 +14,8 @@ from foldgauss.estimator.em.components import Parameters
 from foldgauss.estimator.em.m_step import Model, update_components
 from foldgauss.estimator.em.statistics import Points, accumulate, make_points
 
-__all__ = [
-    "INITIALIZERS",
-    "draw_subset",
-    "initialize",
-    "params_from_gaussians",
-    "params_from_responsibilities",
-    "restrict_covariances",
-]
-
 #: The largest subset of points that an initialization uses; EM itself uses all points.
 _MAX_POINTS = 20_000
-#: Beyond this many points, NumPy's draw without replacement, a permutation of all of them, would need much memory.
-_MAX_PERMUTED = 2**20
 #: Starts of k-means, of which the best is taken: one alone ends in a poor optimum in a fifth of all draws.
 _KMEANS_STARTS = 4
 #: Curves tried for each component.
@@ -55,10 +44,8 @@ def draw_subset(num: int, rng) -> Int[np.ndarray, " m"] | None:
     """Draw the indices, out of `num`, of the points that an initialization uses; None for all."""
     if num <= _MAX_POINTS:
         return None
-    if num <= _MAX_PERMUTED:
-        return rng.choice(num, _MAX_POINTS, replace=False)
-    # Draws with replacement, twice as many as needed, hold hardly any duplicates; a uniform subset of them is kept.
-    return rng.choice(np.unique(rng.choice(num, 2 * _MAX_POINTS)), _MAX_POINTS, replace=False)
+    # Not by `rng`, which would permute all indices.
+    return np.random.default_rng(rng.randint(np.iinfo(np.int32).max)).choice(num, _MAX_POINTS, replace=False)
 
 
 def params_from_responsibilities(y, weights, responsibilities, model: Model, degree: int) -> Parameters:

@@ -28,8 +28,6 @@ from foldgauss.estimator.em.statistics import (
     sum_over_points,
 )
 
-__all__ = ["EMStatus", "Run", "State", "log_likelihood", "run_em", "select_best", "step"]
-
 #: Armijo's condition: the fraction of the predicted gain that a Newton step of the times must achieve.
 _ARMIJO = 1e-4
 #: Steps from the first inverse temperature to 1.

@@ -17,8 +17,6 @@ from foldgauss.estimator.em.cholesky import cholesky, inverse_lower, log_det
 from foldgauss.estimator.em.components import Parameters, change_variable, to_powers
 from foldgauss.estimator.em.statistics import SufficientStatistics, Times, step_times
 
-__all__ = ["Model", "newton_step", "profile_log_likelihood", "residual_scatter", "update_components"]
-
 #: Longest step: half a time_scale for time_loc, a factor exp(0.5) for time_scale.
 _MAX_STEP = 0.5
 #: Curvature is at least this fraction of a component's mass; that of a normal distribution is 1 and 2.

@@ -26,8 +26,6 @@ from foldgauss.estimator.em.statistics import (
     sum_over_points,
 )
 
-__all__ = ["count_parameters", "drop_unused", "prune_mixture"]
-
 #: Components whose removal is tried before the search stops.
 _TRIALS = 3
 

@@ -6,14 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import invalid, require
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
 from foldgauss.estimator.em.components import Parameters
 from foldgauss.fold import PolynomialFold
 from foldgauss.mixture import FoldedMixture
-
-__all__ = ["Scaling", "check_export", "check_time_resolution", "compute_scaling", "to_mixture"]
 
 #: Spacings of floating-point times up to this fraction of a spread are harmless.
 _MAX_SPACING = 0.01
@@ -72,13 +70,13 @@ def check_export(params: Parameters, scaling: Scaling, dtype, origin: float | No
         got = f"{np.dtype(dtype).name}, whose adjacent times differ by {worst:.2g} of a component's spread"
         cure = "" if origin is None else f"Pass time_origin={round(times.mean())}, from which times are then counted. "
         raise invalid("times", expected="a dtype that resolves them", got=got, cure=cure + _COARSE_CURE)
-    if (params.degree + 1) * np.abs(np.log(spread)).max() > np.log(float(np.finfo(dtype).max)):
-        got = (
-            f"spreads of time up to {spread.max():.2g} at degree {params.degree}, out of {np.dtype(dtype).name}'s range"
-        )
-        raise invalid(
-            "times", expected="units near their spread", got=got, cure="Divide the time column, or use float64."
-        )
+    require(
+        not (params.degree + 1) * np.abs(np.log(spread)).max() > np.log(float(np.finfo(dtype).max)),
+        "times",
+        expected="units near their spread",
+        got=f"spreads of time up to {spread.max():.2g} at degree {params.degree}, out of range of {np.dtype(dtype)}",
+        cure="Divide the time column, or use float64.",
+    )
 
 
 def to_mixture(params: Parameters, scaling: Scaling, envelope: AbstractEnvelope, origin: float = 0.0) -> FoldedMixture:

@@ -28,23 +28,6 @@ from foldgauss.envelope import AbstractEnvelope, Constant
 from foldgauss.estimator.chunks import DaskChunks, IterableChunks, Piece
 from foldgauss.estimator.em.components import Densities, Parameters, evaluate_densities
 
-__all__ = [
-    "PAIRS_PER_CHUNK",
-    "Blocks",
-    "Points",
-    "SufficientStatistics",
-    "Times",
-    "accumulate",
-    "enable_dtype",
-    "make_blocks",
-    "make_points",
-    "map_chunks",
-    "map_leading",
-    "step_times",
-    "sum_chunks",
-    "sum_over_points",
-]
-
 #: Densities of point and component held at once. Arrays of this many numbers stay in a core's cache.
 PAIRS_PER_CHUNK = 2**17
 #: The smallest number of rows that a program is compiled for: small batches of any size share one.

@@ -1,23 +1,16 @@
-"""Irregular playback speed from the posterior of frame times: duplicated and dropped frames; comparison of models."""
+"""Irregular playback speed from the posterior of frame times: duplicated and dropped frames."""
 
 import dataclasses
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float64, UInt8
+from jaxtyping import Bool, Float64
 
-from foldgauss._runtime.checks import check_within, invalid, is_integer
-from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles, likelihood_profiles
-from foldgauss.uncertainty.likelihood.noise import FrameNoise
-from foldgauss.uncertainty.posterior.exact import exact_posterior
-from foldgauss.uncertainty.posterior.increments import Increments
-from foldgauss.uncertainty.posterior.log_prob import rendered_log_likelihood
+from foldgauss._runtime.checks import check_within
 from foldgauss.uncertainty.posterior.result import FrameTimePosterior
 from foldgauss.video.models.frame_times import is_cut
-from foldgauss.video.models.metrics import evaluate
-from foldgauss.video.models.video_model import VideoModel
 
 #: An increment is compared with the median of those up to this many intervals before and after it.
 REACH = 4
@@ -59,7 +52,7 @@ class Irregularity:
 def increment_intervals(posterior: FrameTimePosterior, level: float = 0.95) -> IncrementIntervals:
     """Means and central intervals of all increments, each draw in units of its own median increment.
 
-    An increment between two held frames varies only through the median. Raises ValueError for a level outside (0, 1).
+    Raises ValueError for a level outside (0, 1).
     """
     check_within("level", level, "(0, 1)", "a number in (0, 1)")
     steps = np.diff(_thin_draws(posterior), axis=1)
@@ -69,9 +62,9 @@ def increment_intervals(posterior: FrameTimePosterior, level: float = 0.95) -> I
 
 
 def is_assessable(posterior: FrameTimePosterior) -> Bool[np.ndarray, " intervals"]:
-    """Intervals that `irregularities` assesses: not cuts, at least one frame free, both frames identified."""
-    free, identified = posterior.log_prob.increments.free, posterior.identified()
-    return ~find_cuts(posterior) & (free[:-1] | free[1:]) & identified[:-1] & identified[1:]
+    """Intervals that `irregularities` assesses: not cuts, both frames identified."""
+    identified = posterior.identified()
+    return ~find_cuts(posterior) & identified[:-1] & identified[1:]
 
 
 def irregularities(
@@ -80,26 +73,22 @@ def irregularities(
     dropped: float = 1.75,
     *,
     probability: float = 0.5,
-    reach: int = REACH,
 ) -> list[Irregularity]:
     """Intervals below `duplicate` or above `dropped` times the local median in at least `probability` of the draws.
 
-    The local median is that of the `reach` intervals before and after within the shot, in the same draw, so a speed
+    The local median is that of the four intervals before and after within the shot, in the same draw, so a speed
     that changes smoothly is regular. Cuts (`frame_times.is_cut`) are not reported and limit the neighborhood. Intervals
-    between two held frames and those of frames that are not identified (`FrameTimePosterior.identified`) are not
-    assessed.
+    of frames that are not identified (`FrameTimePosterior.identified`) are not assessed.
 
-    Raises ValueError for bounds that are not 0 < duplicate < 1 < dropped, a probability outside (0, 1], reach < 1.
+    Raises ValueError for bounds that are not 0 < duplicate < 1 < dropped, and a probability outside (0, 1].
 
     **Example:** `[one.frames for one in irregularities(posterior) if one.kind == "duplicated"]`.
     """
     check_within("duplicate", duplicate, "(0, 1)", "a number in (0, 1)")
     check_within("dropped", dropped, "(1, inf)", "a number > 1")
     check_within("probability", probability, "(0, 1]", "a number in (0, 1]")
-    if not is_integer(reach, 1):
-        raise invalid("reach", expected="a whole number >= 1", got=reach)
     steps, assessable, found = np.diff(_thin_draws(posterior), axis=1), is_assessable(posterior), []
-    for k, near in _neighbors(find_cuts(posterior), reach):
+    for k, near in _neighbors(find_cuts(posterior)):
         if not assessable[k]:
             continue
         size = steps[:, k] / np.median(steps[:, near], axis=1)
@@ -109,70 +98,6 @@ def irregularities(
                 summary = float(holds.mean()), float(size.mean()), float(low), float(high)
                 found.append(Irregularity((k, k + 1), kind, *summary))
     return found
-
-
-@dataclasses.dataclass(frozen=True)
-class TimesComparison:
-    """Log-likelihoods of one model's frame times for a video, in nats, under a noise common to all models.
-
-    `at_own`: at the model's own times. `at_even`: at evenly spaced times. `log_evidence`: log of the likelihood
-    averaged over the prior of all times but the first and the last, given the splats. `mean_psnr`: in dB, at its own
-    times.
-    """
-
-    name: str
-    at_own: float
-    at_even: float
-    log_evidence: float
-    mean_psnr: float
-
-
-def compare_times(
-    models: Mapping[str, VideoModel],
-    video: UInt8[np.ndarray, "num_frames height width channels"],
-    *,
-    noise: str | FrameNoise = "score",
-    concentration: float = 1.0,
-) -> list[TimesComparison]:
-    """Compare models of `video`, for instance fitted with learned and with evenly spaced times; one row per model.
-
-    All rows share one noise: a `FrameNoise`, or the named estimate for the model with the smallest residuals. The
-    normalizing constant, equal in all rows, is omitted. The splats are held and were fitted to the same frames:
-    differences measure how well each model's splats and times agree with the video, and are not Bayes factors of the
-    two ways to fit.
-
-    Raises ValueError for no models, models of another number of frames, and whatever `likelihood_profiles` raises.
-    """
-    if not models:
-        raise invalid("models", expected="at least one, by name", got="none")
-    for name, model in models.items():
-        if model.num_frames != len(video):
-            raise invalid(f"models[{name!r}]", expected=f"{len(video)} frames, as the video", got=model.num_frames)
-    profiles = {name: likelihood_profiles(model, video, noise=noise) for name, model in models.items()}
-    if not isinstance(noise, FrameNoise):
-        common = min(profiles.values(), key=lambda one: float(np.mean(one.noise.scale**2))).noise
-        for name, model in models.items():
-            if profiles[name].noise is not common:
-                profiles[name] = likelihood_profiles(model, video, noise=common)
-    return [_compare(name, model, video, profiles[name], concentration) for name, model in models.items()]
-
-
-def _compare(
-    name: str, model: VideoModel, video, profiles: LikelihoodProfiles, concentration: float
-) -> TimesComparison:
-    num_frames = len(video)
-    even = np.linspace(0.0, 1.0, num_frames)
-    # Profiles are 0 at their modes: the log-likelihood there is rendered.
-    zero = float(rendered_log_likelihood(model, video, profiles.curves.modes(), profiles.noise).sum())
-    found = exact_posterior(profiles.curves, Increments(even, None, concentration))
-    own = np.asarray(model.frame_times.times(), np.float64)
-    return TimesComparison(
-        name,
-        float(rendered_log_likelihood(model, video, own, profiles.noise).sum()),
-        float(rendered_log_likelihood(model, video, even, profiles.noise).sum()),
-        found.log_evidence + zero,
-        evaluate(model, np.asarray(video)).mean_psnr,
-    )
 
 
 def _thin_draws(posterior: FrameTimePosterior) -> Float64[np.ndarray, "draws num_frames"]:
@@ -199,11 +124,11 @@ def even_times(posterior: FrameTimePosterior) -> tuple[Float64[np.ndarray, " num
     return even, float(np.diff(mean)[~cut].mean())
 
 
-def _neighbors(cut: np.ndarray, reach: int) -> Iterator[tuple[int, list[int]]]:
+def _neighbors(cut: np.ndarray) -> Iterator[tuple[int, list[int]]]:
     """Each interval that is not a cut, with those near it in the same shot, if there are at least two."""
     shot = np.cumsum(cut)
     for k in np.flatnonzero(~cut):
-        around = range(max(k - reach, 0), min(k + reach + 1, len(cut)))
+        around = range(max(k - REACH, 0), min(k + REACH + 1, len(cut)))
         near = [j for j in around if j != k and not cut[j] and shot[j] == shot[k]]
         if len(near) >= 2:
             yield int(k), near

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss._runtime.optional_imports import import_optional
 from foldgauss.uncertainty.diagnostics.irregularities import (
     Irregularity,
@@ -22,8 +22,6 @@ from foldgauss.uncertainty.diagnostics.irregularities import (
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles
 from foldgauss.uncertainty.likelihood.noise import LAST_CORRELATION
 from foldgauss.uncertainty.posterior.result import FrameTimePosterior
-
-__all__ = ["plot_correlation", "plot_increments", "plot_times"]
 
 _BLUE = "#1f4e79"
 _RED = "#d1242f"
@@ -52,8 +50,12 @@ def plot_times(
     **Raises:** ImportError that names the extra if matplotlib is missing; ValueError for `fitted` of another length.
     """
     num_frames = posterior.times.shape[-1]
-    if fitted is not None and np.shape(fitted) != (num_frames,):
-        raise invalid("fitted", expected=f"{num_frames} times", got=f"shape {np.shape(fitted)}")
+    require(
+        fitted is None or np.shape(fitted) == (num_frames,),
+        "fitted",
+        expected=f"{num_frames} times",
+        got=f"shape {np.shape(fitted)}",
+    )
     if axes is None:
         pyplot = import_optional("matplotlib.pyplot", "plot")
         axes = pyplot.subplots(2, 1, sharex=True, layout="constrained", figsize=(9, 6))[1]

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.uncertainty.diagnostics.irregularities import Irregularity, even_times, irregularities, is_assessable
 from foldgauss.uncertainty.posterior.result import FrameTimePosterior
 
@@ -16,13 +16,12 @@ def frame_table(
     """Columns with one entry per frame: `frame`, `fitted` (NaN if not given), `mean`, `std`, `low_50`, `high_50`,
     `low_90`, `high_90`, `exact_mean`, `exact_std`, `r_hat`, `tau`, `ess`, `identified`.
 
-    **Units:** times of the model, [0, 1]; `tau` in steps. Held frames have a spread of 0, NaN for `r_hat`, `tau` and
-    `ess`, and count as identified. Raises ValueError for `fitted` of another length.
+    **Units:** times of the model, [0, 1]; `tau` in steps. The first and the last frame have a spread of 0, NaN for
+    `r_hat`, `tau` and `ess`, and count as identified. Raises ValueError for `fitted` of another length.
     """
     num_frames = posterior.times.shape[-1]
     fitted = np.full(num_frames, np.nan) if fitted is None else np.asarray(fitted, np.float64)
-    if fitted.shape != (num_frames,):
-        raise invalid("fitted", expected=f"{num_frames} times", got=f"shape {fitted.shape}")
+    require(fitted.shape == (num_frames,), "fitted", expected=f"{num_frames} times", got=f"shape {fitted.shape}")
     inner, outer = posterior.interval(0.5), posterior.interval(0.9)
     columns = {
         "frame": np.arange(num_frames),
@@ -109,9 +108,7 @@ def _playback_speed(posterior: FrameTimePosterior, flagged: Sequence[Irregularit
     others = (
         ""
         if assessable.all()
-        else (
-            f" {int((~assessable).sum())} others were not assessed: cuts, and frames that are held or not identified."
-        )
+        else (f" {int((~assessable).sum())} others were not assessed: cuts, and frames that are not identified.")
     )
     caution = (
         "A gap or a duplicate among the frames that the model was fitted to may be absorbed by its frame times and "
@@ -153,17 +150,14 @@ def _comparison(posterior: FrameTimePosterior, fitted) -> str:
 
 
 def _conditions(posterior: FrameTimePosterior) -> str:
-    increments = posterior.log_prob.increments
     held = "durations, colors" if posterior.profiles.level == "splats" else "durations; their colors are integrated out"
     lines = [
         f"- The splats, held as fitted: positions, folds, {held}. A warp of time that the folds, or the maps of an "
         "unsteady camera, have absorbed is not visible: intervals are those of times given these.",
         f"- The noise: {posterior.profiles.noise.describe()}.",
-        f"- The prior: Dirichlet on the increments, of concentration {increments.concentration:g}.",
+        f"- The prior: Dirichlet on the increments, of concentration {posterior.log_prob.concentration:g}.",
+        "- The first frame at 0 and the last at 1.",
     ]
-    held = np.flatnonzero(~increments.free)[1:-1]
-    text = "- The first frame at 0 and the last at 1"
-    lines.append(f"{text}, and the times of {_listed(held)}, held." if len(held) else f"{text}.")
     return "\n".join(lines)
 
 

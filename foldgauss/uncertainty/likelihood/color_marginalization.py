@@ -14,7 +14,7 @@ import scipy.linalg
 from jaxtyping import Float64, UInt8
 
 from foldgauss._numerics.random_streams import Stream, make_generator
-from foldgauss._runtime.checks import invalid, is_integer, is_within
+from foldgauss._runtime.checks import is_integer, is_within, require
 from foldgauss.uncertainty.likelihood.color_normal_equations import ColorEquations, FrameAt, solve_conjugate_gradient
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles
 from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves
@@ -102,22 +102,29 @@ def marginalize_colors(
 
 
 def _check(base: LikelihoodProfiles, num_frames: int, prior_scale: float, most_dense: int, probes: int) -> None:
-    if not isinstance(base, LikelihoodProfiles):
-        raise invalid(
-            "base",
-            expected="LikelihoodProfiles",
-            got=type(base).__name__,
-            cure="Call likelihood_profiles(model, video).",
-        )
-    if base.curves.num_frames != num_frames:
-        got, cure = f"{base.curves.num_frames} frames", "Call likelihood_profiles with this video."
-        raise invalid("base", expected=f"profiles of {num_frames} frames, as the video has", got=got, cure=cure)
-    if not is_within(prior_scale, "(0, inf)"):
-        cure = "Colors are in about [0, 1]."
-        raise invalid("prior_scale", expected="a number > 0", got=prior_scale, cure=cure)
+    require(
+        isinstance(base, LikelihoodProfiles),
+        "base",
+        expected="LikelihoodProfiles",
+        got=type(base).__name__,
+        cure="Call likelihood_profiles(model, video).",
+    )
+    require(
+        base.curves.num_frames == num_frames,
+        "base",
+        expected=f"profiles of {num_frames} frames, as the video has",
+        got=f"{base.curves.num_frames} frames",
+        cure="Call likelihood_profiles with this video.",
+    )
+    require(
+        is_within(prior_scale, "(0, inf)"),
+        "prior_scale",
+        expected="a number > 0",
+        got=prior_scale,
+        cure="Colors are in about [0, 1].",
+    )
     for name, value, least in (("most_dense", most_dense, 0), ("probes", probes, 1)):
-        if not is_integer(value, least):
-            raise invalid(name, expected=f"a whole number >= {least}", got=value)
+        require(is_integer(value, least), name, expected=f"a whole number >= {least}", got=value)
 
 
 def _neighbor_times(times: Float64[np.ndarray, " num_frames"], k: int) -> tuple[float, float]:

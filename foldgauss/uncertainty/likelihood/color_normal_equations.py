@@ -164,14 +164,8 @@ def solve_conjugate_gradient(
 
 
 def _partition(places: Float64[np.ndarray, "num 2"], most: int) -> list[np.ndarray]:
-    """Blocks of at most `most` Gaussians, by recursive bisection along the longer side."""
-    parts, left = [], [np.arange(len(places))]
-    while left:
-        part = left.pop()
-        if len(part) <= most:
-            parts.append(part)
-            continue
-        side = np.argmax(np.ptp(places[part], axis=0))
-        part = part[np.argsort(places[part, side], kind="stable")]
-        left += [part[: len(part) // 2], part[len(part) // 2 :]]
-    return parts
+    """Blocks of at most `most` neighboring Gaussians: columns of about equally many, divided along y."""
+    num_blocks = -(-len(places) // most)
+    columns = max(round(num_blocks**0.5), 1)
+    column = np.argsort(np.argsort(places[:, 0], kind="stable")) * columns // len(places)
+    return np.array_split(np.lexsort((places[:, 1], column)), num_blocks)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from foldgauss._runtime.checks import invalid, is_integer
+from foldgauss._runtime.checks import invalid, require
 from foldgauss.uncertainty.likelihood.noise import (
     NOISES,
     FrameNoise,
@@ -61,13 +61,15 @@ AWAY = 0.5
 class LikelihoodProfiles:
     """Log-likelihood curves of all frames as functions of their times, and the noise that they assume.
 
-    `residual_correlation` (lags,): correlation of residuals by distance in pixels, averaged over frames.
-    `num_rendered`: number of rendered images. `level`: "splats" if all splats are held, "colors" if their colors are
-    integrated out. `notes`: texts of the warnings.
+    `log_likelihood` (num_frames,): of each frame at the mode of its curve, where the curve is 0, in nats, without the
+    normalizing constant of the noise. `residual_correlation` (lags,): correlation of residuals by distance in pixels,
+    averaged over frames. `num_rendered`: number of rendered images. `level`: "splats" if all splats are held, "colors"
+    if their colors are integrated out. `notes`: texts of the warnings.
     """
 
     curves: ProfileCurves
     noise: FrameNoise
+    log_likelihood: Float64[np.ndarray, " num_frames"]
     residual_correlation: Float64[np.ndarray, " lags"]
     num_rendered: int
     level: str = "splats"
@@ -79,32 +81,35 @@ def likelihood_profiles(
     video: UInt8[np.ndarray, "num_frames height width channels"],
     *,
     noise: str | FrameNoise = "score",
-    reach: int | None = None,
     on_render: Callable[[int, int], None] | None = None,
 ) -> LikelihoodProfiles:
     """Compute the likelihood profiles of all frames by rendering the model at adaptively chosen times.
 
     `video` need not be the clip that the model was fitted to, nor have as many frames: each frame is compared at all
-    times, or only within `reach` frame times of its own (default for more than 400 frames: 100, widened as needed). But
-    its first frame is at time 0 of the model and its last at 1; a warning is given if that does not fit, if the
-    model may be of another clip of the same scene, and if Gaussians follow shared paths, which may absorb the times.
+    times, of more than 400 frames first within 100 frame times of its own, widened as needed. But its first frame is at
+    time 0 of the model and its last at 1; a warning is given if that does not fit, if the model may be of another clip
+    of the same scene, and if Gaussians follow shared paths, which may absorb the times.
     `noise`: "score" (see `score_fraction`), "independent", or a `FrameNoise`.
     `on_render` is called with the numbers of images rendered and planned so far.
 
-    Raises ValueError for a video of another size, one that the model does not explain, one that does not identify its
-    times, and best times at the ends of a given `reach`.
+    Raises ValueError for a video of another size, one that the model does not explain, and one that does not identify
+    its times.
     """
     residuals = Residuals(model, video)
     num_frames = len(residuals.frames)
-    if num_frames < 3:
-        cure = "The first frame is at time 0 and the last at 1: others are needed."
-        raise invalid("video", expected="at least 3 frames", got=num_frames, cure=cure)
+    require(
+        num_frames >= 3,
+        "video",
+        expected="at least 3 frames",
+        got=num_frames,
+        cure="The first frame is at time 0 and the last at 1: others are needed.",
+    )
     if isinstance(noise, FrameNoise):
         noise = noise.for_frames(num_frames)
     elif not isinstance(noise, str) or noise not in NOISES:
         raise invalid("noise", expected=f"one of {', '.join(NOISES)}, or a FrameNoise", got=noise)
     _check_changes(residuals.frames)
-    builder = ProfileBuilder(residuals, reach, on_render)
+    builder = ProfileBuilder(residuals, on_render)
     builder.compare_coarse()
     notes = _check_paths(model) + _check_explained(residuals.frames, builder)
     profiles = builder.build(noise)
@@ -118,17 +123,12 @@ def likelihood_profiles(
 class ProfileBuilder:
     """Squared errors of all frames at the times compared so far, refined where the profiles require it."""
 
-    def __init__(
-        self, residuals: Residuals, reach: int | None = None, on_render: Callable[[int, int], None] | None = None
-    ):
+    def __init__(self, residuals: Residuals, on_render: Callable[[int, int], None] | None = None):
         self.residuals, self.on_render, self.num_rendered, self.num_planned = residuals, on_render, 0, 0
         num_frames = len(residuals.frames)
         self.model_times = np.asarray(residuals.model.frame_times.times(), np.float64)
         self.finest = FINEST / COARSE * float(np.median(np.diff(self.model_times)))
-        self.own_reach = reach is None
-        self.reach = (None if num_frames <= MOST_EVERYWHERE else REACH) if reach is None else reach
-        if self.reach is not None and not is_integer(self.reach, 1):
-            raise invalid("reach", expected="a whole number >= 1, or None", got=reach)
+        self.reach = num_frames if num_frames <= MOST_EVERYWHERE else REACH
         self.sketches = Sketches(3 * residuals.model.size[0] * residuals.model.size[1])
         self.samples = [_Samples() for _ in range(num_frames)]
 
@@ -148,29 +148,21 @@ class ProfileBuilder:
             self.reach *= 2
 
     def _compare(self, times: np.ndarray) -> bool:
-        """False if the best time of a frame is at the end of a reach that may be widened."""
+        """False if the best time of a frame is at the end of its reach."""
         known, num_frames = self.model_times, len(self.residuals.frames)
         position = np.interp(times, known, np.arange(len(known))) * ((num_frames - 1) / (len(known) - 1))
         found = [([], [], []) for _ in range(num_frames)]
         for n, (t, image) in enumerate(self._render(times)):
-            near = np.arange(num_frames)
-            if self.reach is not None:
-                near = near[np.abs(near - position[n]) <= self.reach]
+            near = np.flatnonzero(np.abs(np.arange(num_frames) - position[n]) <= self.reach)
             sketch = self.sketches.sketch(image)
             for k, error in zip(near, self.residuals.squared_errors(image, near), strict=True):
                 for each, value in zip(found[k], (t, error, sketch), strict=True):
                     each.append(value)
-        edge = [k for k, (times_of_frame, *_) in enumerate(found) if len(times_of_frame) < 3]  # too few for a curve
-        if not edge:
-            for each, columns in zip(self.samples, found, strict=True):
-                each.set_coarse(*map(np.array, columns))
-            if self.reach is None:
-                return True
-            edge = [k for k, each in enumerate(self.samples) if each.best_at_end(times)]
-        if edge and not self.own_reach:
-            got = f"the best times of frames {edge[:5]} at the ends of {self.reach}"
-            raise invalid("reach", expected="enough for every frame", got=got, cure="Give more, or None.")
-        return not edge
+        if min(len(times_of_frame) for times_of_frame, *_ in found) < 3:  # too few for a curve
+            return False
+        for each, columns in zip(self.samples, found, strict=True):
+            each.set_coarse(*map(np.array, columns))
+        return not any(each.best_at_end(times) for each in self.samples)
 
     def build(self, kind: str | FrameNoise) -> LikelihoodProfiles:
         """After `compare_coarse`: estimate the noise and refine the profiles accordingly."""
@@ -179,7 +171,8 @@ class ProfileBuilder:
         if not isinstance(kind, FrameNoise):  # again, with the residuals at the refined modes
             noise, correlation = self.estimate_noise(kind)
             self.refine(noise)
-        return LikelihoodProfiles(self.curves(noise), noise, correlation, self.num_rendered)
+        best = -noise.weight * np.array([each.errors.min() for each in self.samples])
+        return LikelihoodProfiles(self.curves(noise), noise, best, correlation, self.num_rendered)
 
     def refine(self, noise: FrameNoise) -> None:
         """Insert nodes into the profiles of all frames but the first and the last, whose times are fixed."""
@@ -276,17 +269,24 @@ class _Samples:
 
 def _check_changes(frames: np.ndarray) -> None:
     first = frames[0]
-    if all(np.array_equal(first, frame) for frame in frames[1:]):
-        cure = "Times cannot be inferred where nothing changes."
-        raise invalid("video", expected="frames that differ", got=f"{len(frames)} equal frames", cure=cure)
+    require(
+        not all(np.array_equal(first, frame) for frame in frames[1:]),
+        "video",
+        expected="frames that differ",
+        got=f"{len(frames)} equal frames",
+        cure="Times cannot be inferred where nothing changes.",
+    )
 
 
 def check_explained(left: float, variance: float) -> None:
     """Raise ValueError unless the model's squared error `left` is small enough beside the frames' variance."""
-    if left > (1 - EXPLAINED) * variance:
-        got = f"a model that explains {100 * (1 - left / variance) if variance else 0:.0f}% of their variance"
-        expected = f"frames of which the model explains {100 * EXPLAINED:.0f}%"
-        raise invalid("video", expected=expected, got=got, cure=_RIGHT_MODEL)
+    require(
+        not left > (1 - EXPLAINED) * variance,
+        "video",
+        expected=f"frames of which the model explains {100 * EXPLAINED:.0f}%",
+        got=f"a model that explains {(100 * (1 - left / variance) if variance else 0):.0f}% of their variance",
+        cure=_RIGHT_MODEL,
+    )
 
 
 def _check_explained(frames: np.ndarray, builder: ProfileBuilder) -> list[str]:
@@ -307,10 +307,13 @@ def _check_explained(frames: np.ndarray, builder: ProfileBuilder) -> list[str]:
 
 def _check_identified(curves: ProfileCurves) -> None:
     rises = np.nanmax(curves.values, axis=1) - np.nanmin(curves.values, axis=1)
-    if (rises[1:-1] < FLAT).all():
-        got = f"log-likelihoods that change by at most {rises[1:-1].max():.2g} over all times"
-        cure = "The times are not identified: nothing changes, or the noise is too great (5 gray levels: 5 / 255)."
-        raise invalid("video", expected="frames that identify their times", got=got, cure=cure)
+    require(
+        not (rises[1:-1] < FLAT).all(),
+        "video",
+        expected="frames that identify their times",
+        got=f"log-likelihoods that change by at most {rises[1:-1].max():.2g} over all times",
+        cure="The times are not identified: nothing changes, or the noise is too great (5 gray levels: 5 / 255).",
+    )
 
 
 def _check_paths(model: VideoModel) -> list[str]:

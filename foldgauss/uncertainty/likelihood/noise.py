@@ -11,7 +11,7 @@ import scipy.fft
 import scipy.ndimage
 from jaxtyping import Float, Float64
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 
 #: Names that `likelihood_profiles` accepts for `noise`, besides a FrameNoise.
 NOISES = ("score", "independent")
@@ -44,16 +44,24 @@ class FrameNoise:
         }
         for name, (limit, expected, cure) in limits.items():
             values = np.asarray(getattr(self, name), np.float64)
-            if not (np.isfinite(values).all() and (values > 0).all() and (values <= limit).all()):
-                raise invalid(name, expected=expected, got=values.tolist(), cure=cure)
+            require(
+                np.isfinite(values).all() and (values > 0).all() and (values <= limit).all(),
+                name,
+                expected=expected,
+                got=values.tolist(),
+                cure=cure,
+            )
             object.__setattr__(self, name, values)
 
     def for_frames(self, num_frames: int) -> "FrameNoise":
         """Broadcast to one entry per frame."""
         for name in ("scale", "fraction"):
-            if getattr(self, name).shape not in ((), (1,), (num_frames,)):
-                got = f"shape {getattr(self, name).shape}"
-                raise invalid(f"noise.{name}", expected=f"a number or {num_frames} of them", got=got)
+            require(
+                getattr(self, name).shape in ((), (1,), (num_frames,)),
+                f"noise.{name}",
+                expected=f"a number or {num_frames} of them",
+                got=f"shape {getattr(self, name).shape}",
+            )
         return FrameNoise(*(np.broadcast_to(value, num_frames).copy() for value in (self.scale, self.fraction)))
 
     def describe(self) -> str:
@@ -82,8 +90,7 @@ def covariances(residual: Float[np.ndarray, "channels height width"], most: int 
     """
     height, width = residual.shape[-2:]
     most = max(1, min(height, width) // 3) if most is None else most
-    if not 0 < most < min(height, width):
-        raise invalid("most", expected=f"lags from 1 to {min(height, width) - 1}", got=most)
+    require(0 < most < min(height, width), "most", expected=f"lags from 1 to {min(height, width) - 1}", got=most)
     lags = np.abs(np.arange(-most, most + 1))
     return _lagged_products(residual, most) / ((height - lags)[:, None] * (width - lags)[None, :])
 

@@ -7,7 +7,7 @@ import numba as nb
 import numpy as np
 from jaxtyping import Float, Float64, Int
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import invalid, require
 from foldgauss._runtime.kernels import inline, kernel
 
 _d = nb.float64
@@ -42,13 +42,21 @@ class ProfileCurves:
         Raises ValueError for other shapes, times that do not increase, and log-likelihoods that are not finite.
         """
         count = np.array([len(each) for each in nodes])
-        if len(nodes) != len(values) or not len(nodes) or (count < 3).any():
-            raise invalid("nodes", expected="for each frame at least three, and as many values", got=count.tolist())
+        require(
+            len(nodes) == len(values) and len(nodes) and (count >= 3).all(),
+            "nodes",
+            expected="for each frame at least three, and as many values",
+            got=count.tolist(),
+        )
         table = np.full((3, len(count), count.max()), np.nan)
         for k, (times, height) in enumerate(zip(nodes, values, strict=True)):
             times, height = np.asarray(times, np.float64), np.asarray(height, np.float64)
-            if times.shape != height.shape or times.ndim != 1 or not (np.diff(times) > 0).all():
-                raise invalid(f"nodes[{k}]", expected=f"{height.size} increasing times", got=f"shape {times.shape}")
+            require(
+                times.shape == height.shape and times.ndim == 1 and (np.diff(times) > 0).all(),
+                f"nodes[{k}]",
+                expected=f"{height.size} increasing times",
+                got=f"shape {times.shape}",
+            )
             if not np.isfinite(height).all():
                 raise invalid(f"values[{k}]", expected="finite log-likelihoods", got=height[~np.isfinite(height)][0])
             table[:, k, : count[k]] = times, height, np.gradient(height, times, edge_order=2)
@@ -61,8 +69,12 @@ class ProfileCurves:
     def __call__(self, times: Float[np.ndarray, "*batch num_frames"]) -> Float64[np.ndarray, "*batch num_frames"]:
         """Log-likelihoods of the frames at their `times`."""
         times = np.asarray(times, np.float64)
-        if times.shape[-1:] != (self.num_frames,):
-            raise invalid("times", expected=f"shape (..., {self.num_frames})", got=f"shape {times.shape}")
+        require(
+            times.shape[-1:] == (self.num_frames,),
+            "times",
+            expected=f"shape (..., {self.num_frames})",
+            got=f"shape {times.shape}",
+        )
         flat = np.ascontiguousarray(times.reshape(-1, self.num_frames))
         found = np.empty_like(flat)
         _look_up(flat, self.nodes, self.values, self.slopes, self.count, found)

@@ -1,7 +1,7 @@
 r"""Uncertainty of frame times by refitting splats and times together.
 
-The posterior given likelihood profiles takes the splats as known. Here they are refitted together with the times: to
-resampled frames (method="pixels"), or once more to the same frames (method="order").
+The posterior given likelihood profiles takes the splats as known. Here they are refitted together with the times, to
+resampled frames.
 
 Times are not identified absolutely: for any increasing g, times g(t_k) and splats whose m_t, sigma_t and folds follow g
 show the same frames. Only $t_0 = 0$ and $t_{n-1} = 1$ are fixed, so absolute times spread the more the longer the fit;
@@ -18,14 +18,13 @@ import scipy.stats
 from jaxtyping import Float, Float64, UInt8
 
 from foldgauss._numerics.random_streams import Stream, make_generator, seed_sequence
-from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_integer
+from foldgauss._runtime.checks import check_within, is_integer, require
 from foldgauss.uncertainty.likelihood.likelihood_profiles import check_explained
 from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.video.fitting.config import FitConfig, planned_steps
 from foldgauss.video.fitting.loop import fit_steps, start_from, to_model
 from foldgauss.video.models.video_model import VideoModel
 
-METHODS = ("pixels", "order")
 #: A refit repeats the schedule from this fraction on, with its last learning rates and loss.
 START_AT = 0.7
 #: The least `LearningRates.cooldown` of refits: the spread is that of the estimate, not of its last steps.
@@ -85,9 +84,12 @@ class RefitTimes:
         `std` (num_frames,), or one number, in the model's time: for instance the posterior's given the splats.
         """
         std = np.asarray(std, np.float64)
-        if std.shape not in ((), self.own.shape) or not (np.broadcast_to(std, self.own.shape)[1:-1] > 0).all():
-            expected = f"values > 0, one or {len(self.own)}"
-            raise invalid("std", expected=expected, got=f"shape {std.shape}" if std.ndim else std)
+        require(
+            std.shape in ((), self.own.shape) and (np.broadcast_to(std, self.own.shape)[1:-1] > 0).all(),
+            "std",
+            expected=f"values > 0, one or {len(self.own)}",
+            got=f"shape {std.shape}" if std.ndim else std,
+        )
         inner = np.broadcast_to(std, self.own.shape)[1:-1]
         return float(np.sqrt(np.mean((self.std[1:-1] / inner) ** 2)))
 
@@ -98,7 +100,6 @@ def refit_frame_times(
     config: FitConfig,
     *,
     replicates: int = 20,
-    method: str = "pixels",
     block: int = 16,
     seed: int = 0,
     steps: int | None = None,
@@ -106,10 +107,8 @@ def refit_frame_times(
 ) -> RefitTimes:
     """Frame times of `replicates` refits, which continue from the model with the learning rates of the schedule's end.
 
-    * method="pixels": residual bootstrap; to the model's images plus resampled residuals, see `resample_frames`. The
-      times spread around the model's own, which are the truth of the bootstrap.
-    * method="order": to the unchanged frames, in another order. This is the spread of the optimizer, which the other
-      method includes.
+    A residual bootstrap: each refit is to the model's images plus resampled residuals, see `resample_frames`. The times
+    spread around the model's own, which are the truth of the bootstrap. The optimizer's own spread is included.
 
     `video`: the clip that `model` was fitted to with `config`. `steps` of each refit: by default those of the end of
     the schedule of `config` (from `START_AT` on); `config.minutes` and a compact model that it asks for are ignored.
@@ -119,20 +118,22 @@ def refit_frame_times(
     Raises ValueError for a video that is not the model's, a config that could not have fitted it, and settings out of
     range. Example: `refit_frame_times(model, frames, config, replicates=8).ratio_to(std_given_the_splats)`.
     """
-    check_one_of("method", method, METHODS)
     for name, value, least in (("replicates", replicates, 2), ("seed", seed, 0)):
-        if not is_integer(value, least):
-            raise invalid(name, expected=f"a whole number >= {least}", got=repr(value))
+        require(is_integer(value, least), name, expected=f"a whole number >= {least}", got=repr(value))
     video = np.asarray(video)
-    residuals = _check_video(model, video, method)
-    if not is_integer(block, 1) or block > min(model.size):
-        raise invalid("block", expected=f"a whole number from 1 to {min(model.size)}", got=repr(block))
+    residuals = _check_video(model, video)
+    require(
+        is_integer(block, 1) and block <= min(model.size),
+        "block",
+        expected=f"a whole number from 1 to {min(model.size)}",
+        got=repr(block),
+    )
     config = _fix_steps(config, len(video), steps)
     times = []
     for number in range(replicates):
         own = dataclasses.replace(config, seed=int(seed_sequence(Stream.REFIT, number, seed=seed).generate_state(1)[0]))
         rng = make_generator(Stream.RESAMPLED_FRAME, number, seed=seed)
-        frames = resample_frames(residuals, block, rng) if method == "pixels" else video
+        frames = resample_frames(residuals, block, rng)
         *_, (state, _) = fit_steps(frames, own, start_from(model, own, own.steps, START_AT))  # steps share one state
         refitted = to_model(state, own, model.size, model.fps)
         times.append(np.asarray(refitted.frame_times.times(), np.float64))
@@ -141,19 +142,28 @@ def refit_frame_times(
     return RefitTimes(np.stack(times), np.asarray(model.frame_times.times(), np.float64))
 
 
-def _check_video(model: VideoModel, video: np.ndarray, method: str) -> Residuals:
+def _check_video(model: VideoModel, video: np.ndarray) -> Residuals:
     residuals = Residuals(model, video)
-    if len(video) != model.num_frames:
-        expected = f"the {model.num_frames} frames that the model was fitted to"
-        raise invalid("video", expected=expected, got=f"{len(video)} frames")
-    if len(video) < 3:
-        cure = "The first frame is at time 0 and the last at 1; others are needed."
-        raise invalid("video", expected="at least 3 frames", got=len(video), cure=cure)
-    if method == "pixels" and video.shape[3] == 4:
-        cure = 'Fit it without alpha, or use method="order".'
-        raise invalid(
-            "video", expected="frames without alpha for pixels", got=f"{video.dtype} {video.shape}", cure=cure
-        )
+    require(
+        len(video) == model.num_frames,
+        "video",
+        expected=f"the {model.num_frames} frames that the model was fitted to",
+        got=f"{len(video)} frames",
+    )
+    require(
+        len(video) >= 3,
+        "video",
+        expected="at least 3 frames",
+        got=len(video),
+        cure="The first frame is at time 0 and the last at 1; others are needed.",
+    )
+    require(
+        video.shape[3] != 4,
+        "video",
+        expected="frames without alpha",
+        got=f"{video.dtype} {video.shape}",
+        cure="Fit it without alpha.",
+    )
     images = residuals.render_at(np.asarray(model.frame_times.times()))
     left = sum(float(np.square(residuals.residual(k, each), dtype=np.float64).sum()) for k, each in enumerate(images))
     variation = sum(float(frame.var(axis=(0, 1)).sum()) for frame in residuals.frames) * math.prod(model.size) / 255**2
@@ -163,14 +173,21 @@ def _check_video(model: VideoModel, video: np.ndarray, method: str) -> Residuals
 
 def _fix_steps(config: FitConfig, num_frames: int, steps: int | None) -> FitConfig:
     """The config with the fixed number of steps of a refit."""
-    if not config.learns_frame_times:
-        raise invalid(
-            "config.rates.frame_times", expected="a number > 0", got=0, cure="Fixed frame times have no spread."
-        )
+    require(
+        config.learns_frame_times,
+        "config.rates.frame_times",
+        expected="a number > 0",
+        got=0,
+        cure="Fixed frame times have no spread.",
+    )
     if steps is None:
-        if config.steps is None and config.minutes is not None:
-            cure = "A fit that ends by the clock cannot be repeated."
-            raise invalid("steps", expected="a number for a config with minutes alone", got=None, cure=cure)
+        require(
+            config.steps is not None or config.minutes is None,
+            "steps",
+            expected="a number for a config with minutes alone",
+            got=None,
+            cure="A fit that ends by the clock cannot be repeated.",
+        )
         planned = planned_steps(dataclasses.replace(config, minutes=None), num_frames)
         steps = max(1, round((1 - START_AT) * planned))
     rates = dataclasses.replace(config.rates, cooldown=max(config.rates.cooldown, COOLDOWN_FRACTION))

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numba as nb
 import numpy as np
+import scipy.sparse
 from jaxtyping import Float32, Float64, UInt8
 
 from foldgauss._numerics.random_streams import Stream, make_generator
@@ -133,19 +134,12 @@ class Sketches:
 
     def __init__(self, num_values: int):
         rng = make_generator(Stream.SKETCH)
-        self._bins = rng.integers(0, BINS, num_values, dtype=np.int16)
-        self._signs = rng.choice(np.array([-1, 1], np.float32), num_values)
+        bins = rng.integers(0, BINS, num_values, dtype=np.int16)
+        signs = rng.choice(np.array([-1, 1], np.float32), num_values)
+        self._projection = scipy.sparse.csc_array((signs, bins, np.arange(num_values + 1)), (BINS, num_values))
 
     def sketch(self, image: Float32[np.ndarray, "3 height width"]) -> Float32[np.ndarray, " bins"]:
-        sketch = np.zeros(BINS)
-        _sum_into(sketch, image.reshape(-1), self._bins, self._signs)
-        return sketch.astype(np.float32)
-
-
-@kernel
-def _sum_into(sketch, values, bins, signs):
-    for n in range(len(values)):
-        sketch[bins[n]] += values[n] * signs[n]
+        return self._projection @ image.reshape(-1)
 
 
 @kernel

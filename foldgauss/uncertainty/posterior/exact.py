@@ -9,8 +9,7 @@ frames up to k over the prior, conditional on frame k being at t. It is constant
 
 $$ \phi_{k+1}(t) = L_{k+1}(t) \, \mathbb{E}\, \phi_k(t B), \qquad B \sim \mathrm{Beta}(\alpha k, \alpha) $$
 
-with times from the start of the run. Messages are constant in each cell of a grid; the Beta distribution is integrated
-over the cells.
+Messages are constant in each cell of a grid; the Beta distribution is integrated over the cells.
 """
 
 import dataclasses
@@ -20,9 +19,9 @@ from jaxtyping import Float64
 from scipy.special import betainc, betaincc
 
 from foldgauss._numerics.random_streams import Stream, make_generator
-from foldgauss._runtime.checks import check_within, invalid
+from foldgauss._runtime.checks import check_within, invalid, require
 from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves
-from foldgauss.uncertainty.posterior.increments import Increments
+from foldgauss.uncertainty.posterior.increments import check_prior
 
 #: Cells per frame. Half of them have equal masses and half have equal widths.
 CELLS = 200
@@ -38,34 +37,35 @@ UNDERFLOW = 740.0
 
 @dataclasses.dataclass(frozen=True)
 class ExactPosterior:
-    """Marginal posterior distributions of the free frames' times, and the evidence.
+    """Marginal posterior distributions of the frame times, and the evidence.
 
-    `edges` and `masses`: for each free frame in order, the edges of cells in time and the probability of each cell.
-    `log_evidence`: logarithm of the likelihood averaged over the prior, in nats, relative to the zero of the profiles.
+    `edges` and `masses`: for each frame but the first and the last, the edges of cells in time and the probability of
+    each cell. `log_evidence`: logarithm of the likelihood averaged over the prior, in nats, relative to the zero of the
+    profiles.
     """
 
-    increments: Increments
+    concentration: float
     edges: list[Float64[np.ndarray, " edges"]]
     masses: list[Float64[np.ndarray, " cells"]]
     log_evidence: float
     _forward: list[Float64[np.ndarray, " cells"]] = dataclasses.field(repr=False)
 
     def mean(self) -> Float64[np.ndarray, " num_frames"]:
-        return self._fill(self.increments.held, lambda edges, masses: masses @ middles(edges))
+        return self._collect(0.0, lambda edges, masses: masses @ middles(edges), 1.0)
 
     def std(self) -> Float64[np.ndarray, " num_frames"]:
-        """Standard deviations; 0 for held frames."""
+        """Standard deviations; 0 for the first and the last frame."""
 
         def spread(edges: np.ndarray, masses: np.ndarray) -> float:
             places = middles(edges)
             return np.sqrt(masses @ (places - masses @ places) ** 2)
 
-        return self._fill(np.zeros(self.increments.num_frames), spread)
+        return self._collect(0.0, spread, 0.0)
 
     def quantile(self, probability: float) -> Float64[np.ndarray, " num_frames"]:
         """Quantiles of the times of all frames."""
         check_within("probability", probability, "[0, 1]", "a number in [0, 1]")
-        return self._fill(self.increments.held, lambda edges, masses: np.interp(probability, sum_up(masses), edges))
+        return self._collect(0.0, lambda edges, masses: np.interp(probability, sum_up(masses), edges), 1.0)
 
     def interval(self, level: float = 0.95) -> tuple[Float64[np.ndarray, " num_frames"], ...]:
         """(low, high) of the central intervals that contain the probability `level`."""
@@ -74,77 +74,59 @@ class ExactPosterior:
 
     def sample(self, num: int, seed: int = 0) -> Float64[np.ndarray, "num num_frames"]:
         """Independent draws from the joint posterior, by backward sampling."""
-        rng, alpha = make_generator(Stream.POSTERIOR_DRAW, seed=seed), self.increments.concentration
-        times = np.broadcast_to(self.increments.held, (num, self.increments.num_frames)).copy()
-        which = {k: n for n, k in enumerate(np.flatnonzero(self.increments.free))}
-        for first, last in self.increments.runs:
-            start = self.increments.held[first - 1]
-            for k in range(last, first - 1, -1):
-                edges, message = self.edges[which[k]] - start, self._forward[which[k]]
-                draws = start + _draw(edges, message, k - first + 1, alpha, times[:, k + 1] - start, rng)
-                times[:, k] = np.maximum(np.minimum(draws, np.nextafter(times[:, k + 1], -np.inf)), start)
+        rng = make_generator(Stream.POSTERIOR_DRAW, seed=seed)
+        times = np.zeros((num, len(self.edges) + 2))
+        times[:, -1] = 1.0
+        for k in range(len(self.edges), 0, -1):
+            draws = _draw(self.edges[k - 1], self._forward[k - 1], k, self.concentration, times[:, k + 1], rng)
+            times[:, k] = np.maximum(np.minimum(draws, np.nextafter(times[:, k + 1], -np.inf)), 0.0)
         return times
 
-    def _fill(self, held: np.ndarray, statistic) -> np.ndarray:
-        """A statistic of the marginals of the free frames, beside the values of the held ones."""
-        found = np.array(held)
-        found[self.increments.free] = [statistic(*each) for each in zip(self.edges, self.masses, strict=True)]
-        return found
+    def _collect(self, first: float, statistic, last: float) -> Float64[np.ndarray, " num_frames"]:
+        """A statistic of the marginals, between the values of the first and the last frame."""
+        inner = [statistic(*each) for each in zip(self.edges, self.masses, strict=True)]
+        return np.array([first, *inner, last])
 
 
-def exact_posterior(curves: ProfileCurves, increments: Increments) -> ExactPosterior:
+def exact_posterior(curves: ProfileCurves, concentration: float = 1.0) -> ExactPosterior:
     r"""Compute the exact posterior given likelihood curves, to the precision of grids of 200 cells.
 
+    The first frame is at time 0 and the last at 1. The increments have a Dirichlet prior of `concentration` >= 1. Grids
+    are adapted to the marginals of the previous pass.
+
     **Source:** forward-backward smoothing, e.g. Rabiner 1989, for a chain of continuous states. **Raises:** ValueError
-    for curves of another number of frames, or NaN, and if the frames cannot be in order: of another video, or with too
-    small a noise.
+    for curves with NaN, and if the frames cannot be in order: of another video, or with too small a noise.
 
-    **Example:** `exact_posterior(curves, Increments(np.linspace(0, 1, num_frames))).interval(0.9)`.
+    **Example:** `exact_posterior(curves).interval(0.9)`.
     """
-    if curves.num_frames != increments.num_frames:
-        got = f"{curves.num_frames} profiles, {increments.num_frames} times"
-        raise invalid("curves", expected="as many as there are times", got=got)
-    edges, masses, forward = [], [], []
-    log_evidence = float(curves(increments.held)[~increments.free].sum())
-    for first, last in increments.runs:
-        ends = increments.held[first - 1], increments.held[last + 1]
-        found = _solve_run(curves, range(first, last + 1), ends, increments.concentration)
-        edges += found[0]
-        masses += found[1]
-        forward += found[2]
-        log_evidence += found[3]
-    return ExactPosterior(increments, edges, masses, log_evidence, forward)
-
-
-def _solve_run(curves: ProfileCurves, frames: range, ends: tuple[float, float], alpha: float):
-    """Grids, marginals, forward messages and the log-evidence of a run between two held times.
-
-    Grids are adapted to the marginals of the previous pass.
-    """
-    edges = _trim([likelihood_cells(curves, k, *ends)[0] for k in frames])
-    masses, *_ = _passes(curves, frames, edges, ends, alpha)
+    check_prior(curves.num_frames, concentration)
+    edges = _trim([likelihood_cells(curves, k)[0] for k in range(1, curves.num_frames - 1)])
+    masses, *_ = _passes(curves, edges, concentration)
     for _ in range(ROUNDS):
         edges = _trim([divide(*each) for each in zip(edges, masses, strict=True)])
-        masses, forward, log_evidence = _passes(curves, frames, edges, ends, alpha)
+        masses, forward, log_evidence = _passes(curves, edges, concentration)
         if max(each.max() for each in masses) < COARSE:
             break
-    return edges, masses, forward, log_evidence
+    log_evidence += float(curves[0]([0.0])[0] + curves[-1]([1.0])[0])
+    return ExactPosterior(concentration, edges, masses, log_evidence, forward)
 
 
 def likelihood_cells(
-    curves: ProfileCurves, k: int, start: float = 0.0, end: float = 1.0
+    curves: ProfileCurves, k: int
 ) -> tuple[Float64[np.ndarray, " edges"], Float64[np.ndarray, " cells"]]:
-    """Cells for the likelihood of frame k alone between two times, and their masses; likelihoods of 0 are left out."""
+    """Cells for the likelihood of frame k alone in [0, 1], and their masses; likelihoods of 0 are left out."""
     nodes, _ = curves.nodes_and_values(k)
-    low, high = max(start, nodes[0]), min(end, nodes[-1])
-    if not low < high:
-        got = f"frame {k} from {nodes[0]:.4g} to {nodes[-1]:.4g}, held between {start:.4g} and {end:.4g}"
-        raise invalid("curves", expected="curves that extend between the held frames", got=got)
+    low, high = max(0.0, nodes[0]), min(1.0, nodes[-1])
+    require(
+        low < high,
+        "curves",
+        expected="curves that extend between 0 and 1",
+        got=f"frame {k} from {nodes[0]:.4g} to {nodes[-1]:.4g}",
+    )
     edges = np.concatenate([[low], nodes[(nodes > low) & (nodes < high)], [high]])
     for _ in range(2):
         heights = curves[k](middles(edges)[:, None])[:, 0]
-        if np.isnan(heights).any():
-            raise invalid("curves", expected="log-likelihoods without NaN", got=f"NaN for frame {k}")
+        require(not np.isnan(heights).any(), "curves", expected="log-likelihoods without NaN", got=f"NaN for frame {k}")
         some = np.flatnonzero(heights > heights.max() - UNDERFLOW)
         hull = slice(max(some[0] - 1, 0), some[-1] + 2)
         edges, heights = edges[hull.start : hull.stop + 1], heights[hull]
@@ -173,15 +155,15 @@ def _trim(edges: list[np.ndarray]) -> list[np.ndarray]:
     return [np.unique(each.clip(low, high)) for each, low, high in zip(edges, lows, highs, strict=True)]
 
 
-def _passes(curves: ProfileCurves, frames: range, edges: list[np.ndarray], ends: tuple[float, float], alpha: float):
-    """Marginals, forward messages and the log-evidence."""
-    num, length = len(frames), ends[1] - ends[0]
-    heights = [curves[k](middles(grid)[:, None])[:, 0] for k, grid in zip(frames, edges, strict=True)]
-    since, until = [grid - ends[0] for grid in edges], [ends[1] - grid[::-1] for grid in edges]
+def _passes(curves: ProfileCurves, edges: list[np.ndarray], alpha: float):
+    """Marginals, forward messages and the log-evidence of the frames between the first and the last."""
+    num = len(edges)
+    heights = [curves[k + 1](middles(grid)[:, None])[:, 0] for k, grid in enumerate(edges)]
+    until = [1.0 - grid[::-1] for grid in edges]
     forward = [heights[0]]
     for n in range(1, num):
-        forward.append(heights[n] + _predict(since[n - 1], forward[-1], n, alpha, middles(since[n])))
-    log_evidence = float(_predict(since[-1], forward[-1], num, alpha, np.array([length]))[0])
+        forward.append(heights[n] + _predict(edges[n - 1], forward[-1], n, alpha, middles(edges[n])))
+    log_evidence = float(_predict(edges[-1], forward[-1], num, alpha, np.ones(1))[0])
     # A backward pass is a forward pass in reversed time.
     backward = [np.zeros(len(heights[-1]))]
     for n in range(num - 2, -1, -1):
@@ -189,8 +171,8 @@ def _passes(curves: ProfileCurves, frames: range, edges: list[np.ndarray], ends:
         backward.append(_predict(until[n + 1], message, num - 1 - n, alpha, middles(until[n])))
     masses = []
     for n, message in enumerate(backward[::-1]):
-        before, after = np.log(middles(since[n])), np.log(middles(until[n])[::-1])
-        prior = (alpha * (n + 1) - 1) * before + (alpha * (num - n) - 1) * after + np.log(np.diff(since[n]))
+        before, after = np.log(middles(edges[n])), np.log(middles(until[n])[::-1])
+        prior = (alpha * (n + 1) - 1) * before + (alpha * (num - n) - 1) * after + np.log(np.diff(edges[n]))
         logs = forward[n] + message[::-1] + prior
         if not logs.max() > -np.inf:
             raise _out_of_order()

@@ -26,7 +26,7 @@ class FrameSweep(Move):
     """
 
     def __init__(self, log_prob: FrameTimeLogProb):
-        self.log_prob, self.frames = log_prob, np.flatnonzero(log_prob.increments.free)
+        self.log_prob, self.frames = log_prob, np.arange(1, log_prob.num_free + 1)
         cells = [likelihood_cells(log_prob.curves, k) for k in self.frames]
         self._count = np.array([len(edges) for edges, _ in cells])
         self._edges, self._summed = np.zeros((2, len(cells), self._count.max()))
@@ -35,8 +35,8 @@ class FrameSweep(Move):
 
     def propose(self, model, state: State) -> tuple[State, np.ndarray]:
         """One sweep of all walkers; a walker's acceptance is the fraction of its frames that moved."""
-        times = self.log_prob.increments.times(state.coords)
-        curves, alpha = self.log_prob.curves, self.log_prob.increments.concentration
+        times = self.log_prob.times(state.coords)
+        curves, alpha = self.log_prob.curves, self.log_prob.concentration
         chance = model.random.random_sample((2, *state.coords.shape))
         moved = np.zeros(len(times))
         for parity in (0, 1):

@@ -57,8 +57,8 @@ class FrameTimePosterior:
 
     @property
     def free(self) -> np.ndarray:
-        """Indices of the frames whose times were sampled."""
-        return np.flatnonzero(self.log_prob.increments.free)
+        """Indices of the frames whose times were sampled: all but the first and the last."""
+        return np.arange(1, self.times.shape[-1] - 1)
 
     @property
     def draws(self) -> Float64[np.ndarray, "draws num_frames"]:
@@ -86,14 +86,14 @@ class FrameTimePosterior:
     def identified(self, fraction: float = 0.8) -> np.ndarray:
         """Frames whose time the likelihood determines, bool (num_frames,): spread below `fraction` of the prior's.
 
-        The prior's spread is that of a frame between its neighbors at their posterior means; held frames count as
-        identified.
+        The prior's spread is that of a frame between its neighbors at their posterior means. The first and the last
+        frame count as identified.
         """
-        mean, alpha = self.mean(), self.log_prob.increments.concentration
+        mean, alpha = self.mean(), self.log_prob.concentration
         found = np.ones(len(mean), bool)
         gap = mean[2:] - mean[:-2]
         found[1:-1] = self.std()[1:-1] < fraction * gap * np.sqrt(0.25 / (2 * alpha + 1))
-        return found | ~self.log_prob.increments.free
+        return found
 
     def to_arviz(self) -> "arviz.InferenceData | xarray.DataTree":
         """Draws for ArviZ: an InferenceData, from ArviZ 1.0 on a DataTree. Each walker is a chain.

@@ -5,18 +5,18 @@ import errno
 import hashlib
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 
 from foldgauss._numerics.random_streams import Stream, seed_sequence
-from foldgauss._runtime.checks import invalid, is_integer, short_repr
+from foldgauss._runtime.checks import invalid, is_integer, require, short_repr
 from foldgauss._runtime.optional_imports import import_optional
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles
 from foldgauss.uncertainty.posterior.exact import exact_posterior
-from foldgauss.uncertainty.posterior.log_prob import FrameTimeLogProb, frame_time_log_prob
+from foldgauss.uncertainty.posterior.log_prob import FrameTimeLogProb
 from foldgauss.uncertainty.posterior.result import FrameTimePosterior
 
 #: Convergence: at least so many autocorrelation times are kept,
@@ -42,7 +42,6 @@ SPARE_BYTES = 4 << 20
 def frame_time_posterior(
     profiles: LikelihoodProfiles,
     *,
-    frames: Sequence[int] | None = None,
     concentration: float = 1.0,
     steps: int = 20_000,
     ensembles: int = 4,
@@ -50,27 +49,29 @@ def frame_time_posterior(
     backend: str | os.PathLike | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> FrameTimePosterior:
-    """Sample the times of `frames` (default: all but the first and the last) from their posterior given the splats.
+    """Sample the times of all frames but the first and the last from their posterior given the splats.
 
     Independent emcee ensembles, started from exact draws, run until more than 50 autocorrelation times of every frame
     are kept, split rank R-hat is below 1.01 for all and the means agree with the exact ones, or for `steps` steps, of
     which every tenth is kept. A step is a `FrameSweep`.
 
-    `frames`, `concentration`: see `frame_time_log_prob`. `backend`: an HDF5 file to which emcee's `HDFBackend` writes
+    `concentration`: see `FrameTimeLogProb`. `backend`: an HDF5 file to which emcee's `HDFBackend` writes
     the draws; called again with the same arguments, sampling resumes. `on_progress` is called with the numbers of steps
     done and planned so far.
 
     **Memory:** 16 bytes per kept time (ensembles x (steps / 10) x walkers x frames).
 
     Raises ValueError for settings out of range, a backend that cannot be written or is of another run, a NaN
-    log-probability, and whatever `frame_time_log_prob` raises; ImportError without emcee.
+    log-probability, and frames out of the model's order; ImportError without emcee.
 
     Example: `frame_time_posterior(likelihood_profiles(model, frames)).interval(0.9)`.
     """
     import_optional("emcee", "uncertainty")
     import_optional("arviz", "uncertainty")
     check_settings(steps, ensembles, seed)
-    log_prob = frame_time_log_prob(profiles, frames=frames, concentration=concentration)
+    if not isinstance(profiles, LikelihoodProfiles):
+        raise invalid("profiles", expected="the result of `likelihood_profiles`", got=short_repr(profiles))
+    log_prob = FrameTimeLogProb(profiles.curves, concentration)
     return _Run(log_prob, profiles, ensembles, seed, _check_backend(backend)).sample_until_converged(
         int(steps) // THIN, on_progress
     )
@@ -78,13 +79,14 @@ def frame_time_posterior(
 
 def check_settings(steps: int, ensembles: int, seed: int) -> None:
     """ValueError for settings of `frame_time_posterior` that are out of range."""
-    if not is_integer(ensembles, 2):
-        expected = "at least 2 (a whole number), better 4: R-hat compares them"
-        raise invalid("ensembles", expected=expected, got=short_repr(ensembles))
-    if not is_integer(steps, THIN):
-        raise invalid("steps", expected=f"a whole number >= {THIN}", got=short_repr(steps))
-    if not is_integer(seed, 0):
-        raise invalid("seed", expected="a whole number >= 0", got=short_repr(seed))
+    require(
+        is_integer(ensembles, 2),
+        "ensembles",
+        expected="at least 2 (a whole number), better 4: R-hat compares them",
+        got=short_repr(ensembles),
+    )
+    require(is_integer(steps, THIN), "steps", expected=f"a whole number >= {THIN}", got=short_repr(steps))
+    require(is_integer(seed, 0), "seed", expected="a whole number >= 0", got=short_repr(seed))
 
 
 def _check_backend(backend: str | os.PathLike | None) -> Path | None:
@@ -93,8 +95,12 @@ def _check_backend(backend: str | os.PathLike | None) -> Path | None:
         return None
     import_optional("h5py", "uncertainty")
     path = Path(backend)
-    if path.is_dir() or not os.access(path.parent, os.W_OK):
-        raise invalid("backend", expected="a file in a folder that can be written to", got=str(path))
+    require(
+        not path.is_dir() and os.access(path.parent, os.W_OK),
+        "backend",
+        expected="a file in a folder that can be written to",
+        got=str(path),
+    )
     return path
 
 
@@ -105,17 +111,16 @@ class _Run:
         self, log_prob: FrameTimeLogProb, profiles: LikelihoodProfiles, ensembles: int, seed: int, backend: Path | None
     ):
         self.log_prob, self.profiles, self.seed, self.backend = log_prob, profiles, seed, backend
-        self.exact = exact_posterior(log_prob.curves, log_prob.increments)
+        self.exact = exact_posterior(log_prob.curves, log_prob.concentration)
         if backend is not None:
             _open_draws(backend, self._fingerprint(ensembles))
         self.samplers = [self._make_sampler(n) for n in range(ensembles)]
 
     def _fingerprint(self, ensembles: int) -> str:
         """A hash of everything that the draws depend on."""
-        curves, increments = self.log_prob.curves, self.log_prob.increments
-        parts = [curves.nodes, curves.values, increments.held[~increments.free], increments.free]
-        digest = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts))
-        digest.update(repr((increments.concentration, int(self.seed), int(ensembles))).encode())
+        curves = self.log_prob.curves
+        digest = hashlib.sha256(curves.nodes.tobytes() + curves.values.tobytes())
+        digest.update(repr((self.log_prob.concentration, int(self.seed), int(ensembles))).encode())
         return digest.hexdigest()
 
     def _make_sampler(self, n: int):
@@ -128,7 +133,7 @@ class _Run:
             kept = emcee.backends.HDFBackend(str(self.backend), name=f"ensemble_{n}")
         sampler = emcee.EnsembleSampler(
             WALKERS,
-            self.log_prob.increments.num_free,
+            self.log_prob.num_free,
             self.log_prob,
             vectorize=True,
             moves=FrameSweep(self.log_prob),
@@ -139,7 +144,7 @@ class _Run:
             return sampler
         seeds = seed_sequence(Stream.WALKERS, n, seed=self.seed)
         times = self.exact.sample(WALKERS, int(seeds.generate_state(1)[0]))
-        sampler.start = emcee.State(times[:, self.log_prob.increments.free])
+        sampler.start = emcee.State(times[:, 1:-1])
         sampler.start.random_state = np.random.RandomState(np.random.MT19937(seeds)).get_state()
         return sampler
 
@@ -162,7 +167,7 @@ class _Run:
         """Sample until every ensemble has `goal` kept steps."""
         if self.backend is not None:
             left = sum(goal - sampler.iteration for sampler in self.samplers)
-            _check_space(self.backend, 8 * left * WALKERS * (self.log_prob.increments.num_free + 1))
+            _check_space(self.backend, 8 * left * WALKERS * (self.log_prob.num_free + 1))
         for sampler in self.samplers:
             for state in sampler.sample(
                 sampler.start, iterations=goal - sampler.iteration, thin_by=THIN, skip_initial_state_check=True
@@ -172,8 +177,8 @@ class _Run:
 
     def result(self) -> FrameTimePosterior:
         steps = min(sampler.iteration for sampler in self.samplers)
-        times = np.stack([self.log_prob.increments.times(one.get_chain()[:steps]) for one in self.samplers])
-        free = np.flatnonzero(self.log_prob.increments.free)
+        times = np.stack([self.log_prob.times(one.get_chain()[:steps]) for one in self.samplers])
+        free = range(1, times.shape[-1] - 1)
         tau = np.array([max(_autocorrelation_time(one[..., k]) for one in times) for k in free])
         times = times[:, int(min(np.ceil(BURN_IN * tau.max()), steps // 2)) :]
         kept = times.shape[1]
@@ -192,7 +197,7 @@ class _Run:
         if missing:
             cure = "Give more steps" + (", or use the exact posterior." if "exact" in str(missing) else ".")
             message = f"Not converged after {steps * THIN:,} steps: {'; '.join(missing)}. {cure}"
-        identified = int(found.identified()[free].sum())
+        identified = int(found.identified()[1:-1].sum())
         if identified < len(free):
             message += f" {identified} of {len(free)} frame times are identified."
         return dataclasses.replace(found, converged=not missing, message=message)
@@ -228,9 +233,13 @@ def _open_draws(path: Path, fingerprint: str) -> None:
             raise
         cure = "Remove it, or choose another."
         raise invalid("backend", expected="a file of draws, or none yet", got=f"{path}, damaged", cure=cure) from error
-    if found != fingerprint:
-        cure = "Choose another file, or give the same model, video and settings."
-        raise invalid("backend", expected="the file of this very run", got=f"{path}, of another run", cure=cure)
+    require(
+        found == fingerprint,
+        "backend",
+        expected="the file of this very run",
+        got=f"{path}, of another run",
+        cure="Choose another file, or give the same model, video and settings.",
+    )
 
 
 def _check_space(path: Path, num_bytes: int) -> None:

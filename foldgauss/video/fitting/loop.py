@@ -13,7 +13,6 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from foldgauss._runtime import notebook_hooks
 from foldgauss._runtime.checks import is_integer, is_within, require
 from foldgauss.video.compression.chunks import arrange
 from foldgauss.video.compression.quantize import Quantized, dequantize
@@ -75,10 +74,6 @@ class FitResult:
         if last is not None:
             text += f"; {last.psnr:.2f} dB after {last.step:,} steps, {last.seconds:.1f} s"
         return f"{type(self).__name__}({text})"
-
-    def _repr_png_(self) -> bytes | None:
-        """A plot of the history, for notebooks."""
-        return notebook_hooks.show("history", self.history)
 
 
 def fit(
