@@ -15,6 +15,7 @@ from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import CallableEnvelope, TimeLikelihood
 from foldgauss.fold import PolynomialFold, ZeroFold
 from foldgauss.gaussian import Gaussian
+from foldgauss.mixture import FoldedMixture
 
 BEND = np.array([[0.8, -0.5, 0.3], [0.6, 0.9, -0.4]])
 TRIL = np.array([[0.3, 0.0, 0.0], [0.1, 0.2, 0.0], [-0.1, 0.05, 0.25]])
@@ -31,10 +32,7 @@ CONDITION_TIME = eqx.filter_jit(FoldedGaussian.condition_time)
 MANY = 21
 
 
-@pytest.fixture(autouse=True)
-def _x64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("x64")
 
 
 def _dist(dim=2, power=1.0, floor=0.0, **changes):
@@ -164,30 +162,6 @@ def test_time_given_space_integrates_to_one(dim, cases):
         np.testing.assert_allclose(density.time.panels.probabilities.sum(-1), 1, atol=1e-12)
 
 
-@pytest.mark.slow
-def test_time_given_space_by_plain_quadrature():
-    dist = _dist(2)
-    density = dist.time_given_space(_repeated([0.1, -0.4], [0.6, -0.5], [-0.4, 0.3]))
-    nodes, weights = np.polynomial.legendre.leggauss(20)
-    edges = np.linspace(-2.0, 2.8, 2001)
-    half = 0.5 * (edges[1] - edges[0])
-    t = (edges[:-1, None] + half * (1 + nodes)).ravel()
-    mass = half * np.tile(weights, 2000)[:, None] * np.exp(LOG_PROB(density, jnp.asarray(t)[:, None, None]))
-    np.testing.assert_allclose(mass.sum(0), 1, atol=1e-8)
-    np.testing.assert_allclose(density.mean[:, 0], t @ mass, atol=1e-8)
-    np.testing.assert_allclose(density.cdf(edges[900]), mass[: 900 * 20].sum(0), atol=1e-8)
-
-
-@pytest.mark.slow  # it compiles for long
-def test_chain_rule_both_ways():
-    dist = _dist(2)
-    x = _points(dist)
-    space, time = dist.marginal([0, 1]), dist.time_given_space(x[:, :2])
-    assert isinstance(space, TimeMixture)
-    expected = LOG_PROB(dist, x)
-    np.testing.assert_allclose(LOG_PROB(space, x[:, :2]) + LOG_PROB(time, x[:, 2:]), expected, rtol=1e-12, atol=1e-12)
-
-
 def test_nearest_times_are_refined_by_short_steps_only():
     dist, tau = _dist(2), np.array([-2.5, 0.3, 2.0])
     for away, reached in [(1e-6, 0.0), (-1e-4, 0.0), (0.1, 0.1)]:
@@ -287,6 +261,7 @@ def test_space_given_space_against_its_definition():
     alone = _dist(1, loc=LOC[1:2], scale_tril=np.linalg.norm(TRIL[1])[None, None], fold=PolynomialFold(BEND[:, 1:2]))
     expected = LOG_PROB(dist, full) - np.log(_density_of_one(alone, -0.3))
     np.testing.assert_allclose(LOG_PROB(given, x), expected, rtol=1e-11)
+    np.testing.assert_array_equal(LOG_PROB(pickle.loads(pickle.dumps(given)), x), LOG_PROB(given, x))
     draws = np.asarray(draws).reshape(-1, 3)
     error = draws.std(0) / np.sqrt(len(draws))
     assert (np.abs(draws.mean(0) - given.mean[0]) < 5 * error).all()
@@ -298,30 +273,34 @@ def test_space_given_space_against_its_definition():
 
 
 @pytest.mark.slow  # it compiles for long
-def test_conditioning_and_marginals_commute():
+@pytest.mark.parametrize(
+    ("one", "other", "rest"),
+    [
+        (lambda d, x: d.condition(1, x[:, 1:2]).marginal([0, 2]), lambda d, x: _line(d, x, [0, 1, 3]), [0, 3]),
+        (lambda d, x: d.condition(1, x[:, 1:2]).marginal([0]), lambda d, x: _line(d, x, [0, 1]), [0]),
+        (lambda d, x: _line(d, x, [0, 1, 2]).condition(0, x[:, :1]), lambda d, x: _given(d, x).marginal([0]), [2]),
+        (lambda d, x: d.condition(1, x[:, 1:2]).condition(0, x[:, :1]), lambda d, x: _given(d, x), [2, 3]),
+        (lambda d, x: _given(d, x).condition(-1, x[:, 3:]), lambda d, x: d.condition([0, 3, 1], x[:, [0, 3, 1]]), [2]),
+        (lambda d, x: _given(d, x).condition(-1, x[:, 3:]), lambda d, x: _given(d.condition_time(x[:, 3]), x), [2]),
+    ],
+)
+@pytest.mark.parametrize("mixed", [False, True])
+def test_conditioning_and_marginals_commute(one, other, rest, mixed):
     dist = _dist(3)
     x = _points(dist, 5)
-    log_prob = {
-        "condition, marginal": LOG_PROB(dist.condition([1], x[:, 1:2]).marginal([0, 2]), x[:, [0, 3]]),
-        "marginal, condition": LOG_PROB(dist.marginal([0, 1, 3]).condition([1], x[:, 1:2]), x[:, [0, 3]]),
-    }
-    np.testing.assert_allclose(*log_prob.values(), rtol=1e-10, atol=1e-10)
-    without_time = {
-        "condition, marginal": LOG_PROB(dist.condition([1], x[:, 1:2]).marginal([0]), x[:, :1]),
-        "marginal, condition": LOG_PROB(dist.marginal([0, 1]).condition([1], x[:, 1:2]), x[:, :1]),
-        "ratio": LOG_PROB(dist.marginal([0, 1]), x[:, :2]) - LOG_PROB(dist.marginal([1]), x[:, 1:2]),
-    }
-    for other in list(without_time.values())[1:]:
-        np.testing.assert_allclose(without_time["condition, marginal"], other, rtol=1e-10, atol=1e-10)
-    stepwise = dist.condition([1], x[:, 1:2]).condition([0, -1], x[:, [0, 3]])
-    at_once = dist.condition([0, 1, 3], x[:, [0, 1, 3]])
-    assert isinstance(stepwise, Gaussian)
-    np.testing.assert_allclose(stepwise.loc, at_once.loc, rtol=1e-10)
-    np.testing.assert_allclose(stepwise.covariance_matrix, at_once.covariance_matrix, rtol=1e-10)
-    twice = dist.condition([1], x[:, 1:2]).condition([0], x[:, :1])
-    np.testing.assert_allclose(
-        LOG_PROB(twice, x[:, 2:]), LOG_PROB(dist.condition([0, 1], x[:, :2]), x[:, 2:]), rtol=1e-10, atol=1e-10
-    )
+    if mixed:
+        dist = FoldedMixture(_dist(3, loc=[LOC, LOC + 0.2], time_loc=[0.4, 0.6]), weights=[0.3, 0.7])
+    found, expected = (LOG_PROB(make(dist, x), x[:, rest]) for make in (one, other))
+    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-10)
+
+
+def _line(dist, x, kept):
+    """Some coordinates, given the second."""
+    return dist.marginal(kept).condition(1, x[:, 1:2])
+
+
+def _given(dist, x):
+    return dist.condition([0, 1], x[:, :2])
 
 
 def _parabola(s, scale, power, dtype):
@@ -615,25 +594,6 @@ def test_points_at_infinity():
     assert np.isfinite(time.icdf(jnp.array([1e-300, 1 - 1e-16]))).all()
 
 
-@pytest.mark.slow  # it compiles for long
-def test_batches_transformations_and_round_trips():
-    dist = _dist(2, loc=jnp.stack([LOC[:2], LOC[:2] + 0.1]))
-    marginal, s = dist.marginal([0]), jnp.array([[0.2], [0.5]])
-    together = LOG_PROB(marginal, s)
-    assert marginal.batch_shape == together.shape == (2,)
-    mapped = jax.jit(jax.vmap(lambda d, s: d.marginal([0]).log_prob(s)))(dist, s)
-    np.testing.assert_allclose(mapped, together, rtol=1e-12)
-    np.testing.assert_allclose(marginal.log_prob(s), together, rtol=1e-12)  # jit = eager
-    many = jnp.linspace(-1, 2, 130)[:, None, None]  # more than one chunk
-    assert LOG_PROB(marginal, many).shape == (130, 2)
-    np.testing.assert_allclose(LOG_PROB(marginal, many)[40, 1], LOG_PROB(marginal, many[40])[1], rtol=1e-12)
-    conditional = dist.condition([0], s)
-    assert SAMPLE(conditional, jax.random.key(0), 7).shape == (7, 2, 2)
-    again = pickle.loads(pickle.dumps(conditional))
-    x = jnp.zeros((2, 2))
-    np.testing.assert_array_equal(LOG_PROB(again, x), LOG_PROB(conditional, x))
-
-
 def test_gradients_go_through_the_integral():
     log_prob = lambda loc, s: _dist(1, loc=loc[None]).marginal([0]).log_prob(s)  # noqa: E731
     both = jax.jit(jax.value_and_grad(log_prob, argnums=(0, 1)))
@@ -660,19 +620,24 @@ def test_indices_are_checked(indices, expected):
             call()
 
 
-def test_bad_requests_are_refused():
-    dist = _dist()
-    with pytest.raises(ValueError, match=r"^indices: expected time last, got "):
-        dist.marginal([2, 0])
-    with pytest.raises(ValueError, match=r"^indices: expected at least one coordinate that is not given, got all"):
-        dist.condition([0, 1, 2], [0.0, 0.0, 0.0])
-    with pytest.raises(ValueError, match=r"^values: expected shape "):
-        dist.condition([0], [0.0, 1.0])
-    with pytest.raises(ValueError, match=r"^s: expected shape "):
-        dist.time_given_space([0.0])
-    with pytest.raises(ValueError, match=r"^cdf: expected one coordinate, got 2"):
-        dist.marginal([0, 1]).cdf(jnp.zeros(2))
-    with pytest.raises(ValueError, match=r"^modes: expected the distribution of time given space, got 2 coordinates"):
-        dist.marginal([0, 1]).modes()
-    with pytest.raises(ValueError, match=r"^value: expected shape "):
-        dist.marginal([0, 1]).log_prob(jnp.zeros(3))
+@pytest.mark.parametrize(
+    ("request_of", "message"),
+    [
+        (lambda dist: dist.marginal([2, 0]), "indices: expected time last, got "),
+        (
+            lambda dist: dist.condition([0, 1, 2], np.zeros(3)),
+            "indices: expected at least one coordinate that is not given, got all",
+        ),
+        (lambda dist: dist.condition([0], [0.0, 1.0]), "values: expected shape "),
+        (lambda dist: dist.time_given_space([0.0]), "s: expected shape "),
+        (lambda dist: dist.marginal([0, 1]).cdf(np.zeros(2)), "cdf: expected one coordinate, got 2"),
+        (
+            lambda dist: dist.marginal([0, 1]).modes(),
+            "modes: expected the distribution of time given space, got 2 coordinates",
+        ),
+        (lambda dist: dist.marginal([0, 1]).log_prob(np.zeros(3)), "value: expected shape "),
+    ],
+)
+def test_bad_requests_are_refused(request_of, message):
+    with pytest.raises(ValueError, match=f"^{message}"):
+        request_of(_dist())

@@ -1,5 +1,7 @@
 """Moments, entropy, mode, whitening and derivatives of a Folded-Gaussian, against quadrature and its own samples."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,7 +24,6 @@ ENTROPY = eqx.filter_jit(FoldedGaussian.entropy)
 WHITEN = eqx.filter_jit(FoldedGaussian.fold_to_normal)
 COLOUR = eqx.filter_jit(FoldedGaussian.normal_to_fold)
 LOG_PROB = eqx.filter_jit(FoldedGaussian.log_prob)
-SAMPLE = eqx.filter_jit(FoldedGaussian.sample)
 
 
 class Slope(AbstractEnvelope):
@@ -32,10 +33,7 @@ class Slope(AbstractEnvelope):
         return -(jnp.abs((t - time_loc) / time_scale) ** 3) / 4
 
 
-@pytest.fixture(autouse=True)
-def _x64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("x64")
 
 
 def _dist(power=1.0, floor=0.0, **changes):
@@ -61,46 +59,37 @@ def test_tangents_at_infinity_are_not_nan():
     np.testing.assert_allclose(slopes, np.exp(-0.7), rtol=1e-6)
 
 
-def _book_moments(power, floor, coefficients=BEND, scale=0.3):
-    """The laws of total mean and covariance, integrated by Gauss-Hermite in NumPy."""
-    tau, weights = np.polynomial.hermite_e.hermegauss(80)
-    weights = weights / weights.sum()
-    u = -scale * tau
-    center = LOC + sum((c * u[:, None] ** (k + 1) for k, c in enumerate(coefficients)), np.zeros((80, 2)))
-    a = floor + (1 - floor) * np.exp(-power * tau**2 / 2)
-    y = np.c_[center, 0.4 + scale * tau]
+def _book_moments(a, coefficients=BEND, scale=0.3):
+    """The laws of total mean and covariance, integrated on panels in NumPy; `a` is a function of tau."""
+    minus_tau, weights = _normal_rule(1.0, (0,))
+    u = scale * minus_tau
+    center = LOC + sum((c * u[:, None] ** (k + 1) for k, c in enumerate(coefficients)), np.zeros((len(u), 2)))
+    y = np.c_[center, 0.4 - u]
     mean = weights @ y
     covariance = (weights[:, None] * (y - mean)).T @ (y - mean)
-    covariance[:2, :2] += (weights @ a) * TRIL @ TRIL.T
+    covariance[:2, :2] += (weights @ a(minus_tau)) * TRIL @ TRIL.T
     return mean, covariance
 
 
 # --- moments ----------------------------------------------------------------------------------------------
 
 
-def test_moments_equal_gauss_hermite():
+@pytest.mark.parametrize("degree", [0, 1, 12])
+def test_moments_equal_integrals(degree):
     powers, floors = np.array([0.0, 1.0, 2.0, 1.0]), np.array([0.0, 0.0, 0.1, 0.3])
-    mean, covariance = MOMENTS(_dist(powers, floors))
-    for i in range(4):
-        expected = _book_moments(powers[i], floors[i])
+    coefficients = np.random.default_rng(degree).normal(size=(degree, 2))
+    mean, covariance = MOMENTS(_dist(powers, floors, fold=PolynomialFold(coefficients)))
+    for i, (power, floor) in enumerate(zip(powers, floors, strict=True)):
+        a = partial(lambda power, floor, tau: floor + (1 - floor) * np.exp(-power * tau**2 / 2), power, floor)
+        expected = _book_moments(a, coefficients)
         np.testing.assert_allclose(mean[i], expected[0], rtol=1e-11, atol=1e-11)
         np.testing.assert_allclose(covariance[i], expected[1], rtol=1e-11, atol=1e-11)
 
 
-@pytest.mark.parametrize("degree", [0, 1, 12])
-def test_moments_at_any_degree(degree):
-    coefficients = np.random.default_rng(degree).normal(size=(degree, 2))
-    mean, covariance = MOMENTS(_dist(fold=PolynomialFold(coefficients)))
-    expected = _book_moments(1.0, 0.0, coefficients)
-    np.testing.assert_allclose(mean, expected[0], rtol=1e-11, atol=1e-11)
-    np.testing.assert_allclose(covariance, expected[1], rtol=1e-11, atol=1e-11)
-
-
-def test_moments_of_a_callable_equal_those_of_its_polynomial():
-    bend = jnp.asarray(BEND)
-    polynomial = lambda u: u * (bend[0] + u * (bend[1] + u * bend[2]))  # noqa: E731
-    for a, b in zip(MOMENTS(_dist(fold=polynomial)), MOMENTS(_dist()), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-13)
+def test_moments_under_an_envelope_of_ones_own_equal_integrals():
+    expected = _book_moments(lambda tau: np.exp(-(np.abs(tau) ** 3) / 4))
+    for found, exact in zip(MOMENTS(_dist(envelope=Slope())), expected, strict=True):
+        np.testing.assert_allclose(found, exact, rtol=1e-9, atol=1e-11)
 
 
 def _sigmoid(u):
@@ -205,24 +194,6 @@ def test_coefficients_that_jax_takes_as_zero_warn():
     np.testing.assert_allclose(dist.mean, 0)  # as the density has it
 
 
-def test_moments_and_entropy_are_those_of_the_samples():
-    n = 200_000
-    for envelope, key in [(TimeLikelihood(1.0), 1), (TimeLikelihood(2.0, 0.2), 2), (Slope(), 3)]:
-        dist = _dist(envelope=envelope)
-        x = np.asarray(SAMPLE(dist, jax.random.key(key), (n,)))
-        mean, covariance = MOMENTS(dist)
-        centered = x - np.asarray(mean)
-        z = centered.mean(0) / (x.std(0) / np.sqrt(n))
-        products = centered[:, :, None] * centered[:, None, :]
-        z_products = (products.mean(0) - covariance) / (products.std(0) / np.sqrt(n))
-        log_prob = np.asarray(LOG_PROB(dist, x))
-        z_entropy = (-log_prob.mean() - ENTROPY(dist)) / (log_prob.std() / np.sqrt(n))
-        # |z| < 5 for 13 numbers of 3 laws at fixed seeds; a fresh one would fail at a rate of 2e-5.
-        assert max(np.abs(z).max(), np.abs(z_products).max(), abs(z_entropy)) < 5
-        # And the test has power: 2% more width, or the fold's sign, would show.
-        assert abs((products.mean(0) - 1.04 * covariance) / (products.std(0) / np.sqrt(n))).max() > 5
-
-
 @pytest.mark.parametrize("time_scale", [1e-12, pytest.param(0.3, marks=pytest.mark.slow), 1e6])
 def test_moments_and_entropy_in_float32(time_scale):
     # Offsets 1e4 and the folds' coefficients scaled with time: the same numbers in float64, to float32's digits.
@@ -250,20 +221,10 @@ def test_moments_and_entropy_in_float32(time_scale):
         np.testing.assert_allclose(a, b, rtol=2e-6, atol=2e-6)
 
 
-def test_properties_and_batches():
-    dist = _dist(loc=np.zeros((4, 1, 2)), time_scale=np.array([0.1, 0.2, 0.3]))
-    assert dist.mean.shape == dist.variance.shape == (4, 3, 3)
-    covariance, entropy = dist.covariance_matrix, dist.entropy()
-    assert covariance.shape == (4, 3, 3, 3)
-    assert entropy.shape == (4, 3)
-    one = MOMENTS(_dist(loc=np.zeros(2), time_scale=0.2))[1]
-    np.testing.assert_allclose(covariance[2, 1], one, rtol=1e-13)
-    np.testing.assert_allclose(dist.variance[2, 1], np.diagonal(one), rtol=1e-13)
-    np.testing.assert_allclose(jax.jit(jax.vmap(FoldedGaussian.entropy))(dist), entropy, rtol=1e-13)
-    np.testing.assert_allclose(MOMENTS(dist)[1], covariance, rtol=1e-13)  # jit = eager
-
-
 # --- entropy and mode -------------------------------------------------------------------------------------
+
+#: One space coordinate has a mode at the paper's power.
+LINE = {"loc": LOC[:1], "scale_tril": TRIL[:1, :1], "fold": PolynomialFold(BEND[:, :1])}
 
 
 def test_entropy_is_exact_and_does_not_see_the_fold():
@@ -285,12 +246,13 @@ def test_entropy_with_a_floor_or_an_own_envelope_is_a_quadrature():
     np.testing.assert_allclose(ENTROPY(_dist(envelope=Slope())), expected, rtol=1e-8)
 
 
-@pytest.mark.parametrize("changes", [{"power": 0.9}, {"power": 0.0}, {"envelope": Constant()}, {"floor": 0.1}])
+@pytest.mark.parametrize("changes", [{"power": 0.9}, {"power": 0.0}, {"envelope": Constant()}, {"floor": 0.1}, LINE])
 def test_mode_is_the_highest_point(changes):
     dist = _dist(**changes)
-    np.testing.assert_allclose(dist.mode, [0.1, -0.4, 0.4])
-    away = np.random.default_rng(0).normal(size=(500, 3))
-    top, *others = np.asarray(LOG_PROB(dist, np.asarray(dist.mode) + 0.02 * np.r_[np.zeros((1, 3)), away]))
+    mode = np.append(dist.loc, 0.4)
+    np.testing.assert_allclose(dist.mode, mode)
+    away = np.random.default_rng(0).normal(size=(500, len(mode)))
+    top, *others = np.asarray(LOG_PROB(dist, mode + 0.02 * np.r_[np.zeros((1, len(mode))), away]))
     assert (np.array(others) < top).all()
 
 
@@ -302,11 +264,6 @@ def test_no_unique_mode_is_an_error_that_says_why(power, floor, case):
     with pytest.raises(ValueError, match=f"^mode: expected a unique mode.*got .*{case}"):
         _ = _dist(power, floor).mode
     assert np.isnan(jax.jit(lambda d: d.mode)(_dist(power, floor))).all()
-
-
-def test_one_space_dimension_has_a_mode_at_the_papers_power():
-    line = {"loc": LOC[:1], "scale_tril": TRIL[:1, :1], "fold": PolynomialFold(BEND[:, :1])}
-    np.testing.assert_allclose(_dist(1.0, **line).mode, [0.1, 0.4])
 
 
 def test_mode_under_an_envelope_of_ones_own():

@@ -31,12 +31,6 @@ NO_SCALING = Scaling(np.zeros(3), np.ones(3))
 ENVELOPES = {"0": Constant(), "1": TimeLikelihood(1.0, 1e-3), "2": TimeLikelihood(2.0, 1e-2)}
 
 
-@pytest.fixture
-def x64():
-    with jax.enable_x64(True):
-        yield
-
-
 def _params(dtype=np.float64, seed=0):
     rng = np.random.default_rng(seed)
     tril = np.tril(rng.normal(size=(K, 2, 2)) * 0.2) + 0.6 * np.eye(2)

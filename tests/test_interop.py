@@ -27,12 +27,6 @@ MEAN_AND_VARIANCE = jax.jit(lambda dist: (dist.mean, dist.variance))
 
 
 @pytest.fixture
-def x64():
-    with jax.enable_x64(True):
-        yield
-
-
-@pytest.fixture
 def numpyro():
     module = pytest.importorskip("numpyro", reason="numpyro is an optional extra")
     # numpyro's own code broadcasts and promotes freely; the house rules are for ours.

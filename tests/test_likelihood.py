@@ -22,12 +22,6 @@ LOC, TIME_LOC, TIME_SCALE = [0.1, -0.4], 0.4, 0.3
 fit = functools.partial(likelihood.fit, envelope="time_likelihood")
 
 
-@pytest.fixture
-def x64():
-    with jax.enable_x64(True):
-        yield
-
-
 def _dist(power=1.0, floor=1e-3, bend=BEND):
     return FoldedGaussian(
         jnp.asarray(LOC),
