@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foldgauss.analysis.interop import to_numpyro, to_scipy
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.fold import CallableFold, PolynomialFold, SharedPathFold, ZeroFold
@@ -238,11 +237,3 @@ def test_samples_are_of_their_component(num):
     assert component.shape == (DRAWS, *batch)
     place = np.take_along_axis(np.broadcast_to(far, (DRAWS, *far.shape)), np.asarray(component)[..., None], -1)[..., 0]
     assert np.abs(np.asarray(x[..., 2]) - place).max() < 50
-
-
-def test_one_component_in_numpyro_and_scipy():
-    pytest.importorskip("numpyro", reason="numpyro is an optional extra")
-    mixture = _mixture((), 1)
-    for x in (to_scipy(mixture).rvs(9, random_state=0), to_numpyro(mixture).sample(jax.random.key(0), (9,))):
-        assert x.shape == (9, 3)
-        assert len(np.unique(x, axis=0)) == 9

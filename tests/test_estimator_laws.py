@@ -13,6 +13,9 @@ from sklearn.utils import estimator_checks
 from foldgauss.estimator import EMStatus, FoldedGaussianMixture, FoldedMixtureRegressor
 from foldgauss.estimator.rows import warn_smooth
 
+# Fits need not converge here.
+pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+
 K, N = 3, 300
 KINDS = ("full", "tied", "diag", "spherical")
 #: Most of a test's time is compilation: one kind is fitted in each run, the others in slow ones.
@@ -27,10 +30,7 @@ def _blobs(seed=0, dtype=np.float64):
 
 
 def _fit(x, num=K, *, groups=None, **options):
-    groups = {} if groups is None else {"groups": groups}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        return FoldedGaussianMixture(num, **({"degree": 1, "random_state": 0} | options)).fit(x, **groups)
+    return FoldedGaussianMixture(num, **({"degree": 1, "random_state": 0} | options)).fit(x, groups=groups)
 
 
 ESTIMATORS = [
@@ -74,9 +74,7 @@ def test_weights_equal_repetitions(regression):
 
     def fit(repeats, **options):
         rows = np.repeat(x, repeats, axis=0)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ConvergenceWarning)
-            fitted = clone(estimator).fit(*((rows[:, :2], rows[:, 2:]) if regression else (rows,)), **options)
+        fitted = clone(estimator).fit(*((rows[:, :2], rows[:, 2:]) if regression else (rows,)), **options)
         return getattr(fitted, "mixture_", fitted)
 
     weighted, repeated, plain = fit(1, sample_weight=weights), fit(weights), fit(1)
@@ -113,20 +111,11 @@ def test_every_start_gives_distinct_means_inside_the_data_in_its_dtype(start, dt
     np.testing.assert_allclose(fitted.predict_proba(x).sum(1), 1, rtol=1e-5)
 
 
-@pytest.mark.parametrize("kind", SOME_KINDS)
-def test_more_restarts_are_never_worse(kind):
-    x = np.random.default_rng(0).normal(size=(50, 5))
-    bounds = [_fit(x, n_init=n, init_params="random", max_iter=3, covariance_type=kind).lower_bound_ for n in (1, 5)]
-    assert bounds[1] >= bounds[0]
-
-
 @pytest.mark.parametrize(("max_iter", "tol"), [(2, 1e-7), (300, 1e-1)])
 def test_fit_predict_equals_fit_then_predict(max_iter, tol):
     x = _blobs()
     fitted = _fit(x, max_iter=max_iter, tol=tol, n_init=3)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        labels = FoldedGaussianMixture(**fitted.get_params()).fit_predict(x)
+    labels = FoldedGaussianMixture(**fitted.get_params()).fit_predict(x)
     np.testing.assert_array_equal(labels, fitted.predict(x))
     np.testing.assert_array_equal(labels, fitted.predict_proba(x).argmax(1))
     assert fitted.n_iter_ <= max_iter
