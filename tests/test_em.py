@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import special
 
-from foldgauss.envelope import Constant, TimeLikelihood, plain_envelope
+from foldgauss.envelope import Constant, TimeLikelihood
 from foldgauss.estimator.em import components, loop
 from foldgauss.estimator.em.loop import EMStatus, run_em, select_best
 from foldgauss.estimator.em.m_step import (
@@ -233,47 +233,4 @@ def test_vectorized_restarts_equal_single_runs(x64):
     assert select_best(both).log_likelihood == max(run.log_likelihood for run in both)
 
 
-def test_custom_envelope_can_be_fitted(x64):
-    """A user's own envelope, equal to the built-in: the same run."""
-    own = plain_envelope(lambda t, m, s: 1e-3 + (1 - 1e-3) * jnp.exp(-0.5 * ((t - m) / s) ** 2))
-    points = make_points(_data(), np.ones(N), K)
-    runs = [_run(points, _params(), envelope, _model(), tol=0, max_steps=10) for envelope in (own, ENVELOPES["1"])]
-    np.testing.assert_allclose(runs[0].history, runs[1].history, rtol=1e-9)
-
-
 # --- data that determine nothing ----------------------------------------------------------------------------
-
-
-def test_empty_component_is_reset(x64):
-    params = _params()
-    params = params._replace(time_loc=params.time_loc.at[0].set(1e3))  # out of reach: no mass
-    points, model = make_points(_data(), np.ones(N), K), _model(floor=1e-6)
-    left = _run(points, params, Constant(), model, tol=1e-4, max_steps=30)
-    assert np.exp(np.asarray(left.params.log_weights))[0] == 0
-    run = _run(points, params, Constant(), model, tol=1e-4, max_steps=30, least_mass=1.0)
-    assert (np.exp(np.asarray(run.params.log_weights)) > 0.01).all()
-    assert run.log_likelihood > left.log_likelihood
-
-
-def test_nan_is_never_convergence(x64):
-    points = make_points(_data(), np.ones(N), K)
-    params = _params()
-    broken = params._replace(curve=params.curve.at[0].set(jnp.nan))
-    run = _run(points, broken, Constant(), _model(), tol=1e6, max_steps=30)
-    assert run.status == EMStatus.NOT_FINITE
-    assert select_best([run, run._replace(status=EMStatus.NOT_CONVERGED, history=[-1e9])]).log_likelihood == -1e9
-
-
-def test_singular_component_sets_status(x64):
-    x = np.repeat(_data()[:K], 20, axis=0)  # three points, many times
-    points = make_points(x, np.ones(len(x)), K)
-    params = _params()
-    apart = params._replace(
-        curve=params.curve * 0, time_scale=params.time_scale * 0 + 0.5, time_loc=jnp.asarray(x[::20, 2])
-    )
-    apart = apart._replace(curve=apart.curve.at[:, 0].set(jnp.asarray(x[::20, :2])))
-    run = _run(points, apart, Constant(), _model(), total=len(x), tol=1e-3, max_steps=30)
-    assert run.status == EMStatus.SINGULAR
-    assert all(np.isfinite(z).all() for z in run.params)
-    floored = _run(points, apart, Constant(), _model(floor=1e-4), total=len(x), max_steps=30)
-    assert floored.status == EMStatus.CONVERGED

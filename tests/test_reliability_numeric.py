@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from soft_models import soft_model
+from tiny_clips import moving_disc
 
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.render import ENGINES, RenderOptions
@@ -16,16 +17,6 @@ from foldgauss.render.pallas import HIGHEST_CEILING
 from foldgauss.video import DivergenceWarning, FitConfig, FitDiverged, FrameTimes, LearningRates, evaluate, fit
 from foldgauss.video import fit_steps as steps_of
 from foldgauss.video.fitting.loop import start, start_from, to_model
-
-
-def moving_disc(num_frames=6, size=(48, 64)):
-    """uint8 (num_frames, *size, 3): a disc over a slope."""
-    y, x = np.mgrid[: size[0], : size[1]]
-    centers = np.linspace(0.2, 0.8, num_frames) * size[1]
-    light = np.stack([np.exp(-((x - at) ** 2 + (y - size[0] / 2) ** 2) / 40) for at in centers])[..., None]
-    slope = np.stack([x / size[1], y / size[0], 0 * x + 0.3], -1) * 0.6
-    return np.rint(255 * (slope * (1 - light) + light * np.array([1, 0.2, 0.1]))).astype(np.uint8)
-
 
 CLIP = moving_disc()
 CONFIG = FitConfig(num_gaussians=200, steps=240, seed=1)

@@ -100,11 +100,8 @@ def test_an_interrupt_waits_for_the_workers():
         done.append(k)
 
     _threads.set_num_threads(2)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            _threads.run_tasks(task, range(2))
-        finished = len(done)
-        time.sleep(0.4)
-        assert len(done) == finished
-    finally:
-        _threads.set_num_threads(None)
+    with pytest.raises(KeyboardInterrupt):
+        _threads.run_tasks(task, range(2))
+    finished = len(done)
+    time.sleep(0.4)
+    assert len(done) == finished

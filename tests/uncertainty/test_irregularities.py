@@ -10,9 +10,11 @@ from tiny_clips import NUM_FRAMES, TWICE, clip_of, model_of_12
 from foldgauss.uncertainty import (
     FrameNoise,
     compare_times,
+    frame_table,
     increment_intervals,
     irregularities,
     rendered_log_likelihood,
+    summary,
 )
 from foldgauss.uncertainty.diagnostics.irregularities import even_times
 from foldgauss.video import FrameTimes, VideoModel
@@ -74,8 +76,6 @@ def test_intervals_between_held_frames_are_not_assessed():
 
 
 def test_a_long_step_beside_a_duplicate_is_explained():
-    from foldgauss.uncertainty import summary
-
     steps = np.ones(20)
     steps[[8, 9]] = 0.01, 2.0
     assert "A long step beside a duplicated frame" in summary(posterior_about(times_of(steps)))
@@ -155,8 +155,6 @@ def test_compare_times_refuses_no_models_and_other_lengths():
 
 
 def test_summary_names_frames_that_are_not_identified():
-    from foldgauss.uncertainty import frame_table, summary
-
     times, std = np.linspace(0, 1, 12), np.full(12, 0.02)
     std[5] = 40.0
     posterior = posterior_about(times, std)
@@ -186,8 +184,6 @@ def test_even_times_within_shots():
 
 
 def test_summary_includes_notes_of_the_profiles():
-    from foldgauss.uncertainty import summary
-
     posterior = posterior_about(np.linspace(0, 1, 12))
     noted = dataclasses.replace(posterior.profiles, notes=("It is late.",), level="colors")
     text = summary(dataclasses.replace(posterior, profiles=noted))

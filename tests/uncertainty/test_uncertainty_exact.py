@@ -6,7 +6,7 @@ import scipy.special
 import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from time_clips import free_times, parabolas
+from time_clips import exact_cdfs, free_times, parabolas
 
 from foldgauss.uncertainty import FrameTimeLogProb, Increments, ProfileCurves, exact_posterior
 
@@ -48,28 +48,25 @@ def by_quadrature(curves, increments, far: float, points: int):
     return mean, covariance, np.log(weights.sum()) + heights.max() + num * np.log(z[1] - z[0])
 
 
-@pytest.mark.parametrize("concentration", [1.0, 1.5, 20.0])
-@pytest.mark.parametrize("means", [(0.4, 0.6), (0.5, 0.52), (0.62, 0.45), (0.1, 0.9)])
-def test_two_frames_agree_with_quadrature(concentration, means):
-    # Also where frames are so near, or so far out of order, that only their order separates them.
-    curves, increments = parabolas(means, (0.06, 0.1), 401), free_times(4, concentration)
-    mean, covariance, likelihood_profiles = by_quadrature(curves, increments, 14, 501)
+#: Means of two frames, also where these are so near, or so far out of order, that only their order separates them.
+TWO = (0.4, 0.6), (0.5, 0.52), (0.62, 0.45), (0.1, 0.9)
+
+
+@pytest.mark.parametrize(
+    ("means", "widths", "concentration", "grid", "tolerance"),
+    [
+        *((means, (0.06, 0.1), a, (14, 501), 1e-3) for a in (1.0, 1.5, 20.0) for means in TWO),
+        *(((0.3, 0.42, 0.6), (0.06, 0.08, 0.07), a, (10.0, 91), 2e-3) for a in (1.0, 4.0)),
+    ],
+)
+def test_few_frames_agree_with_quadrature(means, widths, concentration, grid, tolerance):
+    curves, increments = parabolas(means, widths, 401), free_times(len(means) + 2, concentration)
+    mean, covariance, log_evidence = by_quadrature(curves, increments, *grid)
     found = exact_posterior(curves, increments)
     std = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(found.mean()[1:-1], mean, atol=2e-3 * std.min())
     np.testing.assert_allclose(found.std()[1:-1], std, rtol=2e-3)
-    assert found.log_evidence == pytest.approx(likelihood_profiles, abs=1e-3)
-
-
-@pytest.mark.parametrize("concentration", [1.0, 4.0])
-def test_three_frames_agree_with_quadrature(concentration):
-    curves, increments = parabolas((0.3, 0.42, 0.6), (0.06, 0.08, 0.07), 401), free_times(5, concentration)
-    mean, covariance, likelihood_profiles = by_quadrature(curves, increments, 10.0, 91)
-    found = exact_posterior(curves, increments)
-    std = np.sqrt(np.diag(covariance))
-    np.testing.assert_allclose(found.mean()[1:-1], mean, atol=2e-3 * std.min())
-    np.testing.assert_allclose(found.std()[1:-1], std, rtol=2e-3)
-    assert found.log_evidence == pytest.approx(likelihood_profiles, abs=2e-3)
+    assert found.log_evidence == pytest.approx(log_evidence, abs=tolerance)
 
 
 def test_draws_have_the_quadratures_covariance():
@@ -97,28 +94,23 @@ def test_frames_far_apart_are_gaussian():
     assert found.log_evidence == pytest.approx(constant, abs=5e-3)
 
 
-def test_draws_follow_the_known_marginals():
-    means, widths = FAR
-    found = exact_posterior(parabolas(*FAR, 801), free_times(6))
-    draws = found.sample(5000, 3)
-    for k in range(4):  # false-alarm rate 1e-3 each; power: a width wrong by a fifth fails
-        assert scipy.stats.kstest(draws[:, k + 1], scipy.stats.norm(means[k], widths[k]).cdf).pvalue > 1e-3
-        assert scipy.stats.kstest(draws[:, k + 1], scipy.stats.norm(means[k], 1.2 * widths[k]).cdf).pvalue < 1e-3
-    np.testing.assert_array_equal(draws, found.sample(5000, 3))
-    assert (draws != found.sample(5000, 4)).any()
+def p_values(draws, found):
+    return [scipy.stats.kstest(own, cdf).pvalue for own, cdf in zip(draws.T[1:-1], exact_cdfs(found), strict=True)]
 
 
 @pytest.mark.parametrize("concentration", [1.0, 4.0, 20.0])
 def test_draws_follow_the_exact_marginals_where_order_ties(concentration):
     found = exact_posterior(parabolas((0.45, 0.47, 0.6), (0.08, 0.08, 0.1), 401), free_times(5, concentration))
-    draws = found.sample(4000, 0)
-    for n, (edges, masses) in enumerate(zip(found.edges, found.masses, strict=True)):
-        summed = np.concatenate([[0], np.cumsum(masses)])
+    assert min(p_values(found.sample(4000, 0), found)) > 1e-3
 
-        def cdf(t, edges=edges, summed=summed):
-            return np.interp(t, edges, summed)
 
-        assert scipy.stats.kstest(draws[:, n + 1], cdf).pvalue > 1e-3
+def test_draws_follow_the_exact_marginals_and_reproduce():
+    found, wide = (exact_posterior(parabolas(FAR[0], scale * FAR[1], 801), free_times(6)) for scale in (1, 1.2))
+    draws = found.sample(5000, 3)
+    assert min(p_values(draws, found)) > 1e-3  # false-alarm rate 1e-3 each
+    assert max(p_values(draws, wide)) < 1e-3  # power: a width wrong by a fifth fails
+    np.testing.assert_array_equal(draws, found.sample(5000, 3))
+    assert (draws != found.sample(5000, 4)).any()
 
 
 LONG = [pytest.param(150, a, marks=pytest.mark.slow) for a in (1.0, 3.0, 20.0)]
@@ -194,10 +186,14 @@ def test_increments_of_draws_follow_the_prior(concentration, many, known):
             assert marginal is None or scipy.stats.kstest(draws[:, k + 1], marginal.cdf).pvalue > 1e-3
 
 
-def test_levels_are_checked():
-    found = exact_posterior(parabolas(np.array([0.5]), np.array([0.1])), free_times(3, 1.0))
-    with pytest.raises(ValueError, match=r"^level: expected a number in \[0, 1\], got 1.5"):
-        found.interval(1.5)
+@pytest.mark.parametrize(
+    ("method", "message"),
+    [("interval", r"^level: expected a number in \[0, 1\], got 1.5"), ("quantile", "probability")],
+)
+def test_levels_are_checked(method, message):
+    found = exact_posterior(parabolas([0.5], [0.1]), free_times(3))
+    with pytest.raises(ValueError, match=message):
+        getattr(found, method)(1.5)
 
 
 @settings(max_examples=15, deadline=None)
@@ -229,9 +225,3 @@ def test_runs_are_independent():
 def test_narrow_profiles_out_of_order_raise():
     with pytest.raises(ValueError, match="order"):
         exact_posterior(parabolas((0.7, 0.3), (1e-3, 1e-3), 2001), free_times(4))
-
-
-def test_probabilities_of_quantiles_are_checked():
-    found = exact_posterior(parabolas([0.5], [0.1]), free_times(3))
-    with pytest.raises(ValueError, match="probability"):
-        found.quantile(1.5)

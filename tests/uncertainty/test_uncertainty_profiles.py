@@ -16,7 +16,6 @@ from foldgauss.uncertainty import (
     LikelihoodProfiles,
     ProfileCurves,
     exact_posterior,
-    frame_time_log_prob,
     likelihood_profiles,
     rendered_log_likelihood,
 )
@@ -41,13 +40,6 @@ def test_between_nodes_a_profile_is_the_cubic_with_its_slopes():
         slopes = np.gradient(np.sin(5 * nodes[k]), nodes[k], edge_order=2)
         expected = scipy.interpolate.CubicHermiteSpline(nodes[k], np.sin(5 * nodes[k]), slopes)(t[:, k])
         np.testing.assert_allclose(curves(t)[:, k], expected, rtol=1e-10, atol=1e-12)
-
-
-def test_parabolas_are_interpolated_exactly():
-    curves = parabolas([0.3, 0.6], [0.05, 0.1], 31)
-    t = np.random.default_rng(1).uniform(size=(100, 4))
-    expected = -((t[:, 1] - 0.3) ** 2) / 0.005
-    np.testing.assert_allclose(curves(t)[:, 1], expected, atol=1e-9)
 
 
 def test_outside_of_the_nodes_and_nan_give_minus_infinity():
@@ -108,44 +100,24 @@ def test_alpha_is_composited_over_black():
     np.testing.assert_allclose(one, other, rtol=1e-4)
 
 
-def test_flat_profile_keeps_its_prior():
-    curves = parabolas([0.25, 0.5, 0.75], [0.02, 10.0, 0.02])
-    found = exact_posterior(curves, Increments(np.linspace(0, 1, 5)))
-    assert found.std()[2] > 0.8 * 0.5 / np.sqrt(12)
-    assert found.std()[1] == pytest.approx(0.02, rel=0.02)
-
-
-def test_held_frames_stay_at_their_medians(profiles):
-    increments = frame_time_log_prob(profiles, frames=[2, 3, 7]).increments
-    medians = exact_posterior(profiles.curves, FREE).quantile(0.5)
-    held = np.setdiff1d(np.arange(NUM_FRAMES), [2, 3, 7])
-    np.testing.assert_allclose(increments.times(np.zeros(3))[held], medians[held])
-
-
-def test_a_clip_of_another_size_or_type_is_refused():
-    frames = clip(uneven())
-    for wrong in (frames[:, :-1], frames[..., :2], frames.astype(np.float32), frames[0]):
-        with pytest.raises(ValueError, match="video"):
-            likelihood_profiles(model(), wrong)
-    with pytest.raises(ValueError, match="3 frames"):
-        likelihood_profiles(model(), frames[:2])
-
-
-def test_a_model_of_another_video_is_refused():
-    other = np.random.default_rng(0).integers(0, 256, (NUM_FRAMES, *SIZE, 3), np.uint8)
-    with pytest.raises(ValueError, match="explains"):
-        likelihood_profiles(model(), other)
-
-
-def test_a_constant_video_has_no_times():
-    still = np.repeat(clip(np.array([0.0, 0.5, 1.0]))[:1], 6, axis=0)
-    with pytest.raises(ValueError, match="nothing changes"):
-        likelihood_profiles(model(), still)
-
-
-def test_too_large_noise_raises():
-    with pytest.raises(ValueError, match="not identified"):
-        likelihood_profiles(model(), clip(uneven()), noise=FrameNoise(1.0, 1e-6))
+@pytest.mark.parametrize(
+    ("change", "noise", "message"),
+    [
+        (lambda frames: frames[:, :-1], "score", "video"),
+        (lambda frames: frames[..., :2], "score", "video"),
+        (lambda frames: frames.astype(np.float32), "score", "video"),
+        (lambda frames: frames[0], "score", "video"),
+        (lambda frames: frames[:2], "score", "3 frames"),
+        (lambda frames: np.random.default_rng(0).integers(0, 256, frames.shape, np.uint8), "score", "explains"),
+        (lambda frames: clip(uneven(), of=soft_model(size=SIZE, seed=5)), "score", "video"),  # another scene
+        (lambda frames: np.repeat(frames[:1], 6, axis=0), "score", "nothing changes"),
+        (np.asarray, FrameNoise(1.0, 1e-6), "not identified"),
+        *((np.asarray, noise, "noise") for noise in ("loud", "", None, 1.0)),
+    ],
+)
+def test_clips_and_noise_that_do_not_fit_are_refused(change, noise, message):
+    with pytest.raises(ValueError, match=message):
+        likelihood_profiles(model(), change(clip(uneven())), noise=noise)
 
 
 def test_frames_backwards_are_refused():
@@ -153,31 +125,24 @@ def test_frames_backwards_are_refused():
         exact_posterior(likelihood_profiles(model(), clip(uneven(), scale=0.0)[::-1], noise=white(0.0012)).curves, FREE)
 
 
-@pytest.mark.parametrize("noise", ["loud", "", None, 1.0])
-def test_unknown_noise_is_refused(noise):
-    with pytest.raises(ValueError, match="noise"):
-        likelihood_profiles(model(), clip(uneven()), noise=noise)
+T = np.linspace(0, 1, 5)
 
 
-def test_curves_refuse_wrong_shapes_and_values():
-    t = np.linspace(0, 1, 5)
-    for nodes, values, word in (
-        ([t[:2]], [t[:2]], "three"),
-        ([t], [t[:4]], "increasing"),
-        ([t[::-1]], [t], "increasing"),
-        ([t], [np.where(t > 0.5, np.nan, t)], "finite"),
-        ([t, t], [t], "as many"),
-    ):
-        with pytest.raises(ValueError, match=word):
-            ProfileCurves.from_nodes(nodes, values)
+@pytest.mark.parametrize(
+    ("nodes", "values", "word"),
+    [
+        ([T[:2]], [T[:2]], "three"),
+        ([T], [T[:4]], "increasing"),
+        ([T[::-1]], [T], "increasing"),
+        ([T], [np.where(T > 0.5, np.nan, T)], "finite"),
+        ([T, T], [T], "as many"),
+    ],
+)
+def test_curves_refuse_wrong_shapes_and_values(nodes, values, word):
+    with pytest.raises(ValueError, match=word):
+        ProfileCurves.from_nodes(nodes, values)
     with pytest.raises(ValueError, match="shape"):
         parabolas([0.5], [0.1])(np.zeros(2))
-
-
-def test_another_seeded_model_is_another_scene():
-    frames = clip(uneven(), of=soft_model(size=SIZE, seed=5))
-    with pytest.raises(ValueError, match="video"):
-        likelihood_profiles(model(), frames)
 
 
 def test_clip_that_begins_later_than_its_model_warns():

@@ -224,15 +224,18 @@ def test_alpha_can_be_refitted_in_another_order(model, frames):
     assert np.isfinite(found.times).all()
 
 
-def test_wrong_arguments_of_statistics_raise():
+@pytest.mark.parametrize(
+    ("method", "values", "name"),
+    [
+        ("interval", (0, 1, np.nan, "0.9"), "level"),
+        ("ratio_to", (np.ones(6), np.zeros(7), 0.0, np.full(7, np.nan)), "std"),
+    ],
+)
+def test_wrong_arguments_of_statistics_raise(method, values, name):
     own = np.linspace(0, 1, 7)
-    found = RefitTimes(np.stack([own, own]), own)
-    for level in (0, 1, np.nan, "0.9"):
-        with pytest.raises(ValueError, match="level: expected"):
-            found.interval(level)
-    for std in (np.ones(6), np.zeros(7), 0.0, np.full(7, np.nan)):
-        with pytest.raises(ValueError, match="std: expected"):
-            found.ratio_to(std)
+    for value in values:
+        with pytest.raises(ValueError, match=f"{name}: expected"):
+            getattr(RefitTimes(np.stack([own, own]), own), method)(value)
 
 
 @pytest.mark.slow

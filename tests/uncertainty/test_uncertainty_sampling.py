@@ -6,7 +6,7 @@ import emcee
 import numpy as np
 import pytest
 import scipy.stats
-from time_clips import clip, free_times, model, parabolas, uneven, white
+from time_clips import clip, exact_cdfs, free_times, model, parabolas, uneven, white
 
 from foldgauss._runtime.optional_imports import import_optional
 from foldgauss.uncertainty import (
@@ -52,12 +52,6 @@ def worst_ks(found, cdfs) -> float:
     return min(scipy.stats.kstest(some[:, k], cdf).pvalue for k, cdf in zip(free, cdfs, strict=True))
 
 
-def exact_cdfs(found):
-    for edges, masses in zip(found.exact.edges, found.exact.masses, strict=True):
-        summed = np.append(0, np.cumsum(masses))
-        yield lambda t, edges=edges, summed=summed: np.interp(t, edges, summed)
-
-
 def agrees(found, tolerance: float = 5.0) -> bool:
     """Means and standard deviations meet the exact ones, within so many Monte Carlo standard errors."""
     free, exact = found.free, found.exact
@@ -82,10 +76,10 @@ def test_few_frames_sample_the_known_posterior(near):
     assert near.acceptance.shape == (4,)
     assert agrees(near)
     np.testing.assert_allclose(near.interval(0.9), near.exact.interval(0.9), atol=0.15 * near.exact.std().max())
-    assert worst_ks(near, exact_cdfs(near)) > 1e-3
+    assert worst_ks(near, exact_cdfs(near.exact)) > 1e-3
     wide = toy(NEAR[0], np.array(NEAR[1]) * 1.2)
     wrong = dataclasses.replace(near, exact=exact_posterior(wide.curves, near.log_prob.increments))
-    assert worst_ks(near, exact_cdfs(wrong)) < 1e-3
+    assert worst_ks(near, exact_cdfs(wrong.exact)) < 1e-3
 
 
 def test_wrong_prior_is_detected(monkeypatch):
@@ -326,35 +320,3 @@ def test_arviz_before_and_after_1_0_have_the_same_groups(small, monkeypatch):
     assert after.attrs == before.attrs
     for group in ("posterior", "sample_stats"):
         assert after[group].to_dataset().identical(before[group])
-
-
-#: Autoregressive walkers: their number and that of their steps, and the correlation of neighboring steps.
-AR_WALKERS, AR_STEPS, AR_CORRELATION = 20, 2000, 0.9
-
-
-def autoregressive(num: int, rng: np.random.Generator) -> np.ndarray:
-    """Stationary AR(1) chains of standard deviation 1: (num, AR_STEPS)."""
-    chains = rng.normal(size=(AR_STEPS, num))
-    for k in range(1, AR_STEPS):
-        chains[k] = AR_CORRELATION * chains[k - 1] + np.sqrt(1 - AR_CORRELATION**2) * chains[k]
-    return chains.T
-
-
-def test_arviz_statistics_of_known_chains(small):
-    """ESS within 10% of that of AR(1) chains, n (1 - r) / (1 + r); R-hat 1, and the standard error of the mean.
-
-    With the walkers of an ensemble within one chain, as they once were, the ESS would be more than five times too high.
-    """
-    arviz, rng = import_optional("arviz", "uncertainty"), np.random.default_rng(0)
-    times, spread = np.repeat(np.array([0, 0.3, 0.5, 0.7, 1])[None, None, None], AR_STEPS, 1), 0.01
-    times = np.repeat(np.repeat(times, AR_WALKERS, 2), 2, 0)
-    for frame in (1, 2, 3):
-        chains = autoregressive(2 * AR_WALKERS, rng).reshape(2, AR_WALKERS, AR_STEPS)
-        times[..., frame] += spread * np.moveaxis(chains, 1, 2)
-    drawn = dataclasses.replace(small, times=times).to_arviz()["posterior"]["t"].isel(frame=slice(1, 4)).to_dataset()
-    truth = 2 * AR_WALKERS * AR_STEPS * (1 - AR_CORRELATION) / (1 + AR_CORRELATION)
-    np.testing.assert_allclose(arviz.ess(drawn)["t"], truth, rtol=0.1)
-    np.testing.assert_allclose(arviz.rhat(drawn)["t"], 1, atol=0.01)
-    np.testing.assert_allclose(arviz.mcse(drawn)["t"], spread / np.sqrt(truth), rtol=0.1)
-    interleaved = {"t": times.reshape(2, AR_STEPS * AR_WALKERS, 5)[..., 1:4]}
-    assert (arviz.ess(arviz.convert_to_dataset(interleaved))["t"].values > 5 * truth).all()

@@ -22,6 +22,13 @@ def free_times(num_frames: int, concentration: float = 1.0) -> Increments:
     return Increments(np.linspace(0, 1, num_frames), None, concentration)
 
 
+def exact_cdfs(found):
+    """The distribution functions of an `ExactPosterior`'s marginals."""
+    for edges, masses in zip(found.edges, found.masses, strict=True):
+        summed = np.append(0, np.cumsum(masses))
+        yield lambda t, edges=edges, summed=summed: np.interp(t, edges, summed)
+
+
 @functools.cache
 def model():
     return soft_model(size=SIZE)
