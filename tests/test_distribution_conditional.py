@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from folded import BEND, CONDITION_TIME, LOC, LOG_PROB, SAMPLE, TRIL, folded
 from scipy import stats
 
 from foldgauss.analysis.conditional import TimeMixture, _mixture_moments, _nearer
@@ -17,17 +18,9 @@ from foldgauss.fold import PolynomialFold, ZeroFold
 from foldgauss.gaussian import Gaussian
 from foldgauss.mixture import FoldedMixture
 
-BEND = np.array([[0.8, -0.5, 0.3], [0.6, 0.9, -0.4]])
-TRIL = np.array([[0.3, 0.0, 0.0], [0.1, 0.2, 0.0], [-0.1, 0.05, 0.25]])
-LOC = np.array([0.1, -0.4, 0.2])
-
-LOG_PROB = eqx.filter_jit(lambda dist, x: dist.log_prob(x))
 CDF = eqx.filter_jit(lambda dist, x: dist.cdf(x))
-SAMPLE = eqx.filter_jit(lambda dist, key, n: dist.sample(key, (n,)))
 MEAN_AND_VARIANCE = eqx.filter_jit(lambda dist: (dist.mean, dist.variance))
 NEARER = eqx.filter_jit(_nearer)
-CONDITION_TIME = eqx.filter_jit(FoldedGaussian.condition_time)
-
 # An integral over time takes seconds to compile for each shape: what is given has this many points in most tests.
 MANY = 21
 
@@ -35,20 +28,8 @@ MANY = 21
 pytestmark = pytest.mark.usefixtures("x64")
 
 
-def _dist(dim=2, power=1.0, floor=0.0, **changes):
-    parameters = {
-        "loc": LOC[:dim],
-        "scale_tril": TRIL[:dim, :dim],
-        "time_loc": 0.4,
-        "time_scale": 0.3,
-        "fold": PolynomialFold(BEND[:, :dim]),
-        "envelope": TimeLikelihood(power, floor),
-    }
-    return FoldedGaussian(**(parameters | changes))
-
-
 def _points(dist, n=20, key=0):
-    return SAMPLE(dist, jax.random.key(key), n)
+    return SAMPLE(dist, jax.random.key(key), (n,))
 
 
 def _repeated(*values):
@@ -98,8 +79,8 @@ def test_adaptive_panels_see_narrow_peaks_and_count_them_in_logarithms():
 @pytest.mark.parametrize("fold", ["polynomial", "zero", "callable"])
 def test_marginal_with_time_is_a_folded_gaussian(fold):
     bend = jnp.asarray(BEND)
-    kinds = {"polynomial": PolynomialFold(BEND), "zero": ZeroFold(3), "callable": lambda u: u * bend[0]}
-    dist = _dist(3, fold=kinds[fold])
+    kinds = {"polynomial": PolynomialFold(BEND[:2]), "zero": ZeroFold(3), "callable": lambda u: u * bend[0]}
+    dist = folded(3, fold=kinds[fold])
     marginal = dist.marginal([2, 0, -1])
     assert isinstance(marginal, FoldedGaussian)
     at, part = CONDITION_TIME(dist, 0.7), CONDITION_TIME(marginal, 0.7)
@@ -110,7 +91,7 @@ def test_marginal_with_time_is_a_folded_gaussian(fold):
 
 
 def test_conditioning_with_time_is_the_gaussian_of_the_book():
-    dist = _dist(3)
+    dist = folded(3)
     at = CONDITION_TIME(dist, 0.7)
     gaussian = eqx.filter_jit(lambda dist: dist.condition([1, -1, 0], [-0.3, 0.7, 0.2]))(dist)
     sigma, mean = np.asarray(at.covariance_matrix), np.asarray(at.loc)
@@ -141,7 +122,7 @@ ENVELOPES = [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (2.0, 0.01)]  # power and floor
 def test_time_given_space_integrates_to_one(dim, cases):
     nodes, weights = np.polynomial.legendre.leggauss(20)
     for power, floor in cases:
-        dist = _dist(dim, power, floor)
+        dist = folded(dim, power, floor)
         # At s = 1.5 and 1.95 the curve of one space coordinate passes at tau = 6.7 and 7.5, too, in widths of 1e-5;
         # just above -0.16, where it turns back, the density has a flat top.
         s = jnp.concatenate([_points(dist, MANY - 3)[:, :-1], jnp.outer(jnp.array([1.5, 1.95, -0.15]), jnp.ones(dim))])
@@ -163,7 +144,7 @@ def test_time_given_space_integrates_to_one(dim, cases):
 
 
 def test_nearest_times_are_refined_by_short_steps_only():
-    dist, tau = _dist(2), np.array([-2.5, 0.3, 2.0])
+    dist, tau = folded(2), np.array([-2.5, 0.3, 2.0])
     for away, reached in [(1e-6, 0.0), (-1e-4, 0.0), (0.1, 0.1)]:
         for one in tau:
             s = CONDITION_TIME(dist, jnp.asarray(0.4 + 0.3 * one)).loc
@@ -174,16 +155,16 @@ def test_nearest_times_are_refined_by_short_steps_only():
 def test_moments_with_an_own_envelope_equal_those_with_the_same_built_in():
     """An own envelope may depend on t itself, so that times are not centered."""
     own = CallableEnvelope(lambda t, m, scale: -0.5 * ((t - m) / scale) ** 2)
-    density = _dist(1).time_given_space(_repeated(0.3))
+    density = folded(1).time_given_space(_repeated(0.3))
     panels = jax.tree.map(lambda leaf: leaf[0], density.time.panels)
-    mean, covariance = eqx.filter_jit(_mixture_moments)(_dist(1, envelope=own), jnp.array([0.3]), panels)
+    mean, covariance = eqx.filter_jit(_mixture_moments)(folded(1, envelope=own), jnp.array([0.3]), panels)
     np.testing.assert_allclose(mean, density.mean[0], rtol=1e-12)
     np.testing.assert_allclose(covariance[0], density.variance[0], rtol=1e-9)
 
 
 def test_modes_of_time_are_where_the_parabola_passes():
     # s = u^2 passes at u = -sqrt(s) and sqrt(s): two modes, pulled in a little, by the slope of the density of time.
-    dist = _dist(1, 0.0, loc=[0.0], scale_tril=[[0.01]], fold=PolynomialFold([[0.0], [1.0]]))
+    dist = folded(1, 0.0, loc=[0.0], scale_tril=[[0.01]], fold=PolynomialFold([[0.0], [1.0]]))
     s = jnp.linspace(0.09, 0.5, MANY)[:, None]
     density = dist.time_given_space(s)
     away = np.sqrt(s - 0.01**2 / (2 * 0.3**2))
@@ -197,13 +178,13 @@ def test_modes_of_time_are_where_the_parabola_passes():
 
 @pytest.mark.slow  # it compiles for long
 def test_quantiles_and_samples_of_time():
-    dist = _dist(1, 0.0, loc=[0.0], scale_tril=[[0.02]], fold=PolynomialFold([[0.0], [1.0]]))
+    dist = folded(1, 0.0, loc=[0.0], scale_tril=[[0.02]], fold=PolynomialFold([[0.0], [1.0]]))
     density = dist.time_given_space(jnp.array([[0.09], [0.0], [1.0]]))
     q = jnp.linspace(0.001, 0.999, 50)[:, None]
     t = density.icdf(q)
     assert t.shape == (50, 3, 1)
     np.testing.assert_allclose(density.cdf(t), jnp.broadcast_to(q, (50, 3)), atol=1e-10)
-    draws = SAMPLE(density, jax.random.key(1), 50_000)[..., 0]
+    draws = SAMPLE(density, jax.random.key(1), (50_000,))[..., 0]
     for i in range(3):
         cdf = lambda x, i=i: np.asarray(density.cdf(jnp.asarray(x)[:, None, None]))[:, i]  # noqa: E731
         assert stats.kstest(np.asarray(draws[:, i]), cdf).pvalue > 1e-4
@@ -217,7 +198,7 @@ def test_quantiles_and_samples_of_time():
 
 
 def test_the_cdf_of_space_goes_from_zero_to_one():
-    marginal = _dist(1).marginal([0])
+    marginal = folded(1).marginal([0])
     found = CDF(marginal, jnp.array([[-jnp.inf], [-30.0], [0.1], [30.0], [jnp.inf]]))
     np.testing.assert_allclose(np.delete(found, 2), [0, 0, 1, 1], atol=1e-9)
     assert 0.01 < found[2] < 0.99
@@ -225,7 +206,7 @@ def test_the_cdf_of_space_goes_from_zero_to_one():
 
 @pytest.mark.slow
 def test_space_marginal_is_the_law_of_the_samples():
-    dist = _dist(2)
+    dist = folded(2)
     marginal = dist.marginal([0])
     draws = np.asarray(_points(dist, 20_000, key=3))[:, 0]
     grid = np.linspace(-3, 4, 192)  # three times 64, compiled as one
@@ -233,7 +214,7 @@ def test_space_marginal_is_the_law_of_the_samples():
     assert (np.diff(cdf) >= -1e-12).all()
     assert stats.kstest(draws, lambda x: np.interp(x, grid, cdf)).pvalue > 1e-4
     assert stats.kstest(draws + 0.02, lambda x: np.interp(x, grid, cdf)).pvalue < 1e-4
-    own = np.asarray(SAMPLE(marginal, jax.random.key(7), 20_000))
+    own = np.asarray(SAMPLE(marginal, jax.random.key(7), (20_000,)))
     assert own.shape == (20_000, 1)
     assert stats.kstest(own[:, 0], lambda x: np.interp(x, grid, cdf)).pvalue > 1e-4
     for own, whole in zip(MEAN_AND_VARIANCE(marginal), MEAN_AND_VARIANCE(dist), strict=True):
@@ -243,7 +224,7 @@ def test_space_marginal_is_the_law_of_the_samples():
 @pytest.mark.slow
 def test_density_is_the_slope_of_the_distribution_function():
     nodes, weights = np.polynomial.legendre.leggauss(60)
-    for dist in (_dist(2).marginal([1]), _dist(2).condition([0], [0.3]).marginal([0])):
+    for dist in (folded(2).marginal([1]), folded(2).condition([0], [0.3]).marginal([0])):
         x = jnp.asarray(0.25 * nodes)[:, None]
         mass = weights @ jnp.exp(LOG_PROB(dist, x)) * 0.25
         ends = CDF(dist, jnp.array([[-0.25], [0.25]]))
@@ -252,13 +233,13 @@ def test_density_is_the_slope_of_the_distribution_function():
 
 
 def test_space_given_space_against_its_definition():
-    dist = _dist(3)
+    dist = folded(3)
     given = dist.condition([1], _repeated(-0.3))
     assert given.event_shape == (3,)
-    draws = SAMPLE(given, jax.random.key(1), 50_000 // MANY)
+    draws = SAMPLE(given, jax.random.key(1), (50_000 // MANY,))
     x = draws[0]
     full = jnp.stack([x[:, 0], jnp.full(MANY, -0.3), x[:, 1], x[:, 2]], axis=-1)
-    alone = _dist(1, loc=LOC[1:2], scale_tril=np.linalg.norm(TRIL[1])[None, None], fold=PolynomialFold(BEND[:, 1:2]))
+    alone = folded(1, loc=LOC[1:2], scale_tril=np.linalg.norm(TRIL[1])[None, None], fold=PolynomialFold(BEND[:2, 1:2]))
     expected = LOG_PROB(dist, full) - np.log(_density_of_one(alone, -0.3))
     np.testing.assert_allclose(LOG_PROB(given, x), expected, rtol=1e-11)
     np.testing.assert_array_equal(LOG_PROB(pickle.loads(pickle.dumps(given)), x), LOG_PROB(given, x))
@@ -286,10 +267,10 @@ def test_space_given_space_against_its_definition():
 )
 @pytest.mark.parametrize("mixed", [False, True])
 def test_conditioning_and_marginals_commute(one, other, rest, mixed):
-    dist = _dist(3)
+    dist = folded(3)
     x = _points(dist, 5)
     if mixed:
-        dist = FoldedMixture(_dist(3, loc=[LOC, LOC + 0.2], time_loc=[0.4, 0.6]), weights=[0.3, 0.7])
+        dist = FoldedMixture(folded(3, loc=[LOC, LOC + 0.2], time_loc=[0.4, 0.6]), weights=[0.3, 0.7])
     found, expected = (LOG_PROB(make(dist, x), x[:, rest]) for make in (one, other))
     np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-10)
 
@@ -418,7 +399,7 @@ def test_the_other_coordinate_where_time_is_known_to_the_last_digit():
 def test_points_on_a_curve_to_rounding_are_said_to_be():
     # In two space coordinates the density next to the curve hangs on the rounding of s, if the curve is narrow enough.
     for scale, low, high in [(0.1, 0, 1e-9), (1e-17, 1.0, np.inf)]:
-        dist = _dist(2, scale_tril=scale * np.eye(2))
+        dist = folded(2, scale_tril=scale * np.eye(2))
         x = _points(dist, 5)
         errors = np.r_[
             dist.marginal([0, 1]).error_estimate(x[:, :2]), dist.time_given_space(x[:, :2]).time.error_estimate
@@ -428,7 +409,7 @@ def test_points_on_a_curve_to_rounding_are_said_to_be():
     marginal, off = dist.marginal([0, 1]), x[:, :2] + 0.1
     assert (marginal.error_estimate(off) < 1e-14 * jnp.abs(marginal.log_prob(off))).all()
     # In one coordinate only where the curve turns back, at u = -2/3.
-    line = _dist(1, scale_tril=[[1e-17]]).marginal([0])
+    line = folded(1, scale_tril=[[1e-17]]).marginal([0])
     turn = line.parent.condition_time(0.4 + 2 / 3).loc
     assert line.error_estimate(turn) > 1e-2
     assert line.error_estimate(turn + 0.1) < 1e-9  # before it, that is: the parabola is open upwards
@@ -436,7 +417,7 @@ def test_points_on_a_curve_to_rounding_are_said_to_be():
 
 @pytest.mark.slow
 def test_far_points():
-    dist = _dist(1, 1.0)
+    dist = folded(1, 1.0)
     marginal, far, t = dist.marginal([0]), jnp.array([[50.0], [-1e4], [1e6]]), jnp.full((3, 1), 0.3)
     log_prob, time = LOG_PROB(marginal, far), dist.time_given_space(far)
     assert np.isfinite(log_prob).all()
@@ -453,7 +434,7 @@ def test_far_points():
 
 def test_without_fold_density_is_gaussian_or_diverges():
     # On a ridge that stands still p(s) diverges for power (d-1) >= 2; next to it, or without an envelope, it does not.
-    still = _dist(2, jnp.array([1.0, 0.0]), fold=ZeroFold(2)).marginal([0, 1])
+    still = folded(2, jnp.array([1.0, 0.0]), fold=ZeroFold(2)).marginal([0, 1])
     x = LOC[:2] + np.array([[[0.0]], [[1e-3]]])
     values, error = still.log_prob(x), still.error_estimate(x)
     np.testing.assert_array_equal(np.isposinf(values), [[True, False], [False, False]])
@@ -510,7 +491,7 @@ def test_estimated_errors_near_a_ridge_are_no_smaller_than_the_errors():
 def test_a_ridge_that_quadrature_misses_is_said_to_be():
     """Panels are wider than a ridge of 1e-13. The estimated error is the mass of that ridge, a Gaussian integral."""
     for scale in (1e-10, 1e-13, 1e-16):
-        dist = _dist(2, power=1.0, scale_tril=scale * TRIL[:2, :2])
+        dist = folded(2, power=1.0, scale_tril=scale * TRIL[:2, :2])
         speed = np.linalg.solve(TRIL[:2, :2], 0.3 * BEND[0, :2])  # in units of the ridge's width, per time_scale
         truth = -np.log(2 * np.pi * scale * TRIL[0, 0] * TRIL[1, 1] * np.linalg.norm(speed))
         marginal = dist.marginal([0, 1])
@@ -580,7 +561,7 @@ def test_float32_far_out_agrees_with_float64(dim):
 
 @pytest.mark.slow  # it compiles for long
 def test_points_at_infinity():
-    dist = _dist(2)
+    dist = folded(2)
     space, line, time = dist.marginal([0, 1]), dist.marginal([0]), dist.time_given_space([0.1, -0.4])
     for sign in (-1, 1):
         assert np.isneginf(LOG_PROB(line, jnp.array([sign * jnp.inf])))
@@ -595,11 +576,11 @@ def test_points_at_infinity():
 
 
 def test_gradients_go_through_the_integral():
-    log_prob = lambda loc, s: _dist(1, loc=loc[None]).marginal([0]).log_prob(s)  # noqa: E731
+    log_prob = lambda loc, s: folded(1, loc=loc[None]).marginal([0]).log_prob(s)  # noqa: E731
     both = jax.jit(jax.value_and_grad(log_prob, argnums=(0, 1)))
     loc, s, step = jnp.asarray(0.1), jnp.array([0.5]), 1e-5
     value, (by_loc, by_s) = both(loc, s)
-    np.testing.assert_allclose(value, np.log(_density_of_one(_dist(1), 0.5)), rtol=1e-10)
+    np.testing.assert_allclose(value, np.log(_density_of_one(folded(1), 0.5)), rtol=1e-10)
     np.testing.assert_allclose(by_loc, (both(loc + step, s)[0] - both(loc - step, s)[0]) / (2 * step), rtol=1e-6)
     np.testing.assert_allclose(by_s[0], -by_loc, rtol=1e-9)  # p(s) knows s - loc only
 
@@ -615,7 +596,7 @@ def test_gradients_go_through_the_integral():
     ],
 )
 def test_indices_are_checked(indices, expected):
-    for call in (lambda: _dist().marginal(indices), lambda: _dist().condition(indices, [0.0] * len(indices))):
+    for call in (lambda: folded().marginal(indices), lambda: folded().condition(indices, [0.0] * len(indices))):
         with pytest.raises(ValueError, match=f"^indices: expected {expected}"):
             call()
 
@@ -640,4 +621,4 @@ def test_indices_are_checked(indices, expected):
 )
 def test_bad_requests_are_refused(request_of, message):
     with pytest.raises(ValueError, match=f"^{message}"):
-        request_of(_dist())
+        request_of(folded())
