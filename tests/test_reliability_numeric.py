@@ -55,7 +55,7 @@ NAMED = {
     "color_dc": "color_dc moved most",
     "time_loc_logit": None,
     "log_time_scale": "no finite time_loc_logit",
-    "frame_times": "frame times moved",
+    "frame_times": "frame times moved by e^",
 }
 
 
@@ -71,10 +71,13 @@ HIGHEST = ("loc", "log_scale", "opacity_logit")
     ],
 )
 def test_too_high_rate_is_named_and_the_model_not_worse_than_its_start(at_start, leaf, power):
+    """Pictures alone do not show frame times that diverge: they end poorly, and are never worse than before."""
     config, named = too_high(leaf, 10.0**power), NAMED[leaf]
     psnr, told = fitted_with(config)
-    assert psnr > at_start - 0.3
+    times_alone = (leaf, power) == ("frame_times", 3)
+    assert psnr - at_start > (8 if times_alone else -0.3)
     assert bool(told) == (named is not None)
+    assert not times_alone or len(told) == 1
     if told:
         assert named in told[0]
         assert "diverged at step " in told[0]
@@ -83,14 +86,6 @@ def test_too_high_rate_is_named_and_the_model_not_worse_than_its_start(at_start,
 def test_a_rate_too_high_for_all_backoffs_ends_the_fit():
     with pytest.warns(DivergenceWarning), pytest.raises(FitDiverged, match=r"step \d+: no finite time_loc_logit"):
         fit(CLIP, too_high("log_time_scale", 1e9))
-
-
-def test_diverging_frame_times_are_restored(at_start):
-    """Pictures alone do not tell: they come to a poor end, and never get worse than before."""
-    psnr, told = fitted_with(too_high("frame_times", 1e3))
-    assert len(told) == 1
-    assert "frame times moved by e^" in told[0]
-    assert psnr > at_start + 8
 
 
 def test_exhausted_backoffs_restore_the_last_finite_state(at_start):

@@ -1,5 +1,6 @@
 """Sampling of frame times by emcee: known posteriors, seeds, files of draws, argument checks."""
 
+import contextlib
 import dataclasses
 
 import emcee
@@ -186,26 +187,20 @@ def test_too_few_steps_are_reported():
     assert "autocorrelation times" in found.message
 
 
-def test_resumed_run_equals_an_uninterrupted_one(tmp_path):
-    profiles, settings = toy(*NEAR), {"steps": 600, "seed": 5}
-    whole = sampled(profiles, **settings)
-    sampled(profiles, **{**settings, "steps": 300}, backend=tmp_path / "run.h5")
-    for _ in range(2):
-        found = sampled(profiles, **settings, backend=tmp_path / "run.h5")
-        np.testing.assert_array_equal(found.times, whole.times)
-    assert [path.name for path in tmp_path.iterdir()] == ["run.h5"]
-    assert emcee.backends.HDFBackend(str(tmp_path / "run.h5"), name="ensemble_1").get_chain().shape == (60, 32, 3)
-
-
-def test_interrupted_run_goes_on(tmp_path):
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_resumed_run_equals_an_uninterrupted_one(tmp_path, interrupted):
     def interrupt(done, total):
-        if done == 300:
+        if interrupted and done == 300:
             raise KeyboardInterrupt
 
-    profiles, settings = toy(*NEAR), {"steps": 600, "backend": tmp_path / "run.h5"}
-    with pytest.raises(KeyboardInterrupt):
-        sampled(profiles, **settings, on_progress=interrupt)
-    np.testing.assert_array_equal(sampled(profiles, **settings).times, sampled(profiles, steps=600).times)
+    profiles, settings = toy(*NEAR), {"steps": 600, "seed": 5}
+    whole, kept = sampled(profiles, **settings), {"backend": tmp_path / "run.h5"}
+    with contextlib.suppress(KeyboardInterrupt):
+        sampled(profiles, **settings | {"steps": 600 if interrupted else 300}, **kept, on_progress=interrupt)
+    for _ in range(2):
+        np.testing.assert_array_equal(sampled(profiles, **settings, **kept).times, whole.times)
+    assert [path.name for path in tmp_path.iterdir()] == ["run.h5"]
+    assert emcee.backends.HDFBackend(str(tmp_path / "run.h5"), name="ensemble_1").get_chain().shape == (60, 32, 3)
 
 
 def test_file_of_another_run_is_refused(tmp_path):
