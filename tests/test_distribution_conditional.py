@@ -10,7 +10,7 @@ import pytest
 from folded import BEND, CONDITION_TIME, LOC, LOG_PROB, SAMPLE, TRIL, folded
 from scipy import stats
 
-from foldgauss.analysis.conditional import TimeMixture, _mixture_moments, _nearer
+from foldgauss.analysis.conditional import TimeMixture, _mixture_moments
 from foldgauss.analysis.quadrature import SEARCH_GRID, adaptive_panels, find_peaks, gauss_hermite, normal_panels
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import CallableEnvelope, TimeLikelihood
@@ -20,7 +20,6 @@ from foldgauss.mixture import FoldedMixture
 
 CDF = eqx.filter_jit(lambda dist, x: dist.cdf(x))
 MEAN_AND_VARIANCE = eqx.filter_jit(lambda dist: (dist.mean, dist.variance))
-NEARER = eqx.filter_jit(_nearer)
 # An integral over time takes seconds to compile for each shape: what is given has this many points in most tests.
 MANY = 21
 
@@ -141,15 +140,6 @@ def test_time_given_space_integrates_to_one(dim, cases):
         np.testing.assert_allclose((half * weights[:, None] * p).sum((0, 1)), 1, rtol=1e-8)
         assert power == 0 or dim == 2 or (np.isfinite(modes).sum(-1) > 1).any()  # bimodal ones are among them
         np.testing.assert_allclose(density.time.panels.probabilities.sum(-1), 1, atol=1e-12)
-
-
-def test_nearest_times_are_refined_by_short_steps_only():
-    dist, tau = folded(2), np.array([-2.5, 0.3, 2.0])
-    for away, reached in [(1e-6, 0.0), (-1e-4, 0.0), (0.1, 0.1)]:
-        for one in tau:
-            s = CONDITION_TIME(dist, jnp.asarray(0.4 + 0.3 * one)).loc
-            found = NEARER(dist, s, jnp.array([one + away]))
-            np.testing.assert_allclose(found, one + reached, atol=20 * away**2 if reached == 0 else 0)
 
 
 def test_moments_with_an_own_envelope_equal_those_with_the_same_built_in():

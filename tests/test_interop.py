@@ -285,32 +285,6 @@ def test_numpyro_warns_out_of_the_support(cheap, value):
     to_numpyro(cheap.base, validate_args=False).log_prob(x)  # no warning, which would be an error in this suite
 
 
-@pytest.mark.slow
-def test_numpyro_model_under_nuts_finds_the_fold(numpyro):
-    from numpyro import distributions
-    from numpyro.infer import MCMC, NUTS
-
-    x = _dist().sample(jax.random.key(0), (400,))
-
-    def model(x):
-        bend = numpyro.sample("bend", distributions.Normal(0, 1).expand([2, 2]).to_event(2))
-        numpyro.sample("x", to_numpyro(_dist(fold=PolynomialFold(bend))), obs=x)
-        # The same family as a latent variable, not only as a likelihood (a = 1: else it is a funnel).
-        numpyro.sample("latent", to_numpyro(_dist(envelope=Constant())))
-
-    mcmc = MCMC(NUTS(model), num_warmup=150, num_samples=200, progress_bar=False)
-    mcmc.run(jax.random.key(1), x)
-    draws = mcmc.get_samples()
-    mean, error = draws["bend"].mean(0), draws["bend"].std(0)
-    truth = np.array([[0.8, -0.5], [0.6, 0.9]])
-    assert (np.abs(mean - truth) < 5 * error).all()
-    assert (error < 0.1).all()
-    # Power: a fold of the wrong sign lies far outside the posterior.
-    assert (np.abs(mean + truth) > 5 * error).all()
-    assert draws["latent"].shape == (200, 3)
-    np.testing.assert_allclose(draws["latent"][:, 2].mean(), 0.4, atol=0.15)  # sd 0.02 to 0.03
-
-
 def test_missing_numpyro_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "numpyro", None)
     with pytest.raises(ImportError, match=r"pip install 'foldgauss\[numpyro\]'"):

@@ -115,13 +115,6 @@ def test_bic_has_its_least_value_at_the_true_degree():
     assert min((fit(_points(300), degree=degree) for degree in range(4)), key=lambda fit: fit.bic).degree == 2
 
 
-def test_true_parameters_are_recovered_in_float32():
-    dist = fit(_points(20_000), degree=2).check().distribution
-    np.testing.assert_allclose(dist.loc, LOC, atol=0.02)
-    np.testing.assert_allclose(dist.fold.coefficients, BEND, atol=0.03)
-    np.testing.assert_allclose(dist.scale_tril, TRIL, atol=0.01)
-
-
 def test_weights_equal_repetitions_and_rows_of_weight_zero_may_be_nan(x64):
     x, weights = _points(), np.repeat([0, 1, 2, 3, 4], [25, 18, 12, 2, 3])  # of sum 60: one program for both
     weighted = fit(np.where(weights[:, None] > 0, x, np.nan), degree=2, weights=weights).check()
@@ -130,9 +123,12 @@ def test_weights_equal_repetitions_and_rows_of_weight_zero_may_be_nan(x64):
         np.testing.assert_allclose(np.abs(a), np.abs(b), rtol=1e-10, atol=1e-12)  # a QR is unique up to signs
 
 
-def test_fit_is_equivariant_to_units():
+def test_fit_in_float32_recovers_the_truth_and_is_equivariant_to_units():
     x = np.float32(_points(20_000))
-    dist = fit(x, degree=2).distribution
+    dist = fit(x, degree=2).check().distribution
+    np.testing.assert_allclose(dist.loc, LOC, atol=0.02)
+    np.testing.assert_allclose(dist.fold.coefficients, BEND, atol=0.03)
+    np.testing.assert_allclose(dist.scale_tril, TRIL, atol=0.01)
     stretch, shift = np.float32([1e18, 1e-12, 1e4]), np.float32([1e18, 1e-12, 1e7])
     moved = fit(x * stretch + shift, degree=2).check()
     # Offsets of 1e3 time scales cost 10 bits of t, no more.

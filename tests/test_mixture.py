@@ -244,31 +244,6 @@ def test_marginals_and_conditionals_know_their_own(x64):
     )
 
 
-@pytest.mark.slow
-def test_time_posterior(x64):
-    mixture = _mixture(envelope=TimeLikelihood(1.0, 0.05))
-    s = jnp.array([[0.1, -0.2], [-0.4, 0.4]])
-    when = mixture.time_given_space(s)
-    assert isinstance(when.components, TimeMixture)
-    assert (when.event_shape, when.batch_shape) == ((1,), (2,))
-    t = np.linspace(-3, 4, 8001)
-    density = np.asarray(when.pdf(t[:, None, None]))
-    step = t[1] - t[0]
-    np.testing.assert_allclose(density.sum(0) * step, 1, rtol=1e-6)
-    mean = (t[:, None] * density).sum(0) * step
-    np.testing.assert_allclose(when.mean[:, 0], mean, rtol=1e-6)
-    np.testing.assert_allclose(when.variance[:, 0], ((t[:, None] - mean) ** 2 * density).sum(0) * step, rtol=1e-6)
-    assert when.covariance_matrix.shape == (2, 1, 1)
-    below = np.asarray(when.cdf(jnp.array([[[0.4]], [[1e3]], [[-1e3]]])))
-    np.testing.assert_allclose(below, [(density[t < 0.4]).sum(0) * step, [1, 1], [0, 0]], atol=2e-3)
-    q = jnp.array([[0.01], [0.5], [0.9]])
-    np.testing.assert_allclose(when.cdf(when.icdf(q)), np.broadcast_to(q, (3, 2)), atol=1e-9)
-    np.testing.assert_array_equal(when.icdf(jnp.array([[0.0], [1.0]]))[..., 0], [[-np.inf] * 2, [np.inf] * 2])
-    assert (when.error_estimate(0.5) < 1e-6).all()
-    draws = when.sample(jax.random.key(0), (4000,))
-    assert _deviations(draws, when.mean) < ALARM
-
-
 # --- weights of zero, and points far away ---------------------------------------------------------------------
 
 
