@@ -40,12 +40,6 @@ def test_no_import_circle():
     TopologicalSorter(graph).prepare()  # raises CycleError with the modules
 
 
-def test_imports_inside_functions_are_found():
-    hidden = "def f():\n    from foldgauss.b import c\n"
-    known = {"foldgauss.a": None, "foldgauss.b": None}
-    assert imported_modules(hidden, known) == {"foldgauss.b"}
-
-
 @pytest.mark.parametrize("package", PACKAGES)
 def test_folder_says_what_it_is_for(package):
     assert ast.get_docstring(ast.parse(SOURCES[package].read_text())), f"{package} has no docstring"

@@ -386,26 +386,6 @@ def test_the_other_coordinate_where_time_is_known_to_the_last_digit():
 
 
 @pytest.mark.slow
-def test_points_on_a_curve_to_rounding_are_said_to_be():
-    # In two space coordinates the density next to the curve hangs on the rounding of s, if the curve is narrow enough.
-    for scale, low, high in [(0.1, 0, 1e-9), (1e-17, 1.0, np.inf)]:
-        dist = folded(2, scale_tril=scale * np.eye(2))
-        x = _points(dist, 5)
-        errors = np.r_[
-            dist.marginal([0, 1]).error_estimate(x[:, :2]), dist.time_given_space(x[:, :2]).time.error_estimate
-        ]
-        assert ((errors >= low) & (errors <= high)).all()
-    # At a distance from the curve nothing does, but for the digits of log p, -1e32.
-    marginal, off = dist.marginal([0, 1]), x[:, :2] + 0.1
-    assert (marginal.error_estimate(off) < 1e-14 * jnp.abs(marginal.log_prob(off))).all()
-    # In one coordinate only where the curve turns back, at u = -2/3.
-    line = folded(1, scale_tril=[[1e-17]]).marginal([0])
-    turn = line.parent.condition_time(0.4 + 2 / 3).loc
-    assert line.error_estimate(turn) > 1e-2
-    assert line.error_estimate(turn + 0.1) < 1e-9  # before it, that is: the parabola is open upwards
-
-
-@pytest.mark.slow
 def test_far_points():
     dist = folded(1, 1.0)
     marginal, far, t = dist.marginal([0]), jnp.array([[50.0], [-1e4], [1e6]]), jnp.full((3, 1), 0.3)

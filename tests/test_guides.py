@@ -305,12 +305,3 @@ def test_what_is_wrong_fails(text, wrong, tmp_path, monkeypatch):
     (tmp_path / "page.md").write_text(text)
     with pytest.raises(wrong):
         guides.run_page(str(tmp_path / "page.md"), tmp_path, monkeypatch)
-
-
-def test_commands_are_split_as_a_shell_does():
-    text = 'pip install ".[a]" && foldgauss fit a.mp4 \\\n  --out b  # a comment\n\n# nothing\nfoldgauss info b'
-    assert list(guides.commands(text)) == [
-        ["pip", "install", ".[a]"],
-        ["foldgauss", "fit", "a.mp4", "--out", "b"],
-        ["foldgauss", "info", "b"],
-    ]

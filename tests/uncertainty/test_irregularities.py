@@ -103,23 +103,21 @@ def test_intervals_cover():
 
 
 @pytest.mark.parametrize(
-    ("setting", "value"),
+    ("function", "setting", "value"),
     [
-        ("duplicate", 0),
-        ("duplicate", 1.0),
-        ("dropped", 1.0),
-        ("dropped", np.nan),
-        ("probability", 0),
-        ("reach", 0),
-        ("reach", 1.5),
+        (irregularities, "duplicate", 0),
+        (irregularities, "duplicate", 1.0),
+        (irregularities, "dropped", 1.0),
+        (irregularities, "dropped", np.nan),
+        (irregularities, "probability", 0),
+        (irregularities, "reach", 0),
+        (irregularities, "reach", 1.5),
+        (increment_intervals, "level", 1.0),
     ],
 )
-def test_settings_out_of_range(setting, value):
-    posterior = posterior_about(np.linspace(0, 1, 6))
+def test_settings_out_of_range(function, setting, value):
     with pytest.raises(ValueError, match=rf"^{setting}: expected"):
-        irregularities(posterior, **{setting: value})
-    with pytest.raises(ValueError, match=r"^level: expected"):
-        increment_intervals(posterior, 1.0)
+        function(posterior_about(np.linspace(0, 1, 6)), **{setting: value})
 
 
 def test_models_are_compared_under_one_noise():
@@ -146,12 +144,12 @@ def test_models_are_compared_under_one_noise():
     assert again.at_own == pytest.approx(other.at_own, rel=0.1)
 
 
-def test_compare_times_refuses_no_models_and_other_lengths():
-    model = model_of_12()
-    with pytest.raises(ValueError, match=r"^models: expected at least one"):
-        compare_times({}, np.zeros((12, 40, 64, 3), np.uint8))
-    with pytest.raises(ValueError, match=r"models\['a'\]: expected 7 frames"):
-        compare_times({"a": model}, np.zeros((7, 40, 64, 3), np.uint8))
+@pytest.mark.parametrize(
+    ("models", "message"), [((), "^models: expected at least one"), (("a",), r"models\['a'\]: expected 7 frames")]
+)
+def test_compare_times_refuses_no_models_and_other_lengths(models, message):
+    with pytest.raises(ValueError, match=message):
+        compare_times(dict.fromkeys(models, model_of_12()), np.zeros((7, 40, 64, 3), np.uint8))
 
 
 def test_summary_names_frames_that_are_not_identified():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from time_clips import SCALE, model, white
 
-from benchmarks._calibration import SimulatedRanks, ecdf_band, simulated_ranks
+from benchmarks._calibration import ecdf_band, simulated_ranks
 from foldgauss.uncertainty import FrameNoise, Increments
 
 REPLICATES, FRAMES = 300, 6
@@ -124,9 +124,3 @@ def test_envelope_has_its_level(level):
     inside = ((shares >= low - 1e-12) & (shares <= high + 1e-12)).all(1).mean()
     # Counts are integers: never less than the level, and slightly more.
     assert level - 0.02 < inside < level + 0.05
-
-
-def test_coverage_counts_central_ranks():
-    every = SimulatedRanks(np.arange(100)[:, None], 100, [], np.zeros(0), 1.0)
-    for level in (0.5, 0.9, 0.98):
-        assert every.coverage(level)[0] == pytest.approx(level)
