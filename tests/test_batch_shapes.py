@@ -42,12 +42,8 @@ def _points(batch):
     return jnp.asarray(np.random.default_rng(9).normal(0.3, 0.5, (2, *batch, 3)), jnp.float32)
 
 
-def _densities(dist, x):
-    return [dist.log_prob(x), dist.pdf(x)]
-
-
 def _pairs(mixture, x):
-    return [*_densities(mixture, x), mixture.component_log_prob(x), mixture.responsibilities(x)]
+    return [mixture.log_prob(x), mixture.component_log_prob(x), mixture.responsibilities(x)]
 
 
 def _moments(dist):
@@ -74,10 +70,10 @@ def _of_components(m, x):
     t = x[..., 2]
     at, time = folded.condition_time(t), folded.marginal([-1])
     z, log_det = folded.fold_to_normal(x)
-    found = [*_densities(folded, x), z, log_det]
-    found += [*folded.normal_to_fold(x), *_densities(folded.marginal([1, -1]), x[..., 1:])]
-    found += [*_densities(at, x[..., :2]), *_moments(at), at.entropy(), *_moments(at.marginal(1))]
-    return [*found, *_densities(time, x[..., 2:]), time.cdf(x[..., 2:]), time.icdf(jax.nn.sigmoid(t))]
+    found = [folded.log_prob(x), z, log_det]
+    found += [*folded.normal_to_fold(x), folded.marginal([1, -1]).log_prob(x[..., 1:])]
+    found += [at.log_prob(x[..., :2]), *_moments(at), at.entropy(), *_moments(at.marginal(1))]
+    return [*found, time.log_prob(x[..., 2:]), time.cdf(x[..., 2:]), time.icdf(jax.nn.sigmoid(t))]
 
 
 def _of_integrated(m, x):

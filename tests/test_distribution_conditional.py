@@ -447,10 +447,10 @@ def test_estimated_errors_near_a_ridge_are_no_smaller_than_the_errors():
         center = np.asarray(narrow.condition_time(np.float32(rng.normal(0.4, 0.6, size=(32, 3)))).loc)
         away = 1 + np.float32([0, 6e-8, 2e-6])[:, None, None, None] * rng.normal(size=(3, *center.shape))
         s = np.float32(center * away)
-        here = narrow.marginal([0, 1])
-        log_p, estimate = np.asarray(here.log_prob(s)), np.asarray(here.error_estimate(s))
-    exact = jax.tree.map(lambda x: np.asarray(x, np.float64), narrow).marginal([0, 1])
-    error = np.abs(log_p - np.asarray(exact.log_prob(np.float64(s))))
+        here = narrow.time_given_space(s).time  # the integrals of log_prob and of error_estimate are one
+        log_p, estimate = np.asarray(here.log_normalizer), np.asarray(here.error_estimate)
+    exact = jax.tree.map(lambda x: np.asarray(x, np.float64), narrow).time_given_space(np.float64(s)).time
+    error = np.abs(log_p - np.asarray(exact.log_normalizer))
     assert log_p.dtype == np.float32
     assert (error <= estimate).all()
     typical = np.median(estimate, (0, 1)) / np.median(error, (0, 1))

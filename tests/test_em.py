@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import special
 
-from foldgauss.envelope import Constant, TimeLikelihood
+from foldgauss.envelope import Constant, TimeLikelihood, plain_envelope
 from foldgauss.estimator.em import components, loop
 from foldgauss.estimator.em.loop import EMStatus, run_em, select_best
 from foldgauss.estimator.em.m_step import (
@@ -224,4 +224,9 @@ def test_vectorized_restarts_equal_single_runs(x64):
     assert select_best(both).log_likelihood == max(run.log_likelihood for run in both)
 
 
-# --- data that determine nothing ----------------------------------------------------------------------------
+def test_custom_envelope_can_be_fitted(x64):
+    """A user's own envelope, equal to the built-in: the same run."""
+    own = plain_envelope(lambda t, m, s: 1e-3 + (1 - 1e-3) * jnp.exp(-0.5 * ((t - m) / s) ** 2))
+    points = make_points(_data(), np.ones(N), K)
+    runs = [_run(points, _params(), envelope, _model(), tol=0, max_steps=10) for envelope in (own, ENVELOPES["1"])]
+    np.testing.assert_allclose(runs[0].history, runs[1].history, rtol=1e-9)

@@ -105,7 +105,7 @@ def test_gradients_equal_finite_differences(x64):
         return (log_a(x), first(x)), (jax.jacfwd(log_a)(x), jax.jacrev(first)(x))
 
     x, step = jnp.array([[0.5 + 0.7 * tau, 1.5, 0.2, 0.5, 0.7] for tau in (0.3, 2.0)]), 1e-5
-    ups, downs = ([derivatives(x + h)[0] for h in sign * step * np.eye(5)] for sign in (1, -1))
+    ups, downs = ([derivatives(x + h)[0] for h in sign * step * np.eye(5)[:, None]] for sign in (1, -1))
     for order, exact in enumerate(derivatives(x)[1]):
         differences = [(up[order] - down[order]) / (2 * step) for up, down in zip(ups, downs, strict=True)]
         np.testing.assert_allclose(exact, np.stack(differences, axis=-1), rtol=1e-6, atol=1e-8)
