@@ -28,6 +28,7 @@ Commands run in this process, where kernels are compiled once, with the argument
 
 import argparse
 import dataclasses
+import functools
 import importlib
 import re
 import shlex
@@ -51,7 +52,7 @@ from foldgauss import video
 from foldgauss.cli.fitting import demo
 from foldgauss.cli.viewing import view as viewing
 from foldgauss.io import Sound, datasets, export, save_video_model, write_image, write_video
-from foldgauss.video import FitConfig, fit
+from foldgauss.video import FitConfig, VideoModel, fit
 
 ROOT = Path(__file__).parents[1]
 #: All pages of the documentation.
@@ -252,7 +253,6 @@ def _developer_tool(name: str):
     """A tool that an extra installs."""
 
     def check(words: list[str], where: str) -> None:
-        del words
         extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
         named = {re.split(r"[\[<>=]", requirement)[0] for extra in extras.values() for requirement in extra}
         assert name in named, f"{where}: no extra installs {name}"
@@ -283,8 +283,14 @@ _TOOLS = {
 # What pages take for granted.
 
 
+@functools.cache
 def _clip() -> np.ndarray:
     return datasets.bikes(frames=(30, 30 + NUM_FRAMES), size=SIZE).frames  # something moves
+
+
+@functools.cache
+def _fitted() -> VideoModel:
+    return fit(_clip(), FitConfig(num_gaussians=600, steps=STEPS), fps=25.0).model
 
 
 def _video(name: str):
@@ -300,11 +306,7 @@ def _video(name: str):
 
 
 def _model(name: str):
-    def make(folder: Path) -> None:
-        model = fit(_clip(), FitConfig(num_gaussians=600, steps=STEPS), fps=25.0).model
-        save_video_model(folder / name, model)
-
-    return make
+    return lambda folder: save_video_model(folder / name, _fitted())
 
 
 def _images(name: str):

@@ -241,22 +241,15 @@ def test_compiled_code_without_room_is_not_kept_and_that_is_all(tmp_path):
     assert ".nbc" in kept()
 
 
-@pytest.fixture
-def small_disk(tmp_path):
-    """A file system of a size; skips where none can be mounted."""
-    with contextlib.ExitStack() as stack:
-        yield lambda size: Small(stack.enter_context(mounted(tmp_path / size, f"size={size}")))
-
-
-def test_draws_without_room(work, small_disk, capsys):
+def test_draws_without_room(work, tmp_path, capsys):
     """HDF5 crashes where a disk is full in the midst of its writing, so the room is looked at before."""
     pytest.importorskip("emcee", reason="draws need foldgauss[uncertainty]")
-    folder = small_disk("512k").folder
-    out = folder / "draws"
-    assert run("uncertainty", work / "model.safetensors", work / "clip.mp4", "--out", out, "--steps", "100") == 1
-    told = capsys.readouterr().err.strip().splitlines()[-1]
-    assert told.startswith(f"error: path: expected free space for {str(out / 'chains.h5')!r}, got none")
-    assert [path.name for path in folder.rglob("*")] == ["draws"]
+    with mounted(tmp_path / "small", "size=512k") as folder:
+        out = folder / "draws"
+        assert run("uncertainty", work / "model.safetensors", work / "clip.mp4", "--out", out, "--steps", "100") == 1
+        told = capsys.readouterr().err.strip().splitlines()[-1]
+        assert told.startswith(f"error: path: expected free space for {str(out / 'chains.h5')!r}, got none")
+        assert [path.name for path in folder.rglob("*")] == ["draws"]
 
 
 # ------------------------------------------------------------------------- places that cannot be written

@@ -75,6 +75,10 @@ def test_few_frames_sample_the_known_posterior(near):
     assert (near.tau >= 1).all()
     assert (near.acceptance > 0.5).all()
     assert near.acceptance.shape == (4,)
+    assert (np.diff(near.times) > 0).all()
+    assert (near.times[..., 0] == 0).all()
+    assert (near.times[..., -1] == 1).all()
+    assert near.draws.shape == (near.times[..., 0].size, 5)
     assert agrees(near)
     np.testing.assert_allclose(near.interval(0.9), near.exact.interval(0.9), atol=0.15 * near.exact.std().max())
     assert worst_ks(near, exact_cdfs(near.exact)) > 1e-3
@@ -93,13 +97,6 @@ def test_wrong_prior_is_detected(monkeypatch):
 
     monkeypatch.setattr(Increments, "log_prior", wrong)
     assert not agrees(sampled(toy(*NEAR)))
-
-
-def test_draws_keep_their_order_and_their_ends(near):
-    assert (np.diff(near.times) > 0).all()
-    assert (near.times[..., 0] == 0).all()
-    assert (near.times[..., -1] == 1).all()
-    assert near.draws.shape == (near.times[..., 0].size, 5)
 
 
 @pytest.mark.parametrize("concentration", [1.0, 3.0])
