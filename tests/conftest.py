@@ -60,6 +60,12 @@ def optimized():
     _clear_caches()
 
 
+@pytest.fixture
+def x64():
+    with jax.enable_x64(True):
+        yield
+
+
 def _clear_caches():
     jax.clear_caches()
     batch._compile_flat.cache_clear()

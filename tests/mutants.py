@@ -41,7 +41,6 @@ REVIEWED = ROOT / "benchmarks" / "records" / "mutants-equivalent.json"
 TARGETS = {
     "distribution": [
         "test_distribution",
-        "test_distribution_normalisation",
         "test_distribution_moments",
         "test_distribution_extremes",
         "test_distribution_conditional",

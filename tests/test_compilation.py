@@ -42,15 +42,6 @@ def test_densities_of_many_structures_need_few_memory_maps():
     assert (_num_maps() - before) / len(structures) < 40
 
 
-@pytest.mark.skipif(not MAPS.exists(), reason="memory maps are read from /proc, which this system lacks")
-def test_batches_of_many_sizes_share_an_integral():
-    """A program of an integral over time needs 100 memory maps; one for each size would need 300 or more."""
-    marginal, before = _dist(2, 2).marginal((0, 1)), _num_maps()
-    for size in (20, 65, 100):
-        assert marginal.log_prob(np.zeros((size, 2), np.float32)).shape == (size,)
-    assert _num_maps() - before < 500
-
-
 COUNT_MAPS = """
 import numpy as np
 from pathlib import Path

@@ -7,50 +7,28 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from folded import BEND, CONDITION_TIME, LOC, LOG_PROB, SAMPLE, TRIL, folded
 from scipy import stats
 
-from foldgauss.analysis.conditional import TimeMixture, _mixture_moments, _nearer
+from foldgauss.analysis.conditional import TimeMixture, _mixture_moments
 from foldgauss.analysis.quadrature import SEARCH_GRID, adaptive_panels, find_peaks, gauss_hermite, normal_panels
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import CallableEnvelope, TimeLikelihood
 from foldgauss.fold import PolynomialFold, ZeroFold
 from foldgauss.gaussian import Gaussian
+from foldgauss.mixture import FoldedMixture
 
-BEND = np.array([[0.8, -0.5, 0.3], [0.6, 0.9, -0.4]])
-TRIL = np.array([[0.3, 0.0, 0.0], [0.1, 0.2, 0.0], [-0.1, 0.05, 0.25]])
-LOC = np.array([0.1, -0.4, 0.2])
-
-LOG_PROB = eqx.filter_jit(lambda dist, x: dist.log_prob(x))
 CDF = eqx.filter_jit(lambda dist, x: dist.cdf(x))
-SAMPLE = eqx.filter_jit(lambda dist, key, n: dist.sample(key, (n,)))
 MEAN_AND_VARIANCE = eqx.filter_jit(lambda dist: (dist.mean, dist.variance))
-NEARER = eqx.filter_jit(_nearer)
-CONDITION_TIME = eqx.filter_jit(FoldedGaussian.condition_time)
-
 # An integral over time takes seconds to compile for each shape: what is given has this many points in most tests.
 MANY = 21
 
 
-@pytest.fixture(autouse=True)
-def _x64():
-    with jax.enable_x64(True):
-        yield
-
-
-def _dist(dim=2, power=1.0, floor=0.0, **changes):
-    parameters = {
-        "loc": LOC[:dim],
-        "scale_tril": TRIL[:dim, :dim],
-        "time_loc": 0.4,
-        "time_scale": 0.3,
-        "fold": PolynomialFold(BEND[:, :dim]),
-        "envelope": TimeLikelihood(power, floor),
-    }
-    return FoldedGaussian(**(parameters | changes))
+pytestmark = pytest.mark.usefixtures("x64")
 
 
 def _points(dist, n=20, key=0):
-    return SAMPLE(dist, jax.random.key(key), n)
+    return SAMPLE(dist, jax.random.key(key), (n,))
 
 
 def _repeated(*values):
@@ -100,8 +78,8 @@ def test_adaptive_panels_see_narrow_peaks_and_count_them_in_logarithms():
 @pytest.mark.parametrize("fold", ["polynomial", "zero", "callable"])
 def test_marginal_with_time_is_a_folded_gaussian(fold):
     bend = jnp.asarray(BEND)
-    kinds = {"polynomial": PolynomialFold(BEND), "zero": ZeroFold(3), "callable": lambda u: u * bend[0]}
-    dist = _dist(3, fold=kinds[fold])
+    kinds = {"polynomial": PolynomialFold(BEND[:2]), "zero": ZeroFold(3), "callable": lambda u: u * bend[0]}
+    dist = folded(3, fold=kinds[fold])
     marginal = dist.marginal([2, 0, -1])
     assert isinstance(marginal, FoldedGaussian)
     at, part = CONDITION_TIME(dist, 0.7), CONDITION_TIME(marginal, 0.7)
@@ -112,7 +90,7 @@ def test_marginal_with_time_is_a_folded_gaussian(fold):
 
 
 def test_conditioning_with_time_is_the_gaussian_of_the_book():
-    dist = _dist(3)
+    dist = folded(3)
     at = CONDITION_TIME(dist, 0.7)
     gaussian = eqx.filter_jit(lambda dist: dist.condition([1, -1, 0], [-0.3, 0.7, 0.2]))(dist)
     sigma, mean = np.asarray(at.covariance_matrix), np.asarray(at.loc)
@@ -143,7 +121,7 @@ ENVELOPES = [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (2.0, 0.01)]  # power and floor
 def test_time_given_space_integrates_to_one(dim, cases):
     nodes, weights = np.polynomial.legendre.leggauss(20)
     for power, floor in cases:
-        dist = _dist(dim, power, floor)
+        dist = folded(dim, power, floor)
         # At s = 1.5 and 1.95 the curve of one space coordinate passes at tau = 6.7 and 7.5, too, in widths of 1e-5;
         # just above -0.16, where it turns back, the density has a flat top.
         s = jnp.concatenate([_points(dist, MANY - 3)[:, :-1], jnp.outer(jnp.array([1.5, 1.95, -0.15]), jnp.ones(dim))])
@@ -164,52 +142,19 @@ def test_time_given_space_integrates_to_one(dim, cases):
         np.testing.assert_allclose(density.time.panels.probabilities.sum(-1), 1, atol=1e-12)
 
 
-@pytest.mark.slow
-def test_time_given_space_by_plain_quadrature():
-    dist = _dist(2)
-    density = dist.time_given_space(_repeated([0.1, -0.4], [0.6, -0.5], [-0.4, 0.3]))
-    nodes, weights = np.polynomial.legendre.leggauss(20)
-    edges = np.linspace(-2.0, 2.8, 2001)
-    half = 0.5 * (edges[1] - edges[0])
-    t = (edges[:-1, None] + half * (1 + nodes)).ravel()
-    mass = half * np.tile(weights, 2000)[:, None] * np.exp(LOG_PROB(density, jnp.asarray(t)[:, None, None]))
-    np.testing.assert_allclose(mass.sum(0), 1, atol=1e-8)
-    np.testing.assert_allclose(density.mean[:, 0], t @ mass, atol=1e-8)
-    np.testing.assert_allclose(density.cdf(edges[900]), mass[: 900 * 20].sum(0), atol=1e-8)
-
-
-@pytest.mark.slow  # it compiles for long
-def test_chain_rule_both_ways():
-    dist = _dist(2)
-    x = _points(dist)
-    space, time = dist.marginal([0, 1]), dist.time_given_space(x[:, :2])
-    assert isinstance(space, TimeMixture)
-    expected = LOG_PROB(dist, x)
-    np.testing.assert_allclose(LOG_PROB(space, x[:, :2]) + LOG_PROB(time, x[:, 2:]), expected, rtol=1e-12, atol=1e-12)
-
-
-def test_nearest_times_are_refined_by_short_steps_only():
-    dist, tau = _dist(2), np.array([-2.5, 0.3, 2.0])
-    for away, reached in [(1e-6, 0.0), (-1e-4, 0.0), (0.1, 0.1)]:
-        for one in tau:
-            s = CONDITION_TIME(dist, jnp.asarray(0.4 + 0.3 * one)).loc
-            found = NEARER(dist, s, jnp.array([one + away]))
-            np.testing.assert_allclose(found, one + reached, atol=20 * away**2 if reached == 0 else 0)
-
-
 def test_moments_with_an_own_envelope_equal_those_with_the_same_built_in():
     """An own envelope may depend on t itself, so that times are not centered."""
     own = CallableEnvelope(lambda t, m, scale: -0.5 * ((t - m) / scale) ** 2)
-    density = _dist(1).time_given_space(_repeated(0.3))
+    density = folded(1).time_given_space(_repeated(0.3))
     panels = jax.tree.map(lambda leaf: leaf[0], density.time.panels)
-    mean, covariance = eqx.filter_jit(_mixture_moments)(_dist(1, envelope=own), jnp.array([0.3]), panels)
+    mean, covariance = eqx.filter_jit(_mixture_moments)(folded(1, envelope=own), jnp.array([0.3]), panels)
     np.testing.assert_allclose(mean, density.mean[0], rtol=1e-12)
     np.testing.assert_allclose(covariance[0], density.variance[0], rtol=1e-9)
 
 
 def test_modes_of_time_are_where_the_parabola_passes():
     # s = u^2 passes at u = -sqrt(s) and sqrt(s): two modes, pulled in a little, by the slope of the density of time.
-    dist = _dist(1, 0.0, loc=[0.0], scale_tril=[[0.01]], fold=PolynomialFold([[0.0], [1.0]]))
+    dist = folded(1, 0.0, loc=[0.0], scale_tril=[[0.01]], fold=PolynomialFold([[0.0], [1.0]]))
     s = jnp.linspace(0.09, 0.5, MANY)[:, None]
     density = dist.time_given_space(s)
     away = np.sqrt(s - 0.01**2 / (2 * 0.3**2))
@@ -223,13 +168,13 @@ def test_modes_of_time_are_where_the_parabola_passes():
 
 @pytest.mark.slow  # it compiles for long
 def test_quantiles_and_samples_of_time():
-    dist = _dist(1, 0.0, loc=[0.0], scale_tril=[[0.02]], fold=PolynomialFold([[0.0], [1.0]]))
+    dist = folded(1, 0.0, loc=[0.0], scale_tril=[[0.02]], fold=PolynomialFold([[0.0], [1.0]]))
     density = dist.time_given_space(jnp.array([[0.09], [0.0], [1.0]]))
     q = jnp.linspace(0.001, 0.999, 50)[:, None]
     t = density.icdf(q)
     assert t.shape == (50, 3, 1)
     np.testing.assert_allclose(density.cdf(t), jnp.broadcast_to(q, (50, 3)), atol=1e-10)
-    draws = SAMPLE(density, jax.random.key(1), 50_000)[..., 0]
+    draws = SAMPLE(density, jax.random.key(1), (50_000,))[..., 0]
     for i in range(3):
         cdf = lambda x, i=i: np.asarray(density.cdf(jnp.asarray(x)[:, None, None]))[:, i]  # noqa: E731
         assert stats.kstest(np.asarray(draws[:, i]), cdf).pvalue > 1e-4
@@ -243,7 +188,7 @@ def test_quantiles_and_samples_of_time():
 
 
 def test_the_cdf_of_space_goes_from_zero_to_one():
-    marginal = _dist(1).marginal([0])
+    marginal = folded(1).marginal([0])
     found = CDF(marginal, jnp.array([[-jnp.inf], [-30.0], [0.1], [30.0], [jnp.inf]]))
     np.testing.assert_allclose(np.delete(found, 2), [0, 0, 1, 1], atol=1e-9)
     assert 0.01 < found[2] < 0.99
@@ -251,7 +196,7 @@ def test_the_cdf_of_space_goes_from_zero_to_one():
 
 @pytest.mark.slow
 def test_space_marginal_is_the_law_of_the_samples():
-    dist = _dist(2)
+    dist = folded(2)
     marginal = dist.marginal([0])
     draws = np.asarray(_points(dist, 20_000, key=3))[:, 0]
     grid = np.linspace(-3, 4, 192)  # three times 64, compiled as one
@@ -259,7 +204,7 @@ def test_space_marginal_is_the_law_of_the_samples():
     assert (np.diff(cdf) >= -1e-12).all()
     assert stats.kstest(draws, lambda x: np.interp(x, grid, cdf)).pvalue > 1e-4
     assert stats.kstest(draws + 0.02, lambda x: np.interp(x, grid, cdf)).pvalue < 1e-4
-    own = np.asarray(SAMPLE(marginal, jax.random.key(7), 20_000))
+    own = np.asarray(SAMPLE(marginal, jax.random.key(7), (20_000,)))
     assert own.shape == (20_000, 1)
     assert stats.kstest(own[:, 0], lambda x: np.interp(x, grid, cdf)).pvalue > 1e-4
     for own, whole in zip(MEAN_AND_VARIANCE(marginal), MEAN_AND_VARIANCE(dist), strict=True):
@@ -269,7 +214,7 @@ def test_space_marginal_is_the_law_of_the_samples():
 @pytest.mark.slow
 def test_density_is_the_slope_of_the_distribution_function():
     nodes, weights = np.polynomial.legendre.leggauss(60)
-    for dist in (_dist(2).marginal([1]), _dist(2).condition([0], [0.3]).marginal([0])):
+    for dist in (folded(2).marginal([1]), folded(2).condition([0], [0.3]).marginal([0])):
         x = jnp.asarray(0.25 * nodes)[:, None]
         mass = weights @ jnp.exp(LOG_PROB(dist, x)) * 0.25
         ends = CDF(dist, jnp.array([[-0.25], [0.25]]))
@@ -278,15 +223,16 @@ def test_density_is_the_slope_of_the_distribution_function():
 
 
 def test_space_given_space_against_its_definition():
-    dist = _dist(3)
+    dist = folded(3)
     given = dist.condition([1], _repeated(-0.3))
     assert given.event_shape == (3,)
-    draws = SAMPLE(given, jax.random.key(1), 50_000 // MANY)
+    draws = SAMPLE(given, jax.random.key(1), (50_000 // MANY,))
     x = draws[0]
     full = jnp.stack([x[:, 0], jnp.full(MANY, -0.3), x[:, 1], x[:, 2]], axis=-1)
-    alone = _dist(1, loc=LOC[1:2], scale_tril=np.linalg.norm(TRIL[1])[None, None], fold=PolynomialFold(BEND[:, 1:2]))
+    alone = folded(1, loc=LOC[1:2], scale_tril=np.linalg.norm(TRIL[1])[None, None], fold=PolynomialFold(BEND[:2, 1:2]))
     expected = LOG_PROB(dist, full) - np.log(_density_of_one(alone, -0.3))
     np.testing.assert_allclose(LOG_PROB(given, x), expected, rtol=1e-11)
+    np.testing.assert_array_equal(LOG_PROB(pickle.loads(pickle.dumps(given)), x), LOG_PROB(given, x))
     draws = np.asarray(draws).reshape(-1, 3)
     error = draws.std(0) / np.sqrt(len(draws))
     assert (np.abs(draws.mean(0) - given.mean[0]) < 5 * error).all()
@@ -298,30 +244,34 @@ def test_space_given_space_against_its_definition():
 
 
 @pytest.mark.slow  # it compiles for long
-def test_conditioning_and_marginals_commute():
-    dist = _dist(3)
+@pytest.mark.parametrize(
+    ("one", "other", "rest"),
+    [
+        (lambda d, x: d.condition(1, x[:, 1:2]).marginal([0, 2]), lambda d, x: _line(d, x, [0, 1, 3]), [0, 3]),
+        (lambda d, x: d.condition(1, x[:, 1:2]).marginal([0]), lambda d, x: _line(d, x, [0, 1]), [0]),
+        (lambda d, x: _line(d, x, [0, 1, 2]).condition(0, x[:, :1]), lambda d, x: _given(d, x).marginal([0]), [2]),
+        (lambda d, x: d.condition(1, x[:, 1:2]).condition(0, x[:, :1]), lambda d, x: _given(d, x), [2, 3]),
+        (lambda d, x: _given(d, x).condition(-1, x[:, 3:]), lambda d, x: d.condition([0, 3, 1], x[:, [0, 3, 1]]), [2]),
+        (lambda d, x: _given(d, x).condition(-1, x[:, 3:]), lambda d, x: _given(d.condition_time(x[:, 3]), x), [2]),
+    ],
+)
+@pytest.mark.parametrize("mixed", [False, True])
+def test_conditioning_and_marginals_commute(one, other, rest, mixed):
+    dist = folded(3)
     x = _points(dist, 5)
-    log_prob = {
-        "condition, marginal": LOG_PROB(dist.condition([1], x[:, 1:2]).marginal([0, 2]), x[:, [0, 3]]),
-        "marginal, condition": LOG_PROB(dist.marginal([0, 1, 3]).condition([1], x[:, 1:2]), x[:, [0, 3]]),
-    }
-    np.testing.assert_allclose(*log_prob.values(), rtol=1e-10, atol=1e-10)
-    without_time = {
-        "condition, marginal": LOG_PROB(dist.condition([1], x[:, 1:2]).marginal([0]), x[:, :1]),
-        "marginal, condition": LOG_PROB(dist.marginal([0, 1]).condition([1], x[:, 1:2]), x[:, :1]),
-        "ratio": LOG_PROB(dist.marginal([0, 1]), x[:, :2]) - LOG_PROB(dist.marginal([1]), x[:, 1:2]),
-    }
-    for other in list(without_time.values())[1:]:
-        np.testing.assert_allclose(without_time["condition, marginal"], other, rtol=1e-10, atol=1e-10)
-    stepwise = dist.condition([1], x[:, 1:2]).condition([0, -1], x[:, [0, 3]])
-    at_once = dist.condition([0, 1, 3], x[:, [0, 1, 3]])
-    assert isinstance(stepwise, Gaussian)
-    np.testing.assert_allclose(stepwise.loc, at_once.loc, rtol=1e-10)
-    np.testing.assert_allclose(stepwise.covariance_matrix, at_once.covariance_matrix, rtol=1e-10)
-    twice = dist.condition([1], x[:, 1:2]).condition([0], x[:, :1])
-    np.testing.assert_allclose(
-        LOG_PROB(twice, x[:, 2:]), LOG_PROB(dist.condition([0, 1], x[:, :2]), x[:, 2:]), rtol=1e-10, atol=1e-10
-    )
+    if mixed:
+        dist = FoldedMixture(folded(3, loc=[LOC, LOC + 0.2], time_loc=[0.4, 0.6]), weights=[0.3, 0.7])
+    found, expected = (LOG_PROB(make(dist, x), x[:, rest]) for make in (one, other))
+    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-10)
+
+
+def _line(dist, x, kept):
+    """Some coordinates, given the second."""
+    return dist.marginal(kept).condition(1, x[:, 1:2])
+
+
+def _given(dist, x):
+    return dist.condition([0, 1], x[:, :2])
 
 
 def _parabola(s, scale, power, dtype):
@@ -436,28 +386,8 @@ def test_the_other_coordinate_where_time_is_known_to_the_last_digit():
 
 
 @pytest.mark.slow
-def test_points_on_a_curve_to_rounding_are_said_to_be():
-    # In two space coordinates the density next to the curve hangs on the rounding of s, if the curve is narrow enough.
-    for scale, low, high in [(0.1, 0, 1e-9), (1e-17, 1.0, np.inf)]:
-        dist = _dist(2, scale_tril=scale * np.eye(2))
-        x = _points(dist, 5)
-        errors = np.r_[
-            dist.marginal([0, 1]).error_estimate(x[:, :2]), dist.time_given_space(x[:, :2]).time.error_estimate
-        ]
-        assert ((errors >= low) & (errors <= high)).all()
-    # At a distance from the curve nothing does, but for the digits of log p, -1e32.
-    marginal, off = dist.marginal([0, 1]), x[:, :2] + 0.1
-    assert (marginal.error_estimate(off) < 1e-14 * jnp.abs(marginal.log_prob(off))).all()
-    # In one coordinate only where the curve turns back, at u = -2/3.
-    line = _dist(1, scale_tril=[[1e-17]]).marginal([0])
-    turn = line.parent.condition_time(0.4 + 2 / 3).loc
-    assert line.error_estimate(turn) > 1e-2
-    assert line.error_estimate(turn + 0.1) < 1e-9  # before it, that is: the parabola is open upwards
-
-
-@pytest.mark.slow
 def test_far_points():
-    dist = _dist(1, 1.0)
+    dist = folded(1, 1.0)
     marginal, far, t = dist.marginal([0]), jnp.array([[50.0], [-1e4], [1e6]]), jnp.full((3, 1), 0.3)
     log_prob, time = LOG_PROB(marginal, far), dist.time_given_space(far)
     assert np.isfinite(log_prob).all()
@@ -474,7 +404,7 @@ def test_far_points():
 
 def test_without_fold_density_is_gaussian_or_diverges():
     # On a ridge that stands still p(s) diverges for power (d-1) >= 2; next to it, or without an envelope, it does not.
-    still = _dist(2, jnp.array([1.0, 0.0]), fold=ZeroFold(2)).marginal([0, 1])
+    still = folded(2, jnp.array([1.0, 0.0]), fold=ZeroFold(2)).marginal([0, 1])
     x = LOC[:2] + np.array([[[0.0]], [[1e-3]]])
     values, error = still.log_prob(x), still.error_estimate(x)
     np.testing.assert_array_equal(np.isposinf(values), [[True, False], [False, False]])
@@ -517,10 +447,10 @@ def test_estimated_errors_near_a_ridge_are_no_smaller_than_the_errors():
         center = np.asarray(narrow.condition_time(np.float32(rng.normal(0.4, 0.6, size=(32, 3)))).loc)
         away = 1 + np.float32([0, 6e-8, 2e-6])[:, None, None, None] * rng.normal(size=(3, *center.shape))
         s = np.float32(center * away)
-        here = narrow.marginal([0, 1])
-        log_p, estimate = np.asarray(here.log_prob(s)), np.asarray(here.error_estimate(s))
-    exact = jax.tree.map(lambda x: np.asarray(x, np.float64), narrow).marginal([0, 1])
-    error = np.abs(log_p - np.asarray(exact.log_prob(np.float64(s))))
+        here = narrow.time_given_space(s).time  # the integrals of log_prob and of error_estimate are one
+        log_p, estimate = np.asarray(here.log_normalizer), np.asarray(here.error_estimate)
+    exact = jax.tree.map(lambda x: np.asarray(x, np.float64), narrow).time_given_space(np.float64(s)).time
+    error = np.abs(log_p - np.asarray(exact.log_normalizer))
     assert log_p.dtype == np.float32
     assert (error <= estimate).all()
     typical = np.median(estimate, (0, 1)) / np.median(error, (0, 1))
@@ -531,7 +461,7 @@ def test_estimated_errors_near_a_ridge_are_no_smaller_than_the_errors():
 def test_a_ridge_that_quadrature_misses_is_said_to_be():
     """Panels are wider than a ridge of 1e-13. The estimated error is the mass of that ridge, a Gaussian integral."""
     for scale in (1e-10, 1e-13, 1e-16):
-        dist = _dist(2, power=1.0, scale_tril=scale * TRIL[:2, :2])
+        dist = folded(2, power=1.0, scale_tril=scale * TRIL[:2, :2])
         speed = np.linalg.solve(TRIL[:2, :2], 0.3 * BEND[0, :2])  # in units of the ridge's width, per time_scale
         truth = -np.log(2 * np.pi * scale * TRIL[0, 0] * TRIL[1, 1] * np.linalg.norm(speed))
         marginal = dist.marginal([0, 1])
@@ -601,7 +531,7 @@ def test_float32_far_out_agrees_with_float64(dim):
 
 @pytest.mark.slow  # it compiles for long
 def test_points_at_infinity():
-    dist = _dist(2)
+    dist = folded(2)
     space, line, time = dist.marginal([0, 1]), dist.marginal([0]), dist.time_given_space([0.1, -0.4])
     for sign in (-1, 1):
         assert np.isneginf(LOG_PROB(line, jnp.array([sign * jnp.inf])))
@@ -615,31 +545,12 @@ def test_points_at_infinity():
     assert np.isfinite(time.icdf(jnp.array([1e-300, 1 - 1e-16]))).all()
 
 
-@pytest.mark.slow  # it compiles for long
-def test_batches_transformations_and_round_trips():
-    dist = _dist(2, loc=jnp.stack([LOC[:2], LOC[:2] + 0.1]))
-    marginal, s = dist.marginal([0]), jnp.array([[0.2], [0.5]])
-    together = LOG_PROB(marginal, s)
-    assert marginal.batch_shape == together.shape == (2,)
-    mapped = jax.jit(jax.vmap(lambda d, s: d.marginal([0]).log_prob(s)))(dist, s)
-    np.testing.assert_allclose(mapped, together, rtol=1e-12)
-    np.testing.assert_allclose(marginal.log_prob(s), together, rtol=1e-12)  # jit = eager
-    many = jnp.linspace(-1, 2, 130)[:, None, None]  # more than one chunk
-    assert LOG_PROB(marginal, many).shape == (130, 2)
-    np.testing.assert_allclose(LOG_PROB(marginal, many)[40, 1], LOG_PROB(marginal, many[40])[1], rtol=1e-12)
-    conditional = dist.condition([0], s)
-    assert SAMPLE(conditional, jax.random.key(0), 7).shape == (7, 2, 2)
-    again = pickle.loads(pickle.dumps(conditional))
-    x = jnp.zeros((2, 2))
-    np.testing.assert_array_equal(LOG_PROB(again, x), LOG_PROB(conditional, x))
-
-
 def test_gradients_go_through_the_integral():
-    log_prob = lambda loc, s: _dist(1, loc=loc[None]).marginal([0]).log_prob(s)  # noqa: E731
+    log_prob = lambda loc, s: folded(1, loc=loc[None]).marginal([0]).log_prob(s)  # noqa: E731
     both = jax.jit(jax.value_and_grad(log_prob, argnums=(0, 1)))
     loc, s, step = jnp.asarray(0.1), jnp.array([0.5]), 1e-5
     value, (by_loc, by_s) = both(loc, s)
-    np.testing.assert_allclose(value, np.log(_density_of_one(_dist(1), 0.5)), rtol=1e-10)
+    np.testing.assert_allclose(value, np.log(_density_of_one(folded(1), 0.5)), rtol=1e-10)
     np.testing.assert_allclose(by_loc, (both(loc + step, s)[0] - both(loc - step, s)[0]) / (2 * step), rtol=1e-6)
     np.testing.assert_allclose(by_s[0], -by_loc, rtol=1e-9)  # p(s) knows s - loc only
 
@@ -655,24 +566,29 @@ def test_gradients_go_through_the_integral():
     ],
 )
 def test_indices_are_checked(indices, expected):
-    for call in (lambda: _dist().marginal(indices), lambda: _dist().condition(indices, [0.0] * len(indices))):
+    for call in (lambda: folded().marginal(indices), lambda: folded().condition(indices, [0.0] * len(indices))):
         with pytest.raises(ValueError, match=f"^indices: expected {expected}"):
             call()
 
 
-def test_bad_requests_are_refused():
-    dist = _dist()
-    with pytest.raises(ValueError, match=r"^indices: expected time last, got "):
-        dist.marginal([2, 0])
-    with pytest.raises(ValueError, match=r"^indices: expected at least one coordinate that is not given, got all"):
-        dist.condition([0, 1, 2], [0.0, 0.0, 0.0])
-    with pytest.raises(ValueError, match=r"^values: expected shape "):
-        dist.condition([0], [0.0, 1.0])
-    with pytest.raises(ValueError, match=r"^s: expected shape "):
-        dist.time_given_space([0.0])
-    with pytest.raises(ValueError, match=r"^cdf: expected one coordinate, got 2"):
-        dist.marginal([0, 1]).cdf(jnp.zeros(2))
-    with pytest.raises(ValueError, match=r"^modes: expected the distribution of time given space, got 2 coordinates"):
-        dist.marginal([0, 1]).modes()
-    with pytest.raises(ValueError, match=r"^value: expected shape "):
-        dist.marginal([0, 1]).log_prob(jnp.zeros(3))
+@pytest.mark.parametrize(
+    ("request_of", "message"),
+    [
+        (lambda dist: dist.marginal([2, 0]), "indices: expected time last, got "),
+        (
+            lambda dist: dist.condition([0, 1, 2], np.zeros(3)),
+            "indices: expected at least one coordinate that is not given, got all",
+        ),
+        (lambda dist: dist.condition([0], [0.0, 1.0]), "values: expected shape "),
+        (lambda dist: dist.time_given_space([0.0]), "s: expected shape "),
+        (lambda dist: dist.marginal([0, 1]).cdf(np.zeros(2)), "cdf: expected one coordinate, got 2"),
+        (
+            lambda dist: dist.marginal([0, 1]).modes(),
+            "modes: expected the distribution of time given space, got 2 coordinates",
+        ),
+        (lambda dist: dist.marginal([0, 1]).log_prob(np.zeros(3)), "value: expected shape "),
+    ],
+)
+def test_bad_requests_are_refused(request_of, message):
+    with pytest.raises(ValueError, match=f"^{message}"):
+        request_of(folded())

@@ -29,10 +29,7 @@ class OwnLikelihood(AbstractEnvelope):
         return -0.5 * ((t - time_loc) / time_scale) ** 2
 
 
-@pytest.fixture(autouse=True)
-def _x64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("x64")
 
 
 def _dist(power=1.0, floor=0.0, *, time_loc=0.4, time_scale=0.3, bend=BEND, envelope=None, loc=(0.1, -0.4), tril=TRIL):
@@ -49,12 +46,6 @@ def _dist(power=1.0, floor=0.0, *, time_loc=0.4, time_scale=0.3, bend=BEND, enve
 def test_divergence_from_itself_is_zero():
     for power, floor in [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (2.0, 0.1)]:
         np.testing.assert_allclose(KL(_dist(power, floor), _dist(power, floor)), 0, atol=1e-12)
-
-
-@pytest.mark.slow
-def test_divergence_from_the_same_envelope_of_ones_own_is_zero():
-    for pair in [(_dist(envelope=OwnLikelihood()), _dist()), (_dist(), _dist(envelope=OwnLikelihood()))]:
-        np.testing.assert_allclose(KL(*pair), 0, atol=1e-10)
 
 
 @pytest.mark.parametrize(
@@ -86,18 +77,6 @@ def test_exact_and_quadrature_agree():
     np.testing.assert_allclose(KL(_dist(), _dist(envelope=OwnLikelihood(), **q)), exact, rtol=1e-9)
     np.testing.assert_allclose(KL(_dist(envelope=OwnLikelihood()), _dist(1.0, **q)), exact, rtol=1e-9)
     np.testing.assert_allclose(KL(_dist(), _dist(1.0, 1e-200, **q)), exact, rtol=1e-9)
-
-
-@pytest.mark.slow  # it compiles for long
-def test_divergence_is_never_negative():
-    rng = np.random.default_rng(0)
-    n = 200
-    one = {"time_loc": rng.normal(size=n) * 0.1, "time_scale": rng.uniform(0.2, 0.6, n)}
-    other = {"time_loc": rng.normal(size=n) * 0.1, "time_scale": rng.uniform(0.2, 0.6, n)}
-    p, q = _dist(rng.uniform(0, 2, n), **one), _dist(rng.uniform(0, 2, n), **other)
-    divergence = KL(p, q)
-    assert (divergence > 0).all()
-    assert not np.isnan(divergence).any()
 
 
 @pytest.mark.parametrize(
@@ -144,8 +123,6 @@ def test_gaussians():
     expected = 0.5 * (np.trace(inverse @ sigma_p) - 3 + square - log_det)
     p, q = Gaussian(loc_p, tril_p, log_scale=np.log(2.0)), Gaussian(loc_q, tril_q)
     np.testing.assert_allclose(KL(p, q), expected, rtol=1e-12)
-    normal = KL(Gaussian([0.3], [[0.5]]), Gaussian([0.1], [[0.7]]))
-    np.testing.assert_allclose(normal, np.log(1.4) + (0.25 + 0.04) / 0.98 - 0.5, rtol=1e-12)
 
 
 def test_without_fold_and_envelope_it_is_that_of_gaussians():
@@ -282,8 +259,7 @@ def test_gaussians_far_from_time_loc():
     assert np.isposinf(kl_divergence(far, moved))
 
 
-def test_bad_pairs_are_refused():
+@pytest.mark.parametrize("make", [_dist, lambda: Gaussian(jnp.zeros(3), jnp.eye(3))])
+def test_bad_pairs_are_refused(make):
     with pytest.raises(ValueError, match=r"^p, q: expected two distributions of one class and dimension, got "):
-        kl_divergence(_dist(), Gaussian([0.0], [[1.0]]))
-    with pytest.raises(ValueError, match=r"^p, q: expected "):
-        kl_divergence(Gaussian(jnp.zeros(2), jnp.eye(2)), Gaussian(jnp.zeros(3), jnp.eye(3)))
+        kl_divergence(make(), Gaussian(jnp.zeros(2), jnp.eye(2)))

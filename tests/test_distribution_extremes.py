@@ -7,7 +7,7 @@ from benchmarks.numerics import BOUND, Case, cases, excess_bits
 
 # Each compiles for seconds.
 QUICK = {
-    np.float32: {"degree 12"},
+    np.float32: {"degree 12", "centered"},
     np.float64: {"d 64, condition"},
 }
 

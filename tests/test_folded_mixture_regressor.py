@@ -1,15 +1,15 @@
 """The regressor: scikit-learn's checks, linear regression and numerical integration as oracles, coverage, weights."""
 
-import warnings
-
 import numpy as np
 import pytest
 
 pytest.importorskip("sklearn")
-from sklearn.exceptions import ConvergenceWarning, NotFittedError
 from sklearn.linear_model import LinearRegression
 
 from foldgauss import FoldedGaussianMixture, FoldedMixtureRegressor
+
+# Fits need not converge here.
+pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 
 
 def _regressor(*args, **options):
@@ -25,12 +25,6 @@ def _bent(n, seed=0):
     return np.stack([t, other], 1), np.stack([np.sin(2 * t) + 0.5 * other, t**2], 1) + noise.T
 
 
-def _quiet(regressor, *args, **options):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        return regressor.fit(*args, **options)
-
-
 #: One set for nearly all tests: they share its programs.
 OPTIONS = {"n_components": 3, "degree": 3, "time_column": 0, "random_state": 0}
 LEVELS = [0.1, 0.5, 0.9]
@@ -39,7 +33,7 @@ LEVELS = [0.1, 0.5, 0.9]
 @pytest.fixture(scope="module")
 def bent():
     """Fitted to 600 rows of two targets."""
-    return _quiet(_regressor(**OPTIONS), *_bent(600))
+    return _regressor(**OPTIONS).fit(*_bent(600))
 
 
 # --- scikit-learn -------------------------------------------------------------------------------------------
@@ -77,7 +71,7 @@ def test_one_linear_component_is_linear_regression(degree, used):
 def test_predictions_match_integrals_of_the_joint_density(time_column, options):
     X, y = _bent(600)
     X = X if time_column == 0 else X[:, ::-1]
-    regressor = _quiet(_regressor(**OPTIONS | options), X, y)
+    regressor = _regressor(**OPTIONS | options).fit(X, y)
     assert regressor.mixture_.time_column == (0 if time_column == 0 else 1)
     grid = np.linspace(-12, 12, 801)
     first, second = np.meshgrid(grid, grid, indexing="ij")
@@ -137,14 +131,20 @@ def test_shapes_and_blocks(bent, calm_and_noisy):
     np.testing.assert_allclose(bent.predict(X)[-1], bent.predict(X[-1:])[0], rtol=1e-12)
 
 
-def test_invalid_arguments_raise(bent):
-    X, y = _bent(50)
-    with pytest.raises(ValueError, match=r"^time_column: expected a column of 2"):
-        _regressor(1, time_column=2).fit(X, y)  # a target is never time
-    with pytest.raises(ValueError, match="'n_components' parameter"):
-        _regressor(0).fit(X, y)
-    for wrong in (0.0, [0.5, 1.0], np.nan):
-        with pytest.raises(ValueError, match=r"^quantiles: expected levels between 0 and 1"):
-            bent.predict_quantiles(X, wrong)
-    with pytest.raises(NotFittedError):
-        FoldedMixtureRegressor().predict_quantiles(X, 0.5)
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (
+            lambda X, y, fitted: _regressor(1, time_column=2).fit(X, y),
+            "^time_column: expected a column of 2",
+        ),  # a target
+        (lambda X, y, fitted: _regressor(0).fit(X, y), "'n_components' parameter"),
+        (lambda X, y, fitted: fitted.predict_quantiles(X, 0.0), "^quantiles: expected levels between 0 and 1"),
+        (lambda X, y, fitted: fitted.predict_quantiles(X, [0.5, 1.0]), "^quantiles: expected levels between 0 and 1"),
+        (lambda X, y, fitted: fitted.predict_quantiles(X, np.nan), "^quantiles: expected levels between 0 and 1"),
+        (lambda X, y, fitted: FoldedMixtureRegressor().predict_quantiles(X, 0.5), "is not fitted yet"),
+    ],
+)
+def test_invalid_arguments_raise(bent, wrong, message):
+    with pytest.raises(ValueError, match=message):
+        wrong(*_bent(50), bent)

@@ -5,27 +5,17 @@ import math
 import warnings
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from soft_models import soft_model
+from tiny_clips import moving_disc
 
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.render import ENGINES, RenderOptions
 from foldgauss.render.pallas import HIGHEST_CEILING
-from foldgauss.video import DivergenceWarning, FitConfig, FitDiverged, FrameTimes, LearningRates, evaluate, fit
+from foldgauss.video import DivergenceWarning, FitConfig, FitDiverged, LearningRates, evaluate, fit
 from foldgauss.video import fit_steps as steps_of
 from foldgauss.video.fitting.loop import start, start_from, to_model
-
-
-def moving_disc(num_frames=6, size=(48, 64)):
-    """uint8 (num_frames, *size, 3): a disc over a slope."""
-    y, x = np.mgrid[: size[0], : size[1]]
-    centers = np.linspace(0.2, 0.8, num_frames) * size[1]
-    light = np.stack([np.exp(-((x - at) ** 2 + (y - size[0] / 2) ** 2) / 40) for at in centers])[..., None]
-    slope = np.stack([x / size[1], y / size[0], 0 * x + 0.3], -1) * 0.6
-    return np.rint(255 * (slope * (1 - light) + light * np.array([1, 0.2, 0.1]))).astype(np.uint8)
-
 
 CLIP = moving_disc()
 CONFIG = FitConfig(num_gaussians=200, steps=240, seed=1)
@@ -64,7 +54,7 @@ NAMED = {
     "color_dc": "color_dc moved most",
     "time_loc_logit": None,
     "log_time_scale": "no finite time_loc_logit",
-    "frame_times": "frame times moved",
+    "frame_times": "frame times moved by e^",
 }
 
 
@@ -80,10 +70,13 @@ HIGHEST = ("loc", "log_scale", "opacity_logit")
     ],
 )
 def test_too_high_rate_is_named_and_the_model_not_worse_than_its_start(at_start, leaf, power):
+    """Pictures alone do not show frame times that diverge: they end poorly, and are never worse than before."""
     config, named = too_high(leaf, 10.0**power), NAMED[leaf]
     psnr, told = fitted_with(config)
-    assert psnr > at_start - 0.3
+    times_alone = (leaf, power) == ("frame_times", 3)
+    assert psnr - at_start > (8 if times_alone else -0.3)
     assert bool(told) == (named is not None)
+    assert not times_alone or len(told) == 1
     if told:
         assert named in told[0]
         assert "diverged at step " in told[0]
@@ -92,14 +85,6 @@ def test_too_high_rate_is_named_and_the_model_not_worse_than_its_start(at_start,
 def test_a_rate_too_high_for_all_backoffs_ends_the_fit():
     with pytest.warns(DivergenceWarning), pytest.raises(FitDiverged, match=r"step \d+: no finite time_loc_logit"):
         fit(CLIP, too_high("log_time_scale", 1e9))
-
-
-def test_diverging_frame_times_are_restored(at_start):
-    """Pictures alone do not tell: they come to a poor end, and never get worse than before."""
-    psnr, told = fitted_with(too_high("frame_times", 1e3))
-    assert len(told) == 1
-    assert "frame times moved by e^" in told[0]
-    assert psnr > at_start + 8
 
 
 def test_exhausted_backoffs_restore_the_last_finite_state(at_start):
@@ -251,12 +236,3 @@ def test_engines_agree_on_extreme_models(name):
         np.testing.assert_allclose(picture, pictures["reference"], atol=2e-4, err_msg=engine)
     np.testing.assert_allclose(by_pallas, as_judged, atol=2e-4)
     np.testing.assert_allclose(played / 255, np.clip(pictures["reference"], 0, 1), atol=0.5 / 255 + 1e-3)
-
-
-@pytest.mark.parametrize("logits", [[1e30, 0, 0, 0, 0, 0], [-1e30] * 6, [3e38, -3e38, 0, 0, 0, 0]])
-def test_extreme_frame_times_stay_in_order(logits):
-    times = np.asarray(FrameTimes(jnp.asarray(logits, jnp.float32)).times())
-    assert np.isfinite(times).all()
-    assert (np.diff(times) >= 0).all()
-    assert times[0] == 0
-    assert times[-1] == 1

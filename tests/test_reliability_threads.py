@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from soft_models import soft_model
+from tiny_clips import moving_disc
 
 from foldgauss import FoldedMixture
 from foldgauss._runtime import threads as _threads
@@ -35,7 +36,7 @@ pytestmark = pytest.mark.timeout(3 * LIMIT)  # some start several
 TESTS = Path(__file__).parent
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def three_threads():
     """More than the machine may have cores, so that work is shared out."""
     _threads.set_num_threads(3)
@@ -95,7 +96,6 @@ def _pictures(pallas):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("three_threads")
 @pytest.mark.parametrize("pallas", [False, True])
 def test_every_engine_from_many_threads_draws_the_same_bits(pallas):
     works = _pictures(pallas)
@@ -104,7 +104,6 @@ def test_every_engine_from_many_threads_draws_the_same_bits(pallas):
         np.testing.assert_array_equal(picture, truth)
 
 
-@pytest.mark.usefixtures("three_threads")
 def test_first_calls_that_compile_at_once():
     """Sizes that nobody has drawn before: all threads trace and compile the same and other things."""
     splats = soft_model().at(jnp.float32(0.4))
@@ -115,15 +114,7 @@ def test_first_calls_that_compile_at_once():
         np.testing.assert_array_equal(picture, work())
 
 
-def moving_disc(num_frames=5, size=(48, 64)):
-    """uint8 (num_frames, *size, 3)."""
-    y, x = np.mgrid[: size[0], : size[1]]
-    centers = np.linspace(0.3, 0.7, num_frames) * size[1]
-    light = np.stack([np.exp(-((x - at) ** 2 + (y - size[0] / 2) ** 2) / 60) for at in centers])
-    return np.rint(255 * light[..., None] * np.array([0.9, 0.5, 0.2])).astype(np.uint8)
-
-
-CLIP = moving_disc()
+CLIP = moving_disc(num_frames=5)
 SMALL = FitConfig(num_gaussians=2500, steps=12)
 
 
@@ -131,7 +122,6 @@ def leaves_of(fitted) -> list[np.ndarray]:
     return [np.asarray(leaf) for leaf in jax.tree.leaves(fitted.model)]
 
 
-@pytest.mark.usefixtures("three_threads")
 def test_two_fits_and_pictures_at_once():
     configs = [SMALL, dataclasses.replace(SMALL, seed=1, degree=2)]
     truths = [leaves_of(fit(CLIP, config)) for config in configs]
@@ -147,7 +137,6 @@ def test_two_fits_and_pictures_at_once():
         np.testing.assert_array_equal(shown, picture)
 
 
-@pytest.mark.usefixtures("three_threads")
 def test_errors_in_some_threads_are_theirs_alone():
     model = soft_model()
     truth = np.asarray(model.render(0.5, (90, 150)))
@@ -446,16 +435,12 @@ def test_where_no_thread_can_be_started_the_others_do_the_work(monkeypatch, star
         begin(thread)
 
     done = []
-    try:
-        with monkeypatch.context() as patched:
-            patched.setattr(threading.Thread, "start", start)
-            _threads.run_tasks(done.append, range(100))
-            assert sorted(done) == list(range(100))
-            with pytest.raises(ZeroDivisionError):
-                _threads.run_tasks(lambda item: 1 // (item - 50), range(100))
-        assert len(begun) == started
-    finally:
-        _threads.set_num_threads(None)
+    monkeypatch.setattr(threading.Thread, "start", start)
+    _threads.run_tasks(done.append, range(100))
+    assert sorted(done) == list(range(100))
+    with pytest.raises(ZeroDivisionError):
+        _threads.run_tasks(lambda item: 1 // (item - 50), range(100))
+    assert len(begun) == started
 
 
 @pytest.mark.parametrize("count", [1, 2])
@@ -469,13 +454,10 @@ def test_an_interrupt_inside_numba_is_one_again(count):
             raise SystemError("of another kind")
 
     _threads.set_num_threads(count)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            _threads.run_tasks(task, range(5))
-        with pytest.raises(SystemError, match="another"):
-            _threads.run_tasks(task, range(88, 95))
-    finally:
-        _threads.set_num_threads(None)
+    with pytest.raises(KeyboardInterrupt):
+        _threads.run_tasks(task, range(5))
+    with pytest.raises(SystemError, match="another"):
+        _threads.run_tasks(task, range(88, 95))
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no SIGINT to one process alone; CI runs it on Linux")
@@ -535,20 +517,17 @@ def test_an_interrupt_while_modules_are_imported_ends_the_command(module):
     assert run_script(script.replace("SIGINT", "SIGTERM"), module, expected=-signal.SIGTERM) == ""
 
 
-def test_whoever_answers_interrupts_still_does():
-    before = signal.getsignal(signal.SIGINT)
+@pytest.mark.parametrize("handler", [signal.default_int_handler, signal.SIG_IGN, lambda number, frame: None])
+def test_whoever_answers_interrupts_still_does(handler):
+    before = signal.signal(signal.SIGINT, handler)
     try:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
         with use_default_signals():
-            assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
-        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-        for other in (signal.SIG_IGN, lambda number, frame: None):
-            signal.signal(signal.SIGINT, other)
-            with use_default_signals():
-                assert signal.getsignal(signal.SIGINT) is other
-            assert signal.getsignal(signal.SIGINT) is other
+            inside = signal.getsignal(signal.SIGINT)
+        after = signal.getsignal(signal.SIGINT)
     finally:
         signal.signal(signal.SIGINT, before)
+    assert after is handler
+    assert inside is (signal.SIG_DFL if handler is signal.default_int_handler else handler)
 
 
 # --------------------------------------------------------------------------------------------- the same bits

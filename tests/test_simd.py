@@ -57,12 +57,9 @@ def test_what_float32_cannot_hold():
     """Exponentials stay among the normal numbers; NaN stays NaN."""
     x = np.array([-np.inf, -1e30, -100, 100, 1e30, np.inf, np.nan, 0] * 2)
     _, y = apply(_vectors.exp, x)
-    assert (y[:3] > 0).all()
-    assert (y[:3] < 2e-38).all()
-    assert np.isfinite(y[3:6]).all()
-    assert (y[3:6] > 8e37).all()
-    assert np.isnan(y[6])
-    assert y[7] == 1
+    lowest, highest = np.repeat([0, 8e37], 3), np.repeat([2e-38, np.inf], 3)
+    assert ((lowest < y[:6]) & (y[:6] < highest)).all()
+    np.testing.assert_array_equal(y[6:8], [np.nan, 1])
     _, y = apply(_vectors.sigmoid, x)
     np.testing.assert_allclose(y[:8], [0, 0, 0, 1, 1, 1, np.nan, 0.5], atol=1e-37)
 

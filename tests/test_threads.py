@@ -81,8 +81,6 @@ def test_environment_variable(monkeypatch):
     monkeypatch.setenv("FOLDGAUSS_NUM_THREADS", "many")
     with pytest.raises(ValueError, match="FOLDGAUSS_NUM_THREADS"):
         _threads.num_threads()
-    with pytest.raises(ValueError, match="count"):
-        _threads.set_num_threads(0)
 
 
 def test_an_interrupt_waits_for_the_workers():
@@ -100,11 +98,8 @@ def test_an_interrupt_waits_for_the_workers():
         done.append(k)
 
     _threads.set_num_threads(2)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            _threads.run_tasks(task, range(2))
-        finished = len(done)
-        time.sleep(0.4)
-        assert len(done) == finished
-    finally:
-        _threads.set_num_threads(None)
+    with pytest.raises(KeyboardInterrupt):
+        _threads.run_tasks(task, range(2))
+    finished = len(done)
+    time.sleep(0.4)
+    assert len(done) == finished

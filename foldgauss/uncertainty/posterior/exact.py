@@ -198,8 +198,12 @@ def _log_weights(edges: np.ndarray, gaps: int, alpha: float, times: np.ndarray) 
             below = gaps * np.log(fraction)
             inside = below[:, 1:] + np.log(-np.expm1(below[:, :-1] - below[:, 1:]))
         else:  # from the tail that is smaller, whose differences are precise
-            below, above = betainc(alpha * gaps, alpha, fraction), betaincc(alpha * gaps, alpha, fraction)
-            inside = np.log(np.where(below[:, 1:] < 0.5, np.diff(below), -np.diff(above)))
+            below = betainc(alpha * gaps, alpha, fraction)
+            upper = below[:, 1:] >= 0.5
+            at_upper = np.pad(upper, ((0, 0), (0, 1))) | np.pad(upper, ((0, 0), (1, 0)))
+            above = np.zeros_like(below)
+            above[at_upper] = betaincc(alpha * gaps, alpha, fraction[at_upper])
+            inside = np.log(np.where(upper, -np.diff(above), np.diff(below)))
     return np.where(np.isnan(inside), -np.inf, inside)
 
 

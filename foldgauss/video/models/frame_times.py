@@ -49,8 +49,13 @@ class FrameTimes(eqx.Module):
 
         Neighbors are equal only where a weight is too small for the dtype.
         """
-        summed = jnp.cumsum(jax.nn.softmax(jnp.asarray(self.logits)))
-        return jnp.concatenate([jnp.zeros(1, summed.dtype), summed / summed[-1:]])
+        return _cumulate(jnp.asarray(self.logits))
+
+
+@jax.jit  # one program in place of one for each operation
+def _cumulate(logits: Float[Array, " intervals"]) -> Float[Array, " num_frames"]:
+    summed = jnp.cumsum(jax.nn.softmax(logits))
+    return jnp.concatenate([jnp.zeros(1, summed.dtype), summed / summed[-1:]])
 
 
 def make_time_logits(num_frames: int, cuts: Sequence[int]) -> Float32[np.ndarray, " intervals"]:
