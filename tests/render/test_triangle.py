@@ -144,16 +144,6 @@ def test_mirrored_faces_are_the_same_gaussian():
     assert_same_covariance(gaussians_of(mirrored).factor, gaussians_of(triangles).factor)
 
 
-def test_wrong_normal_would_fail():
-    """The erratum: with e2 for the normal, the second scale comes out wrong, by far more than the tolerance."""
-    mean, scale, angle = parameters()
-    edges = np.asarray(triangles_of(from_scale_angle(mean, scale, angle, *rest())).edges)
-    along = edges[:, 0] / np.linalg.norm(edges[:, 0], axis=-1, keepdims=True)
-    second = edges[:, 1] - along * np.sum(along * edges[:, 1], -1, keepdims=True)
-    second[:, 1] = 0  # the part along e2 taken out
-    assert np.median(np.abs(np.linalg.norm(second, axis=-1) / np.asarray(scale)[:, 1] - 1)) > 0.1
-
-
 def test_accurate_far_from_the_origin():
     """Edges are kept: a splat of 1e-5 at a distance of 1000 comes back to 1e-6; through vertices it could not."""
     gaussians = from_scale_angle(*parameters(longest=1e-5), *rest())

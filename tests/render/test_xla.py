@@ -35,15 +35,6 @@ def check_same(ones, others, tolerance):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["plain", "curtain"])
-def test_rounds_and_tiles_change_nothing(kind):
-    """With other tiles, and room for a few splats at a time, drawn in many rounds, all is the same."""
-    splats, size = scene(kind)
-    few = picture_and_grads(splats, size, options=dataclasses.replace(SMOOTH, tile_size=7, list_capacity=80))
-    check_same(picture_and_grads(splats, size), few, 1e-5)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("capacity", [None, 64])
 @pytest.mark.parametrize("tile_size", [None, 4, 7, 32])
 @pytest.mark.parametrize(("kind", "compositing"), [("plain", "over"), ("needles", "sum"), ("curtain", "over")])

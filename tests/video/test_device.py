@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-import json
 import os
 import subprocess
 import sys
@@ -15,7 +14,6 @@ import pytest
 from clips import moving_blobs
 from commands import run
 
-from benchmarks import gpu
 from foldgauss.io import write_image
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.io.models.video_model import load_video_model
@@ -41,13 +39,12 @@ from foldgauss.video.fitting.steppers.engines import choose_engine
 from foldgauss.video.fitting.steppers.interpolated_frames import (
     InterpolatedFrames,
     Prefetcher,
-    choose_targets,
     make_interpolated,
 )
-from foldgauss.video.fitting.steppers.jax_loss import compute_losses, ssim
+from foldgauss.video.fitting.steppers.jax_loss import compute_losses
 from foldgauss.video.fitting.steppers.jax_step import _splats, find_alive, lower_step
 from foldgauss.video.fitting.steppers.jax_stepper import HeldArrays, JaxStepper
-from foldgauss.video.fitting.steppers.loss import image_loss, squared_loss, ssim_map
+from foldgauss.video.fitting.steppers.loss import image_loss, squared_loss
 from foldgauss.video.models.conditioning import ConditioningSpec, condition, find_windows
 from foldgauss.video.models.row_layout import columns
 from foldgauss.video.motion.optical_flow import motion_finder
@@ -121,23 +118,29 @@ def compare_steps(config: FitConfig, progress: float, outside: int = 0):
     return here, there
 
 
-@pytest.mark.parametrize("progress", [0.1, 0.8], ids=["image loss", "squared loss"])
-def test_step_matches_the_cpu(progress):
-    _, there = compare_steps(CONFIG, progress)
-    assert there.statistics is None
-    assert np.abs(there.rows - warm_state(CONFIG).rows).max() > 1e-3  # it did step
+STEPS = [
+    pytest.param({}, 0.1, id="image loss"),
+    pytest.param({}, 0.8, id="squared loss"),
+    *(
+        pytest.param(changes, progress, id=f"{changes} {progress}", marks=pytest.mark.slow)
+        for changes, progress in [
+            ({"views.batch_size": 4, "views.interpolation_fraction": 0.5}, 0.1),  # frames, and images between them
+            ({"views.batch_size": 4, "views.interpolation_fraction": 0.5}, 0.8),  # frames alone
+            ({"degree": 0}, 0.1),
+            ({"floor": 0.1, "power": 0.5}, 0.1),
+            ({"rates.by_duration": False, "rates.frame_times": 0.0}, 0.1),
+            ({"loss.ssim_fraction": 0.0}, 0.1),
+            ({"compositing": "sum", "options": RenderOptions()}, 0.1),
+        ]
+    ),
+]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("progress", [0.1, 0.8], ids=["mixed", "frames alone"])
-def test_step_with_interpolated_frames_matches_the_cpu(progress):
-    """A batch of frames and of images between frames, and later one of frames alone."""
-    config = CONFIG.replace(**{"views.batch_size": 4, "views.interpolation_fraction": 0.5})
-    state = warm_state(config)
-    interpolation = CpuStepper(FRAMES, config, start(FRAMES, config)).interpolation
-    _, fractions = choose_targets(interpolation, config, len(FRAMES), state, 0.1)
-    assert 0 < sum(fraction is not None for fraction in fractions) < 4
+@pytest.mark.parametrize(("changes", "progress"), STEPS)
+def test_step_matches_the_cpu(changes, progress):
+    config = CONFIG.replace(**changes)
     _, there = compare_steps(config, progress)
+    assert there.statistics is None
     assert np.abs(there.rows - warm_state(config).rows).max() > 1e-3  # it did step
 
 
@@ -164,26 +167,6 @@ def test_prepared_images_are_the_same_and_are_dropped():
     assert prefetcher.num_prepared == 0
     prefetcher.interpolate(5, 0, 0.5)  # not prepared
     assert made == [(0, 0.5)]
-
-
-def test_interpolated_views_do_not_depend_on_errors():
-    """So that they can be prepared before the steps until then."""
-    config = FitConfig(views=Views(interpolation_fraction=0.4, error_fraction=0.5, two_cameras=True, batch_size=3))
-    interpolation, seen = make_interpolated(FRAMES, config, motion_finder(FRAMES)), []
-    for errors in np.random.default_rng(0).uniform(0.1, 1, (2, len(FRAMES))):
-        state = warm_state(CONFIG)
-        state.frame_errors = errors
-        seen.append([])
-        for state.step in range(1, 60):
-            chosen = choose_targets(interpolation, config, len(FRAMES), state, 0.1)
-            seen[-1] += [(state.step, int(view), fraction) for view, fraction in zip(*chosen, strict=True)]
-    interpolated = [[given for given in views if given[2] is not None] for views in seen]
-    assert interpolated[0] == interpolated[1]
-    assert 0.3 < len(interpolated[0]) / len(seen[0]) < 0.4
-    assert {view // len(FRAMES) for _, view, _ in interpolated[0]} == {0, 1}  # mirrored ones, too
-    assert seen[0] != seen[1]  # others do
-    _, without = choose_targets(None, config, len(FRAMES), state, 0.1)
-    assert without == [None] * 3
 
 
 def test_a_fit_prepares_its_interpolated_frames(monkeypatch):
@@ -220,22 +203,6 @@ def test_step_of_growing_batches_matches_the_cpu():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"degree": 0},
-        {"floor": 0.1, "power": 0.5},
-        {"rates.by_duration": False, "rates.frame_times": 0.0},
-        {"loss.ssim_fraction": 0.0},
-        {"compositing": "sum", "options": RenderOptions()},
-    ],
-    ids=str,
-)
-def test_steps_of_other_settings_match_the_cpu(changes):
-    compare_steps(CONFIG.replace(**changes), 0.1)
-
-
-@pytest.mark.slow
 def test_a_clip_of_one_frame():
     result = fit(FRAMES[:1], dataclasses.replace(CONFIG, steps=60))
     assert evaluate(result.model, FRAMES[:1]).mean_psnr > 25
@@ -264,12 +231,6 @@ def test_losses_match_the_cpu(ssim_fraction, squared):
         assert float(values[k]) == pytest.approx(judge.value, rel=1e-5)
         assert float(errors[k]) == pytest.approx(judge.mean_squared_error, rel=1e-5)
         close(np.moveaxis(gradient[k], -1, 0), judge.gradient)
-
-
-def test_ssim_matches_the_cpu():
-    rendered, target = (np.ascontiguousarray(one[0, ..., 0]) for one in pictures_of())
-    own = jax.jit(ssim)(rendered[..., None], target[..., None])
-    close(own[..., 0], ssim_map(rendered, target))
 
 
 @pytest.mark.parametrize(("power", "floor", "cutoff"), [(1.0, 0.0, 0.0), (2.0, 0.1, 0.0), (2.0, 0.0, 0.02)])
@@ -538,38 +499,6 @@ def test_alpha_is_refused(monkeypatch):
         next(fit_steps(frames, CONFIG))
 
 
-def test_unknown_engines_are_refused():
-    with pytest.raises(ValueError, match="engine: expected one of"):
-        FitConfig(engine="reference")
-
-
-@pytest.mark.parametrize(
-    "config", [pytest.param(CONFIG, id="plain"), pytest.param(GROWING, id="growing", marks=pytest.mark.slow)]
-)
-def test_resuming_keeps_the_bits(config, tmp_path):
-    """From a checkpoint, written while the arrays are on the device."""
-    path = tmp_path / "kept.safetensors"
-    config = dataclasses.replace(config, steps=min(config.steps, 40))
-    for state, _ in fit_steps(FRAMES, config):
-        if state.step == 23:
-            save_checkpoint(path, state, config=config, source={})
-    for again, info in fit_steps(FRAMES, config, load_checkpoint(path, config=config, source={})):
-        pass
-    assert info.step == config.steps
-    one, other = (jax.tree.map(np.array, own) for own in (state, again))
-    for name in ("rows", "first", "second", "counts", "time_logits", "frame_errors"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-
-
-def test_relocation():
-    """As by the CPU: at the stated steps, of as many Gaussians as before."""
-    for state, info in fit_steps(FRAMES, CONFIG.replace(**{"strategy.relocated_fraction": 0.2})):
-        if info.step in (20, 35, 50):
-            assert (state.counts == 0).sum() >= 15
-    assert state.num_gaussians == 150
-    assert np.isfinite(state.rows).all()
-
-
 def test_diverging_fit_backs_off(monkeypatch):
     config = dataclasses.replace(CONFIG, rates=LearningRates(log_scale=3e38), steps=12)
     with pytest.warns(DivergenceWarning, match="the fit diverged at step"):
@@ -580,12 +509,6 @@ def test_diverging_fit_backs_off(monkeypatch):
     with pytest.raises(FitDiverged, match="The state is that of step 0") as caught:
         list(fit_steps(FRAMES, config))
     assert np.isfinite(caught.value.state.rows).all()
-
-
-def test_minutes_are_planned():
-    by_clock = dataclasses.replace(CONFIG, steps=None, minutes=0.02)
-    *_, (_, info) = fit_steps(FRAMES, by_clock)
-    assert info.stopped_by == "minutes"
 
 
 def test_capacity_doubles_where_it_is_not_enough():
@@ -616,32 +539,3 @@ def test_the_command(tmp_path, capsys):
 
 
 # -------------------------------------------------------------------------------------- its own benchmark
-
-
-def test_gpu_benchmark_requires_a_gpu(capsys):
-    with pytest.raises(SystemExit):
-        gpu.main([])
-    assert "expected a GPU that JAX sees, got none" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        gpu.main(["--anyway"])
-
-
-def test_floors_are_those_of_the_device():
-    """An H200 moves bytes faster and computes as fast as an H100."""
-    few, many = 10_000, 10_000_000_000
-    for pairs, faster in ((few, 4.8 / 3.35), (many, 1.0)):
-        one, other = (gpu.floors(100_000, (640, 1280), pairs, f"NVIDIA {name}") for name in ("H100 80GB", "H200"))
-        assert one["forward"] / other["forward"] == pytest.approx(faster)
-        assert one["both"] > one["forward"]
-    assert gpu.floors(100_000, (640, 1280), many, "NVIDIA H200")["forward"] == pytest.approx(1e3 * many * 23 / 67e12)
-    assert gpu.floors(1, (1, 1), 1, "cpu") == {}
-
-
-@pytest.mark.slow
-def test_the_benchmark_runs(tmp_path):
-    path = tmp_path / "gpu.json"
-    gpu.main(["--anyway", "--tiny", "--json", str(path)])
-    figures = json.loads(path.read_text())["figures"]
-    for name in ("quality_xla_psnr", "quality_pallas_steps", "playback_pallas_fps", "playback_xla_fps"):
-        assert figures[name] > 0
-    assert figures["engines_200_24x40_xla_over_pallas_both"] > 0

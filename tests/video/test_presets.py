@@ -1,7 +1,6 @@
 """Presets: the published recipe, its initialization and its two cameras; drafts."""
 
 import dataclasses
-import itertools
 
 import jax
 import numpy as np
@@ -14,7 +13,7 @@ from foldgauss.video import FitConfig, LearningRates, Views, evaluate, fit, fit_
 from foldgauss.video.fitting.config import PRESETS, chosen_num_gaussians, planned_steps
 from foldgauss.video.fitting.growth import Growth
 from foldgauss.video.fitting.initialize import initialize_uniform
-from foldgauss.video.fitting.loop import start, to_model
+from foldgauss.video.fitting.loop import start
 from foldgauss.video.fitting.schedule import choose_views
 from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
 from foldgauss.video.models.conditioning import mirror
@@ -225,40 +224,3 @@ def test_decayed_selects_the_rates(decayed):
     assert not moved.pop("loc")
     assert set(moved.values()) == {decayed == "loc"}
     assert np.array_equal(np.asarray(state.time_logits), times) == (decayed == "all")
-
-
-def test_a_small_fit_by_the_paper():
-    """All of it at once, through birth and reset; stopped and gone on with, it has the same bits."""
-    config = FitConfig.preset("paper", num_gaussians=300, degree=3, steps=450)
-    whole = []
-    for state, info in itertools.islice(fit_steps(FRAMES, config), 300):
-        whole.append(info.num_gaussians)
-        if info.step == 215:  # after the reset, between births
-            kept = jax.tree.map(np.array, state)
-    assert kept.statistics is not None
-    assert len(set(whole)) > 5
-    assert info.psnr > 15
-    for again, _ in itertools.islice(fit_steps(FRAMES, config, kept), 300 - 215):
-        pass
-    models = [jax.tree.leaves(to_model(one, config, (24, 40), 25.0)) for one in (state, again)]
-    for one, other in zip(*models, strict=True):
-        assert np.isfinite(one).all()
-        np.testing.assert_array_equal(one, other)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"max_gaussians": 0}, "max_gaussians"),
-        ({"max_gaussians": 10**12}, "max_gaussians"),
-        ({"initialization": "random"}, "initialization: expected one of 'flow', 'static', 'uniform'"),
-        ({"rates.decayed": "none"}, "decayed: expected one of"),
-        ({"views.two_cameras": 2}, "two_cameras"),
-        ({"strategy.sparse_updates": None}, "sparse_updates"),
-        ({"strategy.growth": True}, "growth: expected a Growth"),
-    ],
-    ids=str,
-)
-def test_bad_settings(changes, message):
-    with pytest.raises(ValueError, match=message):
-        FitConfig().replace(**changes)

@@ -11,9 +11,8 @@ from path_models import moving_model, moving_splats, random_paths, random_splats
 
 from foldgauss.io import load_video_model, save_video_model
 from foldgauss.video import density_image
-from foldgauss.video.models.conditioning import ConditioningSpec, backpropagate, condition, find_windows
 from foldgauss.video.models.renderer import VideoRenderer
-from foldgauss.video.models.row_layout import columns, pack, unpack
+from foldgauss.video.models.row_layout import pack, unpack
 from foldgauss.video.models.shared_paths import SharedPaths
 
 SIZE, T = (48, 80), np.float32(0.4)
@@ -44,51 +43,6 @@ def test_jax_and_numpy_give_the_same_maps_also_at_repeated_times():
 def test_a_path_with_one_knot_does_not_move():
     paths = random_paths(num_knots=1)
     np.testing.assert_array_equal(paths.at(np.float32(0.7)), paths.matrices[:, 0])
-
-
-@pytest.mark.parametrize("degree", [0, 3])
-def test_kernels_move_splats_as_at_does(degree):
-    splats = moving_splats(degree=degree)
-    home = jax.jit(lambda model, t: model.at(t))(moving_model(splats), T)
-    done = moving_model(splats).prepare(SIZE).at(float(T))
-    alive = np.flatnonzero(np.asarray(home.opacity) > 0)
-    np.testing.assert_array_equal(done.alive, alive)
-    assert len(np.unique(np.asarray(splats.path_index)[alive])) == 3
-    np.testing.assert_allclose(done.mean, home.mean[alive], rtol=1e-5, atol=5e-4)
-    cov = done.factor @ np.swapaxes(done.factor, 1, 2)
-    home_cov = np.asarray(home.factor @ jnp.swapaxes(home.factor, 1, 2))[alive]
-    np.testing.assert_allclose(cov, home_cov, rtol=2e-4, atol=1e-5 * np.abs(home_cov).max())
-
-
-def test_gradients_by_rows_and_by_maps_match_autodiff():
-    splats = moving_splats(degree=3, power=1.0)
-    rows, spec = pack(splats), ConditioningSpec(3, 1.0, 0.0, SIZE, paths=splats.paths)
-    done = condition(rows, find_windows(rows, spec), T, spec)
-    rng = np.random.default_rng(1)
-    w_mean, w_cov = rng.normal(size=done.mean.shape), rng.normal(size=done.factor.shape) / 50
-    w_cov = w_cov + np.swapaxes(w_cov, 1, 2)
-
-    def loss(leaves, maps):
-        steady = SharedPaths(jnp.zeros((2, 1), maps.dtype), maps[:, None])
-        moved = dataclasses.replace(splats, **leaves, paths=steady)
-        home = moving_model(moved).at(jnp.asarray(T, maps.dtype))
-        cov = home.factor @ jnp.swapaxes(home.factor, 1, 2)
-        return jnp.sum(home.mean[done.alive] * w_mean) + jnp.sum(cov[done.alive] * w_cov)
-
-    with jax.enable_x64(True):
-        leaves = {name: jnp.asarray(getattr(splats, name), jnp.float64) for name in columns(3)}
-        maps = jnp.asarray(splats.paths.at(T), jnp.float64)
-        by_leaves, by_maps = jax.tree.map(np.asarray, jax.jit(jax.grad(loss, (0, 1)))(leaves, maps))
-    grad, path_grad = np.zeros_like(rows), np.zeros((2, 2, 3))
-    nothing = np.zeros(len(done.alive), np.float32), np.zeros((len(done.alive), 3), np.float32)
-    d_factor = (2 * w_cov @ done.factor).astype(np.float32)
-    backpropagate(rows, done, (w_mean.astype(np.float32), d_factor, *nothing), spec, grad, path_grad)
-    for name, place in columns(3).items():
-        truth = by_leaves[name].reshape(len(rows), -1)
-        largest = max(np.abs(truth).max(), 1e-3)
-        np.testing.assert_allclose(grad[:, place] / largest, truth / largest, atol=2e-5, err_msg=name)
-    np.testing.assert_array_equal(grad[:, -1], 0)
-    np.testing.assert_allclose(path_grad, by_maps, rtol=1e-4, atol=1e-5 * np.abs(by_maps).max())
 
 
 def test_rows_hold_the_path_and_come_back():
