@@ -286,8 +286,7 @@ def test_depth_order_and_array_order():
         assert (nearest_first != np.arange(depth.size)).any()
         by_depth, as_they_come = (view(scene, camera, SIZE, order=order) for order in ("depth", "array"))
         np.testing.assert_array_equal(as_they_come.color, scene.color)
-        for one, other in zip(jax.tree.leaves(by_depth), jax.tree.leaves(as_they_come), strict=True):
-            np.testing.assert_array_equal(one, np.asarray(other)[nearest_first])
+        jax.tree.map(np.testing.assert_array_equal, by_depth, jax.tree.map(lambda x: x[nearest_first], as_they_come))
 
 
 def test_flat_image_at_a_slant_needs_array_order():

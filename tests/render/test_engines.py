@@ -189,7 +189,7 @@ def test_jit_and_vmap(engine):
     assert np.abs(np.asarray(stack)[1] - truth).max() > 1e-2
 
 
-@pytest.mark.parametrize("engine", OTHERS)
+@pytest.mark.parametrize("engine", [*OTHERS, pytest.param("pallas", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("leaf", LEAVES)
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_splats_that_are_not_finite_are_left_out(engine, leaf, value):
@@ -207,6 +207,27 @@ def test_splats_that_are_not_finite_are_left_out(engine, leaf, value):
     for one, other in zip(jax.tree.leaves(grads), jax.tree.leaves(others), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-3, rtol=1e-4)
     assert not any(np.asarray(one)[3].any() for one in jax.tree.leaves(grads[0]))
+
+
+@pytest.mark.parametrize("engine", OTHERS)
+def test_far_outside(engine):
+    """Splats nowhere near the picture are as if they were fully transparent."""
+    splats, size = scene("plain")
+    mean, factor, opacity, color = map(np.array, jax.tree.leaves(splats))
+    opacity[-10:] = 0
+    without = Splats2D(*map(jnp.asarray, (mean, factor, opacity, color)))
+    away = np.asarray([1e5, -1e5, 1e9, -1e30, 3e38])
+    mean[-10:] = np.concatenate([np.stack([away, away[::-1]], -1), np.stack([away, 0 * away + 5], -1)])
+    factor[-10:], opacity[-10:], color[-10:] = np.eye(2), 1, 1
+    with_them = Splats2D(*map(jnp.asarray, (mean, factor, opacity, color)))
+    (grads, picture), (others, truth) = (
+        grads_and_picture(engine, size, "over", OPTIONS["default"], one, BACKGROUND, weights_for(size))
+        for one in (with_them, without)
+    )
+    np.testing.assert_allclose(picture, truth, atol=1e-6)
+    for one, other in zip(jax.tree.leaves(grads), jax.tree.leaves(others), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-4)
+    assert not any(np.asarray(one)[-10:].any() for one in jax.tree.leaves(grads[0]))
 
 
 def center_of_one(engine, factor):

@@ -122,7 +122,6 @@ def test_scale_cutoff_keeps_the_times_when_both_scales_exceed_it(power, floor, c
 def test_unpack_inverts_pack(degree):
     splats = random_splats(degree=degree)
     again = unpack(pack(splats), degree, splats.envelope)
-    for one, other in zip(jax.tree.leaves(splats), jax.tree.leaves(again), strict=True):
-        np.testing.assert_array_equal(one, other)
+    jax.tree.map(np.testing.assert_array_equal, splats, again)
     places = np.concatenate([np.arange(place.start, place.stop) for place in columns(degree).values()])
     np.testing.assert_array_equal(np.sort(places), np.arange(11 + 2 * degree))

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from edit_cases import apart, picture
-from soft_models import NUM, OBJECT, SIZE, soft_model
+from soft_models import NUM, OBJECT, SIZE, assert_same, soft_model
 
 from foldgauss.io import ModelFileError, load_video_model, save_video_model
 from foldgauss.io.models.model_file import read_header
@@ -235,11 +235,7 @@ def test_round_trip_is_exact(tmp_path, name):
     assert isinstance(video, EditedVideo)
     save_video_model(path, video, metadata={"by": "hand"})
     again = load_video_model(path)
-    assert isinstance(again, EditedVideo)
-    assert jax.tree.structure(again) == jax.tree.structure(video)
-    for one, other in zip(jax.tree.leaves(video), jax.tree.leaves(again), strict=True):
-        assert np.asarray(one).dtype == np.asarray(other).dtype
-        np.testing.assert_array_equal(one, other)
+    assert_same(again, video)
     np.testing.assert_array_equal(list(again.frames()), list(video.frames()))
     further, other = (edit(one).select(layer=1).move((0.05, 0)).video() for one in (again, video))  # and edited further
     assert apart(further, other, 0.31) == 0

@@ -173,10 +173,13 @@ def test_one_frame_has_one_time():
 
 
 def test_one_frame_is_shown_at_all_times(still):
-    _, model = still
+    frames, model = still
     shown = np.stack(list(model.frames(np.array([0.0, 0.5, 1.0]))))
     np.testing.assert_array_equal(shown[1:], shown[:1].repeat(2, 0))
     np.testing.assert_array_equal(np.asarray(model.render(1.0)), np.asarray(model.render(0.0)))
+    assert by_time(model, frame=0).mask.all()
+    with pytest.raises(ValueError, match="at least 3 frames"):
+        likelihood_profiles(model, frames)
     moved = edit(model).move((0.1, 0)).video()
     later = edit(moved).retime(shift=0.5).video()
     for video in (moved, later, layers(model, moved)):
@@ -194,11 +197,6 @@ def test_one_frame_can_be_a_background_layer(still):
         assert psnr(frames[0], shown) > 32
 
 
-def test_one_frame_has_all_its_gaussians(still):
-    model = still[1]
-    assert by_time(model, frame=0).mask.all()
-
-
 @pytest.mark.parametrize("how", [{"quality": 100}, {"psnr": 40, "steps": 60}], ids=["alone", "clip"])
 def test_one_frame_in_a_compact_file(tmp_path, still, how):
     frames, model = still
@@ -206,12 +204,6 @@ def test_one_frame_in_a_compact_file(tmp_path, still, how):
     loaded = load_video_model(save_compact(tmp_path / "m.fgz", made.quantized))
     assert loaded.num_frames == 1
     assert evaluate(loaded, frames).mean_psnr >= how.get("psnr", 30)
-
-
-def test_one_frame_tells_no_times(still):
-    frames, model = still
-    with pytest.raises(ValueError, match="at least 3 frames"):
-        likelihood_profiles(model, frames)
 
 
 # -------------------------------------------------------------------------------------------- alternating
@@ -322,8 +314,10 @@ def test_exact_frames_cost_the_others_no_bits(degree, steps):
         (list(constant(1)), "list.*np.stack"),
         (constant(1)[:0], r"\(0, 24, 32, 3\)"),
         (constant(1)[:, :, :0], r"\(3, 24, 0, 3\)"),
+        (constant(1, channels=2), r"\(3, 24, 32, 2\)"),
+        (constant(1, channels=5), r"\(3, 24, 32, 5\)"),
     ],
-    ids=["16 bits", "floats", "one picture", "a list", "no frames", "no pixels"],
+    ids=["16 bits", "floats", "one picture", "a list", "no frames", "no pixels", "2 channels", "5 channels"],
 )
 def test_invalid_frames_are_rejected_with_a_cure(frames, words):
     with pytest.raises(ValueError, match=f"frames: expected a uint8 array.*{words}"):

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import numpy as np
 import pytest
 from clips import moving_blobs
@@ -279,27 +278,6 @@ def test_limits_bound_the_start():
     assert chosen_num_gaussians(by_size, 5, 24, 40) == 30
     assert chosen_num_gaussians(dataclasses.replace(config, max_gaussians=None), 5, 24, 40) == 500
     assert len(start(FRAMES, config).rows) == 300
-
-
-@pytest.mark.usefixtures("unscaled")
-def test_new_gaussians_come_last_with_empty_moments():
-    steps, before = fit_steps(FRAMES, CONFIG), None
-    for state, info in steps:
-        if info.step == 9:
-            before = jax.tree.map(np.array, state)
-        if info.step == 10:
-            break
-    old = np.flatnonzero(state.counts > 0)
-    new = np.flatnonzero(state.counts == 0)
-    assert len(new) > 0
-    # Those never seen have taken no step either; all that have stand before all that are new.
-    assert new[new > old.max()].size >= len(state.rows) - len(before.rows)
-    born = new[new > old.max()]
-    assert not state.first[born].any()
-    assert not state.second[born].any()
-    assert state.first[old].any(axis=1).all()
-    assert state.statistics.seen.shape == (len(state.rows),)
-    assert not state.statistics.seen.any()
 
 
 def test_screen_gradient_is_in_units_of_half_the_image():

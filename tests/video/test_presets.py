@@ -9,7 +9,7 @@ from clips import moving_blobs
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, cpu, project
-from foldgauss.video import FitConfig, LearningRates, Views, evaluate, fit, fit_steps
+from foldgauss.video import FitConfig, LearningRates, Views, fit_steps
 from foldgauss.video.fitting.config import PRESETS, chosen_num_gaussians, planned_steps
 from foldgauss.video.fitting.growth import Growth
 from foldgauss.video.fitting.initialize import initialize_uniform
@@ -51,7 +51,6 @@ def test_a_draft_is_smaller_than_the_standard():
     draft, standard = FitConfig.preset("draft"), FitConfig()
     assert planned_steps(draft, 24) < planned_steps(standard, 24) / 3
     assert chosen_num_gaussians(draft, 24, 160, 320) < chosen_num_gaussians(standard, 24, 160, 320) / 3
-    assert evaluate(fit(FRAMES, FitConfig.preset("draft", num_gaussians=400, steps=150)).model, FRAMES).mean_psnr > 25
 
 
 def test_the_published_numbers():
@@ -180,17 +179,6 @@ def test_a_pass_sees_every_frame_from_both_sides():
     passes = [np.concatenate([choose_views(config, 4, 4 * k + i, errors) for i in range(4)]) for k in range(2)]
     assert sorted(passes[0]) == sorted(passes[1]) == list(range(8))
     assert passes[0].tolist() != passes[1].tolist()
-
-
-def test_mirrored_views_are_learned():
-    """An uneven clip is learned from both sides: were a target or a gradient not mirrored, it would not be."""
-    config = FitConfig(num_gaussians=400, steps=200)
-    one, two = (
-        evaluate(fit(FRAMES, config.replace(**{"views.two_cameras": two})).model, FRAMES).mean_psnr
-        for two in (False, True)
-    )
-    assert two > 28
-    assert abs(one - two) < 1
 
 
 # --------------------------------------------------------------------------------------------------- steps

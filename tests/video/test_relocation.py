@@ -55,17 +55,19 @@ def test_gaussians_of_little_influence_are_invisible():
 
 def test_new_gaussians_are_where_errors_are():
     """All error is put into one frame: there they start, as many as there were, and the others keep their order."""
-    state, before = fitted_state(), None
+    state = fitted_state()
     before = state.copy()
     state.frame_errors[:] = 1e-12
     state.frame_errors[4] = 0.1
-    relocate(state, FRAMES, CONFIG.replace(**{"strategy.relocated_fraction": 0.1}), SPEC, motion_finder(FRAMES)())
+    relocate(state, FRAMES, CONFIG.replace(**{"strategy.relocated_fraction": 0.2}), SPEC, motion_finder(FRAMES)())
     assert state.num_gaussians == CONFIG.num_gaussians
     new = state.counts == 0
-    assert new.sum() == 30
-    at = columns(CONFIG.fold_degree)["time_loc_logit"].start
-    home = 1 / (1 + np.exp(-state.rows[new, at]))
+    assert new.sum() == 60
+    logits = state.rows[:, columns(CONFIG.fold_degree)["time_loc_logit"].start]
+    home = 1 / (1 + np.exp(-logits[new]))
     np.testing.assert_allclose(home, np.asarray(frame_times(state.time_logits))[4], atol=0.01)
+    for place in np.flatnonzero(new):  # among those of their time
+        assert (~new[:place]).sum() == np.searchsorted(np.sort(logits[~new]), logits[place])
     kept = [row.tobytes() for row in state.rows[~new]]
     place = {row.tobytes(): k for k, row in enumerate(before.rows)}
     assert (np.diff([place[row] for row in kept]) > 0).all()
@@ -107,19 +109,6 @@ def test_gaussians_alive_in_no_frame_move_first():
     relocate(state, FRAMES, CONFIG.replace(**{"strategy.relocated_fraction": 0.01}), SPEC, None)
     kept = {row.tobytes() for row in state.rows}
     assert not any(row.tobytes() in kept for row in before)
-
-
-def test_new_gaussians_lie_among_those_of_their_time():
-    state, at = fitted_state(), columns(CONFIG.fold_degree)
-    state.frame_errors[:] = 1e-12
-    state.frame_errors[5] = 0.1
-    relocate(state, FRAMES, CONFIG.replace(**{"strategy.relocated_fraction": 0.2}), SPEC, None)
-    new = np.flatnonzero(state.counts == 0)
-    assert len(new) == 60
-    times = np.sort(state.rows[state.counts > 0, at["time_loc_logit"].start])
-    for place in new:
-        before = (state.counts[:place] > 0).sum()
-        assert before == np.searchsorted(times, state.rows[place, at["time_loc_logit"].start])
 
 
 @pytest.mark.parametrize(

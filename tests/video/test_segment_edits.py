@@ -5,12 +5,11 @@ import functools
 import gc
 import weakref
 
-import jax
 import numpy as np
 import pytest
 from object_clips import BACKGROUND, BOX, DISC, SPEED, named_model, square
 from scipy.special import expit
-from soft_models import NUM, OBJECT, soft_model, soft_segments
+from soft_models import NUM, OBJECT, assert_same, soft_model, soft_segments
 
 from foldgauss.render import Camera
 from foldgauss.video import (
@@ -113,12 +112,7 @@ def test_one_segment_is_edited_as_the_model_to_the_bit(name):
     wanted = CHAINS[name](edit(model).select(**box)).video()
     got = CHAINS[name](edit(SegmentedVideo.from_models([(0, model)])).select(**box)).video()
     assert isinstance(got, SegmentedVideo)
-    made = got.segments[0].model
-    leaves, described = jax.tree.flatten(made)
-    wanted_leaves, wanted_described = jax.tree.flatten(wanted)
-    assert described == wanted_described
-    for one, other in zip(leaves, wanted_leaves, strict=True):
-        np.testing.assert_array_equal(one, other)
+    assert_same(got.segments[0].model, wanted)
     assert (got.num_gaussians, got.num_parameters) == (wanted.num_gaussians, wanted.num_parameters)
     np.testing.assert_array_equal(drawn(got), drawn(wanted))
 
@@ -471,8 +465,7 @@ def test_edits_act_in_their_order_and_a_selection_goes_along():
     for segment, part in zip(edited.segments, parts, strict=True):
         model = next(own.model for own in video.segments if own.first == segment.first)
         wanted = chain(edit(model), part).video()
-        for one, other in zip(jax.tree.leaves(segment.model), jax.tree.leaves(wanted), strict=True):
-            np.testing.assert_array_equal(one, other)
+        assert_same(segment.model, wanted)
         assert (segment.num_gaussians, segment.num_parameters) == (wanted.num_gaussians, wanted.num_parameters)
     copied = edit(video).select(whole).multiply([(0.2, 0)])
     assert len(copied.selection) == len(whole)
