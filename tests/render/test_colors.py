@@ -15,6 +15,9 @@ def recolored(splats, colors):
     return Splats2D(splats.mean, splats.factor, splats.opacity, colors)
 
 
+PLAIN, PLAIN_SIZE = scene("plain")
+
+
 def weights(splats, size, **how):
     """The map from one channel of the colors to the pixels, as a matrix (pixels, num)."""
     one_hot = recolored(splats, jnp.eye(len(splats.mean), dtype=splats.mean.dtype))
@@ -73,26 +76,20 @@ def test_invisible_splats_keep_their_colors():
         ({"images": []}, "images: expected one for each"),
         ({"images": [np.zeros((5, 5))]}, "shape"),
         ({"images": [np.full((50, 70, 3), np.inf, np.float32)]}, "images: expected finite numbers, got 10500 that"),
+        ({"images": [np.where(np.arange(3 * 50 * 70).reshape(50, 70, 3) == 9, np.nan, 0)]}, "^images: .*got 1 that"),
+        (
+            {"splats": [recolored(PLAIN, PLAIN.color.at[2, 1].set(jnp.nan))]},
+            r"^splats.color: expected finite numbers, got 1 ",
+        ),
         ({"ridge": -1.0}, "ridge"),
         ({"options": RenderOptions(tile_size=8), "engine": "cpu"}, "tile_size"),
     ],
 )
 def test_invalid_arguments_raise(change, message):
-    splats, size = scene("plain")
-    arguments = {"splats": [splats], "images": [np.zeros((*size, 3), np.float32)]} | change
+    """Values that are not finite would stop the solve of every channel, in silence."""
+    arguments = {"splats": [PLAIN], "images": [np.zeros((*PLAIN_SIZE, 3), np.float32)]} | change
     with pytest.raises(ValueError, match=message):
         solve_colors(**arguments)
-
-
-def test_values_that_are_not_finite_raise():
-    """It would stop the solve of every channel, in silence."""
-    splats, size = scene("plain")
-    image = np.zeros((*size, 3), np.float32)
-    image[3, 4, 0] = np.nan
-    with pytest.raises(ValueError, match=r"^images: expected finite numbers, got 1 that"):
-        solve_colors(splats, image)
-    with pytest.raises(ValueError, match=r"^splats.color: expected finite numbers, got 1 "):
-        solve_colors(recolored(splats, splats.color.at[2, 1].set(jnp.nan)), np.zeros_like(image))
 
 
 @pytest.mark.parametrize("dtype", [jnp.float16, pytest.param(jnp.bfloat16, marks=pytest.mark.slow)])

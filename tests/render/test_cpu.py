@@ -3,7 +3,6 @@
 import dataclasses
 
 import judge
-import numba as nb
 import numpy as np
 import pytest
 from scenes import scene
@@ -171,23 +170,6 @@ def test_nan_reaches_no_tile_and_no_cell():
     np.testing.assert_array_equal(first, end)
     kernels._find_cells(num, np.full(8 * num, nan), first_cell, end_cell)
     assert (end_cell <= first_cell).all()
-
-
-def test_exponential():
-    """Within 2e-7 over the powers that are drawn, in a kernel of its own."""
-    from foldgauss._numerics.simd import LANES, exp2, load, store
-    from foldgauss._runtime.kernels import _OPTIONS
-
-    @nb.njit(**_OPTIONS)  # not kept on disk: it is another function every time
-    def apply(x, y):
-        for k in range(np.uint64(0), np.uint64(len(x)), np.uint64(LANES)):
-            store(y, k, exp2(load(x, k)))
-
-    x = np.linspace(-30, 0, 1 << 16).astype(np.float32)
-    y = np.empty_like(x)
-    apply(x, y)
-    np.testing.assert_allclose(y, np.exp2(x.astype(np.float64)), rtol=2.5e-7)
-    assert y[-1] == 1
 
 
 @pytest.mark.parametrize("changed", range(5))
