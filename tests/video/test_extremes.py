@@ -26,7 +26,6 @@ from foldgauss.video import (
     times_at,
 )
 from foldgauss.video.fitting.config import chosen_num_gaussians
-from foldgauss.video.fitting.initialize import CORE, ROUNDS, _even_chance
 from foldgauss.video.fitting.loop import start, to_model
 from foldgauss.video.models.frame_times import is_cut, make_time_logits, snap_to_shots
 from foldgauss.video.motion.optical_flow import Motion
@@ -245,22 +244,6 @@ def test_long_clips_get_as_many_gaussians_a_frame_as_shorter_ones():
     assert number[500] == pytest.approx(2 * number[250], rel=1e-4)
     assert number[5000] == pytest.approx(20 * number[250], rel=1e-4)
     assert chosen_num_gaussians(FitConfig(max_gaussians=9000), 5000, 160, 320) == 9000
-
-
-def test_starts_are_spread_as_by_the_whole_matrix():
-    """Against the matrix of who covers what, which 5,000 frames have no room for."""
-    rng, num, tried = np.random.default_rng(2), 40, 8
-    times, home = np.linspace(0, 1, num), np.repeat(np.arange(num), tried)
-    spread = np.exp(rng.uniform(-5, -2, num))[home]
-    first = np.searchsorted(times, times[home] - CORE * spread)
-    last = np.searchsorted(times, times[home] + CORE * spread, side="right")
-    covers = np.zeros((num, num))
-    for k, a, b in zip(home, first, last, strict=True):
-        covers[k, a:b] += 1 / tried
-    chance = np.full(num, 1 / num)
-    for _ in range(ROUNDS):
-        chance *= (covers / (chance @ covers)).sum(1) / covers.sum(1)
-    np.testing.assert_allclose(_even_chance(home, spread, times), chance / chance.sum(), rtol=1e-9)
 
 
 def test_every_stretch_of_a_long_clip_has_starts():

@@ -16,8 +16,8 @@ from foldgauss.video.fitting.state import paths_of, to_model
 from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.motion.camera_path import fit_affine
 from foldgauss.video.motion.optical_flow import Motion
-from foldgauss.video.motion.path_coordinates import PathCoordinates, prefers_path
-from foldgauss.video.motion.shared_motions import FARTHEST, _are_larger, _Clip, find_shared_motions
+from foldgauss.video.motion.path_coordinates import PathCoordinates
+from foldgauss.video.motion.shared_motions import FARTHEST, _Clip, find_shared_motions
 
 CONFIG = FitConfig(num_gaussians=1500, steps=300, degree=2)
 TIMES = np.linspace(0, 1, 12)
@@ -203,15 +203,6 @@ def test_changes_are_those_of_the_path():
     np.testing.assert_allclose(measured[1][2:-2], expected)
 
 
-def test_unknown_places_and_steps_do_not_count():
-    clip = _Clip.of(Motion.from_frames(FRAMES[:1].repeat(12, 0)))
-    steps, places = np.tile(np.eye(3), (12, 1, 1)), np.zeros((12, 1, 2))
-    steps[3], places[7] = np.nan, np.nan
-    changes = clip.measure_changes(steps, places)
-    np.testing.assert_array_equal(np.flatnonzero(~np.isnan(changes)), [5, 6, 8, 9])
-    assert not _are_larger(np.full(12, np.nan), 0.0)
-
-
 def test_a_camera_that_shakes_for_a_while_is_followed():
     """Most of the changes are zero."""
     maps = np.tile(MAPS[:1], (30, 1, 1))
@@ -302,16 +293,6 @@ def test_coordinates_of_positions_and_tracks_agree():
             np.testing.assert_allclose(own, there, atol=1e-3)
     # The background stands still there, but for the error of the flow.
     assert np.abs(placed.shift[tracks.known]).mean() < 0.2 * np.abs(tracks.shift[tracks.known]).mean()
-
-
-def test_the_longer_or_else_the_steadier_fold_is_preferred():
-    folds = np.array([[[1.0, 0.0]], [[1.0, 0.0]], [[1.0, 0.0]], [[0.1, 0.0]]])
-    by_camera = np.array([[[9.0, 0.0]], [[0.5, 0.0]], [[0.5, 0.0]], [[0.5, 0.0]]])
-    chosen = prefers_path(folds, np.ones(4), by_camera, np.array([2.0, 0.5, 1.0, 1.0]), is_first=True)
-    assert chosen.tolist() == [True, False, True, False]
-    chosen = prefers_path(folds, np.ones(4), 0.9 * by_camera, np.array([2.0, 0.5, 1.0, 1.0]), is_first=False)
-    assert chosen.tolist() == [True, False, True, False]
-    assert not prefers_path(folds, np.ones(4), 0.9 * folds, np.ones(4), is_first=False).any()
 
 
 def test_a_model_can_be_saved_loaded_and_fitted_further(tmp_path):

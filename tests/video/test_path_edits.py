@@ -85,16 +85,6 @@ def test_gathered_gaussians_keep_their_paths_also_where_these_are_as_many():
     np.testing.assert_array_equal(again.path_index, [5, 2])
 
 
-def test_flattened_layers_render_the_same_images():
-    plain, few = soft_model(seed=3), path_model(num_paths=3, num_knots=2, seed=7)
-    video = layers(MODEL, plain, few, MODEL)
-    flat = flatten_video(video)
-    assert flat.splats.paths.times.shape == (5, 6)  # equal ones are not repeated
-    for t in BETWEEN:
-        np.testing.assert_array_equal(VideoRenderer(flat).frame(t), VideoRenderer(video).frame(t))
-    assert flatten_video(layers(plain, plain)).splats.paths is None
-
-
 def test_own_centers_are_those_in_the_frame():
     contributions, every = Contributions(MODEL), np.arange(NUM)
     found = contributions.own_centers(every)

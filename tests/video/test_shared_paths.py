@@ -59,23 +59,28 @@ def test_files_hold_paths(tmp_path):
     jax.tree.map(np.testing.assert_array_equal, again, model)
 
 
+def changed_paths(leaf, value):
+    own = getattr(random_paths(), leaf).copy()
+    own[0, 3] = value
+    return {"paths": dataclasses.replace(random_paths(), **{leaf: own})}
+
+
 @pytest.mark.parametrize(
-    ("leaf", "value", "expected"),
+    ("changes", "expected"),
     [
-        ("matrices", np.nan, "finite times and matrices"),
-        ("times", np.inf, "finite times and matrices"),
-        ("times", -1.0, "times that do not decrease"),
+        (changed_paths("matrices", np.nan), "finite times and matrices"),
+        (changed_paths("times", np.inf), "finite times and matrices"),
+        (changed_paths("times", -1.0), "times that do not decrease"),
+        ({"path_index": np.full(300, 3, np.uint8)}, "paths from 0 to 2, got 3"),
     ],
 )
-def test_paths_that_make_no_sense_are_errors(tmp_path, leaf, value, expected):
-    paths = random_paths()
-    changed = getattr(paths, leaf).copy()
-    changed[0, 3] = value
-    model = moving_model(dataclasses.replace(moving_splats(), paths=dataclasses.replace(paths, **{leaf: changed})))
+def test_paths_that_make_no_sense_are_errors(tmp_path, changes, expected):
+    model = moving_model(dataclasses.replace(moving_splats(), **changes))
     with pytest.raises(ValueError, match=expected):
         model.prepare(SIZE)
+    path = save_video_model(tmp_path / "m.safetensors", model)
     with pytest.raises(ValueError, match=expected):
-        load_video_model(save_video_model(tmp_path / "m.safetensors", model))
+        load_video_model(path)
 
 
 def test_places_of_many_take_no_memory_for_every_knot():
@@ -89,16 +94,6 @@ def test_places_of_many_take_no_memory_for_every_knot():
     tracemalloc.stop()
     expected = jax.tree.map(jnp.asarray, paths).by_path(jnp.asarray(t[:50]), jnp.asarray(path[:50]))
     np.testing.assert_allclose(maps[:50], expected, atol=1e-5)
-
-
-def test_a_number_of_a_path_that_is_not_there_is_an_error(tmp_path):
-    splats = moving_splats()
-    wrong = dataclasses.replace(splats, path_index=np.full(300, 3, np.uint8))
-    with pytest.raises(ValueError, match="path_index: expected paths from 0 to 2, got 3"):
-        moving_model(wrong).prepare(SIZE)
-    path = save_video_model(tmp_path / "m.safetensors", moving_model(wrong))
-    with pytest.raises(ValueError, match="paths from 0 to 2"):
-        load_video_model(path)
 
 
 def test_folded_gaussians_are_those_of_the_frame():
