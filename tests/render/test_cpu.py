@@ -128,29 +128,6 @@ def test_the_end_of_a_list_keeps_the_gradient():
         np.testing.assert_array_equal(one[:first], other[:first])
 
 
-def test_other_tile_sizes_raise():
-    leaves, size = leaves_of("one")
-    cpu.forward(*leaves, size, options=RenderOptions(tile_size=16))
-    with pytest.raises(ValueError, match=r"options.tile_size.*other sizes"):
-        cpu.forward(*leaves, size, options=RenderOptions(tile_size=8))
-
-
-@pytest.mark.parametrize(("colors", "background"), [(0, 0), (2, 3), (3, 2), (3, 0)])
-def test_mismatched_channels_raise(colors, background):
-    leaves, size = leaves_of("one")
-    leaves[3:] = np.zeros((1, colors), np.float32), np.zeros(background, np.float32)
-    with pytest.raises(ValueError, match=r"color, background: expected .* at least one channel"):
-        cpu.forward(*leaves, size)
-
-
-@pytest.mark.parametrize("shape", [(2, 17, 16), (3, 16, 16), (17, 16, 3), (17, 16)])
-def test_mismatched_gradients_raise(shape):
-    leaves, size = leaves_of("one")
-    trace = cpu.forward(*leaves, size)
-    with pytest.raises(ValueError, match=r"^grad_image: expected the image's shape \(3, 17, 16\)"):
-        cpu.backward(trace, np.zeros(shape, np.float32))
-
-
 def test_nan_reaches_no_tile_and_no_cell():
     """No such geometry is made, but an index made of it would write anywhere."""
     nan, num = np.float32(np.nan), kernels.BLOCK
@@ -172,13 +149,36 @@ def test_nan_reaches_no_tile_and_no_cell():
     assert (end_cell <= first_cell).all()
 
 
-@pytest.mark.parametrize("changed", range(5))
-def test_mismatched_arrays_raise(changed):
+def forward(changed=None, wrong=None, size=(16, 16), **how):
+    """A scene of 200, of which one array is another."""
+    leaves = [np.zeros(shape, np.float32) for shape in ((200, 2), (200, 2, 2), (200,), (200, 3), (3,))]
+    if changed is not None:
+        leaves[changed] = wrong(leaves[changed])
+    return cpu.forward(*leaves, size, **how)
+
+
+ARRAYS = "mean, factor, opacity, color, background"
+WRONG = [
+    (lambda: forward(options=RenderOptions(tile_size=8)), r"options.tile_size.*other sizes"),
+    (lambda: forward(size=(0, 10)), "size"),
+    (lambda: forward(3, lambda leaf: leaf[:, :0]), r"color, background: expected .* at least one channel"),
+    (lambda: forward(3, lambda leaf: leaf[:, :2]), r"color, background: expected .* at least one channel"),
+    (lambda: forward(4, lambda leaf: leaf[:0]), r"color, background: expected .* at least one channel"),
+    *((lambda k=k: forward(k, lambda leaf: leaf.astype(np.float64)), ARRAYS) for k in range(5)),
+    *((lambda k=k: forward(k, lambda leaf: np.float32(1)), ARRAYS) for k in range(5)),
+    *((lambda k=k: forward(k, lambda leaf: leaf[:1]), ARRAYS) for k in range(4)),
+    *(
+        (
+            lambda shape=shape: cpu.backward(forward(), np.zeros(shape, np.float32)),
+            r"^grad_image: expected .*\(3, 16, 16\)",
+        )
+        for shape in ((2, 16, 16), (3, 16, 15), (16, 16, 3), (16, 16))
+    ),
+]
+
+
+@pytest.mark.parametrize(("call", "message"), WRONG)
+def test_mismatched_arrays_raise(call, message):
     """The kernels check no bounds."""
-    num = 200
-    leaves = [np.zeros(shape, np.float32) for shape in ((num, 2), (num, 2, 2), (num,), (num, 3), (3,))]
-    for wrong in (leaves[changed][:1], leaves[changed].astype(np.float64), np.float32(1)):
-        with pytest.raises(ValueError, match="mean, factor, opacity, color, background"):
-            cpu.forward(*leaves[:changed], wrong, *leaves[changed + 1 :], (16, 16))
-    with pytest.raises(ValueError, match="size"):
-        cpu.forward(*leaves, (0, 10))
+    with pytest.raises(ValueError, match=message):
+        call()

@@ -698,13 +698,17 @@ def test_turns_shifts_and_ways_that_are_meant():
     E.move((5, -5)).multiply([(0.1, 0)], delays=0.9)
 
 
-def test_a_forgotten_end_of_the_chain_is_told():
-    with pytest.raises(AttributeError, match=r"no attribute 'render'\. End the chain with \.video\(\)\."):
-        E.move((0.1, 0)).render(0.5)
-    with pytest.raises(AttributeError, match=r"no attribute 'mve'\.$"):
-        E.mve((0.1, 0))
-    with pytest.raises(TypeError, match="unexpected keyword argument 'easing'"):
-        E.move((0, 0), easing=2)
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: E.move((0.1, 0)).render(0.5), AttributeError, r"no attribute 'render'\. End the chain with \.video"),
+        (lambda: E.mve((0.1, 0)), AttributeError, r"no attribute 'mve'\.$"),
+        (lambda: E.move((0, 0), easing=2), TypeError, "unexpected keyword argument 'easing'"),
+    ],
+)
+def test_a_forgotten_end_of_the_chain_is_told(call, error, message):
+    with pytest.raises(error, match=message):
+        call()
 
 
 def test_to_the_front_and_to_the_back():

@@ -61,6 +61,7 @@ def test_the_published_numbers():
     assert paper.options == RenderOptions()
     assert paper.strategy.scale_cutoff == pytest.approx(1e-4 / (2 * TAN))
     assert paper.strategy.growth == Growth()
+    assert (paper.rates.cooldown, paper.views.error_fraction, paper.strategy.relocated_fraction) == (0, 0, 0)
     rates = paper.rates
     # A published length is half a frame's width per tan; ours the whole: 1 / (2 tan).
     assert rates.loc == pytest.approx(1.6e-4 * 1.1 / (2 * TAN))

@@ -9,7 +9,6 @@ from clips import moving_blobs
 
 from foldgauss.render import cpu
 from foldgauss.video import FitConfig, Growth, LearningRates, Strategy, Views, evaluate, fit, fit_steps
-from foldgauss.video.fitting.loop import start
 from foldgauss.video.fitting.relocation import RELOCATED_AT, Relocation, measure_influence, relocate
 from foldgauss.video.fitting.schedule import COLD, RateSchedule, choose_views, steps_per_pass
 from foldgauss.video.fitting.state import frame_times
@@ -226,9 +225,3 @@ def test_rates_cool_down():
         np.testing.assert_allclose(cool.at(progress, 0)[0], warm.at(progress, 0)[0], rtol=1e-6)
     np.testing.assert_allclose(cool.at(0.9, 0)[0], (COLD + 0.5 * (1 - COLD)) * warm.at(0.9, 0)[0], rtol=1e-5)
     np.testing.assert_allclose(cool.at(1.0, 0)[0], COLD * warm.at(1.0, 0)[0], rtol=1e-5)
-
-
-def test_the_published_recipe_has_none_of_it():
-    config = FitConfig.preset("paper")
-    assert (config.rates.cooldown, config.views.error_fraction, config.strategy.relocated_fraction) == (0, 0, 0)
-    assert start(FRAMES, dataclasses.replace(config, num_gaussians=50)).num_gaussians == 50
