@@ -100,7 +100,8 @@ def json_changed(value: Any, random: Random) -> Any:
     if not places:
         return random.choice(_VALUES)
     (holder, key), (other, place) = random.choice(places), random.choice(places)
-    old, new = holder.pop(key), random.choice((*_VALUES, json.loads(json.dumps(other[place]))))
+    new = random.choice((random.choice(_VALUES), random.choice(_VALUES), json.loads(json.dumps(other[place]))))
+    old = holder.pop(key)
     near = (old + 1, -old, float(old), old / 3) if type(old) in (int, float) else (old,)
     for one in random.choice(((), (new,), (new,), (new,), (random.choice(near),), (old, new))):
         if isinstance(holder, list):
