@@ -29,6 +29,7 @@ from foldgauss.video import (
 from foldgauss.video.fitting import loop as fit_module
 from foldgauss.video.fitting.config import (
     MOST_PER_PIXEL,
+    PRESETS,
     TYPICAL_LIFETIME,
     chosen_interpolation,
     chosen_num_gaussians,
@@ -226,13 +227,21 @@ def test_frame_times_are_learned():
     assert np.linalg.norm(times - true) < 0.9 * np.linalg.norm(even - true)
 
 
-def test_planned_steps():
-    assert planned_steps(FitConfig(), 24) == 3000
-    assert planned_steps(FitConfig(), 1000) == 20_000
-    assert planned_steps(FitConfig(views=Views(batch_size=4)), 1000) == 5000
-    assert planned_steps(FitConfig(steps=7), 1000) == 7
-    assert planned_steps(FitConfig(minutes=1), 1000) is None
-    assert planned_steps(FitConfig(minutes=1, steps=9), 1000) == 9
+@pytest.mark.parametrize(
+    ("config", "num_frames", "steps"),
+    [
+        (FitConfig(), 24, 3000),
+        (FitConfig(), 1000, 20_000),
+        (FitConfig(views=Views(batch_size=4)), 1000, 5000),
+        (FitConfig(steps=7), 1000, 7),
+        (FitConfig(minutes=1), 1000, None),
+        (FitConfig(minutes=1, steps=9), 1000, 9),
+        *((FitConfig.preset(name, minutes=2), 10, None) for name in PRESETS),
+        *((FitConfig.preset(name, minutes=2, steps=7), 10, 7) for name in PRESETS),
+    ],
+)
+def test_planned_steps(config, num_frames, steps):
+    assert planned_steps(config, num_frames) == steps
 
 
 @pytest.mark.parametrize(

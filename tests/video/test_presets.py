@@ -34,12 +34,6 @@ def test_changes_override_a_preset(name):
     assert dataclasses.replace(FitConfig.preset(name), degree=5, seed=9) == config
 
 
-@pytest.mark.parametrize("name", PRESETS)
-def test_minutes_replace_a_presets_steps(name):
-    assert planned_steps(FitConfig.preset(name, minutes=2), 10) is None
-    assert planned_steps(FitConfig.preset(name, minutes=2, steps=7), 10) == 7
-
-
 def test_unknown_names():
     with pytest.raises(ValueError, match="preset: expected one of 'standard', 'draft', 'paper', got 'papers'"):
         FitConfig.preset("papers")
