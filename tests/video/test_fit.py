@@ -454,7 +454,7 @@ def test_start_uses_the_given_frame_times():
         ({"floor": 0.1}, r"config\.floor"),
         ({"compositing": "sum"}, r"config\.compositing"),
         ({"options": RenderOptions.standard()}, r"config\.options"),
-        ({"strategy.scale_cutoff": 1e-4}, r"config\.strategy\.scale_cutoff: expected the model's, 0, got 0\.0001"),
+        ({"strategy.scale_cutoff": 1e-4}, r"config\.strategy\.scale_cutoff: expected the model's, 0\.0, got 0\.0001"),
     ],
     ids=str,
 )

@@ -66,6 +66,7 @@ def test_equal_images_are_stationary():
     assert np.abs(loss.gradient).max() < 1e-7
 
 
+@pytest.mark.slow
 def test_kernels_from_the_cache_have_the_bits_of_those_compiled_anew(tmp_path):
     """So functions that kernels call are inlined, see `_runtime.kernels.inline`."""
     code = (
