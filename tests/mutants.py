@@ -8,8 +8,9 @@ failure). A mutant is killed where a test fails or a test takes minutes. Message
 and definitions of types are not mutated.
 
 With --json each mutant that is done is kept there, and the same command continues after it; remove a run from the file
-to try it again. On several processors, run several commands, each with its own modules and file. Survivors are listed with their lines: each is either equivalent, or shows what no test checks. Those
-that were found to be equivalent (no test of behavior can see them) are in `REVIEWED` with the reason, by their lines.
+to try it again. On several processors, run several commands, each with its own modules and file. Survivors are listed
+with their lines: each is either equivalent, or shows what no test checks. Those that were found to be equivalent (no
+test of behavior can see them) are in `REVIEWED` with the reason, by their lines.
 """
 
 import ast
