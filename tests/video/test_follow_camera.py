@@ -19,7 +19,7 @@ from foldgauss.video.motion.optical_flow import Motion
 from foldgauss.video.motion.path_coordinates import PathCoordinates
 from foldgauss.video.motion.shared_motions import FARTHEST, _Clip, find_shared_motions
 
-CONFIG = FitConfig(num_gaussians=1000, steps=200, degree=2)
+CONFIG = FitConfig(num_gaussians=1500, steps=300, degree=2)
 TIMES = np.linspace(0, 1, 12)
 
 

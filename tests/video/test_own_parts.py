@@ -5,15 +5,14 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from clips import moving_blobs
-from test_device import _compiled_quickly  # noqa: F401 (a fixture)
 
+from foldgauss.io import datasets
 from foldgauss.video import DensityControl, FitConfig, Loss, fit, fit_steps, register_loss
 from foldgauss.video.fitting.losses import LOSSES
 from foldgauss.video.fitting.steppers.jax_loss import custom_loss
 from foldgauss.video.fitting.steppers.loss import image_loss
 
-CLIP = moving_blobs(height=32, width=40)
+CLIP = datasets.waves().frames
 CONFIG = FitConfig(num_gaussians=30, steps=40, loss=Loss(ssim_fraction=0, l2_fraction=0))
 
 

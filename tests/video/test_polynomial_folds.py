@@ -3,7 +3,7 @@
 import dataclasses
 import warnings
 
-import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from path_models import INDEX, path_model
@@ -50,11 +50,10 @@ def test_the_error_is_what_is_left_at_the_frames_and_higher_degrees_reduce_it():
     assert error[INDEX > 0].mean() < 1.5 * errors[2][INDEX > 0].mean() + 0.1
     # The error is that of the places, weighted by the envelope.
     fixed, stated = without_paths(model, 4)
-    gaussians = fixed.splats.gaussians()
     squares, total = np.zeros(NUM), np.zeros(NUM)
-    at = jax.jit(lambda splats, t: splats.at(t))
     for t in np.asarray(model.frame_times.times()):
-        one, other = at(model.splats, t), at(fixed.splats, t)
+        one, other = model.splats.at(jnp.asarray(t)), fixed.splats.at(jnp.asarray(t))
+        gaussians = fixed.splats.gaussians()
         tau = (t - np.asarray(gaussians.time_loc)) / np.asarray(gaussians.time_scale)
         weight = np.exp(-(tau**2)) * (np.asarray(one.opacity) > 0)
         squares += weight * ((np.asarray(one.mean) - np.asarray(other.mean)) ** 2).sum(-1)

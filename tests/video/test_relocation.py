@@ -1,7 +1,6 @@
 """Relocation of Gaussians, views drawn by error, and the end of the schedule of learning rates."""
 
 import dataclasses
-import functools
 
 import jax
 import numpy as np
@@ -23,14 +22,11 @@ CONFIG = FitConfig(num_gaussians=300, steps=120)
 SPEC = ConditioningSpec(CONFIG.fold_degree, CONFIG.power, CONFIG.floor, FRAMES.shape[1:3])
 
 
-@functools.cache
-def state_after_40():
-    steps = fit_steps(FRAMES, CONFIG.replace(**{"strategy.relocated_fraction": 0}))
-    return next(state for state, info in steps if info.step == 40)
-
-
-def fitted_state():
-    return state_after_40().copy()
+def fitted_state(step: int = 40, config: FitConfig = CONFIG):
+    for state, info in fit_steps(FRAMES, config.replace(**{"strategy.relocated_fraction": 0})):
+        if info.step == step:
+            return state
+    raise AssertionError
 
 
 def render(rows: np.ndarray, window: np.ndarray, t: float) -> np.ndarray:

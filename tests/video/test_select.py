@@ -246,13 +246,13 @@ def test_labels_do_not_propagate_across_a_cut():
 
 
 def test_masks_of_a_smaller_size_have_rounded_sides():
-    """48 of 192 columns and 20 or 21 of 82 rows, as `select(moving=True)` renders smaller images."""
-    large = dataclasses.replace(soft_model(), size=(82, 192))
-    for rows in (20, 21):
-        assert len(by_mask(large, np.ones((rows, 48), bool), frame=0))
-    for rows in (19, 22):
+    """480 of 1920 columns and 204 or 205 of 818 rows, as `select(moving=True)` renders images."""
+    large = dataclasses.replace(soft_model(), size=(818, 1920))
+    for rows in (204, 205):
+        assert len(by_mask(large, np.ones((rows, 480), bool), frame=0))
+    for rows in (203, 206):
         with pytest.raises(ValueError, match="mask: expected the aspect"):
-            by_mask(large, np.ones((rows, 48), bool), frame=0)
+            by_mask(large, np.ones((rows, 480), bool), frame=0)
 
 
 # ------------------------------------------------------------------------------------- boxes, colors, times
@@ -403,7 +403,7 @@ def test_malformed_criteria(criteria, match):
 @pytest.fixture(scope="module")
 def fitted():
     frames, labels = textured_clip()
-    return fit(frames, FitConfig(num_gaussians=2000, steps=400, views=Views(error_fraction=0), seed=2)).model, labels
+    return fit(frames, FitConfig(num_gaussians=3000, steps=600, views=Views(error_fraction=0), seed=2)).model, labels
 
 
 def overlap(model, selection, masks):

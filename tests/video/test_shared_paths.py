@@ -96,10 +96,6 @@ def test_places_of_many_take_no_memory_for_every_knot():
     np.testing.assert_allclose(maps[:50], expected, atol=1e-5)
 
 
-splats_at = jax.jit(lambda splats, t: splats.at(t))
-conditioned = jax.jit(lambda folded, t: folded.condition_time(t))
-
-
 def test_folded_gaussians_are_those_of_the_frame():
     with jax.enable_x64(True):
         splats = jax.tree.map(
@@ -107,7 +103,7 @@ def test_folded_gaussians_are_those_of_the_frame():
         )
         folded = jax.jit(lambda splats: splats.gaussians())(splats)
         for t in (0.1, 0.4, 0.8):
-            there, at = splats_at(splats, jnp.asarray(t)), conditioned(folded, jnp.asarray(t))
+            there, at = splats.at(jnp.asarray(t)), folded.condition_time(t)
             np.testing.assert_allclose(at.loc, there.mean, atol=1e-12)
         one = jax.tree.map(jnp.asarray, splats.paths)
         maps = one.by_index(folded.time_loc, splats.path_index)
@@ -119,7 +115,7 @@ def test_folded_gaussians_are_those_of_the_frame():
         still = jnp.broadcast_to(jnp.eye(2), (*one.matrices.shape[:3], 2))
         shifts = SharedPaths(one.times, jnp.concatenate([still, one.matrices[..., 2:]], -1))
         moved = dataclasses.replace(splats, paths=shifts)
-        there, at = splats_at(moved, jnp.asarray(0.4)), conditioned(moved.gaussians(), jnp.asarray(0.4))
+        there, at = moved.at(jnp.asarray(0.4)), moved.gaussians().condition_time(0.4)
         np.testing.assert_allclose(at.covariance_matrix, there.factor @ there.factor.mT, rtol=1e-9, atol=1e-15)
 
 
