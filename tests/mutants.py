@@ -1,6 +1,6 @@
 """Mutation testing: does the quick suite notice small mistakes in the core modules?
 
-    python -m tests.mutants [--num N] [--seed S] [--workers W] [--only MODULE ...] [--json FILE]
+    python -m tests.mutants [--num N] [--seed S] [--only MODULE ...] [--json FILE]
 
 A mutant is one changed operator, comparison, constant, condition or argument. N of them (300) are drawn with a seed,
 evenly over the modules of `TARGETS`, and each runs the test files of its module (`-m "not slow"`, until the first
@@ -8,11 +8,13 @@ failure). A mutant is killed where a test fails or a test takes minutes. Message
 and definitions of types are not mutated.
 
 With --json each mutant that is done is kept there, and the same command continues after it; remove a run from the file
-to try it again. Survivors are listed with their lines: each is either equivalent, or shows what no test checks. Those
-that were found to be equivalent (no test of behavior can see them) are in `REVIEWED` with the reason, by their lines.
+to try it again. On several processors, run several commands, each with its own modules and file. Survivors are listed
+with their lines: each is either equivalent, or shows what no test checks. Those that were found to be equivalent (no
+test of behavior can see them) are in `REVIEWED` with the reason, by their lines.
 """
 
 import ast
+import functools
 import json
 import os
 import random
@@ -22,10 +24,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from queue import SimpleQueue
-from threading import Lock
 from typing import NamedTuple
 
 from benchmarks import _common
@@ -33,8 +32,6 @@ from benchmarks._common import console
 from benchmarks._runs import Run, Runs
 
 ROOT = Path(__file__).parent.parent
-#: CPython 3.11's parser counts its recursion wrongly where several threads parse at once.
-_PARSING = Lock()
 #: Equivalent mutants: for each module, the mutated line and the reason.
 REVIEWED = ROOT / "benchmarks" / "records" / "mutants-equivalent.json"
 #: The modules, and the test files of each, those that take the least time first.
@@ -161,14 +158,12 @@ def find_mutants(module: str) -> list[Mutant]:
 
 def mutate(source: str, index: int) -> str:
     """The source with its `index`-th place changed; comments are lost."""
-    with _PARSING:
-        return ast.unparse(ast.fix_missing_locations(_Mutator(index).visit(ast.parse(source))))
+    return ast.unparse(ast.fix_missing_locations(_Mutator(index).visit(ast.parse(source))))
 
 
 def find_mutated_line(source: str, mutated: str) -> tuple[str, str]:
     """The line that differs, before and after, without comments and in one piece."""
-    with _PARSING:
-        before = ast.unparse(ast.parse(source)).splitlines()
+    before = ast.unparse(ast.parse(source)).splitlines()
     return next((a.strip(), b.strip()) for a, b in zip(before, mutated.splitlines(), strict=True) if a != b)
 
 
@@ -229,7 +224,6 @@ def main(arguments: list[str] | None = None) -> None:
     parser = _common.parser(__doc__)
     parser.add_argument("--num", type=_common.whole, default=300, metavar="N", help="[300]")
     parser.add_argument("--seed", type=int, default=0, metavar="S", help="[0]")
-    parser.add_argument("--workers", type=_common.whole, default=1, metavar="W", help="[1]")
     parser.add_argument("--only", nargs="+", choices=list(TARGETS), metavar="MODULE", help="[all]")
     options = _common.parse(parser, arguments)
     modules = list(TARGETS) if options.only is None else options.only
@@ -237,26 +231,14 @@ def main(arguments: list[str] | None = None) -> None:
     runs = Runs(options.json, {"seed": options.seed})
     # One module after the other: after a mutant of another one, the kernels of that file are compiled again.
     left = sorted(mutant for mutant in mutants if mutant.name not in runs.done)
-    with tempfile.TemporaryDirectory() as parent, ThreadPoolExecutor(options.workers) as pool:
-        checkouts: SimpleQueue[Checkout] = SimpleQueue()
-        for k in range(options.workers if left else 0):
-            checkouts.put(Checkout(Path(parent) / str(k)))
-        if left:
-            checkout = checkouts.get()
-            passed, last = checkout.run_tests(list(dict.fromkeys(mutant.module for mutant in left)))
-            if not passed:
-                raise SystemExit(f"The tests fail without a change: {last}")
-            checkouts.put(checkout)
-
-        def one(mutant: Mutant) -> None:
-            checkout = checkouts.get()
-            killers = {run["by"].split(" - ")[0] for run in list(runs.done.values()) if run["module"] == mutant.module}
-            try:
-                runs.get(mutant.name, lambda: try_mutant(mutant, checkout, killers))
-            finally:
-                checkouts.put(checkout)
-
-        list(pool.map(one, left))
+    with tempfile.TemporaryDirectory() as parent:
+        checkout = Checkout(Path(parent) / "checkout")
+        passed, last = checkout.run_tests(list(dict.fromkeys(mutant.module for mutant in left))) if left else (True, "")
+        if not passed:
+            raise SystemExit(f"The tests fail without a change: {last}")
+        for mutant in left:
+            killers = {run["by"].split(" - ")[0] for run in runs.done.values() if run["module"] == mutant.module}
+            runs.get(mutant.name, functools.partial(try_mutant, mutant, checkout, killers))
     show({mutant.name: runs.done[mutant.name] for mutant in mutants})
 
 

@@ -42,6 +42,7 @@ cosine, sine = (_vectors.inline(function) for function in (cosine, sine))
     [
         (_vectors.exp, np.exp, NEAR, {"rtol": 4e-7}),
         (_vectors.exp, np.exp, WIDE, {"rtol": 1e-5}),
+        (_vectors.exp2, np.exp2, np.linspace(-30, 0, 1 << 16), {"rtol": 2.5e-7}),
         (_vectors.sigmoid, lambda x: 1 / (1 + np.exp(-x)), NEAR, {"rtol": 5e-7}),
         (_vectors.sqrt, np.sqrt, abs(WIDE), {"rtol": 2e-7}),
         (cosine, lambda x: np.cos(2 * np.pi * x), NEAR, {"atol": 5e-7}),

@@ -171,9 +171,8 @@ _WANTED = (
 
 def _resized_box(data: bytes, random: Random) -> bytes:
     """A box of an MP4 of another size: none, one of 64 bits, the rest, beyond the end."""
-    at = data.find(random.choice((b"ftyp", b"free", b"mdat", b"moov", b"trak", b"edts", b"elst", b"mdia", b"hdlr")))
-    if at < 4:
-        return by_chance(data, random)
+    boxes = (b"ftyp", b"free", b"mdat", b"moov", b"trak", b"edts", b"elst", b"mdia", b"hdlr")
+    at = data.index(random.choice([box for box in boxes if box in data]), 4)
     return data[: at - 4] + random.choice((0, 1, 4, 8, 60, 1 << 31)).to_bytes(4, "big") + data[at:]
 
 

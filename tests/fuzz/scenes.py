@@ -21,7 +21,7 @@ from foldgauss.io import (
 from foldgauss.io.exchange.pseudomesh import read_obj
 
 from .models import tiny_model, written
-from .mutate import by_chance, json_text_changed
+from .mutate import by_chance, json_text_changed, one_of
 from .target import Target, chance
 
 
@@ -52,32 +52,10 @@ def _ply_body(data: bytes) -> int:
 
 def note_changed(data: bytes, random: Random) -> bytes:
     """One of our own facts, in a comment of the header."""
-    at = data.find(b"comment foldgauss ")
-    end = data.find(b"\n", at)
-    if at < 0 or end < 0:
-        return by_chance(data, random)
-    note = json_text_changed(data[at + 18 : end], random).replace(b"\n", b" ")
-    return data[: at + 18] + note + data[end:]
-
-
-def numbers_changed(data: bytes, random: Random) -> bytes:
-    """Numbers of the rows, each whole: extremes in place of some."""
-    start = _ply_body(data)
-    body = bytearray(data[start:])
-    if b"format ascii" in data[:start]:
-        words = bytes(body).split()
-        for _ in range(random.randrange(1, 4)):
-            if words:
-                extremes = (b"nan", b"inf", b"1e39", b"-1e308", b"1e400", b"0", b"1e-46", b"9" * 64, b"9" * 65, b"x")
-                words[random.randrange(len(words))] = random.choice(extremes)
-        return data[:start] + b" ".join(words) + b"\n"
-    order = ">" if b"big_endian" in data[:start] else "<"
-    for _ in range(random.randrange(1, 4)):
-        at = 4 * random.randrange(max(1, len(body) // 4))
-        body[at : at + 4] = struct.pack(
-            order + "f", random.choice((np.nan, np.inf, -np.inf, 0.0, 3.4e38, -3.4e38, 1e-45, 90.0, -200.0, 1.0))
-        )
-    return data[:start] + bytes(body)
+    before, note = data.split(b"comment foldgauss ", 1)
+    note, rest = note.split(b"\n", 1)
+    note = json_text_changed(note, random).replace(b"\n", b" ")
+    return before + b"comment foldgauss " + note + b"\n" + rest
 
 
 @functools.cache
@@ -96,7 +74,7 @@ def _read_vegas(path: Path) -> None:
     assert model.num_frames >= 2
 
 
-_PLY_MUTATIONS = (numbers_changed, note_changed)
+_PLY_MUTATIONS = (by_chance, note_changed)
 
 VEGAS = Target(
     "ply-vegas",
@@ -154,25 +132,18 @@ def _tool(data: bytes) -> bytes:
     return b"\r\n".join(lines) + b"\r\n"
 
 
-def line_changed(data: bytes, random: Random) -> bytes:
-    """A line of a kind that the format knows."""
-    lines = data.split(b"\n")
-    made = (
-        b"v 0 0 0", b"v nan 0 0", b"v 1e39 0 0", b"v 1e38 1e38 -1e38", b"v 1 2", b"v a b c", b"v", b"f 1 2 3",
-        b"f 1 2 3 4", b"f 3 2 1", b"f 0 1 2", b"f -1 -2 -3", b"f 1/2/3 2 3", b"f 99999999999 1 2",
-        b"f " + b"9" * 5000 + b" 1 2", b"f", b"vt 0 0", b"\\", b"v 1_0 0 0", b"v 0x1 0 0",
-        b"f 1.0 2 3", "v １ 0 0".encode(), b"# " + b"a" * 100,
-        b"v 1e-46 0 0", b"v -0 -0 -0",
-    )  # fmt: skip
-    at = random.randrange(len(lines))
-    how = random.randrange(3)
-    if how == 0:
-        lines.insert(at, random.choice(made))
-    elif how == 1:
-        lines[at] = random.choice(made)
-    else:
-        lines[at] = lines[at].rstrip(b"\r") + random.choice((b"\\", b" \\", b"#", b" 1", b"\r\r", b"\x0b1", b"\x1c"))
-    return b"\n".join(lines)
+_LINES = (
+    b"v 0 0 0", b"v nan 0 0", b"v 1e39 0 0", b"v 1e38 1e38 -1e38", b"v 1 2", b"v a b c", b"v", b"f 1 2 3", b"f 1 2 3 4",
+    b"f 3 2 1", b"f 0 1 2", b"f -1 -2 -3", b"f 1/2/3 2 3", b"f 99999999999 1 2", b"f " + b"9" * 5000 + b" 1 2", b"f",
+    b"vt 0 0", b"\\", b"v 1_0 0 0", b"v 0x1 0 0", b"f 1.0 2 3", "v １ 0 0".encode(), b"# " + b"a" * 100, b"v 1e-46 0 0",
+    b"v -0 -0 -0",
+)  # fmt: skip
+_ENDS = (b"\\", b" \\", b"#", b" 1", b"\r\r", b"\x0b1", b"\x1c")
+
+
+def _line(line: bytes, random: Random) -> bytes:
+    """One of a kind that the format knows, or the same with another end."""
+    return random.choice((random.choice(_LINES), random.choice(_LINES), line.rstrip(b"\r") + random.choice(_ENDS)))
 
 
 def _read_mesh(path: Path) -> None:
@@ -188,7 +159,7 @@ OBJ = Target(
     lambda: [_mesh()["frame_0000.obj"], _tool(_mesh()["frame_0000.obj"])],
     _read_mesh,
     (FormatError,),
-    (line_changed,),
+    (one_of(_line),),
     prepare=lambda folder: _beside(folder, "frame_0000.obj"),
     file_name="frame_0000",
 )

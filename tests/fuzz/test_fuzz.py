@@ -6,6 +6,7 @@ from random import Random
 import pytest
 
 from . import media, models, scenes, texts
+from .mutate import MAGICS
 from .target import judge
 
 TARGETS = [target for module in (models, scenes, texts, media) for target in module.TARGETS]
@@ -29,6 +30,12 @@ def test_no_file_breaks_a_parser(target, cases, tmp_path):
         path.write_bytes(seed)
         target.parse(path)  # what it compiles, once, is not the file's
         assert judge(target, path, traced=True) == "accepted"
+    for mutation in target.mutations:  # which are left out of mutants where they raise
+        mutation(corpus[0], Random(2))
+    for start in MAGICS:
+        for data in (start, start + corpus[0], start + corpus[0][len(start) :]):
+            path.write_bytes(data)
+            outcomes.add(judge(target, path))
     for number in range(cases):
         mutant = target.mutant(random, corpus)
         path.write_bytes(mutant)

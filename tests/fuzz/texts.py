@@ -20,7 +20,7 @@ from foldgauss.video.fitting.loop import FitInfo
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
 from .models import tiny_model, written
-from .mutate import by_chance, json_text_changed
+from .mutate import by_chance, json_text_changed, one_of
 from .target import Target, chance
 
 _SCRIPT = b"""\
@@ -184,7 +184,12 @@ _KEYS = (
     b"degrees",
     b"x",
 )
-_LINES = (b'indices = "0,2"', b"segment = 7", b"num_gaussians = 7", b"box = [90, 90, 91, 91]")
+_LINES = (
+    b'indices = "0,2"', b"segment = 7", b"num_gaussians = 7", b"box = [90, 90, 91, 91]", b"[selections]", b"[[edits]]",
+    b"[layers]", b"[[layers]]", b"[camera]", b"[a.b.c]", b"[selections.one]", b"[x]", b"[[camera]]",
+    b'where = "beside"',
+    *(b".".join([b"a"] * num) + b" = 1" for num in (2, 3, 15, 17, 5000)),
+)  # fmt: skip
 _MADE = (
     b"[0, 1]", b'"10:"', b'"a"', b"true", b"-1", b"1e300", b"nan", b"inf", b"1979-05-27T07:32:00Z", b"[[1.0, 2.0]]",
     b"7", b"{}", b"{a.b = 1}", b"[" * 500, b"0x" + b"f" * 4000, b"1" * 4400, b'"""a\nb"""', b"'''", b'"\\u0000"',
@@ -194,39 +199,12 @@ _MADE = (
 )  # fmt: skip
 
 
-def toml_changed(data: bytes, random: Random) -> bytes:
-    """A value, a key or a header of another kind; keys in a row."""
-    lines = data.split(b"\n")
-    at = random.randrange(len(lines))
-    key, equals, _ = lines[at].partition(b" = ")
-    how = random.randrange(7)
-    if how <= 1 and equals:
-        lines[at] = key + b" = " + random.choice(_MADE)
-    elif how == 2:
-        lines.insert(at, random.choice(_KEYS) + b" = " + random.choice(_MADE))
-    elif how == 3 and equals and random.random() < 0.3:
-        lines[at] = random.choice(_LINES)
-    elif how == 3 and equals:
-        lines[at] = random.choice(_KEYS) + b" = " + lines[at].partition(b" = ")[2]
-    elif how == 4:
-        made = (
-            b"[selections]",
-            b"[[edits]]",
-            b"[layers]",
-            b"[[layers]]",
-            b"[camera]",
-            b"[a.b.c]",
-            b"[selections.one]",
-            b"[x]",
-            b"[[camera]]",
-            b'where = "beside"',
-        )
-        lines.insert(at, random.choice(made))
-    elif how == 5:
-        lines[at] = b".".join([b"a"] * random.choice((2, 3, 15, 17, 5000))) + b" = 1"
-    else:
-        return by_chance(data, random)
-    return b"\n".join(lines)
+def _line(line: bytes, random: Random) -> bytes:
+    """The key with a value of another kind, the value of another key, another pair, a header or keys in a row."""
+    key, _, value = line.partition(b" = ")
+    other, made = random.choice(_KEYS), random.choice(_MADE)
+    pairs = [(key, made), (key, made), (other, made), (other, value or made)]
+    return random.choice((*(b" = ".join(pair) for pair in pairs), random.choice(_LINES)))
 
 
 def _apply_script(path: Path) -> None:
@@ -267,7 +245,7 @@ SCRIPT = Target(
     ],
     read_edit_script,
     (EditScriptError,),
-    (toml_changed,),
+    (one_of(_line), by_chance),
     prepare=_beside_scripts,
 )
 
@@ -294,14 +272,6 @@ def _history() -> bytes:
     return b"".join(json.dumps(info_line(info)).encode() + b"\n" for info in _infos())
 
 
-def one_line_changed(data: bytes, random: Random) -> bytes:
-    """One value of one line."""
-    lines = data.split(b"\n")
-    at = random.randrange(len(lines))
-    lines[at] = json_text_changed(lines[at], random)
-    return b"\n".join(lines)
-
-
 def _read_history(path: Path) -> None:
     for info in read_history(path):
         assert f"{info.step:d} {info.psnr:.2f}"
@@ -315,7 +285,7 @@ HISTORY = Target(
     lambda: [_history(), b"", _history() + b'{"step": 9, "prog'],
     _read_history,
     (ValueError,),
-    (one_line_changed,),
+    (one_of(json_text_changed),),
 )
 
 

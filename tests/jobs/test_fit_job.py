@@ -86,47 +86,30 @@ def stopped_after(job, step):
         fit_job(job, lambda progress: progress.step < step)
 
 
-def test_a_stopped_job_goes_on_to_the_same_bits(done, clip, tmp_path, monkeypatch):
-    monkeypatch.setattr(fitting, "REPORT_SECONDS", 0.0)
-    job, record = job_of(clip, tmp_path), done[1]
-    told = []
-    stopped_after(job, 5)
-    assert job.checkpoint.exists()
-    assert not Path(job.target).exists()
-    again = fit_job(job, lambda progress: not told.append(progress.step))
-    assert told[0] == 6
-    assert Path(job.target).read_bytes() == Path(done[0].target).read_bytes()
-    assert {name: again[name] for name in ("psnr", "ssim")} == {name: record[name] for name in ("psnr", "ssim")}
-    assert not job.checkpoint.exists()
-
-
-def test_a_job_killed_at_any_write_goes_on_to_the_same_bits(done, clip, tmp_path):
+@pytest.mark.parametrize("goal", [{}, {"quality": 60.0}, {"size_mb": 0.006}], ids=str)
+def test_a_job_stopped_or_killed_at_any_write_goes_on_to_the_same_bits(clip, tmp_path, monkeypatch, goal):
     """The process ends as each file is about to be written; the next does what is left."""
-    job = job_of(clip, tmp_path, checkpoint_seconds=0.0)
-
-    for name in ("save_checkpoint", "save_video_model", "atomic_path"):
-        with patch.object(fitting, name, side_effect=KeyboardInterrupt), pytest.raises(KeyboardInterrupt):
-            fit_job(job)
-    fit_job(job)
-    assert Path(job.target).read_bytes() == Path(done[0].target).read_bytes()
-
-
-@pytest.mark.parametrize("goal", [{"quality": 60.0}, {"size_mb": 0.006}], ids=str)
-def test_a_compact_job_stopped_or_killed_goes_on_to_the_same_bits(clip, tmp_path, monkeypatch, goal):
     monkeypatch.setattr(fitting, "REPORT_SECONDS", 0.0)
     (tmp_path / "whole").mkdir()
     config = dataclasses.replace(CONFIG, **goal)
-    whole, job = (job_of(clip, place, "model.fgz", config=config) for place in (tmp_path / "whole", tmp_path))
-    record = fit_job(whole)
-    assert record["file_bytes"] == os.path.getsize(whole.target) <= 6000
+    name, writer = ("model.fgz", "save_compact") if goal else ("model.safetensors", "save_video_model")
+    whole, job = (job_of(clip, place, name, config=config) for place in (tmp_path / "whole", tmp_path))
+    record, told = fit_job(whole), []
+    assert record["file_bytes"] == os.path.getsize(whole.target)
+    assert record["file_bytes"] <= 6000 or not goal
     assert load_video_model(whole.target).num_gaussians == record["num_gaussians"]
-    budget = read_metadata(whole.target)["budget"]
-    assert budget == {"steps": CONFIG.steps} | goal
-    stopped_after(job, 9)
-    with patch.object(fitting, "save_compact", side_effect=KeyboardInterrupt), pytest.raises(KeyboardInterrupt):
-        fit_job(job)
-    assert fit_job(job)["psnr"] == record["psnr"]
+    assert read_metadata(whole.target)["budget"] == {"steps": CONFIG.steps} | goal
+    stopped_after(job, 5)
+    assert job.checkpoint.exists()
+    assert not Path(job.target).exists()
+    often = dataclasses.replace(job, checkpoint_seconds=0.0)
+    for writes in ("save_checkpoint", writer, "atomic_path"):
+        with patch.object(fitting, writes, side_effect=KeyboardInterrupt), pytest.raises(KeyboardInterrupt):
+            fit_job(often, lambda progress: not told.append(progress.step))
+    again = fit_job(job)
+    assert told[0] == 6
     assert Path(job.target).read_bytes() == Path(whole.target).read_bytes()
+    assert [again[name] for name in ("psnr", "ssim")] == [record[name] for name in ("psnr", "ssim")]
     assert not job.checkpoint.exists()
 
 

@@ -12,7 +12,7 @@ from scenes import check_slopes, draw, scene
 from test_camera import SIZE, deep_scene, random_cameras, view
 from test_engines import BACKGROUND
 
-from foldgauss.render import ENGINES, RenderOptions, Splats2D, project, render
+from foldgauss.render import ENGINES, RenderOptions, Splats2D, render
 from foldgauss.render.footprint import pixel_centers
 from foldgauss.render.reference import splat_alpha
 
@@ -136,19 +136,6 @@ def test_gradients_agree_with_reference(engine):
     assert np.abs(found.opacity).max() > 0.1
 
 
-def test_gradient_reaches_means_and_camera_through_the_depth():
-    gaussians, camera = deep_scene(dtype=np.float32), next(random_cameras(1))
-
-    @jax.jit
-    @jax.grad
-    def gradient(tree):
-        return jnp.sum(render(project(*tree, SIZE), SIZE, return_depth=True)[1])
-
-    leaves = jax.tree.leaves(gradient((gaussians, camera)))
-    assert all(bool(jnp.isfinite(leaf).all()) for leaf in leaves)
-    assert float(jnp.abs(leaves[0]).max()) > 0
-
-
 def test_order_of_the_results():
     splats, size = deep_splats("one")
     image, alpha, depth = render(splats, size, return_alpha=True, return_depth=True)
@@ -158,19 +145,24 @@ def test_order_of_the_results():
     np.testing.assert_allclose(depth[alpha > 0], splats.depth[0], rtol=1e-6)
 
 
-def test_batches():
-    splats, size = deep_splats("one")
-    both = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf + 0.1]), splats)
-    images, alphas = jax.vmap(lambda one: render(one, size, return_alpha=True))(both)
-    assert (images.shape, alphas.shape) == ((2, *size, 3), (2, *size))
+ONE, ONE_SIZE = scene("one")
+WRONG = [
+    (lambda: render(ONE, ONE_SIZE, return_depth=True), r"splats\.depth: expected a depth of each splat.*project sets"),
+    *(
+        (
+            lambda name=name: render(ONE, ONE_SIZE, compositing="sum", **{name: True}),
+            "compositing: expected 'over' for alpha and depth, got 'sum'",
+        )
+        for name in ("return_alpha", "return_depth")
+    ),
+    (
+        lambda: Splats2D(ONE.mean, ONE.factor, ONE.opacity, ONE.color, jnp.ones(2)),
+        r"depth: expected shape \(1,\), that of opacity, got shape \(2,\)",
+    ),
+]
 
 
-def test_errors():
-    splats, size = scene("one")
-    with pytest.raises(ValueError, match=r"^splats\.depth: expected a depth of each splat.*project sets them"):
-        render(splats, size, return_depth=True)
-    for name in ("return_alpha", "return_depth"):
-        with pytest.raises(ValueError, match=r"^compositing: expected 'over' for alpha and depth, got 'sum'"):
-            render(splats, size, compositing="sum", **{name: True})
-    with pytest.raises(ValueError, match=r"^depth: expected shape \(1,\), that of opacity, got shape \(2,\)"):
-        Splats2D(splats.mean, splats.factor, splats.opacity, splats.color, jnp.ones(2))
+@pytest.mark.parametrize(("call", "message"), WRONG)
+def test_wrong_calls(call, message):
+    with pytest.raises(ValueError, match=f"^{message}"):
+        call()

@@ -74,15 +74,6 @@ def test_front_camera_is_to_pixels(aspect, size):
             np.testing.assert_array_equal(getattr(seen, name), getattr(gaussians, name))
 
 
-@pytest.mark.parametrize("engine", ["reference", "cpu"])
-def test_front_camera_renders_the_flat_image(engine):
-    gaussians = flat_scene()
-    flat = dataclasses.replace(flatten(gaussians).to_pixels(SIZE), depth=jnp.zeros(120))
-    seen = view(gaussians, Camera.front(0.5), SIZE)
-    pictures = (draw(splats, SIZE, engine=engine, options=SMOOTH) for splats in (seen, flat))
-    np.testing.assert_allclose(*pictures, atol=5e-6)
-
-
 def test_published_geometry():
     """Camera at distance 1, half-width 0.36, in the published unit; ours is the frame's width."""
     camera = Camera.front(0.5)
@@ -115,19 +106,6 @@ def test_mirage_parameters():
 # --- the mirror ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("engine", ["reference", "cpu"])
-@pytest.mark.parametrize("seed", range(3))
-def test_opposing_camera_shows_the_mirror_image(engine, seed):
-    """To 1e-6 where splats are wider than 3 px: a position of 96 px is known to 4e-6 px in float32."""
-    gaussians = flat_scene(seed=seed, thinnest=0.03)
-    front, mirror = (
-        np.asarray(draw(view(gaussians, camera, SIZE), SIZE, engine=engine, options=SMOOTH))
-        for camera in (Camera.front(0.5), Camera.opposing(0.5))
-    )
-    assert np.abs(front - mirror[:, ::-1]).max() <= 1e-6
-    assert np.abs(front - mirror).max() > 0.1  # the comparison has power
-
-
 @pytest.mark.parametrize(("aspect", "size"), [(2.0, (96, 48)), (0.6, (50, 50))])
 def test_mirror_in_double_precision(aspect, size):
     with jax.enable_x64(True):
@@ -136,16 +114,6 @@ def test_mirror_in_double_precision(aspect, size):
         front, mirror = (np.asarray(draw(one, size, engine="reference")) for one in splats)
         np.testing.assert_allclose(front, mirror[:, ::-1], atol=1e-12)
         np.testing.assert_array_equal(splats[0].color, splats[1].color)  # ties: array order in both
-
-
-def test_opposing_camera_reverses_layers():
-    gaussians = flat_scene()
-    mean = np.array(gaussians.mean)
-    mean[:, 2] = np.linspace(0.1, -0.1, len(mean))
-    layers = dataclasses.replace(gaussians, mean=jnp.asarray(mean))
-    front, behind = (view(layers, camera(0.5), SIZE).color for camera in (Camera.front, Camera.opposing))
-    np.testing.assert_array_equal(front, np.asarray(layers.color)[::-1])
-    np.testing.assert_array_equal(behind, layers.color)
 
 
 # --- where cameras stand ---------------------------------------------------------------------------------------
@@ -216,41 +184,6 @@ def random_cameras(count, seed=3):
         yield look_at(eye, rng.uniform(-0.2, 0.2, 3), up=rng.normal(size=3), fov=rng.uniform(0.3, 1.2))
 
 
-def test_projection_is_the_pinhole_and_its_jacobian():
-    """The oracle is a pinhole written from eye and axes, differentiated by JAX, with the dense covariance."""
-
-    def pinhole(camera, point):
-        right, down, forward = ((point - camera.position) @ axis for axis in camera.rotation)
-        scale = SIZE[1] / 2 / jnp.tan(camera.fov / 2) / forward
-        return jnp.stack([SIZE[1] / 2 + scale * right, SIZE[0] / 2 + scale * down])
-
-    oracle, slope = (jax.jit(jax.vmap(one, (None, 0))) for one in (pinhole, jax.jacfwd(pinhole, 1)))
-    with jax.enable_x64(True):
-        scene = deep_scene()
-        scene = dataclasses.replace(scene, mean=0.3 * scene.mean)  # inside the clamp
-        for camera in random_cameras(5):
-            seen = view(scene, camera, SIZE, order="array")
-            np.testing.assert_allclose(seen.mean, oracle(camera, scene.mean), rtol=1e-12)
-            half_field = np.asarray([SIZE[1] / 2, SIZE[0] / 2])
-            assert (np.abs(np.asarray(seen.mean) - half_field) < TANGENT_LIMIT * half_field).all()
-            root = np.asarray(slope(camera, scene.mean)) @ np.asarray(scene.factor)
-            np.testing.assert_allclose(covariance(seen), root @ root.mT, rtol=1e-10, atol=1e-10)
-
-
-def test_jacobian_is_clipped():
-    """Outside 1.3 fields of view the shape is that of the clamp's edge at the same depth; the mean is not held."""
-    camera, focal = Camera.front(0.5), float(Camera.front(0.5).focal(SIZE))
-    depth = float(-camera.position[2])
-    edge = TANGENT_LIMIT * SIZE[1] / 2 / focal * depth
-    mean = jnp.asarray([[edge, 0.0, 0.0], [5 * edge, 0.0, 0.0], [0.9 * edge, 0.0, 0.0]])
-    ball = Gaussians3D(mean, jnp.tile(0.05 * jnp.eye(3), (3, 1, 1)), jnp.ones(3), jnp.ones((3, 3)))
-    seen = view(ball, camera, SIZE, order="array")
-    at_edge, beyond, inside = covariance(seen)
-    np.testing.assert_allclose(beyond, at_edge, rtol=1e-5)
-    assert inside[0, 0] < 0.97 * at_edge[0, 0]
-    np.testing.assert_allclose(np.asarray(seen.mean)[1, 0], SIZE[1] / 2 + 5 * TANGENT_LIMIT * 48, rtol=1e-5)
-
-
 @pytest.mark.parametrize("ratio", [1.0, 1e-4, 1e-7, 0.0])
 @pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
 def test_square_factor(ratio, size):
@@ -308,8 +241,7 @@ def test_depth_order_and_array_order():
         assert (nearest_first != np.arange(depth.size)).any()
         by_depth, as_they_come = (view(scene, camera, SIZE, order=order) for order in ("depth", "array"))
         np.testing.assert_array_equal(as_they_come.color, scene.color)
-        for one, other in zip(jax.tree.leaves(by_depth), jax.tree.leaves(as_they_come), strict=True):
-            np.testing.assert_array_equal(one, np.asarray(other)[nearest_first])
+        jax.tree.map(np.testing.assert_array_equal, by_depth, jax.tree.map(lambda x: x[nearest_first], as_they_come))
 
 
 def test_flat_image_at_a_slant_needs_array_order():
@@ -349,11 +281,12 @@ def test_nothing_behind_the_camera_is_rendered():
 
 
 def smooth_loss(scene, camera):
-    """Of the mean and the covariance: any loss of a picture depends on the factor only so."""
+    """Of the mean, the depth and the covariance: any loss of a picture depends on the factor only so."""
     seen = project(scene, camera, SIZE, order="array")
     weights = jnp.asarray([[1.0, 0.7], [-0.4, 1.3]])
     means, shapes = jnp.sin(seen.mean / 30) * weights[:1], jnp.arctan(seen.factor @ seen.factor.mT / 20) * weights[None]
-    return jnp.sum(means) + jnp.sum(shapes) + jnp.sum(seen.opacity[:, None] * seen.color)
+    others = jnp.sum(seen.opacity[:, None] * seen.color) + jnp.sum(jnp.sin(seen.depth))
+    return jnp.sum(means) + jnp.sum(shapes) + others
 
 
 def check_gradient(slope, tree, *, rtol=1e-6, step=1e-6):
@@ -396,18 +329,6 @@ def test_gradients_by_finite_differences(view):
         check_gradient(smooth_slope, (scene, camera()))
 
 
-def test_gradient_of_an_image():
-    with jax.enable_x64(True):
-        scene, camera = flat_scene(10, dtype=np.float64, thickness=1e-5), orbit(Camera.front(0.5), 0.6, 0.2)
-        weights = jnp.asarray(np.random.default_rng(2).normal(size=(*SIZE, 3)))
-        options = RenderOptions(alpha_cutoff=1e-8, alpha_ceiling=1 - 1e-12, transmittance_stop=0.0)
-
-        def loss(tree):
-            return jnp.sum(render(project(*tree, SIZE), SIZE, engine="reference", options=options) * weights)
-
-        check_gradient(jax.jit(jax.value_and_grad(loss)), (scene, camera), rtol=1e-5)
-
-
 @pytest.mark.parametrize("engine", ["cpu", pytest.param("reference", marks=pytest.mark.slow)])
 def test_single_precision_gradients_are_finite_edge_on(engine):
     camera = orbit(Camera.front(0.5), math.pi / 2)
@@ -434,18 +355,15 @@ def test_no_gaussians():
     assert flatten(scene).factor.shape == (0, 2, 2)
 
 
-def test_vmap_over_cameras_and_scenes():
+def test_vmap_over_cameras():
     scene = flat_scene()
     angles = jnp.asarray([0.0, 0.4, math.pi])
     cameras = jax.jit(jax.vmap(lambda angle: Camera.front(0.5).orbit(angle)))(angles)
     many = jax.jit(jax.vmap(lambda camera: project(scene, camera, SIZE)))(cameras)
-    scenes = jax.tree.map(lambda leaf: jnp.asarray(np.stack([leaf, leaf[::-1]])), jax.tree.map(np.asarray, scene))
-    both = jax.jit(jax.vmap(lambda one: project(one, Camera.front(0.5), SIZE)))(scenes)
     for k, angle in enumerate(angles):
         alone = view(scene, orbit(Camera.front(0.5), angle), SIZE)
         np.testing.assert_allclose(np.asarray(many.mean)[k], alone.mean, atol=2e-5)
         np.testing.assert_array_equal(np.asarray(many.color)[k], alone.color)
-    np.testing.assert_array_equal(np.asarray(both.color)[1], np.asarray(scene.color)[::-1])
     eyes = jnp.asarray([[0.0, 0, -1], [1, 0, -1]])
     assert jax.jit(jax.vmap(Camera.look_at))(eyes).rotation.shape == (2, 3, 3)
 
@@ -489,6 +407,9 @@ def test_dtypes():
         (lambda: project(flat_scene(), Camera.front(0.5), SIZE, near=-1.0), "near"),
         (lambda: project(flat_scene(), Camera.front(0.5), (0, 5)), "size"),
         (lambda: Camera.front(0.5).focal((160.0, 320)), "size"),
+        (lambda: Camera.front(0.5).orbit("x"), "^azimuth: expected an angle in radians, got 'x'"),
+        (lambda: Camera.front(0.5).orbit(0.1, target=(0, 0)), r"^target: expected \(x, y, z\), got \(0, 0\)"),
+        (lambda: Camera(jnp.eye(3), jnp.zeros(3), jnp.ones(()), lens=jnp.ones(2)), "rotation, position, fov, lens"),
         (
             lambda: project(jax.tree.map(lambda x: x[None], flat_scene()), Camera.front(0.5), SIZE),
             "jax.vmap",
@@ -509,7 +430,7 @@ def test_undetermined_camera_is_nan_under_tracing():
 
 
 def test_orbit_checks_arguments():
-    """Degrees are warned of, and what is no angle or place is refused; turns that are meant are not."""
+    """Degrees are warned of; turns that are meant are not."""
     camera = Camera.front(0.5)
     camera.orbit(6.0, -1.5).orbit(4 * math.pi)
     jax.jit(lambda angle: camera.orbit(angle).position)(20.0)
@@ -517,7 +438,3 @@ def test_orbit_checks_arguments():
         camera.orbit(20)
     with pytest.warns(UserWarning, match=r"^elevation: expected radians, got -22\.5"):
         camera.orbit(0.1, -22.5)
-    with pytest.raises(ValueError, match=r"^azimuth: expected an angle in radians, got 'x'"):
-        camera.orbit("x")
-    with pytest.raises(ValueError, match=r"^target: expected \(x, y, z\), got \(0, 0\)"):
-        camera.orbit(0.1, target=(0, 0))

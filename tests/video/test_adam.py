@@ -2,13 +2,9 @@
 
 import jax
 import numpy as np
-import optax
 import pytest
 
 from foldgauss.video.fitting.adam import (
-    BETA1,
-    BETA2,
-    EPSILON,
     FRAME_TIME_ADAM,
     RateUnits,
     adam_step,
@@ -18,25 +14,6 @@ from foldgauss.video.fitting.adam import (
 )
 from foldgauss.video.models.frame_times import FrameTimes, make_time_logits
 from foldgauss.video.models.row_layout import columns
-
-
-@pytest.mark.parametrize("width", [11, 17, 25])
-def test_sparse_adam_on_all_rows_agrees_with_optax(width):
-    rng = np.random.default_rng(0)
-    rows = rng.normal(size=(5000, width)).astype(np.float32)
-    rates = rng.uniform(1e-3, 1e-1, width).astype(np.float32)
-    first, second, counts = np.zeros_like(rows), np.zeros_like(rows), np.zeros(len(rows), np.int32)
-    truth, adam = rows.astype(np.float64), optax.scale_by_adam(BETA1, BETA2, EPSILON)
-    with jax.enable_x64(True):
-        state = adam.init(truth)
-    for _ in range(5):
-        grad = rng.normal(size=rows.shape).astype(np.float32)
-        with jax.numpy_dtype_promotion("standard"), jax.enable_x64(True):
-            update, state = adam.update(grad.astype(np.float64), state)
-        truth = truth - rates * np.asarray(update)
-        sparse_adam(rows, grad, first, second, counts, np.arange(len(rows)), rates)
-        assert not grad.any()  # handed back empty
-    np.testing.assert_allclose(rows, truth, atol=2e-5)
 
 
 def test_untouched_rows_stay_and_each_row_counts_its_own_steps():
@@ -90,9 +67,10 @@ def test_rates_scale_with_duration_and_size(unit_size):
     np.testing.assert_allclose(factor[:, place["log_time_scale"]], 1, rtol=1e-3)
 
 
-def test_all_implementations_take_the_same_steps():
+@pytest.mark.parametrize("width", [11, 17, 25])
+def test_all_implementations_take_the_same_steps(width):
     """The rule in NumPy, its twins in Numba and JAX, and optax, over several steps."""
-    rng, num, width = np.random.default_rng(0), 60, 17
+    rng, num = np.random.default_rng(0), 60
     rows = rng.normal(size=(num, width)).astype(np.float32)
     rates = rng.uniform(1e-3, 1e-1, width).astype(np.float32)
     zeros = np.zeros_like(rows), np.zeros_like(rows), np.zeros(num, np.int32)
@@ -103,7 +81,9 @@ def test_all_implementations_take_the_same_steps():
         own[3] += 1
         change, *own[1:3] = adam_step(grad, *own[1:], rates)
         own[0] -= change.astype(np.float32)
-        sparse_adam(sparse[0], grad.copy(), *sparse[1:], np.arange(num), rates)
+        emptied = grad.copy()
+        sparse_adam(sparse[0], emptied, *sparse[1:], np.arange(num), rates)
+        assert not emptied.any()
         masked = masked_adam(
             masked[0], grad, *masked[1:], np.ones(num, bool), rates, rounded=np.zeros(num, np.uint8), units=RateUnits()
         )

@@ -2,14 +2,12 @@
 
 import dataclasses
 
-import jax
 import numpy as np
 import pytest
 from clips import moving_blobs
 
-from foldgauss.video import FitConfig, evaluate, fit, fit_steps
+from foldgauss.video import FitConfig, evaluate, fit
 from foldgauss.video.fitting.schedule import to_planes
-from foldgauss.video.fitting.state import to_model
 from foldgauss.video.models.background import check_background, composite, random_background
 from foldgauss.video.models.renderer import VideoRenderer
 
@@ -75,16 +73,6 @@ def test_backgrounds_depend_on_seed_and_step():
     np.testing.assert_array_equal(one, random_background(0, 3))
     assert len({tuple(random_background(seed, step)) for seed in (0, 1) for step in range(50)}) == 100
     np.testing.assert_allclose(np.mean([random_background(0, k) for k in range(3000)], 0), 0.5, atol=0.03)  # 5 sigma
-
-
-def test_resumed_fit_has_the_same_bits():
-    frames, config = clip(), dataclasses.replace(CONFIG, steps=30)
-    kept = next(state for state, info in fit_steps(frames, config) if info.step == 12)
-    for state, _ in fit_steps(frames, config, kept):
-        pass
-    again = to_model(state, config, (48, 64), 25.0)
-    for one, other in zip(*(jax.tree.leaves(m) for m in (again, fit(frames, config).model)), strict=True):
-        np.testing.assert_array_equal(one, other)
 
 
 def test_without_a_background_images_have_alpha(fitted):

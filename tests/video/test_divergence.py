@@ -1,12 +1,11 @@
 """Divergence: detected, named and undone; and no alarm in fits that converge."""
 
-import dataclasses
 import warnings
 
-import jax
 import numpy as np
 import pytest
 from clips import moving_blobs
+from soft_models import assert_same
 
 from foldgauss.video import DivergenceWarning, FitConfig, FitDiverged, LearningRates, Views, evaluate, fit, fit_steps
 from foldgauss.video.fitting import divergence
@@ -24,7 +23,6 @@ CONFIG = FitConfig(
     views=Views(interpolation_fraction=0.0),
     follow_camera=False,
 )
-RATES = LearningRates()
 
 
 @pytest.fixture(scope="module")
@@ -35,12 +33,6 @@ def slowed(optimized) -> float:
         state.backoffs = 1
 
     return _fit_with(back_off)
-
-
-@pytest.fixture(scope="module")
-def begun() -> float:
-    """dB after one step."""
-    return evaluate(fit(CLIP, dataclasses.replace(CONFIG, steps=1)).model, CLIP).mean_psnr
 
 
 def _fit_with(change, config: FitConfig = CONFIG, at: int = 100) -> float:
@@ -89,15 +81,6 @@ def test_a_fit_that_may_not_back_off_any_more_raises_with_the_last_finite_state(
     assert evaluate(to_model(state, CONFIG, CLIP.shape[1:3], 25.0), CLIP).mean_psnr > 20
 
 
-# Of the others a thousand times as much is borne: they come to an end of what they can do.
-@pytest.mark.parametrize("leaf", ["loc", "color_dc", "log_scale", "log_time_scale"])
-def test_too_high_rates_are_lowered_until_the_fit_converges(begun, leaf):
-    rates = dataclasses.replace(RATES, **{leaf: 1000 * getattr(RATES, leaf)})
-    with pytest.warns(DivergenceWarning, match=r"worse than they were|worse than at the start|no finite"):
-        model = fit(CLIP, CONFIG.replace(rates=rates, **{"rates.final": 0.07})).model
-    assert evaluate(model, CLIP).mean_psnr > begun
-
-
 def test_exploding_folds_are_named_and_undone():
     def explode(state):
         state.rows[:, columns(CONFIG.fold_degree)["coefficients"]] *= 1e6
@@ -134,15 +117,6 @@ def test_exhausted_backoffs_raise():
         with pytest.raises(FitDiverged, match="lower these"):
             spoiled()
     assert sum(issubclass(one.category, DivergenceWarning) for one in told) == MAX_BACKOFFS
-
-
-def test_nonfinite_state_is_refused():
-    for state, info in fit_steps(CLIP, CONFIG):
-        if info.step == 5:
-            break
-    state.rows[3] = np.nan
-    with pytest.raises(FitDiverged, match="state: expected finite parameters"):
-        next(fit_steps(CLIP, CONFIG, state))
 
 
 def _clips():
@@ -184,8 +158,7 @@ def test_guard_changes_no_bit(monkeypatch):
     monkeypatch.setattr(Guard, "keep_good", lambda self, state: None)
     monkeypatch.setattr(CpuStepper, "measure_start", lambda self, state: {})
     alone = fit(CLIP, CONFIG).model
-    for one, other in zip(jax.tree.leaves(watched), jax.tree.leaves(alone), strict=True):
-        np.testing.assert_array_equal(one, other)
+    assert_same(watched, alone)
 
 
 def test_opacity_resets_raise_no_warning():

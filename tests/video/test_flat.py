@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from path_models import path_model
 from soft_models import NUM, OBJECT, soft_model
 
 from foldgauss.render import Camera, RenderOptions
@@ -15,12 +16,25 @@ from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.segmented.flatten import flatten_video
 
 
-def test_flattened_layers_render_the_same_images():
+def _edited_before_a_longer_one():
     front = edit(soft_model(degree=1, options=RenderOptions())).select(OBJECT).move((0.2, 0.1)).video()
-    video = layers(front, soft_model(seed=3, num_frames=9, options=RenderOptions()))
+    return layers(front, soft_model(seed=3, num_frames=9, options=RenderOptions()))
+
+
+def _on_paths():
+    """Equal paths are not repeated."""
+    return layers(path_model(), soft_model(seed=3), path_model(num_paths=3, num_knots=2, seed=7), path_model())
+
+
+@pytest.mark.parametrize(
+    ("make", "num", "num_frames", "paths"), [(_edited_before_a_longer_one, 2, 9, None), (_on_paths, 4, 7, (5, 6))]
+)
+def test_flattened_layers_render_the_same_images(make, num, num_frames, paths):
+    video = make()
     flat = flatten_video(video)
     assert isinstance(flat, VideoModel)
-    assert (flat.num_gaussians, flat.degree, flat.num_frames) == (2 * NUM, 3, 9)
+    assert (flat.num_gaussians, flat.degree, flat.num_frames) == (num * NUM, 3, num_frames)
+    assert paths == (flat.splats.paths and flat.splats.paths.times.shape)
     for t in (0.0, 0.31, 1.0):
         np.testing.assert_array_equal(VideoRenderer(flat).frame(t), VideoRenderer(video).frame(t))
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ import scipy
 from path_models import affine, scene
 
 from foldgauss.io import load_video_model, save_video_model
-from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.video import FitConfig, evaluate, fit, fit_steps
 from foldgauss.video.fitting import loop
 from foldgauss.video.fitting.loop import start, start_from
@@ -18,8 +16,8 @@ from foldgauss.video.fitting.state import paths_of, to_model
 from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.motion.camera_path import fit_affine
 from foldgauss.video.motion.optical_flow import Motion
-from foldgauss.video.motion.path_coordinates import PathCoordinates, prefers_path
-from foldgauss.video.motion.shared_motions import FARTHEST, _are_larger, _Clip, find_shared_motions
+from foldgauss.video.motion.path_coordinates import PathCoordinates
+from foldgauss.video.motion.shared_motions import FARTHEST, _Clip, find_shared_motions
 
 CONFIG = FitConfig(num_gaussians=1500, steps=300, degree=2)
 TIMES = np.linspace(0, 1, 12)
@@ -203,18 +201,6 @@ def test_changes_are_those_of_the_path():
     assert measured[0][2:-2].max() < 1e-12
     expected = np.linalg.norm(np.diff(noise, 4, axis=0), axis=1) * np.sqrt(6 / 70)
     np.testing.assert_allclose(measured[1][2:-2], expected)
-    many = rng.normal(size=(100_000, 1))
-    spread = [np.sqrt(np.mean(np.diff(many, order, axis=0) ** 2) * unit) for order, unit in ((2, 1), (4, 6 / 70))]
-    assert spread[1] == pytest.approx(spread[0], rel=0.02)
-
-
-def test_unknown_places_and_steps_do_not_count():
-    clip = _Clip.of(Motion.from_frames(FRAMES[:1].repeat(12, 0)))
-    steps, places = np.tile(np.eye(3), (12, 1, 1)), np.zeros((12, 1, 2))
-    steps[3], places[7] = np.nan, np.nan
-    changes = clip.measure_changes(steps, places)
-    np.testing.assert_array_equal(np.flatnonzero(~np.isnan(changes)), [5, 6, 8, 9])
-    assert not _are_larger(np.full(12, np.nan), 0.0)
 
 
 def test_a_camera_that_shakes_for_a_while_is_followed():
@@ -307,32 +293,6 @@ def test_coordinates_of_positions_and_tracks_agree():
             np.testing.assert_allclose(own, there, atol=1e-3)
     # The background stands still there, but for the error of the flow.
     assert np.abs(placed.shift[tracks.known]).mean() < 0.2 * np.abs(tracks.shift[tracks.known]).mean()
-
-
-def test_the_longer_or_else_the_steadier_fold_is_preferred():
-    folds = np.array([[[1.0, 0.0]], [[1.0, 0.0]], [[1.0, 0.0]], [[0.1, 0.0]]])
-    by_camera = np.array([[[9.0, 0.0]], [[0.5, 0.0]], [[0.5, 0.0]], [[0.5, 0.0]]])
-    chosen = prefers_path(folds, np.ones(4), by_camera, np.array([2.0, 0.5, 1.0, 1.0]), is_first=True)
-    assert chosen.tolist() == [True, False, True, False]
-    chosen = prefers_path(folds, np.ones(4), 0.9 * by_camera, np.array([2.0, 0.5, 1.0, 1.0]), is_first=False)
-    assert chosen.tolist() == [True, False, True, False]
-    assert not prefers_path(folds, np.ones(4), 0.9 * folds, np.ones(4), is_first=False).any()
-
-
-@pytest.mark.parametrize(("engine", "with_object"), [("cpu", True), ("cpu", False), ("xla", False)])
-def test_a_resumed_fit_has_the_same_bits(tmp_path, engine, with_object):
-    config = dataclasses.replace(CONFIG, num_gaussians=300, steps=24, engine=engine)
-    frames = WITH_OBJECT if with_object else FRAMES
-    for state, info in fit_steps(frames, config):
-        if info.step == 10:
-            save_checkpoint(tmp_path / "half.checkpoint", state, config=config, source={})
-    half = load_checkpoint(tmp_path / "half.checkpoint", config=config, source={})
-    for resumed, _ in fit_steps(frames, config, half):
-        pass
-    one, other = (to_model(each, config, frames.shape[1:3], 12.0).splats for each in (state, resumed))
-    assert one.paths.num_paths == 1 + with_object
-    for mine, theirs in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        np.testing.assert_array_equal(mine, theirs)
 
 
 def test_a_model_can_be_saved_loaded_and_fitted_further(tmp_path):

@@ -33,13 +33,6 @@ def test_cuts_of_frames():
     assert isinstance(cuts, np.ndarray)  # JAX would round float64
 
 
-@pytest.mark.parametrize("rate", [0.5, 2.0])
-def test_remapped_positions_have_the_rate_of_the_output(rate):
-    np.testing.assert_allclose(
-        remapped_positions([[0, 0], [2, 1]], fps=10, rate=rate), np.arange(20 * rate + 1) / rate / 2
-    )
-
-
 @pytest.mark.parametrize("extreme", [100.0, -100.0, 1e30])
 def test_extreme_weights_stay_in_order(extreme):
     times = np.asarray(FrameTimes(jnp.asarray([0.0, extreme, 1.0])).times())
@@ -110,13 +103,22 @@ def test_positions_become_times():
     np.testing.assert_array_equal(times_at(cut, np.array([2.4, 2.6])), cut[[2, 3]])
 
 
-def test_playing_at_another_rate_or_speed():
-    np.testing.assert_allclose(played_positions(4, 2.0), np.arange(7) / 2)
-    np.testing.assert_allclose(played_positions(4, 1.0, speed=0.5), np.arange(7) / 2)
-    np.testing.assert_allclose(played_positions(4, 1.0, speed=-1.5), [3, 1.5, 0])
-    assert len(played_positions(251, 60 / 25)) == 601  # the last frame is not lost to rounding
+HELD = [[0, 0], [1, 1], [3, 1], [4, 0.5]]
 
 
-def test_remapped_time():
-    held = remapped_positions([[0, 0], [1, 1], [3, 1], [4, 0.5]], fps=2)
-    np.testing.assert_allclose(held, [0, 1, 2, 2, 2, 2, 2, 1.5, 1])
+@pytest.mark.parametrize(
+    ("found", "expected"),
+    [
+        (played_positions(4, 2.0), np.arange(7) / 2),
+        (played_positions(4, 1.0, speed=0.5), np.arange(7) / 2),
+        (played_positions(4, 1.0, speed=-1.5), [3, 1.5, 0]),
+        (played_positions(251, 60 / 25), np.arange(601) / 2.4),  # the last frame is not lost to rounding
+        (remapped_positions(HELD, fps=2), [0, 1, 2, 2, 2, 2, 2, 1.5, 1]),
+        *(
+            (remapped_positions([[0, 0], [2, 1]], fps=10, rate=rate), np.arange(20 * rate + 1) / rate / 2)
+            for rate in (0.5, 2.0)
+        ),
+    ],
+)
+def test_positions_at_another_rate_or_speed_or_remapped(found, expected):
+    np.testing.assert_allclose(found, expected)

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import numpy as np
 import pytest
 from clips import moving_blobs
@@ -12,7 +11,7 @@ from foldgauss.video.fitting.budget import StepPlanner
 from foldgauss.video.fitting.config import chosen_num_gaussians
 from foldgauss.video.fitting.densify import densify, reset_opacities
 from foldgauss.video.fitting.growth import EXTENT, PUBLISHED_STEPS, GradientStatistics, Growth
-from foldgauss.video.fitting.loop import start, to_model
+from foldgauss.video.fitting.loop import start
 from foldgauss.video.fitting.schedule import choose_views
 from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
 from foldgauss.video.models.row_layout import columns
@@ -45,47 +44,36 @@ def change(rows, sums, *, growth=GROWTH, max_num=1000, step=600, seed=0):
     return densify(rows, sums, growth, degree=DEGREE, pixels=PIXELS, max_num=max_num, step=step, seed=seed)
 
 
-def test_nothing_happens_below_the_thresholds():
-    stay, born = change(gaussians(), statistics(screen={1: 1.9e-4}, time={2: 1.9e-4}))
-    assert stay.tolist() == [0, 1, 2, 3, 4]
-    assert len(born) == 0
+EVERYBODY = [SMALL] * 5
+WIDE, MIXED = [LARGE] * 5, [SMALL, SMALL, [SMALL, LARGE], SMALL, SMALL]
+#: Scales, lifetime, mean gradients, who is cloned, who is split.
+CRITERIA = {
+    "below the thresholds": (EVERYBODY, 0.1, {"screen": {1: 1.9e-4}, "time": {2: 1.9e-4}}, [], []),
+    "small, on the screen": (EVERYBODY, 0.1, {"screen": {3: 2.1e-4}}, [3], []),
+    "wide, on the screen": (WIDE, 0.9, {"screen": {1: 2.1e-4}}, [], [1]),
+    "wide along one axis": (MIXED, 0.1, {"screen": {2: 1e-3}}, [], [2]),
+    "no longer than the clip, in time": (WIDE, 0.1, {"time": {3: 2.1e-4}}, [3], []),
+    "longer than the clip, in time": (WIDE, 1.1, {"time": {1: 2.1e-4}}, [], [1]),
+    "both": (WIDE, 0.1, {"screen": {2: 3e-4}, "time": {2: 3e-4}}, [2], [2]),
+}
 
 
-@pytest.mark.parametrize("criterion", ["screen", "time"])
-def test_small_gaussians_are_cloned(criterion):
-    """By the screen gradient those that are small, by the time gradient those that live no longer than the clip."""
-    rows = gaussians(scale=SMALL if criterion == "screen" else LARGE)
-    stay, born = change(rows, statistics(**{criterion: {3: 2.1e-4}}))
-    assert stay.tolist() == [0, 1, 2, 3, 4]
-    np.testing.assert_array_equal(born, rows[[3]])
-
-
-@pytest.mark.parametrize("criterion", ["screen", "time"])
-def test_large_gaussians_are_split(criterion):
-    """By the screen gradient those that are wide, by the time gradient those that live longer than the clip."""
-    rows = gaussians(scale=LARGE)
-    rows[:, PLACE["log_time_scale"]] = np.log(0.9 if criterion == "screen" else 1.1)
-    stay, born = change(rows, statistics(**{criterion: {1: 2.1e-4}}))
-    assert stay.tolist() == [0, 2, 3, 4]
-    assert born.shape == (2, rows.shape[1])
-    np.testing.assert_allclose(np.exp(born[:, PLACE["log_scale"]]), LARGE / 1.6, rtol=1e-5)
-    others = [c for name in PLACE if name not in ("loc", "log_scale") for c in range(*PLACE[name].indices(99))]
-    np.testing.assert_array_equal(born[:, others], rows[[1, 1]][:, others])
-    assert not np.array_equal(born[0, PLACE["loc"]], born[1, PLACE["loc"]])
-
-
-def test_both_gradients_together_clone_and_split():
-    rows = gaussians(scale=LARGE)
-    stay, born = change(rows, statistics(screen={2: 3e-4}, time={2: 3e-4}))
-    assert stay.tolist() == [0, 1, 3, 4]
-    np.testing.assert_array_equal(born[0], rows[2])
-    np.testing.assert_allclose(np.exp(born[1:, PLACE["log_scale"]]), LARGE / 1.6, rtol=1e-5)
-
-
-def test_either_axis_makes_a_gaussian_large():
+@pytest.mark.parametrize("name", CRITERIA)
+def test_criteria_clone_and_split(name):
+    """By the screen gradient those that are small or wide, by the time gradient those that live short or long."""
+    scales, lifetime, means, cloned, split = CRITERIA[name]
     rows = gaussians()
-    rows[2, PLACE["log_scale"]] = np.log([SMALL, LARGE])
-    assert 2 not in change(rows, statistics(screen={2: 1e-3}))[0]
+    for row, scale in zip(rows, scales, strict=True):
+        row[PLACE["log_scale"]] = np.log(scale)
+    rows[:, PLACE["log_time_scale"]] = np.log(lifetime)
+    stay, born = change(rows, statistics(**means))
+    assert stay.tolist() == [k for k in range(5) if k not in split]
+    np.testing.assert_array_equal(born[: len(cloned)], rows[cloned])
+    halves, parents = born[len(cloned) :], rows[split * 2]
+    np.testing.assert_allclose(halves[:, PLACE["log_scale"]], parents[:, PLACE["log_scale"]] - np.log(1.6), atol=1e-5)
+    others = [c for name in PLACE if name not in ("loc", "log_scale") for c in range(*PLACE[name].indices(99))]
+    np.testing.assert_array_equal(halves[:, others], parents[:, others])
+    assert len(np.unique(halves[:, PLACE["loc"]], axis=0)) == 2 * len(split)
 
 
 def test_halves_are_drawn_from_their_parent():
@@ -251,25 +239,26 @@ def unscaled(monkeypatch):
     monkeypatch.setattr(Growth, "for_plan", lambda self, plan: self)
 
 
-def run(config, kept=None):
-    """Numbers of Gaussians by step, and the last state."""
-    numbers = []
-    for state, info in fit_steps(FRAMES, config, kept):
-        numbers.append(info.num_gaussians)
-        parts = (state.rows, state.first, state.second, state.counts)
-        assert len({len(part) for part in parts}) == 1
-    return numbers, state
+def grown_numbers(config):
+    """Numbers of Gaussians by step."""
+    return [info.num_gaussians for _, info in fit_steps(FRAMES, config)]
 
 
 @pytest.mark.usefixtures("unscaled")
-def test_fit_grows_on_schedule():
-    numbers, state = run(CONFIG)
-    changed = [step for step in range(2, 61) if numbers[step - 1] != numbers[step - 2]]
-    assert changed
-    assert set(changed) <= {10, 20, 30, 40}
+def test_births_and_resets_are_on_schedule():
+    numbers, highest = [], []
+    for state, info in fit_steps(FRAMES, CONFIG):
+        numbers.append(info.num_gaussians)
+        highest.append(state.rows[:, PLACE["opacity_logit"]].max())
+    assert set(np.flatnonzero(np.diff(numbers)) + 2) <= {10, 20, 30, 40}
     assert numbers[-1] > 200
     assert state.statistics is None
     assert (state.counts == 60).sum() < len(state.counts)
+    for step in (20, 40):
+        assert highest[step - 2] > -4
+        assert highest[step - 1] == pytest.approx(np.log(0.01 / 0.99), rel=1e-5)
+    assert highest[59] > highest[39] + 0.3
+    assert max(grown_numbers(dataclasses.replace(CONFIG, max_gaussians=170))) == 170
 
 
 @pytest.mark.usefixtures("unscaled")
@@ -277,15 +266,9 @@ def test_fit_grows_on_schedule():
 def test_either_gradient_alone_densifies(criterion):
     off = {"screen_gradient": 1e9, "time_gradient": 1e9, "reset_every": 1000}
     growth = dataclasses.replace(QUICK, **off)
-    assert max(run(CONFIG.replace(**{"strategy.growth": growth}))[0]) == 150
+    assert max(grown_numbers(CONFIG.replace(**{"strategy.growth": growth}))) == 150
     on = dataclasses.replace(growth, **{criterion: 1e-5})
-    assert max(run(CONFIG.replace(**{"strategy.growth": on}))[0]) > 200
-
-
-@pytest.mark.usefixtures("unscaled")
-def test_limits_bound_growth():
-    numbers, _ = run(dataclasses.replace(CONFIG, max_gaussians=170))
-    assert max(numbers) == 170
+    assert max(grown_numbers(CONFIG.replace(**{"strategy.growth": on}))) > 200
 
 
 def test_limits_bound_the_start():
@@ -295,38 +278,6 @@ def test_limits_bound_the_start():
     assert chosen_num_gaussians(by_size, 5, 24, 40) == 30
     assert chosen_num_gaussians(dataclasses.replace(config, max_gaussians=None), 5, 24, 40) == 500
     assert len(start(FRAMES, config).rows) == 300
-
-
-@pytest.mark.usefixtures("unscaled")
-def test_new_gaussians_come_last_with_empty_moments():
-    steps, before = fit_steps(FRAMES, CONFIG), None
-    for state, info in steps:
-        if info.step == 9:
-            before = jax.tree.map(np.array, state)
-        if info.step == 10:
-            break
-    old = np.flatnonzero(state.counts > 0)
-    new = np.flatnonzero(state.counts == 0)
-    assert len(new) > 0
-    # Those never seen have taken no step either; all that have stand before all that are new.
-    assert new[new > old.max()].size >= len(state.rows) - len(before.rows)
-    born = new[new > old.max()]
-    assert not state.first[born].any()
-    assert not state.second[born].any()
-    assert state.first[old].any(axis=1).all()
-    assert state.statistics.seen.shape == (len(state.rows),)
-    assert not state.statistics.seen.any()
-
-
-@pytest.mark.usefixtures("unscaled")
-def test_fit_resets_opacities_on_schedule():
-    highest = {}
-    for state, info in fit_steps(FRAMES, CONFIG):
-        highest[info.step] = state.rows[:, PLACE["opacity_logit"]].max()
-    for step in (20, 40):
-        assert highest[step - 1] > -4
-        assert highest[step] == pytest.approx(np.log(0.01 / 0.99), rel=1e-5)
-    assert highest[60] > highest[40] + 0.3
 
 
 def test_screen_gradient_is_in_units_of_half_the_image():
@@ -364,21 +315,6 @@ def test_screen_gradient_is_in_units_of_half_the_image():
     assert state.statistics.screen[0] == pytest.approx(np.hypot(*slope), rel=0.05)
 
 
-@pytest.mark.usefixtures("unscaled")
-@pytest.mark.parametrize("stop", [7, 10, 23, 45])
-def test_resuming_keeps_the_bits(stop):
-    whole = run(CONFIG)
-    for state, info in fit_steps(FRAMES, CONFIG):
-        if info.step == stop:
-            break
-    again = run(CONFIG, jax.tree.map(np.array, state))
-    assert again[0] == whole[0][stop:]
-    for one, other in zip(
-        *(jax.tree.leaves(to_model(state, CONFIG, (24, 40), 25.0)) for _, state in (whole, again)), strict=True
-    ):
-        np.testing.assert_array_equal(one, other)
-
-
 def test_gaussians_outside_the_image_are_not_seen():
     config = CONFIG.replace(**{"strategy.growth": Growth()}, initialization="uniform")
     state = start(FRAMES, config)
@@ -388,10 +324,6 @@ def test_gaussians_outside_the_image_are_not_seen():
     assert CpuStepper(FRAMES, config, state).step(state, 0.0).num_alive == 150
     assert state.statistics.seen[:5].tolist() == [0] * 5
     assert state.statistics.seen[5:].mean() > 0.8
-
-
-def test_without_growth_there_are_no_statistics():
-    assert start(FRAMES, CONFIG.replace(**{"strategy.growth": None})).statistics is None
 
 
 def test_growth_waits_for_the_plan():

@@ -39,11 +39,6 @@ def test_an_own_loss_is_minimized_as_the_built_in_one(engine):
     assert np.abs(images[0] - images[1]).max() <= 1
 
 
-def test_an_unknown_loss_is_refused():
-    with pytest.raises(ValueError, match=r"loss.name: expected one of '3dgs', got 'mine'"):
-        Loss(name="mine")
-
-
 class DropEverySecond(DensityControl):
     """After step 20."""
 

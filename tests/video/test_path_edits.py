@@ -27,6 +27,10 @@ from foldgauss.video.selection.contributions import Contributions
 MODEL = path_model()
 
 
+def with_splats(model, **leaves):
+    return dataclasses.replace(model, splats=dataclasses.replace(model.splats, **leaves))
+
+
 def test_edits_of_one_object_reuse_its_paths_and_leave_others_as_they_are():
     once = edit(MODEL).select(OBJECT).move((0.1, 0)).video().splats
     assert once.paths.num_paths == 4
@@ -58,13 +62,13 @@ def test_an_object_frozen_or_eased_follows_its_path_until_then():
 def test_more_paths_than_there_may_be_are_not_baked():
     matrices, times = np.tile(MODEL.splats.paths.matrices[:1], (MAX_PATHS, 1, 1, 1)), MODEL.splats.paths.times[:1]
     paths = SharedPaths(np.tile(times, (MAX_PATHS, 1)), matrices)
-    full = dataclasses.replace(MODEL, splats=dataclasses.replace(MODEL.splats, paths=paths))
+    full = with_splats(MODEL, paths=paths)
     edited = edit(full).select(OBJECT).move((0.1, 0.0)).video()
     assert isinstance(edited, EditedVideo)
     assert isinstance(edit(full).move((0.1, 0.0)).video(), VideoModel)  # all of them: in place
     expected = edit(full).select(OBJECT).move((0.1, 0.0), **ALWAYS).video()
     np.testing.assert_array_equal(VideoRenderer(edited).image(0.4), VideoRenderer(expected).image(0.4))
-    other = dataclasses.replace(full, splats=dataclasses.replace(full.splats, paths=distinct_paths(MAX_PATHS)))
+    other = with_splats(full, paths=distinct_paths(MAX_PATHS))
     with pytest.raises(ValueError, match="paths: expected at most 255 in all, got 257"):
         flatten_video(layers(other, MODEL))
 
@@ -81,22 +85,12 @@ def test_gathered_gaussians_keep_their_paths_also_where_these_are_as_many():
     np.testing.assert_array_equal(again.path_index, [5, 2])
 
 
-def test_flattened_layers_render_the_same_images():
-    plain, few = soft_model(seed=3), path_model(num_paths=3, num_knots=2, seed=7)
-    video = layers(MODEL, plain, few, MODEL)
-    flat = flatten_video(video)
-    assert flat.splats.paths.times.shape == (5, 6)  # equal ones are not repeated
-    for t in BETWEEN:
-        np.testing.assert_array_equal(VideoRenderer(flat).frame(t), VideoRenderer(video).frame(t))
-    assert flatten_video(layers(plain, plain)).splats.paths is None
-
-
 def test_own_centers_are_those_in_the_frame():
     contributions, every = Contributions(MODEL), np.arange(NUM)
     found = contributions.own_centers(every)
     for k, t in enumerate(contributions.own_times):
         np.testing.assert_allclose(found[k], contributions.centers_at(every[[k]], t)[0], atol=1e-3)
-    home = Contributions(dataclasses.replace(MODEL, splats=dataclasses.replace(MODEL.splats, path_index=0 * INDEX)))
+    home = Contributions(with_splats(MODEL, path_index=0 * INDEX))
     assert np.abs(found - home.own_centers(every)).max(1)[INDEX > 0].min() > 0.1
     np.testing.assert_array_equal(found[INDEX == 0], home.own_centers(every)[INDEX == 0])
 
@@ -105,12 +99,11 @@ def test_selections_are_of_the_frame():
     """A box around an object that its path has moved away finds it there."""
     paths = SharedPaths(np.zeros((1, 1), np.float32), np.float32([[[[1, 0, 0.3], [0, 1, 0.1]]]]))
     model = soft_model()
-    moved = dataclasses.replace(model.splats, path_index=OBJECT.astype(np.uint8), paths=paths)
     height, width = SIZE
     where = np.array([-0.15 + 0.3, 0.1])  # where the object is moved to
     x, y = where * max(SIZE) + [width / 2, height / 2]
     box = tuple(round(float(v)) for v in (x - 8, y - 8, x + 8, y + 8))
-    found = select(dataclasses.replace(model, splats=moved), box=box, frame=3).mask
+    found = select(with_splats(model, path_index=OBJECT.astype(np.uint8), paths=paths), box=box, frame=3).mask
     assert found[OBJECT].mean() > 0.7
     assert select(model, box=box, frame=3).mask[OBJECT].mean() < 0.1
 
@@ -134,17 +127,19 @@ def test_frames_for_other_programs_are_those_of_the_model(tmp_path):
     np.testing.assert_allclose(seen.mean, VideoRenderer(video).splats(0.3).mean, atol=1e-3)
 
 
-def test_info_tells_who_follows_paths(tmp_path, capsys):
-    for model, text in (
-        (MODEL, "26 of 40 Gaussians follow 2 shared paths of 6 knots"),
-        (path_model(num_paths=1), "26 of 40 Gaussians follow a shared path of 6 knots"),
-        (layers(soft_model(), MODEL), "26 of 80 Gaussians follow 2 shared paths of 6 knots"),
-        (layers(MODEL, MODEL), "52 of 80 Gaussians follow 4 shared paths of 6 knots"),
-    ):
-        index = np.minimum(INDEX, 1) if "a shared path" in text else INDEX
-        if isinstance(model, VideoModel):
-            model = dataclasses.replace(model, splats=dataclasses.replace(model.splats, path_index=index))
-        assert run("info", save_video_model(tmp_path / "m.safetensors", model)) == 0
-        assert text in " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert run("info", save_video_model(tmp_path / "m.safetensors", soft_model())) == 0
-    assert "Gaussians follow" not in capsys.readouterr().out
+TOLD = {
+    "26 of 40 Gaussians follow 2 shared paths of 6 knots": MODEL,
+    "26 of 40 Gaussians follow a shared path of 6 knots": with_splats(
+        path_model(num_paths=1), path_index=np.minimum(INDEX, 1)
+    ),
+    "26 of 80 Gaussians follow 2 shared paths of 6 knots": layers(soft_model(), MODEL),
+    "52 of 80 Gaussians follow 4 shared paths of 6 knots": layers(MODEL, MODEL),
+    None: soft_model(),
+}
+
+
+@pytest.mark.parametrize("text", TOLD)
+def test_info_tells_who_follows_paths(text, tmp_path, capsys):
+    assert run("info", save_video_model(tmp_path / "m.safetensors", TOLD[text])) == 0
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert text in shown if text else "Gaussians follow" not in shown

@@ -7,7 +7,6 @@ import pytest
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions
-from foldgauss.video import FitConfig, fit
 from foldgauss.video.fitting.initialize import initialize
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.renderer import VideoRenderer, to_bytes
@@ -55,18 +54,6 @@ def test_frames_are_those_of_the_frame_times():
     np.testing.assert_array_equal(np.stack(list(model.frames())), played)
 
 
-def test_splats_are_those_of_the_model_that_are_alive():
-    model, t = eqx.tree_at(lambda m: m.splats.log_time_scale, _model(), replace_fn=lambda x: x - 1.5), 0.31
-    fast, slow = VideoRenderer(model, (60, 41)).splats(t), model.at(jnp.float32(t), (60, 41))
-    alive = np.asarray(slow.opacity) > 0
-    assert 0 < len(fast.opacity) == alive.sum() < alive.size
-    covariance = lambda factor: np.asarray(factor) @ np.asarray(factor).mT  # noqa: E731
-    np.testing.assert_allclose(fast.mean, slow.mean[alive], rtol=1e-5, atol=1e-4)
-    np.testing.assert_allclose(covariance(fast.factor), covariance(slow.factor[alive]), rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(fast.opacity, slow.opacity[alive], rtol=1e-6)
-    np.testing.assert_allclose(fast.color, slow.color[alive], rtol=1e-6, atol=1e-7)
-
-
 @pytest.mark.parametrize("name", ["power", "floor"])
 def test_several_envelopes_are_rejected(name):
     model = _model(floor=0.1)
@@ -94,17 +81,3 @@ def test_invalid_models_and_sizes_are_rejected():
     broken = eqx.tree_at(lambda m: m.splats.loc, model, jnp.asarray(model.splats.loc).at[3].set(jnp.nan))
     with pytest.raises(ValueError, match="finite"):
         VideoRenderer(broken)
-
-
-def test_gap_of_a_cut_shows_the_nearer_shot():
-    frames = np.concatenate([np.full((3, 32, 48, 3), 200, np.uint8), np.full((3, 32, 48, 3), 40, np.uint8)])
-    model = fit(frames, FitConfig(num_gaussians=200, steps=60)).model
-    times = np.asarray(model.frame_times.times())
-    assert times[3] - times[2] > 0.5  # the cut
-    early, late = 0.9 * times[2] + 0.1 * times[3], 0.1 * times[2] + 0.9 * times[3]
-    playback = VideoRenderer(model)
-    np.testing.assert_array_equal(playback.frame(early), playback.frame(times[2]))
-    np.testing.assert_array_equal(playback.frame(late), playback.frame(times[3]))
-    assert abs(np.mean(playback.frame(early)) - 200) < 15
-    assert abs(np.mean(playback.frame(late)) - 40) < 15
-    np.testing.assert_allclose(model.render(early), model.render(float(times[2])), atol=1e-6)

@@ -1,7 +1,6 @@
 """Presets: the published recipe, its initialization and its two cameras; drafts."""
 
 import dataclasses
-import itertools
 
 import jax
 import numpy as np
@@ -9,12 +8,12 @@ import pytest
 from clips import moving_blobs
 
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, cpu, project
-from foldgauss.video import FitConfig, LearningRates, Views, evaluate, fit, fit_steps
+from foldgauss.render import RenderOptions, cpu
+from foldgauss.video import FitConfig, LearningRates, Views, fit_steps
 from foldgauss.video.fitting.config import PRESETS, chosen_num_gaussians, planned_steps
 from foldgauss.video.fitting.growth import Growth
 from foldgauss.video.fitting.initialize import initialize_uniform
-from foldgauss.video.fitting.loop import start, to_model
+from foldgauss.video.fitting.loop import start
 from foldgauss.video.fitting.schedule import choose_views
 from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
 from foldgauss.video.models.conditioning import mirror
@@ -35,12 +34,6 @@ def test_changes_override_a_preset(name):
     assert dataclasses.replace(FitConfig.preset(name), degree=5, seed=9) == config
 
 
-@pytest.mark.parametrize("name", PRESETS)
-def test_minutes_replace_a_presets_steps(name):
-    assert planned_steps(FitConfig.preset(name, minutes=2), 10) is None
-    assert planned_steps(FitConfig.preset(name, minutes=2, steps=7), 10) == 7
-
-
 def test_unknown_names():
     with pytest.raises(ValueError, match="preset: expected one of 'standard', 'draft', 'paper', got 'papers'"):
         FitConfig.preset("papers")
@@ -52,7 +45,6 @@ def test_a_draft_is_smaller_than_the_standard():
     draft, standard = FitConfig.preset("draft"), FitConfig()
     assert planned_steps(draft, 24) < planned_steps(standard, 24) / 3
     assert chosen_num_gaussians(draft, 24, 160, 320) < chosen_num_gaussians(standard, 24, 160, 320) / 3
-    assert evaluate(fit(FRAMES, FitConfig.preset("draft", num_gaussians=400, steps=150)).model, FRAMES).mean_psnr > 25
 
 
 def test_the_published_numbers():
@@ -63,6 +55,7 @@ def test_the_published_numbers():
     assert paper.options == RenderOptions()
     assert paper.strategy.scale_cutoff == pytest.approx(1e-4 / (2 * TAN))
     assert paper.strategy.growth == Growth()
+    assert (paper.rates.cooldown, paper.views.error_fraction, paper.strategy.relocated_fraction) == (0, 0, 0)
     rates = paper.rates
     # A published length is half a frame's width per tan; ours the whole: 1 / (2 tan).
     assert rates.loc == pytest.approx(1.6e-4 * 1.1 / (2 * TAN))
@@ -134,20 +127,13 @@ def splats_in_pixels(size, num=40):
 
 
 def test_opposite_camera_sees_the_mirrored_image():
-    """And so does `render.camera`'s."""
+    """As `Camera.opposing` does, see tests/render/test_camera.py."""
     size = (24, 40)
     mean, factor, *others = splats_in_pixels(size)
     front = cpu.forward(mean, factor, *others, np.zeros(3, np.float32), size)
     seen = mirror(mean, factor, 40)
     back = cpu.forward(*seen, *others, np.zeros(3, np.float32), size)
     np.testing.assert_allclose(back.image, front.image[:, :, ::-1], atol=2e-6)
-    model = Splats2D((mean - [20, 12]).astype(np.float32) / 40, factor / 40, *others)
-    camera = Camera.opposing(24 / 40)
-    splats = Gaussians3D.from_flat(model)
-    by_camera = project(splats, camera, size)
-    np.testing.assert_allclose(by_camera.mean, seen[0], atol=1e-3)
-    covariance = lambda f: np.asarray(f) @ np.swapaxes(f, 1, 2)  # noqa: E731
-    np.testing.assert_allclose(covariance(by_camera.factor), covariance(seen[1]), rtol=1e-3, atol=1e-3)
 
 
 def test_both_views_give_the_same_gradients():
@@ -183,17 +169,6 @@ def test_a_pass_sees_every_frame_from_both_sides():
     assert passes[0].tolist() != passes[1].tolist()
 
 
-def test_mirrored_views_are_learned():
-    """An uneven clip is learned from both sides: were a target or a gradient not mirrored, it would not be."""
-    config = FitConfig(num_gaussians=400, steps=200)
-    one, two = (
-        evaluate(fit(FRAMES, config.replace(**{"views.two_cameras": two})).model, FRAMES).mean_psnr
-        for two in (False, True)
-    )
-    assert two > 28
-    assert abs(one - two) < 1
-
-
 # --------------------------------------------------------------------------------------------------- steps
 
 
@@ -225,40 +200,3 @@ def test_decayed_selects_the_rates(decayed):
     assert not moved.pop("loc")
     assert set(moved.values()) == {decayed == "loc"}
     assert np.array_equal(np.asarray(state.time_logits), times) == (decayed == "all")
-
-
-def test_a_small_fit_by_the_paper():
-    """All of it at once, through birth and reset; stopped and gone on with, it has the same bits."""
-    config = FitConfig.preset("paper", num_gaussians=300, degree=3, steps=450)
-    whole = []
-    for state, info in itertools.islice(fit_steps(FRAMES, config), 300):
-        whole.append(info.num_gaussians)
-        if info.step == 215:  # after the reset, between births
-            kept = jax.tree.map(np.array, state)
-    assert kept.statistics is not None
-    assert len(set(whole)) > 5
-    assert info.psnr > 15
-    for again, _ in itertools.islice(fit_steps(FRAMES, config, kept), 300 - 215):
-        pass
-    models = [jax.tree.leaves(to_model(one, config, (24, 40), 25.0)) for one in (state, again)]
-    for one, other in zip(*models, strict=True):
-        assert np.isfinite(one).all()
-        np.testing.assert_array_equal(one, other)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"max_gaussians": 0}, "max_gaussians"),
-        ({"max_gaussians": 10**12}, "max_gaussians"),
-        ({"initialization": "random"}, "initialization: expected one of 'flow', 'static', 'uniform'"),
-        ({"rates.decayed": "none"}, "decayed: expected one of"),
-        ({"views.two_cameras": 2}, "two_cameras"),
-        ({"strategy.sparse_updates": None}, "sparse_updates"),
-        ({"strategy.growth": True}, "growth: expected a Growth"),
-    ],
-    ids=str,
-)
-def test_bad_settings(changes, message):
-    with pytest.raises(ValueError, match=message):
-        FitConfig().replace(**changes)

@@ -60,6 +60,16 @@ def test_seconds_between_frames(name):
     np.testing.assert_array_equal(video.render(seconds=0), video.render(0.0))
 
 
+@pytest.mark.parametrize("name", ["with a cut", "edited, with a cut"])
+def test_between_shots_the_nearer_frame_is_shown(name):
+    video = VIDEOS[name]()
+    times = np.asarray(video.frame_times.times())
+    for share, k in ((0.1, 2), (0.9, 3)):
+        t = (1 - share) * times[2] + share * times[3]
+        np.testing.assert_allclose(video.render(float(t)), video.render(frame=k), atol=1e-6)
+        np.testing.assert_array_equal(VideoRenderer(video).frame(t), VideoRenderer(video).frame(times[k]))
+
+
 def test_size_is_still_the_second_argument():
     for video in (VIDEOS["model"](), VIDEOS["edited"]()):
         small = video.render(0.5, (20, 30))

@@ -432,14 +432,19 @@ def test_plans_end_at_the_cut_that_is_nearest(asked):
             assert following < stop
 
 
-def test_plans_of_known_clips():
-    assert plan_segments(250, [90], length=100, overlap=5) == [(0, 90), (90, 190), (185, 250)]
-    assert plan_segments(100, [50], length=100, overlap=5) == [(0, 100)]
-    assert plan_segments(130, [], length=100, overlap=10) == [(0, 70), (60, 130)]  # evened out
-    assert plan_segments(130, [100], length=100, overlap=10) == [(0, 70), (60, 130)]  # 30 frames are too few
-    # Evened out, the last two share less, so that the last does not reach the first.
-    assert plan_segments(33, [9], length=20, overlap=8) == [(0, 20), (12, 25), (20, 33)]
-    assert plan_segments(1, [], length=2, overlap=1) == [(0, 1)]
+@pytest.mark.parametrize(
+    ("num_frames", "cuts", "length", "overlap", "plan"),
+    [
+        (250, [90], 100, 5, [(0, 90), (90, 190), (185, 250)]),
+        (100, [50], 100, 5, [(0, 100)]),
+        (130, [], 100, 10, [(0, 70), (60, 130)]),  # evened out
+        (130, [100], 100, 10, [(0, 70), (60, 130)]),  # 30 frames are too few
+        (33, [9], 20, 8, [(0, 20), (12, 25), (20, 33)]),  # the last two share less: the last must not reach the first
+        (1, [], 2, 1, [(0, 1)]),
+    ],
+)
+def test_plans_of_known_clips(num_frames, cuts, length, overlap, plan):
+    assert plan_segments(num_frames, cuts, length=length, overlap=overlap) == plan
 
 
 @pytest.mark.parametrize(

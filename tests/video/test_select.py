@@ -397,14 +397,6 @@ def test_malformed_criteria(criteria, match):
     assert "\n" not in str(caught.value)
 
 
-def test_what_select_cannot_ask():
-    with pytest.raises(ValueError, match=r"^click: expected a pixel where something is rendered"):
-        by_click(without(MODEL, truth(BACKGROUND)), (0.5, 0.5), frame=0)
-    for options in ({}, {"times": (0, 1), "frame": 1}):
-        with pytest.raises(ValueError, match=r"^times, frames, frame: expected one"):
-            by_time(MODEL, **options)
-
-
 # ------------------------------------------------------------------------------------------------- a real fit
 
 
@@ -473,6 +465,14 @@ WRONG_CALLS = [
     (lambda: influence(MODEL, 0.5, ALL), r"selection: .*The order is \(model, selection, t\)"),
     (lambda: matte(MODEL, ALL, 3), "t: expected a time in"),
     (lambda: influence(MODEL, ALL, "x"), "t: expected a time in"),
+    (
+        lambda: by_click(without(MODEL, truth(BACKGROUND)), (0.5, 0.5), frame=0),
+        "click: expected a pixel where something is rendered",
+    ),
+    *(
+        (lambda options=options: by_time(MODEL, **options), "times, frames, frame: expected one")
+        for options in ({}, {"times": (0, 1), "frame": 1})
+    ),
 ]
 
 

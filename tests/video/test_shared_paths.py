@@ -8,12 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from path_models import moving_model, moving_splats, random_paths, random_splats
+from soft_models import assert_same
 
 from foldgauss.io import load_video_model, save_video_model
 from foldgauss.video import density_image
-from foldgauss.video.models.conditioning import ConditioningSpec, backpropagate, condition, find_windows
-from foldgauss.video.models.renderer import VideoRenderer
-from foldgauss.video.models.row_layout import columns, pack, unpack
+from foldgauss.video.models.row_layout import pack, unpack
 from foldgauss.video.models.shared_paths import SharedPaths
 
 SIZE, T = (48, 80), np.float32(0.4)
@@ -46,88 +45,42 @@ def test_a_path_with_one_knot_does_not_move():
     np.testing.assert_array_equal(paths.at(np.float32(0.7)), paths.matrices[:, 0])
 
 
-@pytest.mark.parametrize("degree", [0, 3])
-def test_kernels_move_splats_as_at_does(degree):
-    splats = moving_splats(degree=degree)
-    home = jax.jit(lambda model, t: model.at(t))(moving_model(splats), T)
-    done = moving_model(splats).prepare(SIZE).at(float(T))
-    alive = np.flatnonzero(np.asarray(home.opacity) > 0)
-    np.testing.assert_array_equal(done.alive, alive)
-    assert len(np.unique(np.asarray(splats.path_index)[alive])) == 3
-    np.testing.assert_allclose(done.mean, home.mean[alive], rtol=1e-5, atol=5e-4)
-    cov = done.factor @ np.swapaxes(done.factor, 1, 2)
-    home_cov = np.asarray(home.factor @ jnp.swapaxes(home.factor, 1, 2))[alive]
-    np.testing.assert_allclose(cov, home_cov, rtol=2e-4, atol=1e-5 * np.abs(home_cov).max())
-
-
-def test_gradients_by_rows_and_by_maps_match_autodiff():
-    splats = moving_splats(degree=3, power=1.0)
-    rows, spec = pack(splats), ConditioningSpec(3, 1.0, 0.0, SIZE, paths=splats.paths)
-    done = condition(rows, find_windows(rows, spec), T, spec)
-    rng = np.random.default_rng(1)
-    w_mean, w_cov = rng.normal(size=done.mean.shape), rng.normal(size=done.factor.shape) / 50
-    w_cov = w_cov + np.swapaxes(w_cov, 1, 2)
-
-    def loss(leaves, maps):
-        steady = SharedPaths(jnp.zeros((2, 1), maps.dtype), maps[:, None])
-        moved = dataclasses.replace(splats, **leaves, paths=steady)
-        home = moving_model(moved).at(jnp.asarray(T, maps.dtype))
-        cov = home.factor @ jnp.swapaxes(home.factor, 1, 2)
-        return jnp.sum(home.mean[done.alive] * w_mean) + jnp.sum(cov[done.alive] * w_cov)
-
-    with jax.enable_x64(True):
-        leaves = {name: jnp.asarray(getattr(splats, name), jnp.float64) for name in columns(3)}
-        maps = jnp.asarray(splats.paths.at(T), jnp.float64)
-        by_leaves, by_maps = jax.tree.map(np.asarray, jax.jit(jax.grad(loss, (0, 1)))(leaves, maps))
-    grad, path_grad = np.zeros_like(rows), np.zeros((2, 2, 3))
-    nothing = np.zeros(len(done.alive), np.float32), np.zeros((len(done.alive), 3), np.float32)
-    d_factor = (2 * w_cov @ done.factor).astype(np.float32)
-    backpropagate(rows, done, (w_mean.astype(np.float32), d_factor, *nothing), spec, grad, path_grad)
-    for name, place in columns(3).items():
-        truth = by_leaves[name].reshape(len(rows), -1)
-        largest = max(np.abs(truth).max(), 1e-3)
-        np.testing.assert_allclose(grad[:, place] / largest, truth / largest, atol=2e-5, err_msg=name)
-    np.testing.assert_array_equal(grad[:, -1], 0)
-    np.testing.assert_allclose(path_grad, by_maps, rtol=1e-4, atol=1e-5 * np.abs(by_maps).max())
-
-
 def test_rows_hold_the_path_and_come_back():
     splats = moving_splats(50)
     rows = pack(splats)
     assert rows.shape == (50, 18)
     again = unpack(rows, 3, splats.envelope, splats.paths)
-    assert jax.tree.structure(again) == jax.tree.structure(splats)
-    for one, other in zip(jax.tree.leaves(again), jax.tree.leaves(splats), strict=True):
-        assert one.dtype == other.dtype
-        np.testing.assert_array_equal(one, other)
+    assert_same(again, splats)
 
 
 def test_files_hold_paths(tmp_path):
     model = moving_model()
     again = load_video_model(save_video_model(tmp_path / "m.safetensors", model))
-    for one, other in zip(jax.tree.leaves(again), jax.tree.leaves(model), strict=True):
-        np.testing.assert_array_equal(one, other)
-    for t in (0.2, 0.5):
-        np.testing.assert_array_equal(VideoRenderer(again).frame(t), VideoRenderer(model).frame(t))
+    jax.tree.map(np.testing.assert_array_equal, again, model)
+
+
+def changed_paths(leaf, value):
+    own = getattr(random_paths(), leaf).copy()
+    own[0, 3] = value
+    return {"paths": dataclasses.replace(random_paths(), **{leaf: own})}
 
 
 @pytest.mark.parametrize(
-    ("leaf", "value", "expected"),
+    ("changes", "expected"),
     [
-        ("matrices", np.nan, "finite times and matrices"),
-        ("times", np.inf, "finite times and matrices"),
-        ("times", -1.0, "times that do not decrease"),
+        (changed_paths("matrices", np.nan), "finite times and matrices"),
+        (changed_paths("times", np.inf), "finite times and matrices"),
+        (changed_paths("times", -1.0), "times that do not decrease"),
+        ({"path_index": np.full(300, 3, np.uint8)}, "paths from 0 to 2, got 3"),
     ],
 )
-def test_paths_that_make_no_sense_are_errors(tmp_path, leaf, value, expected):
-    paths = random_paths()
-    changed = getattr(paths, leaf).copy()
-    changed[0, 3] = value
-    model = moving_model(dataclasses.replace(moving_splats(), paths=dataclasses.replace(paths, **{leaf: changed})))
+def test_paths_that_make_no_sense_are_errors(tmp_path, changes, expected):
+    model = moving_model(dataclasses.replace(moving_splats(), **changes))
     with pytest.raises(ValueError, match=expected):
         model.prepare(SIZE)
+    path = save_video_model(tmp_path / "m.safetensors", model)
     with pytest.raises(ValueError, match=expected):
-        load_video_model(save_video_model(tmp_path / "m.safetensors", model))
+        load_video_model(path)
 
 
 def test_places_of_many_take_no_memory_for_every_knot():
@@ -141,16 +94,6 @@ def test_places_of_many_take_no_memory_for_every_knot():
     tracemalloc.stop()
     expected = jax.tree.map(jnp.asarray, paths).by_path(jnp.asarray(t[:50]), jnp.asarray(path[:50]))
     np.testing.assert_allclose(maps[:50], expected, atol=1e-5)
-
-
-def test_a_number_of_a_path_that_is_not_there_is_an_error(tmp_path):
-    splats = moving_splats()
-    wrong = dataclasses.replace(splats, path_index=np.full(300, 3, np.uint8))
-    with pytest.raises(ValueError, match="path_index: expected paths from 0 to 2, got 3"):
-        moving_model(wrong).prepare(SIZE)
-    path = save_video_model(tmp_path / "m.safetensors", moving_model(wrong))
-    with pytest.raises(ValueError, match="paths from 0 to 2"):
-        load_video_model(path)
 
 
 def test_folded_gaussians_are_those_of_the_frame():

@@ -1,7 +1,6 @@
 """`FitState`: every operation goes by the metadata of its fields, so a new array is added in one place."""
 
 import dataclasses
-from dataclasses import field
 
 import jax
 import numpy as np
@@ -110,31 +109,6 @@ def test_extend_fills_every_per_gaussian_array():
             new = given.get(name, kind.build(Sizes(2, WIDTH, FRAMES)))
             np.testing.assert_array_equal(getattr(state, name), np.concatenate([getattr(before, name), new]))
     assert state.sizes == Sizes(NUM + 2, WIDTH, FRAMES, growing=True)
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass
-class Extended(FitState):
-    """A state with one more array, which only its own line knows."""
-
-    birthday: np.ndarray = field(
-        default=None, metadata={"arrays": StateArray(np.int16, ("num_gaussians", 2, "width"), fill=-1)}
-    )
-
-
-def test_a_new_array_is_added_in_one_place():
-    rows, logits = np.zeros((3, WIDTH), np.float32), np.zeros(FRAMES - 1, np.float32)
-    state = Extended.create(rows, logits)
-    assert state.birthday.shape == (3, 2, WIDTH)
-    assert state.birthday.dtype == np.int16
-    state.birthday[1] = 7
-    state.keep(np.array([1, 2]))
-    state.extend(rows[:1])
-    assert state.birthday[:, 0, 0].tolist() == [7, -1, -1]
-    state.last_finite = state.copy()
-    state.birthday[:] = 0
-    state.restore()
-    assert state.birthday[:, 0, 0].tolist() == [7, -1, -1]
 
 
 @pytest.mark.parametrize("growing", [False, True])

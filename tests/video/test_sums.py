@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from clips import moving_blobs
 
-from foldgauss.video import FitConfig, evaluate, fit, fit_steps
+from foldgauss.video import FitConfig, evaluate, fit
 from foldgauss.video.fitting.loop import start, to_model
 
 
@@ -34,14 +34,3 @@ def test_sums_are_rendered_over_black_only():
     for draw in (lambda: model.render(0.5, background=(1, 1, 1)), lambda: next(model.frames(background=(1, 1, 1)))):
         with pytest.raises(ValueError, match=r"^background: expected black for a model fitted with compositing 'sum'"):
             draw()
-
-
-def test_sums_cannot_have_alpha():
-    frames = np.zeros((3, 8, 8, 4), np.uint8)
-    with pytest.raises(ValueError, match=r"^compositing: expected 'over' for frames with alpha, got 'sum'"):
-        next(fit_steps(frames, FitConfig(compositing="sum")))
-
-
-def test_unknown_compositing_is_refused():
-    with pytest.raises(ValueError, match=r"^compositing: expected one of 'over', 'sum'"):
-        FitConfig(compositing="under")
