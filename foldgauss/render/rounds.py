@@ -34,12 +34,14 @@ class Engine(NamedTuple):
     """One round of an engine. Planes are (tiles, pixels), in the order of `tiles.join_tiles`.
 
     `composite(plan, lists, fields, transmittance, planes)` returns the transmittance and the colors' planes after the
-    round, and what `pull_back` needs of it. `pull_back(plan, lists, fields, needed, grad_planes, behind, sums)` returns
-    `sums` with the gradient sums of the round's splats added, and `behind`, the color behind its splats per unit of
-    transmittance times the incoming gradient, with the splats composited over it.
+    round, and what `pull_back` needs of it; `find_needed(plan, lists, fields, transmittance)` only that.
+    `pull_back(plan, lists, fields, needed, grad_planes, behind, sums)` returns `sums` with the gradient sums of the
+    round's splats added, and `behind`, the color behind its splats per unit of transmittance times the incoming
+    gradient, with the splats composited over it.
     """
 
     composite: Callable
+    find_needed: Callable
     pull_back: Callable
 
 
@@ -80,16 +82,19 @@ def render_backward(engine: Engine, plan: Plan, residuals, grad_image):
     fields = pack_fields(projected, mean, opacity, color)
     grad_planes = split_tiles(plan, grad_image)
 
-    def composite(begin, transmittance):
+    def attenuate(begin, transmittance):
         lists, end = make_lists(plan, projected, mean, begin)
-        after, _, needed = engine.composite(plan, lists, fields[:, :COLOR], transmittance, ())
-        return end, after, [needed, lists]
+        return end, engine.composite(plan, lists, fields[:, :COLOR], transmittance, ())[0]
 
-    start_of = _checkpoint_rounds(initial_transmittance(plan, mean.dtype), num, lambda *start: composite(*start)[:2])
+    start_of = _checkpoint_rounds(initial_transmittance(plan, mean.dtype), num, attenuate)
+
+    def replay(begin, transmittance):
+        lists, _ = make_lists(plan, projected, mean, begin)
+        return [engine.find_needed(plan, lists, fields[:, :COLOR], transmittance), lists]
 
     def backward_round(carry):
         number, sums, behind = carry
-        needed, lists = jax.lax.cond(number == num - 1, lambda: last_round, lambda: composite(*start_of(number))[2])
+        needed, lists = jax.lax.cond(number == num - 1, lambda: last_round, lambda: replay(*start_of(number)))
         return number - 1, *engine.pull_back(plan, lists, fields, needed, grad_planes, behind, sums)
 
     # Without a row for empty slots: millions of zeros added to a single row took half of a step's time on a GPU.

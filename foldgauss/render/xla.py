@@ -245,4 +245,4 @@ def _backward_batch(plan: Plan, fields, lists: Lists, transmittance, grad_planes
     return sums, behind.at[batch.tiles].set(own_behind.T), segments, chunks
 
 
-ENGINE = Engine(_composite, _pull_back)
+ENGINE = Engine(_composite, lambda plan, lists, fields, transmittance: transmittance, _pull_back)

@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float16, Float32, Int, UInt8
 
 from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
-from foldgauss.video.models.polynomial_folds import fit_powers
 
 #: Tracks have at most so many frames to either side.
 LONGEST = 36
@@ -470,9 +469,10 @@ def _gather(stack, index, scaled) -> np.ndarray:
 RIDGES = np.array([0.03, 0.12, 0.48])
 #: Width of the window in which a fold has to follow its track, in units of sigma_t: where the Gaussian is visible.
 WINDOW = 1.2
-#: A power is used only if the fold without it misses by more than this many pixels, see `fit_powers`: beyond its track
-#: a cubic leaves the frame.
+#: A power is used only if the fold without it misses by more than this many pixels,
 NEEDED = 0.3
+#: and with it by less than this fraction of that: beyond its track a cubic leaves the frame.
+GAINED = 0.8
 CHUNK = 1024  # tracks per task
 
 
@@ -485,17 +485,76 @@ def fit_folds(
     from the track. Least squares without a constant, with as many powers as the track needs; those above the third
     are 0, since tracks do not determine them.
     """
-    num, longest, ridges = len(spread), tracks.known.shape[1] // 2, RIDGES[:degree]
-    coefficients, miss = np.zeros((num, degree, 2), np.float32), np.empty(num, np.float32)
-    steps = np.arange(longest, -longest - 1, -1.0)
-
-    def fit(start: int) -> None:
-        part = slice(start, start + CHUNK)
-        window = WINDOW * spread[part, None].astype(np.float64)
-        weight = tracks.known[part] * np.exp(-0.5 * (steps / window) ** 2)
-        u, unit = np.broadcast_to(steps, weight.shape), np.minimum(window, longest)
-        own = u, unit, weight, tracks.shift[part], ridges / weight.sum(1, keepdims=True)
-        coefficients[part, : len(ridges)], miss[part] = fit_powers(*own, min(degree, 1), NEEDED)
-
-    run_tasks(fit, range(0, num, CHUNK))
+    coefficients, miss = _fit_powers(tracks, spread, degree, min(degree, 1))
+    for used in range(2, min(degree, 3) + 1):
+        off = np.flatnonzero(miss > NEEDED)
+        if not len(off):
+            break
+        bent, left = _fit_powers(tracks[off], spread[off], degree, used)
+        better = left < GAINED * miss[off]
+        coefficients[off[better]], miss[off[better]] = bent[better], left[better]
     return coefficients, miss
+
+
+def _fit_powers(
+    tracks: Tracks, spread: Float32[np.ndarray, " num"], degree: int, used: int
+) -> tuple[Float32[np.ndarray, "num degree 2"], Float32[np.ndarray, " num"]]:
+    """`fit_folds` with the first `used` powers."""
+    num = len(spread)
+    coefficients, miss = np.zeros((num, degree, 2), np.float32), np.empty(num, np.float32)
+    arguments = tracks.shift, tracks.known, WINDOW * np.asarray(spread, np.float64), RIDGES, used, coefficients, miss
+    run_tasks(lambda start: _fit(start, min(start + CHUNK, num), *arguments), range(0, num, CHUNK))
+    return coefficients, miss
+
+
+@kernel
+def _fit(start, stop, shift, known, window, ridges, used, coefficients, miss):
+    """Weighted least squares of the tracks start..stop, by Cholesky's factor of the normal equations."""
+    longest = known.shape[1] // 2
+    powers, normal, factor = np.empty(used), np.empty((used, used)), np.empty((used, used))
+    right, fitted = np.empty((used, 2)), np.empty((used, 2))
+    for n in range(start, stop):
+        total, squares = 0.0, 0.0
+        normal[:], right[:] = 0.0, 0.0
+        unit = min(window[n], float(longest))  # of u, so that powers are of one size
+        for step in range(2 * longest + 1):
+            if not known[n, step]:
+                continue
+            u, weight = (longest - step) / unit, math.exp(-0.5 * ((longest - step) / window[n]) ** 2)
+            power = u
+            total += weight
+            for j in range(used):
+                powers[j] = power
+                power *= u
+            for c in range(2):
+                own = shift[n, step, c]
+                squares += weight * own * own
+                for j in range(used):
+                    right[j, c] += weight * own * powers[j]
+            for j in range(used):
+                for k in range(used):
+                    normal[j, k] += weight * powers[j] * powers[k]
+        for j in range(used):
+            for k in range(j + 1):
+                left = normal[j, k] + (ridges[j] if j == k else 0.0)
+                for m in range(k):
+                    left -= factor[j, m] * factor[k, m]
+                factor[j, k] = math.sqrt(left) if j == k else left / factor[k, k]
+        for c in range(2):
+            for j in range(used):
+                left = right[j, c]
+                for m in range(j):
+                    left -= factor[j, m] * fitted[m, c]
+                fitted[j, c] = left / factor[j, j]
+            for j in range(used - 1, -1, -1):
+                left = fitted[j, c]
+                for m in range(j + 1, used):
+                    left -= factor[m, j] * fitted[m, c]
+                fitted[j, c] = left / factor[j, j]
+            # sum w (s - p)^2 = sum w s^2 - 2 sum w s p + sum w p^2
+            for j in range(used):
+                for k in range(used):
+                    squares += fitted[j, c] * normal[j, k] * fitted[k, c]
+                squares -= 2 * fitted[j, c] * right[j, c]
+                coefficients[n, j, c] = fitted[j, c] / unit ** (j + 1)
+        miss[n] = math.sqrt(max(squares, 0.0) / total)
