@@ -252,7 +252,8 @@ def _move_back(
 
     `d_mean` and `d_factor` come in as gradients of the moved splats, and are changed in place.
     """
-    place = rows.shape[1] - 1
+    place, summed = rows.shape[1] - 1, _u(0)
+    xx, xy, x1, yx, yy, y1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0  # by the map of the path `summed`
     for k in range(start, stop):
         path = _u(rows[alive[k], place])
         gx, gy = d_mean[k, 0], d_mean[k, 1]
@@ -265,16 +266,19 @@ def _move_back(
         b, d = w[0, 0] * b + w[0, 1] * d, w[1, 0] * b + w[1, 1] * d
         mean[k, 0], mean[k, 1] = x, y
         factor[k, 0, 0], factor[k, 0, 1], factor[k, 1, 0], factor[k, 1, 1] = a, b, c, d
-        out = by_map[path]
-        out[0, 0] += gx * x + fxx * a + fxy * b
-        out[0, 1] += gx * y + fxx * c + fxy * d
-        out[0, 2] += gx
-        out[1, 0] += gy * x + fyx * a + fyy * b
-        out[1, 1] += gy * y + fyx * c + fyy * d
-        out[1, 2] += gy
+        if path != summed:
+            out = by_map[summed]
+            out[0, 0], out[0, 1], out[0, 2] = out[0, 0] + xx, out[0, 1] + xy, out[0, 2] + x1
+            out[1, 0], out[1, 1], out[1, 2] = out[1, 0] + yx, out[1, 1] + yy, out[1, 2] + y1
+            xx, xy, x1, yx, yy, y1, summed = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, path
+        xx, xy, x1 = xx + gx * x + fxx * a + fxy * b, xy + gx * y + fxx * c + fxy * d, x1 + gx
+        yx, yy, y1 = yx + gy * x + fyx * a + fyy * b, yy + gy * y + fyx * c + fyy * d, y1 + gy
         d_mean[k, 0], d_mean[k, 1] = m[0, 0] * gx + m[1, 0] * gy, m[0, 1] * gx + m[1, 1] * gy
         d_factor[k, 0, 0], d_factor[k, 0, 1] = m[0, 0] * fxx + m[1, 0] * fyx, m[0, 0] * fxy + m[1, 0] * fyy
         d_factor[k, 1, 0], d_factor[k, 1, 1] = m[0, 1] * fxx + m[1, 1] * fyx, m[0, 1] * fxy + m[1, 1] * fyy
+    out = by_map[summed]
+    out[0, 0], out[0, 1], out[0, 2] = out[0, 0] + xx, out[0, 1] + xy, out[0, 2] + x1
+    out[1, 0], out[1, 1], out[1, 2] = out[1, 0] + yx, out[1, 1] + yy, out[1, 2] + y1
 
 
 @dataclasses.dataclass(frozen=True)
