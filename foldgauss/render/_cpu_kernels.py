@@ -97,9 +97,10 @@ def _pixel_range(left, right, width):
 
 
 @kernel
-def project(start, stop, mean, factor, opacity, color, height, width, low_pass, cutoff, support, geometry, span):
+def project(start, stop, mean, factor, opacity, color, height, width, low_pass, cutoff, support, geometry, span, count):
     """Geometry of splats start..stop and the rows of tiles that each one reaches (none if it is not visible).
 
+    The splats that reach a row are added to its number in `count`.
     `support` is the squared support radius in standard deviations, or infinity.
     """
     half_log2e = _f(0.5 * math.log2(math.e))
@@ -146,14 +147,8 @@ def project(start, stop, mean, factor, opacity, color, height, width, low_pass, 
         if after > first:
             span[i, 0] = first >> _i(_SHIFT)
             span[i, 1] = (after + _i(TILE - 1)) >> _i(_SHIFT)
-
-
-@kernel
-def count_rows(start, stop, span, count):
-    """Add to `count`, one number for each row, the splats of start..stop that reach it."""
-    for i in range(start, stop):
-        for row in range(span[i, 0], span[i, 1]):
-            count[row] += 1
+            for row in range(span[i, 0], span[i, 1]):
+                count[row] += 1
 
 
 @kernel
@@ -400,20 +395,14 @@ def _clear_tile(scratch, rows, columns):
     _reorder(scratch, _u(0))
 
 
-@inline
-def _load_rows(scratch, at):
-    """The four rows of pixels of the four cells at `at` in a plane of the scratch."""
-    first, second = load(scratch, at), load(scratch, at + _u(LANES))
-    third, fourth = load(scratch, at + _u(2 * LANES)), load(scratch, at + _u(3 * LANES))
-    return transpose_cells(first, second, third, fourth)
-
-
 @kernel
 def _reorder(scratch, plane):
     """Reorder a plane of the scratch from cells to rows of pixels, or back."""
     for band in range(_u(CELLS)):
         at = plane + band * _u(TILE * CELL)
-        rows = _load_rows(scratch, at)
+        first, second = load(scratch, at), load(scratch, at + _u(LANES))
+        third, fourth = load(scratch, at + _u(2 * LANES)), load(scratch, at + _u(3 * LANES))
+        rows = transpose_cells(first, second, third, fourth)
         store(scratch, at, rows[0])
         store(scratch, at + _u(LANES), rows[1])
         store(scratch, at + _u(2 * LANES), rows[2])
@@ -717,3 +706,61 @@ def gather(
             by_w = total[4] * v + total[5] * w
             d_factor[i, 0, k] = c * p * by_v
             d_factor[i, 1, k] = c * (q * by_v + r * by_w)
+
+
+@kernel
+def list_weights(
+    height,
+    width,
+    begin,
+    entries,
+    tile_start,
+    listed,
+    used,
+    geometry,
+    over,
+    ceiling,
+    stop,
+    at,
+    indices,
+    values,
+):
+    """Composite front to back the splats of every pixel of the rows of tiles from `begin` on.
+
+    Without `indices`, the number of weights of each pixel is written to `at`; with it, the weights, from at[pixel] on.
+    """
+    across = (width + TILE - 1) // TILE
+    most = 0
+    for n in range(len(used)):
+        most = max(most, used[n] - tile_start[n])
+    which, on_row = np.empty(most, np.int32), np.empty((most, 4), np.float32)
+    for n in range(len(used)):
+        top, left = (begin + n // across) * TILE, n % across * TILE
+        for y in range(top, min(top + TILE, height)):
+            num = 0  # splats of the tile that reach this row of pixels: few
+            for k in range(tile_start[n], used[n]):
+                one = geometry[entries[listed[k]]]
+                dy = _f(y) + _f(0.5) - one[_Y]
+                bound = one[_LOG] - one[_R] * dy * one[_R] * dy
+                if bound >= one[_LEAST]:
+                    which[num] = entries[listed[k]]
+                    on_row[num] = one[_P], one[_Q] * dy + one[_P] * (_f(left) + _f(0.5) - one[_X]), bound, one[_LEAST]
+                    num += 1
+            for x in range(left, min(left + TILE, width)):
+                pixel, transmittance, found = y * width + x, _f(1), 0
+                for k in range(num):
+                    sheared = on_row[k, 0] * _f(x - left) + on_row[k, 1]
+                    power = on_row[k, 2] - sheared * sheared
+                    if power < on_row[k, 3]:
+                        continue
+                    if not transmittance > stop:
+                        break
+                    weight = min(math.exp(_f(math.log(2.0)) * power), ceiling) * transmittance
+                    if indices is not None:
+                        indices[at[pixel] + found] = which[k]
+                        values[at[pixel] + found] = weight
+                    found += 1
+                    if over:
+                        transmittance -= weight
+                if indices is None:
+                    at[pixel] = found

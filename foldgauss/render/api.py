@@ -9,19 +9,15 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental.buffer_callback import buffer_callback
 from jaxtyping import Array, Float
 
 from foldgauss._runtime.checks import check_one_of, require
 from foldgauss._runtime.device import default_platform
-from foldgauss.render import cpu, pallas
+from foldgauss.render import cpu, pallas, xla
 from foldgauss.render.reference import render_reference
+from foldgauss.render.rounds import render_rounds
 from foldgauss.render.splats import RenderOptions, Splats2D, check_size
-from foldgauss.render.xla import render_xla
-
-try:
-    from jax.experimental.buffer_callback import buffer_callback
-except ImportError:  # experimental: without it the slower `jax.pure_callback` is used
-    buffer_callback = None
 
 ENGINES = ("auto", "cpu", "xla", "pallas", "reference")
 COMPOSITINGS = ("over", "sum")
@@ -159,12 +155,11 @@ def _run_engine(splats, background, size, compositing, engine, options):
     leaves = tuple(leaf.astype(inner) for leaf in leaves)
     if engine != "cpu" and not len(leaves[2]):
         image = jnp.broadcast_to(leaves[4][None, None, :], (*size, len(leaves[4])))
-    elif engine == "xla":
-        image = render_xla(leaves, size, compositing=compositing, options=options)
-    elif engine == "pallas":
-        image = pallas.render_pallas(leaves, size, compositing=compositing, options=options)
-    else:
+    elif engine == "cpu":
         image = _render_cpu(size, compositing, options, *leaves)
+    else:
+        module = xla if engine == "xla" else pallas
+        image = render_rounds(module.ENGINE, module.choose_plan(leaves, size, compositing, options), leaves)
     return image.astype(dtype)
 
 
@@ -231,7 +226,5 @@ def _call_on_host(function: Callable, shapes, *arrays: jax.Array):
         return out
 
     through_copies = functools.partial(jax.pure_callback, copied, shapes, vmap_method="sequential")
-    if buffer_callback is None:
-        return through_copies(*arrays)
     directly = buffer_callback(in_place, shapes, vmap_method="sequential")
     return jax.lax.platform_dependent(*arrays, cpu=directly, default=through_copies)

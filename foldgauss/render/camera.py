@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, ArrayLike, Float
 
 from foldgauss._numerics.batch import concrete_value
@@ -63,25 +64,6 @@ class Gaussians3D(eqx.Module):
         return cls(mean, jnp.concatenate([plane, across], -2), splats.opacity, splats.color)
 
     @classmethod
-    def from_scale_angle(
-        cls,
-        mean: Float[Array, "num 2"],
-        scale: Float[Array, "num 2"],
-        angle: Float[Array, " num"],
-        opacity: Float[Array, " num"],
-        color: Float[Array, "num channels"],
-        *,
-        thickness: float = THICKNESS,
-    ) -> "Gaussians3D":
-        """Create flat Gaussians from MiraGe's parameters: F = R(angle) diag(s1, s2, thickness).
-
-        The angle, in radians, rotates x (right) towards y (down): clockwise in the image. Source: VeGaS eq:mirage.
-        """
-        cos, sin = jnp.cos(angle), jnp.sin(angle)
-        turn = jnp.stack([jnp.stack([cos, -sin], -1), jnp.stack([sin, cos], -1)], -2)
-        return cls.from_flat(Splats2D(mean, turn * scale[..., None, :], opacity, color), thickness=thickness)
-
-    @classmethod
     def from_quaternions(
         cls,
         mean: Float[Array, "num 3"],
@@ -121,13 +103,7 @@ class Gaussians3D(eqx.Module):
             got=f"{least:g}",
             cure="3DGS stores their logarithms: pass jnp.exp(scale).",
         )
-        w, x, y, z = jnp.moveaxis(_unit(jnp.asarray(quaternion)), -1, 0)
-        rows = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-        rotation = jnp.stack([jnp.stack(row, -1) for row in rows], -2)
+        rotation = Rotation.from_quat(jnp.roll(jnp.asarray(quaternion), -1, axis=-1)).as_matrix()  # x, y, z, w
         return cls(mean, rotation * jnp.asarray(scale)[..., None, :], opacity, color)
 
 
@@ -279,15 +255,12 @@ class Camera(eqx.Module):
         rotation = jnp.matmul(self.rotation, turn.T, precision="highest")
         return dataclasses.replace(self, rotation=rotation, position=position)
 
-    def focal(self, size: tuple[int, int]) -> Float[Array, ""]:
-        """Horizontal focal length in pixels of an image of `size` = (height, width)."""
-        return self._frame_width(size) / (2 * jnp.tan(self.fov / 2))
-
     def intrinsics(self, size: tuple[int, int]) -> Float[Array, "3 3"]:
         """The matrix K in pixels of an image of `size` = (height, width); see `from_matrices`."""
-        focal = self.focal(size)
+        width = self._frame_width(size)
+        focal = width / (2 * jnp.tan(self.fov / 2))
         lens = jnp.asarray([1, 0, 0], focal.dtype) if self.lens is None else self.lens
-        center = jnp.asarray([size[1] / 2, size[0] / 2], lens.dtype) + self._frame_width(size) * lens[1:]
+        center = jnp.asarray([size[1] / 2, size[0] / 2], lens.dtype) + width * lens[1:]
         zero, one = jnp.zeros_like(focal), jnp.ones_like(focal)
         return jnp.stack([focal, zero, center[0], zero, focal * lens[0], center[1], zero, zero, one]).reshape(3, 3)
 
@@ -408,19 +381,11 @@ def _unit(vector: Float[Array, "*batch dim"]) -> Float[Array, "*batch dim"]:
     return vector / _length(vector)
 
 
-def _cos_sin(angle: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Cosine and sine; an angle within rounding of a quarter turn counts as exact: sin(pi) is 0, not 1e-7."""
-    quarters = jnp.round(angle / (math.pi / 2))
-    rest = angle - quarters * (math.pi / 2)
-    rounding = jnp.abs(rest) <= jnp.finfo(angle.dtype).eps * jnp.abs(angle)
-    rest = rest - lax.stop_gradient(jnp.where(rounding, rest, jnp.zeros_like(rest)))
-    cos, sin = jnp.cos(rest), jnp.sin(rest)
-    # By the number of quarters, modulo 4: (cos, sin), (-sin, cos), (-cos, -sin), (sin, -cos).
-    which = jnp.mod(quarters, 4)
-    odd = jnp.mod(quarters, 2) == 1
-    sign_cos = jnp.where((which == 1) | (which == 2), -1.0, 1.0).astype(angle.dtype)
-    sign_sin = jnp.where(which >= 2, -1.0, 1.0).astype(angle.dtype)
-    return sign_cos * jnp.where(odd, sin, cos), sign_sin * jnp.where(odd, cos, sin)
+def _cos_sin(angle: Float[Array, ""]) -> Float[Array, "2"]:
+    """Cosine and sine, 0 where they are within rounding of it: quarter turns are exact."""
+    pair = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+    is_rounding = jnp.abs(pair) <= jnp.finfo(angle.dtype).eps * jnp.abs(angle)
+    return pair - lax.stop_gradient(jnp.where(is_rounding, pair, jnp.zeros_like(pair)))
 
 
 def _check_viewmat(viewmat: Float[Array, "4 4"]) -> None:

@@ -73,28 +73,23 @@ def solve_colors(
             for one, image in zip(frames, images, strict=True)
         ]
 
-    def forward(colors):
-        return render_frames(colors, None)
-
     # The vector-Jacobian product of a linear map is its transpose, wherever it is taken.
     rendered, pull_back = jax.vjp(lambda colors: render_frames(colors, background), start)
 
-    def transpose(frames):
-        return pull_back(frames)[0]
+    def gram(colors):
+        """The product of A^T A and the colors."""
+        return pull_back(render_frames(colors, None))[0]
 
-    row_sums = transpose(forward(jnp.ones_like(start)))
+    row_sums = gram(jnp.ones_like(start))
     damping = ridge * jnp.max(row_sums, initial=0)
-
-    def normal(colors):
-        return transpose(forward(colors)) + damping * colors
 
     def precondition(residual):
         scale = row_sums + damping
         return jnp.where(scale > 0, residual / jnp.where(scale > 0, scale, 1), 0)
 
-    right = transpose(jax.tree.map(jnp.subtract, images, rendered))
+    right, *_ = pull_back(jax.tree.map(jnp.subtract, images, rendered))
     solve = functools.partial(jax.scipy.sparse.linalg.cg, maxiter=max_iterations, tol=tolerance)
-    change, _ = solve(normal, right, M=precondition)
+    change, _ = solve(lambda colors: gram(colors) + damping * colors, right, M=precondition)
     return (start + change).astype(dtype)
 
 

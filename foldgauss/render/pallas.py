@@ -1,7 +1,7 @@
 """The Pallas engine: one GPU program per tile, forward and backward, for `jit`, `grad` and `vmap`.
 
-* *Lists* of splats by tile, in rounds: see `tiles`. The splats' fields are gathered into the order of the lists first,
-  so that a program reads contiguous memory.
+* *Lists* of splats by tile, in rounds: see `tiles` and `rounds`. The splats' fields are gathered into the order of the
+  lists first, so that a program reads contiguous memory.
 * *Compositing.* A program holds the pixels of its tile in registers, traverses its list entry by entry, and stops when
   all of them are finished. Longest lists start first.
 * *Backward*, from the last composited entry to the first. With B the color behind per unit of transmittance, times the
@@ -24,28 +24,9 @@ from jaxtyping import Array, Float
 from foldgauss._runtime.checks import require
 from foldgauss._runtime.device import default_platform
 from foldgauss.render.footprint import cap_alpha, raw_alpha, squared_distance
+from foldgauss.render.rounds import Engine
 from foldgauss.render.splats import RenderOptions
-from foldgauss.render.tiles import (
-    COLOR,
-    MOMENTS,
-    OPACITY,
-    Lists,
-    P,
-    Plan,
-    Q,
-    R,
-    X,
-    Y,
-    checkpoint_rounds,
-    gradients_from_sums,
-    join_tiles,
-    make_canvas,
-    make_lists,
-    make_plan,
-    pack_fields,
-    project,
-    split_tiles,
-)
+from foldgauss.render.tiles import COLOR, OPACITY, Lists, P, Plan, Q, R, X, Y, make_plan
 
 try:  # deprecated since JAX 0.11; the compiler Mosaic GPU supports no loads of single numbers
     from jax.experimental.pallas.triton import CompilerParams
@@ -70,13 +51,6 @@ HIGHEST_CEILING = 0.999
 #: The smallest transmittance at which a pixel is finished: from one that has underflowed to 0 the backward pass could
 #: not go back. Times 1 - HIGHEST_CEILING it is still a normal number of float32.
 LOWEST_STOP = 1e-30
-
-
-def render_pallas(
-    leaves: tuple[Array, ...], size: tuple[int, int], *, compositing: str, options: RenderOptions
-) -> Float[Array, "height width channels"]:
-    """Render (mean, factor, opacity, color, background), all float32; see `render`."""
-    return _render_jit(_plan(leaves, size, compositing, options), leaves)
 
 
 def check_options(options: RenderOptions) -> None:
@@ -114,7 +88,8 @@ def choose_tile_size(size: tuple[int, int], capacity: int | None = None) -> int:
     return SMALL_TILE_SIZE if large < FEW_TILES and small <= (capacity or small) else TILE_SIZE
 
 
-def _plan(leaves, size, compositing, options) -> Plan:
+def choose_plan(leaves, size, compositing, options) -> Plan:
+    """The tiling of an image of (mean, factor, opacity, color, background); see `render`."""
     options = dataclasses.replace(options, transmittance_stop=max(options.transmittance_stop, LOWEST_STOP))
     tile = options.tile_size or choose_tile_size(size, options.list_capacity)
     return make_plan(leaves, size, compositing, options, tile=tile, batch_pixels=1)
@@ -221,104 +196,23 @@ def _like(array: Array) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(array.shape, array.dtype)
 
 
-# ----------------------------------------------------------------------------------- forward and backward
+# ------------------------------------------------------------------------------------------------ rounds
 
 
-def _composite(plan: Plan, lists: Lists, fields, transmittance, color):
-    """Transmittance, colors by channel and last entries, (tiles, pixels) each, after the lists are composited."""
-    shapes = _like(transmittance), tuple(map(_like, color)), jax.ShapeDtypeStruct(transmittance.shape, jnp.int32)
-    entries = fields[lists.splat]
-    return _call(
-        _forward_kernel, plan, shapes, lists.order[:, 0], lists.start, lists.length, entries, transmittance, color
-    )
+def _composite(plan: Plan, lists: Lists, fields, transmittance, planes):
+    """See `rounds.Engine`; the backward pass needs the transmittance behind a round and its last entries."""
+    shapes = _like(transmittance), tuple(map(_like, planes)), jax.ShapeDtypeStruct(transmittance.shape, jnp.int32)
+    arrays = (lists.order[:, 0], lists.start, lists.length, fields[lists.splat], transmittance, planes)
+    transmittance, planes, last = _call(_forward_kernel, plan, shapes, *arrays)
+    return transmittance, planes, (transmittance, last)
 
 
-def _initial_state(plan: Plan, channels: int):
-    """Transmittance, and colors, before compositing."""
-    transmittance = make_canvas(plan, 0, jnp.float32).transmittance.T
-    return transmittance, (jnp.zeros_like(transmittance),) * channels
+def _pull_back(plan: Plan, lists: Lists, fields, needed, grad_planes, behind, sums):
+    """See `rounds.Engine`."""
+    own = jnp.zeros((len(lists.splat), sums.shape[1]), jnp.float32)
+    arrays = (lists.order[:, 0], lists.start, fields[lists.splat], *needed, grad_planes, behind, own)
+    own, behind = _call(_backward_kernel, plan, (_like(own), _like(behind)), *arrays, aliases={7: 0})
+    return sums.at[lists.splat].add(own, mode="drop"), behind
 
 
-def _forward(plan: Plan, leaves):
-    """The number of rounds until no splat or no unfinished pixel was left; transmittance, colors, and of the last round
-    its last entries and lists."""
-    mean, factor, opacity, color, _ = leaves
-    projected = project(plan, mean, factor, opacity)
-    fields = pack_fields(projected, mean, opacity, color)
-
-    def more(carry):
-        return (carry[1] < len(mean)) & jnp.any(carry[2] > plan.stop)
-
-    def composite(carry):
-        number, begin, transmittance, color, _, _ = carry
-        lists, end = make_lists(plan, projected, mean, begin)
-        return number + 1, end, *_composite(plan, lists, fields, transmittance, color), lists
-
-    transmittance, planes = _initial_state(plan, color.shape[1])
-    no_lists = jax.tree.map(
-        lambda spec: jnp.zeros(spec.shape, spec.dtype), jax.eval_shape(lambda: make_lists(plan, projected, mean, 0)[0])
-    )
-    start = jnp.int32(0), jnp.int32(0), transmittance, planes, jnp.zeros(transmittance.shape, jnp.int32), no_lists
-    number, _, *state = jax.lax.while_loop(more, composite, start)
-    return number, *state
-
-
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _render(plan: Plan, leaves):
-    return _render_fwd(plan, leaves)[0]
-
-
-def _render_fwd(plan: Plan, leaves):
-    num, transmittance, color, last, lists = _forward(plan, leaves)
-    planes = [plane + transmittance * own for plane, own in zip(color, leaves[4], strict=True)]
-    return join_tiles(plan, jnp.stack(planes).swapaxes(1, 2)), (leaves, transmittance, last, lists, num)
-
-
-_render_jit = jax.jit(_render, static_argnums=0)
-
-
-def _render_bwd(plan: Plan, residuals, grad_image):
-    leaves, *of_last_round, num = residuals
-    mean, factor, opacity, color, background = leaves
-    projected = project(plan, mean, factor, opacity)
-    fields = pack_fields(projected, mean, opacity, color)
-    grad = split_tiles(plan, grad_image).swapaxes(1, 2)
-    initial, no_colors = _initial_state(plan, 0)
-
-    def attenuate(begin, transmittance):
-        lists, end = make_lists(plan, projected, mean, begin)
-        transmittance, _, _ = _composite(plan, lists, fields[:, :COLOR], transmittance, no_colors)
-        return end, transmittance
-
-    start_of = checkpoint_rounds(plan, initial, num, attenuate)
-
-    def backward_round(carry):
-        number, sums, behind = carry
-
-        def replay():
-            begin, transmittance = start_of(number)
-            lists, _ = make_lists(plan, projected, mean, begin)
-            after, _, last = _composite(plan, lists, fields[:, :COLOR], transmittance, no_colors)
-            return [after, last, lists]
-
-        transmittance, last, lists = jax.lax.cond(number == num - 1, lambda: of_last_round, replay)
-        own, behind = _backward(plan, lists, fields, transmittance, last, grad, behind)
-        return number - 1, sums.at[lists.splat].add(own, mode="drop"), behind
-
-    # Without a row for empty slots: millions of zeros added to a single row took half of a step's time.
-    sums = jnp.zeros((len(mean), MOMENTS + color.shape[1]), jnp.float32)
-    start = num - 1, sums, jnp.sum(grad * background[:, None, None], axis=0)
-    _, sums, _ = jax.lax.while_loop(lambda carry: carry[0] >= 0, backward_round, start)
-    d_background = jnp.sum(of_last_round[0][None] * grad, axis=(1, 2))
-    return ((*gradients_from_sums(projected, sums, factor, opacity), d_background),)
-
-
-def _backward(plan: Plan, lists: Lists, fields, transmittance, last, grad, behind):
-    """Gradient sums of every entry, (capacity, moments and channels), and `behind` with all entries composited."""
-    entries = fields[lists.splat]
-    sums = jnp.zeros((len(entries), MOMENTS + len(grad)), jnp.float32)
-    arrays = (lists.order[:, 0], lists.start, entries, transmittance, last, grad, behind, sums)
-    return _call(_backward_kernel, plan, (_like(sums), _like(behind)), *arrays, aliases={7: 0})
-
-
-_render.defvjp(_render_fwd, _render_bwd)
+ENGINE = Engine(_composite, lambda *before: _composite(*before, ())[2], _pull_back)

@@ -8,14 +8,21 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from foldgauss._runtime.checks import require
+from foldgauss._runtime.checks import is_integer, is_within, require
 
-#: Least support radius in standard deviations: below it a splat is no longer Gaussian.
-SMALLEST_RADIUS = 0.1
-#: Largest support radius in standard deviations: its square is still far from float32's maximum.
-LARGEST_RADIUS = 1e6
 #: Engine "xla" counts (tile, splat) pairs up to one more than this, so that the sum of two counts fits into int32.
 LARGEST_CAPACITY = 2**30 - 2
+#: Valid values of `RenderOptions`. Below a support radius of 0.1 standard deviations a splat is no longer Gaussian; the
+#: square of the largest one is still far from float32's maximum.
+BOUNDS = {
+    "alpha_cutoff": "[1e-8, 1)",
+    "alpha_ceiling": "[0, 1]",
+    "low_pass": "[0, inf)",
+    "transmittance_stop": "[0, 1)",
+    "support_radius": "[0.1, 1e6]",
+    "tile_size": "[4, 32]",
+    "list_capacity": f"[1, {LARGEST_CAPACITY}]",
+}
 
 
 class Splats2D(eqx.Module):
@@ -140,33 +147,17 @@ class RenderOptions:
     list_capacity: int | None = None
 
     def __post_init__(self) -> None:
-        highest = {"alpha_cutoff": 1.0, "alpha_ceiling": 1.0, "low_pass": math.inf, "transmittance_stop": 1.0}
-        for name, high in highest.items():
-            self._check(name, 1e-8 if name == "alpha_cutoff" else 0.0, high, closed=name == "alpha_ceiling")
-        if self.support_radius is not None:
-            self._check("support_radius", SMALLEST_RADIUS, LARGEST_RADIUS, closed=True)
-        for name, low, high in (("tile_size", 4, 32), ("list_capacity", 1, LARGEST_CAPACITY)):
-            value = getattr(self, name)
-            if value is None:
+        for name, bounds in BOUNDS.items():
+            value, whole = getattr(self, name), name in ("tile_size", "list_capacity")
+            if value is None and getattr(type(self), name) is None:
                 continue
             require(
-                isinstance(value, Integral) and not isinstance(value, bool) and low <= value <= high,
+                is_within(value, bounds) and (not whole or is_integer(value, 0)),
                 f"RenderOptions.{name}",
-                expected=f"None or a whole number in [{low}, {high}]",
+                expected=f"a {'whole number' if whole else 'number'} in {bounds}",
                 got=value,
             )
-            object.__setattr__(self, name, int(value))
-
-    def _check(self, name: str, low: float, high: float, *, closed: bool = False) -> None:
-        value = getattr(self, name)
-        within = isinstance(value, Real) and low <= value and (value <= high if closed else value < high)
-        require(
-            within,
-            f"RenderOptions.{name}",
-            expected=f"a number in [{low:g}, {high:g}{']' if closed else ')'}",
-            got=value,
-        )
-        object.__setattr__(self, name, float(value))
+            object.__setattr__(self, name, int(value) if whole else float(value))
 
     @classmethod
     def exact(cls) -> "RenderOptions":

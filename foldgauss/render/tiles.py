@@ -3,11 +3,10 @@
 Every splat is listed in the tiles that its cutoff ellipse reaches: prefix sums assign a slot to each (splat, tile) of a
 bounding box, an exact test drops those that the ellipse misses, and one sort by tile * num + splat groups the slots by
 tile, front to back. The number of slots is static, as XLA requires, but no splat is dropped: those beyond it are
-rendered in further *rounds*, front to back, which continue from the transmittance reached.
+rendered in further *rounds*: see `rounds`.
 """
 
 import functools
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -25,8 +24,6 @@ SLOTS_PER_SPLAT = 16
 SLOTS_PER_TILE = 16
 #: The most slots of one round.
 MAX_SLOTS = 1 << 22
-#: Rounds at whose start the backward pass stores the transmittance; of more rounds, every n-th.
-STORED_ROUNDS = 8
 #: Ellipses are enlarged a little for binning, so that the alpha test alone decides about a pixel.
 SLACK = 1e-3
 #: Sums of slots saturate here, above any capacity.
@@ -251,63 +248,31 @@ def _sort_by_tile(tile, splat, num_tiles: int, num: int):
     return tile.astype(jnp.int32), (key - tile * np.uint32(num)).astype(jnp.int32)
 
 
-# ------------------------------------------------------------------------------------------------ canvas
+# ------------------------------------------------------------------------------------------------ planes
 
 
-class Canvas(NamedTuple):
-    """Pixels by tile, padded to whole batches."""
-
-    transmittance: Float[Array, "pixels tiles"]
-    color: tuple[Float[Array, "pixels tiles"], ...]  # a plane per channel
-
-
-def make_canvas(plan: Plan, channels: int, dtype) -> Canvas:
-    """An empty canvas. Pixels of tiles beyond the image have transmittance 0, so that they count as finished."""
-    pixel, tile = indices(plan.tile**2)[:, None], indices(plan.num_batches * plan.batch)[None, :]
+def initial_transmittance(plan: Plan, dtype) -> Float[Array, "tiles pixels"]:
+    """Tiles are padded to whole batches. Pixels outside the image have transmittance 0: they count as finished."""
+    tile, pixel = indices(plan.num_batches * plan.batch)[:, None], indices(plan.tile**2)[None, :]
     y = tile // plan.grid[1] * plan.tile + pixel // plan.tile
     x = tile % plan.grid[1] * plan.tile + pixel % plan.tile
-    transmittance = ((y < plan.size[0]) & (x < plan.size[1])).astype(dtype)
-    return Canvas(transmittance, tuple(jnp.zeros_like(transmittance) for _ in range(channels)))
+    return ((y < plan.size[0]) & (x < plan.size[1])).astype(dtype)
 
 
-def join_tiles(plan: Plan, planes: Float[Array, "channels pixels tiles"]) -> Float[Array, "height width channels"]:
+def join_tiles(plan: Plan, planes: Float[Array, "channels tiles pixels"]) -> Float[Array, "height width channels"]:
     (rows, columns), tile = plan.grid, plan.tile
-    planes = planes[..., : plan.num_tiles].reshape(len(planes), tile, tile, rows, columns)
-    image = planes.transpose(3, 1, 4, 2, 0).reshape(rows * tile, columns * tile, len(planes))
+    planes = planes[:, : plan.num_tiles].reshape(len(planes), rows, columns, tile, tile)
+    image = planes.transpose(1, 3, 2, 4, 0).reshape(rows * tile, columns * tile, len(planes))
     return image[: plan.size[0], : plan.size[1]]
 
 
-def split_tiles(plan: Plan, image: Float[Array, "height width channels"]) -> Float[Array, "channels pixels tiles"]:
+def split_tiles(plan: Plan, image: Float[Array, "height width channels"]) -> Float[Array, "channels tiles pixels"]:
     """The inverse of `join_tiles`, padded with zeros."""
     (rows, columns), tile, channels = plan.grid, plan.tile, image.shape[-1]
     image = jnp.pad(image, ((0, rows * tile - image.shape[0]), (0, columns * tile - image.shape[1]), (0, 0)))
-    planes = image.reshape(rows, tile, columns, tile, channels).transpose(4, 1, 3, 0, 2)
-    planes = planes.reshape(channels, tile * tile, plan.num_tiles)
-    return jnp.pad(planes, ((0, 0), (0, 0), (0, plan.num_batches * plan.batch - plan.num_tiles)))
-
-
-def checkpoint_rounds(plan: Plan, start, num, attenuate: Callable):
-    """Replay the transmittance of `num` rounds and store checkpoints; returns a function that maps the index of a round
-    to its first splat and the transmittance there, replayed from the last checkpoint before it.
-
-    `start`: transmittance before the first round. `attenuate(begin, transmittance)`: one round; returns the first splat
-    that did not fit, and the transmittance behind it.
-    """
-    stride = jnp.maximum(-(-num // STORED_ROUNDS), 1)
-    last = (num - 1) // stride
-
-    def advance(count, begin, transmittance):
-        return jax.lax.fori_loop(0, count, lambda _, state: attenuate(*state), (begin, transmittance))
-
-    def store(k, carry):
-        begins, stored, begin, transmittance = carry
-        begins, stored = begins.at[k].set(begin), stored.at[k].set(transmittance)
-        return begins, stored, *advance(jnp.where(k < last, stride, 0), begin, transmittance)
-
-    # Those of the first round, which are all that a single one needs.
-    first = jnp.zeros(STORED_ROUNDS, jnp.int32), jnp.broadcast_to(start, (STORED_ROUNDS, *start.shape))
-    begins, stored, *_ = jax.lax.fori_loop(0, jnp.where(num > 1, last + 1, 0), store, (*first, jnp.int32(0), start))
-    return lambda number: advance(number % stride, begins[number // stride], stored[number // stride])
+    planes = image.reshape(rows, tile, columns, tile, channels).transpose(4, 0, 2, 1, 3)
+    planes = planes.reshape(channels, plan.num_tiles, tile * tile)
+    return jnp.pad(planes, ((0, 0), (0, plan.num_batches * plan.batch - plan.num_tiles), (0, 0)))
 
 
 def gradients_from_sums(projected: Projected, sums, factor, opacity):

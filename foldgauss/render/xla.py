@@ -1,13 +1,13 @@
 """The XLA engine: tiled compositing in plain JAX, for `jit`, `grad` and `vmap` on CPU, GPU and TPU.
 
-* *Lists* of splats by tile, in rounds: see `tiles`.
+* *Lists* of splats by tile, in rounds: see `tiles` and `rounds`.
 * *Compositing.* Tiles are processed in batches, longest lists first, so that the tiles of a batch have lists of similar
   length; a batch traverses its lists in chunks and stops when all pixels are finished. Arrays are (pixel of the tile,
   tile): with tiles along the vectors, sums over pixels are whole-vector operations, too.
 * *Backward*, again by batches: forward once more, storing the transmittance at the starts of chunks, then the chunks
   from back to front. With B the color behind per unit of transmittance, times the incoming gradient, dL/dalpha_i =
   T_i (c_i . g - B_i): no division by 1 - alpha, so alpha may be 1. Memory grows with the square root of the longest
-  list only. Rounds are processed from back to front, too; only some of their starts are stored, the others recomputed.
+  list only.
 """
 
 import functools
@@ -20,31 +20,8 @@ from jaxtyping import Array, Float, Int
 
 from foldgauss._runtime.device import default_platform
 from foldgauss.render.footprint import cap_alpha, raw_alpha, squared_distance
-from foldgauss.render.splats import RenderOptions
-from foldgauss.render.tiles import (
-    COLOR,
-    MOMENTS,
-    OPACITY,
-    Canvas,
-    Lists,
-    P,
-    Plan,
-    Projected,
-    Q,
-    R,
-    X,
-    Y,
-    checkpoint_rounds,
-    gradients_from_sums,
-    indices,
-    join_tiles,
-    make_canvas,
-    make_lists,
-    make_plan,
-    pack_fields,
-    project,
-    split_tiles,
-)
+from foldgauss.render.rounds import Engine
+from foldgauss.render.tiles import COLOR, OPACITY, Lists, P, Plan, Q, R, X, Y, indices, make_plan
 
 #: Twice the list entries of 16, but half the pairs of pixel and splat: faster on CPUs.
 TILE_SIZE = 8
@@ -54,14 +31,8 @@ CHUNK = 16
 BATCH_PIXELS = {"cpu": 1 << 14, "other": 1 << 18}
 
 
-def render_xla(
-    leaves: tuple[Array, ...], size: tuple[int, int], *, compositing: str, options: RenderOptions
-) -> Float[Array, "height width channels"]:
-    """Render (mean, factor, opacity, color, background), all of one floating dtype; see `render`."""
-    return _render_jit(_plan(leaves, size, compositing, options), leaves)
-
-
-def _plan(leaves, size, compositing, options) -> Plan:
+def choose_plan(leaves, size, compositing, options) -> Plan:
+    """The tiling of an image of (mean, factor, opacity, color, background); see `render`."""
     pixels = BATCH_PIXELS["cpu" if default_platform() == "cpu" else "other"]
     return make_plan(leaves, size, compositing, options, tile=options.tile_size or TILE_SIZE, batch_pixels=pixels)
 
@@ -128,67 +99,41 @@ def _unroll() -> int:
     return 1 if default_platform() == "cpu" else CHUNK
 
 
-def _composite_batch(plan: Plan, fields, lists: Lists, canvas: Canvas, k) -> Canvas:
+def _composite(plan: Plan, lists: Lists, fields, transmittance, planes):
+    """See `rounds.Engine`; the backward pass needs the transmittance before a round."""
+    composite = functools.partial(_composite_batch, plan, fields, lists)
+    after, planes = jax.lax.fori_loop(0, plan.num_batches, composite, (transmittance, planes))
+    return after, planes, transmittance
+
+
+def _composite_batch(plan: Plan, fields, lists: Lists, k, canvas):
     batch = _select_batch(plan, lists, k, fields.dtype)
 
-    def add(carry, splat):
-        transmittance, color = carry
-        weight = _effective_alpha(plan, transmittance, _raw_alpha(plan, batch, splat)) * transmittance
-        color = tuple(plane + weight * own[None, :] for plane, own in zip(color, splat[COLOR:], strict=True))
-        return (transmittance - weight if plan.over else transmittance, color), None
-
     def walk(carry):
-        chunk, transmittance, color = carry
-        _, splats = _load(batch, lists, fields, chunk)
-        (transmittance, color), _ = jax.lax.scan(add, (transmittance, color), splats, unroll=_unroll())
-        return chunk + 1, transmittance, color
+        chunk, *own = carry
+        return chunk + 1, *_composite_chunk(plan, fields, lists, batch, chunk, *own)
 
     def more(carry):
         return (carry[0] < _num_chunks(batch)) & jnp.any(carry[1] > plan.stop)
 
-    start = jnp.int32(0), canvas.transmittance[:, batch.tiles], tuple(plane[:, batch.tiles] for plane in canvas.color)
-    _, transmittance, color = jax.lax.while_loop(more, walk, start)
-    color = tuple(plane.at[:, batch.tiles].set(own) for plane, own in zip(canvas.color, color, strict=True))
-    return Canvas(canvas.transmittance.at[:, batch.tiles].set(transmittance), color)
+    own = jax.tree.map(lambda plane: plane[batch.tiles].T, canvas)
+    _, *own = jax.lax.while_loop(more, walk, (jnp.int32(0), *own))
+    return jax.tree.map(lambda plane, own: plane.at[batch.tiles].set(own.T), canvas, tuple(own))
 
 
-def _composite_round(plan: Plan, projected: Projected, mean, fields, begin, canvas: Canvas):
-    """Composite the splats that fit into the lists; returns the index of the first that did not, and the canvas."""
-    lists, end = make_lists(plan, projected, mean, begin)
-    composite = functools.partial(_composite_batch, plan, fields, lists)
-    canvas = jax.lax.fori_loop(0, plan.num_batches, lambda k, canvas: composite(canvas, k), canvas)
-    return end, canvas
+def _composite_chunk(plan: Plan, fields, lists: Lists, batch: Batch, chunk, transmittance, color=()):
+    """The transmittance behind a chunk, and the planes of `color` with it."""
+    if not plan.over and not color:
+        return transmittance, color
 
+    def add(carry, splat):
+        transmittance, color = carry
+        weight = _effective_alpha(plan, transmittance, _raw_alpha(plan, batch, splat)) * transmittance
+        color = tuple(plane + weight * own[None, :] for plane, own in zip(color, splat[COLOR:], strict=False))
+        return (transmittance - weight if plan.over else transmittance, color), None
 
-def _forward(plan: Plan, leaves) -> tuple[Int[Array, ""], Canvas]:
-    """The number of rounds until no splat or no unfinished pixel was left, and the canvas."""
-    mean, factor, opacity, color, _ = leaves
-    projected = project(plan, mean, factor, opacity)
-    fields = pack_fields(projected, mean, opacity, color)
-
-    def more(carry):
-        return (carry[1] < len(mean)) & jnp.any(carry[2].transmittance > plan.stop)
-
-    def composite(carry):
-        return carry[0] + 1, *_composite_round(plan, projected, mean, fields, *carry[1:])
-
-    start = jnp.int32(0), jnp.int32(0), make_canvas(plan, color.shape[1], mean.dtype)
-    num, _, canvas = jax.lax.while_loop(more, composite, start)
-    return num, canvas
-
-
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _render(plan: Plan, leaves):
-    return _render_fwd(plan, leaves)[0]
-
-
-def _render_fwd(plan: Plan, leaves):
-    num, canvas = _forward(plan, leaves)
-    planes = [plane + canvas.transmittance * own for plane, own in zip(canvas.color, leaves[4], strict=True)]
-    return join_tiles(plan, jnp.stack(planes)), (leaves, canvas.transmittance, num)
-
-
-_render_jit = jax.jit(_render, static_argnums=0)
+    _, splats = _load(batch, lists, fields, chunk)
+    return jax.lax.scan(add, (transmittance, color), splats, unroll=_unroll())[0]
 
 
 # ---------------------------------------------------------------------------------------------- backward
@@ -202,20 +147,6 @@ def _sum_pixels(plane: Float[Array, "*rest pixels batch"]) -> Float[Array, "*res
     return _sum_pixels(plane[..., :half, :] + plane[..., half:, :])
 
 
-class Checkpoints(NamedTuple):
-    """Transmittance at the starts of chunks, in two levels: of every segment of chunks, and of each chunk in a segment.
-
-    With as many segments as chunks in one, the square root of the longest possible list is enough.
-    """
-
-    segments: Float[Array, "size pixels batch"]
-    chunks: Float[Array, "size pixels batch"]
-
-
-def _num_checkpoints(plan: Plan, num: int) -> int:
-    return math.isqrt(min(num, plan.capacity) // CHUNK) + 1
-
-
 def _store_segments(plan: Plan, fields, lists, batch: Batch, transmittance, stride, segments):
     """Transmittance at every `stride`-th chunk of a batch, and the number of chunks until all pixels are finished."""
 
@@ -226,23 +157,10 @@ def _store_segments(plan: Plan, fields, lists, batch: Batch, transmittance, stri
         chunk, transmittance, stored = carry
         k = chunk // stride
         stored = stored.at[k].set(jnp.where(chunk % stride == 0, transmittance, stored[k]))
-        return chunk + 1, _attenuate(plan, fields, lists, batch, chunk, transmittance), stored
+        return chunk + 1, _composite_chunk(plan, fields, lists, batch, chunk, transmittance)[0], stored
 
     num, _, segments = jax.lax.while_loop(more, walk, (jnp.int32(0), transmittance, segments))
     return num, segments
-
-
-def _attenuate(plan: Plan, fields, lists, batch: Batch, chunk, transmittance):
-    """The transmittance behind a chunk."""
-    if not plan.over:
-        return transmittance
-
-    def add(transmittance, splat):
-        return transmittance - _effective_alpha(
-            plan, transmittance, _raw_alpha(plan, batch, splat)
-        ) * transmittance, None
-
-    return jax.lax.scan(add, transmittance, _load(batch, lists, fields, chunk)[1], unroll=_unroll())[0]
 
 
 def _backward_chunk(plan: Plan, batch: Batch, splats, grad_planes, transmittance, behind):
@@ -284,11 +202,22 @@ def _gradient_sums(plan: Plan, batch: Batch, grad_planes, splat, slope, weight) 
     return jnp.stack([_sum_pixels(plane) for plane in (*rows, *planes)], axis=-1)
 
 
-def _backward_batch(plan: Plan, fields, lists: Lists, transmittance, grad_planes, carry, k):
+def _pull_back(plan: Plan, lists: Lists, fields, transmittance, grad_planes, behind, sums):
+    """See `rounds.Engine`."""
+    # Transmittances at the starts of chunks are stored in two levels: of segments of chunks, and of the chunks of one
+    # segment. With as many segments as chunks in one, the square root of the longest possible list is enough.
+    num = math.isqrt(min(len(sums), plan.capacity) // CHUNK) + 1
+    empty = jnp.zeros((num, plan.tile**2, plan.batch), sums.dtype)
+    backward = functools.partial(_backward_batch, plan, fields, lists, transmittance, grad_planes)
+    sums, behind, *_ = jax.lax.fori_loop(0, plan.num_batches, backward, (sums, behind, empty, empty))
+    return sums, behind
+
+
+def _backward_batch(plan: Plan, fields, lists: Lists, transmittance, grad_planes, k, carry):
     """Add the gradient sums of a batch to the splats'."""
-    sums, behind, (segments, chunks) = carry
+    sums, behind, segments, chunks = carry
     batch = _select_batch(plan, lists, k, fields.dtype)
-    transmittance, grad = transmittance[:, batch.tiles], tuple(plane[:, batch.tiles] for plane in grad_planes)
+    transmittance, grad = transmittance[batch.tiles].T, [plane[batch.tiles].T for plane in grad_planes]
     stride = jnp.maximum(-(-_num_chunks(batch) // len(segments)), 1)
     num, segments = _store_segments(plan, fields, lists, batch, transmittance, stride, segments)
 
@@ -303,7 +232,7 @@ def _backward_batch(plan: Plan, fields, lists: Lists, transmittance, grad_planes
         first, end = segment * stride, jnp.minimum((segment + 1) * stride, num)
 
         def fill(chunk, chunks):
-            transmittance = _attenuate(plan, fields, lists, batch, chunk, chunks[chunk - first])
+            transmittance, _ = _composite_chunk(plan, fields, lists, batch, chunk, chunks[chunk - first])
             return chunks.at[chunk + 1 - first].set(transmittance)
 
         chunks = jax.lax.fori_loop(first, end - 1, fill, chunks.at[0].set(segments[segment]))
@@ -311,40 +240,9 @@ def _backward_batch(plan: Plan, fields, lists: Lists, transmittance, grad_planes
         _, sums, behind = jax.lax.while_loop(lambda carry: carry[0] >= first, walk, (end - 1, sums, behind))
         return segment - 1, sums, behind, chunks
 
-    start = -(-num // stride) - 1, sums, behind[:, batch.tiles], chunks
+    start = -(-num // stride) - 1, sums, behind[batch.tiles].T, chunks
     _, sums, own_behind, chunks = jax.lax.while_loop(lambda carry: carry[0] >= 0, walk_segment, start)
-    return sums, behind.at[:, batch.tiles].set(own_behind), Checkpoints(segments, chunks)
+    return sums, behind.at[batch.tiles].set(own_behind.T), segments, chunks
 
 
-def _render_bwd(plan: Plan, residuals, grad_image):
-    leaves, final_transmittance, num = residuals
-    mean, factor, opacity, color, background = leaves
-    projected = project(plan, mean, factor, opacity)
-    fields = pack_fields(projected, mean, opacity, color)
-    grad_planes = split_tiles(plan, grad_image)
-    behind = jnp.sum(grad_planes * background[:, None, None], axis=0)
-
-    def attenuate(begin, transmittance):
-        end, canvas = _composite_round(plan, projected, mean, fields[:, :COLOR], begin, Canvas(transmittance, ()))
-        return end, canvas.transmittance
-
-    start_of = checkpoint_rounds(plan, make_canvas(plan, 0, mean.dtype).transmittance, num, attenuate)
-
-    def backward_round(carry):
-        number, *state = carry
-        begin, transmittance = start_of(number)
-        lists, _ = make_lists(plan, projected, mean, begin)
-        backward = functools.partial(_backward_batch, plan, fields, lists, transmittance, grad_planes)
-        state = jax.lax.fori_loop(0, plan.num_batches, lambda k, state: backward(state, k), tuple(state))
-        return number - 1, *state
-
-    # Without a row for empty slots: on a GPU, additions to a single row wait for each other.
-    sums = jnp.zeros((len(mean), MOMENTS + color.shape[1]), mean.dtype)
-    empty = jnp.zeros((_num_checkpoints(plan, len(mean)), plan.tile**2, plan.batch), mean.dtype)
-    start = num - 1, sums, behind, Checkpoints(empty, empty)
-    _, sums, *_ = jax.lax.while_loop(lambda carry: carry[0] >= 0, backward_round, start)
-    d_background = jnp.sum(final_transmittance[None, :, :] * grad_planes, axis=(1, 2))
-    return ((*gradients_from_sums(projected, sums, factor, opacity), d_background),)
-
-
-_render.defvjp(_render_fwd, _render_bwd)
+ENGINE = Engine(_composite, lambda plan, lists, fields, transmittance: transmittance, _pull_back)

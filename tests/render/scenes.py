@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from foldgauss.render import Splats2D, render
+from foldgauss.render.camera import THICKNESS, Gaussians3D
 
 #: name: (number, smallest and largest standard deviation in px, lowest and highest opacity, picture size). Most are of
 #: one number and size, so that they are compiled once.
@@ -36,6 +37,14 @@ def scene(kind: str = "plain", *, seed: int = 0, dtype=np.float32) -> tuple[Spla
     turn = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
     leaves = mean, turn * scale, rng.uniform(*opacities, num), rng.uniform(0, 1, (num, 3))
     return Splats2D(*(jnp.asarray(leaf, dtype) for leaf in leaves)), (height, width)
+
+
+@jax.jit
+def from_scale_angle(mean, scale, angle, opacity, color, *, thickness=THICKNESS) -> Gaussians3D:
+    """Flat Gaussians by MiraGe's parameters, F = R(angle) diag(s1, s2, thickness) (VeGaS eq:mirage)."""
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    turn = jnp.stack([jnp.stack([cos, -sin], -1), jnp.stack([sin, cos], -1)], -2)
+    return Gaussians3D.from_flat(Splats2D(mean, turn * scale[..., None, :], opacity, color), thickness=thickness)
 
 
 #: A picture as one compiled program.

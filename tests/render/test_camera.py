@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import draw
+from scenes import draw, from_scale_angle
 
 from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.render.camera import TANGENT_LIMIT, Camera, Gaussians3D, project, square_factor
@@ -21,7 +21,6 @@ SMOOTH = RenderOptions(alpha_cutoff=1e-8, transmittance_stop=0.0)
 view = jax.jit(project, static_argnames=("size", "order", "near"))
 #: The orthogonal projection on the plane z = 0.
 flatten = jax.jit(lambda of: Splats2D(of.mean[:, :2], square_factor(of.factor[:, :2]), of.opacity, of.color))
-from_scale_angle = jax.jit(Gaussians3D.from_scale_angle)
 flat_factor = jax.jit(square_factor)
 orbit, look_at = jax.jit(Camera.orbit), jax.jit(Camera.look_at, static_argnames="aspect")
 
@@ -64,7 +63,7 @@ def test_front_camera_is_to_pixels(aspect, size):
         flat, camera = flatten(gaussians).to_pixels(size, aspect=aspect), Camera.front(aspect)
         seen = view(gaussians, camera, size)
         np.testing.assert_allclose(seen.mean, flat.mean, atol=1e-10)
-        focal = float(camera.focal(size))
+        focal = float(camera.intrinsics(size)[0, 0])
         limit = TANGENT_LIMIT * np.asarray([size[1], size[0]]) / 2 / focal
         tangent = np.clip((np.asarray(flat.mean) - [size[1] / 2, size[0] / 2]) / focal, -limit, limit)
         across = 1e-3 * focal / -float(camera.position[2]) * tangent
@@ -78,7 +77,7 @@ def test_published_geometry():
     """Camera at distance 1, half-width 0.36, in the published unit; ours is the frame's width."""
     camera = Camera.front(0.5)
     np.testing.assert_allclose(camera.position, [0, 0, -0.5 / math.tan(0.6911112 / 2)], rtol=1e-6)
-    np.testing.assert_allclose(camera.focal((640, 1280)), 1280 / (2 * math.tan(0.6911112 / 2)), rtol=1e-6)
+    np.testing.assert_allclose(camera.intrinsics((640, 1280))[0, 0], 1280 / (2 * math.tan(0.6911112 / 2)), rtol=1e-6)
     assert float(-0.5 / camera.position[2]) == pytest.approx(0.36, abs=1e-6)
 
 
@@ -94,13 +93,6 @@ def test_to_flat_inverts_from_flat(thickness):
     np.testing.assert_allclose(covariance(back), covariance(splats), rtol=2e-6, atol=2e-6)
     for name in ("mean", "opacity", "color"):
         np.testing.assert_array_equal(getattr(back, name), getattr(splats, name))
-
-
-def test_mirage_parameters():
-    """eq:mirage, by hand: a quarter turn lays the first axis along y."""
-    one = (jnp.asarray([[0.1, 0.2]]), jnp.asarray([[3.0, 1.0]]), jnp.asarray([math.pi / 2]), jnp.ones(1))
-    gaussians = Gaussians3D.from_scale_angle(*one, jnp.ones((1, 3)), thickness=0.25)
-    np.testing.assert_allclose(gaussians.factor[0], [[0, -1, 0], [3, 0, 0], [0, 0, 0.25]], atol=1e-6)
 
 
 # --- the mirror ------------------------------------------------------------------------------------------------
@@ -406,10 +398,10 @@ def test_dtypes():
         (lambda: project(flat_scene(), Camera.front(0.5), SIZE, order="back"), "order"),
         (lambda: project(flat_scene(), Camera.front(0.5), SIZE, near=-1.0), "near"),
         (lambda: project(flat_scene(), Camera.front(0.5), (0, 5)), "size"),
-        (lambda: Camera.front(0.5).focal((160.0, 320)), "size"),
         (lambda: Camera.front(0.5).orbit("x"), "^azimuth: expected an angle in radians, got 'x'"),
         (lambda: Camera.front(0.5).orbit(0.1, target=(0, 0)), r"^target: expected \(x, y, z\), got \(0, 0\)"),
         (lambda: Camera(jnp.eye(3), jnp.zeros(3), jnp.ones(()), lens=jnp.ones(2)), "rotation, position, fov, lens"),
+        (lambda: Camera.front(0.5).intrinsics((160.0, 320)), "size"),
         (
             lambda: project(jax.tree.map(lambda x: x[None], flat_scene()), Camera.front(0.5), SIZE),
             "jax.vmap",

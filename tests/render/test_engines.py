@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scenes import KINDS, check_slopes, draw, scene
 
-from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, api, cpu, project, render
+from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, cpu, project, render
 
 #: Engine "pallas" takes no ceiling of 1 and, interpreted, long to compile: test_pallas.py. Here "auto" is "cpu".
 OTHERS = ["cpu", "xla", "reference"]
@@ -392,14 +392,14 @@ def test_other_types_raise(call, message):
 @pytest.mark.parametrize(
     "channels", [pytest.param(1, marks=pytest.mark.slow), 3, pytest.param(5, marks=pytest.mark.slow)]
 )
-def test_fallback_callback_renders_the_same(channels, monkeypatch):
-    """Where JAX no longer has `buffer_callback`."""
+def test_callback_with_copies_renders_the_same(channels, monkeypatch):
+    """As where the default device is no CPU."""
     splats, size = scene("plain")
     color = jnp.asarray(np.random.default_rng(0).uniform(size=(len(splats.mean), channels)), jnp.float32)
     splats = dataclasses.replace(splats, color=color)
     draw = jax.value_and_grad(lambda own: jnp.sum(render(own, size, engine="cpu") ** 2))
     value, gradient = draw(splats)
-    monkeypatch.setattr(api, "buffer_callback", None)
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *arrays, cpu, default: default(*arrays))
     jax.clear_caches()
     again, same = draw(splats)
     assert value == again

@@ -8,7 +8,7 @@ import pytest
 from scenes import KINDS, draw, scene
 from test_engines import BACKGROUND, OPTIONS, grads_and_picture, judged, weights_for
 
-from foldgauss.render import RenderOptions, Splats2D, pallas, render, tiles
+from foldgauss.render import RenderOptions, Splats2D, pallas, render, rounds, tiles
 
 QUICK = [("plain", "sum", "sharp")]  # "over" is that of several rounds
 CASES = [
@@ -44,7 +44,7 @@ def test_small_images_have_small_tiles():
     assert sides == [8, 8, 16, 16, 16]
     leaves = *jax.tree.leaves(scene("plain")[0]), BACKGROUND
     for given, side in ({}, 8), ({"tile_size": 32}, 32), ({"list_capacity": 40}, 8), ({"list_capacity": 39}, 16):
-        assert pallas._plan(leaves, (40, 60), "over", RenderOptions(**given)).tile == side
+        assert pallas.choose_plan(leaves, (40, 60), "over", RenderOptions(**given)).tile == side
 
 
 @pytest.mark.slow
@@ -55,8 +55,8 @@ def test_several_rounds_equal_one(tile):
     judgement = judged("plain", "over", "default")
     options = RenderOptions(list_capacity=-(-size[0] // tile) * -(-size[1] // tile), tile_size=tile)  # the least
     leaves = *jax.tree.leaves(splats), BACKGROUND
-    plan = pallas._plan(leaves, size, "over", options)
-    assert tiles._count_slots(plan, *leaves[:3]) > tiles.STORED_ROUNDS * plan.capacity  # so many rounds and more
+    plan = pallas.choose_plan(leaves, size, "over", options)
+    assert tiles._count_slots(plan, *leaves[:3]) > rounds.STORED_ROUNDS * plan.capacity  # so many rounds and more
     grads, picture = grads_and_picture(
         "pallas", size, "over", options, splats, BACKGROUND, weights_for(size, judgement[0])
     )

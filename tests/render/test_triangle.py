@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import from_scale_angle
 
 from foldgauss.render import Splats2D
 from foldgauss.render.camera import Gaussians3D
 from foldgauss.render.triangle import Triangles
 
 #: As compiled programs: of separate operations each would be compiled for each shape. Most Gaussians are 200.
-from_scale_angle = jax.jit(Gaussians3D.from_scale_angle)
 triangles_of, gaussians_of = jax.jit(Triangles.from_gaussians), jax.jit(Triangles.to_gaussians)
 from_flat, from_vertices = jax.jit(Gaussians3D.from_flat), jax.jit(Triangles.from_vertices)
 

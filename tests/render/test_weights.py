@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from foldgauss.render import RenderOptions, cpu
-from foldgauss.render.weights import build_weight_matrix
+from foldgauss.render.cpu import build_weight_matrix
 
 SIZE = 37, 52  # tiles cut off on both sides
 

@@ -12,7 +12,7 @@ from scenes import check_slopes, scene
 from scenes import draw as compiled_draw
 from test_engines import BACKGROUND, LEAVES, grads_and_picture, weights_for
 
-from foldgauss.render import RenderOptions, Splats2D, render, tiles, xla
+from foldgauss.render import RenderOptions, Splats2D, render, rounds, tiles, xla
 
 draw = functools.partial(render, engine="xla", background=BACKGROUND)
 
@@ -77,10 +77,10 @@ def test_a_few_wide_splats_take_one_round_inside_jit():
     num = 12
     leaves = rng.uniform(0, 320, (num, 2)), np.tile(300 * np.eye(2), (num, 1, 1)), np.full(num, 0.1), np.ones((num, 3))
     leaves = [jnp.asarray(leaf, jnp.float32) for leaf in (*leaves, BACKGROUND)]
-    jax.eval_shape(lambda leaves: plans.append(xla._plan(leaves, size, "over", RenderOptions())), leaves)
-    _, (*_, rounds) = jax.jit(xla._render_fwd, static_argnums=0)(plans[0], leaves)
-    assert int(rounds) == 1
-    jax.eval_shape(lambda leaves: plans.append(xla._plan(leaves, (8, 8), "over", RenderOptions())), leaves)
+    jax.eval_shape(lambda leaves: plans.append(xla.choose_plan(leaves, size, "over", RenderOptions())), leaves)
+    _, (*_, count) = jax.jit(rounds.render_forward, static_argnums=(0, 1))(xla.ENGINE, plans[0], leaves)
+    assert int(count) == 1
+    jax.eval_shape(lambda leaves: plans.append(xla.choose_plan(leaves, (8, 8), "over", RenderOptions())), leaves)
     assert plans[1].capacity < 2 * num  # but no more than that
 
 
@@ -90,16 +90,17 @@ def test_backward_is_linear_in_rounds(capacity, most, monkeypatch):
     """A round is drawn again from a start that was kept, not from the first; the gradient is that of one round."""
     splats, size = scene("huge")
     leaves, weights = leaves_of(splats), weights_for(size)
-    calls, grads = counted(monkeypatch, "_composite_round"), []
+    calls, grads = counted(monkeypatch, "_composite"), []
+    engine = xla.ENGINE._replace(composite=xla._composite)
     for options in (RenderOptions(), RenderOptions(list_capacity=capacity)):
-        plan = xla._plan(leaves, size, "over", options)
+        plan = xla.choose_plan(leaves, size, "over", options)
         del calls[:]
-        _, residuals = xla._render_fwd(plan, leaves)
-        grads.append(jax.tree.leaves(xla._render_bwd(plan, residuals, weights)))
+        _, residuals = rounds.render_forward(engine, plan, leaves)
+        grads.append(jax.tree.leaves(rounds.render_backward(engine, plan, residuals, weights)))
         jax.effects_barrier()
-        rounds = int(residuals[-1])
-        assert rounds <= len(calls) <= most * rounds
-    assert rounds > 4
+        num = int(residuals[-1])
+        assert num <= len(calls) <= most * num
+    assert num > 4
     check_same(*grads, 1e-5)
 
 
@@ -111,8 +112,8 @@ def test_pixels_outside_the_image_count_as_finished(monkeypatch):
         BACKGROUND
     ]
     calls = counted(monkeypatch, "_load")
-    plan = xla._plan(leaves, size, "over", RenderOptions())
-    picture, _ = jax.jit(lambda leaves: xla._render_fwd(plan, leaves))(leaves)
+    plan = xla.choose_plan(leaves, size, "over", RenderOptions())
+    picture, _ = jax.jit(lambda leaves: rounds.render_forward(xla.ENGINE, plan, leaves))(leaves)
     jax.effects_barrier()
     assert picture.shape == (*size, 3)
     assert 0 < len(calls) < num / xla.CHUNK / 4
@@ -202,10 +203,23 @@ def test_retraces():
         traces.append(None)
         return draw(splats, size)
 
-    before = xla._render_jit._cache_size()
+    before = rounds.render_rounds._cache_size()
     for shift in (0.0, 0.5, 1.0):
         moved = dataclasses.replace(splats, mean=splats.mean + shift)
         step(moved)
         draw(moved, size)
     assert len(traces) == 1
-    assert xla._render_jit._cache_size() <= before + 2  # one inside the jitted step, one eager
+    assert rounds.render_rounds._cache_size() <= before + 2  # one inside the jitted step, one eager
+
+
+@pytest.mark.slow
+def test_vmap_of_gradients():
+    """A batch of different scenes: each one's lists and rounds are its own."""
+    splats, size = scene("plain")
+    others = Splats2D(splats.mean[::-1] * 0.5, splats.factor * 2, splats.opacity, splats.color)
+    stack = jax.tree.map(lambda *leaves: jnp.stack(leaves), splats, others)
+    options = RenderOptions(list_capacity=256)
+    gradient = jax.grad(lambda s: jnp.sum(draw(s, size, options=options) ** 2))
+    together = jax.vmap(gradient)(stack)
+    for k, one in enumerate((splats, others)):
+        check_same([leaf[k] for leaf in jax.tree.leaves(together)], jax.tree.leaves(gradient(one)), 1e-5)

@@ -27,8 +27,8 @@ from foldgauss.video import (
     select,
 )
 from foldgauss.video.editing.chain import MAX_DISTANCE
+from foldgauss.video.models.conditioning import PreparedModel
 from foldgauss.video.models.frame_times import make_time_logits
-from foldgauss.video.models.prepared import PreparedModel
 from foldgauss.video.models.renderer import VideoRenderer
 
 MODEL = soft_model()
@@ -582,7 +582,7 @@ WRONG = {
     "size of copies": (lambda: E.multiply([(0, 0)], scale=0), "scale: expected numbers > 0"),
     "originals": (lambda: E.multiply([(0, 0)], originals="yes"), "originals: expected True or False"),
     "delays": (lambda: E.multiply([(0, 0)], delays=(1, 2)), "delays: expected one number or 1"),
-    "color": (lambda: E.recolor((1, 2)), "color: expected 3 finite"),
+    "color": (lambda: E.recolor((1, 2)), "color: expected red, green and blue in"),
     "dark color": (lambda: E.recolor((1, 2, -1)), "color: expected red, green and blue in"),
     "no way": (lambda: E.recolor(), "color, hue, gain: expected color, hue, or gain"),
     "two ways": (lambda: E.recolor((1, 0, 0), hue=0.1), "color, hue, gain: expected color, hue, or gain"),

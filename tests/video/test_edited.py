@@ -16,7 +16,7 @@ from foldgauss.io import ModelFileError, load_video_model, save_video_model
 from foldgauss.io.models.model_file import read_header
 from foldgauss.render import Camera, Gaussians3D, RenderOptions, project, render
 from foldgauss.video import Clock, EditedVideo, VideoModel, edit, layers
-from foldgauss.video.models.prepared import PreparedModel
+from foldgauss.video.models.conditioning import PreparedModel
 from foldgauss.video.models.renderer import VideoRenderer
 
 MODEL = soft_model(options=RenderOptions())

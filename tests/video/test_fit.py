@@ -39,7 +39,7 @@ from foldgauss.video.fitting.loop import start, start_from, to_model
 from foldgauss.video.fitting.steppers import cpu_stepper, interpolated_frames
 from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
 from foldgauss.video.fitting.steppers.loss import border_weights
-from foldgauss.video.models.prepared import PreparedModel
+from foldgauss.video.models.conditioning import PreparedModel
 
 CONFIG = FitConfig(num_gaussians=800, steps=60)
 

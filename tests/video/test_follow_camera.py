@@ -212,7 +212,7 @@ def test_a_camera_that_shakes_for_a_while_is_followed():
     steps[1:] = maps[1:] @ np.linalg.inv(maps[:-1])
     places = np.tile(0.3 * np.array([[x, y] for x in (-1, 1) for y in (-1, 1)]), (30, 1, 1))
     assert np.median(clip.measure_changes(steps, places)[2:-2]) < 1e-12
-    np.testing.assert_array_equal(clip.keep_unsteady(steps), steps)
+    np.testing.assert_array_equal(clip.keep_unsteady(steps, steps), steps)
 
 
 def test_shots_with_a_steady_camera_have_coordinates_of_their_frames():

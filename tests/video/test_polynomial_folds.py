@@ -11,7 +11,7 @@ from soft_models import NUM, OBJECT, soft_model
 
 from foldgauss.io import read_vegas_ply, write_vegas_ply
 from foldgauss.video import FrameTimes, without_paths
-from foldgauss.video.models.prepared import PreparedModel
+from foldgauss.video.models.conditioning import PreparedModel
 from foldgauss.video.models.shared_paths import SharedPaths
 
 

@@ -10,11 +10,10 @@ from jaxtyping import Float, Float64
 
 from foldgauss._runtime.checks import invalid
 from foldgauss.render import cpu
-from foldgauss.render.weights import build_weight_matrix
 from foldgauss.uncertainty.likelihood.noise import FrameNoise
 from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.video.models.background import BLACK
-from foldgauss.video.models.prepared import PreparedModel
+from foldgauss.video.models.conditioning import PreparedModel
 from foldgauss.video.models.splats import SH_C0
 
 #: Frames whose Gram matrices are computed at once.
@@ -52,7 +51,7 @@ class ColorEquations:
         alive = self._prepared.at(t)
         leaves = alive.mean, alive.factor, alive.opacity, alive.color, _behind
         model = self.residuals.model
-        found = build_weight_matrix(
+        found = cpu.build_weight_matrix(
             cpu.forward(*leaves, model.size, compositing=model.compositing, options=model.options)
         )
         indices = alive.alive.astype(np.int32)[found.indices]

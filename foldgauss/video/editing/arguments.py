@@ -58,13 +58,6 @@ def broadcast_numbers(parameter: str, values: ArrayLike, num: int) -> tuple[floa
     return numbers if len(numbers) == num else numbers * num
 
 
-def check_color(color: ArrayLike) -> tuple[float, ...]:
-    """Red, green and blue. Raises ValueError unless all are in [0, 1]."""
-    rgb = check_numbers("color", color, 3)
-    require(min(rgb) >= 0 and max(rgb) <= 1, "color", expected="red, green and blue in [0, 1]", got=rgb)
-    return rgb
-
-
 def check_color_map(
     gain: ArrayLike | None, offset: ArrayLike | None, matrix: ArrayLike | None
 ) -> tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]:

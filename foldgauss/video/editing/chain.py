@@ -23,7 +23,6 @@ from foldgauss.render import Camera
 from foldgauss.video.editing.arguments import (
     broadcast_numbers,
     check_array,
-    check_color,
     check_color_map,
     check_number,
     check_numbers,
@@ -40,8 +39,16 @@ from foldgauss.video.editing.bake import (
     opacities_and_colors,
     scale_opacity,
 )
-from foldgauss.video.editing.edited_video import EditedVideo, Layer, as_edited
-from foldgauss.video.editing.layer_edits import Bake, add_edit, apply_edit, can_delete, gather_layer
+from foldgauss.video.editing.edited_video import (
+    Bake,
+    EditedVideo,
+    Layer,
+    add_edit,
+    apply_edit,
+    as_edited,
+    can_delete,
+    gather_layer,
+)
 from foldgauss.video.editing.overlays import (
     IDENTITY,
     LUMINANCE_WEIGHTS,
@@ -57,7 +64,8 @@ from foldgauss.video.editing.overlays import (
     TriangleFunction,
     polar_decompose,
 )
-from foldgauss.video.editing.timing import NEVER, Clock, Span, TimeMap, When, check_clock, frame_times_of, make_span
+from foldgauss.video.editing.timing import NEVER, Clock, Span, TimeMap, When, frame_times_of, make_span
+from foldgauss.video.models.background import check_color
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.selection.selectors import Mask, Selection, check_mask, select, split_mask
 
@@ -295,9 +303,8 @@ class Edit:
             return self if originals else dataclasses.replace(self, selection=self.selection - self.selection)
         copied, copies = self._add_copies(len(shifts))
         for size, turn, shift, delay, mask in zip(sizes, angles, shifts, delays, copies, strict=True):
-            one, still = dataclasses.replace(copied, selection=Selection(mask)), (0.0, 0.0)
-            one = one._map(0.0, ((size, 0.0), (0.0, size)), still, about, when)
-            one = one._map(turn, IDENTITY, still, about, when)._map(0.0, IDENTITY, shift, None, when)
+            one = dataclasses.replace(copied, selection=Selection(mask))
+            one = one._map(turn, ((size, 0.0), (0.0, size)), shift, about, when)
             one = one._retime_linearly(delay, 1.0, 0.0, when, "delays")
             if span is not None:
                 one = one._edit_layers(lambda layer, mask: add_edit(layer, Opacity(mask, span, factor=1.0, before=0.0)))
@@ -383,7 +390,7 @@ class Edit:
         if hue is not None:
             check_within("hue", hue, "[0, 1]", "turns in [0, 1], degrees over 360")
         if color is not None:
-            rgb = check_color(color)
+            rgb = check_color("color", color)
             self._check_selected()
             matrix, gain = np.outer(rgb, LUMINANCE_WEIGHTS), 1 / mean_lightness([self._sum_lightness()])
         hue = None if hue is None else check_number("hue", hue)
@@ -422,7 +429,10 @@ class Edit:
         **Units:** times in [0, 1]; n evenly timed frames lie 1 / (n - 1) apart.
         """
         if clock is not None:
-            check_clock(clock, (shift, stretch, about) != (0, 1, 0))
+            line = (shift, stretch, about)
+            require(line == (0, 1, 0), "clock", expected="a clock, or shift, stretch and about", got="both")
+            cure = "Clock(times, own_times) is linear between knots." if callable(clock) else ""
+            require(isinstance(clock, Clock), "clock", expected="a Clock", got=type(clock).__name__, cure=cure)
             return self._retime_by_clock(clock, when, "clock")
         Clock.shifted(shift, stretch, about=about)  # checks them
         warn_if_outside_clip("shift", shift, stretch, about, len(self._frame_times))

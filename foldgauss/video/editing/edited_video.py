@@ -1,4 +1,4 @@
-"""Edited videos: layers of models with overlays and clocks, rendered as one video."""
+"""Edited videos: layers of models with overlays and clocks, their edits, and their rendering as one video."""
 
 import dataclasses
 import os
@@ -9,22 +9,31 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from foldgauss._runtime.checks import is_integer, require
 from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, pixels_per_unit, project
 from foldgauss.video.editing.overlays import (
+    IDENTITY,
     AbstractOverlay,
+    Affine,
+    Opacity,
+    Recolor,
     Retiming,
     SelectedGaussians,
+    TimedEdit,
     is_active,
     pad_rows,
     padded_size,
 )
+from foldgauss.video.models.conditioning import PreparedModel
 from foldgauss.video.models.frame_times import is_cut, snap_to_shots
-from foldgauss.video.models.prepared import PreparedModel
 from foldgauss.video.models.renderer import FollowingVideo, PreparedVideo
+from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import ONE_SEGMENT, VideoModel
+from foldgauss.video.selection.selectors import Mask
+
+Bake = Callable[[FoldedSplats, Mask], FoldedSplats | None]
 
 
 class Layer(eqx.Module):
@@ -57,6 +66,78 @@ class Layer(eqx.Module):
         """Whether some frame is shown for times around it: next to a cut, or where there is only one frame."""
         times = self.model.frame_times.times()
         return len(times) == 1 or bool(np.asarray(is_cut(times)).any())
+
+
+def apply_edit(layer: Layer, edit: TimedEdit, bake: Bake | None = None) -> Layer:
+    """Bake an edit into the layer's model where `bake` can, else add it as an overlay or a clock."""
+    mask = np.asarray(edit.mask)
+    if not mask.any():
+        return layer
+    for overlay in layer.overlays if isinstance(edit, Retiming) else ():
+        require(
+            not _depends_on_all(overlay) or not _overlaps_partly(overlay, mask),
+            "selection",
+            expected="all Gaussians of an edit about their own center, or none of them",
+            got="a part of them",
+            cure="Retime it before that edit.",
+        )
+    splats = bake(layer.model.splats, mask) if bake is not None and _may_bake(layer, edit) else None
+    if splats is None:
+        return add_edit(layer, edit)
+    return dataclasses.replace(layer, model=dataclasses.replace(layer.model, splats=splats))
+
+
+def add_edit(layer: Layer, edit: TimedEdit) -> Layer:
+    """Add an overlay or a clock after those of the layer, if it has Gaussians."""
+    if not np.asarray(edit.mask).any():
+        return layer
+    name = "clocks" if isinstance(edit, Retiming) else "overlays"
+    return dataclasses.replace(layer, **{name: (*getattr(layer, name), edit)})
+
+
+def gather_layer(
+    layer: Layer, source: Int[np.ndarray, " num_new"], selected: Mask, copy: Int[np.ndarray, " num_new"] | None = None
+) -> Layer:
+    """A layer of the Gaussians at the indices `source`, with their edits; `copy`: 0 for originals, k for a k-th copy.
+
+    An overlay of `selected` Gaussians becomes one overlay for each copy, since each copy has its own center.
+    """
+    copy = np.zeros(len(source), int) if copy is None else copy
+    overlays = []
+    for overlay in layer.overlays:
+        mask = np.asarray(overlay.mask)
+        numbers = range(copy.max(initial=0) + 1) if (mask & selected).any() else [None]
+        masks = [mask[source] if k is None else mask[source] & (copy == k) for k in numbers]
+        overlays += [dataclasses.replace(overlay, mask=one) for one in masks if one.any()]
+    clocks = [dataclasses.replace(clock, mask=np.asarray(clock.mask)[source]) for clock in layer.clocks]
+    model = dataclasses.replace(layer.model, splats=layer.model.splats.take(source))
+    return Layer(model, tuple(overlays), tuple(clock for clock in clocks if clock.mask.any()))
+
+
+def can_delete(layer: Layer, mask: Mask) -> bool:
+    """Whether the edits of the remaining Gaussians stay the same: each overlay is of masked Gaussians only, or none."""
+    return not any(_overlaps_partly(overlay, mask) for overlay in layer.overlays)
+
+
+def _may_bake(layer: Layer, edit: TimedEdit) -> bool:
+    """Whether the parameters may be changed: always, before other edits of the same Gaussians are applied."""
+    if isinstance(edit, Affine) and edit.stretch != IDENTITY and layer.model.scale_cutoff > 0:
+        return False  # the cutoff would leave out Gaussians at other times
+    earlier = layer.clocks if isinstance(edit, Retiming) else layer.overlays
+    return edit.span is None and not any((np.asarray(other.mask) & edit.mask).any() for other in earlier)
+
+
+def _depends_on_all(overlay: AbstractOverlay) -> bool:
+    """Whether the edit of one Gaussian depends on the others of the overlay."""
+    if isinstance(overlay, Opacity | Recolor) or (isinstance(overlay, Affine) and overlay.is_translation):
+        return False
+    return getattr(overlay, "about", None) is None  # functions have none
+
+
+def _overlaps_partly(overlay: AbstractOverlay, mask: Mask) -> bool:
+    """Whether some, but not all, of an overlay's Gaussians are masked."""
+    own = np.asarray(overlay.mask)
+    return bool((own & mask).any() and (own & ~mask).any())
 
 
 class EditedVideo(FollowingVideo, eqx.Module):
@@ -118,14 +199,13 @@ def stack_layers(*videos: VideoModel | EditedVideo, timeline: int = -1) -> Edite
     parts = [as_edited(video) for video in videos]
     require(parts, "videos", expected="at least one", got="none")
     check_timeline(timeline, len(parts), "videos")
-    for part in parts:
-        require(
-            part.camera is None,
-            "videos",
-            expected="videos without a camera",
-            got="one with its own",
-            cure="Stack the layers first, then call edit(...).seen_from(camera).",
-        )
+    require(
+        all(part.camera is None for part in parts),
+        "videos",
+        expected="videos without a camera",
+        got="one with its own",
+        cure="Stack the layers first, then call edit(...).seen_from(camera).",
+    )
     timeline %= len(parts)
     before = sum(len(part.layers) for part in parts[:timeline])
     inner = parts[timeline].timeline % len(parts[timeline].layers)
@@ -201,32 +281,27 @@ class PreparedEditedVideo(PreparedVideo):
 
     def splats(self, t: float) -> Splats2D:
         """The splats of time t, front to back; NumPy leaves."""
-        t = float(t)
-        layers = [layer.condition(t) for layer in self._layers]
+        layers = [layer.condition(float(t)) for layer in self._layers]
         if self._camera is not None:
             for layer in layers:
                 layer.lift_all()
-        if not any(layer.in_space for layer in layers):
-            return _concatenate(layers)
-        camera = self._camera_at(t)
-        for layer in layers:
-            layer.project(camera, self._size)
-        depth = np.concatenate([layer.depth for layer in layers])
-        nearest_first = np.argsort(np.abs(depth - float(camera.position[2])), kind="stable")
-        return jax.tree.map(lambda leaf: leaf[nearest_first], _concatenate(layers))
+        camera = self._camera_at(float(t)) if any(layer.in_space for layer in layers) else None
+        if camera is not None:
+            for layer in layers:
+                layer.project(camera, self._size)
+        parts = [layer.visible() for layer in layers]
+        *leaves, depth = parts[0] if len(parts) == 1 else map(np.concatenate, zip(*parts, strict=True))
+        if camera is not None:
+            nearest_first = np.argsort(np.abs(depth - float(camera.position[2])), kind="stable")
+            leaves = [leaf[nearest_first] for leaf in leaves]
+        return Splats2D(*leaves)
 
     def _camera_at(self, t: float) -> Camera:
         camera = self._camera
-        if camera is None or isinstance(camera, Camera):
-            return self._front() if camera is None else camera
-        camera_at_t = camera(t)
-        require(isinstance(camera_at_t, Camera), "camera(t)", expected="a Camera", got=type(camera_at_t).__name__)
-        return camera_at_t
-
-
-def _concatenate(layers: list["_ConditionedLayer"]) -> Splats2D:
-    parts = [(layer.mean, layer.factor, layer.opacity, layer.color) for layer in layers]
-    return Splats2D(*(parts[0] if len(parts) == 1 else map(np.concatenate, zip(*parts, strict=True))))
+        if callable(camera):
+            camera = camera(t)
+            require(isinstance(camera, Camera), "camera(t)", expected="a Camera", got=type(camera).__name__)
+        return self._front() if camera is None else camera
 
 
 class _PreparedLayer:
@@ -245,7 +320,6 @@ class _PreparedLayer:
             progress = overlay.progress(t)
             if is_active(overlay, progress):
                 conditioned.edit(mask, partial(overlay, t=t, progress=progress))
-        conditioned.drop_transparent()
         return conditioned
 
     def _gaussians(self, t: float) -> tuple[np.ndarray, ...]:
@@ -287,18 +361,37 @@ class _ConditionedLayer:
     def edit(self, mask: Bool[np.ndarray, " num"], change: Callable[[SelectedGaussians], SelectedGaussians]) -> None:
         """Edit the selected Gaussians; all others keep their bits."""
         selected = np.flatnonzero(mask[self.index])
-        if selected.size:
-            before = self._take(selected)
-            self._put(selected, before, change(before))
-
-    def drop_transparent(self) -> None:
-        """Remove Gaussians of opacity 0."""
-        visible = self.opacity > 0
-        if visible.all():
+        if not selected.size:
             return
-        for name in ("index", "mean", "factor", "opacity", "color", "_mean_3d", "_factor_3d", "_lifted"):
-            leaf = getattr(self, name)
-            setattr(self, name, None if leaf is None else leaf[visible])
+        if self.in_space:
+            mean, factor = self._mean_3d[selected], self._factor_3d[selected]
+        else:
+            mean, factor = self._in_model_space(selected)
+        leaves = self.index[selected], mean, factor, self.opacity[selected], self.color[selected]
+        for leaf in leaves:  # a change in place would not be noticed
+            leaf.setflags(write=False)
+        before = SelectedGaussians(*leaves)
+        after = change(before)
+        for name in ("opacity", "color"):
+            if getattr(after, name) is not getattr(before, name):
+                getattr(self, name)[selected] = getattr(after, name)
+        if after.mean is before.mean and after.factor is before.factor:
+            return
+        if self.in_space or after.mean.shape[1] == 3:
+            after = after.in_space()
+            self._make_space()
+            self._mean_3d[selected], self._factor_3d[selected], self._lifted[selected] = after.mean, after.factor, True
+            return
+        if after.mean is not before.mean:
+            self.mean[selected] = after.mean * self._unit + self._middle
+        if after.factor is not before.factor:
+            self.factor[selected] = after.factor * self._unit
+
+    def visible(self) -> tuple[np.ndarray, ...]:
+        """Mean, factor, opacity, color and depth, the z coordinate, of the Gaussians that are not transparent."""
+        depth = self._mean_3d[:, 2] if self.in_space else np.zeros(len(self.index), np.float32)
+        leaves, shown = (self.mean, self.factor, self.opacity, self.color, depth), self.opacity > 0
+        return leaves if shown.all() else tuple(leaf[shown] for leaf in leaves)
 
     def lift_all(self) -> None:
         """Move all into 3D space, flat ones in the plane of the frame."""
@@ -310,44 +403,15 @@ class _ConditionedLayer:
         if not self.in_space:
             return
         lifted = np.flatnonzero(self._lifted)
-        projected = _project(camera, size, self._mean_3d[lifted], self._factor_3d[lifted], self.opacity[lifted])
+        num, rows = len(lifted), padded_size(len(lifted))
+        leaves = (pad_rows(leaf[lifted], rows) for leaf in (self._mean_3d, self._factor_3d, self.opacity))
+        projected = (np.asarray(leaf)[:num] for leaf in _project_padded(camera, size, *leaves))
         self.mean[lifted], self.factor[lifted], self.opacity[lifted] = projected
 
     @property
     def in_space(self) -> bool:
         """Whether a Gaussian is in 3D space."""
         return self._lifted is not None
-
-    @property
-    def depth(self) -> Float[np.ndarray, " num"]:
-        """The z coordinate of each; 0 in the plane of the frame."""
-        return self._mean_3d[:, 2] if self.in_space else np.zeros(len(self.index), np.float32)
-
-    def _take(self, selected: np.ndarray) -> SelectedGaussians:
-        if not self.in_space:
-            mean, factor = self._in_model_space(selected)
-        else:
-            mean, factor = self._mean_3d[selected], self._factor_3d[selected]
-        leaves = (self.index[selected], mean, factor, self.opacity[selected], self.color[selected])
-        for leaf in leaves:  # a change in place would not be noticed
-            leaf.setflags(write=False)
-        return SelectedGaussians(*leaves)
-
-    def _put(self, selected: np.ndarray, before: SelectedGaussians, after: SelectedGaussians) -> None:
-        for name in ("opacity", "color"):
-            if getattr(after, name) is not getattr(before, name):
-                getattr(self, name)[selected] = getattr(after, name)
-        if after.mean is before.mean and after.factor is before.factor:
-            return
-        if not self.in_space and after.mean.shape[1] == 2:
-            if after.mean is not before.mean:
-                self.mean[selected] = after.mean * self._unit + self._middle
-            if after.factor is not before.factor:
-                self.factor[selected] = after.factor * self._unit
-            return
-        after = after.in_space()
-        self._make_space()
-        self._mean_3d[selected], self._factor_3d[selected], self._lifted[selected] = after.mean, after.factor, True
 
     def _make_space(self) -> None:
         if not self.in_space:
@@ -358,14 +422,6 @@ class _ConditionedLayer:
 
     def _in_model_space(self, selected: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray]:
         return (self.mean[selected] - self._middle) / self._unit, self.factor[selected] / self._unit
-
-
-def _project(camera: Camera, size: tuple[int, int], mean: np.ndarray, factor: np.ndarray, opacity: np.ndarray):
-    """Mean, factor and opacity in pixels of the camera, in the same order."""
-    num = len(opacity)
-    rows = padded_size(num)
-    leaves = _project_padded(camera, size, pad_rows(mean, rows), pad_rows(factor, rows), pad_rows(opacity, rows))
-    return tuple(np.asarray(leaf)[:num] for leaf in leaves)
 
 
 @partial(jax.jit, static_argnums=1)

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from foldgauss._runtime.checks import check_one_of, require
 from foldgauss.render import Gaussians3D, Triangles
-from foldgauss.video.editing.arguments import check_array, check_number, check_numbers
+from foldgauss.video.editing.arguments import check_array
 from foldgauss.video.editing.timing import Clock, Span
 
 #: Luminance of red, green and blue: Rec. 709.
@@ -54,7 +54,8 @@ class SelectedGaussians:
 
         The weights include the area since Gaussians far from their own time are small; so the center moves smoothly.
         """
-        weights = self.opacity * _areas(self.factor)
+        first, second = np.moveaxis(self.in_space().factor, 2, 0)
+        weights = self.opacity * np.linalg.norm(np.cross(first, second), axis=1)
         if not weights.sum() > 0:
             weights = np.ones(len(self), np.float32)
         return np.einsum("n,nd->d", weights, self.mean, dtype=np.float64) / weights.sum(dtype=np.float64)
@@ -66,14 +67,6 @@ class SelectedGaussians:
         mean = np.concatenate([self.mean, np.zeros_like(self.mean[:, :1])], 1)
         factor = np.concatenate([self.factor, np.zeros_like(self.factor[:, :1])], 1)
         return dataclasses.replace(self, mean=mean, factor=factor)
-
-
-def _areas(factor: Float[np.ndarray, "num dim 2"]) -> Float[np.ndarray, " num"]:
-    """Areas of the parallelograms spanned by the two columns, in two or three dimensions."""
-    first, second = np.moveaxis(factor, (2, 1), (0, 1))
-    pairs = [(0, 1)] if len(first) == 2 else [(1, 2), (2, 0), (0, 1)]
-    crosses = [first[i] * second[j] - first[j] * second[i] for i, j in pairs]
-    return np.abs(crosses[0]) if len(crosses) == 1 else np.linalg.norm(crosses, axis=0)
 
 
 def _map_factors(matrix: Float[np.ndarray, "dim dim"], factor: Float[np.ndarray, "num dim 2"]) -> np.ndarray:
@@ -106,6 +99,19 @@ class AbstractOverlay(TimedEdit):
         """The selected Gaussians of time t, edited with progress in [0, 1]: 0 is unchanged, 1 fully edited."""
 
 
+def _numbers(parameter: str, *shape: int, optional: bool = False, **more: Any) -> Any:
+    """A static field of finite numbers of a shape, as tuples; or None if `optional`."""
+
+    def convert(values):
+        return None if optional and values is None else _to_tuples(check_array(parameter, values, *shape).tolist())
+
+    return eqx.field(static=True, converter=convert, **more)
+
+
+def _to_tuples(values: Any) -> Any:
+    return tuple(map(_to_tuples, values)) if isinstance(values, list) else values
+
+
 class Affine(AbstractOverlay):
     r"""An affine map of the plane about a point, or about the selection's own center at each time.
 
@@ -117,17 +123,12 @@ class Affine(AbstractOverlay):
     **Units:** `angle` in radians from x to y, which is clockwise on the screen; `offset` and `about` model space.
     """
 
-    angle: float = eqx.field(static=True)
-    stretch: tuple[tuple[float, float], tuple[float, float]] = eqx.field(static=True)
-    offset: tuple[float, float] = eqx.field(static=True)
-    about: tuple[float, float] | None = eqx.field(static=True)
+    angle: float = _numbers("angle")
+    stretch: tuple[tuple[float, float], tuple[float, float]] = _numbers("stretch", 2, 2)
+    offset: tuple[float, float] = _numbers("offset", 2)
+    about: tuple[float, float] | None = _numbers("about", 2, optional=True)
 
     def __check_init__(self) -> None:
-        check_number("angle", self.angle)
-        check_array("stretch", self.stretch, 2, 2)
-        check_numbers("offset", self.offset, 2)
-        if self.about is not None:
-            check_numbers("about", self.about, 2)
         (first, shear), (other, second) = self.stretch
         require(shear == other, "stretch", expected="a symmetric matrix", got=self.stretch)
         require(
@@ -185,14 +186,13 @@ def polar_decompose(
 class Opacity(AbstractOverlay):
     """Opacity times a factor, clipped at 1: `before` at progress 0, `factor` at progress 1, interpolated between."""
 
-    factor: float = eqx.field(static=True)
-    before: float = eqx.field(static=True, default=1.0)
+    factor: float = _numbers("factor")
+    before: float = _numbers("before", default=1.0)
 
     def __check_init__(self) -> None:
         for name in ("factor", "before"):
-            require(
-                check_number(name, getattr(self, name)) >= 0, name, expected="a number >= 0", got=getattr(self, name)
-            )
+            value = getattr(self, name)
+            require(value >= 0, name, expected="a number >= 0", got=value)
 
     def __call__(self, gaussians, t, progress):
         by = self.before + progress * (self.factor - self.before)
@@ -211,15 +211,9 @@ class Recolor(AbstractOverlay):
     distance from gray are kept.
     """
 
-    matrix: tuple[tuple[float, float, float], ...] = eqx.field(static=True)
-    offset: tuple[float, float, float] = eqx.field(static=True)
-    hue: float | None = eqx.field(static=True, default=None)
-
-    def __check_init__(self) -> None:
-        check_array("matrix", self.matrix, 3, 3)
-        check_numbers("offset", self.offset, 3)
-        if self.hue is not None:
-            check_number("hue", self.hue)
+    matrix: tuple[tuple[float, float, float], ...] = _numbers("matrix", 3, 3)
+    offset: tuple[float, float, float] = _numbers("offset", 3)
+    hue: float | None = _numbers("hue", optional=True, default=None)
 
     def map_colors(self, color: Float[np.ndarray, "num 3"]) -> Float[np.ndarray, "num 3"]:
         """The colors at progress 1, float64."""
@@ -251,15 +245,9 @@ class Place(AbstractOverlay):
     **Source:** MiraGe, flat Gaussians in space; VeGaS eq:mirage.
     """
 
-    depth: float = eqx.field(static=True)
-    rotation: tuple[float, float, float] = eqx.field(static=True)
-    about: tuple[float, float] | None = eqx.field(static=True)
-
-    def __check_init__(self) -> None:
-        check_number("depth", self.depth)
-        check_numbers("rotation", self.rotation, 3)
-        if self.about is not None:
-            check_numbers("about", self.about, 2)
+    depth: float = _numbers("depth")
+    rotation: tuple[float, float, float] = _numbers("rotation", 3)
+    about: tuple[float, float] | None = _numbers("about", 2, optional=True)
 
     def __call__(self, gaussians, t, progress):
         gaussians = gaussians.in_space()
@@ -436,30 +424,18 @@ def describe_overlay(overlay: TimedEdit) -> dict:
         got=type(overlay).__name__,
         cure="Save the video without it and apply the function again after loading; or write a video file.",
     )
-    fields = {name: getattr(overlay, name) for name in _field_names(type(overlay))}
-    fields = {name: dataclasses.asdict(x) if isinstance(x, Span | Clock) else x for name, x in fields.items()}
+    fields = dataclasses.asdict(overlay)
+    del fields["mask"]
     return {"kind": names[type(overlay)], **fields}
 
 
 def restore_overlay(description: dict, mask: Bool[np.ndarray, " num_gaussians"]) -> TimedEdit:
     """The inverse of `describe_overlay`. Raises ValueError, KeyError or TypeError for an invalid description."""
-    check_one_of("kind", description["kind"], tuple(KINDS))
-    kind = KINDS[description["kind"]]
-    fields = {name: _to_tuples(description[name]) for name in _field_names(kind)}
+    fields = dict(description)
+    check_one_of("kind", fields["kind"], tuple(KINDS))
+    kind = KINDS[fields.pop("kind")]
     if fields["span"] is not None:
         fields["span"] = Span(**fields["span"])
     if "clock" in fields:
         fields["clock"] = Clock(**fields["clock"])
     return kind(mask=mask, **fields)
-
-
-def _field_names(kind: type) -> list[str]:
-    return [field.name for field in dataclasses.fields(kind) if field.name != "mask"]
-
-
-def _to_tuples(value: Any) -> Any:
-    if isinstance(value, list):
-        return tuple(map(_to_tuples, value))
-    if isinstance(value, dict):
-        return {name: _to_tuples(part) for name, part in value.items()}
-    return value

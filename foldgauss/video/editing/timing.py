@@ -60,7 +60,7 @@ class Span:
             if value is not None:
                 object.__setattr__(self, name, check_number(name, value))
         require(
-            self._first < self._last,
+            None in (self.start, self.stop) or self.start < self.stop,
             "start, stop",
             expected="a start before the stop",
             got=f"{self.start}, {self.stop}",
@@ -75,17 +75,9 @@ class Span:
         )
         check_increasing("times", self.times)
 
-    @property
-    def _first(self) -> float:
-        return -math.inf if self.start is None else self.start
-
-    @property
-    def _last(self) -> float:
-        return math.inf if self.stop is None else self.stop
-
     def progress(self, t: float) -> float:
         """The progress of the edit at time t; 0 where it does not act."""
-        if not self._first <= t < self._last:
+        if (self.start is not None and t < self.start) or (self.stop is not None and t >= self.stop):
             return 0.0
         if not self.times:
             return 1.0
@@ -241,18 +233,6 @@ class Clock:
         return float(np.interp(t, self.times, self.own_times))
 
 
-def check_clock(clock: object, has_line: bool) -> None:
-    """Raise ValueError unless `clock` is one, given without a line of times."""
-    require(not has_line, "clock", expected="a clock, or shift, stretch and about", got="both")
-    require(
-        isinstance(clock, Clock),
-        "clock",
-        expected="a Clock",
-        got=type(clock).__name__,
-        cure="Clock(times, own_times) is linear between knots." if callable(clock) else "",
-    )
-
-
 # -------------------------------------------------------------------------------------------------------- maps
 
 
@@ -283,16 +263,12 @@ class TimeMap:
         """The own time at a time of the whole; before the first frame and after the last, the time of that frame."""
         return float(np.interp(t, self.whole, self.own))
 
-    def to_whole(self, t: float) -> float:
-        """The time of the whole at an own time."""
-        return float(np.interp(t, self.own, self.whole))
-
     def convert_function(self, function: Callable[..., Any]) -> Callable[..., Any]:
         """A function whose last argument is a time of the whole, as a function of own time."""
 
         def converted(*arguments: Any) -> Any:
             *others, t = arguments
-            return function(*others, self.to_whole(float(t)))
+            return function(*others, float(np.interp(t, self.own, self.whole)))
 
         return converted
 

@@ -32,18 +32,20 @@ def composite(
     return np.minimum(frame[..., :3] + transmittance * behind + 0.5, 255).astype(np.uint8)
 
 
+def check_color(parameter: str, color: object) -> Float[np.ndarray, "3"]:
+    """Red, green and blue as an array. Raises ValueError unless they are numbers in [0, 1]."""
+    array = np.asarray(color)
+    is_color = array.shape == (3,) and array.dtype.kind in "fiu" and ((array >= 0) & (array <= 1)).all()
+    require(is_color, parameter, expected="red, green and blue in [0, 1]", got=color)
+    return array
+
+
 def check_background(background: object, compositing: str = "over") -> Float[np.ndarray, " channels"]:
     """The background as float32 (3,), or zeros (4,) for None. Raises ValueError unless it is a color in [0, 1] or None,
     and black for "sum"."""
     if background is None and compositing != "sum":
         return np.zeros(4, np.float32)
-    color = np.asarray(BLACK if background is None else background)
-    require(
-        color.shape == (3,) and color.dtype.kind in "fiu" and ((color >= 0) & (color <= 1)).all(),
-        "background",
-        expected="red, green and blue in [0, 1]",
-        got=background,
-    )
+    color = check_color("background", BLACK if background is None else background)
     require(
         compositing != "sum" or (background is not None and not color.any()),
         "background",

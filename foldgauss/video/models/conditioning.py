@@ -5,19 +5,31 @@ the Gaussians alive, whose number changes with every frame, unlike XLA's fixed s
 gradients agree. Only polynomial folds, shared paths and the time-likelihood envelope are supported.
 """
 
+import collections
 import dataclasses
 import math
-from typing import NamedTuple
+from typing import Any
 
+import jax
 import numba as nb
 import numpy as np
 
 from foldgauss._numerics.simd import LANES, broadcast, cos_and_sin, exp, load, select, sigmoid, sqrt, store
+from foldgauss._runtime.checks import require
 from foldgauss._runtime.kernels import inline, kernel
 from foldgauss._runtime.threads import run_tasks
-from foldgauss.render import pixels_per_unit
-from foldgauss.video.models.row_layout import columns, has_path_column
-from foldgauss.video.models.shared_paths import SharedPaths, from_pixel_gradient, invert_maps, to_pixel_maps
+from foldgauss.envelope import TimeLikelihood
+from foldgauss.render import Splats2D, pixels_per_unit
+from foldgauss.render.splats import check_size
+from foldgauss.video.models.renderer import PreparedVideo
+from foldgauss.video.models.row_layout import columns, has_path_column, pack
+from foldgauss.video.models.shared_paths import (
+    SharedPaths,
+    check_paths,
+    from_pixel_gradient,
+    invert_maps,
+    to_pixel_maps,
+)
 from foldgauss.video.models.splats import SH_C0, TAU_MAX
 
 CHUNK = 4096  # Gaussians per task
@@ -28,34 +40,10 @@ _u = nb.uint64
 _NUM_OUT = 13
 
 
-class _Layout(NamedTuple):
-    """Columns of a row and constants of the model, passed to the kernels as arguments: see `kernels.kernel`."""
-
-    loc: int
-    scale: int
-    color: int
-    angle: int
-    opacity: int
-    time: int
-    spread: int
-    fold: int
-    tau_max: np.float32
-    sh_c0: np.float32
-
-
-_place = {name: place.start for name, place in columns(0).items()}
-_LAYOUT = _Layout(
-    loc=_place["loc"],
-    scale=_place["log_scale"],
-    color=_place["color_dc"],
-    angle=_place["angle_logit"],
-    opacity=_place["opacity_logit"],
-    time=_place["time_loc_logit"],
-    spread=_place["log_time_scale"],
-    fold=_place["coefficients"],
-    tau_max=np.float32(TAU_MAX),
-    sh_c0=np.float32(SH_C0),
-)
+#: Columns of a row by the leaf that begins there, and constants of the model, passed to the kernels as an argument: see
+#: `kernels.kernel`.
+_Layout = collections.namedtuple("_Layout", [*columns(0), "tau_max", "sh_c0"])
+_LAYOUT = _Layout(*(place.start for place in columns(0).values()), np.float32(TAU_MAX), np.float32(SH_C0))
 
 
 @inline
@@ -69,8 +57,10 @@ def _windows(at, start, stop, indices, rows, power, floor, cuts, log_cutoff, win
     for k in range(start, stop):
         i, tau = indices[k], at.tau_max
         if cuts:
-            tau = min(tau, _longest(min(rows[i, at.scale], rows[i, at.scale + 1]) - log_cutoff, power, floor, tau))
-        center, reach = _sigmoid(rows[i, at.time]), tau * math.exp(rows[i, at.spread])
+            tau = min(
+                tau, _longest(min(rows[i, at.log_scale], rows[i, at.log_scale + 1]) - log_cutoff, power, floor, tau)
+            )
+        center, reach = _sigmoid(rows[i, at.time_loc_logit]), tau * math.exp(rows[i, at.log_time_scale])
         window[i, 0] = center - reach
         window[i, 1] = center + reach
 
@@ -85,10 +75,8 @@ def _longest(margin, power, floor, most):
         return _f(0)
     square = 2 * margin
     if floor > 0:
-        needed = math.exp(-2 * margin) - floor
-        if needed <= 0:
-            return most
-        square = math.log((1 - floor) / needed)
+        # Infinite where the envelope never gets so small.
+        square = math.log((1 - floor) / max(math.exp(-2 * margin) - floor, _f(0.0)))
     if 2 * square >= power * most * most:
         return most
     return _f(math.sqrt(2 * square / power))
@@ -142,31 +130,31 @@ def _column(columns, c):
 @kernel
 def _condition_vectors(at, columns, degree, t, unit, cx, cy, power, floor, out):
     none, scale = broadcast(_f(0.0)), broadcast(unit)
-    center, spread = sigmoid(_column(columns, at.time)), exp(_column(columns, at.spread))
+    center, spread = sigmoid(_column(columns, at.time_loc_logit)), exp(_column(columns, at.log_time_scale))
     u = center - broadcast(t)
     x, y = none, none
     for j in range(degree - 1, -1, -1):  # Horner
-        x = u * (x + _column(columns, at.fold + 2 * j))
-        y = u * (y + _column(columns, at.fold + 2 * j + 1))
+        x = u * (x + _column(columns, at.coefficients + 2 * j))
+        y = u * (y + _column(columns, at.coefficients + 2 * j + 1))
     store(out, _u(0), (_column(columns, at.loc) + x) * scale + broadcast(cx))
     store(out, _u(LANES), (_column(columns, at.loc + 1) + y) * scale + broadcast(cy))
     tau = u / spread
     exponent = broadcast(_f(-0.25) * power) * tau * tau  # of sqrt(a) without the floor
     if floor == _f(0.0):
-        first = exp(_column(columns, at.scale) + exponent) * scale
-        second = exp(_column(columns, at.scale + 1) + exponent) * scale
+        first = exp(_column(columns, at.log_scale) + exponent) * scale
+        second = exp(_column(columns, at.log_scale + 1) + exponent) * scale
     else:
         shrink = sqrt(broadcast(floor) + broadcast(_f(1.0) - floor) * exp(exponent + exponent)) * scale
-        first, second = exp(_column(columns, at.scale)) * shrink, exp(_column(columns, at.scale + 1)) * shrink
-    turn = sigmoid(_column(columns, at.angle))
+        first, second = exp(_column(columns, at.log_scale)) * shrink, exp(_column(columns, at.log_scale + 1)) * shrink
+    turn = sigmoid(_column(columns, at.angle_logit))
     cos, sin = cos_and_sin(turn)
     store(out, _u(2 * LANES), cos * first)
     store(out, _u(3 * LANES), none - sin * second)
     store(out, _u(4 * LANES), sin * first)
     store(out, _u(5 * LANES), cos * second)
-    store(out, _u(6 * LANES), sigmoid(_column(columns, at.opacity)))
+    store(out, _u(6 * LANES), sigmoid(_column(columns, at.opacity_logit)))
     for c in range(_u(3)):
-        value = broadcast(_f(0.5)) + broadcast(at.sh_c0) * _column(columns, at.color + c)
+        value = broadcast(_f(0.5)) + broadcast(at.sh_c0) * _column(columns, at.color_dc + c)
         store(out, (_u(7) + c) * _u(LANES), select(value < none, none, value))
     store(out, _u(10 * LANES), center)
     store(out, _u(11 * LANES), spread)
@@ -208,18 +196,18 @@ def _pull_back(
         # Fold: dL/dc_j = g u^j, and dL/du by the derivative of the polynomial.
         d_u, u_power = _f(0.0), _f(1.0)
         for j in range(degree):
-            d_u += _f(j + 1) * u_power * (gx * row[at.fold + 2 * j] + gy * row[at.fold + 2 * j + 1])
+            d_u += _f(j + 1) * u_power * (gx * row[at.coefficients + 2 * j] + gy * row[at.coefficients + 2 * j + 1])
             u_power *= u
-            out[at.fold + 2 * j] += gx * u_power
-            out[at.fold + 2 * j + 1] += gy * u_power
+            out[at.coefficients + 2 * j] += gx * u_power
+            out[at.coefficients + 2 * j + 1] += gy * u_power
         # Scales and angle, from the columns of F = R diag(scales).
         by_first = d_factor[k, 0, 0] * factor[k, 0, 0] + d_factor[k, 1, 0] * factor[k, 1, 0]
         by_second = d_factor[k, 0, 1] * factor[k, 0, 1] + d_factor[k, 1, 1] * factor[k, 1, 1]
-        out[at.scale] += by_first
-        out[at.scale + 1] += by_second
+        out[at.log_scale] += by_first
+        out[at.log_scale + 1] += by_second
         by_angle = d_factor[k, 1, 0] * factor[k, 0, 0] - d_factor[k, 0, 0] * factor[k, 1, 0]
         by_angle += d_factor[k, 1, 1] * factor[k, 0, 1] - d_factor[k, 0, 1] * factor[k, 1, 1]
-        out[at.angle] += by_angle * _f(2 * math.pi) * turn * (_f(1.0) - turn)
+        out[at.angle_logit] += by_angle * _f(2 * math.pi) * turn * (_f(1.0) - turn)
         # Envelope: -tau^2/2 moves with u and with the spread.
         tau = u / spread
         square, slope = tau * tau, _f(0.5) * power
@@ -227,14 +215,14 @@ def _pull_back(
             decay = (_f(1.0) - floor) * math.exp(_f(-0.5) * power * square)
             slope *= decay / (floor + decay)
         by_exponent = (by_first + by_second) * slope
-        out[at.spread] += by_exponent * square
+        out[at.log_time_scale] += by_exponent * square
         d_u -= by_exponent * tau / spread
-        out[at.time] += d_u * center * (_f(1.0) - center)
+        out[at.time_loc_logit] += d_u * center * (_f(1.0) - center)
         d_time -= d_u
-        out[at.opacity] += d_opacity[k] * opacity[k] * (_f(1.0) - opacity[k])
+        out[at.opacity_logit] += d_opacity[k] * opacity[k] * (_f(1.0) - opacity[k])
         for c in range(3):
             if color[k, c] > _f(0.0):
-                out[at.color + c] += d_color[k, c] * at.sh_c0
+                out[at.color_dc + c] += d_color[k, c] * at.sh_c0
     return d_time
 
 
@@ -428,3 +416,58 @@ def backpropagate(
         height, width = spec.size
         path_grad += from_pixel_gradient(by_map.sum(0), float(done.unit), np.array([width / 2, height / 2]))
     return float(by_time.sum())
+
+
+class PreparedModel(PreparedVideo):
+    """The Gaussians of a `VideoModel`, ready to be conditioned on any time, in pixels of an image of `size`.
+
+    `aspect` is the height / width of the frame that covers the image (default: the model's).
+
+    **Example:** `PreparedModel(model, (160, 320)).splats(0.5)`.
+
+    **Source:** VeGaS eq:vegas_equiv_cond. **Raises:** ValueError for an invalid size, and for a model with NaN or
+    infinities or with several envelopes.
+    """
+
+    def __init__(self, model: Any, size: tuple[int, int], *, aspect: float | None = None):
+        check_size(size)
+        height, width = model.size
+        self.rows = pack(model.splats)
+        broken = int((~np.isfinite(self.rows)).any(-1).sum())
+        require(
+            not broken,
+            "model",
+            expected="finite numbers",
+            got=f"others in {broken:,} Gaussians",
+            cure="The fit diverged, or the model was edited: fit again.",
+        )
+        power, floor = (_common_value(model.splats.envelope, name) for name in ("power", "floor"))
+        aspect = height / width if aspect is None else aspect
+        check_paths(model.splats)
+        paths = jax.tree.map(np.asarray, model.splats.paths)
+        own = {"aspect": aspect, "paths": paths, "scale_cutoff": model.scale_cutoff}
+        self.spec = ConditioningSpec(model.splats.degree, power, floor, tuple(size), **own)
+        self.window = find_windows(self.rows, self.spec)
+        self.times = np.asarray(model.frame_times.times())
+
+    def at(self, t: float, members: np.ndarray | None = None) -> ConditionedSplats:
+        """The Gaussians alive at time t, also outside [0, 1]; of `members`, bool (num_gaussians,), if given."""
+        return condition(self.rows, self.window, t, self.spec, members)
+
+    def splats(self, t: float) -> Splats2D:
+        """The splats of the Gaussians alive at time t, front to back; NumPy leaves."""
+        done = self.at(t)
+        return Splats2D(done.mean, done.factor, done.opacity, done.color)
+
+
+def _common_value(envelope: TimeLikelihood, name: str) -> float:
+    """The value that all Gaussians have in common."""
+    values = np.unique(np.asarray(getattr(envelope, name)))
+    require(
+        values.size == 1,
+        f"model.splats.envelope.{name}",
+        expected="one number for all Gaussians",
+        got=f"{values.size} different ones",
+        cure="Use VideoModel.render, which supports one envelope per Gaussian.",
+    )
+    return float(values[0])

@@ -14,9 +14,9 @@ from foldgauss.video.models.video_model import VideoModel, check_model
 
 #: The highest degree that is tried: that of the published VeGaS code.
 MAX_DEGREE = 7
-#: A Gaussian gets another power only if it misses its path by more than this, in pixels,
+#: A Gaussian gets another power only if it misses its path by more than this, in pixels, see `fit_powers`.
 NEEDED = 0.1
-#: and with it by less than this fraction of that.
+#: A fit uses a power only if it misses by less than this fraction of the error without it.
 GAINED = 0.8
 #: Times in a Gaussian's life at which its place is fitted, besides those of the frames.
 OWN_TIMES = 9
@@ -60,10 +60,14 @@ def without_paths(model: VideoModel, degree: int | None = None) -> tuple[VideoMo
     kept = min(splats.degree, highest)
     coefficients[:, :kept] = np.asarray(splats.coefficients)[:, :kept]
     error, pixels = np.zeros(model.num_gaussians), max(model.size)
-    places, moved = _Places(model), np.flatnonzero(on_path)
+    moved, arrays = np.flatnonzero(on_path), jax.tree.map(np.asarray, splats)
+    frames = np.asarray(model.frame_times.times(), np.float64)
     for start in range(0, len(moved), CHUNK):
         which = moved[start : start + CHUNK]
-        coefficients[which], error[which] = places.fit(which, lowest, highest, NEEDED / pixels)
+        u, weight, shift = _sample_places(arrays, frames, which)
+        unit = np.abs(u * (weight > 0)).max(1)[:, None]  # of u, so that powers are of one size
+        how = np.full((1, highest), RIDGE), lowest, NEEDED / pixels
+        coefficients[which], error[which] = fit_powers(u, unit, weight, shift, *how)
     used = max(lowest, int(((coefficients != 0).any(2) * np.arange(1, highest + 1)).max()))
     gaussians = splats.gaussians()
     log_scale, angle = find_axes(gaussians.scale_tril)
@@ -83,60 +87,57 @@ def without_paths(model: VideoModel, degree: int | None = None) -> tuple[VideoMo
     return dataclasses.replace(model, splats=plain), error * pixels
 
 
-class _Places:
-    """Where the Gaussians of a model are at the times at which they are fitted, in model space, float64."""
-
-    def __init__(self, model: VideoModel):
-        self.splats: FoldedSplats = jax.tree.map(np.asarray, model.splats)
-        self.frames = np.asarray(model.frame_times.times(), np.float64)
-
-    def fit(
-        self, which: Int[np.ndarray, " num"], lowest: int, highest: int, needed: float
-    ) -> tuple[Float[np.ndarray, "num highest 2"], Float[np.ndarray, " num"]]:
-        """Coefficients for these Gaussians, and their errors; more than `lowest` powers for errors above `needed`."""
-        u, weight, shift = self._sample(which)
-        unit = np.abs(u * (weight > 0)).max(1)  # of u, so that powers are of one size
-        powers = (u / unit[:, None])[..., None] ** np.arange(1, highest + 1)
-        coefficients = np.zeros((len(which), highest, 2))
-        coefficients[:, :lowest], error = _regress(powers[..., :lowest], weight, shift)
-        for used in range(lowest + 1, highest + 1):
-            off = np.flatnonzero(error > needed)
-            found, left = _regress(powers[off, :, :used], weight[off], shift[off])
-            better = left < GAINED * error[off]
-            coefficients[off[better], :used], error[off[better]] = found[better], left[better]
-        return coefficients / unit[:, None, None] ** np.arange(1, highest + 1)[:, None], error
-
-    def _sample(self, which: Int[np.ndarray, " num"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """u = m_t - t, weight (num, times), 0 where a Gaussian is not shown, and the shift since m_t."""
-        splats, index = self.splats, self.splats.path_index[which]
-        time_loc = expit(splats.time_loc_logit[which].astype(np.float64))
-        time_scale = np.exp(splats.log_time_scale[which].astype(np.float64))
-        ends = np.clip([time_loc - TAU_MAX * time_scale, time_loc + TAU_MAX * time_scale], 0, 1)
-        own = np.linspace(*ends, OWN_TIMES, axis=1)
-        t = np.concatenate([np.broadcast_to(self.frames, (len(which), len(self.frames))), own], 1)
-        u = time_loc[:, None] - t
-        tau = u / time_scale[:, None]
-        power, floor = (np.broadcast_to(getattr(splats.envelope, name), len(splats.loc)) for name in ("power", "floor"))
-        envelope = floor[which, None] + (1 - floor[which, None]) * np.exp(-0.5 * power[which, None] * tau**2)
-        weight = np.where((t >= ends[0][:, None]) & (t <= ends[1][:, None]), envelope, 0)
-        place = np.broadcast_to(splats.loc[which, None].astype(np.float64), (*u.shape, 2))
-        fold = sum(splats.coefficients[which, k, None] * u[..., None] ** (k + 1) for k in range(splats.degree))
-        there = splats.paths.by_index(t, np.broadcast_to(index[:, None], t.shape))
-        home = splats.paths.by_index(time_loc, index)[:, None]
-        return u, weight, _apply(there, place + fold) - _apply(home, place)
+def _sample_places(
+    splats: FoldedSplats, frames: Float[np.ndarray, " frames"], which: Int[np.ndarray, " num"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """u = m_t - t, weight (num, times), 0 where a Gaussian is not shown, and the shift since m_t."""
+    index = splats.path_index[which]
+    time_loc = expit(splats.time_loc_logit[which].astype(np.float64))
+    time_scale = np.exp(splats.log_time_scale[which].astype(np.float64))
+    ends = np.clip([time_loc - TAU_MAX * time_scale, time_loc + TAU_MAX * time_scale], 0, 1)
+    own = np.linspace(*ends, OWN_TIMES, axis=1)
+    t = np.concatenate([np.broadcast_to(frames, (len(which), len(frames))), own], 1)
+    u = time_loc[:, None] - t
+    tau = u / time_scale[:, None]
+    power, floor = (np.broadcast_to(getattr(splats.envelope, name), len(splats.loc)) for name in ("power", "floor"))
+    envelope = floor[which, None] + (1 - floor[which, None]) * np.exp(-0.5 * power[which, None] * tau**2)
+    weight = np.where((t >= ends[0][:, None]) & (t <= ends[1][:, None]), envelope, 0)
+    place = np.broadcast_to(splats.loc[which, None].astype(np.float64), (*u.shape, 2))
+    fold = sum(splats.coefficients[which, k, None] * u[..., None] ** (k + 1) for k in range(splats.degree))
+    there = splats.paths.by_index(t, np.broadcast_to(index[:, None], t.shape))
+    home = splats.paths.by_index(time_loc, index)[:, None]
+    return u, weight, _apply(there, place + fold) - _apply(home, place)
 
 
 def _apply(maps: np.ndarray, place: np.ndarray) -> np.ndarray:
     return (maps[..., :2] @ place[..., None])[..., 0] + maps[..., 2]
 
 
-def _regress(
-    powers: Float[np.ndarray, "num times degree"], weight: Float[np.ndarray, "num times"], shift: np.ndarray
-) -> tuple[Float[np.ndarray, "num degree 2"], Float[np.ndarray, " num"]]:
-    """Weighted least squares without a constant, and the root mean square distance that is left."""
+def fit_powers(
+    u: Float[np.ndarray, "num times"],
+    unit: Float[np.ndarray, "num 1"],
+    weight: Float[np.ndarray, "num times"],
+    shift: Float[np.ndarray, "num times 2"],
+    ridges: Float[np.ndarray, "#num highest"],
+    lowest: int,
+    needed: float,
+) -> tuple[Float[np.ndarray, "num highest 2"], Float[np.ndarray, " num"]]:
+    """Weighted least squares of `shift` by powers of u without a constant: coefficients, and root mean square errors.
+
+    All use `lowest` powers, and those whose error is above `needed` as many more as reduce it, see `GAINED`; the other
+    coefficients are 0. `ridges` are those of the coefficients in powers of u / `unit`, relative to the sum of weights.
+    """
+    num, highest = len(u), ridges.shape[1]
+    powers = np.cumprod(np.broadcast_to((u / unit)[..., None], (*weight.shape, highest)), -1)
     weight = weight / weight.sum(1, keepdims=True)
-    across = powers.mT * weight[:, None]
-    normal = across @ powers + RIDGE * np.eye(powers.shape[-1])
-    found = np.linalg.solve(normal, across @ shift)
-    left = powers @ found - shift
-    return found, np.sqrt((weight * (left**2).sum(-1)).sum(1))
+    ridges = np.broadcast_to(ridges, (num, highest))[..., None] * np.eye(highest)
+    coefficients, error = np.zeros((num, highest, 2)), np.full(num, np.inf)
+    for used in range(lowest, highest + 1):
+        off = np.flatnonzero(error > needed)
+        own, target = powers[off, :, :used], shift[off]
+        across = own.mT * weight[off, None]
+        found = np.linalg.solve(across @ own + ridges[off, :used, :used], across @ target)
+        left = np.sqrt((weight[off] * ((own @ found - target) ** 2).sum(-1)).sum(1))
+        better = left < GAINED * error[off]
+        coefficients[off[better], :used], error[off[better]] = found[better], left[better]
+    return coefficients / unit[..., None] ** np.arange(1, highest + 1)[:, None], error

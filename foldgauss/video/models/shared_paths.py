@@ -15,8 +15,6 @@ from foldgauss.render import Splats2D
 
 #: A Gaussian's path is a byte: 0 for none, else the number of the path, from 1.
 MAX_PATHS = 255
-#: With so many paths at most, maps are chosen one by one, so that the gradient by each is a sum in a fixed order.
-FEW_PATHS = 4
 #: From the times (knots,) and matrices (knots, 2, 3) of a path to those of another.
 PathChange = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -72,20 +70,11 @@ class SharedPaths(eqx.Module):
         return xp.where((path > 0)[..., None, None], maps, xp.eye(2, 3, dtype=maps.dtype))
 
 
-def all_maps(maps: Float[Array, "paths 2 3"]) -> Float[Array, "paths+1 2 3"]:
-    """Maps by the number of a Gaussian's path: the first one is the identity."""
-    xp = np if isinstance(maps, np.ndarray) else jnp
-    return xp.concatenate([xp.eye(2, 3, dtype=maps.dtype)[None], maps])
-
-
 def move_splats(splats: Splats2D, path_index: UInt8[Array, " num"], maps: Float[Array, "paths 2 3"]) -> Splats2D:
     """Splats in model space, each moved by the map of its path."""
-    if len(maps) > FEW_PATHS:
-        own = all_maps(maps)[path_index]
-    else:
-        own = jnp.broadcast_to(jnp.eye(2, 3, dtype=maps.dtype), (*path_index.shape, 2, 3))
-        for number, one in enumerate(maps, 1):
-            own = jnp.where((path_index == number)[:, None, None], one[None], own)
+    own = jnp.broadcast_to(jnp.eye(2, 3, dtype=maps.dtype), (*path_index.shape, 2, 3))
+    for number, one in enumerate(maps, 1):  # not `maps[path_index]`: the gradient is a sum in a fixed order
+        own = jnp.where((path_index == number)[:, None, None], one[None], own)
     linear, offset = own[..., :2], own[..., 2]
     mean = jnp.einsum("nij,nj->ni", linear, splats.mean) + offset
     return Splats2D(mean, linear @ splats.factor, splats.opacity, splats.color, splats.depth)
@@ -125,8 +114,8 @@ def check_paths(splats: Any) -> None:
 def to_pixel_maps(
     maps: Float[np.ndarray, "paths 2 3"], unit: float, center: Float[np.ndarray, "2"]
 ) -> Float[np.ndarray, "paths+1 2 3"]:
-    """Maps by the number of a Gaussian's path, of pixels: model space times `unit`, its origin at `center`; float32."""
-    maps = all_maps(np.asarray(maps, np.float64))
+    """Maps of pixels, float32: model space times `unit`, with its origin at `center`. The first is the identity."""
+    maps = np.concatenate([np.eye(2, 3)[None], maps])
     offset = center + unit * maps[:, :, 2] - maps[:, :, :2] @ center
     return np.concatenate([maps[:, :, :2], offset[:, :, None]], 2).astype(np.float32)
 

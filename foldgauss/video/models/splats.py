@@ -11,8 +11,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, UInt8
 from foldgauss._numerics.batch import concrete_value
 from foldgauss._runtime.checks import require
 from foldgauss.distribution import FoldedGaussian
-from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
-from foldgauss.fold import AbstractFold, PolynomialFold, SharedPathFold, ZeroFold
+from foldgauss.envelope import Constant, TimeLikelihood
+from foldgauss.fold import PolynomialFold, SharedPathFold, ZeroFold
 from foldgauss.mixture import FoldedMixture
 from foldgauss.render import Splats2D
 from foldgauss.video.models.shared_paths import SharedPaths, move_splats
@@ -115,10 +115,13 @@ class FoldedSplats(eqx.Module):
         )
 
     def _unmoved(self) -> FoldedGaussian:
-        """The Folded-Gaussians before `paths` move them."""
+        """The Folded-Gaussians before `paths` move them, of covariance R S (R S)^T with R and S of eq:mirage."""
+        angle = 2 * jnp.pi * jax.nn.sigmoid(self.angle_logit)
+        cos, sin = jnp.cos(angle), jnp.sin(angle)
+        rotation = jnp.stack([jnp.stack([cos, -sin], -1), jnp.stack([sin, cos], -1)], -2)
         return FoldedGaussian(
             self.loc,
-            rotated_scale_tril(jnp.exp(self.log_scale), 2 * jnp.pi * jax.nn.sigmoid(self.angle_logit)),
+            _lower_factor(rotation * jnp.exp(self.log_scale)[:, None]),
             time_loc=jax.nn.sigmoid(self.time_loc_logit),
             time_scale=jnp.exp(self.log_time_scale),
             fold=PolynomialFold(self.coefficients),
@@ -155,6 +158,21 @@ class FoldedSplats(eqx.Module):
             got=concrete_value(time_loc),
             cure="A video's time is [0, 1]: shift and scale the mixture's.",
         )
+        fold, envelope = components.fold, components.envelope
+        require(
+            isinstance(fold, ZeroFold | PolynomialFold),
+            "mixture.components.fold",
+            expected="a PolynomialFold",
+            got=type(fold).__name__,
+            cure="Splats hold polynomial folds only.",
+        )
+        require(
+            isinstance(envelope, TimeLikelihood | Constant),
+            "mixture.components.envelope",
+            expected="a TimeLikelihood or Constant",
+            got=type(envelope).__name__,
+            cure="Splats hold these only.",
+        )
         log_scale, angle = find_axes(components.scale_tril)
         log_weights = mixture.log_weights
         log_opacity = log_weights - log_weights.max() + float(np.log(PEAK_OPACITY))
@@ -164,10 +182,10 @@ class FoldedSplats(eqx.Module):
             angle_logit=jax.scipy.special.logit(angle / (2 * jnp.pi)),
             time_loc_logit=jax.scipy.special.logit(time_loc),
             log_time_scale=jnp.log(components.time_scale),
-            coefficients=_coefficients(components.fold, num, dtype),
+            coefficients=jnp.zeros((num, 0, 2), dtype) if isinstance(fold, ZeroFold) else fold.coefficients,
             opacity_logit=log_opacity - jnp.log(-jnp.expm1(log_opacity)),
             color_dc=(_check_color(color, num, dtype) - 0.5) / SH_C0,
-            envelope=_as_time_likelihood(components.envelope),
+            envelope=TimeLikelihood(power=0.0) if isinstance(envelope, Constant) else envelope,
         )
 
     def to_mixture(self) -> FoldedMixture:
@@ -195,20 +213,6 @@ class FoldedSplats(eqx.Module):
         return splats if self.paths is None else move_splats(splats, self.path_index, self.paths.at(t))
 
 
-def rotated_scale_tril(scale: Float[Array, "num 2"], angle: Float[Array, " num"]) -> Float[Array, "num 2 2"]:
-    """Lower-triangular factor of R(angle) diag(scale)^2 R(angle)^T, in closed form.
-
-    The determinant is the product of the scales: without subtraction, the factor exists for all scales > 0.
-    Source: R and S of eq:mirage.
-    """
-    first, second = scale[:, 0], scale[:, 1]
-    cos, sin = jnp.cos(angle), jnp.sin(angle)
-    top = jnp.hypot(first * cos, second * sin)
-    side = (first - second) * (first + second) * sin * cos / top
-    rows = [jnp.stack([top, jnp.zeros_like(top)], -1), jnp.stack([side, first * second / top], -1)]
-    return jnp.stack(rows, -2)
-
-
 def _lower_factor(factor: Float[Array, "num 2 2"]) -> Float[Array, "num 2 2"]:
     """The lower-triangular factor of F F^T, in closed form; the determinant is that of F."""
     first, second = factor[:, 0], factor[:, 1]
@@ -219,7 +223,7 @@ def _lower_factor(factor: Float[Array, "num 2 2"]) -> Float[Array, "num 2 2"]:
 
 
 def find_axes(tril: Float[Array, "num 2 2"]) -> tuple[Float[Array, "num 2"], Float[Array, " num"]]:
-    """Logarithms of the two standard deviations, the greater first, and the angle: inverse of `rotated_scale_tril`.
+    """Logarithms of the two standard deviations, the greater first, and the angle, from the lower factor.
 
     Closed-form singular values of [[p, 0], [q, r]]. The angle is in [pi/2, 3 pi/2]; it is unique modulo pi.
     """
@@ -229,32 +233,6 @@ def find_axes(tril: Float[Array, "num 2 2"]) -> tuple[Float[Array, "num 2"], Flo
     twice_cross, difference = 2 * p * q, (p - r) * (p + r) - q * q
     isotropic = (twice_cross == 0) & (difference == 0)  # any angle is right, and has no meaningful gradient
     return log_scale, jnp.pi + 0.5 * jnp.arctan2(twice_cross, jnp.where(isotropic, 1, difference))
-
-
-def _coefficients(fold: AbstractFold, num: int, dtype) -> Float[Array, "num degree 2"]:
-    if isinstance(fold, ZeroFold):
-        return jnp.zeros((num, 0, 2), dtype)
-    require(
-        isinstance(fold, PolynomialFold),
-        "mixture.components.fold",
-        expected="a PolynomialFold",
-        got=type(fold).__name__,
-        cure="Splats hold polynomial folds only.",
-    )
-    return fold.coefficients
-
-
-def _as_time_likelihood(envelope: AbstractEnvelope) -> TimeLikelihood:
-    if isinstance(envelope, Constant):
-        return TimeLikelihood(power=0.0)
-    require(
-        isinstance(envelope, TimeLikelihood),
-        "mixture.components.envelope",
-        expected="a TimeLikelihood or Constant",
-        got=type(envelope).__name__,
-        cure="Splats hold these only.",
-    )
-    return envelope
 
 
 def _check_color(color: ArrayLike, num: int, dtype) -> Float[Array, "num 3"]:

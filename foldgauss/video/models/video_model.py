@@ -10,8 +10,8 @@ from foldgauss._runtime.checks import require
 from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.render.splats import check_size
 from foldgauss.video.models.background import BLACK, Background, check_background
+from foldgauss.video.models.conditioning import PreparedModel
 from foldgauss.video.models.frame_times import FrameTimes, snap_to_shots
-from foldgauss.video.models.prepared import PreparedModel
 from foldgauss.video.models.renderer import RenderedVideo, choose_time
 from foldgauss.video.models.splats import FoldedSplats
 

@@ -6,7 +6,7 @@ import logging
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float16, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float16, Float32, UInt8
 
 from foldgauss._runtime.checks import require
 from foldgauss._runtime.threads import run_tasks
@@ -94,11 +94,6 @@ class Alignment:
         pair = (self.there, self.back) if other > frame else (self.back, self.there)
         return tuple(one[min(frame, other)].astype(np.float32) for one in pair)
 
-    def plate_frames(self, frame: int, shot: tuple[int, int]) -> Int[np.ndarray, " num"]:
-        """The frames that show the background of one."""
-        first, last = max(shot[0], frame - PLATE_REACH), min(shot[1] - 1, frame + PLATE_REACH)
-        return np.unique(np.linspace(first, last, min(PLATE_FRAMES, last - first + 1)).round().astype(int))
-
 
 def resize_frames(frames: Frames) -> UInt8[np.ndarray, "frames rows columns 3"]:
     """The frames with a longer side of `SIDE` pixels: small ones are enlarged, so that all lengths are of one unit."""
@@ -166,14 +161,11 @@ def fill_background(frames: Frames, masks: Masks, *, alignment: Alignment | None
 
 def _log_unknown(unknown: int, removed: int) -> None:
     """Log how many of the removed pixels no frame shows."""
-    if unknown:
-        percent = f"{100 * unknown / removed:.0f}%" if 100 * unknown >= removed else "Less than 1%"
+    if removed:
         much = unknown > MUCH_UNKNOWN * removed
         cure = " It is a smear: take more frames, in which the object moves away from it." if much else ""
-        text = "%s of the removed area is shown by no frame and filled from its surroundings.%s"
-        _LOG.log(logging.WARNING if much else logging.INFO, text, percent, cure)
-    elif removed:
-        _LOG.info("All of the removed area is shown by other frames.")
+        text = "%.0f%% of the removed area is shown by no frame and filled from its surroundings.%s"
+        _LOG.log(logging.WARNING if much else logging.INFO, text, 100 * unknown / removed, cure)
 
 
 def render_plate(
@@ -193,7 +185,8 @@ def render_plate(
     size = columns.stop - columns.start, rows.stop - rows.start
     to_box = np.array([[1, 0, columns.start], [0, 1, rows.start], [0, 0, 1]], float)
     to_image = _scale_pixels((height, width), alignment.images.shape[1:])
-    others = alignment.plate_frames(k, shot)
+    first, last = max(shot[0], k - PLATE_REACH), min(shot[1] - 1, k + PLATE_REACH)
+    others = np.unique(np.linspace(first, last, min(PLATE_FRAMES, last - first + 1)).round().astype(int))
     stack, known = np.empty((len(others), size[1], size[0], 3), np.uint8), np.empty((len(others), *size[::-1]), bool)
     for n, j in enumerate(others):
         to_other = np.linalg.inv(to_image) @ alignment.between(k, j) @ to_image @ to_box

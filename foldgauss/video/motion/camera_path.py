@@ -104,20 +104,21 @@ def estimate_camera_path(video: RenderedVideo, *, on_frame: Callable[[], None] =
     size = fit_size(SIDE, *video.size)[::-1]
     times = np.asarray(video.frame_times.times(), np.float64)
     cut = np.asarray(is_cut(times))
-    matrices, inliers, starts = np.tile(np.eye(3), (len(times), 1, 1)), np.ones(len(times)), [0]
+    matrices, inliers, starts = np.tile(np.eye(3), (len(times), 1, 1)), np.ones(len(times)), []
     to_model = pixels_to_model(size)
     to_pixels = np.linalg.inv(to_model)
     before = None
     for k, image in enumerate(VideoRenderer(video, size).frames(times.astype(np.float32))):
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        if k:
+        found = None
+        if k and not cut[k - 1]:
             points, target, known = match_points(*both_flows(before, gray), SPACING, MISS, MISS_FRACTION)
             found = fit_affine(points[known], target[known], INLIER, LEAST_INLIERS * len(points))
-            if cut[k - 1] or found is None:
-                starts.append(k)
-            else:
-                inliers[k] = found[1] / len(points)
-                matrices[k] = to_model @ found[0] @ to_pixels @ matrices[k - 1]
+        if found is None:
+            starts.append(k)
+        else:
+            inliers[k] = found[1] / len(points)
+            matrices[k] = to_model @ found[0] @ to_pixels @ matrices[k - 1]
         before = gray
         on_frame()
     return CameraPath(matrices, inliers, times, tuple(starts))

@@ -198,17 +198,13 @@ def _measure_motion(alignment: Alignment, k: int, shot: tuple[int, int]) -> Floa
             inside = cv2.erode(warp_by(ones, matrix, size, cv2.BORDER_CONSTANT), np.ones((5, 5))) > 0
             flow = both_flows(image, warp_by(alignment.images[j], matrix, size))[0]
             length = np.hypot(flow[..., 0], flow[..., 1])
-            lengths.append(np.where(inside, length, np.inf))
+            lengths.append(np.where(inside, length, np.nan))
             if gap == 1:
                 nearer.append(_measure_parallax(flow, length, matrix))
         if lengths:
             # What is visible in one of the two frames only has no flow to the other.
-            least = np.minimum.reduce(lengths)
-            known = np.isfinite(least)
-            found.append(_compare_to_median(np.where(known, least, np.nan), LEAST_MOTION))
-    with np.errstate(invalid="ignore"):
-        known = ~np.isnan(found)
-        mean = np.where(known, found, 0).sum(0) / np.maximum(known.sum(0), 1)
+            found.append(_compare_to_median(np.fmin.reduce(lengths), LEAST_MOTION))
+    mean = np.nansum(found, 0) / np.maximum((~np.isnan(found)).sum(0), 1)
     return np.float32(mean * (1 - (1 - PARALLAX) * np.mean(nearer, axis=0)))
 
 
@@ -396,8 +392,6 @@ def _choose_pieces(
     labels, expected: Bool[np.ndarray, "rows columns"], reach: float
 ) -> Bool[np.ndarray, "rows columns"]:
     """The pieces that are mostly within `reach` pixels of where an object is expected, or cover much of it."""
-    if not expected.any():
-        return expected
     near = cv2.distanceTransform(np.uint8(~expected), cv2.DIST_L2, 3) <= reach
     num = labels.max() + 1
     area = np.bincount(labels.ravel(), minlength=num)

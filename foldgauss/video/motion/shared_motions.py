@@ -73,8 +73,8 @@ def find_shared_motions(motion: Motion, *, steady: bool = False) -> Float[np.nda
     """
     clip = _Clip.of(motion)
     steps = clip.find_camera_steps()
-    camera = _fill_unknown(steps)
-    path = clip.chain_within_limits(camera if steady else clip.keep_unsteady(steps))
+    camera = np.where(np.isnan(steps), np.eye(3), steps)
+    path = clip.chain_within_limits(camera if steady else clip.keep_unsteady(steps, camera))
     found = [path] if path is not None and (path != np.eye(3)).any() else []
     path = _find_object(clip, camera, smooth=None if found else SMOOTH)
     found += [] if path is None else [path]
@@ -140,11 +140,13 @@ class _Clip:
         """The maps of which as little is forgotten as `FARTHEST` allows; None if all had to be."""
         return next((maps for maps in (self.chain(steps, own) for own in FORGOTTEN) if _is_near(maps)), None)
 
-    def keep_unsteady(self, steps: Float[np.ndarray, "frames 3 3"]) -> Float[np.ndarray, "frames 3 3"]:
-        """The camera's steps, with the identity where unknown and in shots whose unsteadiness is at most `STEADY`."""
+    def keep_unsteady(
+        self, steps: Float[np.ndarray, "frames 3 3"], camera: Float[np.ndarray, "frames 3 3"]
+    ) -> Float[np.ndarray, "frames 3 3"]:
+        """The steps of the `camera`, none in shots where the unsteadiness of the known `steps` is at most `STEADY`."""
         height, width = np.array(self.motion.size) / max(self.motion.size)
         corners = [[0.35 * x * width, 0.35 * y * height] for x in (-1, 1) for y in (-1, 1)]
-        kept = _fill_unknown(steps)
+        kept = camera.copy()
         changes = self.measure_changes(steps, np.tile(corners, (len(steps), 1, 1)))
         for first, stop in self.shots:
             if not _are_larger(changes[first:stop], max(STEADY, LEAST_UNSTEADY / max(self.motion.size))):
@@ -168,11 +170,6 @@ class _Clip:
                 change = np.einsum("i,inj->nj", weights, path)[:, :2]
                 changes[k] = np.sqrt((change**2).sum(1).mean())
         return changes * np.sqrt(6 / 70)  # the sums of the squared weights of second and of fourth differences
-
-
-def _fill_unknown(steps: Float[np.ndarray, "frames 3 3"]) -> Float[np.ndarray, "frames 3 3"]:
-    """The camera's steps: none where they are NaN, which is unknown."""
-    return np.where(np.isnan(steps), np.eye(3), steps)
 
 
 def _are_larger(changes: Float[np.ndarray, " frames"], least: float) -> bool:

@@ -1,5 +1,6 @@
 """Images between frames: the video's own, averaged with what optical flow predicts from its images at the frames."""
 
+import functools
 from collections.abc import Iterator
 from itertools import pairwise
 
@@ -49,18 +50,28 @@ def interpolate_frames(
     renderer = VideoRenderer(video, size, background=background)
     frame_times = np.asarray(video.frame_times.times(), np.float64)
     shown = frame_times if times is None else np.asarray(times)
-    cuts, window = is_cut(frame_times), None
+    cuts = is_cut(frame_times)
+    render = functools.lru_cache(maxsize=4)(lambda k: renderer.frame(frame_times[k]))
+    find_flow = functools.lru_cache(maxsize=3)(lambda k: Motion.from_frames(np.stack([render(k), render(k + 1)])))
+
+    @functools.lru_cache(maxsize=1)
+    def frames_around(k: int) -> tuple[int, np.ndarray, Motion]:
+        """The first of the frames around interval k, these frames, and the flow between them."""
+        around = range(max(k - 1, 0), min(k + 3, len(frame_times)))
+        return around[0], np.stack(list(map(render, around))), Motion.join(list(map(find_flow, around[:-1])))
+
     for t, image in zip(shown, renderer.frames(times), strict=True):
         k = min(max(int(np.searchsorted(frame_times, t, side="right")) - 1, 0), len(frame_times) - 1)
         fraction = 0.0
         if image.shape[2] == 3 and max(image.shape) < MAX_SIDE and k + 1 < len(frame_times) and not cuts[k]:
             fraction = (t - frame_times[k]) / (frame_times[k + 1] - frame_times[k])
-        if not NEAR < fraction < 1 - NEAR:
-            yield image
-            continue
-        if window is None or window.interval != k:
-            window = _Window(renderer, frame_times, k, window)
-        yield window.average(image, fraction)
+        if NEAR < fraction < 1 - NEAR:
+            first, frames, motion = frames_around(k)
+            if k + 1 - first not in motion.cuts:
+                predicted = motion.interpolate(frames, k - first, fraction, image.shape[:2])
+                weight = (FLOW_WEIGHT / (1 + predicted.difference / HALVING_DIFFERENCE))[..., None]
+                image = np.rint(image + weight * (np.clip(predicted.image, 0, 255) - image)).astype(np.uint8)
+        yield image
 
 
 def even_durations(video: RenderedVideo) -> Float[np.ndarray, " intervals"]:
@@ -83,26 +94,3 @@ def even_durations(video: RenderedVideo) -> Float[np.ndarray, " intervals"]:
         moved = np.vdot(here, beside) / np.vdot(beside, beside) if steady else 1.0
         durations[k] = max(moved, 0.0) if moved < REPEATED else 1.0
     return durations
-
-
-class _Window:
-    """The images at the frames around an interval and the flow between them; those of `before` are used again."""
-
-    def __init__(self, renderer: VideoRenderer, times: np.ndarray, interval: int, before: "_Window | None"):
-        images, flows = ({}, {}) if before is None else (before.images, before.flows)
-        around = range(max(interval - 1, 0), min(interval + 3, len(times)))
-        self.interval, self.inner = interval, interval - around[0]
-        self.images = {k: images[k] if k in images else renderer.frame(times[k]) for k in around}
-        self.frames = np.stack(list(self.images.values()))
-        pairs = {k: self.frames[n : n + 2] for n, k in enumerate(around[:-1])}
-        self.flows = {k: flows[k] if k in flows else Motion.from_frames(pair) for k, pair in pairs.items()}
-        self.motion = Motion.join(list(self.flows.values()))
-        self.is_cut = self.inner + 1 in self.motion.cuts
-
-    def average(self, image: np.ndarray, fraction: float) -> UInt8[np.ndarray, "height width 3"]:
-        """The weighted average of the video's own image and the prediction, at a fraction of the interval."""
-        if self.is_cut:
-            return image
-        predicted = self.motion.interpolate(self.frames, self.inner, fraction, image.shape[:2])
-        weight = (FLOW_WEIGHT / (1 + predicted.difference / HALVING_DIFFERENCE))[..., None]
-        return np.rint(image + weight * (np.clip(predicted.image, 0, 255) - image)).astype(np.uint8)

@@ -5,6 +5,7 @@ import itertools
 from collections.abc import Callable
 from typing import Literal
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -183,8 +184,7 @@ class PreparedStabilizedVideo(PreparedVideo):
         if self._video.border == "fill":
             parts += self._beyond_borders(t, to_output)
         parts.append(_apply(to_output, _choose(seen, wide)))
-        leaves = [(part.mean, part.factor, part.opacity, part.color) for part in parts]
-        return Splats2D(*map(np.concatenate, zip(*leaves, strict=True)))
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
     def _beyond_borders(self, t: float, to_output: Affine) -> list[Splats2D]:
         """What other frames show where the image at time t, and those in front of them, have ended."""
@@ -211,8 +211,7 @@ def _are_wide(splats: Splats2D) -> Bool[np.ndarray, " num"]:
 
 
 def _choose(splats: Splats2D, which: Bool[np.ndarray, " num"]) -> Splats2D:
-    leaves = splats.mean, splats.factor, splats.opacity, splats.color
-    return Splats2D(*(np.asarray(leaf)[which] for leaf in leaves))
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[which], splats)
 
 
 def _apply(affine: Affine, splats: Splats2D) -> Splats2D:

@@ -6,8 +6,14 @@ import functools
 import numpy as np
 
 from foldgauss._runtime.checks import invalid, require
-from foldgauss.video.editing.edited_video import EditedVideo, Layer, as_edited, check_timeline, stack_layers
-from foldgauss.video.editing.layer_edits import gather_layer
+from foldgauss.video.editing.edited_video import (
+    EditedVideo,
+    Layer,
+    as_edited,
+    check_timeline,
+    gather_layer,
+    stack_layers,
+)
 from foldgauss.video.editing.overlays import AbstractOverlay, GaussianFunction, Retiming, TriangleFunction, is_active
 from foldgauss.video.editing.timing import NEVER, Clock, TimeMap, distinct_knots, frame_times_of
 from foldgauss.video.models.video_model import VideoModel

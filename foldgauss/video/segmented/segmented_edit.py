@@ -13,12 +13,13 @@ from jaxtyping import ArrayLike
 
 from foldgauss._runtime.checks import check_signature
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.video.editing.arguments import check_color, check_select_arguments, missing_attribute
+from foldgauss.video.editing.arguments import check_select_arguments, missing_attribute
 from foldgauss.video.editing.bake import mean_lightness
 from foldgauss.video.editing.chain import Edit, edit, start_chain
 from foldgauss.video.editing.edited_video import EditedVideo, as_edited
 from foldgauss.video.editing.overlays import LUMINANCE_WEIGHTS
 from foldgauss.video.editing.timing import TimeMap, When, frame_times_of
+from foldgauss.video.models.background import check_color
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
@@ -191,7 +192,7 @@ class SegmentedEdit:
         if not sums:
             _deselect_all(self._stand_in)._check_selected()
         when = {name: value for name, value in kwargs.items() if name in When.__annotations__}
-        matrix = np.outer(check_color(color), LUMINANCE_WEIGHTS)
+        matrix = np.outer(check_color("color", color), LUMINANCE_WEIGHTS)
         return self._record("recolor", (), {"gain": 1 / mean_lightness(sums), "matrix": matrix, **when})
 
     def _record(self, name: str, args: Sequence[Any], kwargs: dict[str, Any]) -> "SegmentedEdit":

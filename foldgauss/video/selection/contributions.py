@@ -8,16 +8,14 @@ over pixels. There are always three channels, the number for which the fit has c
 import dataclasses
 import functools
 import math
-from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from scipy.special import expit
 
 from foldgauss.render import cpu
-from foldgauss.video.models.conditioning import ConditionedSplats, condition
+from foldgauss.video.models.conditioning import ConditionedSplats, PreparedModel, condition
 from foldgauss.video.models.frame_times import snap_to_shots
-from foldgauss.video.models.prepared import PreparedModel
 from foldgauss.video.models.video_model import VideoModel, check_model
 from foldgauss.video.selection.regions import Region
 
@@ -130,17 +128,6 @@ def sum_contributions(
         total[frame.alive] += own
         best[frame.alive] = np.maximum(best[frame.alive], own)
     return inside, total, best
-
-
-def update_best(
-    contributions: Contributions, frames: Iterable[int], best: Float[np.ndarray, " num_gaussians"]
-) -> Float[np.ndarray, " num_gaussians"]:
-    """Each Gaussian's contribution to its best frame: the maximum of `best` and those to `frames`."""
-    best = best.copy()
-    for k in frames:
-        frame = contributions.at_frame(k)
-        best[frame.alive] = np.maximum(best[frame.alive], frame.total)
-    return best
 
 
 def average_seen_colors(

@@ -13,6 +13,7 @@ from jaxtyping import ArrayLike, Bool, Float, Float32, Int, Int8
 
 from foldgauss._runtime.checks import check_within, invalid, is_integer, require, short_repr
 from foldgauss.render import cpu
+from foldgauss.video.models.background import check_color
 from foldgauss.video.models.renderer import check_time
 from foldgauss.video.models.splats import SH_C0
 from foldgauss.video.models.video_model import VideoModel, check_model
@@ -23,7 +24,6 @@ from foldgauss.video.selection.contributions import (
     average_seen_colors,
     render_matte,
     sum_contributions,
-    update_best,
 )
 from foldgauss.video.selection.regions import (
     Masks,
@@ -259,8 +259,15 @@ def list_criteria(**arguments: Any) -> list[tuple[Callable[..., Selection], dict
     require(
         isinstance(given.get("moving", True), bool), "moving", expected="True or False", got=repr(given.get("moving"))
     )
-    functions = {"mask": by_mask, "box": by_box, "polygon": by_polygon, "moving": by_motion, "color": by_color}
-    functions |= {"click": by_click, "times": by_time}
+    functions = {
+        "mask": by_mask,
+        "box": by_box,
+        "polygon": by_polygon,
+        "moving": by_motion,
+        "color": by_color,
+        "click": by_click,
+        "times": by_time,
+    }
     found = {name: {name: given[name]} for name in functions if name in given}
     if not found.keys() & {"mask", "box", "polygon", "click"} and given.keys() & {"frame", "frames"}:
         found["frames"] = {}  # a criterion of its own
@@ -409,13 +416,7 @@ def by_color(
 
     **Example:** `by_color(model, (0.9, 0.2, 0.1), tolerance=25)`. **Raises:** ValueError for an invalid color.
     """
-    wanted = np.asarray(color)
-    require(
-        wanted.shape == (3,) and wanted.dtype.kind in "fiu" and ((wanted >= 0) & (wanted <= 1)).all(),
-        "color",
-        expected="red, green and blue in [0, 1]",
-        got=color,
-    )
+    wanted = check_color("color", color)
     check_within("tolerance", tolerance, "[0, inf)", "a number in [0, inf)")
     contributions = Contributions(model)
     own = np.maximum(0.5 + SH_C0 * np.asarray(model.splats.color_dc), 0)
@@ -544,7 +545,10 @@ def _select_region(model: VideoModel, region: Region, threshold: float, follow: 
     direct[total == 0] = UNKNOWN
     label = direct
     if follow:
-        overall = update_best(contributions, set(range(model.num_frames)) - set(region.frames), best)
+        overall = best.copy()
+        for k in set(range(model.num_frames)) - set(region.frames):
+            frame = contributions.at_frame(k)
+            overall[frame.alive] = np.maximum(overall[frame.alive], frame.total)
         clear = np.where(best >= CLEAR * overall, direct, UNKNOWN)
         label = propagate_labels(contributions, clear, region.frames, overall)
         label = np.where(label == UNKNOWN, direct, label)

@@ -1,13 +1,12 @@
 """Tracking by motion and color: carries labels of Gaussians to other frames, and grows a mask from a single pixel."""
 
 from collections.abc import Iterable
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 import scipy
 import skimage
-from jaxtyping import Bool, Float, Float32, Int, Int8
+from jaxtyping import Bool, Float, Float32, Int8
 
 from foldgauss.video.models.frame_times import is_cut
 from foldgauss.video.selection.contributions import Contributions, FrameContributions
@@ -31,44 +30,18 @@ OUT = 0
 IN = 1
 
 
-class Observations(NamedTuple):
-    """The Gaussians visible in a frame, and the features that tell them apart.
-
-    Colors and motions are those *seen* where the Gaussian is: the image's, averaged by its weights. The Gaussian's own
-    values may be anything where many overlap.
-    """
-
-    index: Int[np.ndarray, " num"]  # among all
-    position: Float32[np.ndarray, "num 2"]  # px
-    motion: Float32[np.ndarray, "num 2"]  # px per frame
-    color: Float32[np.ndarray, "num 3"]  # CIELAB
-    total: Float32[np.ndarray, " num"]  # px
-
-
-def observe(contributions: Contributions, k: int) -> Observations:
-    """The visible Gaussians of frame k."""
-    frame = contributions.at_frame(k)
-    which = np.flatnonzero(frame.total > 0)
-    total = frame.total[which]
-    motion = frame.gather(_render_motion(contributions, k, frame))[which] / total[:, None]
-    color = to_lab(frame.gather(frame.trace.image)[which] / total[:, None])
-    return Observations(frame.alive[which], frame.splats.mean[which], motion, color, total)
-
-
 def _render_motion(
     contributions: Contributions, k: int, frame: FrameContributions
 ) -> Float32[np.ndarray, "2 height width"]:
-    """The motion that frame k shows at each pixel, in pixels per frame; 0 where nothing is rendered."""
-    everyone = frame.render(np.ones((len(frame.alive), 1)))
-    return frame.render(_motion(contributions, k, frame)) / np.maximum(everyone, 1e-6)
+    """The motion that frame k shows at each pixel, in pixels per frame; 0 where nothing is rendered.
 
-
-def _motion(contributions: Contributions, k: int, frame: FrameContributions) -> Float32[np.ndarray, "num_alive 2"]:
-    """Displacement of each Gaussian's center within one frame interval, in pixels."""
+    It is that of the Gaussians' centers within one frame interval, averaged by their weights.
+    """
     intervals = np.diff(contributions.times)
     half = intervals[max(k - 1, 0) : k + 1].min(initial=1.0) / 2  # the shorter interval: the other may be a cut
-    t = float(contributions.times[k])
-    return contributions.centers_at(frame.alive, t + half) - contributions.centers_at(frame.alive, t - half)
+    before, after = (contributions.centers_at(frame.alive, contributions.times[k] + own) for own in (-half, half))
+    everyone = frame.render(np.ones((len(frame.alive), 1)))
+    return frame.render(after - before) / np.maximum(everyone, 1e-6)
 
 
 def to_lab(color: Float[np.ndarray, "num 3"]) -> Float32[np.ndarray, "num 3"]:
@@ -101,13 +74,20 @@ def propagate_labels(
             break
         if not (label[contributions.at_frame(k).alive] == UNKNOWN).any():
             continue
-        seen = observe(contributions, k)
-        own = label[seen.index]
-        known, asked = own != UNKNOWN, (own == UNKNOWN) & (seen.total >= CLEAR * best[seen.index])
+        frame = contributions.at_frame(k)
+        shown, unit = frame.total > 0, max(contributions.size)
+        index, total = frame.alive[shown], frame.total[shown]
+        own = label[index]
+        known, asked = own != UNKNOWN, (own == UNKNOWN) & (total >= CLEAR * best[index])
         if known.any() and asked.any():
-            unit = max(contributions.size)
-            features = np.hstack([seen.position / (PLACE * unit), seen.motion / (MOTION * unit), seen.color / COLOR])
-            label[seen.index[asked]] = _vote(features[known], own[known], features[asked])
+            # Those seen where the Gaussian is; its own color may be anything where many overlap.
+            motion, color = (
+                frame.gather(image)[shown] / total[:, None]
+                for image in (_render_motion(contributions, k, frame), frame.trace.image)
+            )
+            position = frame.splats.mean[shown]
+            features = np.hstack([position / (PLACE * unit), motion / (MOTION * unit), to_lab(color) / COLOR])
+            label[index[asked]] = _vote(features[known], own[known], features[asked])
     return label
 
 
