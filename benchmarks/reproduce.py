@@ -201,7 +201,7 @@ def run_to_end(clip: Clip, name: str, config: FitConfig, folder: Path) -> Run:
     """A fit, continued after its checkpoint. Raises ValueError for a checkpoint of other settings or frames."""
     curve_file = curve_path(folder, name)
     checkpoint = Checkpoint(curve_file.with_suffix(".checkpoint"), config, fingerprint(clip))
-    state = checkpoint.load(required=True) if checkpoint.path.exists() else None
+    state = checkpoint.load()
     curve = Curve(curve_file, state)
     where = "" if state is None else f" continues after step {state.step:,}"
     if state is None and (box := VARIANTS.get(name, {}).get("box")):

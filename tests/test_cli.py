@@ -379,7 +379,7 @@ def interrupted(monkeypatch):
 
 
 def test_stopped_while_scores_are_measured_and_resumed(work, tmp_path, capsys, monkeypatch):
-    """The model is there, and a resumed fit notes in it what an undisturbed one does."""
+    """The fit is kept, and the same command writes the model of an undisturbed one."""
     fit = ("fit", work / "clip.mp4", "--gaussians", 50, "--steps", 12, "--quiet", "--out")
     assert run(*fit, tmp_path / "whole.safetensors") == 0
 
@@ -389,9 +389,8 @@ def test_stopped_while_scores_are_measured_and_resumed(work, tmp_path, capsys, m
     with monkeypatch.context() as patch:
         patch.setattr(fitting, "evaluate_with_progress", stopped)
         assert run(*fit, tmp_path / "model.safetensors") == 130
-    assert "add --resume --overwrite" in capsys.readouterr().err
-    load_video_model(tmp_path / "model.safetensors")
-    assert run(*fit, tmp_path / "model.safetensors", "--resume", "--overwrite") == 0
+    assert "Give the same command again to continue." in capsys.readouterr().err
+    assert run(*fit, tmp_path / "model.safetensors") == 0
     assert (tmp_path / "model.safetensors").read_bytes() == (tmp_path / "whole.safetensors").read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["model.safetensors", "whole.safetensors"]
 
@@ -399,19 +398,18 @@ def test_stopped_while_scores_are_measured_and_resumed(work, tmp_path, capsys, m
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_stopped_and_resumed(number, work, tmp_path, capsys, interrupted):
-    """A signal keeps the fit; --resume ends it; the model equals that of a fit that was never stopped."""
+    """A signal keeps the fit; the same command ends it; the model equals that of a fit that was never stopped."""
     target, kept = tmp_path / "m.safetensors", tmp_path / "m.safetensors.checkpoint"
     arguments = ["fit", work / "clip.mp4", "--out", target, "--gaussians", "400", "--steps", "80"]
     disarm = interrupted(number)
     assert run(*arguments) == 1
     disarm()
-    assert "--resume" in capsys.readouterr().err
+    assert "Give the same command again to continue." in capsys.readouterr().err
     assert kept.exists()
     assert not target.exists()
-    assert run(*arguments) == 2  # a kept fit is not thrown away by accident
-    assert run(*arguments[:-1], "90", "--resume") == 2  # nor continued as another
-    assert run(*arguments, "--frames", "0:5", "--resume") == 2  # nor with other frames
-    assert run(*arguments, "--resume") == 0
+    assert run(*arguments[:-1], "90") == 2  # not continued as another
+    assert run(*arguments, "--frames", "0:5") == 2  # nor with other frames
+    assert run(*arguments) == 0
     assert not kept.exists()
     whole = tmp_path / "whole.safetensors"
     assert run(*arguments[:3], whole, *arguments[4:]) == 0
@@ -436,7 +434,7 @@ def test_killed_at_any_moment_and_resumed(work, tmp_path):
     assert process.wait() == -signal.SIGKILL
     assert not target.exists()
     assert 37 < _step_of(kept) < 300
-    assert run(*command[3:], "--resume") == 0
+    assert run(*command[3:]) == 0
     whole = tmp_path / "whole.safetensors"
     assert run("fit", work / "clip.mp4", "--out", whole, *options) == 0
     assert target.read_bytes() == whole.read_bytes()
@@ -501,7 +499,7 @@ def test_the_history_of_another_fit_is_left_alone(work, tmp_path, capsys, interr
     disarm = interrupted(signal.SIGINT)
     assert run(*quick, "--steps", "80", "--out", target, "--history", tmp_path / "own.jsonl") == 1
     disarm()
-    resumed = [*quick, "--steps", "80", "--out", target, "--resume", "--history"]
+    resumed = [*quick, "--steps", "80", "--out", target, "--history"]
     assert run(*resumed, other) == 2
     assert "history: expected that of the fit which is resumed at step 40" in capsys.readouterr().err
     assert other.read_bytes() == before

@@ -100,10 +100,10 @@ def test_stopped_and_resumed(clip, tmp_path, monkeypatch, capsys, step):
     with monkeypatch.context() as patch:
         patch.setattr(runner, "fit_steps", stepping)
         assert run("fit", clip, *QUICK) == 1
-    assert "--resume" in capsys.readouterr().err
+    assert "Give the same command again to continue." in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["ball.fgz.checkpoint"]
-    assert run("fit", clip, *QUICK, "--quality", 60, "--resume") == 2  # not with another goal
-    assert run("fit", clip, *QUICK, "--resume") == 0
+    assert run("fit", clip, *QUICK, "--quality", 60) == 2  # not with another goal
+    assert run("fit", clip, *QUICK) == 0
     assert run("fit", clip, *QUICK, "--out", "whole.fgz") == 0
     assert (tmp_path / "ball.fgz").read_bytes() == (tmp_path / "whole.fgz").read_bytes()
 

@@ -107,7 +107,7 @@ def test_a_stopped_fit_goes_on_when_the_command_is_given_again(long_clip, whole,
     assert (folder / "segment-0001.safetensors.checkpoint").exists()
     assert run("fit", long_clip, "--out", target, *SEGMENTS[:-1], "2") == 2  # not with other options
     assert "segment_seconds=1.5" in capsys.readouterr().err
-    assert run("fit", long_clip, "--out", target, *SEGMENTS, "--resume") == 0
+    assert run("fit", long_clip, "--out", target, *SEGMENTS) == 0
     assert "continuing: 1 of 3 segments done, 1 begun" in capsys.readouterr().err
     assert target.read_bytes() == whole.read_bytes()
     assert not folder.exists()
@@ -146,7 +146,7 @@ def test_what_was_begun_in_segments_goes_on_so_without_being_told(long_clip, who
     (tmp_path / "m.safetensors.segments").mkdir()
     (tmp_path / "m.safetensors.segments" / "plan.json").write_text('{"asked": {"segment_seconds": 1.5}}')
     checkpoint.write_bytes(b"of a fit in one piece")
-    assert run("fit", long_clip, "--out", target, *QUICK, "--overwrite", "--resume") == 1
+    assert run("fit", long_clip, "--out", target, *QUICK) == 1
     assert checkpoint.name in capsys.readouterr().err
     assert target.read_bytes() == whole.read_bytes()
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax
+import numpy as np
 
 from foldgauss import __version__
 from foldgauss._runtime.checks import require
@@ -29,7 +30,6 @@ from foldgauss.io.models.compact import COMPACT_SUFFIX, leave_room, save_compact
 from foldgauss.io.models.video_model import save_video_model
 from foldgauss.io.provenance import describe_reading, describe_source, fingerprint
 from foldgauss.jobs.job import FitJob, file_digest, limit_range, read_record
-from foldgauss.video.compression.quantize import Quantized
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.divergence import FitDiverged
 from foldgauss.video.fitting.loop import FitInfo, finish, fit_steps
@@ -74,12 +74,14 @@ class Checkpoint:
     source: dict[str, Any]
     on_error: CheckpointError = lambda error, step: None
 
-    def load(self, required: bool) -> FitState | None:
-        """The state of the file; unless `required`, None if it is missing, unreadable or of another fit."""
+    def load(self, *, strict: bool = True) -> FitState | None:
+        """The state of the file, None if it is missing; unless `strict` also if it is damaged or of another fit."""
+        if not self.path.exists():
+            return None
         try:
             return load_checkpoint(self.path, config=self.config, source=self.source)
         except (OSError, ValueError):
-            if required:
+            if strict:
                 raise
             return None
 
@@ -91,58 +93,22 @@ class Checkpoint:
             self.on_error(error, state.step)
 
 
-@dataclasses.dataclass(frozen=True)
-class FitRun:
-    """A finished fit of a job: its frames, its model, the last state and the `info` of the last step.
-
-    `quantized` is the compact model, where one was asked for.
-    """
-
-    job: FitJob
-    clip: Clip
-    model: VideoModel
-    state: FitState
-    info: FitInfo
-    checkpoint: Checkpoint
-    quantized: Quantized | None = None
-
-    def save_checkpoint(self) -> None:
-        """Save the last state, so that the fit need not be repeated if its model cannot be written."""
-        self.checkpoint.try_save(self.state)
-
-    def save(self, scores: Evaluation | None = None) -> None:
-        """Write the model, with its mean scores once they are measured."""
-        metadata = (
-            _describe_clip(self.job, self.clip)
-            | describe_fit(self.job.config, self.state)
-            | ({} if scores is None else mean_scores(scores))
-        )
-        if Path(self.job.target).suffix.lower() == COMPACT_SUFFIX:
-            save_compact(self.job.target, self.quantized, metadata=metadata)
-        else:
-            save_video_model(self.job.target, self.model, metadata=metadata)
-
-    def save_to(self, path: Path, scores: Evaluation | None = None) -> "FitRun":
-        """Write the model to `path`; returns the run with that as its target."""
-        moved = dataclasses.replace(self, job=dataclasses.replace(self.job, target=str(path)))
-        moved.save(scores)
-        return moved
-
-
 def run_fit(
     job: FitJob,
     observer: OpenObserver,
     *,
-    resume: Literal["required", "if possible", "never"] = "if possible",
+    resume: Literal["strictly", "if possible", "never"] = "if possible",
+    measure: Callable[[VideoModel, np.ndarray], Evaluation] = evaluate,
     on_checkpoint_error: CheckpointError = lambda error, step: None,
-) -> FitRun:
-    """Fit the frames of a job, from its checkpoint if it resumes.
+) -> dict[str, Any]:
+    """Fit the frames of a job, from its checkpoint if there is one, and write its model; returns the job's record.
 
-    With `resume` "never", the first step removes an old checkpoint. The observer is opened once the frames are read.
-    Neither the model nor the last state nor a record is written: see `FitRun`.
+    The record is described in `fit_job`. The checkpoint, then that of the last step, stays until the caller removes it.
+    With `resume` "strictly" a checkpoint of another fit is an error; with "never" the first step removes it. The
+    observer is opened once the frames are read; `measure` computes the scores.
 
     Raises `Stopped` if the observer stops the fit, `FitDiverged` as `fit_steps`, ValueError and OSError for frames that
-    cannot be read or fitted, and for a checkpoint that is required.
+    cannot be read or fitted, for outputs that cannot be written, and for a checkpoint of another fit.
     """
     require(
         Path(job.target).suffix.lower() != COMPACT_SUFFIX or job.config.is_compact,
@@ -158,9 +124,9 @@ def run_fit(
         clip = dataclasses.replace(clip, fps=job.fps or clip.fps)
     _limit_compiled(clip.frames.shape)
     checkpoint = Checkpoint(job.checkpoint, job.config, fingerprint(clip), on_checkpoint_error)
-    state = None if resume == "never" else checkpoint.load(required=resume == "required")
-    room = leave_room(job.config.size_mb, _describe_clip(job, clip))
-    config = dataclasses.replace(job.config, size_mb=room)
+    state = None if resume == "never" else checkpoint.load(strict=resume == "strictly")
+    about = _describe_clip(job, clip)
+    config = dataclasses.replace(job.config, size_mb=leave_room(job.config.size_mb, about))
     steps = fit_steps(clip.frames, config, state)
     with observer(clip, state) as observe:
         if resume == "never":  # an earlier fit could be resumed by mistake; its checkpoint goes once a step is taken
@@ -168,7 +134,45 @@ def run_fit(
             job.checkpoint.unlink(missing_ok=True)
         state, info = run_steps(steps, observe, checkpoint, job.checkpoint_seconds)
     model, quantized = finish(state, clip.frames, config, clip.fps)
-    return FitRun(job, clip, model, state, info, checkpoint, quantized)
+    scores = measure(model, clip.frames)
+    about |= describe_fit(job.config, state) | mean_scores(scores)
+
+    def save(path: Path) -> Path:
+        if path.suffix.lower() == COMPACT_SUFFIX:
+            return save_compact(path, quantized, metadata=about)
+        return save_video_model(path, model, metadata=about)
+
+    _write_model(job, save)
+    return {
+        "asked": job.request,
+        "num_frames": clip.num_frames,
+        "size": list(clip.size),
+        "fps": clip.fps,
+        "num_gaussians": model.num_gaussians,
+        "psnr": list(scores.psnr),
+        "ssim": list(scores.ssim),
+        **mean_scores(scores),
+        "steps": info.step,
+        "seconds": round(info.seconds, 2),
+        "stopped_by": info.stopped_by,
+        "file_bytes": os.path.getsize(job.target),
+        "file_digest": file_digest(job.target),
+        "peak_bytes": peak_bytes(),
+        "notes": list(clip.notes),
+        "warnings": [*busy_processors(state, info), *missed_psnr(job.config, scores.mean_psnr)],
+    }
+
+
+def _write_model(job: FitJob, save: Callable[[Path], Path]) -> None:
+    """Write the model; if that fails, the fit is kept by its checkpoint, or the model in the folder for such files."""
+    if not job.checkpoint.exists():
+        write_or_keep(Path(job.target), save)
+        return
+    try:
+        save(Path(job.target))
+    except OSError as error:
+        text = f"The fit is kept in {job.checkpoint}: the same command writes the model."
+        raise OutputError(f"{error} {text}") from error
 
 
 def run_steps(
@@ -177,7 +181,7 @@ def run_steps(
     checkpoint: Checkpoint | None = None,
     seconds: float | None = None,
 ) -> tuple[FitState, FitInfo]:
-    """Take all steps of a fit and return the last; the state is saved every so many `seconds`.
+    """Take all steps of a fit and return the last; the state is saved every so many `seconds`, and at the end.
 
     Raises as `run_fit`.
     """
@@ -193,7 +197,6 @@ def run_steps(
                 state.processor_seconds += now[0] - spent
                 state.waiting_seconds += max(now[1] - waited, 0.0)  # threads that have ended are not counted
                 spent, waited = now
-            if stop or due:
                 if checkpoint is not None:
                     checkpoint.try_save(state)
                 saved = time.monotonic()
@@ -232,7 +235,8 @@ def missed_psnr(config: FitConfig, psnr: float) -> list[str]:
     is_limited = config.quality is not None or config.size_mb is not None
     if config.psnr is None or is_limited or psnr >= config.psnr - TOLERATED_DB:
         return []
-    return [f"expected {config.psnr:g} dB, got {psnr:.2f}."]
+    cure = "Give more --minutes or --steps, or more --gaussians at the start."
+    return [f"--psnr: expected {config.psnr:g} dB, got {psnr:.2f}. {cure}"]
 
 
 def mean_scores(scores: Evaluation) -> dict[str, float]:
@@ -294,7 +298,7 @@ def fit_job(job: FitJob, report: Report = lambda progress: True) -> dict[str, An
 
     The record: `asked` (the request), `num_frames`, `size`, `fps`, `num_gaussians`, `psnr` and `ssim` by frame,
     `mean_psnr`, `mean_ssim`, `steps`, `seconds` (spent fitting), `stopped_by`, `file_bytes`, `file_digest`,
-    `peak_bytes` (of the process, so far) and `warnings`.
+    `peak_bytes` (of the process, so far), `notes` (of the clip) and `warnings`.
 
     Raises `Stopped` if `report` returns False; ValueError and OSError for a clip that cannot be read or fitted and
     outputs that cannot be written; `FitDiverged` as `fit_steps`.
@@ -324,51 +328,23 @@ def _lock_target(job: FitJob) -> Iterator[None]:
 def _fit_and_record(job: FitJob, report: Report) -> dict[str, Any]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        run = run_fit(job, lambda clip, state: nullcontext(_make_reporter(job.name, report)))
-    run.save_checkpoint()  # the evaluation may be interrupted
-    clip, info = run.clip, run.info
-    scores = evaluate(run.model, clip.frames)
-    if job.checkpoint.exists():
-        run.save(scores)
-    else:
-        write_or_keep(Path(job.target), lambda path: run.save_to(path, scores))
-    record = {
-        "asked": job.request,
-        "num_frames": clip.num_frames,
-        "size": list(clip.size),
-        "fps": clip.fps,
-        "num_gaussians": run.model.num_gaussians,
-        "psnr": [round(one, 4) for one in scores.psnr],
-        "ssim": [round(one, 5) for one in scores.ssim],
-        **mean_scores(scores),
-        "steps": info.step,
-        "seconds": round(info.seconds, 2),
-        "stopped_by": info.stopped_by,
-        "file_bytes": os.path.getsize(job.target),
-        "file_digest": file_digest(job.target),
-        "peak_bytes": peak_bytes(),
-        "warnings": [
-            *(clip.notes if job.index is None else ()),
-            *dict.fromkeys(" ".join(str(warning.message).split()) for warning in caught),
-            *busy_processors(run),
-            *(f"psnr: {text}" for text in missed_psnr(job.config, scores.mean_psnr)),
-        ],
-    }
+        record = run_fit(job, lambda clip, state: nullcontext(_make_reporter(job.name, report)))
+    texts = dict.fromkeys(" ".join(str(warning.message).split()) for warning in caught)
+    record["warnings"] = [*texts, *record["warnings"]]
     with atomic_path(job.record) as temporary:
         temporary.write_text(json.dumps(record) + "\n")
     job.checkpoint.unlink(missing_ok=True)
     return record
 
 
-def busy_processors(run: FitRun) -> list[str]:
+def busy_processors(state: FitState, info: FitInfo) -> list[str]:
     """A warning if a fit by minutes waited for processors longer than it computed; otherwise no text."""
-    got = run.state.processor_seconds
-    asked = got + run.state.waiting_seconds
-    if run.info.stopped_by != "minutes" or got >= LEAST_PROCESSOR_FRACTION * asked:
+    got, asked = state.processor_seconds, state.processor_seconds + state.waiting_seconds
+    if info.stopped_by != "minutes" or got >= LEAST_PROCESSOR_FRACTION * asked:
         return []
     return [
-        f"the processors were busy: this fit got {got:,.1f} of the {asked:,.1f} processor seconds that its threads "
-        f"asked for, and took {run.info.step:,} steps. Give more --minutes, or use a quieter machine."
+        f"--minutes: the processors were busy: this fit got {got:,.1f} of the {asked:,.1f} processor seconds that its "
+        f"threads asked for, and took {info.step:,} steps. Give more --minutes, or use a quieter machine."
     ]
 
 

@@ -146,7 +146,7 @@ def test_a_compact_file_needs_a_goal(clip, tmp_path):
 @pytest.mark.parametrize(("psnr", "num"), [(99.0, 1), (5.0, 0)])
 def test_a_psnr_out_of_reach_is_noted(clip, tmp_path, psnr, num):
     job = job_of(clip, tmp_path, "model.fgz", config=dataclasses.replace(CONFIG, psnr=psnr))
-    told = [text for text in fit_job(job)["warnings"] if text.startswith("psnr: expected 99 dB, got ")]
+    told = [text for text in fit_job(job)["warnings"] if text.startswith("--psnr: expected 99 dB, got ")]
     assert len(told) == num
 
 
@@ -233,7 +233,7 @@ def test_the_largest_memory_is_that_of_the_process_alone():
 @pytest.mark.parametrize(("waited", "stopped_by", "told"), [(61, "minutes", 1), (59, "minutes", 0), (61, "steps", 0)])
 def test_a_fit_by_minutes_warns_where_other_programs_had_the_processors(waited, stopped_by, told):
     state = SimpleNamespace(processor_seconds=60.0, waiting_seconds=float(waited))
-    texts = busy_processors(SimpleNamespace(state=state, info=SimpleNamespace(step=400, stopped_by=stopped_by)))
+    texts = busy_processors(state, SimpleNamespace(step=400, stopped_by=stopped_by))
     assert len(texts) == told
     assert all("got 60.0 of the 121.0 processor seconds" in text and "400 steps" in text for text in texts)
 

@@ -54,6 +54,7 @@ _FIGURES = (
     "seconds",
     "steps",
     "file_bytes",
+    "notes",
     "warnings",
 )
 
@@ -129,9 +130,8 @@ def fit_many(
         except OSError as error:  # a full disk must not end the fits
             warn(str(error))
 
-    again = "Give the command again without --overwrite" if overwrite else "Give the same command again"
     with options.open_pool() as pool:
-        outcomes = run_jobs(jobs, "clips", display, pool, cure=f"{again} to continue.", on_end=on_end)
+        outcomes = run_jobs(jobs, "clips", display, pool, overwrite=overwrite, on_end=on_end)
     failed = [outcome for outcome in outcomes if outcome.failure is not None]
     if display == "json":
         emit_json("done", {"summary": str(out_dir / SUMMARY), "done": len(jobs) - len(failed), "failed": len(failed)})

@@ -11,6 +11,8 @@ from foldgauss.cli.shared.console import Display, print_figures, show_progress
 from foldgauss.cli.shared.fit_progress import print_json
 from foldgauss.jobs import FitJob, Outcome, Progress, WorkerPool, run_here, run_on
 from foldgauss.jobs import Stopped as JobsStopped
+from foldgauss.video.fitting.config import FitConfig
+from foldgauss.video.models.metrics import Evaluation
 
 #: Up to so many jobs, each has a line in a log.
 MAX_LINES = 20
@@ -20,6 +22,27 @@ def emit_json(event: str, figures: dict[str, Any]) -> None:
     """Print a line of JSON; a closed standard output must not end the fits."""
     with suppress(OSError):
         print_json(event, figures)
+
+
+def describe_continuation(overwrite: bool) -> str:
+    """How to continue a command that was stopped."""
+    return f"Give the {'command again without --overwrite' if overwrite else 'same command again'} to continue."
+
+
+def summarize_fit(scores: Evaluation, records: Sequence[dict[str, Any]], config: FitConfig) -> dict[str, Any]:
+    """The figures of a fit as results show them, from the records of its parts."""
+    height, width = records[0]["size"]
+    return {
+        "mean_psnr": round(scores.mean_psnr, 3),
+        "mean_ssim": round(scores.mean_ssim, 4),
+        "lowest_psnr": round(min(scores.psnr), 3),
+        "num_frames": len(scores.psnr),
+        "height": height,
+        "width": width,
+        "num_gaussians": sum(record["num_gaussians"] for record in records),
+        "degree": config.fold_degree,
+        "fit_seconds": round(sum(record["seconds"] for record in records), 2),
+    }
 
 
 def report_fit(display: Display, target: str, figures: dict[str, Any]) -> None:
@@ -36,12 +59,12 @@ def run_jobs(
     display: Display,
     pool: WorkerPool | None,
     *,
+    overwrite: bool,
     on_end: Callable[[Outcome], None] = lambda outcome: None,
-    cure: str,
 ) -> list[Outcome]:
     """Run the jobs, by the workers of `pool` or here, and display progress; outcomes in the order of the jobs.
 
-    After Ctrl-C or SIGTERM, and once checkpoints are written, raises `Stopped`, whose message ends with `cure`.
+    After Ctrl-C or SIGTERM, and once checkpoints are written, raises `Stopped`, whose message says how to continue.
     """
     ended: dict[str, Outcome] = {}
     with note_signals() as request, show_progress(display) as show:
@@ -63,7 +86,8 @@ def run_jobs(
         except JobsStopped as error:
             done = sum(outcome.failure is None for outcome in ended.values())
             text = f"stopped by {request.signal or 'the worker'}; {done} of {len(jobs)} {noun} are done"
-            raise Stopped(f"{text}, the others have checkpoints. {cure}") from error
+            hint = describe_continuation(overwrite)
+            raise Stopped(f"{text}, the others have checkpoints. {hint}") from error
     return [ended[job.target] for job in jobs]
 
 

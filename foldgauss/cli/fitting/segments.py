@@ -7,14 +7,19 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from foldgauss._runtime.checks import require
 from foldgauss.cli.app.application import Stopped, err, out, warn
-from foldgauss.cli.fitting.job_progress import emit_json, report_fit, run_jobs
+from foldgauss.cli.fitting.job_progress import (
+    describe_continuation,
+    emit_json,
+    report_fit,
+    run_jobs,
+    summarize_fit,
+)
 from foldgauss.cli.fitting.options import WorkerOptions
 from foldgauss.cli.shared.console import Display, format_count, progress_bar, show_status
 from foldgauss.io._atomic import write_or_keep
 from foldgauss.io.media.reading import describe_crop
-from foldgauss.jobs import FitJob, JoinedFit, LongFit, Outcome, plan_long_fit, segments_folder
+from foldgauss.jobs import FitJob, JoinedFit, LongFit, Outcome, plan_long_fit
 from foldgauss.jobs.job import read_record
 from foldgauss.jobs.segments import SEGMENT_SECONDS, read_segment_seconds
 from foldgauss.video.fitting.config import SHORTEST_LIFETIME, FitConfig, chosen_num_gaussians, planned_steps
@@ -26,21 +31,11 @@ def fit_in_segments(
     options: WorkerOptions,
     *,
     segment_seconds: float | None,
-    resume: bool,
     overwrite: bool,
 ) -> None:
     """Plan the segments of the job's clip, fit them, join them and print the results; continues an unfinished fit."""
     begun, target = time.monotonic(), Path(job.target)
-    folder = segments_folder(target)
-    require(
-        not resume or folder.is_dir(),
-        "--resume",
-        expected=f"a stopped fit in {folder}",
-        got="none",
-        cure="Start it without --resume.",
-    )
-    restart = overwrite and not resume
-    if segment_seconds is None and not restart:
+    if segment_seconds is None and not overwrite:
         segment_seconds = read_segment_seconds(target)
     with options.open_pool() as pool:  # first: workers start while the clip is indexed
         with nullcontext() if display in ("json", "quiet") else show_status("Indexing the clip"):
@@ -53,11 +48,10 @@ def fit_in_segments(
                 segment_seconds=SEGMENT_SECONDS if segment_seconds is None else segment_seconds,
                 checkpoint_seconds=job.checkpoint_seconds,
                 reading=job.reading,
-                restart=restart,
+                restart=overwrite,
             )
         _print_plan(fit, job.config, display, Path(job.clip), options)
-        again = f"Give the same command again{' with --resume added' if restart else ''} to continue."
-        outcomes = run_jobs(fit.jobs, "segments", display, pool, cure=again)
+        outcomes = run_jobs(fit.jobs, "segments", display, pool, overwrite=overwrite)
     for outcome in outcomes:
         for text in (outcome.record or {}).get("warnings", ()):
             warn(f"{outcome.job.name}: {text}")
@@ -65,7 +59,7 @@ def fit_in_segments(
     print_failures(failed)
     if failed:
         others = f"; the others are kept in {fit.folder}" if len(failed) < len(outcomes) else ""
-        raise Stopped(f"{len(failed)} of {len(outcomes)} segments failed{others}. {again}")
+        raise Stopped(f"{len(failed)} of {len(outcomes)} segments failed{others}. {describe_continuation(overwrite)}")
 
     def join(path: Path) -> JoinedFit:
         records = {outcome.job.name: outcome.record for outcome in outcomes}
@@ -76,7 +70,7 @@ def fit_in_segments(
     joined = write_or_keep(target, join)
     target = joined.path
     fit.clean_up()
-    figures = _summarize(fit, joined, outcomes, job.config)
+    figures = _summarize(joined, outcomes, job.config)
     figures |= {"wall_seconds": round(time.monotonic() - begun, 2), "file_bytes": target.stat().st_size}
     report_fit(display, str(target), figures)
 
@@ -103,21 +97,9 @@ def describe_plan(config: FitConfig, num: int, num_frames: int) -> str:
     return ", ".join(filter(None, [gaussians, *map(" or ".join, texts)]))
 
 
-def _summarize(fit: LongFit, joined: JoinedFit, outcomes: list[Outcome], config: FitConfig) -> dict[str, Any]:
+def _summarize(joined: JoinedFit, outcomes: list[Outcome], config: FitConfig) -> dict[str, Any]:
     records = [outcome.record for outcome in outcomes]
-    height, width = records[0]["size"]
-    figures = {
-        "mean_psnr": round(joined.mean_psnr, 3),
-        "mean_ssim": round(joined.mean_ssim, 4),
-        "lowest_psnr": round(min(joined.psnr), 3),
-        "num_segments": len(records),
-        "num_frames": fit.index.num_frames,
-        "height": height,
-        "width": width,
-        "num_gaussians": sum(record["num_gaussians"] for record in records),
-        "degree": config.fold_degree,
-        "fit_seconds": round(sum(record["seconds"] for record in records), 2),
-    }
+    figures = summarize_fit(joined, records, config) | {"num_segments": len(records)}
     peaks = [record["peak_bytes"] for record in records]
     if None not in peaks:
         figures["peak_mib"] = round(max(peaks) / 2**20)
