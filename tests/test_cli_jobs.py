@@ -13,7 +13,6 @@ from commands import run
 import foldgauss.jobs.runner as fitting
 from foldgauss.cli.fitting import job_progress as _jobs_view
 from foldgauss.io import load_video_model, read_video, write_image, write_video
-from foldgauss.jobs import Progress
 from foldgauss.video import SegmentedVideo, VideoModel, evaluate
 
 QUICK = ("--gaussians", "40", "--steps", "12", "--degree", "1")
@@ -88,11 +87,11 @@ class Stopping:
     def __init__(self, monkeypatch, name):
         self.name, self.seen, self.watch = name, 0, _jobs_view._View.update
         monkeypatch.setattr(fitting, "REPORT_SECONDS", 0.0)
-        monkeypatch.setattr(_jobs_view._View, "update", lambda view, share: self(view, share))
+        monkeypatch.setattr(_jobs_view._View, "update", lambda *each: self(*each))
 
-    def __call__(self, view, share: Progress):
-        self.watch(view, share)
-        self.seen += share.name == self.name
+    def __call__(self, view, name, info):
+        self.watch(view, name, info)
+        self.seen += name == self.name
         if self.seen == 2:
             os.kill(os.getpid(), signal.SIGTERM)
 
@@ -131,24 +130,6 @@ def stopped(monkeypatch, where, *words):
     with monkeypatch.context() as patch:
         Stopping(patch, where)
         assert run(*words) == 1
-
-
-@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")
-def test_what_was_begun_in_segments_goes_on_so_without_being_told(long_clip, whole, tmp_path, capsys, monkeypatch):
-    target = tmp_path / "m.safetensors"
-    stopped(monkeypatch, "segment 1", "fit", long_clip, "--out", target, *SEGMENTS)
-    capsys.readouterr()
-    assert run("fit", long_clip, "--out", target, *QUICK, "--preview", tmp_path / "p.png") == 2
-    assert "--preview: expected a fit in one piece" in capsys.readouterr().err
-    assert run("fit", long_clip, "--out", target, *QUICK, "--log-json") == 0
-    assert json.loads(capsys.readouterr().out.splitlines()[0])["spans"] == [[0, 15], [12, 27], [24, 39]]
-    checkpoint = tmp_path / "m.safetensors.checkpoint"
-    (tmp_path / "m.safetensors.segments").mkdir()
-    (tmp_path / "m.safetensors.segments" / "plan.json").write_text('{"asked": {"segment_seconds": 1.5}}')
-    checkpoint.write_bytes(b"of a fit in one piece")
-    assert run("fit", long_clip, "--out", target, *QUICK) == 1
-    assert checkpoint.name in capsys.readouterr().err
-    assert target.read_bytes() == whole.read_bytes()
 
 
 def test_that_nobody_listens_any_more_costs_no_fit(long_clip, whole, tmp_path, monkeypatch):

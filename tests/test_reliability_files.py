@@ -18,7 +18,6 @@ from commands import run
 from benchmarks import _kills, _long, _outputs
 from foldgauss._runtime import kernels as _kernels
 from foldgauss.cli.fitting import fit as fitting
-from foldgauss.cli.shared import rendering as _shared
 from foldgauss.io import load_video_model, save_video_model, write_video
 from foldgauss.io._atomic import lock_output
 from foldgauss.io.models.model_file import load_model, read_header

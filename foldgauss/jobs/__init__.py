@@ -7,7 +7,7 @@ and the next one continues to the same bits. `plan_long_fit` and `make_jobs` mak
 
 from foldgauss.jobs.clips import find_clips, make_jobs
 from foldgauss.jobs.job import FitJob
-from foldgauss.jobs.runner import Progress, Stopped, fit_job
+from foldgauss.jobs.runner import Stopped, fit_job
 from foldgauss.jobs.segments import JoinedFit, LongFit, plan_long_fit, seam_drops, segments_folder
 from foldgauss.jobs.workers import Outcome, SchedulerLost, WorkerPool, local_workers, run_here, run_on, running_cluster
 
@@ -16,7 +16,6 @@ __all__ = [
     "JoinedFit",
     "LongFit",
     "Outcome",
-    "Progress",
     "SchedulerLost",
     "Stopped",
     "WorkerPool",

@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -261,23 +261,11 @@ _SHAPES: set[tuple[int, ...]] = set()
 # -------------------------------------------------------------------------------------------- one fit with a record
 
 
-class Progress(NamedTuple):
-    """Progress of a job: `fraction` in [0, 1], running PSNR in dB, steps, seconds spent and left, as in `FitInfo`."""
-
-    name: str
-    fraction: float
-    psnr: float
-    step: int
-    num_gaussians: int
-    seconds: float
-    seconds_left: float
+#: Receives the last step of a running job now and then, and returns whether to go on.
+Report = Callable[[FitInfo], bool]
 
 
-#: Receives the progress of a job and returns whether to go on.
-Report = Callable[[Progress], bool]
-
-
-def _make_reporter(name: str, report: Report) -> Observer:
+def _make_reporter(report: Report) -> Observer:
     """An observer that reports the progress of a job now and then."""
     reported = time.monotonic()
 
@@ -286,14 +274,12 @@ def _make_reporter(name: str, report: Report) -> Observer:
         if time.monotonic() - reported <= REPORT_SECONDS and info.step != 1 and info.progress < 1:
             return False
         reported = time.monotonic()
-        return not report(
-            Progress(name, info.progress, info.psnr, info.step, info.num_gaussians, info.seconds, info.seconds_left)
-        )
+        return not report(info)
 
     return observe
 
 
-def fit_job(job: FitJob, report: Report = lambda progress: True) -> dict[str, Any]:
+def fit_job(job: FitJob, report: Report = lambda info: True) -> dict[str, Any]:
     """Run the job, or what is left of it; returns its record. A process runs one job at a time.
 
     The record: `asked` (the request), `num_frames`, `size`, `fps`, `num_gaussians`, `psnr` and `ssim` by frame,
@@ -328,7 +314,7 @@ def _lock_target(job: FitJob) -> Iterator[None]:
 def _fit_and_record(job: FitJob, report: Report) -> dict[str, Any]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        record = run_fit(job, lambda clip, state: nullcontext(_make_reporter(job.name, report)))
+        record = run_fit(job, lambda clip, state: nullcontext(_make_reporter(report)))
     texts = dict.fromkeys(" ".join(str(warning.message).split()) for warning in caught)
     record["warnings"] = [*texts, *record["warnings"]]
     with atomic_path(job.record) as temporary:

@@ -259,15 +259,6 @@ def _check_folder(folder: Path) -> None:
         )
 
 
-def read_segment_seconds(target: str | os.PathLike) -> float | None:
-    """The length of segments in the plan of an unfinished fit; None if there is none."""
-    try:
-        seconds = json.loads((segments_folder(target) / _PLAN).read_text())["asked"]["segment_seconds"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return None
-    return seconds if is_within(seconds, "(0, 1e9]") else None
-
-
 def _load_plan(folder: Path, request: dict[str, Any]) -> dict[str, Any] | None:
     """The plan in the folder; None if it cannot be read. Raises ValueError if it is that of another request."""
     try:

@@ -22,7 +22,8 @@ from typing import TYPE_CHECKING, Any
 from foldgauss._runtime.checks import invalid, is_integer, require
 from foldgauss._runtime.threads import available_cores
 from foldgauss.jobs.job import FitJob, read_record
-from foldgauss.jobs.runner import Progress, Report, Stopped, fit_job
+from foldgauss.jobs.runner import Report, Stopped, fit_job
+from foldgauss.video.fitting.loop import FitInfo
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -53,7 +54,8 @@ class Outcome:
     failure: str | None = None
 
 
-OnProgress = Callable[[Progress], None]
+#: Receives the name of a running job and its last step, now and then.
+OnProgress = Callable[[str, FitInfo], None]
 
 
 def run_here(
@@ -65,13 +67,14 @@ def run_here(
     """
     waiting = yield from _finished_outcomes(jobs)
 
-    def report(progress: Progress) -> bool:
-        on_progress(progress)
-        return not should_stop()
-
     for job in waiting:
         if should_stop():
             raise Stopped("stopped between two jobs")
+
+        def report(info: FitInfo, name: str = job.name) -> bool:
+            on_progress(name, info)
+            return not should_stop()
+
         yield _run_job(job, report)
 
 
@@ -258,7 +261,8 @@ def run_on(
                 running.append((client.submit(_run_on_worker, job, topic, pure=False), job))
             time.sleep(_POLL_SECONDS)
             while not events.empty():
-                on_progress(Progress(*events.get()))
+                name, *info = events.get()
+                on_progress(name, FitInfo(*info))
             ended = [pair for pair in running if pair[0].done()]
             running = [pair for pair in running if pair not in ended]
             for future, job in ended:
@@ -316,8 +320,8 @@ def _run_on_worker(job: FitJob, topic: str) -> tuple[dict[str, Any] | None, str 
     worker = get_worker()
     stop = Event(topic)
 
-    def report(progress: Progress) -> bool:
-        worker.log_event(topic, tuple(progress))
+    def report(info: FitInfo) -> bool:
+        worker.log_event(topic, (job.name, *info))
         return not stop.is_set()
 
     outcome = _run_job(job, report)

@@ -27,7 +27,7 @@ def clip(tmp_path_factory):
     return write_drifting(tmp_path_factory.mktemp("clip") / "clip.mp4", NUM_FRAMES)
 
 
-def ignored(progress):
+def ignored(name, info):
     return None
 
 

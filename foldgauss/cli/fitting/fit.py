@@ -11,7 +11,7 @@ import typer
 
 from foldgauss._runtime.checks import require
 from foldgauss._runtime.threads import num_threads
-from foldgauss.cli.app.application import Stopped, command, err, out, warn
+from foldgauss.cli.app.application import Stopped, command, err, warn
 from foldgauss.cli.app.signals import note_signals
 from foldgauss.cli.fitting.job_progress import describe_continuation, report_fit, summarize_fit
 from foldgauss.cli.fitting.options import (
@@ -26,7 +26,7 @@ from foldgauss.cli.fitting.options import (
     Workers,
     fit_options,
 )
-from foldgauss.cli.fitting.segments import describe_plan, fit_in_segments, plan_gaussians
+from foldgauss.cli.fitting.segments import describe_plan, fit_in_segments, plan_gaussians, print_plan
 from foldgauss.cli.shared.arguments import (
     Deinterlace,
     Frames,
@@ -37,12 +37,11 @@ from foldgauss.cli.shared.arguments import (
     parse_frames,
     parse_size,
 )
-from foldgauss.cli.shared.console import Display, choose_display, format_count
+from foldgauss.cli.shared.console import Display, choose_display
 from foldgauss.cli.shared.files import check_output, name_after, refuse_existing, refuse_inputs
 from foldgauss.cli.shared.fit_progress import (
     Observer,
     display_progress,
-    print_json,
     save_previews,
 )
 from foldgauss.cli.shared.rendering import evaluate_with_progress
@@ -54,7 +53,7 @@ from foldgauss.io.models.video_model import MODEL_SUFFIX, check_model_name
 from foldgauss.jobs.job import FitJob
 from foldgauss.jobs.runner import Stopped as FitStopped
 from foldgauss.jobs.runner import run_fit
-from foldgauss.jobs.segments import read_segment_seconds
+from foldgauss.jobs.segments import SEGMENT_SECONDS, segments_folder
 from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig, planned_steps
 from foldgauss.video.fitting.divergence import FitDiverged
 from foldgauss.video.fitting.loop import FitInfo
@@ -122,13 +121,13 @@ def fit(
     display = choose_display(quiet, log_json)
     options = WorkerOptions(workers, scheduler, threads)
     context.with_resource(lock_output(target, own=(job.checkpoint,)))
-    is_begun = job.checkpoint.exists()
-    in_segments = not is_begun and read_segment_seconds(target) is not None
-    refuse_existing(target, overwrite or is_begun or in_segments)
-    if not (segment_seconds is None and workers is None and scheduler is None) or (in_segments and not overwrite):
+    is_begun = job.checkpoint.exists() or segments_folder(target).exists()
+    refuse_existing(target, overwrite or is_begun)
+    if not (segment_seconds is None and workers is None and scheduler is None):
         for option, path in (("--history", history), ("--preview", preview)):
             require(path is None, option, expected="a fit in one piece", got="one in segments", cure="Leave it out.")
-        fit_in_segments(job, display, options, segment_seconds=segment_seconds, overwrite=overwrite)
+        seconds = SEGMENT_SECONDS if segment_seconds is None else segment_seconds
+        fit_in_segments(job, display, options, segment_seconds=seconds, overwrite=overwrite)
         return
     curves = _check_records(video, history, preview, overwrite or is_begun)
     record = fit_with_progress(job, display, overwrite=overwrite, history=history, preview=preview)
@@ -242,24 +241,16 @@ def _save_curves(path: Path, history: Path) -> None:
 
 def _print_plan(clip: Clip, config: FitConfig, display: Display) -> None:
     engine = choose_engine(clip.frames, config)
-    height, width = clip.size
     for text in clip.notes:
         warn(f"{clip.source}: {text}")
-    num = plan_gaussians(config, clip.num_frames, height, width)
+    num = plan_gaussians(config, clip.num_frames, *clip.size)
     steps = planned_steps(config, clip.num_frames)
     if steps is not None and steps * config.views.batch_size < clip.num_frames:
         warn(
             f"--steps: {steps:,} steps use {steps * config.views.batch_size:,} of {clip.num_frames:,} frames; the "
             "others keep their initial Gaussians, which look faint."
         )
-    if display == "json":
-        about = {"clip": clip.source, "num_frames": clip.num_frames, "height": height, "width": width}
-        print_json("start", about | {"most_gaussians": num, "degree": config.fold_degree, "threads": num_threads()})
-    if display in ("json", "quiet"):
-        return
     computed = f"{num_threads()} threads" if engine == "cpu" else f"engine {engine} on {describe_device()}"
-    out.print(
-        f"{clip.source}: {format_count(clip.num_frames, 'frame')} of {height}x{width}"
-        f"{' with alpha' if clip.has_alpha else ''}, {describe_plan(config, num, clip.num_frames)}, {computed}",
-        soft_wrap=True,
-    )
+    alpha, plan = " with alpha" if clip.has_alpha else "", describe_plan(config, num, clip.num_frames)
+    about = {"most_gaussians": num, "degree": config.fold_degree, "threads": num_threads()}
+    print_plan(display, clip.source, clip.num_frames, clip.size, f"{alpha}, {plan}, {computed}", **about)

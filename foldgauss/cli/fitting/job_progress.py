@@ -1,6 +1,5 @@
 """Runs jobs and displays their progress: a bar, lines in a log, or JSON."""
 
-import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
@@ -9,9 +8,11 @@ from foldgauss.cli.app.application import Stopped, err
 from foldgauss.cli.app.signals import note_signals
 from foldgauss.cli.shared.console import Display, print_figures, show_progress
 from foldgauss.cli.shared.fit_progress import print_json
-from foldgauss.jobs import FitJob, Outcome, Progress, WorkerPool, run_here, run_on
+from foldgauss.io.history import info_line
+from foldgauss.jobs import FitJob, Outcome, WorkerPool, run_here, run_on
 from foldgauss.jobs import Stopped as JobsStopped
 from foldgauss.video.fitting.config import FitConfig
+from foldgauss.video.fitting.loop import FitInfo
 from foldgauss.video.models.metrics import Evaluation
 
 #: Up to so many jobs, each has a line in a log.
@@ -96,13 +97,12 @@ class _View:
 
     def __init__(self, noun: str, total: int, display: Display, show: Callable[..., None]):
         self.noun, self.total, self.display, self.show, self.done, self.failed = noun, total, display, show, 0, 0
-        self.running: dict[str, Progress] = {}
+        self.running: dict[str, FitInfo] = {}
 
-    def update(self, progress: Progress) -> None:
-        self.running[progress.name] = progress
+    def update(self, name: str, info: FitInfo) -> None:
+        self.running[name] = info
         if self.display == "json":
-            known = progress._asdict().items()
-            emit_json("progress", {name: value for name, value in known if value == value and value != math.inf})
+            emit_json("progress", {"name": name} | info_line(info))
         self._show()
 
     def end(self, outcome: Outcome) -> None:
@@ -122,8 +122,8 @@ class _View:
 
     def _show(self) -> None:
         """The counts, and the jobs that run."""
-        completed = self.done + self.failed + sum(job.fraction for job in self.running.values())
-        running = (f"{job.name} {job.fraction:.0%} ({job.psnr:.1f} dB)" for job in self.running.values())
+        completed = self.done + self.failed + sum(info.progress for info in self.running.values())
+        running = (f"{name} {info.progress:.0%} ({info.psnr:.1f} dB)" for name, info in self.running.items())
         text = "; ".join([self._counts(), *([", ".join(running)] if self.running else [])])
         self.show("Fitting", completed, self.total, text)
 

@@ -21,7 +21,6 @@ from foldgauss.io._atomic import write_or_keep
 from foldgauss.io.media.reading import describe_crop
 from foldgauss.jobs import FitJob, JoinedFit, LongFit, Outcome, plan_long_fit
 from foldgauss.jobs.job import read_record
-from foldgauss.jobs.segments import SEGMENT_SECONDS, read_segment_seconds
 from foldgauss.video.fitting.config import SHORTEST_LIFETIME, FitConfig, chosen_num_gaussians, planned_steps
 
 
@@ -30,13 +29,11 @@ def fit_in_segments(
     display: Display,
     options: WorkerOptions,
     *,
-    segment_seconds: float | None,
+    segment_seconds: float,
     overwrite: bool,
 ) -> None:
     """Plan the segments of the job's clip, fit them, join them and print the results; continues an unfinished fit."""
     begun, target = time.monotonic(), Path(job.target)
-    if segment_seconds is None and not overwrite:
-        segment_seconds = read_segment_seconds(target)
     with options.open_pool() as pool:  # first: workers start while the clip is indexed
         with nullcontext() if display in ("json", "quiet") else show_status("Indexing the clip"):
             fit = plan_long_fit(
@@ -45,7 +42,7 @@ def fit_in_segments(
                 job.config,
                 size=job.size,
                 frames=job.frames,
-                segment_seconds=SEGMENT_SECONDS if segment_seconds is None else segment_seconds,
+                segment_seconds=segment_seconds,
                 checkpoint_seconds=job.checkpoint_seconds,
                 reading=job.reading,
                 restart=overwrite,
@@ -97,6 +94,15 @@ def describe_plan(config: FitConfig, num: int, num_frames: int) -> str:
     return ", ".join(filter(None, [gaussians, *map(" or ".join, texts)]))
 
 
+def print_plan(display: Display, source: str, num_frames: int, size: tuple[int, int], plan: str, **about: Any) -> None:
+    """Print the clip and what is planned for it, or `about` it as JSON."""
+    height, width = size
+    if display == "json":
+        emit_json("start", {"clip": source, "num_frames": num_frames, "height": height, "width": width} | about)
+    elif display != "quiet":
+        out.print(f"{source}: {format_count(num_frames, 'frame')} of {height}x{width}{plan}", soft_wrap=True)
+
+
 def _summarize(joined: JoinedFit, outcomes: list[Outcome], config: FitConfig) -> dict[str, Any]:
     records = [outcome.record for outcome in outcomes]
     figures = summarize_fit(joined, records, config) | {"num_segments": len(records)}
@@ -116,21 +122,16 @@ def _print_plan(fit: LongFit, config: FitConfig, display: Display, video: Path, 
         warn(f"{video}: {note}")
     longest = fit.jobs[lengths.index(max(lengths))].config  # with its part of the file's size
     num = plan_gaussians(longest, max(lengths), *size, threads=options.threads)
-    if display == "json":
-        about = {"clip": str(video), "num_frames": index.num_frames, "height": size[0], "width": size[1]}
-        emit_json("start", about | {"spans": [list(span) for span in fit.spans], "most_gaussians": num})
-    if display in ("json", "quiet"):
-        return
     done = sum(read_record(job) is not None for job in fit.jobs)
     begun = sum(job.checkpoint.exists() for job in fit.jobs)
-    if done or begun:
+    if (done or begun) and display in ("bar", "lines"):
         err.print(f"continuing: {done} of {len(fit.jobs)} segments done, {begun} begun", soft_wrap=True)
     at_cuts = sum(before[1] == after[0] for before, after in itertools.pairwise(fit.spans))
     span = f"{min(lengths)} to {max(lengths)}" if min(lengths) < max(lengths) else f"{lengths[0]}"
     where = f" ({at_cuts} end at cuts)" if at_cuts else ""
-    out.print(
-        f"{video}: {format_count(index.num_frames, 'frame')} of {size[0]}x{size[1]} in "
-        f"{format_count(len(lengths), 'segment')} of {span} frame{'' if span == '1' else 's'}{where}, each with "
-        f"{describe_plan(config, num, max(lengths))}, by {options}",
-        soft_wrap=True,
+    plan = (
+        f" in {format_count(len(lengths), 'segment')} of {span} frame{'' if span == '1' else 's'}{where}, each with "
+        f"{describe_plan(config, num, max(lengths))}, by {options}"
     )
+    spans = [list(span) for span in fit.spans]
+    print_plan(display, str(video), index.num_frames, size, plan, spans=spans, most_gaussians=num)
