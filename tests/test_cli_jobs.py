@@ -177,7 +177,7 @@ def test_many_clips_make_a_model_each_and_failures_are_listed(clips, tmp_path, c
     assert "1 failed" in told.out
     assert "failed: broken.mp4: path: expected a video file" in told.err
     models = sorted(out.glob("*.fgz"))
-    assert [path.name for path in models] == ["clip0.fgz", "clip1.fgz", "frames.fgz"]
+    assert [path.name for path in models] == ["clip0.mp4.fgz", "clip1.mp4.fgz", "frames.fgz"]
     for path, source in zip(models, ("clip0.mp4", "clip1.mp4", "frames"), strict=True):
         model = load_video_model(path)
         assert isinstance(model, VideoModel)
@@ -211,13 +211,13 @@ def test_many_clips_begun_anew_and_stopped_go_on(clips, tmp_path, capsys, monkey
     assert "Give the command again without --overwrite to continue." in capsys.readouterr().err
     assert run("fit-many", clips, "--out", out, *QUICK) == 2  # what is kept is of other settings
     assert "exists, with other settings" in capsys.readouterr().err
-    kept = out / "records" / "clip1.fgz.checkpoint"
-    before, stamp = kept.read_bytes(), (out / "clip0.fgz").stat().st_mtime_ns
+    kept = out / "records" / "clip1.mp4.fgz.checkpoint"
+    before, stamp = kept.read_bytes(), (out / "clip0.mp4.fgz").stat().st_mtime_ns
     assert run("fit-many", clips, "--out", out, *other[:-1], "3") == 2
     assert kept.read_bytes() == before
     assert run("fit-many", clips, "--out", out, *other) == 1
     assert "4 clips, 1 of them done already" in capsys.readouterr().out
-    assert (out / "clip0.fgz").stat().st_mtime_ns == stamp
+    assert (out / "clip0.mp4.fgz").stat().st_mtime_ns == stamp
     assert {load_video_model(path).degree for path in out.glob("*.fgz")} == {2}
 
 

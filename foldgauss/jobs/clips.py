@@ -1,7 +1,6 @@
 """Fits of many clips: finds the clips of a folder, and makes a job for each."""
 
 import os
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -79,7 +78,7 @@ def make_jobs(
     checkpoint_seconds: float | None = None,
     reading: Reading = AS_STORED,
 ) -> list[FitJob]:
-    """A job for each clip; models go to the folder `out` under the clips' names, with suffix where stems are equal.
+    """A job for each clip; models go to the folder `out` under the clips' names, such as "one.mp4.fgz".
 
     They are compact files where `config` asks for compact models.
 
@@ -87,11 +86,11 @@ def make_jobs(
     """
     out, config = Path(out).absolute(), FitConfig() if config is None else config
     jobs = []
-    for clip, stem in zip(clips, _unique_names(clips), strict=True):
+    for clip in clips:
         job = FitJob(
             clip.name,
             str(clip.absolute()),
-            str(out / f"{stem}{COMPACT_SUFFIX if config.is_compact else MODEL_SUFFIX}"),
+            str(out / f"{clip.name}{COMPACT_SUFFIX if config.is_compact else MODEL_SUFFIX}"),
             config,
             size,
             frames,
@@ -102,15 +101,3 @@ def make_jobs(
         )
         jobs.append(job)
     return jobs
-
-
-def _unique_names(clips: Sequence[Path]) -> list[str]:
-    """A name for each clip that no other has: its stem, or the whole name."""
-    names = [clip.name if clip.is_dir() else clip.stem for clip in clips]
-    while True:
-        counts = Counter(name.casefold() for name in names)
-        alike = [k for k, name in enumerate(names) if counts[name.casefold()] > 1 and name != clips[k].name]
-        if not alike:
-            return names
-        for k in alike:  # then check again: the name a.mp4 may equal the stem of a.mp4.mkv
-            names[k] = clips[k].name

@@ -10,8 +10,8 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -291,24 +291,8 @@ def fit_job(job: FitJob, report: Report = lambda info: True) -> dict[str, Any]:
     """
     if record := read_record(job):
         return record
-    with _lock_target(job):
+    with lock_output(Path(job.target), own=(job.checkpoint, job.record), wait=WAIT_SECONDS):
         return read_record(job) or _fit_and_record(job, report)  # the previous holder of the lock may have finished it
-
-
-@contextmanager
-def _lock_target(job: FitJob) -> Iterator[None]:
-    """Hold the lock of the target, for which a job waits a while."""
-    until = time.monotonic() + WAIT_SECONDS
-    with ExitStack() as stack:
-        while True:
-            try:
-                stack.enter_context(lock_output(Path(job.target), own=(job.checkpoint, job.record)))
-                break
-            except OutputError as error:
-                if not isinstance(error.__cause__, BlockingIOError) or time.monotonic() > until:
-                    raise
-                time.sleep(0.5)
-        yield
 
 
 def _fit_and_record(job: FitJob, report: Report) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any
 
 from foldgauss._runtime.checks import invalid, is_integer, require
+from foldgauss._runtime.optional_imports import import_optional
 from foldgauss._runtime.threads import available_cores
 from foldgauss.jobs.job import FitJob, read_record
 from foldgauss.jobs.runner import Report, Stopped, fit_job
@@ -153,8 +154,7 @@ def local_workers(count: int, *, threads: int | None = None) -> Iterator["Worker
     """
     for name, value in (("workers", count), ("threads", 1 if threads is None else threads)):
         require(is_integer(value, 1), name, expected="a whole number >= 1", got=repr(value))
-    distributed = _import_distributed("workers")
-    import dask
+    distributed, dask = import_optional("distributed", "distributed"), import_optional("dask", "distributed")
 
     threads = max(1, available_cores() // count) if threads is None else threads
     environment = {"FOLDGAUSS_NUM_THREADS": str(threads)}
@@ -204,7 +204,7 @@ def running_cluster(address: str) -> Iterator["WorkerPool"]:
 
     Raises `SchedulerLost` if no scheduler answers, ImportError if dask.distributed is not installed.
     """
-    distributed = _import_distributed("scheduler")
+    distributed = import_optional("distributed", "distributed")
     require(
         _ADDRESS.fullmatch(address),
         "scheduler",
@@ -222,14 +222,6 @@ def running_cluster(address: str) -> Iterator["WorkerPool"]:
             raise SchedulerLost(text) from error
         with client:
             yield WorkerPool(client)
-
-
-def _import_distributed(what: str):
-    try:
-        import distributed
-    except ImportError as error:
-        raise ImportError(f"{what}: needs dask.distributed: pip install 'foldgauss[distributed]'.") from error
-    return distributed
 
 
 def run_on(

@@ -9,7 +9,7 @@ from foldgauss.video.editing.chain import Edit, edit
 from foldgauss.video.editing.edited_video import EditedVideo, Layer
 from foldgauss.video.editing.overlays import SelectedGaussians
 from foldgauss.video.editing.timing import Clock, Span
-from foldgauss.video.fitting.compress import Compressed, compress
+from foldgauss.video.fitting.compress import compress
 from foldgauss.video.fitting.config import FitConfig, LearningRates, Loss, Strategy, Views
 from foldgauss.video.fitting.density_control import DensityControl
 from foldgauss.video.fitting.divergence import DivergenceWarning, FitDiverged
@@ -55,7 +55,6 @@ from foldgauss.video.selection.selectors import (
 __all__ = [
     "CameraPath",
     "Clock",
-    "Compressed",
     "DensityControl",
     "DivergenceWarning",
     "Edit",

@@ -59,12 +59,11 @@ def test_models_of_clips_of_one_name_are_told_apart(tmp_path):
 
 
 def test_no_two_clips_have_one_model(tmp_path):
-    """The whole name of one may be the stem of another."""
     made(tmp_path, "a.mp4", "a.avi", "a.mp4.mkv", "b.mov")
     (tmp_path / "a.mp4.mkv.gif").write_bytes(b"")
     jobs = make_jobs(find_clips(tmp_path).clips, tmp_path / "out")
     names = {job.name: Path(job.target).name for job in jobs}
-    assert names["b.mov"] == "b.safetensors"
+    assert names["b.mov"] == "b.mov.safetensors"
     assert names["a.mp4"] == "a.mp4.safetensors"
     assert names["a.mp4.mkv"] == "a.mp4.mkv.safetensors"
     assert len(set(names.values())) == len(jobs) == 5
@@ -82,10 +81,10 @@ def test_settings_reach_each_job(tmp_path):
     made(tmp_path, "one.mp4", "two.mp4")
     config = FitConfig(steps=7)
     jobs = make_jobs(find_clips(tmp_path).clips, tmp_path, config, size=(8, 8), frames=(0, 3), checkpoint_seconds=2.0)
-    assert {Path(job.target).name for job in jobs} == {"one.safetensors", "two.safetensors"}
+    assert {Path(job.target).name for job in jobs} == {"one.mp4.safetensors", "two.mp4.safetensors"}
     for goal in ({"quality": 50.0}, {"size_mb": 1.0}, {"psnr": 30.0}):  # which ask for compact models
         jobs_of_goal = make_jobs(find_clips(tmp_path).clips, tmp_path, FitConfig(**goal))
-        assert {Path(job.target).name for job in jobs_of_goal} == {"one.fgz", "two.fgz"}
+        assert {Path(job.target).name for job in jobs_of_goal} == {"one.mp4.fgz", "two.mp4.fgz"}
     assert {(job.config.steps, job.size, job.frames, job.checkpoint_seconds) for job in jobs} == {
         (7, (8, 8), (0, 3), 2.0)
     }

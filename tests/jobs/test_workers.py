@@ -108,7 +108,7 @@ def test_a_killed_worker_is_replaced_and_goes_on_from_the_checkpoint(crew, clips
     assert outcome.failure is None
     assert len(kills) == 1
     assert kills[0] not in [child.pid for child in workers()]
-    assert Path(job.target).read_bytes() == done_here["clip1.safetensors"]
+    assert Path(job.target).read_bytes() == done_here["clip1.mp4.safetensors"]
 
 
 def test_workers_keep_what_they_do_when_asked_to_stop(crew, clips, tmp_path):

@@ -5,9 +5,8 @@ import os
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
-from rich.box import SIMPLE_HEAD
-from rich.table import Column, Table
 
 from foldgauss._runtime.checks import ParameterError, require
 from foldgauss.cli.app.application import command, out, warn
@@ -42,8 +41,6 @@ from foldgauss.jobs.job import read_record, read_request, write_request
 from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig
 
 SUMMARY = "summary.json"
-#: With more clips, the table shows no rows; the summary has all.
-MAX_ROWS = 60
 #: Fields of a record that the summary shows.
 _FIGURES = (
     "num_frames",
@@ -136,7 +133,12 @@ def fit_many(
     if display == "json":
         emit_json("done", {"summary": str(out_dir / SUMMARY), "done": len(jobs) - len(failed), "failed": len(failed)})
     elif display != "quiet":
-        _print_table(str(out_dir), outcomes)
+        done = [outcome.record for outcome in outcomes if outcome.failure is None]
+        text = f"{format_count(len(done), 'model')} in {out_dir}"
+        if done:
+            mean, seconds = np.mean([one["mean_psnr"] for one in done]), sum(one["seconds"] for one in done)
+            text += f", mean PSNR {mean:.2f} dB, {seconds:,.0f} s of fitting"
+        out.print(f"{text}; {len(failed)} failed" if failed else text, soft_wrap=True)
     print_failures(failed)
     if failed:
         raise typer.Exit(1)
@@ -176,26 +178,3 @@ def _row(outcome: Outcome) -> dict[str, Any]:
     if outcome.failure is not None:
         return named | {"failure": outcome.failure}
     return named | {"model": Path(outcome.job.target).name} | {name: outcome.record[name] for name in _FIGURES}
-
-
-def _print_table(title: str, outcomes: list[Outcome]) -> None:
-    done = [outcome.record for outcome in outcomes if outcome.failure is None]
-    columns = [
-        Column(name, justify="right") for name in ("frames", "PSNR (dB)", "SSIM", "Gaussians", "bytes", "seconds")
-    ]
-    table = Table(Column("clip", overflow="fold"), *columns, title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for outcome in outcomes:
-        cells = ["failed"]
-        if (one := outcome.record) is not None:
-            cells = [f"{one['num_frames']} of {one['size'][0]}x{one['size'][1]}", f"{one['mean_psnr']:.2f}"]
-            cells += [f"{one['mean_ssim']:.4f}", f"{one['num_gaussians']:,}", f"{one['file_bytes']:,}"]
-            cells += [f"{one['seconds']:.1f}"]
-        table.add_row(outcome.job.name, *cells)
-    if len(outcomes) <= MAX_ROWS:
-        out.print(table)
-    text = f"{format_count(len(done), 'model')} in {title}"
-    if done:
-        mean, seconds = sum(one["mean_psnr"] for one in done) / len(done), sum(one["seconds"] for one in done)
-        text += f", mean PSNR {mean:.2f} dB, {seconds:,.0f} s of fitting"
-    failed = len(outcomes) - len(done)
-    out.print(f"{text}; {failed} failed" if failed else text, soft_wrap=True)

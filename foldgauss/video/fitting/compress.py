@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from foldgauss._runtime.checks import invalid
-from foldgauss.video.compression.quantize import Quantized, dequantize
+from foldgauss.video.compression.quantize import dequantize
 from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig, Strategy, Views, planned_steps
-from foldgauss.video.fitting.loop import FitInfo, check_frames, finish, fit_steps, start_from
+from foldgauss.video.fitting.loop import FitInfo, FitResult, check_frames, fit, start_from
 from foldgauss.video.fitting.rate import COMPRESSION_START, RateControl
 from foldgauss.video.fitting.state import FitState
 from foldgauss.video.models.background import BLACK
@@ -19,14 +19,6 @@ from foldgauss.video.models.video_model import VideoModel, check_model
 
 #: The quality without a clip, where nothing compensates for rounding.
 ROUNDING_QUALITY = 80.0
-
-
-@dataclasses.dataclass(frozen=True)
-class Compressed:
-    """A model's compact form: `quantized`, which `save_compact` writes, and the `model` that it decodes to."""
-
-    quantized: Quantized
-    model: VideoModel
 
 
 def compress(
@@ -39,14 +31,14 @@ def compress(
     steps: int | None = None,
     minutes: float | None = None,
     observers: Iterable[Callable[[FitState, FitInfo], None]] = (),
-) -> Compressed:
+) -> FitResult:
     """Make a model compact: drop Gaussians that are not worth their bits, and round the parameters of the others.
 
     `frames`: the clip, uint8 (num_frames, *model.size, 3), or with alpha (..., 4), to which the model is fitted further
     meanwhile. `FitConfig` explains `quality`, `size_mb` and `psnr`. Without any, the quality is `DEFAULT_QUALITY`,
     or `ROUNDING_QUALITY` without the clip. `steps` and `minutes` are budgets (default: two thirds of the steps of a
     fit). `observers` are called after every step, as by `fit`. Gaussians are reordered. Shared paths remain, to about
-    a fiftieth of a pixel.
+    a fiftieth of a pixel. The result has the compact model, `quantized`, and the `model` that it decodes to.
 
     Without the clip, nothing makes up for what is dropped and rounded, and there is no `psnr`, nor a budget.
 
@@ -69,11 +61,7 @@ def compress(
     budget = planned_steps(dataclasses.replace(config, minutes=None), len(frames))
     state = start_from(model, config, steps or math.ceil((1 - COMPRESSION_START) * budget), COMPRESSION_START)
     config = dataclasses.replace(config, steps=state.plan if steps else None)
-    for state, info in fit_steps(frames, config, state):  # noqa: B020
-        for observe in observers:
-            observe(state, info)
-    made, quantized = finish(state, frames, config, model.fps)
-    return Compressed(quantized, made)
+    return fit(frames, config, fps=model.fps, state=state, observers=observers)
 
 
 def _make_config(model: VideoModel, **goals: float | None) -> FitConfig:
@@ -95,7 +83,7 @@ def _make_config(model: VideoModel, **goals: float | None) -> FitConfig:
     )
 
 
-def _round_only(model: VideoModel, config: FitConfig) -> Compressed:
+def _round_only(model: VideoModel, config: FitConfig) -> FitResult:
     if not config.is_compact:
         config = dataclasses.replace(config, quality=ROUNDING_QUALITY)
     background = None if model.compositing == "over" else BLACK  # alpha is kept, whatever clip the model is of
@@ -104,4 +92,4 @@ def _round_only(model: VideoModel, config: FitConfig) -> Compressed:
     control.check_size(state)
     control.round_only(state)
     quantized = control.finish(state, model.fps)
-    return Compressed(quantized, dequantize(quantized))
+    return FitResult(dequantize(quantized), [], quantized)

@@ -86,6 +86,7 @@ def fit(
     config: FitConfig | None = None,
     *,
     fps: float = 25.0,
+    state: FitState | None = None,
     controls: Iterable[DensityControl] = (),
     observers: Iterable[Callable[[FitState, FitInfo], None]] = (),
     every: int = 10,
@@ -95,7 +96,7 @@ def fit(
     Alpha, by which colors are premultiplied, is learned by compositing frames and splats over random backgrounds:
     `psnr` and `loss` are measured over these. The model is rendered over black by default.
 
-    `fps`: frames per second. `controls` change the Gaussians between steps, after those of the settings: see
+    `fps`: frames per second. `state`: what to start from, see `start_from`. `controls` change the Gaussians between steps, after those of the settings: see
     `DensityControl`. `observers` are called with (state, info) after every step: progress bars, checkpoints.
     `every`: the history keeps every so many steps, and the last. Raises ValueError for frames or settings that cannot
     be fitted. A fit that diverges warns by `DivergenceWarning` and goes on from its last finite state with lower
@@ -108,7 +109,7 @@ def fit(
     observers, history = list(observers), []
     require(is_integer(every, 1), "every", expected="a whole number >= 1", got=repr(every))
     check_rate("fps", fps)
-    for state, info in fit_steps(frames, config, controls=controls):
+    for state, info in fit_steps(frames, config, state, controls=controls):  # noqa: B020
         for observe in observers:
             observe(state, info)
         if info.step % every == 0 or info.progress >= 1:

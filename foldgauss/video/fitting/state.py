@@ -14,10 +14,9 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float32
 
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.video.fitting.adam import adam_step
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.models.conditioning import ConditioningSpec
@@ -92,6 +91,8 @@ _COUNT = {"static": True, "decode": int}
 _NUMBER = {"static": True, "decode": float}
 _ERRORS = {"static": True, "decode": _decode_errors}
 _RULES = {"static": True, "decode": _decode_rules}
+#: The names of the maps of shared paths, of their moments, and of the frames' counts of steps.
+PATH_ARRAYS = ("path_maps", "path_first", "path_second", "frame_counts")
 #: The names of the sums of `GradientStatistics`.
 STATISTICS = ("screen_gradients", "time_gradients", "seen")
 
@@ -289,22 +290,6 @@ def paths_of(state: FitState, times: Float32[np.ndarray, " frames"] | None = Non
         np.asarray(frame_times(state.time_logits)) if times is None else times, (state.path_maps.shape[1], 1)
     )
     return SharedPaths(times, np.swapaxes(state.path_maps, 0, 1).copy())
-
-
-def update_paths(
-    state: FitState, grad: Float[np.ndarray, "frames paths 2 3"], frames: Int[np.ndarray, " n"], rate: float
-) -> bool:
-    """A step of Adam on the maps of `frames`, which are distinct, in place. Returns whether these can be inverted."""
-    num = len(frames)
-    state.frame_counts[frames] += 1
-    arrays = (array[frames].reshape(num, -1) for array in (grad, state.path_first, state.path_second))
-    rates = np.full(grad[0].size, rate, np.float32)
-    move, first, second = adam_step(*arrays, state.frame_counts[frames], rates)
-    for array, value in ((state.path_first, first), (state.path_second, second)):
-        array[frames] = value.reshape(grad[frames].shape)
-    state.path_maps[frames] -= move.reshape(grad[frames].shape).astype(np.float32)
-    with np.errstate(invalid="ignore", over="ignore"):
-        return bool((np.linalg.det(state.path_maps[frames][..., :2]) > 0).all())
 
 
 def measure_relative_size(state: FitState, config: FitConfig) -> float:

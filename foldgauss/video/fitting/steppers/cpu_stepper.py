@@ -7,17 +7,17 @@ import cv2
 import numpy as np
 
 from foldgauss.render import cpu
-from foldgauss.video.fitting.adam import sparse_adam, update_frame_times
+from foldgauss.video.fitting.adam import sparse_adam, update_frame_times, update_paths
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.losses import LOSSES
 from foldgauss.video.fitting.schedule import RateSchedule, choose_start_frames, steps_per_pass, to_planes
 from foldgauss.video.fitting.state import (
+    PATH_ARRAYS,
     FitState,
     frame_times,
     measure_relative_size,
     paths_of,
     spec_of,
-    update_paths,
 )
 from foldgauss.video.fitting.steppers.interpolated_frames import choose_targets, make_interpolated
 from foldgauss.video.fitting.steppers.jax_loss import custom_loss
@@ -63,7 +63,7 @@ class CpuStepper:
         times = np.asarray(frame_times(state.time_logits))
         by_time, by_path = np.zeros_like(times), np.zeros(state.path_maps.shape)
         spec = dataclasses.replace(self.spec, paths=paths_of(state, times))
-        losses, alive, visited = [], [], set()
+        losses, alive, visited = [], [], np.zeros(num_frames, bool)
         squared = progress >= config.squared_from
         screen = None if state.statistics is None else np.full(len(state.rows), -1, np.float32)
         views, fractions = choose_targets(self.interpolation, config, num_frames, state, progress)
@@ -75,7 +75,7 @@ class CpuStepper:
             loss, done, d_time = self._differentiate(state, k, t, spec, own_path, **settings)
             if fraction is None:
                 by_time[k] += d_time  # a batch may hold a frame twice
-                visited.add(k)
+                visited[k] = True
             losses.append(loss.value)
             alive.append(done.alive)
         if state.statistics is not None:
@@ -98,9 +98,11 @@ class CpuStepper:
             moments = state.time_count, state.time_first, state.time_second
             state.time_logits, moments = update_frame_times(state.time_logits, moments, by_time, time_rate)
             state.time_count, state.time_first, state.time_second = moments
-        if by_path.size and visited:
-            path_rate = self.rates.of_paths(progress, state.backoffs)
-            finite &= update_paths(state, by_path, np.array(sorted(visited)), path_rate * relative_size)
+        if by_path.size:
+            rate = self.rates.of_paths(progress, state.backoffs) * np.float32(relative_size)
+            before = tuple(getattr(state, name) for name in PATH_ARRAYS)
+            for name, array in zip(PATH_ARRAYS, update_paths(before, np.float32(by_path), visited, rate), strict=True):
+                setattr(state, name, np.array(array))
         return StepResult(float(np.mean(losses)), num_alive, finite)
 
     def measure_start(self, state: FitState) -> dict[int, float]:

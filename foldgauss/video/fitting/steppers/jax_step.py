@@ -20,9 +20,9 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.render.tiles import find_visible
-from foldgauss.video.fitting.adam import BETA1, BETA2, EPSILON, RateUnits, masked_adam, update_frame_times
+from foldgauss.video.fitting.adam import RateUnits, masked_adam, update_frame_times, update_paths
 from foldgauss.video.fitting.config import Loss
-from foldgauss.video.fitting.state import SIZE_STRIDE, DeviceArrays, FitState, Sizes, frame_times
+from foldgauss.video.fitting.state import PATH_ARRAYS, SIZE_STRIDE, DeviceArrays, FitState, Sizes, frame_times
 from foldgauss.video.fitting.steppers.jax_loss import compute_losses
 from foldgauss.video.fitting.steppers.loss import border_weights
 from foldgauss.video.models.row_layout import columns, unpack
@@ -169,7 +169,10 @@ def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames he
         logits, of_times = update_frame_times(logits, of_times, seen.by_times, control.time_rate)
     errors = jnp.where(seen.errors >= 0, seen.errors, arrays.frame_errors)
     if program.num_paths:
-        arrays = _update_paths(arrays, seen, control.path_rate * _relative_size(program, before, control.num))
+        rate = control.path_rate * _relative_size(program, before, control.num)
+        of_paths = tuple(getattr(arrays, name) for name in PATH_ARRAYS)
+        of_paths = update_paths(of_paths, seen.by_paths, seen.errors >= 0, rate)
+        arrays = arrays._replace(**dict(zip(PATH_ARRAYS, of_paths, strict=True)))
     report = Report(
         loss=seen.loss,
         num_alive=jnp.sum(seen.alive, dtype=jnp.int32),
@@ -192,25 +195,6 @@ def _relative_size(program: Program, rows, num) -> Float[Array, ""]:
     mean = jnp.sum(jnp.where(used, sizes, 0)) / jnp.sum(used).astype(jnp.float32)
     relative = jnp.exp(jnp.minimum(mean, 0)) / np.float32(program.rate_units.size)
     return jnp.where(jnp.isfinite(mean), relative, 1)
-
-
-def _update_paths(arrays: DeviceArrays, seen: "Gradients", rate: Float[Array, ""]) -> DeviceArrays:
-    """The twin of `state.update_paths`, for the frames of the batch."""
-    visited = seen.errors >= 0
-    counts = arrays.frame_counts + visited.astype(jnp.int32)
-    wide = jnp.maximum(counts, 1).astype(jnp.float32)[:, None, None, None]
-    beta1, beta2, one = np.float32(BETA1), np.float32(BETA2), np.float32(1)
-    first = beta1 * arrays.path_first + (one - beta1) * seen.by_paths
-    second = beta2 * arrays.path_second + (one - beta2) * seen.by_paths * seen.by_paths
-    square = second / (one - beta2**wide)
-    maps = arrays.path_maps - rate * (first / (one - beta1**wide)) / (jnp.sqrt(square) + np.float32(EPSILON))
-    chosen = visited[:, None, None, None]
-    return arrays._replace(
-        path_maps=jnp.where(chosen, maps, arrays.path_maps),
-        path_first=jnp.where(chosen, first, arrays.path_first),
-        path_second=jnp.where(chosen, second, arrays.path_second),
-        frame_counts=counts,
-    )
 
 
 class Gradients(NamedTuple):
