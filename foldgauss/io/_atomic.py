@@ -276,8 +276,8 @@ def lock_output(path: Path, *, own: tuple[Path, ...] = (), what: str = "fit", wa
 
     `own`: files that only the holder of the lock writes. Their temporary files, left by a killed process, are removed,
     and so are those of `path` written under the lock; others of `path` once they are an hour old. `what` names the
-    holder in messages. Raises `OutputError` where another process holds the lock for `wait` seconds, or one of the files
-    cannot be written.
+    holder in messages. Raises `OutputError` where another process holds the lock for `wait` seconds, or one of the
+    files cannot be written.
     """
     for target in (path, *own):
         check_writable(target)  # the lock would create a missing folder

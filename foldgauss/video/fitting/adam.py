@@ -6,8 +6,8 @@ $$ m \gets \beta_1 m + (1 - \beta_1) g, \quad v \gets \beta_2 v + (1 - \beta_2) 
    \theta \gets \theta - \eta\, \frac{m / (1 - \beta_1^n)}{\sqrt{v / (1 - \beta_2^n)} + \epsilon} $$
 
 `sparse_adam` (Numba) and its twin `masked_adam` (JAX) are for the rows of Gaussians, `update_paths` (JAX) for the maps
-of shared paths, and `FRAME_TIME_ADAM` (optax) for frame times; tests compare them with the rule in NumPy. Each row counts
-its own steps, so that its bias correction is right however seldom the Gaussian is alive.
+of shared paths, and `FRAME_TIME_ADAM` (optax) for frame times; tests compare them with the rule in NumPy. Each row
+counts its own steps, so that its bias correction is right however seldom the Gaussian is alive.
 """
 
 import math
