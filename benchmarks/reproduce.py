@@ -45,8 +45,7 @@ from foldgauss.io.figures import write_figure
 from foldgauss.io.provenance import fingerprint
 from foldgauss.jobs.runner import Checkpoint, run_steps
 from foldgauss.video import FitConfig, fit_steps
-from foldgauss.video.fitting.config import FIT_ENGINES
-from foldgauss.video.fitting.growth import PUBLISHED_STEPS
+from foldgauss.video.fitting.config import FIT_ENGINES, PUBLISHED_STEPS
 from foldgauss.video.fitting.loop import start
 from foldgauss.video.fitting.state import FitState, to_model
 from foldgauss.video.models.row_layout import columns

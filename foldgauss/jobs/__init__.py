@@ -8,7 +8,7 @@ and the next one continues to the same bits. `plan_long_fit` and `make_jobs` mak
 from foldgauss.jobs.clips import find_clips, make_jobs
 from foldgauss.jobs.job import FitJob
 from foldgauss.jobs.runner import Stopped, fit_job
-from foldgauss.jobs.segments import JoinedFit, LongFit, plan_long_fit, seam_drops, segments_folder
+from foldgauss.jobs.segments import JoinedFit, LongFit, plan_long_fit, segments_folder
 from foldgauss.jobs.workers import Outcome, SchedulerLost, WorkerPool, local_workers, run_here, run_on, running_cluster
 
 __all__ = [
@@ -27,6 +27,5 @@ __all__ = [
     "run_here",
     "run_on",
     "running_cluster",
-    "seam_drops",
     "segments_folder",
 ]

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from foldgauss._runtime.checks import invalid, is_integer, is_within, require
 from foldgauss._runtime.settings import flatten
@@ -33,8 +32,6 @@ SEGMENT_SECONDS = 10.0
 OVERLAP = 8
 #: What a joined file has of each segment beside its own file, in 10^6 bytes, at most: its properties and metadata.
 _MB_PER_SEGMENT = 0.004
-#: Number of frames on either side of an overlap that it is compared with.
-BESIDE = 8
 _PLAN = "plan.json"
 _INDEX = "index.npz"
 #: How the names of files of a fit in the folder begin, of unfinished ones with a dot.
@@ -78,7 +75,7 @@ class LongFit:
         fades = [(b, stop) for (_, stop), (b, _) in zip(self.spans[:-1], self.spans[1:], strict=True) if b < stop]
         if fades:
             self._score_fades(sources, fades, scores, on_frame)
-        joined = JoinedFit(*map(tuple, scores.tolist()), self.target, tuple(fades))
+        joined = JoinedFit(*map(tuple, scores.tolist()), self.target)
         if len(sources) == 1:  # an ordinary model
             with atomic_path(self.target) as temporary:
                 shutil.copyfile(sources[0][1], temporary)
@@ -115,27 +112,9 @@ class LongFit:
 
 @dataclasses.dataclass(frozen=True)
 class JoinedFit(Evaluation):
-    """A joined model and its scores: `psnr` in dB and `ssim` of every frame as played; `fades`: the shared frames."""
+    """A joined model, at `path`, and its scores: `psnr` in dB and `ssim` of every frame as played."""
 
     path: Path
-    fades: tuple[tuple[int, int], ...]
-
-    @property
-    def seam_drop(self) -> float | None:
-        """Mean PSNR in dB by which shared frames are worse than the `BESIDE` on either side; None without any."""
-        drops = seam_drops(np.asarray(self.psnr), self.fades)
-        return float(drops.mean()) if len(drops) else None
-
-
-def seam_drops(
-    scores: Float[np.ndarray, " num_frames"], fades: Sequence[tuple[int, int]], beside: int = BESIDE
-) -> Float[np.ndarray, " fades"]:
-    """For each overlap, the mean score of `beside` frames on either side minus its own mean."""
-    drops = []
-    for first, stop in fades:
-        around = np.concatenate([scores[max(first - beside, 0) : first], scores[stop : stop + beside]])
-        drops.append(around.mean() - scores[first:stop].mean())
-    return np.array(drops)
 
 
 def segments_folder(target: str | os.PathLike) -> Path:
@@ -250,13 +229,15 @@ def _divide_size(config: FitConfig, spans: Sequence[tuple[int, int]], metadata: 
 
 def _check_folder(folder: Path) -> None:
     """Raise ValueError for a folder with files other than those of a fit."""
-    if not folder.is_dir():
-        return
-    foreign = sorted(entry.name for entry in folder.iterdir() if not entry.name.startswith(_OWN))
-    for name in foreign[:1]:
-        raise invalid(
-            "target", expected=f"only files of a fit in {folder}", got=f"{name!r} in it", cure="Move it away."
-        )
+    names = sorted(entry.name for entry in folder.iterdir()) if folder.is_dir() else []
+    foreign = [name for name in names if not name.startswith(_OWN)]
+    require(
+        not foreign,
+        "target",
+        expected=f"only files of a fit in {folder}",
+        got=f"{foreign[:1]} in it",
+        cure="Move it away.",
+    )
 
 
 def _load_plan(folder: Path, request: dict[str, Any]) -> dict[str, Any] | None:

@@ -20,6 +20,7 @@ from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, compress, layers
 from foldgauss.video.compression.chunks import LEAST, arrange, divide, divide_anew, find_layers, visible_spans
 from foldgauss.video.compression.quantize import (
+    TIME_BITS,
     Rule,
     _choose_degrees,
     column_names,
@@ -29,7 +30,6 @@ from foldgauss.video.compression.quantize import (
     quantize,
     quantize_chunk,
 )
-from foldgauss.video.compression.quantized_times import TIME_BITS
 from foldgauss.video.compression.sensitivity import estimate_sensitivities
 from foldgauss.video.models.metrics import evaluate
 from foldgauss.video.models.renderer import VideoRenderer

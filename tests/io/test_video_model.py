@@ -11,7 +11,7 @@ from foldgauss.io import ModelFileError, load_video_model, save_video_model
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.io.models.model_file import save_model
 from foldgauss.video import FitConfig, edit, fit_steps
-from foldgauss.video.fitting.growth import Growth
+from foldgauss.video.fitting.config import Growth
 from foldgauss.video.fitting.loop import to_model
 
 CONFIG = FitConfig(num_gaussians=60, steps=8, degree=2)

@@ -16,7 +16,7 @@ import foldgauss.jobs.segments as long
 from foldgauss.io import VideoError, index_video, load_video_model, read_video, save_video_model
 from foldgauss.io._atomic import OutputError
 from foldgauss.io.models.video_model import read_metadata
-from foldgauss.jobs import Outcome, Stopped, plan_long_fit, run_here, seam_drops, segments_folder
+from foldgauss.jobs import Outcome, Stopped, plan_long_fit, run_here, segments_folder
 from foldgauss.video import SegmentedVideo, VideoModel, evaluate
 
 NUM_FRAMES, ASKED = 34, {"segment_seconds": 1.3, "overlap": 2}
@@ -62,15 +62,6 @@ def test_scores_are_those_of_the_joined_video(whole, clip):
     scores = evaluate(video, read_video(clip).frames)
     assert scores.psnr == pytest.approx(made.psnr, abs=2e-4)
     assert scores.ssim == pytest.approx(made.ssim, abs=2e-5)
-    drops = seam_drops(np.array(scores.psnr), made.fades)
-    assert made.seam_drop == pytest.approx(drops.mean(), abs=1e-3)
-    assert len(drops) == 2
-
-
-def test_seam_drops_are_what_lies_around_less_what_is_shared():
-    scores = np.array([30.0] * 10 + [28.0, 29.0] + [31.0] * 10)
-    assert seam_drops(scores, [(10, 12)], beside=4) == pytest.approx([30.5 - 28.5])
-    assert seam_drops(scores, []).shape == (0,)
 
 
 def test_each_segment_says_what_it_is_of(whole, clip):
@@ -163,7 +154,6 @@ def test_a_short_clip_is_an_ordinary_model(tmp_path):
     fit = plan_long_fit(clip, tmp_path / "short.safetensors", CONFIG)
     made = joined(fit)
     assert len(fit.spans) == 1
-    assert made.seam_drop is None
     assert made.path.read_bytes() == Path(fit.jobs[0].target).read_bytes()
     assert isinstance(load_video_model(made.path), VideoModel)
 

@@ -486,13 +486,6 @@ def test_start_from_reproduces_the_model(fitted):
         np.testing.assert_array_equal(ours, own)
 
 
-def test_start_uses_the_given_frame_times():
-    frames, logits = moving_blobs(), np.log([1.0, 1, 3, 1, 2])
-    state = start(frames, CONFIG, logits)
-    np.testing.assert_allclose(to_model(state, CONFIG, (48, 64), 25.0).frame_times.times()[1:3], [1 / 8, 2 / 8], 1e-5)
-    assert state.time_logits.dtype == np.float32
-
-
 @pytest.mark.parametrize(
     ("changes", "told"),
     [

@@ -11,8 +11,7 @@ from clips import moving_blobs
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, cpu, project
 from foldgauss.video import FitConfig, LearningRates, Views, evaluate, fit, fit_steps
-from foldgauss.video.fitting.config import PRESETS, chosen_num_gaussians, planned_steps
-from foldgauss.video.fitting.growth import Growth
+from foldgauss.video.fitting.config import PRESETS, Growth, chosen_num_gaussians, planned_steps
 from foldgauss.video.fitting.initialize import initialize_uniform
 from foldgauss.video.fitting.loop import start, to_model
 from foldgauss.video.fitting.schedule import choose_views

@@ -109,8 +109,6 @@ def _summarize(joined: JoinedFit, outcomes: list[Outcome], config: FitConfig) ->
     peaks = [record["peak_bytes"] for record in records]
     if None not in peaks:
         figures["peak_mib"] = round(max(peaks) / 2**20)
-    if joined.seam_drop is not None:
-        figures["seam_drop"] = round(joined.seam_drop, 3)
     return figures
 
 

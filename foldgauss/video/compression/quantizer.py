@@ -12,7 +12,7 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.video.compression.quantize import (
     FEATURES,
     Quantized,
@@ -82,9 +82,7 @@ class Quantizer:
         self.exact = compute_columns(model)
         sensitivity, self._seen = estimate_sensitivities(Contributions(model, background), self.exact)
         self._names = [name for name in column_names(self.exact.info.degree) if not is_integral(name)]
-        if not self._seen.any():
-            cure = "No frame shows anything."
-            raise invalid("model", expected="visible Gaussians", got="none", cure=cure)
+        require(self._seen.any(), "model", expected="visible Gaussians", got="none", cure="No frame shows anything.")
         self._fit(sensitivity)
 
     def _fit(self, sensitivity: dict[str, Float[np.ndarray, " num"]]) -> None:

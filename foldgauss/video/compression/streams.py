@@ -7,8 +7,7 @@ from jaxtyping import Int
 
 from foldgauss.video.compression import range_coder
 from foldgauss.video.compression.column_contexts import ColumnContexts
-from foldgauss.video.compression.quantize import Chunk, CompactInfo, Quantized, Rule
-from foldgauss.video.compression.quantized_paths import PathsInfo
+from foldgauss.video.compression.quantize import Chunk, CompactInfo, PathsInfo, Quantized, Rule
 
 
 def encode_motion(quantized: Quantized) -> list[bytes]:

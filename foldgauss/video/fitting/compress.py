@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from foldgauss._runtime.checks import invalid
-from foldgauss.video.compression.quantize import dequantize
+from foldgauss._runtime.checks import require
+from foldgauss.video.compression.quantize import dequantize, describe_model
 from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig, Strategy, Views, planned_steps
 from foldgauss.video.fitting.loop import FitInfo, FitResult, check_frames, fit, start_from
 from foldgauss.video.fitting.rate import COMPRESSION_START, RateControl
@@ -48,11 +48,24 @@ def compress(
     Example: `save_compact("clip.fgz", compress(model, clip.frames, quality=60).quantized)`.
     """
     check_model(model)
-    config = _make_config(model, quality=quality, size_mb=size_mb, psnr=psnr, steps=steps, minutes=minutes)
+    about = describe_model(model)
+    config = FitConfig(
+        degree=about.degree,
+        power=about.power,
+        floor=about.floor,
+        quality=quality,
+        size_mb=size_mb,
+        psnr=psnr,
+        steps=steps,
+        minutes=minutes,
+        compositing=model.compositing,
+        options=model.options,
+        strategy=Strategy(relocated_fraction=0.0, scale_cutoff=model.scale_cutoff),
+        views=Views(interpolation_fraction=0.0),
+    )
     if frames is None:
         for name, value in (("psnr", psnr), ("steps", steps), ("minutes", minutes)):
-            if value is not None:
-                raise invalid(name, expected="None without the clip", got=value, cure="Give the clip's frames.")
+            require(value is None, name, expected="None without the clip", got=value, cure="Give the clip's frames.")
         return _round_only(model, config)
     check_frames_of(model, frames)
     check_frames(frames)
@@ -62,25 +75,6 @@ def compress(
     state = start_from(model, config, steps or math.ceil((1 - COMPRESSION_START) * budget), COMPRESSION_START)
     config = dataclasses.replace(config, steps=state.plan if steps else None)
     return fit(frames, config, fps=model.fps, state=state, observers=observers)
-
-
-def _make_config(model: VideoModel, **goals: float | None) -> FitConfig:
-    """The settings with which the model may be fitted further."""
-    envelope = model.splats.envelope
-    power, floor = (np.unique(np.asarray(getattr(envelope, name))) for name in ("power", "floor"))
-    if power.size != 1 or floor.size != 1:
-        cure = "Save it as .safetensors, which holds one envelope per Gaussian."
-        raise invalid("model.splats.envelope", expected="one for all Gaussians", got="several", cure=cure)
-    return FitConfig(
-        degree=model.degree,
-        power=float(power[0]),
-        floor=float(floor[0]),
-        compositing=model.compositing,
-        options=model.options,
-        strategy=Strategy(relocated_fraction=0.0, scale_cutoff=model.scale_cutoff),
-        views=Views(interpolation_fraction=0.0),
-        **goals,
-    )
 
 
 def _round_only(model: VideoModel, config: FitConfig) -> FitResult:

@@ -11,8 +11,7 @@ import numpy as np
 
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.schedule import BACKOFF_FACTOR
-from foldgauss.video.fitting.state import FitState
-from foldgauss.video.fitting.steppers.protocol import StepResult
+from foldgauss.video.fitting.state import FitState, StepResult
 from foldgauss.video.models.row_layout import columns
 
 #: Steps between the states that are kept to return to, at least.

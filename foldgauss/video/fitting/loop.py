@@ -31,9 +31,8 @@ from foldgauss.video.fitting.initialize import (
 )
 from foldgauss.video.fitting.rate import RateControl, count_bytes, count_past
 from foldgauss.video.fitting.relocation import Relocation, relocates
-from foldgauss.video.fitting.state import FitState, envelope_of, running_psnr, to_model
+from foldgauss.video.fitting.state import FitState, StepResult, envelope_of, running_psnr, to_model
 from foldgauss.video.fitting.steppers.engines import choose_engine, make_stepper
-from foldgauss.video.fitting.steppers.protocol import StepResult
 from foldgauss.video.models.frame_times import FrameTimes, check_rate, make_time_logits
 from foldgauss.video.models.row_layout import pack
 from foldgauss.video.models.shared_paths import SharedPaths
@@ -163,7 +162,7 @@ def fit_steps(
     engine = choose_engine(frames, config)
     _warm_up(frames, config, engine)
     find_motion = motion_finder(frames, motion)
-    state = start(frames, config, None, find_motion, clock) if state is None else state
+    state = start(frames, config, find_motion, clock) if state is None else state
     stepper = make_stepper(engine, frames, config, state, find_motion)
     planner, time_left = StepPlanner(config), TimeLeft(state, config)
     guard = Guard(state, config, stepper.steps_per_pass, alpha=has_alpha)
@@ -265,18 +264,15 @@ def _warm_up(frames: np.ndarray, config: FitConfig, engine: str) -> None:
 def start(
     frames: np.ndarray,
     config: FitConfig,
-    logits: np.ndarray | None = None,
     find_motion: Callable[[], Motion] | None = None,
     clock: Callable[[], float] = time.perf_counter,
 ) -> FitState:
-    """State before the first step; frame times start at softmax weights `logits`, or by default evenly in each shot."""
+    """State before the first step; frame times start evenly in each shot."""
     find_motion = find_motion or motion_finder(frames)
     has_alpha, frames = frames.shape[3] == 4, np.ascontiguousarray(frames[..., :3])  # as seen over black
     begun, num_frames = clock(), len(frames)
     motion = find_motion() if config.follows_motion else None
-    if logits is None:
-        logits = make_time_logits(num_frames, motion.cuts if motion is not None else [])
-    logits = np.array(logits, np.float32)
+    logits = np.array(make_time_logits(num_frames, motion.cuts if motion is not None else []), np.float32)
     splats = _initialize(frames, config, logits, motion)
     if config.is_compact and config.compositing == "over" and not has_alpha and config.initialization != "uniform":
         splats = with_backdrop(splats, frames)

@@ -18,7 +18,6 @@ from jaxtyping import Float32
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.models.conditioning import ConditioningSpec
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.row_layout import columns, unpack
@@ -98,6 +97,24 @@ STATISTICS = ("screen_gradients", "time_gradients", "seen")
 
 
 # --------------------------------------------------------------------------------------------------- state
+
+
+class GradientStatistics(NamedTuple):
+    """Sums over the steps since the last densification; (num,) each."""
+
+    screen: np.ndarray  #: float32: of screen gradients
+    time: np.ndarray  #: float32: of time gradients
+    seen: np.ndarray  #: int32: steps in which the Gaussian was seen
+
+    def add(self, screen: np.ndarray, by_time: np.ndarray) -> None:
+        """Add a step: the largest screen gradient over its views, and dL/dm_t by the raw m_t over all; (num,) each.
+
+        `screen` is negative for Gaussians that no view shows.
+        """
+        shown = screen >= 0
+        np.add(self.screen, screen, out=self.screen, where=shown)
+        np.add(self.time, np.abs(by_time), out=self.time, where=shown)
+        np.add(self.seen, 1, out=self.seen, where=shown)
 
 
 @jax.tree_util.register_dataclass
@@ -267,6 +284,14 @@ DeviceArrays = collections.namedtuple("DeviceArrays", ARRAYS)
 
 
 # ------------------------------------------------------------------------------------ what follows from a state
+
+
+class StepResult(NamedTuple):
+    """What one step reports."""
+
+    loss: float  #: mean over the batch
+    num_alive: int  #: Gaussians that took part
+    finite: bool = True  #: whether the parameters of these are finite after the step
 
 
 def to_model(state: FitState, config: FitConfig, size: tuple[int, int], fps: float) -> VideoModel:

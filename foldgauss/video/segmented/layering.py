@@ -5,7 +5,7 @@ import functools
 
 import numpy as np
 
-from foldgauss._runtime.checks import invalid, require
+from foldgauss._runtime.checks import require
 from foldgauss.video.editing.edited_video import EditedVideo, Layer, as_edited, check_timeline, stack_layers
 from foldgauss.video.editing.layer_edits import gather_layer
 from foldgauss.video.editing.overlays import AbstractOverlay, GaussianFunction, Retiming, TriangleFunction, is_active
@@ -51,12 +51,13 @@ def layers(*videos: Video, timeline: int = -1) -> EditedVideo | SegmentedVideo:
     for number, video in enumerate(videos):
         if not isinstance(video, SegmentedVideo):
             as_edited(video)
-        elif _bounds(video) != _bounds(lead):
-            raise invalid(
-                "videos",
-                expected=f"the segments of video {timeline}, {_format_bounds(lead)}",
-                got=f"{_format_bounds(video)} in video {number}",
-            )
+            continue
+        require(
+            _bounds(video) == _bounds(lead),
+            "videos",
+            expected=f"the segments of video {timeline}, {_format_bounds(lead)}",
+            got=f"{_format_bounds(video)} in video {number}",
+        )
 
     @functools.lru_cache(maxsize=MAX_PREPARED)
     def load(number: int) -> EditedVideo:

@@ -14,6 +14,7 @@ from foldgauss.video.fitting.schedule import RateSchedule, choose_start_frames, 
 from foldgauss.video.fitting.state import (
     PATH_ARRAYS,
     FitState,
+    StepResult,
     frame_times,
     measure_relative_size,
     paths_of,
@@ -22,7 +23,6 @@ from foldgauss.video.fitting.state import (
 from foldgauss.video.fitting.steppers.interpolated_frames import choose_targets, make_interpolated
 from foldgauss.video.fitting.steppers.jax_loss import custom_loss
 from foldgauss.video.fitting.steppers.loss import ImageLoss, border_weights, image_loss, squared_loss
-from foldgauss.video.fitting.steppers.protocol import StepResult
 from foldgauss.video.models.background import random_background
 from foldgauss.video.models.conditioning import (
     ConditionedSplats,
@@ -38,7 +38,7 @@ from foldgauss.video.motion.optical_flow import Motion, motion_finder
 
 
 class CpuStepper:
-    """A `Stepper` with the buffers and constants that all steps share."""
+    """Computes the steps of a fit, with the buffers and constants that all share. Methods change the state in place."""
 
     def __init__(
         self, frames: np.ndarray, config: FitConfig, state: FitState, find_motion: Callable[[], Motion] | None = None
@@ -53,10 +53,12 @@ class CpuStepper:
         self.adopt(state)
 
     def adopt(self, state: FitState) -> None:
+        """Prepare for a state whose arrays were replaced."""
         self.grad = np.zeros_like(state.rows)
         self.window = find_windows(state.rows, self.spec)
 
     def step(self, state: FitState, progress: float) -> StepResult:
+        """One step at a fraction of the plan. The step counter is the caller's."""
         config, num_frames = self.config, self.num_frames
         if self.frames.shape[3] == 4:
             self.background = random_background(config.seed, state.step)
@@ -106,6 +108,7 @@ class CpuStepper:
         return StepResult(float(np.mean(losses)), num_alive, finite)
 
     def measure_start(self, state: FitState) -> dict[int, float]:
+        """Mean squared errors of some frames, by frame."""
         spec, errors = dataclasses.replace(self.spec, paths=paths_of(state)), {}
         times = np.asarray(frame_times(state.time_logits))
         for k in choose_start_frames(self.num_frames):

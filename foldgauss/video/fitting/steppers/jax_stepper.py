@@ -13,7 +13,7 @@ import numpy as np
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, most_gaussians
 from foldgauss.video.fitting.losses import LOSSES
 from foldgauss.video.fitting.schedule import RateSchedule, choose_start_frames, find_views_in_turn, steps_per_pass
-from foldgauss.video.fitting.state import STATISTICS, DeviceArrays, FitState, frame_times
+from foldgauss.video.fitting.state import STATISTICS, DeviceArrays, FitState, StepResult, frame_times
 from foldgauss.video.fitting.steppers.interpolated_frames import Prefetcher, choose_targets, make_interpolated
 from foldgauss.video.fitting.steppers.jax_step import (
     Control,
@@ -25,7 +25,6 @@ from foldgauss.video.fitting.steppers.jax_step import (
     compile_step,
     replicated,
 )
-from foldgauss.video.fitting.steppers.protocol import StepResult
 from foldgauss.video.motion.optical_flow import Motion, motion_finder
 
 #: A fit whose growth has no limit that it could reach has capacity for so many times the Gaussians of its start; where
@@ -66,7 +65,7 @@ class HeldArrays:
 
 
 class JaxStepper:
-    """A `Stepper` on JAX's default device, or on several where the batch can be divided evenly.
+    """The methods of `CpuStepper` on JAX's default device, or on several where the batch can be divided evenly.
 
     The program is compiled when it is made, before any clock runs, and the frames are kept on the device, as bytes.
     """
