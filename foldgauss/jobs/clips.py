@@ -13,7 +13,7 @@ from foldgauss.io.media.writing import ANIMATION_SUFFIXES
 from foldgauss.io.models.compact import COMPACT_SUFFIX
 from foldgauss.io.models.video_model import MODEL_SUFFIX
 from foldgauss.jobs.job import FitJob, stamp_clip
-from foldgauss.video.fitting.config import FitConfig
+from foldgauss.video import FitConfig
 
 #: Suffixes of video files: a file with one of them is taken for a clip, whatever its content.
 CLIP_SUFFIXES = (

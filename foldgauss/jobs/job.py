@@ -10,7 +10,7 @@ from typing import Any
 
 from foldgauss.io.media.clip import AS_STORED, Reading
 from foldgauss.io.media.images import image_paths
-from foldgauss.video.fitting.config import FitConfig
+from foldgauss.video import FitConfig
 
 #: Fields of a record besides the request and the scores of each frame.
 _RECORD = {"num_frames", "size", "fps", "num_gaussians", "mean_psnr", "mean_ssim", "steps", "seconds", "stopped_by"}

@@ -21,21 +21,14 @@ import numpy as np
 from foldgauss import __version__
 from foldgauss._runtime.checks import require
 from foldgauss._runtime.machine import waiting_seconds
+from foldgauss.io import Clip, FrameIndex, read_indexed, read_video, save_video_model
 from foldgauss.io._atomic import OutputError, atomic_path, lock_output, write_or_keep
-from foldgauss.io.media.clip import Clip
-from foldgauss.io.media.indexing import FrameIndex, read_indexed
-from foldgauss.io.media.reading import read_video
 from foldgauss.io.models.checkpoint import is_known_good, load_checkpoint, save_checkpoint
 from foldgauss.io.models.compact import COMPACT_SUFFIX, leave_room, save_compact
-from foldgauss.io.models.video_model import save_video_model
 from foldgauss.io.provenance import describe_reading, describe_source, fingerprint
 from foldgauss.jobs.job import FitJob, file_digest, limit_range, read_record
-from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.divergence import FitDiverged
+from foldgauss.video import Evaluation, FitConfig, FitDiverged, FitState, VideoModel, evaluate
 from foldgauss.video.fitting.loop import FitInfo, finish, fit_steps
-from foldgauss.video.fitting.state import FitState
-from foldgauss.video.models.metrics import Evaluation, evaluate
-from foldgauss.video.models.video_model import VideoModel
 
 #: Seconds between two checkpoints of a running fit.
 CHECKPOINT_SECONDS = 30.0

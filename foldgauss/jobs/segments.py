@@ -14,17 +14,14 @@ import numpy as np
 
 from foldgauss._runtime.checks import invalid, is_integer, is_within, require
 from foldgauss._runtime.settings import flatten
+from foldgauss.io import FrameIndex, index_video, join_segments, read_indexed
 from foldgauss.io._atomic import OutputError, atomic_path
 from foldgauss.io.media.clip import AS_STORED, Reading
-from foldgauss.io.media.indexing import FrameIndex, index_video, read_indexed
-from foldgauss.io.models.segmented import join_segments
 from foldgauss.io.models.video_model import MODEL_SUFFIX, keep_origin, load_video_model, read_metadata
 from foldgauss.io.provenance import describe_reading
 from foldgauss.jobs.job import FitJob, file_digest, limit_range, stamp_clip
 from foldgauss.jobs.runner import mean_scores
-from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.models.metrics import Evaluation, psnr, ssim
-from foldgauss.video.segmented.segmented_video import Segment, SegmentedVideo, plan_segments
+from foldgauss.video import Evaluation, FitConfig, Segment, SegmentedVideo, plan_segments, psnr, ssim
 
 #: Default length of a segment.
 SEGMENT_SECONDS = 10.0

@@ -24,7 +24,7 @@ from foldgauss._runtime.optional_imports import import_optional
 from foldgauss._runtime.threads import available_cores
 from foldgauss.jobs.job import FitJob, read_record
 from foldgauss.jobs.runner import Report, Stopped, fit_job
-from foldgauss.video.fitting.loop import FitInfo
+from foldgauss.video import FitInfo
 
 if TYPE_CHECKING:
     from distributed import Client

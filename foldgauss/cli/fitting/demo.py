@@ -13,13 +13,10 @@ from foldgauss.cli.shared.arguments import Overwrite
 from foldgauss.cli.shared.console import choose_display, print_figures, write_json
 from foldgauss.cli.shared.contact_sheet import make_comparison_sheet
 from foldgauss.cli.shared.files import make_folder, refuse_existing
+from foldgauss.io import load_video_model, read_video, write_image, write_video
 from foldgauss.io.datasets import sample_clip
-from foldgauss.io.media.reading import read_video
-from foldgauss.io.media.writing import write_image, write_video
-from foldgauss.io.models.video_model import load_video_model
 from foldgauss.jobs import FitJob
-from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.models.metrics import Evaluation
+from foldgauss.video import Evaluation, FitConfig
 
 SIZE = (160, 320)
 FRAMES = (0, 24)

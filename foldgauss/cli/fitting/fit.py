@@ -45,21 +45,19 @@ from foldgauss.cli.shared.fit_progress import (
     save_previews,
 )
 from foldgauss.cli.shared.rendering import evaluate_with_progress
+from foldgauss.io import HistoryFile, read_history, write_curves
 from foldgauss.io._atomic import lock_output, resolve
-from foldgauss.io.history import HistoryFile, read_history, write_curves
 from foldgauss.io.media.clip import DEINTERLACE, Clip, check_reading
 from foldgauss.io.models.compact import COMPACT_SUFFIX
 from foldgauss.io.models.video_model import MODEL_SUFFIX, check_model_name
-from foldgauss.jobs.job import FitJob
-from foldgauss.jobs.runner import Stopped as FitStopped
+from foldgauss.jobs import FitJob
+from foldgauss.jobs import Stopped as FitStopped
 from foldgauss.jobs.runner import run_fit
 from foldgauss.jobs.segments import SEGMENT_SECONDS, segments_folder
+from foldgauss.video import Evaluation, FitDiverged, FitInfo
 from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig, planned_steps
-from foldgauss.video.fitting.divergence import FitDiverged
-from foldgauss.video.fitting.loop import FitInfo
 from foldgauss.video.fitting.state import FitState, running_psnr
 from foldgauss.video.fitting.steppers.engines import choose_engine, describe_device
-from foldgauss.video.models.metrics import Evaluation
 
 
 @command("fit")

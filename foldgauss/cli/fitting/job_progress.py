@@ -11,9 +11,7 @@ from foldgauss.cli.shared.fit_progress import print_json
 from foldgauss.io.history import info_line
 from foldgauss.jobs import FitJob, Outcome, WorkerPool, run_here, run_on
 from foldgauss.jobs import Stopped as JobsStopped
-from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.loop import FitInfo
-from foldgauss.video.models.metrics import Evaluation
+from foldgauss.video import Evaluation, FitConfig, FitInfo
 
 #: Up to so many jobs, each has a line in a log.
 MAX_LINES = 20
