@@ -8,12 +8,11 @@ and the next one continues to the same bits. `plan_long_fit` and `make_jobs` mak
 from foldgauss.jobs.clips import find_clips, make_jobs
 from foldgauss.jobs.job import FitJob
 from foldgauss.jobs.runner import Stopped, fit_job
-from foldgauss.jobs.segments import JoinedFit, LongFit, plan_long_fit, segments_folder
+from foldgauss.jobs.segments import LongFit, plan_long_fit, segments_folder
 from foldgauss.jobs.workers import Outcome, SchedulerLost, WorkerPool, local_workers, run_here, run_on, running_cluster
 
 __all__ = [
     "FitJob",
-    "JoinedFit",
     "LongFit",
     "Outcome",
     "SchedulerLost",

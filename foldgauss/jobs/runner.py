@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import numpy as np
@@ -67,16 +67,9 @@ class Checkpoint:
     source: dict[str, Any]
     on_error: CheckpointError = lambda error, step: None
 
-    def load(self, *, strict: bool = True) -> FitState | None:
-        """The state of the file, None if it is missing; unless `strict` also if it is damaged or of another fit."""
-        if not self.path.exists():
-            return None
-        try:
-            return load_checkpoint(self.path, config=self.config, source=self.source)
-        except (OSError, ValueError):
-            if strict:
-                raise
-            return None
+    def load(self) -> FitState | None:
+        """The state of the file, None if there is none. Raises ValueError for one that is damaged or of another fit."""
+        return load_checkpoint(self.path, config=self.config, source=self.source) if self.path.exists() else None
 
     def try_save(self, state: FitState) -> None:
         """Save the state; a full disk must not end the fit."""
@@ -90,18 +83,19 @@ def run_fit(
     job: FitJob,
     observer: OpenObserver,
     *,
-    resume: Literal["strictly", "if possible", "never"] = "if possible",
+    resume: bool = True,
     measure: Callable[[VideoModel, np.ndarray], Evaluation] = evaluate,
     on_checkpoint_error: CheckpointError = lambda error, step: None,
 ) -> dict[str, Any]:
     """Fit the frames of a job, from its checkpoint if there is one, and write its model; returns the job's record.
 
     The record is described in `fit_job`. The checkpoint, then that of the last step, stays until the caller removes it.
-    With `resume` "strictly" a checkpoint of another fit is an error; with "never" the first step removes it. The
-    observer is opened once the frames are read; `measure` computes the scores.
+    Without `resume` the first step removes an earlier one. The observer is opened once the frames are read; `measure`
+    computes the scores.
 
     Raises `Stopped` if the observer stops the fit, `FitDiverged` as `fit_steps`, ValueError and OSError for frames that
-    cannot be read or fitted, for outputs that cannot be written, and for a checkpoint of another fit.
+    cannot be read or fitted, for outputs that cannot be written, and for a checkpoint that is damaged or of another
+    fit.
     """
     require(
         Path(job.target).suffix.lower() != COMPACT_SUFFIX or job.config.is_compact,
@@ -117,12 +111,12 @@ def run_fit(
         clip = dataclasses.replace(clip, fps=job.fps or clip.fps)
     _limit_compiled(clip.frames.shape)
     checkpoint = Checkpoint(job.checkpoint, job.config, fingerprint(clip), on_checkpoint_error)
-    state = None if resume == "never" else checkpoint.load(strict=resume == "strictly")
+    state = checkpoint.load() if resume else None
     about = _describe_clip(job, clip)
     config = dataclasses.replace(job.config, size_mb=leave_room(job.config.size_mb, about))
     steps = fit_steps(clip.frames, config, state)
     with observer(clip, state) as observe:
-        if resume == "never":  # an earlier fit could be resumed by mistake; its checkpoint goes once a step is taken
+        if not resume:  # an earlier fit could be resumed by mistake; its checkpoint goes once a step is taken
             steps = itertools.chain([next(steps)], steps)
             job.checkpoint.unlink(missing_ok=True)
         state, info = run_steps(steps, observe, checkpoint, job.checkpoint_seconds)

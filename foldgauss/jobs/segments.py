@@ -54,8 +54,8 @@ class LongFit:
         records: Mapping[str, Mapping[str, Any]],
         *,
         on_frame: Callable[[], None] = lambda: None,
-    ) -> "JoinedFit":
-        """Write the segments as one model, once all jobs are finished; `records` by the jobs' names.
+    ) -> Evaluation:
+        """Write the segments as one model, once all jobs are finished, and return its scores; `records`: by job.
 
         Frames that two segments share are scored as they are played. Equal segments give equal bytes. The folder
         stays, see `clean_up`. Raises as `join_segments`, and `OutputError` if a segment's file is not as recorded.
@@ -72,7 +72,7 @@ class LongFit:
         fades = [(b, stop) for (_, stop), (b, _) in zip(self.spans[:-1], self.spans[1:], strict=True) if b < stop]
         if fades:
             self._score_fades(sources, fades, scores, on_frame)
-        joined = JoinedFit(*map(tuple, scores.tolist()), self.target)
+        joined = Evaluation(*map(tuple, scores.tolist()))
         if len(sources) == 1:  # an ordinary model
             with atomic_path(self.target) as temporary:
                 shutil.copyfile(sources[0][1], temporary)
@@ -105,13 +105,6 @@ class LongFit:
                 entry.unlink()
         with suppress(OSError):  # files of others
             self.folder.rmdir()
-
-
-@dataclasses.dataclass(frozen=True)
-class JoinedFit(Evaluation):
-    """A joined model, at `path`, and its scores: `psnr` in dB and `ssim` of every frame as played."""
-
-    path: Path
 
 
 def segments_folder(target: str | os.PathLike) -> Path:

@@ -151,19 +151,18 @@ def test_a_psnr_out_of_reach_is_noted(clip, tmp_path, psnr, num):
 
 
 @pytest.mark.parametrize("damage", ["cut", "other"])
-def test_a_checkpoint_that_cannot_be_used_is_not(done, clip, tmp_path, monkeypatch, damage):
+def test_a_checkpoint_that_cannot_be_used_is_an_error_and_stays(clip, tmp_path, monkeypatch, damage):
     monkeypatch.setattr(fitting, "REPORT_SECONDS", 0.0)
     job = job_of(clip, tmp_path)
     if damage == "cut":
         stopped_after(job, 5)
         job.checkpoint.write_bytes(job.checkpoint.read_bytes()[:-10])
     else:
-        other = dataclasses.replace(job, config=dataclasses.replace(CONFIG, seed=1))
-        stopped_after(other, 5)
-    told = []
-    fit_job(job, lambda progress: not told.append(progress.step))
-    assert told[0] == 1
-    assert Path(job.target).read_bytes() == Path(done[0].target).read_bytes()
+        stopped_after(dataclasses.replace(job, config=dataclasses.replace(CONFIG, seed=1)), 5)
+    before = job.checkpoint.read_bytes()
+    with pytest.raises(ValueError, match=job.checkpoint.name):
+        fit_job(job)
+    assert job.checkpoint.read_bytes() == before
 
 
 def test_a_span_is_found_by_its_index(clip, tmp_path):

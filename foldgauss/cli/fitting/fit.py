@@ -197,7 +197,7 @@ def fit_with_progress(
         record = run_fit(
             job,
             observe,
-            resume="never" if overwrite else "strictly",
+            resume=not overwrite,
             measure=partial(evaluate_with_progress, shown=display in ("bar", "lines")),
             on_checkpoint_error=lambda error, step: warn(f"no checkpoint at step {step}: {error}"),
         )

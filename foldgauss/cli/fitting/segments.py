@@ -19,8 +19,9 @@ from foldgauss.cli.fitting.options import WorkerOptions
 from foldgauss.cli.shared.console import Display, format_count, progress_bar, show_status
 from foldgauss.io._atomic import write_or_keep
 from foldgauss.io.media.reading import describe_crop
-from foldgauss.jobs import FitJob, JoinedFit, LongFit, Outcome, plan_long_fit
+from foldgauss.jobs import FitJob, LongFit, Outcome, plan_long_fit
 from foldgauss.jobs.job import read_record
+from foldgauss.video import Evaluation
 from foldgauss.video.fitting.config import SHORTEST_LIFETIME, FitConfig, chosen_num_gaussians, planned_steps
 
 
@@ -58,14 +59,13 @@ def fit_in_segments(
         others = f"; the others are kept in {fit.folder}" if len(failed) < len(outcomes) else ""
         raise Stopped(f"{len(failed)} of {len(outcomes)} segments failed{others}. {describe_continuation(overwrite)}")
 
-    def join(path: Path) -> JoinedFit:
+    def join(path: Path) -> Evaluation:
         records = {outcome.job.name: outcome.record for outcome in outcomes}
         shared = sum(max(0, before[1] - after[0]) for before, after in itertools.pairwise(fit.spans))
         with progress_bar("Joining", max(shared, 1), shown=display == "bar" and shared > 0) as advance:
             return dataclasses.replace(fit, target=path).join(records, on_frame=advance)
 
     joined = write_or_keep(target, join)
-    target = joined.path
     fit.clean_up()
     figures = _summarize(joined, outcomes, job.config)
     figures |= {"wall_seconds": round(time.monotonic() - begun, 2), "file_bytes": target.stat().st_size}
@@ -103,7 +103,7 @@ def print_plan(display: Display, source: str, num_frames: int, size: tuple[int, 
         out.print(f"{source}: {format_count(num_frames, 'frame')} of {height}x{width}{plan}", soft_wrap=True)
 
 
-def _summarize(joined: JoinedFit, outcomes: list[Outcome], config: FitConfig) -> dict[str, Any]:
+def _summarize(joined: Evaluation, outcomes: list[Outcome], config: FitConfig) -> dict[str, Any]:
     records = [outcome.record for outcome in outcomes]
     figures = summarize_fit(joined, records, config) | {"num_segments": len(records)}
     peaks = [record["peak_bytes"] for record in records]

@@ -101,12 +101,6 @@ class Guard:
         state.best_error = min(error, state.best_error or error)
         return ""
 
-    def is_converging(self, state: FitState) -> bool:
-        """Whether the fit has not diverged so far and its frames are better than at the start, as far as is known."""
-        if state.backoffs or not (state.is_finite("rows") and state.is_finite("second") and _has_valid_maps(state)):
-            return False
-        return not self.comparable or (self._error_ratio(state) <= MUCH_WORSE and self._start_ratio(state) < 1)
-
     def replace_good(self, state: FitState) -> None:
         """Keep a copy of a state whose Gaussians are not comparable with those before, nor its errors."""
         self.restart(state)

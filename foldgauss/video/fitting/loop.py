@@ -166,7 +166,7 @@ def fit_steps(
     stepper = make_stepper(engine, frames, config, state, find_motion)
     planner, time_left = StepPlanner(config), TimeLeft(state, config)
     guard = Guard(state, config, stepper.steps_per_pass, alpha=has_alpha)
-    controls = [*_make_controls(frames, config, state, guard, find_motion), *controls]
+    controls = [*_make_controls(frames, config, state, find_motion), *controls]
     if state.step == 0 and guard.comparable and config.initialization != "uniform":
         begun = clock()
         state.start_errors = tuple(stepper.measure_start(state).items())
@@ -205,7 +205,7 @@ def fit_steps(
 
 
 def _make_controls(
-    frames: np.ndarray, config: FitConfig, state: FitState, guard: Guard, find_motion: Callable[[], Motion]
+    frames: np.ndarray, config: FitConfig, state: FitState, find_motion: Callable[[], Motion]
 ) -> list[DensityControl]:
     """What the settings ask for."""
     controls: list[DensityControl] = []
@@ -213,7 +213,7 @@ def _make_controls(
         controls.append(RateControl(frames, config))
         controls[0].check_size(state)
     if relocates(config):
-        controls.append(Relocation(frames, config, guard, find_motion))
+        controls.append(Relocation(frames, config, find_motion))
     if config.strategy.growth is not None:
         controls.append(Densification(config, frames.shape[1:3]))
     return controls
