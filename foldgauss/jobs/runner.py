@@ -20,7 +20,6 @@ import numpy as np
 
 from foldgauss import __version__
 from foldgauss._runtime.checks import require
-from foldgauss._runtime.machine import waiting_seconds
 from foldgauss.io import Clip, FrameIndex, read_indexed, read_video, save_video_model
 from foldgauss.io._atomic import OutputError, atomic_path, lock_output, write_or_keep
 from foldgauss.io.models.checkpoint import is_known_good, load_checkpoint, save_checkpoint
@@ -36,8 +35,6 @@ CHECKPOINT_SECONDS = 30.0
 REPORT_SECONDS = 1.0
 #: Seconds that a job waits for another one of the same target: a worker that is believed dead may be about to finish.
 WAIT_SECONDS = 60.0
-#: A fraction of the processor time that its threads asked for, below which a fit by minutes warns.
-LEAST_PROCESSOR_FRACTION = 0.5
 #: How many dB a model may be below the PSNR that was asked for without a warning.
 TOLERATED_DB = 0.05
 #: Number of clip shapes whose compiled programs are kept.
@@ -112,7 +109,8 @@ def run_fit(
     _limit_compiled(clip.frames.shape)
     checkpoint = Checkpoint(job.checkpoint, job.config, fingerprint(clip), on_checkpoint_error)
     state = checkpoint.load() if resume else None
-    about = _describe_clip(job, clip)
+    span = {"frames": limit_range(job.frames, clip.num_declared)}
+    about = describe_source(clip, job.config.seed) | span | describe_reading(clip) | job.metadata
     config = dataclasses.replace(job.config, size_mb=leave_room(job.config.size_mb, about))
     steps = fit_steps(clip.frames, config, state)
     with observer(clip, state) as observe:
@@ -146,7 +144,7 @@ def run_fit(
         "file_digest": file_digest(job.target),
         "peak_bytes": peak_bytes(),
         "notes": list(clip.notes),
-        "warnings": [*busy_processors(state, info), *missed_psnr(job.config, scores.mean_psnr)],
+        "warnings": missed_psnr(job.config, scores.mean_psnr),
     }
 
 
@@ -165,14 +163,14 @@ def _write_model(job: FitJob, save: Callable[[Path], Path]) -> None:
 def run_steps(
     steps: Iterable[tuple[FitState, FitInfo]],
     observe: Observer,
-    checkpoint: Checkpoint | None = None,
+    checkpoint: Checkpoint,
     seconds: float | None = None,
 ) -> tuple[FitState, FitInfo]:
     """Take all steps of a fit and return the last; the state is saved every so many `seconds`, and at the end.
 
     Raises as `run_fit`.
     """
-    saved, spent, waited = time.monotonic(), time.process_time(), waiting_seconds()
+    saved = time.monotonic()
     try:
         for state, info in steps:
             stop = observe(state, info) and info.progress < 1
@@ -180,40 +178,27 @@ def run_steps(
             longest = (CHECKPOINT_SECONDS if seconds is None else seconds) * (1 if is_known_good(state) else 2)
             due = time.monotonic() - saved > longest
             if stop or due or info.progress >= 1:
-                now = time.process_time(), waiting_seconds()
-                state.processor_seconds += now[0] - spent
-                state.waiting_seconds += max(now[1] - waited, 0.0)  # threads that have ended are not counted
-                spent, waited = now
-                if checkpoint is not None:
-                    checkpoint.try_save(state)
+                checkpoint.try_save(state)
                 saved = time.monotonic()
             if stop:
                 raise Stopped(f"stopped after step {info.step}")
     except FitDiverged as error:
-        if checkpoint is not None and error.state is not None:
+        if error.state is not None:
             checkpoint.try_save(error.state)
         raise
     return state, info
 
 
-def _describe_clip(job: FitJob, clip: Clip) -> dict[str, Any]:
-    """Metadata of a fitted model: its clip, the range of frames, the seed, and how it was read."""
-    frames = limit_range(job.frames, clip.num_declared)
-    return describe_source(clip, job.config.seed) | {"frames": frames} | describe_reading(clip) | job.metadata
-
-
 def describe_fit(config: FitConfig, state: FitState) -> dict[str, Any]:
     """Metadata of how a model was fitted: version, budgets and steps.
 
-    A fit by `minutes` depends on the load of the machine. Its metadata also hold the seconds of the clock, of the
-    processors, and of waiting for processors.
+    A fit by `minutes` depends on the load of the machine: its metadata also hold the seconds of the clock.
     """
     budgets = {name: getattr(config, name) for name in ("steps", "minutes", "quality", "size_mb", "psnr")}
     about = {"version": __version__, "steps": state.step}
     about["budget"] = {name: value for name, value in budgets.items() if value is not None}
     if config.minutes is not None:
         about |= {"fit_seconds": round(state.seconds, 2)}
-        about |= {name: round(getattr(state, name), 2) for name in ("processor_seconds", "waiting_seconds")}
     return about
 
 
@@ -292,17 +277,6 @@ def _fit_and_record(job: FitJob, report: Report) -> dict[str, Any]:
         temporary.write_text(json.dumps(record) + "\n")
     job.checkpoint.unlink(missing_ok=True)
     return record
-
-
-def busy_processors(state: FitState, info: FitInfo) -> list[str]:
-    """A warning if a fit by minutes waited for processors longer than it computed; otherwise no text."""
-    got, asked = state.processor_seconds, state.processor_seconds + state.waiting_seconds
-    if info.stopped_by != "minutes" or got >= LEAST_PROCESSOR_FRACTION * asked:
-        return []
-    return [
-        f"--minutes: the processors were busy: this fit got {got:,.1f} of the {asked:,.1f} processor seconds that its "
-        f"threads asked for, and took {info.step:,} steps. Give more --minutes, or use a quieter machine."
-    ]
 
 
 def peak_bytes() -> int | None:

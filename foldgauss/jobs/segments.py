@@ -78,7 +78,7 @@ class LongFit:
                 shutil.copyfile(sources[0][1], temporary)
             return joined
         each = [read_metadata(job.target) for job in self.jobs]
-        summed = [name for name in ("steps", "fit_seconds", "processor_seconds", "waiting_seconds") if name in each[0]]
+        summed = [name for name in ("steps", "fit_seconds") if name in each[0]]
         about = keep_origin(each[0], "version", "budget") | {name: sum(one[name] for one in each) for name in summed}
         join_segments(self.target, sources, metadata=self.metadata | mean_scores(joined) | about)
         return joined

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
-from types import SimpleNamespace
 from unittest.mock import Mock, patch
 
 import numpy as np
@@ -20,7 +19,6 @@ from foldgauss.io._atomic import OutputError, lock_output
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.jobs import FitJob, Stopped, fit_job
 from foldgauss.jobs.job import read_record
-from foldgauss.jobs.runner import busy_processors
 
 NUM_FRAMES = 10
 
@@ -227,36 +225,3 @@ def test_the_largest_memory_is_that_of_the_process_alone():
     program = "from foldgauss.jobs.runner import peak_bytes; print(peak_bytes())"
     ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120)
     assert 2**26 < int(ran.stdout) < len(own) < fitting.peak_bytes()
-
-
-@pytest.mark.parametrize(("waited", "stopped_by", "told"), [(61, "minutes", 1), (59, "minutes", 0), (61, "steps", 0)])
-def test_a_fit_by_minutes_warns_where_other_programs_had_the_processors(waited, stopped_by, told):
-    state = SimpleNamespace(processor_seconds=60.0, waiting_seconds=float(waited))
-    texts = busy_processors(state, SimpleNamespace(step=400, stopped_by=stopped_by))
-    assert len(texts) == told
-    assert all("got 60.0 of the 121.0 processor seconds" in text and "400 steps" in text for text in texts)
-
-
-@pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="a file of Linux")
-def test_threads_that_share_a_processor_wait_and_a_sleeping_one_does_not():
-    """Four threads on one processor wait for as long as the others run, in turns or one after the other.
-
-    A scheduler with long slices runs each thread to its end while the starting thread waits: then the
-    wait is the processor time once. With short slices it is up to three times that.
-    """
-    program = """
-import os, hashlib, time
-from concurrent.futures import ThreadPoolExecutor
-from foldgauss._runtime.machine import waiting_seconds
-os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-began = waiting_seconds()
-time.sleep(0.5)
-spent, waited = time.process_time(), waiting_seconds()
-with ThreadPoolExecutor(4) as pool:
-    list(pool.map(lambda salt: hashlib.pbkdf2_hmac("sha256", b"", salt, 800_000), [bytes(8)] * 4))
-    print(waited - began, time.process_time() - spent, waiting_seconds() - waited)
-"""
-    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120)
-    asleep, spent, waited = map(float, ran.stdout.split())
-    assert asleep < 0.25
-    assert waited > 0.5 * spent

@@ -65,7 +65,7 @@ def test_scores_are_those_of_the_joined_video(whole, clip):
 
 
 def test_each_segment_says_what_it_is_of(whole, clip):
-    fit, made = whole
+    fit, _ = whole
     for (first, stop), job in zip(fit.spans, fit.jobs, strict=True):
         model = load_video_model(job.target)
         mean = json.loads(job.record.read_text())["mean_psnr"]

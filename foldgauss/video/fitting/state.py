@@ -158,8 +158,6 @@ class FitState:
     coarseness: float = field(default=0.0, metadata=_NUMBER)  # of the steps of rounding; 0 before it is chosen
     rules: tuple[tuple, ...] = field(default=(), metadata=_RULES)  # by which parameters are rounded, once any are
     seconds: float = field(default=0.0, metadata=_NUMBER)
-    processor_seconds: float = field(default=0.0, metadata=_NUMBER)  # of all threads, where `jobs` runs the fit
-    waiting_seconds: float = field(default=0.0, metadata=_NUMBER)  # likewise; see `_runtime.machine`
     # What `divergence.Guard` decides by; stored, so that a resumed fit diverges and recovers as if uninterrupted.
     best_error: float = field(default=0.0, metadata=_NUMBER)  # the lowest one that others are compared with; 0: none
     backoffs: int = field(default=0, metadata=_COUNT)  # how often the fit returned to `last_finite`, with lower rates
