@@ -5,11 +5,10 @@ and the next one continues to the same bits. `plan_long_fit` and `make_jobs` mak
 `run_on` run them.
 """
 
-from foldgauss.jobs.clips import find_clips, make_jobs
-from foldgauss.jobs.job import FitJob
+from foldgauss.jobs.job import FitJob, find_clips, make_jobs
 from foldgauss.jobs.runner import Stopped, fit_job
 from foldgauss.jobs.segments import LongFit, plan_long_fit, segments_folder
-from foldgauss.jobs.workers import Outcome, SchedulerLost, WorkerPool, local_workers, run_here, run_on, running_cluster
+from foldgauss.jobs.workers import Outcome, SchedulerLost, local_workers, run_here, run_on, running_cluster
 
 __all__ = [
     "FitJob",
@@ -17,7 +16,6 @@ __all__ = [
     "Outcome",
     "SchedulerLost",
     "Stopped",
-    "WorkerPool",
     "find_clips",
     "fit_job",
     "local_workers",

@@ -108,27 +108,6 @@ def one_line(error: BaseException) -> str:
     return text if plain else f"{type(error).__name__}: {text}"[:300]
 
 
-@dataclasses.dataclass(frozen=True)
-class WorkerPool:
-    """Workers of dask.distributed, as yielded by `local_workers` and `running_cluster`.
-
-    `cluster` is that of this machine; None for workers that are started elsewhere.
-    """
-
-    client: "Client"
-    cluster: Any = None
-
-    @property
-    def threads(self) -> int:
-        """Number of jobs that can run at once, now. Raises `SchedulerLost`."""
-        try:
-            if self.client.status not in ("running", "connecting"):
-                raise SchedulerLost(_LOST)
-            return sum(self.client.nthreads().values())
-        except (OSError, TimeoutError) as error:
-            raise SchedulerLost(_LOST) from error
-
-
 @contextmanager
 def _silence_dask() -> Iterator[None]:
     """dask logs a traceback for each worker that dies; here outcomes report what matters."""
@@ -144,8 +123,8 @@ def _silence_dask() -> Iterator[None]:
 
 
 @contextmanager
-def local_workers(count: int, *, threads: int | None = None) -> Iterator["WorkerPool"]:
-    """A pool of `count` processes of this machine with `threads` threads each (default: an equal part of the cores).
+def local_workers(count: int, *, threads: int | None = None) -> Iterator["Client"]:
+    """The dask client of `count` processes of this machine, with `threads` each (default: an equal part of the cores).
 
     Workers end with this process, however it ends, and are replaced when they die. They import the program that starts
     them: call this under `if __name__ == "__main__":`, or no worker will start.
@@ -185,7 +164,7 @@ def local_workers(count: int, *, threads: int | None = None) -> Iterator["Worker
         cluster.loop.add_callback(_block_ctrl_c)
         client = stack.enter_context(distributed.Client(cluster, set_as_default=False))
         cluster.scale(count)
-        yield WorkerPool(client, cluster)
+        yield client
 
 
 def _block_ctrl_c() -> None:
@@ -196,7 +175,7 @@ def _block_ctrl_c() -> None:
 
 
 @contextmanager
-def running_cluster(address: str) -> Iterator["WorkerPool"]:
+def running_cluster(address: str) -> Iterator["Client"]:
     """The workers of the scheduler at `address`, as tcp://host:8786.
 
     They must find clips and outputs by the same paths. Start them with one thread each, `dask worker --nthreads 1`: a
@@ -221,24 +200,24 @@ def running_cluster(address: str) -> Iterator["WorkerPool"]:
             text = str(invalid("scheduler", expected="the address of a running scheduler", got=got, cure=cure))
             raise SchedulerLost(text) from error
         with client:
-            yield WorkerPool(client)
+            yield client
 
 
 def run_on(
-    pool: WorkerPool,
+    client: "Client",
     jobs: Sequence[FitJob],
     on_progress: OnProgress,
     *,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> Iterator[Outcome]:
-    """Outcomes of the jobs in the order in which they end, run by the workers of the pool.
+    """Outcomes of the jobs in the order in which they end, run by the workers of a dask client.
 
     Raises `Stopped` once `should_stop` returns True and the workers have written their checkpoints, `SchedulerLost`.
     """
     from distributed import Event
 
     waiting = deque((yield from _finished_outcomes(jobs)))
-    client, topic = pool.client, f"foldgauss-{secrets.token_hex(6)}"
+    topic = f"foldgauss-{secrets.token_hex(6)}"
     running: list[tuple[Any, FitJob]] = []
     stop, events = Event(topic, client=client), queue.SimpleQueue()
     # Events arrive on the client's own thread; `on_progress` is called on this one.
@@ -246,8 +225,11 @@ def run_on(
     seen = time.monotonic()  # when there were workers
     try:
         while waiting or running:
-            threads = pool.threads
-            seen = time.monotonic() if threads else _wait_for_workers(pool, seen)
+            threads = _count_threads(client)
+            seen = time.monotonic() if threads else seen
+            if time.monotonic() - seen > NO_WORKERS_SECONDS:
+                cure = _NONE_HERE if client.cluster else _NONE_THERE
+                raise SchedulerLost(f"No worker for {NO_WORKERS_SECONDS:g} s. Finished jobs are kept: {cure}.")
             while waiting and len(running) < threads:  # no more: dask blames all jobs of a worker that dies
                 job = waiting.popleft()
                 running.append((client.submit(_run_on_worker, job, topic, pure=False), job))
@@ -271,12 +253,14 @@ def run_on(
             client.cancel([future for future, _ in running])
 
 
-def _wait_for_workers(pool: WorkerPool, seen: float) -> float:
-    """Returns `seen`, when there were workers. Raises `SchedulerLost` after `NO_WORKERS_SECONDS` without any."""
-    if time.monotonic() - seen > NO_WORKERS_SECONDS:
-        cure = _NONE_HERE if pool.cluster else "start some, dask worker ADDRESS --nthreads 1, and run the command again"
-        raise SchedulerLost(f"No worker for {NO_WORKERS_SECONDS:g} s. Finished jobs are kept: {cure}.")
-    return seen
+def _count_threads(client: "Client") -> int:
+    """Number of jobs that can run at once, now. Raises `SchedulerLost`."""
+    try:
+        if client.status in ("running", "connecting"):
+            return sum(client.nthreads().values())
+    except (OSError, TimeoutError) as error:
+        raise SchedulerLost(_LOST) from error
+    raise SchedulerLost(_LOST)
 
 
 def _outcome(future: Any, job: FitJob) -> Outcome:
@@ -302,6 +286,7 @@ _NONE_HERE = (
     "they die while they start, for the reason above; a program of your own must start them under "
     '`if __name__ == "__main__":`'
 )
+_NONE_THERE = "start some, dask worker ADDRESS --nthreads 1, and run the command again"
 _LOST = "The scheduler does not answer any more. Finished jobs are kept: start one, and run the command again."
 
 

@@ -82,9 +82,9 @@ def test_workers_make_the_same_bits_and_tell_of_what_failed(crew, clips, done_he
 def test_that_no_worker_comes_is_told_with_what_to_do(monkeypatch, clips, tmp_path, cluster, says):
     monkeypatch.setattr(pool, "NO_WORKERS_SECONDS", -1.0)
     monkeypatch.setattr(distributed, "Event", Mock())
-    client = Mock(status="running", nthreads=dict)
+    client = Mock(status="running", nthreads=dict, cluster=cluster)
     with pytest.raises(SchedulerLost, match=says):
-        list(run_on(pool.WorkerPool(client, cluster), jobs_into(tmp_path, clips), ignored))
+        list(run_on(client, jobs_into(tmp_path, clips), ignored))
 
 
 def test_two_commands_at_once_take_no_port_from_each_other(crew):

@@ -36,8 +36,7 @@ from foldgauss.cli.shared.files import make_folder
 from foldgauss.io._atomic import lock_output, resolve
 from foldgauss.io.media.clip import DEINTERLACE, check_reading
 from foldgauss.jobs import FitJob, Outcome, find_clips, make_jobs
-from foldgauss.jobs.clips import RECORDS
-from foldgauss.jobs.job import read_record, read_request, write_request
+from foldgauss.jobs.job import RECORDS, read_record, read_request, write_request
 from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig
 
 SUMMARY = "summary.json"
@@ -127,8 +126,8 @@ def fit_many(
         except OSError as error:  # a full disk must not end the fits
             warn(str(error))
 
-    with options.open_pool() as pool:
-        outcomes = run_jobs(jobs, "clips", display, pool, overwrite=overwrite, on_end=on_end)
+    with options.open_client() as client:
+        outcomes = run_jobs(jobs, "clips", display, client, overwrite=overwrite, on_end=on_end)
     failed = [outcome for outcome in outcomes if outcome.failure is not None]
     if display == "json":
         emit_json("done", {"summary": str(out_dir / SUMMARY), "done": len(jobs) - len(failed), "failed": len(failed)})

@@ -9,7 +9,7 @@ from foldgauss.cli.app.signals import note_signals
 from foldgauss.cli.shared.console import Display, print_figures, show_progress
 from foldgauss.cli.shared.fit_progress import print_json
 from foldgauss.io.history import info_line
-from foldgauss.jobs import FitJob, Outcome, WorkerPool, run_here, run_on
+from foldgauss.jobs import FitJob, Outcome, run_here, run_on
 from foldgauss.jobs import Stopped as JobsStopped
 from foldgauss.video import Evaluation, FitConfig, FitInfo
 
@@ -56,12 +56,12 @@ def run_jobs(
     jobs: Sequence[FitJob],
     noun: str,
     display: Display,
-    pool: WorkerPool | None,
+    client: Any,
     *,
     overwrite: bool,
     on_end: Callable[[Outcome], None] = lambda outcome: None,
 ) -> list[Outcome]:
-    """Run the jobs, by the workers of `pool` or here, and display progress; outcomes in the order of the jobs.
+    """Run the jobs, by the workers of a dask client or here, and display progress; outcomes in the order of the jobs.
 
     After Ctrl-C or SIGTERM, and once checkpoints are written, raises `Stopped`, whose message says how to continue.
     """
@@ -73,10 +73,10 @@ def run_jobs(
         def should_stop() -> bool:
             return bool(request.signal)
 
-        if pool is None:
+        if client is None:
             outcomes = run_here(jobs, view.update, should_stop=should_stop)
         else:
-            outcomes = run_on(pool, jobs, view.update, should_stop=should_stop)
+            outcomes = run_on(client, jobs, view.update, should_stop=should_stop)
         try:
             for outcome in outcomes:
                 ended[outcome.job.target] = outcome

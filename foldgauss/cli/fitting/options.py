@@ -16,7 +16,7 @@ from foldgauss._runtime.threads import available_cores
 from foldgauss.cli.app.help import complete_choice
 from foldgauss.cli.shared.arguments import override_constants
 from foldgauss.cli.shared.console import format_count
-from foldgauss.jobs import WorkerPool, local_workers, running_cluster
+from foldgauss.jobs import local_workers, running_cluster
 from foldgauss.video.fitting.config import BUDGET, MODEL, OPTIMIZATION, PRESETS, FitConfig
 
 #: Panels of `fit --help`, by group of settings.
@@ -137,7 +137,7 @@ class WorkerOptions:
             return "this process"
         return f"{format_count(self.workers, 'worker')} of {format_count(self.threads, 'thread')}"
 
-    def open_pool(self) -> AbstractContextManager[WorkerPool | None]:
+    def open_client(self) -> AbstractContextManager[Any]:
         """The workers; None for this process."""
         if self.scheduler is not None:
             return running_cluster(self.scheduler)

@@ -35,7 +35,7 @@ def fit_in_segments(
 ) -> None:
     """Plan the segments of the job's clip, fit them, join them and print the results; continues an unfinished fit."""
     begun, target = time.monotonic(), Path(job.target)
-    with options.open_pool() as pool:  # first: workers start while the clip is indexed
+    with options.open_client() as client:  # first: workers start while the clip is indexed
         with nullcontext() if display in ("json", "quiet") else show_status("Indexing the clip"):
             fit = plan_long_fit(
                 job.clip,
@@ -49,7 +49,7 @@ def fit_in_segments(
                 restart=overwrite,
             )
         _print_plan(fit, job.config, display, Path(job.clip), options)
-        outcomes = run_jobs(fit.jobs, "segments", display, pool, overwrite=overwrite)
+        outcomes = run_jobs(fit.jobs, "segments", display, client, overwrite=overwrite)
     for outcome in outcomes:
         for text in (outcome.record or {}).get("warnings", ()):
             warn(f"{outcome.job.name}: {text}")

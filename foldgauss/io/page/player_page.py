@@ -40,7 +40,7 @@ from foldgauss.video.compression.quantize import (
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.motion.moving_object import NothingMoves, nothing_moves
-from foldgauss.video.segmented.flatten import flatten_video
+from foldgauss.video.segmented.layering import flatten_video
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 from foldgauss.video.selection.selectors import by_motion
 

@@ -26,10 +26,6 @@ UNIT_SIZE = 0.005
 MAX_GAUSSIANS = 10_000_000
 #: The default of `Views.interpolation_fraction`.
 INTERPOLATION_FRACTION = 0.1
-#: How Gaussians are initialized: from the clip, with paths along the optical flow or static ones, or uniformly.
-INITIALIZATIONS = ("flow", "static", "uniform")
-#: Which learning rates decay.
-DECAYED = ("all", "loc")
 #: Engines that compute the steps of a fit, named as those of `render`.
 FIT_ENGINES = ("auto", "cpu", "xla", "pallas")
 #: One unit of the published geometry in ours: there the image's half width is tan(FIELD_OF_VIEW / 2), here the longer
@@ -85,7 +81,7 @@ class LearningRates:
         ),
     )
     decayed: str = field(
-        default="all", metadata=setting("Which learning rates decay: all, or that of positions", choices=DECAYED)
+        default="all", metadata=setting("Which learning rates decay: all, or that of positions", choices=("all", "loc"))
     )
     by_duration: bool = field(default=True, metadata=setting("Learning rates are in units of each Gaussian's duration"))
     by_size: bool = field(default=True, metadata=setting("Learning rates are in units of each Gaussian's size"))
@@ -460,7 +456,7 @@ class FitConfig:
             "Initial Gaussians are sampled from the detail and colors of the clip, with paths along the optical flow "
             "of their shot (flow) or without (static), or uniformly over frame and time",
             "See `initialize_uniform`.",
-            choices=INITIALIZATIONS,
+            choices=("flow", "static", "uniform"),
             group=OPTIMIZATION,
         ),
     )

@@ -273,7 +273,20 @@ def start(
     begun, num_frames = clock(), len(frames)
     motion = find_motion() if config.follows_motion else None
     logits = np.array(make_time_logits(num_frames, motion.cuts if motion is not None else []), np.float32)
-    splats = _initialize(frames, config, logits, motion)
+    choose_num = functools.partial(chosen_num_gaussians, config, *frames.shape[:3])
+    shape = {"degree": config.fold_degree, "seed": config.seed, "envelope": envelope_of(config)}
+    if config.initialization == "uniform":
+        splats = initialize_uniform(choose_num(), frames.shape[1:3], **shape)
+    else:
+        times = np.asarray(FrameTimes(logits).times())
+        opacity, paths = SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY, None
+        if motion is not None and config.follow_camera:
+            # Also where the camera moves steadily if that takes no bits.
+            maps = find_shared_motions(motion, steady=config.is_compact)
+            if maps is not None:
+                paths = SharedPaths(np.tile(np.float32(times), (len(maps), 1)), np.float32(maps))
+        clip = {"times": times, "motion": motion, "opacity": opacity, "paths": paths}
+        splats = initialize(frames, lambda life: choose_num(lifetime=life), **clip, **shape)
     if config.is_compact and config.compositing == "over" and not has_alpha and config.initialization != "uniform":
         splats = with_backdrop(splats, frames)
     rows = pack(splats)
@@ -324,24 +337,6 @@ def _check_config(model: VideoModel, config: FitConfig) -> None:
             got=got,
             cure="Give the config that the model was fitted with.",
         )
-
-
-def _initialize(frames: np.ndarray, config: FitConfig, logits: np.ndarray, motion: Motion | None) -> FoldedSplats:
-    """The splats at the start."""
-    shape = {"degree": config.fold_degree, "seed": config.seed}
-    choose_num = functools.partial(chosen_num_gaussians, config, *frames.shape[:3])
-    if config.initialization == "uniform":
-        return initialize_uniform(choose_num(), frames.shape[1:3], envelope=envelope_of(config), **shape)
-    times = np.asarray(FrameTimes(logits).times())
-    opacity = SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY
-    clip = {"times": times, "motion": motion, "opacity": opacity}
-    if motion is not None and config.follow_camera:
-        # Also where the camera moves steadily if that takes no bits.
-        maps = find_shared_motions(motion, steady=config.is_compact)
-        clip["paths"] = (
-            maps if maps is None else SharedPaths(np.tile(np.float32(times), (len(maps), 1)), np.float32(maps))
-        )
-    return initialize(frames, lambda life: choose_num(lifetime=life), envelope=envelope_of(config), **clip, **shape)
 
 
 def _path_fields(splats: FoldedSplats, logits: np.ndarray) -> dict[str, np.ndarray]:
