@@ -2,7 +2,6 @@
 
 Arrays have rows for the largest number of Gaussians that there may be; rows after the first `num` are unused: they
 render nothing and do not learn. A step is one program, to which the arrays are donated; nothing in it calls the host.
-The frames of a batch are divided over the devices of a mesh, each of which has all arrays.
 """
 
 import dataclasses
@@ -14,7 +13,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from foldgauss.envelope import TimeLikelihood
@@ -28,9 +26,6 @@ from foldgauss.video.fitting.steppers.loss import border_weights
 from foldgauss.video.models.row_layout import columns, unpack
 from foldgauss.video.models.shared_paths import move_splats
 from foldgauss.video.models.splats import TAU_MAX
-
-#: The axis of the mesh that views are divided over.
-VIEWS = "views"
 
 
 class Control(NamedTuple):
@@ -85,7 +80,6 @@ class Program:
     learns_times: bool
     grows: bool
     interpolates: bool
-    num_devices: int
     num_paths: int = 0  # that Gaussians share
 
     @property
@@ -99,19 +93,6 @@ class Program:
         return self.num_trained + (self.num_paths > 0)
 
 
-def make_mesh(program: Program) -> Mesh | None:
-    """The devices that views are divided over; None where there is only one."""
-    if program.num_devices == 1:
-        return None
-    return Mesh(np.array(jax.local_devices()[: program.num_devices]), (VIEWS,))
-
-
-def replicated(program: Program) -> NamedSharding | None:
-    """The sharding of arrays that every device has whole."""
-    mesh = make_mesh(program)
-    return None if mesh is None else NamedSharding(mesh, PartitionSpec())
-
-
 @functools.lru_cache(maxsize=8)
 def compile_step(program: Program) -> jax.stages.Compiled:
     """The compiled step: called with `(arrays, frames, control)` it returns `(arrays, report)`.
@@ -123,10 +104,7 @@ def compile_step(program: Program) -> jax.stages.Compiled:
 
 def lower_step(program: Program, platforms: tuple[str, ...] | None = None) -> jax.stages.Lowered:
     """The step before it is compiled; for `platforms`, by default those of this machine."""
-    place = replicated(program)
-    specs = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), _specs(program))
-    options = {} if place is None else {"out_shardings": place}
-    traced = jax.jit(functools.partial(step, program), donate_argnums=0, **options).trace(*specs)
+    traced = jax.jit(functools.partial(step, program), donate_argnums=0).trace(*_specs(program))
     return traced.lower(lowering_platforms=platforms)
 
 
@@ -154,7 +132,7 @@ def _specs(program: Program) -> tuple[DeviceArrays, jax.ShapeDtypeStruct, Contro
 def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames height width 3"], control: Control):
     """The arrays after a step, and its `Report`."""
     times = frame_times(arrays.time_logits)
-    seen = _distribute(program)(arrays.rows, arrays.path_maps, times, frames, control)
+    seen = _differentiate(program, arrays.rows, arrays.path_maps, times, frames, control)
     if program.grows:
         arrays = _add_statistics(arrays, seen, columns(program.degree)["time_loc_logit"].start)
     used = jnp.arange(program.capacity, dtype=jnp.int32) < control.num
@@ -209,35 +187,8 @@ class Gradients(NamedTuple):
     screen: Float[Array, " capacity"]  # largest screen gradient; -1 of Gaussians that no view shows
 
 
-def _distribute(program: Program):
-    """`_differentiate`, on one device or on all of them, each with its views."""
-    mesh, here = make_mesh(program), functools.partial(_differentiate, program)
-    if mesh is None:
-        return here
-    whole, views = PartitionSpec(), PartitionSpec(VIEWS)
-
-    def on_each(rows, path_maps, times, frames, control):
-        own = here(rows, path_maps, times, frames, control)
-        total = functools.partial(jax.lax.psum, axis_name=VIEWS)
-        largest = functools.partial(jax.lax.pmax, axis_name=VIEWS)
-        return Gradients(
-            *map(total, (own.loss, own.by_rows, own.by_paths, own.by_times)),
-            largest(own.errors),
-            largest(own.alive.astype(jnp.int32)) > 0,
-            largest(own.screen),
-        )
-
-    interpolated = InterpolatedViews(views, views) if program.interpolates else None
-    own = Control(views, *5 * [whole], interpolated)
-    # The replication check does not support the loops inside.
-    return jax.shard_map(on_each, mesh=mesh, in_specs=(*4 * [whole], own), out_specs=whole, check_vma=False)
-
-
 def _differentiate(program: Program, rows, path_maps, times, frames, control: Control) -> Gradients:
-    """Render the views and differentiate their losses by rows, the frames' maps of paths, and times.
-
-    All are sums over this device's part of the batch.
-    """
+    """Render the views and differentiate their losses by rows, the frames' maps of paths, and times."""
     k, mirrored = control.views % program.num_frames, control.views >= program.num_frames
     t, target, whole = times[k], frames[k].astype(jnp.float32) * np.float32(1 / 255), jnp.ones(len(k), bool)
     maps = path_maps[k]
@@ -340,10 +291,9 @@ def compile_error(program: Program) -> jax.stages.Compiled:
 
     `maps` (paths, 2, 3) are those of the shared paths at t.
     """
-    place = replicated(program)
     shapes = (program.capacity, program.width), (program.num_paths, 2, 3), (), (), (*program.size, 3)
     dtypes = np.float32, np.float32, np.int32, np.float32, np.uint8
-    specs = (jax.ShapeDtypeStruct(*spec, sharding=place) for spec in zip(shapes, dtypes, strict=True))
+    specs = (jax.ShapeDtypeStruct(*spec) for spec in zip(shapes, dtypes, strict=True))
     return jax.jit(functools.partial(_measure_error, program)).lower(*specs).compile()
 
 

@@ -1,4 +1,4 @@
-"""`JaxStepper`: the steps of a fit on JAX's default devices, where arrays and frames stay between steps.
+"""`JaxStepper`: the steps of a fit on JAX's default device, where arrays and frames stay between steps.
 
 After each step only `jax_step.Report` is fetched, some hundred numbers. Arrays are fetched where they are read from the
 state, and for densification and relocation, which run on the host.
@@ -23,7 +23,6 @@ from foldgauss.video.fitting.steppers.jax_step import (
     array_specs,
     compile_error,
     compile_step,
-    replicated,
 )
 from foldgauss.video.motion.optical_flow import Motion, motion_finder
 
@@ -65,7 +64,7 @@ class HeldArrays:
 
 
 class JaxStepper:
-    """The methods of `CpuStepper` on JAX's default device, or on several where the batch can be divided evenly.
+    """The methods of `CpuStepper` on JAX's default device.
 
     The program is compiled when it is made, before any clock runs, and the frames are kept on the device, as bytes.
     """
@@ -88,7 +87,7 @@ class JaxStepper:
         self._no_targets: jax.Array | None = None
         self.capacity = 0
         self.adopt(state)
-        self.images = jax.device_put(frames, replicated(self.program))
+        self.images = jax.device_put(frames)
 
     def adopt(self, state: FitState) -> None:
         """Move a state's arrays to the device, padded to the capacity."""
@@ -105,7 +104,7 @@ class JaxStepper:
         specs = array_specs(self.program)._asdict()
         arrays = DeviceArrays(*(_pad(getattr(state, name), spec) for name, spec in specs.items()))
         # Copied, since arrays that are donated must be the device's own.
-        arrays = jax.tree.map(lambda leaf: leaf.copy(), jax.device_put(arrays, replicated(self.program)))
+        arrays = jax.tree.map(lambda leaf: leaf.copy(), jax.device_put(arrays))
         state.hold(HeldArrays(arrays, num, state.growing, None))
 
     def step(self, state: FitState, progress: float) -> StepResult:
@@ -141,7 +140,7 @@ class JaxStepper:
                 fractions[n], targets[n] = fraction, self.prefetcher.interpolate(step, int(k), fraction)
         if (fractions < 0).all():  # the device has zeros already
             if self._no_targets is None:
-                self._no_targets = jax.device_put(targets, replicated(self.program))
+                self._no_targets = jax.device_put(targets)
             targets = self._no_targets
         return InterpolatedViews(fractions, targets)
 
@@ -181,8 +180,7 @@ class JaxStepper:
         return min(capacity, most)
 
     def _make_program(self) -> Program:
-        config, devices = self.config, len(jax.local_devices())
-        divisors = [n for n in range(1, min(devices, config.views.batch_size) + 1) if config.views.batch_size % n == 0]
+        config = self.config
         return Program(
             capacity=self.capacity,
             num_frames=self.num_frames,
@@ -202,7 +200,6 @@ class JaxStepper:
             learns_times=config.learns_frame_times and self.num_frames > 2,
             grows=config.strategy.growth is not None,
             interpolates=self.interpolation is not None,
-            num_devices=max(divisors),
             num_paths=self.num_paths,
         )
 
