@@ -30,7 +30,7 @@ from foldgauss.video.compression.quantize import (
     quantize,
     quantize_chunk,
 )
-from foldgauss.video.compression.sensitivity import estimate_sensitivities
+from foldgauss.video.compression.quantizer import estimate_sensitivities
 from foldgauss.video.models.metrics import evaluate
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.shared_paths import SharedPaths

@@ -77,34 +77,21 @@ def choose_start_frames(num_frames: int) -> np.ndarray:
 # ------------------------------------------------------------------------------------------ learning rates
 
 
-class RateSchedule:
-    """Adam's learning rates by column of a row, and that of the frame times, as they decay."""
+def learning_rates(config: FitConfig, progress: float, backoffs: int) -> tuple[np.ndarray, np.float32, np.float32]:
+    """Adam's learning rates at a fraction of the plan and after back-offs.
 
-    def __init__(self, config: FitConfig):
-        width = columns(config.fold_degree)["coefficients"].stop
-        self.config, self.first = config, np.empty(width, np.float32)
-        self.decayed = np.ones(width, bool)
-        for name, place in columns(config.fold_degree).items():
-            self.first[place] = getattr(config.rates, name)
-            self.decayed[place] = config.rates.decayed in ("all", name)
-
-    def at(self, progress: float, backoffs: int) -> tuple[np.ndarray, np.float32]:
-        """The rates of rows, float32 (width,), and of frame times, at a fraction of the plan and after back-offs."""
-        config, decay, slower = self.config, self._decay(progress), BACKOFF_FACTOR**-backoffs
-        rows = np.where(self.decayed, self.first * np.float32(decay), self.first) * np.float32(slower)
-        times = config.rates.frame_times * (decay if config.rates.decayed == "all" else 1.0) * slower
-        return rows, np.float32(times)
-
-    def of_paths(self, progress: float, backoffs: int) -> np.float32:
-        """The rate of the maps of shared paths."""
-        return np.float32(self.config.rates.paths * self._decay(progress) * BACKOFF_FACTOR**-backoffs)
-
-    def _decay(self, progress: float) -> float:
-        config = self.config
-        decay = config.rates.final**progress if config.rates.final > 0 else 1 - progress
-        if 1 - progress < config.rates.cooldown:
-            decay *= COLD + (1 - COLD) * ((1 - progress) / config.rates.cooldown)
-        return decay
+    They are those of rows by column, float32 (width,), of frame times, and of the maps of shared paths.
+    """
+    rates, slower = config.rates, BACKOFF_FACTOR**-backoffs
+    decay = rates.final**progress if rates.final > 0 else 1 - progress
+    if 1 - progress < rates.cooldown:
+        decay *= COLD + (1 - COLD) * ((1 - progress) / rates.cooldown)
+    rows = np.empty(columns(config.fold_degree)["coefficients"].stop, np.float32)
+    for name, place in columns(config.fold_degree).items():
+        factor = np.float32(decay if rates.decayed in ("all", name) else 1.0)
+        rows[place] = np.float32(getattr(rates, name)) * factor * np.float32(slower)
+    times = rates.frame_times * (decay if rates.decayed == "all" else 1.0) * slower
+    return rows, np.float32(times), np.float32(rates.paths * decay * slower)
 
 
 # ------------------------------------------------------------------------------------------------- targets

@@ -7,14 +7,16 @@ starting, pruning, densification, copies, checkpoints and devices all go by it.
 import collections
 import copy
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import field
 from typing import Any, ClassVar, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Array, Bool, Float, Float32
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.fitting.config import FitConfig
@@ -315,14 +317,19 @@ def paths_of(state: FitState, times: Float32[np.ndarray, " frames"] | None = Non
     return SharedPaths(times, np.swapaxes(state.path_maps, 0, 1).copy())
 
 
-def measure_relative_size(state: FitState, config: FitConfig) -> float:
+@functools.partial(jax.jit, static_argnames="unit")
+def measure_relative_size(
+    log_scales: Float[Array, "num 2"], used: Bool[Array, " num"], *, unit: float
+) -> Float[Array, ""]:
     """The size of Gaussians, in units of that at which the learning rate of paths is stated; 1 if it is absolute.
 
-    Their geometric mean, of every `SIZE_STRIDE`-th, at most that of the frame.
+    Their geometric mean, at most that of the frame, of those that are `used`: every `SIZE_STRIDE`-th of a fit.
     """
-    unit = config.rates.units.size
-    mean = float(state.rows[::SIZE_STRIDE, columns(config.fold_degree)["log_scale"]].mean(dtype=np.float64))
-    return math.exp(min(mean, 0.0)) / unit if unit and math.isfinite(mean) else 1.0
+    if not unit:
+        return jnp.float32(1)
+    sizes = jnp.where(used, jnp.mean(log_scales, axis=1), 0)
+    mean = jnp.sum(sizes) / jnp.sum(used).astype(jnp.float32)
+    return jnp.where(jnp.isfinite(mean), jnp.exp(jnp.minimum(mean, 0)) / np.float32(unit), 1)
 
 
 def running_psnr(state: FitState) -> float:

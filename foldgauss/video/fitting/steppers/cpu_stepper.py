@@ -10,9 +10,10 @@ from foldgauss.render import cpu
 from foldgauss.video.fitting.adam import sparse_adam, update_frame_times, update_paths
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.losses import LOSSES
-from foldgauss.video.fitting.schedule import RateSchedule, choose_start_frames, steps_per_pass, to_planes
+from foldgauss.video.fitting.schedule import choose_start_frames, learning_rates, steps_per_pass, to_planes
 from foldgauss.video.fitting.state import (
     PATH_ARRAYS,
+    SIZE_STRIDE,
     FitState,
     StepResult,
     frame_times,
@@ -47,7 +48,7 @@ class CpuStepper:
         self.frames, self.config = frames, config
         self.background = np.zeros(3, np.float32)  # for frames with alpha another one in every step
         self.num_frames = len(frames)
-        self.rates, self.steps_per_pass = RateSchedule(config), steps_per_pass(config, self.num_frames)
+        self.steps_per_pass = steps_per_pass(config, self.num_frames)
         self.spec = spec_of(config, frames.shape[1:3])
         self.interpolation = make_interpolated(frames, config, find_motion or motion_finder(frames))
         self.adopt(state)
@@ -90,8 +91,8 @@ class CpuStepper:
         num_alive = len(touched)
         if not config.strategy.sparse_updates:
             touched = np.arange(len(state.rows))
-        relative_size = measure_relative_size(state, config) if by_path.size else 1.0
-        rates, time_rate = self.rates.at(progress, state.backoffs)
+        scales = state.rows[::SIZE_STRIDE, columns(config.fold_degree)["log_scale"]].copy()  # before the step
+        rates, time_rate, path_rate = learning_rates(config, progress, state.backoffs)
         moments, units = (state.first, state.second, state.counts), config.rates.units
         arrays = state.rows, self.grad, *moments, touched
         finite = sparse_adam(*arrays, rates, rounded=state.rounded, units=units)
@@ -101,7 +102,8 @@ class CpuStepper:
             state.time_logits, moments = update_frame_times(state.time_logits, moments, by_time, time_rate)
             state.time_count, state.time_first, state.time_second = moments
         if by_path.size:
-            rate = self.rates.of_paths(progress, state.backoffs) * np.float32(relative_size)
+            every = np.ones(len(scales), bool)
+            rate = path_rate * measure_relative_size(scales, every, unit=config.rates.units.size)
             before = tuple(getattr(state, name) for name in PATH_ARRAYS)
             for name, array in zip(PATH_ARRAYS, update_paths(before, np.float32(by_path), visited, rate), strict=True):
                 setattr(state, name, np.array(array))

@@ -20,7 +20,15 @@ from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.render.tiles import find_visible
 from foldgauss.video.fitting.adam import RateUnits, masked_adam, update_frame_times, update_paths
 from foldgauss.video.fitting.config import Loss
-from foldgauss.video.fitting.state import PATH_ARRAYS, SIZE_STRIDE, DeviceArrays, FitState, Sizes, frame_times
+from foldgauss.video.fitting.state import (
+    PATH_ARRAYS,
+    SIZE_STRIDE,
+    DeviceArrays,
+    FitState,
+    Sizes,
+    frame_times,
+    measure_relative_size,
+)
 from foldgauss.video.fitting.steppers.jax_loss import compute_losses
 from foldgauss.video.fitting.steppers.loss import border_weights
 from foldgauss.video.models.row_layout import columns, unpack
@@ -147,7 +155,9 @@ def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames he
         logits, of_times = update_frame_times(logits, of_times, seen.by_times, control.time_rate)
     errors = jnp.where(seen.errors >= 0, seen.errors, arrays.frame_errors)
     if program.num_paths:
-        rate = control.path_rate * _relative_size(program, before, control.num)
+        scales = before[::SIZE_STRIDE, columns(program.degree)["log_scale"]]
+        of_stride = jnp.arange(0, program.capacity, SIZE_STRIDE, dtype=jnp.int32) < control.num
+        rate = control.path_rate * measure_relative_size(scales, of_stride, unit=program.rate_units.size)
         of_paths = tuple(getattr(arrays, name) for name in PATH_ARRAYS)
         of_paths = update_paths(of_paths, seen.by_paths, seen.errors >= 0, rate)
         arrays = arrays._replace(**dict(zip(PATH_ARRAYS, of_paths, strict=True)))
@@ -162,17 +172,6 @@ def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames he
     arrays = arrays._replace(rows=rows, first=first, second=second, counts=counts, frame_errors=errors)
     count, first, second = of_times
     return arrays._replace(time_logits=logits, time_count=count, time_first=first, time_second=second), report
-
-
-def _relative_size(program: Program, rows, num) -> Float[Array, ""]:
-    """The twin of `state.measure_relative_size`."""
-    if not program.rate_units.size:
-        return jnp.float32(1)
-    sizes = jnp.mean(rows[::SIZE_STRIDE, columns(program.degree)["log_scale"]], axis=1)
-    used = jnp.arange(0, program.capacity, SIZE_STRIDE, dtype=jnp.int32) < num
-    mean = jnp.sum(jnp.where(used, sizes, 0)) / jnp.sum(used).astype(jnp.float32)
-    relative = jnp.exp(jnp.minimum(mean, 0)) / np.float32(program.rate_units.size)
-    return jnp.where(jnp.isfinite(mean), relative, 1)
 
 
 class Gradients(NamedTuple):

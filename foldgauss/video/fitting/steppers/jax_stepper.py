@@ -12,7 +12,7 @@ import numpy as np
 
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, most_gaussians
 from foldgauss.video.fitting.losses import LOSSES
-from foldgauss.video.fitting.schedule import RateSchedule, choose_start_frames, find_views_in_turn, steps_per_pass
+from foldgauss.video.fitting.schedule import choose_start_frames, find_views_in_turn, learning_rates, steps_per_pass
 from foldgauss.video.fitting.state import STATISTICS, DeviceArrays, FitState, StepResult, frame_times
 from foldgauss.video.fitting.steppers.interpolated_frames import Prefetcher, choose_targets, make_interpolated
 from foldgauss.video.fitting.steppers.jax_step import (
@@ -80,7 +80,7 @@ class JaxStepper:
         self.frames, self.config, self.engine = frames, config, engine
         self.num_frames, *size = frames.shape[:3]
         self.size = tuple(size)
-        self.rates, self.steps_per_pass = RateSchedule(config), steps_per_pass(config, self.num_frames)
+        self.steps_per_pass = steps_per_pass(config, self.num_frames)
         self.interpolation = make_interpolated(frames, config, find_motion or motion_finder(frames))
         self.prefetcher = None if self.interpolation is None else Prefetcher(self.interpolation)
         self._prepared = 0  # steps
@@ -112,7 +112,7 @@ class JaxStepper:
             state.fetch_all()
             self.adopt(state)
         held, config = state.held, self.config
-        rates, time_rate = self.rates.at(progress, state.backoffs)
+        rates, time_rate, path_rate = learning_rates(config, progress, state.backoffs)
         views, fractions = choose_targets(self.interpolation, config, self.num_frames, state, progress)
         control = Control(
             views=views.astype(np.int32),
@@ -120,7 +120,7 @@ class JaxStepper:
             squared=np.bool_(progress >= config.squared_from),
             rates=rates,
             time_rate=time_rate,
-            path_rate=self.rates.of_paths(progress, state.backoffs),
+            path_rate=path_rate,
             interpolated=self._interpolate(views, fractions, state.step),
         )
         self._prepare(state, progress)
