@@ -264,19 +264,17 @@ def fit_job(job: FitJob, report: Report = lambda info: True) -> dict[str, Any]:
     if record := read_record(job):
         return record
     with lock_output(Path(job.target), own=(job.checkpoint, job.record), wait=WAIT_SECONDS):
-        return read_record(job) or _fit_and_record(job, report)  # the previous holder of the lock may have finished it
-
-
-def _fit_and_record(job: FitJob, report: Report) -> dict[str, Any]:
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        record = run_fit(job, lambda clip, state: nullcontext(_make_reporter(report)))
-    texts = dict.fromkeys(" ".join(str(warning.message).split()) for warning in caught)
-    record["warnings"] = [*texts, *record["warnings"]]
-    with atomic_path(job.record) as temporary:
-        temporary.write_text(json.dumps(record) + "\n")
-    job.checkpoint.unlink(missing_ok=True)
-    return record
+        if record := read_record(job):  # the previous holder of the lock may have finished it
+            return record
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            record = run_fit(job, lambda clip, state: nullcontext(_make_reporter(report)))
+        texts = dict.fromkeys(" ".join(str(warning.message).split()) for warning in caught)
+        record["warnings"] = [*texts, *record["warnings"]]
+        with atomic_path(job.record) as temporary:
+            temporary.write_text(json.dumps(record) + "\n")
+        job.checkpoint.unlink(missing_ok=True)
+        return record
 
 
 def peak_bytes() -> int | None:

@@ -119,12 +119,9 @@ class Quantizer:
         # Of usual Gaussians at most 6. Beyond, the class makes up for the line where a Gaussian is unlike the others.
         classes = np.where(np.all(raw == features, axis=1), np.clip(rest, -6, 6), np.clip(rest, -60, 60)).mean(0)
         self.classes = np.rint(np.where(self._seen, classes, -6.0)).astype(np.int32)
-        self._match_errors(sensitivity, whole)
-
-    def _match_errors(self, sensitivity: dict[str, Float[np.ndarray, " num"]], design: np.ndarray) -> None:
-        """Shift the fits so that all columns add the same error: by mean, not typical, sensitivity times step^2."""
+        # All columns are to add the same error: by mean, not typical, sensitivity times step^2.
         for name, fit in self._fits.items():
-            predicted = np.clip((design @ fit + self.classes)[self._seen], -30, 30)
+            predicted = np.clip((whole @ fit + self.classes)[self._seen], -30, 30)
             fit[0] += 0.5 * np.log2(np.mean(sensitivity[name][self._seen] * 4.0**-predicted) + 1e-30)
 
     def make_rules(self, coarseness: float) -> dict[str, Rule]:

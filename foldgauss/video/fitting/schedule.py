@@ -25,21 +25,16 @@ def num_views(config: FitConfig, num_frames: int) -> int:
     return 2 * num_frames if config.views.two_cameras else num_frames
 
 
-def fraction_in_turn(config: FitConfig) -> float:
-    """The fraction of the views that visit all frames in turn; the others are drawn by error."""
-    return 1 - config.views.error_fraction
-
-
 def steps_per_pass(config: FitConfig, num_frames: int) -> int:
     """Steps in which every view is seen at least once."""
-    return math.ceil(num_views(config, num_frames) / (config.views.batch_size * fraction_in_turn(config)))
+    return math.ceil(num_views(config, num_frames) / (config.views.batch_size * (1 - config.views.error_fraction)))
 
 
 def choose_views(config: FitConfig, num_frames: int, step: int, errors: np.ndarray) -> np.ndarray:
     """The views of a step: in turn, and in between by the `errors` of the frames, (num_frames,), 0 where unknown.
 
-    View k is frame k; from the number of frames on, frame k - num_frames, mirrored. All but `fraction_in_turn` of the
-    views, evenly among the others, are drawn in proportion to the errors; frames without one count as average. The
+    View k is frame k; from the number of frames on, frame k - num_frames, mirrored. The fraction `error_fraction` of
+    the views, evenly among the others, is drawn in proportion to the errors; frames without one count as average. The
     others pass through all views, in an order that depends on the seed and the pass only.
     """
     num, (views, drawn) = num_views(config, num_frames), find_views_in_turn(config, num_frames, step)
@@ -51,10 +46,11 @@ def choose_views(config: FitConfig, num_frames: int, step: int, errors: np.ndarr
 
 def find_views_in_turn(config: FitConfig, num_frames: int, step: int) -> tuple[np.ndarray, np.ndarray]:
     """The views of a step if none were drawn by error, and which are drawn (they are the next ones in turn here)."""
-    num, in_turn = num_views(config, num_frames), fraction_in_turn(config)
+    num, in_turn = num_views(config, num_frames), 1 - config.views.error_fraction
     positions = np.arange(step * config.views.batch_size, (step + 1) * config.views.batch_size)
     taken = np.floor(positions * in_turn).astype(int)
-    views = np.array([_shuffle(config, num, k // num)[k % num] for k in taken])
+    orders = (make_generator(Stream.FRAME_ORDER, k // num, seed=config.seed).permutation(num) for k in taken)
+    views = np.array([order[k % num] for order, k in zip(orders, taken, strict=True)])
     return views, np.floor((positions + 1) * in_turn).astype(int) == taken
 
 
@@ -63,10 +59,6 @@ def _chances(errors: np.ndarray, num: int) -> np.ndarray:
     known = (errors > 0) & np.isfinite(errors)
     chances = np.where(known, errors, errors[known].mean() if known.any() else 1.0).astype(float)
     return np.tile(chances / chances.sum(), num // len(errors)) * len(errors) / num
-
-
-def _shuffle(config: FitConfig, num: int, epoch: int) -> np.ndarray:
-    return make_generator(Stream.FRAME_ORDER, epoch, seed=config.seed).permutation(num)
 
 
 def choose_start_frames(num_frames: int) -> np.ndarray:

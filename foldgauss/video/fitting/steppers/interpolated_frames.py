@@ -14,7 +14,7 @@ from jaxtyping import Float32
 from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.threads import num_threads
 from foldgauss.video.fitting.config import INTERPOLATION_FRACTION, FitConfig
-from foldgauss.video.fitting.schedule import choose_views, find_views_in_turn, fraction_in_turn
+from foldgauss.video.fitting.schedule import choose_views, find_views_in_turn
 from foldgauss.video.fitting.state import FitState
 from foldgauss.video.motion.optical_flow import Motion
 
@@ -100,5 +100,5 @@ def make_interpolated(
     chance = config.views.interpolation_fraction
     if chance is None:  # by default only where optical flow is used, and tells what is there (not behind alpha)
         chance = INTERPOLATION_FRACTION if config.follows_motion and frames.shape[3] == 3 else 0.0
-    chance = min(chance / fraction_in_turn(config), 1.0) if len(frames) > 1 else 0.0
+    chance = min(chance / (1 - config.views.error_fraction), 1.0) if len(frames) > 1 else 0.0
     return InterpolatedFrames(frames, config, chance, find_motion()) if chance > 0 else None

@@ -142,7 +142,12 @@ def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames he
     times = frame_times(arrays.time_logits)
     seen = _differentiate(program, arrays.rows, arrays.path_maps, times, frames, control)
     if program.grows:
-        arrays = _add_statistics(arrays, seen, columns(program.degree)["time_loc_logit"].start)
+        shown, at = seen.screen >= 0, columns(program.degree)["time_loc_logit"].start  # as `GradientStatistics.add`
+        arrays = arrays._replace(
+            screen_gradients=arrays.screen_gradients + jnp.where(shown, seen.screen, 0),
+            time_gradients=arrays.time_gradients + jnp.where(shown, jnp.abs(seen.by_rows[:, at]), 0),
+            seen=arrays.seen + shown.astype(jnp.int32),
+        )
     used = jnp.arange(program.capacity, dtype=jnp.int32) < control.num
     touched = seen.alive if program.sparse_updates else used
     moments, before = (arrays.first, arrays.second, arrays.counts), arrays.rows
@@ -269,16 +274,6 @@ def _screen_gradient(program: Program, splats: Splats2D, by_splats: Splats2D, al
     size = jnp.hypot(by_splats.mean[..., 0] * half[0], by_splats.mean[..., 1] * half[1])
     shows = jax.vmap(lambda own: find_visible(own.mean, own.factor, own.opacity, program.size, program.options))(splats)
     return jnp.max(jnp.where(shows & alive, size, jnp.full_like(size, -1.0)), axis=0)
-
-
-def _add_statistics(arrays: DeviceArrays, seen: Gradients, time_column: int) -> DeviceArrays:
-    """The twin of `GradientStatistics.add`."""
-    shown, screen, time = seen.screen >= 0, seen.screen, jnp.abs(seen.by_rows[:, time_column])
-    return arrays._replace(
-        screen_gradients=arrays.screen_gradients + jnp.where(shown, screen, jnp.zeros_like(screen)),
-        time_gradients=arrays.time_gradients + jnp.where(shown, time, jnp.zeros_like(time)),
-        seen=arrays.seen + shown.astype(jnp.int32),
-    )
 
 
 # -------------------------------------------------------------------------------------------------- errors
