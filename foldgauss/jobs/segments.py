@@ -225,7 +225,7 @@ def _check_folder(folder: Path) -> None:
         not foreign,
         "target",
         expected=f"only files of a fit in {folder}",
-        got=f"{foreign[:1]} in it",
+        got=f"{', '.join(map(repr, foreign[:1]))} in it",
         cure="Move it away.",
     )
 

@@ -439,7 +439,7 @@ class ExactColumns:
 
 def compute_columns(model: VideoModel) -> ExactColumns:
     """The columns of a model, float64. Raises ValueError for a model that the format cannot hold."""
-    info = describe_model(model)
+    info = _make_info(model)
     splats = model.splats
 
     def leaf(name: str) -> np.ndarray:
@@ -471,8 +471,7 @@ def _sigmoid(x: np.ndarray) -> np.ndarray:
     return 0.5 * (1 + np.tanh(0.5 * x))
 
 
-def describe_model(model: VideoModel) -> CompactInfo:
-    """The constants of a model, without its paths. Raises ValueError for a model that the format cannot hold."""
+def _make_info(model: VideoModel) -> CompactInfo:
     power, floor = (np.unique(np.asarray(getattr(model.splats.envelope, name))) for name in ("power", "floor"))
     require(
         power.size == floor.size == 1,

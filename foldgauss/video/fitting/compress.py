@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from foldgauss._runtime.checks import require
-from foldgauss.video.compression.quantize import dequantize, describe_model
+from foldgauss.video.compression.quantize import dequantize
 from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig, Strategy, Views, planned_steps
 from foldgauss.video.fitting.loop import FitInfo, FitResult, check_frames, fit, start_from
 from foldgauss.video.fitting.rate import COMPRESSION_START, RateControl
@@ -48,11 +48,18 @@ def compress(
     Example: `save_compact("clip.fgz", compress(model, clip.frames, quality=60).quantized)`.
     """
     check_model(model)
-    about = describe_model(model)
+    power, floor = (np.unique(np.asarray(getattr(model.splats.envelope, name))) for name in ("power", "floor"))
+    require(
+        power.size == floor.size == 1,
+        "model.splats.envelope",
+        expected="one for all Gaussians",
+        got="several",
+        cure="Save it as .safetensors, which holds one envelope per Gaussian.",
+    )
     config = FitConfig(
-        degree=about.degree,
-        power=about.power,
-        floor=about.floor,
+        degree=model.degree,
+        power=float(power[0]),
+        floor=float(floor[0]),
         quality=quality,
         size_mb=size_mb,
         psnr=psnr,
