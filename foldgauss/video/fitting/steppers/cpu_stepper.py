@@ -105,7 +105,9 @@ class CpuStepper:
             every = np.ones(len(scales), bool)
             rate = path_rate * measure_relative_size(scales, every, unit=config.rates.units.size)
             before = tuple(getattr(state, name) for name in PATH_ARRAYS)
-            for name, array in zip(PATH_ARRAYS, update_paths(before, np.float32(by_path), visited, rate), strict=True):
+            with np.errstate(over="ignore"):  # of a fit that diverges
+                after = update_paths(before, np.float32(by_path), visited, rate)
+            for name, array in zip(PATH_ARRAYS, after, strict=True):
                 setattr(state, name, np.array(array))
         return StepResult(float(np.mean(losses)), num_alive, finite)
 
