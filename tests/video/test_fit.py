@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import time
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -29,7 +30,6 @@ from foldgauss.video.fitting import loop as fit_module
 from foldgauss.video.fitting.config import (
     MOST_PER_PIXEL,
     TYPICAL_LIFETIME,
-    chosen_interpolation,
     chosen_num_gaussians,
     planned_steps,
 )
@@ -216,11 +216,11 @@ def test_interpolation_is_the_default():
     ids=["no motion", "alpha"],
 )
 def test_interpolation_is_off_by_default_where_it_is_not_supported(changes, alpha):
-    assert chosen_interpolation(FitConfig().replace(**changes), alpha=alpha) == 0
-    assert (
-        chosen_interpolation(FitConfig().replace(**{"views.interpolation_fraction": 0.1}, **changes), alpha=alpha)
-        == 0.1
-    )
+    frames = np.zeros((3, 8, 8, 4 if alpha else 3), np.uint8)
+    config, motion = FitConfig().replace(**changes), SimpleNamespace(cuts=[], find_still=list)
+    assert interpolated_frames.make_interpolated(frames, config, lambda: motion) is None
+    given = config.replace(**{"views.interpolation_fraction": 0.1, "views.error_fraction": 0.0})
+    assert interpolated_frames.make_interpolated(frames, given, lambda: motion).chance == 0.1
 
 
 def test_still_clip_is_not_interpolated():
