@@ -27,8 +27,22 @@ CLIP_SUFFIXES = (
 #: Folder, beside the models, of checkpoints and records.
 RECORDS = "records"
 #: Fields of a record besides the request and the scores of each frame.
-_RECORD = {"num_frames", "size", "fps", "num_gaussians", "mean_psnr", "mean_ssim", "steps", "seconds", "stopped_by"}
-_RECORD |= {"file_bytes", "file_digest", "peak_bytes", "notes", "warnings"}
+_RECORD = {
+    "num_frames",
+    "size",
+    "fps",
+    "num_gaussians",
+    "mean_psnr",
+    "mean_ssim",
+    "steps",
+    "seconds",
+    "stopped_by",
+    "file_bytes",
+    "file_digest",
+    "peak_bytes",
+    "notes",
+    "warnings",
+}
 #: What reading JSON that is missing, damaged or of another shape may raise.
 _UNREADABLE = (OSError, ValueError, KeyError, TypeError, RecursionError)
 

@@ -85,8 +85,15 @@ Threads = Annotated[
 #: `FitConfig`, and the field.
 SETTINGS = {field.name: (name, field) for name, field, _ in walk(FitConfig) if setting_of(field).option}
 #: Options that help does not show, since few need them: docs/fit.md lists them.
-RARE = {"power", "compositing", "batch_size", "error_fraction", "ssim_fraction"}
-RARE |= {"interpolation_fraction", "interpolation_end"}
+RARE = {
+    "power",
+    "compositing",
+    "batch_size",
+    "error_fraction",
+    "ssim_fraction",
+    "interpolation_fraction",
+    "interpolation_end",
+}
 #: Constants of the renderer, which fits rarely change.
 _CONSTANTS = ("alpha_cutoff", "support_radius", "transmittance_stop")
 _Constant = Annotated[float | None, typer.Option(hidden=True)]
