@@ -14,7 +14,7 @@ import signal
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any
@@ -66,9 +66,7 @@ def run_here(
 
     Raises `Stopped` once `should_stop` returns True and the running job has written its checkpoint.
     """
-    waiting = yield from _finished_outcomes(jobs)
-
-    for job in waiting:
+    for job in jobs:
         if should_stop():
             raise Stopped("stopped between two jobs")
 
@@ -77,18 +75,6 @@ def run_here(
             return not should_stop()
 
         yield _run_job(job, report)
-
-
-def _finished_outcomes(jobs: Sequence[FitJob]) -> Generator[Outcome, None, list[FitJob]]:
-    """Outcomes of the jobs that are finished already; returns the others."""
-    waiting = []
-    for job in jobs:
-        record = read_record(job)
-        if record is None:
-            waiting.append(job)
-        else:
-            yield Outcome(job, record)
-    return waiting
 
 
 def _run_job(job: FitJob, report: Report) -> Outcome:
@@ -216,7 +202,12 @@ def run_on(
     """
     from distributed import Event
 
-    waiting = deque((yield from _finished_outcomes(jobs)))
+    waiting: deque[FitJob] = deque()
+    for job in jobs:
+        if record := read_record(job):  # finished already
+            yield Outcome(job, record)
+        else:
+            waiting.append(job)
     topic = f"foldgauss-{secrets.token_hex(6)}"
     running: list[tuple[Any, FitJob]] = []
     stop, events = Event(topic, client=client), queue.SimpleQueue()
