@@ -117,10 +117,8 @@ def fit_many(
         if found.others:
             names = ", ".join(entry.name for entry in found.others[:3]) + (", ..." if len(found.others) > 3 else "")
             out.print(f"skipped, not clips: {names}", soft_wrap=True)
-    ended: dict[str, Outcome] = {}
 
-    def on_end(outcome: Outcome) -> None:
-        ended[outcome.job.target] = outcome
+    def on_end(ended: dict[str, Outcome]) -> None:
         try:
             _write_summary(out_dir, jobs, ended)
         except OSError as error:  # a full disk must not end the fits

@@ -59,11 +59,12 @@ def run_jobs(
     client: Any,
     *,
     overwrite: bool,
-    on_end: Callable[[Outcome], None] = lambda outcome: None,
+    on_end: Callable[[dict[str, Outcome]], None] = lambda ended: None,
 ) -> list[Outcome]:
     """Run the jobs, by the workers of a dask client or here, and display progress; outcomes in the order of the jobs.
 
     After Ctrl-C or SIGTERM, and once checkpoints are written, raises `Stopped`, whose message says how to continue.
+    `on_end` receives the outcomes so far, by target.
     """
     ended: dict[str, Outcome] = {}
     with note_signals() as request, show_progress(display) as show:
@@ -81,7 +82,7 @@ def run_jobs(
             for outcome in outcomes:
                 ended[outcome.job.target] = outcome
                 view.end(outcome)
-                on_end(outcome)
+                on_end(ended)
         except JobsStopped as error:
             done = sum(outcome.failure is None for outcome in ended.values())
             text = f"stopped by {request.signal or 'the worker'}; {done} of {len(jobs)} {noun} are done"
