@@ -26,6 +26,7 @@ _LAYERS = 256
 _MIN_TRANSMITTANCE = 0.2
 #: Product of alphas and transmittance below which two Gaussians do not overlap.
 _FAINT = 0.004
+_EMPTY = -1
 
 
 #: Overlapping pairs of Gaussians: the front ones, the back ones, and the error of swapping them.
@@ -81,7 +82,8 @@ def find_overlaps(contributions: Contributions) -> Overlaps:
     rows = -(-height // stride), -(-width // stride)
     layers = np.empty((*rows, _LAYERS), np.int32), np.empty((*rows, _LAYERS, 2), np.float32)
     color = np.maximum(0.5 + SH_C0 * np.asarray(contributions.model.splats.color_dc, np.float64), 0)
-    options, pairs = contributions.model.options, nb.typed.Dict.empty(nb.int64, nb.float64)
+    keys, costs = np.full(1 << 20, _EMPTY, np.int64), np.zeros(1 << 20)
+    options, used = contributions.model.options, 0
     for k in range(len(contributions.times)):
         done, offset = contributions.at_frame(k).splats, (k % stride, k // stride % stride)
         transmittance, count = np.ones(rows, np.float32), np.zeros(rows, np.int32)
@@ -89,9 +91,35 @@ def find_overlaps(contributions: Contributions) -> Overlaps:
         _list_layers(
             done.mean, done.factor, done.opacity, done.alive, offset, stride, *seen, transmittance, count, *layers
         )
-        _add_costs(count, *layers, color, pairs)
-    keys, costs = _list_items(pairs)
-    return keys // num, keys % num, costs * stride**2
+        position = [0, 0]
+        while position[0] < rows[0]:
+            if 2 * used > len(keys):
+                keys, costs = _enlarge(keys, costs)
+            *position, used = _add_costs(count, *layers, color, num, keys, costs, position[0], position[1], used)
+    used_slots = np.flatnonzero(keys != _EMPTY)
+    return keys[used_slots] // num, keys[used_slots] % num, costs[used_slots] * stride**2
+
+
+def _enlarge(keys: np.ndarray, costs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    used_slots = np.flatnonzero(keys != _EMPTY)
+    more, own = np.full(4 * len(keys), _EMPTY, np.int64), np.zeros(4 * len(keys))
+    _rehash(keys[used_slots], costs[used_slots], more, own)
+    return more, own
+
+
+@kernel
+def _slot(keys, key):
+    place = (key * 11400714819323198485 >> 20) & (len(keys) - 1)
+    while keys[place] != -1 and keys[place] != key:
+        place = (place + 1) & (len(keys) - 1)
+    return place
+
+
+@kernel
+def _rehash(keys, costs, more, own):
+    for k in range(len(keys)):
+        place = _slot(more, keys[k])
+        more[place], own[place] = keys[k], costs[k]
 
 
 @kernel
@@ -126,11 +154,12 @@ def _list_layers(mean, factor, opacity, alive, offset, stride, low_pass, cutoff,
 
 
 @kernel
-def _add_costs(count, index, layer, color, pairs):
-    """Add the errors of swaps in all pixels of the grid to those of the pairs, whose keys are `front * num + back`."""
-    num = len(color)
-    for r in range(count.shape[0]):
-        for q in range(count.shape[1]):
+def _add_costs(count, index, layer, color, num, keys, costs, row, column, used):
+    """Add the errors of pairs, pixel by pixel, until the table is half full; returns the next pixel and the fill."""
+    for r in range(row, count.shape[0]):
+        for q in range(column if r == row else 0, count.shape[1]):
+            if 2 * used > len(keys):
+                return r, q, used
             for i in range(count[r, q]):
                 if layer[r, q, i, 0] * layer[r, q, i, 1] < _FAINT:
                     continue
@@ -146,12 +175,9 @@ def _add_costs(count, index, layer, color, pairs):
                     for c in range(3):
                         apart += (color[a, c] - color[b, c]) ** 2
                     key = nb.int64(a) * num + b
-                    pairs[key] = pairs.get(key, 0.0) + both * both * apart
-
-
-@kernel
-def _list_items(pairs):
-    keys, values = np.empty(len(pairs), np.int64), np.empty(len(pairs))
-    for k, (key, value) in enumerate(pairs.items()):
-        keys[k], values[k] = key, value
-    return keys, values
+                    place = _slot(keys, key)
+                    if keys[place] == -1:
+                        keys[place] = key
+                        used += 1
+                    costs[place] += both * both * apart
+    return count.shape[0], 0, used
