@@ -241,7 +241,7 @@ def test_stopped_by_hand(clip, tmp_path, capsys, monkeypatch):
     assert run("tradeoff", clip, "--out", target, "--axes", "time", *QUICK) == 1
     told = " ".join(capsys.readouterr().err.split())
     assert "stopped by SIGINT; 1 of 4 points are done" in told
-    assert "Run the same command again to continue." in told
+    assert "Give the same command again to continue." in told
     assert record_of(target)["points"] == []
 
 
