@@ -243,7 +243,7 @@ def _load_plan(folder: Path, request: dict[str, Any]) -> dict[str, Any] | None:
     pairs = {name: (before.get(name), now[name]) for name in now if name != "config" and before.get(name) != now[name]}
     require(
         not pairs,
-        "resume",
+        "overwrite",
         expected=", ".join(f"{name}={pair[0]!r}" for name, pair in pairs.items()),
         got=", ".join(f"{name}={pair[1]!r}" for name, pair in pairs.items()),
         cure=f"An unfinished fit is in {str(folder)!r}: give its options, or start over with --overwrite.",

@@ -134,7 +134,7 @@ CHANGES = {
 def test_other_options_are_refused_by_name(clip, tmp_path, change):
     target = tmp_path / "long.safetensors"
     plan_long_fit(clip, target, CONFIG, **ASKED)
-    with pytest.raises(ValueError, match=f"resume: expected {change}=") as refused:
+    with pytest.raises(ValueError, match=f"overwrite: expected {change}=") as refused:
         plan_long_fit(clip, target, **({"config": CONFIG} | ASKED | CHANGES[change]))
     assert "--overwrite" in str(refused.value)
 

@@ -53,7 +53,7 @@ def test_models_of_clips_of_one_name_are_told_apart(tmp_path):
     assert [Path(job.target).name for job in jobs] == [
         "One.avi.safetensors",
         "one.mp4.safetensors",
-        "two.v1.safetensors",
+        "two.v1.mp4.safetensors",
     ]
     assert {job.record.parent for job in jobs} == {tmp_path / "out" / "records"}
 
