@@ -15,7 +15,7 @@ from benchmarks._dying import HIDDEN
 from foldgauss.io import write_video
 from foldgauss.io.datasets import bunny
 from foldgauss.io.models.model_file import ModelFileError, load_model, read_header
-from foldgauss.io.models.video_model import load_video_model, read_metadata, save_video_model
+from foldgauss.io.models.video_model import load_video_model
 
 FRAMES = (0, 12)
 SIZE = (80, 160)
@@ -40,10 +40,9 @@ class Wrong(AssertionError):
 
 
 class Uninterrupted(NamedTuple):
-    """A fit that nobody disturbs: its model, also as it is before its scores are known; and what it took."""
+    """A fit that nobody disturbs: its model, and what it took."""
 
     model: bytes
-    before_scores: bytes
     seconds: float
     num_checkpoints: int
     checkpoint_bytes: int  # of the smallest
@@ -62,15 +61,13 @@ def command(plan: dict[str, Any], clip: Path, target: Path, options: list[str]) 
 
 
 def uninterrupted(clip: Path, options: list[str], folder: Path) -> Uninterrupted:
-    target, unscored = folder / "whole.safetensors", folder / "unscored.safetensors"
+    target = folder / "whole.safetensors"
     begun = time.monotonic()
     words = command({"ending": ".checkpoint"}, clip, target, options)
     done = subprocess.run(words, check=True, capture_output=True, text=True)
     seconds = time.monotonic() - begun
-    about = {name: value for name, value in read_metadata(target).items() if name not in ("mean_psnr", "mean_ssim")}
-    save_video_model(unscored, load_video_model(target), metadata=about)
     num, least = map(int, done.stderr.split()[-2:])
-    return Uninterrupted(target.read_bytes(), unscored.read_bytes(), seconds, num, least)
+    return Uninterrupted(target.read_bytes(), seconds, num, least)
 
 
 def run(
@@ -91,8 +88,7 @@ def run(
     while True:
         aim = AIMS[len(rows) % len(AIMS)] if len(rows) < num else "none"
         plan, delay = _aimed(aim, rng, whole)
-        more = ["--resume"] * kept.exists() + ["--overwrite"] * target.exists()
-        code = _run(command(plan, clip, target, [*FITS[name], *more]), delay)
+        code = _run(command(plan, clip, target, FITS[name]), delay)
         if code not in (0, -signal.SIGKILL):
             raise Wrong(f"{name}: the fit ended with {code} after {rows[-1:]}")
         if code:
@@ -117,7 +113,7 @@ def _aimed(aim: str, rng: np.random.Generator, whole: Uninterrupted) -> tuple[di
         return {"ending": ".checkpoint"}, float(rng.uniform(0, whole.seconds))
     if aim == "none":
         return {"ending": ".checkpoint"}, None
-    size, most, ending = len(whole.before_scores), 2, ".safetensors"  # without its scores, and with them
+    size, most, ending = len(whole.model), 1, ".safetensors"
     if aim == "checkpoint":
         size, most, ending = whole.checkpoint_bytes, max(whole.num_checkpoints // 2, 1), ".checkpoint"
     plan = {"ending": ending, "moment": str(rng.choice(list(MOMENTS), p=list(MOMENTS.values())))}
@@ -154,8 +150,7 @@ def _check_files(target: Path, kept: Path, before: int | None) -> int | None:
 
 def _check_end(target: Path, whole: Uninterrupted, code: int) -> None:
     """The model must be that of the fit left in peace; after an end in peace nothing else may be there."""
-    found = target.read_bytes()
-    if found != whole.model and (code == 0 or found != whole.before_scores):
+    if target.read_bytes() != whole.model:
         raise Wrong("the model differs from that of a fit that was never killed")
     beside = sorted(path.name for path in target.parent.iterdir() if path != target)
     if code == 0 and beside:

@@ -5,7 +5,7 @@
     python -m benchmarks.reliability long [--frames N] [--size HxW] [--gaussians N] [--steps N] [--json FILE]
     python -m benchmarks.reliability soak [--minutes N] [--json FILE]
 
-* kills: fits, plain and growing, each ended by SIGKILL N times, [25] and resumed each time with --resume. A
+* kills: fits, plain and growing, each ended by SIGKILL N times, [25] and resumed each time by the same command. A
   half of the kills comes at random times of the life of a fit, start-up included, a third at a random byte or another
   moment of the writing of a checkpoint, a sixth in that of the model. After each one what lies there must be whole, and
   each model that a fit ends with must be that of a fit left in peace, bit for bit, with no other file beside it.

@@ -45,8 +45,7 @@ from foldgauss.io.figures import write_figure
 from foldgauss.io.provenance import fingerprint
 from foldgauss.jobs.runner import Checkpoint, run_steps
 from foldgauss.video import FitConfig, fit_steps
-from foldgauss.video.fitting.config import FIT_ENGINES
-from foldgauss.video.fitting.growth import PUBLISHED_STEPS
+from foldgauss.video.fitting.config import FIT_ENGINES, PUBLISHED_STEPS
 from foldgauss.video.fitting.loop import start
 from foldgauss.video.fitting.state import FitState, to_model
 from foldgauss.video.models.row_layout import columns
@@ -201,7 +200,7 @@ def run_to_end(clip: Clip, name: str, config: FitConfig, folder: Path) -> Run:
     """A fit, continued after its checkpoint. Raises ValueError for a checkpoint of other settings or frames."""
     curve_file = curve_path(folder, name)
     checkpoint = Checkpoint(curve_file.with_suffix(".checkpoint"), config, fingerprint(clip))
-    state = checkpoint.load(required=True) if checkpoint.path.exists() else None
+    state = checkpoint.load()
     curve = Curve(curve_file, state)
     where = "" if state is None else f" continues after step {state.step:,}"
     if state is None and (box := VARIANTS.get(name, {}).get("box")):

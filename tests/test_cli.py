@@ -336,14 +336,13 @@ def test_demo_reaches_its_quality(tmp_path):
 
 
 def test_stopped_while_scores_are_measured_and_resumed(work, tmp_path, monkeypatch):
-    """The model is there, and a resumed fit notes in it what an undisturbed one does."""
+    """The fit is kept, and the same command writes the model of an undisturbed one."""
     fit = ("fit", work / "clip.mp4", "--gaussians", 50, "--steps", 12, "--quiet", "--out")
     assert run(*fit, tmp_path / "whole.safetensors") == 0
     with monkeypatch.context() as patch:
         patch.setattr(fitting, "evaluate_with_progress", Mock(side_effect=KeyboardInterrupt))
-        call(*fit, tmp_path / "model.safetensors", code=130, err="add --resume --overwrite")
-    load_video_model(tmp_path / "model.safetensors")
-    assert run(*fit, tmp_path / "model.safetensors", "--resume", "--overwrite") == 0
+        call(*fit, tmp_path / "model.safetensors", code=130, err="Give the same command again to continue.")
+    assert run(*fit, tmp_path / "model.safetensors") == 0
     assert (tmp_path / "model.safetensors").read_bytes() == (tmp_path / "whole.safetensors").read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["model.safetensors", "whole.safetensors"]
 
@@ -356,12 +355,12 @@ def test_stopped_and_resumed(name, number, step, work, tmp_path):
     """A signal, also between the steps of rounding, keeps the fit; resumed it ends with the same bytes."""
     fit = ("fit", work / "clip.mp4", "--gaussians", 400, "--steps", 80, "--out")
     with interrupted_fit(step, number):
-        call(*fit, tmp_path / name, code=1, err="--resume")
+        call(*fit, tmp_path / name, code=1, err="Give the same command again to continue.")
     assert [path.name for path in tmp_path.iterdir()] == [f"{name}.checkpoint"]
     # It is not thrown away by accident, nor continued as another.
-    for options in ((), ("--steps", 90, "--resume"), ("--frames", "0:5", "--resume"), ("--quality", 60, "--resume")):
+    for options in (("--steps", 90), ("--frames", "0:5"), ("--quality", 60)):
         assert run(*fit, tmp_path / name, *options) == 2
-    assert run(*fit, tmp_path / name, "--resume") == 0
+    assert run(*fit, tmp_path / name) == 0
     assert run(*fit, tmp_path / f"whole-{name}") == 0
     assert (tmp_path / name).read_bytes() == (tmp_path / f"whole-{name}").read_bytes()
     assert len(list(tmp_path.iterdir())) == 2
@@ -421,7 +420,7 @@ def test_the_history_of_another_fit_is_left_alone(work, tmp_path):
     before = other.read_bytes()
     with interrupted_fit(40):
         assert run(*fit, own, "--out", tmp_path / "m.safetensors") == 1
-    resume = ("--out", tmp_path / "m.safetensors", "--resume")
+    resume = ("--out", tmp_path / "m.safetensors")
     call(*fit, other, *resume, code=2, err="history: expected that of the fit which is resumed at step 40")
     assert other.read_bytes() == before
     assert run(*fit, own, *resume) == 0

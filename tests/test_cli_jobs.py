@@ -98,7 +98,7 @@ def test_a_stopped_fit_goes_on_when_the_command_is_given_again(long_clip, whole,
         call("fit", long_clip, "--out", target, *SEGMENTS, code=1, err="stopped by SIGTERM; 1 of 3 segments are done")
     assert (folder / "segment-0001.safetensors.checkpoint").exists()
     call("fit", long_clip, "--out", target, *SEGMENTS[:-1], "2", code=2, err="segment_seconds=1.5")
-    call("fit", long_clip, "--out", target, *SEGMENTS, "--resume", err="continuing: 1 of 3 segments done, 1 begun")
+    call("fit", long_clip, "--out", target, *SEGMENTS, err="continuing: 1 of 3 segments done, 1 begun")
     assert target.read_bytes() == whole.read_bytes()
     assert not folder.exists()
 
@@ -112,35 +112,6 @@ def test_begun_anew_and_left_alone(long_clip, whole, tmp_path):
     call("fit", long_clip, "--out", target, *SEGMENTS, "--overwrite", code=2, err="mine.txt")
     (folder / "mine.txt").rename(folder / "segment-0000.safetensors")
     assert run("fit", long_clip, "--out", target, *SEGMENTS, "--overwrite") == 0
-    assert target.read_bytes() == whole.read_bytes()
-
-
-@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals are POSIX's; CI runs it on Linux")
-def test_what_was_begun_in_segments_goes_on_so_without_being_told(long_clip, whole, tmp_path):
-    target = tmp_path / "m.safetensors"
-    with stopped("segment 1"):
-        assert run("fit", long_clip, "--out", target, *SEGMENTS) == 1
-    call(
-        "fit",
-        long_clip,
-        "--out",
-        target,
-        *QUICK,
-        "--preview",
-        tmp_path / "p.png",
-        code=2,
-        err="--preview: expected a fit in one piece",
-    )
-    assert json.loads(call("fit", long_clip, "--out", target, *QUICK, "--log-json").out.splitlines()[0])["spans"] == [
-        [0, 15],
-        [12, 27],
-        [24, 39],
-    ]
-    checkpoint = tmp_path / "m.safetensors.checkpoint"
-    (tmp_path / "m.safetensors.segments").mkdir()
-    (tmp_path / "m.safetensors.segments" / "plan.json").write_text('{"asked": {"segment_seconds": 1.5}}')
-    checkpoint.write_bytes(b"of a fit in one piece")
-    assert checkpoint.name in call("fit", long_clip, "--out", target, *QUICK, "--overwrite", "--resume", code=1).err
     assert target.read_bytes() == whole.read_bytes()
 
 
@@ -186,7 +157,7 @@ def test_many_clips_make_a_model_each_and_failures_are_listed(clips, tmp_path):
         err="failed: broken.mp4: path: expected a video file",
     )
     models = sorted(out.glob("*.fgz"))
-    assert [path.name for path in models] == ["clip0.fgz", "clip1.fgz", "frames.fgz"]
+    assert [path.name for path in models] == ["clip0.mp4.fgz", "clip1.mp4.fgz", "frames.fgz"]
     for path, source in zip(models, ("clip0.mp4", "clip1.mp4", "frames"), strict=True):
         model = load_video_model(path)
         assert isinstance(model, VideoModel)
@@ -213,7 +184,7 @@ def test_many_clips_given_again_do_what_is_left(clips, tmp_path):
     kept = {path: path.read_bytes() for path in out.rglob("*") if path.is_file() and path.name != "summary.json"}
     for settings in (QUICK, (*QUICK[:-1], "3")):  # what is kept is of others
         call(*fit, *settings, code=2, err="exists, with other settings")
-    assert out / "records" / "clip1.fgz.checkpoint" in kept
+    assert out / "records" / "clip1.mp4.fgz.checkpoint" in kept
     assert {path: path.read_bytes() for path in kept} == kept
     call(*fit, *other, out="4 clips, 2 of them done already")
     assert {load_video_model(path).degree for path in out.glob("*.fgz")} == {2}

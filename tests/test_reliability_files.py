@@ -18,7 +18,6 @@ from commands import run
 from benchmarks import _kills, _long, _outputs
 from foldgauss._runtime import kernels as _kernels
 from foldgauss.cli.fitting import fit as fitting
-from foldgauss.cli.shared import rendering as _shared
 from foldgauss.io import load_video_model, save_video_model, write_video
 from foldgauss.io._atomic import lock_output
 from foldgauss.io.models.model_file import load_model, read_header
@@ -201,26 +200,14 @@ def test_a_model_without_room_is_written_by_resuming_to_the_bit(work, disk, monk
     assert run("fit", work / "clip.mp4", "--out", target, *SMALL) == 1
     told = capsys.readouterr().err.strip().splitlines()[-1]
     assert told.startswith(f"error: path: expected free space for {str(target)!r}")
-    assert f"The fit is kept in {kept}: --resume continues" in told
+    assert f"The fit is kept in {kept}: the same command writes the model." in told
     assert read_header(kept)["header"]["counters"]["step"] == 26
     assert set(os.listdir(disk.folder)) <= {kept.name, "ballast"}
     monkeypatch.undo()
     disk.empty()
-    assert run("fit", work / "clip.mp4", "--out", target, *SMALL, "--resume") == 0
+    assert run("fit", work / "clip.mp4", "--out", target, *SMALL) == 0
     assert os.listdir(disk.folder) == [target.name]
     assert target.read_bytes() == (work / "model.safetensors").read_bytes()
-
-
-def test_scores_without_room_are_told_and_the_model_is_there(work, disk, monkeypatch, capsys):
-    target, evaluate = disk.folder / "m.safetensors", _shared.evaluate
-    monkeypatch.setattr(
-        _shared, "evaluate", lambda *arguments, **options: disk.fill() or evaluate(*arguments, **options)
-    )
-    assert run("fit", work / "clip.mp4", "--out", target, *SMALL) == 0
-    assert f"warning: {target} is written, but its scores could not be added" in capsys.readouterr().err
-    found, whole = (next(load_video_model(path).frames([0.3])) for path in (target, work / "model.safetensors"))
-    np.testing.assert_array_equal(found, whole)
-    assert set(os.listdir(disk.folder)) <= {target.name, "ballast"}
 
 
 def test_compiled_code_without_room_is_not_kept_and_that_is_all(tmp_path):

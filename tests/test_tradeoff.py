@@ -237,7 +237,7 @@ def test_stopped_by_hand(clip, tmp_path, monkeypatch):
         "time",
         *QUICK,
         code=1,
-        err=["stopped by SIGINT; 1 of 4 points are done", "Run the same command again to continue."],
+        err=["stopped by SIGINT; 1 of 4 points are done", "Give the same command again to continue."],
     )
     assert record_of(target)["points"] == []
 

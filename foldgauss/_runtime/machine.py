@@ -3,7 +3,6 @@
 import importlib.metadata
 import os
 import platform
-from contextlib import suppress
 from pathlib import Path
 
 from foldgauss._runtime.threads import available_cores, num_threads
@@ -26,15 +25,6 @@ def describe_machine() -> dict[str, object]:
 
 def load_average() -> float | None:
     return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
-
-
-def waiting_seconds() -> float:
-    """Seconds for which threads of this process could run, but others had the processors; 0 where unknown."""
-    nanoseconds = 0
-    for path in Path("/proc/self/task").glob("*/schedstat"):  # of Linux
-        with suppress(OSError):  # the thread has ended
-            nanoseconds += int(path.read_text().split()[1])
-    return nanoseconds / 1e9
 
 
 def cpu_model() -> str:

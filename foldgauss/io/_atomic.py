@@ -271,13 +271,13 @@ _LOCKED: set[Path] = set()
 
 
 @contextmanager
-def lock_output(path: Path, *, own: tuple[Path, ...] = (), what: str = "fit") -> Iterator[None]:
+def lock_output(path: Path, *, own: tuple[Path, ...] = (), what: str = "fit", wait: float = 0.0) -> Iterator[None]:
     """Hold the lock of `path` until the block or the process ends.
 
     `own`: files that only the holder of the lock writes. Their temporary files, left by a killed process, are removed,
     and so are those of `path` written under the lock; others of `path` once they are an hour old. `what` names the
-    holder in messages. Raises `OutputError` at once where another process holds the lock, or one of the files cannot
-    be written.
+    holder in messages. Raises `OutputError` where another process holds the lock for `wait` seconds, or one of the
+    files cannot be written.
     """
     for target in (path, *own):
         check_writable(target)  # the lock would create a missing folder
@@ -285,7 +285,7 @@ def lock_output(path: Path, *, own: tuple[Path, ...] = (), what: str = "fit") ->
     if len(name.encode()) > 240:  # a file name has at most 255 bytes, including '.' and '.lock'
         name = hashlib.sha256(name.encode()).hexdigest()[:32]
     file = path.with_name(f".{name}.lock")
-    lock = FileLock(file, timeout=0)
+    lock = FileLock(file, timeout=wait)
     with translate_output_errors(path):
         try:
             lock.acquire()

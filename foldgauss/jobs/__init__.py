@@ -5,21 +5,17 @@ and the next one continues to the same bits. `plan_long_fit` and `make_jobs` mak
 `run_on` run them.
 """
 
-from foldgauss.jobs.clips import find_clips, make_jobs
-from foldgauss.jobs.job import FitJob
-from foldgauss.jobs.runner import Progress, Stopped, fit_job
-from foldgauss.jobs.segments import JoinedFit, LongFit, plan_long_fit, seam_drops, segments_folder
-from foldgauss.jobs.workers import Outcome, SchedulerLost, WorkerPool, local_workers, run_here, run_on, running_cluster
+from foldgauss.jobs.job import FitJob, find_clips, make_jobs
+from foldgauss.jobs.runner import Stopped, fit_job
+from foldgauss.jobs.segments import LongFit, plan_long_fit, segments_folder
+from foldgauss.jobs.workers import Outcome, SchedulerLost, local_workers, run_here, run_on, running_cluster
 
 __all__ = [
     "FitJob",
-    "JoinedFit",
     "LongFit",
     "Outcome",
-    "Progress",
     "SchedulerLost",
     "Stopped",
-    "WorkerPool",
     "find_clips",
     "fit_job",
     "local_workers",
@@ -28,6 +24,5 @@ __all__ = [
     "run_here",
     "run_on",
     "running_cluster",
-    "seam_drops",
     "segments_folder",
 ]

@@ -10,32 +10,24 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import jax
+import numpy as np
 
 from foldgauss import __version__
 from foldgauss._runtime.checks import require
-from foldgauss._runtime.machine import waiting_seconds
+from foldgauss.io import Clip, FrameIndex, read_indexed, read_video, save_video_model
 from foldgauss.io._atomic import OutputError, atomic_path, lock_output, write_or_keep
-from foldgauss.io.media.clip import Clip
-from foldgauss.io.media.indexing import FrameIndex, read_indexed
-from foldgauss.io.media.reading import read_video
 from foldgauss.io.models.checkpoint import is_known_good, load_checkpoint, save_checkpoint
 from foldgauss.io.models.compact import COMPACT_SUFFIX, leave_room, save_compact
-from foldgauss.io.models.video_model import save_video_model
 from foldgauss.io.provenance import describe_reading, describe_source, fingerprint
 from foldgauss.jobs.job import FitJob, file_digest, limit_range, read_record
-from foldgauss.video.compression.quantize import Quantized
-from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.divergence import FitDiverged
+from foldgauss.video import Evaluation, FitConfig, FitDiverged, FitState, VideoModel, evaluate
 from foldgauss.video.fitting.loop import FitInfo, finish, fit_steps
-from foldgauss.video.fitting.state import FitState
-from foldgauss.video.models.metrics import Evaluation, evaluate
-from foldgauss.video.models.video_model import VideoModel
 
 #: Seconds between two checkpoints of a running fit.
 CHECKPOINT_SECONDS = 30.0
@@ -43,8 +35,6 @@ CHECKPOINT_SECONDS = 30.0
 REPORT_SECONDS = 1.0
 #: Seconds that a job waits for another one of the same target: a worker that is believed dead may be about to finish.
 WAIT_SECONDS = 60.0
-#: A fraction of the processor time that its threads asked for, below which a fit by minutes warns.
-LEAST_PROCESSOR_FRACTION = 0.5
 #: How many dB a model may be below the PSNR that was asked for without a warning.
 TOLERATED_DB = 0.05
 #: Number of clip shapes whose compiled programs are kept.
@@ -74,14 +64,9 @@ class Checkpoint:
     source: dict[str, Any]
     on_error: CheckpointError = lambda error, step: None
 
-    def load(self, required: bool) -> FitState | None:
-        """The state of the file; unless `required`, None if it is missing, unreadable or of another fit."""
-        try:
-            return load_checkpoint(self.path, config=self.config, source=self.source)
-        except (OSError, ValueError):
-            if required:
-                raise
-            return None
+    def load(self) -> FitState | None:
+        """The state of the file, None if there is none. Raises ValueError for one that is damaged or of another fit."""
+        return load_checkpoint(self.path, config=self.config, source=self.source) if self.path.exists() else None
 
     def try_save(self, state: FitState) -> None:
         """Save the state; a full disk must not end the fit."""
@@ -91,58 +76,23 @@ class Checkpoint:
             self.on_error(error, state.step)
 
 
-@dataclasses.dataclass(frozen=True)
-class FitRun:
-    """A finished fit of a job: its frames, its model, the last state and the `info` of the last step.
-
-    `quantized` is the compact model, where one was asked for.
-    """
-
-    job: FitJob
-    clip: Clip
-    model: VideoModel
-    state: FitState
-    info: FitInfo
-    checkpoint: Checkpoint
-    quantized: Quantized | None = None
-
-    def save_checkpoint(self) -> None:
-        """Save the last state, so that the fit need not be repeated if its model cannot be written."""
-        self.checkpoint.try_save(self.state)
-
-    def save(self, scores: Evaluation | None = None) -> None:
-        """Write the model, with its mean scores once they are measured."""
-        metadata = (
-            _describe_clip(self.job, self.clip)
-            | describe_fit(self.job.config, self.state)
-            | ({} if scores is None else mean_scores(scores))
-        )
-        if Path(self.job.target).suffix.lower() == COMPACT_SUFFIX:
-            save_compact(self.job.target, self.quantized, metadata=metadata)
-        else:
-            save_video_model(self.job.target, self.model, metadata=metadata)
-
-    def save_to(self, path: Path, scores: Evaluation | None = None) -> "FitRun":
-        """Write the model to `path`; returns the run with that as its target."""
-        moved = dataclasses.replace(self, job=dataclasses.replace(self.job, target=str(path)))
-        moved.save(scores)
-        return moved
-
-
 def run_fit(
     job: FitJob,
     observer: OpenObserver,
     *,
-    resume: Literal["required", "if possible", "never"] = "if possible",
+    resume: bool = True,
+    measure: Callable[[VideoModel, np.ndarray], Evaluation] = evaluate,
     on_checkpoint_error: CheckpointError = lambda error, step: None,
-) -> FitRun:
-    """Fit the frames of a job, from its checkpoint if it resumes.
+) -> dict[str, Any]:
+    """Fit the frames of a job, from its checkpoint if there is one, and write its model; returns the job's record.
 
-    With `resume` "never", the first step removes an old checkpoint. The observer is opened once the frames are read.
-    Neither the model nor the last state nor a record is written: see `FitRun`.
+    The record is described in `fit_job`. The checkpoint, then that of the last step, stays until the caller removes it.
+    Without `resume` the first step removes an earlier one. The observer is opened once the frames are read; `measure`
+    computes the scores.
 
     Raises `Stopped` if the observer stops the fit, `FitDiverged` as `fit_steps`, ValueError and OSError for frames that
-    cannot be read or fitted, and for a checkpoint that is required.
+    cannot be read or fitted, for outputs that cannot be written, and for a checkpoint that is damaged or of another
+    fit.
     """
     require(
         Path(job.target).suffix.lower() != COMPACT_SUFFIX or job.config.is_compact,
@@ -158,30 +108,69 @@ def run_fit(
         clip = dataclasses.replace(clip, fps=job.fps or clip.fps)
     _limit_compiled(clip.frames.shape)
     checkpoint = Checkpoint(job.checkpoint, job.config, fingerprint(clip), on_checkpoint_error)
-    state = None if resume == "never" else checkpoint.load(required=resume == "required")
-    room = leave_room(job.config.size_mb, _describe_clip(job, clip))
-    config = dataclasses.replace(job.config, size_mb=room)
+    state = checkpoint.load() if resume else None
+    span = {"frames": limit_range(job.frames, clip.num_declared)}
+    about = describe_source(clip, job.config.seed) | span | describe_reading(clip) | job.metadata
+    config = dataclasses.replace(job.config, size_mb=leave_room(job.config.size_mb, about))
     steps = fit_steps(clip.frames, config, state)
     with observer(clip, state) as observe:
-        if resume == "never":  # an earlier fit could be resumed by mistake; its checkpoint goes once a step is taken
+        if not resume:  # an earlier fit could be resumed by mistake; its checkpoint goes once a step is taken
             steps = itertools.chain([next(steps)], steps)
             job.checkpoint.unlink(missing_ok=True)
         state, info = run_steps(steps, observe, checkpoint, job.checkpoint_seconds)
     model, quantized = finish(state, clip.frames, config, clip.fps)
-    return FitRun(job, clip, model, state, info, checkpoint, quantized)
+    scores = measure(model, clip.frames)
+    about |= describe_fit(job.config, state) | mean_scores(scores)
+
+    def save(path: Path) -> Path:
+        if path.suffix.lower() == COMPACT_SUFFIX:
+            return save_compact(path, quantized, metadata=about)
+        return save_video_model(path, model, metadata=about)
+
+    _write_model(job, save)
+    return {
+        "asked": job.request,
+        "num_frames": clip.num_frames,
+        "size": list(clip.size),
+        "fps": clip.fps,
+        "num_gaussians": model.num_gaussians,
+        "psnr": list(scores.psnr),
+        "ssim": list(scores.ssim),
+        **mean_scores(scores),
+        "steps": info.step,
+        "seconds": round(info.seconds, 2),
+        "stopped_by": info.stopped_by,
+        "file_bytes": os.path.getsize(job.target),
+        "file_digest": file_digest(job.target),
+        "peak_bytes": peak_bytes(),
+        "notes": list(clip.notes),
+        "warnings": missed_psnr(job.config, scores.mean_psnr),
+    }
+
+
+def _write_model(job: FitJob, save: Callable[[Path], Path]) -> None:
+    """Write the model; if that fails, the fit is kept by its checkpoint, or the model in the folder for such files."""
+    if not job.checkpoint.exists():
+        write_or_keep(Path(job.target), save)
+        return
+    try:
+        save(Path(job.target))
+    except OSError as error:
+        text = f"The fit is kept in {job.checkpoint}: the same command writes the model."
+        raise OutputError(f"{error} {text}") from error
 
 
 def run_steps(
     steps: Iterable[tuple[FitState, FitInfo]],
     observe: Observer,
-    checkpoint: Checkpoint | None = None,
+    checkpoint: Checkpoint,
     seconds: float | None = None,
 ) -> tuple[FitState, FitInfo]:
-    """Take all steps of a fit and return the last; the state is saved every so many `seconds`.
+    """Take all steps of a fit and return the last; the state is saved every so many `seconds`, and at the end.
 
     Raises as `run_fit`.
     """
-    saved, spent, waited = time.monotonic(), time.process_time(), waiting_seconds()
+    saved = time.monotonic()
     try:
         for state, info in steps:
             stop = observe(state, info) and info.progress < 1
@@ -189,41 +178,27 @@ def run_steps(
             longest = (CHECKPOINT_SECONDS if seconds is None else seconds) * (1 if is_known_good(state) else 2)
             due = time.monotonic() - saved > longest
             if stop or due or info.progress >= 1:
-                now = time.process_time(), waiting_seconds()
-                state.processor_seconds += now[0] - spent
-                state.waiting_seconds += max(now[1] - waited, 0.0)  # threads that have ended are not counted
-                spent, waited = now
-            if stop or due:
-                if checkpoint is not None:
-                    checkpoint.try_save(state)
+                checkpoint.try_save(state)
                 saved = time.monotonic()
             if stop:
                 raise Stopped(f"stopped after step {info.step}")
     except FitDiverged as error:
-        if checkpoint is not None and error.state is not None:
+        if error.state is not None:
             checkpoint.try_save(error.state)
         raise
     return state, info
 
 
-def _describe_clip(job: FitJob, clip: Clip) -> dict[str, Any]:
-    """Metadata of a fitted model: its clip, the range of frames, the seed, and how it was read."""
-    frames = limit_range(job.frames, clip.num_declared)
-    return describe_source(clip, job.config.seed) | {"frames": frames} | describe_reading(clip) | job.metadata
-
-
 def describe_fit(config: FitConfig, state: FitState) -> dict[str, Any]:
     """Metadata of how a model was fitted: version, budgets and steps.
 
-    A fit by `minutes` depends on the load of the machine. Its metadata also hold the seconds of the clock, of the
-    processors, and of waiting for processors.
+    A fit by `minutes` depends on the load of the machine: its metadata also hold the seconds of the clock.
     """
     budgets = {name: getattr(config, name) for name in ("steps", "minutes", "quality", "size_mb", "psnr")}
     about = {"version": __version__, "steps": state.step}
     about["budget"] = {name: value for name, value in budgets.items() if value is not None}
     if config.minutes is not None:
         about |= {"fit_seconds": round(state.seconds, 2)}
-        about |= {name: round(getattr(state, name), 2) for name in ("processor_seconds", "waiting_seconds")}
     return about
 
 
@@ -232,7 +207,8 @@ def missed_psnr(config: FitConfig, psnr: float) -> list[str]:
     is_limited = config.quality is not None or config.size_mb is not None
     if config.psnr is None or is_limited or psnr >= config.psnr - TOLERATED_DB:
         return []
-    return [f"expected {config.psnr:g} dB, got {psnr:.2f}."]
+    cure = "Give more --minutes or --steps, or more --gaussians at the start."
+    return [f"--psnr: expected {config.psnr:g} dB, got {psnr:.2f}. {cure}"]
 
 
 def mean_scores(scores: Evaluation) -> dict[str, float]:
@@ -257,23 +233,11 @@ _SHAPES: set[tuple[int, ...]] = set()
 # -------------------------------------------------------------------------------------------- one fit with a record
 
 
-class Progress(NamedTuple):
-    """Progress of a job: `fraction` in [0, 1], running PSNR in dB, steps, seconds spent and left, as in `FitInfo`."""
-
-    name: str
-    fraction: float
-    psnr: float
-    step: int
-    num_gaussians: int
-    seconds: float
-    seconds_left: float
+#: Receives the last step of a running job now and then, and returns whether to go on.
+Report = Callable[[FitInfo], bool]
 
 
-#: Receives the progress of a job and returns whether to go on.
-Report = Callable[[Progress], bool]
-
-
-def _make_reporter(name: str, report: Report) -> Observer:
+def _make_reporter(report: Report) -> Observer:
     """An observer that reports the progress of a job now and then."""
     reported = time.monotonic()
 
@@ -282,94 +246,35 @@ def _make_reporter(name: str, report: Report) -> Observer:
         if time.monotonic() - reported <= REPORT_SECONDS and info.step != 1 and info.progress < 1:
             return False
         reported = time.monotonic()
-        return not report(
-            Progress(name, info.progress, info.psnr, info.step, info.num_gaussians, info.seconds, info.seconds_left)
-        )
+        return not report(info)
 
     return observe
 
 
-def fit_job(job: FitJob, report: Report = lambda progress: True) -> dict[str, Any]:
+def fit_job(job: FitJob, report: Report = lambda info: True) -> dict[str, Any]:
     """Run the job, or what is left of it; returns its record. A process runs one job at a time.
 
     The record: `asked` (the request), `num_frames`, `size`, `fps`, `num_gaussians`, `psnr` and `ssim` by frame,
     `mean_psnr`, `mean_ssim`, `steps`, `seconds` (spent fitting), `stopped_by`, `file_bytes`, `file_digest`,
-    `peak_bytes` (of the process, so far) and `warnings`.
+    `peak_bytes` (of the process, so far), `notes` (of the clip) and `warnings`.
 
     Raises `Stopped` if `report` returns False; ValueError and OSError for a clip that cannot be read or fitted and
     outputs that cannot be written; `FitDiverged` as `fit_steps`.
     """
     if record := read_record(job):
         return record
-    with _lock_target(job):
-        return read_record(job) or _fit_and_record(job, report)  # the previous holder of the lock may have finished it
-
-
-@contextmanager
-def _lock_target(job: FitJob) -> Iterator[None]:
-    """Hold the lock of the target, for which a job waits a while."""
-    until = time.monotonic() + WAIT_SECONDS
-    with ExitStack() as stack:
-        while True:
-            try:
-                stack.enter_context(lock_output(Path(job.target), own=(job.checkpoint, job.record)))
-                break
-            except OutputError as error:
-                if not isinstance(error.__cause__, BlockingIOError) or time.monotonic() > until:
-                    raise
-                time.sleep(0.5)
-        yield
-
-
-def _fit_and_record(job: FitJob, report: Report) -> dict[str, Any]:
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        run = run_fit(job, lambda clip, state: nullcontext(_make_reporter(job.name, report)))
-    run.save_checkpoint()  # the evaluation may be interrupted
-    clip, info = run.clip, run.info
-    scores = evaluate(run.model, clip.frames)
-    if job.checkpoint.exists():
-        run.save(scores)
-    else:
-        write_or_keep(Path(job.target), lambda path: run.save_to(path, scores))
-    record = {
-        "asked": job.request,
-        "num_frames": clip.num_frames,
-        "size": list(clip.size),
-        "fps": clip.fps,
-        "num_gaussians": run.model.num_gaussians,
-        "psnr": [round(one, 4) for one in scores.psnr],
-        "ssim": [round(one, 5) for one in scores.ssim],
-        **mean_scores(scores),
-        "steps": info.step,
-        "seconds": round(info.seconds, 2),
-        "stopped_by": info.stopped_by,
-        "file_bytes": os.path.getsize(job.target),
-        "file_digest": file_digest(job.target),
-        "peak_bytes": peak_bytes(),
-        "warnings": [
-            *(clip.notes if job.index is None else ()),
-            *dict.fromkeys(" ".join(str(warning.message).split()) for warning in caught),
-            *busy_processors(run),
-            *(f"psnr: {text}" for text in missed_psnr(job.config, scores.mean_psnr)),
-        ],
-    }
-    with atomic_path(job.record) as temporary:
-        temporary.write_text(json.dumps(record) + "\n")
-    job.checkpoint.unlink(missing_ok=True)
-    return record
-
-
-def busy_processors(run: FitRun) -> list[str]:
-    """A warning if a fit by minutes waited for processors longer than it computed; otherwise no text."""
-    got = run.state.processor_seconds
-    asked = got + run.state.waiting_seconds
-    if run.info.stopped_by != "minutes" or got >= LEAST_PROCESSOR_FRACTION * asked:
-        return []
-    return [
-        f"the processors were busy: this fit got {got:,.1f} of the {asked:,.1f} processor seconds that its threads "
-        f"asked for, and took {run.info.step:,} steps. Give more --minutes, or use a quieter machine."
-    ]
+    with lock_output(Path(job.target), own=(job.checkpoint, job.record), wait=WAIT_SECONDS):
+        if record := read_record(job):  # the previous holder of the lock may have finished it
+            return record
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            record = run_fit(job, lambda clip, state: nullcontext(_make_reporter(report)))
+        texts = dict.fromkeys(" ".join(str(warning.message).split()) for warning in caught)
+        record["warnings"] = [*texts, *record["warnings"]]
+        with atomic_path(job.record) as temporary:
+            temporary.write_text(json.dumps(record) + "\n")
+        job.checkpoint.unlink(missing_ok=True)
+        return record
 
 
 def peak_bytes() -> int | None:

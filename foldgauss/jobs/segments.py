@@ -11,21 +11,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from foldgauss._runtime.checks import invalid, is_integer, is_within, require
 from foldgauss._runtime.settings import flatten
+from foldgauss.io import FrameIndex, index_video, join_segments, read_indexed
 from foldgauss.io._atomic import OutputError, atomic_path
 from foldgauss.io.media.clip import AS_STORED, Reading
-from foldgauss.io.media.indexing import FrameIndex, index_video, read_indexed
-from foldgauss.io.models.segmented import join_segments
 from foldgauss.io.models.video_model import MODEL_SUFFIX, keep_origin, load_video_model, read_metadata
 from foldgauss.io.provenance import describe_reading
 from foldgauss.jobs.job import FitJob, file_digest, limit_range, stamp_clip
 from foldgauss.jobs.runner import mean_scores
-from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.models.metrics import Evaluation, psnr, ssim
-from foldgauss.video.segmented.segmented_video import Segment, SegmentedVideo, plan_segments
+from foldgauss.video import Evaluation, FitConfig, Segment, SegmentedVideo, plan_segments, psnr, ssim
 
 #: Default length of a segment.
 SEGMENT_SECONDS = 10.0
@@ -33,8 +29,6 @@ SEGMENT_SECONDS = 10.0
 OVERLAP = 8
 #: What a joined file has of each segment beside its own file, in 10^6 bytes, at most: its properties and metadata.
 _MB_PER_SEGMENT = 0.004
-#: Number of frames on either side of an overlap that it is compared with.
-BESIDE = 8
 _PLAN = "plan.json"
 _INDEX = "index.npz"
 #: How the names of files of a fit in the folder begin, of unfinished ones with a dot.
@@ -60,8 +54,8 @@ class LongFit:
         records: Mapping[str, Mapping[str, Any]],
         *,
         on_frame: Callable[[], None] = lambda: None,
-    ) -> "JoinedFit":
-        """Write the segments as one model, once all jobs are finished; `records` by the jobs' names.
+    ) -> Evaluation:
+        """Write the segments as one model, once all jobs are finished, and return its scores; `records`: by job.
 
         Frames that two segments share are scored as they are played. Equal segments give equal bytes. The folder
         stays, see `clean_up`. Raises as `join_segments`, and `OutputError` if a segment's file is not as recorded.
@@ -78,13 +72,13 @@ class LongFit:
         fades = [(b, stop) for (_, stop), (b, _) in zip(self.spans[:-1], self.spans[1:], strict=True) if b < stop]
         if fades:
             self._score_fades(sources, fades, scores, on_frame)
-        joined = JoinedFit(*map(tuple, scores.tolist()), self.target, tuple(fades))
+        joined = Evaluation(*map(tuple, scores.tolist()))
         if len(sources) == 1:  # an ordinary model
             with atomic_path(self.target) as temporary:
                 shutil.copyfile(sources[0][1], temporary)
             return joined
         each = [read_metadata(job.target) for job in self.jobs]
-        summed = [name for name in ("steps", "fit_seconds", "processor_seconds", "waiting_seconds") if name in each[0]]
+        summed = [name for name in ("steps", "fit_seconds") if name in each[0]]
         about = keep_origin(each[0], "version", "budget") | {name: sum(one[name] for one in each) for name in summed}
         join_segments(self.target, sources, metadata=self.metadata | mean_scores(joined) | about)
         return joined
@@ -111,31 +105,6 @@ class LongFit:
                 entry.unlink()
         with suppress(OSError):  # files of others
             self.folder.rmdir()
-
-
-@dataclasses.dataclass(frozen=True)
-class JoinedFit(Evaluation):
-    """A joined model and its scores: `psnr` in dB and `ssim` of every frame as played; `fades`: the shared frames."""
-
-    path: Path
-    fades: tuple[tuple[int, int], ...]
-
-    @property
-    def seam_drop(self) -> float | None:
-        """Mean PSNR in dB by which shared frames are worse than the `BESIDE` on either side; None without any."""
-        drops = seam_drops(np.asarray(self.psnr), self.fades)
-        return float(drops.mean()) if len(drops) else None
-
-
-def seam_drops(
-    scores: Float[np.ndarray, " num_frames"], fades: Sequence[tuple[int, int]], beside: int = BESIDE
-) -> Float[np.ndarray, " fades"]:
-    """For each overlap, the mean score of `beside` frames on either side minus its own mean."""
-    drops = []
-    for first, stop in fades:
-        around = np.concatenate([scores[max(first - beside, 0) : first], scores[stop : stop + beside]])
-        drops.append(around.mean() - scores[first:stop].mean())
-    return np.array(drops)
 
 
 def segments_folder(target: str | os.PathLike) -> Path:
@@ -250,22 +219,15 @@ def _divide_size(config: FitConfig, spans: Sequence[tuple[int, int]], metadata: 
 
 def _check_folder(folder: Path) -> None:
     """Raise ValueError for a folder with files other than those of a fit."""
-    if not folder.is_dir():
-        return
-    foreign = sorted(entry.name for entry in folder.iterdir() if not entry.name.startswith(_OWN))
-    for name in foreign[:1]:
-        raise invalid(
-            "target", expected=f"only files of a fit in {folder}", got=f"{name!r} in it", cure="Move it away."
-        )
-
-
-def read_segment_seconds(target: str | os.PathLike) -> float | None:
-    """The length of segments in the plan of an unfinished fit; None if there is none."""
-    try:
-        seconds = json.loads((segments_folder(target) / _PLAN).read_text())["asked"]["segment_seconds"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return None
-    return seconds if is_within(seconds, "(0, 1e9]") else None
+    names = sorted(entry.name for entry in folder.iterdir()) if folder.is_dir() else []
+    foreign = [name for name in names if not name.startswith(_OWN)]
+    require(
+        not foreign,
+        "target",
+        expected=f"only files of a fit in {folder}",
+        got=f"{', '.join(map(repr, foreign[:1]))} in it",
+        cure="Move it away.",
+    )
 
 
 def _load_plan(folder: Path, request: dict[str, Any]) -> dict[str, Any] | None:
@@ -281,7 +243,7 @@ def _load_plan(folder: Path, request: dict[str, Any]) -> dict[str, Any] | None:
     pairs = {name: (before.get(name), now[name]) for name in now if name != "config" and before.get(name) != now[name]}
     require(
         not pairs,
-        "resume",
+        "overwrite",
         expected=", ".join(f"{name}={pair[0]!r}" for name, pair in pairs.items()),
         got=", ".join(f"{name}={pair[1]!r}" for name, pair in pairs.items()),
         cure=f"An unfinished fit is in {str(folder)!r}: give its options, or start over with --overwrite.",

@@ -14,15 +14,17 @@ import signal
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any
 
 from foldgauss._runtime.checks import invalid, is_integer, require
+from foldgauss._runtime.optional_imports import import_optional
 from foldgauss._runtime.threads import available_cores
 from foldgauss.jobs.job import FitJob, read_record
-from foldgauss.jobs.runner import Progress, Report, Stopped, fit_job
+from foldgauss.jobs.runner import Report, Stopped, fit_job
+from foldgauss.video import FitInfo
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -53,7 +55,8 @@ class Outcome:
     failure: str | None = None
 
 
-OnProgress = Callable[[Progress], None]
+#: Receives the name of a running job and its last step, now and then.
+OnProgress = Callable[[str, FitInfo], None]
 
 
 def run_here(
@@ -63,28 +66,15 @@ def run_here(
 
     Raises `Stopped` once `should_stop` returns True and the running job has written its checkpoint.
     """
-    waiting = yield from _finished_outcomes(jobs)
-
-    def report(progress: Progress) -> bool:
-        on_progress(progress)
-        return not should_stop()
-
-    for job in waiting:
+    for job in jobs:
         if should_stop():
             raise Stopped("stopped between two jobs")
+
+        def report(info: FitInfo, name: str = job.name) -> bool:
+            on_progress(name, info)
+            return not should_stop()
+
         yield _run_job(job, report)
-
-
-def _finished_outcomes(jobs: Sequence[FitJob]) -> Generator[Outcome, None, list[FitJob]]:
-    """Outcomes of the jobs that are finished already; returns the others."""
-    waiting = []
-    for job in jobs:
-        record = read_record(job)
-        if record is None:
-            waiting.append(job)
-        else:
-            yield Outcome(job, record)
-    return waiting
 
 
 def _run_job(job: FitJob, report: Report) -> Outcome:
@@ -104,27 +94,6 @@ def one_line(error: BaseException) -> str:
     return text if plain else f"{type(error).__name__}: {text}"[:300]
 
 
-@dataclasses.dataclass(frozen=True)
-class WorkerPool:
-    """Workers of dask.distributed, as yielded by `local_workers` and `running_cluster`.
-
-    `cluster` is that of this machine; None for workers that are started elsewhere.
-    """
-
-    client: "Client"
-    cluster: Any = None
-
-    @property
-    def threads(self) -> int:
-        """Number of jobs that can run at once, now. Raises `SchedulerLost`."""
-        try:
-            if self.client.status not in ("running", "connecting"):
-                raise SchedulerLost(_LOST)
-            return sum(self.client.nthreads().values())
-        except (OSError, TimeoutError) as error:
-            raise SchedulerLost(_LOST) from error
-
-
 @contextmanager
 def _silence_dask() -> Iterator[None]:
     """dask logs a traceback for each worker that dies; here outcomes report what matters."""
@@ -140,8 +109,8 @@ def _silence_dask() -> Iterator[None]:
 
 
 @contextmanager
-def local_workers(count: int, *, threads: int | None = None) -> Iterator["WorkerPool"]:
-    """A pool of `count` processes of this machine with `threads` threads each (default: an equal part of the cores).
+def local_workers(count: int, *, threads: int | None = None) -> Iterator["Client"]:
+    """The dask client of `count` processes of this machine, with `threads` each (default: an equal part of the cores).
 
     Workers end with this process, however it ends, and are replaced when they die. They import the program that starts
     them: call this under `if __name__ == "__main__":`, or no worker will start.
@@ -150,8 +119,7 @@ def local_workers(count: int, *, threads: int | None = None) -> Iterator["Worker
     """
     for name, value in (("workers", count), ("threads", 1 if threads is None else threads)):
         require(is_integer(value, 1), name, expected="a whole number >= 1", got=repr(value))
-    distributed = _import_distributed("workers")
-    import dask
+    distributed, dask = import_optional("distributed", "distributed"), import_optional("dask", "distributed")
 
     threads = max(1, available_cores() // count) if threads is None else threads
     environment = {"FOLDGAUSS_NUM_THREADS": str(threads)}
@@ -182,7 +150,7 @@ def local_workers(count: int, *, threads: int | None = None) -> Iterator["Worker
         cluster.loop.add_callback(_block_ctrl_c)
         client = stack.enter_context(distributed.Client(cluster, set_as_default=False))
         cluster.scale(count)
-        yield WorkerPool(client, cluster)
+        yield client
 
 
 def _block_ctrl_c() -> None:
@@ -193,7 +161,7 @@ def _block_ctrl_c() -> None:
 
 
 @contextmanager
-def running_cluster(address: str) -> Iterator["WorkerPool"]:
+def running_cluster(address: str) -> Iterator["Client"]:
     """The workers of the scheduler at `address`, as tcp://host:8786.
 
     They must find clips and outputs by the same paths. Start them with one thread each, `dask worker --nthreads 1`: a
@@ -201,7 +169,7 @@ def running_cluster(address: str) -> Iterator["WorkerPool"]:
 
     Raises `SchedulerLost` if no scheduler answers, ImportError if dask.distributed is not installed.
     """
-    distributed = _import_distributed("scheduler")
+    distributed = import_optional("distributed", "distributed")
     require(
         _ADDRESS.fullmatch(address),
         "scheduler",
@@ -218,32 +186,29 @@ def running_cluster(address: str) -> Iterator["WorkerPool"]:
             text = str(invalid("scheduler", expected="the address of a running scheduler", got=got, cure=cure))
             raise SchedulerLost(text) from error
         with client:
-            yield WorkerPool(client)
-
-
-def _import_distributed(what: str):
-    try:
-        import distributed
-    except ImportError as error:
-        raise ImportError(f"{what}: needs dask.distributed: pip install 'foldgauss[distributed]'.") from error
-    return distributed
+            yield client
 
 
 def run_on(
-    pool: WorkerPool,
+    client: "Client",
     jobs: Sequence[FitJob],
     on_progress: OnProgress,
     *,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> Iterator[Outcome]:
-    """Outcomes of the jobs in the order in which they end, run by the workers of the pool.
+    """Outcomes of the jobs in the order in which they end, run by the workers of a dask client.
 
     Raises `Stopped` once `should_stop` returns True and the workers have written their checkpoints, `SchedulerLost`.
     """
     from distributed import Event
 
-    waiting = deque((yield from _finished_outcomes(jobs)))
-    client, topic = pool.client, f"foldgauss-{secrets.token_hex(6)}"
+    waiting: deque[FitJob] = deque()
+    for job in jobs:
+        if record := read_record(job):  # finished already
+            yield Outcome(job, record)
+        else:
+            waiting.append(job)
+    topic = f"foldgauss-{secrets.token_hex(6)}"
     running: list[tuple[Any, FitJob]] = []
     stop, events = Event(topic, client=client), queue.SimpleQueue()
     # Events arrive on the client's own thread; `on_progress` is called on this one.
@@ -251,14 +216,18 @@ def run_on(
     seen = time.monotonic()  # when there were workers
     try:
         while waiting or running:
-            threads = pool.threads
-            seen = time.monotonic() if threads else _wait_for_workers(pool, seen)
+            threads = _count_threads(client)
+            seen = time.monotonic() if threads else seen
+            if time.monotonic() - seen > NO_WORKERS_SECONDS:
+                cure = _NONE_HERE if client.cluster else _NONE_THERE
+                raise SchedulerLost(f"No worker for {NO_WORKERS_SECONDS:g} s. Finished jobs are kept: {cure}.")
             while waiting and len(running) < threads:  # no more: dask blames all jobs of a worker that dies
                 job = waiting.popleft()
                 running.append((client.submit(_run_on_worker, job, topic, pure=False), job))
             time.sleep(_POLL_SECONDS)
             while not events.empty():
-                on_progress(Progress(*events.get()))
+                name, *info = events.get()
+                on_progress(name, FitInfo(*info))
             ended = [pair for pair in running if pair[0].done()]
             running = [pair for pair in running if pair not in ended]
             for future, job in ended:
@@ -275,12 +244,14 @@ def run_on(
             client.cancel([future for future, _ in running])
 
 
-def _wait_for_workers(pool: WorkerPool, seen: float) -> float:
-    """Returns `seen`, when there were workers. Raises `SchedulerLost` after `NO_WORKERS_SECONDS` without any."""
-    if time.monotonic() - seen > NO_WORKERS_SECONDS:
-        cure = _NONE_HERE if pool.cluster else "start some, dask worker ADDRESS --nthreads 1, and run the command again"
-        raise SchedulerLost(f"No worker for {NO_WORKERS_SECONDS:g} s. Finished jobs are kept: {cure}.")
-    return seen
+def _count_threads(client: "Client") -> int:
+    """Number of jobs that can run at once, now. Raises `SchedulerLost`."""
+    try:
+        if client.status in ("running", "connecting"):
+            return sum(client.nthreads().values())
+    except (OSError, TimeoutError) as error:
+        raise SchedulerLost(_LOST) from error
+    raise SchedulerLost(_LOST)
 
 
 def _outcome(future: Any, job: FitJob) -> Outcome:
@@ -306,6 +277,7 @@ _NONE_HERE = (
     "they die while they start, for the reason above; a program of your own must start them under "
     '`if __name__ == "__main__":`'
 )
+_NONE_THERE = "start some, dask worker ADDRESS --nthreads 1, and run the command again"
 _LOST = "The scheduler does not answer any more. Finished jobs are kept: start one, and run the command again."
 
 
@@ -316,8 +288,8 @@ def _run_on_worker(job: FitJob, topic: str) -> tuple[dict[str, Any] | None, str 
     worker = get_worker()
     stop = Event(topic)
 
-    def report(progress: Progress) -> bool:
-        worker.log_event(topic, tuple(progress))
+    def report(info: FitInfo) -> bool:
+        worker.log_event(topic, (job.name, *info))
         return not stop.is_set()
 
     outcome = _run_job(job, report)

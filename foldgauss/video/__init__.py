@@ -9,11 +9,10 @@ from foldgauss.video.editing.chain import Edit, edit
 from foldgauss.video.editing.edited_video import EditedVideo, Layer
 from foldgauss.video.editing.overlays import SelectedGaussians
 from foldgauss.video.editing.timing import Clock, Span
-from foldgauss.video.fitting.compress import Compressed, compress
-from foldgauss.video.fitting.config import FitConfig, LearningRates, Loss, Strategy, Views
+from foldgauss.video.fitting.compress import compress
+from foldgauss.video.fitting.config import FitConfig, Growth, LearningRates, Loss, Strategy, Views
 from foldgauss.video.fitting.density_control import DensityControl
 from foldgauss.video.fitting.divergence import DivergenceWarning, FitDiverged
-from foldgauss.video.fitting.growth import Growth
 from foldgauss.video.fitting.loop import FitInfo, FitResult, FitState, fit, fit_steps, start_from
 from foldgauss.video.fitting.losses import register_loss
 from foldgauss.video.models.density import density_image
@@ -55,7 +54,6 @@ from foldgauss.video.selection.selectors import (
 __all__ = [
     "CameraPath",
     "Clock",
-    "Compressed",
     "DensityControl",
     "DivergenceWarning",
     "Edit",

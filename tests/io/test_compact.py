@@ -21,6 +21,7 @@ from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, compress, layers
 from foldgauss.video.compression.chunks import LEAST, arrange, divide, divide_anew, find_layers, visible_spans
 from foldgauss.video.compression.quantize import (
+    TIME_BITS,
     Rule,
     _choose_degrees,
     column_names,
@@ -30,8 +31,7 @@ from foldgauss.video.compression.quantize import (
     quantize,
     quantize_chunk,
 )
-from foldgauss.video.compression.quantized_times import TIME_BITS
-from foldgauss.video.compression.sensitivity import estimate_sensitivities
+from foldgauss.video.compression.quantizer import estimate_sensitivities
 from foldgauss.video.models.metrics import evaluate
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.shared_paths import SharedPaths

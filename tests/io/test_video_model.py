@@ -11,7 +11,7 @@ from foldgauss.io import ModelFileError, load_video_model, save_video_model
 from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.io.models.model_file import save_model
 from foldgauss.video import FitConfig, fit_steps
-from foldgauss.video.fitting.growth import Growth
+from foldgauss.video.fitting.config import Growth
 from foldgauss.video.fitting.loop import to_model
 
 CONFIG = FitConfig(num_gaussians=60, steps=8, degree=2)
@@ -66,7 +66,7 @@ def test_checkpoint_keeps_what_growth_is_decided_by(tmp_path, monkeypatch):
     assert_same(whole, to_model(state, config, (24, 32), 25.0))
     save_checkpoint(path, state, config=config, source=SOURCE)  # growth is over
     assert load_checkpoint(path, config=config, source=SOURCE).statistics is None
-    with pytest.raises(ValueError, match=r"resume: expected strategy\.growth="):
+    with pytest.raises(ValueError, match=r"overwrite: expected strategy\.growth="):
         load_checkpoint(path, config=config.replace(**{"strategy.growth": None}), source=SOURCE)
 
 
@@ -74,13 +74,13 @@ def test_checkpoint_of_another_fit_is_refused(tmp_path):
     path = tmp_path / "c"
     state, _ = next(fit_steps(frames(), CONFIG))
     save_checkpoint(path, state, config=CONFIG, source=SOURCE)
-    with pytest.raises(ValueError, match=r"resume: expected degree=2, got degree=3"):
+    with pytest.raises(ValueError, match=r"overwrite: expected degree=2, got degree=3"):
         load_checkpoint(path, config=dataclasses.replace(CONFIG, degree=3), source=SOURCE)
     with pytest.raises(ValueError, match="num_frames"):
         load_checkpoint(path, config=CONFIG, source=SOURCE | {"num_frames": 4})
     for odd in ("none", ["num_frames"], 3):
         save_model(path, state, metadata={"config": odd, "source": SOURCE})
-        with pytest.raises(ValueError, match="resume: expected"):
+        with pytest.raises(ValueError, match="overwrite: expected"):
             load_checkpoint(path, config=CONFIG, source=SOURCE)
 
 
@@ -90,7 +90,7 @@ def test_kinds_are_not_mixed_up(tmp_path):
     with pytest.raises(ModelFileError, match="fit-checkpoint"):
         load_video_model(tmp_path / "c")
     save_video_model(tmp_path / "m", soft_model())
-    with pytest.raises(ValueError, match=r"resume|kind"):
+    with pytest.raises(ValueError, match=r"overwrite|kind"):
         load_checkpoint(tmp_path / "m", config=CONFIG, source=SOURCE)
 
 

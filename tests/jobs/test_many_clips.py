@@ -50,13 +50,13 @@ def test_what_has_no_clips_is_refused_in_words(tmp_path, place, error, message):
 @pytest.mark.parametrize(
     "names",
     [
-        {"one.mp4": "one.mp4", "One.avi": "One.avi", "two.v1.mp4": "two.v1"},
+        {"one.mp4": "one.mp4", "One.avi": "One.avi", "two.v1.mp4": "two.v1.mp4"},
         {  # the whole name of one may be the stem of another
             "a.mp4": "a.mp4",
             "a.avi": "a.avi",
             "a.mp4.mkv": "a.mp4.mkv",
             "a.mp4.mkv.gif": "a.mp4.mkv.gif",
-            "b.mov": "b",
+            "b.mov": "b.mov",
         },
     ],
 )
@@ -79,10 +79,10 @@ def test_settings_reach_each_job(tmp_path):
     made(tmp_path, "one.mp4", "two.mp4")
     config = FitConfig(steps=7)
     jobs = make_jobs(find_clips(tmp_path).clips, tmp_path, config, size=(8, 8), frames=(0, 3), checkpoint_seconds=2.0)
-    assert {Path(job.target).name for job in jobs} == {"one.safetensors", "two.safetensors"}
+    assert {Path(job.target).name for job in jobs} == {"one.mp4.safetensors", "two.mp4.safetensors"}
     for goal in ({"quality": 50.0}, {"size_mb": 1.0}, {"psnr": 30.0}):  # which ask for compact models
         jobs_of_goal = make_jobs(find_clips(tmp_path).clips, tmp_path, FitConfig(**goal))
-        assert {Path(job.target).name for job in jobs_of_goal} == {"one.fgz", "two.fgz"}
+        assert {Path(job.target).name for job in jobs_of_goal} == {"one.mp4.fgz", "two.mp4.fgz"}
     assert {(job.config.steps, job.size, job.frames, job.checkpoint_seconds) for job in jobs} == {
         (7, (8, 8), (0, 3), 2.0)
     }

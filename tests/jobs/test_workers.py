@@ -31,7 +31,7 @@ from foldgauss.jobs import (
 LASTING = dataclasses.replace(CONFIG, steps=100_000)
 
 
-def ignored(progress):
+def ignored(name, info):
     return None
 
 
@@ -70,21 +70,21 @@ def workers() -> list[multiprocessing.Process]:
 
 def test_workers_make_the_same_bits_and_tell_of_what_failed(crew, clips, done_here, tmp_path):
     told = []
-    outcomes = list(run_on(crew, jobs_into(tmp_path, clips), told.append))
+    outcomes = list(run_on(crew, jobs_into(tmp_path, clips), lambda *each: told.append(each)))
     assert {path.name: path.read_bytes() for path in tmp_path.glob("*.safetensors")} == done_here
     (failed,) = (outcome for outcome in outcomes if outcome.failure is not None)
     assert failed.job.name == "broken.mp4"
     assert "does not open as a video" in failed.failure
-    assert {progress.name for progress in told if progress.fraction == 1} == {f"clip{k}.mp4" for k in range(3)}
+    assert {name for name, info in told if info.progress == 1} == {f"clip{k}.mp4" for k in range(3)}
 
 
 @pytest.mark.parametrize(("cluster", "says"), [(None, "start some"), (object(), "if __name__")])
 def test_that_no_worker_comes_is_told_with_what_to_do(monkeypatch, clips, tmp_path, cluster, says):
     monkeypatch.setattr(pool, "NO_WORKERS_SECONDS", -1.0)
     monkeypatch.setattr(distributed, "Event", Mock())
-    client = Mock(status="running", nthreads=dict)
+    client = Mock(status="running", nthreads=dict, cluster=cluster)
     with pytest.raises(SchedulerLost, match=says):
-        list(run_on(pool.WorkerPool(client, cluster), jobs_into(tmp_path, clips), ignored))
+        list(run_on(client, jobs_into(tmp_path, clips), ignored))
 
 
 def test_two_commands_at_once_take_no_port_from_each_other(crew):
@@ -95,7 +95,7 @@ def test_a_killed_worker_is_replaced_and_goes_on_from_the_checkpoint(crew, clips
     (job,) = (job for job in jobs_into(tmp_path, clips) if job.name == "clip1.mp4")
     kills, firsts = [], []
 
-    def watch(progress):
+    def watch(name, progress):
         """Who tells of the first step is killed, once."""
         if not firsts or progress.step < firsts[-1]:
             firsts.append(progress.step)
@@ -108,13 +108,13 @@ def test_a_killed_worker_is_replaced_and_goes_on_from_the_checkpoint(crew, clips
     assert outcome.failure is None
     assert len(kills) == 1
     assert kills[0] not in [child.pid for child in workers()]
-    assert Path(job.target).read_bytes() == done_here["clip1.safetensors"]
+    assert Path(job.target).read_bytes() == done_here["clip1.mp4.safetensors"]
 
 
 def test_workers_keep_what_they_do_when_asked_to_stop(crew, clips, tmp_path):
     jobs, told = jobs_into(tmp_path, clips[1:], LASTING), []
     with pytest.raises(Stopped):
-        list(run_on(crew, jobs, told.append, should_stop=lambda: bool(told)))
+        list(run_on(crew, jobs, lambda *each: told.append(each), should_stop=lambda: bool(told)))
     assert any(job.checkpoint.exists() for job in jobs)
     assert not any(os.path.exists(job.target) for job in jobs)
 
@@ -125,7 +125,7 @@ def test_a_job_that_kills_whoever_takes_it_is_given_up(clips, tmp_path, monkeypa
     job = dataclasses.replace(jobs_into(tmp_path, clips[1:2], LASTING)[0], checkpoint_seconds=1e9)
     killed, begun = set(), time.monotonic()
 
-    def watch(progress):
+    def watch(name, progress):
         assert time.monotonic() - begun < 240
         for child in workers():
             if child.pid not in killed:

@@ -5,15 +5,27 @@ import numpy as np
 import pytest
 
 from foldgauss.video.fitting.adam import (
+    BETA1,
+    BETA2,
+    EPSILON,
     FRAME_TIME_ADAM,
     RateUnits,
-    adam_step,
     masked_adam,
     sparse_adam,
     update_frame_times,
+    update_paths,
 )
 from foldgauss.video.models.frame_times import FrameTimes, make_time_logits
 from foldgauss.video.models.row_layout import columns
+
+
+def adam_step(grad, first, second, counts, rates):
+    """The rule: what to subtract from the parameters, and both moments; `counts` includes this step."""
+    first = (BETA1 * first + (1 - BETA1) * grad).astype(first.dtype)
+    second = (BETA2 * second + (1 - BETA2) * grad**2).astype(second.dtype)
+    counts = counts.reshape(-1, *[1] * (grad.ndim - 1))
+    mean, square = first / (1 - BETA1**counts), second / (1 - BETA2**counts)
+    return rates * mean / (np.sqrt(square) + EPSILON), first, second
 
 
 def test_untouched_rows_stay_and_each_row_counts_its_own_steps():
@@ -94,6 +106,17 @@ def test_all_implementations_take_the_same_steps(width):
         for part, judge in zip(one, own, strict=True):
             np.testing.assert_allclose(part, judge, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(by_optax, own[0], atol=2e-5)  # its bias corrections are float32
+
+
+def test_a_step_of_the_paths_moves_visited_frames_only():
+    rng, shape = np.random.default_rng(0), (7, 2, 2, 3)
+    maps, first, second, grad = (rng.normal(size=shape).astype(np.float32) for _ in range(4))
+    before, visited = (maps, first, second**2, rng.integers(0, 40, 7).astype(np.int32)), np.arange(7) % 2 == 1
+    got = update_paths(before, grad, visited, np.float32(0.1))
+    change, *moments = adam_step(grad, *before[1:3], np.maximum(before[3] + visited, 1), np.float32(0.1))
+    for one, judge, old in zip(got, (maps - change, *moments, before[3] + 1), before, strict=True):
+        np.testing.assert_allclose(one[visited], judge[visited], rtol=2e-5, atol=1e-6)
+        np.testing.assert_array_equal(one[~visited], old[~visited])
 
 
 @pytest.mark.parametrize("units", [RateUnits(), RateUnits(0.06, 0.01)])

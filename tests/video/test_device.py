@@ -1,9 +1,6 @@
 """Fits by one compiled JAX program per step: equal to the CPU's, without calls to the host."""
 
 import dataclasses
-import os
-import subprocess
-import sys
 import threading
 
 import jax
@@ -13,7 +10,6 @@ from clips import moving_blobs
 from commands import run
 
 from foldgauss.io import write_image
-from foldgauss.io.models.checkpoint import load_checkpoint, save_checkpoint
 from foldgauss.io.models.video_model import load_video_model
 from foldgauss.render import RenderOptions, api
 from foldgauss.video import (
@@ -300,51 +296,6 @@ def test_assigned_arrays_are_used():
     assert state.rows[:, place].min() > 2
     assert np.abs(state.first - first).max() < 1e-2  # all else is as it was
     assert not state.changed
-
-
-FOUR_DEVICES = """
-import sys
-import jax
-kept, done, *folders = sys.argv[1:]
-sys.path[:0] = folders
-from test_device import FRAMES, GROWING, STEPS, load_checkpoint, save_checkpoint, stepped
-assert len(jax.devices()) == 4
-state = stepped(load_checkpoint(kept, config=GROWING, source={}))
-assert state.held.arrays.rows.sharding.num_devices == 4
-save_checkpoint(done, state, config=GROWING, source={})
-"""
-STEPS = 3
-
-
-def stepped(state: FitState) -> FitState:
-    step = JaxStepper(FRAMES, GROWING, state, "xla")
-    for _ in range(STEPS):
-        state.best_error = step.step(state, 0.1).loss
-        state.step += 1
-    return state
-
-
-@pytest.mark.slow
-def test_four_devices_match_one(tmp_path):
-    """Frames of a batch are shared out; sums over devices differ by rounding alone."""
-    flags = "--xla_force_host_platform_device_count=4 --xla_backend_optimization_level=0"
-    kept, done = tmp_path / "kept.safetensors", tmp_path / "done.safetensors"
-    here = os.path.dirname(__file__)
-    state = warm_state(GROWING)
-    save_checkpoint(kept, state, config=GROWING, source={})
-    subprocess.run(
-        [sys.executable, "-c", FOUR_DEVICES, str(kept), str(done), here, os.path.dirname(here)],
-        check=True,
-        env=os.environ | {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}", "JAX_PLATFORMS": "cpu"},
-        timeout=600,
-    )
-    one, four = stepped(state), load_checkpoint(done, config=GROWING, source={})
-    assert one.held.arrays.rows.sharding.num_devices == 1
-    assert four.best_error == pytest.approx(one.best_error, rel=1e-6)
-    for name in ("rows", "first", "second", "frame_errors", "time_logits", "path_maps", "path_first", "path_second"):
-        close(getattr(four, name), getattr(one, name), share=1e-4)
-    for own, other in zip(four.statistics, one.statistics, strict=True):
-        close(own, other, share=1e-4)
 
 
 # ---------------------------------------------------------------------------------------------- the door

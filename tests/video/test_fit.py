@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import time
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -31,7 +32,6 @@ from foldgauss.video.fitting.config import (
     MOST_PER_PIXEL,
     PRESETS,
     TYPICAL_LIFETIME,
-    chosen_interpolation,
     chosen_num_gaussians,
     planned_steps,
 )
@@ -194,9 +194,12 @@ def test_interpolation_ends():
     ids=["motion", "no motion", "alpha"],
 )
 def test_interpolation_is_on_by_default_where_it_is_supported(changes, alpha, default):
-    assert chosen_interpolation(FitConfig().replace(**changes), alpha=alpha) == default
-    asked = FitConfig().replace(**{"views.interpolation_fraction": 0.2}, **changes)
-    assert chosen_interpolation(asked, alpha=alpha) == 0.2
+    frames = np.zeros((3, 8, 8, 4 if alpha else 3), np.uint8)
+    config, motion = FitConfig().replace(**changes), SimpleNamespace(cuts=[], find_still=list)
+    made = interpolated_frames.make_interpolated(frames, config, lambda: motion)
+    assert (made.chance if made else 0) == default
+    asked = config.replace(**{"views.interpolation_fraction": 0.2, "views.error_fraction": 0.0})
+    assert interpolated_frames.make_interpolated(frames, asked, lambda: motion).chance == 0.2
 
 
 def test_still_clip_is_not_interpolated():
@@ -437,13 +440,6 @@ def test_start_from_reproduces_the_model(fitted):
     state = start_from(model, CONFIG, 10)
     assert (state.step, state.plan) == (0, 10)
     assert_same(to_model(state, CONFIG, model.size, model.fps), model)
-
-
-def test_start_uses_the_given_frame_times():
-    frames, logits = moving_blobs(), np.log([1.0, 1, 3, 1, 2])
-    state = start(frames, CONFIG, logits)
-    np.testing.assert_allclose(to_model(state, CONFIG, (48, 64), 25.0).frame_times.times()[1:3], [1 / 8, 2 / 8], 1e-5)
-    assert state.time_logits.dtype == np.float32
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from foldgauss.render import Camera, RenderOptions
 from foldgauss.video import FrameTimes, VideoModel, edit, layers
 from foldgauss.video.models.frame_times import make_time_logits
 from foldgauss.video.models.renderer import VideoRenderer
-from foldgauss.video.segmented.flatten import flatten_video
+from foldgauss.video.segmented.layering import flatten_video
 
 
 def _edited_before_a_longer_one():

@@ -8,11 +8,11 @@ from clips import moving_blobs
 
 from foldgauss.video import FitConfig, Loss, Strategy, Views, fit_steps
 from foldgauss.video.fitting.budget import StepPlanner
-from foldgauss.video.fitting.config import chosen_num_gaussians
+from foldgauss.video.fitting.config import EXTENT, PUBLISHED_STEPS, Growth, chosen_num_gaussians
 from foldgauss.video.fitting.densify import densify, reset_opacities
-from foldgauss.video.fitting.growth import EXTENT, PUBLISHED_STEPS, GradientStatistics, Growth
 from foldgauss.video.fitting.loop import start
 from foldgauss.video.fitting.schedule import choose_views
+from foldgauss.video.fitting.state import GradientStatistics
 from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
 from foldgauss.video.models.row_layout import columns
 

@@ -20,7 +20,7 @@ from foldgauss.render import Camera, project
 from foldgauss.video import EditedVideo, SegmentedVideo, VideoModel, edit, layers, select
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.shared_paths import MAX_PATHS, SharedPaths
-from foldgauss.video.segmented.flatten import flatten_video
+from foldgauss.video.segmented.layering import flatten_video
 from foldgauss.video.segmented.segmented_video import Segment
 from foldgauss.video.selection.contributions import Contributions
 

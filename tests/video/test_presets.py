@@ -10,8 +10,7 @@ from clips import moving_blobs
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions, cpu
 from foldgauss.video import FitConfig, LearningRates, Views, fit_steps
-from foldgauss.video.fitting.config import PRESETS, chosen_num_gaussians, planned_steps
-from foldgauss.video.fitting.growth import Growth
+from foldgauss.video.fitting.config import PRESETS, Growth, chosen_num_gaussians, planned_steps
 from foldgauss.video.fitting.initialize import initialize_uniform
 from foldgauss.video.fitting.loop import start
 from foldgauss.video.fitting.schedule import choose_views

@@ -29,7 +29,7 @@ from foldgauss.video import (
 )
 from foldgauss.video.models.frame_times import is_cut, make_time_logits
 from foldgauss.video.models.renderer import VideoRenderer
-from foldgauss.video.segmented.flatten import flatten_video
+from foldgauss.video.segmented.layering import flatten_video
 from foldgauss.video.segmented.segmented_video import MAX_PREPARED
 from foldgauss.video.tradeoff import measure_frame_rate
 

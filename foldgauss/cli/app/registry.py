@@ -58,7 +58,7 @@ EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
             Example("All defaults, into holiday.fgz", "foldgauss fit holiday.mp4"),
             Example("A quick draft of the first half second", "foldgauss fit holiday.mp4 --preset draft --frames 0:12"),
             Example("A file of a given size", "foldgauss fit holiday.mp4 --size-mb 2"),
-            Example("Frames as images; resume a stopped fit", "foldgauss fit frames/ --resume"),
+            Example("Frames as images", "foldgauss fit frames/"),
             Example(
                 "For slow motion above all",
                 "foldgauss fit holiday.mp4 --interpolation-fraction 0.3 --interpolation-end 1",

@@ -100,6 +100,6 @@ def compress_command(
     print_figures(str(target), figures)
     if clip is not None:
         for text in missed_psnr(FitConfig(quality=quality, size_mb=size_mb, psnr=psnr), after.mean_psnr):
-            warn(f"--psnr: {text} Give more --minutes, or fit a better model.")
+            warn(text)
     if sizes[1] >= sizes[0]:
         warn(f"{target} is no smaller than {model_path}.")

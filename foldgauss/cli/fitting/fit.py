@@ -3,16 +3,17 @@
 import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from foldgauss._runtime.checks import require
 from foldgauss._runtime.threads import num_threads
-from foldgauss.cli.app.application import Stopped, command, err, out, warn
+from foldgauss.cli.app.application import Stopped, command, err, warn
 from foldgauss.cli.app.signals import note_signals
-from foldgauss.cli.fitting.job_progress import report_fit
+from foldgauss.cli.fitting.job_progress import describe_continuation, report_fit, summarize_fit
 from foldgauss.cli.fitting.options import (
     PROGRESS,
     CheckpointSeconds,
@@ -25,7 +26,7 @@ from foldgauss.cli.fitting.options import (
     Workers,
     fit_options,
 )
-from foldgauss.cli.fitting.segments import describe_plan, fit_in_segments, plan_gaussians
+from foldgauss.cli.fitting.segments import describe_plan, fit_in_segments, plan_gaussians, print_plan
 from foldgauss.cli.shared.arguments import (
     Deinterlace,
     Frames,
@@ -36,27 +37,25 @@ from foldgauss.cli.shared.arguments import (
     parse_frames,
     parse_size,
 )
-from foldgauss.cli.shared.console import Display, choose_display, format_count, summarize_scores
+from foldgauss.cli.shared.console import Display, choose_display
 from foldgauss.cli.shared.files import check_output, name_after, refuse_existing, refuse_inputs
 from foldgauss.cli.shared.fit_progress import (
     Observer,
     display_progress,
-    print_json,
     save_previews,
 )
 from foldgauss.cli.shared.rendering import evaluate_with_progress
-from foldgauss.io._atomic import OutputError, lock_output, resolve, write_or_keep
-from foldgauss.io.history import HistoryFile, read_history, write_curves
+from foldgauss.io import HistoryFile, read_history, write_curves
+from foldgauss.io._atomic import lock_output, resolve
 from foldgauss.io.media.clip import DEINTERLACE, Clip, check_reading
 from foldgauss.io.models.compact import COMPACT_SUFFIX
 from foldgauss.io.models.video_model import MODEL_SUFFIX, check_model_name
-from foldgauss.jobs.job import FitJob
-from foldgauss.jobs.runner import FitRun, busy_processors, missed_psnr, run_fit
-from foldgauss.jobs.runner import Stopped as FitStopped
-from foldgauss.jobs.segments import read_segment_seconds
+from foldgauss.jobs import FitJob
+from foldgauss.jobs import Stopped as FitStopped
+from foldgauss.jobs.runner import run_fit
+from foldgauss.jobs.segments import SEGMENT_SECONDS, segments_folder
+from foldgauss.video import Evaluation, FitDiverged, FitInfo
 from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig, planned_steps
-from foldgauss.video.fitting.divergence import FitDiverged
-from foldgauss.video.fitting.loop import FitInfo
 from foldgauss.video.fitting.state import FitState, running_psnr
 from foldgauss.video.fitting.steppers.engines import choose_engine, describe_device
 
@@ -81,10 +80,6 @@ def fit(
     levels: Levels = None,
     deinterlace: Deinterlace = DEINTERLACE[0],
     overwrite: Overwrite = False,
-    resume: Annotated[
-        bool,
-        typer.Option("--resume", help="Continue a stopped fit from its checkpoint.", rich_help_panel=PROGRESS),
-    ] = False,
     history: Annotated[
         Path | None,
         typer.Option(
@@ -107,10 +102,9 @@ def fit(
 ) -> None:
     """Fit a model to a clip; the first of its budgets ends the fit.
 
-    A stopped fit has a checkpoint and continues with --resume. Long clips are fitted in segments, in parallel with
+    A stopped fit has a checkpoint: the same command continues it. Long clips are fitted in segments, in parallel with
     workers. Options for rare cases: docs/fit.md.
     """
-    in_segments = not (segment_seconds is None and workers is None and scheduler is None)
     target, config = _choose_target(video, target, config)
     job = FitJob(
         video.name,
@@ -125,59 +119,21 @@ def fit(
     display = choose_display(quiet, log_json)
     options = WorkerOptions(workers, scheduler, threads)
     context.with_resource(lock_output(target, own=(job.checkpoint,)))
-    refuse_existing(target, overwrite)
-    begun = read_segment_seconds(target) is not None and not job.checkpoint.exists() and (resume or not overwrite)
-    if begun or in_segments:
+    is_begun = job.checkpoint.exists() or segments_folder(target).exists()
+    refuse_existing(target, overwrite or is_begun)
+    if not (segment_seconds is None and workers is None and scheduler is None):
         for option, path in (("--history", history), ("--preview", preview)):
             require(path is None, option, expected="a fit in one piece", got="one in segments", cure="Leave it out.")
-        fit_in_segments(job, display, options, segment_seconds=segment_seconds, resume=resume, overwrite=overwrite)
+        seconds = SEGMENT_SECONDS if segment_seconds is None else segment_seconds
+        fit_in_segments(job, display, options, segment_seconds=seconds, overwrite=overwrite)
         return
-    curves = _check_records(video, history, preview, overwrite or resume)
-    _check_checkpoint(job.checkpoint, resume, overwrite)
-
-    @contextmanager
-    def observe(clip: Clip, state: FitState | None) -> Iterator[Observer]:
-        _print_plan(clip, config, display)
-        recorded = None
-        if history is not None:
-            recorded = HistoryFile(history) if state is None else HistoryFile(history, state.step, running_psnr(state))
-        previews = None if preview is None else save_previews(preview, clip, config)
-        with (
-            display_progress(display, "Fitting", history=recorded, preview=previews) as show,
-            stop_on_signals(show, job.checkpoint) as observer,
-        ):
-            yield observer
-
-    run = run_fit(
-        job,
-        observe,
-        resume="required" if resume else "never",
-        on_checkpoint_error=lambda error, step: warn(f"no checkpoint at step {step}: {error}"),
-    )
-    run = _save_model(run)
-    target = Path(run.job.target)
-    try:
-        if history is not None:
-            _save_curves(curves, history)
-        scores = evaluate_with_progress(run.model, run.clip.frames, shown=display in ("bar", "lines"))
-    except KeyboardInterrupt:
-        run.save_checkpoint()  # from which the evaluation can be repeated
-        if run.job.checkpoint.exists():
-            text = f"{run.job.target} is written, without its scores: add --resume --overwrite to measure them."
-            err.print(text, soft_wrap=True)
-        raise
-    try:
-        run.save(scores)
-    except OSError as error:
-        warn(f"{target} is written, but its scores could not be added: {error}")
-    job.checkpoint.unlink(missing_ok=True)
-    for text in missed_psnr(config, scores.mean_psnr):
-        warn(f"--psnr: {text} Give more --minutes or --steps, or more --gaussians at the start.")
-    for text in busy_processors(run):
-        warn(f"--minutes: {text}")
-    figures = summarize_scores(run.model, scores) | summarize_fit(run.info) | {"stopped_by": run.info.stopped_by}
-    figures |= {"file_bytes": target.stat().st_size}
-    report_fit(display, run.job.target, figures)
+    curves = _check_records(video, history, preview, overwrite or is_begun)
+    record = fit_with_progress(job, display, overwrite=overwrite, history=history, preview=preview)
+    if history is not None:
+        _save_curves(curves, history)
+    scores = Evaluation(record["psnr"], record["ssim"])
+    figures = summarize_fit(scores, [record], config) | {name: record[name] for name in ("steps", "stopped_by")}
+    report_fit(display, str(target), figures | {"file_bytes": record["file_bytes"]})
 
 
 def _choose_target(video: Path, out_path: Path | None, config: FitConfig) -> tuple[Path, FitConfig]:
@@ -198,32 +154,61 @@ def _choose_target(video: Path, out_path: Path | None, config: FitConfig) -> tup
     return out_path, config
 
 
-def summarize_fit(info: FitInfo) -> dict[str, float]:
-    """Duration and steps of a fit, as results show them."""
-    return {"fit_seconds": round(info.seconds, 2), "steps": info.step}
+def fit_with_progress(
+    job: FitJob,
+    display: Display,
+    *,
+    overwrite: bool = False,
+    history: Path | None = None,
+    preview: Path | None = None,
+) -> dict[str, Any]:
+    """The record of a job that is run here, from its checkpoint unless `overwrite`, with its progress displayed.
 
-
-@contextmanager
-def stop_on_signals(show: Observer, checkpoint: Path | None = None) -> Iterator[Observer]:
-    """An observer that shows each step and stops the fit after one during which SIGINT or SIGTERM arrived.
-
-    A stopped or diverged fit raises `cli.Stopped`, which says how to continue if the `checkpoint` exists.
+    SIGINT and SIGTERM stop the fit after a step. A stopped or diverged fit raises `cli.Stopped`, which says how to
+    continue if there is a checkpoint.
     """
-    with note_signals() as request:
 
-        def observe(state: FitState, info: FitInfo) -> bool:
-            request.stepping = True
-            show(state, info)
-            return bool(request.signal)
+    @contextmanager
+    def observe(clip: Clip, state: FitState | None) -> Iterator[Observer]:
+        _print_plan(clip, job.config, display)
+        recorded = None
+        if history is not None:
+            recorded = HistoryFile(history) if state is None else HistoryFile(history, state.step, running_psnr(state))
+        previews = None if preview is None else save_previews(preview, clip, job.config)
+        with (
+            display_progress(display, "Fitting", history=recorded, preview=previews) as show,
+            note_signals() as request,
+        ):
 
-        try:
-            yield observe
-        except FitStopped as error:
-            kept = checkpoint is not None and checkpoint.exists()
-            hint = "; add --resume to continue" if kept else "; nothing was saved"
-            raise Stopped(f"{error} by {request.signal}{hint}.") from error
-        except FitDiverged as error:
-            raise Stopped(str(error)) from error
+            def note_step(state: FitState, info: FitInfo) -> bool:
+                request.stepping = True
+                show(state, info)
+                return bool(request.signal)
+
+            try:
+                yield note_step
+            except FitStopped as error:
+                hint = describe_continuation(overwrite) if job.checkpoint.exists() else "Nothing was saved."
+                raise Stopped(f"{error} by {request.signal}. {hint}") from error
+            except FitDiverged as error:
+                raise Stopped(str(error)) from error
+
+    try:
+        record = run_fit(
+            job,
+            observe,
+            resume=not overwrite,
+            measure=partial(evaluate_with_progress, shown=display in ("bar", "lines")),
+            on_checkpoint_error=lambda error, step: warn(f"no checkpoint at step {step}: {error}"),
+        )
+    except KeyboardInterrupt:  # while scores are measured
+        if job.checkpoint.exists():
+            err.print(f"The fit is kept in {job.checkpoint}. {describe_continuation(overwrite)}", soft_wrap=True)
+        raise
+    job.checkpoint.unlink(missing_ok=True)
+    for text in record["warnings"]:
+        warn(text)
+    return record
 
 
 def _check_records(video: Path, history: Path | None, preview: Path | None, overwrite: bool) -> Path:
@@ -244,39 +229,6 @@ def _check_records(video: Path, history: Path | None, preview: Path | None, over
     return curves
 
 
-def _check_checkpoint(checkpoint: Path, resume: bool, overwrite: bool) -> None:
-    """Refuse a checkpoint that would be lost, and --resume without one."""
-    require(
-        resume or overwrite or not checkpoint.exists(),
-        "--out",
-        expected="a new fit",
-        got=f"a stopped one, which has a checkpoint, {checkpoint}",
-        cure="Continue it with --resume, or start over with --overwrite.",
-    )
-    require(
-        not resume or checkpoint.exists(),
-        "--resume",
-        expected=f"a stopped fit in {checkpoint}",
-        got="none",
-        cure="Start it without --resume.",
-    )
-
-
-def _save_model(run: FitRun) -> FitRun:
-    """Write the model before its evaluation, which may be interrupted; if that fails, also the state.
-
-    Returns the run with the path of the model as its target.
-    """
-    try:
-        return run.save_to(Path(run.job.target))
-    except OSError as error:
-        run.save_checkpoint()
-        if not run.job.checkpoint.exists():
-            return write_or_keep(Path(run.job.target), run.save_to)
-        text = f"The fit is kept in {run.job.checkpoint}: --resume continues it, and writes the model."
-        raise OutputError(f"{error} {text}") from error
-
-
 def _save_curves(path: Path, history: Path) -> None:
     """Plot the history; an error is only a warning, since the fit is finished."""
     try:
@@ -287,24 +239,16 @@ def _save_curves(path: Path, history: Path) -> None:
 
 def _print_plan(clip: Clip, config: FitConfig, display: Display) -> None:
     engine = choose_engine(clip.frames, config)
-    height, width = clip.size
     for text in clip.notes:
         warn(f"{clip.source}: {text}")
-    num = plan_gaussians(config, clip.num_frames, height, width)
+    num = plan_gaussians(config, clip.num_frames, *clip.size)
     steps = planned_steps(config, clip.num_frames)
     if steps is not None and steps * config.views.batch_size < clip.num_frames:
         warn(
             f"--steps: {steps:,} steps use {steps * config.views.batch_size:,} of {clip.num_frames:,} frames; the "
             "others keep their initial Gaussians, which look faint."
         )
-    if display == "json":
-        about = {"clip": clip.source, "num_frames": clip.num_frames, "height": height, "width": width}
-        print_json("start", about | {"most_gaussians": num, "degree": config.fold_degree, "threads": num_threads()})
-    if display in ("json", "quiet"):
-        return
     computed = f"{num_threads()} threads" if engine == "cpu" else f"engine {engine} on {describe_device()}"
-    out.print(
-        f"{clip.source}: {format_count(clip.num_frames, 'frame')} of {height}x{width}"
-        f"{' with alpha' if clip.has_alpha else ''}, {describe_plan(config, num, clip.num_frames)}, {computed}",
-        soft_wrap=True,
-    )
+    alpha, plan = " with alpha" if clip.has_alpha else "", describe_plan(config, num, clip.num_frames)
+    about = {"most_gaussians": num, "degree": config.fold_degree, "threads": num_threads()}
+    print_plan(display, clip.source, clip.num_frames, clip.size, f"{alpha}, {plan}, {computed}", **about)

@@ -5,9 +5,8 @@ import os
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
-from rich.box import SIMPLE_HEAD
-from rich.table import Column, Table
 
 from foldgauss._runtime.checks import ParameterError, require
 from foldgauss.cli.app.application import command, out, warn
@@ -37,13 +36,10 @@ from foldgauss.cli.shared.files import make_folder
 from foldgauss.io._atomic import lock_output, resolve
 from foldgauss.io.media.clip import DEINTERLACE, check_reading
 from foldgauss.jobs import FitJob, Outcome, find_clips, make_jobs
-from foldgauss.jobs.clips import RECORDS
-from foldgauss.jobs.job import read_record, read_request, write_request
+from foldgauss.jobs.job import RECORDS, read_record, read_request, write_request
 from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig
 
 SUMMARY = "summary.json"
-#: With more clips, the table shows no rows; the summary has all.
-MAX_ROWS = 60
 #: Fields of a record that the summary shows.
 _FIGURES = (
     "num_frames",
@@ -54,6 +50,7 @@ _FIGURES = (
     "seconds",
     "steps",
     "file_bytes",
+    "notes",
     "warnings",
 )
 
@@ -120,23 +117,25 @@ def fit_many(
         if found.others:
             names = ", ".join(entry.name for entry in found.others[:3]) + (", ..." if len(found.others) > 3 else "")
             out.print(f"skipped, not clips: {names}", soft_wrap=True)
-    ended: dict[str, Outcome] = {}
 
-    def on_end(outcome: Outcome) -> None:
-        ended[outcome.job.target] = outcome
+    def on_end(ended: dict[str, Outcome]) -> None:
         try:
             _write_summary(out_dir, jobs, ended)
         except OSError as error:  # a full disk must not end the fits
             warn(str(error))
 
-    again = "Give the command again without --overwrite" if overwrite else "Give the same command again"
-    with options.open_pool() as pool:
-        outcomes = run_jobs(jobs, "clips", display, pool, cure=f"{again} to continue.", on_end=on_end)
+    with options.open_client() as client:
+        outcomes = run_jobs(jobs, "clips", display, client, overwrite=overwrite, on_end=on_end)
     failed = [outcome for outcome in outcomes if outcome.failure is not None]
     if display == "json":
         emit_json("done", {"summary": str(out_dir / SUMMARY), "done": len(jobs) - len(failed), "failed": len(failed)})
     elif display != "quiet":
-        _print_table(str(out_dir), outcomes)
+        done = [outcome.record for outcome in outcomes if outcome.failure is None]
+        text = f"{format_count(len(done), 'model')} in {out_dir}"
+        if done:
+            mean, seconds = np.mean([one["mean_psnr"] for one in done]), sum(one["seconds"] for one in done)
+            text += f", mean PSNR {mean:.2f} dB, {seconds:,.0f} s of fitting"
+        out.print(f"{text}; {len(failed)} failed" if failed else text, soft_wrap=True)
     print_failures(failed)
     if failed:
         raise typer.Exit(1)
@@ -176,26 +175,3 @@ def _row(outcome: Outcome) -> dict[str, Any]:
     if outcome.failure is not None:
         return named | {"failure": outcome.failure}
     return named | {"model": Path(outcome.job.target).name} | {name: outcome.record[name] for name in _FIGURES}
-
-
-def _print_table(title: str, outcomes: list[Outcome]) -> None:
-    done = [outcome.record for outcome in outcomes if outcome.failure is None]
-    columns = [
-        Column(name, justify="right") for name in ("frames", "PSNR (dB)", "SSIM", "Gaussians", "bytes", "seconds")
-    ]
-    table = Table(Column("clip", overflow="fold"), *columns, title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for outcome in outcomes:
-        cells = ["failed"]
-        if (one := outcome.record) is not None:
-            cells = [f"{one['num_frames']} of {one['size'][0]}x{one['size'][1]}", f"{one['mean_psnr']:.2f}"]
-            cells += [f"{one['mean_ssim']:.4f}", f"{one['num_gaussians']:,}", f"{one['file_bytes']:,}"]
-            cells += [f"{one['seconds']:.1f}"]
-        table.add_row(outcome.job.name, *cells)
-    if len(outcomes) <= MAX_ROWS:
-        out.print(table)
-    text = f"{format_count(len(done), 'model')} in {title}"
-    if done:
-        mean, seconds = sum(one["mean_psnr"] for one in done) / len(done), sum(one["seconds"] for one in done)
-        text += f", mean PSNR {mean:.2f} dB, {seconds:,.0f} s of fitting"
-    failed = len(outcomes) - len(done)
-    out.print(f"{text}; {failed} failed" if failed else text, soft_wrap=True)

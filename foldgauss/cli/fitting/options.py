@@ -16,7 +16,7 @@ from foldgauss._runtime.threads import available_cores
 from foldgauss.cli.app.help import complete_choice
 from foldgauss.cli.shared.arguments import override_constants
 from foldgauss.cli.shared.console import format_count
-from foldgauss.jobs import WorkerPool, local_workers, running_cluster
+from foldgauss.jobs import local_workers, running_cluster
 from foldgauss.video.fitting.config import BUDGET, MODEL, OPTIMIZATION, PRESETS, FitConfig
 
 #: Panels of `fit --help`, by group of settings.
@@ -85,8 +85,15 @@ Threads = Annotated[
 #: `FitConfig`, and the field.
 SETTINGS = {field.name: (name, field) for name, field, _ in walk(FitConfig) if setting_of(field).option}
 #: Options that help does not show, since few need them: docs/fit.md lists them.
-RARE = {"power", "compositing", "batch_size", "error_fraction", "ssim_fraction"}
-RARE |= {"interpolation_fraction", "interpolation_end"}
+RARE = {
+    "power",
+    "compositing",
+    "batch_size",
+    "error_fraction",
+    "ssim_fraction",
+    "interpolation_fraction",
+    "interpolation_end",
+}
 #: Constants of the renderer, which fits rarely change.
 _CONSTANTS = ("alpha_cutoff", "support_radius", "transmittance_stop")
 _Constant = Annotated[float | None, typer.Option(hidden=True)]
@@ -137,7 +144,7 @@ class WorkerOptions:
             return "this process"
         return f"{format_count(self.workers, 'worker')} of {format_count(self.threads, 'thread')}"
 
-    def open_pool(self) -> AbstractContextManager[WorkerPool | None]:
+    def open_client(self) -> AbstractContextManager[Any]:
         """The workers; None for this process."""
         if self.scheduler is not None:
             return running_cluster(self.scheduler)

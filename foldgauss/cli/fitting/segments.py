@@ -7,16 +7,21 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from foldgauss._runtime.checks import require
 from foldgauss.cli.app.application import Stopped, err, out, warn
-from foldgauss.cli.fitting.job_progress import emit_json, report_fit, run_jobs
+from foldgauss.cli.fitting.job_progress import (
+    describe_continuation,
+    emit_json,
+    report_fit,
+    run_jobs,
+    summarize_fit,
+)
 from foldgauss.cli.fitting.options import WorkerOptions
 from foldgauss.cli.shared.console import Display, format_count, progress_bar, show_status
 from foldgauss.io._atomic import write_or_keep
 from foldgauss.io.media.reading import describe_crop
-from foldgauss.jobs import FitJob, JoinedFit, LongFit, Outcome, plan_long_fit, segments_folder
+from foldgauss.jobs import FitJob, LongFit, Outcome, plan_long_fit
 from foldgauss.jobs.job import read_record
-from foldgauss.jobs.segments import SEGMENT_SECONDS, read_segment_seconds
+from foldgauss.video import Evaluation
 from foldgauss.video.fitting.config import SHORTEST_LIFETIME, FitConfig, chosen_num_gaussians, planned_steps
 
 
@@ -25,24 +30,12 @@ def fit_in_segments(
     display: Display,
     options: WorkerOptions,
     *,
-    segment_seconds: float | None,
-    resume: bool,
+    segment_seconds: float,
     overwrite: bool,
 ) -> None:
     """Plan the segments of the job's clip, fit them, join them and print the results; continues an unfinished fit."""
     begun, target = time.monotonic(), Path(job.target)
-    folder = segments_folder(target)
-    require(
-        not resume or folder.is_dir(),
-        "--resume",
-        expected=f"a stopped fit in {folder}",
-        got="none",
-        cure="Start it without --resume.",
-    )
-    restart = overwrite and not resume
-    if segment_seconds is None and not restart:
-        segment_seconds = read_segment_seconds(target)
-    with options.open_pool() as pool:  # first: workers start while the clip is indexed
+    with options.open_client() as client:  # first: workers start while the clip is indexed
         with nullcontext() if display in ("json", "quiet") else show_status("Indexing the clip"):
             fit = plan_long_fit(
                 job.clip,
@@ -50,14 +43,13 @@ def fit_in_segments(
                 job.config,
                 size=job.size,
                 frames=job.frames,
-                segment_seconds=SEGMENT_SECONDS if segment_seconds is None else segment_seconds,
+                segment_seconds=segment_seconds,
                 checkpoint_seconds=job.checkpoint_seconds,
                 reading=job.reading,
-                restart=restart,
+                restart=overwrite,
             )
         _print_plan(fit, job.config, display, Path(job.clip), options)
-        again = f"Give the same command again{' with --resume added' if restart else ''} to continue."
-        outcomes = run_jobs(fit.jobs, "segments", display, pool, cure=again)
+        outcomes = run_jobs(fit.jobs, "segments", display, client, overwrite=overwrite)
     for outcome in outcomes:
         for text in (outcome.record or {}).get("warnings", ()):
             warn(f"{outcome.job.name}: {text}")
@@ -65,18 +57,17 @@ def fit_in_segments(
     print_failures(failed)
     if failed:
         others = f"; the others are kept in {fit.folder}" if len(failed) < len(outcomes) else ""
-        raise Stopped(f"{len(failed)} of {len(outcomes)} segments failed{others}. {again}")
+        raise Stopped(f"{len(failed)} of {len(outcomes)} segments failed{others}. {describe_continuation(overwrite)}")
 
-    def join(path: Path) -> JoinedFit:
+    def join(path: Path) -> Evaluation:
         records = {outcome.job.name: outcome.record for outcome in outcomes}
         shared = sum(max(0, before[1] - after[0]) for before, after in itertools.pairwise(fit.spans))
         with progress_bar("Joining", max(shared, 1), shown=display == "bar" and shared > 0) as advance:
             return dataclasses.replace(fit, target=path).join(records, on_frame=advance)
 
     joined = write_or_keep(target, join)
-    target = joined.path
     fit.clean_up()
-    figures = _summarize(fit, joined, outcomes, job.config)
+    figures = _summarize(joined, outcomes, job.config)
     figures |= {"wall_seconds": round(time.monotonic() - begun, 2), "file_bytes": target.stat().st_size}
     report_fit(display, str(target), figures)
 
@@ -103,26 +94,21 @@ def describe_plan(config: FitConfig, num: int, num_frames: int) -> str:
     return ", ".join(filter(None, [gaussians, *map(" or ".join, texts)]))
 
 
-def _summarize(fit: LongFit, joined: JoinedFit, outcomes: list[Outcome], config: FitConfig) -> dict[str, Any]:
+def print_plan(display: Display, source: str, num_frames: int, size: tuple[int, int], plan: str, **about: Any) -> None:
+    """Print the clip and what is planned for it, or `about` it as JSON."""
+    height, width = size
+    if display == "json":
+        emit_json("start", {"clip": source, "num_frames": num_frames, "height": height, "width": width} | about)
+    elif display != "quiet":
+        out.print(f"{source}: {format_count(num_frames, 'frame')} of {height}x{width}{plan}", soft_wrap=True)
+
+
+def _summarize(joined: Evaluation, outcomes: list[Outcome], config: FitConfig) -> dict[str, Any]:
     records = [outcome.record for outcome in outcomes]
-    height, width = records[0]["size"]
-    figures = {
-        "mean_psnr": round(joined.mean_psnr, 3),
-        "mean_ssim": round(joined.mean_ssim, 4),
-        "lowest_psnr": round(min(joined.psnr), 3),
-        "num_segments": len(records),
-        "num_frames": fit.index.num_frames,
-        "height": height,
-        "width": width,
-        "num_gaussians": sum(record["num_gaussians"] for record in records),
-        "degree": config.fold_degree,
-        "fit_seconds": round(sum(record["seconds"] for record in records), 2),
-    }
+    figures = summarize_fit(joined, records, config) | {"num_segments": len(records)}
     peaks = [record["peak_bytes"] for record in records]
     if None not in peaks:
         figures["peak_mib"] = round(max(peaks) / 2**20)
-    if joined.seam_drop is not None:
-        figures["seam_drop"] = round(joined.seam_drop, 3)
     return figures
 
 
@@ -134,21 +120,16 @@ def _print_plan(fit: LongFit, config: FitConfig, display: Display, video: Path, 
         warn(f"{video}: {note}")
     longest = fit.jobs[lengths.index(max(lengths))].config  # with its part of the file's size
     num = plan_gaussians(longest, max(lengths), *size, threads=options.threads)
-    if display == "json":
-        about = {"clip": str(video), "num_frames": index.num_frames, "height": size[0], "width": size[1]}
-        emit_json("start", about | {"spans": [list(span) for span in fit.spans], "most_gaussians": num})
-    if display in ("json", "quiet"):
-        return
     done = sum(read_record(job) is not None for job in fit.jobs)
     begun = sum(job.checkpoint.exists() for job in fit.jobs)
-    if done or begun:
+    if (done or begun) and display in ("bar", "lines"):
         err.print(f"continuing: {done} of {len(fit.jobs)} segments done, {begun} begun", soft_wrap=True)
     at_cuts = sum(before[1] == after[0] for before, after in itertools.pairwise(fit.spans))
     span = f"{min(lengths)} to {max(lengths)}" if min(lengths) < max(lengths) else f"{lengths[0]}"
     where = f" ({at_cuts} end at cuts)" if at_cuts else ""
-    out.print(
-        f"{video}: {format_count(index.num_frames, 'frame')} of {size[0]}x{size[1]} in "
-        f"{format_count(len(lengths), 'segment')} of {span} frame{'' if span == '1' else 's'}{where}, each with "
-        f"{describe_plan(config, num, max(lengths))}, by {options}",
-        soft_wrap=True,
+    plan = (
+        f" in {format_count(len(lengths), 'segment')} of {span} frame{'' if span == '1' else 's'}{where}, each with "
+        f"{describe_plan(config, num, max(lengths))}, by {options}"
     )
+    spans = [list(span) for span in fit.spans]
+    print_plan(display, str(video), index.num_frames, size, plan, spans=spans, most_gaussians=num)

@@ -295,7 +295,7 @@ def tradeoff_command(
         for job in jobs:
             for path in (Path(job.target), job.record, job.checkpoint):
                 path.unlink(missing_ok=True)
-    outcomes = run_jobs(jobs, "points", choose_display(), None, cure="Run the same command again to continue.")
+    outcomes = run_jobs(jobs, "points", choose_display(), None, overwrite=overwrite)
     for outcome in outcomes:
         if outcome.failure is not None:
             require(outcome.job.name != "base", "base", expected="a fit of the base", got=outcome.failure)

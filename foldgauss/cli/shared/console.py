@@ -166,7 +166,6 @@ _LABELS = {
     "wall_seconds": ("total time", "{:.1f} s"),
     "peak_mib": ("peak memory of a process", "{:,} MiB"),
     "num_segments": ("segments", "{:,}"),
-    "seam_drop": ("PSNR lost where segments meet", "{:.2f} dB"),
     "steps": ("steps", "{:,}"),
     "stopped_by": ("stopped by", "{}"),
     "loss_db": ("loss", "{:.3f} dB"),

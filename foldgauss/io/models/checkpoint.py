@@ -40,7 +40,7 @@ def load_checkpoint(path: PathLike, *, config: FitConfig, source: dict) -> FitSt
             cure = "It is of another version of foldgauss: resume with that, or start a new fit with --overwrite."
         if changed:
             expected, got = (", ".join(f"{name}={one.get(name)!r}" for name in changed) for one in (before, now))
-            raise invalid("resume", expected=expected, got=got, cure=cure)
+            raise invalid("overwrite", expected=expected, got=got, cure=cure)
     state = jax.tree.map(np.array, load_part(Path(path), about))  # updated in place, so they must be its own
     if state.last_finite is None:
         state.last_finite = state.copy()

@@ -37,16 +37,17 @@ from foldgauss.video.compression.quantize import (
     LARGEST,
     MAX_CELL_BITS,
     MAX_CHUNKS,
+    MAX_PATH_BITS,
+    MAX_TIME_BITS,
     Chunk,
     CompactInfo,
+    PathsInfo,
     Quantized,
     Rule,
     decode_values,
     dequantize,
     is_integral,
 )
-from foldgauss.video.compression.quantized_paths import MAX_PATH_BITS, PathsInfo
-from foldgauss.video.compression.quantized_times import MAX_TIME_BITS
 from foldgauss.video.compression.streams import (
     describe_maps,
     encode_chunk,

@@ -29,6 +29,7 @@ from foldgauss.io.models.selections import format_indices
 from foldgauss.io.models.video_model import keep_origin, load_video_model, read_frame_seconds, read_origin
 from foldgauss.video.compression.quantize import (
     COLORS,
+    MAX_PATH_BITS,
     Quantized,
     Rule,
     column_names,
@@ -36,11 +37,10 @@ from foldgauss.video.compression.quantize import (
     is_integral,
     quantize,
 )
-from foldgauss.video.compression.quantized_paths import MAX_PATH_BITS
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.motion.moving_object import NothingMoves, nothing_moves
-from foldgauss.video.segmented.flatten import flatten_video
+from foldgauss.video.segmented.layering import flatten_video
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 from foldgauss.video.selection.selectors import by_motion
 

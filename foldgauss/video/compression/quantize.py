@@ -21,11 +21,9 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int32
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions
-from foldgauss.video.compression.quantized_paths import PathsInfo, decode_paths, describe_paths, round_paths
-from foldgauss.video.compression.quantized_times import choose_time_bits, round_times
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.row_layout import MAX_DEGREE, shift_path
 from foldgauss.video.models.shared_paths import SharedPaths, check_paths
@@ -63,6 +61,23 @@ _MAX_EXPONENT = 120
 FINEST_STEP = -48
 #: Largest steps; those of time and angle (turns) keep their logits finite.
 _MAX_STEP = {"time": 0.125, "angle": 0.125, "size": 0.35, "stretch": 0.5, "duration": 0.5, "opacity": 1.0}
+#: Frame times are rounded to a fraction of 2^-TIME_BITS of each interval,
+TIME_BITS = 10
+#: or finer, with at most so many bits,
+MAX_TIME_BITS = 24
+#: so that no frame moves by more than this fraction of the median interval: the interval of a cut is some hundred
+#: frames long.
+TIME_ERROR = 0.005
+#: Displacement by which rounding the maps may move Gaussians, in pixels of the model's size.
+PATH_ERROR = 0.02
+#: The most bits after the binary point that maps have.
+MAX_PATH_BITS = 28
+#: The step of the times of maps if these are not the frames'.
+KNOT_STEP = 2.0**-24
+#: Fraction of Gaussians on either side that may be outside of the cells.
+_OUTSIDE = 0.005
+#: The least extent of the cells.
+_MIN_SIDE = 0.01
 
 
 def column_names(degree: int, num_paths: int = 0) -> tuple[str, ...]:
@@ -107,6 +122,22 @@ def compute_steps(halves: Int32[np.ndarray, " num"], name: str = "") -> Float[np
     """2^(halves / 2), with at most one rounding, limited to the column's largest step."""
     steps = np.ldexp(np.where(halves % 2, _SQRT2, 1.0), halves // 2)
     return np.minimum(steps, _MAX_STEP[name]) if name in _MAX_STEP else steps
+
+
+@dataclasses.dataclass(frozen=True)
+class PathsInfo:
+    """Constants of shared paths, stored in the header.
+
+    `at_frames`: knots are at the times of the frames, and not stored. `bits`: maps are in steps of 2^-bits.
+    `middle`, `sides`: the rectangle that cells divide instead of the frame, since positions on a path may be outside.
+    """
+
+    num_paths: int
+    num_knots: int
+    at_frames: bool
+    bits: int
+    middle: tuple[float, float]
+    sides: tuple[float, float]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -442,13 +473,21 @@ def _sigmoid(x: np.ndarray) -> np.ndarray:
 
 def _make_info(model: VideoModel) -> CompactInfo:
     power, floor = (np.unique(np.asarray(getattr(model.splats.envelope, name))) for name in ("power", "floor"))
-    if power.size != 1 or floor.size != 1:
-        cure = "Save it as .safetensors, which holds one envelope per Gaussian."
-        raise invalid("model.splats.envelope", expected="one for all Gaussians", got="several", cure=cure)
-    if model.degree > MAX_DEGREE:
-        raise invalid("model.degree", expected=f"at most {MAX_DEGREE}", got=model.degree, cure="Save as .safetensors.")
-    if model.num_gaussians < 1:
-        raise invalid("model", expected="at least one Gaussian", got="none")
+    require(
+        power.size == floor.size == 1,
+        "model.splats.envelope",
+        expected="one for all Gaussians",
+        got="several",
+        cure="Save it as .safetensors, which holds one envelope per Gaussian.",
+    )
+    require(
+        model.degree <= MAX_DEGREE,
+        "model.degree",
+        expected=f"at most {MAX_DEGREE}",
+        got=model.degree,
+        cure="Save as .safetensors.",
+    )
+    require(model.num_gaussians, "model", expected="at least one Gaussian", got="none")
     # A Gaussian's area is about exp(-power tau^2 / 2), of deviation 1 / sqrt(power); a uniform weight of the same
     # deviation reaches sqrt(3) times as far. Twice that takes the fewest bits, as measured.
     power = float(power[0])
@@ -501,17 +540,20 @@ def quantize(
     info = exact.info
     if chunks is None:
         chunks = np.zeros(len(classes), np.int8)
-    if (chunks[1:] > chunks[:-1]).any():  # the file would have another order
-        raise invalid("chunks", expected="numbers that do not increase from front to back", got="others")
+    require(
+        (chunks[1:] <= chunks[:-1]).all(),  # otherwise the file would have another order
+        "chunks",
+        expected="numbers that do not increase from front to back",
+        got="others",
+    )
     made, numbers = [], np.unique(chunks)
-    if len(numbers) > MAX_CHUNKS:
-        raise invalid("chunks", expected=f"at most {MAX_CHUNKS} of them", got=len(numbers))
+    require(len(numbers) <= MAX_CHUNKS, "chunks", expected=f"at most {MAX_CHUNKS} of them", got=len(numbers))
     for number in numbers:
         part = chunks == number
         made.append(quantize_chunk(select_rows(exact, part), classes[part], rules))
     logits = exact.logits - exact.logits.max(initial=-np.inf)
-    intervals = round_times(logits, info.time_bits, LARGEST)
-    paths = {} if info.paths is None else round_paths(info.paths, exact.paths, LARGEST)
+    intervals = round_times(logits, info.time_bits)
+    paths = {} if info.paths is None else round_paths(info.paths, exact.paths)
     return Quantized(info, rules, tuple(made), intervals, **paths)
 
 
@@ -578,9 +620,13 @@ def _round_columns(
         if name == "angle":  # kept in its half turn, so that quantizing a decoded model changes nothing
             low, high = (np.ceil((end - origin) / steps) for end in (0.25, 0.75))
             numbers = np.minimum(np.maximum(numbers, low), high - 1)
-        if not np.isfinite(numbers).all():
-            got = f"another {name} of Gaussian {int(np.argmin(np.isfinite(numbers)))}"
-            raise invalid("model", expected="finite numbers", got=got, cure="Remove it first.")
+        require(
+            np.isfinite(numbers).all(),
+            "model",
+            expected="finite numbers",
+            got=f"another {name} of Gaussian {int(np.argmin(np.isfinite(numbers)))}",
+            cure="Remove it first.",
+        )
         columns[name] = np.clip(numbers, -LARGEST, LARGEST).astype(np.int32)
         decoder.add(name, columns[name], halves)
         if trajectory_power(name):
@@ -596,3 +642,78 @@ def _compute_trajectories(exact: ExactColumns, decoded: dict[str, np.ndarray]) -
     size = np.abs(matrix).max(2, keepdims=True)  # rows differ greatly in size: c_k scales with a power of time
     solved = np.linalg.solve(matrix / size, polynomials / size)
     return {f"{axis}{k}": solved[:, k, a] for k in range(solved.shape[1]) for a, axis in enumerate("xy")}
+
+
+# ------------------------------------------------------------------------------------------ frame times, shared paths
+
+
+def choose_time_bits(logits: Float[np.ndarray, " intervals"]) -> int:
+    """The fewest bits from `TIME_BITS` on with which rounding moves no frame by more than `TIME_ERROR` intervals."""
+    if not len(logits):
+        return TIME_BITS
+    logits = logits - logits.max()
+    median = np.median(np.exp(logits))
+    for bits in range(TIME_BITS, MAX_TIME_BITS):
+        moved = np.cumsum(np.exp(round_times(logits, bits) * 2.0**-bits) - np.exp(logits))
+        moved -= moved[-1] * np.cumsum(np.exp(logits)) / np.exp(logits).sum()  # they end at 1
+        if np.abs(moved).max() <= TIME_ERROR * median:
+            return bits
+    return MAX_TIME_BITS
+
+
+def round_times(logits: Float[np.ndarray, " intervals"], bits: int) -> Int32[np.ndarray, " intervals"]:
+    """Integers of logits up to 0; those of intervals that are 0 in float64 are limited to -`LARGEST`."""
+    return np.rint(np.maximum(logits, -1e5) * 2.0**bits).astype(np.int64).clip(-LARGEST).astype(np.int32)
+
+
+def describe_paths(model: VideoModel) -> PathsInfo:
+    """The constants for a model's paths."""
+    low, high = np.quantile(np.asarray(model.splats.loc, np.float64), [_OUTSIDE, 1 - _OUTSIDE], axis=0)
+    middle, sides = ((low + high) / 2).round(4), np.maximum(high - low, _MIN_SIDE).round(4)
+    paths, frames = model.splats.paths, np.asarray(model.frame_times.times(), np.float64)
+    at_frames = paths.num_knots == len(frames) and np.abs(np.asarray(paths.times) - frames).max() <= 2.0**-20
+    # Half a step of all six numbers of a map moves (x, y) by so much of a step.
+    most = 0.5 * (1 + (np.abs(middle) + sides / 2).sum())
+    bits = math.ceil(math.log2(most * max(model.size) / PATH_ERROR))
+    extent = tuple(middle.tolist()), tuple(sides.tolist())
+    return PathsInfo(paths.num_paths, paths.num_knots, bool(at_frames), min(max(bits, 0), MAX_PATH_BITS), *extent)
+
+
+def round_paths(about: PathsInfo, paths: SharedPaths) -> dict[str, Int32[np.ndarray, "..."]]:
+    """The integers of the maps and, unless they are at the frames, of their times; magnitudes up to `LARGEST`."""
+    scaled = {"maps": np.asarray(paths.matrices, np.float64) * 2.0**about.bits}
+    if not about.at_frames:
+        scaled["knots"] = np.asarray(paths.times, np.float64) / KNOT_STEP
+    for name, numbers in scaled.items():
+        require(
+            (np.abs(numbers) <= LARGEST).all(),
+            "model",
+            expected=f"shared paths whose {name} are within the range of their steps",
+            got="others",
+            cure="Save it as .safetensors.",
+        )
+    return {name: np.rint(numbers).astype(np.int32) for name, numbers in scaled.items()}
+
+
+def decode_paths(
+    about: PathsInfo,
+    maps: Int32[np.ndarray, "paths knots 2 3"],
+    knots: Int32[np.ndarray, "paths knots"] | None,
+    logits: Float[np.ndarray, " intervals"],
+) -> tuple[Float[np.ndarray, "paths knots"], Float[np.ndarray, "paths knots 2 3"]]:
+    """Times and maps; without `knots` the times are those of the frames, `FrameTimes(logits).times()`."""
+    maps = maps * 2.0**-about.bits
+    if knots is not None:
+        return knots * KNOT_STEP, maps
+    summed = np.cumsum(_exp(logits - logits.max(initial=-np.inf)))
+    return np.tile(np.concatenate([[0.0], summed / summed[-1:]]), (about.num_paths, 1)), maps
+
+
+def _exp(x: Float[np.ndarray, " num"]) -> Float[np.ndarray, " num"]:
+    """Exponential of numbers <= 0 by elementary operations only, to 1e-13 and not below e^-690."""
+    x = np.maximum(x, -690.0)
+    e = np.floor(x * (1 / _LN2) + 0.5)
+    rest, total = x - e * _LN2, np.ones_like(x)
+    for k in range(14, 0, -1):
+        total = 1 + total * rest / k
+    return np.ldexp(total, e.astype(np.int32))

@@ -8,13 +8,18 @@ Gaussian is dropped if its removal adds less error than its bits cost.
 
 import dataclasses
 import math
+from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._numerics.random_streams import Stream, make_generator
+from foldgauss._runtime.checks import require
+from foldgauss.render import cpu
 from foldgauss.video.compression.quantize import (
+    AXES,
     FEATURES,
+    ExactColumns,
     Quantized,
     Rule,
     clamp_unit,
@@ -24,12 +29,13 @@ from foldgauss.video.compression.quantize import (
     dequantize,
     is_integral,
     quantize,
+    trajectory_matrix,
 )
-from foldgauss.video.compression.sensitivity import estimate_removal, estimate_sensitivities
-from foldgauss.video.models.row_layout import GROUPS, shift_path
+from foldgauss.video.models.conditioning import backpropagate
+from foldgauss.video.models.row_layout import GROUPS, columns, shift_path
 from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
-from foldgauss.video.selection.contributions import Contributions
+from foldgauss.video.selection.contributions import Contributions, FrameContributions
 
 #: The bits whose price a Gaussian has to be worth: about as many as it takes in a file.
 BITS_PER_GAUSSIAN = 100.0
@@ -41,6 +47,12 @@ BEYOND_BLACK = np.full(3, -0.5, np.float32)
 #: Least number of Gaussians from which steps are regressed on features.
 _FEW = 100
 _MIN_SENSITIVITY = 1e-4  # below, a Gaussian is not visible
+#: Levels of an 8-bit image.
+LEVELS = 255.0
+#: An opaque Gaussian is assumed to differ from what it hides by this fraction of the range.
+CONTRAST = 0.1
+#: Opacities above this count as opaque: the renderer does not see what is behind.
+OPAQUE = 0.97
 
 
 def bit_price(coarseness: float) -> float:
@@ -82,9 +94,7 @@ class Quantizer:
         self.exact = compute_columns(model)
         sensitivity, self._seen = estimate_sensitivities(Contributions(model, background), self.exact)
         self._names = [name for name in column_names(self.exact.info.degree) if not is_integral(name)]
-        if not self._seen.any():
-            cure = "No frame shows anything."
-            raise invalid("model", expected="visible Gaussians", got="none", cure=cure)
+        require(self._seen.any(), "model", expected="visible Gaussians", got="none", cure="No frame shows anything.")
         self._fit(sensitivity)
 
     def _fit(self, sensitivity: dict[str, Float[np.ndarray, " num"]]) -> None:
@@ -109,12 +119,9 @@ class Quantizer:
         # Of usual Gaussians at most 6. Beyond, the class makes up for the line where a Gaussian is unlike the others.
         classes = np.where(np.all(raw == features, axis=1), np.clip(rest, -6, 6), np.clip(rest, -60, 60)).mean(0)
         self.classes = np.rint(np.where(self._seen, classes, -6.0)).astype(np.int32)
-        self._match_errors(sensitivity, whole)
-
-    def _match_errors(self, sensitivity: dict[str, Float[np.ndarray, " num"]], design: np.ndarray) -> None:
-        """Shift the fits so that all columns add the same error: by mean, not typical, sensitivity times step^2."""
+        # All columns are to add the same error: by mean, not typical, sensitivity times step^2.
         for name, fit in self._fits.items():
-            predicted = np.clip((design @ fit + self.classes)[self._seen], -30, 30)
+            predicted = np.clip((whole @ fit + self.classes)[self._seen], -30, 30)
             fit[0] += 0.5 * np.log2(np.mean(sensitivity[name][self._seen] * 4.0**-predicted) + 1e-30)
 
     def make_rules(self, coarseness: float) -> dict[str, Rule]:
@@ -159,3 +166,86 @@ def round_groups(
         own = leaves.get(name, np.asarray(getattr(model.splats, name)))
         leaves[name] = np.float32(np.where(which.reshape(-1, *[1] * (own.ndim - 1)), getattr(decoded, name), own))
     return dataclasses.replace(model.splats, **leaves)
+
+
+# ------------------------------------------------------------------------------------------------ sensitivity
+
+
+def estimate_sensitivities(
+    contributions: Contributions, exact: ExactColumns
+) -> tuple[dict[str, Float[np.ndarray, " num"]], Bool[np.ndarray, " num"]]:
+    """Squared change of the images per squared change of each parameter, and which Gaussians any frame shows.
+
+    The change is in levels, summed over pixels, channels and frames: the diagonal of J^T J with J the derivative of all
+    images with respect to the columns `exact`. It is estimated without bias by (J^T z)^2, with random signs z in every
+    pixel and one draw per frame. Source: M. F. Hutchinson (1990), "A stochastic estimator of the trace".
+    """
+    num, prepared, to_columns = contributions.num_gaussians, contributions.prepared, _ColumnGradients(exact)
+    total: dict[str, np.ndarray] = {name: np.zeros(num) for name in to_columns.names}
+    seen, rows = np.zeros(num, bool), np.zeros((num, 11 + 2 * exact.info.degree), np.float32)
+    for frame, gradients in _draw_gradients(contributions):
+        backpropagate(prepared.rows, frame.splats, gradients, prepared.spec, rows)
+        for name, gradient in to_columns(rows[frame.alive].astype(np.float64), frame.alive).items():
+            total[name][frame.alive] += gradient**2
+        rows[frame.alive] = 0
+        seen[frame.alive] |= (gradients[3] != 0).any(1)  # also black ones, whose color cannot be darker
+    return total, seen
+
+
+def estimate_removal(contributions: Contributions) -> Float[np.ndarray, " num"]:
+    """Squared change of the images, as of `estimate_sensitivities`, if each Gaussian alone were removed.
+
+    Images are linear in the opacity of one Gaussian at the frame's time. What an opaque one hides is not known: those
+    change them by at least `CONTRAST`.
+    """
+    removal, least = np.zeros((2, contributions.num_gaussians))
+    for frame, (_, _, by_opacity, by_color) in _draw_gradients(contributions):
+        opacity = frame.splats.opacity.astype(np.float64)
+        removal[frame.alive] += (opacity * by_opacity) ** 2
+        least[frame.alive] += np.where(opacity > OPAQUE, (CONTRAST * (by_color @ AXES[0])) ** 2, 0)
+    return np.maximum(removal, least)
+
+
+def _draw_gradients(
+    contributions: Contributions,
+) -> Iterator[tuple[FrameContributions, tuple[Float32[np.ndarray, "alive ..."], ...]]]:
+    """Each frame that shows Gaussians, and J^T z by mean, factor, opacity and color."""
+    rng, shape = make_generator(Stream.SENSITIVITY_PROBE), (3, *contributions.size)
+    for k in range(len(contributions.times)):
+        frame = contributions.at_frame(k)
+        if len(frame.alive):
+            signs = rng.integers(0, 2, shape, dtype=np.int8) * np.float32(2 * LEVELS) - np.float32(LEVELS)
+            yield frame, cpu.backward(frame.trace, signs)
+
+
+class _ColumnGradients:
+    """Converts gradients with respect to packed rows to gradients with respect to columns."""
+
+    def __init__(self, exact: ExactColumns):
+        v, info = exact.values, exact.info
+        self._exact, self._at = exact, columns(info.degree)
+        self._matrix = trajectory_matrix(v["time"], v["duration"], info)
+        self._flip = np.where(exact.swapped, -1.0, 1.0)
+        k = np.arange(1, info.degree + 1)[:, None]
+        # A later m_t with the same curve in time, see `shift_path`.
+        self._by_time = np.concatenate([k * exact.polynomials[:, 1:], np.zeros((len(self._flip), 1, 2))], 1)
+        trajectory = [f"{axis}{j}" for j in range(info.degree + 1) for axis in "xy"]
+        self.names = ["size", "stretch", "duration", "opacity", "time", "angle", "luma", "blue", "green", *trajectory]
+
+    def __call__(self, rows: Float[np.ndarray, "alive width"], alive: np.ndarray) -> dict[str, np.ndarray]:
+        at, v = self._at, self._exact.values
+        scale = rows[:, at["log_scale"]]
+        polynomials = np.concatenate([rows[:, at["loc"]], rows[:, at["coefficients"]]], 1).reshape(len(rows), -1, 2)
+        time, turn = v["time"][alive], self._exact.turn[alive]
+        by_time = rows[:, at["time_loc_logit"].start] / np.maximum(time * (1 - time), 1e-12)
+        made = {
+            "size": scale[:, 0] + scale[:, 1],
+            "stretch": (scale[:, 0] - scale[:, 1]) * self._flip[alive],
+            "duration": rows[:, at["log_time_scale"].start],
+            "opacity": rows[:, at["opacity_logit"].start],
+            "time": by_time - (polynomials * self._by_time[alive]).sum((1, 2)),
+            "angle": rows[:, at["angle_logit"].start] / np.maximum(turn * (1 - turn), 1e-12),
+        }
+        made |= dict(zip(("luma", "blue", "green"), AXES @ rows[:, at["color_dc"]].T, strict=True))
+        by_power = np.einsum("njk,nja->nka", self._matrix[alive], polynomials)
+        return made | {f"{axis}{k}": by_power[:, k, a] for k in range(by_power.shape[1]) for a, axis in enumerate("xy")}

@@ -10,7 +10,7 @@ Source: G. N. N. Martin, "Range encoding" (1979); P. Elias' gamma code (1975), i
 "Adaptive weighing of context models for lossless data compression" (2005).
 """
 
-import dataclasses
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
@@ -51,8 +51,7 @@ LOGISTIC = np.floor(np.interp(np.arange(4096), 128 * np.arange(33), _KNOTS) + 0.
 LOGIT = np.minimum(np.searchsorted(LOGISTIC, np.arange(4096) * 16 + 8), 4095) - 2048
 
 
-@dataclasses.dataclass(frozen=True)
-class Column:
+class Column(NamedTuple):
     """What encoder and decoder know of a column before its values.
 
     `present`: which rows have an integer; others are 0. `contexts`: below 256. An integer q encodes the value
@@ -72,11 +71,6 @@ class Column:
         """A column without contexts."""
         one, none = np.ones(num), np.zeros((num, 0), np.int32)
         return cls(np.ones(num, bool), np.zeros((num, 2), np.uint8), np.zeros(num), one, one, none)
-
-    def as_arrays(self) -> tuple:
-        floats = (np.ascontiguousarray(one, np.float64) for one in (self.origin, self.step, self.scale))
-        near = np.ascontiguousarray(self.near, np.int32)
-        return self.present, np.ascontiguousarray(self.contexts, np.uint8), *floats, near
 
 
 # ------------------------------------------------------------------------------------------ coding
@@ -189,7 +183,7 @@ def encode(values: Int32[np.ndarray, " num"], column: Column) -> bytes:
     values, num_bytes = np.array(values, np.int32), 4 * len(values) + 2 * MAX_CODE_BYTES
     while True:
         data, interval = np.empty(num_bytes, np.uint8), np.array([0, 0xFFFFFFFF, 0, 0])
-        if _code(values, *column.as_arrays(), _initial_state(), data, interval, False, num_bytes - MAX_CODE_BYTES):
+        if _code(values, *column, _initial_state(), data, interval, False, num_bytes - MAX_CODE_BYTES):
             low, place = interval[0], interval[3]
             # The shortest bytes that identify the interval: zeros are read after the end.
             data[place] = (low >> 24) + (1 if low & 0xFFFFFF else 0)
@@ -201,7 +195,7 @@ def decode(data: bytes, column: Column) -> Int32[np.ndarray, " num"]:
     """The inverse of `encode`. Raises ValueError for bytes that it cannot have written."""
     values, buffer = np.zeros(len(column.present), np.int32), np.frombuffer(bytearray(data), np.uint8)
     interval = np.array([0, 0xFFFFFFFF, int.from_bytes(data[:4].ljust(4, b"\0"), "big"), 4])
-    fits = _code(values, *column.as_arrays(), _initial_state(), buffer, interval, True, len(data) + 4)
+    fits = _code(values, *column, _initial_state(), buffer, interval, True, len(data) + 4)
     if not fits or interval[3] != len(data) + 3:  # the encoder ends with one byte, the decoder reads four
         raise ValueError("a column of numbers is damaged")
     return values

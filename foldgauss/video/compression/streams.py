@@ -1,14 +1,11 @@
 """The streams of bytes that a compact file consists of, beside its header: frame times, shared paths, and columns."""
 
-import dataclasses
-
 import numpy as np
 from jaxtyping import Int
 
 from foldgauss.video.compression import range_coder
 from foldgauss.video.compression.column_contexts import ColumnContexts
-from foldgauss.video.compression.quantize import Chunk, CompactInfo, Quantized, Rule
-from foldgauss.video.compression.quantized_paths import PathsInfo
+from foldgauss.video.compression.quantize import Chunk, CompactInfo, PathsInfo, Quantized, Rule
 
 
 def encode_motion(quantized: Quantized) -> list[bytes]:
@@ -50,9 +47,7 @@ def describe_maps(about: PathsInfo) -> range_coder.Column:
     place = np.arange(num, dtype=np.int32)
     near = np.where(place // 6 % about.num_knots > 0, place - 6, -1)
     contexts = np.stack([place % 6, np.zeros_like(place)], 1).astype(np.uint8)
-    return dataclasses.replace(
-        range_coder.Column.without_contexts(num), contexts=contexts, near=near.astype(np.int32)[:, None]
-    )
+    return range_coder.Column.without_contexts(num)._replace(contexts=contexts, near=near.astype(np.int32)[:, None])
 
 
 def _encode_plainly(numbers: Int[np.ndarray, " num"]) -> bytes:

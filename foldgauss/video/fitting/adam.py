@@ -5,9 +5,9 @@ With gradient $g$, moments $m, v$, learning rate $\eta$ and $n$ the number of st
 $$ m \gets \beta_1 m + (1 - \beta_1) g, \quad v \gets \beta_2 v + (1 - \beta_2) g^2, \quad
    \theta \gets \theta - \eta\, \frac{m / (1 - \beta_1^n)}{\sqrt{v / (1 - \beta_2^n)} + \epsilon} $$
 
-`adam_step` states it in NumPy; `sparse_adam` (Numba), `masked_adam` (JAX) and `FRAME_TIME_ADAM` (optax) are its twins
-for the rows of Gaussians and for frame times, and tests compare them. Each row counts its own steps, so that its bias
-correction is right however seldom the Gaussian is alive.
+`sparse_adam` (Numba) and its twin `masked_adam` (JAX) are for the rows of Gaussians, `update_paths` (JAX) for the maps
+of shared paths, and `FRAME_TIME_ADAM` (optax) for frame times; tests compare them with the rule in NumPy. Each row
+counts its own steps, so that its bias correction is right however seldom the Gaussian is alive.
 """
 
 import math
@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numba as nb
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
@@ -53,21 +53,6 @@ class RateUnits(NamedTuple):
 
 
 ABSOLUTE = RateUnits()
-
-
-def adam_step(
-    grad: Float[np.ndarray, "num width"],
-    first: Float[np.ndarray, "num width"],
-    second: Float[np.ndarray, "num width"],
-    counts: Int[np.ndarray, " num"],
-    rates: Float[np.ndarray, " width"],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What to subtract from the parameters, and both moments after the step; `counts` includes this step."""
-    first = (BETA1 * first + (1 - BETA1) * grad).astype(first.dtype)
-    second = (BETA2 * second + (1 - BETA2) * grad**2).astype(second.dtype)
-    counts = counts[:, None]
-    mean, square = first / (1 - BETA1**counts), second / (1 - BETA2**counts)
-    return rates * mean / (np.sqrt(square) + EPSILON), first, second
 
 
 # ----------------------------------------------------------------------------------- rows of Gaussians, Numba
@@ -182,7 +167,24 @@ def _rate_factors(rows, degree: int, units: RateUnits) -> Float[Array, "num widt
     return jnp.exp(size[:, None] * of_size[None] + time[:, None] * of_time[None])
 
 
-# ------------------------------------------------------------------------------------------------ frame times
+# ------------------------------------------------------------------------------------- shared paths, frame times
+
+
+@jax.jit
+def update_paths(
+    arrays: tuple[Array, ...], grad: Float[Array, "frames paths 2 3"], visited: Bool[Array, " frames"], rate
+) -> tuple[Array, ...]:
+    """The maps of shared paths, both moments and the frames' counts of steps, after a step on the frames `visited`."""
+    *before, counts = arrays
+    counts = counts + visited.astype(counts.dtype)
+    taken = jnp.maximum(counts, 1).astype(np.float32)[:, None, None, None]
+    beta1, beta2, one = np.float32(BETA1), np.float32(BETA2), np.float32(1)
+    first = beta1 * before[1] + (one - beta1) * grad
+    second = beta2 * before[2] + (one - beta2) * grad * grad
+    mean, square = first / (one - beta1**taken), second / (one - beta2**taken)
+    maps = before[0] - rate * mean / (jnp.sqrt(square) + np.float32(EPSILON))
+    chosen = visited[:, None, None, None]
+    return *(jnp.where(chosen, new, old) for new, old in zip((maps, first, second), before, strict=True)), counts
 
 
 @jax.jit

@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from foldgauss._runtime.checks import invalid
-from foldgauss.video.compression.quantize import Quantized, dequantize
+from foldgauss._runtime.checks import require
+from foldgauss.video.compression.quantize import dequantize
 from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig, Strategy, Views, planned_steps
-from foldgauss.video.fitting.loop import FitInfo, check_frames, finish, fit_steps, start_from
+from foldgauss.video.fitting.loop import FitInfo, FitResult, check_frames, fit, start_from
 from foldgauss.video.fitting.rate import COMPRESSION_START, RateControl
 from foldgauss.video.fitting.state import FitState
 from foldgauss.video.models.background import BLACK
@@ -19,14 +19,6 @@ from foldgauss.video.models.video_model import VideoModel, check_model
 
 #: The quality without a clip, where nothing compensates for rounding.
 ROUNDING_QUALITY = 80.0
-
-
-@dataclasses.dataclass(frozen=True)
-class Compressed:
-    """A model's compact form: `quantized`, which `save_compact` writes, and the `model` that it decodes to."""
-
-    quantized: Quantized
-    model: VideoModel
 
 
 def compress(
@@ -39,14 +31,14 @@ def compress(
     steps: int | None = None,
     minutes: float | None = None,
     observers: Iterable[Callable[[FitState, FitInfo], None]] = (),
-) -> Compressed:
+) -> FitResult:
     """Make a model compact: drop Gaussians that are not worth their bits, and round the parameters of the others.
 
     `frames`: the clip, uint8 (num_frames, *model.size, 3), or with alpha (..., 4), to which the model is fitted further
     meanwhile. `FitConfig` explains `quality`, `size_mb` and `psnr`. Without any, the quality is `DEFAULT_QUALITY`,
     or `ROUNDING_QUALITY` without the clip. `steps` and `minutes` are budgets (default: two thirds of the steps of a
     fit). `observers` are called after every step, as by `fit`. Gaussians are reordered. Shared paths remain, to about
-    a fiftieth of a pixel.
+    a fiftieth of a pixel. The result has the compact model, `quantized`, and the `model` that it decodes to.
 
     Without the clip, nothing makes up for what is dropped and rounded, and there is no `psnr`, nor a budget.
 
@@ -56,11 +48,31 @@ def compress(
     Example: `save_compact("clip.fgz", compress(model, clip.frames, quality=60).quantized)`.
     """
     check_model(model)
-    config = _make_config(model, quality=quality, size_mb=size_mb, psnr=psnr, steps=steps, minutes=minutes)
+    power, floor = (np.unique(np.asarray(getattr(model.splats.envelope, name))) for name in ("power", "floor"))
+    require(
+        power.size == floor.size == 1,
+        "model.splats.envelope",
+        expected="one for all Gaussians",
+        got="several",
+        cure="Save it as .safetensors, which holds one envelope per Gaussian.",
+    )
+    config = FitConfig(
+        degree=model.degree,
+        power=float(power[0]),
+        floor=float(floor[0]),
+        quality=quality,
+        size_mb=size_mb,
+        psnr=psnr,
+        steps=steps,
+        minutes=minutes,
+        compositing=model.compositing,
+        options=model.options,
+        strategy=Strategy(relocated_fraction=0.0, scale_cutoff=model.scale_cutoff),
+        views=Views(interpolation_fraction=0.0),
+    )
     if frames is None:
         for name, value in (("psnr", psnr), ("steps", steps), ("minutes", minutes)):
-            if value is not None:
-                raise invalid(name, expected="None without the clip", got=value, cure="Give the clip's frames.")
+            require(value is None, name, expected="None without the clip", got=value, cure="Give the clip's frames.")
         return _round_only(model, config)
     check_frames_of(model, frames)
     check_frames(frames)
@@ -69,33 +81,10 @@ def compress(
     budget = planned_steps(dataclasses.replace(config, minutes=None), len(frames))
     state = start_from(model, config, steps or math.ceil((1 - COMPRESSION_START) * budget), COMPRESSION_START)
     config = dataclasses.replace(config, steps=state.plan if steps else None)
-    for state, info in fit_steps(frames, config, state):  # noqa: B020
-        for observe in observers:
-            observe(state, info)
-    made, quantized = finish(state, frames, config, model.fps)
-    return Compressed(quantized, made)
+    return fit(frames, config, fps=model.fps, state=state, observers=observers)
 
 
-def _make_config(model: VideoModel, **goals: float | None) -> FitConfig:
-    """The settings with which the model may be fitted further."""
-    envelope = model.splats.envelope
-    power, floor = (np.unique(np.asarray(getattr(envelope, name))) for name in ("power", "floor"))
-    if power.size != 1 or floor.size != 1:
-        cure = "Save it as .safetensors, which holds one envelope per Gaussian."
-        raise invalid("model.splats.envelope", expected="one for all Gaussians", got="several", cure=cure)
-    return FitConfig(
-        degree=model.degree,
-        power=float(power[0]),
-        floor=float(floor[0]),
-        compositing=model.compositing,
-        options=model.options,
-        strategy=Strategy(relocated_fraction=0.0, scale_cutoff=model.scale_cutoff),
-        views=Views(interpolation_fraction=0.0),
-        **goals,
-    )
-
-
-def _round_only(model: VideoModel, config: FitConfig) -> Compressed:
+def _round_only(model: VideoModel, config: FitConfig) -> FitResult:
     if not config.is_compact:
         config = dataclasses.replace(config, quality=ROUNDING_QUALITY)
     background = None if model.compositing == "over" else BLACK  # alpha is kept, whatever clip the model is of
@@ -104,4 +93,4 @@ def _round_only(model: VideoModel, config: FitConfig) -> Compressed:
     control.check_size(state)
     control.round_only(state)
     quantized = control.finish(state, model.fps)
-    return Compressed(quantized, dequantize(quantized))
+    return FitResult(dequantize(quantized), [], quantized)

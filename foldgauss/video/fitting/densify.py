@@ -10,10 +10,9 @@ import numpy as np
 
 from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss.render import pixels_per_unit
-from foldgauss.video.fitting.config import FitConfig, most_gaussians
+from foldgauss.video.fitting.config import FitConfig, Growth, most_gaussians
 from foldgauss.video.fitting.density_control import DensityControl
-from foldgauss.video.fitting.growth import GradientStatistics, Growth
-from foldgauss.video.fitting.state import FitState
+from foldgauss.video.fitting.state import FitState, GradientStatistics
 from foldgauss.video.models.row_layout import columns
 
 #: The published code renders, and so measures, a splat within this many standard deviations.

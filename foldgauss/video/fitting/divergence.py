@@ -11,8 +11,7 @@ import numpy as np
 
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.schedule import BACKOFF_FACTOR
-from foldgauss.video.fitting.state import FitState
-from foldgauss.video.fitting.steppers.protocol import StepResult
+from foldgauss.video.fitting.state import FitState, StepResult
 from foldgauss.video.models.row_layout import columns
 
 #: Steps between the states that are kept to return to, at least.
@@ -101,12 +100,6 @@ class Guard:
         error = _mean_without_worst(state.frame_errors)
         state.best_error = min(error, state.best_error or error)
         return ""
-
-    def is_converging(self, state: FitState) -> bool:
-        """Whether the fit has not diverged so far and its frames are better than at the start, as far as is known."""
-        if state.backoffs or not (state.is_finite("rows") and state.is_finite("second") and _has_valid_maps(state)):
-            return False
-        return not self.comparable or (self._error_ratio(state) <= MUCH_WORSE and self._start_ratio(state) < 1)
 
     def replace_good(self, state: FitState) -> None:
         """Keep a copy of a state whose Gaussians are not comparable with those before, nor its errors."""

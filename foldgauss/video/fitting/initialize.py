@@ -11,7 +11,7 @@ from jaxtyping import Float, Float32, UInt8
 from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.video.fitting.growth import PUBLISHED_UNIT
+from foldgauss.video.fitting.config import PUBLISHED_UNIT
 from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.models.splats import SH_C0, TAU_MAX, FoldedSplats
 from foldgauss.video.motion.optical_flow import Motion, Tracks, fit_folds

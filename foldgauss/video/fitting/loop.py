@@ -30,9 +30,8 @@ from foldgauss.video.fitting.initialize import (
 )
 from foldgauss.video.fitting.rate import RateControl, count_bytes, count_past
 from foldgauss.video.fitting.relocation import Relocation, relocates
-from foldgauss.video.fitting.state import FitState, envelope_of, running_psnr, to_model
+from foldgauss.video.fitting.state import FitState, StepResult, envelope_of, running_psnr, to_model
 from foldgauss.video.fitting.steppers.engines import choose_engine, make_stepper
-from foldgauss.video.fitting.steppers.protocol import StepResult
 from foldgauss.video.models.frame_times import FrameTimes, check_rate, make_time_logits
 from foldgauss.video.models.row_layout import pack
 from foldgauss.video.models.shared_paths import SharedPaths
@@ -81,6 +80,7 @@ def fit(
     config: FitConfig | None = None,
     *,
     fps: float = 25.0,
+    state: FitState | None = None,
     controls: Iterable[DensityControl] = (),
     observers: Iterable[Callable[[FitState, FitInfo], None]] = (),
     every: int = 10,
@@ -90,8 +90,9 @@ def fit(
     Alpha, by which colors are premultiplied, is learned by compositing frames and splats over random backgrounds:
     `psnr` and `loss` are measured over these. The model is rendered over black by default.
 
-    `fps`: frames per second. `controls` change the Gaussians between steps, after those of the settings: see
-    `DensityControl`. `observers` are called with (state, info) after every step: progress bars, checkpoints.
+    `fps`: frames per second. `state`: what to start from, see `start_from`. `controls` change the Gaussians between
+    steps, after those of the settings: see `DensityControl`. `observers` are called with (state, info) after every
+    step: progress bars, checkpoints.
     `every`: the history keeps every so many steps, and the last. Raises ValueError for frames or settings that cannot
     be fitted. A fit that diverges warns by `DivergenceWarning` and goes on from its last finite state with lower
     learning rates; it raises `FitDiverged` where that does not help. No budget includes the compilation of kernels,
@@ -103,7 +104,7 @@ def fit(
     observers, history = list(observers), []
     require(is_integer(every, 1), "every", expected="a whole number >= 1", got=repr(every))
     check_rate("fps", fps)
-    for state, info in fit_steps(frames, config, controls=controls):
+    for state, info in fit_steps(frames, config, state, controls=controls):  # noqa: B020
         for observe in observers:
             observe(state, info)
         if info.step % every == 0 or info.progress >= 1:
@@ -156,11 +157,11 @@ def fit_steps(
     engine = choose_engine(frames, config)
     _warm_up(frames, config, engine)
     find_motion = motion_finder(frames, motion)
-    state = start(frames, config, None, find_motion, clock) if state is None else state
+    state = start(frames, config, find_motion, clock) if state is None else state
     stepper = make_stepper(engine, frames, config, state, find_motion)
     planner, time_left = StepPlanner(config), TimeLeft(state, config)
     guard = Guard(state, config, stepper.steps_per_pass, alpha=has_alpha)
-    controls = [*_make_controls(frames, config, state, guard, find_motion), *controls]
+    controls = [*_make_controls(frames, config, state, find_motion), *controls]
     if state.step == 0 and guard.comparable and config.initialization != "uniform":
         begun = clock()
         state.start_errors = tuple(stepper.measure_start(state).items())
@@ -199,7 +200,7 @@ def fit_steps(
 
 
 def _make_controls(
-    frames: np.ndarray, config: FitConfig, state: FitState, guard: Guard, find_motion: Callable[[], Motion]
+    frames: np.ndarray, config: FitConfig, state: FitState, find_motion: Callable[[], Motion]
 ) -> list[DensityControl]:
     """What the settings ask for."""
     controls: list[DensityControl] = []
@@ -207,7 +208,7 @@ def _make_controls(
         controls.append(RateControl(frames, config))
         controls[0].check_size(state)
     if relocates(config):
-        controls.append(Relocation(frames, config, guard, find_motion))
+        controls.append(Relocation(frames, config, find_motion))
     if config.strategy.growth is not None:
         controls.append(Densification(config, frames.shape[1:3]))
     return controls
@@ -258,19 +259,29 @@ def _warm_up(frames: np.ndarray, config: FitConfig, engine: str) -> None:
 def start(
     frames: np.ndarray,
     config: FitConfig,
-    logits: np.ndarray | None = None,
     find_motion: Callable[[], Motion] | None = None,
     clock: Callable[[], float] = time.perf_counter,
 ) -> FitState:
-    """State before the first step; frame times start at softmax weights `logits`, or by default evenly in each shot."""
+    """State before the first step; frame times start evenly in each shot."""
     find_motion = find_motion or motion_finder(frames)
     has_alpha, frames = frames.shape[3] == 4, np.ascontiguousarray(frames[..., :3])  # as seen over black
     begun, num_frames = clock(), len(frames)
     motion = find_motion() if config.follows_motion else None
-    if logits is None:
-        logits = make_time_logits(num_frames, motion.cuts if motion is not None else [])
-    logits = np.array(logits, np.float32)
-    splats = _initialize(frames, config, logits, motion)
+    logits = np.array(make_time_logits(num_frames, motion.cuts if motion is not None else []), np.float32)
+    choose_num = functools.partial(chosen_num_gaussians, config, *frames.shape[:3])
+    shape = {"degree": config.fold_degree, "seed": config.seed, "envelope": envelope_of(config)}
+    if config.initialization == "uniform":
+        splats = initialize_uniform(choose_num(), frames.shape[1:3], **shape)
+    else:
+        times = np.asarray(FrameTimes(logits).times())
+        opacity, paths = SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY, None
+        if motion is not None and config.follow_camera:
+            # Also where the camera moves steadily if that takes no bits.
+            maps = find_shared_motions(motion, steady=config.is_compact)
+            if maps is not None:
+                paths = SharedPaths(np.tile(np.float32(times), (len(maps), 1)), np.float32(maps))
+        clip = {"times": times, "motion": motion, "opacity": opacity, "paths": paths}
+        splats = initialize(frames, lambda life: choose_num(lifetime=life), **clip, **shape)
     if config.is_compact and config.compositing == "over" and not has_alpha and config.initialization != "uniform":
         splats = with_backdrop(splats, frames)
     rows = pack(splats)
@@ -321,24 +332,6 @@ def _check_config(model: VideoModel, config: FitConfig) -> None:
             got=got,
             cure="Give the config that the model was fitted with.",
         )
-
-
-def _initialize(frames: np.ndarray, config: FitConfig, logits: np.ndarray, motion: Motion | None) -> FoldedSplats:
-    """The splats at the start."""
-    shape = {"degree": config.fold_degree, "seed": config.seed}
-    choose_num = functools.partial(chosen_num_gaussians, config, *frames.shape[:3])
-    if config.initialization == "uniform":
-        return initialize_uniform(choose_num(), frames.shape[1:3], envelope=envelope_of(config), **shape)
-    times = np.asarray(FrameTimes(logits).times())
-    opacity = SUMMED_OPACITY if config.compositing == "sum" else START_OPACITY
-    clip = {"times": times, "motion": motion, "opacity": opacity}
-    if motion is not None and config.follow_camera:
-        # Also where the camera moves steadily if that takes no bits.
-        maps = find_shared_motions(motion, steady=config.is_compact)
-        clip["paths"] = (
-            maps if maps is None else SharedPaths(np.tile(np.float32(times), (len(maps), 1)), np.float32(maps))
-        )
-    return initialize(frames, lambda life: choose_num(lifetime=life), envelope=envelope_of(config), **clip, **shape)
 
 
 def _path_fields(splats: FoldedSplats, logits: np.ndarray) -> dict[str, np.ndarray]:

@@ -19,7 +19,6 @@ from foldgauss.video.fitting.adam import BETA2
 from foldgauss.video.fitting.budget import measure_progress
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.density_control import DensityControl
-from foldgauss.video.fitting.divergence import Guard
 from foldgauss.video.fitting.initialize import (
     SCALE_FACTOR,
     START_OPACITY,
@@ -52,17 +51,17 @@ def relocates(config: FitConfig) -> bool:
 
 
 class Relocation(DensityControl):
-    """Relocation at the fractions `RELOCATED_AT` of the plan, after a pass at least, in fits that converge."""
+    """Relocation at the fractions `RELOCATED_AT` of the plan, after a pass at least, in fits that have not diverged."""
 
-    def __init__(self, frames: np.ndarray, config: FitConfig, guard: Guard, find_motion: Callable[[], Motion]):
-        self.frames, self.config, self.guard, self.find_motion = frames, config, guard, find_motion
+    def __init__(self, frames: np.ndarray, config: FitConfig, find_motion: Callable[[], Motion]):
+        self.frames, self.config, self.find_motion = frames, config, find_motion
 
     def is_due(self, state: FitState) -> bool:
         if not state.plan or state.step < steps_per_pass(self.config, len(self.frames)):
             return False
         before, after = (measure_progress(state, self.config, step) for step in (state.step - 1, state.step))
         crossed = any(before < fraction <= after for fraction in RELOCATED_AT)
-        return crossed and bool(state.frame_errors.any()) and self.guard.is_converging(state)
+        return crossed and bool(state.frame_errors.any()) and not state.backoffs and state.is_finite("second")
 
     def apply(self, state: FitState) -> None:
         motion = self.find_motion() if self.config.follows_motion else None

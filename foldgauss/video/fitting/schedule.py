@@ -25,21 +25,16 @@ def num_views(config: FitConfig, num_frames: int) -> int:
     return 2 * num_frames if config.views.two_cameras else num_frames
 
 
-def fraction_in_turn(config: FitConfig) -> float:
-    """The fraction of the views that visit all frames in turn; the others are drawn by error."""
-    return 1 - config.views.error_fraction
-
-
 def steps_per_pass(config: FitConfig, num_frames: int) -> int:
     """Steps in which every view is seen at least once."""
-    return math.ceil(num_views(config, num_frames) / (config.views.batch_size * fraction_in_turn(config)))
+    return math.ceil(num_views(config, num_frames) / (config.views.batch_size * (1 - config.views.error_fraction)))
 
 
 def choose_views(config: FitConfig, num_frames: int, step: int, errors: np.ndarray) -> np.ndarray:
     """The views of a step: in turn, and in between by the `errors` of the frames, (num_frames,), 0 where unknown.
 
-    View k is frame k; from the number of frames on, frame k - num_frames, mirrored. All but `fraction_in_turn` of the
-    views, evenly among the others, are drawn in proportion to the errors; frames without one count as average. The
+    View k is frame k; from the number of frames on, frame k - num_frames, mirrored. The fraction `error_fraction` of
+    the views, evenly among the others, is drawn in proportion to the errors; frames without one count as average. The
     others pass through all views, in an order that depends on the seed and the pass only.
     """
     num, (views, drawn) = num_views(config, num_frames), find_views_in_turn(config, num_frames, step)
@@ -51,10 +46,11 @@ def choose_views(config: FitConfig, num_frames: int, step: int, errors: np.ndarr
 
 def find_views_in_turn(config: FitConfig, num_frames: int, step: int) -> tuple[np.ndarray, np.ndarray]:
     """The views of a step if none were drawn by error, and which are drawn (they are the next ones in turn here)."""
-    num, in_turn = num_views(config, num_frames), fraction_in_turn(config)
+    num, in_turn = num_views(config, num_frames), 1 - config.views.error_fraction
     positions = np.arange(step * config.views.batch_size, (step + 1) * config.views.batch_size)
     taken = np.floor(positions * in_turn).astype(int)
-    views = np.array([_shuffle(config, num, k // num)[k % num] for k in taken])
+    orders = (make_generator(Stream.FRAME_ORDER, k // num, seed=config.seed).permutation(num) for k in taken)
+    views = np.array([order[k % num] for order, k in zip(orders, taken, strict=True)])
     return views, np.floor((positions + 1) * in_turn).astype(int) == taken
 
 
@@ -65,10 +61,6 @@ def _chances(errors: np.ndarray, num: int) -> np.ndarray:
     return np.tile(chances / chances.sum(), num // len(errors)) * len(errors) / num
 
 
-def _shuffle(config: FitConfig, num: int, epoch: int) -> np.ndarray:
-    return make_generator(Stream.FRAME_ORDER, epoch, seed=config.seed).permutation(num)
-
-
 def choose_start_frames(num_frames: int) -> np.ndarray:
     """The frames whose errors tell how good the start is: evenly spaced, from the first to the last."""
     return np.unique(np.linspace(0, num_frames - 1, NUM_START_FRAMES).round().astype(int))
@@ -77,34 +69,21 @@ def choose_start_frames(num_frames: int) -> np.ndarray:
 # ------------------------------------------------------------------------------------------ learning rates
 
 
-class RateSchedule:
-    """Adam's learning rates by column of a row, and that of the frame times, as they decay."""
+def learning_rates(config: FitConfig, progress: float, backoffs: int) -> tuple[np.ndarray, np.float32, np.float32]:
+    """Adam's learning rates at a fraction of the plan and after back-offs.
 
-    def __init__(self, config: FitConfig):
-        width = columns(config.fold_degree)["coefficients"].stop
-        self.config, self.first = config, np.empty(width, np.float32)
-        self.decayed = np.ones(width, bool)
-        for name, place in columns(config.fold_degree).items():
-            self.first[place] = getattr(config.rates, name)
-            self.decayed[place] = config.rates.decayed in ("all", name)
-
-    def at(self, progress: float, backoffs: int) -> tuple[np.ndarray, np.float32]:
-        """The rates of rows, float32 (width,), and of frame times, at a fraction of the plan and after back-offs."""
-        config, decay, slower = self.config, self._decay(progress), BACKOFF_FACTOR**-backoffs
-        rows = np.where(self.decayed, self.first * np.float32(decay), self.first) * np.float32(slower)
-        times = config.rates.frame_times * (decay if config.rates.decayed == "all" else 1.0) * slower
-        return rows, np.float32(times)
-
-    def of_paths(self, progress: float, backoffs: int) -> np.float32:
-        """The rate of the maps of shared paths."""
-        return np.float32(self.config.rates.paths * self._decay(progress) * BACKOFF_FACTOR**-backoffs)
-
-    def _decay(self, progress: float) -> float:
-        config = self.config
-        decay = config.rates.final**progress if config.rates.final > 0 else 1 - progress
-        if 1 - progress < config.rates.cooldown:
-            decay *= COLD + (1 - COLD) * ((1 - progress) / config.rates.cooldown)
-        return decay
+    They are those of rows by column, float32 (width,), of frame times, and of the maps of shared paths.
+    """
+    rates, slower = config.rates, BACKOFF_FACTOR**-backoffs
+    decay = rates.final**progress if rates.final > 0 else 1 - progress
+    if 1 - progress < rates.cooldown:
+        decay *= COLD + (1 - COLD) * ((1 - progress) / rates.cooldown)
+    rows = np.empty(columns(config.fold_degree)["coefficients"].stop, np.float32)
+    for name, place in columns(config.fold_degree).items():
+        factor = np.float32(decay if rates.decayed in ("all", name) else 1.0)
+        rows[place] = np.float32(getattr(rates, name)) * factor * np.float32(slower)
+    times = rates.frame_times * (decay if rates.decayed == "all" else 1.0) * slower
+    return rows, np.float32(times), np.float32(rates.paths * decay * slower)
 
 
 # ------------------------------------------------------------------------------------------------- targets

@@ -7,19 +7,19 @@ starting, pruning, densification, copies, checkpoints and devices all go by it.
 import collections
 import copy
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import field
 from typing import Any, ClassVar, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Array, Bool, Float, Float32
 
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.video.fitting.adam import adam_step
 from foldgauss.video.fitting.config import FitConfig
-from foldgauss.video.fitting.growth import GradientStatistics
 from foldgauss.video.models.conditioning import ConditioningSpec
 from foldgauss.video.models.frame_times import FrameTimes
 from foldgauss.video.models.row_layout import columns, unpack
@@ -93,11 +93,31 @@ _NUMBER = {"static": True, "decode": float}
 _ERRORS = {"static": True, "decode": _decode_errors}
 _RULES = {"static": True, "decode": _decode_rules}
 _NUMBERS = {"static": True, "decode": tuple}
+#: The names of the maps of shared paths, of their moments, and of the frames' counts of steps.
+PATH_ARRAYS = ("path_maps", "path_first", "path_second", "frame_counts")
 #: The names of the sums of `GradientStatistics`.
 STATISTICS = ("screen_gradients", "time_gradients", "seen")
 
 
 # --------------------------------------------------------------------------------------------------- state
+
+
+class GradientStatistics(NamedTuple):
+    """Sums over the steps since the last densification; (num,) each."""
+
+    screen: np.ndarray  #: float32: of screen gradients
+    time: np.ndarray  #: float32: of time gradients
+    seen: np.ndarray  #: int32: steps in which the Gaussian was seen
+
+    def add(self, screen: np.ndarray, by_time: np.ndarray) -> None:
+        """Add a step: the largest screen gradient over its views, and dL/dm_t by the raw m_t over all; (num,) each.
+
+        `screen` is negative for Gaussians that no view shows.
+        """
+        shown = screen >= 0
+        np.add(self.screen, screen, out=self.screen, where=shown)
+        np.add(self.time, np.abs(by_time), out=self.time, where=shown)
+        np.add(self.seen, 1, out=self.seen, where=shown)
 
 
 @jax.tree_util.register_dataclass
@@ -143,8 +163,6 @@ class FitState:
     last_drop: tuple[float, ...] = field(default=(), metadata=_NUMBERS)
     rules: tuple[tuple, ...] = field(default=(), metadata=_RULES)  # by which parameters are rounded, once any are
     seconds: float = field(default=0.0, metadata=_NUMBER)
-    processor_seconds: float = field(default=0.0, metadata=_NUMBER)  # of all threads, where `jobs` runs the fit
-    waiting_seconds: float = field(default=0.0, metadata=_NUMBER)  # likewise; see `_runtime.machine`
     # What `divergence.Guard` decides by; stored, so that a resumed fit diverges and recovers as if uninterrupted.
     best_error: float = field(default=0.0, metadata=_NUMBER)  # the lowest one that others are compared with; 0: none
     backoffs: int = field(default=0, metadata=_COUNT)  # how often the fit returned to `last_finite`, with lower rates
@@ -271,6 +289,14 @@ DeviceArrays = collections.namedtuple("DeviceArrays", ARRAYS)
 # ------------------------------------------------------------------------------------ what follows from a state
 
 
+class StepResult(NamedTuple):
+    """What one step reports."""
+
+    loss: float  #: mean over the batch
+    num_alive: int  #: Gaussians that took part
+    finite: bool = True  #: whether the parameters of these are finite after the step
+
+
 def to_model(state: FitState, config: FitConfig, size: tuple[int, int], fps: float) -> VideoModel:
     """The model as it stands in `state` (arrays are copied)."""
     return VideoModel(
@@ -294,30 +320,19 @@ def paths_of(state: FitState, times: Float32[np.ndarray, " frames"] | None = Non
     return SharedPaths(times, np.swapaxes(state.path_maps, 0, 1).copy())
 
 
-def update_paths(
-    state: FitState, grad: Float[np.ndarray, "frames paths 2 3"], frames: Int[np.ndarray, " n"], rate: float
-) -> bool:
-    """A step of Adam on the maps of `frames`, which are distinct, in place. Returns whether these can be inverted."""
-    num = len(frames)
-    state.frame_counts[frames] += 1
-    arrays = (array[frames].reshape(num, -1) for array in (grad, state.path_first, state.path_second))
-    rates = np.full(grad[0].size, rate, np.float32)
-    move, first, second = adam_step(*arrays, state.frame_counts[frames], rates)
-    for array, value in ((state.path_first, first), (state.path_second, second)):
-        array[frames] = value.reshape(grad[frames].shape)
-    state.path_maps[frames] -= move.reshape(grad[frames].shape).astype(np.float32)
-    with np.errstate(invalid="ignore", over="ignore"):
-        return bool((np.linalg.det(state.path_maps[frames][..., :2]) > 0).all())
-
-
-def measure_relative_size(state: FitState, config: FitConfig) -> float:
+@functools.partial(jax.jit, static_argnames="unit")
+def measure_relative_size(
+    log_scales: Float[Array, "num 2"], used: Bool[Array, " num"], *, unit: float
+) -> Float[Array, ""]:
     """The size of Gaussians, in units of that at which the learning rate of paths is stated; 1 if it is absolute.
 
-    Their geometric mean, of every `SIZE_STRIDE`-th, at most that of the frame.
+    Their geometric mean, at most that of the frame, of those that are `used`: every `SIZE_STRIDE`-th of a fit.
     """
-    unit = config.rates.units.size
-    mean = float(state.rows[::SIZE_STRIDE, columns(config.fold_degree)["log_scale"]].mean(dtype=np.float64))
-    return math.exp(min(mean, 0.0)) / unit if unit and math.isfinite(mean) else 1.0
+    if not unit:
+        return jnp.float32(1)
+    sizes = jnp.where(used, jnp.mean(log_scales, axis=1), 0)
+    mean = jnp.sum(sizes) / jnp.sum(used).astype(jnp.float32)
+    return jnp.where(jnp.isfinite(mean), jnp.exp(jnp.minimum(mean, 0)) / np.float32(unit), 1)
 
 
 def running_psnr(state: FitState) -> float:

@@ -1,11 +1,13 @@
-"""Layers of videos in segments: each segment with the Gaussians of the other videos, in the segment's own time."""
+"""Layers of videos in segments: each segment with the Gaussians of the others; and layers merged into one model."""
 
 import dataclasses
 import functools
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from foldgauss._runtime.checks import invalid, require
+from foldgauss._runtime.checks import require
 from foldgauss.video.editing.edited_video import (
     EditedVideo,
     Layer,
@@ -16,12 +18,15 @@ from foldgauss.video.editing.edited_video import (
 )
 from foldgauss.video.editing.overlays import AbstractOverlay, GaussianFunction, Retiming, TriangleFunction, is_active
 from foldgauss.video.editing.timing import NEVER, Clock, TimeMap, distinct_knots, frame_times_of
-from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.models.shared_paths import join_paths
+from foldgauss.video.models.splats import FoldedSplats
+from foldgauss.video.models.video_model import ONE_SEGMENT, VideoModel
 from foldgauss.video.segmented.segmented_video import MAX_PREPARED, SegmentedVideo
 from foldgauss.video.selection.selectors import by_time
 
 Video = VideoModel | EditedVideo | SegmentedVideo
 
+_CURE = "Render it to a video file: foldgauss render, or write_video(path, video.frames(), video.fps)."
 #: Clip time. Gaussians that are alive within this margin around a segment are kept.
 _MARGIN = 1e-4
 
@@ -57,12 +62,13 @@ def layers(*videos: Video, timeline: int = -1) -> EditedVideo | SegmentedVideo:
     for number, video in enumerate(videos):
         if not isinstance(video, SegmentedVideo):
             as_edited(video)
-        elif _bounds(video) != _bounds(lead):
-            raise invalid(
-                "videos",
-                expected=f"the segments of video {timeline}, {_format_bounds(lead)}",
-                got=f"{_format_bounds(video)} in video {number}",
-            )
+            continue
+        require(
+            _bounds(video) == _bounds(lead),
+            "videos",
+            expected=f"the segments of video {timeline}, {_format_bounds(lead)}",
+            got=f"{_format_bounds(video)} in video {number}",
+        )
 
     @functools.lru_cache(maxsize=MAX_PREPARED)
     def load(number: int) -> EditedVideo:
@@ -135,3 +141,84 @@ def _convert_overlay(overlay: AbstractOverlay, time_map: TimeMap) -> AbstractOve
         return overlay
     span = time_map.convert_span(overlay.span)
     return None if span is NEVER and not is_active(overlay, 0.0) else dataclasses.replace(overlay, span=span)
+
+
+# ------------------------------------------------------------------------------------------------- flattening
+
+
+def flatten_video(video: Video) -> VideoModel:
+    """The plain model that renders the same at all times: its array has the layers from front to back.
+
+    Raises ValueError if no folded model represents the video, because of edits over a span, clocks, functions or a
+    camera; for layers of several envelopes, with cuts of their own or with too many shared paths, and for a video in
+    segments.
+
+    Example: `flatten_video(layers(person, street))`.
+    """
+    if isinstance(video, VideoModel):
+        return video
+    require(
+        not isinstance(video, SegmentedVideo),
+        "model",
+        expected="a model without segments",
+        got=repr(video),
+        cure=ONE_SEGMENT,
+    )
+    require(
+        video.camera is None and not any(layer.overlays or layer.clocks for layer in video.layers),
+        "model",
+        expected="a plain model, or edits that could be baked",
+        got="one with edits that no folded model represents",
+        cure=_CURE,
+    )
+    lead = video.layers[video.timeline].model
+    _check_alike(video.layers, lead)
+    if len(video.layers) == 1:
+        return lead
+    return dataclasses.replace(lead, splats=_concatenate([layer.model.splats for layer in video.layers]))
+
+
+def _check_alike(layers: tuple[Layer, ...], lead: VideoModel) -> None:
+    for layer in layers:
+        model = layer.model
+        own, other = (jax.tree.map(lambda leaf: np.unique(leaf).tolist(), one.splats.envelope) for one in (model, lead))
+        require(
+            own == other and (len(layers) <= 1 or not any(len(values) > 1 for values in (own.power, own.floor))),
+            "model",
+            expected="layers with one envelope",
+            got="several",
+            cure=_CURE,
+        )
+        require(
+            model.scale_cutoff == lead.scale_cutoff,
+            "model",
+            expected="layers with one scale_cutoff",
+            got="several",
+            cure=_CURE,
+        )
+        require(
+            model is lead or not layer.holds_frames,
+            "model",
+            expected="layers without cuts",
+            got="one that has its own",
+            cure=_CURE,
+        )
+
+
+def _concatenate(parts: list[FoldedSplats]) -> FoldedSplats:
+    """The Gaussians of all parts; folds of a lower degree are padded with zero coefficients, see also `join_paths`."""
+    degree = max(part.degree for part in parts)
+
+    def gather(name: str) -> list:
+        leaves = [jnp.asarray(getattr(part, name)) for part in parts]
+        if name == "coefficients":
+            return [jnp.pad(leaf, ((0, 0), (0, degree - leaf.shape[1]), (0, 0))) for leaf in leaves]
+        return leaves
+
+    path_index, paths = join_paths(parts)
+    envelope = parts[0].envelope
+    if len(parts) > 1:  # it has the same values for all Gaussians, see `_check_alike`
+        envelope = jax.tree.map(lambda leaf: jnp.ravel(leaf)[0], envelope)
+    shared = {"envelope": envelope, "path_index": path_index, "paths": paths}
+    names = [field.name for field in dataclasses.fields(FoldedSplats) if field.name not in shared]
+    return FoldedSplats(**{name: jnp.concatenate(gather(name)) for name in names}, **shared)

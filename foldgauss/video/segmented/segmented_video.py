@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from foldgauss._runtime.checks import invalid, is_integer, require, short_repr
+from foldgauss._runtime.checks import is_integer, require, short_repr
 from foldgauss.render import RenderOptions, Splats2D
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.frame_times import times_at
@@ -72,11 +72,12 @@ class Segment:
     def model(self) -> VideoModel | EditedVideo:
         """The model, loaded on each access. Raises ValueError if it has other frames, and the errors of `load`."""
         model = self.load()
-        if (model.num_frames, tuple(model.size)) != (self.num_frames, tuple(self.size)):
-            expected, got = (
-                f"{one.num_frames} frames of {one.size[0]}x{one.size[1]} (height x width)" for one in (self, model)
-            )
-            raise invalid("segment.load()", expected=f"a model of {expected}", got=f"one of {got}")
+        require(
+            (model.num_frames, tuple(model.size)) == (self.num_frames, tuple(self.size)),
+            "segment.load()",
+            expected=f"a model of {self.num_frames} frames of {self.size[0]}x{self.size[1]} (height x width)",
+            got=f"one of {model.num_frames} frames of {model.size[0]}x{model.size[1]} (height x width)",
+        )
         return model
 
 

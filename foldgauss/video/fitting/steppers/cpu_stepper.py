@@ -7,22 +7,23 @@ import cv2
 import numpy as np
 
 from foldgauss.render import cpu
-from foldgauss.video.fitting.adam import sparse_adam, update_frame_times
+from foldgauss.video.fitting.adam import sparse_adam, update_frame_times, update_paths
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.losses import LOSSES
-from foldgauss.video.fitting.schedule import RateSchedule, choose_start_frames, steps_per_pass, to_planes
+from foldgauss.video.fitting.schedule import choose_start_frames, learning_rates, steps_per_pass, to_planes
 from foldgauss.video.fitting.state import (
+    PATH_ARRAYS,
+    SIZE_STRIDE,
     FitState,
+    StepResult,
     frame_times,
     measure_relative_size,
     paths_of,
     spec_of,
-    update_paths,
 )
 from foldgauss.video.fitting.steppers.interpolated_frames import choose_targets, make_interpolated
 from foldgauss.video.fitting.steppers.jax_loss import custom_loss
 from foldgauss.video.fitting.steppers.loss import ImageLoss, border_weights, image_loss, squared_loss
-from foldgauss.video.fitting.steppers.protocol import StepResult
 from foldgauss.video.models.background import random_background
 from foldgauss.video.models.conditioning import (
     ConditionedSplats,
@@ -38,7 +39,7 @@ from foldgauss.video.motion.optical_flow import Motion, motion_finder
 
 
 class CpuStepper:
-    """A `Stepper` with the buffers and constants that all steps share."""
+    """Computes the steps of a fit, with the buffers and constants that all share. Methods change the state in place."""
 
     def __init__(
         self, frames: np.ndarray, config: FitConfig, state: FitState, find_motion: Callable[[], Motion] | None = None
@@ -47,23 +48,25 @@ class CpuStepper:
         self.frames, self.config = frames, config
         self.background = np.zeros(3, np.float32)  # for frames with alpha another one in every step
         self.num_frames = len(frames)
-        self.rates, self.steps_per_pass = RateSchedule(config), steps_per_pass(config, self.num_frames)
+        self.steps_per_pass = steps_per_pass(config, self.num_frames)
         self.spec = spec_of(config, frames.shape[1:3])
         self.interpolation = make_interpolated(frames, config, find_motion or motion_finder(frames))
         self.adopt(state)
 
     def adopt(self, state: FitState) -> None:
+        """Prepare for a state whose arrays were replaced."""
         self.grad = np.zeros_like(state.rows)
         self.window = find_windows(state.rows, self.spec)
 
     def step(self, state: FitState, progress: float) -> StepResult:
+        """One step at a fraction of the plan. The step counter is the caller's."""
         config, num_frames = self.config, self.num_frames
         if self.frames.shape[3] == 4:
             self.background = random_background(config.seed, state.step)
         times = np.asarray(frame_times(state.time_logits))
         by_time, by_path = np.zeros_like(times), np.zeros(state.path_maps.shape)
         spec = dataclasses.replace(self.spec, paths=paths_of(state, times))
-        losses, alive, visited = [], [], set()
+        losses, alive, visited = [], [], np.zeros(num_frames, bool)
         squared = progress >= config.squared_from
         screen = None if state.statistics is None else np.full(len(state.rows), -1, np.float32)
         views, fractions = choose_targets(self.interpolation, config, num_frames, state, progress)
@@ -75,7 +78,7 @@ class CpuStepper:
             loss, done, d_time = self._differentiate(state, k, t, spec, own_path, **settings)
             if fraction is None:
                 by_time[k] += d_time  # a batch may hold a frame twice
-                visited.add(k)
+                visited[k] = True
             losses.append(loss.value)
             alive.append(done.alive)
         if state.statistics is not None:
@@ -88,8 +91,8 @@ class CpuStepper:
         num_alive = len(touched)
         if not config.strategy.sparse_updates:
             touched = np.arange(len(state.rows))
-        relative_size = measure_relative_size(state, config) if by_path.size else 1.0
-        rates, time_rate = self.rates.at(progress, state.backoffs)
+        scales = state.rows[::SIZE_STRIDE, columns(config.fold_degree)["log_scale"]].copy()  # before the step
+        rates, time_rate, path_rate = learning_rates(config, progress, state.backoffs)
         moments, units = (state.first, state.second, state.counts), config.rates.units
         arrays = state.rows, self.grad, *moments, touched
         finite = sparse_adam(*arrays, rates, rounded=state.rounded, units=units)
@@ -98,12 +101,18 @@ class CpuStepper:
             moments = state.time_count, state.time_first, state.time_second
             state.time_logits, moments = update_frame_times(state.time_logits, moments, by_time, time_rate)
             state.time_count, state.time_first, state.time_second = moments
-        if by_path.size and visited:
-            path_rate = self.rates.of_paths(progress, state.backoffs)
-            finite &= update_paths(state, by_path, np.array(sorted(visited)), path_rate * relative_size)
+        if by_path.size:
+            every = np.ones(len(scales), bool)
+            rate = path_rate * measure_relative_size(scales, every, unit=config.rates.units.size)
+            before = tuple(getattr(state, name) for name in PATH_ARRAYS)
+            with np.errstate(over="ignore"):  # of a fit that diverges
+                after = update_paths(before, np.float32(by_path), visited, rate)
+            for name, array in zip(PATH_ARRAYS, after, strict=True):
+                setattr(state, name, np.array(array))
         return StepResult(float(np.mean(losses)), num_alive, finite)
 
     def measure_start(self, state: FitState) -> dict[int, float]:
+        """Mean squared errors of some frames, by frame."""
         spec, errors = dataclasses.replace(self.spec, paths=paths_of(state)), {}
         times = np.asarray(frame_times(state.time_logits))
         for k in choose_start_frames(self.num_frames):

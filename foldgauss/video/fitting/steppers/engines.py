@@ -12,7 +12,6 @@ from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.state import FitState
 from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
 from foldgauss.video.fitting.steppers.jax_stepper import JaxStepper
-from foldgauss.video.fitting.steppers.protocol import Stepper
 from foldgauss.video.motion.optical_flow import Motion
 
 
@@ -40,7 +39,7 @@ def choose_engine(frames: np.ndarray, config: FitConfig) -> str:
 
 def make_stepper(
     engine: str, frames: np.ndarray, config: FitConfig, state: FitState, find_motion: Callable[[], Motion]
-) -> Stepper:
+) -> CpuStepper | JaxStepper:
     """The stepper of an engine; it takes over the arrays of `state`."""
     if engine == "cpu":
         return CpuStepper(frames, config, state, find_motion)
@@ -49,5 +48,4 @@ def make_stepper(
 
 def describe_device() -> str:
     """The name of the device that JAX engines compute on, as "NVIDIA H200"."""
-    first, *others = jax.local_devices()
-    return f"{len(others) + 1} times {first.device_kind}" if others else first.device_kind
+    return jax.local_devices()[0].device_kind

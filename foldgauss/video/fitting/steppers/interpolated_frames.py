@@ -13,8 +13,8 @@ from jaxtyping import Float32
 
 from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.threads import num_threads
-from foldgauss.video.fitting.config import FitConfig, chosen_interpolation
-from foldgauss.video.fitting.schedule import choose_views, find_views_in_turn, fraction_in_turn
+from foldgauss.video.fitting.config import INTERPOLATION_FRACTION, FitConfig
+from foldgauss.video.fitting.schedule import choose_views, find_views_in_turn
 from foldgauss.video.fitting.state import FitState
 from foldgauss.video.motion.optical_flow import Motion
 
@@ -97,6 +97,8 @@ def make_interpolated(
     frames: np.ndarray, config: FitConfig, find_motion: Callable[[], Motion]
 ) -> InterpolatedFrames | None:
     """The interpolated frames of a fit to `frames`; None where it has none, and so needs no optical flow for them."""
-    chance = chosen_interpolation(config, alpha=frames.shape[3] == 4) if len(frames) > 1 else 0.0
-    chance = min(chance / fraction_in_turn(config), 1.0)
+    chance = config.views.interpolation_fraction
+    if chance is None:  # by default only where optical flow is used, and tells what is there (not behind alpha)
+        chance = INTERPOLATION_FRACTION if config.follows_motion and frames.shape[3] == 3 else 0.0
+    chance = min(chance / (1 - config.views.error_fraction), 1.0) if len(frames) > 1 else 0.0
     return InterpolatedFrames(frames, config, chance, find_motion()) if chance > 0 else None

@@ -58,13 +58,12 @@ def compute_losses(
     difference = rendered - target
     errors = _mean(difference * difference)
 
-    def structural() -> Float[Array, " batch"]:
+    def first() -> Float[Array, " batch"]:
+        if function is not None:
+            return jax.vmap(function)(rendered, target)
         # Not `abs`, whose slope in JAX is 1 where both are equal: there it is 0.
         value = (1 - ssim_fraction) * _mean(difference * jax.lax.stop_gradient(jnp.sign(difference)))
         return value if ssim_fraction == 0 else value + ssim_fraction * (1 - _mean(ssim(rendered, target)))
-
-    def first() -> Float[Array, " batch"]:
-        return structural() if function is None else jax.vmap(function)(rendered, target)
 
     return jax.lax.cond(squared, lambda: np.float32(SQUARE_WEIGHT) * errors, first), errors
 

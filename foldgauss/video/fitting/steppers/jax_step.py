@@ -2,7 +2,6 @@
 
 Arrays have rows for the largest number of Gaussians that there may be; rows after the first `num` are unused: they
 render nothing and do not learn. A step is one program, to which the arrays are donated; nothing in it calls the host.
-The frames of a batch are divided over the devices of a mesh, each of which has all arrays.
 """
 
 import dataclasses
@@ -14,23 +13,27 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.render.tiles import find_visible
-from foldgauss.video.fitting.adam import BETA1, BETA2, EPSILON, RateUnits, masked_adam, update_frame_times
+from foldgauss.video.fitting.adam import RateUnits, masked_adam, update_frame_times, update_paths
 from foldgauss.video.fitting.config import Loss
-from foldgauss.video.fitting.state import SIZE_STRIDE, DeviceArrays, FitState, Sizes, frame_times
+from foldgauss.video.fitting.state import (
+    PATH_ARRAYS,
+    SIZE_STRIDE,
+    DeviceArrays,
+    FitState,
+    Sizes,
+    frame_times,
+    measure_relative_size,
+)
 from foldgauss.video.fitting.steppers.jax_loss import compute_losses
 from foldgauss.video.fitting.steppers.loss import border_weights
 from foldgauss.video.models.row_layout import columns, unpack
 from foldgauss.video.models.shared_paths import move_splats
 from foldgauss.video.models.splats import TAU_MAX
-
-#: The axis of the mesh that views are divided over.
-VIEWS = "views"
 
 
 class Control(NamedTuple):
@@ -85,7 +88,6 @@ class Program:
     learns_times: bool
     grows: bool
     interpolates: bool
-    num_devices: int
     num_paths: int = 0  # that Gaussians share
 
     @property
@@ -99,19 +101,6 @@ class Program:
         return self.num_trained + (self.num_paths > 0)
 
 
-def make_mesh(program: Program) -> Mesh | None:
-    """The devices that views are divided over; None where there is only one."""
-    if program.num_devices == 1:
-        return None
-    return Mesh(np.array(jax.local_devices()[: program.num_devices]), (VIEWS,))
-
-
-def replicated(program: Program) -> NamedSharding | None:
-    """The sharding of arrays that every device has whole."""
-    mesh = make_mesh(program)
-    return None if mesh is None else NamedSharding(mesh, PartitionSpec())
-
-
 @functools.lru_cache(maxsize=8)
 def compile_step(program: Program) -> jax.stages.Compiled:
     """The compiled step: called with `(arrays, frames, control)` it returns `(arrays, report)`.
@@ -123,10 +112,7 @@ def compile_step(program: Program) -> jax.stages.Compiled:
 
 def lower_step(program: Program, platforms: tuple[str, ...] | None = None) -> jax.stages.Lowered:
     """The step before it is compiled; for `platforms`, by default those of this machine."""
-    place = replicated(program)
-    specs = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), _specs(program))
-    options = {} if place is None else {"out_shardings": place}
-    traced = jax.jit(functools.partial(step, program), donate_argnums=0, **options).trace(*specs)
+    traced = jax.jit(functools.partial(step, program), donate_argnums=0).trace(*_specs(program))
     return traced.lower(lowering_platforms=platforms)
 
 
@@ -154,9 +140,14 @@ def _specs(program: Program) -> tuple[DeviceArrays, jax.ShapeDtypeStruct, Contro
 def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames height width 3"], control: Control):
     """The arrays after a step, and its `Report`."""
     times = frame_times(arrays.time_logits)
-    seen = _distribute(program)(arrays.rows, arrays.path_maps, times, frames, control)
+    seen = _differentiate(program, arrays.rows, arrays.path_maps, times, frames, control)
     if program.grows:
-        arrays = _add_statistics(arrays, seen, columns(program.degree)["time_loc_logit"].start)
+        shown, at = seen.screen >= 0, columns(program.degree)["time_loc_logit"].start  # as `GradientStatistics.add`
+        arrays = arrays._replace(
+            screen_gradients=arrays.screen_gradients + jnp.where(shown, seen.screen, 0),
+            time_gradients=arrays.time_gradients + jnp.where(shown, jnp.abs(seen.by_rows[:, at]), 0),
+            seen=arrays.seen + shown.astype(jnp.int32),
+        )
     used = jnp.arange(program.capacity, dtype=jnp.int32) < control.num
     touched = seen.alive if program.sparse_updates else used
     moments, before = (arrays.first, arrays.second, arrays.counts), arrays.rows
@@ -169,7 +160,12 @@ def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames he
         logits, of_times = update_frame_times(logits, of_times, seen.by_times, control.time_rate)
     errors = jnp.where(seen.errors >= 0, seen.errors, arrays.frame_errors)
     if program.num_paths:
-        arrays = _update_paths(arrays, seen, control.path_rate * _relative_size(program, before, control.num))
+        scales = before[::SIZE_STRIDE, columns(program.degree)["log_scale"]]
+        of_stride = jnp.arange(0, program.capacity, SIZE_STRIDE, dtype=jnp.int32) < control.num
+        rate = control.path_rate * measure_relative_size(scales, of_stride, unit=program.rate_units.size)
+        of_paths = tuple(getattr(arrays, name) for name in PATH_ARRAYS)
+        of_paths = update_paths(of_paths, seen.by_paths, seen.errors >= 0, rate)
+        arrays = arrays._replace(**dict(zip(PATH_ARRAYS, of_paths, strict=True)))
     report = Report(
         loss=seen.loss,
         num_alive=jnp.sum(seen.alive, dtype=jnp.int32),
@@ -181,36 +177,6 @@ def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames he
     arrays = arrays._replace(rows=rows, first=first, second=second, counts=counts, frame_errors=errors)
     count, first, second = of_times
     return arrays._replace(time_logits=logits, time_count=count, time_first=first, time_second=second), report
-
-
-def _relative_size(program: Program, rows, num) -> Float[Array, ""]:
-    """The twin of `state.measure_relative_size`."""
-    if not program.rate_units.size:
-        return jnp.float32(1)
-    sizes = jnp.mean(rows[::SIZE_STRIDE, columns(program.degree)["log_scale"]], axis=1)
-    used = jnp.arange(0, program.capacity, SIZE_STRIDE, dtype=jnp.int32) < num
-    mean = jnp.sum(jnp.where(used, sizes, 0)) / jnp.sum(used).astype(jnp.float32)
-    relative = jnp.exp(jnp.minimum(mean, 0)) / np.float32(program.rate_units.size)
-    return jnp.where(jnp.isfinite(mean), relative, 1)
-
-
-def _update_paths(arrays: DeviceArrays, seen: "Gradients", rate: Float[Array, ""]) -> DeviceArrays:
-    """The twin of `state.update_paths`, for the frames of the batch."""
-    visited = seen.errors >= 0
-    counts = arrays.frame_counts + visited.astype(jnp.int32)
-    wide = jnp.maximum(counts, 1).astype(jnp.float32)[:, None, None, None]
-    beta1, beta2, one = np.float32(BETA1), np.float32(BETA2), np.float32(1)
-    first = beta1 * arrays.path_first + (one - beta1) * seen.by_paths
-    second = beta2 * arrays.path_second + (one - beta2) * seen.by_paths * seen.by_paths
-    square = second / (one - beta2**wide)
-    maps = arrays.path_maps - rate * (first / (one - beta1**wide)) / (jnp.sqrt(square) + np.float32(EPSILON))
-    chosen = visited[:, None, None, None]
-    return arrays._replace(
-        path_maps=jnp.where(chosen, maps, arrays.path_maps),
-        path_first=jnp.where(chosen, first, arrays.path_first),
-        path_second=jnp.where(chosen, second, arrays.path_second),
-        frame_counts=counts,
-    )
 
 
 class Gradients(NamedTuple):
@@ -225,35 +191,8 @@ class Gradients(NamedTuple):
     screen: Float[Array, " capacity"]  # largest screen gradient; -1 of Gaussians that no view shows
 
 
-def _distribute(program: Program):
-    """`_differentiate`, on one device or on all of them, each with its views."""
-    mesh, here = make_mesh(program), functools.partial(_differentiate, program)
-    if mesh is None:
-        return here
-    whole, views = PartitionSpec(), PartitionSpec(VIEWS)
-
-    def on_each(rows, path_maps, times, frames, control):
-        own = here(rows, path_maps, times, frames, control)
-        total = functools.partial(jax.lax.psum, axis_name=VIEWS)
-        largest = functools.partial(jax.lax.pmax, axis_name=VIEWS)
-        return Gradients(
-            *map(total, (own.loss, own.by_rows, own.by_paths, own.by_times)),
-            largest(own.errors),
-            largest(own.alive.astype(jnp.int32)) > 0,
-            largest(own.screen),
-        )
-
-    interpolated = InterpolatedViews(views, views) if program.interpolates else None
-    own = Control(views, *5 * [whole], interpolated)
-    # The replication check does not support the loops inside.
-    return jax.shard_map(on_each, mesh=mesh, in_specs=(*4 * [whole], own), out_specs=whole, check_vma=False)
-
-
 def _differentiate(program: Program, rows, path_maps, times, frames, control: Control) -> Gradients:
-    """Render the views and differentiate their losses by rows, the frames' maps of paths, and times.
-
-    All are sums over this device's part of the batch.
-    """
+    """Render the views and differentiate their losses by rows, the frames' maps of paths, and times."""
     k, mirrored = control.views % program.num_frames, control.views >= program.num_frames
     t, target, whole = times[k], frames[k].astype(jnp.float32) * np.float32(1 / 255), jnp.ones(len(k), bool)
     maps = path_maps[k]
@@ -337,16 +276,6 @@ def _screen_gradient(program: Program, splats: Splats2D, by_splats: Splats2D, al
     return jnp.max(jnp.where(shows & alive, size, jnp.full_like(size, -1.0)), axis=0)
 
 
-def _add_statistics(arrays: DeviceArrays, seen: Gradients, time_column: int) -> DeviceArrays:
-    """The twin of `GradientStatistics.add`."""
-    shown, screen, time = seen.screen >= 0, seen.screen, jnp.abs(seen.by_rows[:, time_column])
-    return arrays._replace(
-        screen_gradients=arrays.screen_gradients + jnp.where(shown, screen, jnp.zeros_like(screen)),
-        time_gradients=arrays.time_gradients + jnp.where(shown, time, jnp.zeros_like(time)),
-        seen=arrays.seen + shown.astype(jnp.int32),
-    )
-
-
 # -------------------------------------------------------------------------------------------------- errors
 
 
@@ -356,10 +285,9 @@ def compile_error(program: Program) -> jax.stages.Compiled:
 
     `maps` (paths, 2, 3) are those of the shared paths at t.
     """
-    place = replicated(program)
     shapes = (program.capacity, program.width), (program.num_paths, 2, 3), (), (), (*program.size, 3)
     dtypes = np.float32, np.float32, np.int32, np.float32, np.uint8
-    specs = (jax.ShapeDtypeStruct(*spec, sharding=place) for spec in zip(shapes, dtypes, strict=True))
+    specs = (jax.ShapeDtypeStruct(*spec) for spec in zip(shapes, dtypes, strict=True))
     return jax.jit(functools.partial(_measure_error, program)).lower(*specs).compile()
 
 

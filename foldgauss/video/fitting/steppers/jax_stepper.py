@@ -1,4 +1,4 @@
-"""`JaxStepper`: the steps of a fit on JAX's default devices, where arrays and frames stay between steps.
+"""`JaxStepper`: the steps of a fit on JAX's default device, where arrays and frames stay between steps.
 
 After each step only `jax_step.Report` is fetched, some hundred numbers. Arrays are fetched where they are read from the
 state, and for densification and relocation, which run on the host.
@@ -12,8 +12,8 @@ import numpy as np
 
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, most_gaussians
 from foldgauss.video.fitting.losses import LOSSES
-from foldgauss.video.fitting.schedule import RateSchedule, choose_start_frames, find_views_in_turn, steps_per_pass
-from foldgauss.video.fitting.state import STATISTICS, DeviceArrays, FitState, frame_times
+from foldgauss.video.fitting.schedule import choose_start_frames, find_views_in_turn, learning_rates, steps_per_pass
+from foldgauss.video.fitting.state import STATISTICS, DeviceArrays, FitState, StepResult, frame_times
 from foldgauss.video.fitting.steppers.interpolated_frames import Prefetcher, choose_targets, make_interpolated
 from foldgauss.video.fitting.steppers.jax_step import (
     Control,
@@ -23,9 +23,7 @@ from foldgauss.video.fitting.steppers.jax_step import (
     array_specs,
     compile_error,
     compile_step,
-    replicated,
 )
-from foldgauss.video.fitting.steppers.protocol import StepResult
 from foldgauss.video.motion.optical_flow import Motion, motion_finder
 
 #: A fit whose growth has no limit that it could reach has capacity for so many times the Gaussians of its start; where
@@ -66,7 +64,7 @@ class HeldArrays:
 
 
 class JaxStepper:
-    """A `Stepper` on JAX's default device, or on several where the batch can be divided evenly.
+    """The methods of `CpuStepper` on JAX's default device.
 
     The program is compiled when it is made, before any clock runs, and the frames are kept on the device, as bytes.
     """
@@ -82,14 +80,14 @@ class JaxStepper:
         self.frames, self.config, self.engine = frames, config, engine
         self.num_frames, *size = frames.shape[:3]
         self.size = tuple(size)
-        self.rates, self.steps_per_pass = RateSchedule(config), steps_per_pass(config, self.num_frames)
+        self.steps_per_pass = steps_per_pass(config, self.num_frames)
         self.interpolation = make_interpolated(frames, config, find_motion or motion_finder(frames))
         self.prefetcher = None if self.interpolation is None else Prefetcher(self.interpolation)
         self._prepared = 0  # steps
         self._no_targets: jax.Array | None = None
         self.capacity = 0
         self.adopt(state)
-        self.images = jax.device_put(frames, replicated(self.program))
+        self.images = jax.device_put(frames)
 
     def adopt(self, state: FitState) -> None:
         """Move a state's arrays to the device, padded to the capacity."""
@@ -106,7 +104,7 @@ class JaxStepper:
         specs = array_specs(self.program)._asdict()
         arrays = DeviceArrays(*(_pad(getattr(state, name), spec) for name, spec in specs.items()))
         # Copied, since arrays that are donated must be the device's own.
-        arrays = jax.tree.map(lambda leaf: leaf.copy(), jax.device_put(arrays, replicated(self.program)))
+        arrays = jax.tree.map(lambda leaf: leaf.copy(), jax.device_put(arrays))
         state.hold(HeldArrays(arrays, num, state.growing, None))
 
     def step(self, state: FitState, progress: float) -> StepResult:
@@ -114,7 +112,7 @@ class JaxStepper:
             state.fetch_all()
             self.adopt(state)
         held, config = state.held, self.config
-        rates, time_rate = self.rates.at(progress, state.backoffs)
+        rates, time_rate, path_rate = learning_rates(config, progress, state.backoffs)
         views, fractions = choose_targets(self.interpolation, config, self.num_frames, state, progress)
         control = Control(
             views=views.astype(np.int32),
@@ -122,7 +120,7 @@ class JaxStepper:
             squared=np.bool_(progress >= config.squared_from),
             rates=rates,
             time_rate=time_rate,
-            path_rate=self.rates.of_paths(progress, state.backoffs),
+            path_rate=path_rate,
             interpolated=self._interpolate(views, fractions, state.step),
         )
         self._prepare(state, progress)
@@ -142,7 +140,7 @@ class JaxStepper:
                 fractions[n], targets[n] = fraction, self.prefetcher.interpolate(step, int(k), fraction)
         if (fractions < 0).all():  # the device has zeros already
             if self._no_targets is None:
-                self._no_targets = jax.device_put(targets, replicated(self.program))
+                self._no_targets = jax.device_put(targets)
             targets = self._no_targets
         return InterpolatedViews(fractions, targets)
 
@@ -182,8 +180,7 @@ class JaxStepper:
         return min(capacity, most)
 
     def _make_program(self) -> Program:
-        config, devices = self.config, len(jax.local_devices())
-        divisors = [n for n in range(1, min(devices, config.views.batch_size) + 1) if config.views.batch_size % n == 0]
+        config = self.config
         return Program(
             capacity=self.capacity,
             num_frames=self.num_frames,
@@ -203,7 +200,6 @@ class JaxStepper:
             learns_times=config.learns_frame_times and self.num_frames > 2,
             grows=config.strategy.growth is not None,
             interpolates=self.interpolation is not None,
-            num_devices=max(divisors),
             num_paths=self.num_paths,
         )
 
