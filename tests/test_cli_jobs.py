@@ -15,7 +15,6 @@ from commands import call, run
 import foldgauss.jobs.runner as fitting
 from foldgauss.cli.fitting import job_progress as _jobs_view
 from foldgauss.io import load_video_model, read_video, write_frames, write_video
-from foldgauss.jobs import Progress
 from foldgauss.video import SegmentedVideo, VideoModel, evaluate
 
 QUICK = ("--gaussians", "40", "--steps", "12", "--degree", "1")
@@ -54,7 +53,6 @@ def whole(long_clip, tmp_path_factory):
     """The model of a fit that nothing disturbed."""
     target = tmp_path_factory.mktemp("whole") / "m.safetensors"
     told = ["39 frames of 24x32 in 3 segments of", "each with 40 Gaussians of degree 1, 12 steps, by this process"]
-    told += ["PSNR lost where segments meet"]
     call("fit", long_clip, "--out", target, *SEGMENTS, out=told, err="1 of 3 segments done: segment 0")
     return target
 
@@ -79,9 +77,9 @@ def stopped(name):
     """A signal is sent to this process once a job tells of itself for the second time."""
     seen, update = [], _jobs_view._View.update
 
-    def watch(view, share: Progress):
-        update(view, share)
-        seen.append(share.name)
+    def watch(view, share, info):
+        update(view, share, info)
+        seen.append(share)
         if seen.count(name) == 2:
             os.kill(os.getpid(), signal.SIGTERM)
 

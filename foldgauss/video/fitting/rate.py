@@ -331,12 +331,14 @@ class RateControl(DensityControl):
         adaptation = self._adaptation(state, action)
         gain = adaptation * (_GAIN_OF_GIVEN if _is_given(state) else action.gain)
         drops = action.what == "drop"
+        exact = self._psnr(self._model(state), self.sampled)
         before = self._psnr(self._with_only(state, np.ones(state.num_gaussians, bool)), self.sampled)
-        left = _error_at(before + gain)
-        not_replaced = _left_of_dropping(state, before)
+        still = 1 - adaptation * (1 - _LEFT_OF_ROUNDING)  # of the error of rounding, which `before` may have
+        left = _error_at(exact + gain) + still * (_error_at(before) - _error_at(exact))
+        not_replaced = _left_of_dropping(state, exact)
         most = _MOST_DROPPED_DB * (1 - not_replaced) ** 2
-        remaining = max(not_replaced, _LEFT_OF_DROPPING) if drops else _LEFT_OF_ROUNDING
-        remaining = 1 - adaptation * (1 - remaining)
+        dropping = 1 - adaptation * (1 - max(not_replaced, _LEFT_OF_DROPPING))
+        remaining = dropping if drops else still
 
         def cost(coarseness: float) -> float:
             """dB that the actions cost at once."""
