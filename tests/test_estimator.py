@@ -465,11 +465,11 @@ def test_rows_of_weight_zero_are_ignored(chunked):
     for value in (np.nan, 1e200):
         more = np.concatenate([x, np.full((1, 3), value)])
         rows = [more] if chunked else more
-        weighed = FoldedGaussianMixture(K, **options).fit(rows, sample_weight=weights)
+        weighed = FoldedGaussianMixture(K, **options).fit(rows, sample_weight=[weights] if chunked else weights)
         assert weighed.lower_bound_ == pytest.approx(whole.lower_bound_, rel=1e-9)
     more[-1] = np.nan
     with pytest.raises(ValueError, match="NaN"):
-        FoldedGaussianMixture(K, **options).fit(rows, sample_weight=np.ones(N + 1))
+        FoldedGaussianMixture(K, **options).fit(rows, sample_weight=np.ones((1, N + 1) if chunked else N + 1))
 
 
 @pytest.mark.parametrize("dtype", ["datetime64[s]", "timedelta64[s]", "complex128"])

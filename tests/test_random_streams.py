@@ -13,7 +13,7 @@ from foldgauss._numerics.random_streams import Stream, make_generator
 
 PACKAGE = Path(foldgauss.__file__).parent
 #: Modules whose generators come from an argument of the user: a seed or a generator, as in scipy and numpy.
-FROM_THE_USER = {"analysis/interop.py"}
+FROM_THE_USER = {"estimator/em/initialization.py"}
 
 
 def test_no_two_streams_seeds_or_places_draw_the_same():

@@ -1,4 +1,4 @@
-"""A small model and a clip of it, one frame of which is shown twice, for what is said of frame times; and masks."""
+"""Small clips: of a disc that moves, and of a small model, one frame of which is shown twice; and masks."""
 
 import numpy as np
 from PIL import Image
@@ -8,6 +8,15 @@ from foldgauss.io import save_video_model, write_frames
 from foldgauss.video import FrameTimes, VideoModel
 
 NUM_FRAMES, TWICE = 12, 6
+
+
+def moving_disc(num_frames=6, size=(48, 64)):
+    """uint8 (num_frames, *size, 3): a disc over a slope."""
+    y, x = np.mgrid[: size[0], : size[1]]
+    centers = np.linspace(0.2, 0.8, num_frames) * size[1]
+    light = np.stack([np.exp(-((x - at) ** 2 + (y - size[0] / 2) ** 2) / 40) for at in centers])[..., None]
+    slope = np.stack([x / size[1], y / size[0], 0 * x + 0.3], -1) * 0.6
+    return np.rint(255 * (slope * (1 - light) + light * np.array([1, 0.2, 0.1]))).astype(np.uint8)
 
 
 def model_of_12() -> VideoModel:

@@ -202,13 +202,12 @@ def describe_fit(config: FitConfig, state: FitState) -> dict[str, Any]:
     return about
 
 
-def missed_psnr(config: FitConfig, psnr: float) -> list[str]:
+def missed_psnr(config: FitConfig, psnr: float, cure: str = "--minutes or --steps, or more --gaussians") -> list[str]:
     """A warning that the model of a fit is worse than it was asked to be, if that is its only goal."""
     is_limited = config.quality is not None or config.size_mb is not None
     if config.psnr is None or is_limited or psnr >= config.psnr - TOLERATED_DB:
         return []
-    cure = "Give more --minutes or --steps, or more --gaussians at the start."
-    return [f"--psnr: expected {config.psnr:g} dB, got {psnr:.2f}. {cure}"]
+    return [f"--psnr: expected {config.psnr:g} dB, got {psnr:.2f}. Give more {cure}."]
 
 
 def mean_scores(scores: Evaluation) -> dict[str, float]:

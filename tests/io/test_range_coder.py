@@ -1,6 +1,5 @@
 """The coder of compact files: exact, close to the entropy, safe with any bytes."""
 
-import dataclasses
 
 import numpy as np
 import pytest
@@ -55,9 +54,9 @@ def test_what_is_near_saves_bits():
     values = np.rint(rng.laplace(size=20_000) * scale).astype(np.int32)
     plain = coder.Column.without_contexts(len(values))
     contexts = np.stack([np.log2(scale), 0 * scale], 1).astype(np.uint8)
-    told = len(coder.encode(values, dataclasses.replace(plain, contexts=contexts)))
+    told = len(coder.encode(values, plain._replace(contexts=contexts)))
     assert told < 0.92 * len(coder.encode(values, plain))
     walk = np.rint(np.cumsum(rng.laplace(size=20_000))).astype(np.int32) // 8
     before = np.arange(-1, len(walk) - 1, dtype=np.int32)[:, None]
-    near = len(coder.encode(walk, dataclasses.replace(plain, near=before)))
+    near = len(coder.encode(walk, plain._replace(near=before)))
     assert near < 0.9 * len(coder.encode(walk, plain))

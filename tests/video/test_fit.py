@@ -195,10 +195,11 @@ def test_interpolation_ends():
 )
 def test_interpolation_is_on_by_default_where_it_is_supported(changes, alpha, default):
     frames = np.zeros((3, 8, 8, 4 if alpha else 3), np.uint8)
-    config, motion = FitConfig().replace(**changes), SimpleNamespace(cuts=[], find_still=list)
+    config = FitConfig().replace(**{"views.error_fraction": 0.0}, **changes)
+    motion = SimpleNamespace(cuts=[], find_still=list)
     made = interpolated_frames.make_interpolated(frames, config, lambda: motion)
     assert (made.chance if made else 0) == default
-    asked = config.replace(**{"views.interpolation_fraction": 0.2, "views.error_fraction": 0.0})
+    asked = config.replace(**{"views.interpolation_fraction": 0.2})
     assert interpolated_frames.make_interpolated(frames, asked, lambda: motion).chance == 0.2
 
 

@@ -99,7 +99,7 @@ def compress_command(
     figures |= {"bytes_before": sizes[0], "file_bytes": sizes[1], "ratio": sizes[0] / sizes[1], "bits_per_pixel": bits}
     print_figures(str(target), figures)
     if clip is not None:
-        for text in missed_psnr(FitConfig(quality=quality, size_mb=size_mb, psnr=psnr), after.mean_psnr):
+        for text in missed_psnr(FitConfig(quality=quality, size_mb=size_mb, psnr=psnr), after.mean_psnr, "--minutes"):
             warn(text)
     if sizes[1] >= sizes[0]:
         warn(f"{target} is no smaller than {model_path}.")

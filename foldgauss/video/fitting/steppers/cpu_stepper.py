@@ -109,6 +109,8 @@ class CpuStepper:
                 after = update_paths(before, np.float32(by_path), visited, rate)
             for name, array in zip(PATH_ARRAYS, after, strict=True):
                 setattr(state, name, np.array(array))
+            with np.errstate(invalid="ignore", over="ignore"):
+                finite &= bool((np.linalg.det(state.path_maps[..., :2]) > 0).all())
         return StepResult(float(np.mean(losses)), num_alive, finite)
 
     def measure_start(self, state: FitState) -> dict[int, float]:
