@@ -96,6 +96,15 @@ def test_a_stopped_fit_goes_on_when_the_command_is_given_again(long_clip, whole,
         call("fit", long_clip, "--out", target, *SEGMENTS, code=1, err="stopped by SIGTERM; 1 of 3 segments are done")
     assert (folder / "segment-0001.safetensors.checkpoint").exists()
     call("fit", long_clip, "--out", target, *SEGMENTS[:-1], "2", code=2, err="segment_seconds=1.5")
+    call(
+        "fit",
+        long_clip,
+        "--out",
+        target,
+        *QUICK,
+        code=2,
+        err="expected no other fit to be unfinished, got one in segments",
+    )
     call("fit", long_clip, "--out", target, *SEGMENTS, err="continuing: 1 of 3 segments done, 1 begun")
     assert target.read_bytes() == whole.read_bytes()
     assert not folder.exists()

@@ -107,6 +107,11 @@ class LongFit:
             self.folder.rmdir()
 
 
+def has_plan(target: str | os.PathLike) -> bool:
+    """Whether a fit of `target` in segments is unfinished."""
+    return (segments_folder(target) / _PLAN).exists()
+
+
 def segments_folder(target: str | os.PathLike) -> Path:
     """The folder of the segments of `target` until they are joined."""
     target = Path(target)

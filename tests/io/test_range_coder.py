@@ -1,6 +1,5 @@
 """The coder of compact files: exact, close to the entropy, safe with any bytes."""
 
-
 import numpy as np
 import pytest
 

@@ -34,10 +34,10 @@ def demo(
 
     The frames are of 160x320.
     """
-    for name in FILES:
-        refuse_existing(out_dir / name, overwrite)
     target = out_dir / "model.fgz"
     job = FitJob("bunny", str(sample_clip("bunny")), str(target), CONFIG, SIZE, FRAMES)
+    for name in FILES:
+        refuse_existing(out_dir / name, overwrite or job.checkpoint.exists())
     make_folder(out_dir)
     record = fit_with_progress(job, choose_display(), overwrite=overwrite)
     clip, model = read_video(job.clip, frames=FRAMES, size=SIZE), load_video_model(target)

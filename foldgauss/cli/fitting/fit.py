@@ -53,7 +53,7 @@ from foldgauss.io.models.video_model import MODEL_SUFFIX, check_model_name
 from foldgauss.jobs import FitJob
 from foldgauss.jobs import Stopped as FitStopped
 from foldgauss.jobs.runner import run_fit
-from foldgauss.jobs.segments import SEGMENT_SECONDS, segments_folder
+from foldgauss.jobs.segments import SEGMENT_SECONDS, has_plan
 from foldgauss.video import Evaluation, FitDiverged, FitInfo
 from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig, planned_steps
 from foldgauss.video.fitting.state import FitState, running_psnr
@@ -119,9 +119,19 @@ def fit(
     display = choose_display(quiet, log_json)
     options = WorkerOptions(workers, scheduler, threads)
     context.with_resource(lock_output(target, own=(job.checkpoint,)))
-    is_begun = job.checkpoint.exists() or segments_folder(target).exists()
+    in_segments = not (segment_seconds is None and workers is None and scheduler is None)
+    is_begun, is_other = has_plan(target), job.checkpoint.exists()
+    if not in_segments:
+        is_begun, is_other = is_other, is_begun
     refuse_existing(target, overwrite or is_begun)
-    if not (segment_seconds is None and workers is None and scheduler is None):
+    require(
+        overwrite or not is_other,
+        "--out",
+        expected="no other fit to be unfinished",
+        got=f"{'one in one piece' if in_segments else 'one in segments'} for {target}",
+        cure="Give the command that began it, or add --overwrite.",
+    )
+    if in_segments:
         for option, path in (("--history", history), ("--preview", preview)):
             require(path is None, option, expected="a fit in one piece", got="one in segments", cure="Leave it out.")
         seconds = SEGMENT_SECONDS if segment_seconds is None else segment_seconds

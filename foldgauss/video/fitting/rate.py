@@ -77,6 +77,8 @@ _TOLERANCE_LOG2 = 0.02
 _SLOPE_LOG2 = 0.8
 #: The least fraction of the error of dropping that is expected to remain after many passes.
 _LEFT_OF_DROPPING = 0.2
+#: By how many dB dropping has to worsen the images at once for what remains of it to be measured.
+_LEAST_MEASURED_DB = 0.05
 #: That of the error of rounding.
 _LEFT_OF_ROUNDING = 0.6
 #: How finely the coarseness is searched for a PSNR.
@@ -453,11 +455,10 @@ def _error_at(psnr: float) -> float:
 
 def _left_of_dropping(state: FitState, psnr: float) -> float:
     """The fraction of the error of dropping that remains, by the last dropping and the PSNR that it has led to."""
-    if not state.last_drop:
+    if not state.last_drop or state.last_drop[0] - state.last_drop[1] < _LEAST_MEASURED_DB:
         return _LEFT_OF_DROPPING
     before, after = map(_error_at, state.last_drop)
-    left = (_error_at(psnr) - before) / max(after - before, 1e-12)
-    return min(max(left, 0.0), 1.0)
+    return min(max((_error_at(psnr) - before) / (after - before), 0.0), 1.0)
 
 
 def _is_given(state: FitState) -> bool:

@@ -61,7 +61,8 @@ class Relocation(DensityControl):
             return False
         before, after = (measure_progress(state, self.config, step) for step in (state.step - 1, state.step))
         crossed = any(before < fraction <= after for fraction in RELOCATED_AT)
-        return crossed and bool(state.frame_errors.any()) and not state.backoffs and state.is_finite("second")
+        is_good = not state.backoffs and state.is_finite("rows") and state.is_finite("second")
+        return crossed and bool(state.frame_errors.any()) and is_good
 
     def apply(self, state: FitState) -> None:
         motion = self.find_motion() if self.config.follows_motion else None
