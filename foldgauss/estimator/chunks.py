@@ -207,6 +207,7 @@ def _split_chunk(number: int, x, weights, width: int | None) -> Iterator[Piece]:
         f"sample_weight, chunk {number}",
         expected=f"{len(x)} weights",
         got=f"{len(weights)}" if np.ndim(weights) else "a number",
+        cure="Divide the weights as X: an array for each chunk.",
     )
     for row in range(0, len(x), _PIECE_ROWS):
         rows = slice(row, row + _PIECE_ROWS)

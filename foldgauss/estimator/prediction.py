@@ -1,6 +1,5 @@
 """Evaluation of a fitted mixture at rows of X, in a form that can be sent to workers."""
 
-import functools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -10,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from foldgauss._numerics.batch import compile_eager
 from foldgauss.estimator.em.scaling import Scaling
 from foldgauss.estimator.em.statistics import enable_dtype
 from foldgauss.mixture import FoldedMixture
@@ -54,7 +54,7 @@ def _evaluate_rows(method: Callable, fitted: FittedMixture, x: np.ndarray) -> np
         return np.concatenate([np.asarray(block) for block in blocks])[: len(y)]
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@compile_eager(static=("method",))
 def _call(method: Callable, mixture: FoldedMixture, x: np.ndarray):
     """A method as one program, which is called with less overhead than its parts."""
     return method(mixture, x)

@@ -384,7 +384,8 @@ def _unit(vector: Float[Array, "*batch dim"]) -> Float[Array, "*batch dim"]:
 def _cos_sin(angle: Float[Array, ""]) -> Float[Array, "2"]:
     """Cosine and sine, 0 where they are within rounding of it: quarter turns are exact."""
     pair = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
-    is_rounding = jnp.abs(pair) <= jnp.finfo(angle.dtype).eps * jnp.abs(angle)
+    rounding = jnp.minimum(jnp.finfo(angle.dtype).eps * jnp.abs(angle), 1e-6)
+    is_rounding = jnp.abs(pair) <= rounding
     return pair - lax.stop_gradient(jnp.where(is_rounding, pair, jnp.zeros_like(pair)))
 
 

@@ -98,7 +98,9 @@ def marginalize_colors(
         nodes[k], values[k] = _join(*curve.profile(), nodes[k], values[k])
         if on_frame is not None:
             on_frame(done + 1, len(chosen))
-    return dataclasses.replace(base, curves=ProfileCurves.from_nodes(nodes, values), level="colors")
+    unknown = np.full_like(base.log_likelihood, np.nan)  # of the modes with integrated colors
+    curves = ProfileCurves.from_nodes(nodes, values)
+    return dataclasses.replace(base, curves=curves, log_likelihood=unknown, level="colors")
 
 
 def _check(base: LikelihoodProfiles, num_frames: int, prior_scale: float, most_dense: int, probes: int) -> None:
