@@ -40,7 +40,7 @@ class Wrong(AssertionError):
 
 
 class Uninterrupted(NamedTuple):
-    """A fit that nobody disturbs: its model, and what it took."""
+    """The model and the cost of a fit that is not interrupted."""
 
     model: bytes
     seconds: float

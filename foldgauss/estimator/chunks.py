@@ -45,7 +45,7 @@ def is_chunked(X) -> bool:
 def open_chunks(X, sample_weight=None, width: int | None = None) -> "IterableChunks | DaskChunks":
     """The source of the chunks X; `width` is the number of columns if it is known.
 
-    `sample_weight` is chunked as X is; that of a dask array may be one array.
+    `sample_weight` has the chunks of X. For a dask array it may also be a single array.
 
     **Raises:** ValueError if X can be iterated only once, or is a dask array whose chunks are unknown or split rows.
     """

@@ -86,7 +86,7 @@ def run_fit(
 ) -> dict[str, Any]:
     """Fit the frames of a job, from its checkpoint if there is one, and write its model; returns the job's record.
 
-    The record is described in `fit_job`. The checkpoint, then that of the last step, stays until the caller removes it.
+    The record is described in `fit_job`. The checkpoint of the last step stays until the caller removes it.
     Without `resume` the first step removes an earlier one. The observer is opened once the frames are read; `measure`
     computes the scores.
 
@@ -166,7 +166,7 @@ def run_steps(
     checkpoint: Checkpoint,
     seconds: float | None = None,
 ) -> tuple[FitState, FitInfo]:
-    """Take all steps of a fit and return the last; the state is saved every so many `seconds`, and at the end.
+    """Take all steps of a fit and return the last. The state is saved every `seconds` seconds and at the end.
 
     Raises as `run_fit`.
     """

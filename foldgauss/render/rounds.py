@@ -127,7 +127,7 @@ def _checkpoint_rounds(start: Float[Array, "tiles pixels"], num, attenuate: Call
         begins, stored = begins.at[k].set(begin), stored.at[k].set(transmittance)
         return begins, stored, *advance(jnp.where(k < last, stride, 0), begin, transmittance)
 
-    # Those of the first round, which are all that a single one needs.
+    # The arrays at the start of the first round: a single round needs no others.
     first = jnp.zeros(STORED_ROUNDS, jnp.int32), jnp.broadcast_to(start, (STORED_ROUNDS, *start.shape))
     begins, stored, *_ = jax.lax.fori_loop(0, jnp.where(num > 1, last + 1, 0), store, (*first, jnp.int32(0), start))
     return lambda number: advance(number % stride, begins[number // stride], stored[number // stride])

@@ -471,7 +471,8 @@ def _sigmoid(x: np.ndarray) -> np.ndarray:
     return 0.5 * (1 + np.tanh(0.5 * x))
 
 
-def _make_info(model: VideoModel) -> CompactInfo:
+def envelope_of_all(model: VideoModel) -> tuple[float, float]:
+    """The power and the floor of the envelope. Raises ValueError unless all Gaussians have the same."""
     power, floor = (np.unique(np.asarray(getattr(model.splats.envelope, name))) for name in ("power", "floor"))
     require(
         power.size == floor.size == 1,
@@ -480,6 +481,11 @@ def _make_info(model: VideoModel) -> CompactInfo:
         got="several",
         cure="Save it as .safetensors, which holds one envelope per Gaussian.",
     )
+    return float(power[0]), float(floor[0])
+
+
+def _make_info(model: VideoModel) -> CompactInfo:
+    power, floor = envelope_of_all(model)
     require(
         model.degree <= MAX_DEGREE,
         "model.degree",
@@ -490,12 +496,11 @@ def _make_info(model: VideoModel) -> CompactInfo:
     require(model.num_gaussians, "model", expected="at least one Gaussian", got="none")
     # A Gaussian's area is about exp(-power tau^2 / 2), of deviation 1 / sqrt(power); a uniform weight of the same
     # deviation reaches sqrt(3) times as far. Twice that takes the fewest bits, as measured.
-    power = float(power[0])
     reach = min(TAU_MAX, math.sqrt(12 / max(power, 0.1)))
     return CompactInfo(
         degree=model.degree,
         power=power,
-        floor=float(floor[0]),
+        floor=floor,
         reach=reach,
         size=tuple(map(int, model.size)),
         fps=float(model.fps),
@@ -662,7 +667,7 @@ def choose_time_bits(logits: Float[np.ndarray, " intervals"]) -> int:
 
 
 def round_times(logits: Float[np.ndarray, " intervals"], bits: int) -> Int32[np.ndarray, " intervals"]:
-    """Integers of logits up to 0; those of intervals that are 0 in float64 are limited to -`LARGEST`."""
+    """Integers of logits up to 0, at least -`LARGEST`, which intervals that are 0 in float64 have."""
     return np.rint(np.maximum(logits, -1e5) * 2.0**bits).astype(np.int64).clip(-LARGEST).astype(np.int32)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from foldgauss._runtime.checks import require
-from foldgauss.video.compression.quantize import dequantize
+from foldgauss.video.compression.quantize import dequantize, envelope_of_all
 from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig, Strategy, Views, planned_steps
 from foldgauss.video.fitting.loop import FitInfo, FitResult, check_frames, fit, start_from
 from foldgauss.video.fitting.rate import COMPRESSION_START, RateControl
@@ -48,18 +48,11 @@ def compress(
     Example: `save_compact("clip.fgz", compress(model, clip.frames, quality=60).quantized)`.
     """
     check_model(model)
-    power, floor = (np.unique(np.asarray(getattr(model.splats.envelope, name))) for name in ("power", "floor"))
-    require(
-        power.size == floor.size == 1,
-        "model.splats.envelope",
-        expected="one for all Gaussians",
-        got="several",
-        cure="Save it as .safetensors, which holds one envelope per Gaussian.",
-    )
+    power, floor = envelope_of_all(model)
     config = FitConfig(
         degree=model.degree,
-        power=float(power[0]),
-        floor=float(floor[0]),
+        power=power,
+        floor=floor,
         quality=quality,
         size_mb=size_mb,
         psnr=psnr,
