@@ -595,9 +595,9 @@ START_DENSITY = 0.012
 #: Growth of the binary logarithm of that number for each unit of quality.
 DENSITY_PER_QUALITY = 0.08
 #: The PSNR of usual clips at quality 50, in dB.
-PSNR_AT_50 = 35.0
+PSNR_AT_50 = 33.0
 #: Growth of the binary logarithm of that number for each dB of the PSNR that is asked for.
-DENSITY_PER_DB = 0.32
+DENSITY_PER_DB = 0.14
 #: Gaussians per pixel of a clip for each microsecond of x, see `default_num_gaussians`, with which a fit of a compact
 #: model starts at most: those that do not converge are not worth their bits.
 START_PER_TIME = 7e-4
@@ -643,8 +643,8 @@ def _most_for_rate(config: FitConfig, pixels: int, time: float) -> float:
     limits = [START_PER_TIME * time * pixels if config.is_compact else math.inf]
     if config.quality is not None:
         limits.append(pixels * START_DENSITY * 2 ** (DENSITY_PER_QUALITY * (config.quality - 50)))
-    if config.psnr is not None:  # at what quality is not known yet, so more than twice as many
-        limits.append(2.5 * pixels * START_DENSITY * 2 ** (DENSITY_PER_DB * (config.psnr - PSNR_AT_50)))
+    if config.psnr is not None:  # at what quality is not known yet
+        limits.append(pixels * START_DENSITY * 2 ** (DENSITY_PER_DB * (config.psnr - PSNR_AT_50)))
     if config.size_mb is not None:
         limits.append(GAUSSIANS_PER_MB * config.size_mb)
     return min(limits)

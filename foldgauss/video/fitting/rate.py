@@ -85,19 +85,27 @@ _LEFT_OF_ROUNDING = 0.6
 _TOLERANCE = 0.1
 #: Frames that a PSNR is estimated by.
 _SAMPLED_FRAMES = 12
-#: Rounding for a PSNR adds at least and at most these fractions of the error that is asked for: files of a quality have
-#: 0.02 to 0.2, as estimated.
-_LEAST_ROUNDING = 0.03
-_MOST_ROUNDING = 0.3
+#: By how much steps of rounding for a PSNR are finer at most, as a binary logarithm, than those that Gaussians were
+#: dropped by. A quality has the same for both.
+_FINER_ROUNDING = 1.0
 #: How many dB dropping for a PSNR may cost before the rest of the fit makes up for it, where that reaches the PSNR and
 #: the fit has made up for all of the last dropping.
 _MOST_DROPPED_DB = 6.0
-#: The same where it is not known yet whether the fit reaches it.
-_MOST_RISKED_DB = 0.5
+#: The same where it is not known yet whether the fit reaches it, at first.
+_FIRST_RISKED_DB = 0.5
+#: Later it may cost this many times what the last dropping did, or what the PSNR has risen by since, if that is less.
+_RISK_GROWTH = 2.0
+#: At most.
+_MOST_RISKED_DB = 1.0
 #: About how many dB a finished model gains by further training.
 _GAIN_OF_GIVEN = 0.2
-#: The least of lambda R / D that a fit to a PSNR aims at. Most files have more.
+#: Lambda R / D that a fit to a PSNR aims at: at least, at most, and for the root of the number of passes in between.
 _LEAST_COST = 0.7
+_MOST_COST = 1.5
+_COST_PER_ROOT = 0.1
+#: By how much more passes are left in a fit by minutes than its speed so far suggests: steps of fewer Gaussians, of
+#: which ever more are rounded, are faster.
+_SPEEDUP = 2.0
 #: By how many dB the fit aims at more than it was asked for: what is too much is given up in the end.
 _MARGIN_DB = 0.3
 #: Bits of a Gaussian in a file whose number of Gaussians suits its steps, as measured.
@@ -122,8 +130,8 @@ class Action(NamedTuple):
     """What is done after a fraction of the plan: "drop", "sort", "divide" into chunks, or the group of leaves to round.
 
     `extent`: the fraction of the price of a bit at which Gaussians are dropped, or of the Gaussians that are rounded.
-    `gain`: about how many dB the PSNR rises from then to the end of the fit, rounding included, if nothing is
-    dropped any more; rather too few.
+    `gain`: how many dB the PSNR rises at most from then to the end of the fit, rounding included, if nothing is
+    dropped any more. It is expected to rise as much as it has from the middle of the last dropping, if that is less.
     """
 
     progress: float
@@ -134,12 +142,12 @@ class Action(NamedTuple):
 
 ACTIONS = (
     Action(0.1, "drop", 0.04, 3.0),
-    Action(0.2, "drop", 0.16, 2.2),
-    Action(0.3, "drop", 0.36, 1.6),
-    Action(0.42, "drop", 0.64, 1.0),
-    Action(0.55, "drop", 1.0, 0.6),
+    Action(0.2, "drop", 0.16, 4.0),
+    Action(0.3, "drop", 0.36, 3.0),
+    Action(0.42, "drop", 0.64, 2.2),
+    Action(0.55, "drop", 1.0, 1.6),
     Action(0.55, "sort"),
-    Action(0.7, SHAPE, 0.4, 0.4),
+    Action(0.7, SHAPE, 0.4, 1.3),
     Action(0.78, SHAPE, 0.75),
     Action(0.84, "drop", 1.0),
     Action(0.86, SHAPE, 1.0),
@@ -251,8 +259,11 @@ class RateControl(DensityControl):
         """How much of what an action costs the rest of the fit makes up for, compared with many passes, 0 to 1."""
         if action.progress == 1:
             return 0.0  # although the fit may end before its plan
-        passes = (state.plan - state.step) * self.config.views.batch_size / len(self.frames)
-        return min(passes / _PASSES, 1.0)
+        return min(self._count_passes(state.plan - state.step) / _PASSES, 1.0)
+
+    def _count_passes(self, steps: int) -> float:
+        speedup = 1.0 if self.config.minutes is None else _SPEEDUP
+        return speedup * steps * self.config.views.batch_size / len(self.frames)
 
     def _model(self, state: FitState, fps: float = 25.0) -> VideoModel:
         return to_model(state, self.config, self.frames.shape[1:3], fps)
@@ -331,14 +342,14 @@ class RateControl(DensityControl):
         """
         aim = self.config.psnr + _MARGIN_DB
         adaptation = self._adaptation(state, action)
-        gain = adaptation * (_GAIN_OF_GIVEN if _is_given(state) else action.gain)
         drops = action.what == "drop"
         exact = self._psnr(self._model(state), self.sampled)
+        gain = adaptation * _expected_gain(state, exact, action)
         before = self._psnr(self._with_only(state, np.ones(state.num_gaussians, bool)), self.sampled)
         still = 1 - adaptation * (1 - _LEFT_OF_ROUNDING)  # of the error of rounding, which `before` may have
         left = _error_at(exact + gain) + still * (_error_at(before) - _error_at(exact))
         not_replaced = _left_of_dropping(state, exact)
-        most = _MOST_DROPPED_DB * (1 - not_replaced) ** 2
+        daring = (1 - not_replaced) ** 2
         dropping = 1 - adaptation * (1 - max(not_replaced, _LEFT_OF_DROPPING))
         remaining = dropping if drops else still
 
@@ -352,15 +363,21 @@ class RateControl(DensityControl):
 
         def reaches(coarseness: float) -> bool:
             db = cost(coarseness)
-            more = max(_error_at(before - db) - _error_at(before), 0.0)
-            return -10 * math.log10(left + remaining * more) >= aim and not (drops and db > most)
+            error = left + remaining * max(_error_at(before - db) - _error_at(before), 0.0)
+            if drops and not state.rules:
+                num_values = measured.are_worth(coarseness).sum() * len(column_names(self.config.fold_degree))
+                error += _LEFT_OF_ROUNDING * num_values * 4.0**coarseness / 12 / self._error_at_0_db(state)
+            return -10 * math.log10(error) >= aim and not (drops and db > daring * _MOST_DROPPED_DB)
 
         low, high = FINEST, COARSEST
-        if not drops:
-            low, high = (self._rounding_that_adds(part, state) for part in (_LEAST_ROUNDING, _MOST_ROUNDING))
+        if not drops and state.coarseness:
+            low, high = state.coarseness - _FINER_ROUNDING, state.coarseness
         elif not (state.rules or _is_given(state)):
-            usual = self._usual_coarseness(state, measured, action)
-            low = usual if cost(usual) <= _MOST_RISKED_DB else _last(lambda c: cost(c) <= _MOST_RISKED_DB, low, usual)
+            last, after = state.last_drop or (exact, exact)
+            replaced = min(last - after, exact - last)
+            risk = daring * min(max(_RISK_GROWTH * replaced, _FIRST_RISKED_DB), _MOST_RISKED_DB)
+            risked = lambda coarseness: cost(coarseness) <= risk  # noqa: E731
+            low = _last(risked, low, self._usual_coarseness(state, measured, action))
         return max(low, _last(reaches, low, high))
 
     def _with_only(self, state: FitState, kept: Bool[np.ndarray, " num"]) -> VideoModel:
@@ -371,27 +388,22 @@ class RateControl(DensityControl):
         classes, rules = state.classes[kept].astype(np.int32), _decode_rules(state)
         return dequantize(quantize(select_rows(compute_columns(model), kept), classes, rules))
 
-    def _rounding_that_adds(self, part: float, state: FitState) -> float:
-        """The coarseness at which rounding adds this fraction of the error that is asked for."""
-        num_values = state.num_gaussians * len(column_names(self.config.fold_degree))
-        return 0.5 * math.log2(12 * part * self._error_of_goal(state) / num_values)
-
     def _usual_coarseness(self, state: FitState, worth: Worth, action: Action) -> float:
-        """The coarseness at which the bits of what is kept cost `_LEAST_COST` times the error that is asked for.
+        """The coarseness at which the bits of what is kept cost a usual part of the error that is asked for.
 
-        Where the error falls as a power of the bits, D ~ R^-b, the best file has lambda R = b D. More Gaussians would
-        also leave fewer passes to a fit by minutes.
+        Where the error falls as a power of the bits, D ~ R^-b, the best file has lambda R = b D. b is larger where
+        there is time for many passes. More Gaussians would also leave fewer passes to a fit by minutes.
         """
         grid = np.arange(FINEST, COARSEST, _TOLERANCE)
         kept = [worth.are_worth(coarseness, action.extent).sum() for coarseness in grid]
         costs = [bit_price(coarseness) * USUAL_BITS * num for coarseness, num in zip(grid, kept, strict=True)]
-        limit = _LEAST_COST * self._error_of_goal(state)
+        part = min(max(_COST_PER_ROOT * math.sqrt(self._count_passes(state.plan)), _LEAST_COST), _MOST_COST)
+        limit = part * _error_at(self.config.psnr) * self._error_at_0_db(state)
         return float(grid[np.argmax(np.minimum(costs, limit))])  # the first of enough, or the most
 
-    def _error_of_goal(self, state: FitState) -> float:
-        """The squared error of a clip with the PSNR that is asked for, if all frames improve by as many dB."""
-        uneven = 10 ** (0.1 * (self._typical_psnr(state) - running_psnr(state)))
-        return 255**2 * _error_at(self.config.psnr) * uneven * self.frames[..., :3].size
+    def _error_at_0_db(self, state: FitState) -> float:
+        """The squared error of a clip with a mean PSNR of 0 dB, if all frames differ by as many dB from now."""
+        return 255**2 * 10 ** (0.1 * (self._typical_psnr(state) - running_psnr(state))) * self.frames[..., :3].size
 
     def _typical_psnr(self, state: FitState) -> float:
         """The mean PSNR of the frames as last seen, dB; each at most 100."""
@@ -459,6 +471,13 @@ def _left_of_dropping(state: FitState, psnr: float) -> float:
         return _LEFT_OF_DROPPING
     before, after = map(_error_at, state.last_drop)
     return min(max((_error_at(psnr) - before) / (after - before), 0.0), 1.0)
+
+
+def _expected_gain(state: FitState, psnr: float, action: Action) -> float:
+    """How many dB the PSNR rises until the end if nothing is dropped any more, see `Action`."""
+    if _is_given(state):
+        return _GAIN_OF_GIVEN
+    return min(action.gain, max(psnr - sum(state.last_drop) / 2, 0.0)) if state.last_drop else action.gain
 
 
 def _is_given(state: FitState) -> bool:

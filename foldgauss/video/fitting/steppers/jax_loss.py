@@ -37,7 +37,7 @@ def _along(x: Array, axis: int) -> Array:
 def ssim(
     x: Float[Array, "*batch height width channels"], y: Float[Array, "*batch height width channels"]
 ) -> Float[Array, "*batch height width channels"]:
-    """SSIM at every pixel, as `loss.ssim_map`."""
+    """SSIM at every pixel, with zeros around the images: what `loss.image_loss` averages."""
     mean_x, mean_y, xx, yy, xy = blur(jnp.stack([x, y, x * x, y * y, x * y]))
     var_x, var_y, cov = xx - mean_x * mean_x, yy - mean_y * mean_y, xy - mean_x * mean_y
     top = (2 * mean_x * mean_y + C1) * (2 * cov + C2)
@@ -72,7 +72,7 @@ def custom_loss(rendered: np.ndarray, target: np.ndarray, function: Callable[[Ar
     """A function of `register_loss` for planar float32 images (channels, height, width), with its gradient."""
     value, gradient = _differentiate(function)(np.moveaxis(rendered, 0, -1), np.moveaxis(target, 0, -1))
     error = float(np.square(rendered - target).mean())
-    return ImageLoss(float(value), np.array(np.moveaxis(np.asarray(gradient), -1, 0), order="C"), error, None)
+    return ImageLoss(float(value), np.array(np.moveaxis(np.asarray(gradient), -1, 0), order="C"), error)
 
 
 @functools.cache

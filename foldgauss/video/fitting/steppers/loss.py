@@ -44,12 +44,11 @@ _u = nb.uint64
 
 
 class ImageLoss(NamedTuple):
-    """Value and gradient of the loss of one image, and the metrics computed along with it."""
+    """Value and gradient of the loss of one image, and its mean squared error."""
 
     value: float
     gradient: np.ndarray  # (3, height, width), dL/d rendered
     mean_squared_error: float
-    ssim: float | None  # None where its fraction of the loss is 0: not computed
 
 
 @inline
@@ -151,11 +150,8 @@ def _errors(x, y, start, stop):
 
 
 @kernel
-def _strip(x, y, start, stop, taps, scale_l1, scale_ssim, gradient, similarity):
-    """Gradient of rows start..stop of one plane; returns their sums of |x - y|, (x - y)^2 and SSIM.
-
-    `similarity`: None, or an output for the SSIM of every pixel, (height, width).
-    """
+def _strip(x, y, start, stop, taps, scale_l1, scale_ssim, gradient):
+    """Gradient of rows start..stop of one plane; returns their sums of |x - y|, (x - y)^2 and SSIM."""
     height, width = x.shape
     wide = (width + LANES - 1) // LANES * LANES
     pitch, total = wide + 2 * LANES, 0.0
@@ -180,8 +176,6 @@ def _strip(x, y, start, stop, taps, scale_l1, scale_ssim, gradient, similarity):
                 store(blurred, out, _blur_along(derivatives, _u(j) * _u(pitch) + _u(LANES) + c))
         if start <= row < stop:
             total += ssim[:width].sum()
-            if similarity is not None:
-                similarity[row] = ssim[:width]
     for row in range(start, stop):
         at = row - first
         _finish_row(flat_x, flat_y, at * wide, blurred, (at - RADIUS) * 3 * wide, wide, scale_l1, scale_ssim, ssim)
@@ -206,7 +200,7 @@ def image_loss(rendered: np.ndarray, target: np.ndarray, *, ssim_fraction: float
         difference = rendered - target
         gradient = np.sign(difference) * np.float32(1 / rendered.size)
         absolute, squared = (float(moment.mean(dtype=float)) for moment in (np.abs(difference), difference**2))
-        return ImageLoss(absolute, gradient, squared, None)
+        return ImageLoss(absolute, gradient, squared)
     gradient = np.empty_like(rendered)
     channels, height, _width = rendered.shape
     strips = [(c, r, min(r + STRIP, height)) for c in range(channels) for r in range(0, height, STRIP)]
@@ -216,19 +210,12 @@ def image_loss(rendered: np.ndarray, target: np.ndarray, *, ssim_fraction: float
 
     def work(k: int) -> None:
         c, start, stop = strips[k]
-        sums[k] = _strip(rendered[c], target[c], start, stop, _ALL_TAPS, by_l1, by_ssim, gradient[c], None)
+        sums[k] = _strip(rendered[c], target[c], start, stop, _ALL_TAPS, by_l1, by_ssim, gradient[c])
 
     run_tasks(work, range(len(strips)))
     absolute, squared, similar = sums.sum(0) / rendered.size
     value = (1 - ssim_fraction) * absolute + ssim_fraction * (1 - similar)
-    return ImageLoss(float(value), gradient, float(squared), float(similar))
-
-
-def ssim_map(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """SSIM at every pixel of two float32 planes (height, width), zero padding: what the loss averages."""
-    out, gradient = np.empty_like(x), np.empty_like(x)
-    _strip(x, y, 0, len(x), _ALL_TAPS, np.float32(1), np.float32(1), gradient, out)
-    return out
+    return ImageLoss(float(value), gradient, float(squared))
 
 
 #: Weight of the squared error: about the slope of the absolute one at some 30 dB, so that Adam's moments keep their
@@ -241,7 +228,7 @@ def squared_loss(rendered: np.ndarray, target: np.ndarray) -> ImageLoss:
     difference = rendered - target
     error = float(np.vdot(difference, difference)) / difference.size
     difference *= np.float32(2 * SQUARE_WEIGHT / difference.size)
-    return ImageLoss(SQUARE_WEIGHT * error, difference, error, None)
+    return ImageLoss(SQUARE_WEIGHT * error, difference, error)
 
 
 @functools.cache
