@@ -87,7 +87,7 @@ _TOLERANCE = 0.1
 _SAMPLED_FRAMES = 12
 #: By how much steps of rounding for a PSNR are finer at most, as a binary logarithm, than those that Gaussians were
 #: dropped by. A quality has the same for both.
-_FINER_ROUNDING = 1.0
+_FINER_ROUNDING = 0.5
 #: How many dB dropping for a PSNR may cost before the rest of the fit makes up for it, where that reaches the PSNR and
 #: the fit has made up for all of the last dropping.
 _MOST_DROPPED_DB = 6.0
